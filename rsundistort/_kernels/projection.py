@@ -1,0 +1,593 @@
+"""Lens, rotations and row models, and the loops over them: points, pixels, residual blocks, grids.
+
+One file, because numba's cache does not notice a changed callee elsewhere. Conventions of every function here:
+`lens` is (13,): OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 and the squared radius where the radial part folds;
+`axis` is the component of the image that the clock follows (1: rows, 0: columns) and `sign` its direction;
+`model` is a code of `model.motion.SHUTTER_MODELS`; `intr` is (4,): fx fy cx cy.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ._jit import kernel, parallel_kernel, prange
+
+GLOBAL, TWO_STEP, LINEARIZED, ROTATION = 0, 1, 2, 3
+
+# Newton on the row ends when a step is below this (normalised units): 1e-10 px at any focal length in use.
+_ROW_TOL = 1e-14
+_MAX_NEWTON = 30
+_CHUNK = 512
+
+
+@kernel()
+def _lens(lens, x, y):
+    """Distorted coordinates with their derivatives: xd, yd, dxd/dx, dxd/dy, dyd/dx, dyd/dy, ok."""
+    s = x * x + y * y
+    num = 1.0 + s * (lens[0] + s * (lens[1] + s * lens[4]))
+    den = 1.0 + s * (lens[5] + s * (lens[6] + s * lens[7]))
+    dnum = lens[0] + s * (2.0 * lens[1] + s * 3.0 * lens[4])
+    dden = lens[5] + s * (2.0 * lens[6] + s * 3.0 * lens[7])
+    g = num / den
+    dg = (dnum - g * dden) / den
+    p1, p2 = lens[2], lens[3]
+    xd = x * g + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x) + s * (lens[8] + s * lens[9])
+    yd = y * g + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y + s * (lens[10] + s * lens[11])
+    ts = lens[8] + 2.0 * s * lens[9]
+    tt = lens[10] + 2.0 * s * lens[11]
+    xx = g + 2.0 * x * x * dg + 2.0 * p1 * y + 6.0 * p2 * x + 2.0 * x * ts
+    xy = 2.0 * x * y * dg + 2.0 * p1 * x + 2.0 * p2 * y + 2.0 * y * ts
+    yx = 2.0 * x * y * dg + 2.0 * p1 * x + 2.0 * p2 * y + 2.0 * x * tt
+    yy = g + 2.0 * y * y * dg + 6.0 * p1 * y + 2.0 * p2 * x + 2.0 * y * tt
+    return xd, yd, xx, xy, yx, yy, s <= lens[12]
+
+
+@kernel()
+def _unlens(lens, xd, yd):
+    """Undistorted coordinates by damped Newton from the distorted ones: x, y, ok."""
+    x, y = xd, yd
+    s = x * x + y * y
+    if s > 0.81 * lens[12]:  # start inside the fold, else Newton runs to the wrong side of it
+        shrink = 0.9 * math.sqrt(lens[12] / s)
+        x *= shrink
+        y *= shrink
+    for _ in range(_MAX_NEWTON):
+        px, py, xx, xy, yx, yy, ok = _lens(lens, x, y)
+        ex, ey = px - xd, py - yd
+        det = xx * yy - xy * yx
+        dx = (yy * ex - xy * ey) / det
+        dy = (xx * ey - yx * ex) / det
+        if not (abs(dx) < 1e6 and abs(dy) < 1e6):
+            return x, y, False
+        step = 1.0
+        while step > 1e-3:
+            nx, ny = x - step * dx, y - step * dy
+            if nx * nx + ny * ny <= lens[12]:
+                break
+            step *= 0.5
+        x -= step * dx
+        y -= step * dy
+        if abs(dx) + abs(dy) < _ROW_TOL * (1.0 + abs(x) + abs(y)):
+            break
+    px, py, xx, xy, yx, yy, ok = _lens(lens, x, y)
+    ok = ok and abs(px - xd) + abs(py - yd) < 1e-11 * (1.0 + abs(xd) + abs(yd))
+    return x, y, ok
+
+
+@kernel()
+def _exp_so3(w0, w1, w2, R):
+    """Rotation matrix of a rotation vector (Rodrigues), to rounding also near zero."""
+    t2 = w0 * w0 + w1 * w1 + w2 * w2
+    if t2 < 1e-8:
+        a = 1.0 - t2 / 6.0
+        b = 0.5 - t2 / 24.0
+    else:
+        t = math.sqrt(t2)
+        a = math.sin(t) / t
+        h = math.sin(0.5 * t) / t
+        b = 2.0 * h * h
+    R[0, 0] = 1.0 - b * (w1 * w1 + w2 * w2)
+    R[1, 1] = 1.0 - b * (w0 * w0 + w2 * w2)
+    R[2, 2] = 1.0 - b * (w0 * w0 + w1 * w1)
+    R[0, 1] = b * w0 * w1 - a * w2
+    R[1, 0] = b * w0 * w1 + a * w2
+    R[0, 2] = b * w0 * w2 + a * w1
+    R[2, 0] = b * w0 * w2 - a * w1
+    R[1, 2] = b * w1 * w2 - a * w0
+    R[2, 1] = b * w1 * w2 + a * w0
+
+
+@kernel()
+def _left_jacobian(w0, w1, w2, L):
+    """Left Jacobian of SO(3): Exp(w + dw) = Exp(L dw) Exp(w) to first order."""
+    t2 = w0 * w0 + w1 * w1 + w2 * w2
+    if t2 < 1e-6:
+        a = 1.0 - t2 / 6.0 + t2 * t2 / 120.0
+        b = 0.5 - t2 / 24.0 + t2 * t2 / 720.0
+        c = 1.0 / 6.0 - t2 / 120.0 + t2 * t2 / 5040.0
+    else:
+        t = math.sqrt(t2)
+        a = math.sin(t) / t
+        h = math.sin(0.5 * t) / t
+        b = 2.0 * h * h
+        c = (1.0 - a) / t2
+    L[0, 0] = a + c * w0 * w0
+    L[1, 1] = a + c * w1 * w1
+    L[2, 2] = a + c * w2 * w2
+    L[0, 1] = c * w0 * w1 - b * w2
+    L[1, 0] = c * w0 * w1 + b * w2
+    L[0, 2] = c * w0 * w2 + b * w1
+    L[2, 0] = c * w0 * w2 - b * w1
+    L[1, 2] = c * w1 * w2 - b * w0
+    L[2, 1] = c * w1 * w2 + b * w0
+
+
+@kernel()
+def _row_phi(axis, sign, phi):
+    """The motion phi as row readout from top to bottom would need it, after exchanging x and y for columns.
+
+    An exchange of x and y is a reflection S, and S Exp(w) S = Exp(-S w): so columns take -S phi.
+    """
+    if axis == 1:
+        return sign * phi[0], sign * phi[1], sign * phi[2]
+    return -sign * phi[1], -sign * phi[0], -sign * phi[2]
+
+
+@kernel()
+def _shutter_two_step(X, Y, q0, q1, q2, d):
+    """Paper Eqs. 8-9 for row readout; d gets C, R and their derivatives in X, Y, q (2 + 2 x 5)."""
+    X2 = X - q2 * Y * Y
+    Y2 = Y + q2 * X * Y
+    aspect = 1.0 - q0
+    d[0] = X2 + q1 * Y2
+    d[1] = aspect * Y2
+    yx, yy, yq = q2 * Y, 1.0 + q2 * X, X * Y
+    d[2] = 1.0 + q1 * yx
+    d[3] = -2.0 * q2 * Y + q1 * yy
+    d[4] = 0.0
+    d[5] = Y2
+    d[6] = -Y * Y + q1 * yq
+    d[7] = aspect * yx
+    d[8] = aspect * yy
+    d[9] = -Y2
+    d[10] = 0.0
+    d[11] = aspect * yq
+    return aspect > 0.0 and yy > 0.0
+
+
+@kernel()
+def _shutter_linearized(X, Y, q0, q1, q2, d):
+    """Paper Eq. 6 for row readout, with the implicit row solved in closed form; d as in the two-step model."""
+    a = q0 * Y - q1 * X
+    b = 1.0 + q0 - q2 * X
+    disc = b * b + 4.0 * a * Y
+    if not (disc > 0.0 and b > 0.0):
+        return False
+    root = math.sqrt(disc)
+    r = 2.0 * Y / (b + root)
+    D = 1.0 + r * a
+    if not D > 0.0:
+        return False
+    m = q1 - q2 * Y
+    c = (X + r * m) / D
+    d[0] = c
+    d[1] = r
+    r2 = r * r
+    # root is the derivative of a r^2 + b r - y' with respect to r
+    d[7] = (q1 * r2 + q2 * r) / root
+    d[8] = (1.0 - q0 * r2) / root
+    d[9] = -(Y * r2 + r) / root
+    d[10] = X * r2 / root
+    d[11] = X * r / root
+    ca = r * c / D
+    cr = (m - a * c) / D
+    d[2] = (1.0 + ca * q1 * D) / D + cr * d[7]
+    d[3] = (-r * q2 - ca * q0 * D) / D + cr * d[8]
+    d[4] = -ca * Y + cr * d[9]
+    d[5] = r / D + ca * X + cr * d[10]
+    d[6] = -r * Y / D + cr * d[11]
+    return True
+
+
+@kernel()
+def _project(model, axis, sign, lens, x, y, z, phi, vel, out, jac, E, L):
+    """One camera-frame point into distorted normalised coordinates out[:2]; True when it is valid.
+
+    With jac: out[2:8] derivative with respect to the point (2, 3), out[8:14] to phi, out[14:20] to the
+    camera-frame velocity (only the rotation model uses it). E, L are (3, 3) scratch.
+    """
+    if not z > 0.0:
+        return False
+    X = x / z
+    Y = y / z
+    if model == ROTATION:
+        return _project_exact(axis, sign, lens, x, y, z, phi, vel, out, jac, E, L)
+    if model == GLOBAL:
+        xd, yd, xx, xy, yx, yy, ok = _lens(lens, X, Y)
+        out[0] = xd
+        out[1] = yd
+        if jac:
+            out[2] = xx / z
+            out[3] = xy / z
+            out[4] = -(xx * X + xy * Y) / z
+            out[5] = yx / z
+            out[6] = yy / z
+            out[7] = -(yx * X + yy * Y) / z
+            for k in range(8, 20):
+                out[k] = 0.0
+        return ok
+    q0, q1, q2 = _row_phi(axis, sign, phi)
+    d = out[8:20]  # used as scratch; overwritten below
+    if axis == 0:
+        X, Y = Y, X
+    if model == TWO_STEP:
+        valid = _shutter_two_step(X, Y, q0, q1, q2, d)
+    else:
+        valid = _shutter_linearized(X, Y, q0, q1, q2, d)
+    if not valid:
+        return False
+    C, R = d[0], d[1]
+    Cx, Cy, C0, C1, C2 = d[2], d[3], d[4], d[5], d[6]
+    Rx, Ry, R0, R1, R2 = d[7], d[8], d[9], d[10], d[11]
+    if axis == 0:
+        C, R = R, C
+        X, Y = Y, X
+        Cx, Cy, Rx, Ry = Ry, Rx, Cy, Cx
+        C0, C1, C2, R0, R1, R2 = -sign * R1, -sign * R0, -sign * R2, -sign * C1, -sign * C0, -sign * C2
+    elif sign < 0:
+        C0, C1, C2, R0, R1, R2 = -C0, -C1, -C2, -R0, -R1, -R2
+    xd, yd, xx, xy, yx, yy, ok = _lens(lens, C, R)
+    out[0] = xd
+    out[1] = yd
+    if jac:
+        ux, uy = xx * Cx + xy * Rx, xx * Cy + xy * Ry
+        vx, vy = yx * Cx + yy * Rx, yx * Cy + yy * Ry
+        out[2] = ux / z
+        out[3] = uy / z
+        out[4] = -(ux * X + uy * Y) / z
+        out[5] = vx / z
+        out[6] = vy / z
+        out[7] = -(vx * X + vy * Y) / z
+        out[8] = xx * C0 + xy * R0
+        out[9] = xx * C1 + xy * R1
+        out[10] = xx * C2 + xy * R2
+        out[11] = yx * C0 + yy * R0
+        out[12] = yx * C1 + yy * R1
+        out[13] = yx * C2 + yy * R2
+        for k in range(14, 20):
+            out[k] = 0.0
+    return ok
+
+
+@kernel()
+def _project_exact(axis, sign, lens, x, y, z, phi, vel, out, jac, E, L):
+    """Paper Eq. 2 whole, q(t) = Exp(t phi) (x - t v), with t the distorted row (or column) that the sensor read."""
+    X = x / z
+    Y = y / z
+    xd, yd, xx, xy, yx, yy, ok = _lens(lens, X, Y)
+    t = sign * (yd if axis == 1 else xd)
+    done = False
+    slope = -1.0
+    q0 = q1 = q2 = 0.0
+    w0 = w1 = w2 = 0.0
+    p0 = p1 = p2 = 0.0
+    for _ in range(_MAX_NEWTON):
+        _exp_so3(t * phi[0], t * phi[1], t * phi[2], E)
+        p0, p1, p2 = x - t * vel[0], y - t * vel[1], z - t * vel[2]
+        q0 = E[0, 0] * p0 + E[0, 1] * p1 + E[0, 2] * p2
+        q1 = E[1, 0] * p0 + E[1, 1] * p1 + E[1, 2] * p2
+        q2 = E[2, 0] * p0 + E[2, 1] * p1 + E[2, 2] * p2
+        if not q2 > 0.0:
+            return False
+        # dq/dt = phi x q - E v
+        w0 = phi[1] * q2 - phi[2] * q1 - (E[0, 0] * vel[0] + E[0, 1] * vel[1] + E[0, 2] * vel[2])
+        w1 = phi[2] * q0 - phi[0] * q2 - (E[1, 0] * vel[0] + E[1, 1] * vel[1] + E[1, 2] * vel[2])
+        w2 = phi[0] * q1 - phi[1] * q0 - (E[2, 0] * vel[0] + E[2, 1] * vel[1] + E[2, 2] * vel[2])
+        X = q0 / q2
+        Y = q1 / q2
+        xd, yd, xx, xy, yx, yy, ok = _lens(lens, X, Y)
+        dX = (w0 - X * w2) / q2
+        dY = (w1 - Y * w2) / q2
+        if axis == 1:
+            gap = sign * yd - t
+            slope = sign * (yx * dX + yy * dY) - 1.0
+        else:
+            gap = sign * xd - t
+            slope = sign * (xx * dX + xy * dY) - 1.0
+        if not slope < -1e-3:  # the rows fold over: a row would see the point twice
+            return False
+        if done:
+            break
+        t -= gap / slope
+        done = abs(gap) < _ROW_TOL * (1.0 + abs(t))
+    else:
+        # rounding may keep the last gap just above the tolerance
+        if not abs(gap) < 1e-11 * (1.0 + abs(t)):
+            return False
+    out[0] = xd
+    out[1] = yd
+    if not jac:
+        return ok
+    # derivatives of the distorted coordinates with respect to q
+    a0, a1, a2 = xx / q2, xy / q2, -(xx * X + xy * Y) / q2
+    b0, b1, b2 = yx / q2, yy / q2, -(yx * X + yy * Y) / q2
+    # and with respect to t at a fixed point: the implicit row moves them too
+    at = a0 * w0 + a1 * w1 + a2 * w2
+    bt = b0 * w0 + b1 * w1 + b2 * w2
+    _left_jacobian(t * phi[0], t * phi[1], t * phi[2], L)
+    for k in range(9):
+        if k < 3:  # point: dq = E e_k
+            d0, d1, d2 = E[0, k], E[1, k], E[2, k]
+        elif k < 6:  # phi: dq = -[q]x (t L e_k)
+            l0, l1, l2 = t * L[0, k - 3], t * L[1, k - 3], t * L[2, k - 3]
+            d0 = q2 * l1 - q1 * l2
+            d1 = q0 * l2 - q2 * l0
+            d2 = q1 * l0 - q0 * l1
+        else:  # velocity: dq = -t E e_k
+            d0, d1, d2 = -t * E[0, k - 6], -t * E[1, k - 6], -t * E[2, k - 6]
+        da = a0 * d0 + a1 * d1 + a2 * d2
+        db = b0 * d0 + b1 * d1 + b2 * d2
+        dt = -sign * (db if axis == 1 else da) / slope
+        if k < 3:
+            out[2 + k] = da + at * dt
+            out[5 + k] = db + bt * dt
+        elif k < 6:
+            out[5 + k] = da + at * dt
+            out[8 + k] = db + bt * dt
+        else:
+            out[8 + k] = da + at * dt
+            out[11 + k] = db + bt * dt
+    return ok
+
+
+@kernel()
+def _unproject(model, axis, sign, lens, xd, yd, phi, E):
+    """Ideal normalised coordinates at the reference row of a distorted normalised pixel: x', y', ok."""
+    C, R, ok = _unlens(lens, xd, yd)
+    if model == GLOBAL or not ok:
+        return C, R, ok
+    if model == ROTATION:
+        t = sign * (yd if axis == 1 else xd)
+        _exp_so3(-t * phi[0], -t * phi[1], -t * phi[2], E)
+        w = E[2, 0] * C + E[2, 1] * R + E[2, 2]
+        return (
+            (E[0, 0] * C + E[0, 1] * R + E[0, 2]) / w,
+            (E[1, 0] * C + E[1, 1] * R + E[1, 2]) / w,
+            w > 0.0,
+        )
+    q0, q1, q2 = _row_phi(axis, sign, phi)
+    if axis == 0:
+        C, R = R, C
+    if model == TWO_STEP:
+        Y2 = R / (1.0 - q0)
+        X2 = C - q1 * Y2
+        Y = Y2
+        for _ in range(_MAX_NEWTON):
+            f = Y * (1.0 + q2 * (X2 + q2 * Y * Y)) - Y2
+            step = f / (1.0 + q2 * (X2 + 3.0 * q2 * Y * Y))
+            Y -= step
+            if abs(step) < _ROW_TOL * (1.0 + abs(Y)):
+                break
+        X = X2 + q2 * Y * Y
+        ok = 1.0 - q0 > 0.0 and 1.0 + q2 * X > 0.0 and abs(Y * (1.0 + q2 * X) - Y2) < 1e-11 * (1.0 + abs(Y2))
+    else:
+        # (I + [w]x)^-1 = (I + w w' - [w]x) / (1 + |w|^2), w = R q; the scale drops out
+        w0, w1, w2 = R * q0, R * q1, R * q2
+        dot = w0 * C + w1 * R + w2
+        X = C + w0 * dot - (w1 - w2 * R)
+        Y = R + w1 * dot - (w2 * C - w0)
+        W = 1.0 + w2 * dot - (w0 * R - w1 * C)
+        ok = W > 0.0
+        X /= W
+        Y /= W
+    if axis == 0:
+        X, Y = Y, X
+    return X, Y, ok
+
+
+@parallel_kernel()
+def project_points(model, axis, sign, intr, lens, points_c, phi, vel, xy, valid):
+    """Camera-frame points (n, 3) into pixels xy (n, 2); one motion for all of them."""
+    n = len(points_c)
+    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+        out = np.empty(20)
+        E = np.empty((3, 3))
+        L = np.empty((3, 3))
+        for k in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK)):
+            p = points_c[k]
+            valid[k] = _project(model, axis, sign, lens, p[0], p[1], p[2], phi, vel, out, False, E, L)
+            xy[k, 0] = intr[0] * out[0] + intr[2] if valid[k] else np.nan
+            xy[k, 1] = intr[1] * out[1] + intr[3] if valid[k] else np.nan
+
+
+@kernel()
+def project_jacobians(model, axis, sign, intr, lens, points_c, phi, vel, xy, J_point, J_phi, J_vel, valid):
+    """As `project_points`, with derivatives of the pixels (n, 2, 3) in the point, phi and velocity."""
+    out = np.empty(20)
+    E = np.empty((3, 3))
+    L = np.empty((3, 3))
+    for k in range(len(points_c)):
+        p = points_c[k]
+        valid[k] = _project(model, axis, sign, lens, p[0], p[1], p[2], phi, vel, out, True, E, L)
+        if not valid[k]:
+            out[:] = np.nan
+        for i in range(2):
+            f = intr[i]
+            xy[k, i] = f * out[i] + intr[2 + i]
+            for j in range(3):
+                J_point[k, i, j] = f * out[2 + 3 * i + j]
+                J_phi[k, i, j] = f * out[8 + 3 * i + j]
+                J_vel[k, i, j] = f * out[14 + 3 * i + j]
+
+
+@parallel_kernel()
+def unproject_points(model, axis, sign, intr, lens, xy, phi, ideal, valid):
+    """Pixels (n, 2) into ideal normalised coordinates (n, 2) at the reference row."""
+    n = len(xy)
+    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+        E = np.empty((3, 3))
+        for k in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK)):
+            xd = (xy[k, 0] - intr[2]) / intr[0]
+            yd = (xy[k, 1] - intr[3]) / intr[1]
+            x, y, ok = _unproject(model, axis, sign, lens, xd, yd, phi, E)
+            valid[k] = ok
+            ideal[k, 0] = x if ok else np.nan
+            ideal[k, 1] = y if ok else np.nan
+
+
+@kernel()
+def fill_map(model, axis, sign, intr, lens, phi, rays, row0, col0, map_x, map_y):
+    """Raw pixel that saw each rectified pixel, for the block of the grid that starts at (row0, col0).
+
+    `rays` (3, 3) takes a rectified pixel (u, v, 1) to a direction in the camera frame. Where no raw pixel
+    answers, the map points far outside every photo (finite: a NaN is handled differently by OpenCV 4 and 5).
+    """
+    out = np.empty(20)
+    E = np.empty((3, 3))
+    vel = np.zeros(3)
+    rows, cols = map_x.shape
+    for i in range(rows):
+        v = row0 + i
+        for j in range(cols):
+            u = col0 + j
+            x = rays[0, 0] * u + rays[0, 1] * v + rays[0, 2]
+            y = rays[1, 0] * u + rays[1, 1] * v + rays[1, 2]
+            z = rays[2, 0] * u + rays[2, 1] * v + rays[2, 2]
+            if _project(model, axis, sign, lens, x, y, z, phi, vel, out, False, E, E):
+                map_x[i, j] = intr[0] * out[0] + intr[2]
+                map_y[i, j] = intr[1] * out[1] + intr[3]
+            else:
+                map_x[i, j] = -1e6
+                map_y[i, j] = -1e6
+
+
+@kernel()
+def _loss(kind, s, scale2):
+    """Robust loss rho(s) of a squared residual and its weight rho'(s); kind 0 squared, 1 Huber, 2 Cauchy."""
+    if kind == 1 and s > scale2:
+        root = math.sqrt(s * scale2)
+        return 2.0 * root - scale2, root / s
+    if kind == 2:
+        return scale2 * math.log1p(s / scale2), 1.0 / (1.0 + s / scale2)
+    return s, 1.0
+
+
+# What an observation costs that cannot be projected (behind the camera): its point must not profit from it.
+_INVALID_PX = 100.0
+
+
+@kernel()
+def _camera_frame(R, center, velocity, point, vel_c):
+    """Point in the camera frame at the reference row (x, y, z), and the velocity there in vel_c."""
+    d0, d1, d2 = point[0] - center[0], point[1] - center[1], point[2] - center[2]
+    for a in range(3):
+        vel_c[a] = R[a, 0] * velocity[0] + R[a, 1] * velocity[1] + R[a, 2] * velocity[2]
+    return (
+        R[0, 0] * d0 + R[0, 1] * d1 + R[0, 2] * d2,
+        R[1, 0] * d0 + R[1, 1] * d1 + R[1, 2] * d2,
+        R[2, 0] * d0 + R[2, 1] * d1 + R[2, 2] * d2,
+    )
+
+
+@parallel_kernel()
+def residuals(
+    model, camera_of_frame, axes, signs, intrs, lenses, R_cw, center_w, phi, vel_w, points_w,
+    frame_idx, point_idx, xy_raw, res, valid,
+):  # fmt: skip
+    """Reprojection residuals (o, 2) in pixels: predicted minus measured."""
+    o = len(frame_idx)
+    for chunk in prange((o + _CHUNK - 1) // _CHUNK):
+        out = np.empty(20)
+        E = np.empty((3, 3))
+        L = np.empty((3, 3))
+        vel_c = np.empty(3)
+        for k in range(chunk * _CHUNK, min(o, (chunk + 1) * _CHUNK)):
+            f = frame_idx[k]
+            c = camera_of_frame[f]
+            x, y, z = _camera_frame(R_cw[f], center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
+            valid[k] = _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, out, False, E, L)
+            for i in range(2):
+                res[k, i] = intrs[c, i] * out[i] + intrs[c, 2 + i] - xy_raw[k, i] if valid[k] else _INVALID_PX
+
+
+@parallel_kernel()
+def residual_costs(
+    model, camera_of_frame, axes, signs, intrs, lenses, R_cw, center_w, phi, vel_w, points_w,
+    frame_idx, point_idx, xy_raw, sigma_px, loss_kind, loss_scale, cost,
+):  # fmt: skip
+    """Each observation's robust cost (o,), as in `residual_blocks`."""
+    o = len(frame_idx)
+    scale2 = loss_scale * loss_scale
+    bad = 2.0 * (_INVALID_PX / sigma_px) ** 2
+    for chunk in prange((o + _CHUNK - 1) // _CHUNK):
+        out = np.empty(20)
+        E = np.empty((3, 3))
+        L = np.empty((3, 3))
+        vel_c = np.empty(3)
+        for k in range(chunk * _CHUNK, min(o, (chunk + 1) * _CHUNK)):
+            f = frame_idx[k]
+            c = camera_of_frame[f]
+            x, y, z = _camera_frame(R_cw[f], center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
+            s = bad
+            if _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, out, False, E, L):
+                ex = (intrs[c, 0] * out[0] + intrs[c, 2] - xy_raw[k, 0]) / sigma_px
+                ey = (intrs[c, 1] * out[1] + intrs[c, 3] - xy_raw[k, 1]) / sigma_px
+                s = ex * ex + ey * ey
+            cost[k] = 0.5 * _loss(loss_kind, s, scale2)[0]
+
+
+@parallel_kernel()
+def residual_blocks(
+    model, camera_of_frame, axes, signs, intrs, lenses, R_cw, center_w, phi, vel_w, points_w,
+    frame_idx, point_idx, xy_raw, sigma_px, loss_kind, loss_scale, res, J_frame, J_point, cost,
+):  # fmt: skip
+    """Whitened, robustly weighted residuals (o, 2) with their Jacobians, and each observation's cost.
+
+    J_frame is (o, 2, nb): rotation increment (left, camera frame), centre, then phi when nb = 9.
+    J_point is (o, 2, 3). Observations that cannot be projected get zero Jacobians and the cost of 100 px.
+    """
+    o = len(frame_idx)
+    nb = J_frame.shape[2]
+    scale2 = loss_scale * loss_scale
+    for chunk in prange((o + _CHUNK - 1) // _CHUNK):
+        out = np.empty(20)
+        E = np.empty((3, 3))
+        L = np.empty((3, 3))
+        vel_c = np.empty(3)
+        for k in range(chunk * _CHUNK, min(o, (chunk + 1) * _CHUNK)):
+            f = frame_idx[k]
+            c = camera_of_frame[f]
+            R = R_cw[f]
+            x, y, z = _camera_frame(R_cw[f], center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
+            ok = _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, out, True, E, L)
+            if not ok:
+                bad = (_INVALID_PX / sigma_px) ** 2
+                cost[k] = 0.5 * _loss(loss_kind, 2.0 * bad, scale2)[0]
+                res[k] = 0.0
+                J_frame[k] = 0.0
+                J_point[k] = 0.0
+                continue
+            s = 0.0
+            for i in range(2):
+                res[k, i] = (intrs[c, i] * out[i] + intrs[c, 2 + i] - xy_raw[k, i]) / sigma_px
+                s += res[k, i] * res[k, i]
+            rho, weight = _loss(loss_kind, s, scale2)
+            cost[k] = 0.5 * rho
+            w = math.sqrt(weight)
+            for i in range(2):
+                g = w * intrs[c, i] / sigma_px
+                res[k, i] *= w
+                a0, a1, a2 = g * out[2 + 3 * i], g * out[3 + 3 * i], g * out[4 + 3 * i]
+                v0, v1, v2 = g * out[14 + 3 * i], g * out[15 + 3 * i], g * out[16 + 3 * i]
+                # x_c = Exp(delta) R d and v_c = Exp(delta) R v
+                J_frame[k, i, 0] = a2 * y - a1 * z + v2 * vel_c[1] - v1 * vel_c[2]
+                J_frame[k, i, 1] = a0 * z - a2 * x + v0 * vel_c[2] - v2 * vel_c[0]
+                J_frame[k, i, 2] = a1 * x - a0 * y + v1 * vel_c[0] - v0 * vel_c[1]
+                for b in range(3):
+                    J_point[k, i, b] = a0 * R[0, b] + a1 * R[1, b] + a2 * R[2, b]
+                    J_frame[k, i, 3 + b] = -J_point[k, i, b]
+                if nb > 6:
+                    for b in range(3):
+                        J_frame[k, i, 6 + b] = g * out[8 + 3 * i + b]

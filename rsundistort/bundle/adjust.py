@@ -1,0 +1,110 @@
+"""Bundle adjustment with outlier rounds, and the ladder of shutter models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..model import Reconstruction
+from .options import BundleOptions, BundleResult
+from .problem import BundleProblem, reprojection_residuals
+from .solver import minimize
+
+__all__ = ["LADDER", "bundle_adjust", "climb"]
+
+#: Shutter models in the order in which they are solved, each from the one before.
+LADDER = ("global", "two-step", "rotation")
+
+
+def _noise_px(reconstruction: Reconstruction, shutter_model: str, floor: float) -> float:
+    """Robust standard deviation of the residuals' parts in pixels."""
+    res, valid = reprojection_residuals(reconstruction, shutter_model)
+    if not valid.any():
+        return max(1.0, floor)
+    # median of |x| of a normal variable is 0.6745 sigma; residuals of a fit are shorter than the noise
+    spread = float(np.median(np.abs(res[valid]))) / 0.6745
+    unknowns = 9 * reconstruction.num_images + 3 * reconstruction.num_points
+    shrink = np.sqrt(max(1.0 - unknowns / (2.0 * len(res)), 0.1))
+    return max(spread / shrink, floor)
+
+
+def bundle_adjust(
+    reconstruction: Reconstruction,
+    shutter_model: str = "rotation",
+    options: BundleOptions | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> BundleResult:
+    """Poses, shutter motions and points that explain the measurements best.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Start; its phi is the start of phi.
+    shutter_model : {"global", "two-step", "linearized", "rotation"}
+        How the shutter is modelled.
+    options : BundleOptions, optional
+        Tolerances, loss, priors, anchors.
+    progress : callable, optional
+        Called with the cost after each accepted step.
+
+    Returns
+    -------
+    BundleResult
+        With a stop reason: the estimate of a solve that ran out of iterations is returned, and says so.
+    """
+    options = options or BundleOptions()
+    current = reconstruction.with_points(np.ones(len(reconstruction.observations), bool))
+    iterations = 0
+    sigma = options.sigma_px or _noise_px(current, shutter_model, options.min_sigma_px)
+    for round_ in range(options.outlier_rounds + 1):
+        problem = BundleProblem(current, shutter_model, options, sigma)
+        result = minimize(
+            problem,
+            problem.initial_state(),
+            max_iterations=options.max_iterations,
+            cost_tolerance=options.cost_tolerance,
+            step_tolerance=options.step_tolerance,
+            initial_damping=options.initial_damping,
+            max_damping=options.max_damping,
+            progress=progress,
+        )
+        iterations += result.num_iterations
+        current = problem.reconstruction(result.state)
+        res, valid = reprojection_residuals(current)
+        new_sigma = options.sigma_px or _noise_px(current, shutter_model, options.min_sigma_px)
+        if round_ == options.outlier_rounds:
+            break
+        limit = max(options.outlier_sigma * new_sigma, options.min_outlier_px)
+        keep = valid & (np.linalg.norm(res, axis=1) <= limit)
+        settled = abs(new_sigma - sigma) < 0.05 * sigma
+        if keep.all() and settled:
+            break
+        current = current.with_points(keep)
+        sigma = new_sigma
+    rms = float(np.sqrt(np.mean(res[valid] ** 2))) if valid.any() else float("nan")
+    dropped = len(reconstruction.observations) - len(current.observations)
+    return BundleResult(current, result.stop_reason, result.cost_history, iterations, sigma, rms, dropped)
+
+
+def climb(
+    reconstruction: Reconstruction,
+    rungs: Sequence[str] = LADDER,
+    options: BundleOptions | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> dict[str, BundleResult]:
+    """Solve the shutter models one after the other, each started from the one before, phi from zero.
+
+    Returns
+    -------
+    dict of BundleResult
+        By model, in the order solved. Each rung starts from all the measurements of the one before.
+    """
+    results: dict[str, BundleResult] = {}
+    current = replace(reconstruction, phi=np.zeros((reconstruction.num_images, 3)))
+    for model in rungs:
+        step = None if progress is None else (lambda cost, model=model: progress(model, cost))
+        results[model] = bundle_adjust(current, model, options, step)
+        current = results[model].reconstruction
+    return results

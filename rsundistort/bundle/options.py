@@ -1,0 +1,121 @@
+"""What a bundle adjustment can be told, and what it answers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..model import Reconstruction
+
+__all__ = ["LOSSES", "BundleOptions", "BundleResult"]
+
+#: Robust losses and their codes in the kernels.
+LOSSES: dict[str, int] = {"squared": 0, "huber": 1, "cauchy": 2}
+
+
+@dataclass(frozen=True)
+class BundleOptions:
+    """Options of `bundle_adjust`; each says which inequality it controls.
+
+    Parameters
+    ----------
+    max_iterations : int
+        At most this many steps are tried in one solve.
+    cost_tolerance : float
+        Stop when a step lowers the cost by less than `cost_tolerance * cost`.
+    step_tolerance : float
+        Stop when every centre and point moves by less than `step_tolerance` times the scene's size, and every
+        angle by less than `step_tolerance` radians.
+    initial_damping, max_damping : float
+        Levenberg-Marquardt damping, times the diagonal of the normal equations; above the largest, stop.
+    loss : {"huber", "cauchy", "squared"}
+        Robust loss of an observation.
+    loss_scale : float
+        Residual length, in standard deviations of the noise, where the loss starts to bend.
+    sigma_px : float or None
+        Standard deviation of the measurements in pixels, which weighs them against the priors. None: read off
+        the residuals, robustly, before each solve (never below `min_sigma_px`).
+    min_sigma_px : float
+        Lower limit of that reading.
+    phi_sigma : float
+        Standard deviation of the zero-mean prior on phi, in radians per frame. The default is loose: twice
+        what a swung hand does.
+    outlier_rounds : int
+        Times that observations further than `outlier_sigma` standard deviations are dropped and all is solved again.
+    outlier_sigma : float
+        See `outlier_rounds`.
+    min_outlier_px : float
+        No observation nearer than this to its prediction is dropped.
+    held_phi : mapping of photo name to component indices
+        Hard anchors: components of phi held at zero, e.g. {"0001.jpg": (0,)} is the paper's RS*.
+    dense_limit : int
+        Reduced systems up to this many unknowns are factored densely, larger ones sparsely.
+    """
+
+    max_iterations: int = 100
+    cost_tolerance: float = 1e-9
+    step_tolerance: float = 1e-10
+    initial_damping: float = 1e-4
+    max_damping: float = 1e12
+    loss: str = "huber"
+    loss_scale: float = 2.5
+    sigma_px: float | None = None
+    min_sigma_px: float = 0.1
+    phi_sigma: float = 0.1
+    outlier_rounds: int = 2
+    outlier_sigma: float = 4.5
+    min_outlier_px: float = 0.75
+    held_phi: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    dense_limit: int = 1500
+
+    def __post_init__(self) -> None:
+        if self.loss not in LOSSES:
+            raise InputError(f"loss={self.loss!r}, expected one of {', '.join(LOSSES)}")
+        positive = ("cost_tolerance", "step_tolerance", "initial_damping", "loss_scale", "min_sigma_px", "phi_sigma")
+        for name in (*positive, "outlier_sigma", "max_damping"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"{name}={getattr(self, name)!r}, expected a positive number")
+        if self.sigma_px is not None and not self.sigma_px > 0:
+            raise InputError(f"sigma_px={self.sigma_px!r}, expected a positive number or None")
+        if self.max_iterations < 1 or self.outlier_rounds < 0:
+            raise InputError("max_iterations must be at least 1 and outlier_rounds at least 0")
+
+
+@dataclass(frozen=True)
+class BundleResult:
+    """Outcome of a bundle adjustment.
+
+    Attributes
+    ----------
+    reconstruction : Reconstruction
+        The estimate; observations that were dropped as outliers, and points left without two photos, are gone.
+    stop_reason : str
+        "cost", "step" (converged), "iterations" (ran out) or "damping" (no step lowers the cost any more).
+    cost_history : (k,) array
+        Cost after each accepted step of the last solve, the start first.
+    num_iterations : int
+        Steps tried, over all solves.
+    sigma_px : float
+        Standard deviation of the noise that weighed the measurements in the last solve.
+    rms_px : float
+        Root mean square of the residuals' x and y parts.
+    num_outliers : int
+        Observations dropped.
+    """
+
+    reconstruction: Reconstruction
+    stop_reason: str
+    cost_history: NDArray[np.float64]
+    num_iterations: int
+    sigma_px: float
+    rms_px: float
+    num_outliers: int
+
+    @property
+    def converged(self) -> bool:
+        """Whether the last solve ended because nothing was left to gain."""
+        return self.stop_reason in ("cost", "step", "damping")

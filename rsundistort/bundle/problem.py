@@ -1,0 +1,196 @@
+"""Reprojection errors and priors of a reconstruction as a problem for the solver."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from .._kernels import projection
+from ..errors import InputError
+from ..model import Reconstruction, check_shutter_model
+from .options import LOSSES, BundleOptions
+from .reduced import NormalEquations, Step, Structure
+
+__all__ = ["BundleProblem", "State", "reprojection_residuals"]
+
+
+@dataclass(frozen=True)
+class State:
+    """What a step changes: poses, shutter rotation and points, as in `Reconstruction`."""
+
+    R_cw: NDArray[np.float64]
+    center_w: NDArray[np.float64]
+    phi: NDArray[np.float64]
+    points_w: NDArray[np.float64]
+
+
+def _camera_arrays(reconstruction: Reconstruction) -> tuple[NDArray[Any], ...]:
+    """Photo-to-camera indices, clock axes, signs, intrinsics and lenses as the kernels take them."""
+    args = [camera.kernel_args for camera in reconstruction.cameras]
+    intr, lens, axis, sign = zip(*args, strict=True)
+    return reconstruction.camera_idx, np.array(axis), np.array(sign), np.array(intr), np.array(lens)
+
+
+def reprojection_residuals(
+    reconstruction: Reconstruction, shutter_model: str | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Predicted minus measured pixels (o, 2), and which observations could be projected.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Poses, motions, points and measurements.
+    shutter_model : str, optional
+        Model to predict with; that of the reconstruction when left out.
+    """
+    model = check_shutter_model(shutter_model or reconstruction.shutter_model)
+    obs = reconstruction.observations
+    res = np.empty((len(obs), 2))
+    valid = np.empty(len(obs), bool)
+    projection.residuals(
+        model, *_camera_arrays(reconstruction), reconstruction.R_cw, reconstruction.center_w, reconstruction.phi,
+        reconstruction.velocity, reconstruction.points_w, obs.frame_idx, obs.point_idx, obs.xy_raw, res, valid,
+    )  # fmt: skip
+    return res, valid
+
+
+class BundleProblem:
+    """Robust reprojection errors and the prior on phi, with the gauge and the anchors held.
+
+    Unknowns of a photo: rotation increment (left, radians), centre (world units) and, unless the shutter model is
+    global, phi (radians per unit of the clock). Seven unknowns are held for the gauge: the pose of the photo
+    with the most observations, and one coordinate of the centre farthest from it.
+    """
+
+    def __init__(
+        self, reconstruction: Reconstruction, shutter_model: str, options: BundleOptions, sigma_px: float
+    ) -> None:
+        self._model = check_shutter_model(shutter_model)
+        obs = reconstruction.observations
+        if not len(obs) or reconstruction.num_images < 2:
+            raise InputError("bundle adjustment needs two photos and measurements of common points")
+        self._start = reconstruction
+        self._shutter_model = shutter_model
+        self._options = options
+        self._sigma_px = sigma_px
+        self._block = 6 if shutter_model == "global" else 9
+        order = np.lexsort((obs.frame_idx, obs.point_idx))
+        self._xy = np.ascontiguousarray(obs.xy_raw[order])
+        self._structure = Structure.from_sorted(
+            np.ascontiguousarray(obs.frame_idx[order]),
+            np.ascontiguousarray(obs.point_idx[order]),
+            reconstruction.num_images,
+            reconstruction.num_points,
+        )
+        self._cameras = _camera_arrays(reconstruction)
+        self._velocity = np.zeros((reconstruction.num_images, 3))
+        span = reconstruction.frame_span()
+        self._phi_weight = np.repeat((span / options.phi_sigma)[:, None] ** 2, 3, axis=1)
+        self._free = self._free_unknowns()
+        self._size = float(np.median(np.linalg.norm(reconstruction.points_w - reconstruction.center_w.mean(0), axis=1)))
+
+    def _free_unknowns(self) -> NDArray[np.bool_]:
+        """(m, nb) unknowns that are solved for."""
+        rec = self._start
+        free = np.ones((rec.num_images, self._block), bool)
+        reference = int(np.argmax(np.bincount(self._structure.frame_idx, minlength=rec.num_images)))
+        offset = np.abs(rec.center_w - rec.center_w[reference])
+        far, axis = np.unravel_index(np.argmax(offset), offset.shape)
+        free[reference, :6] = False
+        free[far, 3 + axis] = False
+        for name, components in self._options.held_phi.items():
+            if name not in rec.image_names:
+                raise InputError(f"anchor {name!r} is not a photo of the reconstruction")
+            if any(c not in (0, 1, 2) for c in components):
+                raise InputError(f"anchor {name!r}: components {components}, expected some of 0, 1, 2")
+            if self._block > 6:
+                free[rec.image_names.index(name), [6 + c for c in components]] = False
+        return free
+
+    def initial_state(self) -> State:
+        """The reconstruction's values, with anchored components of phi at zero."""
+        phi = np.zeros_like(self._start.phi)
+        if self._block > 6:
+            phi = np.where(self._free[:, 6:], self._start.phi, 0.0)
+        return State(self._start.R_cw, self._start.center_w, phi, self._start.points_w)
+
+    def reconstruction(self, state: State) -> Reconstruction:
+        """The reconstruction at a state."""
+        U, _, Vt = np.linalg.svd(state.R_cw)  # rounding of many increments
+        return replace(
+            self._start,
+            R_cw=U @ Vt,
+            center_w=state.center_w,
+            phi=state.phi,
+            velocity=self._velocity,
+            points_w=state.points_w,
+            shutter_model=self._shutter_model,
+        )
+
+    def _kernel_args(self, state: State) -> tuple[Any, ...]:
+        s = self._structure
+        return (
+            self._model, *self._cameras, state.R_cw, state.center_w, state.phi, self._velocity, state.points_w,
+            s.frame_idx, s.point_idx, self._xy,
+        )  # fmt: skip
+
+    def _prior_cost(self, state: State) -> float:
+        return 0.5 * float(np.sum(self._phi_weight * state.phi**2)) if self._block > 6 else 0.0
+
+    def _blocks(self, state: State) -> tuple[NDArray[np.float64], ...]:
+        o = len(self._xy)
+        res, J_frame, J_point = np.empty((o, 2)), np.empty((o, 2, self._block)), np.empty((o, 2, 3))
+        cost = np.empty(o)
+        loss = LOSSES[self._options.loss]
+        projection.residual_blocks(
+            *self._kernel_args(state), self._sigma_px, loss, self._options.loss_scale, res, J_frame, J_point, cost
+        )
+        return res, J_frame, J_point, cost
+
+    def linearize(self, state: State) -> NormalEquations:
+        """Normal equations and cost at a state."""
+        res, J_frame, J_point, cost = self._blocks(state)
+        prior_diag = np.zeros((len(state.phi), self._block))
+        prior_gradient = np.zeros_like(prior_diag)
+        if self._block > 6:
+            prior_diag[:, 6:] = self._phi_weight
+            prior_gradient[:, 6:] = self._phi_weight * state.phi
+        total = float(cost.sum()) + self._prior_cost(state)
+        return NormalEquations(
+            self._structure, total, res, J_frame, J_point, prior_diag, prior_gradient, self._free,
+            self._options.dense_limit,
+        )  # fmt: skip
+
+    def cost(self, state: State) -> float:
+        """Half the robust sum of squares in units of the noise, with the priors."""
+        o = len(self._xy)
+        cost = np.empty(o)
+        projection.residual_costs(
+            *self._kernel_args(state), self._sigma_px, LOSSES[self._options.loss], self._options.loss_scale, cost
+        )
+        return float(cost.sum()) + self._prior_cost(state)
+
+    def retract(self, state: State, step: Step) -> State:
+        """The state after a step."""
+        frame, point = step
+        return State(
+            Rotation.from_rotvec(frame[:, :3]).as_matrix() @ state.R_cw,
+            state.center_w + frame[:, 3:6],
+            state.phi + frame[:, 6:] if self._block > 6 else state.phi,
+            state.points_w + point,
+        )
+
+    def step_size(self, state: State, step: Step) -> float:
+        """Largest change: angles in radians, lengths in sizes of the scene."""
+        frame, point = step
+        angles = np.abs(np.delete(frame, [3, 4, 5], axis=1)).max()
+        # a far point moves a lot along its ray without moving in any photo: its depth is its own yardstick
+        depth = np.maximum(np.linalg.norm(state.points_w - state.center_w.mean(0), axis=1), self._size)
+        lengths = max(np.abs(frame[:, 3:6]).max() / self._size, float((np.abs(point).max(1) / depth).max(initial=0)))
+        return float(max(angles, lengths))
+
+

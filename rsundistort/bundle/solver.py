@@ -1,0 +1,103 @@
+"""Levenberg-Marquardt; it knows nothing about cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["LinearSystem", "MinimizeResult", "Problem", "minimize"]
+
+
+class LinearSystem(Protocol):
+    """Normal equations at one state."""
+
+    cost: float
+
+    def solve(self, damping: float) -> tuple[Any, float] | None:
+        """The step at a damping and the decrease it predicts; None if the system cannot be factored."""
+
+
+class Problem(Protocol):
+    """What is minimised."""
+
+    def linearize(self, state: Any) -> LinearSystem:
+        """Normal equations and cost at a state."""
+
+    def retract(self, state: Any, step: Any) -> Any:
+        """The state after a step."""
+
+    def cost(self, state: Any) -> float:
+        """The cost of a state."""
+
+    def step_size(self, state: Any, step: Any) -> float:
+        """Largest change of an unknown in natural units (radians, scene sizes)."""
+
+
+@dataclass(frozen=True)
+class MinimizeResult:
+    """Last state, why the loop stopped, and the costs of the accepted states."""
+
+    state: Any
+    stop_reason: str
+    cost_history: NDArray[np.float64]
+    num_iterations: int
+
+
+def minimize(
+    problem: Problem,
+    state: Any,
+    *,
+    max_iterations: int,
+    cost_tolerance: float,
+    step_tolerance: float,
+    initial_damping: float,
+    max_damping: float,
+    progress: Callable[[float], None] | None = None,
+) -> MinimizeResult:
+    """Lower a problem's cost until nothing is left to gain.
+
+    Damping after H. B. Nielsen: the better the quadratic model foretold the decrease, the more damping falls.
+    """
+    system = problem.linearize(state)
+    cost = system.cost
+    history = [cost]
+    damping, growth = initial_damping, 2.0
+    reason = "iterations"
+    iteration = 0
+    while iteration < max_iterations:
+        iteration += 1
+        solved = system.solve(damping)
+        accepted = False
+        if solved is not None:
+            step, predicted = solved
+            candidate = problem.retract(state, step)
+            new_cost = problem.cost(candidate)
+            decrease = cost - new_cost
+            small_step = problem.step_size(state, step) < step_tolerance
+            if np.isfinite(new_cost) and decrease > 0 and predicted > 0:
+                accepted = True
+                damping *= max(1.0 / 10.0, 1.0 - (2.0 * decrease / predicted - 1.0) ** 3)
+                growth = 2.0
+                state, cost = candidate, new_cost
+                history.append(cost)
+                if progress is not None:
+                    progress(cost)
+                if decrease < cost_tolerance * cost:
+                    reason = "cost"
+                    break
+            if small_step:
+                reason = "step"
+                break
+        if accepted:
+            system = problem.linearize(state)
+        else:
+            damping *= growth
+            growth *= 2.0
+            if damping > max_damping:
+                reason = "damping"
+                break
+    return MinimizeResult(state, reason, np.array(history), iteration)

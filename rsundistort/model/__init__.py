@@ -1,0 +1,15 @@
+"""What data looks like between the stages: frozen dataclasses of arrays."""
+
+from .camera import READOUTS, Camera
+from .motion import SHUTTER_MODELS, RowMotion, check_shutter_model
+from .reconstruction import Observations, Reconstruction
+
+__all__ = [
+    "READOUTS",
+    "SHUTTER_MODELS",
+    "Camera",
+    "Observations",
+    "Reconstruction",
+    "RowMotion",
+    "check_shutter_model",
+]

@@ -1,0 +1,58 @@
+"""The motion of the camera while its shutter runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .checks import check_finite, frozen
+
+__all__ = ["SHUTTER_MODELS", "RowMotion", "check_shutter_model"]
+
+#: Names of the shutter models and their codes in the kernels, in the order of the ladder.
+SHUTTER_MODELS: dict[str, int] = {"global": 0, "two-step": 1, "linearized": 2, "rotation": 3}
+
+
+def check_shutter_model(name: str) -> int:
+    """The code of a shutter model in the kernels."""
+    if name not in SHUTTER_MODELS:
+        raise InputError(f"shutter model {name!r}, expected one of {', '.join(SHUTTER_MODELS)}")
+    return SHUTTER_MODELS[name]
+
+
+@dataclass(frozen=True)
+class RowMotion:
+    """Motion during the readout, per unit of the clock r (r is 0 at the principal row).
+
+    Parameters
+    ----------
+    phi : (3,) array
+        Rotation in radians per unit of r, in the camera frame (the paper's phi).
+    velocity : (3,) array
+        World units per unit of r (the paper's v).
+
+    Examples
+    --------
+    >>> RowMotion([0.1, 0.02, 0.0]).aspect
+    0.9
+    """
+
+    phi: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        for name in ("phi", "velocity"):
+            object.__setattr__(self, name, frozen(check_finite(getattr(self, name), (3,), name)))
+
+    @property
+    def aspect(self) -> float:
+        """Aspect ratio of the paper's imaginary camera, 1 - phi1 (row readout)."""
+        return 1.0 - float(self.phi[0])
+
+    @property
+    def skew(self) -> float:
+        """Skew of the paper's imaginary camera, phi2 (row readout)."""
+        return float(self.phi[1])

@@ -1,0 +1,145 @@
+"""Measurements and what they were explained by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .camera import Camera
+from .checks import check_finite, check_index, check_rotations, frozen
+from .motion import RowMotion, check_shutter_model
+
+__all__ = ["Observations", "Reconstruction"]
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Where photos see points: `xy_raw[k]` is point `point_idx[k]` in photo `frame_idx[k]`.
+
+    Parameters
+    ----------
+    frame_idx, point_idx : (o,) int array
+        Indices of the photo and of the point.
+    xy_raw : (o, 2) array
+        Pixels of the stored photo, integer centres.
+    """
+
+    frame_idx: NDArray[np.int64]
+    point_idx: NDArray[np.int64]
+    xy_raw: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        xy = check_finite(self.xy_raw, (None, 2), "xy_raw")
+        big = np.iinfo(np.int64).max
+        object.__setattr__(self, "frame_idx", frozen(check_index(self.frame_idx, len(xy), big, "frame_idx")))
+        object.__setattr__(self, "point_idx", frozen(check_index(self.point_idx, len(xy), big, "point_idx")))
+        object.__setattr__(self, "xy_raw", frozen(xy))
+
+    def __len__(self) -> int:
+        return len(self.xy_raw)
+
+    def select(self, keep: NDArray[Any]) -> Observations:
+        """The observations that a mask or an index array names."""
+        return Observations(self.frame_idx[keep], self.point_idx[keep], self.xy_raw[keep])
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Cameras, poses, shutter motions and points; all poses at the principal row.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        Physical cameras.
+    image_names : sequence of str, length m
+        Photos.
+    camera_idx : (m,) int array
+        Camera of each photo.
+    R_cw, center_w : (m, 3, 3), (m, 3) array
+        `x_c = R_cw (X_w - center_w)`.
+    points_w : (n, 3) array
+        Scene points.
+    observations : Observations
+        Measurements of the points.
+    phi, velocity : (m, 3) array
+        Motion during readout per unit of the clock (`RowMotion`); zero when left out.
+    shutter_model : str
+        Model under which phi and velocity were solved.
+    """
+
+    cameras: Sequence[Camera]
+    image_names: Sequence[str]
+    camera_idx: NDArray[np.int64]
+    R_cw: NDArray[np.float64]
+    center_w: NDArray[np.float64]
+    points_w: NDArray[np.float64]
+    observations: Observations
+    phi: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    shutter_model: str = "global"
+
+    def __post_init__(self) -> None:
+        m = len(self.image_names)
+        if len(set(self.image_names)) != m:
+            raise InputError("image_names holds a name twice")
+        if not self.cameras:
+            raise InputError("a reconstruction needs at least one camera")
+        check_shutter_model(self.shutter_model)
+        points_w = check_finite(self.points_w, (None, 3), "points_w")
+        fields: dict[str, Any] = {
+            "camera_idx": check_index(self.camera_idx, m, len(self.cameras), "camera_idx"),
+            "R_cw": check_rotations(self.R_cw, m, "R_cw"),
+            "center_w": check_finite(self.center_w, (m, 3), "center_w"),
+            "points_w": points_w,
+        }
+        for name in ("phi", "velocity"):
+            value = getattr(self, name)
+            fields[name] = check_finite(value if np.size(value) else np.zeros((m, 3)), (m, 3), name)
+        for name, value in fields.items():
+            object.__setattr__(self, name, frozen(value))
+        object.__setattr__(self, "cameras", tuple(self.cameras))
+        object.__setattr__(self, "image_names", tuple(self.image_names))
+        obs = self.observations
+        check_index(obs.frame_idx, len(obs), m, "frame_idx")
+        check_index(obs.point_idx, len(obs), len(points_w), "point_idx")
+
+    @property
+    def num_images(self) -> int:
+        """Number of photos."""
+        return len(self.image_names)
+
+    @property
+    def num_points(self) -> int:
+        """Number of points."""
+        return len(self.points_w)
+
+    def camera(self, image: int) -> Camera:
+        """The camera of a photo."""
+        return self.cameras[int(self.camera_idx[image])]
+
+    def motion(self, image: int) -> RowMotion:
+        """The motion of a photo during its readout."""
+        return RowMotion(self.phi[image], self.velocity[image])
+
+    def frame_span(self) -> NDArray[np.float64]:
+        """(m,) how far each photo's clock runs over its frame: turns phi into radians per frame."""
+        return np.array([self.camera(i).frame_span for i in range(self.num_images)])
+
+    def with_points(self, keep_obs: NDArray[np.bool_], min_track: int = 2) -> Reconstruction:
+        """The reconstruction with some observations only, without points left with under `min_track` photos."""
+        obs = self.observations
+        # a photo that sees a point twice counts once
+        key = obs.point_idx * self.num_images + obs.frame_idx
+        _, first = np.unique(np.where(keep_obs, key, -1), return_index=True)
+        first = first[keep_obs[first]]
+        count = np.bincount(obs.point_idx[first], minlength=self.num_points)
+        keep_point = count >= min_track
+        new_idx = np.cumsum(keep_point) - 1
+        keep = keep_obs & keep_point[obs.point_idx]
+        kept = Observations(obs.frame_idx[keep], new_idx[obs.point_idx[keep]], obs.xy_raw[keep])
+        return replace(self, points_w=self.points_w[keep_point], observations=kept)
