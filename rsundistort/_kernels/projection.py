@@ -465,13 +465,22 @@ def fill_map(model, axis, sign, intr, lens, phi, rays, row0, col0, map_x, map_y)
 
 @kernel()
 def _loss(kind, s, scale2):
-    """Robust loss rho(s) of a squared residual and its weight rho'(s); kind 0 squared, 1 Huber, 2 Cauchy."""
+    """Robust loss rho(s) of a squared residual, rho'(s), and the share of curvature that it takes away along r.
+
+    Kinds: 0 squared, 1 Huber, 2 Cauchy, 3 soft L1. The share is -2 s rho''/rho', kept below 0.99 so that the Hessian
+    rho' J'(I - share r r'/s) J stays positive. Without it (plain reweighting) convergence is linear and slow: hundreds
+    of steps where a tenth of the residuals lie in the bend.
+    """
     if kind == 1 and s > scale2:
         root = math.sqrt(s * scale2)
-        return 2.0 * root - scale2, root / s
+        return 2.0 * root - scale2, root / s, 0.99
     if kind == 2:
-        return scale2 * math.log1p(s / scale2), 1.0 / (1.0 + s / scale2)
-    return s, 1.0
+        w = 1.0 / (1.0 + s / scale2)
+        return scale2 * math.log1p(s / scale2), w, min(2.0 * s / scale2 * w, 0.99)
+    if kind == 3:
+        q = math.sqrt(1.0 + s / scale2)
+        return 2.0 * scale2 * (q - 1.0), 1.0 / q, min(s / (s + scale2), 0.99)
+    return s, 1.0, 0.0
 
 
 # What an observation costs that cannot be projected (behind the camera): its point must not profit from it.
@@ -573,12 +582,10 @@ def residual_blocks(
             for i in range(2):
                 res[k, i] = (intrs[c, i] * out[i] + intrs[c, 2 + i] - xy_raw[k, i]) / sigma_px
                 s += res[k, i] * res[k, i]
-            rho, weight = _loss(loss_kind, s, scale2)
+            rho, weight, share = _loss(loss_kind, s, scale2)
             cost[k] = 0.5 * rho
-            w = math.sqrt(weight)
             for i in range(2):
-                g = w * intrs[c, i] / sigma_px
-                res[k, i] *= w
+                g = intrs[c, i] / sigma_px
                 a0, a1, a2 = g * out[2 + 3 * i], g * out[3 + 3 * i], g * out[4 + 3 * i]
                 v0, v1, v2 = g * out[14 + 3 * i], g * out[15 + 3 * i], g * out[16 + 3 * i]
                 # x_c = Exp(delta) R d and v_c = Exp(delta) R v
@@ -591,3 +598,20 @@ def residual_blocks(
                 if nb > 6:
                     for b in range(3):
                         J_frame[k, i, 6 + b] = g * out[8 + 3 * i + b]
+            # J <- sqrt(rho') (I - a n n') J and r <- sqrt(rho') r / (1 - a), n = r/|r|: the gradient stays rho' J'r
+            # and J'J becomes the Hessian of `_loss`
+            w = math.sqrt(weight)
+            keep = math.sqrt(1.0 - share)
+            a_s = (1.0 - keep) / s if s > 0.0 else 0.0
+            r0, r1 = res[k, 0], res[k, 1]
+            m00, m01, m11 = w * (1.0 - a_s * r0 * r0), -w * a_s * r0 * r1, w * (1.0 - a_s * r1 * r1)
+            for b in range(nb):
+                j0, j1 = J_frame[k, 0, b], J_frame[k, 1, b]
+                J_frame[k, 0, b] = m00 * j0 + m01 * j1
+                J_frame[k, 1, b] = m01 * j0 + m11 * j1
+            for b in range(3):
+                j0, j1 = J_point[k, 0, b], J_point[k, 1, b]
+                J_point[k, 0, b] = m00 * j0 + m01 * j1
+                J_point[k, 1, b] = m01 * j0 + m11 * j1
+            res[k, 0] *= w / keep
+            res[k, 1] *= w / keep

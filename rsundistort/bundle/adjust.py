@@ -59,12 +59,13 @@ def bundle_adjust(
     iterations = 0
     sigma = options.sigma_px or _noise_px(current, shutter_model, options.min_sigma_px)
     for round_ in range(options.outlier_rounds + 1):
+        last = round_ == options.outlier_rounds
         problem = BundleProblem(current, shutter_model, options, sigma)
         result = minimize(
             problem,
             problem.initial_state(),
             max_iterations=options.max_iterations,
-            cost_tolerance=options.cost_tolerance,
+            cost_tolerance=options.cost_tolerance if last else options.round_tolerance,
             step_tolerance=options.step_tolerance,
             initial_damping=options.initial_damping,
             max_damping=options.max_damping,
@@ -74,13 +75,10 @@ def bundle_adjust(
         current = problem.reconstruction(result.state)
         res, valid = reprojection_residuals(current)
         new_sigma = options.sigma_px or _noise_px(current, shutter_model, options.min_sigma_px)
-        if round_ == options.outlier_rounds:
+        if last:
             break
         limit = max(options.outlier_sigma * new_sigma, options.min_outlier_px)
         keep = valid & (np.linalg.norm(res, axis=1) <= limit)
-        settled = abs(new_sigma - sigma) < 0.05 * sigma
-        if keep.all() and settled:
-            break
         current = current.with_points(keep)
         sigma = new_sigma
     rms = float(np.sqrt(np.mean(res[valid] ** 2))) if valid.any() else float("nan")
@@ -99,12 +97,15 @@ def climb(
     Returns
     -------
     dict of BundleResult
-        By model, in the order solved. Each rung starts from all the measurements of the one before.
+        By model, in the order solved. All but the last are rough: no outliers are dropped from them.
     """
+    options = options or BundleOptions()
+    # every rung but the last is only a start: what its model cannot explain is no outlier, and it need not converge
+    rough = replace(options, outlier_rounds=0, cost_tolerance=options.round_tolerance)
     results: dict[str, BundleResult] = {}
     current = replace(reconstruction, phi=np.zeros((reconstruction.num_images, 3)))
     for model in rungs:
         step = None if progress is None else (lambda cost, model=model: progress(model, cost))
-        results[model] = bundle_adjust(current, model, options, step)
+        results[model] = bundle_adjust(current, model, options if model == rungs[-1] else rough, step)
         current = results[model].reconstruction
     return results

@@ -14,7 +14,7 @@ from ..model import Reconstruction
 __all__ = ["LOSSES", "BundleOptions", "BundleResult"]
 
 #: Robust losses and their codes in the kernels.
-LOSSES: dict[str, int] = {"squared": 0, "huber": 1, "cauchy": 2}
+LOSSES: dict[str, int] = {"squared": 0, "huber": 1, "cauchy": 2, "soft-l1": 3}
 
 
 @dataclass(frozen=True)
@@ -26,13 +26,16 @@ class BundleOptions:
     max_iterations : int
         At most this many steps are tried in one solve.
     cost_tolerance : float
-        Stop when a step lowers the cost by less than `cost_tolerance * cost`.
+        Stop when a step lowers the cost by less than `cost_tolerance * cost`. The cost is about the number of
+        observations, and half a unit of it is one standard deviation of one unknown.
+    round_tolerance : float
+        The same for the solves before the last outlier round, which only have to tell outliers from the rest.
     step_tolerance : float
         Stop when every centre and point moves by less than `step_tolerance` times the scene's size, and every
         angle by less than `step_tolerance` radians.
     initial_damping, max_damping : float
         Levenberg-Marquardt damping, times the diagonal of the normal equations; above the largest, stop.
-    loss : {"huber", "cauchy", "squared"}
+    loss : {"soft-l1", "huber", "cauchy", "squared"}
         Robust loss of an observation.
     loss_scale : float
         Residual length, in standard deviations of the noise, where the loss starts to bend.
@@ -57,11 +60,12 @@ class BundleOptions:
     """
 
     max_iterations: int = 100
-    cost_tolerance: float = 1e-9
+    cost_tolerance: float = 1e-8
+    round_tolerance: float = 1e-4
     step_tolerance: float = 1e-10
     initial_damping: float = 1e-4
     max_damping: float = 1e12
-    loss: str = "huber"
+    loss: str = "soft-l1"
     loss_scale: float = 2.5
     sigma_px: float | None = None
     min_sigma_px: float = 0.1
@@ -75,7 +79,7 @@ class BundleOptions:
     def __post_init__(self) -> None:
         if self.loss not in LOSSES:
             raise InputError(f"loss={self.loss!r}, expected one of {', '.join(LOSSES)}")
-        positive = ("cost_tolerance", "step_tolerance", "initial_damping", "loss_scale", "min_sigma_px", "phi_sigma")
+        positive = ("cost_tolerance", "round_tolerance", "step_tolerance", "initial_damping", "loss_scale", "min_sigma_px", "phi_sigma")
         for name in (*positive, "outlier_sigma", "max_damping"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name}={getattr(self, name)!r}, expected a positive number")

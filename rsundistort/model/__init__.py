@@ -3,6 +3,7 @@
 from .camera import READOUTS, Camera
 from .motion import SHUTTER_MODELS, RowMotion, check_shutter_model
 from .reconstruction import Observations, Reconstruction
+from .solution import Solution, SolvedImage
 
 __all__ = [
     "READOUTS",
@@ -11,5 +12,7 @@ __all__ = [
     "Observations",
     "Reconstruction",
     "RowMotion",
+    "Solution",
+    "SolvedImage",
     "check_shutter_model",
 ]

@@ -1,0 +1,134 @@
+"""Errors of poses, motions and images against the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..model import Solution
+
+__all__ = ["MotionErrors", "PoseErrors", "motion_errors", "pose_errors", "psnr"]
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """Pose errors of the photos that both sides have.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Photos compared.
+    rotation_deg : (m,) array
+        Angle left after the common rotation that best aligns all orientations.
+    center : (m,) array
+        Distance left after the similarity that best aligns the centres, in units of the truth's mean distance
+        between consecutive centres.
+    """
+
+    names: tuple[str, ...]
+    rotation_deg: NDArray[np.float64]
+    center: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MotionErrors:
+    """Errors of phi in radians per frame, (m, 3), of the photos that both sides have."""
+
+    names: tuple[str, ...]
+    phi_rad_per_frame: NDArray[np.float64]
+
+
+def _rotation_angle_deg(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angles of rotation matrices (m, 3, 3); exact also for tiny ones."""
+    vee = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
+    sine = np.linalg.norm(vee, axis=1) / 2
+    cosine = (np.trace(R, axis1=1, axis2=2) - 1) / 2
+    return np.degrees(np.arctan2(sine, cosine))
+
+
+def _best_rotation(moved: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation nearest to a 3x3 matrix."""
+    U, _, Vt = np.linalg.svd(moved)
+    return U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+
+
+def pose_errors(solution: Solution, truth: Solution) -> PoseErrors:
+    """Pose errors of a solution.
+
+    Parameters
+    ----------
+    solution, truth : Solution
+        Photos are matched by name.
+
+    Raises
+    ------
+    InputError
+        When fewer than three photos have poses on both sides.
+    """
+    true_of = {image.name: image for image in truth.images if image.posed}
+    pairs = [(image, true_of[image.name]) for image in solution.images if image.posed and image.name in true_of]
+    if len(pairs) < 3:
+        raise InputError(f"{len(pairs)} photos have a pose in both solution and truth; need at least three")
+    R = np.array([a.R_cw for a, _ in pairs])
+    R_true = np.array([b.R_cw for _, b in pairs])
+    C = np.array([a.center_w for a, _ in pairs])
+    C_true = np.array([b.center_w for _, b in pairs])
+    # R_true = R A^T for the world rotation A that takes estimated to true coordinates
+    A = _best_rotation(np.einsum("mji,mjk->ik", R_true, R))
+    rotation = _rotation_angle_deg(np.einsum("mij,kj,mlk->mil", R, A, R_true))
+    # similarity of the centres after Umeyama (1991)
+    mean, mean_true = C.mean(0), C_true.mean(0)
+    X, Y = C - mean, C_true - mean_true
+    U, s, Vt = np.linalg.svd(Y.T @ X)
+    flip = np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))])
+    scale = float(np.trace(np.diag(s) @ flip) / max(np.sum(X**2), 1e-300))
+    left = np.linalg.norm(scale * X @ (U @ flip @ Vt).T - Y, axis=1)
+    step = np.linalg.norm(np.diff(C_true, axis=0), axis=1).mean()
+    return PoseErrors(tuple(a.name for a, _ in pairs), rotation, left / max(step, 1e-300))
+
+
+def motion_errors(solution: Solution, truth: Solution) -> MotionErrors:
+    """Errors of phi of a solution; photos are matched by name."""
+    true_of = {image.name: image for image in truth.images if image.motion is not None}
+    names, errors = [], []
+    for image in solution.images:
+        if image.motion is None or image.name not in true_of:
+            continue
+        true_motion = true_of[image.name].motion
+        assert true_motion is not None
+        span = solution.cameras[image.camera_id].frame_span
+        names.append(image.name)
+        errors.append((image.motion.phi - true_motion.phi) * span)
+    if not names:
+        raise InputError("no photo has a motion in both solution and truth")
+    return MotionErrors(tuple(names), np.array(errors))
+
+
+def psnr(image: NDArray[Any], truth: NDArray[Any], mask: NDArray[np.uint8] | None = None, margin_px: int = 2) -> float:
+    """Peak signal-to-noise ratio in dB over the valid pixels.
+
+    Parameters
+    ----------
+    image, truth : arrays of one shape and type
+        uint8, uint16, or float in 0 to 1.
+    mask : (h, w) uint8 array, optional
+        255 where `image` is valid.
+    margin_px : int
+        Pixels nearer than this to an invalid one, or to the border, do not count: an interpolation that reaches beyond
+        the raw photo is no error of the geometry.
+    """
+    if image.shape != truth.shape or image.dtype != truth.dtype:
+        raise InputError(f"image {image.shape} {image.dtype} and truth {truth.shape} {truth.dtype} do not compare")
+    valid = np.full(image.shape[:2], 255, np.uint8) if mask is None else mask
+    size = 2 * margin_px + 1
+    kept = cv2.erode(valid, np.ones((size, size), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+    if not kept.any():
+        return float("nan")
+    peak = float(np.iinfo(image.dtype).max) if np.issubdtype(image.dtype, np.integer) else 1.0
+    mse = float(np.mean((image[kept].astype(np.float64) - truth[kept].astype(np.float64)) ** 2))
+    return float("inf") if mse == 0 else 10.0 * float(np.log10(peak**2 / mse))

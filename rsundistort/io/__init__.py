@@ -1,0 +1,24 @@
+"""Files: photos, cameras, solutions, COLMAP models, nerfstudio."""
+
+from .cameras import camera_from_exif, check_camera_fits, parse_camera
+from .colmap import write_colmap_model
+from .images import Photo, list_photos, output_name, read_photo, write_image
+from .nerfstudio import write_transforms
+from .outputs import output_folder
+from .solution import read_solution, write_solution
+
+__all__ = [
+    "Photo",
+    "camera_from_exif",
+    "check_camera_fits",
+    "list_photos",
+    "output_folder",
+    "output_name",
+    "parse_camera",
+    "read_photo",
+    "read_solution",
+    "write_colmap_model",
+    "write_image",
+    "write_solution",
+    "write_transforms",
+]

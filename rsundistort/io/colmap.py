@@ -1,0 +1,102 @@
+"""COLMAP model of the rectified photos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model import Camera, Reconstruction
+from ..model.projection import unproject_points
+
+__all__ = ["rectified_keypoints", "write_colmap_model"]
+
+# COLMAP's pixel centres are at 0.5, ours at 0
+_HALF = 0.5
+
+
+def rectified_keypoints(reconstruction: Reconstruction, rectified: list[Camera]) -> NDArray[np.float64]:
+    """(o, 2) where the measurements lie in the rectified photos, pixels with integer centres.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Measurements in raw pixels.
+    rectified : list of Camera
+        New camera of each camera of the reconstruction.
+    """
+    obs = reconstruction.observations
+    xy = np.full((len(obs), 2), np.nan)
+    for i in range(reconstruction.num_images):
+        of_photo = obs.frame_idx == i
+        ideal, _ = unproject_points(
+            obs.xy_raw[of_photo], reconstruction.camera(i), reconstruction.motion(i), reconstruction.shutter_model
+        )
+        K = rectified[int(reconstruction.camera_idx[i])].K
+        xy[of_photo] = ideal @ K[:2, :2].T + K[:2, 2]
+    return xy
+
+
+def write_colmap_model(
+    folder: Path,
+    reconstruction: Reconstruction,
+    rectified: list[Camera],
+    names: list[str],
+    colors: NDArray[np.uint8] | None = None,
+) -> None:
+    """Write `cameras.bin`, `images.bin`, `points3D.bin` (and rigs, frames) of PINHOLE cameras without distortion.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if missing.
+    reconstruction : Reconstruction
+        Poses, motions, points and raw measurements.
+    rectified : list of Camera
+        New camera of each camera of the reconstruction.
+    names : list of str
+        File names of the rectified photos.
+    colors : (n, 3) uint8 array, optional
+        Red, green, blue of the points.
+    """
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    for index, camera in enumerate(rectified):
+        K = camera.K
+        params = [K[0, 0], K[1, 1], K[0, 2] + _HALF, K[1, 2] + _HALF]
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(
+                model="PINHOLE", width=camera.width, height=camera.height, params=params, camera_id=index + 1
+            )
+        )
+    obs = reconstruction.observations
+    xy = rectified_keypoints(reconstruction, rectified)
+    usable = np.isfinite(xy).all(1)
+    place = np.full(len(obs), -1)
+    for i, name in enumerate(names):
+        of_photo = np.flatnonzero((obs.frame_idx == i) & usable)
+        place[of_photo] = np.arange(len(of_photo))
+        image = pycolmap.Image(
+            name=name,
+            keypoints=xy[of_photo] + _HALF,
+            camera_id=int(reconstruction.camera_idx[i]) + 1,
+            image_id=i + 1,
+        )
+        R = reconstruction.R_cw[i]
+        pose = pycolmap.Rigid3d(np.column_stack([R, -R @ reconstruction.center_w[i]]))
+        model.add_image_with_trivial_frame(image, pose)
+    order = np.argsort(obs.point_idx, kind="stable")
+    bounds = np.searchsorted(obs.point_idx[order], np.arange(reconstruction.num_points + 1))
+    for p in range(reconstruction.num_points):
+        track = pycolmap.Track()
+        for k in order[bounds[p] : bounds[p + 1]]:
+            if place[k] >= 0:
+                track.add_element(int(obs.frame_idx[k]) + 1, int(place[k]))
+        color = np.zeros(3, np.uint8) if colors is None else colors[p]
+        if track.length() >= 2:
+            model.add_point3D(reconstruction.points_w[p], track, color)
+    model.update_point_3d_errors()
+    folder.mkdir(parents=True, exist_ok=True)
+    model.write(folder)

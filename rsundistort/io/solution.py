@@ -1,0 +1,158 @@
+"""`solution.json`: writing, and reading with checks."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import FileError, FormatError, InputError
+from ..model import READOUTS, Camera, RowMotion, Solution, SolvedImage
+from .cameras import camera_from_json, camera_to_json
+
+__all__ = ["FORMAT", "VERSION", "read_solution", "solution_to_json", "write_solution"]
+
+FORMAT = "rsundistort-solution"
+VERSION = 1
+
+
+def _plain(value: Any) -> Any:
+    """The value with arrays as lists and NumPy scalars as numbers; NaN becomes null."""
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
+
+
+def _imaginary_camera(motion: RowMotion, camera: Camera) -> tuple[float, float]:
+    """Aspect ratio and skew of the paper's imaginary camera in the direction of the readout."""
+    axis, sign = READOUTS[camera.readout]
+    phi = sign * motion.phi
+    # for columns x and y are exchanged, which takes phi to -(phi2, phi1, phi3)
+    turned = RowMotion(phi if axis == 1 else -phi[[1, 0, 2]])
+    return turned.aspect, turned.skew
+
+
+def solution_to_json(solution: Solution) -> dict[str, Any]:
+    """The object of `solution.json`."""
+    images = []
+    for image in solution.images:
+        entry: dict[str, Any] = {
+            "name": image.name,
+            "camera_id": image.camera_id,
+            "registered": image.registered,
+            "R_cw": image.R_cw,
+            "center_w": image.center_w,
+            "phi": None,
+            "velocity": None,
+            "aspect": None,
+            "skew": None,
+            "sigma_phi": image.sigma_phi,
+            "num_observations": image.num_observations,
+            "rms_px": image.rms_px,
+            "rs_shift_px": image.rs_shift_px,
+        }
+        if image.motion is not None:
+            entry["phi"], entry["velocity"] = image.motion.phi, image.motion.velocity
+            entry["aspect"], entry["skew"] = _imaginary_camera(image.motion, solution.cameras[image.camera_id])
+        if image.reason is not None:
+            entry["reason"] = image.reason
+        images.append(entry)
+    value = {
+        "format": FORMAT,
+        "version": VERSION,
+        "generator": dict(solution.generator),
+        "options": dict(solution.options),
+        "cameras": {k: camera_to_json(c) for k, c in solution.cameras.items()},
+        "rectified_cameras": {
+            k: {"width": c.width, "height": c.height, "K": c.K} for k, c in solution.rectified_cameras.items()
+        },
+        "shutter_model": solution.shutter_model,
+        "images": images,
+        "critical_motion": solution.critical_motion,
+        "quality": dict(solution.quality),
+        "stages": list(solution.stages),
+    }
+    result: dict[str, Any] = _plain(value)
+    return result
+
+
+def write_solution(path: Path, solution: Solution) -> None:
+    """Write `solution.json`, whole or not at all."""
+    path = Path(path)
+    aside = path.with_name(f".{path.name}.partial")
+    aside.write_text(json.dumps(solution_to_json(solution), indent=1) + "\n", encoding="utf-8")
+    aside.replace(path)
+
+
+def read_solution(path: Path) -> Solution:
+    """Read a solution or a ground-truth file.
+
+    Raises
+    ------
+    FileError, FormatError
+        When the file is missing, no solution, of another version, or inconsistent.
+    """
+    path = Path(path)
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise FileError(f"{path} cannot be read: {error.strerror}") from error
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise FormatError(f"{path} is no valid JSON: {error}") from error
+    if not isinstance(value, dict) or value.get("format") != FORMAT:
+        raise FormatError(f"{path} is no solution: its format is not {FORMAT!r}")
+    if value.get("version") != VERSION:
+        raise FormatError(
+            f"{path} has version {value.get('version')!r} of the format, this program reads {VERSION}; update rsundistort"
+        )
+    try:
+        return _solution_from_json(value, str(path))
+    except (KeyError, TypeError, AttributeError) as error:
+        raise FormatError(f"{path} lacks or garbles {error}") from error
+    except InputError as error:
+        raise FormatError(f"{path}: {error}") from error
+
+
+def _solution_from_json(value: dict[str, Any], where: str) -> Solution:
+    cameras = {k: camera_from_json(c, f"camera {k}") for k, c in value["cameras"].items()}
+    rectified = {k: Camera(c["width"], c["height"], c["K"]) for k, c in value["rectified_cameras"].items()}
+    images = []
+    for entry in value["images"]:
+        motion = None
+        if entry["registered"] and entry.get("phi") is not None:
+            motion = RowMotion(entry["phi"], entry.get("velocity") or [0, 0, 0])
+        images.append(
+            SolvedImage(
+                name=entry["name"],
+                camera_id=entry["camera_id"],
+                R_cw=entry.get("R_cw"),
+                center_w=entry.get("center_w"),
+                motion=motion,
+                sigma_phi=None if entry.get("sigma_phi") is None else np.asarray(entry["sigma_phi"], float),
+                num_observations=entry.get("num_observations") or 0,
+                rms_px=entry.get("rms_px"),
+                rs_shift_px=entry.get("rs_shift_px"),
+                reason=entry.get("reason"),
+            )
+        )
+    return Solution(
+        shutter_model=value["shutter_model"],
+        cameras=cameras,
+        rectified_cameras=rectified,
+        images=tuple(images),
+        critical_motion=value.get("critical_motion"),
+        quality=value.get("quality") or {},
+        stages=value.get("stages") or (),
+        options=value.get("options") or {},
+        generator=value.get("generator") or {},
+    )

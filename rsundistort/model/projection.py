@@ -1,0 +1,105 @@
+"""The row models as functions of arrays: camera-frame points to pixels, and pixels to ideal directions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .._kernels import projection as kernels
+from .camera import Camera
+from .checks import check_array
+from .motion import RowMotion, check_shutter_model
+
+__all__ = ["ProjectionJacobians", "project_points", "project_points_with_jacobians", "unproject_points"]
+
+
+@dataclass(frozen=True)
+class ProjectionJacobians:
+    """Derivatives of pixels (n, 2, 3): in the camera-frame point and in phi (radians per unit of the clock)."""
+
+    point: NDArray[np.float64]
+    phi: NDArray[np.float64]
+
+
+def project_points(
+    points_c: ArrayLike, camera: Camera, motion: RowMotion | None = None, shutter_model: str = "rotation"
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Pixels where a rolling-shutter photo shows points of the camera frame.
+
+    Parameters
+    ----------
+    points_c : (n, 3) array
+        Points in the camera frame at the reference row, x right, y down, z ahead; any unit of length.
+    camera : Camera
+        Intrinsics, lens and readout direction.
+    motion : RowMotion, optional
+        Rotation during the readout; none when left out.
+    shutter_model : {"global", "two-step", "linearized", "rotation"}
+        Row model: paper Eqs. 8-9, Eq. 6, or Eq. 2 without translation.
+
+    Returns
+    -------
+    xy_raw : (n, 2) array
+        Pixels, integer centres; NaN where invalid.
+    valid : (n,) bool array
+        False for points behind the camera, beyond the fold of the lens model, or seen by no single row.
+
+    Examples
+    --------
+    >>> camera = Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]])
+    >>> project_points([[0.0, 0.5, 5.0]], camera, RowMotion([0.1, 0, 0]))[0].round(3)
+    array([[320.   , 285.004]])
+    """
+    points = np.ascontiguousarray(check_array(points_c, (None, 3), "points_c"))
+    motion = motion or RowMotion()
+    intr, lens, axis, sign = camera.kernel_args
+    xy, valid = np.empty((len(points), 2)), np.empty(len(points), bool)
+    model = check_shutter_model(shutter_model)
+    kernels.project_points(model, axis, sign, intr, lens, points, motion.phi, np.zeros(3), xy, valid)
+    return xy, valid
+
+
+def project_points_with_jacobians(
+    points_c: ArrayLike, camera: Camera, motion: RowMotion | None = None, shutter_model: str = "rotation"
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], ProjectionJacobians]:
+    """As `project_points`, with the exact derivatives of the pixels (the implicit row's included)."""
+    points = np.ascontiguousarray(check_array(points_c, (None, 3), "points_c"))
+    motion = motion or RowMotion()
+    intr, lens, axis, sign = camera.kernel_args
+    n = len(points)
+    xy, valid = np.empty((n, 2)), np.empty(n, bool)
+    J_point, J_phi, J_velocity = (np.empty((n, 2, 3)) for _ in range(3))
+    model = check_shutter_model(shutter_model)
+    kernels.project_jacobians(
+        model, axis, sign, intr, lens, points, motion.phi, np.zeros(3), xy, J_point, J_phi, J_velocity, valid
+    )
+    return xy, valid, ProjectionJacobians(J_point, J_phi)
+
+
+def unproject_points(
+    xy_raw: ArrayLike, camera: Camera, motion: RowMotion | None = None, shutter_model: str = "rotation"
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Ideal normalised coordinates (x', y') at the reference row of pixels of a rolling-shutter photo.
+
+    Parameters
+    ----------
+    xy_raw : (n, 2) array
+        Pixels, integer centres.
+    camera, motion, shutter_model
+        As in `project_points`, of which this is the inverse.
+
+    Returns
+    -------
+    xy_norm : (n, 2) array
+        Global-shutter, lens-free coordinates x/z, y/z; NaN where invalid.
+    valid : (n,) bool array
+        False beyond the fold of the lens model and where the row model has no inverse.
+    """
+    xy = np.ascontiguousarray(check_array(xy_raw, (None, 2), "xy_raw"))
+    motion = motion or RowMotion()
+    intr, lens, axis, sign = camera.kernel_args
+    ideal, valid = np.empty_like(xy), np.empty(len(xy), bool)
+    kernels.unproject_points(check_shutter_model(shutter_model), axis, sign, intr, lens, xy, motion.phi, ideal, valid)
+    return ideal, valid

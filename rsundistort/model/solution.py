@@ -1,0 +1,123 @@
+"""What a run answers: every photo's pose and motion, with how well it fits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .camera import Camera
+from .checks import check_finite, check_rotations, frozen
+from .motion import RowMotion, check_shutter_model
+
+__all__ = ["Solution", "SolvedImage"]
+
+
+@dataclass(frozen=True)
+class SolvedImage:
+    """One photo of a solution.
+
+    Attributes
+    ----------
+    name, camera_id : str
+        Photo and its camera.
+    R_cw, center_w : (3, 3), (3,) array or None
+        Pose at the principal row; None for a photo that did not register.
+    motion : RowMotion or None
+        Motion during the readout.
+    sigma_phi : (3,) array or None
+        Standard deviations of phi, if known.
+    num_observations : int
+        Measurements in this photo.
+    rms_px : float or None
+        Root mean square of the residuals' x and y parts.
+    rs_shift_px : float or None
+        Largest displacement that the shutter caused in this photo.
+    reason : str or None
+        Why the photo did not register.
+    """
+
+    name: str
+    camera_id: str
+    R_cw: NDArray[np.float64] | None = None
+    center_w: NDArray[np.float64] | None = None
+    motion: RowMotion | None = None
+    sigma_phi: NDArray[np.float64] | None = None
+    num_observations: int = 0
+    rms_px: float | None = None
+    rs_shift_px: float | None = None
+    reason: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.R_cw is not None:
+            R = check_rotations(np.asarray(self.R_cw, np.float64)[None], 1, f"R_cw of {self.name}")[0]
+            object.__setattr__(self, "R_cw", frozen(R))
+        if self.center_w is not None:
+            center = check_finite(self.center_w, (3,), f"center_w of {self.name}")
+            object.__setattr__(self, "center_w", frozen(center))
+
+    @property
+    def registered(self) -> bool:
+        """Whether the photo has a motion, and can be rectified."""
+        return self.motion is not None
+
+    @property
+    def posed(self) -> bool:
+        """Whether the photo has a pose; the truth of a warped photo has a motion only."""
+        return self.R_cw is not None and self.center_w is not None
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Poses and motions of a folder of photos; what `solution.json` holds.
+
+    Attributes
+    ----------
+    shutter_model : str
+        Model under which phi was solved.
+    cameras, rectified_cameras : mapping of id to Camera
+        Of the photos, and of the rectified ones (no distortion).
+    images : sequence of SolvedImage
+        All photos, also those that did not register.
+    critical_motion, quality : mapping
+        See the file format.
+    stages : sequence of mapping
+        Name and seconds of each stage, with what it counted.
+    options, generator : mapping
+        What it was made with.
+    """
+
+    shutter_model: str
+    cameras: Mapping[str, Camera]
+    rectified_cameras: Mapping[str, Camera]
+    images: Sequence[SolvedImage]
+    critical_motion: Mapping[str, Any] | None = None
+    quality: Mapping[str, Any] = field(default_factory=dict)
+    stages: Sequence[Mapping[str, Any]] = ()
+    options: Mapping[str, Any] = field(default_factory=dict)
+    generator: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_shutter_model(self.shutter_model)
+        names = [image.name for image in self.images]
+        if len(set(names)) != len(names):
+            raise InputError("the solution names a photo twice")
+        for image in self.images:
+            if image.camera_id not in self.cameras:
+                raise InputError(f"photo {image.name} has camera {image.camera_id!r}, which the solution lacks")
+
+    def image(self, name: str) -> SolvedImage:
+        """The photo of a name."""
+        for image in self.images:
+            if image.name == name:
+                return image
+        raise InputError(f"the solution has no photo {name!r}")
+
+    @property
+    def registered(self) -> list[SolvedImage]:
+        """Photos that have a motion."""
+        return [image for image in self.images if image.registered]

@@ -1,0 +1,41 @@
+"""How stages tell how far they are."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+__all__ = ["ProgressCallback", "StageLog"]
+
+#: Called as (stage, done, total); total is 0 where it is not known.
+ProgressCallback = Callable[[str, int, int], None]
+
+
+class StageLog:
+    """Times stages and passes their progress on.
+
+    Parameters
+    ----------
+    callback : callable, optional
+        See `ProgressCallback`.
+    """
+
+    def __init__(self, callback: ProgressCallback | None) -> None:
+        self._callback = callback
+        self._began = time.perf_counter()
+        self.stages: list[dict[str, Any]] = []
+
+    def tell(self, stage: str, done: int, total: int = 0) -> None:
+        """Pass progress on."""
+        if self._callback is not None:
+            self._callback(stage, done, total)
+
+    def begin(self, stage: str, total: int = 0) -> None:
+        """Start the clock of a stage."""
+        self._began = time.perf_counter()
+        self.tell(stage, 0, total)
+
+    def end(self, stage: str, **counts: Any) -> None:
+        """Note what a stage took and counted."""
+        self.stages.append({"name": stage, "seconds": round(time.perf_counter() - self._began, 3), **counts})

@@ -1,0 +1,207 @@
+"""The main job: a folder of photos in, rectified photos and poses out."""
+
+from __future__ import annotations
+
+import os
+import platform
+import tempfile
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from ..bundle import BundleOptions, reprojection_residuals
+from ..errors import InputError
+from ..io import output_folder, output_name, write_colmap_model, write_solution, write_transforms
+from ..model import Reconstruction, Solution, SolvedImage, check_shutter_model
+from ..rectify import INTERPOLATIONS, largest_shift_px
+from .load import LoadedPhotos, load_photos
+from .progress import ProgressCallback, StageLog
+from .solve import Solved, solve_photos
+from .write import PointColors, mask_names, rectify_photos
+
+__all__ = ["RunOptions", "run", "use_threads", "versions"]
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Options of `run`.
+
+    Parameters
+    ----------
+    camera : str, optional
+        Camera file or numbers, as `io.parse_camera` takes them; else `camera.json`, else EXIF.
+    readout : str, optional
+        Readout direction; else the camera file's, else top-to-bottom.
+    shutter_model : str
+        "auto" (rotation), "rotation", "linearized", "two-step" or "global".
+    seed : int
+        Of every random choice.
+    jobs : int
+        Threads; 0 for all cores.
+    max_features : int
+        Per photo.
+    interpolation, quality
+        Of the rectified photos.
+    still : tuple of str
+        Photos known not to have moved: phi1 is held at zero in them (the paper's remedy).
+    overwrite : bool
+        Replace the outputs of an earlier run.
+    """
+
+    camera: str | None = None
+    readout: str | None = None
+    shutter_model: str = "auto"
+    seed: int = 0
+    jobs: int = 0
+    max_features: int = 8192
+    interpolation: str = "cubic"
+    quality: int = 95
+    still: tuple[str, ...] = ()
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        if self.shutter_model != "auto":
+            check_shutter_model(self.shutter_model)
+        if self.interpolation not in INTERPOLATIONS:
+            raise InputError(f"interpolation={self.interpolation!r}, expected one of {', '.join(INTERPOLATIONS)}")
+        if self.jobs < 0 or self.max_features < 100 or not 1 <= self.quality <= 100:
+            raise InputError("jobs must be 0 or more, max_features at least 100, quality 1 to 100")
+
+
+def versions() -> dict[str, str]:
+    """Versions of what a result depends on."""
+    names = ("rsundistort", "opencv-contrib-python-headless", "numpy", "scipy", "numba", "pycolmap")
+    return {"python": platform.python_version(), **{name: version(name) for name in names}}
+
+
+def use_threads(jobs: int) -> int:
+    """Hold OpenCV and the kernels to a number of threads; 0 for all cores. Returns the number."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    jobs = jobs or cores
+    cv2.setNumThreads(jobs)
+    numba.set_num_threads(min(jobs, numba.config.NUMBA_NUM_THREADS))
+    return jobs
+
+
+def run(
+    photos: Path | str, out: Path | str, options: RunOptions | None = None, progress: ProgressCallback | None = None
+) -> Solution:
+    """Recover how the camera moved during each photo's readout; write rectified photos, masks, poses and a COLMAP model.
+
+    Parameters
+    ----------
+    photos : path
+        Folder of photos of one camera.
+    out : path
+        Folder for the outputs; it gets all of them or stays as it was.
+    options : RunOptions, optional
+        See there.
+    progress : callable, optional
+        Called as (stage, done, total).
+
+    Returns
+    -------
+    Solution
+        As written to `out/solution.json`; photos that did not register are in it, with the reason.
+    """
+    options = options or RunOptions()
+    photos, out = Path(photos), Path(out)
+    model = "rotation" if options.shutter_model == "auto" else options.shutter_model
+    log = StageLog(progress)
+    jobs = use_threads(options.jobs)
+    with output_folder(out, overwrite=options.overwrite, apart_from=[photos]) as scratch:
+        loaded = load_photos(photos, options.camera, options.readout, options.max_features, jobs, log)
+        for name in options.still:
+            if name not in loaded.names:
+                raise InputError(f"still photo {name!r} is not among the photos of {photos}")
+        bundle = BundleOptions(held_phi={name: (0,) for name in options.still})
+        with tempfile.TemporaryDirectory() as work:
+            solved = solve_photos(loaded, model, options.seed, bundle, Path(work), log)
+        rec = solved.result.reconstruction
+        solution = _solution(loaded, solved, options)
+        colors = PointColors(rec)
+        rectified = rectify_photos(
+            photos, solution, list(rec.image_names), scratch,
+            interpolation=options.interpolation, quality=options.quality, jobs=jobs, log=log,
+        )  # fmt: skip
+        for name, photo in rectified:
+            colors.add(name, photo)
+        log.begin("writing")
+        names = [output_name(name) for name in rec.image_names]
+        cameras = [solution.rectified_cameras[str(k + 1)] for k in range(len(rec.cameras))]
+        write_colmap_model(scratch / "sparse", rec, cameras, names, colors.rgb())
+        masks = mask_names([image.name for image in solution.images])
+        files = {name: (f"images/{output_name(name)}", f"masks/{masks[name]}") for name in rec.image_names}
+        write_transforms(scratch / "transforms.json", solution, files)
+        log.end("writing")
+        solution = replace(solution, stages=tuple(log.stages))
+        write_solution(scratch / "solution.json", solution)
+    return solution
+
+
+def _image_rms(rec: Reconstruction) -> NDArray[np.float64]:
+    """(m,) root mean square residual of each photo in pixels."""
+    res, valid = reprojection_residuals(rec)
+    frame = rec.observations.frame_idx[valid]
+    square = np.bincount(frame, np.mean(res[valid] ** 2, axis=1), minlength=rec.num_images)
+    return np.sqrt(square / np.maximum(np.bincount(frame, minlength=rec.num_images), 1))
+
+
+def _solution(loaded: LoadedPhotos, solved: Solved, options: RunOptions) -> Solution:
+    """The solution of an adjusted reconstruction, with every photo of the folder in it."""
+    rec = solved.result.reconstruction
+    rms = _image_rms(rec)
+    counts = np.bincount(rec.observations.frame_idx, minlength=rec.num_images)
+    cameras = {str(k + 1): camera for k, camera in enumerate(rec.cameras)}
+    images = []
+    for name in sorted([*loaded.names, *loaded.skipped]):
+        if name in loaded.skipped:
+            images.append(SolvedImage(name, "1", reason=loaded.skipped[name]))
+        elif name not in rec.image_names:
+            images.append(SolvedImage(name, "1", reason="shares too little with the other photos"))
+        else:
+            i = rec.image_names.index(name)
+            images.append(
+                SolvedImage(
+                    name=name,
+                    camera_id=str(int(rec.camera_idx[i]) + 1),
+                    R_cw=rec.R_cw[i],
+                    center_w=rec.center_w[i],
+                    motion=rec.motion(i),
+                    num_observations=int(counts[i]),
+                    rms_px=float(rms[i]),
+                    rs_shift_px=largest_shift_px(rec.camera(i), rec.motion(i), rec.shutter_model),
+                )
+            )
+    quality = {
+        "num_points": rec.num_points,
+        "num_observations": len(rec.observations),
+        "rms_px": solved.result.rms_px,
+        "global_rms_px": solved.global_result.rms_px,
+        "held_out_rms_px": {},
+        "stop_reason": solved.result.stop_reason,
+    }
+    return Solution(
+        shutter_model=rec.shutter_model,
+        cameras=cameras,
+        # same size and K, so that raw and rectified compare pixel by pixel
+        rectified_cameras={key: camera.pinhole() for key, camera in cameras.items()},
+        images=tuple(images),
+        quality=quality,
+        options={
+            "camera": loaded.camera_source,
+            "shutter_model": options.shutter_model,
+            "readout": loaded.camera.readout,
+            "seed": options.seed,
+            "max_features": options.max_features,
+            "interpolation": options.interpolation,
+            "quality": options.quality,
+            "still": list(options.still),
+        },
+        generator=versions(),
+    )

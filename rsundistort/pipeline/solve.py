@@ -1,0 +1,112 @@
+"""From features to poses, shutter motions and points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..bundle import BundleOptions, BundleResult, bundle_adjust, climb
+from ..errors import ReconstructionError
+from ..model import Reconstruction
+from ..sfm import map_photos, match_photos, retriangulate
+from .load import LoadedPhotos
+from .progress import StageLog
+
+__all__ = ["Solved", "rungs_to", "solve_photos"]
+
+# Feedback ends when no photo's rotation over the frame moves a pixel by more than this between two rounds
+_SETTLED_PX = 0.05
+_MAX_ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Outcome of the reconstruction.
+
+    Attributes
+    ----------
+    result : BundleResult
+        Last adjustment.
+    global_result : BundleResult
+        A global-shutter adjustment of the same measurements: what not modelling the shutter costs.
+    """
+
+    result: BundleResult
+    global_result: BundleResult
+
+
+def rungs_to(shutter_model: str) -> tuple[str, ...]:
+    """Ladder that ends at a shutter model."""
+    if shutter_model == "global":
+        return ("global",)
+    if shutter_model == "two-step":
+        return ("global", "two-step")
+    return ("global", "two-step", shutter_model)
+
+
+def _moved_px(before: Reconstruction, after: Reconstruction) -> float:
+    """Largest change of a shutter rotation over the frame, in pixels."""
+    focal = max(float(camera.K[0, 0]) for camera in after.cameras)
+    change = np.abs(after.phi - before.phi).max(1) * after.frame_span()
+    return float(change.max() * focal)
+
+
+def solve_photos(
+    photos: LoadedPhotos, shutter_model: str, seed: int, options: BundleOptions, scratch: Path, log: StageLog
+) -> Solved:
+    """Match, map, climb the ladder; then free the keypoints of the shutter, rebuild the tracks and adjust, until settled.
+
+    Parameters
+    ----------
+    photos : LoadedPhotos
+        Features and camera.
+    shutter_model : str
+        Last rung of the ladder.
+    seed : int
+        Seed of every random choice.
+    options : BundleOptions
+        Of the adjustments.
+    scratch : Path
+        Folder for the database.
+    log : StageLog
+        Told the progress.
+    """
+    camera_idx = np.zeros(len(photos.names), np.int64)
+    log.begin("matching")
+    matched = match_photos(
+        scratch / "database.db", photos.names, photos.features, [photos.camera], camera_idx,
+        calibrated=photos.calibrated, seed=seed,
+    )  # fmt: skip
+    log.end("matching")
+    log.begin("mapping", len(photos.names))
+    mapped = map_photos(matched, lambda done: log.tell("mapping", done, len(photos.names)))
+    log.end("mapping", photos=mapped.num_images, points=mapped.num_points, observations=len(mapped.observations))
+    if mapped.num_images < 3:
+        raise ReconstructionError(
+            f"only {mapped.num_images} of {len(photos.names)} photos could be joined, the shutter needs three; "
+            "use photos that share more of the scene"
+        )
+    log.begin("ladder")
+    results = climb(mapped, rungs_to(shutter_model), options, lambda model, _: log.tell(f"ladder: {model}", 0))
+    result = results[shutter_model]
+    log.end("ladder", rungs=[{"model": k, "rms_px": r.rms_px, "iterations": r.num_iterations} for k, r in results.items()])
+    for number in range(1, _MAX_ROUNDS + 1):
+        log.begin(f"feedback {number}")
+        before = result.reconstruction
+        tracks = retriangulate(matched, before)
+        result = bundle_adjust(tracks, shutter_model, options, lambda _, n=number: log.tell(f"feedback {n}", 0))
+        after = result.reconstruction
+        moved = np.inf if after.image_names != before.image_names else _moved_px(before, after)
+        log.end(
+            f"feedback {number}", points=after.num_points, observations=len(after.observations), rms_px=result.rms_px,
+            iterations=result.num_iterations, stop_reason=result.stop_reason, moved_px=moved,
+        )  # fmt: skip
+        if moved < _SETTLED_PX:
+            break
+    log.begin("comparison with a global shutter")
+    plain = BundleOptions(outlier_rounds=0, cost_tolerance=options.round_tolerance, sigma_px=result.sigma_px)
+    global_result = bundle_adjust(result.reconstruction, "global", plain)
+    log.end("comparison with a global shutter", rms_px=global_result.rms_px)
+    return Solved(result, global_result)

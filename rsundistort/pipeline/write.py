@@ -1,0 +1,108 @@
+"""The outputs of a run."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FileError, InputError, SkippedPhotoWarning
+from ..io import output_name, read_photo, write_image
+from ..io.images import Photo
+from ..model import Reconstruction, Solution
+from ..rectify import rectify
+from .progress import StageLog
+
+__all__ = ["PointColors", "mask_names", "rectify_photos"]
+
+
+def mask_names(names: Sequence[str]) -> dict[str, str]:
+    """Name of each photo's mask: its stem, unless two photos share it (a.jpg and a.png)."""
+    stems = [Path(name).stem for name in names]
+    return {
+        name: f"{stem}.png" if stems.count(stem) == 1 else f"{name}.png"
+        for name, stem in zip(names, stems, strict=True)
+    }
+
+
+def rectify_photos(
+    folder: Path,
+    solution: Solution,
+    names: Sequence[str],
+    out: Path,
+    *,
+    interpolation: str,
+    quality: int,
+    jobs: int,
+    log: StageLog,
+) -> Iterator[tuple[str, Photo]]:
+    """Rectify photos into `out/images` and `out/masks`, and yield each raw photo by the way.
+
+    Photos that cannot be read, or are of another size than their camera, are skipped with a warning.
+    """
+    (out / "images").mkdir()
+    (out / "masks").mkdir()
+    masks = mask_names([image.name for image in solution.images])
+
+    def work(name: str) -> tuple[str, Photo | None, str]:
+        image = solution.image(name)
+        camera = solution.cameras[image.camera_id]
+        try:
+            photo = read_photo(folder / name)
+            pixels, mask = rectify(
+                photo.pixels, camera, image.motion, solution.shutter_model,
+                solution.rectified_cameras[image.camera_id], interpolation,
+            )  # fmt: skip
+            write_image(out / "images" / output_name(name), pixels, photo.metadata, quality)
+            write_image(out / "masks" / masks[name], mask)
+        except (FileError, InputError) as error:
+            return name, None, str(error)
+        return name, photo, ""
+
+    log.begin("rectifying", len(names))
+    done = 0
+    written = 0
+    with ThreadPoolExecutor(jobs) as pool:
+        # a few photos ahead of the consumer, never the whole folder
+        for start in range(0, len(names), 2 * jobs):
+            for name, photo, problem in pool.map(work, names[start : start + 2 * jobs]):
+                done += 1
+                log.tell("rectifying", done, len(names))
+                if photo is None:
+                    warnings.warn(f"skipped: {name}: {problem}", SkippedPhotoWarning, stacklevel=2)
+                else:
+                    written += 1
+                    yield name, photo
+    log.end("rectifying", photos=written)
+
+
+class PointColors:
+    """Mean colour of each point over the photos that see it."""
+
+    def __init__(self, reconstruction: Reconstruction) -> None:
+        self._rec = reconstruction
+        self._sum = np.zeros((reconstruction.num_points, 3))
+        self._count = np.zeros(reconstruction.num_points)
+
+    def add(self, name: str, photo: Photo) -> None:
+        """Take the colours of one photo."""
+        obs = self._rec.observations
+        of_photo = obs.frame_idx == self._rec.image_names.index(name)
+        xy = np.rint(obs.xy_raw[of_photo]).astype(int)
+        h, w = photo.pixels.shape[:2]
+        values = photo.pixels[np.clip(xy[:, 1], 0, h - 1), np.clip(xy[:, 0], 0, w - 1)].astype(float)
+        if values.ndim == 1:
+            values = np.repeat(values[:, None], 3, axis=1)
+        scale = 255.0 / np.iinfo(photo.pixels.dtype).max if photo.pixels.dtype.kind == "u" else 255.0
+        np.add.at(self._sum, obs.point_idx[of_photo], scale * values[:, 2::-1])
+        np.add.at(self._count, obs.point_idx[of_photo], 1)
+
+    def rgb(self) -> NDArray[np.uint8]:
+        """(n, 3) red, green, blue."""
+        mean = self._sum / np.maximum(self._count, 1)[:, None]
+        return np.clip(np.rint(mean), 0, 255).astype(np.uint8)
+

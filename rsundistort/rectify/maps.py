@@ -1,0 +1,98 @@
+"""Grids: for each pixel of the new pinhole photo, which raw pixel saw it. Lens and shutter in one."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .._kernels import projection as kernels
+from ..errors import InputError
+from ..model import Camera, RowMotion, check_shutter_model
+from ..model.checks import check_finite, check_rotations
+
+__all__ = ["fill_rows", "init_rectify_map", "rectified_rays"]
+
+#: A raw position this far (pixels) beyond the outermost pixel centre still counts as seen: rounding of float32 maps.
+EDGE_PX = 1e-3
+
+
+def rectified_rays(new_K: ArrayLike | None, R: ArrayLike | None, camera: Camera) -> NDArray[np.float64]:
+    """(3, 3) matrix from rectified pixels (u, v, 1) to directions in the camera frame."""
+    K = camera.K if new_K is None else check_finite(new_K, (3, 3), "new_K")
+    rotation = np.eye(3) if R is None else check_rotations(np.asarray(R, np.float64)[None], 1, "R")[0]
+    if abs(np.linalg.det(K)) < 1e-12:
+        raise InputError("new_K is singular")
+    return rotation.T @ np.linalg.inv(K)
+
+
+def fill_rows(
+    camera: Camera,
+    motion: RowMotion,
+    shutter_model: str,
+    rays: NDArray[np.float64],
+    row0: int,
+    map_x: NDArray[np.float32],
+    map_y: NDArray[np.float32],
+) -> None:
+    """Fill the rows `row0 ...` of a grid; where no raw pixel answers, the grid points far outside."""
+    intr, lens, axis, sign = camera.kernel_args
+    model = check_shutter_model(shutter_model)
+    kernels.fill_map(model, axis, sign, intr, lens, motion.phi, rays, row0, 0, map_x, map_y)
+
+
+def init_rectify_map(
+    camera: Camera,
+    motion: RowMotion | None = None,
+    shutter_model: str = "rotation",
+    R: ArrayLike | None = None,
+    new_K: ArrayLike | None = None,
+    size: tuple[int, int] | None = None,
+    m1type: int = cv2.CV_32FC1,
+) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """Maps for `cv2.remap` that take lens and shutter out of a photo, in the manner of `cv2.initUndistortRectifyMap`.
+
+    Parameters
+    ----------
+    camera : Camera
+        Of the raw photo.
+    motion : RowMotion, optional
+        Rotation during the readout; without it the result is `cv2.initUndistortRectifyMap`'s.
+    shutter_model : {"rotation", "two-step", "linearized", "global"}
+        Row model.
+    R : (3, 3) array, optional
+        Rotation from the camera frame to the rectified one.
+    new_K : (3, 3) array, optional
+        Pinhole matrix of the rectified photo; the camera's own when left out.
+    size : (width, height), optional
+        Size of the rectified photo; the camera's own when left out.
+    m1type : {cv2.CV_32FC1, cv2.CV_32FC2, cv2.CV_16SC2}
+        Kind of the maps.
+
+    Returns
+    -------
+    map1, map2 : arrays
+        Raw pixel of each rectified pixel: x and y (CV_32FC1), xy and None (CV_32FC2), or OpenCV's fixed point
+        (CV_16SC2). Where no raw pixel answers they point far outside of every photo.
+
+    Examples
+    --------
+    >>> camera = Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]])
+    >>> map_x, map_y = init_rectify_map(camera, RowMotion([0.1, 0.0, 0.0]))
+    >>> map_x.shape, round(float(map_y[340, 320]), 3)
+    ((480, 640), 330.194)
+    """
+    width, height = size or (camera.width, camera.height)
+    if width < 1 or height < 1:
+        raise InputError(f"size={size}, expected positive (width, height)")
+    map_x = np.empty((height, width), np.float32)
+    map_y = np.empty((height, width), np.float32)
+    fill_rows(camera, motion or RowMotion(), shutter_model, rectified_rays(new_K, R, camera), 0, map_x, map_y)
+    if m1type == cv2.CV_32FC1:
+        return map_x, map_y
+    if m1type == cv2.CV_32FC2:
+        return np.dstack([map_x, map_y]), None
+    if m1type == cv2.CV_16SC2:
+        fixed: tuple[NDArray[np.float32], NDArray[np.float32]] = cv2.convertMaps(map_x, map_y, cv2.CV_16SC2)
+        return fixed
+    raise InputError(f"m1type={m1type}, expected cv2.CV_32FC1, cv2.CV_32FC2 or cv2.CV_16SC2")

@@ -1,0 +1,111 @@
+"""Real photos as if a rotating camera had taken them.
+
+The truth of the round trip: plain NumPy and SciPy, closed form per row, and no function of the kernels it judges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ..errors import InputError
+from ..model import READOUTS, Camera
+
+__all__ = ["random_phi", "warp_photo"]
+
+
+def random_phi(
+    names: Sequence[str], frame_spans: Sequence[float], sigma_rad: float, seed: int, still: Iterable[str] = ()
+) -> dict[str, NDArray[np.float64]]:
+    """Random shutter rotations as in the paper's Experiment I: axis uniform, angle over the frame normal.
+
+    Parameters
+    ----------
+    names, frame_spans : sequences of length m
+        Photos, and `Camera.frame_span` of each.
+    sigma_rad : float
+        Standard deviation of the angle over the whole frame.
+    seed : int
+        The same seed gives the same motions; a still photo does not change the others.
+    still : names
+        Photos that do not move.
+
+    Returns
+    -------
+    dict of (3,) array
+        Radians per unit of the clock.
+    """
+    still = set(still)
+    unknown = still - set(names)
+    if unknown:
+        raise InputError(f"still photo {sorted(unknown)[0]!r} is not among the photos")
+    if not sigma_rad >= 0:
+        raise InputError(f"sigma={sigma_rad}, expected 0 or more radians per frame")
+    rng = np.random.default_rng(seed)
+    result = {}
+    for name, span in zip(names, frame_spans, strict=True):
+        axis = rng.normal(size=3)
+        angle = rng.normal(0.0, sigma_rad)
+        result[name] = np.zeros(3) if name in still else axis / np.linalg.norm(axis) * angle / span
+    return result
+
+
+def warp_photo(
+    photo: NDArray[Any], camera: Camera, phi: NDArray[np.float64]
+) -> tuple[NDArray[Any], NDArray[np.uint8]]:
+    """The photo that a camera rotating by phi would have taken in place of this global-shutter one.
+
+    A pixel of the result was read when the clock stood at its own (distorted) row, so the direction it saw is known:
+    `Exp(-t phi)` of its ray. That direction is looked up, bicubically, in the photo.
+
+    Parameters
+    ----------
+    photo : (h, w) or (h, w, channels) array
+        Taken without motion.
+    camera : Camera
+        Of the photo; its readout direction is the one simulated.
+    phi : (3,) array
+        Radians per unit of the clock.
+
+    Returns
+    -------
+    warped : array
+        As `photo`; its border is repeated where the photo ends.
+    mask : (h, w) uint8 array
+        255 where the photo had the direction, else 0.
+    """
+    h, w = photo.shape[:2]
+    if (w, h) != (camera.width, camera.height):
+        raise InputError(f"photo has {w}x{h} pixels, its camera {camera.width}x{camera.height}")
+    K, dist = np.array(camera.K), np.array(camera.dist)
+    axis, sign = READOUTS[camera.readout]
+    u, v = np.arange(w, dtype=float), np.arange(h, dtype=float)
+    if axis == 1:
+        clock = np.repeat((sign * (v - K[1, 2]) / K[1, 1])[:, None], w, axis=1)
+    else:
+        clock = np.repeat((sign * (u - K[0, 2]) / K[0, 0])[None, :], h, axis=0)
+    uu, vv = np.meshgrid(u, v)
+    if dist.any():
+        tight = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-13)
+        pixels = np.dstack([uu, vv]).reshape(-1, 1, 2)
+        ray = cv2.undistortPointsIter(pixels, K, dist, np.eye(3), np.eye(3), tight).reshape(h, w, 2)
+        x, y = ray[..., 0], ray[..., 1]
+    else:
+        x, y = (uu - K[0, 2]) / K[0, 0], (vv - K[1, 2]) / K[1, 1]
+    # one rotation a row (or column): turn its rays by it
+    steps = clock[:, 0] if axis == 1 else clock[0]
+    R = Rotation.from_rotvec(-steps[:, None] * phi).as_matrix()
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+    turned = np.einsum("vij,vuj->vui" if axis == 1 else "uij,vuj->vui", R, rays)
+    points = cv2.projectPoints(turned.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), K, dist if dist.size else None)[0]
+    source = points.reshape(h, w, 2)
+    ahead = turned[..., 2] > 0
+    inside = ahead & (source >= 0).all(-1) & (source[..., 0] <= w - 1) & (source[..., 1] <= h - 1)
+    source = np.where(ahead[..., None], source, -1e6).astype(np.float32)
+    warped = cv2.remap(photo, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return warped.reshape(photo.shape), np.where(inside, 255, 0).astype(np.uint8)
