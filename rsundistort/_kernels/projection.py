@@ -529,7 +529,6 @@ def residual_costs(
     """Each observation's robust cost (o,), as in `residual_blocks`."""
     o = len(frame_idx)
     scale2 = loss_scale * loss_scale
-    bad = 2.0 * (_INVALID_PX / sigma_px) ** 2
     for chunk in prange((o + _CHUNK - 1) // _CHUNK):
         out = np.empty(20)
         E = np.empty((3, 3))
@@ -539,10 +538,10 @@ def residual_costs(
             f = frame_idx[k]
             c = camera_of_frame[f]
             x, y, z = _camera_frame(R_cw[f], center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
-            s = bad
+            s = 2.0 * (_INVALID_PX / sigma_px[k]) ** 2
             if _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, out, False, E, L):
-                ex = (intrs[c, 0] * out[0] + intrs[c, 2] - xy_raw[k, 0]) / sigma_px
-                ey = (intrs[c, 1] * out[1] + intrs[c, 3] - xy_raw[k, 1]) / sigma_px
+                ex = (intrs[c, 0] * out[0] + intrs[c, 2] - xy_raw[k, 0]) / sigma_px[k]
+                ey = (intrs[c, 1] * out[1] + intrs[c, 3] - xy_raw[k, 1]) / sigma_px[k]
                 s = ex * ex + ey * ey
             cost[k] = 0.5 * _loss(loss_kind, s, scale2)[0]
 
@@ -555,7 +554,7 @@ def residual_blocks(
     """Whitened, robustly weighted residuals (o, 2) with their Jacobians, and each observation's cost.
 
     J_frame is (o, 2, nb): rotation increment (left, camera frame), centre, then phi when nb = 9.
-    J_point is (o, 2, 3). Observations that cannot be projected get zero Jacobians and the cost of 100 px.
+    J_point is (o, 2, 3); sigma_px (o,). Observations that cannot be projected get zero Jacobians and the cost of 100 px.
     """
     o = len(frame_idx)
     nb = J_frame.shape[2]
@@ -572,20 +571,19 @@ def residual_blocks(
             x, y, z = _camera_frame(R_cw[f], center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
             ok = _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, out, True, E, L)
             if not ok:
-                bad = (_INVALID_PX / sigma_px) ** 2
-                cost[k] = 0.5 * _loss(loss_kind, 2.0 * bad, scale2)[0]
+                cost[k] = 0.5 * _loss(loss_kind, 2.0 * (_INVALID_PX / sigma_px[k]) ** 2, scale2)[0]
                 res[k] = 0.0
                 J_frame[k] = 0.0
                 J_point[k] = 0.0
                 continue
             s = 0.0
             for i in range(2):
-                res[k, i] = (intrs[c, i] * out[i] + intrs[c, 2 + i] - xy_raw[k, i]) / sigma_px
+                res[k, i] = (intrs[c, i] * out[i] + intrs[c, 2 + i] - xy_raw[k, i]) / sigma_px[k]
                 s += res[k, i] * res[k, i]
             rho, weight, share = _loss(loss_kind, s, scale2)
             cost[k] = 0.5 * rho
             for i in range(2):
-                g = intrs[c, i] / sigma_px
+                g = intrs[c, i] / sigma_px[k]
                 a0, a1, a2 = g * out[2 + 3 * i], g * out[3 + 3 * i], g * out[4 + 3 * i]
                 v0, v1, v2 = g * out[14 + 3 * i], g * out[15 + 3 * i], g * out[16 + 3 * i]
                 # x_c = Exp(delta) R d and v_c = Exp(delta) R v

@@ -19,12 +19,12 @@ LADDER = ("global", "two-step", "rotation")
 
 
 def _noise_px(reconstruction: Reconstruction, shutter_model: str, floor: float) -> float:
-    """Robust standard deviation of the residuals' parts in pixels."""
+    """Robust standard deviation of the residuals' parts in pixels, of measurements whose relative sigma is 1."""
     res, valid = reprojection_residuals(reconstruction, shutter_model)
     if not valid.any():
         return max(1.0, floor)
     # median of |x| of a normal variable is 0.6745 sigma; residuals of a fit are shorter than the noise
-    spread = float(np.median(np.abs(res[valid]))) / 0.6745
+    spread = float(np.median(np.abs(res / reconstruction.observations.sigma[:, None])[valid])) / 0.6745
     unknowns = 9 * reconstruction.num_images + 3 * reconstruction.num_points
     shrink = np.sqrt(max(1.0 - unknowns / (2.0 * len(res)), 0.1))
     return max(spread / shrink, floor)
@@ -77,7 +77,7 @@ def bundle_adjust(
         new_sigma = options.sigma_px or _noise_px(current, shutter_model, options.min_sigma_px)
         if last:
             break
-        limit = max(options.outlier_sigma * new_sigma, options.min_outlier_px)
+        limit = np.maximum(options.outlier_sigma * new_sigma * current.observations.sigma, options.min_outlier_px)
         keep = valid & (np.linalg.norm(res, axis=1) <= limit)
         current = current.with_points(keep)
         sigma = new_sigma

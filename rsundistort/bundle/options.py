@@ -68,7 +68,7 @@ class BundleOptions:
     loss: str = "soft-l1"
     loss_scale: float = 2.5
     sigma_px: float | None = None
-    min_sigma_px: float = 0.1
+    min_sigma_px: float = 0.02
     phi_sigma: float = 0.1
     outlier_rounds: int = 2
     outlier_sigma: float = 4.5

@@ -76,10 +76,10 @@ class BundleProblem:
         self._start = reconstruction
         self._shutter_model = shutter_model
         self._options = options
-        self._sigma_px = sigma_px
         self._block = 6 if shutter_model == "global" else 9
         order = np.lexsort((obs.frame_idx, obs.point_idx))
         self._xy = np.ascontiguousarray(obs.xy_raw[order])
+        self._sigma_px = sigma_px * obs.sigma[order]
         self._structure = Structure.from_sorted(
             np.ascontiguousarray(obs.frame_idx[order]),
             np.ascontiguousarray(obs.point_idx[order]),

@@ -27,11 +27,14 @@ class Observations:
         Indices of the photo and of the point.
     xy_raw : (o, 2) array
         Pixels of the stored photo, integer centres.
+    sigma : (o,) array, optional
+        Standard deviation of each measurement relative to the best ones; 1 when left out.
     """
 
     frame_idx: NDArray[np.int64]
     point_idx: NDArray[np.int64]
     xy_raw: NDArray[np.float64]
+    sigma: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         xy = check_finite(self.xy_raw, (None, 2), "xy_raw")
@@ -39,13 +42,17 @@ class Observations:
         object.__setattr__(self, "frame_idx", frozen(check_index(self.frame_idx, len(xy), big, "frame_idx")))
         object.__setattr__(self, "point_idx", frozen(check_index(self.point_idx, len(xy), big, "point_idx")))
         object.__setattr__(self, "xy_raw", frozen(xy))
+        sigma = check_finite(self.sigma if np.size(self.sigma) else np.ones(len(xy)), (len(xy),), "sigma")
+        if (sigma <= 0).any():
+            raise InputError("sigma must be positive")
+        object.__setattr__(self, "sigma", frozen(sigma))
 
     def __len__(self) -> int:
         return len(self.xy_raw)
 
     def select(self, keep: NDArray[Any]) -> Observations:
         """The observations that a mask or an index array names."""
-        return Observations(self.frame_idx[keep], self.point_idx[keep], self.xy_raw[keep])
+        return Observations(self.frame_idx[keep], self.point_idx[keep], self.xy_raw[keep], self.sigma[keep])
 
 
 @dataclass(frozen=True)
@@ -141,5 +148,5 @@ class Reconstruction:
         keep_point = count >= min_track
         new_idx = np.cumsum(keep_point) - 1
         keep = keep_obs & keep_point[obs.point_idx]
-        kept = Observations(obs.frame_idx[keep], new_idx[obs.point_idx[keep]], obs.xy_raw[keep])
+        kept = Observations(obs.frame_idx[keep], new_idx[obs.point_idx[keep]], obs.xy_raw[keep], obs.sigma[keep])
         return replace(self, points_w=self.points_w[keep_point], observations=kept)

@@ -58,9 +58,9 @@ class RunOptions:
     shutter_model: str = "auto"
     seed: int = 0
     jobs: int = 0
-    max_features: int = 8192
+    max_features: int = 16384
     interpolation: str = "cubic"
-    quality: int = 95
+    quality: int = 98
     still: tuple[str, ...] = ()
     overwrite: bool = False
 

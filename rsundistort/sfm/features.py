@@ -11,24 +11,31 @@ from numpy.typing import NDArray
 
 __all__ = ["Features", "detect_features"]
 
+# Residuals by size of the feature, in the adjusted herz-jesus-8: 0.117 px below 2.3 px, 0.122 to 3.5, 0.143 to 7,
+# 0.264 above; and large blobs are biased by perspective besides.
+_COARSE_PX = 3.0
+
 
 @dataclass(frozen=True)
 class Features:
-    """Keypoints of one photo.
+    """Keypoints of one photo, the strongest first.
 
     Attributes
     ----------
     xy_raw : (n, 2) float64 array
         Pixels of the stored photo, integer centres.
+    sigma : (n,) float64 array
+        Standard deviation of the position relative to the finest features.
     descriptors : (n, 128) uint8 array
         RootSIFT, scaled by 512 as COLMAP stores it.
     """
 
     xy_raw: NDArray[np.float64]
+    sigma: NDArray[np.float64]
     descriptors: NDArray[np.uint8]
 
 
-def detect_features(photo: NDArray[Any], max_features: int = 8192) -> Features:
+def detect_features(photo: NDArray[Any], max_features: int = 16384) -> Features:
     """The strongest SIFT features of a photo.
 
     Parameters
@@ -45,12 +52,14 @@ def detect_features(photo: NDArray[Any], max_features: int = 8192) -> Features:
     )  # fmt: skip
     keypoints, raw = sift.detectAndCompute(_gray_u8(photo), None)
     if not keypoints:
-        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.uint8))
+        return Features(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.uint8))
     xy = np.array([k.pt for k in keypoints], np.float64)
-    # order by place, not by response: where OpenCV breaks ties must not matter
-    order = np.lexsort((np.array([k.angle for k in keypoints]), xy[:, 0], xy[:, 1]))[:max_features]
+    # ties by place: the order in which OpenCV's threads found them must not matter
+    keys = [(-k.response, k.pt[1], k.pt[0], k.angle) for k in keypoints]
+    order = np.array(sorted(range(len(keys)), key=keys.__getitem__))[:max_features]
     root = np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-12))
-    return Features(xy[order], np.clip(np.rint(512.0 * root), 0, 255).astype(np.uint8)[order])
+    sigma = np.hypot(1.0, np.array([k.size for k in keypoints]) / _COARSE_PX)
+    return Features(xy[order], sigma[order], np.clip(np.rint(512.0 * root), 0, 255).astype(np.uint8)[order])
 
 
 def _gray_u8(photo: NDArray[Any]) -> NDArray[np.uint8]:

@@ -1,0 +1,97 @@
+"""A run's outputs against the truth: poses, motions and images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import FileError, InputError
+from ..evaluation import motion_errors, pose_errors, psnr
+from ..io import output_name, read_photo, read_solution
+from .progress import ProgressCallback, StageLog
+from .write import mask_names
+
+__all__ = ["evaluate"]
+
+
+def _summary(values: list[float] | np.ndarray[Any, Any]) -> dict[str, float]:
+    return {"mean": float(np.mean(values)), "median": float(np.median(values)), "max": float(np.max(values))}
+
+
+def evaluate(
+    out: Path | str,
+    truth: Path | str,
+    *,
+    poses: Path | str | None = None,
+    twins: Path | str | None = None,
+    raw: Path | str | None = None,
+    progress: ProgressCallback | None = None,
+) -> dict[str, Any]:
+    """Compare the outputs of a run with the truth.
+
+    Parameters
+    ----------
+    out : path
+        Folder that a run wrote.
+    truth : path
+        Ground-truth file: motions, and poses if known.
+    poses : path, optional
+        Solution to take the true poses from, e.g. of the same photos without motion.
+    twins : path, optional
+        Folder of global-shutter photos of the same names; `global` beside the truth file when there is one.
+    raw : path, optional
+        Folder of the photos that were rectified, for the figure before; `photos` beside the truth file.
+    progress : callable, optional
+        Called as (stage, done, total).
+
+    Returns
+    -------
+    dict
+        `photos` and `registered` (counts); `rotation_deg` and `center` (in mean distances of consecutive centres)
+        with mean, median, max; `phi_mrad_per_frame` (mean per component, and mean, median, max); `psnr_db` and
+        `psnr_before_db` with median, min and each photo's. What cannot be compared is left out.
+    """
+    out, truth = Path(out), Path(truth)
+    solution, true_solution = read_solution(out / "solution.json"), read_solution(truth)
+    result: dict[str, Any] = {"photos": len(solution.images), "registered": len(solution.registered)}
+    pose_truth = read_solution(Path(poses)) if poses is not None else true_solution
+    if any(image.posed for image in pose_truth.images):
+        errors = pose_errors(solution, pose_truth)
+        result["rotation_deg"], result["center"] = _summary(errors.rotation_deg), _summary(errors.center)
+    phi = np.abs(motion_errors(solution, true_solution).phi_rad_per_frame) * 1e3
+    result["phi_mrad_per_frame"] = {**_summary(phi), "mean_per_component": phi.mean(0).tolist()}
+    folders = {"twins": (twins, truth.parent / "global"), "raw": (raw, truth.parent / "photos")}
+    chosen = {k: Path(given) if given is not None else default for k, (given, default) in folders.items()}
+    for key, (given, _) in folders.items():
+        if given is not None and not chosen[key].is_dir():
+            raise FileError(f"{chosen[key]} is no folder; give the folder of the {key} photos")
+    if chosen["twins"].is_dir():
+        result.update(_image_errors(out, solution, chosen["twins"], chosen["raw"], StageLog(progress)))
+    return result
+
+
+def _image_errors(out: Path, solution: Any, twins: Path, raw: Path, log: StageLog) -> dict[str, Any]:
+    masks = mask_names([image.name for image in solution.images])
+    after: dict[str, float] = {}
+    before: dict[str, float] = {}
+    registered = solution.registered
+    log.begin("comparing", len(registered))
+    for done, image in enumerate(registered, start=1):
+        name = output_name(image.name)
+        twin = read_photo(twins / name).pixels
+        mask = read_photo(out / "masks" / masks[image.name]).pixels
+        try:
+            after[image.name] = psnr(read_photo(out / "images" / name).pixels, twin, mask)
+            if (raw / image.name).is_file():
+                before[image.name] = psnr(read_photo(raw / image.name).pixels, twin, mask)
+        except InputError as error:
+            raise InputError(f"{image.name}: {error}") from error
+        log.tell("comparing", done, len(registered))
+    result: dict[str, Any] = {}
+    for key, values in (("psnr_db", after), ("psnr_before_db", before)):
+        if values:
+            numbers = list(values.values())
+            result[key] = {"median": float(np.median(numbers)), "min": float(np.min(numbers)), "photos": values}
+    return result

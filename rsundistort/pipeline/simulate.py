@@ -1,0 +1,144 @@
+"""Folders of photos with a known shutter motion."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import FileError, FormatError, InputError
+from ..io import list_photos, output_folder, output_name, read_photo, write_image, write_solution
+from ..io.cameras import camera_to_json
+from ..model import RowMotion, Solution, SolvedImage
+from ..rectify import largest_shift_px
+from ..synthetic.warp import random_phi, warp_photo
+from .load import find_camera
+from .progress import ProgressCallback, StageLog
+from .run import use_threads, versions
+
+__all__ = ["WarpOptions", "read_motion_file", "simulate_warp"]
+
+
+@dataclass(frozen=True)
+class WarpOptions:
+    """Options of `simulate_warp`.
+
+    Parameters
+    ----------
+    camera, readout : str, optional
+        As in `RunOptions`; EXIF's focal length serves if there is no camera.
+    sigma_rad : float
+        Standard deviation of the rotation over the frame, in radians.
+    motion : mapping of name to (3,) phi, optional
+        Given motions, radians per unit of the clock; photos not named do not move. Instead of random ones.
+    still : sequence of str
+        Photos that do not move.
+    seed, jobs, quality, overwrite
+        As in `RunOptions`.
+    """
+
+    camera: str | None = None
+    readout: str | None = None
+    sigma_rad: float = 0.05
+    motion: Mapping[str, ArrayLike] | None = None
+    still: Sequence[str] = ()
+    seed: int = 0
+    jobs: int = 0
+    quality: int = 98
+    overwrite: bool = False
+
+
+def read_motion_file(path: Path) -> dict[str, list[float]]:
+    """Motions of a JSON file `{name: [phi1, phi2, phi3]}`, radians per unit of the clock."""
+    try:
+        value = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise FileError(f"{path} cannot be read: {error.strerror}") from error
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise FormatError(f"{path} is no valid JSON: {error}") from error
+    if not isinstance(value, dict):
+        raise FormatError(f"{path}: expected an object of name: [phi1, phi2, phi3]")
+    return value
+
+
+def simulate_warp(
+    photos: Path | str, out: Path | str, options: WarpOptions | None = None, progress: ProgressCallback | None = None
+) -> Solution:
+    """Photos as if a rotating camera had taken them, with the truth.
+
+    Writes `photos/` (warped), `masks/` (255 where the original had the direction), `camera.json` and
+    `ground_truth.json`. The originals are the global-shutter twins.
+
+    Parameters
+    ----------
+    photos, out : path
+        Folder of photos taken without motion; folder for the outputs.
+    options : WarpOptions, optional
+        See there.
+    progress : callable, optional
+        Called as (stage, done, total).
+
+    Returns
+    -------
+    Solution
+        The truth: motions without poses.
+    """
+    options = options or WarpOptions()
+    photos, out = Path(photos), Path(out)
+    names = list_photos(photos)
+    log = StageLog(progress)
+    jobs = use_threads(options.jobs)
+    with output_folder(out, overwrite=options.overwrite, apart_from=[photos]) as scratch:
+        first = [read_photo(photos / name).pixels.shape for name in names[:1]]
+        size = (first[0][1], first[0][0])
+        camera, _, source = find_camera(photos, names[:1], [size], options.camera, options.readout)
+        if options.motion is None:
+            phi = random_phi(names, [camera.frame_span] * len(names), options.sigma_rad, options.seed, options.still)
+        else:
+            unknown = sorted({*options.motion, *options.still} - set(names))
+            if unknown:
+                raise InputError(f"motion or still photo {unknown[0]!r} is not among the photos of {photos}")
+            phi = {name: np.asarray(options.motion.get(name, np.zeros(3)), np.float64) for name in names}
+            phi.update({name: np.zeros(3) for name in options.still})
+        motions = {name: RowMotion(phi[name]) for name in names}
+        (scratch / "photos").mkdir()
+        (scratch / "masks").mkdir()
+
+        def work(name: str) -> None:
+            photo = read_photo(photos / name)
+            warped, mask = warp_photo(photo.pixels, camera, motions[name].phi)
+            write_image(scratch / "photos" / output_name(name), warped, photo.metadata, options.quality)
+            write_image(scratch / "masks" / f"{Path(name).stem}.png", mask)
+
+        log.begin("warping", len(names))
+        with ThreadPoolExecutor(jobs) as pool:
+            for done, _ in enumerate(pool.map(work, names), start=1):
+                log.tell("warping", done, len(names))
+        log.end("warping", photos=len(names))
+        images = tuple(
+            SolvedImage(output_name(n), "1", motion=motions[n], rs_shift_px=largest_shift_px(camera, motions[n]))
+            for n in names
+        )
+        truth = Solution(
+            shutter_model="rotation",
+            cameras={"1": camera},
+            rectified_cameras={"1": camera.pinhole()},
+            images=images,
+            stages=tuple(log.stages),
+            options={
+                "simulation": "warp",
+                "camera": source,
+                "sigma_rad_per_frame": None if options.motion is not None else options.sigma_rad,
+                "seed": options.seed,
+                "still": list(options.still),
+            },
+            generator=versions(),
+        )
+        (scratch / "camera.json").write_text(json.dumps(camera_to_json(camera)) + "\n", encoding="utf-8")
+        write_solution(scratch / "ground_truth.json", truth)
+    return truth
