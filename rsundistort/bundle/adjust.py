@@ -60,7 +60,9 @@ def bundle_adjust(
     sigma = options.sigma_px or _noise_px(current, shutter_model, options.min_sigma_px)
     for round_ in range(options.outlier_rounds + 1):
         last = round_ == options.outlier_rounds
-        problem = BundleProblem(current, shutter_model, options, sigma)
+        # once the outliers are gone the noise is nearly normal: squares converge in a few steps and use it fully
+        stage = options if round_ == 0 else replace(options, loss="squared")
+        problem = BundleProblem(current, shutter_model, stage, sigma)
         result = minimize(
             problem,
             problem.initial_state(),

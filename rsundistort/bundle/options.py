@@ -36,7 +36,7 @@ class BundleOptions:
     initial_damping, max_damping : float
         Levenberg-Marquardt damping, times the diagonal of the normal equations; above the largest, stop.
     loss : {"soft-l1", "huber", "cauchy", "squared"}
-        Robust loss of an observation.
+        Robust loss of an observation until the outliers are gone; after the first outlier round, squares.
     loss_scale : float
         Residual length, in standard deviations of the noise, where the loss starts to bend.
     sigma_px : float or None
@@ -60,8 +60,8 @@ class BundleOptions:
     """
 
     max_iterations: int = 100
-    cost_tolerance: float = 1e-8
-    round_tolerance: float = 1e-4
+    cost_tolerance: float = 1e-7
+    round_tolerance: float = 1e-3
     step_tolerance: float = 1e-10
     initial_damping: float = 1e-4
     max_damping: float = 1e12
@@ -70,9 +70,9 @@ class BundleOptions:
     sigma_px: float | None = None
     min_sigma_px: float = 0.02
     phi_sigma: float = 0.1
-    outlier_rounds: int = 2
+    outlier_rounds: int = 3
     outlier_sigma: float = 4.5
-    min_outlier_px: float = 0.75
+    min_outlier_px: float = 0.25
     held_phi: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     dense_limit: int = 1500
 

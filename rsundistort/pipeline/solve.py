@@ -106,7 +106,7 @@ def solve_photos(
         if moved < _SETTLED_PX:
             break
     log.begin("comparison with a global shutter")
-    plain = BundleOptions(outlier_rounds=0, cost_tolerance=options.round_tolerance, sigma_px=result.sigma_px)
+    plain = BundleOptions(outlier_rounds=0, loss="squared", cost_tolerance=1e-4, sigma_px=result.sigma_px)
     global_result = bundle_adjust(result.reconstruction, "global", plain)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
     return Solved(result, global_result)
