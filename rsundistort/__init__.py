@@ -1,0 +1,71 @@
+"""Rolling-shutter structure from motion: photos in, rectified photos and camera poses out.
+
+After E. Ito and T. Okatani, "Self-calibration-based Approach to Critical Motion Sequences of Rolling-shutter Structure
+from Motion", CVPR 2017. Functions are used in the manner of `cv2`:
+
+>>> import rsundistort as rs
+>>> camera = rs.Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]])
+>>> motion = rs.RowMotion([0.05, 0.02, -0.03])
+>>> rs.distort_points([[320.0, 240.0]], camera, motion, P=camera.K)
+array([[320., 240.]])
+"""
+
+from .bundle import BundleOptions, BundleResult, bundle_adjust, climb
+from .errors import (
+    FileError,
+    FormatError,
+    InputError,
+    MetadataWarning,
+    ReconstructionError,
+    RsUndistortError,
+    RsUndistortWarning,
+    SkippedPhotoWarning,
+)
+from .evaluation import motion_errors, pose_errors, psnr
+from .io import read_solution, write_solution
+from .model import Camera, Observations, Reconstruction, RowMotion, Solution, SolvedImage
+from .model.projection import project_points, unproject_points
+from .pipeline import RunOptions, WarpOptions, evaluate, rectify_folder, run, simulate_warp
+from .rectify import distort_points, init_rectify_map, largest_shift_px, optimal_new_camera, rectify, undistort_points
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "BundleOptions",
+    "BundleResult",
+    "Camera",
+    "FileError",
+    "FormatError",
+    "InputError",
+    "MetadataWarning",
+    "Observations",
+    "Reconstruction",
+    "ReconstructionError",
+    "RowMotion",
+    "RsUndistortError",
+    "RsUndistortWarning",
+    "RunOptions",
+    "SkippedPhotoWarning",
+    "Solution",
+    "SolvedImage",
+    "WarpOptions",
+    "bundle_adjust",
+    "climb",
+    "distort_points",
+    "evaluate",
+    "init_rectify_map",
+    "largest_shift_px",
+    "motion_errors",
+    "optimal_new_camera",
+    "pose_errors",
+    "project_points",
+    "psnr",
+    "read_solution",
+    "rectify",
+    "rectify_folder",
+    "run",
+    "simulate_warp",
+    "undistort_points",
+    "unproject_points",
+    "write_solution",
+]

@@ -1,0 +1,18 @@
+"""Whole jobs: the order of the stages, nothing else."""
+
+from .batch import rectify_folder
+from .evaluate import evaluate
+from .run import RunOptions, run, use_threads, versions
+from .simulate import WarpOptions, read_motion_file, simulate_warp
+
+__all__ = [
+    "RunOptions",
+    "WarpOptions",
+    "evaluate",
+    "read_motion_file",
+    "rectify_folder",
+    "run",
+    "simulate_warp",
+    "use_threads",
+    "versions",
+]

@@ -7,7 +7,7 @@ and written into its database. The measurements of the adjustment remain the raw
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -153,21 +153,20 @@ def _write_photos(db: Any, matched: MatchedPhotos, limit: int | None = None) -> 
         db.write_keypoints(index + 1, keypoints[:limit])
 
 
-def _mapping_database(matched: MatchedPhotos) -> Path:
-    """A database of the strongest keypoints and the verified matches among them."""
+def _mapping_database(matched: MatchedPhotos, folder: Path, limit: int | None) -> Path:
+    """A database of the strongest keypoints (all: None) and the verified matches among them."""
     pycolmap = _pycolmap()
-    path = matched.database.with_name("mapping.db")
+    path = folder / "mapping.db"
     with pycolmap.Database.open(matched.database) as db, pycolmap.Database.open(path) as small:
-        _write_photos(small, matched, _MAPPING_KEYPOINTS)
+        _write_photos(small, matched, limit)
         for i in range(1, len(matched.names) + 1):
             for j in range(i + 1, len(matched.names) + 1):
                 if not db.exists_two_view_geometry(i, j):
                     continue
                 pair = db.read_two_view_geometry(i, j)
                 matches = np.asarray(pair.inlier_matches)
-                kept = matches[(matches < _MAPPING_KEYPOINTS).all(1)] if len(matches) else matches
-                # too few among the strongest: this pair keeps what it has there, others carry the photo
-                pair.inlier_matches = kept
+                if limit is not None and len(matches):
+                    pair.inlier_matches = matches[(matches < limit).all(1)]
                 small.write_two_view_geometry(i, j, pair)
     return path
 
@@ -180,11 +179,12 @@ def _verification(max_error_px: float, seed: int) -> Any:
     return options
 
 
-def _pipeline_options(loose: float, seed: int, refine_intrinsics: bool) -> Any:
+def _pipeline_options(loose: float, seed: int, refine_intrinsics: bool, num_photos: int) -> Any:
     options = _pycolmap().IncrementalPipelineOptions()
     options.random_seed = seed
     options.extract_colors = False
-    options.min_model_size = 2
+    # smaller models are given up and another first pair is tried
+    options.min_model_size = min(10, max(3, num_photos // 2))
     options.ba_refine_focal_length = refine_intrinsics
     options.ba_refine_extra_params = refine_intrinsics
     mapper, triangulation = options.mapper, options.triangulation
@@ -204,8 +204,9 @@ def _pipeline_options(loose: float, seed: int, refine_intrinsics: bool) -> Any:
 def map_photos(matched: MatchedPhotos, progress: Callable[[int], None] | None = None) -> Reconstruction:
     """Global-shutter reconstruction by incremental mapping with loosened thresholds.
 
-    Only photos that registered are in it. If the photos fall apart into several models, the one with the most photos
-    is returned.
+    Only photos that registered are in it. Mapping is tried with the strongest keypoints first, then with all, then
+    with less loose thresholds, until all photos are in one model; the attempt with the most photos is returned. A camera
+    that is only a guess is refined first, with tight thresholds: loose ones let the focal length run away.
 
     Parameters
     ----------
@@ -219,28 +220,53 @@ def map_photos(matched: MatchedPhotos, progress: Callable[[int], None] | None = 
     ReconstructionError
         When no two photos could be joined.
     """
-    pycolmap = _pycolmap()
-    registered = [2]
-
-    def on_next_image() -> None:
-        registered[0] += 1
-        if progress is not None:
-            progress(min(registered[0], len(matched.names)))
-
-    models = pycolmap.incremental_mapping(
-        _mapping_database(matched),
-        matched.database.parent,
-        matched.database.parent,
-        _pipeline_options(_LOOSE, matched.seed, not matched.calibrated),
-        next_image_callback=on_next_image,
-    )
-    if not models:
+    best = None
+    if not matched.calibrated:
+        best = _best_model(matched, [(None, 1.0), (None, 2.0)], progress)
+        if best is not None:
+            cameras = [_refined_camera(best.cameras[k + 1], camera) for k, camera in enumerate(matched.cameras)]
+            matched = replace(matched, cameras=tuple(cameras), calibrated=True)
+    attempts = [(_MAPPING_KEYPOINTS, _LOOSE), (None, _LOOSE), (None, 2.0), (None, 1.0)]
+    found = _best_model(matched, attempts, progress)
+    if found is None:
         raise ReconstructionError(
             f"none of the {len(matched.names)} photos overlap enough to be joined; "
             "use photos that share more of the scene, or check the camera's focal length"
         )
-    best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    return _from_pycolmap(best, matched, None)
+    return _from_pycolmap(found, matched, None)
+
+
+def _best_model(
+    matched: MatchedPhotos, attempts: Sequence[tuple[int | None, float]], progress: Callable[[int], None] | None
+) -> Any:
+    """The pycolmap model with the most photos over attempts (number of keypoints, looseness), or None."""
+    pycolmap = _pycolmap()
+    total = len(matched.names)
+    best, best_count = None, (0, 0)
+    for number, (limit, loose) in enumerate(attempts):
+        registered = [2]
+
+        def on_next_image(registered: list[int] = registered) -> None:
+            registered[0] += 1
+            if progress is not None:
+                progress(min(registered[0], total))
+
+        work = matched.database.parent / f"mapping-{matched.calibrated}-{number}"
+        work.mkdir()
+        models = pycolmap.incremental_mapping(
+            _mapping_database(matched, work, limit),
+            work,
+            work,
+            _pipeline_options(loose, matched.seed, not matched.calibrated, total),
+            next_image_callback=on_next_image,
+        )
+        for model in models.values():
+            count = (model.num_reg_images(), model.num_points3D())
+            if count > best_count:
+                best, best_count = model, count
+        if best_count[0] == total:
+            break
+    return best
 
 
 def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction) -> Reconstruction:
@@ -256,9 +282,7 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction) -> Rec
     """
     pycolmap = _pycolmap()
     index_of = {name: i for i, name in enumerate(reconstruction.image_names)}
-    cameras = list(matched.cameras)
-    for i in range(reconstruction.num_images):
-        cameras[matched.camera_idx[matched.names.index(reconstruction.image_names[i])]] = reconstruction.camera(i)
+    cameras = reconstruction.cameras
     with pycolmap.Database.open(matched.database) as db:
         for index, camera in enumerate(cameras):
             db.update_camera(_database_camera(camera, True, index + 1))
@@ -273,7 +297,7 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction) -> Rec
         matched.database, two_view_geometry_options=_verification(_TIGHT_PX, matched.seed)
     )
     empty = _posed_model(matched, reconstruction, cameras)
-    options = _pipeline_options(1.0, matched.seed, False)
+    options = _pipeline_options(1.0, matched.seed, False, len(matched.names))
     options.mapper.filter_max_reproj_error = _TIGHT_PX
     options.triangulation.merge_max_reproj_error = _TIGHT_PX
     options.triangulation.complete_max_reproj_error = _TIGHT_PX
@@ -354,12 +378,8 @@ def _from_pycolmap(model: Any, matched: MatchedPhotos, posed: Reconstruction | N
     poses = np.array([model.images[i].cam_from_world().matrix() for i in ids])
     R_cw = poses[:, :, :3]
     center_w = -np.einsum("mji,mj->mi", R_cw, poses[:, :, 3])
-    cameras = [
-        camera if matched.calibrated else _refined_camera(model.cameras[k + 1], camera)
-        for k, camera in enumerate(matched.cameras)
-    ]
     camera_idx = np.array([matched.camera_idx[i - 1] for i in ids])
-    return Reconstruction(cameras, names, camera_idx, R_cw, center_w, points_w, observations)
+    return Reconstruction(matched.cameras, names, camera_idx, R_cw, center_w, points_w, observations)
 
 
 def _refined_camera(refined: Any, camera: Camera) -> Camera:

@@ -1,0 +1,48 @@
+# Needs Python 3.10 or newer and make; everything else goes into .venv.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+OUT ?= demo-out
+
+.PHONY: demo test test-all check format bench clean
+
+# made again when the dependencies change
+$(VENV)/.installed: pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "Python 3.10 or newer is needed, this is " + sys.version.split()[0] + "; say make PYTHON=python3.12")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade pip
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $@
+
+demo: $(VENV)/.installed
+	$(BIN)/rsundistort run sample_scenes/courtyard/photos -o $(OUT) --overwrite
+	$(BIN)/rsundistort evaluate $(OUT) --truth sample_scenes/courtyard/ground_truth.json
+	@echo
+	@echo "Look at: sample_scenes/courtyard/photos/0003.jpg (the rolling shutter bent it)"
+	@echo "         $(OUT)/images/0003.jpg (rectified)"
+	@echo "         sample_scenes/courtyard/global/0003.jpg (the truth)"
+	@echo "Open $(OUT)/sparse in COLMAP, or $(OUT)/transforms.json in nerfstudio."
+
+test: $(VENV)/.installed
+	$(BIN)/python -m pytest
+
+test-all: $(VENV)/.installed
+	$(BIN)/python -m pytest -m "slow or not slow"
+
+check: $(VENV)/.installed
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(VENV)/.installed
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+# figures of the README; needs ../shared
+bench: $(VENV)/.installed
+	$(BIN)/python benchmarks/accuracy.py
+	$(BIN)/python benchmarks/speed.py
+
+clean:
+	rm -rf $(VENV) $(OUT) build *.egg-info

@@ -1,0 +1,114 @@
+"""The accuracy figures of the README: prints one JSON object a line, and exits 1 if one is missing.
+
+    python benchmarks/accuracy.py [--photos DIR] [--seeds N]
+
+Needs sample_scenes/courtyard; with the folder of test photos (default ../shared/photos) also warps real photos, and runs
+real ones. Targets are printed beside the figures; a figure that misses its target is not an error of the program.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsundistort import RunOptions, WarpOptions, evaluate, pose_errors, run, simulate_warp
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def show(name: str, **figures: Any) -> None:
+    """Print one JSON line."""
+    print(json.dumps({"name": name, **figures}), flush=True)
+
+
+def brief(result: dict[str, Any]) -> dict[str, Any]:
+    """The figures that the README shows."""
+    return {
+        "registered": f"{result['registered']}/{result['photos']}",
+        "rotation_deg": round(result["rotation_deg"]["mean"], 4),
+        "phi_mrad_per_frame": [round(v, 3) for v in result["phi_mrad_per_frame"]["mean_per_component"]],
+        "psnr_before_db": round(result["psnr_before_db"]["median"], 2),
+        "psnr_db": round(result["psnr_db"]["median"], 2),
+        "psnr_worst_db": round(result["psnr_db"]["min"], 2),
+    }
+
+
+def courtyard(work: Path) -> None:
+    """The sample scene against its truth."""
+    scene = ROOT / "sample_scenes" / "courtyard"
+    run(scene / "photos", work / "courtyard")
+    result = evaluate(work / "courtyard", scene / "ground_truth.json")
+    show("courtyard", **brief(result), target="10/10, <= 0.05 deg, <= 1.5 mrad, >= 36 dB")
+
+
+def herz_jesus(photos: Path, work: Path, seeds: int) -> None:
+    """Real photos without a shutter: unharmed as they are, recovered when warped."""
+    plain, still = work / "plain", work / "global"
+    solution = run(photos, plain)
+    reference = run(photos, still, RunOptions(shutter_model="global"))
+    shifts = [image.rs_shift_px or 0.0 for image in solution.registered]
+    show(
+        "herz-jesus-8 as it is",
+        shift_px_median=round(float(np.median(shifts)), 3),
+        rotation_against_global_deg=round(float(pose_errors(solution, reference).rotation_deg.mean()), 4),
+        target="<= 1 px, <= 0.03 deg",
+    )
+    for sigma, target in ((0.05, "8/8, <= 0.1 deg, >= 38 dB, worst >= 35 dB"), (0.02, "8/8, <= 0.1 deg, >= 40 dB")):
+        pooled: list[float] = []
+        for seed in range(seeds):
+            warped, out = work / f"warped-{sigma}-{seed}", work / f"out-{sigma}-{seed}"
+            simulate_warp(photos, warped, WarpOptions(sigma_rad=sigma, seed=seed))
+            run(warped / "photos", out)
+            truth = warped / "ground_truth.json"
+            result = evaluate(out, truth, poses=plain / "solution.json", twins=photos)
+            pooled += result["psnr_db"]["photos"].values()
+            show(f"herz-jesus-8 warped by {sigma}, seed {seed}", **brief(result), target=target)
+            if seed == 0:
+                blind = work / f"blind-{sigma}"
+                run(warped / "photos", blind, RunOptions(shutter_model="global"))
+                blind_result = evaluate(blind, truth, poses=plain / "solution.json")
+                show("the same without a shutter model", rotation_deg=round(blind_result["rotation_deg"]["mean"], 3))
+        show(f"herz-jesus-8 warped by {sigma}, all seeds", psnr_db=round(float(np.median(pooled)), 2), target=target)
+
+
+def real(name: str, photos: Path, work: Path, camera: str | None) -> None:
+    """Real photos without truth: what the tool says of them."""
+    solution = run(photos, work / name, RunOptions(camera=camera))
+    shifts = [image.rs_shift_px or 0.0 for image in solution.registered]
+    show(
+        name,
+        registered=f"{len(solution.registered)}/{len(solution.images)}",
+        global_rms_px=round(solution.quality["global_rms_px"], 3),
+        rms_px=round(solution.quality["rms_px"], 3),
+        shift_px_median=round(float(np.median(shifts)), 2),
+        shift_px_max=round(float(np.max(shifts)), 2),
+        focal_px=round(float(solution.cameras["1"].K[0, 0]), 1),
+    )
+
+
+def main() -> None:
+    """Run all that can be run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--photos", type=Path, default=ROOT.parent / "shared" / "photos")
+    parser.add_argument("--seeds", type=int, default=3)
+    args = parser.parse_args()
+    warnings.simplefilter("ignore")
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
+        courtyard(work)
+        if not args.photos.is_dir():
+            show("real photos", skipped=f"no folder {args.photos.name} of test photos beside the project")
+            return
+        herz_jesus(args.photos / "herz-jesus-8", work, args.seeds)
+        real("iphone6", args.photos / "iphone6", work, str(args.photos / "iphone6" / "K.txt"))
+        real("lund", args.photos / "lund", work, None)
+
+
+if __name__ == "__main__":
+    main()

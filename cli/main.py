@@ -1,0 +1,42 @@
+"""Entry point: lists the commands without importing what they need."""
+
+from __future__ import annotations
+
+import importlib
+
+import click
+
+# name: one line for the list of commands; the command itself is in the module of that name
+_COMMANDS = {
+    "run": "Photos in, rectified photos and camera poses out.",
+    "rectify": "Rectify a folder of photos with a solution.",
+    "simulate": "Photos with a known shutter motion.",
+    "evaluate": "Errors of a run against the truth.",
+    "info": "Versions, threads and optional parts.",
+}
+
+
+class _LazyGroup(click.Group):
+    """Imports a command's module when it is asked for: `--help` stays quick."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(_COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in _COMMANDS:
+            return None
+        command: click.Command = importlib.import_module(f"rsundistort_cli.{cmd_name}").command
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl(list(_COMMANDS.items()))
+
+
+@click.command(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="rsundistort")
+def cli() -> None:
+    """Take the rolling shutter out of photos, and find where they were taken from.
+
+    Start with: rsundistort run PHOTOS -o OUT
+    """

@@ -1,0 +1,41 @@
+"""Options that several commands share: one flag, one meaning."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+# as `rsundistort.model.READOUTS` and `rsundistort.rectify.INTERPOLATIONS`, which must not be imported for --help
+READOUT_NAMES = ("top-to-bottom", "bottom-to-top", "left-to-right", "right-to-left")
+INTERPOLATION_NAMES = ("cubic", "linear", "lanczos", "nearest")
+
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+photos_argument: Decorator = click.argument("photos", type=click.Path(path_type=Path))
+out_option: Decorator = click.option(
+    "-o", "--out", type=click.Path(path_type=Path), required=True, help="Folder for the outputs."
+)
+camera_option: Decorator = click.option(
+    "--camera",
+    metavar="FILE|NUMBERS",
+    help="camera.json, a text file with the 3x3 matrix K, or fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]. "
+    "Default: camera.json in or beside PHOTOS, else EXIF.",
+)
+readout_option: Decorator = click.option(
+    "--readout", type=click.Choice(READOUT_NAMES), help="Direction of the readout in the stored pixels."
+)
+seed_option: Decorator = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+jobs_option: Decorator = click.option(
+    "--jobs", type=click.IntRange(min=0), default=0, help="Threads; 0, the default, takes all cores."
+)
+overwrite_option: Decorator = click.option("--overwrite", is_flag=True, help="Replace outputs that are in OUT.")
+quiet_option: Decorator = click.option("-q", "--quiet", is_flag=True, help="Nothing but warnings and errors.")
+quality_option: Decorator = click.option(
+    "--quality", type=click.IntRange(1, 100), default=98, show_default=True, help="Of JPEG and WebP."
+)
+interpolation_option: Decorator = click.option(
+    "--interpolation", type=click.Choice(INTERPOLATION_NAMES), default="cubic", show_default=True
+)

@@ -1,0 +1,37 @@
+"""`rsundistort rectify`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from . import options as opt
+from .terminal import errors_for_people, progress_bars
+
+
+@click.command()
+@opt.photos_argument
+@click.option(
+    "--solution", type=click.Path(path_type=Path), required=True, help="solution.json, or a ground-truth file."
+)
+@opt.out_option
+@opt.interpolation_option
+@opt.quality_option
+@opt.jobs_option
+@opt.overwrite_option
+@opt.quiet_option
+def command(
+    photos: Path, solution: Path, out: Path, interpolation: str, quality: int, jobs: int, overwrite: bool, quiet: bool
+) -> None:
+    """Rectify the photos of a folder with the motions of a solution."""
+    with errors_for_people(), progress_bars(quiet) as progress:
+        from rsundistort.pipeline import rectify_folder
+
+        solved, left_out = rectify_folder(
+            photos, solution, out,
+            interpolation=interpolation, quality=quality, jobs=jobs, overwrite=overwrite, progress=progress,
+        )  # fmt: skip
+    if not quiet:
+        count = len(list((out / "images").iterdir()))
+        click.echo(f"{count} photos rectified with the {solved.shutter_model} model, {len(left_out)} left out: {out}")

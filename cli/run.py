@@ -1,0 +1,113 @@
+"""`rsundistort run`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from . import options as opt
+from .terminal import errors_for_people, progress_bars, table
+
+if TYPE_CHECKING:
+    from rsundistort.model import Solution
+
+
+@click.command()
+@opt.photos_argument
+@opt.out_option
+@opt.camera_option
+@opt.readout_option
+@click.option(
+    "--model",
+    "shutter_model",
+    type=click.Choice(("auto", "rotation", "linearized", "two-step", "global")),
+    default="auto",
+    show_default=True,
+    help="How the shutter is modelled; auto is rotation, the exact model.",
+)
+@click.option(
+    "--still", multiple=True, metavar="NAME", help="A photo known not to have moved (its phi1 is held at zero)."
+)
+@click.option(
+    "--max-features", type=click.IntRange(min=100), default=16384, show_default=True, help="Features of a photo."
+)
+@opt.interpolation_option
+@opt.quality_option
+@opt.seed_option
+@opt.jobs_option
+@opt.overwrite_option
+@opt.quiet_option
+def command(
+    photos: Path,
+    out: Path,
+    camera: str | None,
+    readout: str | None,
+    shutter_model: str,
+    still: tuple[str, ...],
+    max_features: int,
+    interpolation: str,
+    quality: int,
+    seed: int,
+    jobs: int,
+    overwrite: bool,
+    quiet: bool,
+) -> None:
+    """Find how the camera moved during each photo's readout, and take it out.
+
+    PHOTOS is a folder of photos that one camera took of one scene, in any order. OUT gets images/, masks/,
+    sparse/ (COLMAP), transforms.json (nerfstudio) and solution.json.
+    """
+    with errors_for_people(), progress_bars(quiet) as progress:
+        from rsundistort.pipeline import RunOptions, run
+
+        solution = run(
+            photos,
+            out,
+            RunOptions(
+                camera=camera,
+                readout=readout,
+                shutter_model=shutter_model,
+                seed=seed,
+                jobs=jobs,
+                max_features=max_features,
+                interpolation=interpolation,
+                quality=quality,
+                still=still,
+                overwrite=overwrite,
+            ),
+            progress,
+        )
+    if not quiet:
+        click.echo(closing_table(solution, out))
+
+
+def closing_table(solution: Solution, out: Path) -> str:
+    """What was found, a line a photo, in 80 columns."""
+    rows = [("photo", "measurements", "rms px", "deg/frame", "shift px")]
+    for image in solution.images:
+        name = image.name if len(image.name) <= 32 else f"...{image.name[-29:]}"
+        if image.motion is None:
+            rows.append((name, "-", "-", "-", "not joined"))
+            continue
+        span = solution.cameras[image.camera_id].frame_span
+        turn = float((image.motion.phi**2).sum() ** 0.5) * span * 57.29577951308232
+        rows.append(
+            (name, str(image.num_observations), f"{image.rms_px:.2f}", f"{turn:.2f}", f"{image.rs_shift_px:.1f}")
+        )
+    quality = solution.quality
+    total = sum(stage["seconds"] for stage in solution.stages)
+    lines = [
+        table(rows),
+        "",
+        f"photos registered  {len(solution.registered)} of {len(solution.images)}",
+        f"shutter model      {solution.shutter_model}",
+        f"camera             {solution.options['camera']}, readout {solution.options['readout']}",
+        f"rms residual       {quality['global_rms_px']:.2f} px with a global shutter, {quality['rms_px']:.2f} px now",
+        f"outputs            {out}  ({total:.0f} s)",
+    ]
+    lost = [image for image in solution.images if not image.registered]
+    if lost:
+        lines += ["", "not joined:", *(f"  {image.name}: {image.reason}" for image in lost)]
+    return "\n".join(lines)

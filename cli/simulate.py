@@ -1,0 +1,98 @@
+"""`rsundistort simulate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from . import options as opt
+from .terminal import errors_for_people, progress_bars, table
+
+
+@click.group()
+def command() -> None:
+    """Make photos with a known shutter motion, and the truth to judge results by."""
+
+
+@command.command()
+@opt.photos_argument
+@opt.out_option
+@opt.camera_option
+@opt.readout_option
+@click.option(
+    "--sigma",
+    type=click.FloatRange(min=0),
+    default=0.05,
+    show_default=True,
+    help="Standard deviation of the rotation over the frame, radians.",
+)
+@click.option(
+    "--motion",
+    type=click.Path(path_type=Path),
+    help="JSON {name: [phi1, phi2, phi3]} in radians per unit of the clock, instead of random motion.",
+)
+@click.option("--still", multiple=True, metavar="NAME", help="A photo that does not move.")
+@opt.quality_option
+@opt.seed_option
+@opt.jobs_option
+@opt.overwrite_option
+@opt.quiet_option
+def warp(
+    photos: Path,
+    out: Path,
+    camera: str | None,
+    readout: str | None,
+    sigma: float,
+    motion: Path | None,
+    still: tuple[str, ...],
+    quality: int,
+    seed: int,
+    jobs: int,
+    overwrite: bool,
+    quiet: bool,
+) -> None:
+    """Warp real photos as if a rotating camera had taken them.
+
+    OUT gets photos/, masks/ (what the originals hold), camera.json and ground_truth.json.
+    """
+    with errors_for_people(), progress_bars(quiet) as progress:
+        from rsundistort.pipeline import WarpOptions, read_motion_file, simulate_warp
+
+        truth = simulate_warp(
+            photos,
+            out,
+            WarpOptions(
+                camera=camera,
+                readout=readout,
+                sigma_rad=sigma,
+                motion=None if motion is None else read_motion_file(motion),
+                still=still,
+                seed=seed,
+                jobs=jobs,
+                quality=quality,
+                overwrite=overwrite,
+            ),
+            progress,
+        )
+    if not quiet:
+        rows = [("photo", "shift px"), *((image.name, f"{image.rs_shift_px:.1f}") for image in truth.images)]
+        click.echo(f"{table(rows)}\n\noutputs  {out}")
+
+
+@command.command()
+@click.argument("recipe", type=click.Path(path_type=Path))
+@opt.out_option
+@opt.overwrite_option
+@opt.quiet_option
+def scene(recipe: Path, out: Path, overwrite: bool, quiet: bool) -> None:
+    """Render the rolling-shutter photos of a scene, with global-shutter twins.
+
+    OUT gets photos/, global/ (the twins), camera.json, ground_truth.json and the recipe.
+    """
+    with errors_for_people(), progress_bars(quiet) as progress:
+        from rsundistort.synthetic import render_scene
+
+        render_scene(recipe, out, overwrite=overwrite, progress=lambda done, total: progress("rendering", done, total))
+    if not quiet:
+        click.echo(f"outputs  {out}")

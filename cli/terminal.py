@@ -1,0 +1,86 @@
+"""What a person sees: progress, warnings, errors, tables."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import click
+
+__all__ = ["errors_for_people", "progress_bars", "table"]
+
+
+@contextmanager
+def errors_for_people() -> Iterator[None]:
+    """Known errors become one line and exit code 1; warnings become one line each."""
+    import cv2
+
+    from rsundistort.errors import RsUndistortError
+
+    # OpenCV's and libtiff's own lines about broken files: ours say it once, with the name
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        click.echo(f"warning: {message}", err=True)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        warnings.showwarning = show
+        try:
+            yield
+        except RsUndistortError as error:
+            click.echo(f"error: {error}", err=True)
+            sys.exit(1)
+        except KeyboardInterrupt:
+            click.echo("stopped; nothing was written", err=True)
+            sys.exit(130)
+
+
+class _Bars:
+    """One bar a stage on stderr; nothing when it is no terminal."""
+
+    def __init__(self, shown: bool) -> None:
+        self._shown = shown
+        self._bar: Any = None
+        self._stage = ""
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        if not self._shown:
+            return
+        from tqdm import tqdm
+
+        if stage != self._stage:
+            self.close()
+            self._stage = stage
+            form = "{desc:<34} {n_fmt}/{total_fmt} {bar} {elapsed}" if total else "{desc:<34} {elapsed}"
+            self._bar = tqdm(total=total or None, desc=stage, leave=False, file=sys.stderr, bar_format=form)
+        self._bar.n = done
+        self._bar.refresh()
+
+    def close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+
+@contextmanager
+def progress_bars(quiet: bool) -> Iterator[_Bars]:
+    """A progress callback that draws bars, unless told to be quiet or stderr is no terminal."""
+    bars = _Bars(not quiet and sys.stderr.isatty())
+    try:
+        yield bars
+    finally:
+        bars.close()
+
+
+def table(rows: Sequence[Sequence[str]]) -> str:
+    """Rows as aligned columns: the first to the left, the others to the right."""
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    lines = []
+    for row in rows:
+        cells = [row[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True))]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)
