@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..model import Reconstruction
 from .options import BundleOptions, BundleResult
@@ -16,6 +17,9 @@ __all__ = ["LADDER", "bundle_adjust", "climb"]
 
 #: Shutter models in the order in which they are solved, each from the one before.
 LADDER = ("global", "two-step", "rotation")
+
+# Radians per frame: a hundredth of a pixel at any focal length in use. Keeps the prior's weight finite.
+_MIN_SPREAD = 1e-6
 
 
 def _noise_px(reconstruction: Reconstruction, shutter_model: str, floor: float) -> float:
@@ -28,6 +32,17 @@ def _noise_px(reconstruction: Reconstruction, shutter_model: str, floor: float) 
     unknowns = 9 * reconstruction.num_images + 3 * reconstruction.num_points
     shrink = np.sqrt(max(1.0 - unknowns / (2.0 * len(res)), 0.1))
     return max(spread / shrink, floor)
+
+
+def _spread(reconstruction: Reconstruction, variance: NDArray[np.float64]) -> float:
+    """Spread of phi over photos and axes in radians per frame, from its values and their posterior variances.
+
+    Values beyond three robust spreads count as three: a few photos that moved far more, or that hang on by few
+    measurements, must not loosen the prior of the rest.
+    """
+    square = (reconstruction.phi**2 + variance) * reconstruction.frame_span()[:, None] ** 2
+    robust = float(np.median(square)) / 0.455  # median of the square of a normal variable
+    return float(np.sqrt(np.minimum(square, 9.0 * robust).mean())) + _MIN_SPREAD
 
 
 def bundle_adjust(
@@ -58,11 +73,12 @@ def bundle_adjust(
     current = reconstruction.with_points(np.ones(len(reconstruction.observations), bool))
     iterations = 0
     sigma = options.sigma_px or _noise_px(current, shutter_model, options.min_sigma_px)
+    phi_sigma = options.phi_sigma or options.phi_sigma_start
     for round_ in range(options.outlier_rounds + 1):
         last = round_ == options.outlier_rounds
         # once the outliers are gone the noise is nearly normal: squares converge in a few steps and use it fully
         stage = options if round_ == 0 else replace(options, loss="squared")
-        problem = BundleProblem(current, shutter_model, stage, sigma)
+        problem = BundleProblem(current, shutter_model, stage, sigma, phi_sigma)
         result = minimize(
             problem,
             problem.initial_state(),
@@ -75,6 +91,9 @@ def bundle_adjust(
         )
         iterations += result.num_iterations
         current = problem.reconstruction(result.state)
+        variance = problem.phi_variance(result.state)
+        if options.phi_sigma is None and shutter_model != "global" and np.isfinite(variance).all():
+            phi_sigma = _spread(current, variance)
         res, valid = reprojection_residuals(current)
         new_sigma = options.sigma_px or _noise_px(current, shutter_model, options.min_sigma_px)
         if last:
@@ -85,7 +104,7 @@ def bundle_adjust(
         sigma = new_sigma
     rms = float(np.sqrt(np.mean(res[valid] ** 2))) if valid.any() else float("nan")
     dropped = len(reconstruction.observations) - len(current.observations)
-    return BundleResult(current, result.stop_reason, result.cost_history, iterations, sigma, rms, dropped)
+    return BundleResult(current, result.stop_reason, result.cost_history, iterations, sigma, phi_sigma, np.sqrt(variance), rms, dropped)
 
 
 def climb(

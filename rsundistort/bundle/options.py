@@ -44,9 +44,12 @@ class BundleOptions:
         the residuals, robustly, before each solve (never below `min_sigma_px`).
     min_sigma_px : float
         Lower limit of that reading.
-    phi_sigma : float
-        Standard deviation of the zero-mean prior on phi, in radians per frame. The default is loose: twice
-        what a swung hand does.
+    phi_sigma : float or None
+        Standard deviation of the zero-mean prior on each component of phi, in radians per frame. None: estimated with
+        the solution (empirical Bayes, `sigma^2 <- mean(phi^2 + posterior variance of phi)` after each solve), so that
+        a shutter that can hardly be seen is not fitted to noise.
+    phi_sigma_start : float
+        Where that estimate starts; about what a swung hand does.
     outlier_rounds : int
         Times that observations further than `outlier_sigma` standard deviations are dropped and all is solved again.
     outlier_sigma : float
@@ -69,7 +72,8 @@ class BundleOptions:
     loss_scale: float = 2.5
     sigma_px: float | None = None
     min_sigma_px: float = 0.02
-    phi_sigma: float = 0.1
+    phi_sigma: float | None = None
+    phi_sigma_start: float = 0.03
     outlier_rounds: int = 3
     outlier_sigma: float = 4.5
     min_outlier_px: float = 0.25
@@ -79,12 +83,14 @@ class BundleOptions:
     def __post_init__(self) -> None:
         if self.loss not in LOSSES:
             raise InputError(f"loss={self.loss!r}, expected one of {', '.join(LOSSES)}")
-        positive = ("cost_tolerance", "round_tolerance", "step_tolerance", "initial_damping", "loss_scale", "min_sigma_px", "phi_sigma")
+        positive = ("cost_tolerance", "round_tolerance", "step_tolerance", "initial_damping", "loss_scale", "min_sigma_px", "phi_sigma_start")
         for name in (*positive, "outlier_sigma", "max_damping"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name}={getattr(self, name)!r}, expected a positive number")
         if self.sigma_px is not None and not self.sigma_px > 0:
             raise InputError(f"sigma_px={self.sigma_px!r}, expected a positive number or None")
+        if self.phi_sigma is not None and not self.phi_sigma > 0:
+            raise InputError(f"phi_sigma={self.phi_sigma!r}, expected a positive number or None")
         if self.max_iterations < 1 or self.outlier_rounds < 0:
             raise InputError("max_iterations must be at least 1 and outlier_rounds at least 0")
 
@@ -105,6 +111,10 @@ class BundleResult:
         Steps tried, over all solves.
     sigma_px : float
         Standard deviation of the noise that weighed the measurements in the last solve.
+    phi_sigma : float
+        Standard deviation of the prior on phi, radians per frame: as given, or as estimated.
+    sigma_phi : (m, 3) array
+        Standard deviations of phi in the solution, radians per unit of the clock; 0 where held.
     rms_px : float
         Root mean square of the residuals' x and y parts.
     num_outliers : int
@@ -116,6 +126,8 @@ class BundleResult:
     cost_history: NDArray[np.float64]
     num_iterations: int
     sigma_px: float
+    phi_sigma: float
+    sigma_phi: NDArray[np.float64]
     rms_px: float
     num_outliers: int
 

@@ -67,7 +67,12 @@ class BundleProblem:
     """
 
     def __init__(
-        self, reconstruction: Reconstruction, shutter_model: str, options: BundleOptions, sigma_px: float
+        self,
+        reconstruction: Reconstruction,
+        shutter_model: str,
+        options: BundleOptions,
+        sigma_px: float,
+        phi_sigma: float | None = None,
     ) -> None:
         self._model = check_shutter_model(shutter_model)
         obs = reconstruction.observations
@@ -89,7 +94,8 @@ class BundleProblem:
         self._cameras = _camera_arrays(reconstruction)
         self._velocity = np.zeros((reconstruction.num_images, 3))
         span = reconstruction.frame_span()
-        self._phi_weight = np.repeat((span / options.phi_sigma)[:, None] ** 2, 3, axis=1)
+        spread = phi_sigma or options.phi_sigma or options.phi_sigma_start
+        self._phi_weight = np.repeat((span / spread)[:, None] ** 2, 3, axis=1)
         self._free = self._free_unknowns()
         self._size = float(np.median(np.linalg.norm(reconstruction.points_w - reconstruction.center_w.mean(0), axis=1)))
 
@@ -117,6 +123,12 @@ class BundleProblem:
         if self._block > 6:
             phi = np.where(self._free[:, 6:], self._start.phi, 0.0)
         return State(self._start.R_cw, self._start.center_w, phi, self._start.points_w)
+
+    def phi_variance(self, state: State) -> NDArray[np.float64]:
+        """(m, 3) posterior variances of phi, radians squared per unit of the clock squared; 0 where held."""
+        if self._block == 6:
+            return np.zeros_like(state.phi)
+        return self.linearize(state).marginal_variances(slice(6, 9))
 
     def reconstruction(self, state: State) -> Reconstruction:
         """The reconstruction at a state."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 from .._kernels import schur
 
 __all__ = ["NormalEquations", "Structure"]
+
+_UNFACTORABLE = (np.linalg.LinAlgError, ValueError, RuntimeError)
 
 Step = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -127,30 +130,58 @@ class NormalEquations:
         m, nb = self._free.shape
         return scipy.sparse.bsr_array((S, self._s.cols, self._s.row_start), shape=(m * nb, m * nb)).tocsr()
 
-    def solve(self, damping: float) -> tuple[Step, float] | None:
-        """Step of the photos (m, nb) and points (n, 3), and the decrease of cost that it predicts."""
-        S, rhs, (V_inv, _) = self.reduce(damping)
+    def _factor(self, S: NDArray[np.float64]) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+        """Solver of the reduced system of the free unknowns: takes right-hand sides (free[, k])."""
         free = self._free.ravel()
         upper = scipy.sparse.triu(self._block_matrix(S)[free][:, free], format="csc")
-        b = -rhs.ravel()[free]
         # unit diagonal: angles, centres and phi differ by orders of magnitude
         scale = 1.0 / np.sqrt(np.maximum(upper.diagonal(), 1e-300))
         D = scipy.sparse.diags_array(scale)
         upper = (D @ upper @ D).tocsc()
+        solve: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+        if self._dense:
+            factor = scipy.linalg.cho_factor(upper.toarray(), lower=False, check_finite=True)
+
+            def solve(b: NDArray[np.float64]) -> NDArray[np.float64]:
+                return scipy.linalg.cho_solve(factor, b)
+        else:
+            full = (upper + scipy.sparse.triu(upper, k=1).T).tocsc()
+            solve = scipy.sparse.linalg.splu(
+                full, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            ).solve
+        return lambda b: (scale * solve((scale * b.T).T).T).T
+
+    def marginal_variances(self, part: slice) -> NDArray[np.float64]:
+        """Variances (m, len(part)) of some unknowns of each photo, all others being free; 0 where held.
+
+        NaN where the system cannot be factored.
+        """
+        S, _, _ = self.reduce(0.0)
+        wanted = np.zeros_like(self._free)
+        wanted[:, part] = self._free[:, part]
+        at = np.flatnonzero(wanted.ravel()[self._free.ravel()])
+        result = np.zeros(self._free.shape)
         try:
-            if self._dense:
-                factor = scipy.linalg.cho_factor(upper.toarray(), lower=False, check_finite=True)
-                x = scipy.linalg.cho_solve(factor, scale * b)
-            else:
-                full = (upper + scipy.sparse.triu(upper, k=1).T).tocsc()
-                lu = scipy.sparse.linalg.splu(
-                    full, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-                )
-                x = lu.solve(scale * b)
-        except (np.linalg.LinAlgError, ValueError, RuntimeError):
-            return None
+            solve = self._factor(S)
+            values = np.empty(len(at))
+            for first in range(0, len(at), 256):  # never the whole inverse
+                some = at[first : first + 256]
+                unit = np.zeros((int(self._free.sum()), len(some)))
+                unit[some, np.arange(len(some))] = 1.0
+                values[first : first + 256] = solve(unit)[some, np.arange(len(some))]
+        except _UNFACTORABLE:
+            values = np.full(len(at), np.nan)
+        result[wanted] = values
+        return result[:, part]
+
+    def solve(self, damping: float) -> tuple[Step, float] | None:
+        """Step of the photos (m, nb) and points (n, 3), and the decrease of cost that it predicts."""
+        S, rhs, (V_inv, _) = self.reduce(damping)
         step_frame = np.zeros(self._free.shape)
-        step_frame.ravel()[free] = scale * x
+        try:
+            step_frame[self._free] = self._factor(S)(-rhs[self._free])
+        except _UNFACTORABLE:
+            return None
         step_point = np.empty_like(self._g_point)
         schur.back_substitute(
             self._s.point_start, self._s.frame_idx, V_inv, self._g_point, self._W, step_frame, step_point

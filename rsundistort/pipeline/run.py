@@ -173,6 +173,7 @@ def _solution(loaded: LoadedPhotos, solved: Solved, options: RunOptions) -> Solu
                     R_cw=rec.R_cw[i],
                     center_w=rec.center_w[i],
                     motion=rec.motion(i),
+                    sigma_phi=None if rec.shutter_model == "global" else solved.result.sigma_phi[i],
                     num_observations=int(counts[i]),
                     rms_px=float(rms[i]),
                     rs_shift_px=largest_shift_px(rec.camera(i), rec.motion(i), rec.shutter_model),
@@ -184,6 +185,7 @@ def _solution(loaded: LoadedPhotos, solved: Solved, options: RunOptions) -> Solu
         "rms_px": solved.result.rms_px,
         "global_rms_px": solved.global_result.rms_px,
         "held_out_rms_px": {},
+        "phi_sigma_rad_per_frame": solved.result.phi_sigma,
         "stop_reason": solved.result.stop_reason,
     }
     return Solution(

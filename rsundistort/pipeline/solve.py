@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +96,7 @@ def solve_photos(
         log.begin(f"feedback {number}")
         before = result.reconstruction
         tracks = retriangulate(matched, before)
+        options = replace(options, phi_sigma_start=result.phi_sigma)
         result = bundle_adjust(tracks, shutter_model, options, lambda _, n=number: log.tell(f"feedback {n}", 0))
         after = result.reconstruction
         moved = np.inf if after.image_names != before.image_names else _moved_px(before, after)
