@@ -2,8 +2,8 @@
 
     python benchmarks/accuracy.py [--photos DIR] [--seeds N]
 
-Needs sample_scenes/courtyard; with the folder of test photos (default ../shared/photos) also warps real photos, and runs
-real ones. Targets are printed beside the figures; a figure that misses its target is not an error of the program.
+Needs sample_scenes/courtyard; with the folder of test photos (default ../shared/photos) also warps real photos, and
+runs real ones. Targets are printed beside the figures; a figure that misses its target is not an error of the program.
 """
 
 from __future__ import annotations
@@ -59,7 +59,10 @@ def herz_jesus(photos: Path, work: Path, seeds: int) -> None:
         rotation_against_global_deg=round(float(pose_errors(solution, reference).rotation_deg.mean()), 4),
         target="<= 1 px, <= 0.03 deg",
     )
-    for sigma, target in ((0.05, "8/8, <= 0.1 deg, >= 38 dB, worst >= 35 dB"), (0.02, "8/8, <= 0.1 deg, >= 40 dB")):
+    for sigma, target in (
+        (0.05, "8/8, <= 0.1 deg, >= 38 dB, worst >= 35 dB"),
+        (0.02, "8/8, <= 0.1 deg, >= 40 dB"),
+    ):
         pooled: list[float] = []
         for seed in range(seeds):
             warped, out = work / f"warped-{sigma}-{seed}", work / f"out-{sigma}-{seed}"
@@ -73,8 +76,15 @@ def herz_jesus(photos: Path, work: Path, seeds: int) -> None:
                 blind = work / f"blind-{sigma}"
                 run(warped / "photos", blind, RunOptions(shutter_model="global"))
                 blind_result = evaluate(blind, truth, poses=plain / "solution.json")
-                show("the same without a shutter model", rotation_deg=round(blind_result["rotation_deg"]["mean"], 3))
-        show(f"herz-jesus-8 warped by {sigma}, all seeds", psnr_db=round(float(np.median(pooled)), 2), target=target)
+                show(
+                    "the same without a shutter model",
+                    rotation_deg=round(blind_result["rotation_deg"]["mean"], 3),
+                )
+        show(
+            f"herz-jesus-8 warped by {sigma}, all seeds",
+            psnr_db=round(float(np.median(pooled)), 2),
+            target=target,
+        )
 
 
 def real(name: str, photos: Path, work: Path, camera: str | None) -> None:

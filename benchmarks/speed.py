@@ -2,8 +2,9 @@
 
     python benchmarks/speed.py [--photos DIR] [--repeat N]
 
-`run` on herz-jesus-8 against pycolmap's own chain (extract, match exhaustively, map, undistort) on the same photos. Each
-runs in a process of its own, by turns; medians. Exits 1 if one crashes, never because a noisy figure misses its target.
+`run` on herz-jesus-8 against pycolmap's own chain (extract, match exhaustively, map, undistort) on the same
+photos. Each runs in a process of its own, by turns; medians. Exits 1 if one crashes, never because a noisy figure
+misses its target.
 """
 
 from __future__ import annotations
@@ -71,7 +72,13 @@ def main() -> None:
         ours.append(timed(OURS, photos))
         peer.append(timed(PEER, photos))
     a, b = statistics.median(ours), statistics.median(peer)
-    figures = {"ours_s": round(a, 2), "peer_s": round(b, 2), "ratio": round(a / b, 3), "target": 1.2, "ok": a <= 1.2 * b}
+    figures = {
+        "ours_s": round(a, 2),
+        "peer_s": round(b, 2),
+        "ratio": round(a / b, 3),
+        "target": 1.2,
+        "ok": a <= 1.2 * b,
+    }
     print(json.dumps({"name": "run herz-jesus-8 against pycolmap's chain", **figures}), flush=True)
     command = Path(sys.executable).with_name("rsundistort")
     times = []

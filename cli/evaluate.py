@@ -21,7 +21,13 @@ from .terminal import errors_for_people, progress_bars, table
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 @opt.quiet_option
 def command(
-    out: Path, truth: Path, poses: Path | None, twins: Path | None, raw: Path | None, as_json: bool, quiet: bool
+    out: Path,
+    truth: Path,
+    poses: Path | None,
+    twins: Path | None,
+    raw: Path | None,
+    as_json: bool,
+    quiet: bool,
 ) -> None:
     """Compare the outputs of a run, in the folder OUT, with the truth."""
     with errors_for_people(), progress_bars(quiet or as_json) as progress:

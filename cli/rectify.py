@@ -13,7 +13,10 @@ from .terminal import errors_for_people, progress_bars
 @click.command()
 @opt.photos_argument
 @click.option(
-    "--solution", type=click.Path(path_type=Path), required=True, help="solution.json, or a ground-truth file."
+    "--solution",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="solution.json, or a ground-truth file.",
 )
 @opt.out_option
 @opt.interpolation_option
@@ -22,7 +25,14 @@ from .terminal import errors_for_people, progress_bars
 @opt.overwrite_option
 @opt.quiet_option
 def command(
-    photos: Path, solution: Path, out: Path, interpolation: str, quality: int, jobs: int, overwrite: bool, quiet: bool
+    photos: Path,
+    solution: Path,
+    out: Path,
+    interpolation: str,
+    quality: int,
+    jobs: int,
+    overwrite: bool,
+    quiet: bool,
 ) -> None:
     """Rectify the photos of a folder with the motions of a solution."""
     with errors_for_people(), progress_bars(quiet) as progress:

@@ -28,10 +28,17 @@ if TYPE_CHECKING:
     help="How the shutter is modelled; auto is rotation, the exact model.",
 )
 @click.option(
-    "--still", multiple=True, metavar="NAME", help="A photo known not to have moved (its phi1 is held at zero)."
+    "--still",
+    multiple=True,
+    metavar="NAME",
+    help="A photo known not to have moved (its phi1 is held at zero).",
 )
 @click.option(
-    "--max-features", type=click.IntRange(min=100), default=16384, show_default=True, help="Features of a photo."
+    "--max-features",
+    type=click.IntRange(min=100),
+    default=16384,
+    show_default=True,
+    help="Features of a photo.",
 )
 @opt.interpolation_option
 @opt.quality_option
@@ -94,7 +101,13 @@ def closing_table(solution: Solution, out: Path) -> str:
         span = solution.cameras[image.camera_id].frame_span
         turn = float((image.motion.phi**2).sum() ** 0.5) * span * 57.29577951308232
         rows.append(
-            (name, str(image.num_observations), f"{image.rms_px:.2f}", f"{turn:.2f}", f"{image.rs_shift_px:.1f}")
+            (
+                name,
+                str(image.num_observations),
+                f"{image.rms_px:.2f}",
+                f"{turn:.2f}",
+                f"{image.rs_shift_px:.1f}",
+            )
         )
     quality = solution.quality
     total = sum(stage["seconds"] for stage in solution.stages)

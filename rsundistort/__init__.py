@@ -26,7 +26,14 @@ from .io import read_solution, write_solution
 from .model import Camera, Observations, Reconstruction, RowMotion, Solution, SolvedImage
 from .model.projection import project_points, unproject_points
 from .pipeline import RunOptions, WarpOptions, evaluate, rectify_folder, run, simulate_warp
-from .rectify import distort_points, init_rectify_map, largest_shift_px, optimal_new_camera, rectify, undistort_points
+from .rectify import (
+    distort_points,
+    init_rectify_map,
+    largest_shift_px,
+    optimal_new_camera,
+    rectify,
+    undistort_points,
+)
 
 __version__ = "0.1.0"
 

@@ -73,9 +73,7 @@ def test_rays_without_motion_meet_the_points_that_opencv_projects(dist):
     camera, v = Camera(400, 300, K, dist), view()
     rng = np.random.default_rng(5)
     points = np.column_stack([rng.uniform(-2, 2, 200), np.full(200, 8.0), rng.uniform(-1.5, 1.5, 200)])
-    uv = cv2.projectPoints(
-        points, cv2.Rodrigues(np.array(v.R_cw))[0], -v.R_cw @ v.center_w, K, np.array(dist)
-    )[0]
+    uv = cv2.projectPoints(points, cv2.Rodrigues(np.array(v.R_cw))[0], -v.R_cw @ v.center_w, K, np.array(dist))[0]
     origins, directions = pixel_rays(camera, v, uv[:, 0])
     scene = Scene((Patch([-20, 8, -20], [40, 0, 0], [0, 0, 40], "grey"),), {"grey": GREY})
     patch, distance = scene.cast(origins, directions)
@@ -211,9 +209,7 @@ def test_truth_of_the_courtyard_is_what_the_recipe_says(courtyard, truth):
         assert image["aspect"] == 1 - image["phi"][0]
         assert image["skew"] == image["phi"][1]
     assert not np.any(truth["images"][0]["phi"])
-    angle = (
-        np.linalg.norm([image["phi"] for image in truth["images"][1:]], axis=1) * courtyard.camera.frame_span
-    )
+    angle = np.linalg.norm([image["phi"] for image in truth["images"][1:]], axis=1) * courtyard.camera.frame_span
     assert 0.02 < np.sqrt((angle**2).mean()) < 0.08  # drawn with a spread of 0.05
 
 

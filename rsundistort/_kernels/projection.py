@@ -223,10 +223,9 @@ def _project(model, axis, sign, lens, x, y, z, phi, vel, out, jac, E, L):
     if axis == 0:
         X, Y = Y, X
     if model == TWO_STEP:
-        valid = _shutter_two_step(X, Y, q0, q1, q2, d)
-    else:
-        valid = _shutter_linearized(X, Y, q0, q1, q2, d)
-    if not valid:
+        if not _shutter_two_step(X, Y, q0, q1, q2, d):
+            return False
+    elif not _shutter_linearized(X, Y, q0, q1, q2, d):
         return False
     C, R = d[0], d[1]
     Cx, Cy, C0, C1, C2 = d[2], d[3], d[4], d[5], d[6]
@@ -554,7 +553,7 @@ def residual_blocks(
     """Whitened, robustly weighted residuals (o, 2) with their Jacobians, and each observation's cost.
 
     J_frame is (o, 2, nb): rotation increment (left, camera frame), centre, then phi when nb = 9.
-    J_point is (o, 2, 3); sigma_px (o,). Observations that cannot be projected get zero Jacobians and the cost of 100 px.
+    J_point is (o, 2, 3), sigma_px (o,). Observations that cannot be projected get zero Jacobians and cost 100 px.
     """
     o = len(frame_idx)
     nb = J_frame.shape[2]

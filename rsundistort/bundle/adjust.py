@@ -104,7 +104,17 @@ def bundle_adjust(
         sigma = new_sigma
     rms = float(np.sqrt(np.mean(res[valid] ** 2))) if valid.any() else float("nan")
     dropped = len(reconstruction.observations) - len(current.observations)
-    return BundleResult(current, result.stop_reason, result.cost_history, iterations, sigma, phi_sigma, np.sqrt(variance), rms, dropped)
+    return BundleResult(
+        current,
+        result.stop_reason,
+        result.cost_history,
+        iterations,
+        sigma,
+        phi_sigma,
+        np.sqrt(variance),
+        rms,
+        dropped,
+    )
 
 
 def climb(

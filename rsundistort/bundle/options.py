@@ -83,7 +83,15 @@ class BundleOptions:
     def __post_init__(self) -> None:
         if self.loss not in LOSSES:
             raise InputError(f"loss={self.loss!r}, expected one of {', '.join(LOSSES)}")
-        positive = ("cost_tolerance", "round_tolerance", "step_tolerance", "initial_damping", "loss_scale", "min_sigma_px", "phi_sigma_start")
+        positive = (
+            "cost_tolerance",
+            "round_tolerance",
+            "step_tolerance",
+            "initial_damping",
+            "loss_scale",
+            "min_sigma_px",
+            "phi_sigma_start",
+        )
         for name in (*positive, "outlier_sigma", "max_damping"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name}={getattr(self, name)!r}, expected a positive number")

@@ -159,7 +159,14 @@ class BundleProblem:
         cost = np.empty(o)
         loss = LOSSES[self._options.loss]
         projection.residual_blocks(
-            *self._kernel_args(state), self._sigma_px, loss, self._options.loss_scale, res, J_frame, J_point, cost
+            *self._kernel_args(state),
+            self._sigma_px,
+            loss,
+            self._options.loss_scale,
+            res,
+            J_frame,
+            J_point,
+            cost,
         )
         return res, J_frame, J_point, cost
 
@@ -182,7 +189,11 @@ class BundleProblem:
         o = len(self._xy)
         cost = np.empty(o)
         projection.residual_costs(
-            *self._kernel_args(state), self._sigma_px, LOSSES[self._options.loss], self._options.loss_scale, cost
+            *self._kernel_args(state),
+            self._sigma_px,
+            LOSSES[self._options.loss],
+            self._options.loss_scale,
+            cost,
         )
         return float(cost.sum()) + self._prior_cost(state)
 
@@ -204,5 +215,3 @@ class BundleProblem:
         depth = np.maximum(np.linalg.norm(state.points_w - state.center_w.mean(0), axis=1), self._size)
         lengths = max(np.abs(frame[:, 3:6]).max() / self._size, float((np.abs(point).max(1) / depth).max(initial=0)))
         return float(max(angles, lengths))
-
-

@@ -27,7 +27,11 @@ def camera_from_json(value: Any, where: str) -> Camera:
         raise FormatError(f"{where} {what}; expected width, height, K, dist, readout")
     try:
         return Camera(
-            value["width"], value["height"], value["K"], value.get("dist") or [], value.get("readout", "top-to-bottom")
+            value["width"],
+            value["height"],
+            value["K"],
+            np.asarray(value.get("dist") or [], float),
+            value.get("readout", "top-to-bottom"),
         )
     except (InputError, TypeError, ValueError) as error:
         raise FormatError(f"{where}: {error}") from error
@@ -132,5 +136,8 @@ def camera_from_exif(path: Path, width: int, height: int, readout: str = "top-to
     if not 0.2 * max(width, height) < focal < 20 * max(width, height):
         return None
     return Camera(
-        width, height, np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]]), readout=readout
+        width,
+        height,
+        np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]]),
+        readout=readout,
     )

@@ -31,7 +31,10 @@ def rectified_keypoints(reconstruction: Reconstruction, rectified: list[Camera])
     for i in range(reconstruction.num_images):
         of_photo = obs.frame_idx == i
         ideal, _ = unproject_points(
-            obs.xy_raw[of_photo], reconstruction.camera(i), reconstruction.motion(i), reconstruction.shutter_model
+            obs.xy_raw[of_photo],
+            reconstruction.camera(i),
+            reconstruction.motion(i),
+            reconstruction.shutter_model,
         )
         K = rectified[int(reconstruction.camera_idx[i])].K
         xy[of_photo] = ideal @ K[:2, :2].T + K[:2, 2]

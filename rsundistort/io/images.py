@@ -20,7 +20,15 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, InputError, MetadataWarning
 
-__all__ = ["PHOTO_SUFFIXES", "RAW_SUFFIXES", "Photo", "list_photos", "output_name", "read_photo", "write_image"]
+__all__ = [
+    "PHOTO_SUFFIXES",
+    "RAW_SUFFIXES",
+    "Photo",
+    "list_photos",
+    "output_name",
+    "read_photo",
+    "write_image",
+]
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 RAW_SUFFIXES = (".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
@@ -205,10 +213,14 @@ def _encode_elsewhere(suffix: str, pixels: NDArray[Any], quality: int) -> bytes:
     )
     job = repr((pixels.shape, pixels.dtype.str, suffix, _encode_params(suffix, quality)))
     done = subprocess.run(
-        [sys.executable, "-c", code, job], input=np.ascontiguousarray(pixels).tobytes(), capture_output=True, check=False
+        [sys.executable, "-c", code, job],
+        input=np.ascontiguousarray(pixels).tobytes(),
+        capture_output=True,
+        check=False,
     )
     if done.returncode or not done.stdout:
         raise InputError(
-            "PNG cannot be written because pycolmap was imported before rsundistort in this program; import rsundistort first"
+            "PNG cannot be written because pycolmap was imported before rsundistort in this program; "
+            "import rsundistort first"
         )
     return done.stdout

@@ -49,7 +49,8 @@ def write_transforms(path: Path, solution: Solution, files: dict[str, tuple[str,
     value: dict[str, Any] = _intrinsics(solution.rectified_cameras[used[0]]) if len(used) == 1 else {}
     frames = []
     for image in images:
-        assert image.R_cw is not None and image.center_w is not None
+        assert image.R_cw is not None
+        assert image.center_w is not None
         matrix = np.eye(4)
         # OpenCV looks along +z with y down, OpenGL along -z with y up
         matrix[:3, :3] = image.R_cw.T @ np.diag([1.0, -1.0, -1.0])

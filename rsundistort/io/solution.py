@@ -113,7 +113,8 @@ def read_solution(path: Path) -> Solution:
         raise FormatError(f"{path} is no solution: its format is not {FORMAT!r}")
     if value.get("version") != VERSION:
         raise FormatError(
-            f"{path} has version {value.get('version')!r} of the format, this program reads {VERSION}; update rsundistort"
+            f"{path} has version {value.get('version')!r} of the format, this program reads {VERSION}; "
+            "update rsundistort"
         )
     try:
         return _solution_from_json(value, str(path))
@@ -130,7 +131,7 @@ def _solution_from_json(value: dict[str, Any], where: str) -> Solution:
     for entry in value["images"]:
         motion = None
         if entry["registered"] and entry.get("phi") is not None:
-            motion = RowMotion(entry["phi"], entry.get("velocity") or [0, 0, 0])
+            motion = RowMotion(np.asarray(entry["phi"], float), np.asarray(entry.get("velocity") or [0, 0, 0], float))
         images.append(
             SolvedImage(
                 name=entry["name"],

@@ -18,9 +18,7 @@ def _shape_text(shape: tuple[int | None, ...]) -> str:
     return "(" + ", ".join(parts) + ("," if len(parts) == 1 else "") + ")"
 
 
-def check_array(
-    value: ArrayLike, shape: tuple[int | None, ...], name: str, dtype: Any = np.float64
-) -> NDArray[Any]:
+def check_array(value: ArrayLike, shape: tuple[int | None, ...], name: str, dtype: Any = np.float64) -> NDArray[Any]:
     """The value as an array of `shape` (None: any length); else an error with expected and got."""
     try:
         array = np.asarray(value, dtype=dtype)

@@ -60,7 +60,14 @@ def rectify_folder(
         written = [
             name
             for name, _ in rectify_photos(
-                photos, solved, names, scratch, interpolation=interpolation, quality=quality, jobs=jobs, log=log
+                photos,
+                solved,
+                names,
+                scratch,
+                interpolation=interpolation,
+                quality=quality,
+                jobs=jobs,
+                log=log,
             )
         ]
         if not written:

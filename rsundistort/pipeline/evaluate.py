@@ -93,5 +93,9 @@ def _image_errors(out: Path, solution: Any, twins: Path, raw: Path, log: StageLo
     for key, values in (("psnr_db", after), ("psnr_before_db", before)):
         if values:
             numbers = list(values.values())
-            result[key] = {"median": float(np.median(numbers)), "min": float(np.min(numbers)), "photos": values}
+            result[key] = {
+                "median": float(np.median(numbers)),
+                "min": float(np.min(numbers)),
+                "photos": values,
+            }
     return result

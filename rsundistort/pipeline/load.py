@@ -91,7 +91,9 @@ def load_photos(
     """Read every photo of a folder once, for its size and features; unreadable ones are skipped with a warning."""
     listed = list_photos(folder)
     if len(listed) < 3:
-        raise InputError(f"{folder} holds {len(listed)} photo{'s' * (len(listed) > 1)}; the shutter needs at least three")
+        raise InputError(
+            f"{folder} holds {len(listed)} photo{'s' * (len(listed) > 1)}; the shutter needs at least three"
+        )
     log.begin("features", len(listed))
     done = 0
 

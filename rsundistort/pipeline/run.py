@@ -89,9 +89,12 @@ def use_threads(jobs: int) -> int:
 
 
 def run(
-    photos: Path | str, out: Path | str, options: RunOptions | None = None, progress: ProgressCallback | None = None
+    photos: Path | str,
+    out: Path | str,
+    options: RunOptions | None = None,
+    progress: ProgressCallback | None = None,
 ) -> Solution:
-    """Recover how the camera moved during each photo's readout; write rectified photos, masks, poses and a COLMAP model.
+    """Recover how the camera moved during each photo's readout; write rectified photos, masks and poses.
 
     Parameters
     ----------
@@ -119,7 +122,7 @@ def run(
         for name in options.still:
             if name not in loaded.names:
                 raise InputError(f"still photo {name!r} is not among the photos of {photos}")
-        bundle = BundleOptions(held_phi={name: (0,) for name in options.still})
+        bundle = BundleOptions(held_phi=dict.fromkeys(options.still, (0,)))
         with tempfile.TemporaryDirectory() as work:
             solved = solve_photos(loaded, model, options.seed, bundle, Path(work), log)
         rec = solved.result.reconstruction

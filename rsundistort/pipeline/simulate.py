@@ -67,7 +67,10 @@ def read_motion_file(path: Path) -> dict[str, list[float]]:
 
 
 def simulate_warp(
-    photos: Path | str, out: Path | str, options: WarpOptions | None = None, progress: ProgressCallback | None = None
+    photos: Path | str,
+    out: Path | str,
+    options: WarpOptions | None = None,
+    progress: ProgressCallback | None = None,
 ) -> Solution:
     """Photos as if a rotating camera had taken them, with the truth.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,10 @@ def rungs_to(shutter_model: str) -> tuple[str, ...]:
     return ("global", "two-step", shutter_model)
 
 
+def _tell(log: StageLog, stage: str, _cost: float) -> None:
+    log.tell(stage, 0)
+
+
 def _moved_px(before: Reconstruction, after: Reconstruction) -> float:
     """Largest change of a shutter rotation over the frame, in pixels."""
     focal = max(float(camera.K[0, 0]) for camera in after.cameras)
@@ -56,7 +61,7 @@ def _moved_px(before: Reconstruction, after: Reconstruction) -> float:
 def solve_photos(
     photos: LoadedPhotos, shutter_model: str, seed: int, options: BundleOptions, scratch: Path, log: StageLog
 ) -> Solved:
-    """Match, map, climb the ladder; then free the keypoints of the shutter, rebuild the tracks and adjust, until settled.
+    """Match, map, climb the ladder; then free the keypoints of the shutter, rebuild the tracks and adjust again.
 
     Parameters
     ----------
@@ -91,17 +96,21 @@ def solve_photos(
     log.begin("ladder")
     results = climb(mapped, rungs_to(shutter_model), options, lambda model, _: log.tell(f"ladder: {model}", 0))
     result = results[shutter_model]
-    log.end("ladder", rungs=[{"model": k, "rms_px": r.rms_px, "iterations": r.num_iterations} for k, r in results.items()])
+    log.end(
+        "ladder",
+        rungs=[{"model": k, "rms_px": r.rms_px, "iterations": r.num_iterations} for k, r in results.items()],
+    )
     for number in range(1, _MAX_ROUNDS + 1):
-        log.begin(f"feedback {number}")
+        stage = f"feedback {number}"
+        log.begin(stage)
         before = result.reconstruction
         tracks = retriangulate(matched, before)
         options = replace(options, phi_sigma_start=result.phi_sigma)
-        result = bundle_adjust(tracks, shutter_model, options, lambda _, n=number: log.tell(f"feedback {n}", 0))
+        result = bundle_adjust(tracks, shutter_model, options, partial(_tell, log, stage))
         after = result.reconstruction
         moved = np.inf if after.image_names != before.image_names else _moved_px(before, after)
         log.end(
-            f"feedback {number}", points=after.num_points, observations=len(after.observations), rms_px=result.rms_px,
+            stage, points=after.num_points, observations=len(after.observations), rms_px=result.rms_px,
             iterations=result.num_iterations, stop_reason=result.stop_reason, moved_px=moved,
         )  # fmt: skip
         if moved < _SETTLED_PX:

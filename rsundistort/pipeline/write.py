@@ -105,4 +105,3 @@ class PointColors:
         """(n, 3) red, green, blue."""
         mean = self._sum / np.maximum(self._count, 1)[:, None]
         return np.clip(np.rint(mean), 0, 255).astype(np.uint8)
-

@@ -46,7 +46,7 @@ def detect_features(photo: NDArray[Any], max_features: int = 16384) -> Features:
         Keep this many, the strongest first.
     """
     # the upscaled first octave is off by a quarter of a pixel unless it is asked to be precise (measured on blobs)
-    sift = cv2.SIFT_create(
+    sift = cv2.SIFT.create(
         nfeatures=max_features, nOctaveLayers=3, contrastThreshold=0.02, edgeThreshold=10, sigma=1.6,
         enable_precise_upscale=True,
     )  # fmt: skip

@@ -205,8 +205,8 @@ def map_photos(matched: MatchedPhotos, progress: Callable[[int], None] | None = 
     """Global-shutter reconstruction by incremental mapping with loosened thresholds.
 
     Only photos that registered are in it. Mapping is tried with the strongest keypoints first, then with all, then
-    with less loose thresholds, until all photos are in one model; the attempt with the most photos is returned. A camera
-    that is only a guess is refined first, with tight thresholds: loose ones let the focal length run away.
+    with less loose thresholds, until all photos are in one model; the attempt with the most photos is returned. A
+    camera that is only a guess is refined first, with tight thresholds: loose ones let the focal length run away.
 
     Parameters
     ----------
@@ -237,7 +237,9 @@ def map_photos(matched: MatchedPhotos, progress: Callable[[int], None] | None = 
 
 
 def _best_model(
-    matched: MatchedPhotos, attempts: Sequence[tuple[int | None, float]], progress: Callable[[int], None] | None
+    matched: MatchedPhotos,
+    attempts: Sequence[tuple[int | None, float]],
+    progress: Callable[[int], None] | None,
 ) -> Any:
     """The pycolmap model with the most photos over attempts (number of keypoints, looseness), or None."""
     pycolmap = _pycolmap()
@@ -293,9 +295,7 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction) -> Rec
                 model, motion = reconstruction.shutter_model, reconstruction.motion(index_of[name])
             db.update_keypoints(index + 1, _pinhole_keypoints(matched.features[index], camera, motion, model))
         db.clear_two_view_geometries()
-    pycolmap.geometric_verification(
-        matched.database, two_view_geometry_options=_verification(_TIGHT_PX, matched.seed)
-    )
+    pycolmap.geometric_verification(matched.database, two_view_geometry_options=_verification(_TIGHT_PX, matched.seed))
     empty = _posed_model(matched, reconstruction, cameras)
     options = _pipeline_options(1.0, matched.seed, False, len(matched.names))
     options.mapper.filter_max_reproj_error = _TIGHT_PX

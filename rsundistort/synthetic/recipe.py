@@ -76,9 +76,7 @@ class Recipe:
     jpeg_quality: int
 
 
-def look_at(
-    center_w: NDArray[np.float64], target_w: NDArray[np.float64], roll_deg: float = 0.0
-) -> NDArray[np.float64]:
+def look_at(center_w: NDArray[np.float64], target_w: NDArray[np.float64], roll_deg: float = 0.0) -> NDArray[np.float64]:
     """R_cw (3, 3) of a camera at center_w that looks at target_w.
 
     Parameters
@@ -105,9 +103,7 @@ def look_at(
     return np.array([cos * right + sin * down, cos * down - sin * right, forward])
 
 
-def _take(
-    entry: Any, where: str, required: tuple[str, ...], optional: tuple[str, ...] = ()
-) -> dict[str, Any]:
+def _take(entry: Any, where: str, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, Any]:
     """The entry, which must be an object with these keys and no others."""
     if not isinstance(entry, dict):
         raise FormatError(f"{where}: expected an object, got {entry!r}")
@@ -156,9 +152,7 @@ def _surface(entry: Any, where: str, textures: dict[str, Texture], rng: np.rando
     optional = ("offset_m", "openings") if kind == "rectangle" else ("offset_m",)
     _take(entry, where, ("kind", "origin_w", "edge_a", "edge_b", "texture"), optional)
     offset = tuple(entry.get("offset_m", (0.0, 0.0)))
-    patch = Patch(
-        entry["origin_w"], entry["edge_a"], entry["edge_b"], entry["texture"], offset, kind == "triangle"
-    )
+    patch = Patch(entry["origin_w"], entry["edge_a"], entry["edge_b"], entry["texture"], offset, kind == "triangle")
     if "openings" not in entry:
         return [patch]
     openings = []
@@ -198,9 +192,7 @@ def _parse(data: Any) -> Recipe:
     )
     _take(data, "recipe", keys)
     if data["format"] != _FORMAT or data["version"] != _VERSION:
-        raise FormatError(
-            f"format {data['format']!r} version {data['version']!r}, expected {_FORMAT} {_VERSION}"
-        )
+        raise FormatError(f"format {data['format']!r} version {data['version']!r}, expected {_FORMAT} {_VERSION}")
     seed = data["seed"]
     camera = Camera(**_take(data["camera"], "camera", ("width", "height", "K", "dist", "readout")))
     textures = {name: _texture(entry, f"textures.{name}") for name, entry in data["textures"].items()}
@@ -217,9 +209,7 @@ def _parse(data: Any) -> Recipe:
         views.append(View(f"{k:04d}.jpg", R_cw, center, motions[k]))
     options = dict(_take(data["render"], "render", ("jpeg_quality",), ("samples", "spread_px", "exposure")))
     quality = options.pop("jpeg_quality")
-    return Recipe(
-        data["name"], Scene(tuple(patches), textures, light, seed), camera, tuple(views), options, quality
-    )
+    return Recipe(data["name"], Scene(tuple(patches), textures, light, seed), camera, tuple(views), options, quality)
 
 
 def load_recipe(path: str | Path) -> Recipe:

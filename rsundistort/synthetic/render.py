@@ -25,6 +25,7 @@ from ..errors import FileError
 from ..model.camera import READOUTS, Camera
 from ..model.checks import check_finite
 from ..model.motion import RowMotion
+from .lens import undistort_to_rays
 from .recipe import Recipe, View, load_recipe
 from .scene import Scene
 
@@ -62,17 +63,10 @@ def _normalised(camera: Camera, uv_raw: NDArray[np.float64]) -> NDArray[np.float
     K = camera.K
     if not camera.dist.any():
         return (uv_raw - K[:2, 2]) / np.diag(K)[:2]
-    # 1e-14: OpenCV's default of five steps is wrong by whole pixels at the edge of a wide lens
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
-    flat = np.ascontiguousarray(uv_raw.reshape(-1, 1, 2))
-    return np.asarray(cv2.undistortPoints(flat, K, camera.dist, criteria=criteria), float).reshape(
-        uv_raw.shape
-    )
+    return undistort_to_rays(uv_raw, K, camera.dist)
 
 
-def pixel_rays(
-    camera: Camera, view: View, uv_raw: ArrayLike
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def pixel_rays(camera: Camera, view: View, uv_raw: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """World rays along which the centres of raw pixels see.
 
     Parameters
@@ -157,9 +151,7 @@ def render_view(
         v, u = np.mgrid[row : row + len(strip), : camera.width].astype(float)
         # All samples of a pixel have the pose of its line, whatever their offset: that is how a line exposes.
         xy_norm = _normalised(camera, np.stack([u, v], -1)[:, :, None] + offsets)
-        raycast.render_rows(
-            scene.geometry, scene.look, R_cw, center_w, by_column, row, xy_norm, spacing, suns, strip
-        )
+        raycast.render_rows(scene.geometry, scene.look, R_cw, center_w, by_column, row, xy_norm, spacing, suns, strip)
     return _develop(image, exposure)
 
 
@@ -246,13 +238,9 @@ def render_scene(
     source = None if isinstance(recipe, Recipe) else Path(recipe)
     loaded = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
     out = Path(out_dir)
-    existing = [
-        name for name in ("photos", "global", "camera.json", "ground_truth.json") if (out / name).exists()
-    ]
+    existing = [name for name in ("photos", "global", "camera.json", "ground_truth.json") if (out / name).exists()]
     if existing and not overwrite:
-        raise FileError(
-            f"{out} already holds {', '.join(existing)}; ask for overwriting, or choose another folder"
-        )
+        raise FileError(f"{out} already holds {', '.join(existing)}; ask for overwriting, or choose another folder")
     try:
         for folder in ("photos", "global"):
             (out / folder).mkdir(parents=True, exist_ok=True)
@@ -265,9 +253,7 @@ def render_scene(
             if progress is not None:
                 progress(done + 1, len(loaded.views))
         described = {"width": camera.width, "height": camera.height, "K": camera.K.tolist()}
-        _write_json(
-            out / "camera.json", {**described, "dist": camera.dist.tolist(), "readout": camera.readout}
-        )
+        _write_json(out / "camera.json", {**described, "dist": camera.dist.tolist(), "readout": camera.readout})
         _write_json(out / "ground_truth.json", _truth(loaded))
         if source is not None and source.resolve() != (out / "recipe.json").resolve():
             shutil.copyfile(source, out / "recipe.json")

@@ -234,9 +234,7 @@ def _sky_image(light: Light, seed: int) -> NDArray[np.float32]:
     return np.asarray(image + (white - image) * 0.85 * cover[..., None], np.float32)
 
 
-def _tree(
-    low: NDArray[np.float64], high: NDArray[np.float64]
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+def _tree(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Order of the patches, and bounds (n, 6) and links (n, 3) of a tree of boxes, split at the median."""
     center = (low + high) / 2
     order: list[int] = []
@@ -361,9 +359,7 @@ class Scene:
             np.array([self.light.sun, self.light.sky, self.light.bounce], float),
         )
 
-    def cast(
-        self, origins_w: ArrayLike, directions_w: ArrayLike
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def cast(self, origins_w: ArrayLike, directions_w: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Nearest surface along rays.
 
         Parameters

@@ -44,9 +44,7 @@ class _Canvas:
         shift = self.rng.uniform(1.0, 2.0, 2)
         scale = np.array([[1 / step[0], 0, shift[0]], [0, 1 / step[1], shift[1]]])
         flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-        field_ = cv2.warpAffine(
-            grid, scale, (self.cols, self.rows), flags=flags, borderMode=cv2.BORDER_REFLECT
-        )
+        field_ = cv2.warpAffine(grid, scale, (self.cols, self.rows), flags=flags, borderMode=cv2.BORDER_REFLECT)
         return np.asarray(field_ / 0.72, np.float32)  # 0.72: what interpolation leaves of the unit spread
 
     def fractal(self, coarse_m: float, fine_m: float, gain: float = 0.8) -> _Image:
@@ -139,9 +137,7 @@ def blocks(
     pits = _smoothstep(canvas.fractal(0.12, 0.03), 1.1, 2.0)
     surface = 1 + relief * bevel + grain * canvas.fractal(0.6, 0.03, 0.8) - 2.5 * grain * pits
     joints = _rgb(joint_colour) * (1 + 0.12 * canvas.fractal(0.2, 0.04))[..., None]
-    image = _mix(
-        joints, face * surface[..., None], _smoothstep(edge, 0.5 * joint_m - 0.5 * soft, 0.5 * joint_m + soft)
-    )
+    image = _mix(joints, face * surface[..., None], _smoothstep(edge, 0.5 * joint_m - 0.5 * soft, 0.5 * joint_m + soft))
     return _weather(canvas, image, weather)
 
 
@@ -158,9 +154,7 @@ def plaster(
     paint = _rgb(colour) * (1 + 0.07 * canvas.fractal(3.0, 0.25))[..., None]
     patch = _smoothstep(canvas.fractal(1.6, 0.1, 0.6), 0.5, 0.7)
     paint = _mix(paint, paint * np.array([0.90, 0.89, 0.88], np.float32), patch)
-    spots = _smoothstep(canvas.fractal(0.16, 0.04), 1.3, 2.1) - 0.7 * _smoothstep(
-        canvas.fractal(0.2, 0.05), 1.4, 2.2
-    )
+    spots = _smoothstep(canvas.fractal(0.16, 0.04), 1.3, 2.1) - 0.7 * _smoothstep(canvas.fractal(0.2, 0.05), 1.4, 2.2)
     paint *= (1 + grain * canvas.fractal(0.5, 0.035, 0.8) - 3.0 * grain * spots)[..., None]
     crack = np.abs(canvas.fractal(1.8, 0.1, 0.55))
     cracked = (1 - _smoothstep(crack, 0.006, 0.03)) * _smoothstep(canvas.noise(2.5), 0.2, 0.8)
@@ -201,11 +195,7 @@ def planks(
     right = np.concatenate([ends, [ends[-1] + 1]])[board]
     gap = np.minimum(x.ravel() - left, right - x.ravel()).reshape(x.shape).astype(np.float32)
     tint = rng.normal(0, variation, (num + 1, 1)) + rng.normal(0, variation / 10, (num + 1, 3))
-    fibre = (
-        turned.noise(0.035, (1.0, 10.0))
-        + 0.8 * turned.noise(0.08, (1.0, 8.0))
-        + 0.6 * turned.fractal(0.4, 0.04)
-    )
+    fibre = turned.noise(0.035, (1.0, 10.0)) + 0.8 * turned.noise(0.08, (1.0, 8.0)) + 0.6 * turned.fractal(0.4, 0.04)
     knots = _smoothstep(turned.noise(0.10, (1.0, 1.6)), 1.9, 2.4)
     face = (_rgb(colour) * (1 + tint.astype(np.float32)))[board].reshape(*x.shape, 3) * (
         1 + 0.7 * grain * fibre - 0.5 * knots
@@ -225,9 +215,7 @@ def crate(canvas: _Canvas, *, colour: _Colour, side_m: float = 0.8, weather: flo
     across = np.abs(np.mod(x, side_m) - np.mod(y, side_m)) / np.sqrt(2)
     rim = np.minimum(to_edge - 0.09, across - 0.05)
     image = _mix(frame, image, _smoothstep(rim, -0.004, 0.006))
-    image = _mix(
-        image, 0.6 * image, (1 - _smoothstep(np.abs(rim - 0.008), 0.0, 0.016))
-    )  # shadow of the frame
+    image = _mix(image, 0.6 * image, (1 - _smoothstep(np.abs(rim - 0.008), 0.0, 0.016)))  # shadow of the frame
     return _weather(canvas, image, weather)
 
 
@@ -245,26 +233,19 @@ def windows(
     glass = rng.uniform(0.24, 0.46, (j.max() + 1, i.max() + 1, 1)) * np.array([0.85, 0.98, 1.15])
     slope = rng.normal(0.10, 0.12, (j.max() + 1, i.max() + 1))
     fx, fy = x / pane_m[0] - i, y / pane_m[1] - j
-    image = (
-        glass[j, i] * (1 + 0.25 * canvas.fractal(0.7, 0.1))[..., None]
-        + (slope[j, i] * (fy - 0.3 * fx))[..., None]
-    )
+    image = glass[j, i] * (1 + 0.25 * canvas.fractal(0.7, 0.1))[..., None] + (slope[j, i] * (fy - 0.3 * fx))[..., None]
     a, b = i // panes[0], j // panes[1]
     drawn = rng.uniform(-0.6, 0.45, (2, b.max() + 1, a.max() + 1))
     sx = x / (pane_m[0] * panes[0]) - a
     folds = 0.55 + 0.10 * np.sin(2 * np.pi * (sx * 9 + 0.4 * canvas.noise(0.5, (1.0, 4.0))))
-    curtain = _smoothstep(
-        np.maximum(drawn[0, b, a] - sx, drawn[1, b, a] - (1 - sx)).astype(np.float32), -0.01, 0.02
-    )
+    curtain = _smoothstep(np.maximum(drawn[0, b, a] - sx, drawn[1, b, a] - (1 - sx)).astype(np.float32), -0.01, 0.02)
     image = _mix(image, folds[..., None] * np.array([0.95, 0.92, 0.84]), 0.75 * curtain)
     near = np.minimum(np.minimum(fx, 1 - fx) * pane_m[0], np.minimum(fy, 1 - fy) * pane_m[1])
     sash = np.minimum(np.minimum(sx, 1 - sx) * pane_m[0] * panes[0], near + 0.03)
     sy = y / (pane_m[1] * panes[1]) - b
     sash = np.minimum(sash, np.minimum(sy, 1 - sy) * pane_m[1] * panes[1])
     wood = _rgb(frame_colour) * (1 + 0.10 * canvas.fractal(0.3, 0.04))[..., None]
-    image = _mix(
-        wood, image, _smoothstep(np.minimum(near - 0.018, sash - 0.045).astype(np.float32), 0.0, 0.010)
-    )
+    image = _mix(wood, image, _smoothstep(np.minimum(near - 0.018, sash - 0.045).astype(np.float32), 0.0, 0.010))
     return np.asarray(image, np.float32)
 
 
@@ -318,9 +299,7 @@ class Texture:
         if unknown or missing:
             raise InputError(f"texture of kind {self.kind!r}: unknown keys {unknown}, missing keys {missing}")
         if len(self.size_m) != 2 or min(self.size_m) <= 0 or self.texels_per_m <= 0:
-            raise InputError(
-                f"texture: size_m={self.size_m}, texels_per_m={self.texels_per_m}, expected positive"
-            )
+            raise InputError(f"texture: size_m={self.size_m}, texels_per_m={self.texels_per_m}, expected positive")
 
     def pyramid(self, seed: int, name: str) -> list[NDArray[np.uint8]]:
         """Mip levels (rows, cols, 3), RGB, gamma-encoded, each half as large as the one before.
@@ -335,8 +314,6 @@ class Texture:
         image = np.clip(cv2.GaussianBlur(image, (0, 0), 1.0), 0, 1)
         levels = [np.round(255 * image).astype(np.uint8)]
         while min(image.shape[:2]) >= 4:
-            image = cv2.resize(
-                image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA
-            )
+            image = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
             levels.append(np.round(255 * image).astype(np.uint8))
         return levels

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..model import READOUTS, Camera
+from .lens import undistort_to_rays
 
 __all__ = ["random_phi", "warp_photo"]
 
@@ -55,9 +56,7 @@ def random_phi(
     return result
 
 
-def warp_photo(
-    photo: NDArray[Any], camera: Camera, phi: NDArray[np.float64]
-) -> tuple[NDArray[Any], NDArray[np.uint8]]:
+def warp_photo(photo: NDArray[Any], camera: Camera, phi: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[np.uint8]]:
     """The photo that a camera rotating by phi would have taken in place of this global-shutter one.
 
     A pixel of the result was read when the clock stood at its own (distorted) row, so the direction it saw is known:
@@ -91,9 +90,7 @@ def warp_photo(
         clock = np.repeat((sign * (u - K[0, 2]) / K[0, 0])[None, :], h, axis=0)
     uu, vv = np.meshgrid(u, v)
     if dist.any():
-        tight = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-13)
-        pixels = np.dstack([uu, vv]).reshape(-1, 1, 2)
-        ray = cv2.undistortPointsIter(pixels, K, dist, np.eye(3), np.eye(3), tight).reshape(h, w, 2)
+        ray = undistort_to_rays(np.dstack([uu, vv]), K, dist)
         x, y = ray[..., 0], ray[..., 1]
     else:
         x, y = (uu - K[0, 2]) / K[0, 0], (vv - K[1, 2]) / K[1, 1]

@@ -1,0 +1,93 @@
+"""The row models once more, in plain NumPy: the source of synthetic measurements.
+
+Shares no function with the library, and no derivation where that could be avoided: implicit rows are found by
+bisection or as fixed points, column readout is written out instead of exchanging x and y, rotations are SciPy's, the
+lens is OpenCV's. `phi` is per unit of the clock, as everywhere.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+MODELS = ("global", "two-step", "linearized", "rotation")
+DIRECTIONS = ("top-to-bottom", "bottom-to-top", "left-to-right", "right-to-left")
+
+
+def clock(readout, xy):
+    """The clock of normalised image coordinates (n, 2): it runs along the readout."""
+    return {
+        "top-to-bottom": xy[:, 1],
+        "bottom-to-top": -xy[:, 1],
+        "left-to-right": xy[:, 0],
+        "right-to-left": -xy[:, 0],
+    }[readout]
+
+
+def lens(dist, xy):
+    """OpenCV's lens on normalised coordinates (n, 2)."""
+    rays = np.column_stack([xy, np.ones(len(xy))])
+    coefficients = np.asarray(dist, float) if len(dist) else None
+    return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), coefficients)[0][:, 0]
+
+
+def two_step(xy, phi, readout):
+    """Paper Eqs. 8-9; for columns the same with x and y exchanged, written out."""
+    x, y = xy.T
+    p1, p2, p3 = phi if readout in ("top-to-bottom", "left-to-right") else -np.asarray(phi)
+    if readout in ("top-to-bottom", "bottom-to-top"):
+        x2, y2 = x - p3 * y**2, y + p3 * x * y
+        return np.column_stack([x2 + p2 * y2, (1 - p1) * y2])
+    # dx = p2 x - p3 x y and dy = -p1 x + p3 x^2 are what the rotation does to first order
+    x2, y2 = x - p3 * x * y, y + p3 * x**2
+    return np.column_stack([(1 + p2) * x2, y2 - p1 * x2])
+
+
+def linearized(xy, phi, readout):
+    """Paper Eq. 6: the pixel at (I + t [phi]x) x', whose own clock is t; bisection on t."""
+    rays = np.column_stack([xy, np.ones(len(xy))])
+
+    def turned(t):
+        q = rays + t[:, None] * np.cross(phi, rays)
+        return q[:, :2] / q[:, 2:]
+
+    low, high = clock(readout, xy) - 0.5, clock(readout, xy) + 0.5
+    assert (clock(readout, turned(low)) > low).all()
+    assert (clock(readout, turned(high)) < high).all()
+    for _ in range(60):
+        middle = (low + high) / 2
+        late = clock(readout, turned(middle)) > middle
+        low, high = np.where(late, middle, low), np.where(late, high, middle)
+    return turned((low + high) / 2)
+
+
+def rotation(xy, phi, dist, readout):
+    """Paper Eq. 2 without translation; the clock is the distorted row, the one that the sensor read."""
+    rays = np.column_stack([xy, np.ones(len(xy))])
+    seen = lens(dist, xy)
+    for _ in range(200):  # contracts by about |phi| a step
+        q = Rotation.from_rotvec(clock(readout, seen)[:, None] * np.asarray(phi)).apply(rays)
+        before, seen = seen, lens(dist, q[:, :2] / q[:, 2:])
+        if np.abs(seen - before).max(initial=0) < 1e-15:
+            break
+    return seen
+
+
+def project_normalised(points_c, phi, model, readout, dist=()):
+    """Distorted normalised coordinates (n, 2) where a rolling-shutter photo shows camera-frame points."""
+    points_c = np.asarray(points_c, float)
+    xy = points_c[:, :2] / points_c[:, 2:]
+    if model == "rotation":
+        return rotation(xy, phi, dist, readout)
+    if model == "two-step":
+        xy = two_step(xy, phi, readout)
+    elif model == "linearized":
+        xy = linearized(xy, phi, readout)
+    return lens(dist, xy)
+
+
+def project(points_w, R_cw, center_w, phi, model, readout, K, dist=()):
+    """Pixels (n, 2) of world points."""
+    normalised = project_normalised((points_w - center_w) @ R_cw.T, phi, model, readout, dist)
+    return normalised * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
