@@ -120,7 +120,30 @@ def closing_table(solution: Solution, out: Path) -> str:
         f"rms residual       {quality['global_rms_px']:.2f} px with a global shutter, {quality['rms_px']:.2f} px now",
         f"outputs            {out}  ({total:.0f} s)",
     ]
+    doubtful = _doubtful(solution)
+    if doubtful:
+        lines += [
+            "",
+            "doubtful (few measurements, or a motion far from the others'; check these, or leave them out):",
+            f"  {', '.join(doubtful)}",
+        ]
     lost = [image for image in solution.images if not image.registered]
     if lost:
         lines += ["", "not joined:", *(f"  {image.name}: {image.reason}" for image in lost)]
     return "\n".join(lines)
+
+
+def _doubtful(solution: Solution) -> list[str]:
+    """Photos whose motion is known to no better than two pixels, or lies beyond five spreads of all of them."""
+    spread = solution.quality["phi_sigma_rad_per_frame"]
+    names = []
+    for image in solution.registered:
+        if image.motion is None or image.sigma_phi is None:
+            continue
+        camera = solution.cameras[image.camera_id]
+        largest = float(abs(image.motion.phi).max()) * camera.frame_span
+        # over half the frame a rotation by an angle moves pixels by about the angle times half the focal length
+        uncertain_px = float(image.sigma_phi.max()) * camera.frame_span * float(camera.K[0, 0]) / 2
+        if uncertain_px > 2.0 or largest > 5.0 * spread:
+            names.append(image.name)
+    return names

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -46,24 +47,39 @@ class _Bars:
         self._shown = shown
         self._bar: Any = None
         self._stage = ""
+        self._lock = threading.Lock()
+        self._ended = threading.Event()
+        if shown:
+            # a stage inside pycolmap says nothing for a while: its clock must go on
+            threading.Thread(target=self._tick, daemon=True).start()
+
+    def _tick(self) -> None:
+        while not self._ended.wait(0.5):
+            with self._lock:
+                if self._bar is not None:
+                    self._bar.refresh()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         if not self._shown:
             return
         from tqdm import tqdm
 
-        if stage != self._stage:
-            self.close()
-            self._stage = stage
-            form = "{desc:<34} {n_fmt}/{total_fmt} {bar} {elapsed}" if total else "{desc:<34} {elapsed}"
-            self._bar = tqdm(total=total or None, desc=stage, leave=False, file=sys.stderr, bar_format=form)
-        self._bar.n = done
-        self._bar.refresh()
+        with self._lock:
+            if stage != self._stage:
+                if self._bar is not None:
+                    self._bar.close()
+                self._stage = stage
+                form = "{desc:<34} {n_fmt}/{total_fmt} {bar} {elapsed}" if total else "{desc:<34} {elapsed}"
+                self._bar = tqdm(total=total or None, desc=stage, leave=False, file=sys.stderr, bar_format=form)
+            self._bar.n = done
+            self._bar.refresh()
 
     def close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None
+        self._ended.set()
+        with self._lock:
+            if self._bar is not None:
+                self._bar.close()
+                self._bar = None
 
 
 @contextmanager

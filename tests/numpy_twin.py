@@ -32,6 +32,15 @@ def lens(dist, xy):
     return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), coefficients)[0][:, 0]
 
 
+def undistort_with_opencv(pixels, K, dist, R=None, P=None):
+    """`cv2.undistortPoints` of pixels (n, 2), iterated to the end; the two majors of OpenCV name it differently."""
+    tight = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
+    R, P = np.eye(3) if R is None else R, np.eye(3) if P is None else P
+    if hasattr(cv2, "undistortPointsIter"):
+        return cv2.undistortPointsIter(pixels[:, None], K, dist, R, P, tight)[:, 0]
+    return cv2.undistortPoints(pixels[:, None], K, dist, R=R, P=P, criteria=tight)[:, 0]
+
+
 def two_step(xy, phi, readout):
     """Paper Eqs. 8-9; for columns the same with x and y exchanged, written out."""
     x, y = xy.T

@@ -16,7 +16,10 @@ from ._jit import kernel, parallel_kernel, prange
 
 GLOBAL, TWO_STEP, LINEARIZED, ROTATION = 0, 1, 2, 3
 
-# Newton on the row ends when a step is below this (normalised units): 1e-10 px at any focal length in use.
+# Newton on the row takes its last step from a gap below this (normalised units): the step squares the gap, and the
+# curvature of the gap is of the order of phi, so 1e-17 is left.
+_LAST_GAP = 1e-8
+# Newton in the plane and on cubics stops at steps below this.
 _ROW_TOL = 1e-14
 _MAX_NEWTON = 30
 _CHUNK = 512
@@ -203,7 +206,7 @@ def _project(model, axis, sign, lens, x, y, z, phi, vel, out, jac, E, L):
     X = x / z
     Y = y / z
     if model == ROTATION:
-        return _project_exact(axis, sign, lens, x, y, z, phi, vel, out, jac, E, L)
+        return _project_exact(axis, sign, lens, x, y, z, phi, vel, math.nan, out, jac, E, L)
     if model == GLOBAL:
         xd, yd, xx, xy, yx, yy, ok = _lens(lens, X, Y)
         out[0] = xd
@@ -261,12 +264,15 @@ def _project(model, axis, sign, lens, x, y, z, phi, vel, out, jac, E, L):
 
 
 @kernel()
-def _project_exact(axis, sign, lens, x, y, z, phi, vel, out, jac, E, L):
-    """Paper Eq. 2 whole, q(t) = Exp(t phi) (x - t v), with t the distorted row (or column) that the sensor read."""
+def _project_exact(axis, sign, lens, x, y, z, phi, vel, start, out, jac, E, L):
+    """Paper Eq. 2 whole, q(t) = Exp(t phi) (x - t v), with t the distorted row (or column) that the sensor read.
+
+    The search for t starts at `start`, or, when that is NaN, at the row of a camera that does not move.
+    """
     X = x / z
     Y = y / z
     xd, yd, xx, xy, yx, yy, ok = _lens(lens, X, Y)
-    t = sign * (yd if axis == 1 else xd)
+    t = start if start == start else sign * (yd if axis == 1 else xd)
     done = False
     slope = -1.0
     q0 = q1 = q2 = 0.0
@@ -300,11 +306,9 @@ def _project_exact(axis, sign, lens, x, y, z, phi, vel, out, jac, E, L):
         if done:
             break
         t -= gap / slope
-        done = abs(gap) < _ROW_TOL * (1.0 + abs(t))
+        done = abs(gap) < _LAST_GAP
     else:
-        # rounding may keep the last gap just above the tolerance
-        if not abs(gap) < 1e-11 * (1.0 + abs(t)):
-            return False
+        return False
     out[0] = xd
     out[1] = yd
     if not jac:
@@ -449,12 +453,22 @@ def fill_map(model, axis, sign, intr, lens, phi, rays, row0, col0, map_x, map_y)
     rows, cols = map_x.shape
     for i in range(rows):
         v = row0 + i
+        # the clock of the last two pixels foretells that of the next
+        t1 = t2 = math.nan
         for j in range(cols):
             u = col0 + j
             x = rays[0, 0] * u + rays[0, 1] * v + rays[0, 2]
             y = rays[1, 0] * u + rays[1, 1] * v + rays[1, 2]
             z = rays[2, 0] * u + rays[2, 1] * v + rays[2, 2]
-            if _project(model, axis, sign, lens, x, y, z, phi, vel, out, False, E, E):
+            if model != ROTATION:
+                ok = _project(model, axis, sign, lens, x, y, z, phi, vel, out, False, E, E)
+            else:
+                ok = z > 0.0 and _project_exact(
+                    axis, sign, lens, x, y, z, phi, vel, 2.0 * t1 - t2, out, False, E, E
+                )
+                t2 = t1
+                t1 = sign * out[axis] if ok else math.nan
+            if ok:
                 map_x[i, j] = intr[0] * out[0] + intr[2]
                 map_y[i, j] = intr[1] * out[1] + intr[3]
             else:

@@ -1,0 +1,393 @@
+"""Bundle adjustment: derivatives through the step, elimination, and what it recovers from the twin's photos."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numba
+import numpy as np
+import pytest
+from numpy_twin import DIRECTIONS, MODELS, project
+from scipy.spatial.transform import Rotation
+
+from rsundistort import BundleOptions, Camera, InputError, Observations, Reconstruction, bundle_adjust, climb
+from rsundistort.bundle import reprojection_residuals
+from rsundistort.bundle.problem import BundleProblem
+
+LENS = [-0.12, 0.03, 0.001, -0.002]
+SHUTTERS = ("two-step", "linearized", "rotation")
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Thousands of calls on problems this small wait for threads longer than they compute; one test asks for more."""
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    yield
+    numba.set_num_threads(threads)
+
+
+def make_cameras(dist=()):
+    """One camera for each readout direction, of different focal lengths."""
+    return [
+        Camera(800, 600, [[700 + 10 * i, 0, 402], [0, 690 + 5 * i, 297], [0, 0, 1]], dist, readout)
+        for i, readout in enumerate(DIRECTIONS)
+    ]
+
+
+def make_scene(rng, model, num_images=6, num_points=60, noise_px=0.0, phi_size=0.05, dist=()):
+    """A cloud seen from all around, rolled and pitched at will: far from every critical motion."""
+    cameras = make_cameras(dist)
+    points_w = rng.uniform(-1, 1, (num_points, 3))
+    center_w = rng.normal(size=(num_images, 3))
+    center_w *= 3.5 / np.linalg.norm(center_w, axis=1, keepdims=True)
+    ahead = -center_w / np.linalg.norm(center_w, axis=1, keepdims=True)
+    right = np.cross(ahead, rng.normal(size=(num_images, 3)))  # any roll
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    R_cw = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    phi = rng.uniform(-phi_size, phi_size, (num_images, 3)) * (model != "global")
+    camera_idx = np.arange(num_images) % len(cameras)
+    point_idx, frame_idx = (a.ravel() for a in np.mgrid[:num_points, :num_images])
+    xy = np.empty((num_points, num_images, 2))
+    for i in range(num_images):
+        camera = cameras[camera_idx[i]]
+        xy[:, i] = project(points_w, R_cw[i], center_w[i], phi[i], model, camera.readout, camera.K, dist)
+    xy += noise_px * rng.normal(size=xy.shape)
+    return Reconstruction(
+        cameras=cameras,
+        image_names=[f"{i}.jpg" for i in range(num_images)],
+        camera_idx=camera_idx,
+        R_cw=R_cw,
+        center_w=center_w,
+        points_w=points_w,
+        observations=Observations(frame_idx, point_idx, xy.reshape(-1, 2)),
+        phi=phi,
+        shutter_model=model,
+    )
+
+
+def perturbed(rec, rng, angle=0.02, length=0.05):
+    """A start near the truth, without any knowledge of the shutter."""
+    turn = Rotation.from_rotvec(angle * rng.normal(size=(rec.num_images, 3))).as_matrix()
+    return replace(
+        rec,
+        R_cw=turn @ rec.R_cw,
+        center_w=rec.center_w + length * rng.normal(size=rec.center_w.shape),
+        points_w=rec.points_w + length * rng.normal(size=rec.points_w.shape),
+        phi=np.zeros_like(rec.phi),
+    )
+
+
+def relative_poses(rec):
+    """Orientations and centres in the frame of photo 0, photo 1 at distance 1: free of the gauge."""
+    centers = (rec.center_w - rec.center_w[0]) @ rec.R_cw[0].T
+    return rec.R_cw @ rec.R_cw[0].T, centers / np.linalg.norm(centers[1])
+
+
+def noisy_problem(rng, model, loss="squared", dense_limit=1500, sigma_px=0.5):
+    """A small problem at a state that is nowhere near a minimum: residuals of tens of pixels."""
+    rec = make_scene(rng, model, num_images=4, num_points=30, noise_px=1.0, dist=LENS)
+    start = replace(perturbed(rec, rng, 0.01, 0.02), phi=rec.phi + 0.02 * rng.normal(size=rec.phi.shape))
+    sigma = rng.uniform(1, 3, len(rec.observations))
+    start = replace(start, observations=replace(rec.observations, sigma=sigma))
+    problem = BundleProblem(start, model, BundleOptions(loss=loss, dense_limit=dense_limit), sigma_px=sigma_px)
+    return problem, problem.initial_state()
+
+
+def unit_steps(problem, state):
+    """A step along each unknown of the photos and points."""
+    equations = problem.linearize(state)
+    frame, point = np.zeros_like(equations._g_frame), np.zeros_like(equations._g_point)
+    for array in (frame, point):
+        for index in np.ndindex(array.shape):
+            array[index] = 1.0
+            yield array is frame, index, (frame, point)
+            array[index] = 0.0
+
+
+def scaled(step, h):
+    return h * step[0], h * step[1]
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_jacobian_equals_central_differences_through_the_step(model, rng):
+    problem, state = noisy_problem(rng, model)
+    obs = problem._start.observations
+    _, J_frame, J_point, _ = problem._blocks(state)
+    h = 1e-6
+
+    def residuals(step):
+        moved = problem.reconstruction(problem.retract(state, step))
+        res, valid = reprojection_residuals(moved)
+        assert valid.all()
+        return res / (0.5 * obs.sigma[:, None])
+
+    for is_frame, (owner, k), step in unit_steps(problem, state):
+        difference = (residuals(scaled(step, h)) - residuals(scaled(step, -h))) / (2 * h)
+        owners = obs.frame_idx if is_frame else obs.point_idx
+        expected = np.where((owners == owner)[:, None], (J_frame if is_frame else J_point)[:, :, k], 0.0)
+        # entries are of the size of the focal length over sigma; rounding of 400 px over h is 1e-7 of them
+        assert np.abs(difference - expected).max() <= 1e-6 * np.abs(J_frame[:, :, :3]).max()
+
+
+@pytest.mark.parametrize(
+    ("model", "loss"),
+    [*((m, "squared") for m in MODELS), *(("rotation", loss) for loss in ("soft-l1", "huber", "cauchy"))],
+)
+def test_gradient_equals_central_differences_of_the_cost(model, loss, rng):
+    # with sigma 10 px the residuals lie on both sides of where the losses bend
+    problem, state = noisy_problem(rng, model, loss, sigma_px=0.5 if loss == "squared" else 10.0)
+    equations = problem.linearize(state)
+    assert equations.cost == pytest.approx(problem.cost(state), rel=1e-13)  # sums of the same numbers
+    h = 1e-5
+    size = np.abs(equations._g_frame).max(), np.abs(equations._g_point).max()
+    for is_frame, index, step in unit_steps(problem, state):
+        ahead, behind = (problem.cost(problem.retract(state, scaled(step, s))) for s in (h, -h))
+        gradient = (equations._g_frame if is_frame else equations._g_point)[index]
+        # third derivatives give h^2 (f/sigma)^2 = 1e-4 of some 1e4; rounding of the cost over h as little
+        assert abs((ahead - behind) / (2 * h) - gradient) <= 1e-6 * size[0 if is_frame else 1]
+
+
+def dense_system(problem, state):
+    """Hessian and gradient of all unknowns, photos first, written out; with the mask of the free ones."""
+    res, J_frame, J_point, _ = problem._blocks(state)
+    obs = problem._start.observations  # made in the order of the problem: by point, then by photo
+    m, nb = problem._free.shape
+    J = np.zeros((len(obs), 2, m * nb + 3 * problem._start.num_points))
+    for k in range(len(obs)):
+        f, p = nb * obs.frame_idx[k], m * nb + 3 * obs.point_idx[k]
+        J[k, :, f : f + nb] = J_frame[k]
+        J[k, :, p : p + 3] = J_point[k]
+    J = J.reshape(-1, J.shape[2])
+    H, g = J.T @ J, J.T @ res.ravel()
+    if nb == 9:  # prior: (phi * span / spread)^2 / 2
+        weight = np.zeros((m, nb))
+        weight[:, 6:] = (problem._start.frame_span() / problem._options.phi_sigma_start)[:, None] ** 2
+        gradient = np.zeros((m, nb))
+        gradient[:, 6:] = weight[:, 6:] * state.phi
+        H[: m * nb, : m * nb] += np.diag(weight.ravel())
+        g[: m * nb] += gradient.ravel()
+    return H, g, np.concatenate([problem._free.ravel(), np.ones(3 * problem._start.num_points, bool)])
+
+
+@pytest.mark.parametrize("damping", [1e-6, 1e-2, 10.0])
+@pytest.mark.parametrize("dense_limit", [1500, 0], ids=["dense", "sparse"])
+@pytest.mark.parametrize(("model", "loss"), [("global", "squared"), ("rotation", "squared"), ("two-step", "cauchy")])
+def test_elimination_gives_the_step_of_the_whole_system(model, loss, dense_limit, damping, rng):
+    problem, state = noisy_problem(rng, model, loss, dense_limit)
+    H, g, free = dense_system(problem, state)
+    expected = np.zeros(len(g))
+    damped = H + damping * np.diag(np.diag(H))
+    # unit diagonal, as any reference solution needs: unknowns differ by orders of magnitude
+    scale = 1 / np.sqrt(np.diag(damped)[free])
+    expected[free] = scale * np.linalg.solve(scale[:, None] * damped[np.ix_(free, free)] * scale, -scale * g[free])
+    (frame, point), predicted = problem.linearize(state).solve(damping)
+    step = np.concatenate([frame.ravel(), point.ravel()])
+    assert (step[~free] == 0).all()
+    # condition numbers up to 1e6 times rounding
+    np.testing.assert_allclose(step, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+    assert predicted == pytest.approx(-(g @ expected + 0.5 * expected @ H @ expected), rel=1e-8)
+
+
+@pytest.mark.parametrize("dense_limit", [1500, 0], ids=["dense", "sparse"])
+def test_variances_of_phi_are_those_of_the_whole_inverse(dense_limit, rng):
+    problem, state = noisy_problem(rng, "rotation", dense_limit=dense_limit)
+    H, _, free = dense_system(problem, state)
+    scale = 1 / np.sqrt(np.diag(H)[free])
+    inverse = scale[:, None] * np.linalg.inv(scale[:, None] * H[np.ix_(free, free)] * scale) * scale
+    variances = np.zeros(len(free))
+    variances[free] = np.diag(inverse)
+    frames = variances[: problem._free.size].reshape(problem._free.shape)
+    np.testing.assert_allclose(problem.phi_variance(state), frames[:, 6:], rtol=1e-8)  # as the step
+
+
+@pytest.mark.parametrize("dist", [[], LENS], ids=["pinhole", "lens"])
+@pytest.mark.parametrize("model", MODELS)
+def test_residuals_and_gradient_vanish_at_the_truth_of_the_twin(model, dist, rng):
+    rec = make_scene(rng, model, dist=dist)
+    res, valid = reprojection_residuals(rec)
+    assert valid.all()
+    assert np.abs(res).max() < 1e-9  # px: 1e-12 times the focal length
+    options = BundleOptions(loss="squared", phi_sigma=1e9)  # else the prior pulls
+    problem = BundleProblem(rec, model, options, sigma_px=1.0)
+    equations = problem.linearize(problem.initial_state())
+    # Jacobians of 1000 px times residuals of 1e-12 to 1e-10 px, summed over 60 points or 6 photos
+    assert np.abs(equations._g_frame).max() < 1e-5
+    assert np.abs(equations._g_point).max() < 1e-5
+    assert equations.cost < 1e-15
+
+
+@pytest.mark.parametrize("model", SHUTTERS)
+def test_truth_is_recovered_without_noise(model, rng):
+    truth = make_scene(rng, model, dist=LENS)
+    # a prior of 10 rad weighs nothing against thousands of pixels a radian
+    options = BundleOptions(loss="squared", sigma_px=0.5, phi_sigma=10.0, outlier_rounds=0, cost_tolerance=1e-12)
+    result = bundle_adjust(perturbed(truth, rng), model, options)
+    assert result.converged
+    assert result.reconstruction.shutter_model == model
+    # the prior's pull on phi: 0.05 / 100 against (700 / 0.5)^2, and what it does to the rest
+    np.testing.assert_allclose(result.reconstruction.phi, truth.phi, atol=1e-8)
+    for found, true in zip(relative_poses(result.reconstruction), relative_poses(truth), strict=True):
+        np.testing.assert_allclose(found, true, atol=1e-7)
+    assert result.rms_px < 1e-5
+    assert result.num_outliers == 0
+
+
+def test_ladder_ends_at_the_truth_and_climbs_in_order(rng):
+    truth = make_scene(rng, "rotation")
+    seen = []
+    results = climb(perturbed(truth, rng), progress=lambda model, cost: seen.append(model))
+    assert list(results) == ["global", "two-step", "rotation"]
+    assert list(dict.fromkeys(seen)) == list(results)
+    assert results["global"].rms_px > results["two-step"].rms_px > results["rotation"].rms_px
+    assert (results["global"].reconstruction.phi == 0).all()
+    # noise is taken for 0.02 px at least, so phi's deviation for 1e-4; the prior pulls by a small part of that
+    np.testing.assert_allclose(results["rotation"].reconstruction.phi, truth.phi, atol=1e-5)
+
+
+@pytest.mark.parametrize("noise_px", [0.1, 0.5, 2.0])
+def test_residuals_and_errors_scale_with_the_noise(noise_px, rng):
+    truth = make_scene(rng, "rotation", num_images=8, num_points=80, noise_px=noise_px)
+    result = bundle_adjust(perturbed(truth, rng), "rotation")
+    # 1280 measurements, 8 * 9 + 3 * 80 - 7 unknowns: residuals are 0.87 of the noise, within 2 % (one sigma)
+    assert 0.6 * noise_px < result.rms_px < 1.1 * noise_px
+    # the median of 1280 residuals knows sigma to 3 %
+    assert result.sigma_px == pytest.approx(noise_px, rel=0.15)
+    # normalised errors have a spread of 1 if the deviations are honest; 24 of them, not independent
+    normalised = (result.reconstruction.phi - truth.phi) / result.sigma_phi
+    assert 0.5 < np.sqrt(np.mean(normalised**2)) < 1.6
+    # the prior is estimated from 24 values of a true spread of 0.05 / sqrt(3) a unit
+    spread = np.sqrt(np.mean((truth.phi * truth.frame_span()[:, None]) ** 2))
+    assert result.phi_sigma == pytest.approx(spread, rel=0.25)
+
+
+def test_gross_outliers_are_dropped_and_the_estimate_stays(rng):
+    truth = make_scene(rng, "rotation", num_images=8, num_points=80, noise_px=0.5)
+    obs = truth.observations
+    gross = rng.random(len(obs)) < 0.05
+    direction = rng.normal(size=(len(obs), 2))
+    direction *= rng.uniform(20, 200, (len(obs), 1)) / np.linalg.norm(direction, axis=1, keepdims=True)
+    spoiled = replace(obs, xy_raw=obs.xy_raw + gross[:, None] * direction)
+    start = replace(perturbed(truth, rng), observations=spoiled)
+    result = bundle_adjust(start, "rotation")
+    kept = {tuple(xy) for xy in result.reconstruction.observations.xy_raw}
+    assert not kept & {tuple(xy) for xy in spoiled.xy_raw[gross]}
+    # good ones go with them where an outlier still bends its point in the first round: seen up to one each
+    assert gross.sum() <= result.num_outliers <= 3 * gross.sum()
+    assert 0.3 < result.rms_px < 0.55
+    clean = bundle_adjust(perturbed(truth, rng), "rotation")
+    # losing 5 % of the measurements moves the estimate by less than its own uncertainty
+    assert (np.abs(result.reconstruction.phi - clean.reconstruction.phi) < 2 * clean.sigma_phi).all()
+    assert np.sqrt(np.mean(((result.reconstruction.phi - truth.phi) / result.sigma_phi) ** 2)) < 1.6
+
+
+def test_estimate_from_gross_outliers_does_not_depend_on_the_loss(rng):
+    truth = make_scene(rng, "rotation", num_images=8, num_points=80, noise_px=0.5)
+    obs = truth.observations
+    gross = rng.random(len(obs)) < 0.05
+    spoiled = replace(obs, xy_raw=obs.xy_raw + gross[:, None] * rng.uniform(20, 200, (len(obs), 2)))
+    start = replace(perturbed(truth, rng), observations=spoiled)
+    losses = ("soft-l1", "cauchy")
+    results = [bundle_adjust(start, "rotation", BundleOptions(loss=loss)) for loss in losses]
+    # the last rounds are squares; which good ones went with the outliers differs, and moves phi by less than its noise
+    for result in results[1:]:
+        assert (np.abs(result.reconstruction.phi - results[0].reconstruction.phi) < results[0].sigma_phi).all()
+
+
+def test_anchored_components_stay_exactly_zero(rng):
+    truth = make_scene(rng, "rotation", noise_px=0.5)
+    options = BundleOptions(held_phi={"2.jpg": (0,), "4.jpg": (0, 1, 2)})
+    result = bundle_adjust(replace(perturbed(truth, rng), phi=truth.phi), "rotation", options)
+    held = np.zeros((6, 3), bool)
+    held[2, 0] = held[4] = True
+    assert (result.reconstruction.phi[held] == 0).all()
+    assert (result.reconstruction.phi[~held] != 0).all()
+    assert (result.sigma_phi[held] == 0).all()
+    assert (result.sigma_phi[~held] > 0).all()
+
+
+def test_unknown_anchors_are_refused_by_name(rng):
+    rec = make_scene(rng, "rotation")
+    with pytest.raises(InputError, match=r"anchor 'x\.jpg' is not a photo"):
+        bundle_adjust(rec, "rotation", BundleOptions(held_phi={"x.jpg": (0,)}))
+    with pytest.raises(InputError, match=r"anchor '1\.jpg': components \(3,\)"):
+        bundle_adjust(rec, "rotation", BundleOptions(held_phi={"1.jpg": (3,)}))
+
+
+def test_too_little_to_adjust_is_refused(rng):
+    rec = make_scene(rng, "rotation")
+    nothing = rec.observations.select(np.zeros(0, int))
+    with pytest.raises(InputError, match="two photos and measurements"):
+        bundle_adjust(replace(rec, observations=nothing), "rotation", BundleOptions(sigma_px=1.0))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"loss": "l2"}, "loss='l2', expected one of squared, huber"),
+        ({"sigma_px": 0.0}, "sigma_px=0.0, expected a positive number or None"),
+        ({"phi_sigma": -1.0}, "phi_sigma=-1.0, expected a positive number or None"),
+        ({"cost_tolerance": float("nan")}, "cost_tolerance=nan, expected a positive number"),
+        ({"max_iterations": 0}, "max_iterations must be at least 1"),
+    ],
+)
+def test_wrong_options_are_refused_by_name(options, message):
+    with pytest.raises(InputError, match=message):
+        BundleOptions(**options)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_similarity_of_the_world_leaves_residuals_unchanged(model, rng):
+    rec = make_scene(rng, model, noise_px=0.5, dist=LENS)
+    A, scale, shift = Rotation.random(rng=rng).as_matrix(), 3.7, np.array([10.0, -20.0, 5.0])
+    moved = replace(
+        rec,
+        R_cw=rec.R_cw @ A.T,
+        center_w=scale * rec.center_w @ A.T + shift,
+        points_w=scale * rec.points_w @ A.T + shift,
+    )
+    # rounding of coordinates of 20 scene sizes
+    np.testing.assert_allclose(reprojection_residuals(moved)[0], reprojection_residuals(rec)[0], atol=1e-9)
+
+
+def test_same_input_gives_the_same_result_on_any_number_of_threads(rng):
+    truth = make_scene(rng, "rotation", num_images=8, num_points=200, noise_px=0.5)
+    start = perturbed(truth, rng)
+
+    def solve(n):
+        numba.set_num_threads(min(n, numba.config.NUMBA_NUM_THREADS))
+        rec = bundle_adjust(start, "rotation").reconstruction
+        return np.concatenate([rec.phi.ravel(), rec.center_w.ravel(), rec.R_cw.ravel(), rec.points_w.ravel()])
+
+    one, again, two = solve(1), solve(1), solve(2)
+    np.testing.assert_array_equal(one, again)
+    # every loop in parallel owns what it writes, so sums are the same; LAPACK's may not be
+    np.testing.assert_allclose(two, one, rtol=1e-9, atol=1e-12)
+
+
+def test_order_of_the_measurements_does_not_matter(rng):
+    truth = make_scene(rng, "rotation", noise_px=0.5)
+    start = perturbed(truth, rng)
+    shuffled = replace(start, observations=start.observations.select(rng.permutation(len(start.observations))))
+    one, two = (bundle_adjust(rec, "rotation").reconstruction for rec in (start, shuffled))
+    np.testing.assert_allclose(two.phi, one.phi, rtol=0, atol=1e-12)  # sorted before the sums
+    np.testing.assert_allclose(two.points_w, one.points_w, rtol=0, atol=1e-12)
+
+
+def test_cost_falls_with_each_accepted_step_and_the_reason_is_said(rng):
+    start = perturbed(make_scene(rng, "rotation", noise_px=0.5), rng)
+    once = BundleOptions(outlier_rounds=0)
+    result = bundle_adjust(start, "rotation", once)
+    assert result.stop_reason == "cost"
+    assert result.converged
+    assert len(result.cost_history) > 3
+    assert (np.diff(result.cost_history) < 0).all()
+    assert result.num_iterations >= len(result.cost_history) - 1
+    costs = []
+    short = bundle_adjust(start, "rotation", replace(once, max_iterations=1), costs.append)
+    assert short.stop_reason == "iterations"
+    assert not short.converged
+    assert short.num_iterations == 1
+    assert costs == short.cost_history[1:].tolist()
+    at_rest = BundleOptions(outlier_rounds=0, step_tolerance=1e3)
+    assert bundle_adjust(start, "rotation", at_rest).stop_reason == "step"

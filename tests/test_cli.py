@@ -1,0 +1,529 @@
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from make_photos import save_png, save_textures, texture
+from rsundistort_cli.main import cli
+
+from rsundistort import Camera, RowMotion, Solution, SolvedImage, write_solution
+
+# reported; strict, so that the mark has to go when the bug does
+BUG = pytest.mark.xfail(strict=True, reason="reported bug")
+COMMAND = Path(sys.executable).with_name("rsundistort")
+CAMERA = "300,300,160,120"
+THREE = ["a.png", "b.png", "c.png"]
+
+
+@pytest.fixture
+def invoke(monkeypatch, tmp_path):
+    """Runs the command inside an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*args):
+        return CliRunner().invoke(cli, [str(arg) for arg in args])
+
+    return run
+
+
+def tree(folder):
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes() if path.is_file() else None
+        for path in sorted(folder.rglob("*"))
+    }
+
+
+def error_line(result):
+    """The error of a refused job: one line, exit code 1, no traceback."""
+    assert result.exit_code == 1, (result.exit_code, result.exception, result.stderr)
+    assert isinstance(result.exception, SystemExit), result.exception
+    lines = result.stderr.splitlines()
+    errors = [line for line in lines if line.startswith("error: ")]
+    assert len(errors) == 1, lines
+    assert lines[-1] == errors[0]
+    assert all(line.startswith("warning: ") for line in lines[:-1]), lines
+    assert result.stdout == ""
+    return errors[0]
+
+
+def solution_of(path, names, camera=None):
+    camera = camera or Camera(320, 240, np.array([[300.0, 0, 160], [0, 300.0, 120], [0, 0, 1]]))
+    images = [
+        SolvedImage(name, "1", np.eye(3), np.array([i, i * i / 9, 0.0]), RowMotion([0.02, -0.01, 0.03]))
+        for i, name in enumerate(names)
+    ]
+    write_solution(path, Solution("rotation", {"1": camera}, {"1": camera.pinhole()}, tuple(images)))
+    return path
+
+
+# ---------------------------------------------------------------- help
+
+
+def test_help_lists_the_commands(invoke):
+    result = invoke("--help")
+    assert result.exit_code == 0
+    for name in ("run", "rectify", "simulate", "evaluate", "info"):
+        assert f"  {name} " in result.stdout
+    assert "simulate" in invoke("-h").stdout
+    assert "warp" in invoke("simulate", "--help").stdout
+    assert "scene" in invoke("simulate", "--help").stdout
+
+
+@pytest.mark.parametrize("args", [["--help"], ["run", "--help"], ["simulate", "warp", "--help"], ["--version"]])
+def test_help_imports_nothing_heavy(args):
+    code = f"""
+import sys
+from rsundistort_cli.main import cli
+try:
+    cli({args!r})
+except SystemExit as stop:
+    assert not stop.code, stop.code
+heavy = sorted({{"numba", "cv2", "pycolmap", "numpy", "scipy", "rsundistort"}} & set(sys.modules))
+assert not heavy, heavy
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout
+
+
+def test_command_is_installed():
+    done = subprocess.run([COMMAND, "--help"], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0
+    assert "rsundistort run PHOTOS -o OUT" in done.stdout
+    assert done.stderr == ""
+
+
+def test_info(invoke):
+    result = invoke("info")
+    assert result.exit_code == 0
+    for name in ("rsundistort", "python", "numba", "pycolmap", "threads"):
+        assert name in result.stdout
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ["frobnicate"],
+        ["run"],
+        ["run", "photos"],
+        ["run", "photos", "-o", "out", "--unknown"],
+        ["run", "photos", "-o", "out", "--model", "spiral"],
+        ["run", "photos", "-o", "out", "--readout", "upwards"],
+        ["run", "photos", "-o", "out", "--quality", "101"],
+        ["run", "photos", "-o", "out", "--max-features", "many"],
+        ["run", "photos", "-o", "out", "--seed", "-1"],
+        ["rectify", "photos", "-o", "out"],
+        ["rectify", "photos", "-o", "out", "--solution", "s.json", "--interpolation", "magic"],
+        ["evaluate", "out"],
+        ["simulate", "spin"],
+        ["simulate", "warp", "photos", "-o", "out", "--sigma", "-0.1"],
+    ],
+)
+def test_wrong_use_is_exit_code_2(invoke, tmp_path, args):
+    result = invoke(*args)
+    assert result.exit_code == 2
+    assert "Usage:" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert tree(tmp_path) == {}
+
+
+def test_choices_are_those_of_the_library():
+    from rsundistort_cli.options import INTERPOLATION_NAMES, READOUT_NAMES
+
+    from rsundistort.model import READOUTS
+    from rsundistort.rectify import INTERPOLATIONS
+
+    assert set(READOUT_NAMES) == set(READOUTS)
+    assert set(INTERPOLATION_NAMES) == set(INTERPOLATIONS)
+
+
+# ---------------------------------------------------------------- run: what is refused
+
+
+def _empty(folder):
+    folder.mkdir()
+    return []
+
+
+def _missing(folder):
+    return []
+
+
+def _one(folder):
+    save_textures(folder, ["a.png"])
+    return ["--camera", CAMERA]
+
+
+def _two(folder):
+    save_textures(folder, ["a.png", "b.png"])
+    return ["--camera", CAMERA]
+
+
+def _truncated(folder):
+    save_textures(folder, ["a.jpg", "b.jpg", "c.png", "d.png"])
+    for path in folder.iterdir():
+        path.write_bytes(path.read_bytes()[:3000])
+    return ["--camera", CAMERA]
+
+
+def _two_left(folder):
+    save_textures(folder, THREE)
+    (folder / "c.png").write_bytes(b"")
+    return ["--camera", CAMERA]
+
+
+def _sizes(folder):
+    save_textures(folder, THREE)
+    save_png(folder / "b.png", texture(240, 320))
+    return ["--camera", CAMERA]
+
+
+def _no_camera(folder):
+    save_textures(folder, THREE)
+    return []
+
+
+def _with_camera_file(content):
+    def make(folder):
+        save_textures(folder, THREE)
+        (folder / "camera.json").write_text(content)
+        return []
+
+    return make
+
+
+def _with_camera(*text):
+    def make(folder):
+        save_textures(folder, THREE)
+        return ["--camera", *text]
+
+    return make
+
+
+def _apart(folder):
+    save_textures(folder, THREE)
+    return ["--camera", CAMERA]
+
+
+def _flat(folder):
+    folder.mkdir()
+    for name in THREE:
+        save_png(folder / name, np.full((240, 320, 3), 99, np.uint8))
+    return ["--camera", CAMERA]
+
+
+def _still(folder):
+    save_textures(folder, THREE)
+    return ["--camera", CAMERA, "--still", "nobody.png"]
+
+
+OTHER_SIZE = json.dumps({"width": 640, "height": 480, "K": [[600, 0, 320], [0, 600, 240], [0, 0, 1]]})
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (_empty, "no photos in photos"),
+        (_missing, "photos is no folder"),
+        (_one, "1 photo;"),
+        (_two, "2 photos;"),
+        (_truncated, "0 readable photos of 4"),
+        (_two_left, "2 readable photos of 3"),
+        (_sizes, "320x240"),
+        (_no_camera, "give --camera"),
+        (_with_camera_file(OTHER_SIZE), "640x480"),
+        (_with_camera_file("{ no"), "camera.json"),
+        (_with_camera_file('{"width": 320}'), "lacks K, height"),
+        (_with_camera("none.json"), "none.json"),
+        (_with_camera("1,2,x"), "expected a file or fx,fy,cx,cy"),
+        (_with_camera("nan,300,160,120"), "NaN"),
+        (_with_camera("300,300,1600,120"), "outside"),
+        (_with_camera(","), "expected a file or fx,fy,cx,cy"),
+        pytest.param(_with_camera(",".join(["1"] * 300)), "expected a file or fx,fy,cx,cy", marks=BUG),
+        (_apart, "share more of the scene"),
+        (_flat, "share more of the scene"),
+        (_still, "nobody.png"),
+    ],
+)
+def test_run_refuses_in_one_line_and_writes_nothing(invoke, tmp_path, make, says):
+    options = make(tmp_path / "photos")
+    before = tree(tmp_path)
+    line = error_line(invoke("run", "photos", "-o", "deep/out", *options))
+    assert says in line
+    assert tree(tmp_path) == before
+
+
+def test_run_refuses_an_out_in_use(invoke, tmp_path):
+    save_textures(tmp_path / "photos", THREE)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine.txt").write_text("mine")
+    (tmp_path / "file").write_text("x")
+    before = tree(tmp_path)
+    for out, says in (
+        ("out", "not empty"),
+        ("file", "is a file"),
+        ("photos", "holds the photos"),
+        ("photos/../photos", "holds the photos"),
+        ("file/out", "cannot be written"),
+    ):
+        line = error_line(invoke("run", "photos", "-o", out, "--camera", CAMERA))
+        assert says in line
+        assert tree(tmp_path) == before
+
+
+def test_a_failing_run_leaves_what_it_was_to_overwrite(invoke, tmp_path):
+    save_textures(tmp_path / "photos", THREE)
+    (tmp_path / "out" / "images").mkdir(parents=True)
+    (tmp_path / "out" / "images" / "a.png").write_bytes(b"earlier")
+    (tmp_path / "out" / "solution.json").write_text("earlier")
+    before = tree(tmp_path)
+    error_line(invoke("run", "photos", "-o", "out", "--camera", CAMERA, "--overwrite"))
+    assert tree(tmp_path) == before
+
+
+@BUG
+def test_refusal_of_the_installed_command(tmp_path):
+    """The whole process, where pycolmap and OpenCV have their own ways to stderr."""
+    save_textures(tmp_path / "photos", THREE)
+    before = tree(tmp_path)
+    done = subprocess.run(
+        [COMMAND, "run", "photos", "-o", "out", "--camera", CAMERA],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        cwd=tmp_path,
+    )
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert done.stderr.startswith("error: ")
+    assert tree(tmp_path) == before
+
+
+def test_truncated_photos_with_the_installed_command(tmp_path):
+    _truncated(tmp_path / "photos")
+    done = subprocess.run(
+        [COMMAND, "run", "photos", "-o", "out", "--camera", CAMERA],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        cwd=tmp_path,
+    )
+    assert done.returncode == 1
+    lines = done.stderr.splitlines()
+    assert [line.split(":")[0] for line in lines] == ["warning"] * 4 + ["error"]
+    assert [name for name in ("a.jpg", "b.jpg", "c.png", "d.png") if any(name in line for line in lines[:4])] == [
+        "a.jpg",
+        "b.jpg",
+        "c.png",
+        "d.png",
+    ]
+    assert not (tmp_path / "out").exists()
+
+
+# ---------------------------------------------------------------- rectify
+
+
+def test_rectify(invoke, tmp_path):
+    save_textures(tmp_path / "photos", THREE)
+    solution_of(tmp_path / "s.json", THREE)
+    result = invoke("rectify", "photos", "--solution", "s.json", "-o", "out")
+    assert result.exit_code == 0, result.stderr
+    assert "3 photos rectified" in result.stdout
+    assert result.stderr == ""
+    names = {path for path, content in tree(tmp_path / "out").items() if content is not None}
+    assert names == {f"{kind}/{name}" for kind in ("images", "masks") for name in THREE} | {"solution.json"}
+    assert invoke("rectify", "photos", "--solution", "s.json", "-o", "quiet", "-q").stdout == ""
+
+
+def test_rectify_leaves_out_photos_of_another_size(invoke, tmp_path):
+    save_textures(tmp_path / "photos", THREE)
+    save_png(tmp_path / "photos" / "b.png", texture(240, 320))
+    (tmp_path / "photos" / "c.png").write_bytes(b"cut")
+    solution_of(tmp_path / "s.json", THREE)
+    result = invoke("rectify", "photos", "--solution", "s.json", "-o", "out")
+    assert result.exit_code == 0, result.stderr
+    warnings = result.stderr.splitlines()
+    assert len(warnings) == 2
+    assert warnings[0].startswith("warning: skipped: b.png")
+    assert warnings[1].startswith("warning: skipped: c.png")
+    assert "1 photos rectified" in result.stdout
+    assert "2 left out" in result.stdout
+    assert set(tree(tmp_path / "out")) == {"images", "images/a.png", "masks", "masks/a.png", "solution.json"}
+
+
+def test_rectify_refuses_photos_that_are_all_of_another_size(invoke, tmp_path):
+    save_textures(tmp_path / "photos", THREE, 240, 320)
+    solution_of(tmp_path / "s.json", THREE)
+    before = tree(tmp_path)
+    assert "could be rectified" in error_line(invoke("rectify", "photos", "--solution", "s.json", "-o", "out"))
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (None, "No such file"),
+        ("{", "no valid JSON"),
+        ("[]", "is no solution"),
+        ('{"format": "rsundistort-solution", "version": 99}', "version 99"),
+        ('{"format": "rsundistort-solution", "version": 1}', "lacks"),
+        ("others", "no motion for any photo"),
+        pytest.param("no rectified camera", "s.json", marks=BUG),
+    ],
+)
+def test_rectify_refuses_what_is_no_solution_of_the_photos(invoke, tmp_path, content, says):
+    save_textures(tmp_path / "photos", THREE)
+    if content == "others":
+        solution_of(tmp_path / "s.json", ["x.png", "y.png"])
+    elif content == "no rectified camera":
+        solution_of(tmp_path / "s.json", THREE)
+        value = json.loads((tmp_path / "s.json").read_text())
+        value["rectified_cameras"] = {}
+        (tmp_path / "s.json").write_text(json.dumps(value))
+    elif content is not None:
+        (tmp_path / "s.json").write_text(content)
+    before = tree(tmp_path)
+    assert says in error_line(invoke("rectify", "photos", "--solution", "s.json", "-o", "out"))
+    assert tree(tmp_path) == before
+
+
+def test_rectify_refuses_bad_folders(invoke, tmp_path):
+    save_textures(tmp_path / "photos", THREE)
+    solution_of(tmp_path / "s.json", THREE)
+    (tmp_path / "empty").mkdir()
+    before = tree(tmp_path)
+    for photos, out in (("empty", "out"), ("none", "out"), ("photos", "photos"), ("photos", "s.json")):
+        error_line(invoke("rectify", photos, "--solution", "s.json", "-o", out))
+        assert tree(tmp_path) == before
+
+
+# ---------------------------------------------------------------- evaluate
+
+
+def test_evaluate(invoke, tmp_path):
+    (tmp_path / "out").mkdir()
+    solution_of(tmp_path / "out" / "solution.json", THREE)
+    solution_of(tmp_path / "truth.json", THREE)
+    result = invoke("evaluate", "out", "--truth", "truth.json", "--json")
+    assert result.exit_code == 0, result.stderr
+    value = json.loads(result.stdout)
+    assert value["photos"] == value["registered"] == 3
+    assert value["rotation_deg"]["max"] < 1e-6
+    assert value["phi_mrad_per_frame"]["max"] == 0
+    text = invoke("evaluate", "out", "--truth", "truth.json").stdout
+    assert "rotation error, deg" in text
+    assert "3 of 3" in text
+
+
+def test_evaluate_refuses(invoke, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "bare").mkdir()
+    solution_of(tmp_path / "out" / "solution.json", THREE)
+    solution_of(tmp_path / "truth.json", THREE)
+    solution_of(tmp_path / "others.json", ["x.png", "y.png", "z.png"])
+    (tmp_path / "garbled.json").write_text("{")
+    before = tree(tmp_path)
+    for args, says in (
+        (["out", "--truth", "none.json"], "none.json"),
+        (["out", "--truth", "garbled.json"], "garbled.json"),
+        (["out", "--truth", "others.json"], "pose in both"),
+        (["bare", "--truth", "truth.json"], "solution.json"),
+        (["none", "--truth", "truth.json"], "solution.json"),
+        (["truth.json", "--truth", "truth.json"], "solution.json"),
+        (["out", "--truth", "truth.json", "--twins", "none"], "none is no folder"),
+        (["out", "--truth", "truth.json", "--twins", "bare"], "a.png"),
+        (["out", "--truth", "truth.json", "--poses", "none.json"], "none.json"),
+    ):
+        assert says in error_line(invoke("evaluate", *args))
+    assert tree(tmp_path) == before
+
+
+# ---------------------------------------------------------------- simulate
+
+
+@pytest.fixture
+def photos(tmp_path):
+    return save_textures(tmp_path / "photos", THREE)
+
+
+def test_simulate_warp(invoke, photos, tmp_path):
+    result = invoke("simulate", "warp", "photos", "-o", "out", "--camera", CAMERA, "--seed", 3)
+    assert result.exit_code == 0, result.stderr
+    assert result.stderr == ""
+    assert "shift px" in result.stdout
+    assert all(name in result.stdout for name in THREE)
+    assert {"photos/a.png", "masks/c.png", "camera.json", "ground_truth.json"} <= set(tree(tmp_path / "out"))
+
+
+@pytest.mark.parametrize(
+    ("motion", "says"),
+    [
+        (None, "motion.json"),
+        ("garbage", "motion.json"),
+        ("[1, 2, 3]", "motion.json"),
+        ('{"nobody.png": [0, 0, 0]}', "nobody.png"),
+        ('{"a.png": [NaN, 0, 0]}', ""),
+        ('{"a.png": [1e999, 0, 0]}', ""),
+        ('{"a.png": [0, 0]}', ""),
+        ('{"a.png": 3}', ""),
+        ('{"a.png": null}', ""),
+        pytest.param('{"a.png": "fast"}', "", marks=BUG),
+        pytest.param('{"a.png": ["x", "y", "z"]}', "", marks=BUG),
+        pytest.param('{"a.png": [[1], [2, 3]]}', "", marks=BUG),
+        pytest.param('{"a.png": {"x": 1}}', "", marks=BUG),
+    ],
+)
+def test_simulate_warp_refuses_bad_motions(invoke, photos, tmp_path, motion, says):
+    if motion is not None:
+        (tmp_path / "motion.json").write_text(motion)
+    before = tree(tmp_path)
+    args = ["simulate", "warp", "photos", "-o", "out", "--camera", CAMERA, "--motion", "motion.json"]
+    assert says in error_line(invoke(*args))
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--camera", CAMERA, "--still", "nobody.png"], "nobody.png"),
+        (["--camera", CAMERA, "--sigma", "nan"], "sigma"),
+        (["--camera", CAMERA, "--sigma", "inf"], ""),
+        (["--camera", "300,300"], "expected a file or fx,fy,cx,cy"),
+        ([], "give --camera"),
+    ],
+)
+def test_simulate_warp_refuses_bad_options(invoke, photos, tmp_path, options, says):
+    before = tree(tmp_path)
+    assert says in error_line(invoke("simulate", "warp", "photos", "-o", "out", *options))
+    assert tree(tmp_path) == before
+
+
+def test_simulate_warp_refuses_bad_photos(invoke, photos, tmp_path):
+    args = ["simulate", "warp", "photos", "-o", "out", "--camera", CAMERA]
+    save_png(photos / "b.png", texture(240, 320))
+    before = tree(tmp_path)
+    error_line(invoke(*args))
+    assert tree(tmp_path) == before
+    (photos / "b.png").write_bytes(b"cut")
+    assert "b.png" in error_line(invoke(*args))
+    shutil.rmtree(photos)
+    error_line(invoke(*args))
+    assert tree(tmp_path) == {}
+
+
+@pytest.mark.parametrize("recipe", [None, "{", "[]", "{}", '{"format": "x"}'])
+def test_simulate_scene_refuses_bad_recipes(invoke, tmp_path, recipe):
+    if recipe is not None:
+        (tmp_path / "recipe.json").write_text(recipe)
+    before = tree(tmp_path)
+    assert "recipe.json" in error_line(invoke("simulate", "scene", "recipe.json", "-o", "out"))
+    assert tree(tmp_path) == before

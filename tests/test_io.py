@@ -1,0 +1,771 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from make_photos import exif_block, texture
+from scipy.spatial.transform import Rotation
+
+from rsundistort import (
+    Camera,
+    FileError,
+    FormatError,
+    InputError,
+    MetadataWarning,
+    Observations,
+    Reconstruction,
+    RowMotion,
+    Solution,
+    SolvedImage,
+    project_points,
+    read_solution,
+    write_solution,
+)
+from rsundistort.io import (
+    camera_from_exif,
+    list_photos,
+    output_folder,
+    output_name,
+    parse_camera,
+    read_photo,
+    write_colmap_model,
+    write_image,
+    write_transforms,
+)
+from rsundistort.io.colmap import rectified_keypoints
+
+# reported; strict, so that the mark has to go when the bug does
+BUG = pytest.mark.xfail(strict=True, reason="reported bug")
+needs_metadata = pytest.mark.skipif(not hasattr(cv2, "imencodeWithMetadata"), reason="this OpenCV has no metadata")
+
+K = [[500.0, 0, 322.5], [0, 510.0, 235.25], [0, 0, 1]]
+CAMERA = {"width": 640, "height": 480, "K": K, "dist": [-0.1, 0.02, 0.001, -0.002], "readout": "bottom-to-top"}
+
+
+def one_line(error):
+    text = str(error.value)
+    assert text
+    assert "\n" not in text
+    return text
+
+
+def tree(folder):
+    """What a folder holds: content of files, None for folders."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes() if path.is_file() else None
+        for path in sorted(folder.rglob("*"))
+    }
+
+
+# ---------------------------------------------------------------- photos
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".TIFF"])
+def test_lossless_kinds_come_back_exactly(tmp_path, suffix, channels, dtype):
+    shape = (37, 53) if channels == 1 else (37, 53, channels)
+    pixels = np.random.default_rng(3).integers(0, np.iinfo(dtype).max + 1, shape, dtype=dtype)
+    path = tmp_path / f"photo{suffix}"
+    write_image(path, pixels)
+    back = read_photo(path).pixels
+    assert back.dtype == dtype
+    np.testing.assert_array_equal(back, pixels)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("shape", [(37, 53), (37, 53, 3)])
+def test_float_tiff_comes_back_exactly(tmp_path, shape):
+    pixels = np.random.default_rng(4).normal(size=shape).astype(np.float32)
+    write_image(tmp_path / "photo.tif", pixels)
+    back = read_photo(tmp_path / "photo.tif").pixels
+    assert back.dtype == np.float32
+    np.testing.assert_array_equal(back, pixels)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".webp"])
+def test_lossy_kinds_come_close_and_quality_costs_bytes(tmp_path, suffix):
+    pixels = cv2.merge([texture(96, 64, channels=1)] * 3)  # grey: WebP halves the colour
+    sizes = []
+    for quality in (60, 98):
+        path = tmp_path / f"{quality}{suffix}"
+        write_image(path, pixels, quality=quality)
+        sizes.append(path.stat().st_size)
+    assert sizes[0] < sizes[1]
+    error = np.abs(read_photo(tmp_path / f"98{suffix}").pixels.astype(int) - pixels)
+    assert error.mean() < 4
+
+
+def stored_jpeg(path, orientation=6):
+    pixels = texture(64, 48)
+    exif = exif_block(orientation, 35)
+    done, data = cv2.imencodeWithMetadata(".jpg", pixels, [cv2.IMAGE_METADATA_EXIF], [exif])
+    assert done
+    path.write_bytes(bytes(data))
+    return exif
+
+
+@needs_metadata
+def test_orientation_is_carried_and_not_applied(tmp_path):
+    stored_jpeg(tmp_path / "turned.jpg")
+    photo = read_photo(tmp_path / "turned.jpg")
+    assert photo.pixels.shape == (48, 64, 3)
+    turned = cv2.imread(str(tmp_path / "turned.jpg"), cv2.IMREAD_COLOR)
+    assert turned.shape == (64, 48, 3)  # the tag is really there: OpenCV follows it unless told not to
+    ignoring = cv2.imread(str(tmp_path / "turned.jpg"), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    np.testing.assert_array_equal(photo.pixels, ignoring)
+
+
+@needs_metadata
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
+def test_exif_is_kept(tmp_path, suffix):
+    exif = stored_jpeg(tmp_path / "in.jpg")
+    photo = read_photo(tmp_path / "in.jpg")
+    write_image(tmp_path / f"out{suffix}", photo.pixels, photo.metadata)
+    again = read_photo(tmp_path / f"out{suffix}")
+    blocks = {kind: np.ravel(block).tobytes() for kind, block in again.metadata}
+    assert blocks[cv2.IMAGE_METADATA_EXIF] == exif.tobytes()
+    assert again.pixels.shape == (48, 64, 3)
+
+
+@needs_metadata
+def test_tiff_says_that_it_loses_metadata(tmp_path):
+    stored_jpeg(tmp_path / "in.jpg")
+    photo = read_photo(tmp_path / "in.jpg")
+    with pytest.warns(MetadataWarning, match="not kept in tif"):
+        write_image(tmp_path / "out.tif", photo.pixels, photo.metadata)
+    np.testing.assert_array_equal(read_photo(tmp_path / "out.tif").pixels, photo.pixels)
+
+
+@pytest.mark.parametrize("part", [0.02, 0.5, 0.98])
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp"])
+def test_truncated_photo_is_refused_by_name(tmp_path, suffix, part):
+    data = bytes(cv2.imencode(suffix, texture(160, 120))[1])
+    (tmp_path / f"cut{suffix}").write_bytes(data[: int(part * len(data))])
+    with pytest.raises(FileError) as error:
+        read_photo(tmp_path / f"cut{suffix}")
+    assert f"cut{suffix}" in one_line(error)
+
+
+@needs_metadata
+def test_jpeg_cut_after_its_thumbnail_is_refused(tmp_path):
+    thumbnail = bytes(cv2.imencode(".jpg", texture(32, 24))[1])  # has an end of its own
+    block = np.frombuffer(exif_block(1).tobytes() + thumbnail, np.uint8)
+    data = bytes(cv2.imencodeWithMetadata(".jpg", texture(160, 120), [cv2.IMAGE_METADATA_EXIF], [block])[1])
+    assert data.count(b"\xff\xd9") >= 2
+    (tmp_path / "whole.jpg").write_bytes(data)
+    assert read_photo(tmp_path / "whole.jpg").pixels.shape == (120, 160, 3)
+    (tmp_path / "cut.jpg").write_bytes(data[: len(data) * 3 // 4])
+    with pytest.raises(FileError, match=r"cut\.jpg"):
+        read_photo(tmp_path / "cut.jpg")
+
+
+@pytest.mark.parametrize("name", ["empty.jpg", "text.jpg", "missing.jpg", "folder.png", "text.dng", "empty.nef"])
+def test_what_is_no_photo_is_refused_by_name(tmp_path, name):
+    if name.startswith("empty"):
+        (tmp_path / name).write_bytes(b"")
+    elif name.startswith("text"):
+        (tmp_path / name).write_text("this is no photo\n" * 100)
+    elif name.startswith("folder"):
+        (tmp_path / name).mkdir()
+    with pytest.raises(FileError) as error:
+        read_photo(tmp_path / name)
+    assert name in one_line(error)
+
+
+def test_write_image_refuses_what_cannot_be_stored(tmp_path):
+    with pytest.raises(InputError) as error:
+        write_image(tmp_path / "photo.xyz", texture(8, 8))
+    assert ".xyz" in one_line(error)
+    with pytest.raises(FileError) as missing:
+        write_image(tmp_path / "no" / "photo.png", texture(8, 8))
+    assert "photo.png" in one_line(missing)
+    assert not list(tmp_path.iterdir())
+
+
+def test_write_image_replaces_a_file(tmp_path):
+    write_image(tmp_path / "a.png", texture(8, 8, 1))
+    write_image(tmp_path / "a.png", texture(8, 8, 2))
+    np.testing.assert_array_equal(read_photo(tmp_path / "a.png").pixels, texture(8, 8, 2))
+
+
+def test_list_photos_sorts_and_passes_over_other_files(tmp_path):
+    for name in ("b.JPG", "a.png", "c.tiff", "d.NEF", ".hidden.jpg", "notes.txt", "camera.json", "e.webp"):
+        (tmp_path / name).write_bytes(b"x")
+    (tmp_path / "folder.jpg").mkdir()
+    assert list_photos(tmp_path) == ["a.png", "b.JPG", "c.tiff", "d.NEF", "e.webp"]
+
+
+@pytest.mark.parametrize("kind", ["empty", "missing", "file", "others"])
+def test_list_photos_refuses(tmp_path, kind):
+    folder = tmp_path / kind
+    if kind == "file":
+        folder.write_text("x")
+    elif kind != "missing":
+        folder.mkdir()
+    if kind == "others":
+        (folder / ".a.jpg").write_bytes(b"x")
+        (folder / "a.txt").write_bytes(b"x")
+    with pytest.raises(FileError) as error:
+        list_photos(folder)
+    assert str(folder) in one_line(error)
+
+
+def test_output_name_turns_raw_into_tiff():
+    assert [output_name(n) for n in ("a.jpg", "b.DNG", "c.x.nef", "d.TIF")] == ["a.jpg", "b.tif", "c.x.tif", "d.TIF"]
+
+
+# ---------------------------------------------------------------- cameras
+
+
+def test_camera_json(tmp_path):
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(CAMERA))
+    camera = parse_camera(str(path), 640, 480)
+    assert camera == Camera(640, 480, np.array(K), np.array(CAMERA["dist"]), "bottom-to-top")
+    assert parse_camera(str(path), 640, 480, "left-to-right").readout == "left-to-right"
+    path.write_text(json.dumps({k: CAMERA[k] for k in ("width", "height", "K")}))
+    assert parse_camera(str(path), 640, 480) == Camera(640, 480, np.array(K))
+
+
+@pytest.mark.parametrize("text", ["500 0 322.5\n0 510 235.25\n0 0 1\n", "500,0,322.5,0,510,235.25,0,0,1"])
+def test_camera_of_a_text_file(tmp_path, text):
+    (tmp_path / "K.txt").write_text(text)
+    assert parse_camera(str(tmp_path / "K.txt"), 640, 480) == Camera(640, 480, np.array(K))
+
+
+def test_camera_of_a_scaled_matrix(tmp_path):
+    (tmp_path / "K.txt").write_text(" ".join(str(2 * v) for v in np.ravel(K)))
+    assert parse_camera(str(tmp_path / "K.txt"), 640, 480) == Camera(640, 480, np.array(K))
+
+
+@pytest.mark.parametrize("lens", [[], [-0.1, 0.02, 0.001, -0.002], [-0.1, 0.02, 0.001, -0.002, 0.003]])
+def test_camera_of_numbers(lens):
+    text = ",".join(str(v) for v in [500.0, 510.0, 322.5, 235.25, *lens])
+    expected = Camera(640, 480, np.array(K), np.array(lens), "right-to-left")
+    assert parse_camera(text, 640, 480, "right-to-left") == expected
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "500,510",
+        "500,510,322,235,0.1",
+        "500,510,322,235,0.1,0.2,0.3",
+        "500,510,322,235,1,2,3,4,5,6",
+        "500,510,322,",
+        "a,b,c,d",
+        "nan,510,322,235",
+        "500,inf,322,235",
+        "-500,510,322,235",
+        "0,510,322,235",
+        "500,510,-1,235",
+        "500,510,322,9999",
+    ],
+)
+def test_garbled_numbers_are_refused(text):
+    with pytest.raises(InputError) as error:
+        parse_camera(text, 640, 480)
+    one_line(error)
+
+
+@BUG
+def test_many_numbers_are_refused():
+    with pytest.raises(InputError) as error:
+        parse_camera(",".join(["1"] * 300), 640, 480)
+    one_line(error)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"width": 641},
+        {"width": 480, "height": 640},
+        {"K": [[500, 0, 700], [0, 500, 240], [0, 0, 1]]},
+        {"K": [[500, 0, 320], [0, 500, 240]]},
+        {"K": [[500, 1, 320], [0, 500, 240], [0, 0, 1]]},
+        {"K": "unit"},
+        {"K": [[float("nan")] * 3] * 3},
+        {"K": None},
+        {"dist": [0.1, 0.2]},
+        {"dist": "none"},
+        {"dist": {"k1": 0.1}},
+        {"readout": "upwards"},
+        {"readout": 3},
+        {"width": "wide"},
+        {"width": float("nan")},
+        {"width": None},
+        {"width": -640},
+        {"focal": 500},
+        pytest.param({"width": float("inf")}, marks=BUG),
+    ],
+    ids=str,
+)
+def test_camera_json_that_does_not_fit_is_refused(tmp_path, change):
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps({**CAMERA, **change}))
+    with pytest.raises(InputError) as error:
+        parse_camera(str(path), 640, 480)
+    assert "camera.json" in one_line(error)
+
+
+def test_a_camera_of_another_size_says_both_sizes(tmp_path):
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(CAMERA))
+    with pytest.raises(InputError) as error:
+        parse_camera(str(path), 320, 240)
+    assert "640x480" in one_line(error)
+    assert "320x240" in one_line(error)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b'{"width": 640,\n "height"\n}', b"[1, 2]", b"{}", b"1 2 3", b"word " * 9, b"\xff\xfe\x00"]
+)
+def test_camera_files_that_are_none_are_refused(tmp_path, content):
+    path = tmp_path / "camera.json"
+    path.write_bytes(content)
+    with pytest.raises((FormatError, FileError)) as error:
+        parse_camera(str(path), 640, 480)
+    assert str(path) in one_line(error)
+
+
+def test_missing_camera_files_are_refused(tmp_path):
+    for path in (tmp_path / "none.json", tmp_path):
+        with pytest.raises(FileError) as error:
+            parse_camera(str(path), 640, 480)
+        assert str(path) in one_line(error)
+
+
+@needs_metadata
+def test_camera_of_exif(tmp_path):
+    stored_jpeg(tmp_path / "photo.jpg")
+    camera = camera_from_exif(tmp_path / "photo.jpg", 64, 48, "left-to-right")
+    assert camera is not None
+    assert (camera.width, camera.height, camera.readout) == (64, 48, "left-to-right")
+    # 35 mm on the film's diagonal or width: near the width of the photo
+    assert 0.8 * 64 < camera.K[0, 0] < 1.2 * 64
+    np.testing.assert_array_equal(camera.K[:2, 2], [31.5, 23.5])
+    write_image(tmp_path / "bare.png", texture(64, 48))
+    assert camera_from_exif(tmp_path / "bare.png", 64, 48) is None
+
+
+# ---------------------------------------------------------------- solutions
+
+
+def small_solution(readout="top-to-bottom"):
+    first = Camera(640, 480, np.array(K), np.array([-0.1, 0.02, 0.001, -0.002]), readout)
+    second = Camera(400, 300, np.array([[300.0, 0, 201.0], [0, 310.0, 148.5], [0, 0, 1]]), readout=readout)
+    images = []
+    for i, camera_id in enumerate(("1", "2", "1")):
+        images.append(
+            SolvedImage(
+                name=f"{i}.jpg",
+                camera_id=camera_id,
+                R_cw=Rotation.from_rotvec([0.1 * i, -0.2, 0.3]).as_matrix(),
+                center_w=np.array([0.1 + i, 1 / 3, -2.0]),
+                motion=RowMotion([0.01 + i, -0.02, 0.03 / 7], [0, 0.1, 0]),
+                sigma_phi=np.array([1e-3, 2e-3, 3e-4]),
+                num_observations=17 + i,
+                rms_px=0.25,
+                rs_shift_px=12.5,
+            )
+        )
+    images.append(SolvedImage("lost.jpg", "1", reason="shares too little with the other photos"))
+    return Solution(
+        shutter_model="rotation",
+        cameras={"1": first, "2": second},
+        rectified_cameras={"1": first.pinhole(), "2": second.pinhole()},
+        images=tuple(images),
+        quality={"rms_px": np.float64(0.2), "num_points": np.int64(5), "bad": np.nan},
+        stages=({"name": "features", "seconds": 1.5},),
+        options={"seed": 3, "still": ["0.jpg"]},
+        generator={"rsundistort": "0"},
+    )
+
+
+def test_solution_round_trip(tmp_path):
+    solution = small_solution()
+    path = tmp_path / "solution.json"
+    write_solution(path, solution)
+    assert [p.name for p in tmp_path.iterdir()] == ["solution.json"]
+    back = read_solution(path)
+    assert back.cameras == solution.cameras
+    for key, camera in solution.rectified_cameras.items():
+        np.testing.assert_array_equal(back.rectified_cameras[key].K, camera.K)
+        assert (back.rectified_cameras[key].width, back.rectified_cameras[key].height) == (camera.width, camera.height)
+    assert back.shutter_model == solution.shutter_model
+    assert back.options == solution.options
+    assert back.generator == solution.generator
+    assert list(back.stages) == list(solution.stages)
+    assert back.quality == {"rms_px": 0.2, "num_points": 5, "bad": None}
+    assert [image.name for image in back.registered] == ["0.jpg", "1.jpg", "2.jpg"]
+    for a, b in zip(back.images, solution.images, strict=True):
+        for name in ("name", "camera_id", "registered", "posed", "num_observations", "rms_px", "rs_shift_px", "reason"):
+            assert getattr(a, name) == getattr(b, name)
+        if b.motion is None:
+            assert a.motion is None
+            assert a.R_cw is None
+            continue
+        np.testing.assert_array_equal(a.R_cw, b.R_cw)
+        np.testing.assert_array_equal(a.center_w, b.center_w)
+        np.testing.assert_array_equal(a.motion.phi, b.motion.phi)
+        np.testing.assert_array_equal(a.motion.velocity, b.motion.velocity)
+        np.testing.assert_array_equal(a.sigma_phi, b.sigma_phi)
+    text = path.read_text()
+    assert "NaN" not in text
+    write_solution(path, back)
+    assert path.read_text() == text
+
+
+def test_solution_without_poses_round_trips(tmp_path):
+    solution = small_solution()
+    images = tuple(replace(image, R_cw=None, center_w=None) for image in solution.images)
+    write_solution(tmp_path / "truth.json", replace(solution, images=images))
+    back = read_solution(tmp_path / "truth.json")
+    assert len(back.registered) == 3
+    assert not any(image.posed for image in back.images)
+
+
+@pytest.mark.parametrize(
+    ("readout", "aspect", "skew"),
+    [
+        ("top-to-bottom", 1 - 0.1, 0.02),
+        ("bottom-to-top", 1 + 0.1, -0.02),
+        ("left-to-right", 1 + 0.02, -0.1),
+        ("right-to-left", 1 - 0.02, 0.1),
+    ],
+)
+def test_imaginary_camera_follows_the_readout(tmp_path, readout, aspect, skew):
+    camera = Camera(640, 480, np.array(K), readout=readout)
+    image = SolvedImage("a.jpg", "1", motion=RowMotion([0.1, 0.02, 0.3]))
+    write_solution(tmp_path / "s.json", Solution("rotation", {"1": camera}, {"1": camera}, (image,)))
+    entry = json.loads((tmp_path / "s.json").read_text())["images"][0]
+    assert entry["aspect"] == pytest.approx(aspect)
+    assert entry["skew"] == pytest.approx(skew)
+
+
+@pytest.mark.parametrize("readout", ["top-to-bottom", "bottom-to-top", "left-to-right", "right-to-left"])
+def test_imaginary_camera_is_what_a_slight_motion_does(tmp_path, readout):
+    camera = Camera(640, 480, np.array(K), readout=readout)
+    motion = RowMotion([1e-4, 2e-4, 3e-4])
+    image = SolvedImage("a.jpg", "1", motion=motion)
+    write_solution(tmp_path / "s.json", Solution("rotation", {"1": camera}, {"1": camera}, (image,)))
+    entry = json.loads((tmp_path / "s.json").read_text())["images"][0]
+    # near the principal point the raw photo is an affine image of the ideal one
+    h = 1e-4
+    xy, valid = project_points([[0, 0, 1], [h, 0, 1], [0, h, 1]], camera, motion, "rotation")
+    assert valid.all()
+    seen = (xy - camera.K[:2, 2]) / np.diag(camera.K)[:2]
+    jacobian = (seen[1:] - seen[0]).T / h
+    clock, other = (1, 0) if readout in ("top-to-bottom", "bottom-to-top") else (0, 1)
+    assert jacobian[clock, clock] == pytest.approx(entry["aspect"], abs=2e-7)
+    assert jacobian[other, clock] == pytest.approx(entry["skew"], abs=2e-7)
+
+
+def garble(path, change):
+    value = json.loads(path.read_text())
+    change(value)
+    path.write_text(json.dumps(value))
+
+
+@pytest.mark.parametrize("key", ["cameras", "rectified_cameras", "images", "shutter_model", "format", "version"])
+def test_solution_that_lacks_a_key_is_refused(tmp_path, key):
+    path = tmp_path / "solution.json"
+    write_solution(path, small_solution())
+    garble(path, lambda value: value.pop(key))
+    with pytest.raises(FormatError) as error:
+        read_solution(path)
+    assert "solution.json" in one_line(error)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("format", "other"),
+        ("version", 2),
+        ("version", "1"),
+        ("cameras", []),
+        ("cameras", {}),
+        ("images", 5),
+        ("images", [1]),
+        ("shutter_model", "spiral"),
+        ("shutter_model", []),
+        ("rectified_cameras", {"1": {"width": 3, "height": 3}}),
+        pytest.param("rectified_cameras", {"1": {"width": "wide", "height": 3, "K": K}}, marks=BUG),
+        pytest.param("rectified_cameras", {}, marks=BUG),
+    ],
+)
+def test_garbled_solution_is_refused(tmp_path, key, value):
+    path = tmp_path / "solution.json"
+    write_solution(path, small_solution())
+    garble(path, lambda whole: whole.update({key: value}))
+    with pytest.raises(FormatError) as error:
+        read_solution(path)
+    assert "solution.json" in one_line(error)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("name", "1.jpg"),
+        ("name", ["a"]),
+        ("camera_id", "9"),
+        ("phi", [1, 2]),
+        pytest.param("phi", "fast", marks=BUG),
+        ("phi", [float("inf"), 0, 0]),
+        pytest.param("velocity", ["a", "b", "c"], marks=BUG),
+        ("R_cw", [[1, 0, 0], [0, 1, 0], [0, 0, 2]]),
+        pytest.param("R_cw", "eye", marks=BUG),
+        pytest.param("R_cw", [[1], [2, 3]], marks=BUG),
+        ("center_w", [1, 2]),
+        ("center_w", "here"),
+        pytest.param("sigma_phi", ["a", "b", "c"], marks=BUG),
+    ],
+)
+def test_garbled_photo_of_a_solution_is_refused(tmp_path, key, value):
+    path = tmp_path / "solution.json"
+    write_solution(path, small_solution())
+    garble(path, lambda whole: whole["images"][0].update({key: value}))
+    with pytest.raises(FormatError) as error:
+        read_solution(path)
+    assert "solution.json" in one_line(error)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[]", b"\xff\xfe", b"3", b"null"])
+def test_what_is_no_solution_is_refused(tmp_path, content):
+    path = tmp_path / "solution.json"
+    path.write_bytes(content)
+    with pytest.raises(FormatError) as error:
+        read_solution(path)
+    assert "solution.json" in one_line(error)
+
+
+def test_missing_solution_is_refused(tmp_path):
+    for path in (tmp_path / "none.json", tmp_path):
+        with pytest.raises(FileError) as error:
+            read_solution(path)
+        assert str(path) in one_line(error)
+
+
+# ---------------------------------------------------------------- folders of outputs
+
+
+def test_outputs_appear_at_the_end(tmp_path):
+    out = tmp_path / "deep" / "out"
+    with output_folder(out) as scratch:
+        (scratch / "images").mkdir()
+        (scratch / "images" / "a.png").write_bytes(b"a")
+        (scratch / "solution.json").write_bytes(b"s")
+        assert not (out / "images").exists()
+        assert not (out / "solution.json").exists()
+    assert tree(out) == {"images": None, "images/a.png": b"a", "solution.json": b"s"}
+
+
+def write_and_fail(out, error, overwrite=False):
+    with output_folder(out, overwrite=overwrite) as scratch:
+        (scratch / "a.txt").write_text("new")
+        raise error
+
+
+@pytest.mark.parametrize("error", [InputError("bad"), FileError("no disk"), KeyboardInterrupt(), ZeroDivisionError()])
+def test_failure_removes_what_was_made(tmp_path, error):
+    with pytest.raises(type(error)):
+        write_and_fail(tmp_path / "deep" / "out", error)
+    assert tree(tmp_path) == {}
+
+
+def test_failure_leaves_a_folder_that_was_there(tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    with pytest.raises(InputError):
+        write_and_fail(out, InputError("bad"))
+    assert tree(tmp_path) == {"out": None}
+    (out / "a.txt").write_text("old")
+    with pytest.raises(InputError):
+        write_and_fail(out, InputError("bad"), overwrite=True)
+    assert tree(out) == {"a.txt": b"old"}
+
+
+def test_folder_in_use_is_refused(tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(FileError, match="not empty") as error, output_folder(tmp_path):
+        pytest.fail("entered")
+    assert str(tmp_path) in one_line(error)
+    assert tree(tmp_path) == {"mine.txt": b"mine"}
+
+
+def test_overwrite_replaces_outputs_and_keeps_the_rest(tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "old.png").write_bytes(b"old")
+    (tmp_path / "solution.json").write_bytes(b"old")
+    with output_folder(tmp_path, overwrite=True) as scratch:
+        (scratch / "images").mkdir()
+        (scratch / "images" / "new.png").write_bytes(b"new")
+        (scratch / "solution.json").write_bytes(b"new")
+    assert tree(tmp_path) == {
+        "images": None,
+        "images/new.png": b"new",
+        "mine.txt": b"mine",
+        "solution.json": b"new",
+    }
+
+
+@BUG
+def test_overwrite_replaces_a_file_by_a_folder_of_its_name(tmp_path):
+    (tmp_path / "sparse").write_bytes(b"old")
+    with output_folder(tmp_path, overwrite=True) as scratch:
+        (scratch / "images").mkdir()
+        (scratch / "sparse").mkdir()
+    assert tree(tmp_path) == {"images": None, "sparse": None}
+
+
+def test_the_photos_folder_is_refused(tmp_path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    (tmp_path / "link").symlink_to(photos)
+    for out in (photos, tmp_path / "link", tmp_path / "photos" / ".." / "photos"):
+        with (
+            pytest.raises(FileError, match="holds the photos"),
+            output_folder(out, overwrite=True, apart_from=[photos]),
+        ):
+            pytest.fail("entered")
+    assert tree(photos) == {}
+
+
+def test_a_file_and_a_folder_below_a_file_are_refused(tmp_path):
+    (tmp_path / "file").write_text("x")
+    for out in (tmp_path / "file", tmp_path / "file" / "out", tmp_path / "file" / "deep" / "out"):
+        with pytest.raises(FileError) as error, output_folder(out, overwrite=True):
+            pytest.fail("entered")
+        one_line(error)
+    assert tree(tmp_path) == {"file": b"x"}
+
+
+# ---------------------------------------------------------------- nerfstudio
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_transforms_project_as_the_solution(tmp_path, cameras):
+    solution = small_solution()
+    if cameras == 1:
+        solution = replace(solution, images=tuple(replace(image, camera_id="1") for image in solution.images))
+    files = {f"{i}.jpg": (f"images/{i}.jpg", f"masks/{i}.png") for i in range(3)}
+    write_transforms(tmp_path / "transforms.json", solution, files)
+    value = json.loads((tmp_path / "transforms.json").read_text())
+    assert ("fl_x" in value) == (cameras == 1)
+    assert [frame["file_path"] for frame in value["frames"]] == [f"images/{i}.jpg" for i in range(3)]
+    assert [frame["mask_path"] for frame in value["frames"]] == [f"masks/{i}.png" for i in range(3)]
+    rng = np.random.default_rng(0)
+    for frame, image in zip(value["frames"], solution.registered, strict=True):
+        assert ("fl_x" in frame) == (cameras == 2)
+        intrinsics = {**value, **frame}
+        assert intrinsics["camera_model"] == "OPENCV"
+        camera = solution.rectified_cameras[image.camera_id]
+        assert (intrinsics["w"], intrinsics["h"]) == (camera.width, camera.height)
+        assert all(intrinsics[k] == 0 for k in ("k1", "k2", "p1", "p2"))
+        points_c = np.column_stack([rng.uniform(-1, 1, (20, 2)), rng.uniform(3, 6, 20)])
+        points_w = points_c @ image.R_cw + image.center_w
+        ours = points_c @ camera.K.T
+        ours = ours[:, :2] / ours[:, 2:] + 0.5
+        matrix = np.array(frame["transform_matrix"])
+        np.testing.assert_array_equal(matrix[3], [0, 0, 0, 1])
+        assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1)
+        x, y, z, _ = np.linalg.inv(matrix) @ np.column_stack([points_w, np.ones(20)]).T
+        assert (z < 0).all()  # OpenGL looks along -z, y up
+        theirs = np.column_stack(
+            [
+                intrinsics["cx"] + intrinsics["fl_x"] * x / -z,
+                intrinsics["cy"] - intrinsics["fl_y"] * y / -z,
+            ]
+        )
+        np.testing.assert_allclose(theirs, ours, atol=1e-9)
+
+
+def test_transforms_leave_out_photos_without_a_pose(tmp_path):
+    solution = small_solution()
+    images = (replace(solution.images[0], R_cw=None, center_w=None), *solution.images[1:])
+    files = {f"{i}.jpg": (f"images/{i}.jpg", f"masks/{i}.png") for i in range(3)}
+    write_transforms(tmp_path / "transforms.json", replace(solution, images=images), files)
+    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    assert [frame["file_path"] for frame in frames] == ["images/1.jpg", "images/2.jpg"]
+
+
+# ---------------------------------------------------------------- COLMAP
+
+
+def noise_free(model, lens=()):
+    """Three photos of two cameras with exact measurements."""
+    rng = np.random.default_rng(5)
+    cameras = [
+        Camera(640, 480, np.array(K), np.array(lens)),
+        Camera(400, 300, np.array([[300.0, 0, 201.0], [0, 310.0, 148.5], [0, 0, 1]])),
+    ]
+    points = np.column_stack([rng.uniform(-2, 2, (80, 2)), rng.uniform(6, 10, 80)])
+    camera_idx = np.array([0, 1, 0])
+    R = Rotation.from_rotvec(rng.normal(0, 0.05, (3, 3))).as_matrix()
+    center = np.array([[-0.5, 0, 0], [0, 0.2, 0.1], [0.6, -0.1, 0]])
+    phi = np.zeros((3, 3)) if model == "global" else rng.normal(0, 0.05, (3, 3))
+    frame, point, xy = [], [], []
+    for i in range(3):
+        camera = cameras[camera_idx[i]]
+        pixels, valid = project_points((points - center[i]) @ R[i].T, camera, RowMotion(phi[i]), model)
+        valid &= (pixels >= 0).all(1) & (pixels <= [camera.width - 1, camera.height - 1]).all(1)
+        seen = rng.permutation(np.flatnonzero(valid))
+        frame += [i] * len(seen)
+        point += seen.tolist()
+        xy.append(pixels[seen])
+    observations = Observations(np.array(frame), np.array(point), np.concatenate(xy))
+    names = ["a.jpg", "b.jpg", "c.jpg"]
+    return Reconstruction(cameras, names, camera_idx, R, center, points, observations, phi, shutter_model=model)
+
+
+@pytest.mark.parametrize(
+    ("model", "lens"), [("global", ()), ("global", (-0.1, 0.02, 1e-3, -2e-3)), ("rotation", (-0.1, 0.02, 1e-3, -2e-3))]
+)
+def test_colmap_model_opens_and_projects_onto_the_measurements(tmp_path, model, lens):
+    import pycolmap
+
+    rec = noise_free(model, lens)
+    rectified = [camera.pinhole() for camera in rec.cameras]
+    colors = np.random.default_rng(6).integers(0, 256, (rec.num_points, 3), dtype=np.uint8)
+    write_colmap_model(tmp_path / "sparse", rec, rectified, list(rec.image_names), colors)
+    assert {"cameras.bin", "images.bin", "points3D.bin"} <= {p.name for p in (tmp_path / "sparse").iterdir()}
+    read = pycolmap.Reconstruction(tmp_path / "sparse")
+    assert read.num_reg_images() == 3
+    assert read.num_cameras() == 2
+    for index, camera in enumerate(rec.cameras):
+        theirs = read.cameras[index + 1]
+        assert theirs.model.name == "PINHOLE"
+        assert (theirs.width, theirs.height) == (camera.width, camera.height)
+        np.testing.assert_allclose(theirs.params, [*np.diag(camera.K)[:2], *(camera.K[:2, 2] + 0.5)])
+    keypoints = rectified_keypoints(rec, rectified)
+    assert np.isfinite(keypoints).all()
+    if model == "global" and not lens:
+        np.testing.assert_allclose(keypoints, rec.observations.xy_raw, atol=1e-9)
+    obs = rec.observations
+    for i, name in enumerate(rec.image_names):
+        image = read.images[i + 1]
+        assert image.name == name
+        assert image.camera_id == rec.camera_idx[i] + 1
+        matrix = image.cam_from_world().matrix()
+        np.testing.assert_allclose(matrix[:, :3], rec.R_cw[i], atol=1e-12)
+        np.testing.assert_allclose(image.projection_center(), rec.center_w[i], atol=1e-12)
+        of_photo = np.flatnonzero(obs.frame_idx == i)
+        assert len(image.points2D) == len(of_photo)
+        for k, element in zip(of_photo, image.points2D, strict=True):
+            np.testing.assert_allclose(element.xy, keypoints[k] + 0.5, atol=1e-9)
+            if not element.has_point3D():
+                continue
+            point = read.points3D[element.point3D_id]
+            np.testing.assert_array_equal(point.xyz, rec.points_w[obs.point_idx[k]])
+            np.testing.assert_array_equal(point.color, colors[obs.point_idx[k]])
+            camera = read.cameras[image.camera_id]
+            projected = camera.img_from_cam(image.cam_from_world() * point.xyz)
+            np.testing.assert_allclose(np.ravel(projected), element.xy, atol=1e-6)
+    tracks = np.bincount(obs.point_idx, minlength=rec.num_points)
+    assert read.num_points3D() == (tracks >= 2).sum() > 40
+    assert read.compute_mean_reprojection_error() < 1e-6
