@@ -44,4 +44,5 @@ def command(
         )  # fmt: skip
     if not quiet:
         count = len(list((out / "images").iterdir()))
-        click.echo(f"{count} photos rectified with the {solved.shutter_model} model, {len(left_out)} left out: {out}")
+        done = f"{count} photo{'s' * (count != 1)} rectified with the {solved.shutter_model} model"
+        click.echo(f"{done}, {len(left_out)} left out: {out}")

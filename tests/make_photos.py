@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 COURTYARD = Path(__file__).parent.parent / "sample_scenes" / "courtyard"
-COURTYARD_NAMES = [f"{k:04}.png" for k in range(1, 8)]
+COURTYARD_NAMES = [f"{k:04}.png" for k in range(1, 7)]
 
 
 def texture(width: int, height: int, seed: int = 0, channels: int = 3) -> np.ndarray:

@@ -43,7 +43,7 @@ def tree(folder):
 
 @pytest.fixture(scope="module")
 def courtyard(tmp_path_factory):
-    """Seven photos of the courtyard at half size, and one that was cut short."""
+    """Six photos of the courtyard at half size, and one that was cut short."""
     folder = tmp_path_factory.mktemp("courtyard")
     photos = half_courtyard(folder)
     whole = (photos / COURTYARD_NAMES[0]).read_bytes()
@@ -92,8 +92,8 @@ def test_unreadable_photo_is_in_the_solution_with_its_reason(solved):
 
 def test_poses_and_motions_are_near_the_truth(courtyard, solved):
     result = evaluate(solved[1], courtyard / "ground_truth.json")
-    assert result["photos"] == 8
-    assert result["registered"] == 7
+    assert result["photos"] == 7
+    assert result["registered"] == 6
     assert result["rotation_deg"]["max"] <= 0.15
     assert result["center"]["max"] <= 0.02
     assert result["phi_mrad_per_frame"]["mean"] <= 4.0
@@ -177,8 +177,8 @@ def test_progress_is_told(solved):
     stages = [stage for stage, _, _ in told]
     assert stages[0] == "features"
     assert {"matching", "mapping", "rectifying", "writing"} <= set(stages)
-    assert ("features", 8, 8) in told
-    assert ("rectifying", 7, 7) in told
+    assert ("features", 7, 7) in told
+    assert ("rectifying", 6, 6) in told
     assert all(0 <= done <= total or total == 0 for _, done, total in told)
 
 
@@ -206,7 +206,7 @@ def test_grey_16_bit_and_global_model(courtyard, tmp_path):
         assert done
     shutil.copy(courtyard / "camera.json", photos)
     solution = run(photos, tmp_path / "out", RunOptions(max_features=2500, shutter_model="global"))
-    assert len(solution.registered) >= 6
+    assert len(solution.registered) >= 5
     assert all((image.motion.phi == 0).all() for image in solution.registered)
     image = read_photo(tmp_path / "out" / "images" / "0001.tif").pixels
     assert image.dtype == np.uint16
@@ -221,7 +221,7 @@ def test_failing_run_leaves_out_as_it_was(tmp_path):
     (out / "mine.txt").write_text("mine")
     before = tree(tmp_path)
     with pytest.raises(ReconstructionError):
-        run(photos, out, RunOptions(camera=CAMERA, overwrite=True))
+        run(photos, out, RunOptions(camera=CAMERA, overwrite=True, max_features=500))
     assert tree(tmp_path) == before
     with pytest.raises(FileError, match="not empty"):
         run(photos, out, RunOptions(camera=CAMERA))
@@ -347,7 +347,6 @@ def test_simulate_warp_follows_its_seed(tmp_path):
     np.testing.assert_array_equal(read_photo(tmp_path / "first" / "photos" / "b.png").pixels, texture(320, 240, 1))
 
 
-@pytest.mark.xfail(strict=True, reason="reported bug")
 def test_simulated_masks_of_photos_of_one_stem_are_kept_apart(tmp_path):
     photos = save_textures(tmp_path / "photos", ["a.jpg", "a.png"])
     simulate_warp(photos, tmp_path / "out", WarpOptions(camera=CAMERA))

@@ -463,9 +463,7 @@ def fill_map(model, axis, sign, intr, lens, phi, rays, row0, col0, map_x, map_y)
             if model != ROTATION:
                 ok = _project(model, axis, sign, lens, x, y, z, phi, vel, out, False, E, E)
             else:
-                ok = z > 0.0 and _project_exact(
-                    axis, sign, lens, x, y, z, phi, vel, 2.0 * t1 - t2, out, False, E, E
-                )
+                ok = z > 0.0 and _project_exact(axis, sign, lens, x, y, z, phi, vel, 2.0 * t1 - t2, out, False, E, E)
                 t2 = t1
                 t1 = sign * out[axis] if ok else math.nan
             if ok:

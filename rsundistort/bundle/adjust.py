@@ -34,6 +34,13 @@ def _noise_px(reconstruction: Reconstruction, shutter_model: str, floor: float) 
     return max(spread / shrink, floor)
 
 
+def _believed(reconstruction: Reconstruction, options: BundleOptions, sigma: float) -> NDArray[np.bool_]:
+    """(o,) measurements that lie as near to their prediction as their noise allows."""
+    res, valid = reprojection_residuals(reconstruction)
+    limit = np.maximum(options.outlier_sigma * sigma * reconstruction.observations.sigma, options.min_outlier_px)
+    return valid & (np.linalg.norm(res, axis=1) <= limit)
+
+
 def _spread(reconstruction: Reconstruction, variance: NDArray[np.float64]) -> float:
     """Spread of phi over photos and axes in radians per frame, from its values and their posterior variances.
 
@@ -70,15 +77,19 @@ def bundle_adjust(
         With a stop reason: the estimate of a solve that ran out of iterations is returned, and says so.
     """
     options = options or BundleOptions()
-    current = reconstruction.with_points(np.ones(len(reconstruction.observations), bool))
+    # `base` holds all measurements of the points still in use, `keep` says which of them are believed: one that was
+    # doubted while an outlier bent its point is heard again in the next round
+    base = reconstruction.with_points(np.ones(len(reconstruction.observations), bool))
+    keep = np.ones(len(base.observations), bool)
     iterations = 0
-    sigma = options.sigma_px or _noise_px(current, shutter_model, options.min_sigma_px)
+    sigma = options.sigma_px or _noise_px(base, shutter_model, options.min_sigma_px)
     phi_sigma = options.phi_sigma or options.phi_sigma_start
     for round_ in range(options.outlier_rounds + 1):
         last = round_ == options.outlier_rounds
         # once the outliers are gone the noise is nearly normal: squares converge in a few steps and use it fully
         stage = options if round_ == 0 else replace(options, loss="squared")
-        problem = BundleProblem(current, shutter_model, stage, sigma, phi_sigma)
+        believed = replace(base, observations=base.observations.select(keep))
+        problem = BundleProblem(believed, shutter_model, stage, sigma, phi_sigma)
         result = minimize(
             problem,
             problem.initial_state(),
@@ -94,14 +105,15 @@ def bundle_adjust(
         variance = problem.phi_variance(result.state)
         if options.phi_sigma is None and shutter_model != "global" and np.isfinite(variance).all():
             phi_sigma = _spread(current, variance)
-        res, valid = reprojection_residuals(current)
-        new_sigma = options.sigma_px or _noise_px(current, shutter_model, options.min_sigma_px)
         if last:
             break
-        limit = np.maximum(options.outlier_sigma * new_sigma * current.observations.sigma, options.min_outlier_px)
-        keep = valid & (np.linalg.norm(res, axis=1) <= limit)
-        current = current.with_points(keep)
-        sigma = new_sigma
+        sigma = options.sigma_px or _noise_px(current, shutter_model, options.min_sigma_px)
+        base = replace(current, observations=base.observations)
+        keep = _believed(base, options, sigma)
+        alive = base.track_lengths(keep) >= 2
+        keep = keep[alive[base.observations.point_idx]]
+        base = base.take_points(alive)
+    res, valid = reprojection_residuals(current)
     rms = float(np.sqrt(np.mean(res[valid] ** 2))) if valid.any() else float("nan")
     dropped = len(reconstruction.observations) - len(current.observations)
     return BundleResult(

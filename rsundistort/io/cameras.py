@@ -33,7 +33,7 @@ def camera_from_json(value: Any, where: str) -> Camera:
             np.asarray(value.get("dist") or [], float),
             value.get("readout", "top-to-bottom"),
         )
-    except (InputError, TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"{where}: {error}") from error
 
 
@@ -61,7 +61,7 @@ def parse_camera(text: str, width: int, height: int, readout: str | None = None)
         Readout direction; overrides a file's.
     """
     path = Path(text)
-    if not path.is_file() and "," in text:
+    if "," in text and not _is_file(path):
         camera = _camera_from_numbers(text, width, height)
     else:
         camera = _camera_from_file(path, width, height)
@@ -69,6 +69,13 @@ def parse_camera(text: str, width: int, height: int, readout: str | None = None)
     if readout is not None and readout != camera.readout:
         camera = Camera(camera.width, camera.height, camera.K, camera.dist, readout)
     return camera
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a text too long to be a name
+        return False
 
 
 def check_camera_fits(camera: Camera, width: int, height: int, where: str) -> None:
@@ -91,7 +98,8 @@ def _camera_from_numbers(text: str, width: int, height: int) -> Camera:
     except ValueError:
         values = []
     if len(values) not in (4, 8, 9):
-        raise InputError(f"camera {text!r} is no file; expected a file or fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]")
+        shown = text if len(text) <= 60 else f"{text[:57]}..."
+        raise InputError(f"camera {shown!r} is no file; expected a file or fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]")
     fx, fy, cx, cy = values[:4]
     return Camera(width, height, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array(values[4:]))
 

@@ -60,6 +60,11 @@ def list_photos(folder: Path) -> list[str]:
         for entry in folder.iterdir()
         if entry.suffix.lower() in PHOTO_SUFFIXES + RAW_SUFFIXES and not entry.name.startswith(".") and entry.is_file()
     )
+    outputs: dict[str, str] = {}
+    for name in names:
+        other = outputs.setdefault(output_name(name), name)
+        if other != name:
+            raise InputError(f"{other} and {name} would both be rectified to {output_name(name)}; move one away")
     if not names:
         kinds = ", ".join(s[1:] for s in PHOTO_SUFFIXES) + " and RAW"
         raise FileError(f"no photos in {folder}; it should hold files of the kinds {kinds}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -11,6 +12,10 @@ from pathlib import Path
 from ..errors import FileError
 
 __all__ = ["output_folder"]
+
+
+# a full disk, a read-only one, a limit: anything else is not OUT's fault
+_CANNOT_WRITE = (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EPERM, errno.EDQUOT)
 
 
 @contextmanager
@@ -54,10 +59,12 @@ def output_folder(folder: Path, *, overwrite: bool = False, apart_from: Sequence
             target = folder / entry.name
             if target.is_dir() and not target.is_symlink():
                 shutil.rmtree(target)
+            else:
+                target.unlink(missing_ok=True)
             entry.replace(target)
         made = None
     except OSError as error:
-        if isinstance(error, FileError):
+        if isinstance(error, FileError) or error.errno not in _CANNOT_WRITE:
             raise
         raise FileError(f"{folder} cannot be written: {error.strerror}") from error
     finally:

@@ -118,10 +118,12 @@ def read_solution(path: Path) -> Solution:
         )
     try:
         return _solution_from_json(value, str(path))
-    except (KeyError, TypeError, AttributeError) as error:
-        raise FormatError(f"{path} lacks or garbles {error}") from error
     except InputError as error:
         raise FormatError(f"{path}: {error}") from error
+    except KeyError as error:
+        raise FormatError(f"{path} lacks {error}") from error
+    except (TypeError, AttributeError, ValueError, OverflowError) as error:
+        raise FormatError(f"{path} is garbled: {error}") from error
 
 
 def _solution_from_json(value: dict[str, Any], where: str) -> Solution:
@@ -129,6 +131,8 @@ def _solution_from_json(value: dict[str, Any], where: str) -> Solution:
     rectified = {k: Camera(c["width"], c["height"], c["K"]) for k, c in value["rectified_cameras"].items()}
     images = []
     for entry in value["images"]:
+        if entry["camera_id"] not in rectified:
+            raise InputError(f"photo {entry['name']} has camera {entry['camera_id']!r}, which is not rectified")
         motion = None
         if entry["registered"] and entry.get("phi") is not None:
             motion = RowMotion(np.asarray(entry["phi"], float), np.asarray(entry.get("velocity") or [0, 0, 0], float))

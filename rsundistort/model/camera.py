@@ -69,7 +69,8 @@ class Camera:
     def __post_init__(self) -> None:
         for name in ("width", "height"):
             value = getattr(self, name)
-            if isinstance(value, bool) or int(value) != value or value < 1:
+            whole = isinstance(value, (int, float, np.number)) and not isinstance(value, bool) and np.isfinite(value)
+            if not whole or int(value) != value or value < 1:
                 raise InputError(f"{name}={value!r}, expected a positive whole number")
             object.__setattr__(self, name, int(value))
         K = check_finite(self.K, (3, 3), "K")

@@ -137,16 +137,37 @@ class Reconstruction:
         """(m,) how far each photo's clock runs over its frame: turns phi into radians per frame."""
         return np.array([self.camera(i).frame_span for i in range(self.num_images)])
 
+    def normalized(self) -> Reconstruction:
+        """The same in a frame of its own: the first photo at the origin, consecutive centres 1 apart in the mean.
+
+        Which similarity a mapping ends in is chance; results of two runs must compare without aligning them.
+        """
+        R0, origin = self.R_cw[0], self.center_w[0]
+        step = float(np.linalg.norm(np.diff(self.center_w, axis=0), axis=1).mean()) if self.num_images > 1 else 0.0
+        scale = 1.0 / step if step > 0 else 1.0
+        return replace(
+            self,
+            R_cw=self.R_cw @ R0.T,
+            center_w=scale * (self.center_w - origin) @ R0.T,
+            points_w=scale * (self.points_w - origin) @ R0.T,
+            velocity=scale * self.velocity @ R0.T,
+        )
+
+    def track_lengths(self, keep_obs: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """(n,) number of photos that see each point among some observations; a photo counts once."""
+        obs = self.observations
+        key = np.unique((obs.point_idx * self.num_images + obs.frame_idx)[keep_obs])
+        return np.bincount(key // self.num_images, minlength=self.num_points)
+
+    def take_points(self, keep_point: NDArray[np.bool_]) -> Reconstruction:
+        """The reconstruction with some points only, and all their observations."""
+        obs = self.observations
+        new_idx = np.cumsum(keep_point) - 1
+        kept = obs.select(keep_point[obs.point_idx])
+        kept = replace(kept, point_idx=new_idx[kept.point_idx])
+        return replace(self, points_w=self.points_w[keep_point], observations=kept)
+
     def with_points(self, keep_obs: NDArray[np.bool_], min_track: int = 2) -> Reconstruction:
         """The reconstruction with some observations only, without points left with under `min_track` photos."""
-        obs = self.observations
-        # a photo that sees a point twice counts once
-        key = obs.point_idx * self.num_images + obs.frame_idx
-        _, first = np.unique(np.where(keep_obs, key, -1), return_index=True)
-        first = first[keep_obs[first]]
-        count = np.bincount(obs.point_idx[first], minlength=self.num_points)
-        keep_point = count >= min_track
-        new_idx = np.cumsum(keep_point) - 1
-        keep = keep_obs & keep_point[obs.point_idx]
-        kept = Observations(obs.frame_idx[keep], new_idx[obs.point_idx[keep]], obs.xy_raw[keep], obs.sigma[keep])
-        return replace(self, points_w=self.points_w[keep_point], observations=kept)
+        alive = self.track_lengths(keep_obs) >= min_track
+        return replace(self, observations=self.observations.select(keep_obs)).take_points(alive)

@@ -15,11 +15,13 @@ from ..errors import FileError, FormatError, InputError
 from ..io import list_photos, output_folder, output_name, read_photo, write_image, write_solution
 from ..io.cameras import camera_to_json
 from ..model import RowMotion, Solution, SolvedImage
+from ..model.checks import check_finite
 from ..rectify import largest_shift_px
 from ..synthetic.warp import random_phi, warp_photo
 from .load import find_camera
 from .progress import ProgressCallback, StageLog
 from .run import use_threads, versions
+from .write import mask_names
 
 __all__ = ["WarpOptions", "read_motion_file", "simulate_warp"]
 
@@ -63,7 +65,7 @@ def read_motion_file(path: Path) -> dict[str, list[float]]:
         raise FormatError(f"{path} is no valid JSON: {error}") from error
     if not isinstance(value, dict):
         raise FormatError(f"{path}: expected an object of name: [phi1, phi2, phi3]")
-    return value
+    return {name: check_finite(phi, (3,), f"{path}: motion of {name}").tolist() for name, phi in value.items()}
 
 
 def simulate_warp(
@@ -111,12 +113,13 @@ def simulate_warp(
         motions = {name: RowMotion(phi[name]) for name in names}
         (scratch / "photos").mkdir()
         (scratch / "masks").mkdir()
+        masks = mask_names(names)
 
         def work(name: str) -> None:
             photo = read_photo(photos / name)
             warped, mask = warp_photo(photo.pixels, camera, motions[name].phi)
             write_image(scratch / "photos" / output_name(name), warped, photo.metadata, options.quality)
-            write_image(scratch / "masks" / f"{Path(name).stem}.png", mask)
+            write_image(scratch / "masks" / masks[name], mask)
 
         log.begin("warping", len(names))
         with ThreadPoolExecutor(jobs) as pool:

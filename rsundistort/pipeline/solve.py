@@ -119,4 +119,4 @@ def solve_photos(
     plain = BundleOptions(outlier_rounds=0, loss="squared", cost_tolerance=1e-4, sigma_px=result.sigma_px)
     global_result = bundle_adjust(result.reconstruction, "global", plain)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
-    return Solved(result, global_result)
+    return Solved(replace(result, reconstruction=result.reconstruction.normalized()), global_result)

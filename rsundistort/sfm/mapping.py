@@ -63,7 +63,7 @@ def _pycolmap() -> Any:
     """Pycolmap, quiet, and imported late: it takes half a second, and cv2 must come first (see `io.images`)."""
     import pycolmap
 
-    pycolmap.logging.minloglevel = 2
+    pycolmap.logging.minloglevel = 3
     return pycolmap
 
 
@@ -182,6 +182,8 @@ def _verification(max_error_px: float, seed: int) -> Any:
 def _pipeline_options(loose: float, seed: int, refine_intrinsics: bool, num_photos: int) -> Any:
     options = _pycolmap().IncrementalPipelineOptions()
     options.random_seed = seed
+    # one thread: with more, the same seed now and then takes another first pair; small problems are no slower
+    options.num_threads = options.mapper.num_threads = 1
     options.extract_colors = False
     # smaller models are given up and another first pair is tried
     options.min_model_size = min(10, max(3, num_photos // 2))
