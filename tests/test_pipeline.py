@@ -184,7 +184,6 @@ def test_progress_is_told(solved):
 
 @pytest.mark.filterwarnings("ignore::rsundistort.SkippedPhotoWarning")
 @pytest.mark.slow
-@pytest.mark.xfail(reason="reported bug: now and then mapping ends in another world frame")
 def test_same_seed_same_poses(courtyard, solved, tmp_path):
     first = solved[0]
     second = run(courtyard / "photos", tmp_path / "out", OPTIONS)

@@ -17,8 +17,9 @@ from .progress import StageLog
 
 __all__ = ["Solved", "rungs_to", "solve_photos"]
 
-# Feedback ends when no photo's rotation over the frame moves a pixel by more than this between two rounds
-_SETTLED_PX = 0.05
+# Feedback ends when no photo's rotation over the frame changes by more than this angle times the focal length between
+# two rounds; a pixel at the border then moves by less than half of it.
+_SETTLED_PX = 0.2
 _MAX_ROUNDS = 4
 
 

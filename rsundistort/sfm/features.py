@@ -53,13 +53,14 @@ def detect_features(photo: NDArray[Any], max_features: int = 16384) -> Features:
     keypoints, raw = sift.detectAndCompute(_gray_u8(photo), None)
     if not keypoints:
         return Features(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.uint8))
-    xy = np.array([k.pt for k in keypoints], np.float64)
+    xy = np.asarray(cv2.KeyPoint.convert(keypoints), np.float64)
+    response, angle, size = np.array([(k.response, k.angle, k.size) for k in keypoints]).T
     # ties by place: the order in which OpenCV's threads found them must not matter
-    keys = [(-k.response, k.pt[1], k.pt[0], k.angle) for k in keypoints]
-    order = np.array(sorted(range(len(keys)), key=keys.__getitem__))[:max_features]
+    order = np.lexsort((angle, xy[:, 0], xy[:, 1], -response))[:max_features]
+    xy, raw, size = xy[order], raw[order], size[order]
     root = np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-12))
-    sigma = np.hypot(1.0, np.array([k.size for k in keypoints]) / _COARSE_PX)
-    return Features(xy[order], sigma[order], np.clip(np.rint(512.0 * root), 0, 255).astype(np.uint8)[order])
+    descriptors = np.clip(np.rint(512.0 * root), 0, 255).astype(np.uint8)
+    return Features(xy, np.hypot(1.0, size / _COARSE_PX), descriptors)
 
 
 def _gray_u8(photo: NDArray[Any]) -> NDArray[np.uint8]:
