@@ -50,7 +50,7 @@ def project_points(
     --------
     >>> camera = Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]])
     >>> project_points([[0.0, 0.5, 5.0]], camera, RowMotion([0.1, 0, 0]))[0].round(3)
-    array([[320.   , 285.004]])
+    array([[320.   , 285.417]])
     """
     points = np.ascontiguousarray(check_array(points_c, (None, 3), "points_c"))
     motion = motion or RowMotion()

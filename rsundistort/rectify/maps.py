@@ -80,7 +80,7 @@ def init_rectify_map(
     >>> camera = Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]])
     >>> map_x, map_y = init_rectify_map(camera, RowMotion([0.1, 0.0, 0.0]))
     >>> map_x.shape, round(float(map_y[340, 320]), 3)
-    ((480, 640), 330.194)
+    ((480, 640), 330.61)
     """
     width, height = size or (camera.width, camera.height)
     if width < 1 or height < 1:
