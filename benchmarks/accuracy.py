@@ -15,9 +15,21 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
-from rsundistort import RunOptions, WarpOptions, evaluate, pose_errors, run, simulate_warp
+from rsundistort import (
+    RowMotion,
+    RunOptions,
+    WarpOptions,
+    evaluate,
+    pose_errors,
+    psnr,
+    read_solution,
+    rectify,
+    run,
+    simulate_warp,
+)
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -85,6 +97,43 @@ def herz_jesus(photos: Path, work: Path, seeds: int) -> None:
             psnr_db=round(float(np.median(pooled)), 2),
             target=target,
         )
+    limits(photos, work / "warped-0.02-0", plain)
+
+
+def limits(photos: Path, warped: Path, plain: Path) -> None:
+    """What small errors of phi cost in dB, with the true motion as the base.
+
+    The photos' own phi is what the solution of the photos as they are finds: a common part of phi and a small error of
+    the lens calibration cannot be told apart.
+    """
+    truth, own = read_solution(warped / "ground_truth.json"), read_solution(plain / "solution.json")
+    span = truth.cameras["1"].frame_span
+    own_phi = {image.name: image.motion.phi for image in own.registered if image.motion is not None}
+    stretch = np.array([0.6e-3 / span, 0, 0])
+    offsets = {
+        "true motion": dict.fromkeys(own_phi, np.zeros(3)),
+        "true motion + the photos' own phi": own_phi,
+        "true motion + 0.6 mrad of phi1": dict.fromkeys(own_phi, stretch),
+        "true motion + both": {name: phi + stretch for name, phi in own_phi.items()},
+    }
+    figures = {}
+    for label, offset in offsets.items():
+        values = []
+        for image in truth.registered:
+            assert image.motion is not None
+            raw = cv2.imread(str(warped / "photos" / image.name), cv2.IMREAD_UNCHANGED)
+            twin = cv2.imread(str(photos / image.name), cv2.IMREAD_UNCHANGED)
+            motion = RowMotion(image.motion.phi + offset[image.name])
+            rectified, mask = rectify(raw, truth.cameras["1"], motion)
+            values.append(psnr(rectified, twin, mask))
+        figures[label] = round(float(np.median(values)), 2)
+    sigma = np.mean([image.sigma_phi for image in own.registered if image.sigma_phi is not None], axis=0)
+    show(
+        "what errors of phi cost (warped by 0.02, seed 0)",
+        psnr_db=figures,
+        own_phi_mrad_per_frame=(1e3 * span * np.mean(list(own_phi.values()), axis=0)).round(2).tolist(),
+        sigma_phi_mrad_per_frame=(1e3 * span * sigma).round(2).tolist(),
+    )
 
 
 def real(name: str, photos: Path, work: Path, camera: str | None) -> None:

@@ -188,9 +188,10 @@ def test_committed_photo_is_what_the_recipe_renders(courtyard):
     image = render_view(courtyard.scene, camera, v, **courtyard.render_options)
     committed = cv2.imread(str(COURTYARD / "photos" / v.name))[:192]
     difference = np.abs(image.astype(float) - committed)
-    # what JPEG at quality 94 leaves is 1.1 on average; another scene, seed or pose gives more than 10
+    # what JPEG at quality 94 leaves is 1.1 on average and 44.0 dB, give or take what the decoders of OpenCV 4 and 5
+    # differ by; another scene, seed or pose gives more than 10 and less than 25 dB
     assert difference.mean() < 1.5
-    assert 20 * np.log10(255 / np.sqrt((difference**2).mean())) > 44
+    assert 20 * np.log10(255 / np.sqrt((difference**2).mean())) > 43
 
 
 def test_truth_of_the_courtyard_is_what_the_recipe_says(courtyard, truth):
