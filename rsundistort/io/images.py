@@ -134,7 +134,9 @@ def _read_raw(path: Path) -> NDArray[np.uint16]:
         with rawpy.imread(str(path)) as raw:
             rgb = raw.postprocess(use_camera_wb=True, output_bps=16, user_flip=0, no_auto_bright=True)
     except (rawpy.LibRawError, OSError) as error:
-        raise FileError(f"{path.name} cannot be developed: {error}") from error
+        reason = error.args[0] if error.args else error
+        text = reason.decode(errors="replace") if isinstance(reason, bytes) else str(reason)
+        raise FileError(f"{path.name} cannot be developed ({text}); copy it again from the camera") from error
     return np.ascontiguousarray(rgb[..., ::-1])
 
 
