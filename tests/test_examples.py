@@ -11,6 +11,7 @@ MODULES = (
     "rsundistort.model.motion",
     "rsundistort.model.projection",
     "rsundistort.rectify.maps",
+    "rsundistort.testing",
 )
 
 
