@@ -83,16 +83,20 @@ def warp(
 @command.command()
 @click.argument("recipe", type=click.Path(path_type=Path))
 @opt.out_option
+@click.option("--depth/--no-depth", default=True, show_default=True, help="Write depth maps.")
+@opt.jobs_option
 @opt.overwrite_option
 @opt.quiet_option
-def scene(recipe: Path, out: Path, overwrite: bool, quiet: bool) -> None:
-    """Render the rolling-shutter photos of a scene, with global-shutter twins.
+def scene(recipe: Path, out: Path, depth: bool, jobs: int, overwrite: bool, quiet: bool) -> None:
+    """Render the rolling-shutter photos of a scene, with everything that is true about them.
 
-    OUT gets photos/, global/ (the twins), camera.json, ground_truth.json and the recipe.
+    OUT gets photos/, global/ (the twins), depth/, global-depth/, tracks.npz, camera.json (cameras.json if there are
+    several), ground_truth.json and the recipe.
     """
     with errors_for_people(), progress_bars(quiet) as progress:
-        from rsundistort.synthetic import render_scene
+        from rsundistort.pipeline import SceneOptions, simulate_scene
 
-        render_scene(recipe, out, overwrite=overwrite, progress=lambda done, total: progress("rendering", done, total))
+        truth = simulate_scene(recipe, out, SceneOptions(depth=depth, jobs=jobs, overwrite=overwrite), progress)
     if not quiet:
-        click.echo(f"outputs  {out}")
+        rows = [("photo", "shift px"), *((image.name, f"{image.rs_shift_px:.1f}") for image in truth.images)]
+        click.echo(f"{table(rows)}\n\noutputs  {out}")

@@ -25,7 +25,16 @@ from .evaluation import motion_errors, pose_errors, psnr
 from .io import read_solution, write_solution
 from .model import Camera, Observations, Reconstruction, RowMotion, Solution, SolvedImage
 from .model.projection import project_points, unproject_points
-from .pipeline import RunOptions, WarpOptions, evaluate, rectify_folder, run, simulate_warp
+from .pipeline import (
+    RunOptions,
+    SceneOptions,
+    WarpOptions,
+    evaluate,
+    rectify_folder,
+    run,
+    simulate_scene,
+    simulate_warp,
+)
 from .rectify import (
     distort_points,
     init_rectify_map,
@@ -52,6 +61,7 @@ __all__ = [
     "RsUndistortError",
     "RsUndistortWarning",
     "RunOptions",
+    "SceneOptions",
     "SkippedPhotoWarning",
     "Solution",
     "SolvedImage",
@@ -71,6 +81,7 @@ __all__ = [
     "rectify",
     "rectify_folder",
     "run",
+    "simulate_scene",
     "simulate_warp",
     "undistort_points",
     "unproject_points",

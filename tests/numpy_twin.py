@@ -1,15 +1,18 @@
 """The row models once more, in plain NumPy: the source of synthetic measurements.
 
-Shares no function with the library, and no derivation where that could be avoided: implicit rows are found by
-bisection or as fixed points, column readout is written out instead of exchanging x and y, rotations are SciPy's, the
-lens is OpenCV's. `phi` is per unit of the clock, as everywhere.
+Shares no function with the kernels, and no derivation where that could be avoided: implicit rows are found by bisection
+or as fixed points, column readout is written out instead of exchanging x and y, rotations are SciPy's, the lens is
+OpenCV's. The exact model is `synthetic.measurements`, the generator that users and experiments have too. `phi` is per
+unit of the clock, as everywhere.
 """
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
+
+from rsundistort.model import Camera, RowMotion
+from rsundistort.synthetic import project_rows
 
 MODELS = ("global", "two-step", "linearized", "rotation")
 DIRECTIONS = ("top-to-bottom", "bottom-to-top", "left-to-right", "right-to-left")
@@ -72,15 +75,10 @@ def linearized(xy, phi, readout):
 
 
 def rotation(xy, phi, dist, readout):
-    """Paper Eq. 2 without translation; the clock is the distorted row, the one that the sensor read."""
+    """Paper Eq. 2 without translation, by the generator of measurements; in units of a camera with K = 1."""
+    unit = Camera(1, 1, np.eye(3), dist, readout)
     rays = np.column_stack([xy, np.ones(len(xy))])
-    seen = lens(dist, xy)
-    for _ in range(200):  # contracts by about |phi| a step
-        q = Rotation.from_rotvec(clock(readout, seen)[:, None] * np.asarray(phi)).apply(rays)
-        before, seen = seen, lens(dist, q[:, :2] / q[:, 2:])
-        if np.abs(seen - before).max(initial=0) < 1e-15:
-            break
-    return seen
+    return project_rows(rays, np.eye(3), np.zeros(3), RowMotion(phi), unit)[0]
 
 
 def project_normalised(points_c, phi, model, readout, dist=()):

@@ -179,11 +179,11 @@ def _bilinear(texels, decode, start, rows, cols, x, y, weight, rgb):
 @kernel()
 def _albedo(look, p, s, t, footprint_m, rgb):
     """Colour of patch p at (s, t), averaged over about footprint_m: trilinear in the texture's pyramid."""
-    texture_of, offset_m, extent_m, texels, decode, levels, first_level, size_m = look[:8]
+    texture_of, offset_m, axes_m, texels, decode, levels, first_level, size_m = look[:8]
     texture = texture_of[p]
     top, end = first_level[texture], first_level[texture + 1]
-    u = (offset_m[p, 0] + s * extent_m[p, 0]) / size_m[texture, 0]
-    v = (offset_m[p, 1] + t * extent_m[p, 1]) / size_m[texture, 1]
+    u = (offset_m[p, 0] + s * axes_m[p, 0] + t * axes_m[p, 2]) / size_m[texture, 0]
+    v = (offset_m[p, 1] + s * axes_m[p, 1] + t * axes_m[p, 3]) / size_m[texture, 1]
     lod = math.log2(max(footprint_m * levels[top, 2] / size_m[texture, 0], 1.0))
     lod = min(lod, end - top - 1.0)
     low = int(lod)
@@ -230,13 +230,14 @@ def _sky(sky, dx, dy, dz, rgb):
 def render_rows(geometry, look, R_cw, center_w, by_column, first_row, xy_norm, spacing, suns, image):
     """Mean radiance (rows, cols, 3) of the pixels of a strip that starts at first_row.
 
-    `xy_norm` (rows, cols, n, 2): ideal normalised coordinates of the n samples of each pixel, `spacing`
-    between them in the same units. `R_cw` (lines, 3, 3) and `center_w` (lines, 3): pose of each sensor line;
-    lines are rows, or columns if by_column. `suns` (n, 3): towards the point of the sun's disc that sample k
-    looks at.
+    `xy_norm` (rows, cols, n, 2): ideal normalised coordinates of the n samples of each pixel, `spacing` between them in
+    the same units. `R_cw` (lines, times, 3, 3) and `center_w` (lines, times, 3): poses of each sensor line at moments
+    of its exposure, which the samples take in turn; lines are rows, or columns if by_column. `suns` (n, 3): towards the
+    point of the sun's disc that sample k looks at.
     """
     light, light_grid, sky, colours = look[8:]
     rows, cols, n = xy_norm.shape[:3]
+    times = R_cw.shape[1]
     for i in prange(rows):
         stack = np.empty(_STACK, np.int64)
         rgb = np.empty(3)
@@ -244,10 +245,10 @@ def render_rows(geometry, look, R_cw, center_w, by_column, first_row, xy_norm, s
         planes = geometry[0]
         for j in range(cols):
             line = j if by_column else first_row + i
-            R = R_cw[line]
-            ox, oy, oz = center_w[line]
             total[:] = 0.0
             for k in range(n):
+                R = R_cw[line, k % times]
+                ox, oy, oz = center_w[line, k % times]
                 x, y = xy_norm[i, j, k]
                 dx = R[0, 0] * x + R[1, 0] * y + R[2, 0]
                 dy = R[0, 1] * x + R[1, 1] * y + R[2, 1]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from .camera import Camera
 from .checks import check_finite, check_rotations, frozen
-from .motion import RowMotion, check_shutter_model
+from .motion import SOLUTION_MODELS, RowMotion
 
 __all__ = ["Solution", "SolvedImage"]
 
@@ -102,13 +102,19 @@ class Solution:
     generator: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check_shutter_model(self.shutter_model)
+        if self.shutter_model not in SOLUTION_MODELS:
+            raise InputError(f"shutter model {self.shutter_model!r}, expected one of {', '.join(SOLUTION_MODELS)}")
         names = [image.name for image in self.images]
         if len(set(names)) != len(names):
             raise InputError("the solution names a photo twice")
         for image in self.images:
             if image.camera_id not in self.cameras:
                 raise InputError(f"photo {image.name} has camera {image.camera_id!r}, which the solution lacks")
+
+    @property
+    def map_model(self) -> str:
+        """Shutter model of the remap grids: without depth, translation is left and rotation taken out."""
+        return "rotation" if self.shutter_model == "constant-motion" else self.shutter_model
 
     def image(self, name: str) -> SolvedImage:
         """The photo of a name."""

@@ -3,15 +3,18 @@
 from .batch import rectify_folder
 from .evaluate import evaluate
 from .run import RunOptions, run, use_threads, versions
+from .scene import SceneOptions, simulate_scene
 from .simulate import WarpOptions, read_motion_file, simulate_warp
 
 __all__ = [
     "RunOptions",
+    "SceneOptions",
     "WarpOptions",
     "evaluate",
     "read_motion_file",
     "rectify_folder",
     "run",
+    "simulate_scene",
     "simulate_warp",
     "use_threads",
     "versions",

@@ -54,7 +54,7 @@ def rectify_photos(
         try:
             photo = read_photo(folder / name)
             pixels, mask = rectify(
-                photo.pixels, camera, image.motion, solution.shutter_model,
+                photo.pixels, camera, image.motion, solution.map_model,
                 solution.rectified_cameras[image.camera_id], interpolation,
             )  # fmt: skip
             write_image(out / "images" / output_name(name), pixels, photo.metadata, quality)

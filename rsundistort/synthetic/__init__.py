@@ -1,28 +1,43 @@
 """Known truth: a ray caster for rolling-shutter scenes, and real photos warped; no function shared with the kernels."""
 
-from .recipe import Recipe, View, load_recipe, look_at
-from .render import line_poses, pixel_rays, render_scene, render_view, rs_shift_px
+from .flight import look_at
+from .measurements import Measured, measure, project_rows
+from .plausible import check_recipe
+from .points import TruePoints, true_points
+from .recipe import Noise, Recipe, View, load_recipe
+from .render import add_noise, line_poses, pixel_rays, render_depth, render_view, rs_shift_px
 from .scene import Light, Opening, Patch, Scene, box, wall
+from .surfaces import height_field, mesh
 from .textures import Texture
 from .warp import random_phi, warp_photo
 
 __all__ = [
     "Light",
+    "Measured",
+    "Noise",
     "Opening",
     "Patch",
     "Recipe",
     "Scene",
     "Texture",
+    "TruePoints",
     "View",
+    "add_noise",
     "box",
+    "check_recipe",
+    "height_field",
     "line_poses",
     "load_recipe",
     "look_at",
+    "measure",
+    "mesh",
     "pixel_rays",
+    "project_rows",
     "random_phi",
-    "render_scene",
+    "render_depth",
     "render_view",
     "rs_shift_px",
+    "true_points",
     "wall",
     "warp_photo",
 ]

@@ -1,4 +1,7 @@
-"""Recipes of synthetic scenes: a JSON file that names textures, surfaces, light, camera, path and motion."""
+"""Recipes of synthetic scenes: a JSON file that names textures, surfaces, light, cameras, path and motion.
+
+`sample_scenes/README.md` describes the format for people.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +17,13 @@ from ..errors import FileError, FormatError, InputError
 from ..model.camera import Camera
 from ..model.checks import check_finite, check_rotations, frozen
 from ..model.motion import RowMotion
-from .scene import Light, Opening, Patch, Scene, box, wall
+from .entries import number, take
+from .flight import Pose, motions_of, poses_of
+from .scene import Light, Patch, Scene
+from .surfaces import surface_patches
 from .textures import Texture
 
-__all__ = ["Recipe", "View", "load_recipe", "look_at"]
+__all__ = ["Noise", "Recipe", "View", "load_recipe"]
 
 _FORMAT, _VERSION = "rsundistort-recipe", 1
 
@@ -36,12 +42,22 @@ class View:
         Centre of the camera then, world units.
     motion : RowMotion
         Motion during the readout.
+    camera_id : str
+        Which of the recipe's cameras took it.
+    exposure : float
+        How long a line is exposed, in units of the clock, around the moment of its pose.
     """
 
     name: str
     R_cw: NDArray[np.float64]
     center_w: NDArray[np.float64]
     motion: RowMotion
+    camera_id: str = "1"
+    exposure: float = 0.0
+
+    def at_once(self) -> View:
+        """The view of the global-shutter twin: the same pose, without motion."""
+        return View(self.name, self.R_cw, self.center_w, RowMotion(), self.camera_id)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "R_cw", frozen(check_rotations([self.R_cw], 1, "R_cw")[0]))
@@ -49,8 +65,28 @@ class View:
 
 
 @dataclass(frozen=True)
+class Noise:
+    """Noise of the sensor, in grey levels of the developed photo.
+
+    Parameters
+    ----------
+    read_grey : float
+        Standard deviation that is there without light.
+    shot_grey : float
+        Standard deviation that full white adds; its variance grows with the grey level.
+    """
+
+    read_grey: float = 0.0
+    shot_grey: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (self.read_grey >= 0 and self.shot_grey >= 0):
+            raise InputError(f"noise of {self.read_grey}, {self.shot_grey} grey levels; both must be 0 or more")
+
+
+@dataclass(frozen=True)
 class Recipe:
-    """A scene, the camera, the photos to take of it, and how to render them.
+    """A scene, the cameras, the photos to take of it, and how to render them.
 
     Parameters
     ----------
@@ -58,7 +94,7 @@ class Recipe:
         Name of the recipe.
     scene : Scene
         What is there.
-    camera : Camera
+    cameras : dict of id to Camera
         What takes the photos.
     views : tuple of View
         The photos.
@@ -66,150 +102,127 @@ class Recipe:
         Keyword arguments of `render_view`.
     jpeg_quality : int
         Of the files, 0-100.
+    noise : Noise
+        Of the rolling-shutter photos; the twins have none.
+    readout_ms : float or None
+        Time over which a frame is read, where the recipe says it.
+    num_points : int
+        True points to give away with the photos.
+    owners : tuple of str
+        Which entry of the recipe each patch of the scene comes from.
+    files : tuple of str
+        Meshes and pictures that the recipe names, relative to it.
     """
 
     name: str
     scene: Scene
-    camera: Camera
+    cameras: dict[str, Camera]
     views: tuple[View, ...]
     render_options: dict[str, Any]
     jpeg_quality: int
+    noise: Noise = Noise()
+    readout_ms: float | None = None
+    num_points: int = 2000
+    owners: tuple[str, ...] = ()
+    files: tuple[str, ...] = ()
+
+    def camera(self, view: View) -> Camera:
+        """The camera that took a view."""
+        return self.cameras[view.camera_id]
 
 
-def look_at(center_w: NDArray[np.float64], target_w: NDArray[np.float64], roll_deg: float = 0.0) -> NDArray[np.float64]:
-    """R_cw (3, 3) of a camera at center_w that looks at target_w.
-
-    Parameters
-    ----------
-    center_w, target_w : (3,) array
-        World frame, z up.
-    roll_deg : float
-        Turn of the camera about the viewing direction, clockwise as the photographer sees it; at 0 the x axis
-        is level.
-
-    Examples
-    --------
-    >>> look_at(np.zeros(3), np.array([0.0, 2.0, 0.0])).round().astype(int).tolist()
-    [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
-    """
-    forward = np.asarray(target_w, float) - center_w
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    if np.linalg.norm(right) < 1e-9:
-        raise InputError("a camera that looks straight up or down needs another description than look_at")
-    right /= np.linalg.norm(right)
-    down = np.cross(forward, right)
-    cos, sin = np.cos(np.radians(roll_deg)), np.sin(np.radians(roll_deg))
-    return np.array([cos * right + sin * down, cos * down - sin * right, forward])
-
-
-def _take(entry: Any, where: str, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, Any]:
-    """The entry, which must be an object with these keys and no others."""
-    if not isinstance(entry, dict):
-        raise FormatError(f"{where}: expected an object, got {entry!r}")
-    unknown, missing = sorted(set(entry) - set(required) - set(optional)), sorted(set(required) - set(entry))
-    if unknown or missing:
-        problem = [f"unknown key {key!r}" for key in unknown] + [f"missing key {key!r}" for key in missing]
-        raise FormatError(f"{where}: {', '.join(problem)}")
-    return entry
-
-
-def _kind(entry: Any, where: str, kinds: tuple[str, ...]) -> str:
-    kind = entry.get("kind") if isinstance(entry, dict) else None
-    if kind not in kinds:
-        raise FormatError(f"{where}: kind {kind!r}, expected one of {', '.join(kinds)}")
-    return str(kind)
-
-
-def _texture(entry: Any, where: str) -> Texture:
+def _texture(entry: Any, where: str, folder: Path) -> Texture:
     if not isinstance(entry, dict) or "kind" not in entry or "size_m" not in entry:
         raise FormatError(f"{where}: expected an object with kind and size_m")
     options = {k: v for k, v in entry.items() if k not in ("kind", "size_m", "texels_per_m")}
+    if entry["kind"] == "picture" and "path" in options:
+        options["path"] = str(folder / options["path"])
     return Texture(entry["kind"], tuple(entry["size_m"]), entry.get("texels_per_m", 128.0), options)
 
 
-def _surface(entry: Any, where: str, textures: dict[str, Texture], rng: np.random.Generator) -> list[Patch]:
-    kind = _kind(entry, where, ("rectangle", "triangle", "box"))
-    if kind == "box":
-        _take(entry, where, ("kind", "center_w", "size_m", "texture"), ("yaw_deg", "top", "tile_m"))
-        size = check_finite(entry["size_m"], (3,), f"{where}: size_m")
-        # each face shows another part of the texture, or another of its tiles (the sides of crates)
-        offsets = np.zeros((6, 2))
-        for face, (i, j) in enumerate(((0, 2), (1, 2), (0, 2), (1, 2), (0, 1), (1, 0))):
-            texture = textures.get(entry["texture"] if face < 4 else entry.get("top", entry["texture"]))
-            room = np.subtract(texture.size_m if texture else (0, 0), (size[i], size[j]))
-            offsets[face] = rng.uniform(0, 1, 2) * np.maximum(room, 0)
-        if "tile_m" in entry:
-            offsets = np.round(offsets / entry["tile_m"]) * entry["tile_m"]
-        return box(
-            entry["center_w"],
-            size,
-            entry["texture"],
-            entry.get("yaw_deg", 0.0),
-            entry.get("top", ""),
-            offsets,
-        )
-    optional = ("offset_m", "openings") if kind == "rectangle" else ("offset_m",)
-    _take(entry, where, ("kind", "origin_w", "edge_a", "edge_b", "texture"), optional)
-    offset = tuple(entry.get("offset_m", (0.0, 0.0)))
-    patch = Patch(entry["origin_w"], entry["edge_a"], entry["edge_b"], entry["texture"], offset, kind == "triangle")
-    if "openings" not in entry:
-        return [patch]
-    openings = []
-    for k, each in enumerate(entry["openings"]):
-        _take(each, f"{where}.openings[{k}]", ("at_m", "size_m", "depth_m"), ("back", "reveal", "offset_m"))
-        options: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in each.items()}
-        openings.append(Opening(**options))
-    return wall(patch, openings)
+def _files(data: dict[str, Any]) -> tuple[str, ...]:
+    """Files beside the recipe that it names; none may lie outside its folder, since they are copied with it."""
+    named = [each["path"] for each in (*data["surfaces"], *data["textures"].values()) if "path" in each]
+    for name in named:
+        if Path(name).is_absolute() or ".." in Path(name).parts:
+            raise FormatError(f"file {name!r}: expected a path below the recipe's own folder")
+    return tuple(sorted(set(named)))
 
 
-def _motions(entry: Any, camera: Camera, num: int, seed: int) -> list[RowMotion]:
-    _kind(entry, "motion", ("rotation",))
-    _take(entry, "motion", ("kind", "sigma_rad_per_frame"), ("still",))
-    rng = np.random.default_rng([seed, 1])
-    motions = []
-    for k in range(num):
-        axis = rng.normal(size=3)
-        angle = entry["sigma_rad_per_frame"] * rng.normal() / camera.frame_span
-        still = k in entry.get("still", ())
-        motions.append(RowMotion() if still else RowMotion(angle * axis / np.linalg.norm(axis)))
-    return motions
+def _cameras(data: dict[str, Any]) -> dict[str, Camera]:
+    if ("camera" in data) == ("cameras" in data):
+        raise FormatError("recipe: expected either camera or cameras")
+    entries = {"1": data["camera"]} if "camera" in data else data["cameras"]
+    if not entries:
+        raise FormatError("recipe: cameras is empty")
+    keys = ("width", "height", "K", "dist", "readout")
+    where = {id_: "camera" if "camera" in data else f"cameras.{id_}" for id_ in entries}
+    return {id_: Camera(**take(entry, where[id_], keys)) for id_, entry in entries.items()}
 
 
-def _parse(data: Any) -> Recipe:
-    keys = (
-        "format",
-        "version",
-        "name",
-        "seed",
-        "camera",
-        "render",
-        "light",
-        "textures",
-        "surfaces",
-        "path",
-        "motion",
+def _shutter(entry: Any) -> tuple[float | None, float]:
+    """Readout time in ms, and the share of it for which a line is exposed."""
+    if entry is None:
+        return None, 0.0
+    take(entry, "shutter", ("readout_ms",), ("exposure_ms",))
+    readout = number(entry["readout_ms"], "shutter.readout_ms")
+    exposure = number(entry.get("exposure_ms", 0.0), "shutter.exposure_ms")
+    if readout <= 0 or exposure < 0:
+        raise FormatError(f"shutter: readout_ms={readout:g}, exposure_ms={exposure:g}; expected times")
+    return readout, exposure / readout
+
+
+def _views(data: dict[str, Any], cameras: dict[str, Camera], exposed: float) -> tuple[View, ...]:
+    poses: list[Pose] = poses_of(data["path"], next(iter(cameras)))
+    for k, pose in enumerate(poses):
+        if pose.camera_id not in cameras:
+            raise FormatError(f"path[{k}]: camera {pose.camera_id!r}, expected one of {', '.join(cameras)}")
+    spans = [cameras[pose.camera_id].frame_span for pose in poses]
+    motions = motions_of(data["motion"], poses, spans, data["seed"])
+    return tuple(
+        View(f"{k:04d}.jpg", pose.R_cw, pose.center_w, motion, pose.camera_id, exposed * span)
+        for k, (pose, motion, span) in enumerate(zip(poses, motions, spans, strict=True))
     )
-    _take(data, "recipe", keys)
+
+
+def _parse(data: Any, folder: Path) -> Recipe:
+    keys = ("format", "version", "name", "seed", "render", "light", "textures", "surfaces", "path", "motion")
+    take(data, "recipe", keys, ("camera", "cameras", "shutter", "noise", "points"))
     if data["format"] != _FORMAT or data["version"] != _VERSION:
         raise FormatError(f"format {data['format']!r} version {data['version']!r}, expected {_FORMAT} {_VERSION}")
     seed = data["seed"]
-    camera = Camera(**_take(data["camera"], "camera", ("width", "height", "K", "dist", "readout")))
-    textures = {name: _texture(entry, f"textures.{name}") for name, entry in data["textures"].items()}
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise FormatError(f"seed={seed!r}, expected a whole number of 0 or more")
+    files = _files(data)
+    cameras = _cameras(data)
+    textures = {name: _texture(entry, f"textures.{name}", folder) for name, entry in data["textures"].items()}
     patches: list[Patch] = []
+    owners: list[str] = []
     for k, entry in enumerate(data["surfaces"]):
-        patches += _surface(entry, f"surfaces[{k}]", textures, np.random.default_rng([seed, 3, k]))
-    light = Light(**_take(data["light"], "light", (), tuple(f.name for f in fields(Light))))
-    motions = _motions(data["motion"], camera, len(data["path"]), seed)
-    views = []
-    for k, entry in enumerate(data["path"]):
-        _take(entry, f"path[{k}]", ("center_w", "look_at_w"), ("roll_deg",))
-        center = check_finite(entry["center_w"], (3,), f"path[{k}]: center_w")
-        R_cw = look_at(center, entry["look_at_w"], entry.get("roll_deg", 0.0))
-        views.append(View(f"{k:04d}.jpg", R_cw, center, motions[k]))
-    options = dict(_take(data["render"], "render", ("jpeg_quality",), ("samples", "spread_px", "exposure")))
-    quality = options.pop("jpeg_quality")
-    return Recipe(data["name"], Scene(tuple(patches), textures, light, seed), camera, tuple(views), options, quality)
+        where = f"surfaces[{k}]"
+        added = surface_patches(entry, where, textures, folder, np.random.default_rng([seed, 3, k]))
+        patches += added
+        owners += [f"{where} ({entry['kind']})"] * len(added)
+    light = Light(**take(data["light"], "light", (), tuple(f.name for f in fields(Light))))
+    noise = Noise(**take(data.get("noise", {}), "noise", (), ("read_grey", "shot_grey")))
+    readout_ms, exposed = _shutter(data.get("shutter"))
+    options = dict(take(data["render"], "render", ("jpeg_quality",), ("samples", "spread_px", "exposure")))
+    num_points = data.get("points", 2000)
+    if not isinstance(num_points, int) or num_points < 0:
+        raise FormatError(f"points={num_points!r}, expected a whole number")
+    return Recipe(
+        name=data["name"],
+        scene=Scene(tuple(patches), textures, light, seed),
+        cameras=cameras,
+        views=_views(data, cameras, exposed),
+        render_options=options,
+        jpeg_quality=options.pop("jpeg_quality"),
+        noise=noise,
+        readout_ms=readout_ms,
+        num_points=num_points,
+        owners=tuple(owners),
+        files=files,
+    )
 
 
 def load_recipe(path: str | Path) -> Recipe:
@@ -218,22 +231,23 @@ def load_recipe(path: str | Path) -> Recipe:
     Parameters
     ----------
     path : path
-        File of format rsundistort-recipe.
+        File of format rsundistort-recipe. Meshes and pictures are looked for beside it.
 
     Returns
     -------
     recipe : Recipe
         Ready to render. A FormatError names the entry that is wrong.
     """
+    path = Path(path)
     try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"))
+        data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise FileError(f"cannot read {path}: {error.strerror}") from error
     except ValueError as error:
         raise FormatError(f"{path} is not JSON: {error}") from error
     try:
-        return _parse(data)
+        return _parse(data, path.parent)
     except InputError as error:
         raise FormatError(f"{path}: {error}") from error
-    except (TypeError, KeyError, AttributeError) as error:
+    except (TypeError, KeyError, AttributeError, ValueError) as error:
         raise FormatError(f"{path}: an entry has the wrong type ({error})") from error

@@ -6,14 +6,8 @@ sensor line from SciPy, and shares no code with the kernels that go from the wor
 
 from __future__ import annotations
 
-import json
-import shutil
-from collections.abc import Callable
-from importlib.metadata import version
 from math import gcd
-from pathlib import Path
 from statistics import NormalDist
-from typing import Any
 
 import cv2
 import numpy as np
@@ -21,20 +15,19 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from .._kernels import raycast
-from ..errors import FileError
+from ..errors import InputError
 from ..model.camera import READOUTS, Camera
 from ..model.checks import check_finite
-from ..model.motion import RowMotion
 from .lens import undistort_to_rays
-from .recipe import Recipe, View, load_recipe
+from .recipe import Noise, View
 from .scene import Scene
 
-__all__ = ["line_poses", "pixel_rays", "render_scene", "render_view", "rs_shift_px"]
+__all__ = ["add_noise", "line_poses", "pixel_rays", "render_depth", "render_view", "rs_shift_px"]
 
 _STRIP_ROWS = 64  # keeps the sample coordinates of a strip to some 16 MB
 
 
-def line_poses(camera: Camera, view: View) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def line_poses(camera: Camera, view: View, delay: float = 0.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Pose of the camera at each sensor line.
 
     Parameters
@@ -43,17 +36,19 @@ def line_poses(camera: Camera, view: View) -> tuple[NDArray[np.float64], NDArray
         Its readout says whether lines are rows or columns and which is read first.
     view : View
         Pose at the line of the principal point, and the motion.
+    delay : float
+        Time after the middle of the line's exposure, in units of the clock.
 
     Returns
     -------
     R_cw : (lines, 3, 3) array
-        World to camera: Exp(tau*phi) @ view.R_cw, tau the clock of the line.
+        World to camera: Exp(tau*phi) @ view.R_cw, tau the clock of the line plus the delay.
     center_w : (lines, 3) array
         view.center_w + tau*velocity.
     """
     axis, sign = READOUTS[camera.readout]
     lines = np.arange(camera.height if axis == 1 else camera.width)
-    tau = sign * (lines - camera.K[axis, 2]) / camera.K[axis, axis]
+    tau = sign * (lines - camera.K[axis, 2]) / camera.K[axis, axis] + delay
     turn = Rotation.from_rotvec(tau[:, None] * view.motion.phi).as_matrix()
     return turn @ view.R_cw, view.center_w + tau[:, None] * view.motion.velocity
 
@@ -127,7 +122,7 @@ def render_view(
     camera : Camera
         Size, intrinsics, lens and readout.
     view : View
-        Pose at mid-frame, and motion.
+        Pose at mid-frame, motion and exposure: the samples of a pixel are spread over the exposure of its line.
     samples : int
         A pixel is the mean of this many rays.
     spread_px : float
@@ -140,9 +135,14 @@ def render_view(
     photo : (height, width, 3) uint8 array
         BGR.
     """
+    if samples < 1 or not spread_px > 0 or not exposure > 0:
+        raise InputError(f"samples={samples}, spread_px={spread_px}, exposure={exposure}; all must be positive")
     offsets = _footprint(samples, spread_px)
     spacing = 2.4 * spread_px / samples**0.5 / float(camera.K[0, 0])
-    R_cw, center_w = line_poses(camera, view)
+    # moments of the exposure, mixed so that they do not go with the place in the pixel
+    moments = [((k * 7 + 3) % samples + 0.5) / samples - 0.5 for k in range(samples)] if view.exposure else [0.0]
+    poses = [line_poses(camera, view, moment * view.exposure) for moment in moments]
+    R_cw, center_w = (np.ascontiguousarray(np.stack(each, axis=1)) for each in zip(*poses, strict=True))
     by_column = READOUTS[camera.readout][0] == 0
     suns = scene.light.sun_directions(samples)
     image = np.empty((camera.height, camera.width, 3))
@@ -172,97 +172,28 @@ def rs_shift_px(scene: Scene, camera: Camera, view: View) -> float:
     return float(np.linalg.norm(ideal[:, 0] - uv, axis=1).max())
 
 
-def _truth_image(recipe: Recipe, view: View) -> dict[str, Any]:
-    return {
-        "name": view.name,
-        "camera_id": "1",
-        "registered": True,
-        "R_cw": view.R_cw.tolist(),
-        "center_w": view.center_w.tolist(),
-        "phi": view.motion.phi.tolist(),
-        "velocity": view.motion.velocity.tolist(),
-        "aspect": view.motion.aspect,
-        "skew": view.motion.skew,
-        "sigma_phi": None,
-        "num_observations": 0,
-        "rms_px": None,
-        "rs_shift_px": rs_shift_px(recipe.scene, recipe.camera, view),
-    }
+def render_depth(scene: Scene, camera: Camera, view: View) -> NDArray[np.float32]:
+    """Depth that the centre of each pixel sees, in the camera at the moment of its line.
 
-
-def _truth(recipe: Recipe) -> dict[str, Any]:
-    """The ground truth in the format of a solution."""
-    camera = recipe.camera
-    size_and_K = {"width": camera.width, "height": camera.height, "K": camera.K.tolist()}
-    return {
-        "format": "rsundistort-solution",
-        "version": 1,
-        "generator": {"rsundistort": version("rsundistort")},
-        "options": {"recipe": recipe.name, "seed": recipe.scene.seed},
-        "cameras": {"1": {**size_and_K, "dist": camera.dist.tolist(), "readout": camera.readout}},
-        "rectified_cameras": {"1": size_and_K},
-        "shutter_model": "rotation",
-        "images": [_truth_image(recipe, view) for view in recipe.views],
-        "critical_motion": None,
-        "quality": {"num_points": 0, "num_observations": 0, "rms_px": None, "held_out_rms_px": {}},
-        "stages": [],
-    }
-
-
-def _write_json(path: Path, value: dict[str, Any]) -> None:
-    path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
-
-
-def render_scene(
-    recipe: str | Path | Recipe,
-    out_dir: str | Path,
-    *,
-    overwrite: bool = False,
-    progress: Callable[[int, int], None] | None = None,
-) -> None:
-    """Render a recipe: photos with a rolling shutter, their twins without, camera and ground truth.
-
-    Writes photos/NAME, global/NAME, camera.json, ground_truth.json and a copy of the recipe.
-
-    Parameters
-    ----------
-    recipe : path or Recipe
-        What to render.
-    out_dir : path
-        Folder to write; made if need be.
-    overwrite : bool
-        Replace what an earlier run left; else that is an error.
-    progress : callable, optional
-        Called with (photos done, photos in all) after each photo.
+    Returns
+    -------
+    depth : (height, width) float32 array
+        z in the camera, world units; inf where nothing is.
     """
-    source = None if isinstance(recipe, Recipe) else Path(recipe)
-    loaded = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
-    out = Path(out_dir)
-    existing = [name for name in ("photos", "global", "camera.json", "ground_truth.json") if (out / name).exists()]
-    if existing and not overwrite:
-        raise FileError(f"{out} already holds {', '.join(existing)}; ask for overwriting, or choose another folder")
-    try:
-        for folder in ("photos", "global"):
-            (out / folder).mkdir(parents=True, exist_ok=True)
-        camera = loaded.camera
-        for done, view in enumerate(loaded.views):
-            still = View(view.name, view.R_cw, view.center_w, RowMotion())
-            for folder, each in (("photos", view), ("global", still)):
-                photo = render_view(loaded.scene, camera, each, **loaded.render_options)
-                (out / folder / view.name).write_bytes(_encode_jpeg(photo, loaded.jpeg_quality))
-            if progress is not None:
-                progress(done + 1, len(loaded.views))
-        described = {"width": camera.width, "height": camera.height, "K": camera.K.tolist()}
-        _write_json(out / "camera.json", {**described, "dist": camera.dist.tolist(), "readout": camera.readout})
-        _write_json(out / "ground_truth.json", _truth(loaded))
-        if source is not None and source.resolve() != (out / "recipe.json").resolve():
-            shutil.copyfile(source, out / "recipe.json")
-    except OSError as error:
-        raise FileError(f"cannot write to {out}: {error}") from error
+    depth = np.empty((camera.height, camera.width), np.float32)
+    for row in range(0, camera.height, _STRIP_ROWS):
+        strip = depth[row : row + _STRIP_ROWS]
+        v, u = np.mgrid[row : row + len(strip), : camera.width].astype(float)
+        # directions have depth 1, so the distance along them is the depth
+        distance = scene.cast(*pixel_rays(camera, view, np.stack([u.ravel(), v.ravel()], 1)))[1]
+        strip[:] = distance.reshape(strip.shape)
+    return depth
 
 
-def _encode_jpeg(photo: NDArray[np.uint8], quality: int) -> bytes:
-    """The JPEG file of a BGR photo; the same bytes for the same pixels, quality and libjpeg."""
-    # chroma at full size: halved, it alone costs 2 dB
-    sampling = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
-    return bytes(cv2.imencode(".jpg", photo, [cv2.IMWRITE_JPEG_QUALITY, quality, *sampling])[1])
+def add_noise(photo: NDArray[np.uint8], noise: Noise, seed: int, number: int) -> NDArray[np.uint8]:
+    """The photo with the noise of the sensor, drawn for the photo of this number."""
+    if not (noise.read_grey or noise.shot_grey):
+        return photo
+    rng = np.random.default_rng([seed, 4, number])
+    spread = np.sqrt(noise.read_grey**2 + noise.shot_grey**2 * photo / 255.0)
+    return np.clip(np.round(photo + spread * rng.standard_normal(photo.shape)), 0, 255).astype(np.uint8)

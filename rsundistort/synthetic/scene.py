@@ -40,6 +40,9 @@ class Patch:
         Where on the texture the origin lies, metres along a and b.
     triangle : bool
         Only the half next to the origin: s + t <= 1.
+    axes_m : (4,) floats, optional
+        How far one goes on the texture along edge a (x, y) and along edge b (x, y), metres. Default: a runs along the
+        texture's x axis and b along its y axis, both at their true length.
     """
 
     origin_w: NDArray[np.float64]
@@ -48,6 +51,7 @@ class Patch:
     texture: str
     offset_m: tuple[float, float] = (0.0, 0.0)
     triangle: bool = False
+    axes_m: tuple[float, float, float, float] | None = None
 
     def __post_init__(self) -> None:
         for name in ("origin_w", "edge_a_w", "edge_b_w"):
@@ -347,7 +351,12 @@ class Scene:
         return (
             np.array([names.index(p.texture) for p in patches]),
             np.array([p.offset_m for p in patches]),
-            extent_m,
+            np.array(
+                [
+                    p.axes_m if p.axes_m is not None else (size[0], 0.0, 0.0, size[1])
+                    for p, size in zip(patches, extent_m, strict=True)
+                ]
+            ),
             np.concatenate(texels),
             (np.arange(256) / 255.0) ** 2.2,
             np.array(levels, np.int64),

@@ -1,4 +1,4 @@
-"""Procedural textures of the synthetic scenes: seeded, band-limited, never twice the same block.
+"""Textures of the synthetic scenes, procedural but for pictures: seeded, band-limited, never twice the same block.
 
 Every maker returns colours (rows, cols, 3), float32, RGB, gamma-encoded 0-1; row 0 is the bottom of the
 surface. Its finest grain is several texels, so that the ray caster's mip pyramid filters it without aliasing.
@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import FileError, FormatError, InputError
 
 __all__ = ["TEXTURE_KINDS", "Texture"]
 
@@ -263,15 +263,31 @@ def ground(canvas: _Canvas, *, colour: _Colour, contrast: float = 0.12) -> _Imag
     return np.asarray(_rgb(colour) * tone[..., None] + 0.02 * canvas.noise(0.5)[..., None], np.float32)
 
 
+def picture(canvas: _Canvas, *, path: str) -> _Image:
+    """A picture, stretched over the texture; what is finer than a texel is averaged away."""
+    try:
+        data = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise FileError(f"texture: cannot read {path}: {error.strerror}") from error
+    found = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    if found is None:
+        raise FormatError(f"texture: {path} is no picture that can be read")
+    shrinks = found.shape[0] > canvas.rows or found.shape[1] > canvas.cols
+    resized = cv2.resize(
+        found, (canvas.cols, canvas.rows), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
+    )
+    return np.asarray(resized[::-1, :, ::-1] / np.float32(255), np.float32)  # row 0 is the bottom
+
+
 #: Makers of textures by the name that recipes use; their keywords are the keys of a recipe's texture.
 TEXTURE_KINDS: dict[str, Callable[..., _Image]] = {
-    maker.__name__: maker for maker in (blocks, plaster, planks, crate, windows, foliage, ground)
+    maker.__name__: maker for maker in (blocks, plaster, planks, crate, windows, foliage, ground, picture)
 }
 
 
 @dataclass(frozen=True)
 class Texture:
-    """A procedural texture, described.
+    """A texture, described.
 
     Parameters
     ----------

@@ -1,0 +1,191 @@
+"""Photos of a synthetic scene, with everything that is true about them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..io import output_folder, write_solution
+from ..io.cameras import camera_to_json
+from ..model import Solution, SolvedImage
+from ..synthetic import Recipe, TruePoints, add_noise, check_recipe, load_recipe, render_depth, render_view, true_points
+from ..synthetic import rs_shift_px as shift_in_scene
+from .progress import ProgressCallback, StageLog
+from .run import use_threads
+
+__all__ = ["SceneOptions", "simulate_scene"]
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """Options of `simulate_scene`.
+
+    Parameters
+    ----------
+    depth : bool
+        Whether depth maps are written; they take more room than all the rest.
+    jobs, overwrite
+        As in `RunOptions`.
+    """
+
+    depth: bool = True
+    jobs: int = 0
+    overwrite: bool = False
+
+
+def simulate_scene(
+    recipe: Path | str | Recipe,
+    out: Path | str,
+    options: SceneOptions | None = None,
+    progress: ProgressCallback | None = None,
+) -> Solution:
+    """Render a recipe: rolling-shutter photos and what is true about them.
+
+    Writes `photos/`; `global/`, their global-shutter twins, from the pose of the principal row, without noise and blur;
+    `depth/` and `global-depth/` (float32 TIFF, z in the camera at the moment of the pixel's line, inf where nothing
+    is); `tracks.npz` (points on the surfaces with the pixels that show them; keys as in `TruePoints`, with `K`,
+    `width`, `height`, `R_cw`, `center_w`, `image_names` of the photos); `camera.json`, or `cameras.json` where
+    there are several; `ground_truth.json`; and the recipe with the files that it names. The same
+    recipe gives the same bytes.
+
+    Parameters
+    ----------
+    recipe : path or Recipe
+        What to render.
+    out : path
+        Folder for the outputs; it gets all of them or stays as it was.
+    options : SceneOptions, optional
+        See there.
+    progress : callable, optional
+        Called as (stage, done, total).
+
+    Returns
+    -------
+    Solution
+        The truth.
+
+    Raises
+    ------
+    InputError
+        When the recipe makes no sense: a camera in a wall, a surface behind every camera, rows that fold over.
+    """
+    options = options or SceneOptions()
+    source = None if isinstance(recipe, Recipe) else Path(recipe)
+    loaded = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
+    out = Path(out)
+    log = StageLog(progress)
+    use_threads(options.jobs)
+    log.begin("checking")
+    check_recipe(loaded)
+    log.end("checking")
+    with output_folder(out, overwrite=options.overwrite) as scratch:
+        log.begin("points")
+        points = true_points(loaded)
+        log.end("points")
+        folders = ("photos", "global", *(("depth", "global-depth") if options.depth else ()))
+        for folder in folders:
+            (scratch / folder).mkdir()
+        log.begin("rendering", len(loaded.views))
+        for number, view in enumerate(loaded.views):
+            camera = loaded.camera(view)
+            for folder, each in (("photos", view), ("global", view.at_once())):
+                photo = render_view(loaded.scene, camera, each, **loaded.render_options)
+                if folder == "photos":
+                    photo = add_noise(photo, loaded.noise, loaded.scene.seed, number)
+                (scratch / folder / view.name).write_bytes(_encode_jpeg(photo, loaded.jpeg_quality))
+                if options.depth:
+                    to = scratch / ("depth" if folder == "photos" else "global-depth") / f"{Path(view.name).stem}.tif"
+                    to.write_bytes(bytes(cv2.imencode(".tif", render_depth(loaded.scene, camera, each))[1]))
+            log.tell("rendering", number + 1, len(loaded.views))
+        log.end("rendering")
+        truth = _truth(loaded, points)
+        _write_cameras(scratch, loaded)
+        arrays: dict[str, Any] = _tracks(loaded, points)
+        np.savez_compressed(scratch / "tracks.npz", **arrays)
+        write_solution(scratch / "ground_truth.json", truth)
+        if source is not None:
+            shutil.copyfile(source, scratch / "recipe.json")
+            for name in loaded.files:
+                (scratch / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(source.parent / name, scratch / name)
+    return truth
+
+
+def _truth(recipe: Recipe, points: TruePoints) -> Solution:
+    """The ground truth in the format of a solution; no times and dates, which would change its bytes."""
+    moves = any(view.motion.velocity.any() for view in recipe.views)
+    counts = np.bincount(points.frame_idx, minlength=len(recipe.views))
+    images = tuple(
+        SolvedImage(
+            view.name,
+            view.camera_id,
+            view.R_cw,
+            view.center_w,
+            view.motion,
+            num_observations=int(number),
+            rs_shift_px=shift_in_scene(recipe.scene, recipe.camera(view), view),
+        )
+        for view, number in zip(recipe.views, counts, strict=True)
+    )
+    options: dict[str, Any] = {"simulation": "scene", "recipe": recipe.name, "seed": recipe.scene.seed}
+    if recipe.readout_ms is not None:
+        options["readout_ms"] = recipe.readout_ms
+    return Solution(
+        shutter_model="constant-motion" if moves else "rotation",
+        cameras=recipe.cameras,
+        rectified_cameras={key: camera.pinhole() for key, camera in recipe.cameras.items()},
+        images=images,
+        quality={"num_points": len(points.points_w), "num_observations": len(points.frame_idx)},
+        options=options,
+        generator={"rsundistort": version("rsundistort")},
+    )
+
+
+def _tracks(recipe: Recipe, points: TruePoints) -> dict[str, NDArray[Any]]:
+    cameras = [recipe.camera(view) for view in recipe.views]
+    same = len(recipe.cameras) == 1
+    return {
+        "image_names": np.array([view.name for view in recipe.views]),
+        "K": cameras[0].K if same else np.array([camera.K for camera in cameras]),
+        "width": np.array(cameras[0].width if same else [camera.width for camera in cameras]),
+        "height": np.array(cameras[0].height if same else [camera.height for camera in cameras]),
+        "R_cw": np.array([view.R_cw for view in recipe.views]),
+        "center_w": np.array([view.center_w for view in recipe.views]),
+        "points_w": points.points_w,
+        "frame_idx": points.frame_idx,
+        "point_idx": points.point_idx,
+        "xy_raw": points.xy_raw,
+        "xy_global": points.xy_global,
+    }
+
+
+def _write_cameras(folder: Path, recipe: Recipe) -> None:
+    """`camera.json`, or all cameras with the photos they took."""
+    if len(recipe.cameras) == 1:
+        name, value = "camera.json", camera_to_json(next(iter(recipe.cameras.values())))
+    else:
+        name = "cameras.json"
+        value = {
+            "cameras": {key: camera_to_json(camera) for key, camera in recipe.cameras.items()},
+            "images": {view.name: view.camera_id for view in recipe.views},
+        }
+    (folder / name).write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
+
+
+def _encode_jpeg(photo: NDArray[np.uint8], quality: int) -> bytes:
+    """The JPEG file of a BGR photo; the same bytes for the same pixels, quality and libjpeg."""
+    # chroma at full size: halved, it alone costs 2 dB
+    sampling = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    done, data = cv2.imencode(".jpg", photo, [cv2.IMWRITE_JPEG_QUALITY, quality, *sampling])
+    if not done:
+        raise InputError(f"a photo of {photo.shape[1]}x{photo.shape[0]} pixels cannot be written as JPEG")
+    return bytes(data)
