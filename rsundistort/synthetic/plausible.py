@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..errors import InputError
+from .fold import check_no_fold
 from .recipe import Recipe, View
 from .render import line_poses, render_depth
 
@@ -27,6 +28,7 @@ def check_recipe(recipe: Recipe) -> None:
         depth = render_depth(recipe.scene, camera, view)
         if not np.isfinite(depth).any():
             raise InputError(f"photo {view.name} shows nothing but sky; look_at_w is away from every surface")
+        check_no_fold(view.name, camera, view.motion.phi, view.R_cw @ view.motion.velocity, depth)
     _check_in_front(recipe)
 
 

@@ -122,7 +122,7 @@ class Recipe:
     jpeg_quality: int
     noise: Noise = Noise()
     readout_ms: float | None = None
-    num_points: int = 2000
+    num_points: int = 1000
     owners: tuple[str, ...] = ()
     files: tuple[str, ...] = ()
 
@@ -207,7 +207,7 @@ def _parse(data: Any, folder: Path) -> Recipe:
     noise = Noise(**take(data.get("noise", {}), "noise", (), ("read_grey", "shot_grey")))
     readout_ms, exposed = _shutter(data.get("shutter"))
     options = dict(take(data["render"], "render", ("jpeg_quality",), ("samples", "spread_px", "exposure")))
-    num_points = data.get("points", 2000)
+    num_points = data.get("points", 1000)
     if not isinstance(num_points, int) or num_points < 0:
         raise FormatError(f"points={num_points!r}, expected a whole number")
     return Recipe(
