@@ -14,7 +14,7 @@ import numpy as np
 from rsundistort.model import Camera, RowMotion
 from rsundistort.synthetic import project_rows
 
-MODELS = ("global", "two-step", "linearized", "rotation")
+MODELS = ("global", "two-step", "linearized", "rotation", "constant-motion")
 DIRECTIONS = ("top-to-bottom", "bottom-to-top", "left-to-right", "right-to-left")
 
 
@@ -74,19 +74,20 @@ def linearized(xy, phi, readout):
     return turned((low + high) / 2)
 
 
-def rotation(xy, phi, dist, readout):
-    """Paper Eq. 2 without translation, by the generator of measurements; in units of a camera with K = 1."""
+def exact(points_c, phi, velocity_c, dist, readout):
+    """Paper Eq. 2 by the generator of measurements; in units of a camera with K = 1."""
     unit = Camera(1, 1, np.eye(3), dist, readout)
-    rays = np.column_stack([xy, np.ones(len(xy))])
-    return project_rows(rays, np.eye(3), np.zeros(3), RowMotion(phi), unit)[0]
+    return project_rows(points_c, np.eye(3), np.zeros(3), RowMotion(phi, velocity_c), unit)[0]
 
 
-def project_normalised(points_c, phi, model, readout, dist=()):
+def project_normalised(points_c, phi, model, readout, dist=(), velocity_c=(0, 0, 0)):
     """Distorted normalised coordinates (n, 2) where a rolling-shutter photo shows camera-frame points."""
     points_c = np.asarray(points_c, float)
-    xy = points_c[:, :2] / points_c[:, 2:]
     if model == "rotation":
-        return rotation(xy, phi, dist, readout)
+        return exact(points_c, phi, (0, 0, 0), dist, readout)
+    if model == "constant-motion":
+        return exact(points_c, phi, velocity_c, dist, readout)
+    xy = points_c[:, :2] / points_c[:, 2:]
     if model == "two-step":
         xy = two_step(xy, phi, readout)
     elif model == "linearized":
@@ -94,7 +95,8 @@ def project_normalised(points_c, phi, model, readout, dist=()):
     return lens(dist, xy)
 
 
-def project(points_w, R_cw, center_w, phi, model, readout, K, dist=()):
+def project(points_w, R_cw, center_w, phi, model, readout, K, dist=(), velocity_w=(0, 0, 0)):
     """Pixels (n, 2) of world points."""
-    normalised = project_normalised((points_w - center_w) @ R_cw.T, phi, model, readout, dist)
+    velocity_c = R_cw @ np.asarray(velocity_w, float)
+    normalised = project_normalised((points_w - center_w) @ R_cw.T, phi, model, readout, dist, velocity_c)
     return normalised * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, Camera, InputError, Observations, Reconstruction, bundle_adjust, climb
 from rsundistort.bundle import reprojection_residuals
-from rsundistort.bundle.problem import BundleProblem
+from rsundistort.bundle.problem import BundleProblem, Spreads
 
 LENS = [-0.12, 0.03, 0.001, -0.002]
-SHUTTERS = ("two-step", "linearized", "rotation")
+SHUTTERS = ("two-step", "linearized", "rotation", "constant-motion")
 
 
 @pytest.fixture(autouse=True)
@@ -46,12 +46,14 @@ def make_scene(rng, model, num_images=6, num_points=60, noise_px=0.0, phi_size=0
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     R_cw = np.stack([right, np.cross(ahead, right), ahead], axis=1)
     phi = rng.uniform(-phi_size, phi_size, (num_images, 3)) * (model != "global")
+    # photos are about 4 apart
+    velocity = rng.uniform(-0.2, 0.2, (num_images, 3)) * (model == "constant-motion")
     camera_idx = np.arange(num_images) % len(cameras)
     point_idx, frame_idx = (a.ravel() for a in np.mgrid[:num_points, :num_images])
     xy = np.empty((num_points, num_images, 2))
     for i in range(num_images):
         camera = cameras[camera_idx[i]]
-        xy[:, i] = project(points_w, R_cw[i], center_w[i], phi[i], model, camera.readout, camera.K, dist)
+        xy[:, i] = project(points_w, R_cw[i], center_w[i], phi[i], model, camera.readout, camera.K, dist, velocity[i])
     xy += noise_px * rng.normal(size=xy.shape)
     return Reconstruction(
         cameras=cameras,
@@ -62,6 +64,7 @@ def make_scene(rng, model, num_images=6, num_points=60, noise_px=0.0, phi_size=0
         points_w=points_w,
         observations=Observations(frame_idx, point_idx, xy.reshape(-1, 2)),
         phi=phi,
+        velocity=velocity,
         shutter_model=model,
     )
 
@@ -75,6 +78,7 @@ def perturbed(rec, rng, angle=0.02, length=0.05):
         center_w=rec.center_w + length * rng.normal(size=rec.center_w.shape),
         points_w=rec.points_w + length * rng.normal(size=rec.points_w.shape),
         phi=np.zeros_like(rec.phi),
+        velocity=np.zeros_like(rec.velocity),
     )
 
 
@@ -90,7 +94,8 @@ def noisy_problem(rng, model, loss="squared", dense_limit=1500, sigma_px=0.5):
     start = replace(perturbed(rec, rng, 0.01, 0.02), phi=rec.phi + 0.02 * rng.normal(size=rec.phi.shape))
     sigma = rng.uniform(1, 3, len(rec.observations))
     start = replace(start, observations=replace(rec.observations, sigma=sigma))
-    problem = BundleProblem(start, model, BundleOptions(loss=loss, dense_limit=dense_limit), sigma_px=sigma_px)
+    options = BundleOptions(loss=loss, dense_limit=dense_limit)
+    problem = BundleProblem(start, model, options, sigma_px, Spreads(0.03, 0.1))
     return problem, problem.initial_state()
 
 
@@ -160,11 +165,13 @@ def dense_system(problem, state):
         J[k, :, p : p + 3] = J_point[k]
     J = J.reshape(-1, J.shape[2])
     H, g = J.T @ J, J.T @ res.ravel()
-    if nb == 9:  # prior: (phi * span / spread)^2 / 2
+    if nb > 6:  # priors: (phi * span / spread)^2 / 2, and the same for the velocity
         weight = np.zeros((m, nb))
-        weight[:, 6:] = (problem._start.frame_span() / problem._options.phi_sigma_start)[:, None] ** 2
+        weight[:, 6:9] = (problem._start.frame_span() / 0.03)[:, None] ** 2
+        weight[:, 9:] = (problem._start.frame_span() / 0.1)[:, None] ** 2
         gradient = np.zeros((m, nb))
-        gradient[:, 6:] = weight[:, 6:] * state.phi
+        gradient[:, 6:9] = weight[:, 6:9] * state.phi
+        gradient[:, 9:] = weight[:, 9:] * state.velocity[:, : nb - 9]
         H[: m * nb, : m * nb] += np.diag(weight.ravel())
         g[: m * nb] += gradient.ravel()
     return H, g, np.concatenate([problem._free.ravel(), np.ones(3 * problem._start.num_points, bool)])
@@ -172,7 +179,10 @@ def dense_system(problem, state):
 
 @pytest.mark.parametrize("damping", [1e-6, 1e-2, 10.0])
 @pytest.mark.parametrize("dense_limit", [1500, 0], ids=["dense", "sparse"])
-@pytest.mark.parametrize(("model", "loss"), [("global", "squared"), ("rotation", "squared"), ("two-step", "cauchy")])
+@pytest.mark.parametrize(
+    ("model", "loss"),
+    [("global", "squared"), ("rotation", "squared"), ("two-step", "cauchy"), ("constant-motion", "squared")],
+)
 def test_elimination_gives_the_step_of_the_whole_system(model, loss, dense_limit, damping, rng):
     problem, state = noisy_problem(rng, model, loss, dense_limit)
     H, g, free = dense_system(problem, state)
@@ -190,15 +200,17 @@ def test_elimination_gives_the_step_of_the_whole_system(model, loss, dense_limit
 
 
 @pytest.mark.parametrize("dense_limit", [1500, 0], ids=["dense", "sparse"])
-def test_variances_of_phi_are_those_of_the_whole_inverse(dense_limit, rng):
+def test_covariances_are_those_of_the_whole_inverse(dense_limit, rng):
     problem, state = noisy_problem(rng, "rotation", dense_limit=dense_limit)
     H, _, free = dense_system(problem, state)
     scale = 1 / np.sqrt(np.diag(H)[free])
     inverse = scale[:, None] * np.linalg.inv(scale[:, None] * H[np.ix_(free, free)] * scale) * scale
-    variances = np.zeros(len(free))
-    variances[free] = np.diag(inverse)
-    frames = variances[: problem._free.size].reshape(problem._free.shape)
-    np.testing.assert_allclose(problem.phi_variance(state), frames[:, 6:], rtol=1e-8)  # as the step
+    whole = np.zeros((len(free), len(free)))
+    whole[np.ix_(free, free)] = inverse
+    m, nb = problem._free.shape
+    expected = np.array([whole[nb * i : nb * i + nb, nb * i : nb * i + nb] for i in range(m)])
+    size = np.sqrt(np.einsum("iaa,ibb->iab", expected, expected))
+    np.testing.assert_array_less(np.abs(problem.covariances(state) - expected), 1e-8 * size + 1e-300)  # as the step
 
 
 @pytest.mark.parametrize("dist", [[], LENS], ids=["pinhole", "lens"])
@@ -208,8 +220,8 @@ def test_residuals_and_gradient_vanish_at_the_truth_of_the_twin(model, dist, rng
     res, valid = reprojection_residuals(rec)
     assert valid.all()
     assert np.abs(res).max() < 1e-9  # px: 1e-12 times the focal length
-    options = BundleOptions(loss="squared", phi_sigma=1e9)  # else the prior pulls
-    problem = BundleProblem(rec, model, options, sigma_px=1.0)
+    options = BundleOptions(loss="squared")
+    problem = BundleProblem(rec, model, options, 1.0, Spreads(1e9, 1e9))  # else the priors pull
     equations = problem.linearize(problem.initial_state())
     # Jacobians of 1000 px times residuals of 1e-12 to 1e-10 px, summed over 60 points or 6 photos
     assert np.abs(equations._g_frame).max() < 1e-5
@@ -220,29 +232,52 @@ def test_residuals_and_gradient_vanish_at_the_truth_of_the_twin(model, dist, rng
 @pytest.mark.parametrize("model", SHUTTERS)
 def test_truth_is_recovered_without_noise(model, rng):
     truth = make_scene(rng, model, dist=LENS)
-    # a prior of 10 rad weighs nothing against thousands of pixels a radian
-    options = BundleOptions(loss="squared", sigma_px=0.5, phi_sigma=10.0, outlier_rounds=0, cost_tolerance=1e-12)
+    # priors of 10 rad and 10 baselines weigh nothing against thousands of pixels a radian
+    options = BundleOptions(
+        loss="squared", sigma_px=0.5, phi_sigma=10.0, velocity_sigma=10.0, outlier_rounds=0, cost_tolerance=1e-12
+    )  # fmt: skip
     result = bundle_adjust(perturbed(truth, rng), model, options)
     assert result.converged
     assert result.reconstruction.shutter_model == model
     # the prior's pull on phi: 0.05 / 100 against (700 / 0.5)^2, and what it does to the rest
-    np.testing.assert_allclose(result.reconstruction.phi, truth.phi, atol=1e-8)
+    # (rotation and translation differ by depth alone, so the pull reaches further with both)
+    np.testing.assert_allclose(
+        result.reconstruction.phi, truth.phi, atol=1e-7 if model == "constant-motion" else 1e-8
+    )  # fmt: skip
     for found, true in zip(relative_poses(result.reconstruction), relative_poses(truth), strict=True):
-        np.testing.assert_allclose(found, true, atol=1e-7)
+        np.testing.assert_allclose(found, true, atol=1e-6 if model == "constant-motion" else 1e-7)
     assert result.rms_px < 1e-5
     assert result.num_outliers == 0
 
 
 def test_ladder_ends_at_the_truth_and_climbs_in_order(rng):
-    truth = make_scene(rng, "rotation")
+    truth = make_scene(rng, "constant-motion")
     seen = []
     results = climb(perturbed(truth, rng), progress=lambda model, cost: seen.append(model))
-    assert list(results) == ["global", "two-step", "rotation"]
+    assert list(results) == ["global", "two-step", "rotation", "constant-motion"]
     assert list(dict.fromkeys(seen)) == list(results)
-    assert results["global"].rms_px > results["two-step"].rms_px > results["rotation"].rms_px
+    rms = [result.rms_px for result in results.values()]
+    assert rms == sorted(rms, reverse=True)
     assert (results["global"].reconstruction.phi == 0).all()
+    assert (results["rotation"].reconstruction.velocity == 0).all()
     # noise is taken for 0.02 px at least, so phi's deviation for 1e-4; the prior pulls by a small part of that
-    np.testing.assert_allclose(results["rotation"].reconstruction.phi, truth.phi, atol=1e-5)
+    np.testing.assert_allclose(results["constant-motion"].reconstruction.phi, truth.phi, atol=1e-4)
+
+
+def test_spreads_of_the_priors_do_not_depend_on_their_start(rng):
+    truth = make_scene(rng, "constant-motion", num_images=8, num_points=60, noise_px=0.5)
+    ends = []
+    for factor in (1 / 3, 1.0, 3.0):
+        options = BundleOptions(phi_sigma_start=0.03 * factor, velocity_sigma_start=0.03 * factor)
+        ends.append(climb(perturbed(truth, np.random.default_rng(1)), options=options)["constant-motion"])
+    span = truth.frame_span()[:, None]
+    for result in ends:
+        assert result.phi_sigma == pytest.approx(ends[1].phi_sigma, rel=0.02)
+        assert result.velocity_sigma == pytest.approx(ends[1].velocity_sigma, rel=0.02)
+        # 24 values of each
+        assert result.phi_sigma == pytest.approx(np.sqrt(np.mean((truth.phi * span) ** 2)), rel=0.3)
+        true_velocity = np.sqrt(np.mean((truth.velocity * span) ** 2)) / truth.baseline
+        assert result.velocity_sigma == pytest.approx(true_velocity, rel=0.3)
 
 
 @pytest.mark.parametrize("noise_px", [0.1, 0.5, 2.0])
@@ -345,6 +380,7 @@ def test_similarity_of_the_world_leaves_residuals_unchanged(model, rng):
         R_cw=rec.R_cw @ A.T,
         center_w=scale * rec.center_w @ A.T + shift,
         points_w=scale * rec.points_w @ A.T + shift,
+        velocity=scale * rec.velocity @ A.T,
     )
     # rounding of coordinates of 20 scene sizes
     np.testing.assert_allclose(reprojection_residuals(moved)[0], reprojection_residuals(rec)[0], atol=1e-9)
@@ -376,7 +412,7 @@ def test_order_of_the_measurements_does_not_matter(rng):
 
 def test_cost_falls_with_each_accepted_step_and_the_reason_is_said(rng):
     start = perturbed(make_scene(rng, "rotation", noise_px=0.5), rng)
-    once = BundleOptions(outlier_rounds=0)
+    once = BundleOptions(outlier_rounds=0, spread_rounds=0)
     result = bundle_adjust(start, "rotation", once)
     assert result.stop_reason == "cost"
     assert result.converged

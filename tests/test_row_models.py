@@ -39,7 +39,7 @@ def draw_points(rng, n=60, field=0.6):
 def draw_motions(rng, n=6):
     """Motions up to 0.1 rad a unit, small ones too, and one along each axis."""
     random = rng.uniform(-0.1, 0.1, (n, 3)) * np.array([1, 1, 1, 0.1, 1e-3, 1e-6])[:n, None]
-    return np.vstack([random, 0.1 * np.eye(3)])
+    return [RowMotion(phi, rng.uniform(-0.3, 0.3, 3)) for phi in np.vstack([random, 0.1 * np.eye(3)])]
 
 
 @all_lenses
@@ -47,10 +47,10 @@ def draw_motions(rng, n=6):
 @all_models
 def test_forward_equals_the_numpy_twin(model, readout, dist, rng):
     camera, points = make_camera(dist, readout), draw_points(rng)
-    for phi in draw_motions(rng):
-        xy, valid = project_points(points, camera, RowMotion(phi), model)
+    for motion in draw_motions(rng):
+        xy, valid = project_points(points, camera, motion, model)
         assert valid.all()
-        twin = project_normalised(points, phi, model, readout, dist)
+        twin = project_normalised(points, motion.phi, model, readout, dist, motion.velocity)
         # both solve the row to 1e-14 or better and then round a few dozen times
         assert np.abs((xy - K[:2, 2]) / FOCAL - twin).max() <= 1e-12
 
@@ -60,9 +60,11 @@ def test_forward_equals_the_numpy_twin(model, readout, dist, rng):
 @all_models
 def test_unproject_inverts_project(model, readout, dist, rng):
     camera, points = make_camera(dist, readout), draw_points(rng)
-    for phi in draw_motions(rng):
-        xy, _ = project_points(points, camera, RowMotion(phi), model)
-        ideal, valid = unproject_points(xy, camera, RowMotion(phi), model)
+    for motion in draw_motions(rng):
+        # without depth, translation cannot be undone
+        motion = RowMotion(motion.phi)
+        xy, _ = project_points(points, camera, motion, model)
+        ideal, valid = unproject_points(xy, camera, motion, model)
         assert valid.all()
         # Newton of the lens ends at 1e-14; its slope, above 0.5 here, hardly amplifies that
         assert np.abs(ideal - points[:, :2] / points[:, 2:]).max() <= 1e-10
@@ -76,23 +78,30 @@ def test_jacobians_equal_central_differences(model, readout, dist, rng):
     points /= points[:, 2:]  # one scale of lengths, one step for the differences
     points *= rng.uniform(1, 2, (20, 1))
     h = 1e-5
-    for phi in draw_motions(rng):
-        xy, valid, J = project_points_with_jacobians(points, camera, RowMotion(phi), model)
+    for motion in draw_motions(rng):
+        xy, valid, J = project_points_with_jacobians(points, camera, motion, model)
         assert valid.all()
         # the same formulas, compiled once with and once without derivatives: rounding of pixels up to 400
-        np.testing.assert_allclose(xy, project_points(points, camera, RowMotion(phi), model)[0], atol=1e-11)
+        np.testing.assert_allclose(xy, project_points(points, camera, motion, model)[0], atol=1e-11)
+
+        def difference(step, d_point, d_phi, d_velocity, motion=motion):
+            ends = [
+                project_points(
+                    points + s * d_point * step,
+                    camera,
+                    RowMotion(motion.phi + s * d_phi * step, motion.velocity + s * d_velocity * step),
+                    model,
+                )[0]
+                for s in (1, -1)
+            ]
+            return (ends[0] - ends[1]) / (2 * h)
+
         for j, step in enumerate(h * np.eye(3)):
-            by_point = (
-                project_points(points + step, camera, RowMotion(phi), model)[0]
-                - project_points(points - step, camera, RowMotion(phi), model)[0]
-            ) / (2 * h)
-            by_phi = (
-                project_points(points, camera, RowMotion(phi + step), model)[0]
-                - project_points(points, camera, RowMotion(phi - step), model)[0]
-            ) / (2 * h)
+            by_point, by_phi, by_velocity = (difference(step, *which) for which in np.eye(3))
             # derivatives are of the size of the focal length, 400; differences are good to h^2 + 1e-13/h = 1e-8
             assert np.abs(J.point[:, :, j] - by_point).max() <= 1e-6 * 400
             assert np.abs(J.phi[:, :, j] - by_phi).max() <= 1e-6 * 400
+            assert np.abs(J.velocity[:, :, j] - by_velocity).max() <= 1e-6 * 400
 
 
 @all_lenses

@@ -14,7 +14,7 @@ import numpy as np
 
 from ._jit import kernel, parallel_kernel, prange
 
-GLOBAL, TWO_STEP, LINEARIZED, ROTATION = 0, 1, 2, 3
+GLOBAL, TWO_STEP, LINEARIZED, ROTATION, CONSTANT_MOTION = 0, 1, 2, 3, 4
 
 # Newton on the row takes its last step from a gap below this (normalised units): the step squares the gap, and the
 # curvature of the gap is of the order of phi, so 1e-17 is left.
@@ -199,14 +199,15 @@ def _project(model, axis, sign, lens, x, y, z, phi, vel, out, jac, E, L):
     """One camera-frame point into distorted normalised coordinates out[:2]; True when it is valid.
 
     With jac: out[2:8] derivative with respect to the point (2, 3), out[8:14] to phi, out[14:20] to the
-    camera-frame velocity (only the rotation model uses it). E, L are (3, 3) scratch.
+    camera-frame velocity, which only the constant-motion model uses. E, L are (3, 3) scratch.
     """
     if not z > 0.0:
         return False
     X = x / z
     Y = y / z
-    if model == ROTATION:
-        return _project_exact(axis, sign, lens, x, y, z, phi, vel, math.nan, out, jac, E, L)
+    if model >= ROTATION:
+        moving = 1.0 if model == CONSTANT_MOTION else 0.0
+        return _project_exact(axis, sign, lens, x, y, z, phi, vel, moving, math.nan, out, jac, E, L)
     if model == GLOBAL:
         xd, yd, xx, xy, yx, yy, ok = _lens(lens, X, Y)
         out[0] = xd
@@ -264,13 +265,15 @@ def _project(model, axis, sign, lens, x, y, z, phi, vel, out, jac, E, L):
 
 
 @kernel()
-def _project_exact(axis, sign, lens, x, y, z, phi, vel, start, out, jac, E, L):
+def _project_exact(axis, sign, lens, x, y, z, phi, vel, moving, start, out, jac, E, L):
     """Paper Eq. 2 whole, q(t) = Exp(t phi) (x - t v), with t the distorted row (or column) that the sensor read.
 
-    The search for t starts at `start`, or, when that is NaN, at the row of a camera that does not move.
+    v is moving * vel; with moving = 0 it is the rotation model. The search for t starts at `start`, or, when that is
+    NaN, at the row of a camera that does not move.
     """
     X = x / z
     Y = y / z
+    v0, v1, v2 = moving * vel[0], moving * vel[1], moving * vel[2]
     xd, yd, xx, xy, yx, yy, ok = _lens(lens, X, Y)
     t = start if start == start else sign * (yd if axis == 1 else xd)
     done = False
@@ -280,16 +283,16 @@ def _project_exact(axis, sign, lens, x, y, z, phi, vel, start, out, jac, E, L):
     p0 = p1 = p2 = 0.0
     for _ in range(_MAX_NEWTON):
         _exp_so3(t * phi[0], t * phi[1], t * phi[2], E)
-        p0, p1, p2 = x - t * vel[0], y - t * vel[1], z - t * vel[2]
+        p0, p1, p2 = x - t * v0, y - t * v1, z - t * v2
         q0 = E[0, 0] * p0 + E[0, 1] * p1 + E[0, 2] * p2
         q1 = E[1, 0] * p0 + E[1, 1] * p1 + E[1, 2] * p2
         q2 = E[2, 0] * p0 + E[2, 1] * p1 + E[2, 2] * p2
         if not q2 > 0.0:
             return False
         # dq/dt = phi x q - E v
-        w0 = phi[1] * q2 - phi[2] * q1 - (E[0, 0] * vel[0] + E[0, 1] * vel[1] + E[0, 2] * vel[2])
-        w1 = phi[2] * q0 - phi[0] * q2 - (E[1, 0] * vel[0] + E[1, 1] * vel[1] + E[1, 2] * vel[2])
-        w2 = phi[0] * q1 - phi[1] * q0 - (E[2, 0] * vel[0] + E[2, 1] * vel[1] + E[2, 2] * vel[2])
+        w0 = phi[1] * q2 - phi[2] * q1 - (E[0, 0] * v0 + E[0, 1] * v1 + E[0, 2] * v2)
+        w1 = phi[2] * q0 - phi[0] * q2 - (E[1, 0] * v0 + E[1, 1] * v1 + E[1, 2] * v2)
+        w2 = phi[0] * q1 - phi[1] * q0 - (E[2, 0] * v0 + E[2, 1] * v1 + E[2, 2] * v2)
         X = q0 / q2
         Y = q1 / q2
         xd, yd, xx, xy, yx, yy, ok = _lens(lens, X, Y)
@@ -329,7 +332,8 @@ def _project_exact(axis, sign, lens, x, y, z, phi, vel, start, out, jac, E, L):
             d1 = q0 * l2 - q2 * l0
             d2 = q1 * l0 - q0 * l1
         else:  # velocity: dq = -t E e_k
-            d0, d1, d2 = -t * E[0, k - 6], -t * E[1, k - 6], -t * E[2, k - 6]
+            s = -t * moving
+            d0, d1, d2 = s * E[0, k - 6], s * E[1, k - 6], s * E[2, k - 6]
         da = a0 * d0 + a1 * d1 + a2 * d2
         db = b0 * d0 + b1 * d1 + b2 * d2
         dt = -sign * (db if axis == 1 else da) / slope
@@ -351,7 +355,7 @@ def _unproject(model, axis, sign, lens, xd, yd, phi, E):
     C, R, ok = _unlens(lens, xd, yd)
     if model == GLOBAL or not ok:
         return C, R, ok
-    if model == ROTATION:
+    if model >= ROTATION:
         t = sign * (yd if axis == 1 else xd)
         _exp_so3(-t * phi[0], -t * phi[1], -t * phi[2], E)
         w = E[2, 0] * C + E[2, 1] * R + E[2, 2]
@@ -460,10 +464,12 @@ def fill_map(model, axis, sign, intr, lens, phi, rays, row0, col0, map_x, map_y)
             x = rays[0, 0] * u + rays[0, 1] * v + rays[0, 2]
             y = rays[1, 0] * u + rays[1, 1] * v + rays[1, 2]
             z = rays[2, 0] * u + rays[2, 1] * v + rays[2, 2]
-            if model != ROTATION:
+            if model < ROTATION:
                 ok = _project(model, axis, sign, lens, x, y, z, phi, vel, out, False, E, E)
             else:
-                ok = z > 0.0 and _project_exact(axis, sign, lens, x, y, z, phi, vel, 2.0 * t1 - t2, out, False, E, E)
+                ok = z > 0.0 and _project_exact(
+                    axis, sign, lens, x, y, z, phi, vel, 0.0, 2.0 * t1 - t2, out, False, E, E
+                )
                 t2 = t1
                 t1 = sign * out[axis] if ok else math.nan
             if ok:
@@ -564,8 +570,9 @@ def residual_blocks(
 ):  # fmt: skip
     """Whitened, robustly weighted residuals (o, 2) with their Jacobians, and each observation's cost.
 
-    J_frame is (o, 2, nb): rotation increment (left, camera frame), centre, then phi when nb = 9.
-    J_point is (o, 2, 3), sigma_px (o,). Observations that cannot be projected get zero Jacobians and cost 100 px.
+    J_frame is (o, 2, nb): rotation increment (left, camera frame), centre, phi from nb = 9 on, and velocity (world
+    frame) when nb = 12. J_point is (o, 2, 3), sigma_px (o,). Observations that cannot be projected get zero Jacobians
+    and cost 100 px.
     """
     o = len(frame_idx)
     nb = J_frame.shape[2]
@@ -607,6 +614,9 @@ def residual_blocks(
                 if nb > 6:
                     for b in range(3):
                         J_frame[k, i, 6 + b] = g * out[8 + 3 * i + b]
+                if nb > 9:
+                    for b in range(3):
+                        J_frame[k, i, 9 + b] = v0 * R[0, b] + v1 * R[1, b] + v2 * R[2, b]
             # J <- sqrt(rho') (I - a n n') J and r <- sqrt(rho') r / (1 - a), n = r/|r|: the gradient stays rho' J'r
             # and J'J becomes the Hessian of `_loss`
             w = math.sqrt(weight)

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from ..model import Reconstruction
 from .options import BundleOptions, BundleResult
-from .problem import BundleProblem, reprojection_residuals
+from .problem import BundleProblem, Spreads, reprojection_residuals
 from .solver import minimize
 
 __all__ = ["LADDER", "bundle_adjust", "climb"]
 
 #: Shutter models in the order in which they are solved, each from the one before.
-LADDER = ("global", "two-step", "rotation")
+LADDER = ("global", "two-step", "rotation", "constant-motion")
 
 # Radians per frame: a hundredth of a pixel at any focal length in use. Keeps the prior's weight finite.
 _MIN_SPREAD = 1e-6
@@ -41,15 +41,41 @@ def _believed(reconstruction: Reconstruction, options: BundleOptions, sigma: flo
     return valid & (np.linalg.norm(res, axis=1) <= limit)
 
 
-def _spread(reconstruction: Reconstruction, variance: NDArray[np.float64]) -> float:
-    """Spread of phi over photos and axes in radians per frame, from its values and their posterior variances.
+def _spread(values: NDArray[np.float64], variance: NDArray[np.float64], span: NDArray[np.float64]) -> float:
+    """Spread over photos and axes, per frame, of unknowns (m, 3) per unit of the clock with posterior variances (m, 3).
 
     Values beyond three robust spreads count as three: a few photos that moved far more, or that hang on by few
-    measurements, must not loosen the prior of the rest.
+    measurements, must not loosen the prior of the rest. Held values tell nothing.
     """
-    square = (reconstruction.phi**2 + variance) * reconstruction.frame_span()[:, None] ** 2
+    square = ((values**2 + variance) * span[:, None] ** 2)[variance > 0]
+    if not square.size:
+        return 0.0
     robust = float(np.median(square)) / 0.455  # median of the square of a normal variable
-    return float(np.sqrt(np.minimum(square, 9.0 * robust).mean())) + _MIN_SPREAD
+    return float(np.sqrt(np.minimum(square, 9.0 * robust).mean()))
+
+
+def _estimated(
+    spreads: Spreads, current: Reconstruction, covariances: NDArray[np.float64], options: BundleOptions
+) -> Spreads:
+    """The spreads of both priors that a solution shows; those that were given stay."""
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
+    if not np.isfinite(variances).all():
+        return spreads
+    span = current.frame_span()
+    phi, velocity = spreads.phi, spreads.velocity
+    if options.phi_sigma is None and variances.shape[1] > 6:
+        phi = _spread(current.phi, variances[:, 6:9], span) + _MIN_SPREAD
+    if options.velocity_sigma is None and variances.shape[1] > 9:
+        velocity = _spread(current.velocity, variances[:, 9:], span) + _MIN_SPREAD * current.baseline
+    return Spreads(phi, velocity)
+
+
+def _settled(before: Spreads, after: Spreads, tolerance: float) -> bool:
+    """Whether neither spread changed by more than a share."""
+    return all(
+        abs(new - old) <= tolerance * new
+        for old, new in ((before.phi, after.phi), (before.velocity, after.velocity))
+    )  # fmt: skip
 
 
 def bundle_adjust(
@@ -64,7 +90,7 @@ def bundle_adjust(
     ----------
     reconstruction : Reconstruction
         Start; its phi is the start of phi.
-    shutter_model : {"global", "two-step", "linearized", "rotation"}
+    shutter_model : {"global", "two-step", "linearized", "rotation", "constant-motion"}
         How the shutter is modelled.
     options : BundleOptions, optional
         Tolerances, loss, priors, anchors.
@@ -83,18 +109,22 @@ def bundle_adjust(
     keep = np.ones(len(base.observations), bool)
     iterations = 0
     sigma = options.sigma_px or _noise_px(base, shutter_model, options.min_sigma_px)
-    phi_sigma = options.phi_sigma or options.phi_sigma_start
-    for round_ in range(options.outlier_rounds + 1):
-        last = round_ == options.outlier_rounds
+    baseline = reconstruction.baseline
+    spreads = Spreads(
+        options.phi_sigma or options.phi_sigma_start,
+        (options.velocity_sigma or options.velocity_sigma_start) * baseline,
+    )
+    for round_ in range(options.outlier_rounds + options.spread_rounds + 1):
+        cleaning = round_ < options.outlier_rounds
         # once the outliers are gone the noise is nearly normal: squares converge in a few steps and use it fully
-        stage = options if round_ == 0 else replace(options, loss="squared")
+        stage = options if round_ == 0 or not options.outlier_rounds else replace(options, loss="squared")
         believed = replace(base, observations=base.observations.select(keep))
-        problem = BundleProblem(believed, shutter_model, stage, sigma, phi_sigma)
+        problem = BundleProblem(believed, shutter_model, stage, sigma, spreads)
         result = minimize(
             problem,
             problem.initial_state(),
             max_iterations=options.max_iterations,
-            cost_tolerance=options.cost_tolerance if last else options.round_tolerance,
+            cost_tolerance=options.round_tolerance if cleaning else options.cost_tolerance,
             step_tolerance=options.step_tolerance,
             initial_damping=options.initial_damping,
             max_damping=options.max_damping,
@@ -102,17 +132,19 @@ def bundle_adjust(
         )
         iterations += result.num_iterations
         current = problem.reconstruction(result.state)
-        variance = problem.phi_variance(result.state)
-        if options.phi_sigma is None and shutter_model != "global" and np.isfinite(variance).all():
-            phi_sigma = _spread(current, variance)
-        if last:
+        covariances = problem.covariances(result.state)
+        before, spreads = spreads, _estimated(spreads, current, covariances, options)
+        if cleaning:
+            sigma = options.sigma_px or _noise_px(current, shutter_model, options.min_sigma_px)
+            base = replace(current, observations=base.observations)
+            keep = _believed(base, options, sigma)
+            alive = base.track_lengths(keep) >= 2
+            keep = keep[alive[base.observations.point_idx]]
+            base = base.take_points(alive)
+        elif _settled(before, spreads, options.spread_tolerance):
             break
-        sigma = options.sigma_px or _noise_px(current, shutter_model, options.min_sigma_px)
-        base = replace(current, observations=base.observations)
-        keep = _believed(base, options, sigma)
-        alive = base.track_lengths(keep) >= 2
-        keep = keep[alive[base.observations.point_idx]]
-        base = base.take_points(alive)
+        else:
+            base = replace(current, observations=base.observations)
     res, valid = reprojection_residuals(current)
     rms = float(np.sqrt(np.mean(res[valid] ** 2))) if valid.any() else float("nan")
     dropped = len(reconstruction.observations) - len(current.observations)
@@ -122,8 +154,9 @@ def bundle_adjust(
         result.cost_history,
         iterations,
         sigma,
-        phi_sigma,
-        np.sqrt(variance),
+        spreads.phi,
+        spreads.velocity / baseline,
+        covariances,
         rms,
         dropped,
     )
@@ -144,7 +177,7 @@ def climb(
     """
     options = options or BundleOptions()
     # every rung but the last is only a start: what its model cannot explain is no outlier, and it need not converge
-    rough = replace(options, outlier_rounds=0, cost_tolerance=options.round_tolerance)
+    rough = replace(options, outlier_rounds=0, spread_rounds=0, cost_tolerance=options.round_tolerance)
     results: dict[str, BundleResult] = {}
     current = replace(reconstruction, phi=np.zeros((reconstruction.num_images, 3)))
     for model in rungs:

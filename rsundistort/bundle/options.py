@@ -50,6 +50,13 @@ class BundleOptions:
         a shutter that can hardly be seen is not fitted to noise.
     phi_sigma_start : float
         Where that estimate starts; about what a swung hand does.
+    velocity_sigma, velocity_sigma_start : float or None, float
+        The same for each component of the velocity of the constant-motion model, in baselines per frame (a baseline is
+        the mean distance of consecutive centres).
+    spread_rounds : int
+        At most this many more solves settle the two spreads, until neither changes by more than `spread_tolerance`.
+    spread_tolerance : float
+        See `spread_rounds`; a share.
     outlier_rounds : int
         Times that observations further than `outlier_sigma` standard deviations are dropped and all is solved again.
     outlier_sigma : float
@@ -74,6 +81,10 @@ class BundleOptions:
     min_sigma_px: float = 0.02
     phi_sigma: float | None = None
     phi_sigma_start: float = 0.03
+    velocity_sigma: float | None = None
+    velocity_sigma_start: float = 0.03
+    spread_rounds: int = 12
+    spread_tolerance: float = 0.01
     outlier_rounds: int = 3
     outlier_sigma: float = 4.5
     min_outlier_px: float = 0.25
@@ -91,16 +102,20 @@ class BundleOptions:
             "loss_scale",
             "min_sigma_px",
             "phi_sigma_start",
+            "velocity_sigma_start",
+            "spread_tolerance",
         )
         for name in (*positive, "outlier_sigma", "max_damping"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name}={getattr(self, name)!r}, expected a positive number")
         if self.sigma_px is not None and not self.sigma_px > 0:
             raise InputError(f"sigma_px={self.sigma_px!r}, expected a positive number or None")
-        if self.phi_sigma is not None and not self.phi_sigma > 0:
-            raise InputError(f"phi_sigma={self.phi_sigma!r}, expected a positive number or None")
-        if self.max_iterations < 1 or self.outlier_rounds < 0:
-            raise InputError("max_iterations must be at least 1 and outlier_rounds at least 0")
+        for name in ("phi_sigma", "velocity_sigma"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise InputError(f"{name}={value!r}, expected a positive number or None")
+        if self.max_iterations < 1 or self.outlier_rounds < 0 or self.spread_rounds < 0:
+            raise InputError("max_iterations must be at least 1, outlier_rounds and spread_rounds at least 0")
 
 
 @dataclass(frozen=True)
@@ -121,8 +136,12 @@ class BundleResult:
         Standard deviation of the noise that weighed the measurements in the last solve.
     phi_sigma : float
         Standard deviation of the prior on phi, radians per frame: as given, or as estimated.
-    sigma_phi : (m, 3) array
-        Standard deviations of phi in the solution, radians per unit of the clock; 0 where held.
+    velocity_sigma : float
+        Standard deviation of the prior on the velocity, baselines per frame; for constant-motion only.
+    covariances : (m, nb, nb) array
+        Covariance of each photo's unknowns, the rest being free: rotation (left, radians, camera frame), centre, phi,
+        velocity, as far as the model has them (nb = 6, 9 or 12). The gauge is that of the solve: the photo with the
+        most observations has its pose held, and the centre farthest from it one coordinate; 0 where held.
     rms_px : float
         Root mean square of the residuals' x and y parts.
     num_outliers : int
@@ -135,9 +154,24 @@ class BundleResult:
     num_iterations: int
     sigma_px: float
     phi_sigma: float
-    sigma_phi: NDArray[np.float64]
+    velocity_sigma: float
+    covariances: NDArray[np.float64]
     rms_px: float
     num_outliers: int
+
+    @property
+    def sigma_phi(self) -> NDArray[np.float64]:
+        """(m, 3) standard deviations of phi, radians per unit of the clock; 0 where held, and for a global shutter."""
+        return self._sigmas(6)
+
+    @property
+    def sigma_velocity(self) -> NDArray[np.float64]:
+        """(m, 3) standard deviations of the velocity, world units per unit of the clock; 0 where there is none."""
+        return self._sigmas(9)
+
+    def _sigmas(self, first: int) -> NDArray[np.float64]:
+        variances = np.diagonal(self.covariances, axis1=1, axis2=2)[:, first : first + 3]
+        return np.sqrt(variances) if variances.shape[1] else np.zeros((len(self.covariances), 3))
 
     @property
     def converged(self) -> bool:

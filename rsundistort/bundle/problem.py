@@ -15,16 +15,17 @@ from ..model import Reconstruction, check_shutter_model
 from .options import LOSSES, BundleOptions
 from .reduced import NormalEquations, Step, Structure
 
-__all__ = ["BundleProblem", "State", "reprojection_residuals"]
+__all__ = ["BundleProblem", "Spreads", "State", "reprojection_residuals"]
 
 
 @dataclass(frozen=True)
 class State:
-    """What a step changes: poses, shutter rotation and points, as in `Reconstruction`."""
+    """What a step changes: poses, shutter motion and points, as in `Reconstruction`."""
 
     R_cw: NDArray[np.float64]
     center_w: NDArray[np.float64]
     phi: NDArray[np.float64]
+    velocity: NDArray[np.float64]
     points_w: NDArray[np.float64]
 
 
@@ -58,12 +59,33 @@ def reprojection_residuals(
     return res, valid
 
 
-class BundleProblem:
-    """Robust reprojection errors and the prior on phi, with the gauge and the anchors held.
+@dataclass(frozen=True)
+class Spreads:
+    """Standard deviations of the zero-mean priors on the shutter's motion.
 
-    Unknowns of a photo: rotation increment (left, radians), centre (world units) and, unless the shutter model is
-    global, phi (radians per unit of the clock). Seven unknowns are held for the gauge: the pose of the photo
-    with the most observations, and one coordinate of the centre farthest from it.
+    Attributes
+    ----------
+    phi : float
+        Radians per frame.
+    velocity : float
+        World units per frame.
+    """
+
+    phi: float
+    velocity: float
+
+
+# Unknowns of a photo: pose, phi, velocity.
+_BLOCK = {"global": 6, "constant-motion": 12}
+
+
+class BundleProblem:
+    """Robust reprojection errors and the priors on phi and velocity, with the gauge and the anchors held.
+
+    Unknowns of a photo: rotation increment (left, radians), centre (world units), phi (radians per unit of the clock)
+    unless the shutter is global, and velocity (world units per unit of the clock) if the motion is whole. Seven
+    unknowns are held for the gauge: the pose of the photo with the most observations, and one coordinate of the centre
+    farthest from it.
     """
 
     def __init__(
@@ -72,7 +94,7 @@ class BundleProblem:
         shutter_model: str,
         options: BundleOptions,
         sigma_px: float,
-        phi_sigma: float | None = None,
+        spreads: Spreads,
     ) -> None:
         self._model = check_shutter_model(shutter_model)
         obs = reconstruction.observations
@@ -81,7 +103,7 @@ class BundleProblem:
         self._start = reconstruction
         self._shutter_model = shutter_model
         self._options = options
-        self._block = 6 if shutter_model == "global" else 9
+        self._block = _BLOCK.get(shutter_model, 9)
         order = np.lexsort((obs.frame_idx, obs.point_idx))
         self._xy = np.ascontiguousarray(obs.xy_raw[order])
         self._sigma_px = sigma_px * obs.sigma[order]
@@ -92,10 +114,9 @@ class BundleProblem:
             reconstruction.num_points,
         )
         self._cameras = _camera_arrays(reconstruction)
-        self._velocity = np.zeros((reconstruction.num_images, 3))
-        span = reconstruction.frame_span()
-        spread = phi_sigma or options.phi_sigma or options.phi_sigma_start
-        self._phi_weight = np.repeat((span / spread)[:, None] ** 2, 3, axis=1)
+        span = reconstruction.frame_span()[:, None]
+        weight = np.hstack([np.repeat((span / s) ** 2, 3, axis=1) for s in (spreads.phi, spreads.velocity)])
+        self._motion_weight = weight[:, : self._block - 6]
         self._free = self._free_unknowns()
         self._size = float(np.median(np.linalg.norm(reconstruction.points_w - reconstruction.center_w.mean(0), axis=1)))
 
@@ -118,17 +139,18 @@ class BundleProblem:
         return free
 
     def initial_state(self) -> State:
-        """The reconstruction's values, with anchored components of phi at zero."""
-        phi = np.zeros_like(self._start.phi)
-        if self._block > 6:
-            phi = np.where(self._free[:, 6:], self._start.phi, 0.0)
-        return State(self._start.R_cw, self._start.center_w, phi, self._start.points_w)
+        """The reconstruction's values; zero for held components of the motion and those that the model lacks."""
+        motion = np.zeros((self._start.num_images, 6))
+        found = np.hstack([self._start.phi, self._start.velocity])[:, : self._block - 6]
+        motion[:, : self._block - 6] = np.where(self._free[:, 6:], found, 0.0)
+        return State(self._start.R_cw, self._start.center_w, motion[:, :3], motion[:, 3:], self._start.points_w)
 
-    def phi_variance(self, state: State) -> NDArray[np.float64]:
-        """(m, 3) posterior variances of phi, radians squared per unit of the clock squared; 0 where held."""
-        if self._block == 6:
-            return np.zeros_like(state.phi)
-        return self.linearize(state).marginal_variances(slice(6, 9))
+    def covariances(self, state: State) -> NDArray[np.float64]:
+        """(m, nb, nb) covariance of each photo's unknowns, all others being free; 0 where held (the gauge).
+
+        Order and units as the unknowns above. NaN where the system cannot be factored.
+        """
+        return self.linearize(state).marginal_covariances()
 
     def reconstruction(self, state: State) -> Reconstruction:
         """The reconstruction at a state."""
@@ -138,7 +160,7 @@ class BundleProblem:
             R_cw=U @ Vt,
             center_w=state.center_w,
             phi=state.phi,
-            velocity=self._velocity,
+            velocity=state.velocity,
             points_w=state.points_w,
             shutter_model=self._shutter_model,
         )
@@ -146,12 +168,16 @@ class BundleProblem:
     def _kernel_args(self, state: State) -> tuple[Any, ...]:
         s = self._structure
         return (
-            self._model, *self._cameras, state.R_cw, state.center_w, state.phi, self._velocity, state.points_w,
+            self._model, *self._cameras, state.R_cw, state.center_w, state.phi, state.velocity, state.points_w,
             s.frame_idx, s.point_idx, self._xy,
         )  # fmt: skip
 
+    def _motion(self, state: State) -> NDArray[np.float64]:
+        """(m, nb - 6) unknowns of the shutter."""
+        return np.hstack([state.phi, state.velocity])[:, : self._block - 6]
+
     def _prior_cost(self, state: State) -> float:
-        return 0.5 * float(np.sum(self._phi_weight * state.phi**2)) if self._block > 6 else 0.0
+        return 0.5 * float(np.sum(self._motion_weight * self._motion(state) ** 2))
 
     def _blocks(self, state: State) -> tuple[NDArray[np.float64], ...]:
         o = len(self._xy)
@@ -175,9 +201,8 @@ class BundleProblem:
         res, J_frame, J_point, cost = self._blocks(state)
         prior_diag = np.zeros((len(state.phi), self._block))
         prior_gradient = np.zeros_like(prior_diag)
-        if self._block > 6:
-            prior_diag[:, 6:] = self._phi_weight
-            prior_gradient[:, 6:] = self._phi_weight * state.phi
+        prior_diag[:, 6:] = self._motion_weight
+        prior_gradient[:, 6:] = self._motion_weight * self._motion(state)
         total = float(cost.sum()) + self._prior_cost(state)
         return NormalEquations(
             self._structure, total, res, J_frame, J_point, prior_diag, prior_gradient, self._free,
@@ -203,15 +228,17 @@ class BundleProblem:
         return State(
             Rotation.from_rotvec(frame[:, :3]).as_matrix() @ state.R_cw,
             state.center_w + frame[:, 3:6],
-            state.phi + frame[:, 6:] if self._block > 6 else state.phi,
+            state.phi + frame[:, 6:9] if self._block > 6 else state.phi,
+            state.velocity + frame[:, 9:] if self._block > 9 else state.velocity,
             state.points_w + point,
         )
 
     def step_size(self, state: State, step: Step) -> float:
         """Largest change: angles in radians, lengths in sizes of the scene."""
         frame, point = step
-        angles = np.abs(np.delete(frame, [3, 4, 5], axis=1)).max()
+        angles = np.abs(frame[:, [0, 1, 2, *range(6, min(self._block, 9))]]).max()
         # a far point moves a lot along its ray without moving in any photo: its depth is its own yardstick
         depth = np.maximum(np.linalg.norm(state.points_w - state.center_w.mean(0), axis=1), self._size)
-        lengths = max(np.abs(frame[:, 3:6]).max() / self._size, float((np.abs(point).max(1) / depth).max(initial=0)))
+        ways = np.abs(frame[:, [3, 4, 5, *range(9, self._block)]]).max() / self._size
+        lengths = max(ways, float((np.abs(point).max(1) / depth).max(initial=0)))
         return float(max(angles, lengths))

@@ -16,6 +16,9 @@ from .._kernels import schur
 
 __all__ = ["NormalEquations", "Structure"]
 
+# Photos whose columns of the inverse are held at once: 16 of 12 unknowns in a system of 10,000 photos are 180 MB.
+_COVARIANCE_PHOTOS = 16
+
 _UNFACTORABLE = (np.linalg.LinAlgError, ValueError, RuntimeError)
 
 Step = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -151,28 +154,34 @@ class NormalEquations:
             ).solve
         return lambda b: (scale * solve((scale * b.T).T).T).T
 
-    def marginal_variances(self, part: slice) -> NDArray[np.float64]:
-        """Variances (m, len(part)) of some unknowns of each photo, all others being free; 0 where held.
+    def marginal_covariances(self) -> NDArray[np.float64]:
+        """Covariances (m, nb, nb) of the unknowns of each photo, all others being free; 0 where held.
 
-        NaN where the system cannot be factored.
+        The diagonal blocks of the inverse reduced system, a few columns at a time: never the whole inverse. NaN where
+        the system cannot be factored.
         """
-        S, _, _ = self.reduce(0.0)
-        wanted = np.zeros_like(self._free)
-        wanted[:, part] = self._free[:, part]
-        at = np.flatnonzero(wanted.ravel()[self._free.ravel()])
-        result = np.zeros(self._free.shape)
+        m, nb = self._free.shape
+        place = np.full(m * nb, -1)
+        place[self._free.ravel()] = np.arange(int(self._free.sum()))
+        place = place.reshape(m, nb)
+        result = np.zeros((m, nb, nb))
         try:
-            solve = self._factor(S)
-            values = np.empty(len(at))
-            for first in range(0, len(at), 256):  # never the whole inverse
-                some = at[first : first + 256]
-                unit = np.zeros((int(self._free.sum()), len(some)))
-                unit[some, np.arange(len(some))] = 1.0
-                values[first : first + 256] = solve(unit)[some, np.arange(len(some))]
+            solve = self._factor(self.reduce(0.0)[0])
+            for first in range(0, m, _COVARIANCE_PHOTOS):
+                photos = range(first, min(first + _COVARIANCE_PHOTOS, m))
+                columns = place[photos][self._free[photos]]
+                unit = np.zeros((int(self._free.sum()), len(columns)))
+                unit[columns, np.arange(len(columns))] = 1.0
+                inverse = solve(unit)
+                done = 0
+                for i in photos:
+                    free = np.flatnonzero(self._free[i])
+                    block = inverse[place[i, free], done : done + len(free)]
+                    result[i][np.ix_(free, free)] = (block + block.T) / 2
+                    done += len(free)
         except _UNFACTORABLE:
-            values = np.full(len(at), np.nan)
-        result[wanted] = values
-        return result[:, part]
+            result[:] = np.where(self._free[:, :, None] & self._free[:, None, :], np.nan, 0.0)
+        return result
 
     def solve(self, damping: float) -> tuple[Step, float] | None:
         """Step of the photos (m, nb) and points (n, 3), and the decrease of cost that it predicts."""

@@ -10,13 +10,10 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from .checks import check_finite, frozen
 
-__all__ = ["SHUTTER_MODELS", "SOLUTION_MODELS", "RowMotion", "check_shutter_model"]
+__all__ = ["SHUTTER_MODELS", "RowMotion", "check_shutter_model"]
 
 #: Names of the shutter models and their codes in the kernels, in the order of the ladder.
-SHUTTER_MODELS: dict[str, int] = {"global": 0, "two-step": 1, "linearized": 2, "rotation": 3}
-
-#: Names that a solution may carry; a ground truth can hold translation.
-SOLUTION_MODELS = (*SHUTTER_MODELS, "constant-motion")
+SHUTTER_MODELS: dict[str, int] = {"global": 0, "two-step": 1, "linearized": 2, "rotation": 3, "constant-motion": 4}
 
 
 def check_shutter_model(name: str) -> int:

@@ -17,10 +17,14 @@ __all__ = ["ProjectionJacobians", "project_points", "project_points_with_jacobia
 
 @dataclass(frozen=True)
 class ProjectionJacobians:
-    """Derivatives of pixels (n, 2, 3): in the camera-frame point and in phi (radians per unit of the clock)."""
+    """Derivatives of pixels (n, 2, 3), lengths and radians per unit of the clock.
+
+    In the camera-frame point, in phi, and in the camera-frame velocity (zero for models without translation).
+    """
 
     point: NDArray[np.float64]
     phi: NDArray[np.float64]
+    velocity: NDArray[np.float64]
 
 
 def project_points(
@@ -35,9 +39,9 @@ def project_points(
     camera : Camera
         Intrinsics, lens and readout direction.
     motion : RowMotion, optional
-        Rotation during the readout; none when left out.
-    shutter_model : {"global", "two-step", "linearized", "rotation"}
-        Row model: paper Eqs. 8-9, Eq. 6, or Eq. 2 without translation.
+        Motion during the readout, its velocity in the camera frame too; none when left out.
+    shutter_model : {"global", "two-step", "linearized", "rotation", "constant-motion"}
+        Row model: paper Eqs. 8-9, Eq. 6, Eq. 2 without translation, or Eq. 2 whole, which alone heeds the velocity.
 
     Returns
     -------
@@ -57,7 +61,7 @@ def project_points(
     intr, lens, axis, sign = camera.kernel_args
     xy, valid = np.empty((len(points), 2)), np.empty(len(points), bool)
     model = check_shutter_model(shutter_model)
-    kernels.project_points(model, axis, sign, intr, lens, points, motion.phi, np.zeros(3), xy, valid)
+    kernels.project_points(model, axis, sign, intr, lens, points, motion.phi, motion.velocity, xy, valid)
     return xy, valid
 
 
@@ -73,9 +77,9 @@ def project_points_with_jacobians(
     J_point, J_phi, J_velocity = (np.empty((n, 2, 3)) for _ in range(3))
     model = check_shutter_model(shutter_model)
     kernels.project_jacobians(
-        model, axis, sign, intr, lens, points, motion.phi, np.zeros(3), xy, J_point, J_phi, J_velocity, valid
+        model, axis, sign, intr, lens, points, motion.phi, motion.velocity, xy, J_point, J_phi, J_velocity, valid
     )
-    return xy, valid, ProjectionJacobians(J_point, J_phi)
+    return xy, valid, ProjectionJacobians(J_point, J_phi, J_velocity)
 
 
 def unproject_points(

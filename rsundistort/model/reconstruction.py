@@ -137,14 +137,19 @@ class Reconstruction:
         """(m,) how far each photo's clock runs over its frame: turns phi into radians per frame."""
         return np.array([self.camera(i).frame_span for i in range(self.num_images)])
 
+    @property
+    def baseline(self) -> float:
+        """Mean distance of consecutive centres, the paper's t-bar; 1 where they coincide."""
+        step = np.linalg.norm(np.diff(self.center_w, axis=0), axis=1)
+        return float(step.mean()) if step.any() else 1.0
+
     def normalized(self) -> Reconstruction:
         """The same in a frame of its own: the first photo at the origin, consecutive centres 1 apart in the mean.
 
         Which similarity a mapping ends in is chance; results of two runs must compare without aligning them.
         """
         R0, origin = self.R_cw[0], self.center_w[0]
-        step = float(np.linalg.norm(np.diff(self.center_w, axis=0), axis=1).mean()) if self.num_images > 1 else 0.0
-        scale = 1.0 / step if step > 0 else 1.0
+        scale = 1.0 / self.baseline
         return replace(
             self,
             R_cw=self.R_cw @ R0.T,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from .camera import Camera
 from .checks import check_finite, check_rotations, frozen
-from .motion import SOLUTION_MODELS, RowMotion
+from .motion import RowMotion, check_shutter_model
 
 __all__ = ["Solution", "SolvedImage"]
 
@@ -102,8 +102,7 @@ class Solution:
     generator: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.shutter_model not in SOLUTION_MODELS:
-            raise InputError(f"shutter model {self.shutter_model!r}, expected one of {', '.join(SOLUTION_MODELS)}")
+        check_shutter_model(self.shutter_model)
         names = [image.name for image in self.images]
         if len(set(names)) != len(names):
             raise InputError("the solution names a photo twice")
