@@ -58,9 +58,9 @@ photos = pytest.mark.parametrize(("path", "camera", "motion", "stem", "interpola
 @photos
 def test_rectified_photo_is_the_golden_one(path, camera, motion, stem, interpolation, golden):
     rectified, _ = rectify(shrink(read_photo(path).pixels), camera, motion, interpolation=interpolation)
-    # OpenCV 4 (4.12, 4.14) and 5.0 round cubic and linear remaps of 8 bit otherwise; JPEG and grid are the same. Measured
-    # on courtyard: 30 % of the pixels differ by 1 grey level, 0.5 % by 2, at most 0.005 % by 3, none by more. A shift
-    # by 1/32 pixel changes 1.2 % of the pixels by more than 2, the two-step model 45 %.
+    # OpenCV 4 (4.12, 4.14) and 5.0 round cubic and linear remaps of 8 bit otherwise; JPEG and grid are the same.
+    # Measured on courtyard: 30 % of the pixels differ by 1 grey level, 0.5 % by 2, at most 0.005 % by 3, none by more.
+    # A shift by 1/32 pixel changes 1.2 % of the pixels by more than 2, the two-step model 45 %.
     golden.image(f"{FOLDER}/{stem}.png", rectified, max_grey=2, max_share=0.001)
 
 
