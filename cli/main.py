@@ -12,6 +12,7 @@ _COMMANDS = {
     "rectify": "Rectify a folder of photos with a solution.",
     "simulate": "Photos with a known shutter motion.",
     "evaluate": "Errors of a run against the truth.",
+    "experiment": "The paper's experiments, on any scene.",
     "info": "Versions, threads and optional parts.",
 }
 

@@ -8,12 +8,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import InputError
 from ..model import Reconstruction
 from .options import BundleOptions, BundleResult
 from .problem import BundleProblem, Spreads, reprojection_residuals
 from .solver import minimize
+from .triangulate import revive_points
 
-__all__ = ["LADDER", "bundle_adjust", "climb"]
+__all__ = ["LADDER", "bundle_adjust", "climb", "objective"]
 
 #: Shutter models in the order in which they are solved, each from the one before.
 LADDER = ("global", "two-step", "rotation", "constant-motion")
@@ -78,6 +80,26 @@ def _settled(before: Spreads, after: Spreads, tolerance: float) -> bool:
     )  # fmt: skip
 
 
+def _starting_spreads(options: BundleOptions, baseline: float) -> Spreads:
+    return Spreads(
+        options.phi_sigma or options.phi_sigma_start,
+        (options.velocity_sigma or options.velocity_sigma_start) * baseline,
+    )
+
+
+def objective(reconstruction: Reconstruction, shutter_model: str, options: BundleOptions) -> float:
+    """What `bundle_adjust` lowers in its first solve, at a reconstruction's values.
+
+    Half the robust sum of squares in units of the noise (`options.sigma_px`, which must be given), and the priors.
+    Motion that the model lacks, or that is held, counts as zero.
+    """
+    if options.sigma_px is None:
+        raise InputError("the objective needs sigma_px: half a sum of squares means nothing without the noise")
+    spreads = _starting_spreads(options, reconstruction.baseline)
+    problem = BundleProblem(reconstruction, shutter_model, options, options.sigma_px, spreads)
+    return problem.cost(problem.initial_state())
+
+
 def bundle_adjust(
     reconstruction: Reconstruction,
     shutter_model: str = "rotation",
@@ -106,14 +128,12 @@ def bundle_adjust(
     # `base` holds all measurements of the points still in use, `keep` says which of them are believed: one that was
     # doubted while an outlier bent its point is heard again in the next round
     base = reconstruction.with_points(np.ones(len(reconstruction.observations), bool))
+    base = revive_points(base, shutter_model)
     keep = np.ones(len(base.observations), bool)
     iterations = 0
     sigma = options.sigma_px or _noise_px(base, shutter_model, options.min_sigma_px)
     baseline = reconstruction.baseline
-    spreads = Spreads(
-        options.phi_sigma or options.phi_sigma_start,
-        (options.velocity_sigma or options.velocity_sigma_start) * baseline,
-    )
+    spreads = _starting_spreads(options, baseline)
     for round_ in range(options.outlier_rounds + options.spread_rounds + 1):
         cleaning = round_ < options.outlier_rounds
         # once the outliers are gone the noise is nearly normal: squares converge in a few steps and use it fully
@@ -134,17 +154,18 @@ def bundle_adjust(
         current = problem.reconstruction(result.state)
         covariances = problem.covariances(result.state)
         before, spreads = spreads, _estimated(spreads, current, covariances, options)
+        revived = revive_points(current, shutter_model)
         if cleaning:
             sigma = options.sigma_px or _noise_px(current, shutter_model, options.min_sigma_px)
-            base = replace(current, observations=base.observations)
+            base = replace(revived, observations=base.observations)
             keep = _believed(base, options, sigma)
             alive = base.track_lengths(keep) >= 2
             keep = keep[alive[base.observations.point_idx]]
             base = base.take_points(alive)
-        elif _settled(before, spreads, options.spread_tolerance):
+        elif revived is current and _settled(before, spreads, options.spread_tolerance):
             break
         else:
-            base = replace(current, observations=base.observations)
+            base = replace(revived, observations=base.observations)
     res, valid = reprojection_residuals(current)
     rms = float(np.sqrt(np.mean(res[valid] ** 2))) if valid.any() else float("nan")
     dropped = len(reconstruction.observations) - len(current.observations)

@@ -1,5 +1,5 @@
 """Comparison of solutions and images with the truth."""
 
-from .metrics import MotionErrors, PoseErrors, motion_errors, pose_errors, psnr
+from .metrics import MotionErrors, PoseErrors, align_points, motion_errors, pose_errors, psnr, rotation_angles_deg
 
-__all__ = ["MotionErrors", "PoseErrors", "motion_errors", "pose_errors", "psnr"]
+__all__ = ["MotionErrors", "PoseErrors", "align_points", "motion_errors", "pose_errors", "psnr", "rotation_angles_deg"]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..model import Solution
 
-__all__ = ["MotionErrors", "PoseErrors", "motion_errors", "pose_errors", "psnr"]
+__all__ = ["MotionErrors", "PoseErrors", "align_points", "motion_errors", "pose_errors", "psnr", "rotation_angles_deg"]
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,8 @@ class MotionErrors:
     phi_rad_per_frame: NDArray[np.float64]
 
 
-def _rotation_angle_deg(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Angles of rotation matrices (m, 3, 3); exact also for tiny ones."""
+def rotation_angles_deg(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angles (m,) of rotation matrices (m, 3, 3); exact also for tiny ones."""
     vee = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
     sine = np.linalg.norm(vee, axis=1) / 2
     cosine = (np.trace(R, axis1=1, axis2=2) - 1) / 2
@@ -55,6 +55,25 @@ def _best_rotation(moved: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotation nearest to a 3x3 matrix."""
     U, _, Vt = np.linalg.svd(moved)
     return U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+
+
+def align_points(
+    points: NDArray[np.float64], true_points: NDArray[np.float64]
+) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+    """Similarity that best takes points (n, 3) to the true ones in the least-squares sense, after Umeyama (1991).
+
+    Returns
+    -------
+    scale, R, shift
+        `scale * R @ x + shift`; float, (3, 3), (3,).
+    """
+    mean, mean_true = points.mean(0), true_points.mean(0)
+    X, Y = points - mean, true_points - mean_true
+    U, s, Vt = np.linalg.svd(Y.T @ X)
+    flip = np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))])
+    scale = float(np.trace(np.diag(s) @ flip) / max(np.sum(X**2), 1e-300))
+    R = U @ flip @ Vt
+    return scale, R, mean_true - scale * R @ mean
 
 
 def pose_errors(solution: Solution, truth: Solution) -> PoseErrors:
@@ -80,14 +99,9 @@ def pose_errors(solution: Solution, truth: Solution) -> PoseErrors:
     C_true = np.array([b.center_w for _, b in pairs])
     # R_true = R A^T for the world rotation A that takes estimated to true coordinates
     A = _best_rotation(np.einsum("mji,mjk->ik", R_true, R))
-    rotation = _rotation_angle_deg(np.einsum("mij,kj,mlk->mil", R, A, R_true))
-    # similarity of the centres after Umeyama (1991)
-    mean, mean_true = C.mean(0), C_true.mean(0)
-    X, Y = C - mean, C_true - mean_true
-    U, s, Vt = np.linalg.svd(Y.T @ X)
-    flip = np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))])
-    scale = float(np.trace(np.diag(s) @ flip) / max(np.sum(X**2), 1e-300))
-    left = np.linalg.norm(scale * X @ (U @ flip @ Vt).T - Y, axis=1)
+    rotation = rotation_angles_deg(np.einsum("mij,kj,mlk->mil", R, A, R_true))
+    scale, S, shift = align_points(C, C_true)
+    left = np.linalg.norm(scale * C @ S.T + shift - C_true, axis=1)
     step = np.linalg.norm(np.diff(C_true, axis=0), axis=1).mean()
     return PoseErrors(tuple(a.name for a, _ in pairs), rotation, left / max(step, 1e-300))
 

@@ -1,7 +1,7 @@
 """Files: photos, cameras, solutions, COLMAP models, nerfstudio."""
 
 from .cameras import camera_from_exif, check_camera_fits, parse_camera
-from .colmap import write_colmap_model
+from .colmap import read_colmap_poses, write_colmap_model
 from .images import Photo, list_photos, output_name, read_photo, write_image
 from .nerfstudio import write_transforms
 from .outputs import output_folder
@@ -15,6 +15,7 @@ __all__ = [
     "output_folder",
     "output_name",
     "parse_camera",
+    "read_colmap_poses",
     "read_photo",
     "read_solution",
     "write_colmap_model",

@@ -3,17 +3,68 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import FileError, FormatError
 from ..model import Camera, Reconstruction
 from ..model.projection import unproject_points
 
-__all__ = ["rectified_keypoints", "write_colmap_model"]
+__all__ = ["read_colmap_poses", "rectified_keypoints", "write_colmap_model"]
 
 # COLMAP's pixel centres are at 0.5, ours at 0
 _HALF = 0.5
+
+
+def read_colmap_poses(folder: Path) -> tuple[Any, ...]:
+    """Poses, points and tracks of a COLMAP model, without its measurements.
+
+    Parameters
+    ----------
+    folder : Path
+        With cameras, images and points3D, text or binary. Cameras must be pinholes.
+
+    Returns
+    -------
+    cameras, names, camera_idx, R_cw, center_w, points_w, frame_idx, point_idx
+        As in `Reconstruction`.
+    """
+    import pycolmap
+
+    try:
+        model = pycolmap.Reconstruction(folder)
+    except Exception as error:  # pycolmap raises what its C++ raised
+        raise FileError(f"{folder} is no COLMAP model: {error}") from error
+    ids = sorted(model.cameras)
+    cameras = []
+    for camera_id in ids:
+        camera = model.cameras[camera_id]
+        if camera.model_name not in ("PINHOLE", "SIMPLE_PINHOLE"):
+            raise FormatError(f"{folder}: camera {camera_id} is {camera.model_name}, expected PINHOLE")
+        K = np.array(camera.calibration_matrix())
+        K[:2, 2] -= _HALF
+        cameras.append(Camera(camera.width, camera.height, K))
+    images = [model.images[i] for i in sorted(model.reg_image_ids())]
+    place = {image.image_id: k for k, image in enumerate(images)}
+    poses = np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4)
+    points, frame, point = [], [], []
+    for number, point_id in enumerate(sorted(model.point3D_ids())):
+        points.append(model.points3D[point_id].xyz)
+        for image_id in sorted({element.image_id for element in model.points3D[point_id].track.elements}):
+            frame.append(place[image_id])
+            point.append(number)
+    return (
+        cameras,
+        [image.name for image in images],
+        np.array([ids.index(image.camera_id) for image in images], np.int64),
+        poses[:, :, :3],
+        -np.einsum("mji,mj->mi", poses[:, :, :3], poses[:, :, 3]),
+        np.array(points).reshape(-1, 3),
+        np.array(frame, np.int64),
+        np.array(point, np.int64),
+    )
 
 
 def rectified_keypoints(reconstruction: Reconstruction, rectified: list[Camera]) -> NDArray[np.float64]:

@@ -1,0 +1,72 @@
+"""Points that a start has put where no photo can see them, placed anew."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model import READOUTS, Reconstruction
+from ..model.projection import unproject_points
+from .problem import reprojection_residuals
+
+__all__ = ["revive_points"]
+
+# Rays that do not meet ahead of the cameras are taken to meet this many sizes of the scene away.
+_FAR = 50.0
+
+
+def _world_rays(
+    reconstruction: Reconstruction, some: NDArray[np.int64], shutter_model: str
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Centres and unit directions (k, 3) along which some observations were seen, each at the moment of its line."""
+    obs = reconstruction.observations
+    centers, rays = np.empty((len(some), 3)), np.empty((len(some), 3))
+    valid = np.empty(len(some), bool)
+    for i in np.unique(obs.frame_idx[some]):
+        mine = obs.frame_idx[some] == i
+        camera, xy = reconstruction.camera(i), obs.xy_raw[some[mine]]
+        ideal, valid[mine] = unproject_points(xy, camera, reconstruction.motion(i), shutter_model)
+        axis, sign = READOUTS[camera.readout]
+        clock = sign * (xy[:, axis] - camera.K[axis, 2]) / camera.K[axis, axis]
+        moves = shutter_model == "constant-motion"
+        centers[mine] = reconstruction.center_w[i] + moves * clock[:, None] * reconstruction.velocity[i]
+        rays[mine] = np.column_stack([ideal, np.ones(len(ideal))]) @ reconstruction.R_cw[i]
+    rays[~valid] = (0.0, 0.0, 1.0)
+    return centers, rays / np.linalg.norm(rays, axis=1, keepdims=True), valid
+
+
+def revive_points(reconstruction: Reconstruction, shutter_model: str) -> Reconstruction:
+    """The reconstruction with points that some of their photos cannot see (behind the camera) triangulated anew.
+
+    Such a measurement has no derivative, so an adjustment could never bring its point back. The new place is where the
+    rays come nearest to each other, or far along them if that is behind a camera too.
+    """
+    obs = reconstruction.observations
+    lost = np.unique(obs.point_idx[~reprojection_residuals(reconstruction, shutter_model)[1]])
+    if not len(lost):
+        return reconstruction
+    number = np.full(reconstruction.num_points, -1)
+    number[lost] = np.arange(len(lost))
+    some = np.flatnonzero(number[obs.point_idx] >= 0)
+    centers, rays, valid = _world_rays(reconstruction, some, shutter_model)
+    some, centers, rays = some[valid], centers[valid], rays[valid]
+    of = number[obs.point_idx[some]]
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    A, b, middle, way = (np.zeros((len(lost), *shape)) for shape in ((3, 3), (3,), (3,), (3,)))
+    np.add.at(A, of, across)
+    np.add.at(b, of, np.einsum("kij,kj->ki", across, centers))
+    np.add.at(middle, of, centers)
+    np.add.at(way, of, rays)
+    count = np.maximum(np.bincount(of, minlength=len(lost)), 1)[:, None]
+    middle, way = middle / count, way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
+    size = float(np.median(np.linalg.norm(reconstruction.points_w - reconstruction.center_w.mean(0), axis=1)))
+    # a ridge of 1e-9 leaves parallel rays at a finite place
+    found = np.linalg.solve(A + 1e-9 * np.eye(3), (b + 1e-9 * middle)[..., None])[..., 0]
+    ahead = np.ones(len(lost), bool)
+    np.logical_and.at(ahead, of, ((found[of] - centers) * rays).sum(1) > 1e-6 * size)
+    found = np.where(ahead[:, None], found, middle + _FAR * size * way)
+    points = reconstruction.points_w.copy()
+    points[lost] = found
+    return replace(reconstruction, points_w=points)

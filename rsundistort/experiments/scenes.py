@@ -1,0 +1,118 @@
+"""Scenes with known cameras, points and visibility: what an experiment projects its own measurements from."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FileError, FormatError, InputError
+from ..io import read_colmap_poses
+from ..model import Camera
+
+__all__ = ["KnownScene", "load_scene"]
+
+_ARRAYS = ("K", "width", "height", "R_cw", "center_w", "points_w", "frame_idx", "point_idx")
+
+
+@dataclass(frozen=True)
+class KnownScene:
+    """Cameras, points, and which photo sees which point.
+
+    Attributes
+    ----------
+    name : str
+        For files and figures.
+    camera : Camera
+        Of all photos.
+    R_cw, center_w : (m, 3, 3), (m, 3) array
+        Poses in the order of the sequence; the mean distance of consecutive centres is 1.
+    points_w : (n, 3) array
+        Points.
+    frame_idx, point_idx : (o,) int array
+        Photo `frame_idx[k]` sees point `point_idx[k]`.
+    """
+
+    name: str
+    camera: Camera
+    R_cw: NDArray[np.float64]
+    center_w: NDArray[np.float64]
+    points_w: NDArray[np.float64]
+    frame_idx: NDArray[np.int64]
+    point_idx: NDArray[np.int64]
+
+    @property
+    def num_images(self) -> int:
+        """Number of photos."""
+        return len(self.R_cw)
+
+
+def _scaled(scene: KnownScene) -> KnownScene:
+    """The scene in units of its mean distance of consecutive centres (the paper's t-bar)."""
+    step = float(np.linalg.norm(np.diff(scene.center_w, axis=0), axis=1).mean())
+    if not step > 0:
+        raise InputError(f"{scene.name}: all photos are taken from one place")
+    return KnownScene(
+        scene.name, scene.camera, scene.R_cw, scene.center_w / step, scene.points_w / step, scene.frame_idx,
+        scene.point_idx,
+    )  # fmt: skip
+
+
+def load_scene(path: Path | str) -> KnownScene:
+    """A scene from an `.npz` (arrays as in `tracks.npz`), a COLMAP model, or the output folder of a run.
+
+    Points that fewer than two photos see are left out.
+
+    Raises
+    ------
+    FileError, FormatError, InputError
+        When there is nothing to read, or no scene of one camera, or fewer than three photos.
+    """
+    path = Path(path)
+    if path.is_dir():
+        folder = path / "sparse" if (path / "sparse").is_dir() else path
+        cameras, names, _, R, center, points, frame, point = read_colmap_poses(folder)
+        if len(set(cameras)) != 1:
+            raise InputError(f"{path} has {len(cameras)} cameras; the experiment takes scenes of one")
+        order = np.argsort(names)
+        rank = np.empty(len(names), np.int64)
+        rank[order] = np.arange(len(names))
+        scene = KnownScene(path.name, cameras[0], R[order], center[order], points, rank[frame], point)
+    elif path.suffix == ".npz":
+        scene = _from_npz(path)
+    else:
+        raise FileError(f"{path} is no scene; give an .npz, a COLMAP model or the output folder of a run")
+    if scene.num_images < 3:
+        raise InputError(f"{path} has {scene.num_images} photos; the experiment needs at least three")
+    return _scaled(_seen_twice(scene))
+
+
+def _from_npz(path: Path) -> KnownScene:
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            found = {name: arrays[name] for name in _ARRAYS}
+    except OSError as error:
+        raise FileError(f"{path} cannot be read: {error.strerror or error}") from error
+    except (ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise FormatError(f"{path} is no scene: {error}") from error
+    if found["K"].shape != (3, 3):
+        raise InputError(f"{path} has several cameras; the experiment takes scenes of one")
+    camera = Camera(int(found["width"]), int(found["height"]), found["K"])
+    return KnownScene(
+        path.stem if path.stem != "tracks" else path.resolve().parent.name,
+        camera, *(found[name] for name in ("R_cw", "center_w", "points_w", "frame_idx", "point_idx")),
+    )  # fmt: skip
+
+
+def _seen_twice(scene: KnownScene) -> KnownScene:
+    """The scene without points that fewer than two photos see."""
+    seen = np.unique(np.stack([scene.point_idx, scene.frame_idx]), axis=1)
+    kept = np.bincount(seen[0], minlength=len(scene.points_w)) >= 2
+    new = np.cumsum(kept) - 1
+    point, frame = seen[:, kept[seen[0]]]
+    return KnownScene(
+        scene.name, scene.camera, scene.R_cw, scene.center_w, scene.points_w[kept], frame, new[point],
+    )  # fmt: skip
