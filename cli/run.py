@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,10 +23,10 @@ if TYPE_CHECKING:
 @click.option(
     "--model",
     "shutter_model",
-    type=click.Choice(("auto", "rotation", "linearized", "two-step", "global")),
+    type=click.Choice(("auto", "constant-motion", "rotation", "linearized", "two-step", "global")),
     default="auto",
     show_default=True,
-    help="How the shutter is modelled; auto is rotation, the exact model.",
+    help="How the shutter is modelled; auto is the model that foretells measurements held out from its fit.",
 )
 @click.option(
     "--still",
@@ -116,6 +117,7 @@ def closing_table(solution: Solution, out: Path) -> str:
         "",
         f"photos registered  {len(solution.registered)} of {len(solution.images)}",
         f"shutter model      {solution.shutter_model}",
+        *_held_out(quality["held_out_rms_px"]),
         f"camera             {solution.options['camera']}, readout {solution.options['readout']}",
         f"rms residual       {quality['global_rms_px']:.2f} px with a global shutter, {quality['rms_px']:.2f} px now",
         f"outputs            {out}  ({total:.0f} s)",
@@ -131,6 +133,13 @@ def closing_table(solution: Solution, out: Path) -> str:
     if lost:
         lines += ["", "not joined:", *(f"  {image.name}: {image.reason}" for image in lost)]
     return "\n".join(lines)
+
+
+def _held_out(rms_px: Mapping[str, float]) -> list[str]:
+    """A line on how well each rung of the ladder foretold measurements that it was not fitted to."""
+    if not rms_px:
+        return []
+    return ["held-out residual  " + ", ".join(f"{model} {rms:.3f}" for model, rms in rms_px.items()) + " px"]
 
 
 def _doubtful(solution: Solution) -> list[str]:

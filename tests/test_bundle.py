@@ -11,7 +11,8 @@ from numpy_twin import DIRECTIONS, MODELS, project
 from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, Camera, InputError, Observations, Reconstruction, bundle_adjust, climb
-from rsundistort.bundle import reprojection_residuals
+from rsundistort.bundle import LADDER, choose_model, objective, reprojection_residuals
+from rsundistort.bundle.choice import hold_out
 from rsundistort.bundle.problem import BundleProblem, Spreads
 
 LENS = [-0.12, 0.03, 0.001, -0.002]
@@ -427,3 +428,52 @@ def test_cost_falls_with_each_accepted_step_and_the_reason_is_said(rng):
     assert costs == short.cost_history[1:].tolist()
     at_rest = BundleOptions(outlier_rounds=0, step_tolerance=1e3)
     assert bundle_adjust(start, "rotation", at_rest).stop_reason == "step"
+
+
+@pytest.mark.parametrize("model", ["global", "two-step", "rotation", "constant-motion"])
+def test_the_model_that_made_the_measurements_is_chosen(model, rng):
+    # strong motion, so that every rung's mistake shows against the noise
+    truth = make_scene(rng, model, num_images=10, num_points=150, noise_px=0.3, phi_size=0.15)
+    start = climb(perturbed(truth, rng), LADDER[: max(LADDER.index(model) + 1, 3)])["rotation"].reconstruction
+    choice = choose_model(start, sigma_px=0.3)
+    assert choice.shutter_model == model
+    assert list(choice.held_out_rms_px) == list(LADDER)
+    # what it was made from foretells to the noise, and to what the point's own uncertainty adds
+    assert 0.25 < choice.held_out_rms_px[model] < 0.5
+    assert 140 <= choice.num_held_out <= 150  # a tenth of them, one a track; the ladder dropped a few
+    assert choose_model(start, sigma_px=0.3) == choice
+
+
+def test_held_out_measurements_leave_their_tracks_three(rng):
+    rec = make_scene(rng, "rotation", num_images=6, num_points=40)
+    some = rng.random(len(rec.observations)) < 0.7
+    rec = rec.with_points(some)
+    fitted, held = hold_out(rec, share=0.2, seed=3)
+    assert (fitted ^ held).all()
+    points = rec.observations.point_idx[held]
+    assert len(np.unique(points)) == len(points)
+    left = np.bincount(rec.observations.point_idx[fitted], minlength=rec.num_points)
+    assert (left[points] >= 3).all()
+    assert (hold_out(rec, share=0.2, seed=4)[1] != held).any()
+
+
+def test_points_that_no_photo_can_see_come_back(rng):
+    truth = make_scene(rng, "rotation", noise_px=0.3)
+    points = truth.points_w.copy()
+    points[3] = truth.center_w[0] - 5 * truth.R_cw[0, 2]  # behind photo 0
+    points[17] *= 100
+    result = bundle_adjust(replace(truth, points_w=points), "rotation", BundleOptions(outlier_rounds=0))
+    assert result.reconstruction.num_points == truth.num_points
+    found, true = ((rec.points_w[[3, 17]] - rec.center_w[0]) @ rec.R_cw[0].T for rec in (result.reconstruction, truth))
+    np.testing.assert_allclose(found, true, atol=0.05)
+    assert result.rms_px < 0.4
+
+
+def test_objective_of_the_truth_is_above_that_of_the_estimate(rng):
+    truth = make_scene(rng, "rotation", noise_px=0.5)
+    options = BundleOptions(outlier_rounds=0, loss="squared", sigma_px=0.5, phi_sigma=0.03)
+    result = bundle_adjust(perturbed(truth, rng), "rotation", options)
+    assert objective(result.reconstruction, "rotation", options) == pytest.approx(result.cost_history[-1], rel=1e-6)
+    assert objective(result.reconstruction, "rotation", options) < objective(truth, "rotation", options)
+    with pytest.raises(InputError, match="needs sigma_px"):
+        objective(truth, "rotation", BundleOptions())

@@ -38,7 +38,8 @@ class RunOptions:
     readout : str, optional
         Readout direction; else the camera file's, else top-to-bottom.
     shutter_model : str
-        "auto" (rotation), "rotation", "linearized", "two-step" or "global".
+        "constant-motion", "rotation", "linearized", "two-step", "global", or "auto": the one that foretells held-out
+        measurements best.
     seed : int
         Of every random choice.
     jobs : int
@@ -114,7 +115,6 @@ def run(
     """
     options = options or RunOptions()
     photos, out = Path(photos), Path(out)
-    model = "rotation" if options.shutter_model == "auto" else options.shutter_model
     log = StageLog(progress)
     jobs = use_threads(options.jobs)
     with output_folder(out, overwrite=options.overwrite, apart_from=[photos]) as scratch:
@@ -124,7 +124,7 @@ def run(
                 raise InputError(f"still photo {name!r} is not among the photos of {photos}")
         bundle = BundleOptions(held_phi=dict.fromkeys(options.still, (0,)))
         with tempfile.TemporaryDirectory() as work:
-            solved = solve_photos(loaded, model, options.seed, bundle, Path(work), log)
+            solved = solve_photos(loaded, options.shutter_model, options.seed, bundle, Path(work), log)
         rec = solved.result.reconstruction
         solution = _solution(loaded, solved, options)
         colors = PointColors(rec)
@@ -187,7 +187,7 @@ def _solution(loaded: LoadedPhotos, solved: Solved, options: RunOptions) -> Solu
         "num_observations": len(rec.observations),
         "rms_px": solved.result.rms_px,
         "global_rms_px": solved.global_result.rms_px,
-        "held_out_rms_px": {},
+        "held_out_rms_px": {} if solved.choice is None else solved.choice.held_out_rms_px,
         "phi_sigma_rad_per_frame": solved.result.phi_sigma,
         "stop_reason": solved.result.stop_reason,
     }

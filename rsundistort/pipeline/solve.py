@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..bundle import BundleOptions, BundleResult, bundle_adjust, climb
+from ..bundle import LADDER, BundleOptions, BundleResult, ModelChoice, bundle_adjust, choose_model, climb
 from ..errors import ReconstructionError
 from ..model import Reconstruction
 from ..sfm import map_photos, match_photos, retriangulate
@@ -33,10 +33,13 @@ class Solved:
         Last adjustment.
     global_result : BundleResult
         A global-shutter adjustment of the same measurements: what not modelling the shutter costs.
+    choice : ModelChoice or None
+        How the model was chosen; None where it was given.
     """
 
     result: BundleResult
     global_result: BundleResult
+    choice: ModelChoice | None = None
 
 
 def rungs_to(shutter_model: str) -> tuple[str, ...]:
@@ -45,6 +48,8 @@ def rungs_to(shutter_model: str) -> tuple[str, ...]:
         return ("global",)
     if shutter_model == "two-step":
         return ("global", "two-step")
+    if shutter_model == "constant-motion":
+        return LADDER
     return ("global", "two-step", shutter_model)
 
 
@@ -69,7 +74,7 @@ def solve_photos(
     photos : LoadedPhotos
         Features and camera.
     shutter_model : str
-        Last rung of the ladder.
+        Last rung of the ladder; "auto": solved up to rotation, then the rung that foretells held-out measurements.
     seed : int
         Seed of every random choice.
     options : BundleOptions
@@ -94,6 +99,8 @@ def solve_photos(
             f"only {mapped.num_images} of {len(photos.names)} photos could be joined, the shutter needs three; "
             "use photos that share more of the scene"
         )
+    auto = shutter_model == "auto"
+    shutter_model = "rotation" if auto else shutter_model
     log.begin("ladder")
     results = climb(mapped, rungs_to(shutter_model), options, lambda model, _: log.tell(f"ladder: {model}", 0))
     result = results[shutter_model]
@@ -116,8 +123,19 @@ def solve_photos(
         )  # fmt: skip
         if moved < _SETTLED_PX:
             break
+    choice = None
+    if auto:
+        log.begin("choice of the model")
+        choice = choose_model(
+            result.reconstruction, LADDER, options, sigma_px=result.sigma_px, seed=seed,
+            progress=lambda model, _: log.tell(f"choice: {model}", 0),
+        )  # fmt: skip
+        if choice.shutter_model != shutter_model:
+            start = replace(tracks, shutter_model=choice.shutter_model)
+            result = bundle_adjust(start, choice.shutter_model, options, partial(_tell, log, "choice"))
+        log.end("choice of the model", chosen=choice.shutter_model, gain=choice.gain, num_held_out=choice.num_held_out)
     log.begin("comparison with a global shutter")
     plain = BundleOptions(outlier_rounds=0, loss="squared", cost_tolerance=1e-4, sigma_px=result.sigma_px)
     global_result = bundle_adjust(result.reconstruction, "global", plain)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
-    return Solved(replace(result, reconstruction=result.reconstruction.normalized()), global_result)
+    return Solved(replace(result, reconstruction=result.reconstruction.normalized()), global_result, choice)

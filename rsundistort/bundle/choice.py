@@ -1,0 +1,137 @@
+"""Which shutter model the measurements support: the one that foretells measurements it was not fitted to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model import Observations, Reconstruction
+from .adjust import LADDER, bundle_adjust
+from .options import BundleOptions
+from .problem import reprojection_residuals
+
+__all__ = ["ModelChoice", "choose_model", "hold_out"]
+
+# A track gives one measurement away if this many are left: two fix the point, the third checks them.
+_LEFT_OVER = 3
+# Longer residuals, in standard deviations, count as this: a wrong match tells nothing about the shutter.
+_CLIP = 5.0
+# A rung is kept if the held-out error falls by this many standard errors: of rungs that explain nothing, one in six
+# would pass with one, one in forty does with two.
+_MIN_GAIN = 2.0
+
+
+@dataclass(frozen=True)
+class ModelChoice:
+    """Outcome of `choose_model`.
+
+    Attributes
+    ----------
+    shutter_model : str
+        The last rung that explained the held-out measurements better than the one kept before it.
+    held_out_rms_px : dict of model to float
+        Root mean square of the held-out residuals' parts, long ones clipped.
+    gain : dict of model to float
+        How much the held-out error (half a clipped sum of squares in units of the noise, per measurement) fell against
+        the rung kept before, in units of the standard error of that fall. The first rung has none.
+    num_held_out : int
+        Measurements held out.
+    """
+
+    shutter_model: str
+    held_out_rms_px: dict[str, float]
+    gain: dict[str, float]
+    num_held_out: int
+
+
+def hold_out(
+    reconstruction: Reconstruction, share: float = 0.1, seed: int = 0
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Masks (o,) of the measurements to fit and of those to hold out.
+
+    At most one measurement of a track is held out, and only of tracks of at least four photos.
+    """
+    obs = reconstruction.observations
+    rng = np.random.default_rng([seed, 7])
+    lengths = np.bincount(obs.point_idx, minlength=reconstruction.num_points)
+    spare = np.flatnonzero(lengths > _LEFT_OVER)
+    wanted = min(round(share * len(obs)), len(spare))
+    chosen = rng.permutation(spare)[:wanted]
+    # a random measurement of each chosen point: the first of its own in a random order
+    order = rng.permutation(len(obs))
+    first = np.full(reconstruction.num_points, -1)
+    first[obs.point_idx[order[::-1]]] = order[::-1]
+    held = np.zeros(len(obs), bool)
+    held[first[chosen]] = True
+    return ~held, held
+
+
+def _errors(rec: Reconstruction, held: Observations, sigma_px: float) -> tuple[NDArray[np.float64], float]:
+    """Half the clipped squared residual of each held-out measurement in units of the noise, and their rms in pixels."""
+    res, valid = reprojection_residuals(replace(rec, observations=held))
+    noise = sigma_px * held.sigma
+    square = np.where(valid, (res**2).sum(1) / noise**2, np.inf)
+    clipped = np.minimum(square, 2 * _CLIP**2)
+    return clipped / 2, float(np.sqrt(np.mean(clipped * noise**2) / 2))
+
+
+def choose_model(
+    reconstruction: Reconstruction,
+    rungs: Sequence[str] = LADDER,
+    options: BundleOptions | None = None,
+    *,
+    sigma_px: float,
+    seed: int = 0,
+    progress: Callable[[str, float], None] | None = None,
+) -> ModelChoice:
+    """Fit each rung to nine tenths of the measurements, and keep it only if it foretells the rest better.
+
+    Better means: the mean held-out error falls by more than two standard errors (over measurements, which lie on
+    different tracks).
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Measurements without gross outliers, and a start.
+    rungs : sequence of str
+        Models in the order of the ladder.
+    options : BundleOptions, optional
+        Of the fits, which are rough and of plain squares.
+    sigma_px : float
+        Noise of the measurements, as the last adjustment found it.
+    seed : int
+        Of the choice of measurements.
+    progress : callable, optional
+        Called as (model, cost).
+    """
+    fitted, held = hold_out(reconstruction, seed=seed)
+    base = options or BundleOptions()
+    # the gross outliers are gone: squares, and no closer than tells one rung from the next
+    rough = replace(
+        base, outlier_rounds=0, spread_rounds=4, spread_tolerance=0.05, loss="squared", sigma_px=sigma_px,
+        cost_tolerance=1e-5,
+    )  # fmt: skip
+    current = replace(reconstruction, observations=reconstruction.observations.select(fitted))
+    held_out = reconstruction.observations.select(held)
+    chosen, best = rungs[0], np.zeros(0)
+    rms: dict[str, float] = {}
+    gain: dict[str, float] = {}
+    for model in rungs:
+        step = None if progress is None else (lambda cost, model=model: progress(model, cost))
+        result = bundle_adjust(current, model, rough, step)
+        # the next rung starts from this one's shape, but keeps a motion that the rung does not model
+        moved = result.reconstruction
+        current = replace(moved, phi=current.phi) if model == "global" else moved
+        errors, rms[model] = _errors(moved, held_out, sigma_px)
+        if model == rungs[0]:
+            best = errors
+            continue
+        fall = best - errors
+        spread = float(fall.std(ddof=1) / np.sqrt(len(fall))) if len(fall) > 1 else np.inf
+        gain[model] = float(fall.mean() / spread) if spread > 0 else 0.0
+        if gain[model] > _MIN_GAIN:
+            chosen, best = model, errors
+    return ModelChoice(chosen, rms, gain, int(held.sum()))
