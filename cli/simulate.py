@@ -33,6 +33,11 @@ def command() -> None:
     help="JSON {name: [phi1, phi2, phi3]} in radians per unit of the clock, instead of random motion.",
 )
 @click.option("--still", multiple=True, metavar="NAME", help="A photo that does not move.")
+@click.option(
+    "--crop",
+    is_flag=True,
+    help="Cut all photos to the largest rectangle that every one fills, and the originals alike into global/.",
+)
 @opt.quality_option
 @opt.seed_option
 @opt.jobs_option
@@ -46,6 +51,7 @@ def warp(
     sigma: float,
     motion: Path | None,
     still: tuple[str, ...],
+    crop: bool,
     quality: int,
     seed: int,
     jobs: int,
@@ -54,7 +60,8 @@ def warp(
 ) -> None:
     """Warp real photos as if a rotating camera had taken them.
 
-    OUT gets photos/, masks/ (what the originals hold), camera.json and ground_truth.json.
+    OUT gets photos/, masks/ (what the originals hold), camera.json and ground_truth.json; with --crop also global/,
+    and camera and truth of the cut photos. --sigma is of the whole frame, also with --crop.
     """
     with errors_for_people(), progress_bars(quiet) as progress:
         from rsundistort.pipeline import WarpOptions, read_motion_file, simulate_warp
@@ -68,6 +75,7 @@ def warp(
                 sigma_rad=sigma,
                 motion=None if motion is None else read_motion_file(motion),
                 still=still,
+                crop=crop,
                 seed=seed,
                 jobs=jobs,
                 quality=quality,
@@ -77,7 +85,8 @@ def warp(
         )
     if not quiet:
         rows = [("photo", "shift px"), *((image.name, f"{image.rs_shift_px:.1f}") for image in truth.images)]
-        click.echo(f"{table(rows)}\n\noutputs  {out}")
+        size = f"\n\nsize     {truth.cameras['1'].width}x{truth.cameras['1'].height}" if crop else "\n"
+        click.echo(f"{table(rows)}{size}\noutputs  {out}")
 
 
 @command.command()

@@ -462,10 +462,36 @@ def test_simulate_warp(invoke, photos, tmp_path):
     assert {"photos/a.png", "masks/c.png", "camera.json", "ground_truth.json"} <= set(tree(tmp_path / "out"))
 
 
+def test_simulate_warp_crop(invoke, photos, tmp_path):
+    result = invoke("simulate", "warp", "photos", "-o", "out", "--camera", CAMERA, "--crop")
+    assert result.exit_code == 0, result.stderr
+    assert result.stderr == ""
+    camera = json.loads((tmp_path / "out" / "camera.json").read_text())
+    assert f"size     {camera['width']}x{camera['height']}" in result.stdout
+    assert (camera["width"], camera["height"]) < (320, 240)
+    made = set(tree(tmp_path / "out"))
+    assert {f"{folder}/{name}" for folder in ("photos", "masks", "global") for name in THREE} < made
+    # and it is found beside the photos by what reads them
+    args = ["rectify", "out/photos", "--solution", "out/ground_truth.json", "-o", "back"]
+    assert invoke(*args).exit_code == 0
+
+
+def test_simulate_warp_refuses_to_crop_to_a_stamp(invoke, photos, tmp_path):
+    (tmp_path / "motion.json").write_text('{"b.png": [3, 0, 0]}')
+    before = tree(tmp_path)
+    args = ["simulate", "warp", "photos", "-o", "out", "--camera", CAMERA, "--motion", "motion.json"]
+    error = error_line(invoke(*args, "--crop"))
+    assert "too strong" in error
+    assert "b.png" in error
+    assert tree(tmp_path) == before
+    assert invoke(*args).exit_code == 0
+
+
 @pytest.mark.parametrize(
     ("motion", "says"),
     [
         (None, "motion.json"),
+        ('{"b.png": [-0.95, 0, 0]}', "the rows of b.png fold over"),
         ("garbage", "motion.json"),
         ("[1, 2, 3]", "motion.json"),
         ('{"nobody.png": [0, 0, 0]}', "nobody.png"),

@@ -17,7 +17,7 @@ from ..errors import InputError
 from ..model import READOUTS, Camera
 from .lens import undistort_to_rays
 
-__all__ = ["random_phi", "warp_photo"]
+__all__ = ["crop_camera", "largest_rectangle", "random_phi", "warp_mask", "warp_photo"]
 
 
 def random_phi(
@@ -81,6 +81,19 @@ def warp_photo(photo: NDArray[Any], camera: Camera, phi: NDArray[np.float64]) ->
     h, w = photo.shape[:2]
     if (w, h) != (camera.width, camera.height):
         raise InputError(f"photo has {w}x{h} pixels, its camera {camera.width}x{camera.height}")
+    source, inside = _lookup(camera, phi)
+    warped = cv2.remap(photo, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return warped.reshape(photo.shape), np.where(inside, 255, 0).astype(np.uint8)
+
+
+def warp_mask(camera: Camera, phi: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """The mask that `warp_photo` gives with the photo: (h, w) uint8, 255 where the photo has the direction."""
+    return np.where(_lookup(camera, phi)[1], 255, 0).astype(np.uint8)
+
+
+def _lookup(camera: Camera, phi: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Pixel (h, w, 2) of the photo without motion whose direction each warped pixel saw, and whether it has it."""
+    w, h = camera.width, camera.height
     K, dist = np.array(camera.K), np.array(camera.dist)
     axis, sign = READOUTS[camera.readout]
     u, v = np.arange(w, dtype=float), np.arange(h, dtype=float)
@@ -103,6 +116,52 @@ def warp_photo(photo: NDArray[Any], camera: Camera, phi: NDArray[np.float64]) ->
     source = points.reshape(h, w, 2)
     ahead = turned[..., 2] > 0
     inside = ahead & (source >= 0).all(-1) & (source[..., 0] <= w - 1) & (source[..., 1] <= h - 1)
-    source = np.where(ahead[..., None], source, -1e6).astype(np.float32)
-    warped = cv2.remap(photo, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    return warped.reshape(photo.shape), np.where(inside, 255, 0).astype(np.uint8)
+    return np.where(ahead[..., None], source, -1e6).astype(np.float32), inside
+
+
+def largest_rectangle(valid: NDArray[np.bool_]) -> tuple[int, int, int, int]:
+    """The largest rectangle along the axes that holds valid pixels only.
+
+    The maximal-rectangle problem in linear time: row by row each pixel knows how many valid pixels stand above it, and
+    between which columns all of the row's runs under these reach; its rectangle is that wide and that high, and the
+    largest rectangle is that of one of its pixels. Rows are handled whole, in NumPy.
+
+    Parameters
+    ----------
+    valid : (h, w) bool array
+        Pixels that may lie in it.
+
+    Returns
+    -------
+    x, y, width, height : int
+        Its upper left pixel and its size; of several the one that ends first from the top; zeros if nothing is valid.
+    """
+    w = valid.shape[1]
+    columns = np.arange(w)
+    above, left, right = np.zeros(w, int), np.zeros(w, int), np.full(w, w)
+    best, found = 0, (0, 0, 0, 0)
+    for y, row in enumerate(valid):
+        # the run of valid pixels around each pixel of the row: its first column and the one behind its last
+        first = np.maximum.accumulate(np.where(row, 0, columns + 1))
+        behind = np.minimum.accumulate(np.where(row, w, columns)[::-1])[::-1]
+        above = np.where(row, above + 1, 0)
+        left = np.where(row, np.maximum(left, first), 0)
+        right = np.where(row, np.minimum(right, behind), w)
+        area = (right - left) * above
+        x = int(area.argmax())
+        if area[x] > best:
+            best = int(area[x])
+            found = (int(left[x]), y + 1 - int(above[x]), int(right[x] - left[x]), int(above[x]))
+    return found
+
+
+def crop_camera(camera: Camera, rectangle: tuple[int, int, int, int]) -> Camera:
+    """The camera of photos cut to a rectangle (x, y, width, height) of pixels.
+
+    The principal point moves with the corner, and the clock with it: a line keeps its moment, so that a motion per unit
+    of the clock stays what it was. The span of the frame shrinks.
+    """
+    x, y, width, height = rectangle
+    K = np.array(camera.K)
+    K[:2, 2] -= x, y
+    return Camera(width, height, K, camera.dist, camera.readout)
