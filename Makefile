@@ -42,6 +42,7 @@ format: $(VENV)/.installed
 # figures of the README; needs ../shared
 bench: $(VENV)/.installed
 	$(BIN)/python benchmarks/accuracy.py
+	$(BIN)/python benchmarks/truth.py
 	$(BIN)/python benchmarks/speed.py
 
 clean:

@@ -88,10 +88,10 @@ def simulate_warp(
 
     Writes `photos/` (warped), `masks/` (255 where the original had the direction), `camera.json` and
     `ground_truth.json`. The originals are the global-shutter twins; with the option `crop` they are cut to the same
-    rectangle, in `global/`, and camera and truth are those of the cut photos. What the twins lose would count as an
-    error of the photos compared with them, so they are stored without loss, and JPEG at quality 100 (55 dB from the
-    original where quality 98 is 49: measured on a photo of a facade). The EXIF of cut photos still tells the angle of
-    the whole frame: go by `camera.json`.
+    rectangle, in `global/`, and camera and truth are those of the cut photos. The twins have the lens of the photos,
+    which rectified photos have not. What they lose would count as an error of the photos compared with them, so they
+    are stored without loss, and JPEG at quality 100 (55 dB from the original where quality 98 is 49: measured on a
+    photo of a facade). The EXIF of cut photos still tells the angle of the whole frame: go by `camera.json`.
 
     Parameters
     ----------
