@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import covariance
 import numba
 import numpy as np
 import pytest
@@ -477,3 +478,18 @@ def test_objective_of_the_truth_is_above_that_of_the_estimate(rng):
     assert objective(result.reconstruction, "rotation", options) < objective(truth, "rotation", options)
     with pytest.raises(InputError, match="needs sigma_px"):
         objective(truth, "rotation", BundleOptions())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["rotation", "constant-motion"])
+def test_predicted_deviations_are_those_of_monte_carlo(model):
+    # of 200 trials each of 50 ratios has a standard error of 5 %
+    for found in covariance.ratios(model, 200).values():
+        assert found.min() > 0.85
+        assert found.max() < 1.15
+
+
+def test_predicted_deviations_are_those_of_few_trials():
+    for found in covariance.ratios("rotation", 30).values():
+        # 13 % each, and the components of a photo go together
+        assert 0.85 < np.sqrt(np.mean(found**2)) < 1.15
