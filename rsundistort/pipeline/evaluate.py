@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import FileError, InputError
 from ..evaluation import motion_errors, pose_errors, psnr
 from ..io import output_name, read_photo, read_solution
+from ..model import RowMotion, Solution, SolvedImage
+from ..rectify import rectify
 from .progress import ProgressCallback, StageLog
 from .write import mask_names
 
@@ -40,7 +44,8 @@ def evaluate(
     poses : path, optional
         Solution to take the true poses from, e.g. of the same photos without motion.
     twins : path, optional
-        Folder of global-shutter photos of the same names; `global` beside the truth file when there is one.
+        Folder of global-shutter photos of the same names, taken by the same camera: a lens is taken out of them before
+        the comparison. `global` beside the truth file when there is one.
     raw : path, optional
         Folder of the photos that were rectified, for the figure before; `photos` beside the truth file.
     progress : callable, optional
@@ -68,11 +73,27 @@ def evaluate(
         if given is not None and not chosen[key].is_dir():
             raise FileError(f"{chosen[key]} is no folder; give the folder of the {key} photos")
     if chosen["twins"].is_dir():
-        result.update(_image_errors(out, solution, chosen["twins"], chosen["raw"], StageLog(progress)))
+        result.update(_image_errors(out, solution, true_solution, chosen, StageLog(progress)))
     return result
 
 
-def _image_errors(out: Path, solution: Any, twins: Path, raw: Path, log: StageLog) -> dict[str, Any]:
+def _without_lens(
+    twin: NDArray[Any], image: SolvedImage, solution: Solution, truth: Solution
+) -> tuple[NDArray[Any], NDArray[np.uint8]]:
+    """A global-shutter photo as the rectified camera would have taken it, and the mask of what it shows."""
+    by_name = {each.name: each for each in truth.images}
+    taken_by = truth.cameras[by_name[image.name].camera_id] if image.name in by_name else None
+    rectified = solution.rectified_cameras[image.camera_id]
+    whole = np.full(twin.shape[:2], 255, np.uint8)
+    if taken_by is None or not taken_by.dist.any():
+        return twin, whole
+    return rectify(twin, taken_by, RowMotion(), "global", rectified)
+
+
+def _image_errors(
+    out: Path, solution: Solution, truth: Solution, folders: Mapping[str, Path], log: StageLog
+) -> dict[str, Any]:
+    twins, raw = folders["twins"], folders["raw"]
     masks = mask_names([image.name for image in solution.images])
     after: dict[str, float] = {}
     before: dict[str, float] = {}
@@ -80,12 +101,14 @@ def _image_errors(out: Path, solution: Any, twins: Path, raw: Path, log: StageLo
     log.begin("comparing", len(registered))
     for done, image in enumerate(registered, start=1):
         name = output_name(image.name)
-        twin = read_photo(twins / name).pixels
+        taken = read_photo(twins / name).pixels
         mask = read_photo(out / "masks" / masks[image.name]).pixels
         try:
-            after[image.name] = psnr(read_photo(out / "images" / name).pixels, twin, mask)
+            twin, shown = _without_lens(taken, image, solution, truth)
+            after[image.name] = psnr(read_photo(out / "images" / name).pixels, twin, np.minimum(mask, shown))
             if (raw / image.name).is_file():
-                before[image.name] = psnr(read_photo(raw / image.name).pixels, twin, mask)
+                # photo and twin have the same lens
+                before[image.name] = psnr(read_photo(raw / image.name).pixels, taken, mask)
         except InputError as error:
             raise InputError(f"{image.name}: {error}") from error
         log.tell("comparing", done, len(registered))
