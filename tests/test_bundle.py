@@ -493,3 +493,40 @@ def test_predicted_deviations_are_those_of_few_trials():
     for found in covariance.ratios("rotation", 30).values():
         # 13 % each, and the components of a photo go together
         assert 0.85 < np.sqrt(np.mean(found**2)) < 1.15
+
+
+def test_two_photos_are_too_few_for_a_shutter(rng):
+    rec = make_scene(rng, "global", num_images=2)
+    with pytest.raises(InputError, match="at least three"):
+        bundle_adjust(rec, "rotation")
+    assert bundle_adjust(rec, "global").converged
+
+
+def test_photos_without_parallax_are_refused(rng):
+    rec = make_scene(rng, "global")
+    with pytest.raises(InputError, match="without parallax"):
+        bundle_adjust(replace(rec, center_w=np.tile(rec.center_w[:1], (6, 1))), "rotation")
+
+
+def test_a_photo_with_fewer_measurements_than_unknowns_keeps_its_motion_at_the_prior(rng):
+    truth = make_scene(rng, "rotation", num_images=8, num_points=80, noise_px=0.3)
+    obs = truth.observations
+    poor = (obs.frame_idx != 5) | (obs.point_idx < 4)  # 8 numbers for 9 unknowns
+    start = perturbed(replace(truth, observations=obs.select(poor)), rng, 0.002, 0.005)
+    result = bundle_adjust(start, "rotation")
+    prior = result.phi_sigma / truth.frame_span()[5]
+    # its pose takes six of the eight numbers; two are left for phi, whose third direction stays at the prior
+    assert result.sigma_phi[5].max() > 0.8 * prior
+    assert (np.abs(result.reconstruction.phi[5] - truth.phi[5]) < 3 * result.sigma_phi[5]).all()
+    others = np.delete(np.arange(8), 5)
+    assert result.sigma_phi[others].max() < 0.2 * prior
+    np.testing.assert_allclose(result.reconstruction.phi[others], truth.phi[others], atol=0.01)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_measurements_that_are_no_numbers_are_refused(value, rng):
+    obs = make_scene(rng, "rotation").observations
+    xy = obs.xy_raw.copy()
+    xy[3, 1] = value
+    with pytest.raises(InputError, match="xy_raw holds NaN or infinity"):
+        replace(obs, xy_raw=xy)

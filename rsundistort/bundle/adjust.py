@@ -100,6 +100,16 @@ def objective(reconstruction: Reconstruction, shutter_model: str, options: Bundl
     return problem.cost(problem.initial_state())
 
 
+def _check_solvable(reconstruction: Reconstruction, shutter_model: str) -> None:
+    """Refuse what has no answer: too few photos for a shutter, and photos without parallax."""
+    m = reconstruction.num_images
+    if shutter_model != "global" and m < 3:
+        raise InputError(f"{m} photos cannot tell the shutter from the scene; at least three are needed")
+    size = float(np.median(np.linalg.norm(reconstruction.points_w - reconstruction.center_w.mean(0), axis=1)))
+    if m > 1 and not np.linalg.norm(np.ptp(reconstruction.center_w, axis=0)) > 1e-9 * size:
+        raise InputError("all photos are taken from one place: without parallax there is no scene to solve for")
+
+
 def bundle_adjust(
     reconstruction: Reconstruction,
     shutter_model: str = "rotation",
@@ -122,12 +132,20 @@ def bundle_adjust(
     Returns
     -------
     BundleResult
-        With a stop reason: the estimate of a solve that ran out of iterations is returned, and says so.
+        With a stop reason: the estimate of a solve that ran out of iterations is returned, and says so. A photo whose
+        measurements cannot support its shutter keeps its motion at the prior: its `sigma_phi` is then the prior's.
+
+    Raises
+    ------
+    InputError
+        Fewer than two photos (three for a shutter), no common points, or all photos taken from one place.
     """
     options = options or BundleOptions()
     # `base` holds all measurements of the points still in use, `keep` says which of them are believed: one that was
     # doubted while an outlier bent its point is heard again in the next round
     base = reconstruction.with_points(np.ones(len(reconstruction.observations), bool))
+    if base.num_points:
+        _check_solvable(base, shutter_model)
     base = revive_points(base, shutter_model)
     keep = np.ones(len(base.observations), bool)
     iterations = 0
