@@ -59,3 +59,68 @@ def one(
                 numbers = (metrics[m]["median"] for m in ("rotation_deg", "translation", "structure"))
                 rows.append((scene, method, *(f"{v:.4f}" for v in numbers), f"{metrics['iterations']['median']:.0f}"))
         click.echo(f"{table(rows)}\n\nmedians; outputs  {out}")
+
+
+@command.command()
+@click.argument("still", type=click.Path(path_type=Path))
+@click.argument("swung", type=click.Path(path_type=Path))
+@opt.out_option
+@opt.camera_option
+@opt.readout_option
+@click.option(
+    "--model",
+    "shutter_model",
+    type=click.Choice(("auto", "constant-motion", "rotation", "linearized", "two-step")),
+    default="auto",
+    show_default=True,
+    help="How the shutter of SWUNG is modelled, as in run.",
+)
+@opt.seed_option
+@opt.jobs_option
+@opt.overwrite_option
+@opt.quiet_option
+def two(
+    still: Path,
+    swung: Path,
+    out: Path,
+    camera: str | None,
+    readout: str | None,
+    shutter_model: str,
+    seed: int,
+    jobs: int,
+    overwrite: bool,
+    quiet: bool,
+) -> None:
+    """Camera positions of real photos taken in motion, against those of photos taken still.
+
+    STILL and SWUNG are folders of photos with the same names, each pair taken from one place by one camera. OUT gets
+    the outputs of three runs (still/, swung/ and, without a shutter model, swung-global/), summary.json, photos.csv
+    and paths.png.
+    """
+    with errors_for_people(), progress_bars(quiet) as progress:
+        from rsundistort.experiments import TwoOptions, experiment_two
+
+        options = TwoOptions(camera, readout, shutter_model, seed, jobs, overwrite)
+        summary = experiment_two(still, swung, out, options, progress)
+    if not quiet:
+        click.echo(_comparison(summary, out))
+
+
+def _comparison(summary: dict[str, Any], out: Path) -> str:
+    """Errors with and without the shutter model, and which photos were joined."""
+    rows = [["", "mean", "median", "worst"]]
+    for label, metric in (("position error, baselines", "position"), ("rotation error, deg", "rotation_deg")):
+        for kind in ("without", "with"):
+            v = summary[f"{kind}_shutter_model"][metric]
+            numbers = (f"{v[part]:.4f}" for part in ("mean", "median", "max"))
+            rows.append([f"{label}, {kind} a shutter model", *numbers])
+    joined = ", ".join(f"{key} {count}" for key, count in summary["registered"].items())
+    lines = [
+        table(rows),
+        "",
+        f"shutter model      {summary['shutter_model']}",
+        f"photos registered  {joined} of {summary['photos']}; {summary['compared']} compared",
+    ]
+    for key, lost in summary["not_registered"].items():
+        lines += [f"  {key}: {name} not joined: {reason}" for name, reason in lost.items()]
+    return "\n".join([*lines, f"outputs            {out}"])

@@ -2,5 +2,16 @@
 
 from .one import METHODS, OneOptions, experiment_one
 from .scenes import KnownScene, load_scene
+from .two import PathComparison, TwoOptions, compare_paths, experiment_two
 
-__all__ = ["METHODS", "KnownScene", "OneOptions", "experiment_one", "load_scene"]
+__all__ = [
+    "METHODS",
+    "KnownScene",
+    "OneOptions",
+    "PathComparison",
+    "TwoOptions",
+    "compare_paths",
+    "experiment_one",
+    "experiment_two",
+    "load_scene",
+]

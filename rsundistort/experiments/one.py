@@ -17,12 +17,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..bundle import BundleOptions, bundle_adjust, objective
-from ..errors import InputError
+from ..errors import FileError, FormatError, InputError
 from ..evaluation import align_points, rotation_angles_deg
 from ..model import Observations, Reconstruction, RowMotion
 from ..pipeline.progress import ProgressCallback
 from ..synthetic import project_rows
-from .figures import cumulative_histograms
+from .figures import cumulative_histograms, need_matplotlib
 from .scenes import KnownScene, load_scene
 
 __all__ = ["METHODS", "OneOptions", "experiment_one"]
@@ -220,6 +220,13 @@ def _done(path: Path) -> dict[tuple[str, int, str], dict[str, Any]]:
     return found
 
 
+def _cut_torn_line(path: Path) -> None:
+    """Cut off what a crash left of a line: the next one must not join it."""
+    if path.is_file():
+        whole = path.read_bytes().rfind(b"\n") + 1
+        os.truncate(path, whole)
+
+
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
     """Processes started within have one thread each: as many as cores would wait for each other with more."""
@@ -260,7 +267,7 @@ def experiment_one(
     options: OneOptions | None = None,
     progress: ProgressCallback | None = None,
 ) -> dict[str, Any]:
-    """Run the trials and write `trials.jsonl`, `summary.json`, `summary.csv` and `histograms.png`.
+    """Run the trials and write `settings.json`, `trials.jsonl`, `summary.json`, `summary.csv` and `histograms.png`.
 
     Trials that `out` already holds, of the same settings, are not run again.
 
@@ -285,10 +292,16 @@ def experiment_one(
     names = [scene.name for scene in loaded]
     if len(set(names)) != len(names):
         raise InputError(f"two scenes are called {max(names, key=names.count)!r}; rename one")
+    # before the hours of work, not after them
+    need_matplotlib()
     out = Path(out)
-    out.mkdir(parents=True, exist_ok=True)
-    _check_settings(out / "settings.json", _settings(options))
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"{out} cannot be made: {error.strerror}; give another folder") from error
+    _check_settings(out / "settings.json", _settings(options), {scene.name: scene.digest for scene in loaded})
     trials = out / "trials.jsonl"
+    _cut_torn_line(trials)
     done = _done(trials)
     jobs = []
     for scene in loaded:
@@ -315,8 +328,13 @@ def experiment_one(
         # spawned, not forked: the kernels' threads do not survive a fork
         pool = ProcessPoolExecutor(min(cores, max(total, 1)), get_context("spawn"))
         with _one_thread_each(), pool:
-            for future in as_completed([pool.submit(run_trial, *job) for job in jobs]):
-                keep(future.result())
+            try:
+                for future in as_completed([pool.submit(run_trial, *job) for job in jobs]):
+                    keep(future.result())
+            except BaseException:
+                # leaving the pool waits for it: hours, if what is queued were run
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
     wanted = [
         done[scene.name, trial, method]
         for scene in loaded
@@ -330,17 +348,26 @@ def experiment_one(
     return summary
 
 
-def _check_settings(path: Path, settings: dict[str, Any]) -> None:
-    """Refuse to mix trials of different settings in one folder."""
+def _check_settings(path: Path, settings: dict[str, Any], digests: dict[str, str]) -> None:
+    """Refuse to mix trials of different settings, or of different scenes of one name, in one folder."""
+    known: dict[str, str] = {}
     if path.is_file():
-        earlier = json.loads(path.read_text(encoding="utf-8"))
+        try:
+            earlier = json.loads(path.read_text(encoding="utf-8"))
+            known = dict(earlier.get("scenes", {}))
+        except (ValueError, AttributeError) as error:
+            raise FormatError(f"{path} cannot be read; give another folder") from error
         changed = [key for key in settings if earlier.get(key) != settings[key]]
         if changed:
             raise InputError(
                 f"{path.parent} holds trials with another {changed[0]} ({earlier.get(changed[0])!r}, not "
                 f"{settings[changed[0]]!r}); give another folder"
             )
-    path.write_text(json.dumps(settings, indent=1) + "\n", encoding="utf-8")
+        other = [name for name, digest in digests.items() if known.get(name, digest) != digest]
+        if other:
+            raise InputError(f"{path.parent} holds trials of another scene called {other[0]}; give another folder")
+    text = json.dumps({**settings, "scenes": {**known, **digests}}, indent=1)
+    path.write_text(text + "\n", encoding="utf-8")
 
 
 def _write_csv(path: Path, summary: dict[str, Any]) -> None:

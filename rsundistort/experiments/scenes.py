@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 from ..errors import FileError, FormatError, InputError
 from ..io import read_colmap_poses
 from ..model import Camera
+from ..model.checks import check_finite, check_index, check_rotations, frozen
 
 __all__ = ["KnownScene", "load_scene"]
 
@@ -43,6 +46,26 @@ class KnownScene:
     points_w: NDArray[np.float64]
     frame_idx: NDArray[np.int64]
     point_idx: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        checked = {
+            "R_cw": check_rotations(self.R_cw, len(self.R_cw), "R_cw"),
+            "center_w": check_finite(self.center_w, (len(self.R_cw), 3), "center_w"),
+            "points_w": check_finite(self.points_w, (None, 3), "points_w"),
+            "frame_idx": check_index(self.frame_idx, len(self.frame_idx), len(self.R_cw), "frame_idx"),
+            "point_idx": check_index(self.point_idx, len(self.frame_idx), len(self.points_w), "point_idx"),
+        }
+        for name, array in checked.items():
+            object.__setattr__(self, name, frozen(array))
+
+    @property
+    def digest(self) -> str:
+        """The same for the same camera, poses, points and visibility, whatever the name."""
+        parts = (self.camera.K, self.R_cw, self.center_w, self.points_w, self.frame_idx, self.point_idx)
+        total = hashlib.sha256(f"{self.camera.width} {self.camera.height} {self.camera.readout}".encode())
+        for part in parts:
+            total.update(part.tobytes())
+        return total.hexdigest()[:16]
 
     @property
     def num_images(self) -> int:
@@ -80,7 +103,7 @@ def load_scene(path: Path | str) -> KnownScene:
         order = np.argsort(names)
         rank = np.empty(len(names), np.int64)
         rank[order] = np.arange(len(names))
-        scene = KnownScene(path.name, cameras[0], R[order], center[order], points, rank[frame], point)
+        scene = KnownScene(path.resolve().name, cameras[0], R[order], center[order], points, rank[frame], point)
     elif path.suffix == ".npz":
         scene = _from_npz(path)
     else:
@@ -92,19 +115,30 @@ def load_scene(path: Path | str) -> KnownScene:
 
 def _from_npz(path: Path) -> KnownScene:
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        arrays = np.load(path, allow_pickle=False)
+        if not isinstance(arrays, np.lib.npyio.NpzFile):
+            raise FormatError(f"{path} is no scene: it holds a single array")
+        with arrays:
             found = {name: arrays[name] for name in _ARRAYS}
     except OSError as error:
         raise FileError(f"{path} cannot be read: {error.strerror or error}") from error
-    except (ValueError, KeyError, zipfile.BadZipFile) as error:
+    except FormatError:
+        raise
+    # what NumPy raises of a file that was cut short or garbled
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise FormatError(f"{path} is no scene: {error}") from error
-    if found["K"].shape != (3, 3):
+    if found["K"].ndim == 3:
         raise InputError(f"{path} has several cameras; the experiment takes scenes of one")
-    camera = Camera(int(found["width"]), int(found["height"]), found["K"])
-    return KnownScene(
-        path.stem if path.stem != "tracks" else path.resolve().parent.name,
-        camera, *(found[name] for name in ("R_cw", "center_w", "points_w", "frame_idx", "point_idx")),
-    )  # fmt: skip
+    if found["width"].ndim or found["height"].ndim:
+        raise FormatError(f"{path} is no scene: width and height must be single numbers")
+    try:
+        return KnownScene(
+            path.stem if path.stem != "tracks" else path.resolve().parent.name,
+            Camera(int(found["width"]), int(found["height"]), found["K"]),
+            *(found[name] for name in ("R_cw", "center_w", "points_w", "frame_idx", "point_idx")),
+        )
+    except (InputError, TypeError) as error:
+        raise FormatError(f"{path} is no scene: {error}") from error
 
 
 def _seen_twice(scene: KnownScene) -> KnownScene:
@@ -113,6 +147,9 @@ def _seen_twice(scene: KnownScene) -> KnownScene:
     kept = np.bincount(seen[0], minlength=len(scene.points_w)) >= 2
     new = np.cumsum(kept) - 1
     point, frame = seen[:, kept[seen[0]]]
+    blind = np.flatnonzero(np.bincount(frame, minlength=scene.num_images) == 0)
+    if len(blind):
+        raise InputError(f"{scene.name}: photo {blind[0]} shares no point with another photo")
     return KnownScene(
         scene.name, scene.camera, scene.R_cw, scene.center_w, scene.points_w[kept], frame, new[point],
     )  # fmt: skip

@@ -1,0 +1,270 @@
+"""The paper's Experiment II: photos of a scene taken still, and taken again while the camera moved."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..evaluation import align_points, pose_errors
+from ..io import list_photos, output_folder
+from ..model import Solution, check_shutter_model
+from ..pipeline import RunOptions, run, versions
+from ..pipeline.progress import ProgressCallback
+from .figures import camera_paths, need_matplotlib
+
+__all__ = ["PathComparison", "TwoOptions", "compare_paths", "experiment_two"]
+
+# folders of the three runs
+_STILL, _WITH, _WITHOUT = "still", "swung", "swung-global"
+
+
+@dataclass(frozen=True)
+class TwoOptions:
+    """Options of `experiment_two`.
+
+    Parameters
+    ----------
+    camera, readout : str, optional
+        Of both folders, as `RunOptions` has them.
+    shutter_model : str
+        Of the photos that were taken in motion: any of `RunOptions` but "global", with which it is compared.
+    seed, jobs : int
+        As `RunOptions` has them.
+    overwrite : bool
+        Replace the outputs of an earlier run.
+    """
+
+    camera: str | None = None
+    readout: str | None = None
+    shutter_model: str = "auto"
+    seed: int = 0
+    jobs: int = 0
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        if self.shutter_model == "global":
+            raise InputError("shutter_model='global' is what the others are compared with; give another")
+        if self.shutter_model != "auto":
+            check_shutter_model(self.shutter_model)
+        if self.jobs < 0:
+            raise InputError(f"jobs={self.jobs}, expected 0 or more")
+
+
+@dataclass(frozen=True)
+class PathComparison:
+    """Camera poses of the photos taken in motion, beside those of the same photos taken still.
+
+    Lengths are in baselines: the mean distance of consecutive centres of the still photos compared.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Photos that have a pose in all three reconstructions, sorted.
+    still_w : (m, 3) array
+        Centres of the photos taken still, in the world frame of their reconstruction.
+    R_cw : (m, 3, 3) array
+        Their orientations, world to camera.
+    centers_w : mapping of "with" and "without" to (m, 3) array
+        Centres with and without the shutter model, after the similarity that takes them nearest to `still_w`.
+    position : mapping of "with" and "without" to (m,) array
+        Distances from `still_w`.
+    rotation_deg : mapping of "with" and "without" to (m,) array
+        Angles left after the common rotation that best aligns all orientations, degrees.
+    """
+
+    names: tuple[str, ...]
+    still_w: NDArray[np.float64]
+    R_cw: NDArray[np.float64]
+    centers_w: Mapping[str, NDArray[np.float64]]
+    position: Mapping[str, NDArray[np.float64]]
+    rotation_deg: Mapping[str, NDArray[np.float64]]
+
+
+def compare_paths(still: Solution, with_model: Solution, without: Solution) -> PathComparison:
+    """Errors of two reconstructions of photos taken in motion, on the photos that both share with the still one.
+
+    Parameters
+    ----------
+    still : Solution
+        Of the photos taken without motion: what the others are measured against.
+    with_model, without : Solution
+        Of the photos taken in motion, with and without a shutter model. Photos are matched by name.
+
+    Raises
+    ------
+    InputError
+        When fewer than three photos have a pose in all three, or the still ones were taken from one place.
+    """
+    posed = [{image.name for image in solution.images if image.posed} for solution in (still, with_model, without)]
+    names = sorted(posed[0] & posed[1] & posed[2])
+    if len(names) < 3:
+        raise InputError(
+            f"{len(names)} photos were joined in all three reconstructions, expected at least three "
+            f"({len(posed[0])} still, {len(posed[1])} swung, {len(posed[2])} swung without a shutter model)"
+        )
+
+    def only(solution: Solution) -> Solution:
+        """The solution of the photos compared alone, in their order."""
+        return replace(solution, images=tuple(solution.image(name) for name in names))
+
+    truth = only(still)
+    centers, R_cw = _centers(truth), np.array([image.R_cw for image in truth.images])
+    baseline = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).mean())
+    # normalized reconstructions have baselines around 1; below this nothing but rounding is left
+    if not baseline > 1e-12:
+        raise InputError("the photos taken still were all taken from one place; their path tells nothing")
+    still_w = centers / baseline
+    centers_w, position, rotation = {}, {}, {}
+    for key, solution in (("with", only(with_model)), ("without", only(without))):
+        found = _centers(solution)
+        scale, A, shift = align_points(found, still_w)
+        centers_w[key] = scale * found @ A.T + shift
+        # orientations are aligned by themselves: of a walk along a straight line, the similarity of the centres leaves
+        # the turn about that line open
+        errors = pose_errors(solution, truth)
+        position[key], rotation[key] = errors.center, errors.rotation_deg
+    return PathComparison(tuple(names), still_w, R_cw, centers_w, position, rotation)
+
+
+def _centers(solution: Solution) -> NDArray[np.float64]:
+    return np.array([image.center_w for image in solution.images])
+
+
+def check_same_names(still: Path, swung: Path) -> list[str]:
+    """The names of the photos that both folders hold; refuses folders that differ in them, or are one."""
+    if still.resolve() == swung.resolve():
+        raise InputError(f"{still} is given twice; give one folder taken still and one taken in motion")
+    here, there = list_photos(still), list_photos(swung)
+    for lone, folder, other in ((set(here) - set(there), still, swung), (set(there) - set(here), swung, still)):
+        if lone:
+            more = f" and {len(lone) - 1} more" if len(lone) > 1 else ""
+            raise InputError(
+                f"{folder} has {min(lone)}{more}, which {other} has not; "
+                "photos taken from one place need the same name in both folders"
+            )
+    return here
+
+
+def experiment_two(
+    still: Path | str,
+    swung: Path | str,
+    out: Path | str,
+    options: TwoOptions | None = None,
+    progress: ProgressCallback | None = None,
+) -> dict[str, Any]:
+    """Camera paths of photos taken in motion, with and without a shutter model, against the same photos taken still.
+
+    Writes `still/`, `swung/` and `swung-global/` (outputs of `run`), `summary.json`, `photos.csv` and `paths.png`.
+
+    Parameters
+    ----------
+    still, swung : path
+        Folders of photos with the same names, each pair taken from one place by one camera.
+    out : path
+        Folder for the outputs; it gets all of them or stays as it was.
+    options : TwoOptions, optional
+        See there.
+    progress : callable, optional
+        Called as (stage, done, total).
+
+    Returns
+    -------
+    dict
+        As in `summary.json`.
+
+    Raises
+    ------
+    InputError, ReconstructionError
+        When the names differ, or fewer than three photos are joined in all three reconstructions.
+    """
+    options = options or TwoOptions()
+    still, swung, out = Path(still), Path(swung), Path(out)
+    # before the minutes of work, not after them
+    need_matplotlib()
+    names = check_same_names(still, swung)
+    common = RunOptions(camera=options.camera, readout=options.readout, seed=options.seed, jobs=options.jobs)
+    solutions: dict[str, Solution] = {}
+    with output_folder(out, overwrite=options.overwrite, apart_from=[still, swung]) as scratch:
+        for key, photos, model in (
+            (_STILL, still, "global"),
+            (_WITH, swung, options.shutter_model),
+            (_WITHOUT, swung, "global"),
+        ):
+            told = None if progress is None else _within(progress, key)
+            solutions[key] = run(photos, scratch / key, replace(common, shutter_model=model), told)
+        found = compare_paths(solutions[_STILL], solutions[_WITH], solutions[_WITHOUT])
+        summary = _summary(names, solutions, found, options)
+        (scratch / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+        _write_csv(scratch / "photos.csv", names, solutions, found)
+        camera_paths(found, solutions[_WITH].shutter_model, scratch / "paths.png")
+    return summary
+
+
+def _within(progress: ProgressCallback, key: str) -> ProgressCallback:
+    """Progress of one of the three runs."""
+    return lambda stage, done, total: progress(f"{key}: {stage}", done, total)
+
+
+def _spread(values: NDArray[np.float64]) -> dict[str, float]:
+    return {"mean": float(np.mean(values)), "median": float(np.median(values)), "max": float(np.max(values))}
+
+
+def _summary(
+    names: Sequence[str], solutions: Mapping[str, Solution], found: PathComparison, options: TwoOptions
+) -> dict[str, Any]:
+    return {
+        "photos": len(names),
+        "registered": {key: len(solution.registered) for key, solution in solutions.items()},
+        "not_registered": {
+            key: {image.name: image.reason for image in solution.images if not image.registered}
+            for key, solution in solutions.items()
+        },
+        "compared": len(found.names),
+        "shutter_model": solutions[_WITH].shutter_model,
+        **{
+            f"{key}_shutter_model": {
+                "position": _spread(found.position[key]),
+                "rotation_deg": _spread(found.rotation_deg[key]),
+            }
+            for key in ("with", "without")
+        },
+        "rms_px": {key: solution.quality.get("rms_px") for key, solution in solutions.items()},
+        "cameras": {key: solution.options.get("camera") for key, solution in solutions.items()},
+        "options": {"shutter_model": options.shutter_model, "seed": options.seed},
+        "generator": versions(),
+    }
+
+
+def _write_csv(path: Path, names: Sequence[str], solutions: Mapping[str, Solution], found: PathComparison) -> None:
+    """A line for each photo; errors are empty where it was not joined in all three reconstructions."""
+    place = {name: k for k, name in enumerate(found.names)}
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(
+            [
+                "photo",
+                *(f"registered_{key}" for key in solutions),
+                "position_with",
+                "position_without",
+                "rotation_deg_with",
+                "rotation_deg_without",
+            ]
+        )
+        for name in names:
+            k = place.get(name)
+            errors = (*found.position.values(), *found.rotation_deg.values())
+            writer.writerow(
+                [
+                    name,
+                    *(int(solution.image(name).registered) for solution in solutions.values()),
+                    *("" if k is None else f"{values[k]:.6g}" for values in errors),
+                ]
+            )
