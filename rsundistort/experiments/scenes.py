@@ -115,10 +115,11 @@ def load_scene(path: Path | str) -> KnownScene:
 
 def _from_npz(path: Path) -> KnownScene:
     try:
-        arrays = np.load(path, allow_pickle=False)
-        if not isinstance(arrays, np.lib.npyio.NpzFile):
-            raise FormatError(f"{path} is no scene: it holds a single array")
-        with arrays:
+        # NumPy leaves open what it opened itself and could not read
+        with path.open("rb") as file:
+            arrays = np.load(file, allow_pickle=False)
+            if not isinstance(arrays, np.lib.npyio.NpzFile):
+                raise FormatError(f"{path} is no scene: it holds a single array")
             found = {name: arrays[name] for name in _ARRAYS}
     except OSError as error:
         raise FileError(f"{path} cannot be read: {error.strerror or error}") from error
@@ -131,13 +132,16 @@ def _from_npz(path: Path) -> KnownScene:
         raise InputError(f"{path} has several cameras; the experiment takes scenes of one")
     if found["width"].ndim or found["height"].ndim:
         raise FormatError(f"{path} is no scene: width and height must be single numbers")
+    for name, array in found.items():
+        if array.dtype.kind not in "fiu":
+            raise FormatError(f"{path} is no scene: {name} holds {array.dtype}, expected numbers")
     try:
         return KnownScene(
             path.stem if path.stem != "tracks" else path.resolve().parent.name,
             Camera(int(found["width"]), int(found["height"]), found["K"]),
             *(found[name] for name in ("R_cw", "center_w", "points_w", "frame_idx", "point_idx")),
         )
-    except (InputError, TypeError) as error:
+    except InputError as error:
         raise FormatError(f"{path} is no scene: {error}") from error
 
 
