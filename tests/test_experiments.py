@@ -19,6 +19,7 @@ from rsundistort import (
     FormatError,
     InputError,
     Reconstruction,
+    ReconstructionError,
     RowMotion,
     Solution,
     SolvedImage,
@@ -246,6 +247,7 @@ def test_every_method_ends_and_the_anchor_costs_something(scene):
         ({"noise_px": 0.0}, "noise_px=0"),
         ({"rotation_rad": -0.1}, "rotation_rad=-0.1"),
         ({"translation": float("nan")}, "translation=nan"),
+        ({"start_length": float("inf")}, "start_length=inf"),
         ({"trials": 0}, "trials"),
         ({"jobs": -1}, "jobs"),
     ],
@@ -683,6 +685,20 @@ def test_experiment_two_keeps_outputs_unless_told(folders, made_up, tmp_path):
 def test_experiment_two_leaves_nothing_where_too_few_are_joined(folders, made_up, monkeypatch, poses, tmp_path):
     monkeypatch.setattr(two, "run", lambda *_: solution_of(*poses, lost=NAMES[:4]))
     with pytest.raises(InputError, match="2 photos were joined in all three"):
+        experiment_two(*folders, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_experiment_two_says_which_photos_cannot_be_joined(folders, made_up, monkeypatch, tmp_path):
+    good = two.run
+
+    def fake(photos, out, options, progress=None):
+        if photos.name == "swung":
+            raise ReconstructionError("only 2 of 6 photos could be joined")
+        return good(photos, out, options, progress)
+
+    monkeypatch.setattr(two, "run", fake)
+    with pytest.raises(ReconstructionError, match="swung: only 2 of 6"):
         experiment_two(*folders, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

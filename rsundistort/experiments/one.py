@@ -81,8 +81,8 @@ class OneOptions:
         if unknown or not self.methods:
             raise InputError(f"method {(unknown or ['none'])[0]!r}, expected some of {', '.join(METHODS)}")
         for name in ("noise_px", "rotation_rad", "translation", "start_rotation_deg", "start_length"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"{name}={getattr(self, name)!r}, expected 0 or more")
+            if not 0 <= getattr(self, name) < np.inf:
+                raise InputError(f"{name}={getattr(self, name)!r}, expected a finite number, 0 or more")
         if not self.noise_px > 0:
             raise InputError("noise_px=0: the methods weigh measurements by their noise; give a positive one")
         if self.trials < 1 or self.jobs < 0:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import InputError, ReconstructionError
 from ..evaluation import align_points, pose_errors
 from ..io import list_photos, output_folder
 from ..model import Solution, check_shutter_model
@@ -199,7 +199,10 @@ def experiment_two(
             (_WITHOUT, swung, "global"),
         ):
             told = None if progress is None else _within(progress, key)
-            solutions[key] = run(photos, scratch / key, replace(common, shutter_model=model), told)
+            try:
+                solutions[key] = run(photos, scratch / key, replace(common, shutter_model=model), told)
+            except ReconstructionError as error:
+                raise ReconstructionError(f"{photos}: {error}") from error
         found = compare_paths(solutions[_STILL], solutions[_WITH], solutions[_WITHOUT])
         summary = _summary(names, solutions, found, options)
         (scratch / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
