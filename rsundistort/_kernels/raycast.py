@@ -247,12 +247,13 @@ def render_rows(geometry, look, R_cw, center_w, by_column, first_row, xy_norm, s
             line = j if by_column else first_row + i
             total[:] = 0.0
             for k in range(n):
-                R = R_cw[line, k % times]
-                ox, oy, oz = center_w[line, k % times]
-                x, y = xy_norm[i, j, k]
-                dx = R[0, 0] * x + R[1, 0] * y + R[2, 0]
-                dy = R[0, 1] * x + R[1, 1] * y + R[2, 1]
-                dz = R[0, 2] * x + R[1, 2] * y + R[2, 2]
+                # numbers, not views: views of arrays count references, which threads wait for
+                m = k % times
+                ox, oy, oz = center_w[line, m, 0], center_w[line, m, 1], center_w[line, m, 2]
+                x, y = xy_norm[i, j, k, 0], xy_norm[i, j, k, 1]
+                dx = R_cw[line, m, 0, 0] * x + R_cw[line, m, 1, 0] * y + R_cw[line, m, 2, 0]
+                dy = R_cw[line, m, 0, 1] * x + R_cw[line, m, 1, 1] * y + R_cw[line, m, 2, 1]
+                dz = R_cw[line, m, 0, 2] * x + R_cw[line, m, 1, 2] * y + R_cw[line, m, 2, 2]
                 p, d, s, t = _nearest(geometry, stack, ox, oy, oz, dx, dy, dz, False)
                 if p < 0:
                     _sky(sky, dx, dy, dz, total)
