@@ -538,20 +538,34 @@ def residuals(
                 res[k, i] = intrs[c, i] * out[i] + intrs[c, 2 + i] - xy_raw[k, i] if valid[k] else _INVALID_PX
 
 
+@kernel()
+def _project_near(model, axis, sign, lens, x, y, z, phi, vel, clock, out, jac, E, L):
+    """As `_project`; the exact models search the row from `clock`, or afresh when that is NaN."""
+    if model < ROTATION:
+        return _project(model, axis, sign, lens, x, y, z, phi, vel, out, jac, E, L)
+    moving = 1.0 if model == CONSTANT_MOTION else 0.0
+    return z > 0.0 and _project_exact(axis, sign, lens, x, y, z, phi, vel, moving, clock, out, jac, E, L)
+
+
 @parallel_kernel()
 def residual_costs(
     model, camera_of_frame, axes, signs, intrs, lenses, R_cw, center_w, phi, vel_w, points_w,
-    frame_idx, point_idx, xy_raw, sigma_px, loss_kind, loss_scale, cost,
+    frame_idx, point_idx, xy_raw, sigma_px, loss_kind, loss_scale, clock, cost,
 ):  # fmt: skip
-    """Each observation's robust cost (o,), as in `residual_blocks`."""
+    """Robust cost, as in `residual_blocks`, summed over chunks of observations: cost (c,) for any c.
+
+    The rows (o,) that the model predicts are left in `clock`, NaN where there is none, for `residual_blocks`.
+    """
     o = len(frame_idx)
     scale2 = loss_scale * loss_scale
-    for chunk in prange((o + _CHUNK - 1) // _CHUNK):
+    size = (o + len(cost) - 1) // len(cost)
+    for chunk in prange(len(cost)):
         out = np.empty(20)
         E = np.empty((3, 3))
         L = np.empty((3, 3))
         vel_c = np.empty(3)
-        for k in range(chunk * _CHUNK, min(o, (chunk + 1) * _CHUNK)):
+        total = 0.0
+        for k in range(chunk * size, min(o, (chunk + 1) * size)):
             f = frame_idx[k]
             c = camera_of_frame[f]
             x, y, z = _camera_frame(R_cw[f], center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
@@ -560,77 +574,75 @@ def residual_costs(
                 ex = (intrs[c, 0] * out[0] + intrs[c, 2] - xy_raw[k, 0]) / sigma_px[k]
                 ey = (intrs[c, 1] * out[1] + intrs[c, 3] - xy_raw[k, 1]) / sigma_px[k]
                 s = ex * ex + ey * ey
-            cost[k] = 0.5 * _loss(loss_kind, s, scale2)[0]
+                clock[k] = signs[c] * out[axes[c]]
+            else:
+                clock[k] = np.nan
+            total += 0.5 * _loss(loss_kind, s, scale2)[0]
+        cost[chunk] = total
 
 
 @parallel_kernel()
 def residual_blocks(
     model, camera_of_frame, axes, signs, intrs, lenses, R_cw, center_w, phi, vel_w, points_w,
-    frame_idx, point_idx, xy_raw, sigma_px, loss_kind, loss_scale, res, J_frame, J_point, cost,
+    frame_idx, point_idx, xy_raw, sigma_px, loss_kind, loss_scale, clock, res, J_frame, cost,
 ):  # fmt: skip
-    """Whitened, robustly weighted residuals (o, 2) with their Jacobians, and each observation's cost.
+    """Whitened, robustly weighted residuals (o, 2) with their Jacobians, and the cost summed over chunks: cost (c,).
 
     J_frame is (o, 2, nb): rotation increment (left, camera frame), centre, phi from nb = 9 on, and velocity (world
-    frame) when nb = 12. J_point is (o, 2, 3), sigma_px (o,). Observations that cannot be projected get zero Jacobians
-    and cost 100 px.
+    frame) when nb = 12. The Jacobian of the point is minus that of the centre. `clock` (o,) is where the search for
+    the row starts, NaN: afresh; sigma_px is (o,). Observations that cannot be projected get zero Jacobians and cost
+    100 px.
     """
     o = len(frame_idx)
     nb = J_frame.shape[2]
     scale2 = loss_scale * loss_scale
-    for chunk in prange((o + _CHUNK - 1) // _CHUNK):
+    size = (o + len(cost) - 1) // len(cost)
+    for chunk in prange(len(cost)):
         out = np.empty(20)
         E = np.empty((3, 3))
         L = np.empty((3, 3))
         vel_c = np.empty(3)
-        for k in range(chunk * _CHUNK, min(o, (chunk + 1) * _CHUNK)):
+        total = 0.0
+        for k in range(chunk * size, min(o, (chunk + 1) * size)):
             f = frame_idx[k]
             c = camera_of_frame[f]
             R = R_cw[f]
-            x, y, z = _camera_frame(R_cw[f], center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
-            ok = _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, out, True, E, L)
-            if not ok:
-                cost[k] = 0.5 * _loss(loss_kind, 2.0 * (_INVALID_PX / sigma_px[k]) ** 2, scale2)[0]
+            x, y, z = _camera_frame(R, center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
+            if not _project_near(
+                model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, clock[k], out, True, E, L
+            ):
+                total += 0.5 * _loss(loss_kind, 2.0 * (_INVALID_PX / sigma_px[k]) ** 2, scale2)[0]
                 res[k] = 0.0
                 J_frame[k] = 0.0
-                J_point[k] = 0.0
                 continue
-            s = 0.0
-            for i in range(2):
-                res[k, i] = (intrs[c, i] * out[i] + intrs[c, 2 + i] - xy_raw[k, i]) / sigma_px[k]
-                s += res[k, i] * res[k, i]
+            r0 = (intrs[c, 0] * out[0] + intrs[c, 2] - xy_raw[k, 0]) / sigma_px[k]
+            r1 = (intrs[c, 1] * out[1] + intrs[c, 3] - xy_raw[k, 1]) / sigma_px[k]
+            s = r0 * r0 + r1 * r1
             rho, weight, share = _loss(loss_kind, s, scale2)
-            cost[k] = 0.5 * rho
-            for i in range(2):
-                g = intrs[c, i] / sigma_px[k]
-                a0, a1, a2 = g * out[2 + 3 * i], g * out[3 + 3 * i], g * out[4 + 3 * i]
-                v0, v1, v2 = g * out[14 + 3 * i], g * out[15 + 3 * i], g * out[16 + 3 * i]
-                # x_c = Exp(delta) R d and v_c = Exp(delta) R v
-                J_frame[k, i, 0] = a2 * y - a1 * z + v2 * vel_c[1] - v1 * vel_c[2]
-                J_frame[k, i, 1] = a0 * z - a2 * x + v0 * vel_c[2] - v2 * vel_c[0]
-                J_frame[k, i, 2] = a1 * x - a0 * y + v1 * vel_c[0] - v0 * vel_c[1]
-                for b in range(3):
-                    J_point[k, i, b] = a0 * R[0, b] + a1 * R[1, b] + a2 * R[2, b]
-                    J_frame[k, i, 3 + b] = -J_point[k, i, b]
-                if nb > 6:
-                    for b in range(3):
-                        J_frame[k, i, 6 + b] = g * out[8 + 3 * i + b]
-                if nb > 9:
-                    for b in range(3):
-                        J_frame[k, i, 9 + b] = v0 * R[0, b] + v1 * R[1, b] + v2 * R[2, b]
+            total += 0.5 * rho
             # J <- sqrt(rho') (I - a n n') J and r <- sqrt(rho') r / (1 - a), n = r/|r|: the gradient stays rho' J'r
             # and J'J becomes the Hessian of `_loss`
             w = math.sqrt(weight)
             keep = math.sqrt(1.0 - share)
             a_s = (1.0 - keep) / s if s > 0.0 else 0.0
-            r0, r1 = res[k, 0], res[k, 1]
             m00, m01, m11 = w * (1.0 - a_s * r0 * r0), -w * a_s * r0 * r1, w * (1.0 - a_s * r1 * r1)
-            for b in range(nb):
-                j0, j1 = J_frame[k, 0, b], J_frame[k, 1, b]
-                J_frame[k, 0, b] = m00 * j0 + m01 * j1
-                J_frame[k, 1, b] = m01 * j0 + m11 * j1
-            for b in range(3):
-                j0, j1 = J_point[k, 0, b], J_point[k, 1, b]
-                J_point[k, 0, b] = m00 * j0 + m01 * j1
-                J_point[k, 1, b] = m01 * j0 + m11 * j1
-            res[k, 0] *= w / keep
-            res[k, 1] *= w / keep
+            res[k, 0] = r0 * w / keep
+            res[k, 1] = r1 * w / keep
+            g0, g1 = intrs[c, 0] / sigma_px[k], intrs[c, 1] / sigma_px[k]
+            for i in range(2):
+                u, v = (m00 * g0, m01 * g1) if i == 0 else (m01 * g0, m11 * g1)
+                a0, a1, a2 = u * out[2] + v * out[5], u * out[3] + v * out[6], u * out[4] + v * out[7]
+                v0, v1, v2 = u * out[14] + v * out[17], u * out[15] + v * out[18], u * out[16] + v * out[19]
+                # x_c = Exp(delta) R d and v_c = Exp(delta) R v
+                J_frame[k, i, 0] = a2 * y - a1 * z + v2 * vel_c[1] - v1 * vel_c[2]
+                J_frame[k, i, 1] = a0 * z - a2 * x + v0 * vel_c[2] - v2 * vel_c[0]
+                J_frame[k, i, 2] = a1 * x - a0 * y + v1 * vel_c[0] - v0 * vel_c[1]
+                for b in range(3):
+                    J_frame[k, i, 3 + b] = -(a0 * R[0, b] + a1 * R[1, b] + a2 * R[2, b])
+                if nb > 6:
+                    for b in range(3):
+                        J_frame[k, i, 6 + b] = u * out[8 + b] + v * out[11 + b]
+                if nb > 9:
+                    for b in range(3):
+                        J_frame[k, i, 9 + b] = v0 * R[0, b] + v1 * R[1, b] + v2 * R[2, b]
+        cost[chunk] = total

@@ -1,53 +1,72 @@
-"""Block normal equations and the elimination of points.
+"""Block normal equations, the elimination of points, and what is left: factored, or multiplied.
 
-Observations are sorted by point (`point_start` (n+1,) are their ranges); `frame_order` lists them by photo
-(`frame_start` (m+1,)). Every loop in parallel owns what it writes, so sums do not depend on the number of threads.
+Observations are sorted by track (`track_start` (n+1,) are their ranges, `point_of` (n,) the point of each track);
+`frame_order` lists them by photo (`frame_start` (m+1,)). Of each observation only the Jacobian J (o, 2, nb) of its
+photo is kept: that of its point is minus that of the photo's centre, J_p = -J[:, :, 3:6]. So all that the elimination
+needs of a pair of photos is a 2x2 matrix between their Jacobians, and W = J'J_p is never written. `unknowns` is a
+tuple of nb zeros: its length is known when a kernel is compiled, so that the loops over a block unroll. Every loop in
+parallel owns what it writes, so sums do not depend on the number of threads.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
 from ._jit import kernel, parallel_kernel, prange
 
-
-@parallel_kernel()
-def point_blocks(point_start, res, J_frame, J_point, V, g_point, W):
-    """V (n, 3, 3) = sum Jp'Jp, g (n, 3) = sum Jp'r and W (o, nb, 3) = Jf'Jp."""
-    nb = J_frame.shape[2]
-    for p in prange(len(V)):
-        V[p] = 0.0
-        g_point[p] = 0.0
-        for k in range(point_start[p], point_start[p + 1]):
-            for i in range(2):
-                for a in range(3):
-                    ja = J_point[k, i, a]
-                    g_point[p, a] += ja * res[k, i]
-                    for b in range(3):
-                        V[p, a, b] += ja * J_point[k, i, b]
-            for a in range(nb):
-                for b in range(3):
-                    W[k, a, b] = J_frame[k, 0, a] * J_point[k, 0, b] + J_frame[k, 1, a] * J_point[k, 1, b]
+# Tracks that a thread takes at a time.
+_CHUNK = 256
+# Sums whose order the compiler may choose, so that they use vectors; infinities and NaN keep their meaning.
+_SUMS = {"reassoc", "contract", "nsz"}
 
 
 @parallel_kernel()
-def frame_blocks(frame_start, frame_order, res, J_frame, U, g_frame):
-    """U (m, nb, nb) = sum Jf'Jf and g (m, nb) = sum Jf'r."""
-    nb = J_frame.shape[2]
-    for f in prange(len(U)):
-        U[f] = 0.0
+def point_blocks(track_start, point_of, res, J, V, g_point):
+    """V (n, 3, 3) = sum Jp'Jp and g (n, 3) = sum Jp'r."""
+    n = len(V)
+    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+        for track in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK)):
+            v00 = v01 = v02 = v11 = v12 = v22 = g0 = g1 = g2 = 0.0
+            for k in range(track_start[track], track_start[track + 1]):
+                for i in range(2):
+                    a, b, c, r = J[k, i, 3], J[k, i, 4], J[k, i, 5], res[k, i]
+                    v00 += a * a
+                    v01 += a * b
+                    v02 += a * c
+                    v11 += b * b
+                    v12 += b * c
+                    v22 += c * c
+                    g0 -= a * r
+                    g1 -= b * r
+                    g2 -= c * r
+            p = point_of[track]
+            V[p, 0, 0] = v00
+            V[p, 0, 1] = V[p, 1, 0] = v01
+            V[p, 0, 2] = V[p, 2, 0] = v02
+            V[p, 1, 1] = v11
+            V[p, 1, 2] = V[p, 2, 1] = v12
+            V[p, 2, 2] = v22
+            g_point[p, 0] = g0
+            g_point[p, 1] = g1
+            g_point[p, 2] = g2
+
+
+@parallel_kernel()
+def frame_gradients(frame_start, frame_order, res, J, diagonal, g_frame):
+    """Diagonal (m, nb) of sum J'J and g (m, nb) = sum J'r."""
+    nb = J.shape[2]
+    for f in prange(len(g_frame)):
+        diagonal[f] = 0.0
         g_frame[f] = 0.0
         for s in range(frame_start[f], frame_start[f + 1]):
             k = frame_order[s]
-            for i in range(2):
-                for a in range(nb):
-                    ja = J_frame[k, i, a]
-                    g_frame[f, a] += ja * res[k, i]
-                    for b in range(a + 1):
-                        U[f, a, b] += ja * J_frame[k, i, b]
-        for a in range(nb):
-            for b in range(a):
-                U[f, b, a] = U[f, a, b]
+            r0, r1 = res[k, 0], res[k, 1]
+            for a in range(nb):
+                j0, j1 = J[k, 0, a], J[k, 1, a]
+                diagonal[f, a] += j0 * j0 + j1 * j1
+                g_frame[f, a] += j0 * r0 + j1 * r1
 
 
 @kernel()
@@ -70,29 +89,24 @@ def _invert_spd3(A, damping, B):
 
 
 @parallel_kernel()
-def eliminate_points(point_start, V, g_point, W, damping, V_inv, WV):
-    """V_inv (n, 3, 3) of the damped point blocks and WV (o, nb, 3) = W V_inv."""
-    nb = W.shape[1]
-    for p in prange(len(V)):
-        _invert_spd3(V[p], damping, V_inv[p])
-        for k in range(point_start[p], point_start[p + 1]):
-            for a in range(nb):
-                for b in range(3):
-                    WV[k, a, b] = (
-                        W[k, a, 0] * V_inv[p, 0, b] + W[k, a, 1] * V_inv[p, 1, b] + W[k, a, 2] * V_inv[p, 2, b]
-                    )
+def invert_points(V, damping, V_inv):
+    """V_inv (n, 3, 3) of the damped point blocks."""
+    n = len(V)
+    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+        for p in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK)):
+            _invert_spd3(V[p], damping, V_inv[p])
 
 
 @kernel()
-def _neighbours(f, frame_start, frame_order, frame_idx, point_idx, point_start, slot, found):
+def _neighbours(f, frame_start, frame_order, frame_idx, track_idx, track_start, slot, found):
     """Photos >= f that share a point with f, ascending in found[:count]; slot (m,) is scratch of -1."""
     count = 0
     slot[f] = 0
     found[0] = f
     count = 1
     for s in range(frame_start[f], frame_start[f + 1]):
-        p = point_idx[frame_order[s]]
-        for k in range(point_start[p], point_start[p + 1]):
+        t = track_idx[frame_order[s]]
+        for k in range(track_start[t], track_start[t + 1]):
             g = frame_idx[k]
             if g > f and slot[g] < 0:
                 slot[g] = 0
@@ -103,25 +117,25 @@ def _neighbours(f, frame_start, frame_order, frame_idx, point_idx, point_start, 
 
 
 @kernel()
-def covisible_counts(frame_start, frame_order, frame_idx, point_idx, point_start, counts):
+def covisible_counts(frame_start, frame_order, frame_idx, track_idx, track_start, counts):
     """Number of photos >= f that each photo f shares points with, itself included."""
     m = len(counts)
     slot = np.full(m, -1)
     found = np.empty(m, np.int64)
     for f in range(m):
-        counts[f] = _neighbours(f, frame_start, frame_order, frame_idx, point_idx, point_start, slot, found)
+        counts[f] = _neighbours(f, frame_start, frame_order, frame_idx, track_idx, track_start, slot, found)
         for i in range(counts[f]):
             slot[found[i]] = -1
 
 
 @kernel()
-def covisible_columns(frame_start, frame_order, frame_idx, point_idx, point_start, row_start, cols):
+def covisible_columns(frame_start, frame_order, frame_idx, track_idx, track_start, row_start, cols):
     """Block columns of the upper triangle of the reduced system, ascending in each block row."""
     m = len(row_start) - 1
     slot = np.full(m, -1)
     found = np.empty(m, np.int64)
     for f in range(m):
-        count = _neighbours(f, frame_start, frame_order, frame_idx, point_idx, point_start, slot, found)
+        count = _neighbours(f, frame_start, frame_order, frame_idx, track_idx, track_start, slot, found)
         for i in range(count):
             cols[row_start[f] + i] = found[i]
             slot[found[i]] = -1
@@ -129,48 +143,220 @@ def covisible_columns(frame_start, frame_order, frame_idx, point_idx, point_star
 
 @parallel_kernel()
 def reduced_system(
-    frame_start, frame_order, frame_idx, point_idx, point_start, row_start, cols,
-    U, g_frame, g_point, W, WV, damping, S, rhs,
+    unknowns, frame_start, frame_order, frame_idx, track_idx, track_start, point_of, row_start, cols,
+    J, V_inv, g_point, g_frame, diagonal, S, rhs,
 ):  # fmt: skip
-    """S (blocks, nb, nb) = U - W V^-1 W' (upper block triangle) and rhs (m, nb) = g - W V^-1 g_point."""
-    m = len(U)
-    nb = U.shape[1]
+    """S (blocks, nb, nb) = U + diag(diagonal) - W V^-1 W' (upper block triangle) and rhs (m, nb) = g - W V^-1 g_point.
+
+    With W = J'J_p, W_k V^-1 W_n' = J_k' M J_n, where M = J_p,k V^-1 J_p,n' is 2x2; U = sum J'J goes with k = n.
+    """
+    nb = len(unknowns)
+    m = len(g_frame)
     for f in prange(m):
         slot = np.empty(m, np.int64)
         for i in range(row_start[f], row_start[f + 1]):
             slot[cols[i]] = i
             S[i] = 0.0
+        own = S[row_start[f]]
         for a in range(nb):
             rhs[f, a] = g_frame[f, a]
-            for b in range(nb):
-                S[row_start[f], a, b] = U[f, a, b]
-            S[row_start[f], a, a] += damping * U[f, a, a]
+            own[a, a] = diagonal[f, a]
         for s in range(frame_start[f], frame_start[f + 1]):
             k = frame_order[s]
-            p = point_idx[k]
+            t = track_idx[k]
+            B = V_inv[point_of[t]]
+            g = g_point[point_of[t]]
+            x0, x1, x2 = -J[k, 0, 3], -J[k, 0, 4], -J[k, 0, 5]
+            y0, y1, y2 = -J[k, 1, 3], -J[k, 1, 4], -J[k, 1, 5]
+            u0 = x0 * B[0, 0] + x1 * B[1, 0] + x2 * B[2, 0]
+            u1 = x0 * B[0, 1] + x1 * B[1, 1] + x2 * B[2, 1]
+            u2 = x0 * B[0, 2] + x1 * B[1, 2] + x2 * B[2, 2]
+            w0 = y0 * B[0, 0] + y1 * B[1, 0] + y2 * B[2, 0]
+            w1 = y0 * B[0, 1] + y1 * B[1, 1] + y2 * B[2, 1]
+            w2 = y0 * B[0, 2] + y1 * B[1, 2] + y2 * B[2, 2]
+            e0 = u0 * g[0] + u1 * g[1] + u2 * g[2]
+            e1 = w0 * g[0] + w1 * g[1] + w2 * g[2]
             for a in range(nb):
-                rhs[f, a] -= WV[k, a, 0] * g_point[p, 0] + WV[k, a, 1] * g_point[p, 1] + WV[k, a, 2] * g_point[p, 2]
-            for n in range(point_start[p], point_start[p + 1]):
+                rhs[f, a] -= J[k, 0, a] * e0 + J[k, 1, a] * e1
+            for n in range(track_start[t], track_start[t + 1]):
                 if frame_idx[n] >= f:
+                    # J_p,n is minus these: the sign of M turns, so the update is added
+                    c0, c1, c2 = J[n, 0, 3], J[n, 0, 4], J[n, 0, 5]
+                    d0, d1, d2 = J[n, 1, 3], J[n, 1, 4], J[n, 1, 5]
+                    m00, m01 = u0 * c0 + u1 * c1 + u2 * c2, u0 * d0 + u1 * d1 + u2 * d2
+                    m10, m11 = w0 * c0 + w1 * c1 + w2 * c2, w0 * d0 + w1 * d1 + w2 * d2
+                    if n == k:
+                        m00 += 1.0
+                        m11 += 1.0
                     block = S[slot[frame_idx[n]]]
                     for a in range(nb):
-                        w0, w1, w2 = WV[k, a, 0], WV[k, a, 1], WV[k, a, 2]
+                        l0 = J[k, 0, a] * m00 + J[k, 1, a] * m10
+                        l1 = J[k, 0, a] * m01 + J[k, 1, a] * m11
                         for b in range(nb):
-                            block[a, b] -= w0 * W[n, b, 0] + w1 * W[n, b, 1] + w2 * W[n, b, 2]
+                            block[a, b] += l0 * J[n, 0, b] + l1 * J[n, 1, b]
 
 
 @parallel_kernel()
-def back_substitute(point_start, frame_idx, V_inv, g_point, W, step_frame, step_point):
-    """step_point (n, 3) = -V^-1 (g_point + sum W' step_frame)."""
-    nb = W.shape[1]
-    for p in prange(len(V_inv)):
-        t0, t1, t2 = g_point[p, 0], g_point[p, 1], g_point[p, 2]
-        for k in range(point_start[p], point_start[p + 1]):
-            f = frame_idx[k]
+def back_substitute(unknowns, track_start, point_of, frame_idx, V_inv, g_point, J, step_frame, step_point):
+    """step_point (n, 3) = -V^-1 (g_point + sum Jp' J step_frame)."""
+    nb = len(unknowns)
+    n = len(V_inv)
+    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+        for track in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK)):
+            p = point_of[track]
+            t0, t1, t2 = g_point[p, 0], g_point[p, 1], g_point[p, 2]
+            for k in range(track_start[track], track_start[track + 1]):
+                f = frame_idx[k]
+                x = y = 0.0
+                for a in range(nb):
+                    x += J[k, 0, a] * step_frame[f, a]
+                    y += J[k, 1, a] * step_frame[f, a]
+                t0 -= J[k, 0, 3] * x + J[k, 1, 3] * y
+                t1 -= J[k, 0, 4] * x + J[k, 1, 4] * y
+                t2 -= J[k, 0, 5] * x + J[k, 1, 5] * y
+            for a in range(3):
+                step_point[p, a] = -(V_inv[p, a, 0] * t0 + V_inv[p, a, 1] * t1 + V_inv[p, a, 2] * t2)
+
+
+@parallel_kernel()
+def multiply(unknowns, row_start, cols, low_start, low_block, low_col, S, x, y):
+    """Product y (m, nb) of the symmetric matrix of upper blocks S with x; low_* list the blocks below the diagonal."""
+    nb = len(unknowns)
+    for f in prange(len(x)):
+        y[f] = 0.0
+        for i in range(row_start[f], row_start[f + 1]):
+            g = cols[i]
             for a in range(nb):
-                d = step_frame[f, a]
-                t0 += W[k, a, 0] * d
-                t1 += W[k, a, 1] * d
-                t2 += W[k, a, 2] * d
-        for a in range(3):
-            step_point[p, a] = -(V_inv[p, a, 0] * t0 + V_inv[p, a, 1] * t1 + V_inv[p, a, 2] * t2)
+                t = 0.0
+                for b in range(nb):
+                    t += S[i, a, b] * x[g, b]
+                y[f, a] += t
+        for s in range(low_start[f], low_start[f + 1]):
+            i, g = low_block[s], low_col[s]
+            for b in range(nb):
+                t = x[g, b]
+                for a in range(nb):
+                    y[f, a] += S[i, b, a] * t
+
+
+# The factor L of the envelope: rows in bands of four, each band from its first column (a multiple of four) to its
+# diagonal, rows one after the other: entry (4 g + r, c) is data[offset[g] + r * (4 g + 4 - first[g]) + c - first[g]].
+@kernel()
+def fill_envelope(place, row_start, cols, S, scale, first, offset, data):
+    """Blocks into the envelope, scaled on both sides; place (m, nb) is each unknown's row, -1 if held.
+
+    What lies left of the envelope is left out. Rows past the last unknown, up to a multiple of four, are the identity.
+    """
+    data[:] = 0.0
+    nb = place.shape[1]
+    for g in range(len(first)):
+        for r in range(4):
+            data[offset[g] + r * (4 * g + 4 - first[g]) + 4 * g + r - first[g]] = 1.0
+    for f in range(len(row_start) - 1):
+        for i in range(row_start[f], row_start[f + 1]):
+            for a in range(nb):
+                for b in range(nb):
+                    row, col = place[f, a], place[cols[i], b]
+                    value = S[i, a, b]
+                    if row < col:
+                        row, col = col, row
+                        if cols[i] == f:
+                            continue
+                    g = row // 4
+                    if col >= 0 and col >= first[g]:
+                        at = offset[g] + (row - 4 * g) * (4 * g + 4 - first[g]) + col - first[g]
+                        data[at] = value * scale[row] * scale[col]
+
+
+@kernel(fastmath=_SUMS)
+def _band_tile(data, first, offset, g, c):
+    """Columns 4c to 4c + 3 of band g of the factor, from the columns before them; False if it is not positive."""
+    fg, fc = first[g], first[c]
+    wg, wc = 4 * g + 4 - fg, 4 * c + 4 - fc
+    low = max(fg, fc)
+    width = 4 * c - low
+    a = offset[g] + low - fg
+    b = offset[c] + low - fc
+    a0, a1, a2, a3 = data[a:], data[a + wg :], data[a + 2 * wg :], data[a + 3 * wg :]
+    b0, b1, b2, b3 = data[b:], data[b + wc :], data[b + 2 * wc :], data[b + 3 * wc :]
+    s00 = s01 = s02 = s03 = s10 = s11 = s12 = s13 = 0.0
+    s20 = s21 = s22 = s23 = s30 = s31 = s32 = s33 = 0.0
+    for k in range(width):
+        x0, x1, x2, x3 = a0[k], a1[k], a2[k], a3[k]
+        y0, y1, y2, y3 = b0[k], b1[k], b2[k], b3[k]
+        s00 += x0 * y0
+        s01 += x0 * y1
+        s02 += x0 * y2
+        s03 += x0 * y3
+        s10 += x1 * y0
+        s11 += x1 * y1
+        s12 += x1 * y2
+        s13 += x1 * y3
+        s20 += x2 * y0
+        s21 += x2 * y1
+        s22 += x2 * y2
+        s23 += x2 * y3
+        s30 += x3 * y0
+        s31 += x3 * y1
+        s32 += x3 * y2
+        s33 += x3 * y3
+    sums = ((s00, s01, s02, s03), (s10, s11, s12, s13), (s20, s21, s22, s23), (s30, s31, s32, s33))
+    at, dia = offset[g] + 4 * c - fg, offset[c] + 4 * c - fc
+    for i in range(4):
+        row = at + i * wg
+        for j in range(i + 1 if g == c else 4):
+            v = data[row + j] - sums[i][j]
+            for k in range(j):
+                v -= data[row + k] * data[dia + j * wc + k]
+            if g == c and i == j:
+                if not v > 1e-15:  # of a unit diagonal
+                    return False
+                data[row + j] = math.sqrt(v)
+            else:
+                data[row + j] = v / data[dia + j * wc + j]
+    return True
+
+
+@parallel_kernel()
+def factor_envelope(first, offset, panel, data):
+    """Cholesky factor in place, `panel` bands at a time; False if the matrix is not positive."""
+    bands = len(first)
+    for start in range(0, bands, panel):
+        stop = min(bands, start + panel)
+        # bands of a panel do not need each other up to its first column
+        if start > first[start:stop].min() // 4:
+            for g in prange(start, stop):
+                for c in range(first[g] // 4, start):
+                    _band_tile(data, first, offset, g, c)
+        for g in range(start, stop):
+            for c in range(max(first[g] // 4, start), g + 1):
+                if not _band_tile(data, first, offset, g, c):
+                    return False
+    return True
+
+
+@parallel_kernel(fastmath=_SUMS)
+def solve_envelope(first, offset, data, B):
+    """B (k, n): right-hand sides become solutions, n a multiple of four."""
+    for j in prange(len(B)):
+        x = B[j]
+        begun = False
+        for i in range(len(x)):
+            if not begun and x[i] == 0.0:  # columns of the identity begin late
+                continue
+            begun = True
+            g = i // 4
+            fg = first[g]
+            at = offset[g] + (i - 4 * g) * (4 * g + 4 - fg)
+            t = 0.0
+            for k in range(i - fg):
+                t += data[at + k] * x[fg + k]
+            x[i] = (x[i] - t) / data[at + i - fg]
+        for i in range(len(x) - 1, -1, -1):
+            g = i // 4
+            fg = first[g]
+            at = offset[g] + (i - 4 * g) * (4 * g + 4 - fg)
+            t = x[i] / data[at + i - fg]
+            x[i] = t
+            for k in range(i - fg):
+                x[fg + k] -= t * data[at + k]

@@ -65,8 +65,12 @@ class BundleOptions:
         No observation nearer than this to its prediction is dropped.
     held_phi : mapping of photo name to component indices
         Hard anchors: components of phi held at zero, e.g. {"0001.jpg": (0,)} is the paper's RS*.
-    dense_limit : int
-        Reduced systems up to this many unknowns are factored densely, larger ones sparsely.
+    factor_limit : float
+        Reduced systems whose factorisation takes at most this many multiply-adds are factored, others are solved by
+        preconditioned conjugate gradients.
+    cg_tolerance : float
+        Conjugate gradients stop when the residual, in the norm of the preconditioner, falls below `cg_tolerance` times
+        the right-hand side.
     """
 
     max_iterations: int = 100
@@ -89,7 +93,8 @@ class BundleOptions:
     outlier_sigma: float = 4.5
     min_outlier_px: float = 0.25
     held_phi: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
-    dense_limit: int = 1500
+    factor_limit: float = 1e10
+    cg_tolerance: float = 0.01
 
     def __post_init__(self) -> None:
         if self.loss not in LOSSES:
@@ -104,6 +109,7 @@ class BundleOptions:
             "phi_sigma_start",
             "velocity_sigma_start",
             "spread_tolerance",
+            "cg_tolerance",
         )
         for name in (*positive, "outlier_sigma", "max_damping"):
             if not getattr(self, name) > 0:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -13,7 +14,7 @@ from .._kernels import projection
 from ..errors import InputError
 from ..model import Reconstruction, check_shutter_model
 from .options import LOSSES, BundleOptions
-from .reduced import NormalEquations, Step, Structure
+from .reduced import Elimination, NormalEquations, Step, Structure
 
 __all__ = ["BundleProblem", "Spreads", "State", "reprojection_residuals"]
 
@@ -75,6 +76,9 @@ class Spreads:
     velocity: float
 
 
+# Observations that a thread takes at a time, and whose costs are summed together.
+_CHUNK = 1024
+
 # Unknowns of a photo: pose, phi, velocity.
 _BLOCK = {"global": 6, "constant-motion": 12}
 
@@ -104,20 +108,22 @@ class BundleProblem:
         self._shutter_model = shutter_model
         self._options = options
         self._block = _BLOCK.get(shutter_model, 9)
-        order = np.lexsort((obs.frame_idx, obs.point_idx))
-        self._xy = np.ascontiguousarray(obs.xy_raw[order])
-        self._sigma_px = sigma_px * obs.sigma[order]
-        self._structure = Structure.from_sorted(
-            np.ascontiguousarray(obs.frame_idx[order]),
-            np.ascontiguousarray(obs.point_idx[order]),
-            reconstruction.num_images,
-            reconstruction.num_points,
+        self._structure = Structure.from_observations(
+            obs.frame_idx, obs.point_idx, reconstruction.num_images, reconstruction.num_points
         )
+        self._xy = obs.xy_raw[self._structure.order]
+        self._sigma_px = sigma_px * obs.sigma[self._structure.order]
+        # the rows that the last cost predicted, where the next Jacobians look for them
+        self._clock = np.full(len(obs), np.nan)
+        self._clock_of: State | None = None
         self._cameras = _camera_arrays(reconstruction)
         span = reconstruction.frame_span()[:, None]
         weight = np.hstack([np.repeat((span / s) ** 2, 3, axis=1) for s in (spreads.phi, spreads.velocity)])
         self._motion_weight = weight[:, : self._block - 6]
         self._free = self._free_unknowns()
+        self._elimination = Elimination.of(
+            self._structure, self._free, options.factor_limit, options.cg_tolerance
+        )  # fmt: skip
         self._size = float(np.median(np.linalg.norm(reconstruction.points_w - reconstruction.center_w.mean(0), axis=1)))
 
     def _free_unknowns(self) -> NDArray[np.bool_]:
@@ -169,7 +175,7 @@ class BundleProblem:
         s = self._structure
         return (
             self._model, *self._cameras, state.R_cw, state.center_w, state.phi, state.velocity, state.points_w,
-            s.frame_idx, s.point_idx, self._xy,
+            s.frame_idx, s.point_idx, self._xy, self._sigma_px, LOSSES[self._options.loss], self._options.loss_scale,
         )  # fmt: skip
 
     def _motion(self, state: State) -> NDArray[np.float64]:
@@ -179,47 +185,39 @@ class BundleProblem:
     def _prior_cost(self, state: State) -> float:
         return 0.5 * float(np.sum(self._motion_weight * self._motion(state) ** 2))
 
-    def _blocks(self, state: State) -> tuple[NDArray[np.float64], ...]:
+    def _jacobians(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+        """Weighted residuals (o, 2), Jacobians of the photos (o, 2, nb), and the cost without priors."""
         o = len(self._xy)
-        res, J_frame, J_point = np.empty((o, 2)), np.empty((o, 2, self._block)), np.empty((o, 2, 3))
-        cost = np.empty(o)
-        loss = LOSSES[self._options.loss]
-        projection.residual_blocks(
-            *self._kernel_args(state),
-            self._sigma_px,
-            loss,
-            self._options.loss_scale,
-            res,
-            J_frame,
-            J_point,
-            cost,
-        )
-        return res, J_frame, J_point, cost
+        res, J_frame = np.empty((o, 2)), np.empty((o, 2, self._block))
+        if state is not self._clock_of:
+            self._clock.fill(np.nan)
+            self._clock_of = None
+        cost = np.empty(-(-o // _CHUNK))
+        with numba.parallel_chunksize(1):
+            projection.residual_blocks(*self._kernel_args(state), self._clock, res, J_frame, cost)
+        return res, J_frame, float(cost.sum())
+
+    def _blocks(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
+        """Weighted residuals, Jacobians of photos and points, and the cost without priors."""
+        res, J_frame, cost = self._jacobians(state)
+        return res, J_frame, -J_frame[:, :, 3:6], cost
 
     def linearize(self, state: State) -> NormalEquations:
         """Normal equations and cost at a state."""
-        res, J_frame, J_point, cost = self._blocks(state)
+        res, J_frame, cost = self._jacobians(state)
         prior_diag = np.zeros((len(state.phi), self._block))
         prior_gradient = np.zeros_like(prior_diag)
         prior_diag[:, 6:] = self._motion_weight
         prior_gradient[:, 6:] = self._motion_weight * self._motion(state)
-        total = float(cost.sum()) + self._prior_cost(state)
-        return NormalEquations(
-            self._structure, total, res, J_frame, J_point, prior_diag, prior_gradient, self._free,
-            self._options.dense_limit,
-        )  # fmt: skip
+        total = cost + self._prior_cost(state)
+        return NormalEquations(self._elimination, total, res, J_frame, prior_diag, prior_gradient)
 
     def cost(self, state: State) -> float:
         """Half the robust sum of squares in units of the noise, with the priors."""
-        o = len(self._xy)
-        cost = np.empty(o)
-        projection.residual_costs(
-            *self._kernel_args(state),
-            self._sigma_px,
-            LOSSES[self._options.loss],
-            self._options.loss_scale,
-            cost,
-        )
+        cost = np.empty(-(-len(self._xy) // _CHUNK))
+        with numba.parallel_chunksize(1):
+            projection.residual_costs(*self._kernel_args(state), self._clock, cost)
+        self._clock_of = state
         return float(cost.sum()) + self._prior_cost(state)
 
     def retract(self, state: State, step: Step) -> State:
