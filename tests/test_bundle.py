@@ -283,6 +283,29 @@ def test_spreads_of_the_priors_do_not_depend_on_their_start(rng):
         assert result.velocity_sigma == pytest.approx(true_velocity, rel=0.3)
 
 
+def test_estimated_spread_is_the_mean_square_of_what_is_found_and_what_is_left_open(rng):
+    truth = make_scene(rng, "rotation", num_images=8, num_points=60, noise_px=0.5)
+    result = bundle_adjust(perturbed(truth, rng), "rotation", BundleOptions(spread_tolerance=1e-6, spread_rounds=40))
+    square = (result.reconstruction.phi**2 + result.sigma_phi**2) * truth.frame_span()[:, None] ** 2
+    assert np.abs(result.reconstruction.phi).max() < 3 * np.sqrt(np.median(square) / 0.455)  # none is cut
+    assert result.phi_sigma == pytest.approx(np.sqrt(square.mean()), rel=1e-4)
+
+
+def test_settling_moves_points_alone_and_never_to_a_higher_cost(rng):
+    truth = make_scene(rng, "rotation", noise_px=0.5)
+    start = replace(truth, points_w=truth.points_w + 0.02 * rng.normal(size=truth.points_w.shape))
+    problem = BundleProblem(start, "rotation", BundleOptions(loss="squared"), 0.5, Spreads(0.03, 0.03))
+    state = problem.initial_state()
+    before = problem._track_costs(state)
+    settled = problem.settle(state)
+    assert (problem._track_costs(settled) <= before).all()
+    # with the true photos one step ends at the noise: half the number of values, less three for each point
+    assert problem.cost(state) > 10 * len(truth.observations)
+    assert problem.cost(settled) == pytest.approx(len(truth.observations) - 1.5 * truth.num_points, rel=0.25)
+    for name in ("R_cw", "center_w", "phi", "velocity"):
+        assert getattr(settled, name) is getattr(state, name)
+
+
 @pytest.mark.parametrize("noise_px", [0.1, 0.5, 2.0])
 def test_residuals_and_errors_scale_with_the_noise(noise_px, rng):
     truth = make_scene(rng, "rotation", num_images=8, num_points=80, noise_px=noise_px)

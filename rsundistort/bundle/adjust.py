@@ -23,6 +23,9 @@ LADDER = ("global", "two-step", "rotation", "constant-motion")
 # Radians per frame: a hundredth of a pixel at any focal length in use. Keeps the prior's weight finite.
 _MIN_SPREAD = 1e-6
 
+# Of a spread, between two solves.
+_LARGEST_CHANGE = 4.0
+
 
 def _noise_px(reconstruction: Reconstruction, shutter_model: str, floor: float) -> float:
     """Robust standard deviation of the residuals' parts in pixels, of measurements whose relative sigma is 1."""
@@ -43,17 +46,26 @@ def _believed(reconstruction: Reconstruction, options: BundleOptions, sigma: flo
     return valid & (np.linalg.norm(res, axis=1) <= limit)
 
 
-def _spread(values: NDArray[np.float64], variance: NDArray[np.float64], span: NDArray[np.float64]) -> float:
+def _spread(
+    values: NDArray[np.float64], variance: NDArray[np.float64], span: NDArray[np.float64], spread: float
+) -> float:
     """Spread over photos and axes, per frame, of unknowns (m, 3) per unit of the clock with posterior variances (m, 3).
 
-    Values beyond three robust spreads count as three: a few photos that moved far more, or that hang on by few
-    measurements, must not loosen the prior of the rest. Held values tell nothing.
+    `spread` is that of the prior under which they were found. Values beyond three robust spreads count as three: a few
+    photos that moved far more, or that hang on by few measurements, must not loosen the prior of the rest. Held values
+    tell nothing.
     """
-    square = ((values**2 + variance) * span[:, None] ** 2)[variance > 0]
-    if not square.size:
+    free = variance > 0
+    if not free.any():
         return 0.0
-    robust = float(np.median(square)) / 0.455  # median of the square of a normal variable
-    return float(np.sqrt(np.minimum(square, 9.0 * robust).mean()))
+    scale = np.broadcast_to(span[:, None] ** 2, values.shape)[free]
+    square, unknown = values[free] ** 2 * scale, float((variance[free] * scale).mean())
+    robust = float(np.median(square + variance[free] * scale)) / 0.455  # median of the square of a normal variable
+    seen = float(np.minimum(square, 9.0 * robust).mean())
+    # MacKay's fixed point of sigma^2 = mean(phi^2 + variance): a few rounds where that takes dozens. `told` is the
+    # share of the unknowns that the measurements, not the prior, decide
+    told = max(1.0 - unknown / spread**2, 1e-3)
+    return float(np.clip(np.sqrt(seen / told), spread / _LARGEST_CHANGE, spread * _LARGEST_CHANGE))
 
 
 def _estimated(
@@ -66,9 +78,9 @@ def _estimated(
     span = current.frame_span()
     phi, velocity = spreads.phi, spreads.velocity
     if options.phi_sigma is None and variances.shape[1] > 6:
-        phi = _spread(current.phi, variances[:, 6:9], span) + _MIN_SPREAD
+        phi = _spread(current.phi, variances[:, 6:9], span, spreads.phi) + _MIN_SPREAD
     if options.velocity_sigma is None and variances.shape[1] > 9:
-        velocity = _spread(current.velocity, variances[:, 9:], span) + _MIN_SPREAD * current.baseline
+        velocity = _spread(current.velocity, variances[:, 9:], span, spreads.velocity) + _MIN_SPREAD * current.baseline
     return Spreads(phi, velocity)
 
 

@@ -220,6 +220,21 @@ class BundleProblem:
         self._clock_of = state
         return float(cost.sum()) + self._prior_cost(state)
 
+    def settle(self, state: State) -> State:
+        """The state with each point one Gauss-Newton step nearer to its measurements, where that lowers its cost."""
+        moved = replace(state, points_w=state.points_w + self.linearize(state).point_steps())
+        better = self._track_costs(moved) < self._track_costs(state)
+        return replace(state, points_w=np.where(better[:, None], moved.points_w, state.points_w))
+
+    def _track_costs(self, state: State) -> NDArray[np.float64]:
+        """(n,) cost of each point's measurements."""
+        cost = np.empty(len(self._xy))
+        projection.residual_costs(*self._kernel_args(state), self._clock, cost)
+        self._clock_of = state
+        total = np.zeros(len(state.points_w))
+        np.add.at(total, self._structure.point_idx, cost)
+        return total
+
     def retract(self, state: State, step: Step) -> State:
         """The state after a step."""
         frame, point = step

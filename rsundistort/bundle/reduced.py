@@ -336,6 +336,12 @@ class NormalEquations:
             )  # fmt: skip
         return S, rhs, V_inv
 
+    def point_steps(self) -> Array:
+        """Gauss-Newton steps (n, 3) of the points alone, the photos being held."""
+        V_inv = np.empty_like(self._V)
+        schur.invert_points(self._V, 0.0, V_inv)
+        return -np.einsum("nij,nj->ni", V_inv, self._g_point)
+
     def marginal_covariances(self) -> Array:
         """Covariances (m, nb, nb) of the unknowns of each photo, all others being free; 0 where held.
 

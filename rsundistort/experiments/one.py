@@ -138,7 +138,7 @@ def draw_trial(scene: KnownScene, options: OneOptions, trial: int) -> tuple[Reco
     return truth, start
 
 
-def _options(method: str, options: OneOptions) -> BundleOptions:
+def method_options(method: str, options: OneOptions) -> BundleOptions:
     """Least squares with the protocol's noise; the paper's methods without priors, ours with estimated ones."""
     paper = method in ("wo-rs", "rs", "rs-star", "rs-linearized")
     return BundleOptions(
@@ -171,12 +171,14 @@ def errors_of(found: Reconstruction, truth: Reconstruction) -> dict[str, float]:
 def run_trial(scene: KnownScene, options: OneOptions, trial: int) -> list[dict[str, Any]]:
     """One line of `trials.jsonl` for each method."""
     truth, rough = draw_trial(scene, options, trial)
-    start = bundle_adjust(rough, "global", replace(_options("wo-rs", options), cost_tolerance=1e-6)).reconstruction
+    start = bundle_adjust(
+        rough, "global", replace(method_options("wo-rs", options), cost_tolerance=1e-6)
+    ).reconstruction
     lines = []
     for method in options.methods:
         model = METHODS[method][0]
         began = time.perf_counter()
-        chosen = _options(method, options)
+        chosen = method_options(method, options)
         result = bundle_adjust(rough if method == "wo-rs" else start, model, chosen)
         seconds = time.perf_counter() - began
         # the method's own cost of the true parameters, with the spreads it ended with
