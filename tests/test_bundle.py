@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from rsundistort import BundleOptions, Camera, InputError, Observations, Reconstruction, bundle_adjust, climb
 from rsundistort.bundle import LADDER, choose_model, objective, reprojection_residuals
 from rsundistort.bundle.choice import hold_out
+from rsundistort.bundle.intrinsics import moved_camera
 from rsundistort.bundle.problem import BundleProblem, Spreads
 
 LENS = [-0.12, 0.03, 0.001, -0.002]
@@ -90,38 +91,54 @@ def relative_poses(rec):
     return rec.R_cw @ rec.R_cw[0].T, centers / np.linalg.norm(centers[1])
 
 
-def noisy_problem(rng, model, loss="squared", factor_limit=1e10, sigma_px=0.5):
+def noisy_problem(rng, model, loss="squared", factor_limit=1e10, sigma_px=0.5, refine=(), dist=LENS):
     """A small problem at a state that is nowhere near a minimum: residuals of tens of pixels."""
-    rec = make_scene(rng, model, num_images=4, num_points=30, noise_px=1.0, dist=LENS)
+    num_images = 5 if refine else 4  # of four cameras: two photos share one
+    rec = make_scene(rng, model, num_images=num_images, num_points=30, noise_px=1.0, dist=dist)
     start = replace(perturbed(rec, rng, 0.01, 0.02), phi=rec.phi + 0.02 * rng.normal(size=rec.phi.shape))
     sigma = rng.uniform(1, 3, len(rec.observations))
     start = replace(start, observations=replace(rec.observations, sigma=sigma))
-    options = BundleOptions(loss=loss, factor_limit=factor_limit, cg_tolerance=1e-13)
+    options = BundleOptions(loss=loss, factor_limit=factor_limit, cg_tolerance=1e-13, refine=refine)
     problem = BundleProblem(start, model, options, sigma_px, Spreads(0.03, 0.1))
     return problem, problem.initial_state()
 
 
+def gradients(equations):
+    """Gradients of photos (m, nb), points (n, 3) and cameras (c, nc)."""
+    border = equations._border
+    return equations._g_frame, equations._g_point, equations._g_camera.reshape(border.num_cameras, border.J.shape[2])
+
+
 def unit_steps(problem, state):
-    """A step along each unknown of the photos and points."""
-    equations = problem.linearize(state)
-    frame, point = np.zeros_like(equations._g_frame), np.zeros_like(equations._g_point)
-    for array in (frame, point):
+    """A step along each unknown of the photos (kind 0), points (1) and cameras (2)."""
+    arrays = [np.zeros_like(gradient) for gradient in gradients(problem.linearize(state))]
+    for kind, array in enumerate(arrays):
         for index in np.ndindex(array.shape):
             array[index] = 1.0
-            yield array is frame, index, (frame, point)
+            yield kind, index, tuple(arrays)
             array[index] = 0.0
 
 
 def scaled(step, h):
-    return h * step[0], h * step[1]
+    return tuple(h * part for part in step)
 
 
+REFINE = ("f", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+RATIONAL = [*LENS, 0.01, 0.05, -0.02, 0.01]
+
+
+@pytest.mark.parametrize(
+    ("refine", "dist"), [((), LENS), (REFINE, LENS), (("fx", "fy", "k1"), []), (REFINE, RATIONAL)],
+    ids=["calibrated", "refined", "pinhole", "rational"],
+)  # fmt: skip
 @pytest.mark.parametrize("model", MODELS)
-def test_jacobian_equals_central_differences_through_the_step(model, rng):
-    problem, state = noisy_problem(rng, model)
+def test_jacobian_equals_central_differences_through_the_step(model, refine, dist, rng):
+    problem, state = noisy_problem(rng, model, refine=refine, dist=dist)
     order = problem._structure.order
     obs = problem._start.observations.select(order)
     _, J_frame, J_point, _ = problem._blocks(state)
+    jacobians = J_frame, J_point, problem._camera_jacobians(state)
+    owners_of = obs.frame_idx, obs.point_idx, problem._start.camera_idx[obs.frame_idx]
     h = 1e-6
 
     def residuals(step):
@@ -130,42 +147,46 @@ def test_jacobian_equals_central_differences_through_the_step(model, rng):
         assert valid.all()
         return res[order] / (0.5 * obs.sigma[:, None])
 
-    for is_frame, (owner, k), step in unit_steps(problem, state):
+    for kind, (owner, k), step in unit_steps(problem, state):
         difference = (residuals(scaled(step, h)) - residuals(scaled(step, -h))) / (2 * h)
-        owners = obs.frame_idx if is_frame else obs.point_idx
-        expected = np.where((owners == owner)[:, None], (J_frame if is_frame else J_point)[:, :, k], 0.0)
+        expected = np.where((owners_of[kind] == owner)[:, None], jacobians[kind][:, :, k], 0.0)
         # entries are of the size of the focal length over sigma; rounding of 400 px over h is 1e-7 of them
         assert np.abs(difference - expected).max() <= 1e-6 * np.abs(J_frame[:, :, :3]).max()
 
 
+@pytest.mark.parametrize("refine", [(), REFINE], ids=["calibrated", "refined"])
 @pytest.mark.parametrize(
     ("model", "loss"),
     [*((m, "squared") for m in MODELS), *(("rotation", loss) for loss in ("soft-l1", "huber", "cauchy"))],
 )
-def test_gradient_equals_central_differences_of_the_cost(model, loss, rng):
+def test_gradient_equals_central_differences_of_the_cost(model, loss, refine, rng):
     # with sigma 10 px the residuals lie on both sides of where the losses bend
-    problem, state = noisy_problem(rng, model, loss, sigma_px=0.5 if loss == "squared" else 10.0)
+    problem, state = noisy_problem(rng, model, loss, sigma_px=0.5 if loss == "squared" else 10.0, refine=refine)
     equations = problem.linearize(state)
     assert equations.cost == pytest.approx(problem.cost(state), rel=1e-13)  # sums of the same numbers
     h = 1e-5
-    size = np.abs(equations._g_frame).max(), np.abs(equations._g_point).max()
-    for is_frame, index, step in unit_steps(problem, state):
+    for kind, index, step in unit_steps(problem, state):
         ahead, behind = (problem.cost(problem.retract(state, scaled(step, s))) for s in (h, -h))
-        gradient = (equations._g_frame if is_frame else equations._g_point)[index]
+        gradient = gradients(equations)[kind]
         # third derivatives give h^2 (f/sigma)^2 = 1e-4 of some 1e4; rounding of the cost over h as little
-        assert abs((ahead - behind) / (2 * h) - gradient) <= 1e-6 * size[0 if is_frame else 1]
+        assert abs((ahead - behind) / (2 * h) - gradient[index]) <= 1e-6 * np.abs(gradient).max()
 
 
 def dense_system(problem, state):
-    """Hessian and gradient of all unknowns, photos first, written out; with the mask of the free ones."""
+    """Hessian and gradient of all unknowns, photos, points, cameras, written out; with the mask of the free ones."""
     res, J_frame, J_point, _ = problem._blocks(state)
+    J_camera = problem._camera_jacobians(state)
+    nc = J_camera.shape[2]
     obs = problem._start.observations.select(problem._structure.order)
     m, nb = problem._free.shape
-    J = np.zeros((len(obs), 2, m * nb + 3 * problem._start.num_points))
+    others = 3 * problem._start.num_points, nc * len(state.cameras)
+    J = np.zeros((len(obs), 2, m * nb + sum(others)))
     for k in range(len(obs)):
         f, p = nb * obs.frame_idx[k], m * nb + 3 * obs.point_idx[k]
+        c = m * nb + others[0] + nc * problem._start.camera_idx[obs.frame_idx[k]]
         J[k, :, f : f + nb] = J_frame[k]
         J[k, :, p : p + 3] = J_point[k]
+        J[k, :, c : c + nc] = J_camera[k]
     J = J.reshape(-1, J.shape[2])
     H, g = J.T @ J, J.T @ res.ravel()
     if nb > 6:  # priors: (phi * span / spread)^2 / 2, and the same for the velocity
@@ -177,34 +198,36 @@ def dense_system(problem, state):
         gradient[:, 9:] = weight[:, 9:] * state.velocity[:, : nb - 9]
         H[: m * nb, : m * nb] += np.diag(weight.ravel())
         g[: m * nb] += gradient.ravel()
-    return H, g, np.concatenate([problem._free.ravel(), np.ones(3 * problem._start.num_points, bool)])
+    return H, g, np.concatenate([problem._free.ravel(), np.ones(sum(others), bool)])
 
 
+@pytest.mark.parametrize("refine", [(), ("f", "k1", "k2")], ids=["calibrated", "refined"])
 @pytest.mark.parametrize("damping", [1e-6, 1e-2, 10.0])
 @pytest.mark.parametrize("factor_limit", [1e10, -1], ids=["factored", "conjugate gradients"])
 @pytest.mark.parametrize(
     ("model", "loss"),
     [("global", "squared"), ("rotation", "squared"), ("two-step", "cauchy"), ("constant-motion", "squared")],
 )
-def test_elimination_gives_the_step_of_the_whole_system(model, loss, factor_limit, damping, rng):
-    problem, state = noisy_problem(rng, model, loss, factor_limit)
+def test_elimination_gives_the_step_of_the_whole_system(model, loss, factor_limit, damping, refine, rng):
+    problem, state = noisy_problem(rng, model, loss, factor_limit, refine=refine)
     H, g, free = dense_system(problem, state)
     expected = np.zeros(len(g))
     damped = H + damping * np.diag(np.diag(H))
     # unit diagonal, as any reference solution needs: unknowns differ by orders of magnitude
     scale = 1 / np.sqrt(np.diag(damped)[free])
     expected[free] = scale * np.linalg.solve(scale[:, None] * damped[np.ix_(free, free)] * scale, -scale * g[free])
-    (frame, point), predicted = problem.linearize(state).solve(damping)
-    step = np.concatenate([frame.ravel(), point.ravel()])
+    parts, predicted = problem.linearize(state).solve(damping)
+    step = np.concatenate([part.ravel() for part in parts])
     assert (step[~free] == 0).all()
     # condition numbers up to 1e6 times rounding
     np.testing.assert_allclose(step, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
     assert predicted == pytest.approx(-(g @ expected + 0.5 * expected @ H @ expected), rel=1e-8)
 
 
+@pytest.mark.parametrize("refine", [(), ("f", "k1")], ids=["calibrated", "refined"])
 @pytest.mark.parametrize("factor_limit", [1e10, -1], ids=["factored", "conjugate gradients"])
-def test_covariances_are_those_of_the_whole_inverse(factor_limit, rng):
-    problem, state = noisy_problem(rng, "rotation", factor_limit=factor_limit)
+def test_covariances_are_those_of_the_whole_inverse(factor_limit, refine, rng):
+    problem, state = noisy_problem(rng, "rotation", factor_limit=factor_limit, refine=refine)
     H, _, free = dense_system(problem, state)
     scale = 1 / np.sqrt(np.diag(H)[free])
     inverse = scale[:, None] * np.linalg.inv(scale[:, None] * H[np.ix_(free, free)] * scale) * scale
@@ -213,7 +236,11 @@ def test_covariances_are_those_of_the_whole_inverse(factor_limit, rng):
     m, nb = problem._free.shape
     expected = np.array([whole[nb * i : nb * i + nb, nb * i : nb * i + nb] for i in range(m)])
     size = np.sqrt(np.einsum("iaa,ibb->iab", expected, expected))
-    np.testing.assert_array_less(np.abs(problem.covariances(state) - expected), 1e-8 * size + 1e-300)  # as the step
+    photos, cameras = problem.covariances(state)
+    np.testing.assert_array_less(np.abs(photos - expected), 1e-8 * size + 1e-300)  # as the step
+    expected = whole[len(whole) - len(cameras) :, len(whole) - len(cameras) :]
+    size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_array_less(np.abs(cameras - expected), 1e-8 * size + 1e-300)
 
 
 @pytest.mark.parametrize("dist", [[], LENS], ids=["pinhole", "lens"])
@@ -251,6 +278,56 @@ def test_truth_is_recovered_without_noise(model, rng):
         np.testing.assert_allclose(found, true, atol=1e-6 if model == "constant-motion" else 1e-7)
     assert result.rms_px < 1e-5
     assert result.num_outliers == 0
+
+
+def spoilt_cameras(rec, refine):
+    """Cameras of which some intrinsics are only guessed: 3 % off in f, 1 % in the centre, no lens."""
+    off = {"f": 0.03, "fx": 0.03, "fy": -0.02, "cx": 0.01, "cy": -0.01}
+    step = np.array([off.get(name, 0.0) for name in refine])
+    lens = any(name.startswith(("k", "p")) for name in refine)
+    moved = [moved_camera(camera, refine, step) for camera in rec.cameras]
+    return replace(rec, cameras=[replace(c, dist=np.zeros(0)) if lens else c for c in moved])
+
+
+@pytest.mark.parametrize("refine", [("f", "k1", "k2", "p1", "p2"), ("fx", "fy", "cx", "cy")], ids=" ".join)
+@pytest.mark.parametrize("model", ["global", "two-step", "rotation", "constant-motion"])
+def test_intrinsics_are_recovered_without_noise(model, refine, rng):
+    truth = make_scene(rng, model, num_images=12, num_points=120, dist=LENS)
+    options = BundleOptions(
+        loss="squared", sigma_px=0.5, phi_sigma=10.0, velocity_sigma=10.0, outlier_rounds=0, cost_tolerance=1e-12,
+        refine=refine,
+    )  # fmt: skip
+    start = spoilt_cameras(replace(perturbed(truth, rng, 0.01, 0.02), phi=truth.phi, velocity=truth.velocity), refine)
+    result = bundle_adjust(start, model, options)
+    for found, true in zip(result.reconstruction.cameras, truth.cameras, strict=True):
+        np.testing.assert_allclose(found.K, true.K, atol=1e-2)
+        np.testing.assert_allclose(found.dist, true.dist, atol=1e-4)
+    assert result.rms_px < 1e-4
+
+
+def test_normalised_errors_of_refined_intrinsics_are_one(rng):
+    refine = ("f", "k1", "k2")
+    errors = []
+    for _ in range(6):
+        truth = make_scene(rng, "rotation", num_images=12, num_points=80, noise_px=0.5, dist=[-0.12, 0.03, 0, 0])
+        start = replace(perturbed(truth, rng, 0.01, 0.02), phi=truth.phi)
+        result = bundle_adjust(spoilt_cameras(start, refine), "rotation", BundleOptions(refine=refine))
+        for found, true, sigma in zip(
+            result.reconstruction.cameras, truth.cameras, result.sigma_intrinsics, strict=True
+        ):  # fmt: skip
+            errors.append((found.K[0, 0] - true.K[0, 0]) / sigma["f"])
+            errors.extend((found.dist[:2] - true.dist[:2]) / [sigma["k1"], sigma["k2"]])
+    assert 0.75 < np.sqrt(np.mean(np.square(errors))) < 1.3  # 72 values, a third of them independent
+
+
+@pytest.mark.parametrize(
+    ("refine", "message"),
+    [(("f", "fx"), "either f"), (("k9",), "'k9'"), (("k1", "k1"), "twice")],
+    ids=["f and fx", "unknown", "twice"],
+)
+def test_intrinsics_that_contradict_each_other_are_refused(refine, message):
+    with pytest.raises(InputError, match=message):
+        BundleOptions(refine=refine)
 
 
 def test_ladder_ends_at_the_truth_and_climbs_in_order(rng):

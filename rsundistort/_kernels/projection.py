@@ -646,3 +646,95 @@ def residual_blocks(
                     for b in range(3):
                         J_frame[k, i, 9 + b] = v0 * R[0, b] + v1 * R[1, b] + v2 * R[2, b]
         cost[chunk] = total
+
+
+@kernel()
+def _lens_basis(lens, x, y, d):
+    """Derivatives (5, 2) of the distorted coordinates by k1 k2 p1 p2 k3."""
+    s = x * x + y * y
+    den = 1.0 + s * (lens[5] + s * (lens[6] + s * lens[7]))
+    d[0, 0], d[0, 1] = x * s / den, y * s / den
+    d[1, 0], d[1, 1] = s * d[0, 0], s * d[0, 1]
+    d[2, 0], d[2, 1] = 2.0 * x * y, s + 2.0 * y * y
+    d[3, 0], d[3, 1] = s + 2.0 * x * x, 2.0 * x * y
+    d[4, 0], d[4, 1] = s * d[1, 0], s * d[1, 1]
+
+
+@kernel()
+def _lens_jacobian(model, axis, sign, lens, x, y, z, phi, vel, xd, yd, d, E):
+    """Derivatives d (5, 2) by k1 k2 p1 p2 k3 of the distorted coordinates (xd, yd) that `_project` found.
+
+    The exact models read the row from the distorted image, so a change of the lens moves it; the others apply the lens
+    last.
+    """
+    if model < ROTATION:
+        X, Y, _ = _unlens(lens, xd, yd)
+        _lens_basis(lens, X, Y, d)
+        return
+    moving = 1.0 if model == CONSTANT_MOTION else 0.0
+    t = sign * (yd if axis == 1 else xd)
+    _exp_so3(t * phi[0], t * phi[1], t * phi[2], E)
+    v0, v1, v2 = moving * vel[0], moving * vel[1], moving * vel[2]
+    p0, p1, p2 = x - t * v0, y - t * v1, z - t * v2
+    q0 = E[0, 0] * p0 + E[0, 1] * p1 + E[0, 2] * p2
+    q1 = E[1, 0] * p0 + E[1, 1] * p1 + E[1, 2] * p2
+    q2 = E[2, 0] * p0 + E[2, 1] * p1 + E[2, 2] * p2
+    w0 = phi[1] * q2 - phi[2] * q1 - (E[0, 0] * v0 + E[0, 1] * v1 + E[0, 2] * v2)
+    w1 = phi[2] * q0 - phi[0] * q2 - (E[1, 0] * v0 + E[1, 1] * v1 + E[1, 2] * v2)
+    w2 = phi[0] * q1 - phi[1] * q0 - (E[2, 0] * v0 + E[2, 1] * v1 + E[2, 2] * v2)
+    X, Y = q0 / q2, q1 / q2
+    _, _, xx, xy, yx, yy, _ = _lens(lens, X, Y)
+    dX, dY = (w0 - X * w2) / q2, (w1 - Y * w2) / q2
+    at, bt = xx * dX + xy * dY, yx * dX + yy * dY
+    slope = sign * (bt if axis == 1 else at) - 1.0
+    _lens_basis(lens, X, Y, d)
+    for k in range(5):
+        dt = -sign * (d[k, 1] if axis == 1 else d[k, 0]) / slope
+        d[k, 0] += at * dt
+        d[k, 1] += bt * dt
+
+
+@parallel_kernel()
+def intrinsic_blocks(
+    model, camera_of_frame, axes, signs, intrs, lenses, R_cw, center_w, phi, vel_w, points_w,
+    frame_idx, point_idx, xy_raw, sigma_px, loss_kind, loss_scale, unknowns, J_camera,
+):  # fmt: skip
+    """Jacobians (o, 2, nc) by the intrinsics of each observation's camera, weighted as in `residual_blocks`.
+
+    `unknowns` (nc,) are codes: 0 log f (both), 1 log fx, 2 log fy, 3 cx / fx, 4 cy / fy, 5 to 9 k1 k2 p1 p2 k3.
+    """
+    o = len(frame_idx)
+    scale2 = loss_scale * loss_scale
+    for chunk in prange((o + _CHUNK - 1) // _CHUNK):
+        out = np.empty(20)
+        E = np.empty((3, 3))
+        L = np.empty((3, 3))
+        d = np.empty((5, 2))
+        vel_c = np.empty(3)
+        for k in range(chunk * _CHUNK, min(o, (chunk + 1) * _CHUNK)):
+            f = frame_idx[k]
+            c = camera_of_frame[f]
+            axis, sign, lens = axes[c], signs[c], lenses[c]
+            J_camera[k] = 0.0
+            x, y, z = _camera_frame(R_cw[f], center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
+            if not _project(model, axis, sign, lens, x, y, z, phi[f], vel_c, out, False, E, L):
+                continue
+            xd, yd = out[0], out[1]
+            r0 = (intrs[c, 0] * xd + intrs[c, 2] - xy_raw[k, 0]) / sigma_px[k]
+            r1 = (intrs[c, 1] * yd + intrs[c, 3] - xy_raw[k, 1]) / sigma_px[k]
+            s = r0 * r0 + r1 * r1
+            _, weight, share = _loss(loss_kind, s, scale2)
+            w = math.sqrt(weight)
+            a_s = (1.0 - math.sqrt(1.0 - share)) / s if s > 0.0 else 0.0
+            m00, m01, m11 = w * (1.0 - a_s * r0 * r0), -w * a_s * r0 * r1, w * (1.0 - a_s * r1 * r1)
+            g0, g1 = intrs[c, 0] / sigma_px[k], intrs[c, 1] / sigma_px[k]
+            _lens_jacobian(model, axis, sign, lens, x, y, z, phi[f], vel_c, xd, yd, d, E)
+            for i in range(len(unknowns)):
+                code = unknowns[i]
+                if code >= 5:
+                    u, v = d[code - 5, 0], d[code - 5, 1]
+                else:
+                    u = xd if code < 2 else (1.0 if code == 3 else 0.0)
+                    v = yd if code == 0 or code == 2 else (1.0 if code == 4 else 0.0)
+                J_camera[k, 0, i] = m00 * g0 * u + m01 * g1 * v
+                J_camera[k, 1, i] = m01 * g0 * u + m11 * g1 * v

@@ -197,6 +197,54 @@ def reduced_system(
 
 
 @parallel_kernel()
+def border_rows(
+    frame_start, frame_order, frame_idx, track_idx, track_start, point_of, camera_of_frame,
+    J, J_camera, V_inv, g_point, B, rhs,
+):  # fmt: skip
+    """The reduced system against the k unknowns of all cameras together, nc each, as a share of every photo f.
+
+    B (m, nb + nc, k): rows of its own unknowns, then of its camera's (to be summed over the photos of a camera), and
+    rhs (m, nc): -W V^-1 g_point of its camera.
+    """
+    nb, nc = J.shape[2], J_camera.shape[2]
+    for f in prange(len(B)):
+        left = np.empty((2, nb + nc))
+        B[f] = 0.0
+        rhs[f] = 0.0
+        for s in range(frame_start[f], frame_start[f + 1]):
+            k = frame_order[s]
+            t = track_idx[k]
+            V = V_inv[point_of[t]]
+            g = g_point[point_of[t]]
+            left[:, :nb] = J[k]
+            left[:, nb:] = J_camera[k]
+            u = np.zeros((2, 3))  # J_p V^-1
+            e = np.zeros(2)
+            for i in range(2):
+                for b in range(3):
+                    for a in range(3):
+                        u[i, b] -= J[k, i, 3 + a] * V[a, b]
+                    e[i] += u[i, b] * g[b]
+            for a in range(nc):
+                rhs[f, a] -= J_camera[k, 0, a] * e[0] + J_camera[k, 1, a] * e[1]
+            for n in range(track_start[t], track_start[t + 1]):
+                at = camera_of_frame[frame_idx[n]] * nc
+                # J_p,n is minus J's columns of the centre: the sign of M turns
+                m00 = u[0, 0] * J[n, 0, 3] + u[0, 1] * J[n, 0, 4] + u[0, 2] * J[n, 0, 5]
+                m01 = u[0, 0] * J[n, 1, 3] + u[0, 1] * J[n, 1, 4] + u[0, 2] * J[n, 1, 5]
+                m10 = u[1, 0] * J[n, 0, 3] + u[1, 1] * J[n, 0, 4] + u[1, 2] * J[n, 0, 5]
+                m11 = u[1, 0] * J[n, 1, 3] + u[1, 1] * J[n, 1, 4] + u[1, 2] * J[n, 1, 5]
+                if n == k:
+                    m00 += 1.0
+                    m11 += 1.0
+                for a in range(nb + nc):
+                    l0 = left[0, a] * m00 + left[1, a] * m10
+                    l1 = left[0, a] * m01 + left[1, a] * m11
+                    for b in range(nc):
+                        B[f, a, at + b] += l0 * J_camera[n, 0, b] + l1 * J_camera[n, 1, b]
+
+
+@parallel_kernel()
 def back_substitute(unknowns, track_start, point_of, frame_idx, V_inv, g_point, J, step_frame, step_point):
     """step_point (n, 3) = -V^-1 (g_point + sum Jp' J step_frame)."""
     nb = len(unknowns)

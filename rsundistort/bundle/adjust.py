@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import Reconstruction
+from .intrinsics import pixels_of
 from .options import BundleOptions, BundleResult
 from .problem import BundleProblem, Spreads, reprojection_residuals
 from .solver import minimize
@@ -182,7 +183,7 @@ def bundle_adjust(
         )
         iterations += result.num_iterations
         current = problem.reconstruction(result.state)
-        covariances = problem.covariances(result.state)
+        covariances, intrinsic_covariance = problem.covariances(result.state)
         before, spreads = spreads, _estimated(spreads, current, covariances, options)
         revived = revive_points(current, shutter_model)
         if cleaning:
@@ -208,8 +209,20 @@ def bundle_adjust(
         spreads.phi,
         spreads.velocity / baseline,
         covariances,
+        _sigma_intrinsics(current, options.refine, intrinsic_covariance),
         rms,
         dropped,
+    )
+
+
+def _sigma_intrinsics(
+    current: Reconstruction, names: Sequence[str], covariance: NDArray[np.float64]
+) -> tuple[dict[str, float], ...]:
+    """Standard deviations of each camera's refined intrinsics, in pixels or as coefficients."""
+    sigmas = np.sqrt(np.diagonal(covariance)).reshape(len(current.cameras), len(names))
+    return tuple(
+        dict(zip(names, (sigma * pixels_of(camera, names)).tolist(), strict=True))
+        for camera, sigma in zip(current.cameras, sigmas, strict=True)
     )
 
 
@@ -228,7 +241,8 @@ def climb(
     """
     options = options or BundleOptions()
     # every rung but the last is only a start: what its model cannot explain is no outlier, and it need not converge
-    rough = replace(options, outlier_rounds=0, spread_rounds=0, cost_tolerance=options.round_tolerance)
+    # a shutter that is not modelled yet would be blamed on the lens
+    rough = replace(options, outlier_rounds=0, spread_rounds=0, cost_tolerance=options.round_tolerance, refine=())
     results: dict[str, BundleResult] = {}
     current = replace(reconstruction, phi=np.zeros((reconstruction.num_images, 3)))
     for model in rungs:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import Reconstruction
+from .intrinsics import check_refined
 
 __all__ = ["LOSSES", "BundleOptions", "BundleResult"]
 
@@ -65,6 +66,8 @@ class BundleOptions:
         No observation nearer than this to its prediction is dropped.
     held_phi : mapping of photo name to component indices
         Hard anchors: components of phi held at zero, e.g. {"0001.jpg": (0,)} is the paper's RS*.
+    refine : tuple of str
+        Intrinsics of each camera that are solved for with the rest: some of f (or fx, fy), cx, cy, k1, k2, p1, p2, k3.
     factor_limit : float
         Reduced systems whose factorisation takes at most this many multiply-adds are factored, others are solved by
         preconditioned conjugate gradients.
@@ -93,10 +96,12 @@ class BundleOptions:
     outlier_sigma: float = 4.5
     min_outlier_px: float = 0.25
     held_phi: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    refine: tuple[str, ...] = ()
     factor_limit: float = 1e10
     cg_tolerance: float = 0.01
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "refine", check_refined(self.refine))
         if self.loss not in LOSSES:
             raise InputError(f"loss={self.loss!r}, expected one of {', '.join(LOSSES)}")
         positive = (
@@ -148,6 +153,8 @@ class BundleResult:
         Covariance of each photo's unknowns, the rest being free: rotation (left, radians, camera frame), centre, phi,
         velocity, as far as the model has them (nb = 6, 9 or 12). The gauge is that of the solve: the photo with the
         most observations has its pose held, and the centre farthest from it one coordinate; 0 where held.
+    sigma_intrinsics : tuple of dict of name to float
+        Standard deviation of each camera's refined intrinsics, in pixels, or as the lens coefficients.
     rms_px : float
         Root mean square of the residuals' x and y parts.
     num_outliers : int
@@ -162,6 +169,7 @@ class BundleResult:
     phi_sigma: float
     velocity_sigma: float
     covariances: NDArray[np.float64]
+    sigma_intrinsics: tuple[dict[str, float], ...]
     rms_px: float
     num_outliers: int
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,17 +13,19 @@ from scipy.spatial.transform import Rotation
 
 from .._kernels import projection
 from ..errors import InputError
-from ..model import Reconstruction, check_shutter_model
+from ..model import Camera, Reconstruction, check_shutter_model
+from .intrinsics import INTRINSICS, moved_camera
 from .options import LOSSES, BundleOptions
-from .reduced import Elimination, NormalEquations, Step, Structure
+from .reduced import Border, Elimination, NormalEquations, Step, Structure
 
 __all__ = ["BundleProblem", "Spreads", "State", "reprojection_residuals"]
 
 
 @dataclass(frozen=True)
 class State:
-    """What a step changes: poses, shutter motion and points, as in `Reconstruction`."""
+    """What a step changes: cameras, poses, shutter motion and points, as in `Reconstruction`."""
 
+    cameras: tuple[Camera, ...]
     R_cw: NDArray[np.float64]
     center_w: NDArray[np.float64]
     phi: NDArray[np.float64]
@@ -30,11 +33,10 @@ class State:
     points_w: NDArray[np.float64]
 
 
-def _camera_arrays(reconstruction: Reconstruction) -> tuple[NDArray[Any], ...]:
+def _camera_arrays(camera_idx: NDArray[np.int64], cameras: Sequence[Camera]) -> tuple[NDArray[Any], ...]:
     """Photo-to-camera indices, clock axes, signs, intrinsics and lenses as the kernels take them."""
-    args = [camera.kernel_args for camera in reconstruction.cameras]
-    intr, lens, axis, sign = zip(*args, strict=True)
-    return reconstruction.camera_idx, np.array(axis), np.array(sign), np.array(intr), np.array(lens)
+    intr, lens, axis, sign = zip(*(camera.kernel_args for camera in cameras), strict=True)
+    return camera_idx, np.array(axis), np.array(sign), np.array(intr), np.array(lens)
 
 
 def reprojection_residuals(
@@ -54,8 +56,9 @@ def reprojection_residuals(
     res = np.empty((len(obs), 2))
     valid = np.empty(len(obs), bool)
     projection.residuals(
-        model, *_camera_arrays(reconstruction), reconstruction.R_cw, reconstruction.center_w, reconstruction.phi,
-        reconstruction.velocity, reconstruction.points_w, obs.frame_idx, obs.point_idx, obs.xy_raw, res, valid,
+        model, *_camera_arrays(reconstruction.camera_idx, reconstruction.cameras),
+        reconstruction.R_cw, reconstruction.center_w, reconstruction.phi, reconstruction.velocity,
+        reconstruction.points_w, obs.frame_idx, obs.point_idx, obs.xy_raw, res, valid,
     )  # fmt: skip
     return res, valid
 
@@ -87,9 +90,9 @@ class BundleProblem:
     """Robust reprojection errors and the priors on phi and velocity, with the gauge and the anchors held.
 
     Unknowns of a photo: rotation increment (left, radians), centre (world units), phi (radians per unit of the clock)
-    unless the shutter is global, and velocity (world units per unit of the clock) if the motion is whole. Seven
-    unknowns are held for the gauge: the pose of the photo with the most observations, and one coordinate of the centre
-    farthest from it.
+    unless the shutter is global, and velocity (world units per unit of the clock) if the motion is whole. Unknowns of a
+    camera: the intrinsics that the options name, as in `moved_camera`. Seven unknowns are held for the gauge: the pose
+    of the photo with the most observations, and one coordinate of the centre farthest from it.
     """
 
     def __init__(
@@ -116,7 +119,8 @@ class BundleProblem:
         # the rows that the last cost predicted, where the next Jacobians look for them
         self._clock = np.full(len(obs), np.nan)
         self._clock_of: State | None = None
-        self._cameras = _camera_arrays(reconstruction)
+        self._refine = options.refine
+        self._refine_codes = np.array([INTRINSICS[name] for name in options.refine], np.int64)
         span = reconstruction.frame_span()[:, None]
         weight = np.hstack([np.repeat((span / s) ** 2, 3, axis=1) for s in (spreads.phi, spreads.velocity)])
         self._motion_weight = weight[:, : self._block - 6]
@@ -149,12 +153,15 @@ class BundleProblem:
         motion = np.zeros((self._start.num_images, 6))
         found = np.hstack([self._start.phi, self._start.velocity])[:, : self._block - 6]
         motion[:, : self._block - 6] = np.where(self._free[:, 6:], found, 0.0)
-        return State(self._start.R_cw, self._start.center_w, motion[:, :3], motion[:, 3:], self._start.points_w)
+        start = self._start
+        return State(
+            tuple(start.cameras), start.R_cw, start.center_w, motion[:, :3], motion[:, 3:], start.points_w
+        )  # fmt: skip
 
-    def covariances(self, state: State) -> NDArray[np.float64]:
-        """(m, nb, nb) covariance of each photo's unknowns, all others being free; 0 where held (the gauge).
+    def covariances(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Covariances of each photo's unknowns (m, nb, nb), 0 where held (the gauge), and of all cameras' (k, k).
 
-        Order and units as the unknowns above. NaN where the system cannot be factored.
+        All others being free. Order and units as the unknowns above. NaN where the system cannot be factored.
         """
         return self.linearize(state).marginal_covariances()
 
@@ -163,6 +170,7 @@ class BundleProblem:
         U, _, Vt = np.linalg.svd(state.R_cw)  # rounding of many increments
         return replace(
             self._start,
+            cameras=state.cameras,
             R_cw=U @ Vt,
             center_w=state.center_w,
             phi=state.phi,
@@ -174,7 +182,8 @@ class BundleProblem:
     def _kernel_args(self, state: State) -> tuple[Any, ...]:
         s = self._structure
         return (
-            self._model, *self._cameras, state.R_cw, state.center_w, state.phi, state.velocity, state.points_w,
+            self._model, *_camera_arrays(self._start.camera_idx, state.cameras),
+            state.R_cw, state.center_w, state.phi, state.velocity, state.points_w,
             s.frame_idx, s.point_idx, self._xy, self._sigma_px, LOSSES[self._options.loss], self._options.loss_scale,
         )  # fmt: skip
 
@@ -210,7 +219,15 @@ class BundleProblem:
         prior_diag[:, 6:] = self._motion_weight
         prior_gradient[:, 6:] = self._motion_weight * self._motion(state)
         total = cost + self._prior_cost(state)
-        return NormalEquations(self._elimination, total, res, J_frame, prior_diag, prior_gradient)
+        border = Border(self._camera_jacobians(state), self._start.camera_idx, len(state.cameras))
+        return NormalEquations(self._elimination, total, res, J_frame, prior_diag, prior_gradient, border)
+
+    def _camera_jacobians(self, state: State) -> NDArray[np.float64]:
+        """Weighted Jacobians (o, 2, nc) of the intrinsics that are refined."""
+        J = np.empty((len(self._xy), 2, len(self._refine)))
+        if self._refine:
+            projection.intrinsic_blocks(*self._kernel_args(state), self._refine_codes, J)
+        return J
 
     def cost(self, state: State) -> float:
         """Half the robust sum of squares in units of the noise, with the priors."""
@@ -237,8 +254,12 @@ class BundleProblem:
 
     def retract(self, state: State, step: Step) -> State:
         """The state after a step."""
-        frame, point = step
+        frame, point, intrinsics = step
+        cameras = state.cameras
+        if self._refine:
+            cameras = tuple(moved_camera(c, self._refine, s) for c, s in zip(cameras, intrinsics, strict=True))
         return State(
+            cameras,
             Rotation.from_rotvec(frame[:, :3]).as_matrix() @ state.R_cw,
             state.center_w + frame[:, 3:6],
             state.phi + frame[:, 6:9] if self._block > 6 else state.phi,
@@ -247,11 +268,11 @@ class BundleProblem:
         )
 
     def step_size(self, state: State, step: Step) -> float:
-        """Largest change: angles in radians, lengths in sizes of the scene."""
-        frame, point = step
+        """Largest change: angles in radians, lengths in sizes of the scene, intrinsics in their own units."""
+        frame, point, intrinsics = step
         angles = np.abs(frame[:, [0, 1, 2, *range(6, min(self._block, 9))]]).max()
         # a far point moves a lot along its ray without moving in any photo: its depth is its own yardstick
         depth = np.maximum(np.linalg.norm(state.points_w - state.center_w.mean(0), axis=1), self._size)
         ways = np.abs(frame[:, [3, 4, 5, *range(9, self._block)]]).max() / self._size
         lengths = max(ways, float((np.abs(point).max(1) / depth).max(initial=0)))
-        return float(max(angles, lengths))
+        return float(max(angles, lengths, np.abs(intrinsics).max(initial=0.0)))

@@ -1,4 +1,7 @@
-"""The reduced system of the photos: elimination of the points, then an envelope factorised, or conjugate gradients."""
+"""The reduced system of the photos, bordered by what they share.
+
+Elimination of the points, then an envelope factorised, or conjugate gradients.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from .._kernels import schur
 
-__all__ = ["Elimination", "NormalEquations", "Structure"]
+__all__ = ["Border", "Elimination", "NormalEquations", "Structure"]
 
 # Right-hand sides of the inverse that are held at once: 192 in a system of 10,000 photos are 180 MB.
 _COLUMNS = 192
@@ -27,7 +30,7 @@ _MAX_CG = 500
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-Step = tuple[Array, Array]
+Step = tuple[Array, Array, Array]
 
 
 @dataclass(frozen=True)
@@ -156,15 +159,79 @@ class Envelope:
         return solve
 
     def gather(self, x: Array) -> Array:
-        """Values of the photos (m, nb) as one right-hand side (1, padded rows)."""
-        B = np.zeros((1, 4 * len(self.first)))
+        """Values of the photos (k, m, nb) as right-hand sides (k, padded rows)."""
+        B = np.zeros((len(x), 4 * len(self.first)))
         free = self.place >= 0
-        B[0, self.place[free]] = x[free]
+        B[:, self.place[free]] = x[:, free]
         return B
 
     def scatter(self, B: Array) -> Array:
-        """One right-hand side (1, padded rows) as values of the photos; 0 where held."""
-        return np.where(self.place >= 0, B[0, self.place], 0.0)
+        """Right-hand sides (k, padded rows) as values of the photos (k, m, nb); 0 where held."""
+        return np.where(self.place >= 0, B[:, self.place], 0.0)
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """The reduced system of the photos, bordered by the k unknowns that they share: [[S, B'], [B, C]] [x; y] = [b; c].
+
+    Attributes
+    ----------
+    S : (blocks, nb, nb) array
+        Upper triangle of blocks of the photos.
+    b : (m, nb) array
+        Right-hand side of the photos.
+    border, corner, c : (k, m, nb), (k, k), (k,) array
+        B, C and the right-hand side of the cameras.
+    """
+
+    S: Array
+    b: Array
+    border: Array
+    corner: Array
+    c: Array
+
+
+@dataclass(frozen=True)
+class Border:
+    """Intrinsics that photos share: nc unknowns of each camera.
+
+    Attributes
+    ----------
+    J : (o, 2, nc) array
+        Weighted Jacobians of the observations, nc may be 0.
+    camera_of_frame : (m,) int array
+        Camera of each photo.
+    num_cameras : int
+        Number of cameras.
+    """
+
+    J: Array
+    camera_of_frame: Index
+    num_cameras: int
+
+    def sum_photos(self, x: Array) -> Array:
+        """Values of the photos (m, nc, ...) summed over those of each camera, (cameras * nc, ...)."""
+        total = np.zeros((self.num_cameras, *x.shape[1:]))
+        np.add.at(total, self.camera_of_frame, x)
+        return total.reshape(self.num_cameras * x.shape[1], *x.shape[2:])
+
+
+def _products(A: Array, B: Array) -> Array:
+    """(i, j) inner products of stacks of photos' values; not of BLAS, whose waiting threads take our processors."""
+    result: Array = np.einsum("ima,jma->ij", A, B)
+    return result
+
+
+def _positive_inverse(A: Array) -> Array | None:
+    """Inverse of a small symmetric matrix with unknowns of different scale; None if it is not positive."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(A), 1e-300))
+    try:
+        L = np.linalg.cholesky(scale[:, None] * A * scale)
+    except np.linalg.LinAlgError:
+        return None
+    half = np.linalg.inv(L) * scale
+    inverse: Array = half.T @ half
+    return inverse
 
 
 @dataclass(frozen=True)
@@ -212,56 +279,87 @@ class Elimination:
         below = (start, by_column, rows[by_column])
         return cls(structure, free, envelopes[best], clusters, below, cg_tolerance)
 
-    def solve(self, S: Array, b: Array) -> tuple[Array, Array] | None:
-        """Solution (m, nb) of S x = b, 0 where held, and the residual b - S x; None if S is not positive."""
+    def solve(self, reduced: Reduced) -> tuple[Array, Array, Array, Array] | None:
+        """Solution of the photos (m, nb), 0 where held, and of the cameras (k,), with the residuals of both.
+
+        None if the matrix is not positive.
+        """
         if self.clusters is not None:
-            return self._conjugate_gradients(self.clusters, S, b)
-        solve = self.envelope.factor(self.structure, S)
+            return self._conjugate_gradients(self.clusters, reduced)
+        solve = self.envelope.factor(self.structure, reduced.S)
         if solve is None:
             return None
-        B = self.envelope.gather(b)
-        solve(B)
-        return self.envelope.scatter(B), np.zeros_like(b)
+        rhs = self.envelope.gather(np.concatenate([reduced.b[None], reduced.border]))
+        solve(rhs)
+        x, *X = self.envelope.scatter(rhs)
+        y = np.zeros_like(reduced.c)
+        if len(y):
+            eliminated = _positive_inverse(reduced.corner - _products(reduced.border, np.array(X)))
+            if eliminated is None:
+                return None
+            y = eliminated @ (reduced.c - _products(reduced.border, x[None])[:, 0])
+            x = x - np.tensordot(y, X, 1)
+        return x, y, np.zeros_like(x), np.zeros_like(y)
 
-    def _conjugate_gradients(self, clusters: Envelope, S: Array, b: Array) -> tuple[Array, Array] | None:
-        """Preconditioned by the factored diagonal blocks of neighbouring photos."""
+    def _conjugate_gradients(
+        self, clusters: Envelope, reduced: Reduced
+    ) -> tuple[Array, Array, Array, Array] | None:  # fmt: skip
+        """Preconditioned by the factored diagonal blocks of neighbouring photos, and the corner of the cameras."""
+        S, b, border = reduced.S, reduced.b, reduced.border
         precondition = clusters.factor(self.structure, S)
-        if precondition is None:
+        corner_inverse = _positive_inverse(reduced.corner)
+        if precondition is None or corner_inverse is None:
             return None
         unknowns = (0.0,) * b.shape[1]
         s = self.structure
-        x = np.zeros_like(b)
-        r = np.where(self.free, b, 0.0)
-        p = np.zeros_like(b)
+        x, y = np.zeros_like(b), np.zeros_like(reduced.c)
+        r, ry = np.where(self.free, b, 0.0), reduced.c.copy()
+        p, py = np.zeros_like(x), np.zeros_like(y)
         Sp = np.empty_like(b)
         rho = first = 0.0
         for _ in range(_MAX_CG):
-            B = clusters.gather(r)
+            B = clusters.gather(r[None])
             precondition(B)
-            z = clusters.scatter(B)
-            before, rho = rho, float((r * z).sum())
+            z, zy = clusters.scatter(B)[0], corner_inverse @ ry
+            before, rho = rho, float((r * z).sum() + (ry * zy).sum())
             first = first or rho
             if not rho > self.cg_tolerance**2 * first:
                 break
-            p = z + (rho / before if before else 0.0) * p
+            beta = rho / before if before else 0.0
+            p, py = z + beta * p, zy + beta * py
             schur.multiply(unknowns, s.row_start, s.cols, *self.below, S, p, Sp)
-            curvature = float((p * Sp)[self.free].sum())
+            Spy = reduced.corner @ py
+            if len(py):
+                Spy += _products(border, p[None])[:, 0]
+                Sp += np.tensordot(py, border, 1)
+            curvature = float((p * Sp)[self.free].sum() + (py * Spy).sum())
             if not curvature > 0:
                 return None
-            x += (rho / curvature) * p
-            r -= np.where(self.free, (rho / curvature) * Sp, 0.0)
-        return x, r
+            alpha = rho / curvature
+            x, y = x + alpha * p, y + alpha * py
+            r, ry = r - np.where(self.free, alpha * Sp, 0.0), ry - alpha * Spy
+        return x, y, r, ry
 
-    def marginal_covariances(self, S: Array) -> Array:
-        """Diagonal blocks (m, nb, nb) of the inverse, 0 where held; NaN if S is not positive.
+    def marginal_covariances(self, reduced: Reduced) -> tuple[Array, Array]:
+        """Covariances of each photo's unknowns (m, nb, nb), 0 where held, and of the cameras' (k, k).
 
-        A few columns at a time: never the whole inverse.
+        The diagonal blocks of the inverse, a few columns at a time: never the whole inverse. NaN if the matrix is not
+        positive.
         """
         m, nb = self.free.shape
-        solve = self.envelope.factor(self.structure, S)
-        if solve is None:
-            return np.where(self.free[:, :, None] & self.free[:, None, :], np.nan, 0.0)
-        result = np.zeros((m, nb, nb))
+        solve = self.envelope.factor(self.structure, reduced.S)
+        cameras: Array | None = np.zeros((0, 0))
+        X = np.zeros_like(reduced.border)
+        if solve is not None and len(reduced.c):
+            rhs = self.envelope.gather(reduced.border)
+            solve(rhs)
+            X = self.envelope.scatter(rhs)
+            cameras = _positive_inverse(reduced.corner - _products(reduced.border, X))
+        if solve is None or cameras is None:
+            unknown = np.where(self.free[:, :, None] & self.free[:, None, :], np.nan, 0.0)
+            return unknown, np.full_like(reduced.corner, np.nan)
+        # what the cameras leave open moves the photos with them
+        result: Array = np.einsum("ima,ij,jmb->mab", X, cameras, X)
         place = self.envelope.place
         step = max(_COLUMNS // nb, 1)
         for begin in range(0, m, step):
@@ -273,9 +371,9 @@ class Elimination:
             for i in photos:
                 free = np.flatnonzero(self.free[i])
                 block = unit[done : done + len(free)][:, place[i, free]]
-                result[i][np.ix_(free, free)] = (block + block.T) / 2
+                result[i][np.ix_(free, free)] += (block + block.T) / 2
                 done += len(free)
-        return result
+        return result, cameras
 
 
 class NormalEquations:
@@ -291,6 +389,8 @@ class NormalEquations:
         Weighted residuals and Jacobians; that of the point is minus that of the centre.
     prior_diag, prior_gradient : (m, nb) array
         Diagonal Hessian and gradient of the priors of the photos.
+    border : Border
+        What the photos share.
     """
 
     def __init__(
@@ -301,29 +401,39 @@ class NormalEquations:
         J_frame: Array,
         prior_diag: Array,
         prior_gradient: Array,
+        border: Border,
     ) -> None:
         self.cost = cost
         self._elimination = elimination
         s = self._s = elimination.structure
-        m, nb = prior_diag.shape
+        nb = prior_diag.shape[1]
         n = len(s.point_of)
         self._J = J_frame
         self._unknowns = (0.0,) * nb
         self._prior_diag = prior_diag
-        self._diagonal = np.empty((m, nb))
-        self._g_frame = np.empty((m, nb))
         self._V = np.empty((n, 3, 3))
         self._g_point = np.empty((n, 3))
         schur.point_blocks(s.track_start, s.point_of, res, J_frame, self._V, self._g_point)
-        with numba.parallel_chunksize(1):
-            schur.frame_gradients(s.frame_start, s.frame_order, res, J_frame, self._diagonal, self._g_frame)
+        self._diagonal, self._g_frame = self._gradients(res, J_frame)
         self._diagonal += prior_diag
         self._g_frame += prior_gradient
+        self._border = border
+        diagonal, g_camera = self._gradients(res, border.J)
+        self._camera_diagonal, self._g_camera = border.sum_photos(diagonal), border.sum_photos(g_camera)
 
-    def reduce(self, damping: float) -> tuple[Array, Array, Array]:
-        """Blocks (upper triangle) and right-hand side (m, nb) of the damped reduced system, and V^-1 (n, 3, 3)."""
+    def _gradients(self, res: Array, J: Array) -> tuple[Array, Array]:
+        """Diagonal of J'J and J'res, summed over each photo (m, unknowns)."""
         s = self._s
-        nb = len(self._unknowns)
+        diagonal, gradient = np.zeros((2, len(s.frame_start) - 1, J.shape[2]))
+        if J.shape[2]:
+            with numba.parallel_chunksize(1):
+                schur.frame_gradients(s.frame_start, s.frame_order, res, J, diagonal, gradient)
+        return diagonal, gradient
+
+    def reduce(self, damping: float) -> tuple[Reduced, Array]:
+        """The damped system without the points, and V^-1 (n, 3, 3)."""
+        s = self._s
+        m, nb = self._g_frame.shape
         V_inv = np.empty_like(self._V)
         schur.invert_points(self._V, damping, V_inv)
         S = np.empty((len(s.cols), nb, nb))
@@ -334,34 +444,41 @@ class NormalEquations:
                 s.row_start, s.cols, self._J, V_inv, self._g_point, self._g_frame,
                 self._prior_diag + damping * self._diagonal, S, rhs,
             )  # fmt: skip
-        return S, rhs, V_inv
+        nc = self._border.J.shape[2]
+        k = len(self._g_camera)
+        rows, rhs_camera = np.zeros((m, nb + nc, k)), np.zeros((m, nc))
+        if nc:
+            with numba.parallel_chunksize(1):
+                schur.border_rows(
+                    s.frame_start, s.frame_order, s.frame_idx, s.track_idx, s.track_start, s.point_of,
+                    self._border.camera_of_frame, self._J, self._border.J, V_inv, self._g_point, rows, rhs_camera,
+                )  # fmt: skip
+        corner = self._border.sum_photos(rows[:, nb:]) + np.diag(damping * self._camera_diagonal)
+        border = np.where(self._elimination.free, rows[:, :nb].transpose(2, 0, 1), 0.0)
+        c = -self._g_camera - self._border.sum_photos(rhs_camera)
+        return Reduced(S, -rhs, border, (corner + corner.T) / 2, c), V_inv
 
-    def point_steps(self) -> Array:
-        """Gauss-Newton steps (n, 3) of the points alone, the photos being held."""
-        V_inv = np.empty_like(self._V)
-        schur.invert_points(self._V, 0.0, V_inv)
-        return -np.einsum("nij,nj->ni", V_inv, self._g_point)
+    def marginal_covariances(self) -> tuple[Array, Array]:
+        """Covariances of the unknowns of each photo (m, nb, nb) and of all cameras (k, k), all others being free.
 
-    def marginal_covariances(self) -> Array:
-        """Covariances (m, nb, nb) of the unknowns of each photo, all others being free; 0 where held.
-
-        NaN where the system cannot be factored.
+        0 where held; NaN where the system cannot be factored.
         """
         return self._elimination.marginal_covariances(self.reduce(0.0)[0])
 
     def solve(self, damping: float) -> tuple[Step, float] | None:
-        """Step of the photos (m, nb) and points (n, 3), and the decrease of cost that it predicts."""
-        S, rhs, V_inv = self.reduce(damping)
-        solved = self._elimination.solve(S, -rhs)
+        """Step of the photos (m, nb), points (n, 3) and cameras (c, nc), and the decrease of cost that it predicts."""
+        reduced, V_inv = self.reduce(damping)
+        solved = self._elimination.solve(reduced)
         if solved is None:
             return None
-        step_frame, residual = solved
+        step_frame, step_camera, residual, camera_residual = solved
+        steps = step_camera.reshape(self._border.num_cameras, self._border.J.shape[2])
         step_point = np.empty_like(self._g_point)
         schur.back_substitute(
-            self._unknowns, self._s.track_start, self._s.point_of, self._s.frame_idx, V_inv, self._g_point, self._J,
-            step_frame, step_point,
+            self._unknowns, self._s.track_start, self._s.point_of, self._s.frame_idx, V_inv, self._pulled(steps),
+            self._J, step_frame, step_point,
         )  # fmt: skip
-        if not (np.isfinite(step_frame).all() and np.isfinite(step_point).all()):
+        if not all(np.isfinite(step).all() for step in (step_frame, step_point, step_camera)):
             return None
         # of the system that was solved: an unfinished solution leaves (H + damping D) step + g = -residual.
         # Sums, not np.vdot: threads of BLAS that wait for work take the processors from ours
@@ -369,5 +486,22 @@ class NormalEquations:
         predicted = 0.5 * float(
             (step_frame * (damping * self._diagonal * step_frame - self._g_frame + residual)).sum()
             + (step_point * (damping * diag_point * step_point - self._g_point)).sum()
+            + (step_camera * (damping * self._camera_diagonal * step_camera - self._g_camera + camera_residual)).sum()
         )
-        return (step_frame, step_point), predicted
+        return (step_frame, step_point, steps), predicted
+
+    def _pulled(self, steps: Array) -> Array:
+        """Gradient of the points (n, 3) after a step of the cameras (c, nc)."""
+        if not steps.size:
+            return self._g_point
+        s = self._s
+        V, pull = np.empty_like(self._V), np.empty_like(self._g_point)
+        moved = np.einsum("oij,oj->oi", self._border.J, steps[self._border.camera_of_frame[s.frame_idx]])
+        schur.point_blocks(s.track_start, s.point_of, moved, self._J, V, pull)
+        return self._g_point + pull
+
+    def point_steps(self) -> Array:
+        """Gauss-Newton steps (n, 3) of the points alone, the photos being held."""
+        V_inv = np.empty_like(self._V)
+        schur.invert_points(self._V, 0.0, V_inv)
+        return -np.einsum("nij,nj->ni", V_inv, self._g_point)

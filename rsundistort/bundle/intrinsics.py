@@ -1,0 +1,58 @@
+"""Which intrinsics of a camera an adjustment refines, and what a step does to them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..model import Camera
+
+__all__ = ["INTRINSICS", "check_refined", "moved_camera", "pixels_of"]
+
+#: Intrinsics that can be refined and their codes in the kernels: `f` keeps the ratio of fx and fy.
+INTRINSICS: dict[str, int] = {
+    name: code for code, name in enumerate(("f", "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"))
+}
+
+
+def check_refined(names: Sequence[str]) -> tuple[str, ...]:
+    """The names, refused if one is unknown, named twice, or contradicts another."""
+    names = tuple(names)
+    for name in names:
+        if name not in INTRINSICS:
+            raise InputError(f"cannot refine {name!r}, expected some of {', '.join(INTRINSICS)}")
+    if len(set(names)) != len(names):
+        raise InputError(f"intrinsics to refine are named twice: {', '.join(names)}")
+    if "f" in names and {"fx", "fy"} & set(names):
+        raise InputError("refine either f, which keeps the ratio of fx and fy, or fx and fy")
+    return names
+
+
+def moved_camera(camera: Camera, names: Sequence[str], step: NDArray[np.float64]) -> Camera:
+    """The camera after a step (len(names),): of log f, of cx / fx and cy / fy, and of the lens coefficients."""
+    K = np.array(camera.K)
+    dist = np.zeros(max(len(camera.dist), 5 if "k3" in names else 4))
+    dist[: len(camera.dist)] = camera.dist
+    # a step of e^10 is as astray as any
+    for name, value in zip(names, np.clip(step, -10, 10), strict=True):
+        if name in ("f", "fx"):
+            K[0, 0] *= np.exp(value)
+        if name in ("f", "fy"):
+            K[1, 1] *= np.exp(value)
+        if name == "cx":
+            K[0, 2] += camera.K[0, 0] * value
+        if name == "cy":
+            K[1, 2] += camera.K[1, 1] * value
+        if INTRINSICS[name] >= INTRINSICS["k1"]:
+            dist[INTRINSICS[name] - INTRINSICS["k1"]] += value
+    return replace(camera, K=K, dist=dist if dist.any() else camera.dist)
+
+
+def pixels_of(camera: Camera, names: Sequence[str]) -> NDArray[np.float64]:
+    """(len(names),) pixels (or coefficients) that a unit of each unknown stands for."""
+    fx, fy = camera.K[0, 0], camera.K[1, 1]
+    return np.array([{"f": fx, "fx": fx, "fy": fy, "cx": fx, "cy": fy}.get(name, 1.0) for name in names])
