@@ -29,6 +29,12 @@ if TYPE_CHECKING:
     help="How the shutter is modelled; auto is the model that foretells measurements held out from its fit.",
 )
 @click.option(
+    "--refine",
+    metavar="NAMES",
+    help="Intrinsics to solve for with the rest: some of f (or fx, fy), cx, cy, k1, k2, p1, p2, k3 with commas "
+    "between, or none. By default none of a camera that was given, f,k1,k2 of one that EXIF guessed.",
+)
+@click.option(
     "--still",
     multiple=True,
     metavar="NAME",
@@ -53,6 +59,7 @@ def command(
     camera: str | None,
     readout: str | None,
     shutter_model: str,
+    refine: str | None,
     still: tuple[str, ...],
     max_features: int,
     interpolation: str,
@@ -82,6 +89,7 @@ def command(
                 max_features=max_features,
                 interpolation=interpolation,
                 quality=quality,
+                refine=_names(refine),
                 still=still,
                 overwrite=overwrite,
             ),
@@ -89,6 +97,14 @@ def command(
         )
     if not quiet:
         click.echo(closing_table(solution, out))
+
+
+def _names(refine: str | None) -> tuple[str, ...] | None:
+    """Names between commas; () for none, None where nothing was said."""
+    if refine is None:
+        return None
+    names = tuple(name.strip() for name in refine.split(",") if name.strip())
+    return () if names == ("none",) else names
 
 
 def closing_table(solution: Solution, out: Path) -> str:
@@ -119,6 +135,7 @@ def closing_table(solution: Solution, out: Path) -> str:
         f"shutter model      {solution.shutter_model}",
         *_held_out(quality["held_out_rms_px"]),
         f"camera             {solution.options['camera']}, readout {solution.options['readout']}",
+        *_intrinsics(solution),
         f"rms residual       {quality['global_rms_px']:.2f} px with a global shutter, {quality['rms_px']:.2f} px now",
         f"outputs            {out}  ({total:.0f} s)",
     ]
@@ -133,6 +150,27 @@ def closing_table(solution: Solution, out: Path) -> str:
     if lost:
         lines += ["", "not joined:", *(f"  {image.name}: {image.reason}" for image in lost)]
     return "\n".join(lines)
+
+
+def _intrinsics(solution: Solution) -> list[str]:
+    """A line on each camera whose intrinsics were solved for, with standard deviations."""
+    lines = []
+    for key, sigmas in solution.quality["sigma_intrinsics"].items():
+        camera = solution.cameras[key]
+        values = {
+            "f": camera.K[0, 0],
+            "fx": camera.K[0, 0],
+            "fy": camera.K[1, 1],
+            "cx": camera.K[0, 2],
+            "cy": camera.K[1, 2],
+        }
+        values |= dict(zip(("k1", "k2", "p1", "p2", "k3"), camera.dist, strict=False))
+        found = [
+            f"{name} {values.get(name, 0.0):.{4 if name[0] in 'kp' else 1}f} +- {sigma:.{4 if name[0] in 'kp' else 1}f}"
+            for name, sigma in sigmas.items()
+        ]
+        lines += [f"{'refined' if i == 0 else '':19}{', '.join(found[i : i + 3])}" for i in range(0, len(found), 3)]
+    return lines
 
 
 def _held_out(rms_px: Mapping[str, float]) -> list[str]:

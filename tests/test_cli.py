@@ -217,6 +217,11 @@ def _flat(folder):
     return ["--camera", CAMERA]
 
 
+def _refine(folder):
+    save_textures(folder, THREE)
+    return ["--camera", CAMERA, "--refine", "f,zoom"]
+
+
 def _still(folder):
     save_textures(folder, THREE)
     return ["--camera", CAMERA, "--still", "nobody.png"]
@@ -248,6 +253,7 @@ OTHER_SIZE = json.dumps({"width": 640, "height": 480, "K": [[600, 0, 320], [0, 6
         (_apart, "share more of the scene"),
         (_flat, "share more of the scene"),
         (_still, "nobody.png"),
+        (_refine, "cannot refine 'zoom'"),
     ],
 )
 def test_run_refuses_in_one_line_and_writes_nothing(invoke, tmp_path, make, says):

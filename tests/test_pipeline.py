@@ -199,6 +199,29 @@ def test_same_seed_same_poses(courtyard, solved, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:skipped")
+def test_guessed_focal_length_is_refined(courtyard, solved, tmp_path):
+    true = read_solution(courtyard / "ground_truth.json").cameras["1"]
+    fx, fy, cx, cy = 1.04 * true.K[0, 0], 1.04 * true.K[1, 1], true.K[0, 2], true.K[1, 2]
+    options = replace(OPTIONS, camera=f"{fx},{fy},{cx},{cy}", refine=("f", "k1", "k2"))
+    solution = run(courtyard / "photos", tmp_path / "out", options)
+    found = solution.cameras["1"]
+    sigma = solution.quality["sigma_intrinsics"]["1"]
+    assert set(sigma) == {"f", "k1", "k2"}
+    assert abs(found.K[0, 0] - true.K[0, 0]) < 5 * sigma["f"] < 5.0  # px; the guess was 16 off
+    assert np.abs(found.dist[:2]).max() < 0.01
+    before, after = (evaluate(out, courtyard / "ground_truth.json") for out in (solved[1], tmp_path / "out"))
+    assert after["phi_mrad_per_frame"]["mean"] < 1.5 * before["phi_mrad_per_frame"]["mean"] + 0.5
+
+
+def test_calibrated_intrinsics_stay_as_given(courtyard, solved):
+    solution = solved[0]
+    assert solution.cameras["1"] == read_solution(courtyard / "ground_truth.json").cameras["1"]
+    assert solution.quality["sigma_intrinsics"] == {"1": {}}
+    assert solution.options["refine"] == []
+
+
+@pytest.mark.slow
 def test_grey_16_bit_and_global_model(courtyard, tmp_path):
     """Other kinds of photos than the fixture's, through the whole run."""
     photos = tmp_path / "photos"
@@ -233,7 +256,14 @@ def test_failing_run_leaves_out_as_it_was(tmp_path):
 
 @pytest.mark.parametrize(
     "options",
-    [{"shutter_model": "spiral"}, {"interpolation": "magic"}, {"jobs": -1}, {"max_features": 5}, {"quality": 0}],
+    [
+        {"shutter_model": "spiral"},
+        {"interpolation": "magic"},
+        {"jobs": -1},
+        {"max_features": 5},
+        {"quality": 0},
+        {"refine": ("k9",)},
+    ],
 )
 def test_run_options_are_checked(options):
     with pytest.raises(InputError):

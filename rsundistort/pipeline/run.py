@@ -27,6 +27,10 @@ from .write import PointColors, mask_names, rectify_photos
 __all__ = ["RunOptions", "run", "use_threads", "versions"]
 
 
+# What EXIF does not know, and a set of photos tells.
+_GUESSED = ("f", "k1", "k2")
+
+
 @dataclass(frozen=True)
 class RunOptions:
     """Options of `run`.
@@ -48,6 +52,9 @@ class RunOptions:
         Per photo.
     interpolation, quality
         Of the rectified photos.
+    refine : tuple of str, optional
+        Intrinsics that are solved for with the rest, as in `BundleOptions`; by default none where the camera is given,
+        f, k1 and k2 where EXIF had to guess it.
     still : tuple of str
         Photos known not to have moved: phi1 is held at zero in them (the paper's remedy).
     overwrite : bool
@@ -62,12 +69,14 @@ class RunOptions:
     max_features: int = 16384
     interpolation: str = "cubic"
     quality: int = 98
+    refine: tuple[str, ...] | None = None
     still: tuple[str, ...] = ()
     overwrite: bool = False
 
     def __post_init__(self) -> None:
         if self.shutter_model != "auto":
             check_shutter_model(self.shutter_model)
+        BundleOptions(refine=self.refine or ())
         if self.interpolation not in INTERPOLATIONS:
             raise InputError(f"interpolation={self.interpolation!r}, expected one of {', '.join(INTERPOLATIONS)}")
         if self.jobs < 0 or self.max_features < 100 or not 1 <= self.quality <= 100:
@@ -122,7 +131,10 @@ def run(
         for name in options.still:
             if name not in loaded.names:
                 raise InputError(f"still photo {name!r} is not among the photos of {photos}")
-        bundle = BundleOptions(held_phi=dict.fromkeys(options.still, (0,)))
+        refine = options.refine
+        if refine is None:
+            refine = () if loaded.calibrated else _GUESSED
+        bundle = BundleOptions(held_phi=dict.fromkeys(options.still, (0,)), refine=refine)
         with tempfile.TemporaryDirectory() as work:
             solved = solve_photos(loaded, options.shutter_model, options.seed, bundle, Path(work), log)
         rec = solved.result.reconstruction
@@ -188,6 +200,7 @@ def _solution(loaded: LoadedPhotos, solved: Solved, options: RunOptions) -> Solu
         "rms_px": solved.result.rms_px,
         "global_rms_px": solved.global_result.rms_px,
         "held_out_rms_px": {} if solved.choice is None else solved.choice.held_out_rms_px,
+        "sigma_intrinsics": dict(zip(cameras, solved.result.sigma_intrinsics, strict=True)),
         "phi_sigma_rad_per_frame": solved.result.phi_sigma,
         "stop_reason": solved.result.stop_reason,
     }
@@ -206,6 +219,7 @@ def _solution(loaded: LoadedPhotos, solved: Solved, options: RunOptions) -> Solu
             "max_features": options.max_features,
             "interpolation": options.interpolation,
             "quality": options.quality,
+            "refine": list(solved.result.sigma_intrinsics[0]),
             "still": list(options.still),
         },
         generator=versions(),

@@ -135,7 +135,9 @@ def solve_photos(
             result = bundle_adjust(start, choice.shutter_model, options, partial(_tell, log, "choice"))
         log.end("choice of the model", chosen=choice.shutter_model, gain=choice.gain, num_held_out=choice.num_held_out)
     log.begin("comparison with a global shutter")
-    plain = BundleOptions(outlier_rounds=0, loss="squared", cost_tolerance=1e-4, sigma_px=result.sigma_px)
+    plain = BundleOptions(
+        outlier_rounds=0, loss="squared", cost_tolerance=1e-4, sigma_px=result.sigma_px, refine=options.refine
+    )
     global_result = bundle_adjust(result.reconstruction, "global", plain)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
     return Solved(replace(result, reconstruction=result.reconstruction.normalized()), global_result, choice)
