@@ -85,6 +85,13 @@ def _estimated(
     return Spreads(phi, velocity)
 
 
+def _estimates_spreads(shutter_model: str, options: BundleOptions) -> bool:
+    """Whether a spread is to be estimated."""
+    return (shutter_model != "global" and options.phi_sigma is None) or (
+        shutter_model == "constant-motion" and options.velocity_sigma is None
+    )
+
+
 def _settled(before: Spreads, after: Spreads, tolerance: float) -> bool:
     """Whether neither spread changed by more than a share."""
     return all(
@@ -167,6 +174,8 @@ def bundle_adjust(
     spreads = _starting_spreads(options, baseline)
     for round_ in range(options.outlier_rounds + options.spread_rounds + 1):
         cleaning = round_ < options.outlier_rounds
+        # where the first spreads are but a guess, their solution need not be exact
+        rough = cleaning or (round_ == 0 and options.spread_rounds > 0 and _estimates_spreads(shutter_model, options))
         # once the outliers are gone the noise is nearly normal: squares converge in a few steps and use it fully
         stage = options if round_ == 0 or not options.outlier_rounds else replace(options, loss="squared")
         believed = replace(base, observations=base.observations.select(keep))
@@ -175,7 +184,7 @@ def bundle_adjust(
             problem,
             problem.initial_state(),
             max_iterations=options.max_iterations,
-            cost_tolerance=options.round_tolerance if cleaning else options.cost_tolerance,
+            cost_tolerance=options.round_tolerance if rough else options.cost_tolerance,
             step_tolerance=options.step_tolerance,
             initial_damping=options.initial_damping,
             max_damping=options.max_damping,
@@ -193,7 +202,7 @@ def bundle_adjust(
             alive = base.track_lengths(keep) >= 2
             keep = keep[alive[base.observations.point_idx]]
             base = base.take_points(alive)
-        elif revived is current and _settled(before, spreads, options.spread_tolerance):
+        elif not rough and revived is current and _settled(before, spreads, options.spread_tolerance):
             break
         else:
             base = replace(revived, observations=base.observations)

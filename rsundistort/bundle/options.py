@@ -30,7 +30,8 @@ class BundleOptions:
         Stop when a step lowers the cost by less than `cost_tolerance * cost`. The cost is about the number of
         observations, and half a unit of it is one standard deviation of one unknown.
     round_tolerance : float
-        The same for the solves before the last outlier round, which only have to tell outliers from the rest.
+        The same for the solves before the last outlier round, which only have to tell outliers from the rest, and for
+        the first one if it starts from a guess of the spreads.
     step_tolerance : float
         Stop when every centre and point moves by less than `step_tolerance` times the scene's size, and every
         angle by less than `step_tolerance` radians.
