@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -37,8 +38,24 @@ if TYPE_CHECKING:
 @click.option(
     "--still",
     multiple=True,
-    metavar="NAME",
-    help="A photo known not to have moved (its phi1 is held at zero).",
+    metavar="NAME[=MRAD]",
+    help="A photo known not to have moved: its phi1 is held at zero, or near zero with so many mrad per frame of "
+    "standard deviation. May be repeated.",
+)
+@click.option(
+    "--known",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    metavar="CSV",
+    help="Motions known from elsewhere: name, phi1, phi2, phi3 (rad per frame; or omega1.. in rad/s) and sigma.",
+)
+@click.option("--readout-ms", type=click.FloatRange(min=0, min_open=True), help="Time of the readout, for rad/s.")
+@click.option(
+    "--remedy",
+    type=click.Choice(("auto", "prior", "none")),
+    default="auto",
+    show_default=True,
+    help="Where all cameras are level: auto looks for a photo that did not move, prior takes the motions to be zero "
+    "in the mean, none does neither.",
 )
 @click.option(
     "--max-features",
@@ -61,6 +78,9 @@ def command(
     shutter_model: str,
     refine: str | None,
     still: tuple[str, ...],
+    known: Path | None,
+    readout_ms: float | None,
+    remedy: str,
     max_features: int,
     interpolation: str,
     quality: int,
@@ -75,6 +95,7 @@ def command(
     sparse/ (COLMAP), transforms.json (nerfstudio) and solution.json.
     """
     with errors_for_people(), progress_bars(quiet) as progress:
+        from rsundistort.io import read_known_motions
         from rsundistort.pipeline import RunOptions, run
 
         solution = run(
@@ -90,7 +111,9 @@ def command(
                 interpolation=interpolation,
                 quality=quality,
                 refine=_names(refine),
-                still=still,
+                still=_anchors(still),
+                known={} if known is None else read_known_motions(known, readout_ms and readout_ms / 1e3),
+                remedy=remedy,
                 overwrite=overwrite,
             ),
             progress,
@@ -105,6 +128,25 @@ def _names(refine: str | None) -> tuple[str, ...] | None:
         return None
     names = tuple(name.strip() for name in refine.split(",") if name.strip())
     return () if names == ("none",) else names
+
+
+def _anchors(still: tuple[str, ...]) -> dict[str, float]:
+    """Photos and their standard deviations, radians per frame, of NAME or NAME=MRAD."""
+    anchors: dict[str, float] = {}
+    for text in still:
+        name, equals, number = text.rpartition("=")
+        try:
+            sigma = float(number) / 1e3 if equals else 0.0
+        except ValueError:  # a name with = in it
+            name, sigma = text, 0.0
+        if not equals:
+            name = text
+        if equals and not sigma > 0 and name != text:
+            raise click.BadParameter(f"{text}: the standard deviation must be positive", param_hint="--still")
+        if anchors.get(name, sigma) != sigma:
+            raise click.BadParameter(f"{name} is named twice, with different standard deviations", param_hint="--still")
+        anchors[name] = sigma
+    return anchors
 
 
 def closing_table(solution: Solution, out: Path) -> str:
@@ -139,6 +181,12 @@ def closing_table(solution: Solution, out: Path) -> str:
         f"rms residual       {quality['global_rms_px']:.2f} px with a global shutter, {quality['rms_px']:.2f} px now",
         f"outputs            {out}  ({total:.0f} s)",
     ]
+    critical = solution.critical_motion
+    if critical is not None:
+        said = [critical["sentence"], *critical["warnings"]]
+        if critical["flagged"]:
+            said.append(f"confounded: {critical['meaning']}; see rsundistort analyze {out}")
+        lines += ["", *(line for text in said for line in textwrap.wrap(text, 80))]
     doubtful = _doubtful(solution)
     if doubtful:
         lines += [

@@ -3,6 +3,7 @@
 from .adjust import LADDER, bundle_adjust, climb, objective
 from .choice import ModelChoice, choose_model
 from .options import BundleOptions, BundleResult
+from .posterior import Posterior, gauge_directions
 from .problem import reprojection_residuals
 
 __all__ = [
@@ -10,9 +11,11 @@ __all__ = [
     "BundleOptions",
     "BundleResult",
     "ModelChoice",
+    "Posterior",
     "bundle_adjust",
     "choose_model",
     "climb",
+    "gauge_directions",
     "objective",
     "reprojection_residuals",
 ]

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from ..model import Reconstruction
@@ -16,6 +16,17 @@ __all__ = ["LOSSES", "BundleOptions", "BundleResult"]
 
 #: Robust losses and their codes in the kernels.
 LOSSES: dict[str, int] = {"squared": 0, "huber": 1, "cauchy": 2, "soft-l1": 3}
+
+
+def _known(name: str, phi: ArrayLike, sigma: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A known motion, checked."""
+    values, sigmas = (np.array(np.broadcast_to(np.asarray(value, np.float64), 3)) for value in (phi, sigma))
+    unknown = np.isposinf(sigmas)
+    if not (np.isfinite(values) | unknown).all():
+        raise InputError(f"known motion of {name!r}: {values.tolist()}, expected finite numbers")
+    if not (sigmas > 0).all():
+        raise InputError(f"known motion of {name!r}: sigma {sigmas.tolist()}, expected positive numbers")
+    return np.where(unknown, 0.0, values), sigmas
 
 
 @dataclass(frozen=True)
@@ -67,6 +78,9 @@ class BundleOptions:
         No observation nearer than this to its prediction is dropped.
     held_phi : mapping of photo name to component indices
         Hard anchors: components of phi held at zero, e.g. {"0001.jpg": (0,)} is the paper's RS*.
+    known_phi : mapping of photo name to (phi, sigma)
+        Motions that are known from elsewhere, each with its standard deviation, (3,) radians per frame; components of
+        infinite sigma are unknown. A soft anchor is a known phi of zero.
     refine : tuple of str
         Intrinsics of each camera that are solved for with the rest: some of f (or fx, fy), cx, cy, k1, k2, p1, p2, k3.
     factor_limit : float
@@ -97,12 +111,20 @@ class BundleOptions:
     outlier_sigma: float = 4.5
     min_outlier_px: float = 0.25
     held_phi: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    known_phi: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
     refine: tuple[str, ...] = ()
     factor_limit: float = 1e10
     cg_tolerance: float = 0.01
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "refine", check_refined(self.refine))
+        known = {name: _known(name, *value) for name, value in self.known_phi.items()}
+        object.__setattr__(self, "known_phi", known)
+        for name, components in self.held_phi.items():
+            if any(component not in (0, 1, 2) for component in components):
+                raise InputError(f"anchor {name!r}: components {components}, expected some of 0, 1, 2")
+            if name in known and np.isfinite(known[name][1][list(components)]).any():
+                raise InputError(f"anchor {name!r} is held at zero and known from elsewhere; give one of them")
         if self.loss not in LOSSES:
             raise InputError(f"loss={self.loss!r}, expected one of {', '.join(LOSSES)}")
         positive = (

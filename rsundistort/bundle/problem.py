@@ -124,11 +124,27 @@ class BundleProblem:
         span = reconstruction.frame_span()[:, None]
         weight = np.hstack([np.repeat((span / s) ** 2, 3, axis=1) for s in (spreads.phi, spreads.velocity)])
         self._motion_weight = weight[:, : self._block - 6]
+        self._known, self._known_weight = self._known_motions(span)
         self._free = self._free_unknowns()
         self._elimination = Elimination.of(
             self._structure, self._free, options.factor_limit, options.cg_tolerance
         )  # fmt: skip
         self._size = float(np.median(np.linalg.norm(reconstruction.points_w - reconstruction.center_w.mean(0), axis=1)))
+
+    def _known_motions(self, span: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Motions (m, nb - 6) known from elsewhere, per unit of the clock, and their weights."""
+        known, weight = np.zeros((2, *self._motion_weight.shape))
+        for name, (phi, sigma) in self._options.known_phi.items():
+            i = self._photo(name)
+            if self._block > 6:
+                known[i, :3], weight[i, :3] = phi / span[i], (span[i] / sigma) ** 2
+        return known, weight
+
+    def _photo(self, name: str) -> int:
+        """Index of an anchor's photo."""
+        if name not in self._start.image_names:
+            raise InputError(f"anchor {name!r} is not a photo of the reconstruction")
+        return self._start.image_names.index(name)
 
     def _free_unknowns(self) -> NDArray[np.bool_]:
         """(m, nb) unknowns that are solved for."""
@@ -140,12 +156,10 @@ class BundleProblem:
         free[reference, :6] = False
         free[far, 3 + axis] = False
         for name, components in self._options.held_phi.items():
-            if name not in rec.image_names:
-                raise InputError(f"anchor {name!r} is not a photo of the reconstruction")
-            if any(c not in (0, 1, 2) for c in components):
-                raise InputError(f"anchor {name!r}: components {components}, expected some of 0, 1, 2")
             if self._block > 6:
-                free[rec.image_names.index(name), [6 + c for c in components]] = False
+                free[self._photo(name), [6 + c for c in components]] = False
+            else:
+                self._photo(name)
         return free
 
     def initial_state(self) -> State:
@@ -192,7 +206,9 @@ class BundleProblem:
         return np.hstack([state.phi, state.velocity])[:, : self._block - 6]
 
     def _prior_cost(self, state: State) -> float:
-        return 0.5 * float(np.sum(self._motion_weight * self._motion(state) ** 2))
+        motion = self._motion(state)
+        known = self._known_weight * (motion - self._known) ** 2
+        return 0.5 * float(np.sum(self._motion_weight * motion**2 + known))
 
     def _jacobians(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
         """Weighted residuals (o, 2), Jacobians of the photos (o, 2, nb), and the cost without priors."""
@@ -216,8 +232,9 @@ class BundleProblem:
         res, J_frame, cost = self._jacobians(state)
         prior_diag = np.zeros((len(state.phi), self._block))
         prior_gradient = np.zeros_like(prior_diag)
-        prior_diag[:, 6:] = self._motion_weight
-        prior_gradient[:, 6:] = self._motion_weight * self._motion(state)
+        motion = self._motion(state)
+        prior_diag[:, 6:] = self._motion_weight + self._known_weight
+        prior_gradient[:, 6:] = self._motion_weight * motion + self._known_weight * (motion - self._known)
         total = cost + self._prior_cost(state)
         border = Border(self._camera_jacobians(state), self._start.camera_idx, len(state.cameras))
         return NormalEquations(self._elimination, total, res, J_frame, prior_diag, prior_gradient, border)

@@ -5,6 +5,7 @@ Elimination of the points, then an envelope factorised, or conjugate gradients.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -340,6 +341,21 @@ class Elimination:
             r, ry = r - np.where(self.free, alpha * Sp, 0.0), ry - alpha * Spy
         return x, y, r, ry
 
+    def apply_inverse(self, reduced: Reduced, vectors: Array) -> Array:
+        """Covariance of the photos' unknowns times vectors (k, m, nb); NaN if the matrix is not positive."""
+        solve = self.envelope.factor(self.structure, reduced.S)
+        if solve is None:
+            return np.full_like(vectors, np.nan)
+        rhs = self.envelope.gather(np.concatenate([np.where(self.free, vectors, 0.0), reduced.border]))
+        solve(rhs)
+        found, X = np.split(self.envelope.scatter(rhs), [len(vectors)])
+        if len(X):
+            cameras = _positive_inverse(reduced.corner - _products(reduced.border, X))
+            if cameras is None:
+                return np.full_like(vectors, np.nan)
+            found = found + np.tensordot(_products(found, reduced.border) @ cameras, X, 1)
+        return found
+
     def marginal_covariances(self, reduced: Reduced) -> tuple[Array, Array]:
         """Covariances of each photo's unknowns (m, nb, nb), 0 where held, and of the cameras' (k, k).
 
@@ -464,6 +480,21 @@ class NormalEquations:
         0 where held; NaN where the system cannot be factored.
         """
         return self._elimination.marginal_covariances(self.reduce(0.0)[0])
+
+    def apply_inverse(self, vectors: Array) -> Array:
+        """Covariance of the photos' unknowns, all others being free, times vectors (k, m, nb)."""
+        return self._elimination.apply_inverse(self.reduce(0.0)[0], vectors)
+
+    def variance_of_points(self, weights: Array) -> tuple[float, Array]:
+        """Variance of sum(weights * points), weights (n, 3), and its covariance (m, nb) with the photos' unknowns."""
+        dual = copy.copy(self)
+        dual._g_frame, dual._g_camera = np.zeros_like(self._g_frame), np.zeros_like(self._g_camera)
+        dual._g_point = -weights
+        solved = dual.solve(0.0)
+        if solved is None:
+            return np.nan, np.full_like(self._g_frame, np.nan)
+        (frame, point, _), _ = solved
+        return float((weights * point).sum()), frame
 
     def solve(self, damping: float) -> tuple[Step, float] | None:
         """Step of the photos (m, nb), points (n, 3) and cameras (c, nc), and the decrease of cost that it predicts."""

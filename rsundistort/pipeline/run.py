@@ -5,19 +5,22 @@ from __future__ import annotations
 import os
 import platform
 import tempfile
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numba
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..bundle import BundleOptions, reprojection_residuals
+from ..critical import Remedy, with_remedy
 from ..errors import InputError
 from ..io import output_folder, output_name, write_colmap_model, write_solution, write_transforms
-from ..model import Reconstruction, Solution, SolvedImage, check_shutter_model
+from ..model import READOUTS, Reconstruction, Solution, SolvedImage, check_shutter_model
 from ..rectify import INTERPOLATIONS, largest_shift_px
 from .load import LoadedPhotos, load_photos
 from .progress import ProgressCallback, StageLog
@@ -55,8 +58,13 @@ class RunOptions:
     refine : tuple of str, optional
         Intrinsics that are solved for with the rest, as in `BundleOptions`; by default none where the camera is given,
         f, k1 and k2 where EXIF had to guess it.
-    still : tuple of str
-        Photos known not to have moved: phi1 is held at zero in them (the paper's remedy).
+    still : mapping of photo name to float
+        Photos known not to have moved: phi1 is held at zero in them (the paper's remedy), or, where the number is
+        positive, near zero with that standard deviation, radians per frame.
+    known : mapping of photo name to (phi, sigma)
+        Motions known from elsewhere, as in `BundleOptions.known_phi`.
+    remedy : str
+        What to do about a critical motion: "auto", "prior" or "none"; see `critical.heal`.
     overwrite : bool
         Replace the outputs of an earlier run.
     """
@@ -70,17 +78,34 @@ class RunOptions:
     interpolation: str = "cubic"
     quality: int = 98
     refine: tuple[str, ...] | None = None
-    still: tuple[str, ...] = ()
+    still: Mapping[str, float] = field(default_factory=dict)
+    known: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
+    remedy: str = "auto"
     overwrite: bool = False
 
     def __post_init__(self) -> None:
         if self.shutter_model != "auto":
             check_shutter_model(self.shutter_model)
-        BundleOptions(refine=self.refine or ())
+        with_remedy(self.bundle_options(self.refine or (), "top-to-bottom"), self.remedy)
         if self.interpolation not in INTERPOLATIONS:
             raise InputError(f"interpolation={self.interpolation!r}, expected one of {', '.join(INTERPOLATIONS)}")
         if self.jobs < 0 or self.max_features < 100 or not 1 <= self.quality <= 100:
             raise InputError("jobs must be 0 or more, max_features at least 100, quality 1 to 100")
+
+    def bundle_options(self, refine: tuple[str, ...], readout: str) -> BundleOptions:
+        """Options of the adjustments of photos of one readout direction."""
+        phi1 = 0 if READOUTS[readout][0] == 1 else 1  # the rotation that stretches the photo along its readout
+        soft, hard = {}, {}
+        for name, sigma in self.still.items():
+            if not 0 <= sigma < np.inf:
+                raise InputError(f"still photo {name!r}: sigma {sigma!r}, expected 0 or a positive number")
+            if sigma > 0 and name in self.known:
+                raise InputError(f"photo {name!r} is said to be still and its motion to be known; give one of them")
+            if sigma > 0:
+                soft[name] = (np.zeros(3), np.where(np.arange(3) == phi1, sigma, np.inf))
+            else:
+                hard[name] = (phi1,)
+        return BundleOptions(held_phi=hard, known_phi={**self.known, **soft}, refine=refine)
 
 
 def versions() -> dict[str, str]:
@@ -128,15 +153,15 @@ def run(
     jobs = use_threads(options.jobs)
     with output_folder(out, overwrite=options.overwrite, apart_from=[photos]) as scratch:
         loaded = load_photos(photos, options.camera, options.readout, options.max_features, jobs, log)
-        for name in options.still:
+        for name in (*options.still, *options.known):
             if name not in loaded.names:
-                raise InputError(f"still photo {name!r} is not among the photos of {photos}")
+                raise InputError(f"anchor {name!r} is not among the photos of {photos}")
         refine = options.refine
         if refine is None:
             refine = () if loaded.calibrated else _GUESSED
-        bundle = BundleOptions(held_phi=dict.fromkeys(options.still, (0,)), refine=refine)
+        bundle = options.bundle_options(refine, loaded.camera.readout)
         with tempfile.TemporaryDirectory() as work:
-            solved = solve_photos(loaded, options.shutter_model, options.seed, bundle, Path(work), log)
+            solved = solve_photos(loaded, options.shutter_model, options.seed, bundle, Path(work), log, options.remedy)
         rec = solved.result.reconstruction
         solution = _solution(loaded, solved, options)
         colors = PointColors(rec)
@@ -165,6 +190,26 @@ def _image_rms(rec: Reconstruction) -> NDArray[np.float64]:
     frame = rec.observations.frame_idx[valid]
     square = np.bincount(frame, np.mean(res[valid] ** 2, axis=1), minlength=rec.num_images)
     return np.sqrt(square / np.maximum(np.bincount(frame, minlength=rec.num_images), 1))
+
+
+def _critical(remedy: Remedy) -> dict[str, Any]:
+    """What `solution.json` says of critical motions."""
+    after = remedy.after
+    return {
+        "singular_values": after.meter.singular_values.tolist(),
+        "null_vector": after.meter.null_vector.tolist(),
+        "y_axis_spread_deg": after.meter.y_axis_spread_deg,
+        "meaning": after.meter.meaning,
+        "sigma_log_k": after.sigma_log_k,
+        "sigma_log_k_before": remedy.before.sigma_log_k,
+        "weakest_sigma": after.weakest_sigma,
+        "weakest_share": after.weakest_share,
+        "flagged": after.is_flagged,
+        "remedy": remedy.name,
+        "anchors": dict(remedy.anchors),
+        "sentence": remedy.sentence,
+        "warnings": list(remedy.warnings),
+    }
 
 
 def _solution(loaded: LoadedPhotos, solved: Solved, options: RunOptions) -> Solution:
@@ -211,6 +256,7 @@ def _solution(loaded: LoadedPhotos, solved: Solved, options: RunOptions) -> Solu
         rectified_cameras={key: camera.pinhole() for key, camera in cameras.items()},
         images=tuple(images),
         quality=quality,
+        critical_motion=None if solved.remedy is None else _critical(solved.remedy),
         options={
             "camera": loaded.camera_source,
             "shutter_model": options.shutter_model,
@@ -220,7 +266,9 @@ def _solution(loaded: LoadedPhotos, solved: Solved, options: RunOptions) -> Solu
             "interpolation": options.interpolation,
             "quality": options.quality,
             "refine": list(solved.result.sigma_intrinsics[0]),
-            "still": list(options.still),
+            "still": dict(options.still),
+            "known": sorted(options.known),
+            "remedy": options.remedy,
         },
         generator=versions(),
     )

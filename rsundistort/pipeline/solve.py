@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -9,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from ..bundle import LADDER, BundleOptions, BundleResult, ModelChoice, bundle_adjust, choose_model, climb
-from ..errors import ReconstructionError
+from ..critical import Remedy, heal, with_remedy
+from ..errors import ReconstructionError, RsUndistortWarning
 from ..model import Reconstruction
 from ..sfm import map_photos, match_photos, retriangulate
 from .load import LoadedPhotos
@@ -35,11 +37,14 @@ class Solved:
         A global-shutter adjustment of the same measurements: what not modelling the shutter costs.
     choice : ModelChoice or None
         How the model was chosen; None where it was given.
+    remedy : Remedy or None
+        What was done about a critical motion; None for a global shutter.
     """
 
     result: BundleResult
     global_result: BundleResult
     choice: ModelChoice | None = None
+    remedy: Remedy | None = None
 
 
 def rungs_to(shutter_model: str) -> tuple[str, ...]:
@@ -64,8 +69,26 @@ def _moved_px(before: Reconstruction, after: Reconstruction) -> float:
     return float(change.max() * focal)
 
 
+def _of_joined(options: BundleOptions, mapped: Reconstruction) -> BundleOptions:
+    """Options without the anchors of photos that could not be joined."""
+    lost = sorted({*options.held_phi, *options.known_phi} - set(mapped.image_names))
+    if lost:
+        warnings.warn(f"not joined, so no anchor: {', '.join(lost)}", RsUndistortWarning, stacklevel=3)
+    return replace(
+        options,
+        held_phi={name: held for name, held in options.held_phi.items() if name not in lost},
+        known_phi={name: known for name, known in options.known_phi.items() if name not in lost},
+    )
+
+
 def solve_photos(
-    photos: LoadedPhotos, shutter_model: str, seed: int, options: BundleOptions, scratch: Path, log: StageLog
+    photos: LoadedPhotos,
+    shutter_model: str,
+    seed: int,
+    options: BundleOptions,
+    scratch: Path,
+    log: StageLog,
+    remedy: str = "auto",
 ) -> Solved:
     """Match, map, climb the ladder; then free the keypoints of the shutter, rebuild the tracks and adjust again.
 
@@ -83,7 +106,10 @@ def solve_photos(
         Folder for the database.
     log : StageLog
         Told the progress.
+    remedy : str
+        What to do about a critical motion, of `critical.REMEDIES`.
     """
+    options = with_remedy(options, remedy)
     camera_idx = np.zeros(len(photos.names), np.int64)
     log.begin("matching")
     matched = match_photos(
@@ -99,6 +125,7 @@ def solve_photos(
             f"only {mapped.num_images} of {len(photos.names)} photos could be joined, the shutter needs three; "
             "use photos that share more of the scene"
         )
+    options = _of_joined(options, mapped)
     auto = shutter_model == "auto"
     shutter_model = "rotation" if auto else shutter_model
     log.begin("ladder")
@@ -134,10 +161,15 @@ def solve_photos(
             start = replace(tracks, shutter_model=choice.shutter_model)
             result = bundle_adjust(start, choice.shutter_model, options, partial(_tell, log, "choice"))
         log.end("choice of the model", chosen=choice.shutter_model, gain=choice.gain, num_held_out=choice.num_held_out)
+    mended = None
+    if result.reconstruction.shutter_model != "global":
+        log.begin("critical motion")
+        result, mended = heal(result, options, remedy)
+        log.end("critical motion", remedy=mended.name, sigma_log_k=mended.after.sigma_log_k)
     log.begin("comparison with a global shutter")
     plain = BundleOptions(
         outlier_rounds=0, loss="squared", cost_tolerance=1e-4, sigma_px=result.sigma_px, refine=options.refine
     )
     global_result = bundle_adjust(result.reconstruction, "global", plain)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
-    return Solved(replace(result, reconstruction=result.reconstruction.normalized()), global_result, choice)
+    return Solved(replace(result, reconstruction=result.reconstruction.normalized()), global_result, choice, mended)

@@ -1,0 +1,301 @@
+"""Critical motions on synthetic measurements: prints one JSON object a line.
+
+    python benchmarks/critical.py [still] [nobody] [spread] [--trials N] [--nw-rsba DIR]
+
+`still`: the level cameras and points of sample_scenes/colonnade, random motions of 0.05 rad a frame, one photo (another
+in each trial) still, which the tool is not told: how often `auto` picks it, or another that moved by less than 1 mrad,
+and the error of the scene's vertical scale, beside that without remedy for both models.
+`nobody`: eleven level photos that all moved: the error that the prior leaves, against spread / sqrt(m), and how often
+it lies within two of the reported standard deviations.
+`spread`: the reported standard deviation of log k against the spread of k over the trials, for cameras that are level,
+tilted by 5, 10 and 20 degrees, and with one photo turned by 90.
+`nw-rsba`: meter and sigma(log k) of the problems of that generator, by class.
+
+Measurements by `project_rows`, plain NumPy, with noise of 0.5 px. The vertical scale is that of the affine map that
+takes the true points to the found ones best, along the mean y axis, against the root of the scale of area across it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rsundistort import BundleOptions, Camera, Observations, Reconstruction, RowMotion, climb
+from rsundistort.critical import heal, shape_cost, with_remedy
+from rsundistort.critical.meter import readout_axes
+from rsundistort.synthetic import project_rows
+
+ROOT = Path(__file__).resolve().parent.parent
+NOISE_PX = 0.5
+SIGMA_RAD = 0.05
+
+
+def colonnade() -> Reconstruction:
+    """Cameras, points and tracks of the sample scene, nothing measured, nothing moving."""
+    with np.load(ROOT / "sample_scenes" / "colonnade" / "tracks.npz") as data:
+        camera = Camera(int(data["width"]), int(data["height"]), data["K"])
+        return Reconstruction(
+            [camera],
+            [str(name) for name in data["image_names"]],
+            np.zeros(len(data["R_cw"]), np.int64),
+            data["R_cw"],
+            data["center_w"],
+            data["points_w"],
+            Observations(data["frame_idx"], data["point_idx"], np.zeros((len(data["frame_idx"]), 2))),
+        )
+
+
+def level_scene(rng: np.random.Generator, m: int = 10, tilt_deg: float = 0.0, portrait: bool = False) -> Reconstruction:
+    """Photos in an arc around a cloud of 300 points, level, tilted at random, or one of them turned by 90 degrees."""
+    camera = Camera(960, 720, [[900.0, 0, 480], [0, 900.0, 360], [0, 0, 1]])
+    points = rng.uniform(-1, 1, (300, 3)) * [2.0, 1.2, 2.0]
+    turn = np.linspace(-0.6, 0.6, m) + rng.normal(0, 0.05, m)
+    centers = np.column_stack([7 * np.sin(turn), rng.normal(0, 0.3, m), -7 * np.cos(turn)])
+    R = Rotation.from_euler("y", turn[:, None])
+    R = Rotation.from_euler("x", rng.normal(0, tilt_deg, (m, 1)), degrees=True) * R
+    # a tilted camera goes up or down, so that it still looks at the scene
+    R_cw = R.as_matrix()
+    centers -= 7 * (R_cw[:, 2, 1])[:, None] * np.array([0.0, 1.0, 0.0])
+    if portrait:
+        R_cw[m // 2] = Rotation.from_euler("z", 90, degrees=True).as_matrix() @ R_cw[m // 2]
+    point, frame = (a.ravel() for a in np.mgrid[: len(points), :m])
+    return Reconstruction(
+        [camera], [f"{i:02d}" for i in range(m)], np.zeros(m, np.int64), R_cw, centers, points,
+        Observations(frame, point, np.zeros((len(frame), 2))),
+    )  # fmt: skip
+
+
+def with_motion(scene: Reconstruction, rng: np.random.Generator, still: int | None, model: str) -> Reconstruction:
+    """The scene with random motions and noisy measurements.
+
+    With a still photo, the paper's motions: an axis uniform on the sphere, a normal angle. Else every component of phi
+    is normal, with the same spread: what a reported standard deviation assumes.
+    """
+    m = scene.num_images
+    phi = rng.normal(0, SIGMA_RAD / np.sqrt(3), (m, 3))
+    if still is not None:
+        axis = rng.normal(size=(m, 3))
+        phi = rng.normal(0, SIGMA_RAD, (m, 1)) * axis / np.linalg.norm(axis, axis=1, keepdims=True)
+        phi[still] = 0.0
+    phi /= scene.frame_span()[:, None]
+    truth = replace(scene, phi=phi, shutter_model=model)
+    return measured(truth, rng)
+
+
+def measured(truth: Reconstruction, rng: np.random.Generator) -> Reconstruction:
+    """The truth with new noise; measurements outside of the photo stay."""
+    obs = truth.observations
+    xy = np.zeros((len(obs), 2))
+    for i in range(truth.num_images):
+        mine = obs.frame_idx == i
+        points = truth.points_w[obs.point_idx[mine]]
+        motion = RowMotion(truth.phi[i])
+        if truth.shutter_model == "two-step":
+            from numpy_twin import project  # the paper's model, in plain NumPy
+
+            camera = truth.camera(i)
+            xy[mine] = project(
+                points, truth.R_cw[i], truth.center_w[i], truth.phi[i], "two-step", camera.readout, camera.K, [],
+                np.zeros(3),
+            )  # fmt: skip
+        else:
+            xy[mine] = project_rows(points, truth.R_cw[i], truth.center_w[i], motion, truth.camera(i))[0]
+    good = np.isfinite(xy).all(1)
+    noisy = xy[good] + rng.normal(0, NOISE_PX, (int(good.sum()), 2))
+    observations = Observations(obs.frame_idx[good], obs.point_idx[good], noisy)
+    return replace(truth, observations=observations).with_points(np.ones(int(good.sum()), bool))
+
+
+def start_of(truth: Reconstruction, rng: np.random.Generator) -> Reconstruction:
+    """A rough global-shutter start."""
+    turn = Rotation.from_rotvec(0.005 * rng.normal(size=(truth.num_images, 3))).as_matrix()
+    return replace(
+        truth,
+        R_cw=turn @ truth.R_cw,
+        center_w=truth.center_w + 0.02 * truth.baseline * rng.normal(size=truth.center_w.shape),
+        points_w=truth.points_w + 0.02 * truth.baseline * rng.normal(size=truth.points_w.shape),
+        phi=np.zeros_like(truth.phi),
+        shutter_model="global",
+    )
+
+
+def log_vertical_scale(found: Reconstruction, truth: Reconstruction) -> float:
+    """Log k of the found points against the true ones; the two have the same points."""
+    axes = readout_axes(truth.R_cw, ["top-to-bottom"] * truth.num_images)
+    vertical = np.linalg.eigh(axes.T @ axes)[1][:, -1]
+    x = truth.points_w - truth.points_w.mean(0)
+    y = found.points_w - found.points_w.mean(0)
+    B = np.linalg.lstsq(x, y, rcond=None)[0].T
+    along = np.linalg.norm(B @ vertical)
+    return float(np.log(along / np.sqrt(abs(np.linalg.det(B)) / along)))
+
+
+def options_of(remedy: str) -> BundleOptions:
+    """Clean measurements of known noise."""
+    return with_remedy(BundleOptions(loss="squared", outlier_rounds=0, sigma_px=NOISE_PX), remedy)
+
+
+def solved(truth: Reconstruction, rng: np.random.Generator, model: str, remedy: str) -> tuple[Any, Any]:
+    """The healed solution and what was done."""
+    options = options_of(remedy)
+    rungs = ("global", "two-step", model) if model != "two-step" else ("global", "two-step")
+    result = climb(start_of(truth, rng), rungs, options)[model]
+    return heal(result, options, remedy)
+
+
+def trial_still(trial: int) -> dict[str, Any]:
+    """One random motion with one still photo."""
+    numba.set_num_threads(1)
+    rng = np.random.default_rng([5, trial])
+    scene = colonnade()
+    still = int(rng.integers(scene.num_images))
+    truth = with_motion(scene, rng, still, "rotation")
+    moved = np.linalg.norm(truth.phi, axis=1) * truth.frame_span()
+    out: dict[str, Any] = {}
+    for name, model, remedy in (
+        ("auto", "rotation", "auto"),
+        ("none", "rotation", "none"),
+        ("none, two-step", "two-step", "none"),
+    ):
+        result, done = solved(truth, np.random.default_rng([6, trial]), model, remedy)
+        error = log_vertical_scale(result.reconstruction, truth)
+        out[name] = {"error": error, "sigma": done.after.sigma_log_k, "meter": done.after.meter.value}
+        if name == "auto":
+            picked = [truth.image_names.index(anchor) for anchor in done.anchors]
+            out["picked"] = bool(picked) and moved[picked[0]] < 1e-3
+            out["remedy"] = done.name
+    return out
+
+
+def trial_nobody(trial: int) -> dict[str, Any]:
+    """Eleven level photos, all of which moved."""
+    numba.set_num_threads(1)
+    rng = np.random.default_rng([7, trial])
+    truth = with_motion(level_scene(rng, 11), rng, None, "rotation")
+    result, done = solved(truth, rng, "rotation", "auto")
+    return {
+        "error": log_vertical_scale(result.reconstruction, truth),
+        "sigma": done.after.sigma_log_k,
+        "remedy": done.name,
+    }
+
+
+def trial_spread(arguments: tuple[str, str, int]) -> tuple[float, float]:
+    """Log k and its reported standard deviation in one trial of a scene whose motion stays."""
+    numba.set_num_threads(1)
+    kind, model, trial = arguments
+    fixed = np.random.default_rng([8, len(kind)])
+    tilt = float(kind.split()[0]) if kind[0].isdigit() else 0.0
+    scene = level_scene(fixed, 10, tilt, kind == "one portrait")
+    truth = replace(with_motion(scene, fixed, None, model), phi=np.zeros((10, 3)))
+    # the motion is drawn from the prior in each trial: the posterior's spread is that of the errors over both
+    rng = np.random.default_rng([9, trial])
+    truth = with_motion(scene, rng, None, model)
+    options = replace(options_of("prior"), phi_sigma=SIGMA_RAD / np.sqrt(3))
+    result = climb(start_of(truth, rng), ("global", "two-step", model)[: 2 + (model != "two-step")], options)[model]
+    return log_vertical_scale(result.reconstruction, truth), shape_cost(result, options).sigma_log_k
+
+
+def percent(values: Any) -> float:
+    return round(100 * float(values), 3)
+
+
+def show_still(pool: ProcessPoolExecutor, trials: int) -> None:
+    """Print the figures of `still`."""
+    found = list(pool.map(trial_still, range(trials)))
+    figures = {}
+    for name in ("auto", "none", "none, two-step"):
+        errors = np.abs([each[name]["error"] for each in found])
+        covered = np.mean(errors <= 2 * np.array([each[name]["sigma"] for each in found]))
+        figures[name] = {
+            "median_percent": percent(np.median(errors)),
+            "worst_percent": percent(errors.max()),
+            "within_two_sigma": round(float(covered), 3),
+            "median_sigma_percent": percent(np.median([each[name]["sigma"] for each in found])),
+        }
+    print(
+        json.dumps(
+            {
+                "name": "colonnade, one photo still",
+                "trials": trials,
+                "picked_still": round(float(np.mean([each["picked"] for each in found])), 3),
+                "remedies": {r: sum(each["remedy"] == r for each in found) for r in {e["remedy"] for e in found}},
+                **figures,
+                "target": "picked >= 0.9; auto: median <= 0.5 %, worst <= 2 %",
+            }
+        ),
+        flush=True,
+    )
+
+
+def show_nobody(pool: ProcessPoolExecutor, trials: int) -> None:
+    """Print the figures of `nobody`."""
+    found = list(pool.map(trial_nobody, range(trials)))
+    errors = np.abs([each["error"] for each in found])
+    sigma = np.array([each["sigma"] for each in found])
+    # median of |x| of a normal variable is 0.6745 sigma
+    theory = 0.6745 * SIGMA_RAD / np.sqrt(3) / np.sqrt(11) / (720 / 900)
+    print(
+        json.dumps(
+            {
+                "name": "eleven level photos, all moved",
+                "trials": trials,
+                "median_percent": percent(np.median(errors)),
+                "theory_percent": percent(theory),
+                "ratio": round(float(np.median(errors)) / theory, 3),
+                "within_two_sigma": round(float(np.mean(errors <= 2 * sigma)), 3),
+                "remedies": {r: sum(each["remedy"] == r for each in found) for r in {e["remedy"] for e in found}},
+                "target": "ratio <= 1.3, within two sigma 0.90 to 0.99",
+            }
+        ),
+        flush=True,
+    )
+
+
+def show_spread(pool: ProcessPoolExecutor, trials: int) -> None:
+    """Print the figures of `spread`."""
+    for kind in ("parallel", "5 degrees", "10 degrees", "20 degrees", "one portrait"):
+        for model in ("two-step", "rotation"):
+            found = np.array(list(pool.map(trial_spread, [(kind, model, t) for t in range(trials)])))
+            spread = float(np.sqrt(np.mean(found[:, 0] ** 2)))
+            predicted = float(np.sqrt(np.mean(found[:, 1] ** 2)))
+            print(
+                json.dumps(
+                    {
+                        "name": f"sigma(log k), {kind}, {model}",
+                        "trials": trials,
+                        "predicted_percent": percent(predicted),
+                        "spread_percent": percent(spread),
+                        "ratio": round(predicted / spread, 3),
+                        "target": "0.8 to 1.2",
+                    }
+                ),
+                flush=True,
+            )
+
+
+def main() -> None:
+    """Print what was asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parts = {"still": (show_still, 50), "nobody": (show_nobody, 100), "spread": (show_spread, 200)}
+    parser.add_argument("parts", nargs="*", choices=[[], *parts], default=list(parts))
+    parser.add_argument("--trials", type=int)
+    args = parser.parse_args()
+    sys.path.insert(0, str(ROOT / "tests"))
+    with ProcessPoolExecutor() as pool:
+        for name in args.parts:
+            show, trials = parts[name]
+            show(pool, args.trials or trials)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,64 @@
+"""What an adjustment leaves open: covariances of linear functions of photos and points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .options import BundleOptions, BundleResult
+from .problem import BundleProblem, Spreads
+
+__all__ = ["Posterior", "gauge_directions"]
+
+Array = NDArray[np.float64]
+
+
+class Posterior:
+    """Covariances at a result, all unknowns being free but the anchors and the gauge.
+
+    Parameters
+    ----------
+    result : BundleResult
+        Where.
+    options : BundleOptions, optional
+        Those of the adjustment: anchors, known motions and refined intrinsics count.
+    """
+
+    def __init__(self, result: BundleResult, options: BundleOptions | None = None) -> None:
+        rec = result.reconstruction
+        spreads = Spreads(result.phi_sigma, max(result.velocity_sigma * rec.baseline, 1e-300))
+        plain = replace(options or BundleOptions(), loss="squared")
+        problem = BundleProblem(rec, rec.shutter_model, plain, result.sigma_px, spreads)
+        self._equations = problem.linearize(problem.initial_state())
+
+    def of_photos(self, vectors: Array) -> Array:
+        """Covariance of the photos' unknowns times vectors (k, m, nb), as in `BundleResult.covariances`."""
+        return self._equations.apply_inverse(vectors)
+
+    def of_points(self, weights: Array) -> tuple[float, Array]:
+        """Variance of a linear function of the points, `sum(weights * points_w)` with weights (n, 3).
+
+        And its covariance (m, nb) with the photos' unknowns. NaN where the system cannot be factored.
+        """
+        return self._equations.variance_of_points(weights)
+
+
+def gauge_directions(result: BundleResult) -> Array:
+    """(7, m, nb) changes of the photos' unknowns that move, turn or scale the world, and change no photo."""
+    rec = result.reconstruction
+    m, nb = result.covariances.shape[:2]
+    directions = np.zeros((7, m, nb))
+    centers = rec.center_w - rec.center_w.mean(0)
+    for k in range(3):
+        unit = np.eye(3)[k]
+        directions[k, :, :3] = -rec.R_cw[:, :, k]
+        directions[k, :, 3:6] = np.cross(unit, centers)
+        directions[3 + k, :, 3:6] = unit
+        if nb > 9:
+            directions[k, :, 9:] = np.cross(unit, rec.velocity)
+    directions[6, :, 3:6] = centers
+    if nb > 9:
+        directions[6, :, 9:] = rec.velocity
+    return directions

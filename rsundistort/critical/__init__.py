@@ -1,0 +1,17 @@
+"""Critical motions: the meter, what they cost in a solution, and their remedies."""
+
+from .cost import ShapeCost, shape_cost
+from .meter import CriticalMotion, critical_motion
+from .remedy import REMEDIES, Remedy, heal, still_probability, with_remedy
+
+__all__ = [
+    "REMEDIES",
+    "CriticalMotion",
+    "Remedy",
+    "ShapeCost",
+    "critical_motion",
+    "heal",
+    "shape_cost",
+    "still_probability",
+    "with_remedy",
+]

@@ -1,0 +1,143 @@
+"""What the weakest change of shape costs in a solution at hand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..bundle import BundleOptions, BundleResult, Posterior, gauge_directions
+from ..errors import InputError
+from ..model import READOUTS, Reconstruction
+from .meter import CriticalMotion, critical_motion, readout_axes
+
+__all__ = ["ShapeCost", "row_phi", "shape_cost"]
+
+# Below this standard deviation of log k there is nothing to mend: half a pixel over a thousand rows.
+_SMALL = 0.0005
+
+_MAX_POWER_STEPS = 200
+
+
+@dataclass(frozen=True)
+class ShapeCost:
+    """How uncertain the shape of a solution is.
+
+    Attributes
+    ----------
+    sigma_log_k : float
+        Standard deviation of the logarithm of the scene's scale along the mean axis of readout, against the other two:
+        the points' own, all photos' motions being unknown.
+    weakest_sigma : float
+        Standard deviation along the weakest mode of the whole system: the unit vector over all photos' unknowns that is
+        known worst, among those that are no motion of the world. Rotations and phi in radians, lengths in baselines.
+    weakest_share : float
+        How much of that mode is the vertical scale: square of the correlation of the two, 0 to 1.
+    meter : CriticalMotion
+        Of the solution's poses.
+    """
+
+    sigma_log_k: float
+    weakest_sigma: float
+    weakest_share: float
+    meter: CriticalMotion
+
+    @property
+    def is_flagged(self) -> bool:
+        """Whether the poses are nearly critical, and it costs something here."""
+        return self.meter.is_low and not self.sigma_log_k <= _SMALL
+
+    @property
+    def sentence(self) -> str:
+        """For people."""
+        if not np.isfinite(self.sigma_log_k):
+            return "the height of the scene is not determined: the measurements leave it entirely open"
+        percent = 100 * self.sigma_log_k
+        value = f"{percent:.{2 if percent < 1 else 1}f}"
+        said = f"the height of the scene is uncertain by +-{value} % (one standard deviation)"
+        if not self.is_flagged:
+            return said
+        if self.meter.num_photos < 3:
+            return f"{said}, because two photos never tell the shutter from the shape"
+        if self.meter.y_axis_spread_deg < 1:
+            return f"{said}, because all cameras were held level"
+        if self.meter.y_axis_spread_deg < 15:
+            return f"{said}, because all cameras were held nearly level"
+        return f"{said}, because the cameras were not turned against each other"
+
+
+def row_phi(reconstruction: Reconstruction) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Components (m, 3) of phi that change aspect, skew and lens of a photo's rows or columns, and their signs (m,).
+
+    As phi1, phi2 and phi3 of the paper for photos that are read from top to bottom; the signs are of the clock.
+    """
+    axes = np.array([READOUTS[reconstruction.camera(i).readout] for i in range(reconstruction.num_images)])
+    by_row = axes[:, 0] == 1
+    components = np.where(by_row[:, None], [0, 1, 2], [1, 0, 2])
+    return components.astype(np.int64), np.where(by_row, 1.0, -1.0) * axes[:, 1]
+
+
+def _log_scale(reconstruction: Reconstruction) -> NDArray[np.float64]:
+    """(n, 3) the logarithm of the scene's scale along the axis of readout, as a linear function of small changes.
+
+    Of the affine map B that takes the points to the changed ones best: log |B y| - log sqrt(det B / |B y|). Far points
+    hardly count: their own noise is larger than the scene.
+    """
+    rec = reconstruction
+    axes = readout_axes(rec.R_cw, [rec.camera(i).readout for i in range(rec.num_images)])
+    vertical = np.linalg.eigh(axes.T @ axes)[1][:, -1]
+    x = rec.points_w - np.median(rec.points_w, axis=0)
+    distance = np.linalg.norm(x, axis=1)
+    weight = np.minimum(1.0, (np.median(distance) / np.maximum(distance, 1e-300)) ** 4)
+    x = rec.points_w - np.average(rec.points_w, axis=0, weights=weight)
+    g = weight[:, None] * x @ np.linalg.pinv((weight[:, None] * x).T @ x)
+    value: NDArray[np.float64] = 1.5 * (g @ vertical)[:, None] * vertical - 0.5 * g
+    return value
+
+
+def shape_cost(result: BundleResult, options: BundleOptions | None = None) -> ShapeCost:
+    """How uncertain the shape of a solution is, from its covariance and its poses.
+
+    Parameters
+    ----------
+    result : BundleResult
+        Of a model with a shutter.
+    options : BundleOptions, optional
+        Of the adjustment: its anchors, known motions and refined intrinsics count.
+
+    Raises
+    ------
+    InputError
+        The shutter model is global: its shape is not in question.
+    """
+    rec = result.reconstruction
+    if rec.shutter_model == "global":
+        raise InputError("a global shutter has no motion that could be confounded with the shape of the scene")
+    covariance = Posterior(result, options)
+    variance, with_photos = covariance.of_points(_log_scale(rec))
+    # lengths in baselines: angles, phi and lengths are then of one size
+    unit = np.ones(with_photos.shape[1])
+    unit[3:6] = unit[9:] = rec.baseline
+    basis = np.linalg.qr((gauge_directions(result) / unit).reshape(7, -1).T)[0]
+
+    def free(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return (x.ravel() - basis @ (basis.T @ x.ravel())).reshape(with_photos.shape)
+
+    # power iterations with the covariance in the gauge of least spread: P C P, P projecting off motions of the world
+    x = free(with_photos / unit)
+    value = 0.0
+    for _ in range(_MAX_POWER_STEPS):
+        y = free(covariance.of_photos((x / unit)[None])[0] / unit)
+        before, value = value, float(np.linalg.norm(y) / np.linalg.norm(x))
+        x = y / np.linalg.norm(y)
+        if not abs(value - before) > 1e-4 * value:
+            break
+    share = float((x * with_photos / unit).sum()) ** 2 / (variance * value)
+    readout = [rec.camera(i).readout for i in range(rec.num_images)]
+    return ShapeCost(
+        sigma_log_k=float(np.sqrt(variance)),
+        weakest_sigma=float(np.sqrt(value)),
+        weakest_share=float(min(share, 1.0)),
+        meter=critical_motion(rec.R_cw, rec.center_w, readout),
+    )
