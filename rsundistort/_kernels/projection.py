@@ -27,7 +27,7 @@ _MAX_NEWTON = 30
 _CHUNK = 512
 
 
-@kernel()
+@kernel(forceinline=True)
 def _lens(lens, x, y):
     """Distorted coordinates with their derivatives: xd, yd, dxd/dx, dxd/dy, dyd/dx, dyd/dy, ok."""
     s = x * x + y * y
@@ -82,7 +82,7 @@ def _unlens(lens, xd, yd):
     return x, y, ok
 
 
-@kernel()
+@kernel(forceinline=True)
 def _rodrigues(t2):
     """Of an angle t given by its square: sin t / t and (1 - cos t) / t^2, to rounding at any angle."""
     if t2 < 0.25:  # what is left out is below t^14 / 15! = 5e-17
@@ -94,7 +94,7 @@ def _rodrigues(t2):
     return math.sin(t) / t, 2.0 * h * h
 
 
-@kernel()
+@kernel(forceinline=True)
 def _third_factor(t2, a):
     """(t - sin t) / t^3 of an angle t given by its square, and a = sin t / t."""
     if t2 < 0.25:
@@ -103,7 +103,7 @@ def _third_factor(t2, a):
     return (1.0 - a) / t2
 
 
-@kernel()
+@kernel(forceinline=True)
 def _turn(w0, w1, w2, a, b, x, y, z):
     """(I + a [w] + b [w]^2) (x, y, z).
 
@@ -118,7 +118,7 @@ def _turn(w0, w1, w2, a, b, x, y, z):
     )
 
 
-@kernel()
+@kernel(forceinline=True)
 def _row_phi(axis, sign, phi):
     """The motion phi as row readout from top to bottom would need it, after exchanging x and y for columns.
 
@@ -129,7 +129,7 @@ def _row_phi(axis, sign, phi):
     return -sign * phi[1], -sign * phi[0], -sign * phi[2]
 
 
-@kernel()
+@kernel(forceinline=True)
 def _shutter_two_step(X, Y, q0, q1, q2, d):
     """Paper Eqs. 8-9 for row readout; d gets C, R and their derivatives in X, Y, q (2 + 2 x 5)."""
     X2 = X - q2 * Y * Y
@@ -151,7 +151,7 @@ def _shutter_two_step(X, Y, q0, q1, q2, d):
     return aspect > 0.0 and yy > 0.0
 
 
-@kernel()
+@kernel(forceinline=True)
 def _shutter_linearized(X, Y, q0, q1, q2, d):
     """Paper Eq. 6 for row readout, with the implicit row solved in closed form; d as in the two-step model."""
     a = q0 * Y - q1 * X
@@ -185,9 +185,11 @@ def _shutter_linearized(X, Y, q0, q1, q2, d):
     return True
 
 
-@kernel()
-def _project(model, axis, sign, lens, x, y, z, phi, vel, out, jac):
+@kernel(forceinline=True)
+def _project(model, axis, sign, lens, x, y, z, phi, vel, start, out, jac):
     """One camera-frame point into distorted normalised coordinates out[:2]; True when it is valid.
+
+    The exact models search the row from `start`; when that is NaN, from the row of a camera that does not move.
 
     With jac: out[2:8] derivative with respect to the point (2, 3), out[8:14] to phi, out[14:20] to the
     camera-frame velocity, which only the constant-motion model uses.
@@ -198,7 +200,7 @@ def _project(model, axis, sign, lens, x, y, z, phi, vel, out, jac):
     Y = y / z
     if model >= ROTATION:
         moving = 1.0 if model == CONSTANT_MOTION else 0.0
-        return _project_exact(axis, sign, lens, x, y, z, phi, vel, moving, math.nan, out, jac)
+        return _project_exact(axis, sign, lens, x, y, z, phi, vel, moving, start, out, jac)
     if model == GLOBAL:
         xd, yd, xx, xy, yx, yy, ok = _lens(lens, X, Y)
         out[0] = xd
@@ -255,12 +257,11 @@ def _project(model, axis, sign, lens, x, y, z, phi, vel, out, jac):
     return ok
 
 
-@kernel()
+@kernel(forceinline=True)
 def _project_exact(axis, sign, lens, x, y, z, phi, vel, moving, start, out, jac):
     """Paper Eq. 2 whole, q(t) = Exp(t phi) (x - t v), with t the distorted row (or column) that the sensor read.
 
-    v is moving * vel; with moving = 0 it is the rotation model. The search for t starts at `start`, or, when that is
-    NaN, at the row of a camera that does not move.
+    v is moving * vel; with moving = 0 it is the rotation model. For `start` and `out` see `_project`.
     """
     f0, f1, f2 = phi[0], phi[1], phi[2]
     v0, v1, v2 = moving * vel[0], moving * vel[1], moving * vel[2]
@@ -368,7 +369,7 @@ def project_points(model, axis, sign, intr, lens, points_c, phi, vel, xy, valid)
         out = np.empty(20)
         for k in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK)):
             p = points_c[k]
-            valid[k] = _project(model, axis, sign, lens, p[0], p[1], p[2], phi, vel, out, False)
+            valid[k] = _project(model, axis, sign, lens, p[0], p[1], p[2], phi, vel, math.nan, out, False)
             xy[k, 0] = intr[0] * out[0] + intr[2] if valid[k] else np.nan
             xy[k, 1] = intr[1] * out[1] + intr[3] if valid[k] else np.nan
 
@@ -379,7 +380,7 @@ def project_jacobians(model, axis, sign, intr, lens, points_c, phi, vel, xy, J_p
     out = np.empty(20)
     for k in range(len(points_c)):
         p = points_c[k]
-        valid[k] = _project(model, axis, sign, lens, p[0], p[1], p[2], phi, vel, out, True)
+        valid[k] = _project(model, axis, sign, lens, p[0], p[1], p[2], phi, vel, math.nan, out, True)
         if not valid[k]:
             out[:] = np.nan
         for i in range(2):
@@ -424,12 +425,9 @@ def fill_map(model, axis, sign, intr, lens, phi, rays, row0, col0, map_x, map_y)
             x = rays[0, 0] * u + rays[0, 1] * v + rays[0, 2]
             y = rays[1, 0] * u + rays[1, 1] * v + rays[1, 2]
             z = rays[2, 0] * u + rays[2, 1] * v + rays[2, 2]
-            if model < ROTATION:
-                ok = _project(model, axis, sign, lens, x, y, z, phi, vel, out, False)
-            else:
-                ok = z > 0.0 and _project_exact(axis, sign, lens, x, y, z, phi, vel, 0.0, 2.0 * t1 - t2, out, False)
-                t2 = t1
-                t1 = sign * out[axis] if ok else math.nan
+            ok = _project(model, axis, sign, lens, x, y, z, phi, vel, 2.0 * t1 - t2, out, False)
+            t2 = t1
+            t1 = sign * out[axis] if ok else math.nan
             if ok:
                 map_x[i, j] = intr[0] * out[0] + intr[2]
                 map_y[i, j] = intr[1] * out[1] + intr[3]
@@ -438,7 +436,7 @@ def fill_map(model, axis, sign, intr, lens, phi, rays, row0, col0, map_x, map_y)
                 map_y[i, j] = -1e6
 
 
-@kernel()
+@kernel(forceinline=True)
 def _loss(kind, s, scale2):
     """Robust loss rho(s) of a squared residual, rho'(s), and the share of curvature that it takes away along r.
 
@@ -462,7 +460,7 @@ def _loss(kind, s, scale2):
 _INVALID_PX = 100.0
 
 
-@kernel()
+@kernel(forceinline=True)
 def _camera_frame(R, center, velocity, point, vel_c):
     """Point in the camera frame at the reference row (x, y, z), and the velocity there in vel_c."""
     d0, d1, d2 = point[0] - center[0], point[1] - center[1], point[2] - center[2]
@@ -489,18 +487,9 @@ def residuals(
             f = frame_idx[k]
             c = camera_of_frame[f]
             x, y, z = _camera_frame(R_cw[f], center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
-            valid[k] = _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, out, False)
+            valid[k] = _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, math.nan, out, False)
             for i in range(2):
                 res[k, i] = intrs[c, i] * out[i] + intrs[c, 2 + i] - xy_raw[k, i] if valid[k] else _INVALID_PX
-
-
-@kernel()
-def _project_near(model, axis, sign, lens, x, y, z, phi, vel, clock, out, jac):
-    """As `_project`; the exact models search the row from `clock`, or afresh when that is NaN."""
-    if model < ROTATION:
-        return _project(model, axis, sign, lens, x, y, z, phi, vel, out, jac)
-    moving = 1.0 if model == CONSTANT_MOTION else 0.0
-    return z > 0.0 and _project_exact(axis, sign, lens, x, y, z, phi, vel, moving, clock, out, jac)
 
 
 @parallel_kernel()
@@ -524,10 +513,12 @@ def residual_costs(
             c = camera_of_frame[f]
             x, y, z = _camera_frame(R_cw[f], center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
             s = 2.0 * (_INVALID_PX / sigma_px[k]) ** 2
-            if _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, out, False):
-                ex = (intrs[c, 0] * out[0] + intrs[c, 2] - xy_raw[k, 0]) / sigma_px[k]
-                ey = (intrs[c, 1] * out[1] + intrs[c, 3] - xy_raw[k, 1]) / sigma_px[k]
-                s = ex * ex + ey * ey
+            # the row is near where it was measured
+            row = signs[c] * (xy_raw[k, axes[c]] - intrs[c, 2 + axes[c]]) / intrs[c, axes[c]]
+            if _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, row, out, False):
+                ex = intrs[c, 0] * out[0] + intrs[c, 2] - xy_raw[k, 0]
+                ey = intrs[c, 1] * out[1] + intrs[c, 3] - xy_raw[k, 1]
+                s = (ex * ex + ey * ey) / sigma_px[k] ** 2
                 clock[k] = signs[c] * out[axes[c]]
             else:
                 clock[k] = np.nan
@@ -560,13 +551,14 @@ def residual_blocks(
             c = camera_of_frame[f]
             R = R_cw[f]
             x, y, z = _camera_frame(R, center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
-            if not _project_near(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, clock[k], out, True):
+            if not _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, clock[k], out, True):
                 total += 0.5 * _loss(loss_kind, 2.0 * (_INVALID_PX / sigma_px[k]) ** 2, scale2)[0]
                 res[k] = 0.0
                 J_frame[k] = 0.0
                 continue
-            r0 = (intrs[c, 0] * out[0] + intrs[c, 2] - xy_raw[k, 0]) / sigma_px[k]
-            r1 = (intrs[c, 1] * out[1] + intrs[c, 3] - xy_raw[k, 1]) / sigma_px[k]
+            precision = 1.0 / sigma_px[k]
+            r0 = (intrs[c, 0] * out[0] + intrs[c, 2] - xy_raw[k, 0]) * precision
+            r1 = (intrs[c, 1] * out[1] + intrs[c, 3] - xy_raw[k, 1]) * precision
             s = r0 * r0 + r1 * r1
             rho, weight, share = _loss(loss_kind, s, scale2)
             total += 0.5 * rho
@@ -578,7 +570,7 @@ def residual_blocks(
             m00, m01, m11 = w * (1.0 - a_s * r0 * r0), -w * a_s * r0 * r1, w * (1.0 - a_s * r1 * r1)
             res[k, 0] = r0 * w / keep
             res[k, 1] = r1 * w / keep
-            g0, g1 = intrs[c, 0] / sigma_px[k], intrs[c, 1] / sigma_px[k]
+            g0, g1 = intrs[c, 0] * precision, intrs[c, 1] * precision
             for i in range(2):
                 u, v = (m00 * g0, m01 * g1) if i == 0 else (m01 * g0, m11 * g1)
                 a0, a1, a2 = u * out[2] + v * out[5], u * out[3] + v * out[6], u * out[4] + v * out[7]
