@@ -282,7 +282,7 @@ def border_rows(
                         B[f, a, at + b] += l0 * J_camera[n, 0, b] + l1 * J_camera[n, 1, b]
 
 
-@parallel_kernel()
+@parallel_kernel(fastmath=_SUMS)
 def back_substitute(unknowns, track_start, point_of, frame_idx, V_inv, g_point, J, step_frame, step_point):
     """step_point (n, 3) = -V^-1 (g_point + sum Jp' J step_frame)."""
     nb = len(unknowns)
@@ -327,7 +327,7 @@ def multiply(unknowns, row_start, cols, low_start, low_block, low_col, S, x, y):
 
 # The factor L of the envelope: rows in bands of four, each band from its first column (a multiple of four) to its
 # diagonal, rows one after the other: entry (4 g + r, c) is data[offset[g] + r * (4 g + 4 - first[g]) + c - first[g]].
-@kernel()
+@parallel_kernel()
 def fill_envelope(place, row_start, cols, S, scale, first, offset, data):
     """Blocks into the envelope, scaled on both sides; place (m, nb) is each unknown's row, -1 if held.
 
@@ -338,7 +338,7 @@ def fill_envelope(place, row_start, cols, S, scale, first, offset, data):
     for g in range(len(first)):
         for r in range(4):
             data[offset[g] + r * (4 * g + 4 - first[g]) + 4 * g + r - first[g]] = 1.0
-    for f in range(len(row_start) - 1):
+    for f in prange(len(row_start) - 1):
         for i in range(row_start[f], row_start[f + 1]):
             for a in range(nb):
                 for b in range(nb):

@@ -194,10 +194,12 @@ class BundleProblem:
     def _prior_cost(self, state: State) -> float:
         return 0.5 * float(np.sum(self._motion_weight * self._motion(state) ** 2))
 
-    def _jacobians(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    def _jacobians(
+        self, state: State, spent: NormalEquations | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
         """Weighted residuals (o, 2), Jacobians of the photos (o, 2, nb), and the cost without priors."""
         o = len(self._xy)
-        res, J_frame = np.empty((o, 2)), np.empty((o, 2, self._block))
+        res, J_frame = spent.blocks if spent else (np.empty((o, 2)), np.empty((o, 2, self._block)))
         if state is not self._clock_of:
             self._clock.fill(np.nan)
             self._clock_of = None
@@ -211,9 +213,9 @@ class BundleProblem:
         res, J_frame, cost = self._jacobians(state)
         return res, J_frame, -J_frame[:, :, 3:6], cost
 
-    def linearize(self, state: State) -> NormalEquations:
-        """Normal equations and cost at a state."""
-        res, J_frame, cost = self._jacobians(state)
+    def linearize(self, state: State, spent: NormalEquations | None = None) -> NormalEquations:
+        """Normal equations and cost at a state, written over those of `spent`: fresh memory takes time to get."""
+        res, J_frame, cost = self._jacobians(state, spent)
         prior_diag = np.zeros((len(state.phi), self._block))
         prior_gradient = np.zeros_like(prior_diag)
         prior_diag[:, 6:] = self._motion_weight
@@ -272,7 +274,8 @@ class BundleProblem:
         frame, point, intrinsics = step
         angles = np.abs(frame[:, [0, 1, 2, *range(6, min(self._block, 9))]]).max()
         # a far point moves a lot along its ray without moving in any photo: its depth is its own yardstick
-        depth = np.maximum(np.linalg.norm(state.points_w - state.center_w.mean(0), axis=1), self._size)
+        far = state.points_w - state.center_w.mean(0)
+        depth = np.maximum(np.sqrt(np.einsum("na,na->n", far, far)), self._size)
         ways = np.abs(frame[:, [3, 4, 5, *range(9, self._block)]]).max() / self._size
-        lengths = max(ways, float((np.abs(point).max(1) / depth).max(initial=0)))
+        lengths = max(ways, float((np.abs(point) / depth[:, None]).max(initial=0)))
         return float(max(angles, lengths, np.abs(intrinsics).max(initial=0.0)))

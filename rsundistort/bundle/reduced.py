@@ -391,6 +391,11 @@ class NormalEquations:
         Diagonal Hessian and gradient of the priors of the photos.
     border : Border
         What the photos share.
+
+    Attributes
+    ----------
+    blocks : tuple of array
+        res and J_frame.
     """
 
     def __init__(
@@ -409,6 +414,7 @@ class NormalEquations:
         nb = prior_diag.shape[1]
         n = len(s.point_of)
         self._J = J_frame
+        self.blocks = res, J_frame
         self._unknowns = (0.0,) * nb
         self._prior_diag = prior_diag
         self._V = np.empty((n, 3, 3))
