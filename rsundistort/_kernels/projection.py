@@ -603,7 +603,7 @@ def _lens_basis(lens, x, y, d):
 
 
 @kernel()
-def _lens_jacobian(model, axis, sign, lens, x, y, z, phi, vel, xd, yd, d, E):
+def _lens_jacobian(model, axis, sign, lens, x, y, z, phi, vel, xd, yd, d):
     """Derivatives d (5, 2) by k1 k2 p1 p2 k3 of the distorted coordinates (xd, yd) that `_project` found.
 
     The exact models read the row from the distorted image, so a change of the lens moves it; the others apply the lens
@@ -615,15 +615,12 @@ def _lens_jacobian(model, axis, sign, lens, x, y, z, phi, vel, xd, yd, d, E):
         return
     moving = 1.0 if model == CONSTANT_MOTION else 0.0
     t = sign * (yd if axis == 1 else xd)
-    _exp_so3(t * phi[0], t * phi[1], t * phi[2], E)
+    f0, f1, f2 = phi[0], phi[1], phi[2]
     v0, v1, v2 = moving * vel[0], moving * vel[1], moving * vel[2]
-    p0, p1, p2 = x - t * v0, y - t * v1, z - t * v2
-    q0 = E[0, 0] * p0 + E[0, 1] * p1 + E[0, 2] * p2
-    q1 = E[1, 0] * p0 + E[1, 1] * p1 + E[1, 2] * p2
-    q2 = E[2, 0] * p0 + E[2, 1] * p1 + E[2, 2] * p2
-    w0 = phi[1] * q2 - phi[2] * q1 - (E[0, 0] * v0 + E[0, 1] * v1 + E[0, 2] * v2)
-    w1 = phi[2] * q0 - phi[0] * q2 - (E[1, 0] * v0 + E[1, 1] * v1 + E[1, 2] * v2)
-    w2 = phi[0] * q1 - phi[1] * q0 - (E[2, 0] * v0 + E[2, 1] * v1 + E[2, 2] * v2)
+    a, b = _rodrigues(t * t * (f0 * f0 + f1 * f1 + f2 * f2))
+    q0, q1, q2 = _turn(t * f0, t * f1, t * f2, a, b, x - t * v0, y - t * v1, z - t * v2)
+    e0, e1, e2 = _turn(t * f0, t * f1, t * f2, a, b, v0, v1, v2)
+    w0, w1, w2 = f1 * q2 - f2 * q1 - e0, f2 * q0 - f0 * q2 - e1, f0 * q1 - f1 * q0 - e2
     X, Y = q0 / q2, q1 / q2
     _, _, xx, xy, yx, yy, _ = _lens(lens, X, Y)
     dX, dY = (w0 - X * w2) / q2, (w1 - Y * w2) / q2
@@ -649,8 +646,6 @@ def intrinsic_blocks(
     scale2 = loss_scale * loss_scale
     for chunk in prange((o + _CHUNK - 1) // _CHUNK):
         out = np.empty(20)
-        E = np.empty((3, 3))
-        L = np.empty((3, 3))
         d = np.empty((5, 2))
         vel_c = np.empty(3)
         for k in range(chunk * _CHUNK, min(o, (chunk + 1) * _CHUNK)):
@@ -659,7 +654,7 @@ def intrinsic_blocks(
             axis, sign, lens = axes[c], signs[c], lenses[c]
             J_camera[k] = 0.0
             x, y, z = _camera_frame(R_cw[f], center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
-            if not _project(model, axis, sign, lens, x, y, z, phi[f], vel_c, out, False, E, L):
+            if not _project(model, axis, sign, lens, x, y, z, phi[f], vel_c, math.nan, out, False):
                 continue
             xd, yd = out[0], out[1]
             r0 = (intrs[c, 0] * xd + intrs[c, 2] - xy_raw[k, 0]) / sigma_px[k]
@@ -670,7 +665,7 @@ def intrinsic_blocks(
             a_s = (1.0 - math.sqrt(1.0 - share)) / s if s > 0.0 else 0.0
             m00, m01, m11 = w * (1.0 - a_s * r0 * r0), -w * a_s * r0 * r1, w * (1.0 - a_s * r1 * r1)
             g0, g1 = intrs[c, 0] / sigma_px[k], intrs[c, 1] / sigma_px[k]
-            _lens_jacobian(model, axis, sign, lens, x, y, z, phi[f], vel_c, xd, yd, d, E)
+            _lens_jacobian(model, axis, sign, lens, x, y, z, phi[f], vel_c, xd, yd, d)
             for i in range(len(unknowns)):
                 code = unknowns[i]
                 if code >= 5:
