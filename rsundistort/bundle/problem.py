@@ -16,7 +16,7 @@ from ..errors import InputError
 from ..model import Camera, Reconstruction, check_shutter_model
 from .intrinsics import INTRINSICS, moved_camera
 from .options import LOSSES, BundleOptions
-from .reduced import Border, Elimination, NormalEquations, Step, Structure
+from .reduced import Border, Elimination, NormalEquations, Step, Structure, by_first_photo
 
 __all__ = ["BundleProblem", "Spreads", "State", "reprojection_residuals"]
 
@@ -107,7 +107,14 @@ class BundleProblem:
         obs = reconstruction.observations
         if not len(obs) or reconstruction.num_images < 2:
             raise InputError("bundle adjustment needs two photos and measurements of common points")
-        self._start = reconstruction
+        # points in the order of their tracks: what a photo sees lies together in memory
+        self._points = by_first_photo(
+            obs.frame_idx, obs.point_idx, reconstruction.num_images, reconstruction.num_points
+        )
+        rank = np.argsort(self._points)
+        self._given = reconstruction
+        obs = replace(obs, point_idx=rank[obs.point_idx])
+        self._start = replace(reconstruction, points_w=reconstruction.points_w[self._points], observations=obs)
         self._shutter_model = shutter_model
         self._options = options
         self._block = _BLOCK.get(shutter_model, 9)
@@ -168,14 +175,16 @@ class BundleProblem:
     def reconstruction(self, state: State) -> Reconstruction:
         """The reconstruction at a state."""
         U, _, Vt = np.linalg.svd(state.R_cw)  # rounding of many increments
+        points_w = np.empty_like(state.points_w)
+        points_w[self._points] = state.points_w
         return replace(
-            self._start,
+            self._given,
             cameras=state.cameras,
             R_cw=U @ Vt,
             center_w=state.center_w,
             phi=state.phi,
             velocity=state.velocity,
-            points_w=state.points_w,
+            points_w=points_w,
             shutter_model=self._shutter_model,
         )
 
