@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from functools import partial
 
 import numba
 
+# Threads of OpenMP that spin while they wait take the processors from those that work as soon as anything else runs:
+# a launch then takes 7 ms, not 10 us. libgomp reads this when numba loads it, at the first launch.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+# fastmath: products are fused into sums, nothing else; infinities and NaN keep their meaning.
 # error_model: a division by zero gives inf, which the validity flags catch, and loops can vectorise.
 # cache: compiled once per installation, not per run. Numba's cache does not notice a changed callee in another
 # file, so a kernel and all its callees stay in one file.
-kernel = partial(numba.njit, cache=True, nogil=True, error_model="numpy")
-parallel_kernel = partial(numba.njit, cache=True, nogil=True, error_model="numpy", parallel=True)
+# forceinline, for callees in inner loops: else each call counts the references of its arrays, twice the whole time.
+kernel = partial(numba.njit, cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+parallel_kernel = partial(kernel, parallel=True)
 prange = numba.prange

@@ -19,13 +19,15 @@ GLOBAL, TWO_STEP, LINEARIZED, ROTATION, CONSTANT_MOTION = 0, 1, 2, 3, 4
 # Newton on the row takes its last step from a gap below this (normalised units): the step squares the gap, and the
 # curvature of the gap is of the order of phi, so 1e-17 is left.
 _LAST_GAP = 1e-8
+# Derivatives are taken at the row itself: they change as the gap does.
+_SAME_ROW = 1e-13
 # Newton in the plane and on cubics stops at steps below this.
 _ROW_TOL = 1e-14
 _MAX_NEWTON = 30
 _CHUNK = 512
 
 
-@kernel()
+@kernel(forceinline=True)
 def _lens(lens, x, y):
     """Distorted coordinates with their derivatives: xd, yd, dxd/dx, dxd/dy, dyd/dx, dyd/dy, ok."""
     s = x * x + y * y
@@ -33,8 +35,9 @@ def _lens(lens, x, y):
     den = 1.0 + s * (lens[5] + s * (lens[6] + s * lens[7]))
     dnum = lens[0] + s * (2.0 * lens[1] + s * 3.0 * lens[4])
     dden = lens[5] + s * (2.0 * lens[6] + s * 3.0 * lens[7])
-    g = num / den
-    dg = (dnum - g * dden) / den
+    inverse = 1.0 / den
+    g = num * inverse
+    dg = (dnum - g * dden) * inverse
     p1, p2 = lens[2], lens[3]
     xd = x * g + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x) + s * (lens[8] + s * lens[9])
     yd = y * g + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y + s * (lens[10] + s * lens[11])
@@ -79,55 +82,43 @@ def _unlens(lens, xd, yd):
     return x, y, ok
 
 
-@kernel()
-def _exp_so3(w0, w1, w2, R):
-    """Rotation matrix of a rotation vector (Rodrigues), to rounding also near zero."""
-    t2 = w0 * w0 + w1 * w1 + w2 * w2
-    if t2 < 1e-8:
-        a = 1.0 - t2 / 6.0
-        b = 0.5 - t2 / 24.0
-    else:
-        t = math.sqrt(t2)
-        a = math.sin(t) / t
-        h = math.sin(0.5 * t) / t
-        b = 2.0 * h * h
-    R[0, 0] = 1.0 - b * (w1 * w1 + w2 * w2)
-    R[1, 1] = 1.0 - b * (w0 * w0 + w2 * w2)
-    R[2, 2] = 1.0 - b * (w0 * w0 + w1 * w1)
-    R[0, 1] = b * w0 * w1 - a * w2
-    R[1, 0] = b * w0 * w1 + a * w2
-    R[0, 2] = b * w0 * w2 + a * w1
-    R[2, 0] = b * w0 * w2 - a * w1
-    R[1, 2] = b * w1 * w2 - a * w0
-    R[2, 1] = b * w1 * w2 + a * w0
+@kernel(forceinline=True)
+def _rodrigues(t2):
+    """Of an angle t given by its square: sin t / t and (1 - cos t) / t^2, to rounding at any angle."""
+    if t2 < 0.25:  # what is left out is below t^14 / 15! = 5e-17
+        a = t2 * (1 / 5040 - t2 * (1 / 362880 - t2 * (1 / 39916800 - t2 * (1 / 6227020800))))
+        b = t2 * (1 / 40320 - t2 * (1 / 3628800 - t2 * (1 / 479001600 - t2 * (1 / 87178291200))))
+        return 1.0 - t2 * (1 / 6 - t2 * (1 / 120 - a)), 0.5 - t2 * (1 / 24 - t2 * (1 / 720 - b))
+    t = math.sqrt(t2)
+    h = math.sin(0.5 * t) / t
+    return math.sin(t) / t, 2.0 * h * h
 
 
-@kernel()
-def _left_jacobian(w0, w1, w2, L):
-    """Left Jacobian of SO(3): Exp(w + dw) = Exp(L dw) Exp(w) to first order."""
-    t2 = w0 * w0 + w1 * w1 + w2 * w2
-    if t2 < 1e-6:
-        a = 1.0 - t2 / 6.0 + t2 * t2 / 120.0
-        b = 0.5 - t2 / 24.0 + t2 * t2 / 720.0
-        c = 1.0 / 6.0 - t2 / 120.0 + t2 * t2 / 5040.0
-    else:
-        t = math.sqrt(t2)
-        a = math.sin(t) / t
-        h = math.sin(0.5 * t) / t
-        b = 2.0 * h * h
-        c = (1.0 - a) / t2
-    L[0, 0] = a + c * w0 * w0
-    L[1, 1] = a + c * w1 * w1
-    L[2, 2] = a + c * w2 * w2
-    L[0, 1] = c * w0 * w1 - b * w2
-    L[1, 0] = c * w0 * w1 + b * w2
-    L[0, 2] = c * w0 * w2 + b * w1
-    L[2, 0] = c * w0 * w2 - b * w1
-    L[1, 2] = c * w1 * w2 - b * w0
-    L[2, 1] = c * w1 * w2 + b * w0
+@kernel(forceinline=True)
+def _third_factor(t2, a):
+    """(t - sin t) / t^3 of an angle t given by its square, and a = sin t / t."""
+    if t2 < 0.25:
+        c = t2 * (1 / 362880 - t2 * (1 / 39916800 - t2 * (1 / 6227020800 - t2 * (1 / 1307674368000))))
+        return 1 / 6 - t2 * (1 / 120 - t2 * (1 / 5040 - c))
+    return (1.0 - a) / t2
 
 
-@kernel()
+@kernel(forceinline=True)
+def _turn(w0, w1, w2, a, b, x, y, z):
+    """(I + a [w] + b [w]^2) (x, y, z).
+
+    With a, b of `_rodrigues` this is Exp(w); with b and the third factor it is the left Jacobian L of SO(3),
+    Exp(w + dw) = Exp(L dw) Exp(w) to first order. The transpose of either has -a.
+    """
+    c0, c1, c2 = w1 * z - w2 * y, w2 * x - w0 * z, w0 * y - w1 * x
+    return (
+        x + a * c0 + b * (w1 * c2 - w2 * c1),
+        y + a * c1 + b * (w2 * c0 - w0 * c2),
+        z + a * c2 + b * (w0 * c1 - w1 * c0),
+    )
+
+
+@kernel(forceinline=True)
 def _row_phi(axis, sign, phi):
     """The motion phi as row readout from top to bottom would need it, after exchanging x and y for columns.
 
@@ -138,7 +129,7 @@ def _row_phi(axis, sign, phi):
     return -sign * phi[1], -sign * phi[0], -sign * phi[2]
 
 
-@kernel()
+@kernel(forceinline=True)
 def _shutter_two_step(X, Y, q0, q1, q2, d):
     """Paper Eqs. 8-9 for row readout; d gets C, R and their derivatives in X, Y, q (2 + 2 x 5)."""
     X2 = X - q2 * Y * Y
@@ -160,7 +151,7 @@ def _shutter_two_step(X, Y, q0, q1, q2, d):
     return aspect > 0.0 and yy > 0.0
 
 
-@kernel()
+@kernel(forceinline=True)
 def _shutter_linearized(X, Y, q0, q1, q2, d):
     """Paper Eq. 6 for row readout, with the implicit row solved in closed form; d as in the two-step model."""
     a = q0 * Y - q1 * X
@@ -194,12 +185,14 @@ def _shutter_linearized(X, Y, q0, q1, q2, d):
     return True
 
 
-@kernel()
-def _project(model, axis, sign, lens, x, y, z, phi, vel, out, jac, E, L):
+@kernel(forceinline=True)
+def _project(model, axis, sign, lens, x, y, z, phi, vel, start, out, jac):
     """One camera-frame point into distorted normalised coordinates out[:2]; True when it is valid.
 
+    The exact models search the row from `start`; when that is NaN, from the row of a camera that does not move.
+
     With jac: out[2:8] derivative with respect to the point (2, 3), out[8:14] to phi, out[14:20] to the
-    camera-frame velocity, which only the constant-motion model uses. E, L are (3, 3) scratch.
+    camera-frame velocity, which only the constant-motion model uses.
     """
     if not z > 0.0:
         return False
@@ -207,7 +200,7 @@ def _project(model, axis, sign, lens, x, y, z, phi, vel, out, jac, E, L):
     Y = y / z
     if model >= ROTATION:
         moving = 1.0 if model == CONSTANT_MOTION else 0.0
-        return _project_exact(axis, sign, lens, x, y, z, phi, vel, moving, math.nan, out, jac, E, L)
+        return _project_exact(axis, sign, lens, x, y, z, phi, vel, moving, start, out, jac)
     if model == GLOBAL:
         xd, yd, xx, xy, yx, yy, ok = _lens(lens, X, Y)
         out[0] = xd
@@ -264,106 +257,80 @@ def _project(model, axis, sign, lens, x, y, z, phi, vel, out, jac, E, L):
     return ok
 
 
-@kernel()
-def _project_exact(axis, sign, lens, x, y, z, phi, vel, moving, start, out, jac, E, L):
+@kernel(forceinline=True)
+def _project_exact(axis, sign, lens, x, y, z, phi, vel, moving, start, out, jac):
     """Paper Eq. 2 whole, q(t) = Exp(t phi) (x - t v), with t the distorted row (or column) that the sensor read.
 
-    v is moving * vel; with moving = 0 it is the rotation model. The search for t starts at `start`, or, when that is
-    NaN, at the row of a camera that does not move.
+    v is moving * vel; with moving = 0 it is the rotation model. For `start` and `out` see `_project`.
     """
-    X = x / z
-    Y = y / z
+    f0, f1, f2 = phi[0], phi[1], phi[2]
     v0, v1, v2 = moving * vel[0], moving * vel[1], moving * vel[2]
-    xd, yd, xx, xy, yx, yy, ok = _lens(lens, X, Y)
-    t = start if start == start else sign * (yd if axis == 1 else xd)
-    done = False
-    slope = -1.0
-    q0 = q1 = q2 = 0.0
-    w0 = w1 = w2 = 0.0
-    p0 = p1 = p2 = 0.0
+    angle2 = f0 * f0 + f1 * f1 + f2 * f2
+    t = start
+    if t != t:
+        xd, yd, xx, xy, yx, yy, ok = _lens(lens, x / z, y / z)
+        t = sign * (yd if axis == 1 else xd)
     for _ in range(_MAX_NEWTON):
-        _exp_so3(t * phi[0], t * phi[1], t * phi[2], E)
-        p0, p1, p2 = x - t * v0, y - t * v1, z - t * v2
-        q0 = E[0, 0] * p0 + E[0, 1] * p1 + E[0, 2] * p2
-        q1 = E[1, 0] * p0 + E[1, 1] * p1 + E[1, 2] * p2
-        q2 = E[2, 0] * p0 + E[2, 1] * p1 + E[2, 2] * p2
+        a, b = _rodrigues(t * t * angle2)
+        w0, w1, w2 = t * f0, t * f1, t * f2
+        q0, q1, q2 = _turn(w0, w1, w2, a, b, x - t * v0, y - t * v1, z - t * v2)
         if not q2 > 0.0:
             return False
         # dq/dt = phi x q - E v
-        w0 = phi[1] * q2 - phi[2] * q1 - (E[0, 0] * v0 + E[0, 1] * v1 + E[0, 2] * v2)
-        w1 = phi[2] * q0 - phi[0] * q2 - (E[1, 0] * v0 + E[1, 1] * v1 + E[1, 2] * v2)
-        w2 = phi[0] * q1 - phi[1] * q0 - (E[2, 0] * v0 + E[2, 1] * v1 + E[2, 2] * v2)
-        X = q0 / q2
-        Y = q1 / q2
+        d0, d1, d2 = f1 * q2 - f2 * q1, f2 * q0 - f0 * q2, f0 * q1 - f1 * q0
+        if moving != 0.0:
+            e0, e1, e2 = _turn(w0, w1, w2, a, b, v0, v1, v2)
+            d0, d1, d2 = d0 - e0, d1 - e1, d2 - e2
+        inverse = 1.0 / q2
+        X, Y = q0 * inverse, q1 * inverse
         xd, yd, xx, xy, yx, yy, ok = _lens(lens, X, Y)
-        dX = (w0 - X * w2) / q2
-        dY = (w1 - Y * w2) / q2
-        if axis == 1:
-            gap = sign * yd - t
-            slope = sign * (yx * dX + yy * dY) - 1.0
-        else:
-            gap = sign * xd - t
-            slope = sign * (xx * dX + xy * dY) - 1.0
+        dX, dY = (d0 - X * d2) * inverse, (d1 - Y * d2) * inverse
+        xt, yt = xx * dX + xy * dY, yx * dX + yy * dY
+        slope = sign * (yt if axis == 1 else xt) - 1.0
         if not slope < -1e-3:  # the rows fold over: a row would see the point twice
             return False
-        if done:
+        gap = sign * (yd if axis == 1 else xd) - t
+        if abs(gap) < (_SAME_ROW if jac else _LAST_GAP):
             break
         t -= gap / slope
-        done = abs(gap) < _LAST_GAP
     else:
         return False
-    out[0] = xd
-    out[1] = yd
+    # the last step, along the tangent
+    out[0] = xd - xt * gap / slope
+    out[1] = yd - yt * gap / slope
     if not jac:
         return ok
-    # derivatives of the distorted coordinates with respect to q
-    a0, a1, a2 = xx / q2, xy / q2, -(xx * X + xy * Y) / q2
-    b0, b1, b2 = yx / q2, yy / q2, -(yx * X + yy * Y) / q2
-    # and with respect to t at a fixed point: the implicit row moves them too
-    at = a0 * w0 + a1 * w1 + a2 * w2
-    bt = b0 * w0 + b1 * w1 + b2 * w2
-    _left_jacobian(t * phi[0], t * phi[1], t * phi[2], L)
-    for k in range(9):
-        if k < 3:  # point: dq = E e_k
-            d0, d1, d2 = E[0, k], E[1, k], E[2, k]
-        elif k < 6:  # phi: dq = -[q]x (t L e_k)
-            l0, l1, l2 = t * L[0, k - 3], t * L[1, k - 3], t * L[2, k - 3]
-            d0 = q2 * l1 - q1 * l2
-            d1 = q0 * l2 - q2 * l0
-            d2 = q1 * l0 - q0 * l1
-        else:  # velocity: dq = -t E e_k
-            s = -t * moving
-            d0, d1, d2 = s * E[0, k - 6], s * E[1, k - 6], s * E[2, k - 6]
-        da = a0 * d0 + a1 * d1 + a2 * d2
-        db = b0 * d0 + b1 * d1 + b2 * d2
-        dt = -sign * (db if axis == 1 else da) / slope
-        if k < 3:
-            out[2 + k] = da + at * dt
-            out[5 + k] = db + bt * dt
-        elif k < 6:
-            out[5 + k] = da + at * dt
-            out[8 + k] = db + bt * dt
-        else:
-            out[8 + k] = da + at * dt
-            out[11 + k] = db + bt * dt
+    c = _third_factor(t * t * angle2, a)
+    row0, row1 = (yx, yy) if axis == 1 else (xx, xy)
+    for i in range(2):
+        # derivatives of a distorted coordinate by X and Y: at a fixed t, and as the implicit row moves
+        ux, uy, ut = (xx, xy, xt) if i == 0 else (yx, yy, yt)
+        s = -sign * ut / slope
+        ux, uy = (ux + s * row0) * inverse, (uy + s * row1) * inverse
+        uz = -(ux * X + uy * Y)
+        # point: dq = E dx; velocity: dq = -t E dv; phi: dq = -[q] t L dphi
+        p0, p1, p2 = _turn(w0, w1, w2, -a, b, ux, uy, uz)
+        out[2 + 3 * i], out[3 + 3 * i], out[4 + 3 * i] = p0, p1, p2
+        m = -t * moving
+        out[14 + 3 * i], out[15 + 3 * i], out[16 + 3 * i] = m * p0, m * p1, m * p2
+        c0, c1, c2 = q1 * uz - q2 * uy, q2 * ux - q0 * uz, q0 * uy - q1 * ux
+        p0, p1, p2 = _turn(w0, w1, w2, -b, c, c0, c1, c2)
+        out[8 + 3 * i], out[9 + 3 * i], out[10 + 3 * i] = t * p0, t * p1, t * p2
     return ok
 
 
 @kernel()
-def _unproject(model, axis, sign, lens, xd, yd, phi, E):
+def _unproject(model, axis, sign, lens, xd, yd, phi):
     """Ideal normalised coordinates at the reference row of a distorted normalised pixel: x', y', ok."""
     C, R, ok = _unlens(lens, xd, yd)
     if model == GLOBAL or not ok:
         return C, R, ok
     if model >= ROTATION:
         t = sign * (yd if axis == 1 else xd)
-        _exp_so3(-t * phi[0], -t * phi[1], -t * phi[2], E)
-        w = E[2, 0] * C + E[2, 1] * R + E[2, 2]
-        return (
-            (E[0, 0] * C + E[0, 1] * R + E[0, 2]) / w,
-            (E[1, 0] * C + E[1, 1] * R + E[1, 2]) / w,
-            w > 0.0,
-        )
+        w0, w1, w2 = -t * phi[0], -t * phi[1], -t * phi[2]
+        a, b = _rodrigues(w0 * w0 + w1 * w1 + w2 * w2)
+        X, Y, W = _turn(w0, w1, w2, a, b, C, R, 1.0)
+        return X / W, Y / W, W > 0.0
     q0, q1, q2 = _row_phi(axis, sign, phi)
     if axis == 0:
         C, R = R, C
@@ -400,11 +367,9 @@ def project_points(model, axis, sign, intr, lens, points_c, phi, vel, xy, valid)
     n = len(points_c)
     for chunk in prange((n + _CHUNK - 1) // _CHUNK):
         out = np.empty(20)
-        E = np.empty((3, 3))
-        L = np.empty((3, 3))
         for k in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK)):
             p = points_c[k]
-            valid[k] = _project(model, axis, sign, lens, p[0], p[1], p[2], phi, vel, out, False, E, L)
+            valid[k] = _project(model, axis, sign, lens, p[0], p[1], p[2], phi, vel, math.nan, out, False)
             xy[k, 0] = intr[0] * out[0] + intr[2] if valid[k] else np.nan
             xy[k, 1] = intr[1] * out[1] + intr[3] if valid[k] else np.nan
 
@@ -413,11 +378,9 @@ def project_points(model, axis, sign, intr, lens, points_c, phi, vel, xy, valid)
 def project_jacobians(model, axis, sign, intr, lens, points_c, phi, vel, xy, J_point, J_phi, J_vel, valid):
     """As `project_points`, with derivatives of the pixels (n, 2, 3) in the point, phi and velocity."""
     out = np.empty(20)
-    E = np.empty((3, 3))
-    L = np.empty((3, 3))
     for k in range(len(points_c)):
         p = points_c[k]
-        valid[k] = _project(model, axis, sign, lens, p[0], p[1], p[2], phi, vel, out, True, E, L)
+        valid[k] = _project(model, axis, sign, lens, p[0], p[1], p[2], phi, vel, math.nan, out, True)
         if not valid[k]:
             out[:] = np.nan
         for i in range(2):
@@ -434,11 +397,10 @@ def unproject_points(model, axis, sign, intr, lens, xy, phi, ideal, valid):
     """Pixels (n, 2) into ideal normalised coordinates (n, 2) at the reference row."""
     n = len(xy)
     for chunk in prange((n + _CHUNK - 1) // _CHUNK):
-        E = np.empty((3, 3))
         for k in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK)):
             xd = (xy[k, 0] - intr[2]) / intr[0]
             yd = (xy[k, 1] - intr[3]) / intr[1]
-            x, y, ok = _unproject(model, axis, sign, lens, xd, yd, phi, E)
+            x, y, ok = _unproject(model, axis, sign, lens, xd, yd, phi)
             valid[k] = ok
             ideal[k, 0] = x if ok else np.nan
             ideal[k, 1] = y if ok else np.nan
@@ -452,7 +414,6 @@ def fill_map(model, axis, sign, intr, lens, phi, rays, row0, col0, map_x, map_y)
     answers, the map points far outside every photo (finite: a NaN is handled differently by OpenCV 4 and 5).
     """
     out = np.empty(20)
-    E = np.empty((3, 3))
     vel = np.zeros(3)
     rows, cols = map_x.shape
     for i in range(rows):
@@ -464,14 +425,9 @@ def fill_map(model, axis, sign, intr, lens, phi, rays, row0, col0, map_x, map_y)
             x = rays[0, 0] * u + rays[0, 1] * v + rays[0, 2]
             y = rays[1, 0] * u + rays[1, 1] * v + rays[1, 2]
             z = rays[2, 0] * u + rays[2, 1] * v + rays[2, 2]
-            if model < ROTATION:
-                ok = _project(model, axis, sign, lens, x, y, z, phi, vel, out, False, E, E)
-            else:
-                ok = z > 0.0 and _project_exact(
-                    axis, sign, lens, x, y, z, phi, vel, 0.0, 2.0 * t1 - t2, out, False, E, E
-                )
-                t2 = t1
-                t1 = sign * out[axis] if ok else math.nan
+            ok = _project(model, axis, sign, lens, x, y, z, phi, vel, 2.0 * t1 - t2, out, False)
+            t2 = t1
+            t1 = sign * out[axis] if ok else math.nan
             if ok:
                 map_x[i, j] = intr[0] * out[0] + intr[2]
                 map_y[i, j] = intr[1] * out[1] + intr[3]
@@ -480,7 +436,7 @@ def fill_map(model, axis, sign, intr, lens, phi, rays, row0, col0, map_x, map_y)
                 map_y[i, j] = -1e6
 
 
-@kernel()
+@kernel(forceinline=True)
 def _loss(kind, s, scale2):
     """Robust loss rho(s) of a squared residual, rho'(s), and the share of curvature that it takes away along r.
 
@@ -504,7 +460,7 @@ def _loss(kind, s, scale2):
 _INVALID_PX = 100.0
 
 
-@kernel()
+@kernel(forceinline=True)
 def _camera_frame(R, center, velocity, point, vel_c):
     """Point in the camera frame at the reference row (x, y, z), and the velocity there in vel_c."""
     d0, d1, d2 = point[0] - center[0], point[1] - center[1], point[2] - center[2]
@@ -526,25 +482,14 @@ def residuals(
     o = len(frame_idx)
     for chunk in prange((o + _CHUNK - 1) // _CHUNK):
         out = np.empty(20)
-        E = np.empty((3, 3))
-        L = np.empty((3, 3))
         vel_c = np.empty(3)
         for k in range(chunk * _CHUNK, min(o, (chunk + 1) * _CHUNK)):
             f = frame_idx[k]
             c = camera_of_frame[f]
             x, y, z = _camera_frame(R_cw[f], center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
-            valid[k] = _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, out, False, E, L)
+            valid[k] = _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, math.nan, out, False)
             for i in range(2):
                 res[k, i] = intrs[c, i] * out[i] + intrs[c, 2 + i] - xy_raw[k, i] if valid[k] else _INVALID_PX
-
-
-@kernel()
-def _project_near(model, axis, sign, lens, x, y, z, phi, vel, clock, out, jac, E, L):
-    """As `_project`; the exact models search the row from `clock`, or afresh when that is NaN."""
-    if model < ROTATION:
-        return _project(model, axis, sign, lens, x, y, z, phi, vel, out, jac, E, L)
-    moving = 1.0 if model == CONSTANT_MOTION else 0.0
-    return z > 0.0 and _project_exact(axis, sign, lens, x, y, z, phi, vel, moving, clock, out, jac, E, L)
 
 
 @parallel_kernel()
@@ -561,8 +506,6 @@ def residual_costs(
     size = (o + len(cost) - 1) // len(cost)
     for chunk in prange(len(cost)):
         out = np.empty(20)
-        E = np.empty((3, 3))
-        L = np.empty((3, 3))
         vel_c = np.empty(3)
         total = 0.0
         for k in range(chunk * size, min(o, (chunk + 1) * size)):
@@ -570,10 +513,12 @@ def residual_costs(
             c = camera_of_frame[f]
             x, y, z = _camera_frame(R_cw[f], center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
             s = 2.0 * (_INVALID_PX / sigma_px[k]) ** 2
-            if _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, out, False, E, L):
-                ex = (intrs[c, 0] * out[0] + intrs[c, 2] - xy_raw[k, 0]) / sigma_px[k]
-                ey = (intrs[c, 1] * out[1] + intrs[c, 3] - xy_raw[k, 1]) / sigma_px[k]
-                s = ex * ex + ey * ey
+            # the row is near where it was measured
+            row = signs[c] * (xy_raw[k, axes[c]] - intrs[c, 2 + axes[c]]) / intrs[c, axes[c]]
+            if _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, row, out, False):
+                ex = intrs[c, 0] * out[0] + intrs[c, 2] - xy_raw[k, 0]
+                ey = intrs[c, 1] * out[1] + intrs[c, 3] - xy_raw[k, 1]
+                s = (ex * ex + ey * ey) / sigma_px[k] ** 2
                 clock[k] = signs[c] * out[axes[c]]
             else:
                 clock[k] = np.nan
@@ -599,8 +544,6 @@ def residual_blocks(
     size = (o + len(cost) - 1) // len(cost)
     for chunk in prange(len(cost)):
         out = np.empty(20)
-        E = np.empty((3, 3))
-        L = np.empty((3, 3))
         vel_c = np.empty(3)
         total = 0.0
         for k in range(chunk * size, min(o, (chunk + 1) * size)):
@@ -608,15 +551,14 @@ def residual_blocks(
             c = camera_of_frame[f]
             R = R_cw[f]
             x, y, z = _camera_frame(R, center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
-            if not _project_near(
-                model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, clock[k], out, True, E, L
-            ):
+            if not _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, clock[k], out, True):
                 total += 0.5 * _loss(loss_kind, 2.0 * (_INVALID_PX / sigma_px[k]) ** 2, scale2)[0]
                 res[k] = 0.0
                 J_frame[k] = 0.0
                 continue
-            r0 = (intrs[c, 0] * out[0] + intrs[c, 2] - xy_raw[k, 0]) / sigma_px[k]
-            r1 = (intrs[c, 1] * out[1] + intrs[c, 3] - xy_raw[k, 1]) / sigma_px[k]
+            precision = 1.0 / sigma_px[k]
+            r0 = (intrs[c, 0] * out[0] + intrs[c, 2] - xy_raw[k, 0]) * precision
+            r1 = (intrs[c, 1] * out[1] + intrs[c, 3] - xy_raw[k, 1]) * precision
             s = r0 * r0 + r1 * r1
             rho, weight, share = _loss(loss_kind, s, scale2)
             total += 0.5 * rho
@@ -628,7 +570,7 @@ def residual_blocks(
             m00, m01, m11 = w * (1.0 - a_s * r0 * r0), -w * a_s * r0 * r1, w * (1.0 - a_s * r1 * r1)
             res[k, 0] = r0 * w / keep
             res[k, 1] = r1 * w / keep
-            g0, g1 = intrs[c, 0] / sigma_px[k], intrs[c, 1] / sigma_px[k]
+            g0, g1 = intrs[c, 0] * precision, intrs[c, 1] * precision
             for i in range(2):
                 u, v = (m00 * g0, m01 * g1) if i == 0 else (m01 * g0, m11 * g1)
                 a0, a1, a2 = u * out[2] + v * out[5], u * out[3] + v * out[6], u * out[4] + v * out[7]
@@ -661,7 +603,7 @@ def _lens_basis(lens, x, y, d):
 
 
 @kernel()
-def _lens_jacobian(model, axis, sign, lens, x, y, z, phi, vel, xd, yd, d, E):
+def _lens_jacobian(model, axis, sign, lens, x, y, z, phi, vel, xd, yd, d):
     """Derivatives d (5, 2) by k1 k2 p1 p2 k3 of the distorted coordinates (xd, yd) that `_project` found.
 
     The exact models read the row from the distorted image, so a change of the lens moves it; the others apply the lens
@@ -673,15 +615,12 @@ def _lens_jacobian(model, axis, sign, lens, x, y, z, phi, vel, xd, yd, d, E):
         return
     moving = 1.0 if model == CONSTANT_MOTION else 0.0
     t = sign * (yd if axis == 1 else xd)
-    _exp_so3(t * phi[0], t * phi[1], t * phi[2], E)
+    f0, f1, f2 = phi[0], phi[1], phi[2]
     v0, v1, v2 = moving * vel[0], moving * vel[1], moving * vel[2]
-    p0, p1, p2 = x - t * v0, y - t * v1, z - t * v2
-    q0 = E[0, 0] * p0 + E[0, 1] * p1 + E[0, 2] * p2
-    q1 = E[1, 0] * p0 + E[1, 1] * p1 + E[1, 2] * p2
-    q2 = E[2, 0] * p0 + E[2, 1] * p1 + E[2, 2] * p2
-    w0 = phi[1] * q2 - phi[2] * q1 - (E[0, 0] * v0 + E[0, 1] * v1 + E[0, 2] * v2)
-    w1 = phi[2] * q0 - phi[0] * q2 - (E[1, 0] * v0 + E[1, 1] * v1 + E[1, 2] * v2)
-    w2 = phi[0] * q1 - phi[1] * q0 - (E[2, 0] * v0 + E[2, 1] * v1 + E[2, 2] * v2)
+    a, b = _rodrigues(t * t * (f0 * f0 + f1 * f1 + f2 * f2))
+    q0, q1, q2 = _turn(t * f0, t * f1, t * f2, a, b, x - t * v0, y - t * v1, z - t * v2)
+    e0, e1, e2 = _turn(t * f0, t * f1, t * f2, a, b, v0, v1, v2)
+    w0, w1, w2 = f1 * q2 - f2 * q1 - e0, f2 * q0 - f0 * q2 - e1, f0 * q1 - f1 * q0 - e2
     X, Y = q0 / q2, q1 / q2
     _, _, xx, xy, yx, yy, _ = _lens(lens, X, Y)
     dX, dY = (w0 - X * w2) / q2, (w1 - Y * w2) / q2
@@ -707,8 +646,6 @@ def intrinsic_blocks(
     scale2 = loss_scale * loss_scale
     for chunk in prange((o + _CHUNK - 1) // _CHUNK):
         out = np.empty(20)
-        E = np.empty((3, 3))
-        L = np.empty((3, 3))
         d = np.empty((5, 2))
         vel_c = np.empty(3)
         for k in range(chunk * _CHUNK, min(o, (chunk + 1) * _CHUNK)):
@@ -717,7 +654,7 @@ def intrinsic_blocks(
             axis, sign, lens = axes[c], signs[c], lenses[c]
             J_camera[k] = 0.0
             x, y, z = _camera_frame(R_cw[f], center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
-            if not _project(model, axis, sign, lens, x, y, z, phi[f], vel_c, out, False, E, L):
+            if not _project(model, axis, sign, lens, x, y, z, phi[f], vel_c, math.nan, out, False):
                 continue
             xd, yd = out[0], out[1]
             r0 = (intrs[c, 0] * xd + intrs[c, 2] - xy_raw[k, 0]) / sigma_px[k]
@@ -728,7 +665,7 @@ def intrinsic_blocks(
             a_s = (1.0 - math.sqrt(1.0 - share)) / s if s > 0.0 else 0.0
             m00, m01, m11 = w * (1.0 - a_s * r0 * r0), -w * a_s * r0 * r1, w * (1.0 - a_s * r1 * r1)
             g0, g1 = intrs[c, 0] / sigma_px[k], intrs[c, 1] / sigma_px[k]
-            _lens_jacobian(model, axis, sign, lens, x, y, z, phi[f], vel_c, xd, yd, d, E)
+            _lens_jacobian(model, axis, sign, lens, x, y, z, phi[f], vel_c, xd, yd, d)
             for i in range(len(unknowns)):
                 code = unknowns[i]
                 if code >= 5:

@@ -13,6 +13,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
 
 from ._jit import kernel, parallel_kernel, prange
 
@@ -141,7 +144,55 @@ def covisible_columns(frame_start, frame_order, frame_idx, track_idx, track_star
             slot[found[i]] = -1
 
 
-@parallel_kernel()
+@intrinsic
+def _add_product(typingctx, unknowns, S, i, J, k, n, m00, m01, m10, m11):
+    """S[i] += J[k]' M J[n], rows of blocks as vectors.
+
+    Written for LLVM itself: numba unrolls loops over so few columns into scalars, at four times the time.
+    """
+
+    def generate(context, builder, signature, args):
+        columns = signature.args[0].count
+        vector = ir.VectorType(ir.DoubleType(), columns)
+        first = ir.Constant(ir.VectorType(ir.IntType(32), columns), [0] * columns)
+
+        def row(array, block, r):
+            ary = context.make_array(signature.args[array])(context, builder, value=args[array])
+            at = [block, context.get_constant(types.intp, r), context.get_constant(types.intp, 0)]
+            pointer = cgutils.get_item_pointer(context, builder, signature.args[array], ary, at)
+            return builder.bitcast(pointer, vector.as_pointer())
+
+        def times(value, x):
+            filled = builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.IntType(32)(0))
+            return builder.fmul(builder.shuffle_vector(filled, filled, first), x, flags=("contract",))
+
+        def plus(x, y):
+            return builder.fadd(x, y, flags=("contract",))
+
+        k0, k1, n0, n1 = (builder.load(row(3, block, r), align=8) for block in args[4:6] for r in range(2))
+        m00, m01, m10, m11 = args[6:]
+        l0, l1 = plus(times(m00, k0), times(m10, k1)), plus(times(m01, k0), times(m11, k1))
+        for a in range(columns):
+            pointer = row(1, args[2], a)
+            l0a, l1a = (builder.extract_element(x, ir.IntType(32)(a)) for x in (l0, l1))
+            total = plus(times(l1a, n1), plus(times(l0a, n0), builder.load(pointer, align=8)))
+            builder.store(total, pointer, align=8)
+        return context.get_dummy_value()
+
+    return types.void(unknowns, S, i, J, k, n, m00, m01, m10, m11), generate
+
+
+@kernel(fastmath=_SUMS)
+def _times(x0, x1, x2, B, p):
+    """Row (x0, x1, x2) times the symmetric matrix B[p]."""
+    return (
+        x0 * B[p, 0, 0] + x1 * B[p, 0, 1] + x2 * B[p, 0, 2],
+        x0 * B[p, 0, 1] + x1 * B[p, 1, 1] + x2 * B[p, 1, 2],
+        x0 * B[p, 0, 2] + x1 * B[p, 1, 2] + x2 * B[p, 2, 2],
+    )
+
+
+@parallel_kernel(fastmath=_SUMS)
 def reduced_system(
     unknowns, frame_start, frame_order, frame_idx, track_idx, track_start, point_of, row_start, cols,
     J, V_inv, g_point, g_frame, diagonal, S, rhs,
@@ -157,25 +208,17 @@ def reduced_system(
         for i in range(row_start[f], row_start[f + 1]):
             slot[cols[i]] = i
             S[i] = 0.0
-        own = S[row_start[f]]
         for a in range(nb):
             rhs[f, a] = g_frame[f, a]
-            own[a, a] = diagonal[f, a]
+            S[row_start[f], a, a] = diagonal[f, a]
         for s in range(frame_start[f], frame_start[f + 1]):
             k = frame_order[s]
             t = track_idx[k]
-            B = V_inv[point_of[t]]
-            g = g_point[point_of[t]]
-            x0, x1, x2 = -J[k, 0, 3], -J[k, 0, 4], -J[k, 0, 5]
-            y0, y1, y2 = -J[k, 1, 3], -J[k, 1, 4], -J[k, 1, 5]
-            u0 = x0 * B[0, 0] + x1 * B[1, 0] + x2 * B[2, 0]
-            u1 = x0 * B[0, 1] + x1 * B[1, 1] + x2 * B[2, 1]
-            u2 = x0 * B[0, 2] + x1 * B[1, 2] + x2 * B[2, 2]
-            w0 = y0 * B[0, 0] + y1 * B[1, 0] + y2 * B[2, 0]
-            w1 = y0 * B[0, 1] + y1 * B[1, 1] + y2 * B[2, 1]
-            w2 = y0 * B[0, 2] + y1 * B[1, 2] + y2 * B[2, 2]
-            e0 = u0 * g[0] + u1 * g[1] + u2 * g[2]
-            e1 = w0 * g[0] + w1 * g[1] + w2 * g[2]
+            p = point_of[t]
+            u0, u1, u2 = _times(-J[k, 0, 3], -J[k, 0, 4], -J[k, 0, 5], V_inv, p)
+            w0, w1, w2 = _times(-J[k, 1, 3], -J[k, 1, 4], -J[k, 1, 5], V_inv, p)
+            e0 = u0 * g_point[p, 0] + u1 * g_point[p, 1] + u2 * g_point[p, 2]
+            e1 = w0 * g_point[p, 0] + w1 * g_point[p, 1] + w2 * g_point[p, 2]
             for a in range(nb):
                 rhs[f, a] -= J[k, 0, a] * e0 + J[k, 1, a] * e1
             for n in range(track_start[t], track_start[t + 1]):
@@ -188,12 +231,7 @@ def reduced_system(
                     if n == k:
                         m00 += 1.0
                         m11 += 1.0
-                    block = S[slot[frame_idx[n]]]
-                    for a in range(nb):
-                        l0 = J[k, 0, a] * m00 + J[k, 1, a] * m10
-                        l1 = J[k, 0, a] * m01 + J[k, 1, a] * m11
-                        for b in range(nb):
-                            block[a, b] += l0 * J[n, 0, b] + l1 * J[n, 1, b]
+                    _add_product(unknowns, S, slot[frame_idx[n]], J, k, n, m00, m01, m10, m11)
 
 
 @parallel_kernel()
@@ -244,7 +282,7 @@ def border_rows(
                         B[f, a, at + b] += l0 * J_camera[n, 0, b] + l1 * J_camera[n, 1, b]
 
 
-@parallel_kernel()
+@parallel_kernel(fastmath=_SUMS)
 def back_substitute(unknowns, track_start, point_of, frame_idx, V_inv, g_point, J, step_frame, step_point):
     """step_point (n, 3) = -V^-1 (g_point + sum Jp' J step_frame)."""
     nb = len(unknowns)
@@ -289,7 +327,7 @@ def multiply(unknowns, row_start, cols, low_start, low_block, low_col, S, x, y):
 
 # The factor L of the envelope: rows in bands of four, each band from its first column (a multiple of four) to its
 # diagonal, rows one after the other: entry (4 g + r, c) is data[offset[g] + r * (4 g + 4 - first[g]) + c - first[g]].
-@kernel()
+@parallel_kernel()
 def fill_envelope(place, row_start, cols, S, scale, first, offset, data):
     """Blocks into the envelope, scaled on both sides; place (m, nb) is each unknown's row, -1 if held.
 
@@ -300,7 +338,7 @@ def fill_envelope(place, row_start, cols, S, scale, first, offset, data):
     for g in range(len(first)):
         for r in range(4):
             data[offset[g] + r * (4 * g + 4 - first[g]) + 4 * g + r - first[g]] = 1.0
-    for f in range(len(row_start) - 1):
+    for f in prange(len(row_start) - 1):
         for i in range(row_start[f], row_start[f + 1]):
             for a in range(nb):
                 for b in range(nb):

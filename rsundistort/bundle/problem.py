@@ -16,7 +16,7 @@ from ..errors import InputError
 from ..model import Camera, Reconstruction, check_shutter_model
 from .intrinsics import INTRINSICS, moved_camera
 from .options import LOSSES, BundleOptions
-from .reduced import Border, Elimination, NormalEquations, Step, Structure
+from .reduced import Border, Elimination, NormalEquations, Step, Structure, by_first_photo
 
 __all__ = ["BundleProblem", "Spreads", "State", "reprojection_residuals"]
 
@@ -107,7 +107,14 @@ class BundleProblem:
         obs = reconstruction.observations
         if not len(obs) or reconstruction.num_images < 2:
             raise InputError("bundle adjustment needs two photos and measurements of common points")
-        self._start = reconstruction
+        # points in the order of their tracks: what a photo sees lies together in memory
+        self._points = by_first_photo(
+            obs.frame_idx, obs.point_idx, reconstruction.num_images, reconstruction.num_points
+        )
+        rank = np.argsort(self._points)
+        self._given = reconstruction
+        obs = replace(obs, point_idx=rank[obs.point_idx])
+        self._start = replace(reconstruction, points_w=reconstruction.points_w[self._points], observations=obs)
         self._shutter_model = shutter_model
         self._options = options
         self._block = _BLOCK.get(shutter_model, 9)
@@ -182,14 +189,16 @@ class BundleProblem:
     def reconstruction(self, state: State) -> Reconstruction:
         """The reconstruction at a state."""
         U, _, Vt = np.linalg.svd(state.R_cw)  # rounding of many increments
+        points_w = np.empty_like(state.points_w)
+        points_w[self._points] = state.points_w
         return replace(
-            self._start,
+            self._given,
             cameras=state.cameras,
             R_cw=U @ Vt,
             center_w=state.center_w,
             phi=state.phi,
             velocity=state.velocity,
-            points_w=state.points_w,
+            points_w=points_w,
             shutter_model=self._shutter_model,
         )
 
@@ -210,10 +219,12 @@ class BundleProblem:
         known = self._known_weight * (motion - self._known) ** 2
         return 0.5 * float(np.sum(self._motion_weight * motion**2 + known))
 
-    def _jacobians(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    def _jacobians(
+        self, state: State, spent: NormalEquations | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
         """Weighted residuals (o, 2), Jacobians of the photos (o, 2, nb), and the cost without priors."""
         o = len(self._xy)
-        res, J_frame = np.empty((o, 2)), np.empty((o, 2, self._block))
+        res, J_frame = spent.blocks if spent else (np.empty((o, 2)), np.empty((o, 2, self._block)))
         if state is not self._clock_of:
             self._clock.fill(np.nan)
             self._clock_of = None
@@ -227,9 +238,9 @@ class BundleProblem:
         res, J_frame, cost = self._jacobians(state)
         return res, J_frame, -J_frame[:, :, 3:6], cost
 
-    def linearize(self, state: State) -> NormalEquations:
-        """Normal equations and cost at a state."""
-        res, J_frame, cost = self._jacobians(state)
+    def linearize(self, state: State, spent: NormalEquations | None = None) -> NormalEquations:
+        """Normal equations and cost at a state, written over those of `spent`: fresh memory takes time to get."""
+        res, J_frame, cost = self._jacobians(state, spent)
         prior_diag = np.zeros((len(state.phi), self._block))
         prior_gradient = np.zeros_like(prior_diag)
         motion = self._motion(state)
@@ -289,7 +300,8 @@ class BundleProblem:
         frame, point, intrinsics = step
         angles = np.abs(frame[:, [0, 1, 2, *range(6, min(self._block, 9))]]).max()
         # a far point moves a lot along its ray without moving in any photo: its depth is its own yardstick
-        depth = np.maximum(np.linalg.norm(state.points_w - state.center_w.mean(0), axis=1), self._size)
+        far = state.points_w - state.center_w.mean(0)
+        depth = np.maximum(np.sqrt(np.einsum("na,na->n", far, far)), self._size)
         ways = np.abs(frame[:, [3, 4, 5, *range(9, self._block)]]).max() / self._size
-        lengths = max(ways, float((np.abs(point).max(1) / depth).max(initial=0)))
+        lengths = max(ways, float((np.abs(point) / depth[:, None]).max(initial=0)))
         return float(max(angles, lengths, np.abs(intrinsics).max(initial=0.0)))

@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from .._kernels import schur
 
-__all__ = ["Border", "Elimination", "NormalEquations", "Structure"]
+__all__ = ["Border", "Elimination", "NormalEquations", "Structure", "by_first_photo"]
 
 # Right-hand sides of the inverse that are held at once: 192 in a system of 10,000 photos are 180 MB.
 _COLUMNS = 192
@@ -32,6 +32,13 @@ _MAX_CG = 500
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Step = tuple[Array, Array, Array]
+
+
+def by_first_photo(frame_idx: Index, point_idx: Index, num_frames: int, num_points: int) -> Index:
+    """Points in the order of the first photo that sees each."""
+    first = np.full(num_points, num_frames)
+    np.minimum.at(first, point_idx, frame_idx)
+    return np.argsort(first, kind="stable")
 
 
 @dataclass(frozen=True)
@@ -67,9 +74,7 @@ class Structure:
     @classmethod
     def from_observations(cls, frame_idx: Index, point_idx: Index, num_frames: int, num_points: int) -> Structure:
         """Structure of observations in any order."""
-        first = np.full(num_points, num_frames)
-        np.minimum.at(first, point_idx, frame_idx)
-        point_of = np.argsort(first, kind="stable")
+        point_of = by_first_photo(frame_idx, point_idx, num_frames, num_points)
         track = np.empty(num_points, np.int64)
         track[point_of] = np.arange(num_points)
         order = np.argsort(track[point_idx] * num_frames + frame_idx, kind="stable")
@@ -407,6 +412,11 @@ class NormalEquations:
         Diagonal Hessian and gradient of the priors of the photos.
     border : Border
         What the photos share.
+
+    Attributes
+    ----------
+    blocks : tuple of array
+        res and J_frame.
     """
 
     def __init__(
@@ -425,6 +435,7 @@ class NormalEquations:
         nb = prior_diag.shape[1]
         n = len(s.point_of)
         self._J = J_frame
+        self.blocks = res, J_frame
         self._unknowns = (0.0,) * nb
         self._prior_diag = prior_diag
         self._V = np.empty((n, 3, 3))

@@ -27,8 +27,8 @@ class LinearSystem(Protocol):
 class Problem(Protocol):
     """What is minimised."""
 
-    def linearize(self, state: Any) -> LinearSystem:
-        """Normal equations and cost at a state."""
+    def linearize(self, state: Any, spent: Any = None) -> LinearSystem:
+        """Normal equations and cost at a state; they may be written over those of `spent`, which nobody needs."""
 
     def retract(self, state: Any, step: Any) -> Any:
         """The state after a step."""
@@ -104,7 +104,7 @@ def minimize(
                 reason = "step"
                 break
         if accepted:
-            system = problem.linearize(state)
+            system = problem.linearize(state, system)
         else:
             damping *= growth
             growth *= 2.0
