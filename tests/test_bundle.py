@@ -236,6 +236,18 @@ def test_covariances_are_those_of_the_whole_inverse(factor_limit, refine, rng):
     m, nb = problem._free.shape
     expected = np.array([whole[nb * i : nb * i + nb, nb * i : nb * i + nb] for i in range(m)])
     size = np.sqrt(np.einsum("iaa,ibb->iab", expected, expected))
+    # of linear functions: of one photo's unknowns, and of all points (which the problem keeps in another order)
+    vector = rng.normal(size=(1, m, nb))
+    found = problem.linearize(state).apply_inverse(vector)[0]
+    reference = (whole[: m * nb, : m * nb] @ vector.ravel()).reshape(m, nb)
+    np.testing.assert_allclose(found, reference, rtol=0, atol=1e-8 * np.abs(reference).max())
+    weights = rng.normal(size=(problem._start.num_points, 3))
+    variance, with_photos = problem.variance_of_points(state, weights)
+    start, stop = m * nb, m * nb + weights.size
+    b = weights[problem._points].ravel()
+    assert variance == pytest.approx(b @ whole[start:stop, start:stop] @ b, rel=1e-7)
+    reference = (whole[: m * nb, start:stop] @ b).reshape(m, nb)
+    np.testing.assert_allclose(with_photos, reference, rtol=0, atol=1e-7 * np.abs(reference).max())
     photos, cameras = problem.covariances(state)
     np.testing.assert_array_less(np.abs(photos - expected), 1e-8 * size + 1e-300)  # as the step
     expected = whole[len(whole) - len(cameras) :, len(whole) - len(cameras) :]

@@ -30,8 +30,9 @@ class Posterior:
         rec = result.reconstruction
         spreads = Spreads(result.phi_sigma, max(result.velocity_sigma * rec.baseline, 1e-300))
         plain = replace(options or BundleOptions(), loss="squared")
-        problem = BundleProblem(rec, rec.shutter_model, plain, result.sigma_px, spreads)
-        self._equations = problem.linearize(problem.initial_state())
+        self._problem = BundleProblem(rec, rec.shutter_model, plain, result.sigma_px, spreads)
+        self._state = self._problem.initial_state()
+        self._equations = self._problem.linearize(self._state)
 
     def of_photos(self, vectors: Array) -> Array:
         """Covariance of the photos' unknowns times vectors (k, m, nb), as in `BundleResult.covariances`."""
@@ -42,7 +43,7 @@ class Posterior:
 
         And its covariance (m, nb) with the photos' unknowns. NaN where the system cannot be factored.
         """
-        return self._equations.variance_of_points(weights)
+        return self._problem.variance_of_points(self._state, weights)
 
 
 def gauge_directions(result: BundleResult) -> Array:

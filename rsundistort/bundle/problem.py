@@ -186,6 +186,12 @@ class BundleProblem:
         """
         return self.linearize(state).marginal_covariances()
 
+    def variance_of_points(
+        self, state: State, weights: NDArray[np.float64]
+    ) -> tuple[float, NDArray[np.float64]]:  # fmt: skip
+        """Variance of sum(weights * points_w), weights (n, 3), and its covariance (m, nb) with the photos' unknowns."""
+        return self.linearize(state).variance_of_points(weights[self._points])
+
     def reconstruction(self, state: State) -> Reconstruction:
         """The reconstruction at a state."""
         U, _, Vt = np.linalg.svd(state.R_cw)  # rounding of many increments

@@ -84,7 +84,7 @@ def minimize(
             step, predicted = solved
             candidate = problem.retract(state, step)
             new_cost = problem.cost(candidate)
-            if not cost - new_cost > _GOOD_STEP * predicted:
+            if predicted > cost_tolerance * cost and not cost - new_cost > _GOOD_STEP * predicted:
                 candidate = problem.settle(candidate)
                 new_cost = problem.cost(candidate)
             decrease = cost - new_cost
