@@ -1,6 +1,6 @@
 """Critical motions on synthetic measurements: prints one JSON object a line.
 
-    python benchmarks/critical.py [still] [nobody] [spread] [--trials N] [--nw-rsba DIR]
+    python benchmarks/critical.py [still] [nobody] [spread] [nw-rsba] [--trials N]
 
 `still`: the level cameras and points of sample_scenes/colonnade, random motions of 0.05 rad a frame, one photo (another
 in each trial) still, which the tool is not told: how often `auto` picks it, or another that moved by less than 1 mrad,
@@ -9,7 +9,8 @@ and the error of the scene's vertical scale, beside that without remedy for both
 it lies within two of the reported standard deviations.
 `spread`: the reported standard deviation of log k against the spread of k over the trials, for cameras that are level,
 tilted by 5, 10 and 20 degrees, and with one photo turned by 90.
-`nw-rsba`: meter and sigma(log k) of the problems of that generator, by class.
+`nw-rsba`: meter and sigma(log k) of that generator's problems (../shared/nw-rsba) by class, how many are flagged, and
+the figures of benchmarks/nw_rsba.py with and without the remedy.
 
 Measurements by `project_rows`, plain NumPy, with noise of 0.5 px. The vertical scale is that of the affine map that
 takes the true points to the found ones best, along the mean y axis, against the root of the scale of area across it.
@@ -27,6 +28,7 @@ from typing import Any
 
 import numba
 import numpy as np
+import nw_rsba
 from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, Camera, Observations, Reconstruction, RowMotion, climb
@@ -35,6 +37,10 @@ from rsundistort.critical.meter import readout_axes
 from rsundistort.synthetic import project_rows
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "tests"))
+from critical_scenes import named_scene  # noqa: E402
+from numpy_twin import project  # noqa: E402  (the paper's model, in plain NumPy)
+
 NOISE_PX = 0.5
 SIGMA_RAD = 0.05
 
@@ -52,26 +58,6 @@ def colonnade() -> Reconstruction:
             data["points_w"],
             Observations(data["frame_idx"], data["point_idx"], np.zeros((len(data["frame_idx"]), 2))),
         )
-
-
-def level_scene(rng: np.random.Generator, m: int = 10, tilt_deg: float = 0.0, portrait: bool = False) -> Reconstruction:
-    """Photos in an arc around a cloud of 300 points, level, tilted at random, or one of them turned by 90 degrees."""
-    camera = Camera(960, 720, [[900.0, 0, 480], [0, 900.0, 360], [0, 0, 1]])
-    points = rng.uniform(-1, 1, (300, 3)) * [2.0, 1.2, 2.0]
-    turn = np.linspace(-0.6, 0.6, m) + rng.normal(0, 0.05, m)
-    centers = np.column_stack([7 * np.sin(turn), rng.normal(0, 0.3, m), -7 * np.cos(turn)])
-    R = Rotation.from_euler("y", turn[:, None])
-    R = Rotation.from_euler("x", rng.normal(0, tilt_deg, (m, 1)), degrees=True) * R
-    # a tilted camera goes up or down, so that it still looks at the scene
-    R_cw = R.as_matrix()
-    centers -= 7 * (R_cw[:, 2, 1])[:, None] * np.array([0.0, 1.0, 0.0])
-    if portrait:
-        R_cw[m // 2] = Rotation.from_euler("z", 90, degrees=True).as_matrix() @ R_cw[m // 2]
-    point, frame = (a.ravel() for a in np.mgrid[: len(points), :m])
-    return Reconstruction(
-        [camera], [f"{i:02d}" for i in range(m)], np.zeros(m, np.int64), R_cw, centers, points,
-        Observations(frame, point, np.zeros((len(frame), 2))),
-    )  # fmt: skip
 
 
 def with_motion(scene: Reconstruction, rng: np.random.Generator, still: int | None, model: str) -> Reconstruction:
@@ -100,8 +86,6 @@ def measured(truth: Reconstruction, rng: np.random.Generator) -> Reconstruction:
         points = truth.points_w[obs.point_idx[mine]]
         motion = RowMotion(truth.phi[i])
         if truth.shutter_model == "two-step":
-            from numpy_twin import project  # the paper's model, in plain NumPy
-
             camera = truth.camera(i)
             xy[mine] = project(
                 points, truth.R_cw[i], truth.center_w[i], truth.phi[i], "two-step", camera.readout, camera.K, [],
@@ -180,7 +164,7 @@ def trial_nobody(trial: int) -> dict[str, Any]:
     """Eleven level photos, all of which moved."""
     numba.set_num_threads(1)
     rng = np.random.default_rng([7, trial])
-    truth = with_motion(level_scene(rng, 11), rng, None, "rotation")
+    truth = with_motion(named_scene("parallel", 11, num_points=300, seed=trial), rng, None, "rotation")
     result, done = solved(truth, rng, "rotation", "auto")
     return {
         "error": log_vertical_scale(result.reconstruction, truth),
@@ -190,13 +174,10 @@ def trial_nobody(trial: int) -> dict[str, Any]:
 
 
 def trial_spread(arguments: tuple[str, str, int]) -> tuple[float, float]:
-    """Log k and its reported standard deviation in one trial of a scene whose motion stays."""
+    """Log k and its reported standard deviation in one trial of a scene."""
     numba.set_num_threads(1)
     kind, model, trial = arguments
-    fixed = np.random.default_rng([8, len(kind)])
-    tilt = float(kind.split()[0]) if kind[0].isdigit() else 0.0
-    scene = level_scene(fixed, 10, tilt, kind == "one portrait")
-    truth = replace(with_motion(scene, fixed, None, model), phi=np.zeros((10, 3)))
+    scene = named_scene(kind, num_points=300)
     # the motion is drawn from the prior in each trial: the posterior's spread is that of the errors over both
     rng = np.random.default_rng([9, trial])
     truth = with_motion(scene, rng, None, model)
@@ -283,14 +264,54 @@ def show_spread(pool: ProcessPoolExecutor, trials: int) -> None:
             )
 
 
+def show_outsider(_pool: ProcessPoolExecutor, _trials: int) -> None:
+    """Print the figures of `nw-rsba`."""
+    folder = ROOT.parent / "shared" / "nw-rsba"
+    if not folder.is_dir():
+        print(json.dumps({"name": "nw-rsba", "skipped": "no such problems beside the project"}))
+        return
+    for name in nw_rsba.CLASSES:
+        with np.load(folder / f"{name}.npz") as file:
+            arrays = {key: file[key] for key in file.files}
+        costs, before, after = [], [], []
+        for k in range(len(arrays["K"])):
+            result = climb(nw_rsba.problem(arrays, k))["constant-motion"]
+            healed, done = heal(result, BundleOptions())
+            costs.append(done.before)
+            before.append(nw_rsba.errors(result.reconstruction, arrays, k))
+            after.append(nw_rsba.errors(healed.reconstruction, arrays, k))
+        meters = [cost.meter.value for cost in costs]
+        sigmas = [cost.sigma_log_k for cost in costs]
+        print(
+            json.dumps(
+                {
+                    "name": f"nw-rsba {name}",
+                    "flagged": f"{sum(cost.is_flagged for cost in costs)}/{len(costs)}",
+                    "meter": [round(min(meters), 3), round(max(meters), 3)],
+                    "sigma_percent": [percent(min(sigmas)), percent(max(sigmas))],
+                    "points_rotation_centres": {
+                        "none": np.median(before, axis=0).round(4).tolist(),
+                        "auto": np.median(after, axis=0).round(4).tolist(),
+                    },
+                    "target": "all near-parallel and parallel, no general problem flagged; nothing worse",
+                }
+            ),
+            flush=True,
+        )
+
+
 def main() -> None:
     """Print what was asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parts = {"still": (show_still, 50), "nobody": (show_nobody, 100), "spread": (show_spread, 200)}
+    parts = {
+        "still": (show_still, 50),
+        "nobody": (show_nobody, 100),
+        "spread": (show_spread, 200),
+        "nw-rsba": (show_outsider, 0),
+    }
     parser.add_argument("parts", nargs="*", choices=[[], *parts], default=list(parts))
     parser.add_argument("--trials", type=int)
     args = parser.parse_args()
-    sys.path.insert(0, str(ROOT / "tests"))
     with ProcessPoolExecutor() as pool:
         for name in args.parts:
             show, trials = parts[name]

@@ -10,6 +10,7 @@ import click
 _COMMANDS = {
     "run": "Photos in, rectified photos and camera poses out.",
     "rectify": "Rectify a folder of photos with a solution.",
+    "analyze": "Whether poses let the shutter be told from the scene's shape.",
     "simulate": "Photos with a known shutter motion.",
     "evaluate": "Errors of a run against the truth.",
     "experiment": "The paper's experiments, on any scene.",

@@ -185,7 +185,7 @@ def closing_table(solution: Solution, out: Path) -> str:
     if critical is not None:
         said = [critical["sentence"], *critical["warnings"]]
         if critical["flagged"]:
-            said.append(f"confounded: {critical['meaning']}; see rsundistort analyze {out}")
+            said += ["at the next shoot:", *critical["advice"]]
         lines += ["", *(line for text in said for line in textwrap.wrap(text, 80))]
     doubtful = _doubtful(solution)
     if doubtful:

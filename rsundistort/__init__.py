@@ -11,6 +11,7 @@ array([[320., 240.]])
 """
 
 from .bundle import BundleOptions, BundleResult, bundle_adjust, climb
+from .critical import CriticalMotion, critical_motion
 from .errors import (
     FileError,
     FormatError,
@@ -29,6 +30,7 @@ from .pipeline import (
     RunOptions,
     SceneOptions,
     WarpOptions,
+    analyze,
     evaluate,
     rectify_folder,
     run,
@@ -50,6 +52,7 @@ __all__ = [
     "BundleOptions",
     "BundleResult",
     "Camera",
+    "CriticalMotion",
     "FileError",
     "FormatError",
     "InputError",
@@ -66,8 +69,10 @@ __all__ = [
     "Solution",
     "SolvedImage",
     "WarpOptions",
+    "analyze",
     "bundle_adjust",
     "climb",
+    "critical_motion",
     "distort_points",
     "evaluate",
     "init_rectify_map",

@@ -1,14 +1,18 @@
 """Critical motions: the meter, what they cost in a solution, and their remedies."""
 
+from .advice import Advice, advise, advise_poses
 from .cost import ShapeCost, shape_cost
 from .meter import CriticalMotion, critical_motion
 from .remedy import REMEDIES, Remedy, heal, still_probability, with_remedy
 
 __all__ = [
     "REMEDIES",
+    "Advice",
     "CriticalMotion",
     "Remedy",
     "ShapeCost",
+    "advise",
+    "advise_poses",
     "critical_motion",
     "heal",
     "shape_cost",

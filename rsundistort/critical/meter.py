@@ -70,15 +70,15 @@ class CriticalMotion:
             return "too few photos: two never tell the shutter from the shape of the scene"
         if not self.is_low:
             return "nothing: the photos are turned enough against each other"
-        hidden = int((self.singular_values < _LOW).sum())
         ds, da = np.abs(self.null_vector[:2])
         affine = float(np.hypot(ds, da))
-        if hidden >= 2 and affine > 0.9:
-            return "the scene's aspect ratio and skew: the photos are not turned against each other"
+        second, first = self.singular_values[3:]
+        if affine > 0.9 and second < max(2 * first, _ZERO):
+            return "the scene's skew and aspect ratio: the photos are not turned against each other"
         if da > 0.9:
             return "the scene's vertical scale: the y axes of the photos are nearly parallel"
         if affine > 0.9:
-            return "the scene's skew and aspect ratio"
+            return "the scene's skew and aspect ratio, mixed"
         return "the scene's shape, by a projective change that skew and aspect ratio hide"
 
 

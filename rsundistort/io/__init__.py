@@ -4,7 +4,7 @@ from .cameras import camera_from_exif, check_camera_fits, parse_camera
 from .colmap import read_colmap_poses, write_colmap_model
 from .images import Photo, list_photos, output_name, read_photo, write_image
 from .motions import read_known_motions
-from .nerfstudio import write_transforms
+from .nerfstudio import read_transforms, write_transforms
 from .outputs import output_folder
 from .solution import read_solution, write_solution
 
@@ -20,6 +20,7 @@ __all__ = [
     "read_known_motions",
     "read_photo",
     "read_solution",
+    "read_transforms",
     "write_colmap_model",
     "write_image",
     "write_solution",

@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..errors import FileError, FormatError
 from ..model import Camera, Solution
 
-__all__ = ["write_transforms"]
+__all__ = ["read_transforms", "write_transforms"]
 
 
 def _intrinsics(camera: Camera) -> dict[str, Any]:
@@ -30,6 +32,23 @@ def _intrinsics(camera: Camera) -> dict[str, Any]:
         "p1": 0.0,
         "p2": 0.0,
     }
+
+
+def read_transforms(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Poses R_cw (m, 3, 3) and center_w (m, 3) of a `transforms.json`."""
+    try:
+        frames = json.loads(path.read_text(encoding="utf-8"))["frames"]
+        matrices = np.array([frame["transform_matrix"] for frame in frames], np.float64).reshape(-1, 4, 4)
+    except OSError as error:
+        raise FileError(f"{path} cannot be read: {error.strerror}") from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(f"{path} is no transforms.json: expected frames with a transform_matrix each") from error
+    # back from OpenGL's axes; a matrix may hold a scale
+    axes = matrices[:, :3, :3] @ np.diag([1.0, -1.0, -1.0])
+    length = np.linalg.norm(axes, axis=1, keepdims=True)
+    if not (length > 0).all():
+        raise FormatError(f"{path}: a transform_matrix is no pose")
+    return (axes / length).transpose(0, 2, 1), matrices[:, :3, 3]
 
 
 def write_transforms(path: Path, solution: Solution, files: dict[str, tuple[str, str]]) -> None:

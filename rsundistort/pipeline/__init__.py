@@ -1,5 +1,6 @@
 """Whole jobs: the order of the stages, nothing else."""
 
+from .analyze import analyze
 from .batch import rectify_folder
 from .evaluate import evaluate
 from .run import RunOptions, run, use_threads, versions
@@ -10,6 +11,7 @@ __all__ = [
     "RunOptions",
     "SceneOptions",
     "WarpOptions",
+    "analyze",
     "evaluate",
     "read_motion_file",
     "rectify_folder",

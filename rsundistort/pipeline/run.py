@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..bundle import BundleOptions, reprojection_residuals
-from ..critical import Remedy, with_remedy
+from ..critical import with_remedy
 from ..errors import InputError
 from ..io import output_folder, output_name, write_colmap_model, write_solution, write_transforms
 from ..model import READOUTS, Reconstruction, Solution, SolvedImage, check_shutter_model
@@ -192,8 +192,10 @@ def _image_rms(rec: Reconstruction) -> NDArray[np.float64]:
     return np.sqrt(square / np.maximum(np.bincount(frame, minlength=rec.num_images), 1))
 
 
-def _critical(remedy: Remedy) -> dict[str, Any]:
+def _critical(solved: Solved) -> dict[str, Any]:
     """What `solution.json` says of critical motions."""
+    remedy = solved.remedy
+    assert remedy is not None
     after = remedy.after
     return {
         "singular_values": after.meter.singular_values.tolist(),
@@ -209,6 +211,7 @@ def _critical(remedy: Remedy) -> dict[str, Any]:
         "anchors": dict(remedy.anchors),
         "sentence": remedy.sentence,
         "warnings": list(remedy.warnings),
+        "advice": [each.sentence for each in solved.advice],
     }
 
 
@@ -256,7 +259,7 @@ def _solution(loaded: LoadedPhotos, solved: Solved, options: RunOptions) -> Solu
         rectified_cameras={key: camera.pinhole() for key, camera in cameras.items()},
         images=tuple(images),
         quality=quality,
-        critical_motion=None if solved.remedy is None else _critical(solved.remedy),
+        critical_motion=None if solved.remedy is None else _critical(solved),
         options={
             "camera": loaded.camera_source,
             "shutter_model": options.shutter_model,

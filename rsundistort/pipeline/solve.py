@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..bundle import LADDER, BundleOptions, BundleResult, ModelChoice, bundle_adjust, choose_model, climb
-from ..critical import Remedy, heal, with_remedy
+from ..critical import Advice, Remedy, advise, heal, with_remedy
 from ..errors import ReconstructionError, RsUndistortWarning
 from ..model import Reconstruction
 from ..sfm import map_photos, match_photos, retriangulate
@@ -39,12 +40,15 @@ class Solved:
         How the model was chosen; None where it was given.
     remedy : Remedy or None
         What was done about a critical motion; None for a global shutter.
+    advice : sequence of Advice
+        For the next shoot, where the poses are critical.
     """
 
     result: BundleResult
     global_result: BundleResult
     choice: ModelChoice | None = None
     remedy: Remedy | None = None
+    advice: Sequence[Advice] = ()
 
 
 def rungs_to(shutter_model: str) -> tuple[str, ...]:
@@ -161,10 +165,12 @@ def solve_photos(
             start = replace(tracks, shutter_model=choice.shutter_model)
             result = bundle_adjust(start, choice.shutter_model, options, partial(_tell, log, "choice"))
         log.end("choice of the model", chosen=choice.shutter_model, gain=choice.gain, num_held_out=choice.num_held_out)
-    mended = None
+    mended, advice = None, []
     if result.reconstruction.shutter_model != "global":
         log.begin("critical motion")
         result, mended = heal(result, options, remedy)
+        if mended.after.is_flagged:
+            advice = advise(result, options)
         log.end("critical motion", remedy=mended.name, sigma_log_k=mended.after.sigma_log_k)
     log.begin("comparison with a global shutter")
     plain = BundleOptions(
@@ -172,4 +178,6 @@ def solve_photos(
     )
     global_result = bundle_adjust(result.reconstruction, "global", plain)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
-    return Solved(replace(result, reconstruction=result.reconstruction.normalized()), global_result, choice, mended)
+    return Solved(
+        replace(result, reconstruction=result.reconstruction.normalized()), global_result, choice, mended, advice
+    )

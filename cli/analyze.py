@@ -1,0 +1,48 @@
+"""`rsundistort analyze`."""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import click
+
+from . import options as opt
+from .terminal import errors_for_people
+
+
+@click.command()
+@click.argument("path", type=click.Path(path_type=Path))
+@opt.readout_option
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def command(path: Path, readout: str | None, as_json: bool) -> None:
+    """Say whether a set of camera poses lets the shutter be told from the scene's shape.
+
+    PATH is a solution (solution.json, or the output of a run), a COLMAP model, or a transforms.json.
+    """
+    with errors_for_people():
+        from rsundistort.pipeline import analyze
+
+        result = analyze(path, readout)
+    click.echo(json.dumps(result) if as_json else _text(result))
+
+
+def _text(result: dict[str, Any]) -> str:
+    values = ", ".join(f"{value:.3f}" for value in result["singular_values"])
+    ds, da, *p = result["null_vector"]
+    lines = [
+        f"photos             {result['photos']}, readout {', '.join(result['readout'])}",
+        f"meter              {result['singular_values'][-1]:.3f} of {values}",
+        f"y axes             {result['y_axis_spread_deg']:.1f} degrees apart (root mean square)",
+        f"hidden best        skew {ds:.2f}, aspect {da:.2f}, plane at infinity {', '.join(f'{x:.2f}' for x in p)}",
+        f"confounded         {result['meaning']}",
+    ]
+    if result["sentence"]:
+        lines += ["", *textwrap.wrap(result["sentence"], 80)]
+    if result["advice"]:
+        lines += ["", "at the next shoot:"]
+        for each in result["advice"]:
+            lines += textwrap.wrap(each, 80, initial_indent="  ", subsequent_indent="    ")
+    return "\n".join(lines)

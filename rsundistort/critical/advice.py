@@ -1,0 +1,148 @@
+"""What to photograph at the next shoot, and what it would gain for the cameras at hand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ..bundle import BundleOptions, BundleResult
+from ..model import Observations, Reconstruction
+from ..model.projection import project_points
+from .cost import ShapeCost, shape_cost
+from .meter import critical_motion
+
+__all__ = ["Advice", "advise", "advise_poses"]
+
+_TILT_DEG = 20.0
+# A photo of the advice sees what a photo at hand sees, if at least this many points stay in it.
+_MIN_POINTS = 20
+
+
+@dataclass(frozen=True)
+class Advice:
+    """Photos to add, and their gain.
+
+    Attributes
+    ----------
+    what : str
+        In words.
+    meter : float
+        Smallest singular value of the meter with them.
+    sigma_log_k : float or None
+        Standard deviation of the height of the scene with them; None where only poses are known.
+    """
+
+    what: str
+    meter: float
+    sigma_log_k: float | None = None
+
+    @property
+    def sentence(self) -> str:
+        """For people."""
+        if self.sigma_log_k is None:
+            return f"{self.what}: the meter would read {self.meter:.2f}"
+        return f"{self.what}: the height would be uncertain by +-{100 * self.sigma_log_k:.2g} %"
+
+
+def _candidates(
+    R_cw: NDArray[np.float64], center_w: NDArray[np.float64], pivots: NDArray[np.float64]
+) -> list[tuple[str, list[tuple[int, NDArray[np.float64], NDArray[np.float64]]]]]:
+    """What could be added: words, and the photos as (photo that it repeats, R_cw, center_w).
+
+    Tilted photos are taken from above or below, turned about the `pivots` (m, 3), what the photos look at.
+    """
+    m = len(R_cw)
+    middle = int(np.argmin(np.linalg.norm(center_w - center_w.mean(0), axis=1)))
+    rolled = Rotation.from_euler("z", 90, degrees=True).as_matrix() @ R_cw[middle]
+    tilted = []
+    for number, i in enumerate(dict.fromkeys((m // 4, m // 2, 3 * m // 4))):
+        tilt = Rotation.from_euler("x", _TILT_DEG * (-1) ** number, degrees=True).as_matrix()
+        R = tilt @ R_cw[i]
+        ahead = R_cw[i] @ (pivots[i] - center_w[i])
+        tilted.append((i, R, pivots[i] - R.T @ ahead))
+    count = {1: "one photo", 2: "two photos", 3: "three photos"}[len(tilted)]
+    return [
+        ("one photo more, turned by 90 degrees", [(middle, rolled, center_w[middle])]),
+        (f"{count} more, tilted up or down by {_TILT_DEG:.0f} degrees", tilted),
+    ]
+
+
+def advise_poses(
+    R_cw: NDArray[np.float64], center_w: NDArray[np.float64], readout: Sequence[str]
+) -> list[Advice]:  # fmt: skip
+    """Advice from poses alone, (m, 3, 3) and (m, 3), with the readout of each; see `advise`."""
+    # the scene is as far away as the cameras are apart
+    distance = np.linalg.norm(center_w - center_w.mean(0), axis=1).max(initial=0.0) or 1.0
+    pivots = center_w + distance * R_cw[:, 2]
+    found = []
+    for what, photos in _candidates(R_cw, center_w, pivots):
+        R = np.concatenate([R_cw, [photo[1] for photo in photos]])
+        centers = np.concatenate([center_w, [photo[2] for photo in photos]])
+        directions = [*readout, *(readout[photo[0]] for photo in photos)]
+        found.append(Advice(what, critical_motion(R, centers, directions).value))
+    return found
+
+
+def advise(result: BundleResult, options: BundleOptions | None = None) -> list[Advice]:
+    """What a photo turned by 90 degrees, or a few tilted by 20, would gain for the cameras at hand.
+
+    The views are added to the solution: each repeats a photo, turned, with those of its points that stay in it,
+    measured as well as the others, and with a motion as unknown as theirs.
+    """
+    rec = result.reconstruction
+    obs = rec.observations
+    pivots = np.array(
+        [
+            np.median(rec.points_w[obs.point_idx[obs.frame_idx == i]], axis=0)
+            if (obs.frame_idx == i).any()
+            else rec.points_w.mean(0)
+            for i in range(rec.num_images)
+        ]
+    )
+    found = []
+    for what, photos in _candidates(rec.R_cw, rec.center_w, pivots):
+        more = rec
+        for photo in photos:
+            more = _with_view(more, *photo)
+        if more.num_images == rec.num_images + len(photos):
+            m, nb = result.covariances.shape[:2]
+            imagined = replace(result, reconstruction=more, covariances=np.zeros((m + len(photos), nb, nb)))
+            cost: ShapeCost = shape_cost(imagined, options)
+            found.append(Advice(what, cost.meter.value, cost.sigma_log_k))
+    return found
+
+
+def _with_view(
+    rec: Reconstruction, like: int, R_cw: NDArray[np.float64], center_w: NDArray[np.float64]
+) -> Reconstruction:
+    """The reconstruction with one photo more, of points that another photo sees; unchanged if it sees too few."""
+    obs = rec.observations
+    camera = rec.camera(like)
+    mine = np.flatnonzero(obs.frame_idx == like)
+    points = rec.points_w[obs.point_idx[mine]]
+    xy, seen = project_points((points - center_w) @ R_cw.T, camera, None, "global")
+    with np.errstate(invalid="ignore"):
+        seen &= ((xy >= 0) & (xy <= [camera.width - 1, camera.height - 1])).all(1)
+    if seen.sum() < _MIN_POINTS:
+        return rec
+    mine = mine[seen]
+    name = f"advice {rec.num_images}"
+    return replace(
+        rec,
+        image_names=[*rec.image_names, name],
+        camera_idx=np.append(rec.camera_idx, rec.camera_idx[like]),
+        R_cw=np.concatenate([rec.R_cw, R_cw[None]]),
+        center_w=np.concatenate([rec.center_w, center_w[None]]),
+        phi=np.concatenate([rec.phi, np.zeros((1, 3))]),
+        velocity=np.concatenate([rec.velocity, np.zeros((1, 3))]),
+        observations=Observations(
+            np.concatenate([obs.frame_idx, np.full(len(mine), rec.num_images)]),
+            np.concatenate([obs.point_idx, obs.point_idx[mine]]),
+            np.concatenate([obs.xy_raw, xy[seen]]),
+            np.concatenate([obs.sigma, obs.sigma[mine]]),
+        ),
+    )
