@@ -48,6 +48,12 @@ if TYPE_CHECKING:
     metavar="CSV",
     help="Motions known from elsewhere: name, phi1, phi2, phi3 (rad per frame; or omega1.. in rad/s) and sigma.",
 )
+@click.option(
+    "--lengths",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    metavar="CSV",
+    help="Lengths measured in the scene, two or more: photo1, x1, y1, photo2, x2, y2, length, sigma.",
+)
 @click.option("--readout-ms", type=click.FloatRange(min=0, min_open=True), help="Time of the readout, for rad/s.")
 @click.option(
     "--remedy",
@@ -79,6 +85,7 @@ def command(
     refine: str | None,
     still: tuple[str, ...],
     known: Path | None,
+    lengths: Path | None,
     readout_ms: float | None,
     remedy: str,
     max_features: int,
@@ -95,7 +102,7 @@ def command(
     sparse/ (COLMAP), transforms.json (nerfstudio) and solution.json.
     """
     with errors_for_people(), progress_bars(quiet) as progress:
-        from rsundistort.io import read_known_motions
+        from rsundistort.io import read_known_lengths, read_known_motions
         from rsundistort.pipeline import RunOptions, run
 
         solution = run(
@@ -113,6 +120,7 @@ def command(
                 refine=_names(refine),
                 still=_anchors(still),
                 known={} if known is None else read_known_motions(known, readout_ms and readout_ms / 1e3),
+                lengths=() if lengths is None else read_known_lengths(lengths),
                 remedy=remedy,
                 overwrite=overwrite,
             ),

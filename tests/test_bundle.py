@@ -12,7 +12,7 @@ from numpy_twin import DIRECTIONS, MODELS, project
 from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, Camera, InputError, Observations, Reconstruction, bundle_adjust, climb
-from rsundistort.bundle import LADDER, choose_model, objective, reprojection_residuals
+from rsundistort.bundle import LADDER, KnownLength, choose_model, objective, reprojection_residuals
 from rsundistort.bundle.choice import hold_out
 from rsundistort.bundle.intrinsics import moved_camera
 from rsundistort.bundle.problem import BundleProblem, Spreads
@@ -253,6 +253,65 @@ def test_covariances_are_those_of_the_whole_inverse(factor_limit, refine, rng):
     expected = whole[len(whole) - len(cameras) :, len(whole) - len(cameras) :]
     size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     np.testing.assert_array_less(np.abs(cameras - expected), 1e-8 * size + 1e-300)
+
+
+@pytest.mark.parametrize("refine", [(), ("f", "k1")], ids=["calibrated", "refined"])
+@pytest.mark.parametrize("damping", [0.0, 1e-2])
+def test_known_lengths_join_the_system(damping, refine, rng):
+    problem, state = noisy_problem(rng, "rotation", refine=refine)
+    given = problem._given
+    obs = given.observations
+
+    def end(point):
+        k = int(np.flatnonzero(obs.point_idx == point)[0])
+        return (given.image_names[obs.frame_idx[k]], *obs.xy_raw[k])
+
+    lengths = [KnownLength(end(0), end(1), 1.0, 0.01), KnownLength(end(2), end(3), 2.0, 0.03)]
+    lengths.append(KnownLength(end(1), end(4), 1.5, 0.02))
+    joined = BundleProblem(given, "rotation", replace(problem._options, lengths=lengths), 0.5, Spreads(0.03, 0.1))
+    H, g, free = dense_system(joined, state)
+    m, nb = joined._free.shape
+    points = slice(m * nb, m * nb + 3 * given.num_points)
+    residuals, J = joined._lengths.residuals(state.points_w), joined._lengths.jacobian(state.points_w)
+    h = 1e-6
+    for point, axis in [(int(p), a) for p in np.unique(joined._lengths._ends) for a in range(3)]:
+        step = np.zeros_like(state.points_w)
+        step[point, axis] = h
+        ahead, behind = (joined._lengths.residuals(state.points_w + s * step) for s in (1, -1))
+        np.testing.assert_allclose((ahead - behind) / (2 * h), J[:, point, axis], atol=1e-5 * np.abs(J).max())
+    J = J.reshape(len(lengths), -1)
+    damped = H + damping * np.diag(np.diag(H))
+    for A in (H, damped):
+        A[points, points] += J.T @ J
+    g[points] += J.T @ residuals
+    scale = 1 / np.sqrt(np.diag(damped)[free])
+    inverse = scale[:, None] * np.linalg.inv(scale[:, None] * damped[np.ix_(free, free)] * scale) * scale
+    expected = np.zeros(len(g))
+    expected[free] = -inverse @ g[free]
+    equations = joined.linearize(state)
+    assert equations.cost == pytest.approx(joined.cost(state), rel=1e-12)
+    assert equations.cost == pytest.approx(problem.cost(state) + 0.5 * residuals @ residuals, rel=1e-12)
+    parts, predicted = equations.solve(damping)
+    step = np.concatenate([part.ravel() for part in parts])
+    np.testing.assert_allclose(step, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
+    assert predicted == pytest.approx(-(g @ expected + 0.5 * expected @ H @ expected), rel=1e-7)
+    if damping == 0:
+        whole = np.zeros((len(free), len(free)))
+        whole[np.ix_(free, free)] = inverse
+        vector = rng.normal(size=(1, m, nb))
+        reference = (whole[: m * nb, : m * nb] @ vector.ravel()).reshape(m, nb)
+        found = equations.apply_inverse(vector)[0]
+        np.testing.assert_allclose(found, reference, rtol=0, atol=1e-7 * np.abs(reference).max())
+        photos, cameras = equations.marginal_covariances()
+        for i in range(m):
+            block = whole[nb * i : nb * i + nb, nb * i : nb * i + nb]
+            np.testing.assert_allclose(photos[i], block, rtol=0, atol=1e-7 * np.abs(block).max())
+        block = whole[len(whole) - len(cameras) :, len(whole) - len(cameras) :]
+        np.testing.assert_allclose(cameras, block, rtol=0, atol=1e-7 * np.abs(block).max(initial=0))
+        weights = rng.normal(size=(given.num_points, 3))
+        variance, _ = joined.variance_of_points(state, weights)
+        b = weights[joined._points].ravel()
+        assert variance == pytest.approx(b @ whole[points, points] @ b, rel=1e-6)
 
 
 @pytest.mark.parametrize("dist", [[], LENS], ids=["pinhole", "lens"])

@@ -13,9 +13,10 @@ from numpy_twin import project
 from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, InputError, Observations, RsUndistortError, bundle_adjust, climb, critical_motion
+from rsundistort.bundle import KnownLength
 from rsundistort.bundle.problem import BundleProblem, Spreads
 from rsundistort.critical import advise, heal, shape_cost, still_probability, with_remedy
-from rsundistort.io import read_known_motions
+from rsundistort.io import read_known_lengths, read_known_motions
 
 SIGMA_RAD = 0.05
 NOISE_PX = 0.5
@@ -315,6 +316,79 @@ def test_known_motions_are_residuals(rng):
     nothing = replace(options, known_phi={"00.jpg": (np.ones(3), np.full(3, np.inf))})
     same = bundle_adjust(result.reconstruction, "two-step", nothing)
     np.testing.assert_allclose(same.reconstruction.phi, result.reconstruction.phi, atol=1e-4)
+
+
+def seen_at(truth, point, photo=0):
+    """Where a photo sees a point."""
+    obs = truth.observations
+    k = np.flatnonzero((obs.point_idx == point) & (obs.frame_idx == photo))[0]
+    return (truth.image_names[photo], *obs.xy_raw[k])
+
+
+def test_a_known_height_and_width_fix_the_scale(rng):
+    scene = named_scene("parallel")
+    x = scene.points_w.copy()
+    x[:4] = [[-1, -1, 0.2], [-1, 1, 0.2], [-1, 0.3, 0], [1, 0.3, 0]]
+    truth, result, options = adjusted(replace(scene, points_w=x), rng, model="two-step")
+    lengths = [
+        KnownLength(seen_at(truth, 0), seen_at(truth, 1), 200.0, 0.2),  # centimetres
+        KnownLength(seen_at(truth, 2), seen_at(truth, 3), 200.0, 0.2),
+    ]
+    informed = replace(options, lengths=lengths)
+    after = bundle_adjust(result.reconstruction, "two-step", informed)
+    height, width = (
+        np.linalg.norm(after.reconstruction.points_w[i] - after.reconstruction.points_w[i + 1]) for i in (0, 2)
+    )
+    assert height / width == pytest.approx(1.0, abs=4e-3)
+    before = shape_cost(result, options).sigma_log_k
+    healed, remedy = heal(after, informed)
+    assert healed is after
+    assert remedy.name == "given"
+    # not below that of the ratio, above it by the noise of four points
+    assert 1e-3 * np.sqrt(2) < remedy.after.sigma_log_k < 0.4 * before
+    assert "lengths in the scene" in remedy.sentence
+
+
+@pytest.mark.parametrize(
+    ("end", "length", "sigma", "says"),
+    [
+        (("00.jpg", 5000.0, 0.0), 1.0, 0.1, "no point was measured"),
+        (("nobody", 0.0, 0.0), 1.0, 0.1, "'nobody' is not a photo"),
+        (None, 1.0, 0.0, "sigma"),
+        (None, -1.0, 0.1, "length"),
+        (("00.jpg", np.nan, 0.0), 1.0, 0.1, "finite"),
+    ],
+)
+def test_bad_lengths_are_refused(end, length, sigma, says, rng):
+    truth = with_measurements(named_scene("random"), np.zeros((10, 3)), "rotation")
+    good = KnownLength(seen_at(truth, 0), seen_at(truth, 1), 1.0, 0.1)
+
+    def solve(start, end, *numbers):
+        bundle_adjust(truth, "rotation", BundleOptions(lengths=[good, KnownLength(start, end, *numbers)]))
+
+    with pytest.raises(InputError, match=says):
+        solve(end or seen_at(truth, 2), seen_at(truth, 3), length, sigma)
+    with pytest.raises(InputError, match="same point"):
+        solve(seen_at(truth, 2), seen_at(truth, 2), 1.0, 0.1)
+    with pytest.raises(InputError, match="scale of the world"):
+        BundleOptions(lengths=[good])
+
+
+def test_known_lengths_are_read(tmp_path):
+    path = tmp_path / "lengths.csv"
+    path.write_text("photo1,x1,y1,photo2,x2,y2,length,sigma\na.jpg,1,2,,3,4,2.1,0.01\na.jpg,1,2,b.jpg,3,4,0.9,0.01\n")
+    first, second = read_known_lengths(path)
+    assert first == KnownLength(("a.jpg", 1, 2), ("a.jpg", 3, 4), 2.1, 0.01)
+    assert second.end == ("b.jpg", 3, 4)
+    for text, says in (
+        ("photo1,x1\n", "no column"),
+        ("photo1,x1,y1,photo2,x2,y2,length,sigma\na,1,2,b,3,4,x,1\n", "line 2"),
+        ("photo1,x1,y1,photo2,x2,y2,length,sigma\na,1,2,b,3,4,1,0\n", "sigma"),
+        ("photo1,x1,y1,photo2,x2,y2,length,sigma\na,1,2,b,3,4,1,1\n", "need two"),
+    ):
+        path.write_text(text)
+        with pytest.raises(RsUndistortError, match=says):
+            read_known_lengths(path)
 
 
 def test_without_a_remedy_there_is_no_prior(rng):

@@ -2,6 +2,7 @@
 
 from .adjust import LADDER, bundle_adjust, climb, objective
 from .choice import ModelChoice, choose_model
+from .lengths import KnownLength
 from .options import BundleOptions, BundleResult
 from .posterior import Posterior, gauge_directions
 from .problem import reprojection_residuals
@@ -10,6 +11,7 @@ __all__ = [
     "LADDER",
     "BundleOptions",
     "BundleResult",
+    "KnownLength",
     "ModelChoice",
     "Posterior",
     "bundle_adjust",

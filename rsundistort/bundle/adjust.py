@@ -250,8 +250,10 @@ def climb(
     """
     options = options or BundleOptions()
     # every rung but the last is only a start: what its model cannot explain is no outlier, and it need not converge
-    # a shutter that is not modelled yet would be blamed on the lens
-    rough = replace(options, outlier_rounds=0, spread_rounds=0, cost_tolerance=options.round_tolerance, refine=())
+    # a shutter that is not modelled yet would be blamed on the lens, and bend known lengths
+    rough = replace(
+        options, outlier_rounds=0, spread_rounds=0, cost_tolerance=options.round_tolerance, refine=(), lengths=()
+    )
     results: dict[str, BundleResult] = {}
     current = replace(reconstruction, phi=np.zeros((reconstruction.num_images, 3)))
     for model in rungs:

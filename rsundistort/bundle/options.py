@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from ..model import Reconstruction
 from .intrinsics import check_refined
+from .lengths import KnownLength, check_lengths
 
 __all__ = ["LOSSES", "BundleOptions", "BundleResult"]
 
@@ -81,6 +82,8 @@ class BundleOptions:
     known_phi : mapping of photo name to (phi, sigma)
         Motions that are known from elsewhere, each with its standard deviation, (3,) radians per frame; components of
         infinite sigma are unknown. A soft anchor is a known phi of zero.
+    lengths : sequence of KnownLength
+        Known lengths in the scene, two or more: their ratios are residuals.
     refine : tuple of str
         Intrinsics of each camera that are solved for with the rest: some of f (or fx, fy), cx, cy, k1, k2, p1, p2, k3.
     factor_limit : float
@@ -112,12 +115,14 @@ class BundleOptions:
     min_outlier_px: float = 0.25
     held_phi: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     known_phi: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
+    lengths: Sequence[KnownLength] = ()
     refine: tuple[str, ...] = ()
     factor_limit: float = 1e10
     cg_tolerance: float = 0.01
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "refine", check_refined(self.refine))
+        object.__setattr__(self, "lengths", check_lengths(self.lengths))
         known = {name: _known(name, *value) for name, value in self.known_phi.items()}
         object.__setattr__(self, "known_phi", known)
         for name, components in self.held_phi.items():

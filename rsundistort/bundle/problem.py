@@ -15,6 +15,7 @@ from .._kernels import projection
 from ..errors import InputError
 from ..model import Camera, Reconstruction, check_shutter_model
 from .intrinsics import INTRINSICS, moved_camera
+from .lengths import LengthResiduals
 from .options import LOSSES, BundleOptions
 from .reduced import Border, Elimination, NormalEquations, Step, Structure, by_first_photo
 
@@ -131,6 +132,7 @@ class BundleProblem:
         span = reconstruction.frame_span()[:, None]
         weight = np.hstack([np.repeat((span / s) ** 2, 3, axis=1) for s in (spreads.phi, spreads.velocity)])
         self._motion_weight = weight[:, : self._block - 6]
+        self._lengths = LengthResiduals(self._start, options.lengths)
         self._known, self._known_weight = self._known_motions(span)
         self._free = self._free_unknowns()
         self._elimination = Elimination.of(
@@ -223,7 +225,8 @@ class BundleProblem:
     def _prior_cost(self, state: State) -> float:
         motion = self._motion(state)
         known = self._known_weight * (motion - self._known) ** 2
-        return 0.5 * float(np.sum(self._motion_weight * motion**2 + known))
+        lengths = float(np.sum(self._lengths.residuals(state.points_w) ** 2))
+        return 0.5 * (float(np.sum(self._motion_weight * motion**2 + known)) + lengths)
 
     def _jacobians(
         self, state: State, spent: NormalEquations | None = None
@@ -254,7 +257,8 @@ class BundleProblem:
         prior_gradient[:, 6:] = self._motion_weight * motion + self._known_weight * (motion - self._known)
         total = cost + self._prior_cost(state)
         border = Border(self._camera_jacobians(state), self._start.camera_idx, len(state.cameras))
-        return NormalEquations(self._elimination, total, res, J_frame, prior_diag, prior_gradient, border)
+        lengths = self._lengths.residuals(state.points_w), self._lengths.jacobian(state.points_w)
+        return NormalEquations(self._elimination, total, res, J_frame, prior_diag, prior_gradient, border, lengths)
 
     def _camera_jacobians(self, state: State) -> NDArray[np.float64]:
         """Weighted Jacobians (o, 2, nc) of the intrinsics that are refined."""

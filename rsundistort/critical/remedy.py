@@ -61,7 +61,7 @@ class Remedy:
         return {
             "anchor": f"{names} most likely did not move and holds the height of the scene ({was} without it); {left}",
             "prior": f"no photo stands out as still; the motions are taken to be zero in the mean; {left}",
-            "given": f"with what is known of {names or 'the motions'}, {left}",
+            "given": f"with what is known of {names or 'lengths in the scene'}, {left}",
             "none": left,
         }[self.name]
 
@@ -146,7 +146,7 @@ def heal(result: BundleResult, options: BundleOptions, remedy: str = "auto") -> 
     before = shape_cost(result, options)
     given = {name: 0.0 for name, held in options.held_phi.items() if held}
     given |= {name: float(np.min(sigma)) for name, (_, sigma) in options.known_phi.items()}
-    if given:
+    if given or options.lengths:
         still = {
             name: sigma
             for name, sigma in given.items()

@@ -3,6 +3,7 @@
 from .cameras import camera_from_exif, check_camera_fits, parse_camera
 from .colmap import read_colmap_poses, write_colmap_model
 from .images import Photo, list_photos, output_name, read_photo, write_image
+from .lengths import read_known_lengths
 from .motions import read_known_motions
 from .nerfstudio import read_transforms, write_transforms
 from .outputs import output_folder
@@ -17,6 +18,7 @@ __all__ = [
     "output_name",
     "parse_camera",
     "read_colmap_poses",
+    "read_known_lengths",
     "read_known_motions",
     "read_photo",
     "read_solution",

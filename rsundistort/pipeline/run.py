@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..bundle import BundleOptions, reprojection_residuals
+from ..bundle import BundleOptions, KnownLength, reprojection_residuals
 from ..critical import with_remedy
 from ..errors import InputError
 from ..io import output_folder, output_name, write_colmap_model, write_solution, write_transforms
@@ -63,6 +63,8 @@ class RunOptions:
         positive, near zero with that standard deviation, radians per frame.
     known : mapping of photo name to (phi, sigma)
         Motions known from elsewhere, as in `BundleOptions.known_phi`.
+    lengths : sequence of KnownLength
+        Lengths measured in the scene, as in `BundleOptions.lengths`.
     remedy : str
         What to do about a critical motion: "auto", "prior" or "none"; see `critical.heal`.
     overwrite : bool
@@ -80,6 +82,7 @@ class RunOptions:
     refine: tuple[str, ...] | None = None
     still: Mapping[str, float] = field(default_factory=dict)
     known: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
+    lengths: Sequence[KnownLength] = ()
     remedy: str = "auto"
     overwrite: bool = False
 
@@ -105,7 +108,7 @@ class RunOptions:
                 soft[name] = (np.zeros(3), np.where(np.arange(3) == phi1, sigma, np.inf))
             else:
                 hard[name] = (phi1,)
-        return BundleOptions(held_phi=hard, known_phi={**self.known, **soft}, refine=refine)
+        return BundleOptions(held_phi=hard, known_phi={**self.known, **soft}, lengths=self.lengths, refine=refine)
 
 
 def versions() -> dict[str, str]:
@@ -153,7 +156,8 @@ def run(
     jobs = use_threads(options.jobs)
     with output_folder(out, overwrite=options.overwrite, apart_from=[photos]) as scratch:
         loaded = load_photos(photos, options.camera, options.readout, options.max_features, jobs, log)
-        for name in (*options.still, *options.known):
+        ends = (end[0] for each in options.lengths for end in (each.start, each.end))
+        for name in (*options.still, *options.known, *ends):
             if name not in loaded.names:
                 raise InputError(f"anchor {name!r} is not among the photos of {photos}")
         refine = options.refine
@@ -271,6 +275,7 @@ def _solution(loaded: LoadedPhotos, solved: Solved, options: RunOptions) -> Solu
             "refine": list(solved.result.sigma_intrinsics[0]),
             "still": dict(options.still),
             "known": sorted(options.known),
+            "lengths": len(options.lengths),
             "remedy": options.remedy,
         },
         generator=versions(),

@@ -1,0 +1,113 @@
+"""Lengths that are known: they fix the ratios of a scene that a critical motion leaves open."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..model import Reconstruction
+
+__all__ = ["KnownLength", "LengthResiduals", "check_lengths"]
+
+# A point whose measurement lies so near to where the user pointed is the one meant, pixels.
+_REACH_PX = 5.0
+
+End = tuple[str, float, float]
+
+
+@dataclass(frozen=True)
+class KnownLength:
+    """A length between two points of the scene, in any unit: all lengths share it.
+
+    Parameters
+    ----------
+    start, end : (photo name, x, y)
+        Where the points are seen, in pixels of stored photos with integer centres; each is taken to be the point that
+        was measured nearest, within 5 px.
+    length : float
+        What was measured.
+    sigma : float
+        Its standard deviation, in the same unit.
+    """
+
+    start: End
+    end: End
+    length: float
+    sigma: float
+
+    def __post_init__(self) -> None:
+        for name, value in (("length", self.length), ("sigma", self.sigma)):
+            if not 0 < value < np.inf:
+                raise InputError(f"known length from {self.start} to {self.end}: {name}={value!r}, expected above 0")
+        if not np.isfinite([*self.start[1:], *self.end[1:]]).all():
+            raise InputError(f"known length from {self.start} to {self.end}: pixels must be finite numbers")
+
+
+def check_lengths(lengths: Sequence[KnownLength]) -> tuple[KnownLength, ...]:
+    """The lengths, refused if there is one alone: it tells the scale of the world, which changes no photo."""
+    if len(lengths) == 1:
+        raise InputError("one known length tells the scale of the world only; give two, or a height and a width")
+    return tuple(lengths)
+
+
+def _nearest_point(reconstruction: Reconstruction, end: End) -> int:
+    """The point that was measured nearest to a pixel of a photo."""
+    name, x, y = end
+    if name not in reconstruction.image_names:
+        raise InputError(f"known length: {name!r} is not a photo of the reconstruction")
+    obs = reconstruction.observations
+    mine = np.flatnonzero(obs.frame_idx == reconstruction.image_names.index(name))
+    distance = np.linalg.norm(obs.xy_raw[mine] - [x, y], axis=1)
+    if not len(mine) or distance.min() > _REACH_PX:
+        raise InputError(f"known length: no point was measured within {_REACH_PX:.0f} px of ({x:g}, {y:g}) in {name}")
+    return int(obs.point_idx[mine[np.argmin(distance)]])
+
+
+class LengthResiduals:
+    """Residuals of known lengths: logarithms of their ratios, the common scale taken out.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Whose points are meant.
+    lengths : sequence of KnownLength
+        None, or two and more.
+    """
+
+    def __init__(self, reconstruction: Reconstruction, lengths: Sequence[KnownLength]) -> None:
+        ends = [
+            (_nearest_point(reconstruction, each.start), _nearest_point(reconstruction, each.end)) for each in lengths
+        ]
+        for (a, b), each in zip(ends, lengths, strict=True):
+            if a == b:
+                raise InputError(f"known length: {each.start} and {each.end} are the same point of the scene")
+        self._ends = np.array(ends, np.int64).reshape(-1, 2)
+        self._target = np.log([each.length for each in lengths])
+        weight = np.array([each.length / each.sigma for each in lengths])
+        unit = weight[:, None] / max(float(np.linalg.norm(weight)), 1e-300)
+        # weighted, and without the part that a change of the world's scale explains
+        self._whiten = (np.eye(len(lengths)) - unit @ unit.T) * weight
+
+    def __len__(self) -> int:
+        return len(self._target)
+
+    def residuals(self, points_w: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(q,) residuals in units of their standard deviations."""
+        chord = points_w[self._ends[:, 1]] - points_w[self._ends[:, 0]]
+        length = np.maximum(np.linalg.norm(chord, axis=1), 1e-300)
+        value: NDArray[np.float64] = self._whiten @ (np.log(length) - self._target)
+        return value
+
+    def jacobian(self, points_w: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(q, n, 3) derivatives of the residuals by the points."""
+        chord = points_w[self._ends[:, 1]] - points_w[self._ends[:, 0]]
+        along = chord / np.maximum((chord**2).sum(1, keepdims=True), 1e-300)
+        J = np.zeros((len(self), len(points_w), 3))
+        for k, (a, b) in enumerate(self._ends):
+            J[:, a] -= self._whiten[:, k, None] * along[k]
+            J[:, b] += self._whiten[:, k, None] * along[k]
+        return J

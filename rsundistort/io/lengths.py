@@ -1,0 +1,52 @@
+"""Lengths that were measured in the scene: CSV files."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+from ..bundle import KnownLength
+from ..errors import FileError, FormatError, InputError
+
+__all__ = ["read_known_lengths"]
+
+_COLUMNS = ("photo1", "x1", "y1", "photo2", "x2", "y2", "length", "sigma")
+
+
+def read_known_lengths(path: Path | str) -> list[KnownLength]:
+    """Lengths between points of the scene, as `BundleOptions.lengths` takes them.
+
+    Parameters
+    ----------
+    path : path
+        CSV with the header `photo1, x1, y1, photo2, x2, y2, length, sigma`: where the two ends are seen (pixels of the
+        stored photos, integer centres; `photo2` may be empty for the same photo), the length, in any unit, and its
+        standard deviation. Two lines or more.
+
+    Raises
+    ------
+    FileError, FormatError
+        Not readable; missing columns, numbers that are none or not positive.
+    """
+    path = Path(path)
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            reader.fieldnames = [column.strip() for column in reader.fieldnames or []]
+            rows = list(reader)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise FileError(f"{path} is no readable CSV file: {error}") from error
+    if missing := [column for column in _COLUMNS if column not in reader.fieldnames]:
+        raise FormatError(f"{path} has no column {missing[0]!r}; expected {', '.join(_COLUMNS)}")
+    found = []
+    for number, row in enumerate(rows, start=2):
+        first = (row["photo1"] or "").strip()
+        second = (row["photo2"] or "").strip() or first
+        try:
+            x1, y1, x2, y2, length, sigma = (float(row[c] or "") for c in ("x1", "y1", "x2", "y2", "length", "sigma"))
+            found.append(KnownLength((first, x1, y1), (second, x2, y2), length, sigma))
+        except (ValueError, InputError) as error:
+            raise FormatError(f"{path}, line {number}: {error}") from None
+    if len(found) < 2:
+        raise FormatError(f"{path} holds {len(found)} lengths; ratios need two, such as a height and a width")
+    return found
