@@ -43,8 +43,11 @@ def need_matplotlib() -> Any:
 
 def cumulative_histograms(entries: Sequence[Mapping[str, Any]], methods: Sequence[str], path: Path) -> None:
     """Share of trials whose error is below a value: a row for each metric, a column for each scene."""
+    figure_of = need_matplotlib()
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
     scenes = list(dict.fromkeys(entry["scene"] for entry in entries))
-    figure = need_matplotlib()(figsize=(3.2 * len(scenes) + 0.6, 2.5 * len(_AXES) + 0.6))
+    figure = figure_of(figsize=(3.2 * len(scenes) + 0.6, 2.5 * len(_AXES) + 0.6))
     axes = figure.subplots(len(_AXES), len(scenes), squeeze=False)
     for row, (metric, label) in enumerate(_AXES.items()):
         for column, scene in enumerate(scenes):
@@ -55,6 +58,11 @@ def cumulative_histograms(entries: Sequence[Mapping[str, Any]], methods: Sequenc
                 ax.step(values, share, where="post", color=f"C{number}", label=_LABELS.get(method, method), lw=1.5)
             # the methods' errors differ by orders of magnitude
             ax.set_xscale("log")
+            low, high = ax.get_xlim()
+            subs = (1, 2, 5) if high < 60 * low else (1,)  # more labels would lie on each other
+            ax.xaxis.set_major_locator(LogLocator(subs=subs))
+            ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            ax.xaxis.set_minor_formatter(NullFormatter())
             ax.set_ylim(0, 1)
             ax.grid(alpha=0.3, which="major")
             ax.set_xlabel(label)
