@@ -255,6 +255,22 @@ def test_covariances_are_those_of_the_whole_inverse(factor_limit, refine, rng):
     np.testing.assert_array_less(np.abs(cameras - expected), 1e-8 * size + 1e-300)
 
 
+@pytest.mark.parametrize("refine", [(), ("f",)], ids=["calibrated", "refined"])
+@pytest.mark.parametrize("model", ["global", "rotation", "constant-motion"])
+def test_conjugate_gradients_of_several_clusters_give_the_factored_step(model, refine, rng):
+    # 75 photos are three clusters, whose borders do not lie between bands of four unknowns: some are held
+    rec = make_scene(rng, model, num_images=75, num_points=40, noise_px=1.0)
+    start = replace(perturbed(rec, rng, 0.001, 0.002), phi=rec.phi)
+    steps = []
+    for factor_limit in (1e10, -1):
+        options = BundleOptions(loss="squared", factor_limit=factor_limit, cg_tolerance=1e-13, refine=refine)
+        problem = BundleProblem(start, model, options, 0.5, Spreads(0.03, 0.1))
+        assert (problem._elimination.clusters is not None) == (factor_limit < 0)
+        steps.append(problem.linearize(problem.initial_state()).solve(1e-4)[0])
+    for factored, iterated in zip(*steps, strict=True):
+        np.testing.assert_allclose(iterated, factored, rtol=0, atol=1e-7 * np.abs(factored).max(initial=0))
+
+
 @pytest.mark.parametrize("refine", [(), ("f", "k1")], ids=["calibrated", "refined"])
 @pytest.mark.parametrize("damping", [0.0, 1e-2])
 def test_known_lengths_join_the_system(damping, refine, rng):

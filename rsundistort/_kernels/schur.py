@@ -328,10 +328,10 @@ def multiply(unknowns, row_start, cols, low_start, low_block, low_col, S, x, y):
 # The factor L of the envelope: rows in bands of four, each band from its first column (a multiple of four) to its
 # diagonal, rows one after the other: entry (4 g + r, c) is data[offset[g] + r * (4 g + 4 - first[g]) + c - first[g]].
 @parallel_kernel()
-def fill_envelope(place, row_start, cols, S, scale, first, offset, data):
+def fill_envelope(place, row_start, cols, kept, S, scale, first, offset, data):
     """Blocks into the envelope, scaled on both sides; place (m, nb) is each unknown's row, -1 if held.
 
-    What lies left of the envelope is left out. Rows past the last unknown, up to a multiple of four, are the identity.
+    Blocks that are not `kept` (blocks,) are left out. Rows past the last unknown, up to a multiple of four, are the identity.
     """
     data[:] = 0.0
     nb = place.shape[1]
@@ -340,6 +340,8 @@ def fill_envelope(place, row_start, cols, S, scale, first, offset, data):
             data[offset[g] + r * (4 * g + 4 - first[g]) + 4 * g + r - first[g]] = 1.0
     for f in prange(len(row_start) - 1):
         for i in range(row_start[f], row_start[f + 1]):
+            if not kept[i]:
+                continue
             for a in range(nb):
                 for b in range(nb):
                     row, col = place[f, a], place[cols[i], b]
@@ -349,7 +351,7 @@ def fill_envelope(place, row_start, cols, S, scale, first, offset, data):
                         if cols[i] == f:
                             continue
                     g = row // 4
-                    if col >= 0 and col >= first[g]:
+                    if col >= 0:
                         at = offset[g] + (row - 4 * g) * (4 * g + 4 - first[g]) + col - first[g]
                         data[at] = value * scale[row] * scale[col]
 

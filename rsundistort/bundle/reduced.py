@@ -107,6 +107,8 @@ class Envelope:
         First column of each band of four rows, and where the band begins in the data.
     num_values : int
         Length of the data.
+    kept : (blocks,) bool array
+        Blocks of the matrix that lie inside.
     multiply_adds : float
         What the factorisation takes.
     """
@@ -116,6 +118,7 @@ class Envelope:
     first: Index
     offset: Index
     num_values: int
+    kept: NDArray[np.bool_]
     multiply_adds: float
 
     @classmethod
@@ -132,14 +135,19 @@ class Envelope:
         cols = rank[structure.cols]
         leftmost = np.arange(m)
         np.minimum.at(leftmost, np.maximum(rows, cols), np.minimum(rows, cols))
+        kept = np.ones(len(rows), bool)
         if cluster:
             leftmost = np.maximum(leftmost, np.arange(m) // cluster * cluster)
+            # a band of four rows can reach over the border of two clusters: half a coupling is not positive
+            kept = rows // cluster == cols // cluster
         bands = (size + 3) // 4
         first_of_row = np.concatenate([np.repeat(begin[leftmost], np.diff(begin)), np.full(4 * bands - size, size)])
         first = np.minimum(first_of_row.reshape(bands, 4).min(1), 4 * np.arange(bands)) // 4 * 4
         width = 4 * np.arange(1, bands + 1) - first
         offset = np.concatenate([[0], np.cumsum(4 * width)])
-        return cls(place, size, first, offset[:-1], int(offset[-1]), float((2.0 * width.astype(float) ** 2).sum()))
+        return cls(
+            place, size, first, offset[:-1], int(offset[-1]), kept, float((2.0 * width.astype(float) ** 2).sum())
+        )
 
     def factor(self, structure: Structure, S: Array) -> Callable[[Array], None] | None:
         """Solver in place of right-hand sides (k, padded rows), of the blocks inside the envelope; None if it fails."""
@@ -150,7 +158,7 @@ class Envelope:
         scale[self.place[free]] = 1.0 / np.sqrt(np.maximum(diagonal[free], 1e-300))
         data = np.empty(self.num_values)
         schur.fill_envelope(
-            self.place, structure.row_start, structure.cols, S, scale, self.first, self.offset, data
+            self.place, structure.row_start, structure.cols, self.kept, S, scale, self.first, self.offset, data
         )  # fmt: skip
         panel = _PANEL if self.multiply_adds > _WORTH_THREADS else max(len(self.first), 1)
         if not schur.factor_envelope(self.first, self.offset, panel, data):
