@@ -331,7 +331,8 @@ def multiply(unknowns, row_start, cols, low_start, low_block, low_col, S, x, y):
 def fill_envelope(place, row_start, cols, kept, S, scale, first, offset, data):
     """Blocks into the envelope, scaled on both sides; place (m, nb) is each unknown's row, -1 if held.
 
-    Blocks that are not `kept` (blocks,) are left out. Rows past the last unknown, up to a multiple of four, are the identity.
+    Blocks that are not `kept` (blocks,) are left out. Rows past the last unknown, up to a multiple of four, are those
+    of the identity.
     """
     data[:] = 0.0
     nb = place.shape[1]
