@@ -140,6 +140,8 @@ def _names(refine: str | None) -> tuple[str, ...] | None:
 
 def _anchors(still: tuple[str, ...]) -> dict[str, float]:
     """Photos and their standard deviations, radians per frame, of NAME or NAME=MRAD."""
+    from rsundistort import InputError
+
     anchors: dict[str, float] = {}
     for text in still:
         name, equals, number = text.rpartition("=")
@@ -150,9 +152,9 @@ def _anchors(still: tuple[str, ...]) -> dict[str, float]:
         if not equals:
             name = text
         if equals and not sigma > 0 and name != text:
-            raise click.BadParameter(f"{text}: the standard deviation must be positive", param_hint="--still")
+            raise InputError(f"--still {text}: the standard deviation must be positive")
         if anchors.get(name, sigma) != sigma:
-            raise click.BadParameter(f"{name} is named twice, with different standard deviations", param_hint="--still")
+            raise InputError(f"--still {name} is named twice, with different standard deviations")
         anchors[name] = sigma
     return anchors
 

@@ -11,6 +11,7 @@ import pytest
 from click.testing import CliRunner
 from make_photos import save_png, save_textures, texture
 from rsundistort_cli.main import cli
+from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, RowMotion, Solution, SolvedImage, write_solution
 
@@ -222,6 +223,40 @@ def _refine(folder):
     return ["--camera", CAMERA, "--refine", "f,zoom"]
 
 
+def _contradicting(folder):
+    save_textures(folder, THREE)
+    return ["--camera", CAMERA, "--still", "a.png", "--still", "a.png=2"]
+
+
+def _no_sigma(folder):
+    save_textures(folder, THREE)
+    return ["--camera", CAMERA, "--still", "a.png=-1"]
+
+
+def _still_and_known(folder):
+    save_textures(folder, THREE)
+    (folder.parent / "gyro.csv").write_text("name,phi1,phi2,phi3,sigma\na.png,0,0,0,0.001\n")
+    return ["--camera", CAMERA, "--still", "a.png=1", "--known", "gyro.csv"]
+
+
+def _unknown_known(folder):
+    save_textures(folder, THREE)
+    (folder.parent / "gyro.csv").write_text("name,phi1,phi2,phi3,sigma\nnobody.png,0,0,0,0.001\n")
+    return ["--camera", CAMERA, "--known", "gyro.csv"]
+
+
+def _mixed_units(folder):
+    save_textures(folder, THREE)
+    (folder.parent / "gyro.csv").write_text("name,phi1,omega2,sigma\na.png,0,0,0.001\n")
+    return ["--camera", CAMERA, "--known", "gyro.csv"]
+
+
+def _one_length(folder):
+    save_textures(folder, THREE)
+    (folder.parent / "l.csv").write_text("photo1,x1,y1,photo2,x2,y2,length,sigma\na.png,1,2,,3,4,1,0.1\n")
+    return ["--camera", CAMERA, "--lengths", "l.csv"]
+
+
 def _still(folder):
     save_textures(folder, THREE)
     return ["--camera", CAMERA, "--still", "nobody.png"]
@@ -253,6 +288,12 @@ OTHER_SIZE = json.dumps({"width": 640, "height": 480, "K": [[600, 0, 320], [0, 6
         (_apart, "share more of the scene"),
         (_flat, "share more of the scene"),
         (_still, "nobody.png"),
+        (_contradicting, "named twice"),
+        (_no_sigma, "must be positive"),
+        (_still_and_known, "give one of them"),
+        (_unknown_known, "nobody.png"),
+        (_mixed_units, "mixes"),
+        (_one_length, "need two"),
         (_refine, "cannot refine 'zoom'"),
     ],
 )
@@ -262,6 +303,82 @@ def test_run_refuses_in_one_line_and_writes_nothing(invoke, tmp_path, make, says
     line = error_line(invoke("run", "photos", "-o", "deep/out", *FEW, *options))
     assert says in line
     assert tree(tmp_path) == before
+
+
+# ---------------------------------------------------------------- analyze
+
+
+LEVEL = {
+    "R_cw": [[[c, 0, -s], [0, 1, 0], [s, 0, c]] for c, s in ((1, 0), (0.8, 0.6), (0.6, 0.8), (0.96, 0.28))],
+    "center_w": [[0, 0, 0], [1, 0.1, 0], [2, -0.2, 0.5], [3, 0.3, 0]],
+}
+
+
+def _level_solution(path):
+    camera = Camera(320, 240, np.array([[300.0, 0, 160], [0, 300.0, 120], [0, 0, 1]]))
+    images = [
+        SolvedImage(f"{i}.png", "1", np.array(R), np.array(C, float), RowMotion())
+        for i, (R, C) in enumerate(zip(LEVEL["R_cw"], LEVEL["center_w"], strict=True))
+    ]
+    write_solution(path, Solution("rotation", {"1": camera}, {"1": camera.pinhole()}, tuple(images)))
+
+
+def test_analyze_a_solution_and_transforms(invoke, tmp_path):
+    _level_solution(tmp_path / "solution.json")
+    result = invoke("analyze", "solution.json")
+    assert result.exit_code == 0, result.stderr
+    assert "vertical scale" in result.stdout
+    assert "turned by 90 degrees" in result.stdout
+    assert all(len(line) <= 100 for line in result.stdout.splitlines())
+    as_json = json.loads(invoke("analyze", tmp_path, "--json").stdout)
+    assert as_json["critical"] is True
+    assert as_json["singular_values"][-1] < 1e-9
+    frames = []
+    for R, C in zip(LEVEL["R_cw"], LEVEL["center_w"], strict=True):
+        matrix = np.eye(4)
+        matrix[:3, :3] = np.array(R).T @ np.diag([1, -1, -1])
+        matrix[:3, 3] = C
+        frames.append({"transform_matrix": matrix.tolist()})
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    found = json.loads(invoke("analyze", "transforms.json", "--json").stdout)
+    np.testing.assert_allclose(found["singular_values"], as_json["singular_values"], atol=1e-9)
+    # read by columns, the same cameras are told apart
+    columns = json.loads(invoke("analyze", "transforms.json", "--readout", "left-to-right", "--json").stdout)
+    assert columns["critical"] is False
+    assert columns["advice"] == []
+
+
+def test_analyze_a_colmap_model_with_a_lens(invoke, tmp_path):
+    _level_solution(tmp_path / "solution.json")
+    model = tmp_path / "model"
+    model.mkdir()
+    (model / "cameras.txt").write_text("1 SIMPLE_RADIAL 320 240 300 160.5 120.5 0.01\n")
+    (model / "points3D.txt").write_text("")
+    lines = []
+    for i, (R, C) in enumerate(zip(LEVEL["R_cw"], LEVEL["center_w"], strict=True), start=1):
+        x, y, z, w = Rotation.from_matrix(R).as_quat()
+        t = -np.array(R) @ C
+        lines.append(f"{i} {w} {x} {y} {z} {t[0]} {t[1]} {t[2]} 1 {i}.png\n\n")
+    (model / "images.txt").write_text("".join(lines))
+    found = json.loads(invoke("analyze", "model", "--json").stdout)
+    expected = json.loads(invoke("analyze", "solution.json", "--json").stdout)
+    np.testing.assert_allclose(found["singular_values"], expected["singular_values"], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "says"),
+    [
+        ("nothing.json", None, "does not exist"),
+        ("transforms.json", "{}", "no transforms.json"),
+        ("transforms.json", '{"frames": [{"transform_matrix": [[1, 2], [3, 4]]}]}', "no transforms.json"),
+        ("transforms.json", '{"frames": []}', "0 poses"),
+        ("solution.json", "{}", ""),
+    ],
+)
+def test_analyze_refuses_what_has_no_poses(invoke, tmp_path, name, text, says):
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    assert says in error_line(invoke("analyze", name))
 
 
 def test_run_refuses_an_out_in_use(invoke, tmp_path):

@@ -18,13 +18,15 @@ __all__ = ["read_colmap_poses", "rectified_keypoints", "write_colmap_model"]
 _HALF = 0.5
 
 
-def read_colmap_poses(folder: Path) -> tuple[Any, ...]:
+def read_colmap_poses(folder: Path, any_lens: bool = False) -> tuple[Any, ...]:
     """Poses, points and tracks of a COLMAP model, without its measurements.
 
     Parameters
     ----------
     folder : Path
-        With cameras, images and points3D, text or binary. Cameras must be pinholes.
+        With cameras, images and points3D, text or binary.
+    any_lens : bool
+        Whether cameras may have a lens distortion, which is left out; else they must be pinholes.
 
     Returns
     -------
@@ -41,7 +43,7 @@ def read_colmap_poses(folder: Path) -> tuple[Any, ...]:
     cameras = []
     for camera_id in ids:
         camera = model.cameras[camera_id]
-        if camera.model_name not in ("PINHOLE", "SIMPLE_PINHOLE"):
+        if not any_lens and camera.model_name not in ("PINHOLE", "SIMPLE_PINHOLE"):
             raise FormatError(f"{folder}: camera {camera_id} is {camera.model_name}, expected PINHOLE")
         K = np.array(camera.calibration_matrix())
         K[:2, 2] -= _HALF

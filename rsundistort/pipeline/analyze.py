@@ -40,7 +40,7 @@ def analyze(path: Path | str, readout: str | None = None) -> dict[str, Any]:
     if path.is_dir() and (path / "solution.json").is_file():
         path = path / "solution.json"
     if path.is_dir():
-        _, names, _, R_cw, center_w, *_ = read_colmap_poses(path)
+        _, names, _, R_cw, center_w, *_ = read_colmap_poses(path, any_lens=True)
         directions = [readout or "top-to-bottom"] * len(names)
     elif path.name.endswith("transforms.json"):
         R_cw, center_w = read_transforms(path)
