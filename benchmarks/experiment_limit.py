@@ -6,8 +6,7 @@
 posterior mode under the very distribution that the motion was drawn from, which no estimator betters on average (to
 second order in the noise). `ratio_reached` is the error of the paper's RS* over that of constant-motion, which is told
 nothing and starts from the global-shutter solution; `ratio_limit` is RS* over the oracle: what any method could reach.
-Medians over the trials. `noise_of_rs_star` is RS* on measurements of the same motion without its translation, which its
-model lacks: the error that is left to it by noise alone.
+Medians over the trials. The same for the variant without translation and the rotation model (`turning_...`).
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from rsundistort import bundle_adjust
-from rsundistort.experiments import OneOptions, load_scene
+from rsundistort.experiments import KnownScene, OneOptions, load_scene
 from rsundistort.experiments.one import draw_trial, errors_of, method_options
 from rsundistort.model import Reconstruction
 
@@ -38,15 +37,36 @@ def from_global(rough: Reconstruction, options: OneOptions) -> Reconstruction:
     return bundle_adjust(rough, "global", rough_options).reconstruction
 
 
-def oracle(truth: Reconstruction, options: OneOptions) -> dict[str, float]:
-    """Errors of constant-motion from the truth, with the spreads that the motion was drawn with."""
+def oracle(truth: Reconstruction, method: str, options: OneOptions) -> dict[str, float]:
+    """Errors of a model from the truth, with the spreads that the motion was drawn with."""
     # the axis is uniform: a component has a third of the angle's variance
     told = replace(
-        method_options("constant-motion", options),
+        method_options(method, options),
         phi_sigma=options.rotation_rad / np.sqrt(3.0),
-        velocity_sigma=options.translation,
+        velocity_sigma=max(options.translation, 1e-6),
     )
-    return errors_of(bundle_adjust(truth, "constant-motion", told).reconstruction, truth)
+    return errors_of(bundle_adjust(truth, method, told).reconstruction, truth)
+
+
+def trial_errors(scene: KnownScene, method: str, options: OneOptions, trial: int) -> dict[str, dict[str, float]]:
+    """Errors of RS*, of a method, and of its oracle in one trial."""
+    truth, rough = draw_trial(scene, options, trial)
+    start = from_global(rough, options)
+    found = {name: solved(start, truth, name, options) for name in ("rs-star", method)}
+    return {**found, "oracle": oracle(truth, method, options)}
+
+
+def ratios(errors: list[dict[str, dict[str, float]]], method: str) -> dict[str, dict[str, float]]:
+    """Medians of RS* over those of the method and of its oracle, and the medians."""
+    medians = {
+        name: {k: float(np.median([trial[name][k] for trial in errors])) for k in METRICS}
+        for name in ("rs-star", method, "oracle")
+    }
+    found = {
+        f"ratio_{what}": {k: round(medians["rs-star"][k] / medians[name][k], 1) for k in METRICS}
+        for what, name in (("reached", method), ("limit", "oracle"))
+    }
+    return found | {name: {k: round(v, 5) for k, v in each.items()} for name, each in medians.items()}
 
 
 def main() -> None:
@@ -60,27 +80,12 @@ def main() -> None:
         scene = load_scene(path)
         for seed in range(args.seeds):
             options = OneOptions(seed=seed)
-            errors: dict[str, list[dict[str, float]]] = {}
-            for trial in range(args.trials):
-                truth, rough = draw_trial(scene, options, trial)
-                start = from_global(rough, options)
-                for method in ("rs-star", "constant-motion"):
-                    errors.setdefault(method, []).append(solved(start, truth, method, options))
-                errors.setdefault("oracle", []).append(oracle(truth, options))
-                turning = replace(options, translation=0.0)
-                truth, rough = draw_trial(scene, turning, trial)
-                errors.setdefault("noise_of_rs_star", []).append(
-                    solved(from_global(rough, turning), truth, "rs-star", turning)
-                )
-            medians = {m: {k: float(np.median([e[k] for e in all_])) for k in METRICS} for m, all_ in errors.items()}
-            ratios = {
-                name: {k: round(medians["rs-star"][k] / medians[method][k], 1) for k in METRICS}
-                for name, method in (("ratio_reached", "constant-motion"), ("ratio_limit", "oracle"))
-            }
-            rounded = {m: {k: round(v, 5) for k, v in each.items()} for m, each in medians.items()}
-            print(
-                json.dumps({"scene": scene.name, "seed": seed, "trials": args.trials, **ratios, **rounded}), flush=True
-            )
+            turning = replace(options, translation=0.0)
+            line = {"scene": scene.name, "seed": seed, "trials": args.trials}
+            for prefix, method, chosen in (("", "constant-motion", options), ("turning_", "rotation", turning)):
+                errors = [trial_errors(scene, method, chosen, trial) for trial in range(args.trials)]
+                line |= {prefix + key: value for key, value in ratios(errors, method).items()}
+            print(json.dumps(line), flush=True)
 
 
 if __name__ == "__main__":
