@@ -166,7 +166,7 @@ def bundle_adjust(
     base = reconstruction.with_points(np.ones(len(reconstruction.observations), bool))
     if base.num_points:
         _check_solvable(base, shutter_model)
-    base = revive_points(base, shutter_model)
+    base = revive_points(base, shutter_model, from_afar=True)
     keep = np.ones(len(base.observations), bool)
     iterations = 0
     sigma = options.sigma_px or _noise_px(base, shutter_model, options.min_sigma_px)

@@ -1,4 +1,4 @@
-"""Points that a start has put where no photo can see them, placed anew."""
+"""Points placed anew that lie where no photo can see them, or at infinity."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ from .problem import reprojection_residuals
 
 __all__ = ["revive_points"]
 
-# Rays that do not meet ahead of the cameras are taken to meet this many sizes of the scene away.
-_FAR = 50.0
+# Rays that do not meet ahead of the cameras are taken to meet this many sizes of the scene away: so near that they pull
+# (at 50 sizes the way back takes five times as many steps).
+_FAR = 3.0
+# Points beyond so many sizes of the scene are as good as at infinity: no step brings them back.
+_LOST = 1e4
 
 
 def _world_rays(
@@ -37,14 +40,21 @@ def _world_rays(
     return centers, rays / np.linalg.norm(rays, axis=1, keepdims=True), valid
 
 
-def revive_points(reconstruction: Reconstruction, shutter_model: str) -> Reconstruction:
-    """The reconstruction with points that some of their photos cannot see (behind the camera) triangulated anew.
+def revive_points(reconstruction: Reconstruction, shutter_model: str, from_afar: bool = False) -> Reconstruction:
+    """The reconstruction with points triangulated anew that no adjustment could bring back.
 
-    Such a measurement has no derivative, so an adjustment could never bring its point back. The new place is where the
-    rays come nearest to each other, or far along them if that is behind a camera too.
+    A measurement that cannot be seen (its point is behind the camera) has no derivative, and a point that ran off to
+    infinity has next to none; a shutter that was not modelled yet sends points there whose rays it bent apart. The new
+    place is where the rays come nearest to each other. Where that is behind a camera, it is far along them, for a point
+    at infinity only if `from_afar`: in a solution that models the shutter it may belong there.
     """
     obs = reconstruction.observations
-    lost = np.unique(obs.point_idx[~reprojection_residuals(reconstruction, shutter_model)[1]])
+    points = reconstruction.points_w
+    size = float(np.median(np.linalg.norm(points - reconstruction.center_w.mean(0), axis=1)))
+    far = np.linalg.norm(points - reconstruction.center_w.mean(0), axis=1) > _LOST * size
+    unseen = np.zeros(reconstruction.num_points, bool)
+    unseen[obs.point_idx[~reprojection_residuals(reconstruction, shutter_model)[1]]] = True
+    lost = np.flatnonzero(unseen | far)
     if not len(lost):
         return reconstruction
     number = np.full(reconstruction.num_points, -1)
@@ -61,12 +71,15 @@ def revive_points(reconstruction: Reconstruction, shutter_model: str) -> Reconst
     np.add.at(way, of, rays)
     count = np.maximum(np.bincount(of, minlength=len(lost)), 1)[:, None]
     middle, way = middle / count, way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
-    size = float(np.median(np.linalg.norm(reconstruction.points_w - reconstruction.center_w.mean(0), axis=1)))
     # a ridge of 1e-9 leaves parallel rays at a finite place
     found = np.linalg.solve(A + 1e-9 * np.eye(3), (b + 1e-9 * middle)[..., None])[..., 0]
     ahead = np.ones(len(lost), bool)
     np.logical_and.at(ahead, of, ((found[of] - centers) * rays).sum(1) > 1e-6 * size)
     found = np.where(ahead[:, None], found, middle + _FAR * size * way)
-    points = reconstruction.points_w.copy()
-    points[lost] = found
+    moved = ahead & (np.linalg.norm(found - reconstruction.center_w.mean(0), axis=1) <= _LOST * size)
+    moved |= unseen[lost] | from_afar
+    if not moved.any():
+        return reconstruction
+    points = points.copy()
+    points[lost[moved]] = found[moved]
     return replace(reconstruction, points_w=points)
