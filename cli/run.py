@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--still",
+    "--anchor",
     multiple=True,
     metavar="NAME[=MRAD]",
     help="A photo known not to have moved: its phi1 is held at zero, or near zero with so many mrad per frame of "
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--lengths",
+    "--length",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     metavar="CSV",
     help="Lengths measured in the scene, two or more: photo1, x1, y1, photo2, x2, y2, length, sigma.",
@@ -193,7 +195,7 @@ def closing_table(solution: Solution, out: Path) -> str:
     ]
     critical = solution.critical_motion
     if critical is not None:
-        said = [critical["sentence"], *critical["warnings"]]
+        said = [critical["sentence"]]
         if critical["flagged"]:
             said += ["at the next shoot:", *critical["advice"]]
         lines += ["", *(line for text in said for line in textwrap.wrap(text, 80))]

@@ -15,6 +15,7 @@ from rsundistort import (
     InputError,
     ReconstructionError,
     RowMotion,
+    RsUndistortWarning,
     RunOptions,
     SkippedPhotoWarning,
     Solution,
@@ -212,6 +213,31 @@ def test_guessed_focal_length_is_refined(courtyard, solved, tmp_path):
     assert np.abs(found.dist[:2]).max() < 0.01
     before, after = (evaluate(out, courtyard / "ground_truth.json") for out in (solved[1], tmp_path / "out"))
     assert after["phi_mrad_per_frame"]["mean"] < 1.5 * before["phi_mrad_per_frame"]["mean"] + 0.5
+
+
+@pytest.mark.slow
+def test_a_wrong_anchor_is_obeyed_and_warned_of(courtyard, tmp_path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for name in COURTYARD_NAMES:
+        shutil.copy(courtyard / "photos" / name, photos)
+    shutil.copy(courtyard / "camera.json", photos)
+    truth = read_solution(courtyard / "ground_truth.json")
+    moved = max(truth.images, key=lambda image: np.linalg.norm(image.motion.phi[1:])).name
+    options = replace(OPTIONS, still={moved: 0.0}, shutter_model="rotation")
+    with pytest.warns(RsUndistortWarning, match=f"{moved} is said to have been still"):
+        solution = run(photos, tmp_path / "out", options)
+    assert solution.image(moved).motion.phi[0] == 0.0
+    assert solution.critical_motion["remedy"] == "given"
+    assert solution.critical_motion["anchors"] == {moved: 0.0}
+
+
+def test_what_a_solution_says_of_critical_motions(solved):
+    said = solved[0].critical_motion
+    assert len(said["singular_values"]) == len(said["null_vector"]) == 5
+    assert 0 < said["sigma_log_k"] < 0.01
+    assert said["remedy"] in ("none needed", "prior", "anchor")
+    assert "the height of the scene is uncertain by" in said["sentence"]
 
 
 def test_calibrated_intrinsics_stay_as_given(courtyard, solved):

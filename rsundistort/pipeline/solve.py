@@ -169,6 +169,8 @@ def solve_photos(
     if result.reconstruction.shutter_model != "global":
         log.begin("critical motion")
         result, mended = heal(result, options, remedy)
+        for text in mended.warnings:
+            warnings.warn(text, RsUndistortWarning, stacklevel=3)
         if mended.after.is_flagged:
             advice = advise(result, options)
         log.end("critical motion", remedy=mended.name, sigma_log_k=mended.after.sigma_log_k)
