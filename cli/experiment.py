@@ -45,7 +45,7 @@ def one(
 
     OUT gets trials.jsonl, summary.json, summary.csv and histograms.png; trials that it already holds are not repeated.
     """
-    with errors_for_people(), progress_bars(quiet) as progress:
+    with errors_for_people("the same command goes on where it was"), progress_bars(quiet) as progress:
         from rsundistort.experiments import OneOptions, experiment_one
 
         kinds: dict[str, Any] = {"methods": methods} if methods else {}

@@ -15,7 +15,7 @@ __all__ = ["errors_for_people", "progress_bars", "table"]
 
 
 @contextmanager
-def errors_for_people() -> Iterator[None]:
+def errors_for_people(kept: str = "nothing was written") -> Iterator[None]:
     """Known errors become one line and exit code 1; warnings become one line each."""
     import cv2
 
@@ -36,7 +36,7 @@ def errors_for_people() -> Iterator[None]:
             click.echo(f"error: {error}", err=True)
             sys.exit(1)
         except KeyboardInterrupt:
-            click.echo("stopped; nothing was written", err=True)
+            click.echo(f"stopped; {kept}", err=True)
             sys.exit(130)
 
 
