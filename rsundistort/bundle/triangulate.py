@@ -50,6 +50,8 @@ def revive_points(reconstruction: Reconstruction, shutter_model: str, from_afar:
     """
     obs = reconstruction.observations
     points = reconstruction.points_w
+    if not len(points):
+        return reconstruction
     size = float(np.median(np.linalg.norm(points - reconstruction.center_w.mean(0), axis=1)))
     far = np.linalg.norm(points - reconstruction.center_w.mean(0), axis=1) > _LOST * size
     unseen = np.zeros(reconstruction.num_points, bool)
