@@ -125,8 +125,7 @@ def _check_solvable(reconstruction: Reconstruction, shutter_model: str) -> None:
     m = reconstruction.num_images
     if shutter_model != "global" and m < 3:
         raise InputError(f"{m} photos cannot tell the shutter from the scene; at least three are needed")
-    size = float(np.median(np.linalg.norm(reconstruction.points_w - reconstruction.center_w.mean(0), axis=1)))
-    if m > 1 and not np.linalg.norm(np.ptp(reconstruction.center_w, axis=0)) > 1e-9 * size:
+    if m > 1 and not np.linalg.norm(np.ptp(reconstruction.center_w, axis=0)) > 1e-9 * reconstruction.size:
         raise InputError("all photos are taken from one place: without parallax there is no scene to solve for")
 
 

@@ -32,11 +32,11 @@ class Posterior:
         plain = replace(options or BundleOptions(), loss="squared")
         self._problem = BundleProblem(rec, rec.shutter_model, plain, result.sigma_px, spreads)
         self._state = self._problem.initial_state()
-        self._equations = self._problem.linearize(self._state)
+        self._covariance = self._problem.linearize(self._state).covariance()
 
     def of_photos(self, vectors: Array) -> Array:
         """Covariance of the photos' unknowns times vectors (k, m, nb), as in `BundleResult.covariances`."""
-        return self._equations.apply_inverse(vectors)
+        return self._covariance(vectors)
 
     def of_points(self, weights: Array) -> tuple[float, Array]:
         """Variance of a linear function of the points, `sum(weights * points_w)` with weights (n, 3).

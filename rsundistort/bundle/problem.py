@@ -138,7 +138,7 @@ class BundleProblem:
         self._elimination = Elimination.of(
             self._structure, self._free, options.factor_limit, options.cg_tolerance
         )  # fmt: skip
-        self._size = float(np.median(np.linalg.norm(reconstruction.points_w - reconstruction.center_w.mean(0), axis=1)))
+        self._size = reconstruction.size
 
     def _known_motions(self, span: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Motions (m, nb - 6) known from elsewhere, per unit of the clock, and their weights."""

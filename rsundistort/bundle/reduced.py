@@ -248,6 +248,42 @@ def _positive_inverse(A: Array) -> Array | None:
 
 
 @dataclass(frozen=True)
+class Factored:
+    """A reduced system that is factored: for as many right-hand sides as one likes.
+
+    Attributes
+    ----------
+    envelope : Envelope
+        Where its factor has entries.
+    solve_rows : callable
+        Solves for right-hand sides (k, padded rows) in place, the cameras being held.
+    border : (k, m, nb) array
+        Of the reduced system.
+    border_solved : (k, m, nb) array
+        S^-1 B': what a change of the cameras does to the photos, up to its sign.
+    cameras : (k, k) array
+        Covariance of the cameras' unknowns.
+    """
+
+    envelope: Envelope
+    solve_rows: Callable[[Array], None]
+    border: Array
+    border_solved: Array
+    cameras: Array
+
+    def solve_photos(self, b: Array) -> Array:
+        """S^-1 b for stacks (k, m, nb): the cameras being held."""
+        rows = self.envelope.gather(b)
+        self.solve_rows(rows)
+        return self.envelope.scatter(rows)
+
+    def covariance_times(self, vectors: Array) -> Array:
+        """Covariance of the photos' unknowns, the cameras being free, times vectors (k, m, nb)."""
+        found = self.solve_photos(vectors)
+        return found + np.tensordot(_products(found, self.border) @ self.cameras, self.border_solved, 1)
+
+
+@dataclass(frozen=True)
 class Elimination:
     """How the reduced system of a structure is solved: fixed while a problem is solved.
 
@@ -299,20 +335,24 @@ class Elimination:
         """
         if self.clusters is not None:
             return self._conjugate_gradients(self.clusters, reduced)
+        factored = self.factored(reduced)
+        if factored is None:
+            return None
+        x = factored.solve_photos(reduced.b[None])
+        y = factored.cameras @ (reduced.c - _products(reduced.border, x)[:, 0])
+        x = x[0] - np.tensordot(y, factored.border_solved, 1)
+        return x, y, np.zeros_like(x), np.zeros_like(y)
+
+    def factored(self, reduced: Reduced) -> Factored | None:
+        """The system factored; None if it is not positive."""
         solve = self.envelope.factor(self.structure, reduced.S)
         if solve is None:
             return None
-        rhs = self.envelope.gather(np.concatenate([reduced.b[None], reduced.border]))
-        solve(rhs)
-        x, *X = self.envelope.scatter(rhs)
-        y = np.zeros_like(reduced.c)
-        if len(y):
-            eliminated = _positive_inverse(reduced.corner - _products(reduced.border, np.array(X)))
-            if eliminated is None:
-                return None
-            y = eliminated @ (reduced.c - _products(reduced.border, x[None])[:, 0])
-            x = x - np.tensordot(y, X, 1)
-        return x, y, np.zeros_like(x), np.zeros_like(y)
+        rows = self.envelope.gather(reduced.border)
+        solve(rows)
+        X = self.envelope.scatter(rows)
+        cameras = _positive_inverse(reduced.corner - _products(reduced.border, X))
+        return None if cameras is None else Factored(self.envelope, solve, reduced.border, X, cameras)
 
     def _conjugate_gradients(
         self, clusters: Envelope, reduced: Reduced
@@ -353,21 +393,6 @@ class Elimination:
             r, ry = r - np.where(self.free, alpha * Sp, 0.0), ry - alpha * Spy
         return x, y, r, ry
 
-    def apply_inverse(self, reduced: Reduced, vectors: Array) -> Array:
-        """Covariance of the photos' unknowns times vectors (k, m, nb); NaN if the matrix is not positive."""
-        solve = self.envelope.factor(self.structure, reduced.S)
-        if solve is None:
-            return np.full_like(vectors, np.nan)
-        rhs = self.envelope.gather(np.concatenate([np.where(self.free, vectors, 0.0), reduced.border]))
-        solve(rhs)
-        found, X = np.split(self.envelope.scatter(rhs), [len(vectors)])
-        if len(X):
-            cameras = _positive_inverse(reduced.corner - _products(reduced.border, X))
-            if cameras is None:
-                return np.full_like(vectors, np.nan)
-            found = found + np.tensordot(_products(found, reduced.border) @ cameras, X, 1)
-        return found
-
     def marginal_covariances(self, reduced: Reduced) -> tuple[Array, Array]:
         """Covariances of each photo's unknowns (m, nb, nb), 0 where held, and of the cameras' (k, k).
 
@@ -375,18 +400,12 @@ class Elimination:
         positive.
         """
         m, nb = self.free.shape
-        solve = self.envelope.factor(self.structure, reduced.S)
-        cameras: Array | None = np.zeros((0, 0))
-        X = np.zeros_like(reduced.border)
-        if solve is not None and len(reduced.c):
-            rhs = self.envelope.gather(reduced.border)
-            solve(rhs)
-            X = self.envelope.scatter(rhs)
-            cameras = _positive_inverse(reduced.corner - _products(reduced.border, X))
-        if solve is None or cameras is None:
+        factored = self.factored(reduced)
+        if factored is None:
             unknown = np.where(self.free[:, :, None] & self.free[:, None, :], np.nan, 0.0)
             return unknown, np.full_like(reduced.corner, np.nan)
         # what the cameras leave open moves the photos with them
+        X, cameras = factored.border_solved, factored.cameras
         result: Array = np.einsum("ima,ij,jmb->mab", X, cameras, X)
         place = self.envelope.place
         step = max(_COLUMNS // nb, 1)
@@ -394,7 +413,7 @@ class Elimination:
             photos = np.arange(begin, min(begin + step, m))
             unit = np.zeros((int(self.free[photos].sum()), 4 * len(self.envelope.first)))
             unit[np.arange(len(unit)), place[photos][self.free[photos]]] = 1.0
-            solve(unit)
+            factored.solve_rows(unit)
             done = 0
             for i in photos:
                 free = np.flatnonzero(self.free[i])
@@ -515,13 +534,17 @@ class NormalEquations:
             cameras = cameras - np.einsum("qk,qp,pl->kl", camera, inner, camera)
         return photos, cameras
 
-    def apply_inverse(self, vectors: Array) -> Array:
-        """Covariance of the photos' unknowns, all others being free, times vectors (k, m, nb)."""
-        found = self._elimination.apply_inverse(self.reduce(0.0)[0], vectors)
-        if len(self._lengths):
-            frame, _, _, inner = self._of_lengths(0.0)
-            found = found - np.tensordot(_products(vectors, frame) @ inner, frame, 1)
-        return found
+    def covariance(self) -> Callable[[Array], Array]:
+        """Covariance of the photos' unknowns, all others being free, as a function of vectors (k, m, nb)."""
+        factored = self._elimination.factored(self.reduce(0.0)[0])
+        if factored is None:
+            return lambda vectors: np.full_like(vectors, np.nan)
+        if not len(self._lengths):
+            return factored.covariance_times
+        frame, _, _, inner = self._of_lengths(0.0)
+        return lambda vectors: (
+            factored.covariance_times(vectors) - np.tensordot(_products(vectors, frame) @ inner, frame, 1)
+        )
 
     def variance_of_points(self, weights: Array) -> tuple[float, Array]:
         """Variance of sum(weights * points), weights (n, 3), and its covariance (m, nb) with the photos' unknowns."""

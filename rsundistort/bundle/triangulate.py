@@ -52,7 +52,7 @@ def revive_points(reconstruction: Reconstruction, shutter_model: str, from_afar:
     points = reconstruction.points_w
     if not len(points):
         return reconstruction
-    size = float(np.median(np.linalg.norm(points - reconstruction.center_w.mean(0), axis=1)))
+    size = reconstruction.size
     far = np.linalg.norm(points - reconstruction.center_w.mean(0), axis=1) > _LOST * size
     unseen = np.zeros(reconstruction.num_points, bool)
     unseen[obs.point_idx[~reprojection_residuals(reconstruction, shutter_model)[1]]] = True

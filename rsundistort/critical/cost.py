@@ -67,15 +67,10 @@ class ShapeCost:
         return f"{said}, because the cameras were not turned against each other"
 
 
-def row_phi(reconstruction: Reconstruction) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Components (m, 3) of phi that change aspect, skew and lens of a photo's rows or columns, and their signs (m,).
-
-    As phi1, phi2 and phi3 of the paper for photos that are read from top to bottom; the signs are of the clock.
-    """
-    axes = np.array([READOUTS[reconstruction.camera(i).readout] for i in range(reconstruction.num_images)])
-    by_row = axes[:, 0] == 1
-    components = np.where(by_row[:, None], [0, 1, 2], [1, 0, 2])
-    return components.astype(np.int64), np.where(by_row, 1.0, -1.0) * axes[:, 1]
+def row_phi(reconstruction: Reconstruction) -> NDArray[np.int64]:
+    """Components (m, 3) of phi that are each photo's phi1, phi2, phi3 of the paper, which reads rows."""
+    by_row = np.array([READOUTS[reconstruction.camera(i).readout][0] == 1 for i in range(reconstruction.num_images)])
+    return np.where(by_row[:, None], [0, 1, 2], [1, 0, 2]).astype(np.int64)
 
 
 def _log_scale(reconstruction: Reconstruction) -> NDArray[np.float64]:

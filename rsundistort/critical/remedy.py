@@ -35,7 +35,8 @@ class Remedy:
     ----------
     name : str
         "none needed" (or none possible: the covariance cannot be computed), "anchor" (a photo taken to be still),
-        "prior" (no photo was), "given" (anchors or motions that the user knows), or "none" (switched off).
+        "prior" (no photo stands out, or none was asked for), "given" (anchors, motions or lengths that the user knows),
+        or "none" (switched off).
     anchors : dict of photo name to float
         Photos whose phi1 is taken to be zero, with the standard deviation, radians per frame; 0 is hard.
     before, after : ShapeCost
@@ -60,7 +61,7 @@ class Remedy:
         names = ", ".join(self.anchors)
         return {
             "anchor": f"{names} most likely did not move and holds the height of the scene ({was} without it); {left}",
-            "prior": f"no photo stands out as still; the motions are taken to be zero in the mean; {left}",
+            "prior": f"no photo is taken to be still, the motions to be zero in the mean; {left}",
             "given": f"with what is known of {names or 'lengths in the scene'}, {left}",
             "none": left,
         }[self.name]
@@ -85,17 +86,17 @@ def still_probability(result: BundleResult) -> NDArray[np.float64]:
     """(m,) probability that each photo did not move, from its phi2 and phi3.
 
     Those two are determined where phi1 is not. Either the photo was still (they are zero but for 1 mrad per frame), as
-    one in ten is, or it moved like the rest (zero mean, the spread that the adjustment estimated).
+    one in ten is, or it moved like the rest (zero mean, their robust spread).
     """
     rec = result.reconstruction
     span = rec.frame_span()
-    components, _ = row_phi(rec)
+    components = row_phi(rec)
     rows = np.arange(rec.num_images)[:, None]
     pair = components[:, 1:]
     found = rec.phi[rows, pair] * span[:, None]
     covariance = result.covariances[rows[:, :, None], 6 + pair[:, :, None], 6 + pair[:, None, :]]
     covariance = covariance * span[:, None, None] ** 2
-    # the spread of what moved, robustly: the prior's was estimated with phi1, which a critical motion leaves at zero
+    # not the prior's: that was estimated with phi1, which a critical motion leaves at zero
     spread = max(float(np.median(np.abs(found))) / 0.6745, 2 * _STILL)
     still = _log_normal(found, covariance + _STILL**2 * np.eye(2))
     moved = _log_normal(found, covariance + spread**2 * np.eye(2))
@@ -109,7 +110,7 @@ def contradictions(result: BundleResult, names: Mapping[str, float]) -> tuple[st
     rec = result.reconstruction
     probability = still_probability(result)
     span = rec.frame_span()
-    components, _ = row_phi(rec)
+    components = row_phi(rec)
     found = []
     for name in names:
         i = rec.image_names.index(name)
@@ -165,7 +166,7 @@ def heal(result: BundleResult, options: BundleOptions, remedy: str = "auto") -> 
     p = float(probability[best])
     # moments of the mixture: still, or moved like the rest
     sigma = float(np.sqrt(p * _STILL**2 + (1 - p) * result.phi_sigma**2))
-    components, _ = row_phi(rec)
+    components = row_phi(rec)
     sigmas = np.full(3, np.inf)
     sigmas[components[best, 0]] = sigma
     name = rec.image_names[best]

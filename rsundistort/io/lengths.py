@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 from ..bundle import KnownLength
-from ..errors import FileError, FormatError, InputError
+from ..errors import FormatError, InputError
+from .tables import read_table
 
 __all__ = ["read_known_lengths"]
 
@@ -29,21 +29,15 @@ def read_known_lengths(path: Path | str) -> list[KnownLength]:
         Not readable; missing columns, numbers that are none or not positive.
     """
     path = Path(path)
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            reader.fieldnames = [column.strip() for column in reader.fieldnames or []]
-            rows = list(reader)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise FileError(f"{path} is no readable CSV file: {error}") from error
-    if missing := [column for column in _COLUMNS if column not in reader.fieldnames]:
+    columns, rows = read_table(path)
+    if missing := [column for column in _COLUMNS if column not in columns]:
         raise FormatError(f"{path} has no column {missing[0]!r}; expected {', '.join(_COLUMNS)}")
     found = []
     for number, row in enumerate(rows, start=2):
-        first = (row["photo1"] or "").strip()
-        second = (row["photo2"] or "").strip() or first
+        first = row["photo1"]
+        second = row["photo2"] or first
         try:
-            x1, y1, x2, y2, length, sigma = (float(row[c] or "") for c in ("x1", "y1", "x2", "y2", "length", "sigma"))
+            x1, y1, x2, y2, length, sigma = (float(row[c]) for c in ("x1", "y1", "x2", "y2", "length", "sigma"))
             found.append(KnownLength((first, x1, y1), (second, x2, y2), length, sigma))
         except (ValueError, InputError) as error:
             raise FormatError(f"{path}, line {number}: {error}") from None

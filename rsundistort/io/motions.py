@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, FormatError
+from ..errors import FormatError
+from .tables import read_table
 
 __all__ = ["read_known_motions"]
 
@@ -38,14 +38,7 @@ def read_known_motions(path: Path | str, readout_s: float | None = None) -> Know
         Not readable; mixed units, missing columns, numbers that are none, sigmas that are not positive, a name twice.
     """
     path = Path(path)
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            columns = [column.strip() for column in reader.fieldnames or []]
-            reader.fieldnames = columns
-            rows = list(reader)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise FileError(f"{path} is no readable CSV file: {error}") from error
+    columns, rows = read_table(path)
     units = [unit for unit in ("phi", "omega") if any(f"{unit}{k}" in columns for k in (1, 2, 3))]
     if len(units) > 1:
         raise FormatError(f"{path} mixes phi (rad per frame) and omega (rad/s); give one of them")
@@ -58,14 +51,14 @@ def read_known_motions(path: Path | str, readout_s: float | None = None) -> Know
         scale = readout_s
     found: Known = {}
     for number, row in enumerate(rows, start=2):
-        name = (row["name"] or "").strip()
+        name = row["name"]
         where = f"{path}, line {number} ({name or 'no name'})"
         if not name or name in found:
             raise FormatError(f"{where}: expected a name, and each once")
         phi, sigma = np.zeros(3), np.full(3, np.inf)
         for k in range(3):
-            text = (row.get(f"{units[0]}{k + 1}") or "").strip()
-            spread = (row.get(f"sigma{k + 1}") or row.get("sigma") or "").strip()
+            text = row.get(f"{units[0]}{k + 1}", "")
+            spread = row.get(f"sigma{k + 1}") or row.get("sigma", "")
             if not text:
                 continue
             try:

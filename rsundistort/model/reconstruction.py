@@ -143,6 +143,11 @@ class Reconstruction:
         step = np.linalg.norm(np.diff(self.center_w, axis=0), axis=1)
         return float(step.mean()) if step.any() else 1.0
 
+    @property
+    def size(self) -> float:
+        """Median distance of the points from the middle of the cameras, world units; there must be points."""
+        return float(np.median(np.linalg.norm(self.points_w - self.center_w.mean(0), axis=1)))
+
     def normalized(self) -> Reconstruction:
         """The same in a frame of its own: the first photo at the origin, consecutive centres 1 apart in the mean.
 

@@ -1,0 +1,22 @@
+"""Tables that people write: CSV files with a header."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+from ..errors import FileError
+
+__all__ = ["read_table"]
+
+
+def read_table(path: Path) -> tuple[list[str], list[dict[str, str]]]:
+    """Columns and rows of a CSV file, without the blanks around columns and cells; a missing cell is empty."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.DictReader(file, restval="")
+            columns = [column.strip() for column in reader.fieldnames or []]
+            reader.fieldnames = columns
+            return columns, [{column: row[column].strip() for column in columns} for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise FileError(f"{path} is no readable CSV file: {error}") from error
