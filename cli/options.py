@@ -20,9 +20,10 @@ out_option: Decorator = click.option(
 )
 camera_option: Decorator = click.option(
     "--camera",
-    metavar="FILE|NUMBERS",
-    help="camera.json, a text file with the 3x3 matrix K, or fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]. "
-    "Default: camera.json in or beside PHOTOS, else EXIF.",
+    metavar="FILE|FOLDER|NUMBERS",
+    help="camera.json, cameras.json, OpenCV or ROS calibration, COLMAP cameras, a text file with the 3x3 matrix K, a "
+    "folder of such files named by group, or fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]. "
+    "Default: camera.json or cameras.json in or beside PHOTOS, else EXIF.",
 )
 readout_option: Decorator = click.option(
     "--readout", type=click.Choice(READOUT_NAMES), help="Direction of the readout in the stored pixels."

@@ -19,6 +19,11 @@ from .terminal import errors_for_people, progress_bars
     help="solution.json, or a ground-truth file.",
 )
 @opt.out_option
+@click.option(
+    "--masks",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    help="Folder of masks, a.png for a.jpg: what is black in them is black in OUT/masks.",
+)
 @opt.interpolation_option
 @opt.quality_option
 @opt.jobs_option
@@ -28,6 +33,7 @@ def command(
     photos: Path,
     solution: Path,
     out: Path,
+    masks: Path | None,
     interpolation: str,
     quality: int,
     jobs: int,
@@ -40,7 +46,8 @@ def command(
 
         solved, left_out = rectify_folder(
             photos, solution, out,
-            interpolation=interpolation, quality=quality, jobs=jobs, overwrite=overwrite, progress=progress,
+            interpolation=interpolation, quality=quality, jobs=jobs, overwrite=overwrite, masks=masks,
+            progress=progress,
         )  # fmt: skip
     if not quiet:
         count = len(list((out / "images").iterdir()))

@@ -20,7 +20,18 @@ if TYPE_CHECKING:
 @opt.photos_argument
 @opt.out_option
 @opt.camera_option
-@opt.readout_option
+@click.option(
+    "--readout",
+    multiple=True,
+    metavar="[GROUP=]DIRECTION",
+    help=f"Direction of the readout in the stored pixels: {', '.join(opt.READOUT_NAMES)}; of all photos, or of a "
+    "group (as the closing table names it). By default the camera file's, else guessed and settled by the photos.",
+)
+@click.option(
+    "--masks",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    help="Folder of masks, a.png for a.jpg: what is black in them is not looked at, nor kept in OUT/masks.",
+)
 @click.option(
     "--model",
     "shutter_model",
@@ -82,7 +93,8 @@ def command(
     photos: Path,
     out: Path,
     camera: str | None,
-    readout: str | None,
+    readout: tuple[str, ...],
+    masks: Path | None,
     shutter_model: str,
     refine: str | None,
     still: tuple[str, ...],
@@ -112,7 +124,8 @@ def command(
             out,
             RunOptions(
                 camera=camera,
-                readout=readout,
+                readout=_readouts(readout),
+                masks=masks,
                 shutter_model=shutter_model,
                 seed=seed,
                 jobs=jobs,
@@ -138,6 +151,19 @@ def _names(refine: str | None) -> tuple[str, ...] | None:
         return None
     names = tuple(name.strip() for name in refine.split(",") if name.strip())
     return () if names == ("none",) else names
+
+
+def _readouts(readout: tuple[str, ...]) -> dict[str, str] | None:
+    """Directions by group, the empty name for all others, of DIRECTION or GROUP=DIRECTION."""
+    from rsundistort import InputError
+
+    directions: dict[str, str] = {}
+    for text in readout:
+        group, _, direction = text.rpartition("=")
+        if directions.get(group, direction) != direction:
+            raise InputError(f"--readout {text}: another direction was given before")
+        directions[group] = direction
+    return directions or None
 
 
 def _anchors(still: tuple[str, ...]) -> dict[str, float]:
@@ -188,7 +214,7 @@ def closing_table(solution: Solution, out: Path) -> str:
         f"photos registered  {len(solution.registered)} of {len(solution.images)}",
         f"shutter model      {solution.shutter_model}",
         *_held_out(quality["held_out_rms_px"]),
-        f"camera             {solution.options['camera']}, readout {solution.options['readout']}",
+        *_cameras(solution),
         *_intrinsics(solution),
         f"rms residual       {quality['global_rms_px']:.2f} px with a global shutter, {quality['rms_px']:.2f} px now",
         f"outputs            {out}  ({total:.0f} s)",
@@ -210,6 +236,14 @@ def closing_table(solution: Solution, out: Path) -> str:
     if lost:
         lines += ["", "not joined:", *(f"  {image.name}: {image.reason}" for image in lost)]
     return "\n".join(lines)
+
+
+def _cameras(solution: Solution) -> list[str]:
+    """Where the cameras come from and which way they are read out; a line on each group where there are several."""
+    source, readout = solution.options["camera"], solution.options["readout"]
+    if isinstance(readout, str):
+        return [f"camera             {source}, readout {readout}"]
+    return [f"cameras            {source}", *(f"  {group}: readout {each}" for group, each in readout.items())]
 
 
 def _intrinsics(solution: Solution) -> list[str]:

@@ -2,6 +2,7 @@
 
 from .adjust import LADDER, bundle_adjust, climb, objective
 from .choice import ModelChoice, choose_model
+from .direction import ReadoutChoice, choose_readouts
 from .lengths import KnownLength
 from .options import BundleOptions, BundleResult
 from .posterior import Posterior, gauge_directions
@@ -14,8 +15,10 @@ __all__ = [
     "KnownLength",
     "ModelChoice",
     "Posterior",
+    "ReadoutChoice",
     "bundle_adjust",
     "choose_model",
+    "choose_readouts",
     "climb",
     "gauge_directions",
     "objective",

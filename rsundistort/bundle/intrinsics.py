@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +11,34 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..model import Camera
 
-__all__ = ["INTRINSICS", "check_refined", "moved_camera", "pixels_of"]
+__all__ = ["INTRINSICS", "GuessedCameras", "check_refined", "deviation", "moved_camera", "pixels_of"]
 
 #: Intrinsics that can be refined and their codes in the kernels: `f` keeps the ratio of fx and fy.
 INTRINSICS: dict[str, int] = {
     name: code for code, name in enumerate(("f", "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"))
 }
+
+
+@dataclass(frozen=True)
+class GuessedCameras:
+    """What was believed of the cameras before the photos were looked at: a prior on the intrinsics that are refined.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        Guesses, one for each camera of the reconstruction.
+    sigma : mapping of intrinsic to float
+        Standard deviations: of f (fx, fy) relative, of cx and cy in focal lengths, of the lens coefficients.
+        Intrinsics that are not named have no prior.
+    """
+
+    cameras: Sequence[Camera]
+    sigma: Mapping[str, float]
+
+    def __post_init__(self) -> None:
+        for name, value in self.sigma.items():
+            if name not in INTRINSICS or not value > 0:
+                raise InputError(f"guessed {name!r}: sigma {value!r}, expected a positive one of an intrinsic")
 
 
 def check_refined(names: Sequence[str]) -> tuple[str, ...]:
@@ -50,6 +72,20 @@ def moved_camera(camera: Camera, names: Sequence[str], step: NDArray[np.float64]
         if INTRINSICS[name] >= INTRINSICS["k1"]:
             dist[INTRINSICS[name] - INTRINSICS["k1"]] += value
     return replace(camera, K=K, dist=dist if dist.any() else camera.dist)
+
+
+def deviation(
+    camera: Camera, guess: Camera, names: Sequence[str]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+    """How far (len(names),) a camera is from a guess, in the units of `GuessedCameras`; derivatives in the unknowns."""
+    (fx, fy, cx, cy), dist, *_ = camera.kernel_args
+    (gx, gy, gcx, gcy), guess_dist, *_ = guess.kernel_args
+    apart = {"f": np.log(fx / gx), "fx": np.log(fx / gx), "fy": np.log(fy / gy), "cx": (cx - gcx) / gx}
+    apart["cy"] = (cy - gcy) / gy
+    slope = {"cx": fx / gx, "cy": fy / gy}
+    for name, value in zip(("k1", "k2", "p1", "p2", "k3"), dist - guess_dist, strict=False):
+        apart[name] = value
+    return np.array([apart[name] for name in names]), np.array([slope.get(name, 1.0) for name in names])
 
 
 def pixels_of(camera: Camera, names: Sequence[str]) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from ..model import Reconstruction
-from .intrinsics import check_refined
+from .intrinsics import GuessedCameras, check_refined
 from .lengths import KnownLength, check_lengths
 
 __all__ = ["LOSSES", "BundleOptions", "BundleResult"]
@@ -86,6 +86,8 @@ class BundleOptions:
         Known lengths in the scene, two or more: their ratios are residuals.
     refine : tuple of str
         Intrinsics of each camera that are solved for with the rest: some of f (or fx, fy), cx, cy, k1, k2, p1, p2, k3.
+    guessed : GuessedCameras, optional
+        Prior on these intrinsics; without it they follow the photos alone.
     factor_limit : float
         Reduced systems whose factorisation takes at most this many multiply-adds are factored, others are solved by
         preconditioned conjugate gradients.
@@ -117,6 +119,7 @@ class BundleOptions:
     known_phi: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
     lengths: Sequence[KnownLength] = ()
     refine: tuple[str, ...] = ()
+    guessed: GuessedCameras | None = None
     factor_limit: float = 1e11
     cg_tolerance: float = 0.01
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from .._kernels import projection
 from ..errors import InputError
 from ..model import Camera, Reconstruction, check_shutter_model
-from .intrinsics import INTRINSICS, moved_camera
+from .intrinsics import INTRINSICS, deviation, moved_camera
 from .lengths import LengthResiduals
 from .options import LOSSES, BundleOptions
 from .reduced import Border, Elimination, NormalEquations, Step, Structure, by_first_photo
@@ -226,7 +226,18 @@ class BundleProblem:
         motion = self._motion(state)
         known = self._known_weight * (motion - self._known) ** 2
         lengths = float(np.sum(self._lengths.residuals(state.points_w) ** 2))
-        return 0.5 * (float(np.sum(self._motion_weight * motion**2 + known)) + lengths)
+        cameras = float(np.sum(self._camera_priors(state)[0] ** 2))
+        return 0.5 * (float(np.sum(self._motion_weight * motion**2 + known)) + lengths + cameras)
+
+    def _camera_priors(self, state: State) -> NDArray[np.float64]:
+        """(2, cameras, nc) residuals of the prior on the intrinsics, and their derivatives."""
+        result = np.zeros((2, len(state.cameras), len(self._refine)))
+        guessed = self._options.guessed
+        if guessed is not None and self._refine:
+            sigma = np.array([guessed.sigma.get(name, np.inf) for name in self._refine])
+            for k, (camera, guess) in enumerate(zip(state.cameras, guessed.cameras, strict=True)):
+                result[:, k] = np.array(deviation(camera, guess, self._refine)) / sigma
+        return result
 
     def _jacobians(
         self, state: State, spent: NormalEquations | None = None
@@ -256,7 +267,8 @@ class BundleProblem:
         prior_diag[:, 6:] = self._motion_weight + self._known_weight
         prior_gradient[:, 6:] = self._motion_weight * motion + self._known_weight * (motion - self._known)
         total = cost + self._prior_cost(state)
-        border = Border(self._camera_jacobians(state), self._start.camera_idx, len(state.cameras))
+        prior = self._camera_priors(state)
+        border = Border(self._camera_jacobians(state), self._start.camera_idx, prior[1] ** 2, prior[1] * prior[0])
         lengths = self._lengths.residuals(state.points_w), self._lengths.jacobian(state.points_w)
         return NormalEquations(self._elimination, total, res, J_frame, prior_diag, prior_gradient, border, lengths)
 

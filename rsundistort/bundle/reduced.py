@@ -214,13 +214,19 @@ class Border:
         Weighted Jacobians of the observations, nc may be 0.
     camera_of_frame : (m,) int array
         Camera of each photo.
-    num_cameras : int
-        Number of cameras.
+    prior_diag, prior_gradient : (cameras, nc) array
+        Diagonal Hessian and gradient of the priors of the cameras.
     """
 
     J: Array
     camera_of_frame: Index
-    num_cameras: int
+    prior_diag: Array
+    prior_gradient: Array
+
+    @property
+    def num_cameras(self) -> int:
+        """Number of cameras."""
+        return len(self.prior_diag)
 
     def sum_photos(self, x: Array) -> Array:
         """Values of the photos (m, nc, ...) summed over those of each camera, (cameras * nc, ...)."""
@@ -476,7 +482,8 @@ class NormalEquations:
         self._g_frame += prior_gradient
         self._border = border
         diagonal, g_camera = self._gradients(res, border.J)
-        self._camera_diagonal, self._g_camera = border.sum_photos(diagonal), border.sum_photos(g_camera)
+        self._camera_diagonal = border.sum_photos(diagonal)
+        self._g_camera = border.sum_photos(g_camera) + border.prior_gradient.ravel()
         self._lengths = lengths[1]
         self._g_point += np.einsum("q,qna->na", *lengths)
 
@@ -517,7 +524,10 @@ class NormalEquations:
                     s.frame_start, s.frame_order, s.frame_idx, s.track_idx, s.track_start, s.point_of,
                     self._border.camera_of_frame, self._J, self._border.J, V_inv, g_point, rows, rhs_camera,
                 )  # fmt: skip
-        corner = self._border.sum_photos(rows[:, nb:]) + np.diag(damping * self._camera_diagonal)
+        # nothing pulls at a camera that took none of the photos, whatever holds it
+        unused = np.repeat(np.bincount(self._border.camera_of_frame, minlength=self._border.num_cameras) == 0, nc)
+        held = self._border.prior_diag.ravel() + damping * self._camera_diagonal + unused
+        corner = self._border.sum_photos(rows[:, nb:]) + np.diag(held)
         border = np.where(self._elimination.free, rows[:, :nb].transpose(2, 0, 1), 0.0)
         c = -g_camera - self._border.sum_photos(rhs_camera)
         return Reduced(S, -rhs, border, (corner + corner.T) / 2, c), V_inv

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..model import Solution
+from ..model import READOUTS, Solution
 
 __all__ = ["MotionErrors", "PoseErrors", "align_points", "motion_errors", "pose_errors", "psnr", "rotation_angles_deg"]
 
@@ -107,17 +107,21 @@ def pose_errors(solution: Solution, truth: Solution) -> PoseErrors:
 
 
 def motion_errors(solution: Solution, truth: Solution) -> MotionErrors:
-    """Errors of phi of a solution; photos are matched by name."""
+    """Errors of phi of a solution; photos are matched by name.
+
+    A readout that is taken to run the other way turns the sign of phi and is no error.
+    """
     true_of = {image.name: image for image in truth.images if image.motion is not None}
     names, errors = [], []
     for image in solution.images:
         if image.motion is None or image.name not in true_of:
             continue
-        true_motion = true_of[image.name].motion
-        assert true_motion is not None
-        span = solution.cameras[image.camera_id].frame_span
+        true_image = true_of[image.name]
+        assert true_image.motion is not None
+        camera, true_camera = solution.cameras[image.camera_id], truth.cameras[true_image.camera_id]
+        reverse = READOUTS[camera.readout][1] * READOUTS[true_camera.readout][1]
         names.append(image.name)
-        errors.append((image.motion.phi - true_motion.phi) * span)
+        errors.append((image.motion.phi - reverse * true_image.motion.phi) * camera.frame_span)
     if not names:
         raise InputError("no photo has a motion in both solution and truth")
     return MotionErrors(tuple(names), np.array(errors))

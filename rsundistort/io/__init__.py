@@ -1,9 +1,11 @@
 """Files: photos, cameras, solutions, COLMAP models, nerfstudio."""
 
 from .cameras import camera_from_exif, check_camera_fits, parse_camera
+from .stub import CameraFile, ExifFacts, read_camera_file, read_exif, group_of, guess_readouts
 from .colmap import read_colmap_poses, write_colmap_model
 from .images import Photo, list_photos, output_name, read_photo, write_image
 from .lengths import read_known_lengths
+from .masks import find_masks, read_mask
 from .motions import read_known_motions
 from .nerfstudio import read_transforms, write_transforms
 from .outputs import output_folder
@@ -13,6 +15,7 @@ __all__ = [
     "Photo",
     "camera_from_exif",
     "check_camera_fits",
+    "find_masks",
     "list_photos",
     "output_folder",
     "output_name",
@@ -20,6 +23,7 @@ __all__ = [
     "read_colmap_poses",
     "read_known_lengths",
     "read_known_motions",
+    "read_mask",
     "read_photo",
     "read_solution",
     "read_transforms",

@@ -26,6 +26,7 @@ def rectify_folder(
     quality: int = 98,
     jobs: int = 0,
     overwrite: bool = False,
+    masks: Path | str | None = None,
     progress: ProgressCallback | None = None,
 ) -> tuple[Solution, Sequence[str]]:
     """Rectify the photos of a folder with the motions of a solution, into `out/images` and `out/masks`.
@@ -34,7 +35,7 @@ def rectify_folder(
     ----------
     photos, solution, out : path
         Folder of the raw photos; `solution.json` or a ground-truth file; folder for the outputs.
-    interpolation, quality, jobs, overwrite, progress
+    interpolation, quality, jobs, overwrite, masks, progress
         As in `run`.
 
     Returns
@@ -68,6 +69,7 @@ def rectify_folder(
                 quality=quality,
                 jobs=jobs,
                 log=log,
+                masks=None if masks is None else Path(masks),
             )
         ]
         if not written:

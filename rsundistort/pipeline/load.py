@@ -1,19 +1,20 @@
-"""Photos with their features and their camera, from a folder."""
+"""Photos with their features and their cameras, from a folder."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import FileError, InputError, SkippedPhotoWarning
-from ..io import camera_from_exif, list_photos, parse_camera, read_photo
-from ..model import Camera
+from ..io import find_masks, list_photos, read_mask, read_photo
 from ..sfm import Features, detect_features
+from .cameras import PhotoCameras, find_cameras
 from .progress import StageLog
 
-__all__ = ["LoadedPhotos", "find_camera", "load_photos"]
+__all__ = ["LoadedPhotos", "load_photos"]
 
 
 @dataclass(frozen=True)
@@ -26,74 +27,48 @@ class LoadedPhotos:
         Readable photos.
     skipped : dict of name to reason
         Unreadable ones.
-    camera : Camera
-        Of all of them.
-    calibrated : bool
-        Whether the camera was given; else it is EXIF's guess.
-    camera_source : str
-        Where the camera comes from, for people.
+    cameras : PhotoCameras
+        Which camera took which.
     """
 
     names: list[str]
     features: list[Features]
     skipped: dict[str, str]
-    camera: Camera
-    calibrated: bool
-    camera_source: str
+    cameras: PhotoCameras
 
 
-def find_camera(
-    folder: Path, names: list[str], sizes: list[tuple[int, int]], camera: str | None, readout: str | None
-) -> tuple[Camera, bool, str]:
-    """The camera of a folder's photos: as told, `camera.json` in the folder or beside it, or EXIF.
+def load_photos(
+    folder: Path,
+    camera: str | None,
+    readout: str | Mapping[str, str] | None,
+    max_features: int,
+    jobs: int,
+    log: StageLog,
+    masks: Path | None = None,
+) -> LoadedPhotos:
+    """Read every photo of a folder once, for its size and features; unreadable ones are skipped with a warning.
 
     Parameters
     ----------
     folder : Path
         Of the photos.
-    names, sizes : lists
-        Photos and their (width, height).
-    camera : str, optional
-        As `parse_camera` takes it.
-    readout : str, optional
-        Readout direction; overrides the file's.
-
-    Returns
-    -------
-    camera, calibrated, source
-        See `LoadedPhotos`.
+    camera, readout
+        As in `find_cameras`.
+    max_features : int
+        Of a photo.
+    jobs : int
+        Threads.
+    log : StageLog
+        Told the progress.
+    masks : Path, optional
+        Folder of the users' masks, as `io.find_masks` takes it.
     """
-    width, height = sizes[0]
-    for name, size in zip(names, sizes, strict=True):
-        if size != (width, height):
-            raise InputError(
-                f"{names[0]} has {width}x{height} pixels but {name} has {size[0]}x{size[1]}; "
-                "one run takes the photos of one camera in one mode: put the others into a folder of their own"
-            )
-    if camera is not None:
-        return parse_camera(camera, width, height, readout), True, camera
-    for path in (folder / "camera.json", folder.parent / "camera.json"):
-        if path.is_file():
-            return parse_camera(str(path), width, height, readout), True, str(path)
-    for name in names:
-        guess = camera_from_exif(folder / name, width, height, readout or "top-to-bottom")
-        if guess is not None:
-            return guess, False, f"EXIF of {name}, refined"
-    raise InputError(
-        f"{names[0]} has no focal length in its EXIF and there is no camera.json; "
-        "give --camera FILE or --camera fx,fy,cx,cy in pixels"
-    )
-
-
-def load_photos(
-    folder: Path, camera: str | None, readout: str | None, max_features: int, jobs: int, log: StageLog
-) -> LoadedPhotos:
-    """Read every photo of a folder once, for its size and features; unreadable ones are skipped with a warning."""
     listed = list_photos(folder)
     if len(listed) < 3:
         raise InputError(
             f"{folder} holds {len(listed)} photo{'s' * (len(listed) > 1)}; the shutter needs at least three"
         )
+    mask_of = {} if masks is None else find_masks(masks, listed)
     log.begin("features", len(listed))
     done = 0
 
@@ -102,7 +77,9 @@ def load_photos(
             pixels = read_photo(folder / name).pixels
         except FileError as error:
             return str(error)
-        return (pixels.shape[1], pixels.shape[0]), detect_features(pixels, max_features)
+        size = pixels.shape[1], pixels.shape[0]
+        mask = read_mask(mask_of[name], *size) if name in mask_of else None
+        return size, detect_features(pixels, max_features, mask)
 
     names: list[str] = []
     sizes: list[tuple[int, int]] = []
@@ -124,6 +101,6 @@ def load_photos(
             f"{folder} holds {len(names)} readable photo{'s' * (len(names) != 1)} of {len(listed)}; "
             f"the shutter needs at least three ({next(iter(skipped.values()))})"
         )
-    found_camera, calibrated, source = find_camera(folder, names, sizes, camera, readout)
+    cameras = find_cameras(folder, names, sizes, camera, readout)
     log.end("features", photos=len(names), keypoints=sum(len(f.xy_raw) for f in features))
-    return LoadedPhotos(names, features, skipped, found_camera, calibrated, source)
+    return LoadedPhotos(names, features, skipped, cameras)

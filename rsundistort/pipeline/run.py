@@ -22,6 +22,7 @@ from ..errors import InputError
 from ..io import output_folder, output_name, write_colmap_model, write_solution, write_transforms
 from ..model import READOUTS, Reconstruction, Solution, SolvedImage, check_shutter_model
 from ..rectify import INTERPOLATIONS, largest_shift_px
+from .cameras import PhotoCameras, check_readouts
 from .load import LoadedPhotos, load_photos
 from .progress import ProgressCallback, StageLog
 from .solve import Solved, solve_photos
@@ -41,9 +42,13 @@ class RunOptions:
     Parameters
     ----------
     camera : str, optional
-        Camera file or numbers, as `io.parse_camera` takes them; else `camera.json`, else EXIF.
-    readout : str, optional
-        Readout direction; else the camera file's, else top-to-bottom.
+        File or folder of cameras, or numbers, as `io.read_camera_file` takes them; else `camera.json` or `cameras.json`
+        in or beside the folder of photos, else EXIF.
+    readout : str or mapping of group to str, optional
+        Readout direction of all photos, or of groups; else the camera file's; else it is guessed, and told by the fit.
+    masks : path, optional
+        Folder of masks, as `io.find_masks` takes it: no features where they are black, and nothing of it in the masks
+        of the rectified photos.
     shutter_model : str
         "constant-motion", "rotation", "linearized", "two-step", "global", or "auto": the one that foretells held-out
         measurements best.
@@ -72,7 +77,8 @@ class RunOptions:
     """
 
     camera: str | None = None
-    readout: str | None = None
+    readout: str | Mapping[str, str] | None = None
+    masks: Path | None = None
     shutter_model: str = "auto"
     seed: int = 0
     jobs: int = 0
@@ -89,17 +95,19 @@ class RunOptions:
     def __post_init__(self) -> None:
         if self.shutter_model != "auto":
             check_shutter_model(self.shutter_model)
-        with_remedy(self.bundle_options(self.refine or (), "top-to-bottom"), self.remedy)
+        check_readouts(self.readout)
+        with_remedy(self.bundle_options(self.refine or (), {}), self.remedy)
         if self.interpolation not in INTERPOLATIONS:
             raise InputError(f"interpolation={self.interpolation!r}, expected one of {', '.join(INTERPOLATIONS)}")
         if self.jobs < 0 or self.max_features < 100 or not 1 <= self.quality <= 100:
             raise InputError("jobs must be 0 or more, max_features at least 100, quality 1 to 100")
 
-    def bundle_options(self, refine: tuple[str, ...], readout: str) -> BundleOptions:
-        """Options of the adjustments of photos of one readout direction."""
-        phi1 = 0 if READOUTS[readout][0] == 1 else 1  # the rotation that stretches the photo along its readout
+    def bundle_options(self, refine: tuple[str, ...], readout: Mapping[str, str]) -> BundleOptions:
+        """Options of the adjustments of photos with these readout directions."""
         soft, hard = {}, {}
         for name, sigma in self.still.items():
+            # the rotation that stretches the photo along its readout
+            phi1 = 0 if READOUTS[readout.get(name, "top-to-bottom")][0] == 1 else 1
             if not 0 <= sigma < np.inf:
                 raise InputError(f"still photo {name!r}: sigma {sigma!r}, expected 0 or a positive number")
             if sigma > 0 and name in self.known:
@@ -155,23 +163,31 @@ def run(
     log = StageLog(progress)
     jobs = use_threads(options.jobs)
     with output_folder(out, overwrite=options.overwrite, apart_from=[photos]) as scratch:
-        loaded = load_photos(photos, options.camera, options.readout, options.max_features, jobs, log)
+        loaded = load_photos(
+            photos, options.camera, options.readout, options.max_features, jobs, log, options.masks
+        )  # fmt: skip
         ends = (end[0] for each in options.lengths for end in (each.start, each.end))
         for name in (*options.still, *options.known, *ends):
             if name not in loaded.names:
                 raise InputError(f"anchor {name!r} is not among the photos of {photos}")
         refine = options.refine
         if refine is None:
-            refine = () if loaded.calibrated else _GUESSED
-        bundle = options.bundle_options(refine, loaded.camera.readout)
+            refine = () if loaded.cameras.calibrated else _GUESSED
+
+        def bundle_options(rec: Reconstruction, refine: tuple[str, ...] = refine) -> BundleOptions:
+            return options.bundle_options(refine, {n: rec.camera(i).readout for i, n in enumerate(rec.image_names)})
+
         with tempfile.TemporaryDirectory() as work:
-            solved = solve_photos(loaded, options.shutter_model, options.seed, bundle, Path(work), log, options.remedy)
+            solved = solve_photos(
+                loaded, options.shutter_model, options.seed, bundle_options, Path(work), log, options.remedy
+            )  # fmt: skip
         rec = solved.result.reconstruction
         solution = _solution(loaded, solved, options)
         colors = PointColors(rec)
         rectified = rectify_photos(
             photos, solution, list(rec.image_names), scratch,
             interpolation=options.interpolation, quality=options.quality, jobs=jobs, log=log,
+            masks=options.masks,
         )  # fmt: skip
         for name, photo in rectified:
             colors.add(name, photo)
@@ -186,6 +202,12 @@ def run(
         solution = replace(solution, stages=tuple(log.stages))
         write_solution(scratch / "solution.json", solution)
     return solution
+
+
+def _readouts(rec: Reconstruction, cameras: PhotoCameras) -> str | dict[str, str]:
+    """Direction of the readout of all cameras, or by group where they differ."""
+    directions = {label: camera.readout for label, camera in zip(cameras.labels, rec.cameras, strict=True)}
+    return rec.cameras[0].readout if len(set(directions.values())) == 1 else directions
 
 
 def _image_rms(rec: Reconstruction) -> NDArray[np.float64]:
@@ -265,9 +287,9 @@ def _solution(loaded: LoadedPhotos, solved: Solved, options: RunOptions) -> Solu
         quality=quality,
         critical_motion=None if solved.remedy is None else _critical(solved),
         options={
-            "camera": loaded.camera_source,
+            "camera": loaded.cameras.source,
             "shutter_model": options.shutter_model,
-            "readout": loaded.camera.readout,
+            "readout": _readouts(rec, loaded.cameras),
             "seed": options.seed,
             "max_features": options.max_features,
             "interpolation": options.interpolation,

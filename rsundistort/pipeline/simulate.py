@@ -20,7 +20,7 @@ from ..model.checks import check_finite
 from ..rectify import largest_shift_px
 from ..synthetic.fold import check_no_fold
 from ..synthetic.warp import crop_camera, largest_rectangle, random_phi, warp_mask, warp_photo
-from .load import find_camera
+from .cameras import find_cameras
 from .progress import ProgressCallback, StageLog
 from .run import use_threads, versions
 from .write import mask_names
@@ -121,7 +121,8 @@ def simulate_warp(
     with output_folder(out, overwrite=options.overwrite, apart_from=[photos]) as scratch:
         first = [read_photo(photos / name).pixels.shape for name in names[:1]]
         size = (first[0][1], first[0][0])
-        camera, _, source = find_camera(photos, names[:1], [size], options.camera, options.readout)
+        found = find_cameras(photos, names[:1], [size], options.camera, options.readout)
+        camera, source = found.of(0), found.source
         if options.motion is None:
             phi = random_phi(names, [camera.frame_span] * len(names), options.sigma_rad, options.seed, options.still)
         else:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from ..bundle import LADDER, BundleOptions, BundleResult, ModelChoice, bundle_adjust, choose_model, climb
+from ..bundle import LADDER, BundleOptions, BundleResult, ModelChoice, bundle_adjust, choose_model, choose_readouts, climb
 from ..critical import Advice, Remedy, advise, heal, with_remedy
 from ..errors import ReconstructionError, RsUndistortWarning
 from ..model import Reconstruction
@@ -62,6 +62,10 @@ def rungs_to(shutter_model: str) -> tuple[str, ...]:
     return ("global", "two-step", shutter_model)
 
 
+def _tell_model(log: StageLog, model: str, _cost: float) -> None:
+    log.tell(f"readout: {model}", 0)
+
+
 def _tell(log: StageLog, stage: str, _cost: float) -> None:
     log.tell(stage, 0)
 
@@ -85,11 +89,28 @@ def _of_joined(options: BundleOptions, mapped: Reconstruction) -> BundleOptions:
     )
 
 
+def _read_out(
+    mapped: Reconstruction, photos: LoadedPhotos, options: BundleOptions, seed: int, log: StageLog
+) -> Reconstruction:
+    """The reconstruction with the directions of readout that nobody told as the measurements have them."""
+    guessed = [k for k, told in enumerate(photos.cameras.readout_told) if not told]
+    if not guessed:
+        return mapped
+    log.begin("readout")
+    choice = choose_readouts(mapped, guessed, options, seed=seed, progress=partial(_tell_model, log))
+    log.end(
+        "readout",
+        directions={photos.cameras.labels[k]: choice.reconstruction.cameras[k].readout for k in guessed},
+        gain_of_other_axis={photos.cameras.labels[k]: gain for k, gain in choice.gain.items()},
+    )
+    return choice.reconstruction
+
+
 def solve_photos(
     photos: LoadedPhotos,
     shutter_model: str,
     seed: int,
-    options: BundleOptions,
+    options_of: Callable[[Reconstruction], BundleOptions],
     scratch: Path,
     log: StageLog,
     remedy: str = "auto",
@@ -99,13 +120,13 @@ def solve_photos(
     Parameters
     ----------
     photos : LoadedPhotos
-        Features and camera.
+        Features and cameras.
     shutter_model : str
         Last rung of the ladder; "auto": solved up to rotation, then the rung that foretells held-out measurements.
     seed : int
         Seed of every random choice.
-    options : BundleOptions
-        Of the adjustments.
+    options_of : callable
+        Options of the adjustments for a reconstruction, whose cameras say which way they are read out.
     scratch : Path
         Folder for the database.
     log : StageLog
@@ -113,12 +134,11 @@ def solve_photos(
     remedy : str
         What to do about a critical motion, of `critical.REMEDIES`.
     """
-    options = with_remedy(options, remedy)
-    camera_idx = np.zeros(len(photos.names), np.int64)
+    cameras = photos.cameras
     log.begin("matching")
     matched = match_photos(
-        scratch / "database.db", photos.names, photos.features, [photos.camera], camera_idx,
-        calibrated=photos.calibrated, seed=seed,
+        scratch / "database.db", photos.names, photos.features, cameras.cameras, cameras.camera_idx,
+        calibrated=cameras.calibrated, seed=seed,
     )  # fmt: skip
     log.end("matching")
     log.begin("mapping", len(photos.names))
@@ -129,7 +149,8 @@ def solve_photos(
             f"only {mapped.num_images} of {len(photos.names)} photos could be joined, the shutter needs three; "
             "use photos that share more of the scene"
         )
-    options = _of_joined(options, mapped)
+    mapped = _read_out(mapped, photos, options_of(mapped), seed, log)
+    options = _of_joined(with_remedy(options_of(mapped), remedy), mapped)
     auto = shutter_model == "auto"
     shutter_model = "rotation" if auto else shutter_model
     log.begin("ladder")

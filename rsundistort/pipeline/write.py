@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, InputError, SkippedPhotoWarning
-from ..io import output_name, read_photo, write_image
+from ..io import find_masks, output_name, read_mask, read_photo, write_image
 from ..io.images import Photo
 from ..model import Reconstruction, Solution
 from ..rectify import rectify
@@ -39,26 +39,31 @@ def rectify_photos(
     quality: int,
     jobs: int,
     log: StageLog,
+    masks: Path | None = None,
 ) -> Iterator[tuple[str, Photo]]:
     """Rectify photos into `out/images` and `out/masks`, and yield each raw photo by the way.
+
+    What the users' own masks (a folder, as `io.find_masks` takes it) leave out is left out of `out/masks`.
 
     Photos that cannot be read, or are of another size than their camera, are skipped with a warning.
     """
     (out / "images").mkdir()
     (out / "masks").mkdir()
-    masks = mask_names([image.name for image in solution.images])
+    mask_name = mask_names([image.name for image in solution.images])
+    mask_of = {} if masks is None else find_masks(masks, names)
 
     def work(name: str) -> tuple[str, Photo | None, str]:
         image = solution.image(name)
         camera = solution.cameras[image.camera_id]
         try:
             photo = read_photo(folder / name)
+            own = read_mask(mask_of[name], camera.width, camera.height) if name in mask_of else None
             pixels, mask = rectify(
                 photo.pixels, camera, image.motion, solution.map_model,
-                solution.rectified_cameras[image.camera_id], interpolation,
+                solution.rectified_cameras[image.camera_id], interpolation, mask=own,
             )  # fmt: skip
             write_image(out / "images" / output_name(name), pixels, photo.metadata, quality)
-            write_image(out / "masks" / masks[name], mask)
+            write_image(out / "masks" / mask_name[name], mask)
         except (FileError, InputError) as error:
             return name, None, str(error)
         return name, photo, ""

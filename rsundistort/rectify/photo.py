@@ -34,6 +34,7 @@ def rectify(
     new_camera: Camera | None = None,
     interpolation: str = "cubic",
     jobs: int = 1,
+    mask: NDArray[np.uint8] | None = None,
 ) -> tuple[NDArray[Any], NDArray[np.uint8]]:
     """A photo as a global shutter without lens distortion would have taken it, and which pixels were seen.
 
@@ -51,13 +52,15 @@ def rectify(
         OpenCV positions cubic and lanczos to 1/32 pixel.
     jobs : int
         Threads; the result does not depend on them.
+    mask : (h, w) uint8 array, optional
+        0 where pixels of the photo do not count: they are rectified, but not in the mask of the result.
 
     Returns
     -------
     rectified : array
         As `photo`, of the new camera's size; 0 where nothing was seen.
-    mask : (h, w) uint8 array
-        255 where a raw pixel answers, else 0.
+    valid : (h, w) uint8 array
+        255 where a raw pixel (that counts) answers, else 0.
     """
     photo = np.asarray(photo)
     if photo.dtype not in (np.uint8, np.uint16, np.float32) or photo.ndim not in (2, 3):
@@ -66,6 +69,8 @@ def rectify(
         raise InputError(
             f"photo has {photo.shape[1]}x{photo.shape[0]} pixels, its camera {camera.width}x{camera.height}"
         )
+    if mask is not None and (mask.dtype != np.uint8 or mask.shape != photo.shape[:2]):
+        raise InputError(f"mask is {mask.dtype} {mask.shape}, expected uint8 {photo.shape[:2]}")
     if interpolation not in INTERPOLATIONS:
         raise InputError(f"interpolation={interpolation!r}, expected one of {', '.join(INTERPOLATIONS)}")
     target = new_camera or camera.pinhole()
@@ -75,7 +80,7 @@ def rectify(
     rays = rectified_rays(target.K, None, camera)
     shape = (target.height, target.width)
     rectified = np.empty(shape + photo.shape[2:], photo.dtype)
-    mask = np.empty(shape, np.uint8)
+    valid = np.empty(shape, np.uint8)
     flag = INTERPOLATIONS[interpolation]
 
     def strip(row0: int) -> None:
@@ -89,7 +94,9 @@ def rectify(
         values = cv2.remap(photo, map_x, map_y, flag, borderMode=cv2.BORDER_REPLICATE)
         values[~seen] = 0
         rectified[rows] = values.reshape(rectified[rows].shape)
-        mask[rows] = np.where(seen, 255, 0)
+        if mask is not None:
+            seen &= cv2.remap(mask, map_x, map_y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE) > 0
+        valid[rows] = np.where(seen, 255, 0)
 
     starts = range(0, target.height, _STRIP_ROWS)
     if jobs == 1:
@@ -98,4 +105,4 @@ def rectify(
     else:
         with ThreadPoolExecutor(jobs) as pool:
             list(pool.map(strip, starts))
-    return rectified, mask
+    return rectified, valid

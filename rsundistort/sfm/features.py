@@ -35,7 +35,9 @@ class Features:
     descriptors: NDArray[np.uint8]
 
 
-def detect_features(photo: NDArray[Any], max_features: int = 16384) -> Features:
+def detect_features(
+    photo: NDArray[Any], max_features: int = 16384, mask: NDArray[np.uint8] | None = None
+) -> Features:  # fmt: skip
     """The strongest SIFT features of a photo.
 
     Parameters
@@ -44,13 +46,15 @@ def detect_features(photo: NDArray[Any], max_features: int = 16384) -> Features:
         8-bit, 16-bit or float (0 to 1) pixels in OpenCV's channel order.
     max_features : int
         Keep this many, the strongest first.
+    mask : (h, w) uint8 array, optional
+        No features where it is 0.
     """
     # the upscaled first octave is off by a quarter of a pixel unless it is asked to be precise (measured on blobs)
     sift = cv2.SIFT.create(
         nfeatures=max_features, nOctaveLayers=3, contrastThreshold=0.02, edgeThreshold=10, sigma=1.6,
         enable_precise_upscale=True,
     )  # fmt: skip
-    keypoints, raw = sift.detectAndCompute(_gray_u8(photo), None)
+    keypoints, raw = sift.detectAndCompute(_gray_u8(photo), mask)
     if not keypoints:
         return Features(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.uint8))
     xy = np.asarray(cv2.KeyPoint.convert(keypoints), np.float64)

@@ -1,0 +1,75 @@
+"""Masks that users drew: which pixels of a photo to leave out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FileError, InputError
+
+__all__ = ["find_masks", "read_mask"]
+
+_SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".webp", ".jpg", ".jpeg")
+
+
+def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
+    """Masks of photos: files of the same stem (`a.png` for `a.jpg`), or of the whole name, as COLMAP has them.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the masks. A photo need not have one.
+    names : sequence of str
+        Photos.
+
+    Raises
+    ------
+    FileError, InputError
+        When the folder is missing, or no mask in it is of one of the photos.
+    """
+    if not folder.is_dir():
+        raise FileError(f"{folder} is no folder; give the folder that holds the masks")
+    files = {path.name: path for path in sorted(folder.iterdir()) if path.suffix.lower() in _SUFFIXES}
+    by_stem: dict[str, list[Path]] = {}
+    for path in files.values():
+        by_stem.setdefault(path.stem, []).append(path)
+    found: dict[str, Path] = {}
+    for name in names:
+        fitting = by_stem.get(name) or by_stem.get(Path(name).stem) or []
+        if len(fitting) > 1:
+            raise InputError(f"{name} has several masks: {', '.join(path.name for path in fitting)}; keep one of them")
+        if fitting:
+            found[name] = fitting[0]
+    if not found:
+        raise InputError(f"{folder} holds no mask of any photo; it should hold {Path(names[0]).stem}.png and so on")
+    return found
+
+
+def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8]:
+    """A mask of a photo's size: 255 where its pixels count, 0 where they do not.
+
+    Raises
+    ------
+    FileError, InputError
+        When it cannot be read, or is of another size.
+    """
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+        pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
+    except OSError as error:
+        raise FileError(f"mask {path} cannot be read: {error.strerror}") from error
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise FileError(f"mask {path} cannot be decoded; expected an 8-bit image, black where pixels do not count")
+    if pixels.shape != (height, width):
+        raise InputError(
+            f"mask {path} has {pixels.shape[1]}x{pixels.shape[0]} pixels, its photo {width}x{height}; "
+            "masks are of the stored photo, not turned"
+        )
+    # masks kept as JPEG are not quite black and white
+    return np.where(pixels >= 128, 255, 0).astype(np.uint8)

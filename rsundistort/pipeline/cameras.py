@@ -1,0 +1,184 @@
+"""Which camera took each photo, and which way its shutter runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..io import (
+    CameraFile,
+    ExifFacts,
+    camera_from_exif,
+    check_camera_fits,
+    group_of,
+    guess_readouts,
+    read_camera_file,
+    read_exif,
+)
+from ..model import READOUTS, Camera
+
+__all__ = ["PhotoCameras", "check_readouts", "find_cameras"]
+
+#: What `camera.json` files are called where none is named.
+_BESIDE = ("camera.json", "cameras.json")
+
+
+@dataclass(frozen=True)
+class PhotoCameras:
+    """The cameras of a folder's photos.
+
+    Attributes
+    ----------
+    cameras : sequence of Camera
+        Each a body in one mode, read out one way.
+    labels : sequence of str
+        Their names, for people.
+    camera_idx : (m,) int array
+        Camera of each photo.
+    calibrated : bool
+        Whether they were given; else they are EXIF's guesses.
+    readout_told : tuple of bool
+        Whether the direction of each camera's readout was given; else it is a guess.
+    source : str
+        Where they come from, for people.
+    notes : sequence of str
+        What was guessed, for people.
+    """
+
+    cameras: Sequence[Camera]
+    labels: Sequence[str]
+    camera_idx: NDArray[np.int64]
+    calibrated: bool
+    readout_told: tuple[bool, ...]
+    source: str
+    notes: Sequence[str] = ()
+
+    def of(self, image: int) -> Camera:
+        """The camera of a photo."""
+        return self.cameras[int(self.camera_idx[image])]
+
+
+def check_readouts(readout: str | Mapping[str, str] | None) -> dict[str, str]:
+    """Directions by group, the empty name for all others; refused where one is no direction."""
+    told = {"": readout} if isinstance(readout, str) else dict(readout or {})
+    for group, direction in told.items():
+        if direction not in READOUTS:
+            where = f" of {group}" if group else ""
+            raise InputError(f"readout{where} {direction!r}, expected one of {', '.join(READOUTS)}")
+    return told
+
+
+def find_cameras(
+    folder: Path,
+    names: Sequence[str],
+    sizes: Sequence[tuple[int, int]],
+    camera: str | None = None,
+    readout: str | Mapping[str, str] | None = None,
+) -> PhotoCameras:
+    """The cameras of a folder's photos: as told, `camera.json` or `cameras.json` in the folder or beside it, or EXIF.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the photos.
+    names, sizes : sequences of length m
+        Photos and their (width, height).
+    camera : str, optional
+        As `io.read_camera_file` takes it.
+    readout : str or mapping, optional
+        Direction of the readout of all photos, or by group (the label of a camera); overrides the file's.
+
+    Raises
+    ------
+    InputError
+        When a photo has no camera, or one of another size.
+    """
+    facts = [read_exif(folder / name) for name in names]
+    groups = [group_of(fact, *size) for fact, size in zip(facts, sizes, strict=True)]
+    if camera is None:
+        beside = (parent / name for parent in (folder, folder.parent) for name in _BESIDE)
+        camera = next((str(path) for path in beside if path.is_file()), None)
+    if camera is not None:
+        file = read_camera_file(camera, *sizes[0])
+        keys = _keys_in(file, camera, names, sizes, groups)
+        known = dict(file.cameras)
+        calibrated, source, notes = True, camera, list[str]()
+    else:
+        known, keys, notes = _from_exif(folder, names, sizes, facts, groups)
+        calibrated, source = False, "EXIF, refined"
+    labels = list(dict.fromkeys(keys))
+    told = check_readouts(readout)
+    unknown = sorted(told.keys() - {"", *labels})
+    if unknown:
+        raise InputError(f"readout of {unknown[0]!r}: no such group of photos, there are {', '.join(labels)}")
+    cameras = []
+    for label in labels:
+        found = known[label]
+        direction = told.get(label, told.get(""))
+        cameras.append(found if direction is None else replace(found, readout=direction))
+    place = {label: k for k, label in enumerate(labels)}
+    return PhotoCameras(
+        tuple(cameras),
+        tuple(labels),
+        np.array([place[key] for key in keys], np.int64),
+        calibrated,
+        tuple(label in told or "" in told or calibrated for label in labels),
+        source,
+        tuple(note for note in notes if not told),
+    )
+
+
+def _keys_in(
+    file: CameraFile, where: str, names: Sequence[str], sizes: Sequence[tuple[int, int]], groups: Sequence[str]
+) -> list[str]:
+    """Camera of the file for each photo: by its name, else by its group, else the only one of its size."""
+    keys = []
+    for name, size, group in zip(names, sizes, groups, strict=True):
+        fitting = [key for key, each in file.cameras.items() if (each.width, each.height) == size]
+        if file.camera_of_image:
+            if name not in file.camera_of_image:
+                raise InputError(f"{where} says of no camera that it took {name}; name it there, or move it away")
+            key = file.camera_of_image[name]
+        elif len(file.cameras) == 1:
+            (key,) = file.cameras
+        elif group in file.cameras:
+            key = group
+        elif len(fitting) == 1:
+            key = fitting[0]
+        else:
+            which = "no camera" if not fitting else "several cameras"
+            raise InputError(
+                f"{where} holds {which} of the size of {name}, {size[0]}x{size[1]}; call its file {group}.json"
+            )
+        check_camera_fits(file.cameras[key], *size, f"{where} for {name}")
+        keys.append(key)
+    return keys
+
+
+def _from_exif(
+    folder: Path,
+    names: Sequence[str],
+    sizes: Sequence[tuple[int, int]],
+    facts: Sequence[ExifFacts],
+    groups: Sequence[str],
+) -> tuple[dict[str, Camera], list[str], list[str]]:
+    """Cameras by group with the focal length of EXIF, the group of each photo, and what was guessed."""
+    directions, notes = guess_readouts(facts, sizes, groups)
+    known: dict[str, Camera] = {}
+    for name, size, group in zip(names, sizes, groups, strict=True):
+        if group not in known:
+            guess = camera_from_exif(folder / name, *size, directions[group])
+            if guess is not None:
+                known[group] = guess
+    for name, group in zip(names, groups, strict=True):
+        if group not in known:
+            raise InputError(
+                f"{name} has no focal length in its EXIF and there is no camera.json; "
+                "give --camera FILE or --camera fx,fy,cx,cy in pixels"
+            )
+    return known, list(groups), list(notes)
