@@ -13,11 +13,19 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from rsundistort import RunOptions, run
+from rsundistort import BundleOptions, BundleResult, Reconstruction, RsUndistortWarning, RunOptions
+from rsundistort.bundle import Posterior
+from rsundistort.critical.cost import row_phi
+from rsundistort.pipeline.load import load_photos
+from rsundistort.pipeline.progress import StageLog
+from rsundistort.pipeline.run import use_threads
+from rsundistort.pipeline.solve import solve_photos
 
 import pycolmap  # isort: skip  # after rsundistort: see rsundistort/io/images.py
 
@@ -51,6 +59,33 @@ def colmap_focal_lengths(photos: Path, seeds: int) -> list[tuple[int, float]]:
     return found
 
 
+def solve(photos: Path) -> tuple[BundleResult, BundleOptions]:
+    """The rotation model of the photos, as `run` solves it, and the options of the adjustment."""
+    log, options = StageLog(None), RunOptions()
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore", RsUndistortWarning)
+        loaded = load_photos(photos, None, None, options.max_features, use_threads(0), log)
+
+        def of(rec: Reconstruction) -> BundleOptions:
+            return options.options_for(rec, loaded.cameras)
+
+        solved = solve_photos(loaded, "rotation", 0, of, Path(folder), log)
+    return solved.result, of(solved.result.reconstruction)
+
+
+def mean_phi1(rec: Reconstruction) -> float:
+    """Mean of the paper's phi1, radians per frame."""
+    return float(np.mean(rec.phi[np.arange(rec.num_images), row_phi(rec)[:, 0]] * rec.frame_span()))
+
+
+def sigma_mean_phi1(result: BundleResult, options: BundleOptions) -> float:
+    """Its standard deviation, radians per frame."""
+    rec = result.reconstruction
+    mean = np.zeros((1, *result.covariances.shape[:2]))
+    mean[0, np.arange(rec.num_images), 6 + row_phi(rec)[:, 0]] = rec.frame_span() / rec.num_images
+    return float(np.sqrt((mean * Posterior(result, options).of_photos(mean)).sum()))
+
+
 def main() -> None:
     """Measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -64,9 +99,8 @@ def main() -> None:
             print(json.dumps({"name": name, "skipped": "no folder of test photos beside the project"}))
             continue
         peer = colmap_focal_lengths(photos, args.seeds)
-        with tempfile.TemporaryDirectory() as folder:
-            solution = run(photos, Path(folder) / "out", RunOptions())
-        camera = solution.cameras["1"]
+        result, options = solve(photos)
+        camera = result.reconstruction.cameras[0]
         focal = [f for _, f in peer]
         figures = {
             "name": f"self-calibration of {name}",
@@ -74,9 +108,12 @@ def main() -> None:
             "colmap_registered": [count for count, _ in peer],
             "colmap_median": round(float(np.median(focal)), 1),
             "f": round(float(camera.K[0, 0]), 1),
-            "sigma_f": round(solution.quality["sigma_intrinsics"]["1"]["f"], 2),
-            "registered": len(solution.registered),
-            "model": solution.shutter_model,
+            "sigma_f": round(result.sigma_intrinsics[0]["f"], 2),
+            "exif_f": round(float(options.guessed.cameras[0].K[0, 0]), 1),
+            "registered": result.reconstruction.num_images,
+            "mean_phi1_mrad": round(1e3 * mean_phi1(result.reconstruction), 3),
+            "sigma_mean_phi1_mrad": round(1e3 * sigma_mean_phi1(result, options), 4),
+            "sigma_mean_phi1_f_known_mrad": round(1e3 * sigma_mean_phi1(result, replace(options, refine=())), 4),
             "ratio": round(float(camera.K[0, 0] / np.median(focal)), 4),
         }
         print(json.dumps(figures), flush=True)

@@ -13,10 +13,19 @@ from numpy_twin import DIRECTIONS, MODELS, project
 from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, Camera, InputError, Observations, Reconstruction, bundle_adjust, climb
-from rsundistort.bundle import LADDER, KnownLength, choose_model, objective, reprojection_residuals
+from rsundistort.bundle import (
+    LADDER,
+    GuessedCameras,
+    KnownLength,
+    choose_model,
+    choose_readouts,
+    objective,
+    reprojection_residuals,
+)
 from rsundistort.bundle.choice import hold_out
 from rsundistort.bundle.intrinsics import moved_camera
 from rsundistort.bundle.problem import BundleProblem, Spreads
+from rsundistort.model import READOUTS
 
 LENS = [-0.12, 0.03, 0.001, -0.002]
 SHUTTERS = ("two-step", "linearized", "rotation", "constant-motion")
@@ -413,6 +422,64 @@ def test_intrinsics_that_contradict_each_other_are_refused(refine, message):
         BundleOptions(refine=refine)
 
 
+GUESS_SIGMA = {"f": 0.01, "cx": 0.002, "k1": 0.03, "p1": 1e-3}
+
+
+def guessing_problem(rng, used=4):
+    """A problem whose intrinsics are pulled at guesses elsewhere; the last of `used` + 0 cameras may have no photo."""
+    rec = make_scene(rng, "rotation", num_images=6, num_points=30, noise_px=1.0, dist=LENS)
+    rec = replace(rec, camera_idx=np.arange(6) % used)
+    refine = tuple(GUESS_SIGMA)
+    guesses = [moved_camera(camera, refine, rng.normal(size=4) * [0.01, 0.002, 0.03, 1e-3]) for camera in rec.cameras]
+    options = BundleOptions(
+        loss="squared", sigma_px=1.0, refine=refine, guessed=GuessedCameras(guesses, GUESS_SIGMA), outlier_rounds=0
+    )
+    return rec, options
+
+
+def test_gradient_of_the_prior_on_intrinsics_equals_central_differences(rng):
+    rec, options = guessing_problem(rng)
+    problem = BundleProblem(rec, "rotation", options, 1.0, Spreads(0.03, 0.1))
+    state = problem.initial_state()
+    equations = problem.linearize(state)
+    expected = gradients(equations)[2]
+    h = 1e-5
+    for kind, index, step in unit_steps(problem, state):
+        if kind == 2:
+            ahead, behind = (problem.cost(problem.retract(state, scaled(step, s))) for s in (h, -h))
+            assert abs((ahead - behind) / (2 * h) - expected[index]) <= 1e-6 * np.abs(expected).max()
+
+
+def test_weak_photos_leave_intrinsics_at_their_guess_and_strong_ones_do_not(rng):
+    rec, options = guessing_problem(rng)
+    tight = replace(options, guessed=GuessedCameras(options.guessed.cameras, {k: 1e-9 for k in GUESS_SIGMA}))
+    held = bundle_adjust(rec, "rotation", tight)
+    for camera, guess in zip(held.reconstruction.cameras, tight.guessed.cameras, strict=True):
+        assert camera.K == pytest.approx(guess.K, rel=1e-6)
+        assert camera.dist == pytest.approx(guess.dist, abs=1e-6)
+    assert all(sigma["k1"] == pytest.approx(1e-9, rel=0.01) for sigma in held.sigma_intrinsics)
+    loose = replace(options, guessed=GuessedCameras(options.guessed.cameras, {k: 1e6 for k in GUESS_SIGMA}))
+    free, without = (bundle_adjust(rec, "rotation", each) for each in (loose, replace(options, guessed=None)))
+    assert free.reconstruction.cameras[0].K == pytest.approx(without.reconstruction.cameras[0].K, rel=1e-5)
+
+
+@pytest.mark.parametrize("guess", [False, True])
+def test_a_camera_that_took_no_photo_stays_as_it_was(guess, rng):
+    rec, options = guessing_problem(rng, used=3)
+    options = options if guess else replace(options, guessed=None)
+    before = rec.cameras[3] if not guess else options.guessed.cameras[3]
+    result = bundle_adjust(rec, "rotation", options)
+    assert result.converged
+    assert result.reconstruction.cameras[3].K == pytest.approx(before.K, rel=1e-6)
+    assert result.reconstruction.cameras[3].dist == pytest.approx(before.dist, abs=1e-6)
+
+
+@pytest.mark.parametrize(("sigma", "named"), [({"f": -1.0}, "f"), ({"zoom": 1.0}, "zoom")])
+def test_impossible_priors_on_intrinsics_are_refused(sigma, named):
+    with pytest.raises(InputError, match=named):
+        GuessedCameras((), sigma)
+
+
 def test_ladder_ends_at_the_truth_and_climbs_in_order(rng):
     truth = make_scene(rng, "constant-motion")
     seen = []
@@ -627,6 +694,33 @@ def test_the_model_that_made_the_measurements_is_chosen(model, rng):
     assert 0.25 < choice.held_out_rms_px[model] < 0.5
     assert 140 <= choice.num_held_out <= 150  # a tenth of them, one a track; the ladder dropped a few
     assert choose_model(start, sigma_px=0.3) == choice
+
+
+@pytest.mark.parametrize("wrong", [(), (1,), (0, 2), (0, 1, 2, 3)])
+def test_the_axis_of_the_readout_is_found_whatever_was_guessed(wrong, rng):
+    rec = make_scene(rng, "rotation", num_images=12, num_points=150, noise_px=0.3, phi_size=0.05)
+    cameras = list(rec.cameras)
+    for k in wrong:
+        other = "left-to-right" if cameras[k].readout.endswith(("top", "bottom")) else "top-to-bottom"
+        cameras[k] = replace(cameras[k], readout=other)
+    guessed = replace(perturbed(rec, rng), cameras=cameras, shutter_model="global")
+    choice = choose_readouts(guessed, range(4))
+    assert choice.turned == wrong
+    for found, true in zip(choice.reconstruction.cameras, rec.cameras, strict=True):
+        assert READOUTS[found.readout][0] == READOUTS[true.readout][0]
+
+
+def test_without_motion_the_guess_of_the_readout_stays(rng):
+    rec = make_scene(rng, "global", num_images=12, num_points=100, noise_px=0.3)
+    choice = choose_readouts(perturbed(rec, rng), range(4))
+    assert choice.turned == ()
+    assert choice.reconstruction.cameras == rec.cameras
+
+
+def test_a_camera_whose_readout_was_told_is_left_alone(rng):
+    rec = make_scene(rng, "rotation", num_images=8, num_points=100, noise_px=0.3)
+    assert list(choose_readouts(rec, [2]).gain) == [2]
+    assert choose_readouts(rec, []).gain == {}
 
 
 def test_held_out_measurements_leave_their_tracks_three(rng):

@@ -3,6 +3,7 @@
 from .adjust import LADDER, bundle_adjust, climb, objective
 from .choice import ModelChoice, choose_model
 from .direction import ReadoutChoice, choose_readouts
+from .intrinsics import GuessedCameras
 from .lengths import KnownLength
 from .options import BundleOptions, BundleResult
 from .posterior import Posterior, gauge_directions
@@ -12,6 +13,7 @@ __all__ = [
     "LADDER",
     "BundleOptions",
     "BundleResult",
+    "GuessedCameras",
     "KnownLength",
     "ModelChoice",
     "Posterior",

@@ -13,7 +13,7 @@ from .adjust import LADDER, bundle_adjust
 from .options import BundleOptions
 from .problem import reprojection_residuals
 
-__all__ = ["ModelChoice", "choose_model", "held_out_errors", "hold_out", "standard_errors"]
+__all__ = ["ModelChoice", "choose_model", "clipped_errors", "hold_out", "standard_errors"]
 
 # A track gives one measurement away if this many are left: two fix the point, the third checks them.
 _LEFT_OVER = 3
@@ -69,17 +69,17 @@ def hold_out(
     return ~held, held
 
 
-def held_out_errors(rec: Reconstruction, held: Observations, sigma_px: float) -> tuple[NDArray[np.float64], float]:
-    """Half the clipped squared residual of each held-out measurement in units of the noise, and their rms in pixels."""
-    res, valid = reprojection_residuals(replace(rec, observations=held))
-    noise = sigma_px * held.sigma
+def clipped_errors(rec: Reconstruction, measured: Observations, sigma_px: float) -> tuple[NDArray[np.float64], float]:
+    """Half the clipped squared residual of each measurement in units of the noise, and their rms in pixels."""
+    res, valid = reprojection_residuals(replace(rec, observations=measured))
+    noise = sigma_px * measured.sigma
     square = np.where(valid, (res**2).sum(1) / noise**2, np.inf)
     clipped = np.minimum(square, 2 * _CLIP**2)
     return clipped / 2, float(np.sqrt(np.mean(clipped * noise**2) / 2))
 
 
 def standard_errors(fall: NDArray[np.float64]) -> float:
-    """Mean fall of the held-out errors in units of its standard error; 0 if nothing fell."""
+    """Mean fall of errors in units of its standard error; 0 if nothing fell."""
     spread = float(fall.std(ddof=1) / np.sqrt(len(fall))) if len(fall) > 1 else np.inf
     return float(fall.mean() / spread) if spread > 0 else 0.0
 
@@ -131,7 +131,7 @@ def choose_model(
         # the next rung starts from this one's shape, but keeps a motion that the rung does not model
         moved = result.reconstruction
         current = replace(moved, phi=current.phi) if model == "global" else moved
-        errors, rms[model] = held_out_errors(moved, held_out, sigma_px)
+        errors, rms[model] = clipped_errors(moved, held_out, sigma_px)
         if model == rungs[0]:
             best = errors
             continue

@@ -1,21 +1,23 @@
-"""Along which axis of its photos a camera is read out: the one whose fit foretells held-out measurements better."""
+"""Along which axis of its photos a camera is read out: the one that fits the measurements better."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..model import READOUTS, Reconstruction
 from .adjust import climb
-from .choice import held_out_errors, hold_out, standard_errors
-from .options import BundleOptions
+from .choice import clipped_errors, standard_errors
+from .options import BundleOptions, BundleResult
 
 __all__ = ["ReadoutChoice", "choose_readouts"]
 
 # The first guess is right far more often than not: it is given up for a gain of this many standard errors.
-_MIN_GAIN = 3.0
+_MIN_GAIN = 5.0
 # Reversing the readout negates the motion and changes nothing else, so one direction of each axis is tried.
 _OTHER_AXIS = ("top-to-bottom", "left-to-right")
 
@@ -29,8 +31,8 @@ class ReadoutChoice:
     reconstruction : Reconstruction
         As given, its cameras read out along the better axis.
     gain : dict of int to float
-        For each camera that was open, how much the held-out error would fall (if negative: rise) along the other axis
-        than the one given, in units of the standard error of that fall.
+        For each camera that was open, how much the error would fall (if negative: rise) along the other axis than the
+        one given, in units of the standard error of that fall over the points.
     """
 
     reconstruction: Reconstruction
@@ -47,10 +49,11 @@ def choose_readouts(
     open_cameras: Sequence[int],
     options: BundleOptions | None = None,
     *,
-    seed: int = 0,
     progress: Callable[[str, float], None] | None = None,
 ) -> ReadoutChoice:
-    """Fit the rotation model with each open camera read out along either axis, and keep what foretells better.
+    """Fit the rotation model with each open camera read out along either axis, and keep what fits better.
+
+    Both fits have the same unknowns and priors, so that nothing has to be held out to compare them.
 
     Parameters
     ----------
@@ -60,43 +63,41 @@ def choose_readouts(
         Cameras whose direction is a guess.
     options : BundleOptions, optional
         Of the fits.
-    seed : int
-        Of the choice of measurements.
     progress : callable, optional
         Called as (model, cost).
     """
-    fitted, held = hold_out(reconstruction, seed=seed)
-    obs = reconstruction.observations
-    held_out = obs.select(held)
     # anchors are meant for one axis; neither they nor a lens decide between two
     rough = replace(
-        options or BundleOptions(), outlier_rounds=0, spread_rounds=2, spread_tolerance=0.1, cost_tolerance=1e-4,
+        options or BundleOptions(), outlier_rounds=0, spread_rounds=1, spread_tolerance=0.1, cost_tolerance=1e-3,
         held_phi={}, known_phi={}, lengths=(), refine=(),
     )  # fmt: skip
 
-    def fit(rec: Reconstruction) -> tuple[Reconstruction, float]:
-        start = replace(rec, observations=obs.select(fitted))
-        result = climb(start, ("two-step", "rotation"), rough, progress)["rotation"]
-        return result.reconstruction, result.sigma_px
+    def fit(rec: Reconstruction) -> BundleResult:
+        return climb(rec, ("two-step", "rotation"), rough, progress)["rotation"]
+
+    def errors_of(result: BundleResult) -> NDArray[Any]:
+        errors = clipped_errors(result.reconstruction, reconstruction.observations, sigma_px)[0]
+        return np.bincount(reconstruction.observations.point_idx, errors)
 
     photos = np.bincount(reconstruction.camera_idx, minlength=len(reconstruction.cameras))
     undecided = [camera for camera in open_cameras if photos[camera]]
     best, gains = reconstruction, dict[int, float]()
-    if not undecided or not held.any():
+    if not undecided:
         return ReadoutChoice(best, gains)
-    found, sigma_px = fit(best)
-    errors = held_out_errors(found, held_out, sigma_px)[0]
+    found = fit(best)
+    best, sigma_px = found.reconstruction, found.sigma_px
+    errors = errors_of(found)
     while undecided:
         # the clearest case first: while one camera is wrong, the others' evidence is drowned in its residuals
         others = {camera: _turned(best, camera) for camera in undecided}
-        other_errors = {camera: held_out_errors(fit(rec)[0], held_out, sigma_px)[0] for camera, rec in others.items()}
+        other_errors = {camera: errors_of(fit(rec)) for camera, rec in others.items()}
         gains.update({camera: standard_errors(errors - each) for camera, each in other_errors.items()})
         clearest = max(undecided, key=lambda camera: gains[camera])
         if not gains[clearest] > _MIN_GAIN:
             break
         best, errors = others[clearest], other_errors[clearest]
-        undecided.remove(clearest)
-    return ReadoutChoice(best, gains)
+        undecided = [camera for camera in undecided if camera != clearest and gains[camera] > -_MIN_GAIN]
+    return ReadoutChoice(replace(reconstruction, cameras=best.cameras), gains)
 
 
 def _turned(reconstruction: Reconstruction, camera: int) -> Reconstruction:

@@ -83,7 +83,7 @@ def deviation(
     apart = {"f": np.log(fx / gx), "fx": np.log(fx / gx), "fy": np.log(fy / gy), "cx": (cx - gcx) / gx}
     apart["cy"] = (cy - gcy) / gy
     slope = {"cx": fx / gx, "cy": fy / gy}
-    for name, value in zip(("k1", "k2", "p1", "p2", "k3"), dist - guess_dist, strict=False):
+    for name, value in zip(("k1", "k2", "p1", "p2", "k3"), dist[:5] - guess_dist[:5], strict=True):
         apart[name] = value
     return np.array([apart[name] for name in names]), np.array([slope.get(name, 1.0) for name in names])
 

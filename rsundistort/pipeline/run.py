@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..bundle import BundleOptions, KnownLength, reprojection_residuals
+from ..bundle import BundleOptions, GuessedCameras, KnownLength, reprojection_residuals
 from ..critical import with_remedy
 from ..errors import InputError
 from ..io import output_folder, output_name, write_colmap_model, write_solution, write_transforms
@@ -31,8 +31,10 @@ from .write import PointColors, mask_names, rectify_photos
 __all__ = ["RunOptions", "run", "use_threads", "versions"]
 
 
-# What EXIF does not know, and a set of photos tells.
+# What EXIF does not know, and a set of photos tells; and how far it may be off (relative f, lens coefficients): equivalent
+# focal lengths are rounded to millimetres, focusing and stabilising crop a little, phones hardly distort.
 _GUESSED = ("f", "k1", "k2")
+_GUESS_SIGMA = {"f": 0.05, "k1": 0.2, "k2": 0.4}
 
 
 @dataclass(frozen=True)
@@ -96,18 +98,18 @@ class RunOptions:
         if self.shutter_model != "auto":
             check_shutter_model(self.shutter_model)
         check_readouts(self.readout)
-        with_remedy(self.bundle_options(self.refine or (), {}), self.remedy)
+        with_remedy(self.bundle_options(), self.remedy)
         if self.interpolation not in INTERPOLATIONS:
             raise InputError(f"interpolation={self.interpolation!r}, expected one of {', '.join(INTERPOLATIONS)}")
         if self.jobs < 0 or self.max_features < 100 or not 1 <= self.quality <= 100:
             raise InputError("jobs must be 0 or more, max_features at least 100, quality 1 to 100")
 
-    def bundle_options(self, refine: tuple[str, ...], readout: Mapping[str, str]) -> BundleOptions:
-        """Options of the adjustments of photos with these readout directions."""
+    def bundle_options(self, readout: Mapping[str, str] | None = None) -> BundleOptions:
+        """Options of the adjustments of photos with these readout directions, top-to-bottom where none is named."""
         soft, hard = {}, {}
         for name, sigma in self.still.items():
             # the rotation that stretches the photo along its readout
-            phi1 = 0 if READOUTS[readout.get(name, "top-to-bottom")][0] == 1 else 1
+            phi1 = 0 if READOUTS[(readout or {}).get(name, "top-to-bottom")][0] == 1 else 1
             if not 0 <= sigma < np.inf:
                 raise InputError(f"still photo {name!r}: sigma {sigma!r}, expected 0 or a positive number")
             if sigma > 0 and name in self.known:
@@ -116,7 +118,18 @@ class RunOptions:
                 soft[name] = (np.zeros(3), np.where(np.arange(3) == phi1, sigma, np.inf))
             else:
                 hard[name] = (phi1,)
-        return BundleOptions(held_phi=hard, known_phi={**self.known, **soft}, lengths=self.lengths, refine=refine)
+        return BundleOptions(
+            held_phi=hard, known_phi={**self.known, **soft}, lengths=self.lengths, refine=self.refine or ()
+        )  # fmt: skip
+
+    def options_for(self, reconstruction: Reconstruction, cameras: PhotoCameras) -> BundleOptions:
+        """Options of the adjustments of a reconstruction, by its readout directions and by whether EXIF guessed."""
+        rec = reconstruction
+        options = self.bundle_options({name: rec.camera(i).readout for i, name in enumerate(rec.image_names)})
+        if cameras.calibrated:
+            return options
+        refine = _GUESSED if self.refine is None else self.refine
+        return replace(options, refine=refine, guessed=GuessedCameras(cameras.cameras, _GUESS_SIGMA))
 
 
 def versions() -> dict[str, str]:
@@ -170,16 +183,10 @@ def run(
         for name in (*options.still, *options.known, *ends):
             if name not in loaded.names:
                 raise InputError(f"anchor {name!r} is not among the photos of {photos}")
-        refine = options.refine
-        if refine is None:
-            refine = () if loaded.cameras.calibrated else _GUESSED
-
-        def bundle_options(rec: Reconstruction, refine: tuple[str, ...] = refine) -> BundleOptions:
-            return options.bundle_options(refine, {n: rec.camera(i).readout for i, n in enumerate(rec.image_names)})
-
         with tempfile.TemporaryDirectory() as work:
             solved = solve_photos(
-                loaded, options.shutter_model, options.seed, bundle_options, Path(work), log, options.remedy
+                loaded, options.shutter_model, options.seed, lambda rec: options.options_for(rec, loaded.cameras),
+                Path(work), log, options.remedy,
             )  # fmt: skip
         rec = solved.result.reconstruction
         solution = _solution(loaded, solved, options)

@@ -10,7 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from ..bundle import LADDER, BundleOptions, BundleResult, ModelChoice, bundle_adjust, choose_model, choose_readouts, climb
+from ..bundle import (
+    LADDER,
+    BundleOptions,
+    BundleResult,
+    ModelChoice,
+    bundle_adjust,
+    choose_model,
+    choose_readouts,
+    climb,
+)
 from ..critical import Advice, Remedy, advise, heal, with_remedy
 from ..errors import ReconstructionError, RsUndistortWarning
 from ..model import Reconstruction
@@ -89,15 +98,13 @@ def _of_joined(options: BundleOptions, mapped: Reconstruction) -> BundleOptions:
     )
 
 
-def _read_out(
-    mapped: Reconstruction, photos: LoadedPhotos, options: BundleOptions, seed: int, log: StageLog
-) -> Reconstruction:
+def _read_out(mapped: Reconstruction, photos: LoadedPhotos, options: BundleOptions, log: StageLog) -> Reconstruction:
     """The reconstruction with the directions of readout that nobody told as the measurements have them."""
     guessed = [k for k, told in enumerate(photos.cameras.readout_told) if not told]
     if not guessed:
         return mapped
     log.begin("readout")
-    choice = choose_readouts(mapped, guessed, options, seed=seed, progress=partial(_tell_model, log))
+    choice = choose_readouts(mapped, guessed, options, progress=partial(_tell_model, log))
     log.end(
         "readout",
         directions={photos.cameras.labels[k]: choice.reconstruction.cameras[k].readout for k in guessed},
@@ -149,7 +156,7 @@ def solve_photos(
             f"only {mapped.num_images} of {len(photos.names)} photos could be joined, the shutter needs three; "
             "use photos that share more of the scene"
         )
-    mapped = _read_out(mapped, photos, options_of(mapped), seed, log)
+    mapped = _read_out(mapped, photos, options_of(mapped), log)
     options = _of_joined(with_remedy(options_of(mapped), remedy), mapped)
     auto = shutter_model == "auto"
     shutter_model = "rotation" if auto else shutter_model
