@@ -1,7 +1,6 @@
 """Files: photos, cameras, solutions, COLMAP models, nerfstudio."""
 
 from .cameras import camera_from_exif, check_camera_fits, parse_camera
-from .stub import CameraFile, ExifFacts, read_camera_file, read_exif, group_of, guess_readouts
 from .colmap import read_colmap_poses, write_colmap_model
 from .images import Photo, list_photos, output_name, read_photo, write_image
 from .lengths import read_known_lengths
