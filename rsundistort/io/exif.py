@@ -1,0 +1,351 @@
+"""What EXIF says of a camera: its focal length, which photos one camera took, and which were turned after readout."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..model import READOUTS, Camera
+
+__all__ = [
+    "CameraGroup",
+    "ExifFacts",
+    "camera_from_exif",
+    "focal_from_exif",
+    "group_of",
+    "group_photos",
+    "guess_readouts",
+    "read_exif",
+]
+
+# diagonal of the 36 x 24 mm frame that 35-mm equivalents refer to (CIPA DCG-001)
+_FILM_DIAGONAL_MM = math.hypot(36, 24)
+# mm per FocalPlaneResolutionUnit: inch, cm, mm, micrometre
+_UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+
+
+@dataclass(frozen=True)
+class ExifFacts:
+    """What a photo's EXIF says of its camera; None where it says nothing that can be believed.
+
+    Attributes
+    ----------
+    make, model, lens, serial : str or None
+        Maker and model of the camera, model of the lens, serial number of the body.
+    focal_mm : float or None
+        Focal length in mm.
+    focal_35mm : float or None
+        Focal length that sees the same diagonal on 36 x 24 mm.
+    sensor_width_mm : float or None
+        Long side of the sensor, from the resolution of the focal plane.
+    digital_zoom : float or None
+        Above 1 where the camera enlarged the middle of its picture.
+    orientation : int or None
+        1 to 8; how to turn the stored pixels for a person.
+    width, height : int or None
+        Size of the photo in pixels, as EXIF claims it.
+    """
+
+    make: str | None = None
+    model: str | None = None
+    lens: str | None = None
+    serial: str | None = None
+    focal_mm: float | None = None
+    focal_35mm: float | None = None
+    sensor_width_mm: float | None = None
+    digital_zoom: float | None = None
+    orientation: int | None = None
+    width: int | None = None
+    height: int | None = None
+
+
+def read_exif(path: Path) -> ExifFacts:
+    """The facts of a JPEG, PNG, WebP, TIFF, HEIC, DNG or another RAW file that is a TIFF.
+
+    Never raises: what is missing, damaged or not to be believed is None. It changes Python's filters of warnings while it
+    reads, so it is not for several threads at once.
+    """
+    from PIL.ExifTags import Base
+
+    main, sub = _tags(Path(path))
+
+    def text(tag: int) -> str | None:
+        return _text(sub.get(tag, main.get(tag)))
+
+    def number(tag: int, low: float, high: float) -> float | None:
+        return _number(sub.get(tag, main.get(tag)), low, high)
+
+    def whole(tag: int, low: int, high: int) -> int | None:
+        value = number(tag, low, high)
+        return int(value) if value is not None and value == int(value) else None
+
+    focal_mm = number(Base.FocalLength, 0.5, 3000)
+    focal_35mm = number(Base.FocalLengthIn35mmFilm, 4, 5000)
+    width, height = whole(Base.ExifImageWidth, 1, 10**6), whole(Base.ExifImageHeight, 1, 10**6)
+    sensor = None
+    per_unit = number(Base.FocalPlaneXResolution, 1e-3, 1e9)
+    unit_mm = _UNITS_MM.get(whole(Base.FocalPlaneResolutionUnit, 0, 100) or 2)
+    if per_unit and unit_mm and width and height:
+        sensor = _number(max(width, height) / per_unit * unit_mm, 1, 100)
+    if sensor and focal_mm and focal_35mm:
+        # two ways to the same figure; editors that scale a photo leave one of them as it was
+        ratio = focal_mm * 36 / sensor / focal_35mm
+        sensor = sensor if 0.75 < ratio < 1.33 else None
+    zoom = number(Base.DigitalZoomRatio, 1, 100)
+    return ExifFacts(
+        make=text(Base.Make),
+        model=text(Base.Model),
+        lens=text(Base.LensModel),
+        serial=text(Base.BodySerialNumber),
+        focal_mm=focal_mm,
+        focal_35mm=focal_35mm,
+        sensor_width_mm=sensor,
+        digital_zoom=zoom,
+        orientation=whole(Base.Orientation, 1, 8),
+        width=width,
+        height=height,
+    )
+
+
+def _tags(path: Path) -> tuple[dict[int, Any], dict[int, Any]]:
+    """Tags of the main and of the EXIF directory; empty where there are none that can be read."""
+    from PIL import Image, ImageFile, JpegImagePlugin, PngImagePlugin, WebPImagePlugin
+    from PIL.ExifTags import IFD
+
+    # not Image.open, which refuses photos of 180 megapixels and more before it has read their EXIF
+    openers: dict[bytes, type[ImageFile.ImageFile]] = {
+        b"\xff\xd8": JpegImagePlugin.JpegImageFile,
+        b"\x89P": PngImagePlugin.PngImageFile,
+        b"RI": WebPImagePlugin.WebPImageFile,
+    }
+    exif = Image.Exif()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            with path.open("rb") as file:
+                head = file.read(12)
+                file.seek(0)
+                if head[:2] in (b"II", b"MM"):
+                    exif.load_from_fp(file)
+                elif head[:2] in openers:
+                    exif.load(openers[head[:2]](file).info.get("exif", b""))
+                elif head[4:8] == b"ftyp":
+                    exif.load(_heif_block(file))
+                return _entries(exif), _entries(exif.get_ifd(IFD.Exif))
+        except Exception:  # Pillow raises whatever it tripped over
+            return _entries(exif), {}
+
+
+def _heif_block(file: Any) -> bytes:
+    """The EXIF of a HEIC photo, if the extra that reads it is there."""
+    import pillow_heif
+
+    return bytes(pillow_heif.open_heif(file).info.get("exif") or b"")
+
+
+def _entries(directory: Any) -> dict[int, Any]:
+    """A directory without the entries that cannot be read."""
+    found = {}
+    for tag in list(directory):
+        try:
+            found[tag] = directory[tag]
+        except Exception:  # as above; the other entries may be good
+            continue
+    return found
+
+
+def _text(value: Any) -> str | None:
+    """A text without the padding of fixed-length fields; None if nothing is left."""
+    if isinstance(value, bytes):
+        value = value.decode("latin-1")
+    if not isinstance(value, str):
+        return None
+    value = value.split("\0")[0]
+    try:
+        value = value.encode("latin-1").decode()  # Pillow takes every text for Latin-1, cameras write UTF-8 too
+    except UnicodeError:
+        pass
+    value = " ".join("".join(c for c in value if c.isprintable()).split())[:100]
+    return value if any(c.isalnum() for c in value) and value.lower() not in ("unknown", "n/a", "none") else None
+
+
+def _number(value: Any, low: float, high: float) -> float | None:
+    """The number, or the first of several, if it lies between the bounds."""
+    if isinstance(value, tuple) and value:
+        value = value[0]
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ArithmeticError):
+        return None
+    return number if low <= number <= high else None
+
+
+def focal_from_exif(facts: ExifFacts, width: int, height: int) -> float | None:
+    """Focal length in pixels of a photo of this size, from the sensor's size or else the 35-mm equivalent.
+
+    The photo is taken to show all of the frame: of one that was cut, EXIF knows the focal length only before the cut.
+    """
+    if facts.focal_mm and facts.sensor_width_mm:
+        focal = facts.focal_mm / facts.sensor_width_mm * max(width, height) * (facts.digital_zoom or 1)
+    elif facts.focal_35mm:
+        focal = facts.focal_35mm / _FILM_DIAGONAL_MM * math.hypot(width, height)
+    else:
+        return None
+    return focal if _is_credible(focal, width, height) else None
+
+
+def _is_credible(focal: float, width: int, height: int) -> bool:
+    return 0.2 * max(width, height) < focal < 20 * max(width, height)
+
+
+def camera_from_exif(path: Path, width: int, height: int, readout: str = "top-to-bottom") -> Camera | None:
+    """A camera with the focal length of the photo's EXIF and the centre as principal point; None without one.
+
+    Where EXIF has neither the sensor's size nor a 35-mm equivalent, pycolmap's table of sensor widths by make and model
+    is asked.
+    """
+    focal = focal_from_exif(read_exif(path), width, height) or _focal_of_model(path, width, height)
+    if focal is None:
+        return None
+    K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+    return Camera(width, height, K, readout=readout)
+
+
+def _focal_of_model(path: Path, width: int, height: int) -> float | None:
+    import pycolmap
+
+    pycolmap.logging.minloglevel = 3
+    try:
+        guess = pycolmap.infer_camera_from_image(path)
+    except (RuntimeError, ValueError):
+        return None
+    focal = guess.mean_focal_length() * max(width, height) / max(guess.width, guess.height)
+    return focal if guess.has_prior_focal_length and _is_credible(focal, width, height) else None
+
+
+def group_of(facts: ExifFacts, width: int, height: int) -> str:
+    """A label of the physical camera and its mode: alike for two photos that can share their intrinsics.
+
+    Examples
+    --------
+    >>> facts = ExifFacts(make="Apple", model="iPhone 6", focal_mm=4.15)
+    >>> group_of(facts, 3264, 2448)
+    'apple-iphone-6-4.15mm-3264x2448'
+    >>> group_of(ExifFacts(), 3264, 2448)
+    'camera-3264x2448'
+    """
+    return f"{_body(facts)}-{width}x{height}"
+
+
+def _body(facts: ExifFacts) -> str:
+    """The label without the size."""
+    make, model = facts.make or "", facts.model or ""
+    if model.lower().startswith(make.lower()):  # "Canon", "Canon EOS 5D"
+        make = ""
+    # a phone's lens names the phone again, and one lens has several such names
+    lens = "" if facts.lens is None or (model and model.lower() in facts.lens.lower()) else facts.lens
+    words = [make, model, lens, facts.serial or ""]
+    if not any(words[:2]):
+        words[0] = "camera"
+    if facts.focal_mm or facts.focal_35mm:
+        words.append(f"{facts.focal_mm:.4g}mm" if facts.focal_mm else f"{facts.focal_35mm:.4g}mm-of-35")
+    if facts.digital_zoom and facts.digital_zoom > 1:
+        words.append(f"zoom-{facts.digital_zoom:.3g}")
+    text = "".join(c if c.isalnum() or c == "." else " " for c in " ".join(words).lower())
+    return "-".join(text.split())
+
+
+@dataclass(frozen=True)
+class CameraGroup:
+    """Photos of one physical camera in one mode.
+
+    Attributes
+    ----------
+    label : str
+        As `group_of` gives it.
+    facts : ExifFacts
+        Of the first photo.
+    width, height : int
+        Size of its photos in pixels.
+    names : tuple of str
+        The photos.
+    upright : bool
+        Whether no photo has a tag that turns it.
+    """
+
+    label: str
+    facts: ExifFacts
+    width: int
+    height: int
+    names: tuple[str, ...]
+    upright: bool
+
+
+def group_photos(photos: Iterable[tuple[str, ExifFacts, int, int]]) -> dict[str, CameraGroup]:
+    """Groups by label, in the order of their first photos.
+
+    Parameters
+    ----------
+    photos : iterable of (name, facts, width, height)
+        The size is that of the stored pixels, not the one that EXIF claims.
+    """
+    members: dict[str, list[tuple[str, ExifFacts, int, int]]] = {}
+    for photo in photos:
+        members.setdefault(group_of(*photo[1:]), []).append(photo)
+    return {
+        label: CameraGroup(
+            label,
+            *group[0][1:],
+            names=tuple(photo[0] for photo in group),
+            upright=all(photo[1].orientation in (None, 1) for photo in group),
+        )
+        for label, group in members.items()
+    }
+
+
+def guess_readouts(groups: Mapping[str, CameraGroup], readout: str = "top-to-bottom") -> tuple[dict[str, str], str]:
+    """Readout direction of each group of a mixed folder, and what to say of it.
+
+    Sensors lie on their long side. A camera that gave photos of W x H and of H x W, without an orientation tag, turned the
+    pixels of the portrait ones after readout: theirs runs along the other axis. Which way round it runs cannot be seen,
+    and does not matter: to reverse the readout is to negate the motion.
+
+    Parameters
+    ----------
+    groups : mapping of label to CameraGroup
+        As `group_photos` gives them.
+    readout : str
+        Of photos that were not turned.
+
+    Returns
+    -------
+    readouts : dict of label to direction
+        For every group.
+    sentence : str
+        What was guessed, for people; empty if nothing was.
+    """
+    across = "left-to-right" if READOUTS[readout][0] == 1 else "top-to-bottom"
+    frames = {(_body(group.facts), group.width, group.height) for group in groups.values()}
+    readouts = {}
+    turned = 0
+    for label, group in groups.items():
+        is_turned = (
+            group.height > group.width
+            and group.upright
+            and (_body(group.facts), group.height, group.width) in frames
+        )
+        readouts[label] = across if is_turned else readout
+        turned += is_turned * len(group.names)
+    if not turned:
+        return readouts, ""
+    photos, have = ("photo", "has") if turned == 1 else ("photos", "have")
+    return readouts, (
+        f"{turned} portrait {photos} {have} the sides of a landscape camera exchanged and no orientation tag: "
+        f"turned after readout, so read out {across} ({readout} the others); --readout says otherwise"
+    )
