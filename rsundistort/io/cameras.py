@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +15,17 @@ from ..model import Camera
 __all__ = ["camera_from_exif", "camera_from_json", "camera_to_json", "check_camera_fits", "parse_camera"]
 
 _REQUIRED = {"width", "height", "K"}
-_KNOWN = _REQUIRED | {"dist", "readout"}
+_KNOWN = _REQUIRED | {"dist", "readout", "lens"}
 
 
 def camera_from_json(value: Any, where: str) -> Camera:
     """A camera of a parsed `camera.json`; `where` names it in errors."""
     if not isinstance(value, dict):
-        raise FormatError(f"{where}: expected an object with width, height, K, dist, readout")
+        raise FormatError(f"{where}: expected an object with width, height, K, dist, readout, lens")
     missing, unknown = _REQUIRED - value.keys(), value.keys() - _KNOWN
     if missing or unknown:
         what = f"lacks {', '.join(sorted(missing))}" if missing else f"has unknown {', '.join(sorted(unknown))}"
-        raise FormatError(f"{where} {what}; expected width, height, K, dist, readout")
+        raise FormatError(f"{where} {what}; expected width, height, K, dist, readout, lens")
     try:
         return Camera(
             value["width"],
@@ -32,20 +33,24 @@ def camera_from_json(value: Any, where: str) -> Camera:
             value["K"],
             np.asarray(value.get("dist") or [], float),
             value.get("readout", "top-to-bottom"),
+            value.get("lens", "pinhole"),
         )
     except (TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"{where}: {error}") from error
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
-    """The object of `camera.json`."""
-    return {
+    """The object of `camera.json`; the lens model is named when it is not the pinhole one."""
+    value: dict[str, Any] = {
         "width": camera.width,
         "height": camera.height,
         "K": camera.K.tolist(),
         "dist": camera.dist.tolist(),
         "readout": camera.readout,
     }
+    if camera.lens != "pinhole":
+        value["lens"] = camera.lens
+    return value
 
 
 def parse_camera(text: str, width: int, height: int, readout: str | None = None) -> Camera:
@@ -67,7 +72,7 @@ def parse_camera(text: str, width: int, height: int, readout: str | None = None)
         camera = _camera_from_file(path, width, height)
     check_camera_fits(camera, width, height, text)
     if readout is not None and readout != camera.readout:
-        camera = Camera(camera.width, camera.height, camera.K, camera.dist, readout)
+        camera = replace(camera, readout=readout)
     return camera
 
 
