@@ -1,7 +1,17 @@
 """Files: photos, cameras, solutions, COLMAP models, nerfstudio."""
 
-from .cameras import camera_from_exif, check_camera_fits, parse_camera
-from .colmap import read_colmap_poses, write_colmap_model
+from .cameras import CameraFile, check_camera_fits, parse_camera, read_camera_file
+from .colmap import read_colmap_cameras, read_colmap_poses, write_colmap_model
+from .exif import (
+    CameraGroup,
+    ExifFacts,
+    camera_from_exif,
+    focal_from_exif,
+    group_of,
+    group_photos,
+    guess_readouts,
+    read_exif,
+)
 from .images import Photo, list_photos, output_name, read_photo, write_image
 from .lengths import read_known_lengths
 from .motions import read_known_motions
@@ -10,14 +20,24 @@ from .outputs import output_folder
 from .solution import read_solution, write_solution
 
 __all__ = [
+    "CameraFile",
+    "CameraGroup",
+    "ExifFacts",
     "Photo",
     "camera_from_exif",
     "check_camera_fits",
+    "focal_from_exif",
+    "group_of",
+    "group_photos",
+    "guess_readouts",
     "list_photos",
     "output_folder",
     "output_name",
     "parse_camera",
+    "read_camera_file",
+    "read_colmap_cameras",
     "read_colmap_poses",
+    "read_exif",
     "read_known_lengths",
     "read_known_motions",
     "read_photo",

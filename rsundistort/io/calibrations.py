@@ -85,8 +85,8 @@ def camera_from_calibration(tree: Mapping[str, Any], where: str, width: int, hei
     ----------
     tree : mapping
         With a camera matrix, distortion coefficients in OpenCV's order, width and height; `distortion_model` (or
-        `camera_model`, or OpenCV's flag `fisheye_model`) says whether the lens is a fisheye. The binning and the region of
-        interest of ROS (REP 104: given in pixels of the full sensor) are applied.
+        `camera_model`, or OpenCV's flag `fisheye_model`) says whether the lens is a fisheye. The binning and the region
+        of interest of ROS (REP 104: given in pixels of the full sensor) are applied.
     where : str
         Names the file in errors.
     width, height : int
@@ -179,9 +179,7 @@ def _distortion(fields: Mapping[str, Any]) -> tuple[NDArray[np.float64], str]:
     models = [str(fields.get(name, "")) for name in ("distortionmodel", "cameramodel")]
     for model in models:
         if _plain(model) not in _PINHOLE | _FISHEYE:
-            raise ValueError(
-                f"lens model {model!r} is not supported; expected plumb_bob, rational_polynomial or equidistant (fisheye)"
-            )
+            raise ValueError(f"lens model {model!r} is none of plumb_bob, rational_polynomial, equidistant (fisheye)")
     if flag or any(_plain(model) in _FISHEYE for model in models):
         return dist, "fisheye"
     if len(dist) == 14:  # the last two tilt the sensor

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import FileError, FormatError, InputError
-from ..model import Camera
+from ..model import READOUTS, Camera
 from .calibrations import camera_from_calibration, is_calibration, parse_xml, parse_yaml
 from .colmap import read_colmap_cameras
 
@@ -26,17 +26,17 @@ __all__ = [
 ]
 
 _REQUIRED = {"width", "height", "K"}
-_KNOWN = _REQUIRED | {"dist", "readout"}
+_KNOWN = _REQUIRED | {"dist", "readout", "lens"}
 
 
 def camera_from_json(value: Any, where: str) -> Camera:
     """A camera of a parsed `camera.json`; `where` names it in errors."""
     if not isinstance(value, dict):
-        raise FormatError(f"{where}: expected an object with width, height, K, dist, readout")
+        raise FormatError(f"{where}: expected an object with width, height, K, dist, readout, lens")
     missing, unknown = _REQUIRED - value.keys(), value.keys() - _KNOWN
     if missing or unknown:
         what = f"lacks {', '.join(sorted(missing))}" if missing else f"has unknown {', '.join(sorted(unknown))}"
-        raise FormatError(f"{where} {what}; expected width, height, K, dist, readout")
+        raise FormatError(f"{where} {what}; expected width, height, K, dist, readout, lens")
     try:
         return Camera(
             value["width"],
@@ -44,20 +44,24 @@ def camera_from_json(value: Any, where: str) -> Camera:
             value["K"],
             np.asarray(value.get("dist") or [], float),
             value.get("readout", "top-to-bottom"),
+            value.get("lens", "pinhole"),
         )
     except (TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"{where}: {error}") from error
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
-    """The object of `camera.json`."""
-    return {
+    """The object of `camera.json`; the lens model is named when it is not the pinhole one."""
+    value: dict[str, Any] = {
         "width": camera.width,
         "height": camera.height,
         "K": camera.K.tolist(),
         "dist": camera.dist.tolist(),
         "readout": camera.readout,
     }
+    if camera.lens != "pinhole":
+        value["lens"] = camera.lens
+    return value
 
 
 @dataclass(frozen=True)
@@ -93,8 +97,8 @@ def read_camera_file(text: str | Path, width: int, height: int) -> CameraFile:
     ----------
     text : str or Path
         A file (`camera.json`, `cameras.json`, the nine numbers of K, a calibration of OpenCV or ROS, COLMAP's
-        `cameras.txt` or `cameras.bin`), told by its content; a folder with a COLMAP model, or with several such files of
-        one camera each; or "fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]".
+        `cameras.txt` or `cameras.bin`), told by its content; a folder with a COLMAP model, or with such files of one
+        camera each; or "fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]".
     width, height : int
         Size of the photos, for formats that hold none.
 
@@ -151,9 +155,10 @@ def _how_to_fit(camera: Camera, width: int, height: int) -> str:
     """What to do about a camera of another size."""
     if (camera.width, camera.height) == (height, width):
         stored = "portrait" if height > width else "landscape"
+        across = "left-to-right" if READOUTS[camera.readout][0] == 1 else "top-to-bottom"
         return (
-            f"the photos are stored in {stored}, turned after they were read out: give a camera with width and height, "
-            "fx and fy, cx and cy exchanged and the readout along the other axis"
+            f"they are stored in {stored}, turned since they were read out: give a camera with width and height, fx "
+            f"and fy, cx and cy exchanged and the readout {across}"
         )
     factor = Fraction(width, camera.width)
     if factor == Fraction(height, camera.height):
@@ -220,25 +225,35 @@ def _read_file(path: Path, width: int, height: int) -> CameraFile:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "it is no text"
         raise FileError(f"camera file {path} cannot be read: {reason}") from error
+    if _is_colmap_text(content):
+        return CameraFile(*read_colmap_cameras(path), source=f"{path} (COLMAP)")
+    K = _nine_numbers(content)
+    if K is not None:
+        try:
+            return CameraFile({"1": Camera(width, height, K)}, source=f"{path} (K)")
+        except InputError as error:
+            raise FormatError(f"{path}: {error}") from error
     try:
-        if content.startswith("{"):
-            return _from_json(json.loads(content, object_pairs_hook=_unique), path, width, height)
-        if content.startswith("<"):
-            tree, kind = parse_xml(content), "OpenCV XML"
-        elif _is_colmap_text(content):
-            return CameraFile(*read_colmap_cameras(path), source=f"{path} (COLMAP)")
-        else:
-            numbers = _nine_numbers(content)
-            if numbers is not None:
-                return CameraFile({"1": Camera(width, height, numbers)}, source=f"{path} (K)")
-            tree, kind = parse_yaml(content), "OpenCV YAML" if "opencv-matrix" in content else "ROS YAML"
-    except (FormatError, FileError):
-        raise
+        tree, kind = _parse(content)
     except (ValueError, RecursionError) as error:
-        raise FormatError(f"{path} cannot be understood: {error}; expected {_KINDS}") from error
-    if not is_calibration(tree):
+        raise FormatError(f"{path} cannot be understood ({error}); expected {_KINDS}") from error
+    source = f"{path} ({kind})"
+    if is_calibration(tree) and not (kind == "JSON" and "K" in tree):
+        return CameraFile({"1": camera_from_calibration(tree, str(path), width, height)}, source=source)
+    if kind != "JSON":
         raise FormatError(f"{path} holds no camera; expected {_KINDS}")
-    return CameraFile({"1": camera_from_calibration(tree, str(path), width, height)}, source=f"{path} ({kind})")
+    if "cameras" in tree:
+        return _several_of_json(tree, path)
+    return CameraFile({"1": camera_from_json(tree, str(path))}, source=str(path))
+
+
+def _parse(content: str) -> tuple[Any, str]:
+    """The tree of a text, and its format."""
+    if content.startswith("{"):
+        return json.loads(content, object_pairs_hook=_unique), "JSON"
+    if content.startswith("<"):
+        return parse_xml(content), "OpenCV XML"
+    return parse_yaml(content), "OpenCV YAML" if "opencv-matrix" in content else "ROS YAML"
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -251,11 +266,8 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return value
 
 
-def _from_json(value: dict[str, Any], path: Path, width: int, height: int) -> CameraFile:
-    if "K" not in value and is_calibration(value):
-        return CameraFile({"1": camera_from_calibration(value, str(path), width, height)}, source=f"{path} (OpenCV JSON)")
-    if "cameras" not in value:
-        return CameraFile({"1": camera_from_json(value, str(path))}, source=str(path))
+def _several_of_json(value: dict[str, Any], path: Path) -> CameraFile:
+    """The cameras of a `cameras.json`."""
     cameras, images = value["cameras"], value.get("images", {})
     if not isinstance(cameras, dict) or not isinstance(images, dict) or value.keys() - {"cameras", "images"}:
         raise FormatError(f'{path}: expected {{"cameras": {{id: camera}}, "images": {{name: id}}}} and no more')
@@ -281,4 +293,5 @@ def _nine_numbers(content: str) -> Any:
         K = np.array([float(v) for v in content.replace(",", " ").split()]).reshape(3, 3)
     except ValueError:
         return None
-    return K / K[2, 2] if K[2, 2] else K
+    with np.errstate(all="ignore"):  # the camera refuses what is not finite
+        return K / K[2, 2] if K[2, 2] else K

@@ -78,7 +78,7 @@ def read_colmap_cameras(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
 
 
 def _read_model(path: Path) -> Any:
-    """pycolmap's model of a camera file, with its images where they lie beside it."""
+    """The model of a camera file, with its images where they lie beside it."""
     import pycolmap
 
     pycolmap.logging.minloglevel = 3
@@ -101,6 +101,9 @@ def _read_model(path: Path) -> Any:
         raise FormatError(f"{path} is no whole COLMAP camera file: {' '.join(str(error).split())}") from error
     if not model.cameras:
         raise FormatError(f"{path} holds no camera")
+    # pycolmap takes what was cut off for zeros; a file is the count, then id, model, size and parameters of each camera
+    if suffix == ".bin" and path.stat().st_size < 8 + sum(24 + 8 * len(c.params) for c in model.cameras.values()):
+        raise FormatError(f"{path} is cut short; copy it again")
     return model
 
 

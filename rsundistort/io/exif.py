@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import warnings
 from collections.abc import Iterable, Mapping
@@ -68,8 +69,8 @@ class ExifFacts:
 def read_exif(path: Path) -> ExifFacts:
     """The facts of a JPEG, PNG, WebP, TIFF, HEIC, DNG or another RAW file that is a TIFF.
 
-    Never raises: what is missing, damaged or not to be believed is None. It changes Python's filters of warnings while it
-    reads, so it is not for several threads at once.
+    Never raises: what is missing, damaged or not to be believed is None. It changes Python's filters of warnings while
+    it reads, so it is not for several threads at once.
     """
     from PIL.ExifTags import Base
 
@@ -167,10 +168,8 @@ def _text(value: Any) -> str | None:
     if not isinstance(value, str):
         return None
     value = value.split("\0")[0]
-    try:
-        value = value.encode("latin-1").decode()  # Pillow takes every text for Latin-1, cameras write UTF-8 too
-    except UnicodeError:
-        pass
+    with contextlib.suppress(UnicodeError):  # Pillow takes every text for Latin-1, cameras write UTF-8 too
+        value = value.encode("latin-1").decode()
     value = " ".join("".join(c for c in value if c.isprintable()).split())[:100]
     return value if any(c.isalnum() for c in value) and value.lower() not in ("unknown", "n/a", "none") else None
 
@@ -312,9 +311,9 @@ def group_photos(photos: Iterable[tuple[str, ExifFacts, int, int]]) -> dict[str,
 def guess_readouts(groups: Mapping[str, CameraGroup], readout: str = "top-to-bottom") -> tuple[dict[str, str], str]:
     """Readout direction of each group of a mixed folder, and what to say of it.
 
-    Sensors lie on their long side. A camera that gave photos of W x H and of H x W, without an orientation tag, turned the
-    pixels of the portrait ones after readout: theirs runs along the other axis. Which way round it runs cannot be seen,
-    and does not matter: to reverse the readout is to negate the motion.
+    Sensors lie on their long side. A camera that gave photos of W x H and of H x W, without an orientation tag, turned
+    the pixels of the portrait ones after readout: theirs runs along the other axis. Which way round it runs cannot be
+    seen, and does not matter: to reverse the readout is to negate the motion.
 
     Parameters
     ----------
@@ -336,16 +335,14 @@ def guess_readouts(groups: Mapping[str, CameraGroup], readout: str = "top-to-bot
     turned = 0
     for label, group in groups.items():
         is_turned = (
-            group.height > group.width
-            and group.upright
-            and (_body(group.facts), group.height, group.width) in frames
+            group.height > group.width and group.upright and (_body(group.facts), group.height, group.width) in frames
         )
         readouts[label] = across if is_turned else readout
         turned += is_turned * len(group.names)
     if not turned:
         return readouts, ""
-    photos, have = ("photo", "has") if turned == 1 else ("photos", "have")
+    photos, were, are = ("photo", "was", "is") if turned == 1 else ("photos", "were", "are")
     return readouts, (
-        f"{turned} portrait {photos} {have} the sides of a landscape camera exchanged and no orientation tag: "
-        f"turned after readout, so read out {across} ({readout} the others); --readout says otherwise"
+        f"{turned} portrait {photos} of a camera that took landscape ones too {were} turned after readout, to go by "
+        f"the missing orientation tag: {are} taken as read out {across}, the others {readout}"
     )
