@@ -2,16 +2,8 @@
 
 from .cameras import CameraFile, check_camera_fits, parse_camera, read_camera_file
 from .colmap import read_colmap_cameras, read_colmap_poses, write_colmap_model
-from .exif import (
-    CameraGroup,
-    ExifFacts,
-    camera_from_exif,
-    focal_from_exif,
-    group_of,
-    group_photos,
-    guess_readouts,
-    read_exif,
-)
+from .exif_facts import ExifFacts, camera_from_exif, focal_from_exif, read_exif
+from .groups import CameraGroup, group_of, group_photos, guess_readouts
 from .images import Photo, list_photos, output_name, read_photo, write_image
 from .lengths import read_known_lengths
 from .motions import read_known_motions
