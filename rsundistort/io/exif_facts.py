@@ -168,6 +168,8 @@ def _number(value: Any, low: float, high: float) -> float | None:
     """The number, or the first of several, if it lies between the bounds."""
     if isinstance(value, tuple) and value:
         value = value[0]
+    if isinstance(value, str):  # of another type than it should be
+        return None
     try:
         number = float(value)
     except (TypeError, ValueError, ArithmeticError):
