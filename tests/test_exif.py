@@ -18,6 +18,7 @@ from make_photos import texture
 from rsundistort.io import (
     ExifFacts,
     camera_from_exif,
+    facts_of_exif,
     focal_from_exif,
     group_of,
     group_photos,
@@ -130,6 +131,11 @@ def test_facts_of_every_kind_of_file(tmp_path, wrap, order):
     path = tmp_path / "Größe 1.bin"
     path.write_bytes(wrap(phone(order)))
     assert read_exif(path) == PHONE
+
+
+def test_facts_of_a_block():
+    assert facts_of_exif(phone()) == facts_of_exif(b"Exif\0\0" + phone(">")) == PHONE
+    assert facts_of_exif(b"") == facts_of_exif(b"Exif\0\0") == facts_of_exif(b"noise") == ExifFacts()
 
 
 def test_other_segments_before_the_exif(tmp_path):

@@ -2,7 +2,7 @@
 
 from .cameras import CameraFile, check_camera_fits, parse_camera, read_camera_file
 from .colmap import read_colmap_cameras, read_colmap_poses, write_colmap_model
-from .exif_facts import ExifFacts, camera_from_exif, focal_from_exif, read_exif
+from .exif_facts import ExifFacts, camera_from_exif, facts_of_exif, focal_from_exif, read_exif
 from .groups import CameraGroup, group_of, group_photos, guess_readouts
 from .images import Photo, list_photos, output_name, read_photo, write_image
 from .lengths import read_known_lengths
@@ -18,6 +18,7 @@ __all__ = [
     "Photo",
     "camera_from_exif",
     "check_camera_fits",
+    "facts_of_exif",
     "focal_from_exif",
     "group_of",
     "group_photos",

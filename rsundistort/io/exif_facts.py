@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 
 from ..model import Camera
 
-__all__ = ["ExifFacts", "camera_from_exif", "focal_from_exif", "read_exif"]
+__all__ = ["ExifFacts", "camera_from_exif", "facts_of_exif", "focal_from_exif", "read_exif"]
 
 # diagonal of the 36 x 24 mm frame that 35-mm equivalents refer to (CIPA DCG-001)
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
@@ -62,15 +63,67 @@ def read_exif(path: Path) -> ExifFacts:
     Never raises: what is missing, damaged or not to be believed is None. It changes Python's filters of warnings while
     it reads, so it is not for several threads at once.
     """
+    with _quiet():
+        try:
+            block = _exif_block(Path(path))
+        except Exception:  # Pillow raises whatever it tripped over
+            block = b""
+    return facts_of_exif(block)
+
+
+def facts_of_exif(block: bytes) -> ExifFacts:
+    """The facts of an EXIF block, a TIFF structure with or without the head that it has in a JPEG; as `read_exif`."""
+    from PIL import Image
+    from PIL.ExifTags import IFD
+
+    exif = Image.Exif()
+    with _quiet():
+        try:
+            exif.load(block)
+            return _facts({**_entries(exif.get_ifd(IFD.Exif)), **_entries(exif)})
+        except Exception:  # as above; what was read before is good
+            return _facts(_entries(exif))
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the warnings that Pillow gives of damage."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def _exif_block(path: Path) -> bytes:
+    """The EXIF block of a photo; empty if there is none."""
+    from PIL import ImageFile, JpegImagePlugin, PngImagePlugin, WebPImagePlugin
+
+    # not Image.open, which refuses photos of 180 megapixels and more before it has read their EXIF
+    openers: dict[bytes, type[ImageFile.ImageFile]] = {
+        b"\xff\xd8": JpegImagePlugin.JpegImageFile,
+        b"\x89P": PngImagePlugin.PngImageFile,
+        b"RI": WebPImagePlugin.WebPImageFile,
+    }
+    with path.open("rb") as file:
+        head = file.read(12)
+        file.seek(0)
+        if head[:2] in (b"II", b"MM"):
+            return file.read()
+        if head[4:8] == b"ftyp":  # with the extra that reads it
+            import pillow_heif
+
+            return bytes(pillow_heif.open_heif(file).info.get("exif") or b"")
+        return bytes(openers[head[:2]](file).info.get("exif", b"")) if head[:2] in openers else b""
+
+
+def _facts(tags: dict[int, Any]) -> ExifFacts:
+    """What the tags of the main and of the EXIF directory say."""
     from PIL.ExifTags import Base
 
-    main, sub = _tags(Path(path))
-
     def text(tag: int) -> str | None:
-        return _text(sub.get(tag, main.get(tag)))
+        return _text(tags.get(tag))
 
     def number(tag: int, low: float, high: float) -> float | None:
-        return _number(sub.get(tag, main.get(tag)), low, high)
+        return _number(tags.get(tag), low, high)
 
     def whole(tag: int, low: int, high: int) -> int | None:
         value = number(tag, low, high)
@@ -88,7 +141,6 @@ def read_exif(path: Path) -> ExifFacts:
         # two ways to the same figure; editors that scale a photo leave one of them as it was
         ratio = focal_mm * 36 / sensor / focal_35mm
         sensor = sensor if 0.75 < ratio < 1.33 else None
-    zoom = number(Base.DigitalZoomRatio, 1, 100)
     return ExifFacts(
         make=text(Base.Make),
         model=text(Base.Model),
@@ -97,47 +149,11 @@ def read_exif(path: Path) -> ExifFacts:
         focal_mm=focal_mm,
         focal_35mm=focal_35mm,
         sensor_width_mm=sensor,
-        digital_zoom=zoom,
+        digital_zoom=number(Base.DigitalZoomRatio, 1, 100),
         orientation=whole(Base.Orientation, 1, 8),
         width=width,
         height=height,
     )
-
-
-def _tags(path: Path) -> tuple[dict[int, Any], dict[int, Any]]:
-    """Tags of the main and of the EXIF directory; empty where there are none that can be read."""
-    from PIL import Image, ImageFile, JpegImagePlugin, PngImagePlugin, WebPImagePlugin
-    from PIL.ExifTags import IFD
-
-    # not Image.open, which refuses photos of 180 megapixels and more before it has read their EXIF
-    openers: dict[bytes, type[ImageFile.ImageFile]] = {
-        b"\xff\xd8": JpegImagePlugin.JpegImageFile,
-        b"\x89P": PngImagePlugin.PngImageFile,
-        b"RI": WebPImagePlugin.WebPImageFile,
-    }
-    exif = Image.Exif()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            with path.open("rb") as file:
-                head = file.read(12)
-                file.seek(0)
-                if head[:2] in (b"II", b"MM"):
-                    exif.load_from_fp(file)
-                elif head[:2] in openers:
-                    exif.load(openers[head[:2]](file).info.get("exif", b""))
-                elif head[4:8] == b"ftyp":
-                    exif.load(_heif_block(file))
-                return _entries(exif), _entries(exif.get_ifd(IFD.Exif))
-        except Exception:  # Pillow raises whatever it tripped over
-            return _entries(exif), {}
-
-
-def _heif_block(file: Any) -> bytes:
-    """The EXIF of a HEIC photo, if the extra that reads it is there."""
-    import pillow_heif
-
-    return bytes(pillow_heif.open_heif(file).info.get("exif") or b"")
 
 
 def _entries(directory: Any) -> dict[int, Any]:
