@@ -363,7 +363,9 @@ def test_a_name_given_twice_is_refused(tmp_path, part):
 
 def test_numbers():
     found = read_camera_file("500.1,510,322.7,235.25,-0.1,0.02,0,0", 640, 480)
-    assert found.cameras["1"] == Camera(640, 480, [[500.1, 0, 322.7], [0, 510, 235.25], [0, 0, 1]], [-0.1, 0.02, 0, 0])
+    assert found.cameras["camera"] == Camera(
+        640, 480, [[500.1, 0, 322.7], [0, 510, 235.25], [0, 0, 1]], [-0.1, 0.02, 0, 0]
+    )
 
 
 # ---------------------------------------------------------------- folders

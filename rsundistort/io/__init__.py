@@ -3,7 +3,7 @@
 from .cameras import CameraFile, check_camera_fits, parse_camera, read_camera_file
 from .colmap import read_colmap_cameras, read_colmap_poses, write_colmap_model
 from .exif_facts import ExifFacts, camera_from_exif, facts_of_exif, focal_from_exif, read_exif
-from .groups import CameraGroup, group_of, group_photos, guess_readouts
+from .groups import group_of, guess_readouts
 from .images import Photo, list_photos, output_name, read_photo, write_image
 from .lengths import read_known_lengths
 from .motions import read_known_motions
@@ -13,7 +13,6 @@ from .solution import read_solution, write_solution
 
 __all__ = [
     "CameraFile",
-    "CameraGroup",
     "ExifFacts",
     "Photo",
     "camera_from_exif",
@@ -21,7 +20,6 @@ __all__ = [
     "facts_of_exif",
     "focal_from_exif",
     "group_of",
-    "group_photos",
     "guess_readouts",
     "list_photos",
     "output_folder",

@@ -71,7 +71,7 @@ class CameraFile:
     Attributes
     ----------
     cameras : dict of id to Camera
-        One under the id "1"; of COLMAP and `cameras.json` under their ids; of a folder under the files' stems.
+        One under the id "camera"; of COLMAP and `cameras.json` under their ids; of a folder under the files' stems.
     camera_of_image : dict of photo name to id
         Where the file says which photo is whose, else empty.
     source : str
@@ -87,6 +87,7 @@ _KINDS = (
     "camera.json, cameras.json, the nine numbers of K, a calibration of OpenCV (YAML, XML, JSON) or ROS (YAML), "
     "or COLMAP's cameras.txt or cameras.bin"
 )
+_ONLY = "camera"  # the id of one that has none
 _SUFFIXES = (".json", ".txt", ".yaml", ".yml", ".xml", ".bin")
 
 
@@ -109,7 +110,7 @@ def read_camera_file(text: str | Path, width: int, height: int) -> CameraFile:
     """
     path = Path(text)
     if "," in str(text) and not _exists(path):
-        return CameraFile({"1": _camera_from_numbers(str(text), width, height)}, source="numbers")
+        return CameraFile({_ONLY: _camera_from_numbers(str(text), width, height)}, source="numbers")
     if not _is_folder(path):
         return _read_file(path, width, height)
     if (path / "cameras.bin").is_file() or (path / "cameras.txt").is_file():
@@ -230,7 +231,7 @@ def _read_file(path: Path, width: int, height: int) -> CameraFile:
     K = _nine_numbers(content)
     if K is not None:
         try:
-            return CameraFile({"1": Camera(width, height, K)}, source=f"{path} (K)")
+            return CameraFile({_ONLY: Camera(width, height, K)}, source=f"{path} (K)")
         except InputError as error:
             raise FormatError(f"{path}: {error}") from error
     try:
@@ -239,12 +240,12 @@ def _read_file(path: Path, width: int, height: int) -> CameraFile:
         raise FormatError(f"{path} cannot be understood ({error}); expected {_KINDS}") from error
     source = f"{path} ({kind})"
     if is_calibration(tree) and not (kind == "JSON" and "K" in tree):
-        return CameraFile({"1": camera_from_calibration(tree, str(path), width, height)}, source=source)
+        return CameraFile({_ONLY: camera_from_calibration(tree, str(path), width, height)}, source=source)
     if kind != "JSON":
         raise FormatError(f"{path} holds no camera; expected {_KINDS}")
     if "cameras" in tree:
         return _several_of_json(tree, path)
-    return CameraFile({"1": camera_from_json(tree, str(path))}, source=str(path))
+    return CameraFile({_ONLY: camera_from_json(tree, str(path))}, source=str(path))
 
 
 def _parse(content: str) -> tuple[Any, str]:

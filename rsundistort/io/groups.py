@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 from ..model import READOUTS
 from .exif_facts import ExifFacts
 
-__all__ = ["CameraGroup", "group_of", "group_photos", "guess_readouts"]
+__all__ = ["group_of", "guess_readouts"]
 
 
 def group_of(facts: ExifFacts, width: int, height: int) -> str:
@@ -43,55 +42,12 @@ def _body(facts: ExifFacts) -> str:
     return "-".join(text.split())
 
 
-@dataclass(frozen=True)
-class CameraGroup:
-    """Photos of one physical camera in one mode.
-
-    Attributes
-    ----------
-    label : str
-        As `group_of` gives it.
-    facts : ExifFacts
-        Of the first photo.
-    width, height : int
-        Size of its photos in pixels.
-    names : tuple of str
-        The photos.
-    upright : bool
-        Whether no photo has a tag that turns it.
-    """
-
-    label: str
-    facts: ExifFacts
-    width: int
-    height: int
-    names: tuple[str, ...]
-    upright: bool
-
-
-def group_photos(photos: Iterable[tuple[str, ExifFacts, int, int]]) -> dict[str, CameraGroup]:
-    """Groups by label, in the order of their first photos.
-
-    Parameters
-    ----------
-    photos : iterable of (name, facts, width, height)
-        The size is that of the stored pixels, not the one that EXIF claims.
-    """
-    members: dict[str, list[tuple[str, ExifFacts, int, int]]] = {}
-    for photo in photos:
-        members.setdefault(group_of(*photo[1:]), []).append(photo)
-    return {
-        label: CameraGroup(
-            label,
-            *group[0][1:],
-            names=tuple(photo[0] for photo in group),
-            upright=all(photo[1].orientation in (None, 1) for photo in group),
-        )
-        for label, group in members.items()
-    }
-
-
-def guess_readouts(groups: Mapping[str, CameraGroup], readout: str = "top-to-bottom") -> tuple[dict[str, str], str]:
+def guess_readouts(
+    facts: Sequence[ExifFacts],
+    sizes: Sequence[tuple[int, int]],
+    groups: Sequence[str],
+    readout: str = "top-to-bottom",
+) -> tuple[dict[str, str], list[str]]:
     """Readout direction of each group of a mixed folder, and what to say of it.
 
     Sensors lie on their long side. A camera that gave photos of W x H and of H x W, without an orientation tag, turned
@@ -100,8 +56,8 @@ def guess_readouts(groups: Mapping[str, CameraGroup], readout: str = "top-to-bot
 
     Parameters
     ----------
-    groups : mapping of label to CameraGroup
-        As `group_photos` gives them.
+    facts, sizes, groups : sequences of length m
+        Of each photo what its EXIF says, the (width, height) of its stored pixels, and its label as of `group_of`.
     readout : str
         Of photos that were not turned.
 
@@ -109,23 +65,22 @@ def guess_readouts(groups: Mapping[str, CameraGroup], readout: str = "top-to-bot
     -------
     readouts : dict of label to direction
         For every group.
-    sentence : str
+    notes : list of str
         What was guessed, for people; empty if nothing was.
     """
     across = "left-to-right" if READOUTS[readout][0] == 1 else "top-to-bottom"
-    frames = {(_body(group.facts), group.width, group.height) for group in groups.values()}
+    frames = {(_body(fact), *size) for fact, size in zip(facts, sizes, strict=True)}
+    # a tag that turns the photo for people says that nobody has turned its pixels
+    tagged = {group for fact, group in zip(facts, groups, strict=True) if fact.orientation not in (None, 1)}
     readouts = {}
-    turned = 0
-    for label, group in groups.items():
-        is_turned = (
-            group.height > group.width and group.upright and (_body(group.facts), group.height, group.width) in frames
-        )
-        readouts[label] = across if is_turned else readout
-        turned += is_turned * len(group.names)
-    if not turned:
-        return readouts, ""
-    photos, were, are = ("photo", "was", "is") if turned == 1 else ("photos", "were", "are")
-    return readouts, (
-        f"{turned} portrait {photos} of a camera that took landscape ones too {were} turned after readout, to go by "
+    for fact, (width, height), group in zip(facts, sizes, groups, strict=True):
+        turned = height > width and group not in tagged and (_body(fact), height, width) in frames
+        readouts[group] = across if turned else readout
+    count = sum(readouts[group] == across for group in groups)
+    if not count:
+        return readouts, []
+    photos, were, are = ("photo", "was", "is") if count == 1 else ("photos", "were", "are")
+    return readouts, [
+        f"{count} portrait {photos} of a camera that took landscape ones too {were} turned after readout, to go by "
         f"the missing orientation tag: {are} taken as read out {across}, the others {readout}"
-    )
+    ]
