@@ -35,6 +35,7 @@ from rsundistort.io import (
     write_image,
     write_transforms,
 )
+from rsundistort.io.cameras import camera_to_json
 from rsundistort.io.colmap import rectified_keypoints
 
 needs_metadata = pytest.mark.skipif(not hasattr(cv2, "imencodeWithMetadata"), reason="this OpenCV has no metadata")
@@ -229,6 +230,16 @@ def test_camera_json(tmp_path):
     assert parse_camera(str(path), 640, 480) == Camera(640, 480, np.array(K))
 
 
+def test_the_lens_of_a_camera_json(tmp_path):
+    path = tmp_path / "camera.json"
+    fisheye = Camera(640, 480, np.array(K), np.array([0.1, -0.02, 0.01, 0.0]), "bottom-to-top", "fisheye")
+    path.write_text(json.dumps(camera_to_json(fisheye)))
+    assert parse_camera(str(path), 640, 480) == fisheye
+    assert parse_camera(str(path), 640, 480, "left-to-right").lens == "fisheye"
+    # an older reader can read what it knows
+    assert "lens" not in camera_to_json(fisheye.pinhole())
+
+
 @pytest.mark.parametrize("text", ["500 0 322.5\n0 510 235.25\n0 0 1\n", "500,0,322.5,0,510,235.25,0,0,1"])
 def test_camera_of_a_text_file(tmp_path, text):
     (tmp_path / "K.txt").write_text(text)
@@ -292,6 +303,9 @@ def test_many_numbers_are_refused():
         {"dist": {"k1": 0.1}},
         {"readout": "upwards"},
         {"readout": 3},
+        {"lens": "fish"},
+        {"lens": ["fisheye"]},
+        {"lens": "fisheye", "dist": [0.1] * 5},
         {"width": "wide"},
         {"width": float("nan")},
         {"width": None},

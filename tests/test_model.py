@@ -78,7 +78,9 @@ def scaled(i, j, value):
         (make_camera, {"K": scaled(1, 1, -400)}, "K has focal lengths 500, -400; both must be positive"),
         (make_camera, {"K": scaled(0, 1, 0.1)}, "K must be .* without skew"),
         (make_camera, {"K": scaled(2, 2, 2)}, r"K must be \[\[fx, 0, cx\], \[0, fy, cy\], \[0, 0, 1\]\]"),
-        (make_camera, {"dist": [0.1, 0.2]}, r"dist has 2 numbers, expected one of \(0, 4, 5, 8, 12\)"),
+        (make_camera, {"dist": [0.1, 0.2]}, r"dist has 2 numbers, a pinhole lens has one of \(0, 4, 5, 8, 12\)"),
+        (make_camera, {"dist": [0.1] * 5, "lens": "fisheye"}, r"dist has 5 numbers, a fisheye lens has one of"),
+        (make_camera, {"lens": "omni"}, "lens='omni', expected one of pinhole, fisheye"),
         (make_camera, {"dist": [0.1, 0, NAN, 0]}, "dist holds NaN or infinity"),
         (make_camera, {"readout": "down"}, "readout='down', expected one of top-to-bottom, bottom-to-top"),
         (RowMotion, {"phi": [0.1, 0.2]}, r"phi\.shape=\(2,\), expected \(3,\)"),
@@ -148,7 +150,8 @@ def test_camera_is_a_value():
     assert camera == same
     assert hash(camera) == hash(same)
     assert isinstance(same.width, int)
-    for changes in ({"width": 641}, {"readout": "bottom-to-top"}, {"K": scaled(0, 0, 501)}, {"dist": []}):
+    others = {"width": 641}, {"readout": "bottom-to-top"}, {"K": scaled(0, 0, 501)}, {"dist": []}, {"lens": "fisheye"}
+    for changes in others:
         assert camera != make_camera(**{"dist": [0.1, 0, 0, 0], **changes})
     assert camera != "camera"
     assert camera.pinhole() == make_camera()

@@ -1,7 +1,9 @@
 """Files: photos, cameras, solutions, COLMAP models, nerfstudio."""
 
-from .cameras import camera_from_exif, check_camera_fits, parse_camera
-from .colmap import read_colmap_poses, write_colmap_model
+from .cameras import CameraFile, check_camera_fits, parse_camera, read_camera_file
+from .colmap import read_colmap_cameras, read_colmap_poses, write_colmap_model
+from .exif_facts import ExifFacts, camera_from_exif, facts_of_exif, focal_from_exif, read_exif
+from .groups import group_of, guess_readouts
 from .images import Photo, list_photos, output_name, read_photo, write_image
 from .lengths import read_known_lengths
 from .masks import find_masks, read_mask
@@ -11,15 +13,24 @@ from .outputs import output_folder
 from .solution import read_solution, write_solution
 
 __all__ = [
+    "CameraFile",
+    "ExifFacts",
     "Photo",
     "camera_from_exif",
     "check_camera_fits",
+    "facts_of_exif",
     "find_masks",
+    "focal_from_exif",
+    "group_of",
+    "guess_readouts",
     "list_photos",
     "output_folder",
     "output_name",
     "parse_camera",
+    "read_camera_file",
+    "read_colmap_cameras",
     "read_colmap_poses",
+    "read_exif",
     "read_known_lengths",
     "read_known_motions",
     "read_mask",

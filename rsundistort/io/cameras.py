@@ -1,30 +1,42 @@
-"""Cameras from files, from the command line and from EXIF."""
+"""Cameras from files and from the command line."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..errors import FileError, FormatError, InputError
-from ..model import Camera
+from ..model import READOUTS, Camera
+from .calibrations import camera_from_calibration, is_calibration, parse_xml, parse_yaml
+from .colmap import read_colmap_cameras
 
-__all__ = ["camera_from_exif", "camera_from_json", "camera_to_json", "check_camera_fits", "parse_camera"]
+__all__ = [
+    "CameraFile",
+    "camera_from_json",
+    "camera_to_json",
+    "check_camera_fits",
+    "parse_camera",
+    "read_camera_file",
+]
 
 _REQUIRED = {"width", "height", "K"}
-_KNOWN = _REQUIRED | {"dist", "readout"}
+_KNOWN = _REQUIRED | {"dist", "readout", "lens"}
 
 
 def camera_from_json(value: Any, where: str) -> Camera:
     """A camera of a parsed `camera.json`; `where` names it in errors."""
     if not isinstance(value, dict):
-        raise FormatError(f"{where}: expected an object with width, height, K, dist, readout")
+        raise FormatError(f"{where}: expected an object with width, height, K, dist, readout, lens")
     missing, unknown = _REQUIRED - value.keys(), value.keys() - _KNOWN
     if missing or unknown:
         what = f"lacks {', '.join(sorted(missing))}" if missing else f"has unknown {', '.join(sorted(unknown))}"
-        raise FormatError(f"{where} {what}; expected width, height, K, dist, readout")
+        raise FormatError(f"{where} {what}; expected width, height, K, dist, readout, lens")
     try:
         return Camera(
             value["width"],
@@ -32,50 +44,101 @@ def camera_from_json(value: Any, where: str) -> Camera:
             value["K"],
             np.asarray(value.get("dist") or [], float),
             value.get("readout", "top-to-bottom"),
+            value.get("lens", "pinhole"),
         )
     except (TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"{where}: {error}") from error
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
-    """The object of `camera.json`."""
-    return {
+    """The object of `camera.json`; the lens model is named when it is not the pinhole one."""
+    value: dict[str, Any] = {
         "width": camera.width,
         "height": camera.height,
         "K": camera.K.tolist(),
         "dist": camera.dist.tolist(),
         "readout": camera.readout,
     }
+    if camera.lens != "pinhole":
+        value["lens"] = camera.lens
+    return value
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """What a file or a folder of cameras holds.
+
+    Attributes
+    ----------
+    cameras : dict of id to Camera
+        One under the id "camera"; of COLMAP and `cameras.json` under their ids; of a folder under the files' stems.
+    camera_of_image : dict of photo name to id
+        Where the file says which photo is whose, else empty.
+    source : str
+        The file and its kind, for people.
+    readout_told : set of id
+        Cameras whose file says which way they are read out; of the others "top-to-bottom" is but a guess.
+    """
+
+    cameras: Mapping[str, Camera]
+    camera_of_image: Mapping[str, str] = field(default_factory=dict)
+    source: str = ""
+    readout_told: frozenset[str] = frozenset()
+
+
+_KINDS = (
+    "camera.json, cameras.json, the nine numbers of K, a calibration of OpenCV (YAML, XML, JSON) or ROS (YAML), "
+    "or COLMAP's cameras.txt or cameras.bin"
+)
+_ONLY = "camera"  # the id of one that has none
+_SUFFIXES = (".json", ".txt", ".yaml", ".yml", ".xml", ".bin")
+
+
+def read_camera_file(text: str | Path, width: int, height: int) -> CameraFile:
+    """The cameras of a file, of a folder, or of numbers; whether they fit the photos is not checked.
+
+    Parameters
+    ----------
+    text : str or Path
+        A file (`camera.json`, `cameras.json`, the nine numbers of K, a calibration of OpenCV or ROS, COLMAP's
+        `cameras.txt` or `cameras.bin`), told by its content; a folder with a COLMAP model, or with such files of one
+        camera each; or "fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]".
+    width, height : int
+        Size of the photos, for formats that hold none.
+
+    Raises
+    ------
+    FileError, FormatError, InputError
+        When there is no such file, when it cannot be read, when two cameras have one name.
+    """
+    path = Path(text)
+    if "," in str(text) and not _exists(path):
+        return CameraFile({_ONLY: _camera_from_numbers(str(text), width, height)}, source="numbers")
+    if not _is_folder(path):
+        return _read_file(path, width, height)
+    if (path / "cameras.bin").is_file() or (path / "cameras.txt").is_file():
+        return CameraFile(*read_colmap_cameras(path), source=f"{path} (COLMAP)")
+    return _read_folder(path, width, height)
 
 
 def parse_camera(text: str, width: int, height: int, readout: str | None = None) -> Camera:
-    """A camera from a file or from numbers.
+    """The one camera of a file or of numbers, checked to fit the photos.
 
     Parameters
     ----------
     text : str
-        Path of a `camera.json`, path of a text file with the 3x3 matrix K, or "fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]".
+        As `read_camera_file` takes it.
     width, height : int
         Size of the photos; a file of another size is refused, with what both are.
     readout : str, optional
         Readout direction; overrides a file's.
     """
-    path = Path(text)
-    if "," in text and not _is_file(path):
-        camera = _camera_from_numbers(text, width, height)
-    else:
-        camera = _camera_from_file(path, width, height)
+    found = read_camera_file(text, width, height)
+    if len(found.cameras) != 1:
+        raise InputError(f"{text} holds {len(found.cameras)} cameras, expected one")
+    (camera,) = found.cameras.values()
     check_camera_fits(camera, width, height, text)
-    if readout is not None and readout != camera.readout:
-        camera = Camera(camera.width, camera.height, camera.K, camera.dist, readout)
-    return camera
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # a text too long to be a name
-        return False
+    return camera if readout is None else replace(camera, readout=readout)
 
 
 def check_camera_fits(camera: Camera, width: int, height: int, where: str) -> None:
@@ -83,13 +146,42 @@ def check_camera_fits(camera: Camera, width: int, height: int, where: str) -> No
     if (camera.width, camera.height) != (width, height):
         raise InputError(
             f"{where} is for {camera.width}x{camera.height} pixels but the photos have {width}x{height}; "
-            "give the camera of these photos, or scale its K"
+            + _how_to_fit(camera, width, height)
         )
     cx, cy = camera.K[0, 2], camera.K[1, 2]
     if not (0 <= cx <= width and 0 <= cy <= height):
         raise InputError(
             f"{where} has its principal point at ({cx:g}, {cy:g}), outside the photos' {width}x{height} pixels"
         )
+
+
+def _how_to_fit(camera: Camera, width: int, height: int) -> str:
+    """What to do about a camera of another size."""
+    if (camera.width, camera.height) == (height, width):
+        stored = "portrait" if height > width else "landscape"
+        across = "left-to-right" if READOUTS[camera.readout][0] == 1 else "top-to-bottom"
+        return (
+            f"they are stored in {stored}, turned since they were read out: give a camera with width and height, fx "
+            f"and fy, cx and cy exchanged and the readout {across}"
+        )
+    factor = Fraction(width, camera.width)
+    if factor == Fraction(height, camera.height):
+        return (
+            f"that is {factor} of its size: if they were scaled and not cut, multiply fx, fy, cx + 0.5 and cy + 0.5 "
+            f"by {factor}"
+        )
+    return "give the camera of these photos"
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except (OSError, ValueError):  # a text that is too long for a name, or holds a NUL
+        return False
+
+
+def _is_folder(path: Path) -> bool:
+    return _exists(path) and path.is_dir()
 
 
 def _camera_from_numbers(text: str, width: int, height: int) -> Camera:
@@ -104,48 +196,111 @@ def _camera_from_numbers(text: str, width: int, height: int) -> Camera:
     return Camera(width, height, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array(values[4:]))
 
 
-def _camera_from_file(path: Path, width: int, height: int) -> Camera:
+def _read_folder(folder: Path, width: int, height: int) -> CameraFile:
+    """Cameras under the stems of their files."""
     try:
-        content = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        files = sorted(
+            entry
+            for entry in folder.iterdir()
+            if entry.suffix.lower() in _SUFFIXES and not entry.name.startswith(".") and entry.is_file()
+        )
+    except OSError as error:
+        raise FileError(f"{folder} cannot be read: {error.strerror}") from error
+    if not files:
+        raise FileError(f"{folder} holds no camera files; expected {_KINDS}")
+    file_of: dict[str, Path] = {}
+    cameras = {}
+    told = set()
+    for file in files:
+        other = file_of.setdefault(file.stem, file)
+        if other != file:
+            raise InputError(f"{other} and {file.name} are two cameras with one name, {file.stem}; take one away")
+        found = _read_file(file, width, height)
+        if len(found.cameras) != 1:
+            raise InputError(f"{file} holds {len(found.cameras)} cameras; in a folder each file holds one")
+        (cameras[file.stem],) = found.cameras.values()
+        if found.readout_told:
+            told.add(file.stem)
+    source = f"{folder} ({len(cameras)} camera file{'s' * (len(cameras) > 1)})"
+    return CameraFile(cameras, source=source, readout_told=frozenset(told))
+
+
+def _read_file(path: Path, width: int, height: int) -> CameraFile:
+    if path.suffix.lower() == ".bin":
+        return CameraFile(*read_colmap_cameras(path), source=f"{path} (COLMAP)")
+    try:
+        content = path.read_text(encoding="utf-8-sig").strip()
+    except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "it is no text"
         raise FileError(f"camera file {path} cannot be read: {reason}") from error
-    if content.lstrip().startswith("{"):
+    if _is_colmap_text(content):
+        return CameraFile(*read_colmap_cameras(path), source=f"{path} (COLMAP)")
+    K = _nine_numbers(content)
+    if K is not None:
         try:
-            value = json.loads(content)
-        except json.JSONDecodeError as error:
-            raise FormatError(f"{path} is no valid JSON: {error}") from error
-        return camera_from_json(value, str(path))
+            return CameraFile({_ONLY: Camera(width, height, K)}, source=f"{path} (K)")
+        except InputError as error:
+            raise FormatError(f"{path}: {error}") from error
+    try:
+        tree, kind = _parse(content)
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"{path} cannot be understood ({error}); expected {_KINDS}") from error
+    source = f"{path} ({kind})"
+    if is_calibration(tree) and not (kind == "JSON" and "K" in tree):
+        return CameraFile({_ONLY: camera_from_calibration(tree, str(path), width, height)}, source=source)
+    if kind != "JSON":
+        raise FormatError(f"{path} holds no camera; expected {_KINDS}")
+    if "cameras" in tree:
+        return _several_of_json(tree, path)
+    told = frozenset({_ONLY} if "readout" in tree else ())
+    return CameraFile({_ONLY: camera_from_json(tree, str(path))}, source=str(path), readout_told=told)
+
+
+def _parse(content: str) -> tuple[Any, str]:
+    """The tree of a text, and its format."""
+    if content.startswith("{"):
+        return json.loads(content, object_pairs_hook=_unique), "JSON"
+    if content.startswith("<"):
+        return parse_xml(content), "OpenCV XML"
+    return parse_yaml(content), "OpenCV YAML" if "opencv-matrix" in content else "ROS YAML"
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON, which may name a thing once."""
+    value = dict(pairs)
+    if len(value) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"{twice!r} is there twice")
+    return value
+
+
+def _several_of_json(value: dict[str, Any], path: Path) -> CameraFile:
+    """The cameras of a `cameras.json`."""
+    cameras, images = value["cameras"], value.get("images", {})
+    if not isinstance(cameras, dict) or not isinstance(images, dict) or value.keys() - {"cameras", "images"}:
+        raise FormatError(f'{path}: expected {{"cameras": {{id: camera}}, "images": {{name: id}}}} and no more')
+    if not cameras:
+        raise FormatError(f"{path} holds no camera")
+    for name, key in images.items():
+        if not isinstance(key, str) or key not in cameras:
+            raise FormatError(f"{path}: photo {name!r} has camera {key!r}, which is not among its cameras")
+    found = {key: camera_from_json(each, f"{path}: camera {key}") for key, each in cameras.items()}
+    return CameraFile(found, images, str(path), frozenset(key for key in found if "readout" in cameras[key]))
+
+
+def _is_colmap_text(content: str) -> bool:
+    """Whether the first line of data is "CAMERA_ID MODEL ...", which no other format here begins with."""
+    lines = (line.split() for line in content.splitlines() if line.strip() and not line.startswith("#"))
+    words = next(lines, [])
+    return len(words) > 4 and words[0].isdigit() and words[1].isidentifier()
+
+
+def _nine_numbers(content: str) -> Any:
+    """K, or None if the text is no nine numbers."""
     try:
         K = np.array([float(v) for v in content.replace(",", " ").split()]).reshape(3, 3)
     except ValueError:
-        raise FormatError(f"{path} is neither a camera.json nor the nine numbers of K") from None
-    try:
-        return Camera(width, height, K / K[2, 2] if K[2, 2] else K)
-    except InputError as error:
-        raise FormatError(f"{path}: {error}") from error
-
-
-def camera_from_exif(path: Path, width: int, height: int, readout: str = "top-to-bottom") -> Camera | None:
-    """A camera with the focal length of the photo's EXIF and the centre as principal point; None without one.
-
-    pycolmap reads the 35-mm equivalent, or the focal length with its table of sensor widths.
-    """
-    import pycolmap
-
-    pycolmap.logging.minloglevel = 3
-    try:
-        guess = pycolmap.infer_camera_from_image(path)
-    except (RuntimeError, ValueError):
         return None
-    if not guess.has_prior_focal_length:
-        return None
-    focal = guess.mean_focal_length() * max(width, height) / max(guess.width, guess.height)
-    if not 0.2 * max(width, height) < focal < 20 * max(width, height):
-        return None
-    return Camera(
-        width,
-        height,
-        np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]]),
-        readout=readout,
-    )
+    with np.errstate(all="ignore"):  # the camera refuses what is not finite
+        return K / K[2, 2] if K[2, 2] else K

@@ -1,8 +1,10 @@
-"""COLMAP model of the rectified photos."""
+"""COLMAP models: cameras and poses in, the model of the rectified photos out."""
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -12,10 +14,97 @@ from ..errors import FileError, FormatError
 from ..model import Camera, Reconstruction
 from ..model.projection import unproject_points
 
-__all__ = ["read_colmap_poses", "rectified_keypoints", "write_colmap_model"]
+__all__ = ["read_colmap_cameras", "read_colmap_poses", "rectified_keypoints", "write_colmap_model"]
 
 # COLMAP's pixel centres are at 0.5, ours at 0
 _HALF = 0.5
+
+# COLMAP's camera models that are ours with some of the coefficients zero: the lens, the number of coefficients
+_LENSES = {
+    "SIMPLE_PINHOLE": ("pinhole", 0),
+    "PINHOLE": ("pinhole", 0),
+    "SIMPLE_RADIAL": ("pinhole", 4),
+    "RADIAL": ("pinhole", 4),
+    "OPENCV": ("pinhole", 4),
+    "FULL_OPENCV": ("pinhole", 8),
+    "SIMPLE_FISHEYE": ("fisheye", 0),
+    "FISHEYE": ("fisheye", 0),
+    "SIMPLE_RADIAL_FISHEYE": ("fisheye", 4),
+    "RADIAL_FISHEYE": ("fisheye", 4),
+    "OPENCV_FISHEYE": ("fisheye", 4),
+}
+
+
+def read_colmap_cameras(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
+    """Cameras of a COLMAP model, with their lenses.
+
+    Parameters
+    ----------
+    path : Path
+        `cameras.bin` or `cameras.txt`, under any stem, or the folder that holds one of them, binary before text.
+
+    Returns
+    -------
+    cameras : dict of camera id to Camera
+        In pixels with integer centres.
+    camera_of_image : dict of name to camera id
+        Where the rest of the model lies beside the cameras, else empty.
+    """
+    if path.is_dir():
+        path = path / "cameras.bin" if (path / "cameras.bin").is_file() else path / "cameras.txt"
+    model = _read_model(path)
+    cameras = {}
+    for camera_id in sorted(model.cameras):
+        found = model.cameras[camera_id]
+        where = f"{path}: camera {camera_id}"
+        if found.model_name not in _LENSES:
+            raise FormatError(f"{where} is {found.model_name}; expected one of {', '.join(_LENSES)}")
+        lens, length = _LENSES[found.model_name]
+        extra = np.array(found.params)[list(found.extra_params_idxs())]
+        dist = np.zeros(length)
+        dist[: len(extra)] = extra
+        K = np.array(
+            [
+                [found.focal_length_x, 0, found.principal_point_x - _HALF],
+                [0, found.focal_length_y, found.principal_point_y - _HALF],
+                [0, 0, 1],
+            ]
+        )
+        try:
+            cameras[str(camera_id)] = Camera(found.width, found.height, K, dist, lens=lens)
+        except ValueError as error:
+            raise FormatError(f"{where}: {error}") from error
+    return cameras, {image.name: str(image.camera_id) for image in model.images.values()}
+
+
+def _read_model(path: Path) -> Any:
+    """The model of a camera file, with its images where they lie beside it."""
+    import pycolmap
+
+    pycolmap.logging.minloglevel = 3
+    suffix = ".bin" if path.suffix.lower() == ".bin" else ".txt"
+    model = pycolmap.Reconstruction()
+    read = model.read_binary if suffix == ".bin" else model.read_text
+    rest = [f"images{suffix}", f"points3D{suffix}"]
+    try:
+        if path.name == f"cameras{suffix}" and all(path.with_name(name).is_file() for name in rest):
+            read(path.parent)
+        else:  # pycolmap reads whole models only
+            with TemporaryDirectory() as alone:
+                shutil.copyfile(path, Path(alone, f"cameras{suffix}"))
+                for name in rest:
+                    Path(alone, name).write_bytes(bytes(8) if suffix == ".bin" else b"")
+                read(alone)
+    except OSError as error:
+        raise FileError(f"{path} cannot be read: {error.strerror}") from error
+    except Exception as error:  # pycolmap raises what its C++ raised
+        raise FormatError(f"{path} is no whole COLMAP camera file: {' '.join(str(error).split())}") from error
+    if not model.cameras:
+        raise FormatError(f"{path} holds no camera")
+    # pycolmap takes what was cut off for zeros; a file is the count, then id, model, size and parameters of each camera
+    if suffix == ".bin" and path.stat().st_size < 8 + sum(24 + 8 * len(c.params) for c in model.cameras.values()):
+        raise FormatError(f"{path} is cut short; copy it again")
+    return model
 
 
 def read_colmap_poses(folder: Path, any_lens: bool = False) -> tuple[Any, ...]:

@@ -1,4 +1,4 @@
-"""The camera: pinhole matrix, OpenCV lens distortion, size, and the way its shutter runs."""
+"""The camera: pinhole matrix, lens model and distortion of OpenCV, size, and the way its shutter runs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from .checks import check_finite, frozen
 
-__all__ = ["READOUTS", "Camera"]
+__all__ = ["LENSES", "READOUTS", "Camera"]
 
 #: Readout directions, in the stored pixel frame: (axis of the clock, its sign).
 READOUTS: dict[str, tuple[int, float]] = {
@@ -22,7 +22,11 @@ READOUTS: dict[str, tuple[int, float]] = {
     "right-to-left": (0, -1.0),
 }
 
-_DIST_LENGTHS = (0, 4, 5, 8, 12)
+#: Lens models, and how many numbers their distortion may have.
+LENSES: dict[str, tuple[int, ...]] = {
+    "pinhole": (0, 4, 5, 8, 12),
+    "fisheye": (0, 4),
+}
 
 
 def _fold_radius_squared(dist: NDArray[np.float64]) -> float:
@@ -49,9 +53,12 @@ class Camera:
     K : (3, 3) array
         Pinhole matrix in pixels with integer pixel centres (OpenCV); no skew.
     dist : (0 | 4 | 5 | 8 | 12,) array
-        OpenCV's distortion k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]].
+        OpenCV's distortion k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]; of a fisheye k1 k2 k3 k4.
     readout : str
         One of `READOUTS`, in the stored pixel frame.
+    lens : {"pinhole", "fisheye"}
+        Lens model: that of `cv2.projectPoints`, or that of `cv2.fisheye` (Kannala and Brandt 2006; COLMAP's
+        OPENCV_FISHEYE), whose radius in the image is a polynomial of the angle from the optical axis.
 
     Examples
     --------
@@ -65,6 +72,7 @@ class Camera:
     K: NDArray[np.float64]
     dist: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     readout: str = "top-to-bottom"
+    lens: str = "pinhole"
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
@@ -78,9 +86,13 @@ class Camera:
             raise InputError(f"K has focal lengths {K[0, 0]:g}, {K[1, 1]:g}; both must be positive")
         if K[0, 1] != 0 or K[1, 0] != 0 or (K[2] != [0, 0, 1]).any():
             raise InputError("K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], without skew")
+        if self.lens not in LENSES:
+            raise InputError(f"lens={self.lens!r}, expected one of {', '.join(LENSES)}")
         dist = check_finite(np.ravel(self.dist), (None,), "dist")
-        if len(dist) not in _DIST_LENGTHS:
-            raise InputError(f"dist has {len(dist)} numbers, expected one of {_DIST_LENGTHS} in OpenCV's order")
+        if len(dist) not in LENSES[self.lens]:
+            raise InputError(
+                f"dist has {len(dist)} numbers, a {self.lens} lens has one of {LENSES[self.lens]} in OpenCV's order"
+            )
         if self.readout not in READOUTS:
             raise InputError(f"readout={self.readout!r}, expected one of {', '.join(READOUTS)}")
         object.__setattr__(self, "K", frozen(K))
@@ -90,13 +102,13 @@ class Camera:
         if not isinstance(other, Camera):
             return NotImplemented
         return (
-            (self.width, self.height, self.readout) == (other.width, other.height, other.readout)
+            (self.width, self.height, self.readout, self.lens) == (other.width, other.height, other.readout, other.lens)
             and np.array_equal(self.K, other.K)
             and np.array_equal(self.dist, other.dist)
         )
 
     def __hash__(self) -> int:
-        return hash((self.width, self.height, self.readout, self.K.tobytes(), self.dist.tobytes()))
+        return hash((self.width, self.height, self.readout, self.lens, self.K.tobytes(), self.dist.tobytes()))
 
     @property
     def frame_span(self) -> float:
@@ -116,5 +128,5 @@ class Camera:
         return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]), lens, axis, sign
 
     def pinhole(self) -> Camera:
-        """The same camera without lens distortion: the default camera of rectified photos."""
+        """The pinhole camera of the same K, without lens distortion: the default camera of rectified photos."""
         return Camera(self.width, self.height, self.K, np.zeros(0), self.readout)

@@ -107,10 +107,11 @@ def find_cameras(
         file = read_camera_file(camera, *sizes[0])
         keys = _keys_in(file, camera, names, sizes, groups)
         known = dict(file.cameras)
-        calibrated, source, notes = True, camera, list[str]()
+        calibrated, source, notes = True, file.source, list[str]()
+        in_file = file.readout_told
     else:
         known, keys, notes = _from_exif(folder, names, sizes, facts, groups)
-        calibrated, source = False, "EXIF, refined"
+        calibrated, source, in_file = False, "EXIF, refined", frozenset[str]()
     labels = list(dict.fromkeys(keys))
     told = check_readouts(readout)
     unknown = sorted(told.keys() - {"", *labels})
@@ -127,7 +128,7 @@ def find_cameras(
         tuple(labels),
         np.array([place[key] for key in keys], np.int64),
         calibrated,
-        tuple(label in told or "" in told or calibrated for label in labels),
+        tuple(label in told or "" in told or label in in_file for label in labels),
         source,
         tuple(note for note in notes if not told),
     )

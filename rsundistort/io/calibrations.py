@@ -1,0 +1,189 @@
+"""Cameras in the calibration files of OpenCV and ROS.
+
+Both are trees of named values; the names differ a little from program to program, the meaning does not. YAML is read by
+PyYAML and XML by the standard library, not by `cv2.FileStorage`: that refuses what ROS writes (lists in block style,
+empty names, Windows line ends), and a file with deep nesting ends the process.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FormatError
+from ..model import Camera
+
+__all__ = ["camera_from_calibration", "is_calibration", "parse_xml", "parse_yaml"]
+
+# names without case, underscores, hyphens and blanks; the first are what OpenCV's and ROS's own programs write
+_MATRIX = ("cameramatrix", "k", "intrinsicmatrix", "mtx")
+_DISTORTION = ("distortioncoefficients", "distcoeffs", "d", "dist", "distortion", "distortioncoeffs", "distcoeff")
+_WIDTH = ("imagewidth", "width")
+_HEIGHT = ("imageheight", "height")
+_SIZE = ("imagesize", "size", "resolution")
+
+# the names of lens models
+_PINHOLE = {"", "pinhole", "plumbbob", "radtan", "rationalpolynomial", "thinprism", "opencv"}
+_FISHEYE = {"fisheye", "equidistant", "opencvfisheye", "kannalabrandt", "kannalabrandt4", "kannalabrandt8"}
+
+
+def parse_yaml(text: str) -> Any:
+    """The first document of a YAML text, every scalar as a string.
+
+    Raises
+    ------
+    ValueError
+        When it is no YAML.
+    """
+    import yaml
+
+    # OpenCV 4 writes %YAML:1.0, which YAML's own directive is not
+    text = re.sub(r"\A\s*%YAML:[^\n]*\n", "", text)
+    try:
+        # in Python, not in C, which overflows the stack where this raises; the first document only, since
+        # `ros2 topic echo` ends each message with ---
+        return next(iter(yaml.load_all(text, yaml.BaseLoader)), None)
+    except yaml.MarkedYAMLError as error:
+        line = f" in line {error.problem_mark.line + 1}" if error.problem_mark else ""
+        raise ValueError(f"{error.problem}{line}") from error
+    except (yaml.YAMLError, RecursionError) as error:
+        raise ValueError(" ".join(str(error).split())) from error
+
+
+def parse_xml(text: str) -> Any:
+    """The tree of an XML text, as `parse_yaml` gives it; a list of numbers is one string.
+
+    Raises
+    ------
+    ValueError
+        When it is no XML.
+    """
+    from xml.etree import ElementTree
+
+    def value(element: Any) -> Any:
+        return {child.tag: value(child) for child in element} if len(element) else (element.text or "").strip()
+
+    try:
+        return value(ElementTree.fromstring(text))
+    except (ElementTree.ParseError, RecursionError) as error:
+        raise ValueError(str(error)) from error
+
+
+def is_calibration(tree: Any) -> bool:
+    """Whether a tree holds a camera matrix under one of its usual names."""
+    return isinstance(tree, Mapping) and any(name in _fields(tree) for name in _MATRIX)
+
+
+def camera_from_calibration(tree: Mapping[str, Any], where: str, width: int, height: int) -> Camera:
+    """The camera of a calibration of OpenCV or of a ROS `camera_info`.
+
+    Parameters
+    ----------
+    tree : mapping
+        With a camera matrix, distortion coefficients in OpenCV's order, width and height; `distortion_model` (or
+        `camera_model`, or OpenCV's flag `fisheye_model`) says whether the lens is a fisheye. The binning and the region
+        of interest of ROS (REP 104: given in pixels of the full sensor) are applied.
+    where : str
+        Names the file in errors.
+    width, height : int
+        Size of the photos, for a file that holds none.
+
+    Returns
+    -------
+    Camera
+        In pixels with integer centres, as both write them.
+    """
+    fields = _fields(tree)
+    try:
+        matrix = _numbers(_first(fields, _MATRIX))
+        if len(matrix) != 9:
+            raise ValueError(f"its camera matrix has {len(matrix)} numbers, expected 9")
+        width, height = _size(fields, width, height)
+        width, height, K = _read_out(fields, width, height, matrix.reshape(3, 3))
+        dist, lens = _distortion(fields)
+        return Camera(width, height, K, dist, lens=lens)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise FormatError(f"{where}: {error}") from error
+
+
+def _fields(tree: Mapping[str, Any]) -> dict[str, Any]:
+    return {_plain(key): value for key, value in tree.items()}
+
+
+def _plain(name: Any) -> str:
+    return re.sub(r"[\s_-]", "", str(name)).lower()
+
+
+def _first(fields: Mapping[str, Any], names: tuple[str, ...]) -> Any:
+    return next((fields[name] for name in names if name in fields), None)
+
+
+def _numbers(value: Any) -> NDArray[np.float64]:
+    """The numbers of a matrix, of lists, or of a text; none of nothing."""
+    if isinstance(value, Mapping):
+        value = value.get("data")
+    if isinstance(value, str):
+        value = value.split()
+    return np.ravel(np.array([] if value is None else value, float))
+
+
+def _whole(fields: Mapping[str, Any], name: str) -> int:
+    """A whole number that may be missing, which is zero."""
+    values = _numbers(fields.get(name))
+    if not len(values):
+        return 0
+    if len(values) != 1 or values[0] != int(values[0]) or values[0] < 0:
+        raise ValueError(f"{name} is {fields[name]}, expected a whole number")
+    return int(values[0])
+
+
+def _size(fields: Mapping[str, Any], width: int, height: int) -> tuple[int, int]:
+    wide, high = _first(fields, _WIDTH), _first(fields, _HEIGHT)
+    given = np.concatenate([_numbers(wide), _numbers(high)])
+    if not len(given):
+        given = _numbers(_first(fields, _SIZE))
+    if not len(given):
+        return width, height
+    if len(given) != 2 or (given != np.round(given)).any() or (given < 1).any():
+        raise ValueError(f"its image size is {given.tolist()}, expected a width and a height")
+    return int(given[0]), int(given[1])
+
+
+def _read_out(
+    fields: Mapping[str, Any], width: int, height: int, K: NDArray[np.float64]
+) -> tuple[int, int, NDArray[np.float64]]:
+    """Size and matrix of the pixels that a ROS driver hands out: the region of interest, then binned."""
+    roi = _fields(fields["roi"]) if isinstance(fields.get("roi"), Mapping) else {}
+    binning = np.maximum([_whole(fields, "binningx"), _whole(fields, "binningy")], 1)
+    K = K.copy()
+    K[:2, 2] -= _whole(roi, "xoffset"), _whole(roi, "yoffset")
+    # a binned pixel has its centre where the mean of the centres of its pixels is
+    K[:2] /= binning[:, None]
+    K[:2, 2] += (1 / binning - 1) / 2
+    size = (_whole(roi, "width") or width) // binning[0], (_whole(roi, "height") or height) // binning[1]
+    return int(size[0]), int(size[1]), K
+
+
+def _distortion(fields: Mapping[str, Any]) -> tuple[NDArray[np.float64], str]:
+    """Coefficients and lens model."""
+    if not any(name in fields for name in _DISTORTION):
+        for name in fields:  # a lens lost to a misspelling would be missed by nobody
+            if name.startswith(("distc", "distort")) and name != "distortionmodel":
+                raise ValueError(f"{name!r} is no name of distortion coefficients; say distortion_coefficients")
+    dist = _numbers(_first(fields, _DISTORTION))
+    flag = _plain(fields.get("fisheyemodel", "")) not in ("", "0", "false")
+    models = [str(fields.get(name, "")) for name in ("distortionmodel", "cameramodel")]
+    for model in models:
+        if _plain(model) not in _PINHOLE | _FISHEYE:
+            raise ValueError(f"lens model {model!r} is none of plumb_bob, rational_polynomial, equidistant (fisheye)")
+    if flag or any(_plain(model) in _FISHEYE for model in models):
+        return dist, "fisheye"
+    if len(dist) == 14:  # the last two tilt the sensor
+        if dist[12:].any():
+            raise ValueError("the distortion of a tilted sensor (14 numbers) is not supported; calibrate without it")
+        dist = dist[:12]
+    return dist, "pinhole"
