@@ -12,6 +12,21 @@ import click
 READOUT_NAMES = ("top-to-bottom", "bottom-to-top", "left-to-right", "right-to-left")
 INTERPOLATION_NAMES = ("cubic", "linear", "lanczos", "nearest")
 
+
+def readout_by_group(
+    _context: click.Context, _option: click.Parameter, value: tuple[str, ...]
+) -> dict[str, str] | None:
+    """Directions by group, the empty name for all others, of DIRECTION or GROUP=DIRECTION."""
+    directions: dict[str, str] = {}
+    for text in value:
+        group, _, direction = text.rpartition("=")
+        if direction not in READOUT_NAMES:
+            raise click.BadParameter(f"{direction!r} is not one of {', '.join(READOUT_NAMES)}")
+        if directions.setdefault(group, direction) != direction:
+            raise click.BadParameter(f"{text!r}: another direction was given before")
+    return directions or None
+
+
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 photos_argument: Decorator = click.argument("photos", type=click.Path(path_type=Path))

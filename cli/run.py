@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     "--readout",
     multiple=True,
     metavar="[GROUP=]DIRECTION",
+    callback=opt.readout_by_group,
     help=f"Direction of the readout in the stored pixels: {', '.join(opt.READOUT_NAMES)}; of all photos, or of a "
     "group (as the closing table names it). By default the camera file's, else guessed and settled by the photos.",
 )
@@ -93,7 +94,7 @@ def command(
     photos: Path,
     out: Path,
     camera: str | None,
-    readout: tuple[str, ...],
+    readout: dict[str, str] | None,
     masks: Path | None,
     shutter_model: str,
     refine: str | None,
@@ -124,7 +125,7 @@ def command(
             out,
             RunOptions(
                 camera=camera,
-                readout=_readouts(readout),
+                readout=readout,
                 masks=masks,
                 shutter_model=shutter_model,
                 seed=seed,
@@ -151,19 +152,6 @@ def _names(refine: str | None) -> tuple[str, ...] | None:
         return None
     names = tuple(name.strip() for name in refine.split(",") if name.strip())
     return () if names == ("none",) else names
-
-
-def _readouts(readout: tuple[str, ...]) -> dict[str, str] | None:
-    """Directions by group, the empty name for all others, of DIRECTION or GROUP=DIRECTION."""
-    from rsundistort import InputError
-
-    directions: dict[str, str] = {}
-    for text in readout:
-        group, _, direction = text.rpartition("=")
-        if directions.get(group, direction) != direction:
-            raise InputError(f"--readout {text}: another direction was given before")
-        directions[group] = direction
-    return directions or None
 
 
 def _anchors(still: tuple[str, ...]) -> dict[str, float]:

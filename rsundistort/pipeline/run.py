@@ -31,8 +31,8 @@ from .write import PointColors, mask_names, rectify_photos
 __all__ = ["RunOptions", "run", "use_threads", "versions"]
 
 
-# What EXIF does not know, and a set of photos tells; and how far it may be off (relative f, lens coefficients): equivalent
-# focal lengths are rounded to millimetres, focusing and stabilising crop a little, phones hardly distort.
+# What EXIF does not know, and a set of photos tells; and how far it may be off (relative f, lens coefficients):
+# equivalent focal lengths are rounded to millimetres, focusing and stabilising crop a little, phones hardly distort.
 _GUESSED = ("f", "k1", "k2")
 _GUESS_SIGMA = {"f": 0.05, "k1": 0.2, "k2": 0.4}
 
