@@ -166,17 +166,17 @@ def test_run_and_rectify_keep_masks_out_of_features_and_outputs(tmp_path):
     photos = half_courtyard(tmp_path, COURTYARD_NAMES[:4])
     masks = tmp_path / "masks"
     masks.mkdir()
-    mask = np.full((240, 320), 255, np.uint8)
-    mask[:, 200:] = 0
+    mask = np.full((320, 480), 255, np.uint8)
+    mask[:, 300:] = 0
     for name in COURTYARD_NAMES[:3]:  # the last photo has none
         save_png(masks / name, mask)
     options = RunOptions(max_features=2500, jobs=2, shutter_model="rotation", masks=masks)
     solution = run(photos, tmp_path / "out", options)
     shown = [cv2.imread(str(tmp_path / "out" / "masks" / name), cv2.IMREAD_GRAYSCALE) for name in COURTYARD_NAMES[:4]]
     for valid in shown[:3]:
-        assert (valid[:, 260:] == 0).all()
-        assert (valid[40:200, 40:150] == 255).all()
-    assert (shown[3][60:180, 220:280] == 255).all()
+        assert (valid[:, 360:] == 0).all()
+        assert (valid[60:260, 60:240] == 255).all()
+    assert (shown[3][80:240, 320:420] == 255).all()
     shutil.rmtree(tmp_path / "out" / "images")
     rectify_folder(photos, tmp_path / "out" / "solution.json", tmp_path / "again", masks=masks)
     again = cv2.imread(str(tmp_path / "again" / "masks" / COURTYARD_NAMES[0]), cv2.IMREAD_GRAYSCALE)

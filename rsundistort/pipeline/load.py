@@ -77,6 +77,7 @@ def load_photos(
             pixels = read_photo(folder / name).pixels
         except FileError as error:
             return str(error)
+        # a mask that cannot be used stops the run: without it, what it hides would be measured
         size = pixels.shape[1], pixels.shape[0]
         mask = read_mask(mask_of[name], *size) if name in mask_of else None
         return size, detect_features(pixels, max_features, mask)
