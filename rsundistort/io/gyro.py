@@ -12,6 +12,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -78,18 +79,27 @@ class GyroLog:
         rate = (self._angle(end_s) - self._angle(start_s)) / (end_s - start_s)[..., None]
         return np.where(self._covers(start_s, end_s)[..., None], rate, np.nan)
 
+    @cached_property
+    def _angle_before(self) -> NDArray[np.float64]:
+        """(n, 3) integral of the rates from the first sample to each."""
+        step = np.diff(self.time_s)[:, None]
+        return np.vstack([np.zeros(3), np.cumsum(0.5 * step * (self.omega_c[1:] + self.omega_c[:-1]), axis=0)])
+
+    @cached_property
+    def _gaps_before(self) -> NDArray[np.int64]:
+        """(n,) number of gaps before each sample."""
+        return np.concatenate([[0], np.cumsum(np.diff(self.time_s) > _GAP_STEPS * self.step_s)])
+
     def _angle(self, at_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """(..., 3) integral of the rates from the first sample."""
-        step = np.diff(self.time_s)[:, None]
-        before = np.vstack([np.zeros(3), np.cumsum(0.5 * step * (self.omega_c[1:] + self.omega_c[:-1]), axis=0)])
-        i = np.clip(np.searchsorted(self.time_s, at_s, side="right") - 1, 0, len(step) - 1)
+        i = np.clip(np.searchsorted(self.time_s, at_s, side="right") - 1, 0, len(self.time_s) - 2)
         passed = (at_s - self.time_s[i])[..., None]
-        slope = (self.omega_c[i + 1] - self.omega_c[i]) / step[i]
-        angle: NDArray[np.float64] = before[i] + passed * (self.omega_c[i] + 0.5 * passed * slope)
+        slope = (self.omega_c[i + 1] - self.omega_c[i]) / (self.time_s[i + 1] - self.time_s[i])[..., None]
+        angle: NDArray[np.float64] = self._angle_before[i] + passed * (self.omega_c[i] + 0.5 * passed * slope)
         return angle
 
     def _covers(self, start_s: NDArray[np.float64], end_s: NDArray[np.float64]) -> NDArray[np.bool_]:
-        gaps = np.concatenate([[0], np.cumsum(np.diff(self.time_s) > _GAP_STEPS * self.step_s)])
+        gaps = self._gaps_before
         first = np.searchsorted(self.time_s, start_s, side="right") - 1  # the sample before, and the one after
         last = np.searchsorted(self.time_s, end_s, side="left")
         inside = (first >= 0) & (last < len(self.time_s))
@@ -174,6 +184,8 @@ def _samples(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Times (n,) and rates (n, 3) as written, without a last line that was cut off."""
     body = lines[start:]
+    if len(body) < 2:
+        raise FormatError(f"{path} holds no two samples")
     for last in (len(body), len(body) - 1):
         try:
             table = np.loadtxt(body[:last], delimiter=",", usecols=columns, ndmin=2, comments=None)
@@ -251,8 +263,8 @@ def motions_from_gyro(
     -------
     dict of photo name to (phi, sigma)
         Radians per frame, (3,) each, as `BundleOptions.known_phi` takes them: minus the mean rate over the readout,
-        times its time. The standard deviation holds the noise of the samples, a zero-rate offset of 0.01 rad/s, what the
-        uncertainty of the clocks and of the readout (3 %) does to the mean, and how far the rate varies within the
+        times its time. The standard deviation holds the noise of the samples, a zero-rate offset of 0.01 rad/s, what
+        the uncertainty of the clocks and of the readout (3 %) does to the mean, and how far the rate varies within the
         readout, which the model takes to be constant. Photos that the log does not cover are left out, with a warning.
 
     Raises

@@ -49,7 +49,8 @@ class VideoFrames:
     num_frames : int
         Whole frames of the video.
     num_damaged : int
-        Frames that were passed over because they, or what they build on, could not be decoded.
+        Frames that were passed over because they, or what they build on, could not be decoded; a decoder may have kept
+        others to itself.
     orientation : int
         EXIF orientation, which players apply and the frames do not: they are as the sensor stored them.
     make, model : str
@@ -96,8 +97,9 @@ def extract_frames(
         Any file that FFmpeg decodes. One frame is held in memory at a time.
     folder : path
         Made if missing, must be empty; it gets all frames or stays as it was. `frames.csv` has the columns `name`,
-        `frame` (from 0), `time_s` (seconds since the first frame; empty where the video holds no times) and `sharpness`
-        (variance of the Laplacian, grey levels squared, of the frame reduced to at most 960 pixels).
+        `frame` (number among those that could be decoded, from 0), `time_s` (seconds since the first frame; empty where
+        the video holds no times) and `sharpness` (variance of the Laplacian, grey levels squared, of the frame reduced
+        to at most 960 pixels).
     every : int
         Take each frame whose number is a multiple of this; if it is damaged, the next whole one.
     sharpest : int
@@ -261,7 +263,7 @@ class _Decoded:
         """Say what was wrong with the video."""
         said = []
         if self.num_damaged:
-            said.append(f"{self.num_damaged} of {self.num_whole + self.num_damaged} frames damaged and left out")
+            said.append(f"{self.num_damaged} frames or more are damaged and were left out")
         length = self._stream.duration and float(self._stream.duration * self._stream.time_base)
         if length is None and self._stream.container.duration is not None:
             length = self._stream.container.duration / 1e6
