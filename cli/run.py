@@ -287,20 +287,23 @@ def _video(solution: Solution) -> list[str]:
 
 
 def _readout(solution: Solution) -> list[str]:
-    """A line on how fast the photos turned, where the time of the readout is known."""
-    ms = solution.quality.get("readout_ms")
-    if ms is None:
-        return []
+    """Lines on how fast the photos turned, where the time of the readout is known."""
+    times = solution.quality.get("readout_times") or {}
     rates = sorted(
         float((image.motion.phi**2).sum() ** 0.5)
         * solution.cameras[image.camera_id].frame_span
-        / ms
+        / times[image.camera_id]["ms"]
         * 57295.77951308232
         for image in solution.registered
-        if image.motion is not None
+        if image.motion is not None and image.camera_id in times
     )
-    turned = f": median {rates[len(rates) // 2]:.1f}, largest {rates[-1]:.1f} deg/s" if rates else ""
-    return [f"readout time       {ms:g} ms{turned}", f"{'':19}({solution.quality['readout_source']})"]
+    if not rates:
+        return []
+    said = dict.fromkeys(f"{time['ms']:g} ms ({time['source']})" for time in times.values())
+    return [
+        f"rates of turn      median {rates[len(rates) // 2]:.1f}, largest {rates[-1]:.1f} deg/s, by a readout of",
+        *(f"{'':19}{each}" for each in said),
+    ]
 
 
 def _held_out(rms_px: Mapping[str, float]) -> list[str]:

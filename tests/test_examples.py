@@ -7,6 +7,7 @@ import pytest
 
 MODULES = (
     "rsundistort",
+    "rsundistort.io.readout_times",
     "rsundistort.model.camera",
     "rsundistort.model.motion",
     "rsundistort.model.projection",

@@ -9,11 +9,11 @@ import pytest
 from critical_scenes import named_scene
 from scipy.spatial.transform import Rotation
 
-from rsundistort import Camera, FileError, FormatError, InputError, RowMotion, RsUndistortWarning
-from rsundistort.io import GyroLog, gyro_offset, motions_from_gyro, read_gyro, read_photo_times
+from rsundistort import Camera, FileError, FormatError, GyroOptions, InputError, RowMotion, RsUndistortWarning
+from rsundistort.io import GyroLog, VideoFrames, gyro_offset, motions_from_gyro, read_gyro, read_photo_times
 from rsundistort.io.gyro import parse_axes
 from rsundistort.model import READOUTS
-from rsundistort.pipeline.gyro import gyro_contradiction
+from rsundistort.pipeline.gyro import gyro_contradiction, gyro_motions, known_readouts
 from rsundistort.synthetic import project_rows
 
 READOUT_S = 0.03
@@ -90,6 +90,12 @@ def test_sign_by_a_camera_that_is_turned_step_by_step(readout):
     assert np.abs(uv - seen)[inside].max() < 0.05
     still, _ = project_rows(points, start.inv().as_matrix(), np.zeros(3), RowMotion(), camera)
     assert np.abs(still - seen)[inside].max() > 3
+
+
+def test_each_photo_may_have_its_own_readout():
+    known = motions_from_gyro(log(), {"a": 1.0, "b": 1.0}, {"a": 0.01, "b": 0.02})
+    assert known["a"][0] == pytest.approx(-0.01 * mean_rates(1.0, 0.01), rel=0, abs=1e-7)
+    assert known["b"][0] == pytest.approx(-0.02 * mean_rates(1.0, 0.02), rel=0, abs=1e-7)
 
 
 def test_offset_is_added_to_the_photos_times():
@@ -308,3 +314,43 @@ def test_offset_is_found_from_a_solution(rng):
     assert wrong < 0.8
     with pytest.raises(InputError, match="no offset"):
         gyro_offset(shaken, times + 100, phi, READOUT_S, largest_s=5)
+
+
+# ---------------------------------------------------------------- in a run
+
+
+def test_photos_find_their_times_and_readouts(tmp_path):
+    time_s = np.arange(0, 4, 0.001)
+    gyro = GyroOptions(write_csv(tmp_path / "gyro.csv", time_s, rates(time_s)), offset_s=0.5)
+    readouts = {"a.jpg": READOUT_S, "b.jpg": READOUT_S, "c.jpg": None}
+    with pytest.raises(InputError, match="--photo-times"):
+        gyro_motions(tmp_path, gyro, gyro.log(), readouts)
+    (tmp_path / "frames.csv").write_text("name,time_s\nb.jpg,1.0\nother.jpg,2.0\n")
+    known = gyro_motions(tmp_path, gyro, gyro.log(), readouts)
+    assert list(known) == ["b.jpg"]
+    assert known["b.jpg"][0] == pytest.approx(-READOUT_S * mean_rates(1.5, READOUT_S), rel=0, abs=1e-7)
+    (tmp_path / "times.csv").write_text("name,time_s\nc.jpg,1.0\n")
+    with pytest.raises(InputError, match=r"c\.jpg .*--readout-ms"):
+        gyro_motions(tmp_path, replace(gyro, times=tmp_path / "times.csv"), gyro.log(), readouts)
+    (tmp_path / "times.csv").write_text("name,time_s\nz.jpg,1.0\n")
+    with pytest.raises(InputError, match=r"none of the photos, such as a\.jpg"):
+        gyro_motions(tmp_path, replace(gyro, times=tmp_path / "times.csv"), gyro.log(), readouts)
+    with pytest.raises(InputError, match="expected seconds"):
+        GyroOptions(gyro.file, offset_s=float("nan"))
+
+
+def test_who_says_how_long_the_readout_takes(tmp_path):
+    """The user before the log, the log before the table."""
+    camera = Camera(1280, 720, [[1000, 0, 640], [0, 1000, 360], [0, 0, 1]])
+    other = Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]])
+    frames = VideoFrames(("a.png",), np.zeros(1), 1, 0, 1, "Apple", "iPhone 6s")
+    told = log(readout_s=0.02)
+
+    def known(given_s, log_):
+        return known_readouts(tmp_path, ["a.png", "b.png"], [camera, other], [0, 1], frames, given_s, log_)
+
+    assert known(0.03, told) == {0: (0.03, "given"), 1: (0.03, "given")}
+    assert known(None, told) == dict.fromkeys((0, 1), (0.02, "the gyroscope's log"))
+    found = known(None, log())
+    assert list(found) == [0]  # the other's size is not in the table
+    assert found[0][0] == pytest.approx(0.01501)

@@ -6,6 +6,7 @@ import csv
 from pathlib import Path
 
 import pytest
+from make_photos import save_textures
 
 import rsundistort.io.readout_times as table
 from rsundistort.io import readout_time
@@ -52,6 +53,20 @@ def test_sources_that_name_no_size_say_so():
     seconds, source = readout_time("DJI", "FC330", 4000, 3000)
     assert seconds == pytest.approx(0.033)
     assert source.endswith("for no stated size")
+
+
+def test_make_and_model_of_a_photo():
+    photos = Path(__file__).parents[2] / "shared" / "photos" / "iphone6"
+    if not photos.is_dir():
+        pytest.skip("needs ../shared")
+    assert table.camera_body(min(photos.glob("*.[jJ]*"))) == ("Apple", "iPhone 6")
+
+
+def test_photos_without_make_and_model(tmp_path):
+    save_textures(tmp_path, ["a.jpg", "b.png"])
+    (tmp_path / "c.jpg").write_bytes(b"no photo")
+    for name in ("a.jpg", "b.png", "c.jpg", "none.jpg"):
+        assert table.camera_body(tmp_path / name) is None
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row['model']}-{row['width']}")

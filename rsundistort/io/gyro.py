@@ -239,7 +239,7 @@ def read_photo_times(path: Path | str) -> dict[str, float]:
 def motions_from_gyro(
     log: GyroLog,
     times_s: Mapping[str, float],
-    readout_s: float,
+    readout_s: float | Mapping[str, float],
     *,
     offset_s: float = 0.0,
     offset_sigma_s: float = 0.001,
@@ -252,8 +252,8 @@ def motions_from_gyro(
         Of the camera.
     times_s : mapping of photo name to float
         When the middle line of each photo was read, by the camera's clock.
-    readout_s : float
-        Time of the readout of a frame.
+    readout_s : float, or mapping of photo name to float
+        Time of the readout of a frame, of all photos or of each.
     offset_s : float
         What the clock of the log shows when the camera's shows zero.
     offset_sigma_s : float
@@ -272,18 +272,18 @@ def motions_from_gyro(
     InputError
         The log covers none of the photos, or the time of the readout is not positive.
     """
-    if not 0 < readout_s < np.inf:
-        raise InputError(f"the time of the readout is {readout_s!r} s, expected a positive number")
     names = list(times_s)
+    span = np.array([readout_s[name] if isinstance(readout_s, Mapping) else readout_s for name in names], float)
+    if not ((span > 0) & np.isfinite(span)).all():
+        raise InputError(f"the time of the readout is {readout_s!r} s, expected positive numbers")
     middle = np.array([times_s[name] for name in names], float) + offset_s
-    start, end = middle - readout_s / 2, middle + readout_s / 2
+    start, end = middle - span / 2, middle + span / 2
     rate = log.mean(start, end)
     shifted = np.stack([log.mean(start + shift, end + shift) for shift in (-offset_sigma_s, offset_sigma_s)])
-    # at the middles of eight slices of the readout
-    edges = start + readout_s * np.arange(9)[:, None] / 8
+    edges = start + span * np.arange(9)[:, None] / 8
     slices = log.mean(edges[:-1], edges[1:])
     variance = (
-        log.noise**2 * min(1.0, log.step_s / readout_s)
+        log.noise**2 * np.minimum(1.0, log.step_s / span)[:, None]
         + _BIAS**2
         + np.mean((shifted - rate) ** 2, axis=0)
         + (_READOUT_SHARE * rate) ** 2
@@ -302,9 +302,7 @@ def motions_from_gyro(
             RsUndistortWarning,
             stacklevel=2,
         )
-    return {
-        name: (-readout_s * rate[i], readout_s * np.sqrt(variance[i])) for i, name in enumerate(names) if covered[i]
-    }
+    return {name: (-span[i] * rate[i], span[i] * np.sqrt(variance[i])) for i, name in enumerate(names) if covered[i]}
 
 
 def gyro_offset(

@@ -17,7 +17,7 @@ from ..io.readout_times import camera_body, readout_time
 from ..io.video import FRAME_TABLE, VideoFrames
 from ..model import Camera, Reconstruction
 
-__all__ = ["GyroOptions", "gyro_contradiction", "gyro_motions", "known_readout"]
+__all__ = ["GyroOptions", "gyro_contradiction", "gyro_motions", "known_readouts"]
 
 # Known motions that a solution misses by this many of their standard deviations are not those of its photos.
 _FAR = 3.0
@@ -57,33 +57,47 @@ class GyroOptions:
         return {"name": Path(self.file).name, "offset_s": self.offset_s, "axes": self.axes}
 
 
-def known_readout(
-    photo: Path, camera: Camera, frames: VideoFrames | None, given_s: float | None, log: GyroLog | None
-) -> tuple[float, str] | None:
-    """Seconds that the readout of a frame takes, and who says so: the user, the gyroscope's log, or the table."""
+def known_readouts(
+    folder: Path,
+    names: Sequence[str],
+    cameras: Sequence[Camera],
+    camera_idx: ArrayLike,
+    frames: VideoFrames | None,
+    given_s: float | None,
+    log: GyroLog | None,
+) -> dict[int, tuple[float, str]]:
+    """Seconds that the readout of a frame takes, and who says so: the user, the gyroscope's log, or the table.
+
+    By camera; those of which nothing is known are missing. A camera's make and model are those of its first photo, or
+    the video's.
+    """
     if given_s is not None:
-        return given_s, "given"
+        return dict.fromkeys(range(len(cameras)), (given_s, "given"))
     if log is not None and log.readout_s is not None:
-        return log.readout_s, "the gyroscope's log"
-    body = (frames.make, frames.model) if frames is not None else camera_body(photo)
-    return None if body is None else readout_time(*body, camera.width, camera.height)
+        return dict.fromkeys(range(len(cameras)), (log.readout_s, "the gyroscope's log"))
+    index = np.asarray(camera_idx).tolist()
+    found = {}
+    for k, camera in enumerate(cameras):
+        body = camera_body(folder / names[index.index(k)]) if frames is None else (frames.make, frames.model)
+        readout = None if body is None else readout_time(*body, camera.width, camera.height)
+        if readout is not None:
+            found[k] = readout
+    return found
 
 
-def gyro_motions(
-    folder: Path, names: Sequence[str], gyro: GyroOptions, log: GyroLog, readout: tuple[float, str] | None
-) -> Known:
-    """Motions of the photos that have a time, as `RunOptions.known` takes them."""
-    if readout is None:
-        raise InputError(
-            f"{gyro.file}: how long does the camera take to read a frame? It is not in the table; give --readout-ms"
-        )
+def gyro_motions(folder: Path, gyro: GyroOptions, log: GyroLog, readout_s: Mapping[str, float | None]) -> Known:
+    """Motions of the photos that have a time, as `RunOptions.known` takes them; `readout_s` by photo."""
     table = Path(gyro.times) if gyro.times is not None else folder / FRAME_TABLE
     if gyro.times is None and not table.is_file():
         raise InputError(f"{gyro.file}: when were the photos taken? Give a table of name, time_s with --photo-times")
-    times = {name: time for name, time in read_photo_times(table).items() if name in names}
+    times = {name: time for name, time in read_photo_times(table).items() if name in readout_s}
     if not times:
-        raise InputError(f"{table} has the time of none of the photos, such as {names[0]}")
-    return motions_from_gyro(log, times, readout[0], offset_s=gyro.offset_s)
+        raise InputError(f"{table} has the time of none of the photos, such as {next(iter(readout_s))}")
+    if unknown := [name for name in times if readout_s[name] is None]:
+        raise InputError(
+            f"{gyro.file}: how long does the camera of {unknown[0]} take to read a frame? Give --readout-ms"
+        )
+    return motions_from_gyro(log, times, {name: readout_s[name] or 0.0 for name in times}, offset_s=gyro.offset_s)
 
 
 def gyro_contradiction(rec: Reconstruction, known: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> str | None:

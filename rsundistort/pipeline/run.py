@@ -25,7 +25,7 @@ from ..io.motions import Known
 from ..model import READOUTS, Reconstruction, Solution, SolvedImage, check_shutter_model
 from ..rectify import INTERPOLATIONS, largest_shift_px
 from .frames import find_photos
-from .gyro import GyroOptions, gyro_contradiction, gyro_motions, known_readout
+from .gyro import GyroOptions, gyro_contradiction, gyro_motions, known_readouts
 from .load import LoadedPhotos, load_photos
 from .progress import ProgressCallback, StageLog
 from .solve import Solved, solve_photos
@@ -175,14 +175,18 @@ def run(
         source = find_photos(photos, scratch, options.camera, options.every, options.sharpest, log)
         folder = source.folder
         loaded = load_photos(folder, source.camera, options.readout, options.max_features, jobs, log)
-        readout = known_readout(folder / loaded.names[0], loaded.camera, source.frames, options.readout_s, gyro_log)
+        cameras, camera_idx = [loaded.camera], [0] * len(loaded.names)
+        readouts = known_readouts(
+            folder, loaded.names, cameras, camera_idx, source.frames, options.readout_s, gyro_log
+        )  # fmt: skip
         ends = (end[0] for each in options.lengths for end in (each.start, each.end))
         for name in (*options.still, *options.known, *ends):
             if name not in loaded.names:
                 raise InputError(f"anchor {name!r} is not among the photos of {photos}")
         from_gyro: Known = {}
         if options.gyro is not None and gyro_log is not None:
-            motions = gyro_motions(folder, loaded.names, options.gyro, gyro_log, readout)
+            times = [readouts[k][0] if k in readouts else None for k in camera_idx]
+            motions = gyro_motions(folder, options.gyro, gyro_log, dict(zip(loaded.names, times, strict=True)))
             from_gyro = {k: v for k, v in motions.items() if k not in options.known and k not in options.still}
             options = replace(options, known={**options.known, **from_gyro})
         refine = options.refine
@@ -194,7 +198,7 @@ def run(
         rec = solved.result.reconstruction
         if contradiction := gyro_contradiction(rec, from_gyro):
             warnings.warn(contradiction, RsUndistortWarning, stacklevel=2)
-        solution = _solution(loaded, solved, options, readout, source.video)
+        solution = _solution(loaded, solved, options, readouts, source.video)
         colors = PointColors(rec)
         rectified = rectify_photos(
             folder, solution, list(rec.image_names), scratch,
@@ -250,7 +254,7 @@ def _solution(
     loaded: LoadedPhotos,
     solved: Solved,
     options: RunOptions,
-    readout: tuple[float, str] | None,
+    readouts: Mapping[int, tuple[float, str]],
     video: dict[str, Any] | None,
 ) -> Solution:
     """The solution of an adjusted reconstruction, with every photo of the folder in it."""
@@ -288,8 +292,7 @@ def _solution(
         "sigma_intrinsics": dict(zip(cameras, solved.result.sigma_intrinsics, strict=True)),
         "phi_sigma_rad_per_frame": solved.result.phi_sigma,
         "stop_reason": solved.result.stop_reason,
-        "readout_ms": readout and readout[0] * 1e3,
-        "readout_source": readout and readout[1],
+        "readout_times": {str(k + 1): {"ms": 1e3 * s, "source": source} for k, (s, source) in readouts.items()},
     }
     return Solution(
         shutter_model=rec.shutter_model,
