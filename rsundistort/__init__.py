@@ -27,6 +27,7 @@ from .io import read_solution, write_solution
 from .model import Camera, Observations, Reconstruction, RowMotion, Solution, SolvedImage
 from .model.projection import project_points, unproject_points
 from .pipeline import (
+    GyroOptions,
     RunOptions,
     SceneOptions,
     WarpOptions,
@@ -55,6 +56,7 @@ __all__ = [
     "CriticalMotion",
     "FileError",
     "FormatError",
+    "GyroOptions",
     "InputError",
     "MetadataWarning",
     "Observations",
