@@ -270,11 +270,14 @@ def closing_table(solution: Solution, out: Path) -> str:
 
 
 def _cameras(solution: Solution) -> list[str]:
-    """Where the cameras come from and which way they are read out; a line on each group where there are several."""
+    """Where the cameras come from, which way they are read out by group where they differ, and what was guessed."""
     source, readout = solution.options["camera"], solution.options["readout"]
     if isinstance(readout, str):
-        return [f"camera             {source}, readout {readout}"]
-    return [f"cameras            {source}", *(f"  {group}: readout {each}" for group, each in readout.items())]
+        lines = [f"camera             {source}, readout {readout}"]
+    else:
+        lines = [f"cameras            {source}", *(f"  {group}: readout {each}" for group, each in readout.items())]
+    guesses = solution.options.get("guesses", ())
+    return lines + [f"  {line}" for text in guesses for line in textwrap.wrap(text, 78)]
 
 
 def _intrinsics(solution: Solution) -> list[str]:

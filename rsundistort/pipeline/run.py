@@ -248,6 +248,20 @@ def _readouts(rec: Reconstruction, cameras: PhotoCameras) -> str | dict[str, str
     return rec.cameras[0].readout if len(set(directions.values())) == 1 else directions
 
 
+def _guesses(solved: Solved, cameras: PhotoCameras) -> list[str]:
+    """What was guessed of the cameras, and what the photos said of it, for people."""
+    choice = solved.readouts
+    found = [] if choice is None else choice.turned
+    said = [] if found else list(cameras.notes)
+    for k in found:
+        assert choice is not None
+        said.append(
+            f"{cameras.labels[k]} fits better as read out {choice.reconstruction.cameras[k].readout} "
+            f"(by {choice.gain[k]:.0f} standard errors); --readout settles it"
+        )
+    return said
+
+
 def _image_rms(rec: Reconstruction) -> NDArray[np.float64]:
     """(m,) root mean square residual of each photo in pixels."""
     res, valid = reprojection_residuals(rec)
@@ -335,6 +349,7 @@ def _solution(
             "camera": loaded.cameras.source,
             "shutter_model": options.shutter_model,
             "readout": _readouts(rec, loaded.cameras),
+            "guesses": _guesses(solved, loaded.cameras),
             "seed": options.seed,
             "max_features": options.max_features,
             "interpolation": options.interpolation,
