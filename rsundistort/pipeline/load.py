@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import FileError, InputError, SkippedPhotoWarning
-from ..io import camera_from_exif, list_photos, parse_camera, read_photo
+from ..io import MAX_MEGAPIXELS, camera_from_exif, list_photos, parse_camera, read_photo
 from ..model import Camera
 from ..sfm import Features, detect_features
 from .progress import StageLog
+from .write import check_not_rectified
 
 __all__ = ["LoadedPhotos", "find_camera", "load_photos"]
 
@@ -86,10 +87,18 @@ def find_camera(
 
 
 def load_photos(
-    folder: Path, camera: str | None, readout: str | None, max_features: int, jobs: int, log: StageLog
+    folder: Path,
+    camera: str | None,
+    readout: str | None,
+    max_features: int,
+    jobs: int,
+    log: StageLog,
+    raw_as: str = "tif",
+    again: bool = True,
+    max_megapixels: float = MAX_MEGAPIXELS,
 ) -> LoadedPhotos:
-    """Read every photo of a folder once, for its size and features; unreadable ones are skipped with a warning."""
-    listed = list_photos(folder)
+    """Read every photo of a folder once, for its size and features; unusable ones are skipped with a warning."""
+    listed = list_photos(folder, raw_as)
     if len(listed) < 3:
         raise InputError(
             f"{folder} holds {len(listed)} photo{'s' * (len(listed) > 1)}; the shutter needs at least three"
@@ -99,9 +108,14 @@ def load_photos(
 
     def load(name: str) -> tuple[tuple[int, int], Features] | str:
         try:
-            pixels = read_photo(folder / name).pixels
+            photo = read_photo(folder / name, max_megapixels)
+            if not again:
+                check_not_rectified(photo)
+            pixels = photo.pixels
         except FileError as error:
             return str(error)
+        except InputError as error:
+            return f"{name}: {error}"
         return (pixels.shape[1], pixels.shape[0]), detect_features(pixels, max_features)
 
     names: list[str] = []
