@@ -100,7 +100,7 @@ def output_name(name: str, raw_as: str = "tif") -> str:
 def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> Photo:
     """A photo as the sensor stored it.
 
-    The content says what kind it is of; a warning says so where the name's ending says another.
+    The content says what kind it is of; a warning says so where the name's ending says another, unless that is RAW.
 
     Parameters
     ----------
@@ -125,6 +125,10 @@ def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> Photo:
         raise FileError(f"{path.name} is cut short or empty; copy it again from the camera")
     if not kind:
         raise FileError(f"{path.name} cannot be decoded; it is no photo of a known kind")
+    named = kind_of_name(path.name)
+    if named == "RAW" != kind:
+        # turned or cropped by whoever made it of the RAW, perhaps: no longer what the sensor's rows saw
+        raise FileError(f"{path.name} is {kind} by its content, not RAW; if it is a photo of its own, rename it")
 
     def check_size(width: int, height: int) -> None:
         if width * height > max_megapixels * 1e6:
@@ -147,7 +151,6 @@ def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> Photo:
     else:
         pixels = _decode(as_stored(data) if kind == "TIFF" else data, path.name)
         metadata = tiff_metadata(data) if kind == "TIFF" else metadata_of(data, kind)
-    named = kind_of_name(path.name)
     if kind != named:
         warnings.warn(
             f"{path.name} is {kind} by its content{f', not {named}' if named else ''}; it is read as that",
