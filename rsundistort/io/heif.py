@@ -45,7 +45,9 @@ def read_heif(data: bytes, name: str) -> tuple[NDArray[np.uint16], Metadata]:
         pixels = np.array(np.asarray(image))
         info = image.info
     except (ValueError, EOFError, SyntaxError, RuntimeError, OSError) as error:
-        raise FileError(f"{name} cannot be decoded ({error}); copy it again from the camera") from error
+        raise FileError(
+            f"{name} cannot be decoded ({' '.join(str(error).split())}); copy it again from the camera"
+        ) from error
     if pixels.dtype == np.uint8:
         pixels = pixels.astype(np.uint16) * 257
     orientation = _orientation(data)

@@ -24,6 +24,7 @@ INTERPOLATIONS: dict[str, int] = {
 }
 
 _STRIP_ROWS = 64
+_MAX_SIDE = 32766  # cv2.remap counts in 16 bits
 
 
 def rectify(
@@ -65,6 +66,10 @@ def rectify(
     if photo.shape[:2] != (camera.height, camera.width):
         raise InputError(
             f"photo has {photo.shape[1]}x{photo.shape[0]} pixels, its camera {camera.width}x{camera.height}"
+        )
+    if max(photo.shape[:2]) > _MAX_SIDE:
+        raise InputError(
+            f"photo has {photo.shape[1]}x{photo.shape[0]} pixels, and OpenCV rectifies sides up to {_MAX_SIDE}"
         )
     if interpolation not in INTERPOLATIONS:
         raise InputError(f"interpolation={interpolation!r}, expected one of {', '.join(INTERPOLATIONS)}")
