@@ -11,6 +11,7 @@ import cv2
 import exifread
 import numpy as np
 import pytest
+import tifffile
 from hypothesis import given
 from hypothesis import strategies as st
 from make_photos import MAKER_NOTE, THUMBNAIL, camera_exif, small_dng, tagged_jpeg, texture
@@ -100,7 +101,6 @@ def test_opencv_and_pillow_follow_what_is_written(tmp_path, suffix):
 @pytest.mark.parametrize("channels", [1, 3, 4])
 def test_tiff_of_either_byte_order_is_exact(tmp_path, rng, channels, dtype, order):
     """Pixels follow the byte order of the EXIF block; tifffile reads them independently where it can inflate them."""
-    tifffile = pytest.importorskip("tifffile")
     shape = (37, 53) if channels == 1 else (37, 53, channels)
     pixels = (rng.random(shape) * 60000).astype(dtype)
     write_image(tmp_path / "a.tif", pixels, Metadata(camera_exif(order)))
@@ -302,6 +302,21 @@ def test_a_block_built_of_a_block_says_the_same(order):
     )
     moved = {"Image ExifOffset", "Image GPSInfo", "Image ImageWidth", "Image ImageLength"}  # a size is the file's
     assert {k: v for k, v in after.items() if k not in moved} == {k: v for k, v in before.items() if k not in moved}
+
+
+@pytest.mark.parametrize("byteorder", "<>")
+def test_a_bigtiff_is_read_in_the_stored_frame(tmp_path, byteorder):
+    pixels = texture(64, 48).astype(np.uint16) * 257
+    extra = [(0x0112, "H", 1, 6, True), (0x010F, "s", 0, "A Maker", True)]
+    tifffile.imwrite(
+        tmp_path / "a.tif", pixels[..., ::-1], bigtiff=True, photometric="rgb", extratags=extra, byteorder=byteorder
+    )
+    photo = read_photo(tmp_path / "a.tif")
+    np.testing.assert_array_equal(photo.pixels, pixels)
+    assert photo.metadata.orientation == 6
+    write_image(tmp_path / "b.tif", photo.pixels, photo.metadata)
+    assert tags(tmp_path / "b.tif")["Image Make"] == "A Maker"
+    np.testing.assert_array_equal(read_photo(tmp_path / "b.tif").pixels, pixels)
 
 
 def test_raw_keeps_its_tags_and_its_maker_note_in_place(tmp_path):

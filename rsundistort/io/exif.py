@@ -21,6 +21,7 @@ __all__ = [
     "corrected_exif",
     "described_entries",
     "exif_of_tiff",
+    "exif_structure",
     "pack_ifd",
     "read_orientation",
 ]
@@ -28,7 +29,7 @@ __all__ = [
 ORIENTATION = 0x0112
 EXIF_IFD, GPS_IFD, INTEROP_IFD = 0x8769, 0x8825, 0xA005
 MAKER_NOTE, COLOR_SPACE = 0x927C, 0xA001
-_WIDTHS, _HEIGHTS = {0x0100: "IFD0", 0xA002: "Exif"}, {0x0101: "IFD0", 0xA003: "Exif"}
+_WIDTH, _LENGTH, _PIXELS_X, _PIXELS_Y = 0x0100, 0x0101, 0xA002, 0xA003
 _THUMBNAIL_AT, _THUMBNAIL_LENGTH = 0x0201, 0x0202
 
 #: Tags of IFD0 that describe the photo rather than the layout of the file that it came in.
@@ -41,7 +42,7 @@ _DESCRIBING = frozenset(
 )
 
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
-_SHORT, _LONG = 3, 4
+_SHORT, _LONG, _LAST_CLASSIC = 3, 4, 13
 # a block fits into one JPEG segment
 _MOST_IN_JPEG = 65000
 
@@ -153,6 +154,14 @@ class TiffStructure:
         return {} if not at else {entry.tag: entry for entry in reversed(self.ifd(at, name)[0])}
 
 
+def exif_structure(block: bytes) -> TiffStructure:
+    """An EXIF block, which has the short offsets of a classic TIFF."""
+    structure = TiffStructure(block)
+    if structure.is_big:
+        raise Damaged("its header is that of a BigTIFF")
+    return structure
+
+
 def read_orientation(block: bytes) -> int:
     """The EXIF orientation of a block as it stands there, 1 without one; may be none of 1 to 8."""
     try:
@@ -224,40 +233,49 @@ def corrected_exif(
         block = b"II*\0\x08\0\0\0" + bytes(6)
     data = bytearray(block)
     try:
-        structure = TiffStructure(block)
-        entries, link, following = structure.main()
+        structure = exif_structure(block)
         order = structure.order
+        entries, link, following = structure.main()
 
         def put(entry: Entry, value: int) -> None:
-            kind, form = (_SHORT, "HH") if value < 65536 else (_LONG, "I")
-            packed = struct.pack(order + form, *((value, 0) if kind == _SHORT else (value,)))
-            data[entry.at : entry.at + 12] = struct.pack(order + "HHI", entry.tag, kind, 1) + packed
+            if entry.count != 1 or structure.number(entry) != value:
+                kind, form, values = (_SHORT, "HH", (value, 0)) if value < 65536 else (_LONG, "I", (value,))
+                struct.pack_into(f"{order}HHI{form}", data, entry.at, entry.tag, kind, 1, *values)
 
         if width is not None and height is not None:
-            found = {"IFD0": entries, "Exif": structure.sub(entries, EXIF_IFD, "the Exif IFD")}
-            for tags, value in ((_WIDTHS, width), (_HEIGHTS, height)):
-                for tag, where in tags.items():
-                    if tag in found[where]:
-                        put(found[where][tag], value)
-            structure.sub(found["Exif"], INTEROP_IFD, "the interoperability IFD")
+            exif = structure.sub(entries, EXIF_IFD, "the Exif IFD")
+            for ifd, tag, value in (
+                (entries, _WIDTH, width), (entries, _LENGTH, height),
+                (exif, _PIXELS_X, width), (exif, _PIXELS_Y, height),
+            ):  # fmt: skip
+                if tag in ifd:
+                    put(ifd[tag], value)
+            structure.sub(exif, INTEROP_IFD, "the interoperability IFD")
             structure.sub(entries, GPS_IFD, "the GPS IFD")
             if following:
                 _cut_thumbnail(data, structure, link, following)
-        if orientation is not None:
-            if ORIENTATION in entries:
-                put(entries[ORIENTATION], orientation)
-            elif orientation != 1:
-                data += b"\0" * (len(data) % 2)
-                every = [
-                    (e.tag, e.kind, e.count, e.value_at if e.size > 4 else structure.value(e)) for e in entries.values()
-                ]
-                every.append((ORIENTATION, _SHORT, 1, struct.pack(order + "H", orientation)))
-                kept = struct.unpack_from(order + "I", data, link)[0] if link else 0
-                data[4:8] = struct.pack(order + "I", len(data))
-                data += pack_ifd(order, every, len(data), kept)
+        if orientation is not None and ORIENTATION in entries:
+            put(entries[ORIENTATION], orientation)
+        elif orientation not in (None, 1):
+            _add_orientation(data, structure, entries, link, orientation)
         return bytes(data), structure.problems
     except Damaged as error:
         return bytes(data), [str(error)]
+
+
+def _add_orientation(
+    data: bytearray, structure: TiffStructure, entries: dict[int, Entry], link: int, orientation: int
+) -> None:
+    """Put a longer IFD0 at the end of the block; the values of its entries stay where they are."""
+    order = structure.order
+    data += bytes(len(data) % 2)
+    every: list[tuple[int, int, int, bytes | int]] = [
+        (e.tag, e.kind, e.count, e.value_at if e.size > 4 else structure.value(e)) for e in entries.values()
+    ]
+    every.append((ORIENTATION, _SHORT, 1, struct.pack(order + "H", orientation)))
+    following = struct.unpack_from(order + "I", data, link)[0] if link else 0
+    struct.pack_into(order + "I", data, 4, len(data))
+    data += pack_ifd(order, every, len(data), following)
 
 
 def _cut_thumbnail(data: bytearray, structure: TiffStructure, link: int, thumbnail_ifd: int) -> None:
@@ -305,7 +323,10 @@ def exif_of_tiff(data: bytes, without: frozenset[int] = frozenset()) -> bytes:
         return [
             (entry.tag, entry.kind, entry.count, structure.value(entry))
             for entry in ifd.values()
-            if entry.tag not in pointers and entry.tag not in without and entry is not note
+            if entry.tag not in pointers
+            and entry.tag not in without
+            and entry is not note
+            and entry.kind <= _LAST_CLASSIC
         ]
 
     main = [entry for entry in values(entries) if entry[0] in _DESCRIBING]

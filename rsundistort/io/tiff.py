@@ -19,6 +19,7 @@ from .exif import (
     TiffStructure,
     described_entries,
     exif_of_tiff,
+    exif_structure,
     pack_ifd,
 )
 from .metadata import Metadata
@@ -84,7 +85,7 @@ def encode_tiff(pixels: NDArray[Any], metadata: Metadata) -> tuple[bytes, list[s
     data = bytearray(b"II*\0" + bytes(4))
     if metadata.exif:
         try:
-            described = list(described_entries(TiffStructure(metadata.exif)))
+            described = list(described_entries(exif_structure(metadata.exif)))
         except Damaged as error:
             lost.append(f"the EXIF, which is damaged ({error})")
         if described:
