@@ -116,6 +116,10 @@ if TYPE_CHECKING:
 )
 @opt.interpolation_option
 @opt.quality_option
+@opt.raw_as_option
+@opt.apply_orientation_option
+@opt.again_option
+@opt.max_pixels_option
 @opt.seed_option
 @opt.jobs_option
 @opt.overwrite_option
@@ -142,6 +146,10 @@ def command(
     max_features: int,
     interpolation: str,
     quality: int,
+    raw_as: str,
+    apply_orientation: bool,
+    again: bool,
+    max_megapixels: float,
     seed: int,
     jobs: int,
     overwrite: bool,
@@ -170,6 +178,10 @@ def command(
                 max_features=max_features,
                 interpolation=interpolation,
                 quality=quality,
+                raw_as=raw_as,
+                apply_orientation=apply_orientation,
+                again=again,
+                max_megapixels=max_megapixels,
                 refine=_names(refine),
                 still=_anchors(still),
                 known={} if known is None else read_known_motions(known, readout_s),
