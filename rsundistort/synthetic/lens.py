@@ -1,7 +1,7 @@
 """OpenCV's lens models and their inverses, iterated to rounding: the truth must not use our own.
 
 OpenCV's default of five steps back is wrong by whole pixels at the edge of a wide lens, and
-`cv2.fisheye.undistortPoints` takes what lies beyond pi/2 focal lengths from the centre to lie there.
+`cv2.fisheye.undistortPoints` treats all that lies beyond pi/2 focal lengths from the centre as if it lay there.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def distort_rays(rays_c: ArrayLike, camera: Camera, K: ArrayLike | None = None) 
 
 
 def undistort_to_rays(uv_raw: ArrayLike, camera: Camera) -> NDArray[np.float64]:
-    """Undistorted normalised coordinates (..., 2) of pixels (..., 2); NaN where a fisheye has none before 90 degrees."""
+    """Undistorted normalised coordinates (..., 2) of pixels (..., 2); of a fisheye NaN from 90 degrees on."""
     uv, K = np.asarray(uv_raw, np.float64), np.array(camera.K)
     if camera.is_pinhole:
         return np.asarray((uv - K[:2, 2]) / np.diag(K)[:2], np.float64)
