@@ -2,9 +2,9 @@
 
     python benchmarks/clock.py
 
-On sample_scenes/handheld (k1 k2 p1 p2, all four directions), `distorted` is the library, `undistorted` the same with the
-row freed of the lens as its clock. That is a shutter in front of a pinhole camera whose photo the lens bends afterwards,
-so it is made from the library with cameras that have no lens, and OpenCV's lens.
+On sample_scenes/handheld (k1 k2 p1 p2, all four directions), `distorted` is the library, `undistorted` the same with
+the row freed of the lens as its clock. That is a pinhole camera with a shutter, whose photo a lens bends afterwards, so
+it is made from the library with cameras that have no lens, and OpenCV's lens.
 
 `psnr_db`: photos rectified with their true motions against their twins, over the pixels that both show; median and
 worst photo. `phi_mrad_per_frame`: largest error of any component of phi, of any photo, of a bundle adjustment of the
