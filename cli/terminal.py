@@ -22,7 +22,11 @@ def errors_for_people(kept: str = "nothing was written") -> Iterator[None]:
     from rsundistort.errors import RsUndistortError
 
     # OpenCV's and libtiff's own lines about broken files: ours say it once, with the name
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    silent = 0
+    if hasattr(cv2, "setLogLevel"):  # OpenCV 4
+        cv2.setLogLevel(silent)
+    else:
+        cv2.utils.logging.setLogLevel(silent)
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
         click.echo(f"warning: {message}", err=True)
