@@ -19,7 +19,7 @@ from PIL import Image, ImageCms
 
 from rsundistort import MetadataWarning
 from rsundistort.io import Metadata, read_photo, write_image
-from rsundistort.io.exif import corrected_exif, exif_of_tiff
+from rsundistort.io.photos.exif import corrected_exif, exif_of_tiff
 from rsundistort.model.orientation import turn_pixels
 
 SUFFIXES = (".jpg", ".png", ".webp", ".tif")
