@@ -14,7 +14,13 @@ from ..errors import FileError, FormatError
 from ..model import Camera, Reconstruction
 from ..model.projection import unproject_points
 
-__all__ = ["read_colmap_cameras", "read_colmap_poses", "rectified_keypoints", "write_colmap_model"]
+__all__ = [
+    "camera_from_colmap",
+    "read_colmap_cameras",
+    "read_colmap_poses",
+    "rectified_keypoints",
+    "write_colmap_model",
+]
 
 # COLMAP's pixel centres are at 0.5, ours at 0
 _HALF = 0.5
@@ -55,26 +61,27 @@ def read_colmap_cameras(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
     model = _read_model(path)
     cameras = {}
     for camera_id in sorted(model.cameras):
-        found = model.cameras[camera_id]
-        where = f"{path}: camera {camera_id}"
-        if found.model_name not in _LENSES:
-            raise FormatError(f"{where} is {found.model_name}; expected one of {', '.join(_LENSES)}")
-        lens, length = _LENSES[found.model_name]
-        extra = np.array(found.params)[list(found.extra_params_idxs())]
-        dist = np.zeros(length)
-        dist[: len(extra)] = extra
-        K = np.array(
-            [
-                [found.focal_length_x, 0, found.principal_point_x - _HALF],
-                [0, found.focal_length_y, found.principal_point_y - _HALF],
-                [0, 0, 1],
-            ]
-        )
-        try:
-            cameras[str(camera_id)] = Camera(found.width, found.height, K, dist, lens=lens)
-        except ValueError as error:
-            raise FormatError(f"{where}: {error}") from error
+        cameras[str(camera_id)] = camera_from_colmap(model.cameras[camera_id], f"{path}: camera {camera_id}")
     return cameras, {image.name: str(image.camera_id) for image in model.images.values()}
+
+
+def camera_from_colmap(found: Any, where: str) -> Camera:
+    """Our camera of a `pycolmap.Camera`; `where` names it in errors."""
+    if found.model_name not in _LENSES:
+        raise FormatError(f"{where} is {found.model_name}; expected one of {', '.join(_LENSES)}")
+    lens, length = _LENSES[found.model_name]
+    extra = np.array(found.params)[list(found.extra_params_idxs())]
+    dist = np.zeros(length)
+    dist[: len(extra)] = extra
+    K = [
+        [found.focal_length_x, 0, found.principal_point_x - _HALF],
+        [0, found.focal_length_y, found.principal_point_y - _HALF],
+        [0, 0, 1],
+    ]
+    try:
+        return Camera(found.width, found.height, np.array(K), dist, lens=lens)
+    except ValueError as error:
+        raise FormatError(f"{where}: {error}") from error
 
 
 def _read_model(path: Path) -> Any:

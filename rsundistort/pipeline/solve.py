@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,11 +24,11 @@ from ..bundle import (
 from ..critical import Advice, Remedy, advise, heal, with_remedy
 from ..errors import ReconstructionError, RsUndistortWarning
 from ..model import Reconstruction
-from ..sfm import map_photos, match_photos, retriangulate
+from ..sfm import MatchedPhotos, map_photos, match_photos, retriangulate
 from .load import LoadedPhotos
 from .progress import StageLog
 
-__all__ = ["Solved", "rungs_to", "solve_photos"]
+__all__ = ["Solved", "rungs_to", "solve_photos", "solve_tracks"]
 
 # Feedback ends when no photo's rotation over the frame changes by more than this angle times the focal length between
 # two rounds; a pixel at the border then moves by less than half of it.
@@ -103,18 +103,17 @@ def _of_joined(options: BundleOptions, mapped: Reconstruction) -> BundleOptions:
 
 
 def _read_out(
-    mapped: Reconstruction, photos: LoadedPhotos, options: BundleOptions, log: StageLog
+    mapped: Reconstruction, guessed: Mapping[int, str], options: BundleOptions, log: StageLog
 ) -> ReadoutChoice | None:
     """The directions of readout that nobody told, as the measurements have them; None if all were told."""
-    guessed = [k for k, told in enumerate(photos.cameras.readout_told) if not told]
     if not guessed:
         return None
     log.begin("readout")
-    choice = choose_readouts(mapped, guessed, options, progress=partial(_tell_model, log))
+    choice = choose_readouts(mapped, list(guessed), options, progress=partial(_tell_model, log))
     log.end(
         "readout",
-        directions={photos.cameras.labels[k]: choice.reconstruction.cameras[k].readout for k in guessed},
-        gain_of_other_axis={photos.cameras.labels[k]: gain for k, gain in choice.gain.items()},
+        directions={label: choice.reconstruction.cameras[k].readout for k, label in guessed.items()},
+        gain_of_other_axis={guessed[k]: gain for k, gain in choice.gain.items()},
     )
     return choice
 
@@ -162,7 +161,36 @@ def solve_photos(
             f"only {mapped.num_images} of {len(photos.names)} photos could be joined, the shutter needs three; "
             "use photos that share more of the scene"
         )
-    readouts = _read_out(mapped, photos, options_of(mapped), log)
+    guessed = {k: cameras.labels[k] for k, told in enumerate(cameras.readout_told) if not told}
+    solved = solve_tracks(mapped, guessed, shutter_model, seed, options_of, log, remedy, matched)
+    # which frame a mapping ends in is chance
+    return replace(solved, result=replace(solved.result, reconstruction=solved.result.reconstruction.normalized()))
+
+
+def solve_tracks(
+    mapped: Reconstruction,
+    guessed: Mapping[int, str],
+    shutter_model: str,
+    seed: int,
+    options_of: Callable[[Reconstruction], BundleOptions],
+    log: StageLog,
+    remedy: str = "auto",
+    matched: MatchedPhotos | None = None,
+) -> Solved:
+    """Climb the ladder from a global-shutter reconstruction, in its frame.
+
+    Parameters
+    ----------
+    mapped : Reconstruction
+        Poses, points and measurements.
+    guessed : mapping of int to str
+        Cameras whose direction of readout nobody told, and their names for people.
+    shutter_model, seed, options_of, log, remedy
+        As in `solve_photos`.
+    matched : MatchedPhotos, optional
+        The matches behind it: its tracks are then rebuilt with the motions found, until these settle.
+    """
+    readouts = _read_out(mapped, guessed, options_of(mapped), log)
     if readouts is not None:
         mapped = readouts.reconstruction
     options = _of_joined(with_remedy(options_of(mapped), remedy), mapped)
@@ -175,21 +203,10 @@ def solve_photos(
         "ladder",
         rungs=[{"model": k, "rms_px": r.rms_px, "iterations": r.num_iterations} for k, r in results.items()],
     )
-    for number in range(1, _MAX_ROUNDS + 1):
-        stage = f"feedback {number}"
-        log.begin(stage)
-        before = result.reconstruction
-        tracks = retriangulate(matched, before)
-        options = replace(options, phi_sigma_start=result.phi_sigma)
-        result = bundle_adjust(tracks, shutter_model, options, partial(_tell, log, stage))
-        after = result.reconstruction
-        moved = np.inf if after.image_names != before.image_names else _moved_px(before, after)
-        log.end(
-            stage, points=after.num_points, observations=len(after.observations), rms_px=result.rms_px,
-            iterations=result.num_iterations, stop_reason=result.stop_reason, moved_px=moved,
-        )  # fmt: skip
-        if moved < _SETTLED_PX:
-            break
+    tracks = result.reconstruction
+    if matched is not None:
+        result, tracks = _fed_back(matched, result, options, log)
+    options = replace(options, phi_sigma_start=result.phi_sigma)
     choice = None
     if auto:
         log.begin("choice of the model")
@@ -216,5 +233,27 @@ def solve_photos(
     )
     global_result = bundle_adjust(result.reconstruction, "global", plain)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
-    normalized = replace(result, reconstruction=result.reconstruction.normalized())
-    return Solved(normalized, global_result, choice, mended, advice, readouts)
+    return Solved(result, global_result, choice, mended, advice, readouts)
+
+
+def _fed_back(
+    matched: MatchedPhotos, result: BundleResult, options: BundleOptions, log: StageLog
+) -> tuple[BundleResult, Reconstruction]:
+    """Free keypoints of the shutter, rebuild the tracks and adjust, until the motions settle; and the last tracks."""
+    shutter_model = result.reconstruction.shutter_model
+    for number in range(1, _MAX_ROUNDS + 1):
+        stage = f"feedback {number}"
+        log.begin(stage)
+        before = result.reconstruction
+        tracks = retriangulate(matched, before)
+        options = replace(options, phi_sigma_start=result.phi_sigma)
+        result = bundle_adjust(tracks, shutter_model, options, partial(_tell, log, stage))
+        after = result.reconstruction
+        moved = np.inf if after.image_names != before.image_names else _moved_px(before, after)
+        log.end(
+            stage, points=after.num_points, observations=len(after.observations), rms_px=result.rms_px,
+            iterations=result.num_iterations, stop_reason=result.stop_reason, moved_px=moved,
+        )  # fmt: skip
+        if moved < _SETTLED_PX:
+            break
+    return result, tracks

@@ -1,0 +1,148 @@
+"""COLMAP models with their measurements, as reconstructions of ours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..bundle import reprojection_residuals
+from ..errors import FileError, FormatError
+from ..model import Observations, Reconstruction
+from .colmap import camera_from_colmap
+
+__all__ = ["ColmapModel", "colmap_model_of", "read_colmap_model"]
+
+# COLMAP's pixel centres are at 0.5, ours at 0
+_HALF = 0.5
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """A COLMAP model as a reconstruction, with the names by which COLMAP knows its parts.
+
+    Attributes
+    ----------
+    reconstruction : Reconstruction
+        Registered photos in the order of their ids, points that two of them see, and the keypoints as measurements.
+    camera_ids, image_ids, point_ids : (cameras,), (m,), (n,) int array
+        COLMAP's ids.
+    keypoint_idx : (o,) int array
+        Which keypoint of its photo each measurement is.
+    colors : (n, 3) uint8 array
+        Red, green, blue of the points.
+    unregistered : sequence of str
+        Photos without a pose.
+    """
+
+    reconstruction: Reconstruction
+    camera_ids: NDArray[np.int64]
+    image_ids: NDArray[np.int64]
+    point_ids: NDArray[np.int64]
+    keypoint_idx: NDArray[np.int64]
+    colors: NDArray[np.uint8]
+    unregistered: Sequence[str]
+
+
+def read_colmap_model(folder: Path) -> ColmapModel:
+    """The COLMAP model of a folder, text or binary.
+
+    Raises
+    ------
+    FileError, FormatError
+        When there is none, or one that cannot be taken (see `colmap_model_of`).
+    """
+    import pycolmap
+
+    pycolmap.logging.minloglevel = 3
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise FileError(f"{folder} is no folder; give the folder with cameras, images and points3D of a COLMAP model")
+    try:
+        model = pycolmap.Reconstruction(folder)
+    except Exception as error:  # pycolmap raises what its C++ raised
+        raise FileError(f"{folder} is no COLMAP model: {' '.join(str(error).split())}") from error
+    return colmap_model_of(model, str(folder))
+
+
+def colmap_model_of(model: Any, where: str = "the model") -> ColmapModel:
+    """Our reconstruction of a `pycolmap.Reconstruction`; `where` names it in errors.
+
+    A photo that a track holds twice is measured once, by the keypoint nearer to where the point projects.
+
+    Raises
+    ------
+    FormatError
+        When it has a camera of a model that is not ours, a rig of several sensors, a pose or a point that is no number,
+        fewer than two photos, or no point.
+    """
+    for rig in model.rigs.values():
+        if rig.num_sensors() > 1:
+            raise FormatError(
+                f"{where}: rig {rig.rig_id} holds {rig.num_sensors()} sensors, expected one; see docs/colmap.md"
+            )
+    camera_ids = sorted(model.cameras)
+    cameras = [camera_from_colmap(model.cameras[k], f"{where}: camera {k}") for k in camera_ids]
+    images = [model.images[k] for k in sorted(model.reg_image_ids())]
+    if len(images) < 2 or not model.num_points3D():
+        raise FormatError(
+            f"{where} holds {len(images)} registered photos and {model.num_points3D()} points, expected more"
+        )
+    poses = np.array([image.cam_from_world().matrix() for image in images])
+    point_ids = np.array(sorted(model.point3D_ids()), np.int64)
+    points_w = np.array([model.points3D[k].xyz for k in point_ids.tolist()])
+    colors = np.array([model.points3D[k].color for k in point_ids.tolist()], np.uint8)
+    for name, values in (("pose", poses), ("point", points_w)):
+        if not np.isfinite(values).all():
+            raise FormatError(f"{where} holds a {name} that is no number")
+    frame_idx, point_of, keypoint, xy = [], [], [], []
+    for i, image in enumerate(images):
+        seen = [(k, p.point3D_id, *p.xy) for k, p in enumerate(image.points2D) if p.has_point3D()]
+        frame_idx.append(np.full(len(seen), i))
+        table = np.array(seen, np.float64).reshape(-1, 4)
+        keypoint.append(table[:, 0].astype(np.int64))
+        point_of.append(np.searchsorted(point_ids, table[:, 1].astype(np.int64)))
+        xy.append(table[:, 2:] - _HALF)
+    frame, point = np.concatenate(frame_idx), np.concatenate(point_of)
+    place = {key: k for k, key in enumerate(camera_ids)}
+    R_cw = poses[:, :, :3]
+    rec = Reconstruction(
+        cameras,
+        [image.name for image in images],
+        np.array([place[image.camera_id] for image in images], np.int64),
+        R_cw,
+        -np.einsum("mji,mj->mi", R_cw, poses[:, :, 3]),
+        points_w,
+        Observations(frame, point, np.concatenate(xy)),
+    )
+    once = _once_a_photo(rec)
+    alive = rec.track_lengths(once) >= 2
+    kept = once & alive[point]
+    unregistered = sorted({image.name for image in model.images.values()} - set(rec.image_names))
+    return ColmapModel(
+        rec.with_points(once),
+        np.array(camera_ids, np.int64),
+        np.array([image.image_id for image in images], np.int64),
+        point_ids[alive],
+        np.concatenate(keypoint)[kept],
+        colors[alive],
+        tuple(unregistered),
+    )
+
+
+def _once_a_photo(rec: Reconstruction) -> NDArray[np.bool_]:
+    """(o,) measurements but those by which a photo sees a point again, farther from its projection."""
+    obs = rec.observations
+    res, valid = reprojection_residuals(rec)
+    square = np.where(valid, (res**2).sum(1), np.inf)
+    order = np.lexsort((square, obs.point_idx, obs.frame_idx))
+    pair = np.column_stack([obs.frame_idx, obs.point_idx])[order]
+    first = np.ones(len(order), bool)
+    first[1:] = (pair[1:] != pair[:-1]).any(1)
+    kept = np.zeros(len(order), bool)
+    kept[order[first]] = True
+    return kept
