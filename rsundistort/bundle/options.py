@@ -117,7 +117,7 @@ class BundleOptions:
     known_phi: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
     lengths: Sequence[KnownLength] = ()
     refine: tuple[str, ...] = ()
-    factor_limit: float = 1e11
+    factor_limit: float | None = None
     cg_tolerance: float = 0.01
 
     def __post_init__(self) -> None:
