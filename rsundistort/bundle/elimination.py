@@ -67,14 +67,14 @@ class Elimination:
     ) -> Elimination:
         """Choose between factorisation and conjugate gradients, for photos at R_cw (m, 3, 3) and center_w (m, 3).
 
-        Conjugate gradients are taken if they are expected to end before the factorisation would, or, with a limit, if
-        that takes more multiply-adds. In the first case they may take as long as the factorisation, which then solves
-        what they have not: no system takes more than twice the time of the better way.
+        Conjugate gradients are taken if they are expected to take half the time of the factorisation, or, with a limit,
+        if that takes more multiply-adds. In the first case they may take as long as the factorisation, which then
+        solves what they have not.
         """
         envelope = Envelope.smallest(structure.pattern, free)
         adds = envelope.multiply_adds
         products = 2 * _WAIT * 2 * len(structure.pattern.cols) * free.shape[1] ** 2  # of one iteration
-        if adds <= (_EXPECTED_CG * products if factor_limit is None else factor_limit):
+        if adds <= (2 * _EXPECTED_CG * products if factor_limit is None else factor_limit):
             return cls(structure, free, envelope, None, cg_tolerance, 0)
         photos = _CLUSTER
         space = CoarseSpace.of(structure.pattern, free, *poses, photos)
@@ -84,7 +84,7 @@ class Elimination:
         if factor_limit is not None:
             return cls(structure, free, envelope, space, cg_tolerance, _MAX_CG)
         iteration = products + _WAIT * 2 * space.envelope.num_values
-        worth = space.envelope.multiply_adds + _EXPECTED_CG * iteration < adds
+        worth = 2 * (space.envelope.multiply_adds + _EXPECTED_CG * iteration) < adds
         return cls(
             structure, free, envelope, space if worth else None, cg_tolerance, min(_MAX_CG, int(adds / iteration))
         )  # fmt: skip
