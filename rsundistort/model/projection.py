@@ -12,7 +12,7 @@ from .camera import Camera
 from .checks import check_array
 from .motion import RowMotion, check_shutter_model
 
-__all__ = ["ProjectionJacobians", "project_points", "project_points_with_jacobians", "unproject_points"]
+__all__ = ["ProjectionJacobians", "clock_of", "project_points", "project_points_with_jacobians", "unproject_points"]
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,12 @@ def project_points_with_jacobians(
         model, axis, sign, intr, lens, points, motion.phi, motion.velocity, xy, J_point, J_phi, J_velocity, valid
     )
     return xy, valid, ProjectionJacobians(J_point, J_phi, J_velocity)
+
+
+def clock_of(camera: Camera, xy_raw: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n,) clock r at which a camera read raw pixels (n, 2); 0 at the line of the principal point."""
+    intr, _, axis, sign = camera.kernel_args
+    return np.asarray(sign * (xy_raw[:, axis] - intr[2 + axis]) / intr[axis])
 
 
 def unproject_points(
