@@ -68,7 +68,37 @@ if TYPE_CHECKING:
     metavar="CSV",
     help="Lengths measured in the scene, two or more: photo1, x1, y1, photo2, x2, y2, length, sigma.",
 )
-@click.option("--readout-ms", type=click.FloatRange(min=0, min_open=True), help="Time of the readout, for rad/s.")
+@click.option(
+    "--readout-ms",
+    type=click.FloatRange(min=0, min_open=True),
+    help="Time of the readout of a frame. Default: the gyroscope's log, or a table of cameras.",
+)
+@click.option("--every", type=click.IntRange(min=1), metavar="N", help="Of a video: the photos are each N-th frame,")
+@click.option("--sharpest", type=click.IntRange(min=1), metavar="N", help="or the sharpest of each N frames.")
+@click.option(
+    "--gyro",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    metavar="FILE",
+    help="A gyroscope's log: CSV with time_s, wx, wy, wz in rad/s, or Gyroflow's .gcsv.",
+)
+@click.option(
+    "--gyro-offset",
+    type=float,
+    default=0.0,
+    metavar="S",
+    help="Seconds that the gyroscope's clock shows when the camera's shows zero.",
+)
+@click.option(
+    "--gyro-axes",
+    metavar="XYZ",
+    help="Axes of the gyroscope that point right, down and ahead in the stored pixels; small letters are reversed.",
+)
+@click.option(
+    "--photo-times",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    metavar="CSV",
+    help="When photos were taken, for --gyro: name, time_s. Default: frames.csv among them.",
+)
 @click.option(
     "--remedy",
     type=click.Choice(("auto", "prior", "none")),
@@ -86,6 +116,10 @@ if TYPE_CHECKING:
 )
 @opt.interpolation_option
 @opt.quality_option
+@opt.raw_as_option
+@opt.apply_orientation_option
+@opt.again_option
+@opt.max_pixels_option
 @opt.seed_option
 @opt.jobs_option
 @opt.overwrite_option
@@ -102,10 +136,20 @@ def command(
     known: Path | None,
     lengths: Path | None,
     readout_ms: float | None,
+    every: int | None,
+    sharpest: int | None,
+    gyro: Path | None,
+    gyro_offset: float,
+    gyro_axes: str | None,
+    photo_times: Path | None,
     remedy: str,
     max_features: int,
     interpolation: str,
     quality: int,
+    raw_as: str,
+    apply_orientation: bool,
+    again: bool,
+    max_megapixels: float,
     seed: int,
     jobs: int,
     overwrite: bool,
@@ -113,13 +157,14 @@ def command(
 ) -> None:
     """Find how the camera moved during each photo's readout, and take it out.
 
-    PHOTOS is a folder of photos that one camera took of one scene, in any order. OUT gets images/, masks/,
-    sparse/ (COLMAP), transforms.json (nerfstudio) and solution.json.
+    PHOTOS is a folder of photos that one camera took of one scene, in any order, or a video. OUT gets images/, masks/,
+    sparse/ (COLMAP), transforms.json (nerfstudio) and solution.json; of a video frames/, too.
     """
     with errors_for_people(), progress_bars(quiet) as progress:
         from rsundistort.io import read_known_lengths, read_known_motions
-        from rsundistort.pipeline import RunOptions, run
+        from rsundistort.pipeline import GyroOptions, RunOptions, run
 
+        readout_s = readout_ms and readout_ms / 1e3
         solution = run(
             photos,
             out,
@@ -133,11 +178,19 @@ def command(
                 max_features=max_features,
                 interpolation=interpolation,
                 quality=quality,
+                raw_as=raw_as,
+                apply_orientation=apply_orientation,
+                again=again,
+                max_megapixels=max_megapixels,
                 refine=_names(refine),
                 still=_anchors(still),
-                known={} if known is None else read_known_motions(known, readout_ms and readout_ms / 1e3),
+                known={} if known is None else read_known_motions(known, readout_s),
                 lengths=() if lengths is None else read_known_lengths(lengths),
                 remedy=remedy,
+                every=every,
+                sharpest=sharpest,
+                gyro=None if gyro is None else GyroOptions(gyro, gyro_offset, gyro_axes, photo_times),
+                readout_s=readout_s,
                 overwrite=overwrite,
             ),
             progress,
@@ -203,7 +256,9 @@ def closing_table(solution: Solution, out: Path) -> str:
         f"shutter model      {solution.shutter_model}",
         *_held_out(quality["held_out_rms_px"]),
         *_cameras(solution),
+        *_video(solution),
         *_intrinsics(solution),
+        *_readout(solution),
         f"rms residual       {quality['global_rms_px']:.2f} px with a global shutter, {quality['rms_px']:.2f} px now",
         f"outputs            {out}  ({total:.0f} s)",
     ]
@@ -227,11 +282,14 @@ def closing_table(solution: Solution, out: Path) -> str:
 
 
 def _cameras(solution: Solution) -> list[str]:
-    """Where the cameras come from and which way they are read out; a line on each group where there are several."""
+    """Where the cameras come from, which way they are read out by group where they differ, and what was guessed."""
     source, readout = solution.options["camera"], solution.options["readout"]
     if isinstance(readout, str):
-        return [f"camera             {source}, readout {readout}"]
-    return [f"cameras            {source}", *(f"  {group}: readout {each}" for group, each in readout.items())]
+        lines = [f"camera             {source}, readout {readout}"]
+    else:
+        lines = [f"cameras            {source}", *(f"  {group}: readout {each}" for group, each in readout.items())]
+    guesses = solution.options.get("guesses", ())
+    return lines + [f"  {line}" for text in guesses for line in textwrap.wrap(text, 78)]
 
 
 def _intrinsics(solution: Solution) -> list[str]:
@@ -253,6 +311,36 @@ def _intrinsics(solution: Solution) -> list[str]:
         ]
         lines += [f"{'refined' if i == 0 else '':19}{', '.join(found[i : i + 3])}" for i in range(0, len(found), 3)]
     return lines
+
+
+def _video(solution: Solution) -> list[str]:
+    """A line on the video whose frames the photos are."""
+    video = solution.options.get("video")
+    if not video:
+        return []
+    turned = {3: 180, 6: 90, 8: 270}.get(video["orientation"])
+    said = f", players turn them by {turned} degrees clockwise, the files do not" if turned else ""
+    return [f"video              {len(solution.images)} of {video['frames']} frames{said}"]
+
+
+def _readout(solution: Solution) -> list[str]:
+    """Lines on how fast the photos turned, where the time of the readout is known."""
+    times = solution.quality.get("readout_times") or {}
+    rates = sorted(
+        float((image.motion.phi**2).sum() ** 0.5)
+        * solution.cameras[image.camera_id].frame_span
+        / times[image.camera_id]["ms"]
+        * 57295.77951308232
+        for image in solution.registered
+        if image.motion is not None and image.camera_id in times
+    )
+    if not rates:
+        return []
+    said = dict.fromkeys(f"{time['ms']:g} ms ({time['source']})" for time in times.values())
+    return [
+        f"rates of turn      median {rates[len(rates) // 2]:.1f}, largest {rates[-1]:.1f} deg/s, by a readout of",
+        *(f"{'':19}{each}" for each in said),
+    ]
 
 
 def _held_out(rms_px: Mapping[str, float]) -> list[str]:

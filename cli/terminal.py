@@ -21,8 +21,9 @@ def errors_for_people(kept: str = "nothing was written") -> Iterator[None]:
 
     from rsundistort.errors import RsUndistortError
 
-    # OpenCV's and libtiff's own lines about broken files: ours say it once, with the name
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    # OpenCV's and libtiff's own lines about broken files: ours say it once, with the name. 0 is silent; the function's
+    # place is OpenCV 4's, or 5's
+    (cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel)(0)
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
         click.echo(f"warning: {message}", err=True)

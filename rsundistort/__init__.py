@@ -14,6 +14,7 @@ from .bundle import BundleOptions, BundleResult, bundle_adjust, climb
 from .critical import CriticalMotion, critical_motion
 from .errors import (
     FileError,
+    FileKindWarning,
     FormatError,
     InputError,
     MetadataWarning,
@@ -27,6 +28,7 @@ from .io import read_solution, write_solution
 from .model import AtInfinity, Camera, DepthMap, Observations, Plane, Reconstruction, RowMotion, Solution, SolvedImage
 from .model.projection import project_points, unproject_points
 from .pipeline import (
+    GyroOptions,
     RunOptions,
     SceneOptions,
     WarpOptions,
@@ -56,7 +58,9 @@ __all__ = [
     "CriticalMotion",
     "DepthMap",
     "FileError",
+    "FileKindWarning",
     "FormatError",
+    "GyroOptions",
     "InputError",
     "MetadataWarning",
     "Observations",

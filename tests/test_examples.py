@@ -8,6 +8,7 @@ import pytest
 MODULES = (
     "rsundistort",
     "rsundistort.io.groups",
+    "rsundistort.io.readout_times",
     "rsundistort.model.camera",
     "rsundistort.model.motion",
     "rsundistort.model.projection",

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import zlib
 
+import cv2
+import numpy as np
 import pytest
 
 ROUND_TRIP = """
 import sys
 from pathlib import Path
 import numpy as np
-from rsundistort.io import read_photo, write_image
+from rsundistort.io import Metadata, read_photo, write_image
 for dtype in (np.uint8, np.uint16):
     for shape in ((300, 400), (300, 400, 3)):
         pixels = np.random.default_rng(0).integers(0, np.iinfo(dtype).max + 1, shape, dtype=dtype)
@@ -20,6 +23,14 @@ for dtype in (np.uint8, np.uint16):
         write_image(path, pixels)
         back = read_photo(path).pixels
         assert back.dtype == dtype and np.array_equal(back, pixels)
+metadata = Metadata(b"II*\\0\\x08\\0\\0\\0" + bytes(6), b"<x/>", bytes(16) + b"RGB " + bytes(70000))
+write_image(path, pixels, metadata)
+assert read_photo(path).metadata == metadata
+import struct
+profile = b"iCCPp\\0\\0" + PROFILE
+data = SMALL
+path.write_bytes(data[:33] + struct.pack(">I", len(profile) - 4) + profile + bytes(4) + data[33:])
+assert read_photo(path).metadata.icc == bytes(70000)  # inflated
 print("done")
 """
 
@@ -36,8 +47,11 @@ print("done")
     ids=lambda text: text.replace("import ", "").replace("\n", "-"),
 )
 def test_png_is_written_whoever_comes_first(tmp_path, first):
+    # compressed here, since the process may not be able to
+    small = bytes(cv2.imencode(".png", np.zeros((2, 2), np.uint8))[1])
+    given = f"\nSMALL = {small!r}\nPROFILE = {zlib.compress(bytes(70000))!r}\n"
     done = subprocess.run(
-        [sys.executable, "-c", first + ROUND_TRIP, str(tmp_path)],
+        [sys.executable, "-c", first + given + ROUND_TRIP, str(tmp_path)],
         capture_output=True,
         text=True,
         timeout=120,

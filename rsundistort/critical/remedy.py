@@ -58,7 +58,9 @@ class Remedy:
         if self.name == "none needed":
             return left
         was = f"+-{100 * self.before.sigma_log_k:.1f} %"
-        names = ", ".join(self.anchors)
+        names = ", ".join([*self.anchors][:3])
+        if len(self.anchors) > 3:
+            names = f"{names} and {len(self.anchors) - 3} more"
         return {
             "anchor": f"{names} most likely did not move and holds the height of the scene ({was} without it); {left}",
             "prior": f"no photo is taken to be still, the motions to be zero in the mean; {left}",

@@ -4,26 +4,39 @@ from .cameras import CameraFile, check_camera_fits, parse_camera, read_camera_fi
 from .colmap import read_colmap_cameras, read_colmap_poses, write_colmap_model
 from .exif_facts import ExifFacts, camera_from_exif, facts_of_exif, focal_from_exif, read_exif
 from .groups import group_of, guess_readouts
-from .images import Photo, list_photos, output_name, read_photo, write_image
+from .gyro import GyroLog, gyro_offset, motions_from_gyro, read_gyro, read_photo_times
+from .images import MAX_MEGAPIXELS, RAW_AS, Photo, list_photos, output_name, read_photo, write_image
 from .lengths import read_known_lengths
 from .masks import find_masks, read_mask
+from .metadata import Metadata
 from .motions import read_known_motions
 from .nerfstudio import read_transforms, write_transforms
 from .outputs import output_folder
+from .readout_times import readout_time
 from .solution import read_solution, write_solution
+from .video import VideoFrames, extract_frames, is_video
 
 __all__ = [
+    "MAX_MEGAPIXELS",
+    "RAW_AS",
     "CameraFile",
     "ExifFacts",
+    "GyroLog",
+    "Metadata",
     "Photo",
+    "VideoFrames",
     "camera_from_exif",
     "check_camera_fits",
+    "extract_frames",
     "facts_of_exif",
     "find_masks",
     "focal_from_exif",
     "group_of",
     "guess_readouts",
+    "gyro_offset",
+    "is_video",
     "list_photos",
+    "motions_from_gyro",
     "output_folder",
     "output_name",
     "parse_camera",
@@ -31,12 +44,15 @@ __all__ = [
     "read_colmap_cameras",
     "read_colmap_poses",
     "read_exif",
+    "read_gyro",
     "read_known_lengths",
     "read_known_motions",
     "read_mask",
     "read_photo",
+    "read_photo_times",
     "read_solution",
     "read_transforms",
+    "readout_time",
     "write_colmap_model",
     "write_image",
     "write_solution",

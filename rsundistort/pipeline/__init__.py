@@ -3,11 +3,13 @@
 from .analyze import analyze
 from .batch import rectify_folder
 from .evaluate import evaluate
+from .gyro import GyroOptions
 from .run import RunOptions, run, use_threads, versions
 from .scene import SceneOptions, simulate_scene
 from .simulate import WarpOptions, read_motion_file, simulate_warp
 
 __all__ = [
+    "GyroOptions",
     "RunOptions",
     "SceneOptions",
     "WarpOptions",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import tempfile
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
@@ -18,15 +19,27 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..bundle import BundleOptions, GuessedCameras, KnownLength, reprojection_residuals
 from ..critical import with_remedy
-from ..errors import InputError
-from ..io import output_folder, output_name, write_colmap_model, write_solution, write_transforms
+from ..errors import InputError, RsUndistortWarning
+from ..io import (
+    MAX_MEGAPIXELS,
+    RAW_AS,
+    output_folder,
+    output_name,
+    write_colmap_model,
+    write_solution,
+    write_transforms,
+)
+from ..io.motions import Known
 from ..model import READOUTS, Reconstruction, Solution, SolvedImage, check_shutter_model
+from ..model.orientation import turn_reconstruction, turn_solution
 from ..rectify import INTERPOLATIONS, largest_shift_px
 from .cameras import PhotoCameras, check_readouts
+from .frames import find_photos
+from .gyro import GyroOptions, gyro_contradiction, gyro_motions, known_readouts
 from .load import LoadedPhotos, load_photos
 from .progress import ProgressCallback, StageLog
 from .solve import Solved, solve_photos
-from .write import PointColors, mask_names, rectify_photos
+from .write import PointColors, mask_names, rectify_photos, turn_of
 
 __all__ = ["RunOptions", "run", "use_threads", "versions"]
 
@@ -62,6 +75,15 @@ class RunOptions:
         Per photo.
     interpolation, quality
         Of the rectified photos.
+    raw_as : {"tif", "jpg", "png"}
+        What RAW and HEIC are written as: 16 bit, but for jpg.
+    apply_orientation : bool
+        Turn the rectified photos, their masks, cameras and poses by the EXIF orientation, which then is 1. Photos that
+        it mirrors are turned only, and keep the mirror as their orientation: no camera takes a mirror image.
+    again : bool
+        Take photos that are rectified already.
+    max_megapixels : float
+        Photos with more pixels are left out before they are decoded.
     refine : tuple of str, optional
         Intrinsics that are solved for with the rest, as in `BundleOptions`; by default none where the camera is given,
         f, k1 and k2 where EXIF had to guess it.
@@ -74,6 +96,12 @@ class RunOptions:
         Lengths measured in the scene, as in `BundleOptions.lengths`.
     remedy : str
         What to do about a critical motion: "auto", "prior" or "none"; see `critical.heal`.
+    every, sharpest : int, optional
+        Of a video: each N-th frame, or the sharpest of each N frames, as in `io.extract_frames`.
+    gyro : GyroOptions, optional
+        A gyroscope's log, for the motions that are neither `known` nor those of `still` photos.
+    readout_s : float, optional
+        Time of the readout of a frame; else the log's, else that of the camera in the table, if it is there.
     overwrite : bool
         Replace the outputs of an earlier run.
     """
@@ -87,11 +115,19 @@ class RunOptions:
     max_features: int = 16384
     interpolation: str = "cubic"
     quality: int = 98
+    raw_as: str = "tif"
+    apply_orientation: bool = False
+    again: bool = False
+    max_megapixels: float = MAX_MEGAPIXELS
     refine: tuple[str, ...] | None = None
     still: Mapping[str, float] = field(default_factory=dict)
     known: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
     lengths: Sequence[KnownLength] = ()
     remedy: str = "auto"
+    every: int | None = None
+    sharpest: int | None = None
+    gyro: GyroOptions | None = None
+    readout_s: float | None = None
     overwrite: bool = False
 
     def __post_init__(self) -> None:
@@ -101,8 +137,12 @@ class RunOptions:
         with_remedy(self.bundle_options(), self.remedy)
         if self.interpolation not in INTERPOLATIONS:
             raise InputError(f"interpolation={self.interpolation!r}, expected one of {', '.join(INTERPOLATIONS)}")
+        if self.raw_as not in RAW_AS:
+            raise InputError(f"raw_as={self.raw_as!r}, expected one of {', '.join(RAW_AS)}")
         if self.jobs < 0 or self.max_features < 100 or not 1 <= self.quality <= 100:
             raise InputError("jobs must be 0 or more, max_features at least 100, quality 1 to 100")
+        if self.readout_s is not None and not 0 < self.readout_s < np.inf:
+            raise InputError(f"readout_s={self.readout_s!r}, expected a positive number of seconds")
 
     def bundle_options(self, readout: Mapping[str, str] | None = None) -> BundleOptions:
         """Options of the adjustments of photos with these readout directions, top-to-bottom where none is named."""
@@ -158,7 +198,7 @@ def run(
     Parameters
     ----------
     photos : path
-        Folder of photos of one camera.
+        Folder of photos of one camera, or a video, whose frames go to `out/frames`.
     out : path
         Folder for the outputs; it gets all of them or stays as it was.
     options : RunOptions, optional
@@ -176,34 +216,57 @@ def run(
     log = StageLog(progress)
     jobs = use_threads(options.jobs)
     with output_folder(out, overwrite=options.overwrite, apart_from=[photos]) as scratch:
+        gyro_log = None if options.gyro is None else options.gyro.log()
+        source = find_photos(photos, scratch, options.camera, options.every, options.sharpest, log)
+        folder = source.folder
         loaded = load_photos(
-            photos, options.camera, options.readout, options.max_features, jobs, log, options.masks
+            folder, source.camera, options.readout, options.max_features, jobs, log, options.masks,
+            options.raw_as, options.again, options.max_megapixels,
+        )  # fmt: skip
+        cameras = loaded.cameras
+        readouts = known_readouts(
+            folder, loaded.names, cameras.cameras, cameras.camera_idx, source.frames, options.readout_s, gyro_log
         )  # fmt: skip
         ends = (end[0] for each in options.lengths for end in (each.start, each.end))
         for name in (*options.still, *options.known, *ends):
             if name not in loaded.names:
                 raise InputError(f"anchor {name!r} is not among the photos of {photos}")
+        from_gyro: Known = {}
+        if options.gyro is not None and gyro_log is not None:
+            times = [readouts[k][0] if k in readouts else None for k in cameras.camera_idx.tolist()]
+            motions = gyro_motions(folder, options.gyro, gyro_log, dict(zip(loaded.names, times, strict=True)))
+            from_gyro = {k: v for k, v in motions.items() if k not in options.known and k not in options.still}
+            options = replace(options, known={**options.known, **from_gyro})
         with tempfile.TemporaryDirectory() as work:
             solved = solve_photos(
-                loaded, options.shutter_model, options.seed, lambda rec: options.options_for(rec, loaded.cameras),
+                loaded, options.shutter_model, options.seed, lambda rec: options.options_for(rec, cameras),
                 Path(work), log, options.remedy,
             )  # fmt: skip
         rec = solved.result.reconstruction
-        solution = _solution(loaded, solved, options)
+        if contradiction := gyro_contradiction(rec, from_gyro):
+            warnings.warn(contradiction, RsUndistortWarning, stacklevel=2)
+        solution = _solution(loaded, solved, options, readouts, source.video)
         colors = PointColors(rec)
         rectified = rectify_photos(
-            photos, solution, list(rec.image_names), scratch,
+            folder, solution, list(rec.image_names), scratch,
             interpolation=options.interpolation, quality=options.quality, jobs=jobs, log=log,
-            masks=options.masks,
+            masks=options.masks, raw_as=options.raw_as, apply_orientation=options.apply_orientation,
+            max_megapixels=options.max_megapixels,
         )  # fmt: skip
+        turns: dict[str, int] = {}
         for name, photo in rectified:
             colors.add(name, photo)
+            turns[name] = turn_of(solution.image(name), photo)[0]
         log.begin("writing")
-        names = [output_name(name) for name in rec.image_names]
-        cameras = [solution.rectified_cameras[str(k + 1)] for k in range(len(rec.cameras))]
-        write_colmap_model(scratch / "sparse", rec, cameras, names, colors.rgb())
+        if options.apply_orientation:
+            solution, rec = turn_solution(solution, turns), turn_reconstruction(rec, turns)
+        names = [output_name(name, options.raw_as) for name in rec.image_names]
+        new_cameras = [solution.rectified_cameras[str(k + 1)] for k in range(len(rec.cameras))]
+        write_colmap_model(scratch / "sparse", rec, new_cameras, names, colors.rgb())
         masks = mask_names([image.name for image in solution.images])
-        files = {name: (f"images/{output_name(name)}", f"masks/{masks[name]}") for name in rec.image_names}
+        files = {
+            name: (f"images/{output_name(name, options.raw_as)}", f"masks/{masks[name]}") for name in rec.image_names
+        }
         write_transforms(scratch / "transforms.json", solution, files)
         log.end("writing")
         solution = replace(solution, stages=tuple(log.stages))
@@ -215,6 +278,20 @@ def _readouts(rec: Reconstruction, cameras: PhotoCameras) -> str | dict[str, str
     """Direction of the readout of all cameras, or by group where they differ."""
     directions = {label: camera.readout for label, camera in zip(cameras.labels, rec.cameras, strict=True)}
     return rec.cameras[0].readout if len(set(directions.values())) == 1 else directions
+
+
+def _guesses(solved: Solved, cameras: PhotoCameras) -> list[str]:
+    """What was guessed of the cameras, and what the photos said of it, for people."""
+    choice = solved.readouts
+    found = [] if choice is None else choice.turned
+    said = [] if found else list(cameras.notes)
+    for k in found:
+        assert choice is not None
+        said.append(
+            f"{cameras.labels[k]} fits better as read out {choice.reconstruction.cameras[k].readout} "
+            f"(by {choice.gain[k]:.0f} standard errors); --readout settles it"
+        )
+    return said
 
 
 def _image_rms(rec: Reconstruction) -> NDArray[np.float64]:
@@ -248,7 +325,13 @@ def _critical(solved: Solved) -> dict[str, Any]:
     }
 
 
-def _solution(loaded: LoadedPhotos, solved: Solved, options: RunOptions) -> Solution:
+def _solution(
+    loaded: LoadedPhotos,
+    solved: Solved,
+    options: RunOptions,
+    readouts: Mapping[int, tuple[float, str]],
+    video: dict[str, Any] | None,
+) -> Solution:
     """The solution of an adjusted reconstruction, with every photo of the folder in it."""
     rec = solved.result.reconstruction
     rms = _image_rms(rec)
@@ -284,6 +367,7 @@ def _solution(loaded: LoadedPhotos, solved: Solved, options: RunOptions) -> Solu
         "sigma_intrinsics": dict(zip(cameras, solved.result.sigma_intrinsics, strict=True)),
         "phi_sigma_rad_per_frame": solved.result.phi_sigma,
         "stop_reason": solved.result.stop_reason,
+        "readout_times": {str(k + 1): {"ms": 1e3 * s, "source": source} for k, (s, source) in readouts.items()},
     }
     return Solution(
         shutter_model=rec.shutter_model,
@@ -297,15 +381,19 @@ def _solution(loaded: LoadedPhotos, solved: Solved, options: RunOptions) -> Solu
             "camera": loaded.cameras.source,
             "shutter_model": options.shutter_model,
             "readout": _readouts(rec, loaded.cameras),
+            "guesses": _guesses(solved, loaded.cameras),
             "seed": options.seed,
             "max_features": options.max_features,
             "interpolation": options.interpolation,
             "quality": options.quality,
+            "raw_as": options.raw_as,
             "refine": list(solved.result.sigma_intrinsics[0]),
             "still": dict(options.still),
             "known": sorted(options.known),
             "lengths": len(options.lengths),
             "remedy": options.remedy,
+            "video": video,
+            "gyro": options.gyro and options.gyro.facts(),
         },
         generator=versions(),
     )

@@ -25,6 +25,7 @@ INTERPOLATIONS: dict[str, int] = {
 }
 
 _STRIP_ROWS = 64
+_MAX_SIDE = 32766  # cv2.remap counts in 16 bits
 
 
 def rectify(
@@ -76,6 +77,10 @@ def rectify(
         )
     if mask is not None and (mask.dtype != np.uint8 or mask.shape != photo.shape[:2]):
         raise InputError(f"mask is {mask.dtype} {mask.shape}, expected uint8 {photo.shape[:2]}")
+    if max(photo.shape[:2]) > _MAX_SIDE:
+        raise InputError(
+            f"photo has {photo.shape[1]}x{photo.shape[0]} pixels, and OpenCV rectifies sides up to {_MAX_SIDE}"
+        )
     if interpolation not in INTERPOLATIONS:
         raise InputError(f"interpolation={interpolation!r}, expected one of {', '.join(INTERPOLATIONS)}")
     target = new_camera or camera.pinhole()

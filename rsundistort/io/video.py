@@ -1,0 +1,304 @@
+"""Frames of a video as photos, with the times at which they were taken."""
+
+from __future__ import annotations
+
+import csv
+import struct
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FileError, InputError, RsUndistortError, RsUndistortWarning
+from .exif import ORIENTATION, pack_ifd
+from .images import write_image
+from .metadata import Metadata
+from .outputs import output_folder
+
+__all__ = ["FRAME_TABLE", "VIDEO_SUFFIXES", "VideoFrames", "extract_frames", "is_video"]
+
+VIDEO_SUFFIXES = (
+    ".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".3gp", ".wmv", ".h264",
+)  # fmt: skip
+
+#: Table that lies beside the frames.
+FRAME_TABLE = "frames.csv"
+
+# longer side in pixels of the picture whose sharpness is measured: motion blur shows, noise of single pixels does not
+_MEASURED_PX = 960
+# EXIF orientation that shows a frame as its display matrix asks, by the angle counterclockwise
+_ORIENTATIONS = {0: 1, -90: 6, 90: 8, 180: 3, -180: 3}
+_ATTACHED_PICTURE = 1024  # FFmpeg's AV_DISPOSITION_ATTACHED_PIC
+_MAKE = ("make", "com.apple.quicktime.make", "com.android.manufacturer")
+_MODEL = ("model", "com.apple.quicktime.model", "com.android.model")
+
+
+@dataclass(frozen=True)
+class VideoFrames:
+    """Frames that were taken from a video.
+
+    Attributes
+    ----------
+    names : tuple of str
+        PNG files, in the order of the video.
+    time_s : (m,) array
+        When each was taken, seconds since the first frame of the video; NaN where the video holds no times.
+    num_frames : int
+        Whole frames of the video.
+    num_damaged : int
+        Frames that were passed over because they, or what they build on, could not be decoded; a decoder may have kept
+        others to itself.
+    orientation : int
+        EXIF orientation, which players apply and the frames do not: they are as the sensor stored them.
+    make, model : str
+        Camera, where the video names it; else empty.
+    """
+
+    names: tuple[str, ...]
+    time_s: NDArray[np.float64]
+    num_frames: int
+    num_damaged: int
+    orientation: int
+    make: str
+    model: str
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A decoded frame that may become a photo; `picture` is PyAV's."""
+
+    number: int
+    time_s: float
+    sharpness: float
+    picture: Any
+
+
+def is_video(path: Path) -> bool:
+    """Whether a path is a file with the ending of a video."""
+    return Path(path).suffix.lower() in VIDEO_SUFFIXES and Path(path).is_file()
+
+
+def extract_frames(
+    video: Path | str,
+    folder: Path | str,
+    *,
+    every: int | None = None,
+    sharpest: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> VideoFrames:
+    """Write frames of a video as PNG files, in the stored pixels, and `frames.csv` with their times.
+
+    Parameters
+    ----------
+    video : path
+        Any file that FFmpeg decodes. One frame is held in memory at a time.
+    folder : path
+        Made if missing, must be empty; it gets all frames or stays as it was. `frames.csv` has the columns `name`,
+        `frame` (number among those that could be decoded, from 0), `time_s` (seconds since the first frame; empty where
+        the video holds no times) and `sharpness` (variance of the Laplacian, grey levels squared, of the frame reduced
+        to at most 960 pixels).
+    every : int
+        Take each frame whose number is a multiple of this; if it is damaged, the next whole one.
+    sharpest : int
+        Take the sharpest of each so many frames. Give this or `every`.
+    progress : callable, optional
+        Called with the number of frames read, and of all, 0 where that is not known.
+
+    Returns
+    -------
+    VideoFrames
+        Names and times. A display matrix (a phone held upright) is not applied; it is written as the EXIF orientation,
+        with make and model, where OpenCV can write EXIF.
+
+    Raises
+    ------
+    InputError
+        Neither or both of `every` and `sharpest`, or PyAV is missing.
+    FileError
+        No video, or not a whole frame in it. A video that is cut short, or damaged in places, gives the frames that it
+        has, with a warning.
+    """
+    video = Path(video)
+    if (every is None) == (sharpest is None):
+        raise InputError(
+            f"{video.name} is a video: say which frames are the photos, --every N or --sharpest N (of each N frames)"
+        )
+    group = every or sharpest or 0
+    if group < 1:
+        raise InputError(f"every {group} frames: expected 1 or more")
+    try:
+        import av
+    except ImportError:
+        raise InputError(f'{video.name} is a video, which needs PyAV: pip install "rsundistort[video]"') from None
+    with output_folder(Path(folder)) as scratch:
+        try:
+            # a name with a colon is no protocol, and a file that refers to others must not fetch them
+            with av.open(f"file:{video}", options={"protocol_whitelist": "file"}) as container:
+                return _extract(container, video, scratch, group, measure=sharpest is not None, progress=progress)
+        except (OSError, av.error.FFmpegError) as error:
+            if isinstance(error, RsUndistortError):
+                raise
+            raise FileError(
+                f"{video} cannot be read as a video ({error.strerror}); if it was cut short while being recorded, "
+                "repair it or copy it again"
+            ) from error
+
+
+def _extract(
+    container: Any,
+    video: Path,
+    folder: Path,
+    group: int,
+    *,
+    measure: bool,
+    progress: Callable[[int, int], None] | None,
+) -> VideoFrames:
+    # a cover picture is a video stream, too
+    stream = next((s for s in container.streams.video if not int(s.disposition) & _ATTACHED_PICTURE), None)
+    if stream is None:
+        raise FileError(f"{video} holds no pictures")
+    tags = {key.lower(): value for key, value in (*container.metadata.items(), *stream.metadata.items())}
+    make, model = (next((tags[key].strip() for key in keys if tags.get(key)), "") for keys in (_MAKE, _MODEL))
+    decoded = _Decoded(stream)
+    rows: list[_Frame] = []
+    names: list[str] = []
+    orientation = 1
+    best: _Frame | None = None
+
+    def keep(frame: _Frame) -> None:
+        nonlocal orientation
+        orientation = _ORIENTATIONS.get(frame.picture.rotation, 1)
+        names.append(f"{video.stem}_{frame.number:06d}.png")
+        write_image(folder / names[-1], _pixels(frame.picture), _metadata(orientation, make, model))
+        rows.append(_Frame(frame.number, frame.time_s, frame.sharpness, None))
+
+    for number, time_s, picture in decoded:
+        if progress is not None:
+            progress(number + 1, stream.frames)
+        if best is not None and number // group > best.number // group:
+            keep(best)
+            best = None
+        if measure or best is None:
+            frame = _Frame(number, time_s, _sharpness(picture), picture)
+            best = frame if best is None or frame.sharpness > best.sharpness else best
+    if best is not None:
+        keep(best)
+    if not rows:
+        raise FileError(f"{video} holds no whole frame; copy it again from the camera")
+    decoded.warn(video.name)
+    with (folder / FRAME_TABLE).open("w", encoding="utf-8", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(["name", "frame", "time_s", "sharpness"])
+        for name, row in zip(names, rows, strict=True):
+            time = f"{row.time_s:.6f}" if np.isfinite(row.time_s) else ""
+            table.writerow([name, row.number, time, f"{row.sharpness:.2f}"])
+    times = np.array([row.time_s for row in rows])
+    return VideoFrames(tuple(names), times, decoded.num_whole, decoded.num_damaged, orientation, make, model)
+
+
+class _Decoded:
+    """Whole frames of a stream in the order of presentation, each as (number, time_s, picture).
+
+    A frame that cannot be decoded is concealed by the decoder, and those that build on it inherit the fault: all up to
+    the next whole key frame are passed over.
+    """
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+        self.num_whole = 0
+        self.num_damaged = 0
+        self._interlaced = False
+        self._timeless = 0
+        self._broken = ""
+        self._end_s = 0.0
+
+    def __iter__(self) -> Iterator[tuple[int, float, Any]]:
+        first: float | None = None
+        previous = np.nan
+        step = float(1 / self._stream.average_rate) if self._stream.average_rate else np.nan
+        damaged = False
+        for number, picture in enumerate(self._pictures()):
+            damaged = picture is None or picture.is_corrupt or (damaged and not picture.key_frame)
+            if picture is not None and picture.time is not None:
+                first = picture.time if first is None else first
+                time_s = picture.time - first
+            else:
+                time_s = previous + step  # NaN until a frame has a time
+            previous = time_s
+            self._end_s = max(self._end_s, time_s + step) if np.isfinite(time_s + step) else self._end_s
+            if damaged:
+                self.num_damaged += 1
+                continue
+            self.num_whole += 1
+            self._interlaced |= picture.interlaced_frame
+            self._timeless += picture.time is None
+            yield number, time_s, picture
+
+    def _pictures(self) -> Iterator[Any]:
+        """Decoded frames; None for one that could not be."""
+        import av
+
+        self._stream.thread_type = "SLICE"  # threads that take a frame each lose the faults of the last ones
+        packets = self._stream.container.demux(self._stream)
+        while True:
+            try:
+                packet = next(packets)
+            except StopIteration:
+                return
+            except av.error.FFmpegError as error:
+                self._broken = error.strerror
+                packet = None  # what the decoder still holds
+            try:
+                yield from self._stream.codec_context.decode(packet)
+            except av.error.FFmpegError:
+                yield None
+            if packet is None:
+                return
+
+    def warn(self, name: str) -> None:
+        """Say what was wrong with the video."""
+        said = []
+        if self.num_damaged:
+            said.append(f"{self.num_damaged} frames or more are damaged and were left out")
+        length = self._stream.duration and float(self._stream.duration * self._stream.time_base)
+        if length is None and self._stream.container.duration is not None:
+            length = self._stream.container.duration / 1e6
+        # containers round, and count the sound that goes on after the last frame
+        if self._broken or (length and self._end_s and self._end_s < length - max(0.5, 0.02 * length)):
+            said.append(f"it ends at {self._end_s:.1f} s{f' of {length:.1f} s' if length else ''}")
+        if self._interlaced:
+            said.append("it is interlaced: each frame holds two moments, which no shutter model describes")
+        if self._timeless:
+            said.append(f"{self._timeless} frames have no time of their own")
+        if said:
+            warnings.warn(f"{name}: {'; '.join(said)}", RsUndistortWarning, stacklevel=4)
+
+
+def _pixels(picture: Any) -> NDArray[Any]:
+    """(h, w, 3) BGR, 8 bit, or 16 bit where the video has more than eight."""
+    if max(component.bits for component in picture.format.components) > 8:
+        deep: NDArray[Any] = picture.to_ndarray(format="rgb48le")
+        return np.ascontiguousarray(deep[..., ::-1])
+    pixels: NDArray[Any] = picture.to_ndarray(format="bgr24")
+    return pixels
+
+
+def _sharpness(picture: Any) -> float:
+    """Variance of the Laplacian of the reduced grey frame."""
+    scale = min(1.0, _MEASURED_PX / max(picture.width, picture.height))
+    width, height = (max(2, round(scale * side)) for side in (picture.width, picture.height))
+    grey = picture.to_ndarray(format="gray", width=width, height=height)
+    return float(cv2.Laplacian(grey, cv2.CV_32F).var())
+
+
+def _metadata(orientation: int, make: str, model: str) -> Metadata:
+    """EXIF with the orientation, and make and model if known."""
+    texts = [(tag, text.encode("ascii", "replace") + b"\0") for tag, text in ((0x010F, make), (0x0110, model)) if text]
+    entries: list[tuple[int, int, int, bytes | int]] = [(tag, 2, len(text), text) for tag, text in texts]
+    entries.append((ORIENTATION, 3, 1, struct.pack("<H", orientation)))
+    return Metadata(exif=b"II*\0" + struct.pack("<I", 8) + pack_ifd("<", entries, 8))

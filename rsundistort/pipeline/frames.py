@@ -1,0 +1,71 @@
+"""The photos of a run: a folder, or frames of a video."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from ..io.video import VideoFrames, extract_frames, is_video
+from .progress import StageLog
+
+__all__ = ["PhotoSource", "find_photos"]
+
+
+@dataclass(frozen=True)
+class PhotoSource:
+    """Where the photos of a run are.
+
+    Attributes
+    ----------
+    folder : Path
+        Of the photos.
+    camera : str or None
+        As `find_camera` takes it.
+    frames : VideoFrames or None
+        Of the video, if they are frames of one.
+    video : dict or None
+        What `solution.json` says of it.
+    """
+
+    folder: Path
+    camera: str | None
+    frames: VideoFrames | None = None
+    video: dict[str, Any] | None = None
+
+
+def find_photos(
+    photos: Path, scratch: Path, camera: str | None, every: int | None, sharpest: int | None, log: StageLog
+) -> PhotoSource:
+    """A folder as it is; of a video, frames in `scratch/frames`, with the `camera.json` that lies beside the video."""
+    if not is_video(photos):
+        if every is not None or sharpest is not None:
+            raise InputError(f"{photos} is no video; --every and --sharpest choose frames of one")
+        return PhotoSource(photos, camera)
+    log.begin("frames")
+    folder = scratch / "frames"
+    frames = extract_frames(
+        photos, folder, every=every, sharpest=sharpest, progress=lambda done, total: log.tell("frames", done, total)
+    )
+    log.end("frames", photos=len(frames.names), frames=frames.num_frames, damaged=frames.num_damaged)
+    if len(frames.names) < 3:
+        raise InputError(
+            f"{photos} gives {len(frames.names)} photos; the shutter needs at least three, take a smaller N"
+        )
+    beside = photos.parent / "camera.json"
+    return PhotoSource(
+        folder,
+        str(beside) if camera is None and beside.is_file() else camera,
+        frames,
+        {
+            "name": photos.name,
+            "every": every,
+            "sharpest": sharpest,
+            "frames": frames.num_frames,
+            "damaged": frames.num_damaged,
+            "orientation": frames.orientation,
+            "make": frames.make,
+            "model": frames.model,
+        },
+    )

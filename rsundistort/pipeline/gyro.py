@@ -1,0 +1,118 @@
+"""What a run knows of the time of the readout, and of motions from a gyroscope."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import InputError
+from ..io import read_exif
+from ..io.gyro import GyroLog, motions_from_gyro, read_gyro, read_photo_times
+from ..io.motions import Known
+from ..io.readout_times import readout_time
+from ..io.video import FRAME_TABLE, VideoFrames
+from ..model import Camera, Reconstruction
+
+__all__ = ["GyroOptions", "gyro_contradiction", "gyro_motions", "known_readouts"]
+
+# Known motions that a solution misses by this many of their standard deviations are not those of its photos.
+_FAR = 3.0
+
+
+@dataclass(frozen=True)
+class GyroOptions:
+    """A gyroscope's log, and how its clock and its axes lie to the camera's.
+
+    Parameters
+    ----------
+    file : path
+        As `io.read_gyro` takes it.
+    offset_s : float
+        What the clock of the log shows when the camera's shows zero.
+    axes : str, optional
+        As `io.read_gyro` takes them.
+    times : path, optional
+        CSV with `name, time_s`; by default `frames.csv` among the photos.
+    """
+
+    file: Path | str
+    offset_s: float = 0.0
+    axes: str | None = None
+    times: Path | str | None = None
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.offset_s):
+            raise InputError(f"offset of the gyroscope's clock: {self.offset_s!r}, expected seconds")
+
+    def log(self) -> GyroLog:
+        """The log itself."""
+        return read_gyro(self.file, self.axes)
+
+    def facts(self) -> dict[str, Any]:
+        """What `solution.json` says of it."""
+        return {"name": Path(self.file).name, "offset_s": self.offset_s, "axes": self.axes}
+
+
+def known_readouts(
+    folder: Path,
+    names: Sequence[str],
+    cameras: Sequence[Camera],
+    camera_idx: ArrayLike,
+    frames: VideoFrames | None,
+    given_s: float | None,
+    log: GyroLog | None,
+) -> dict[int, tuple[float, str]]:
+    """Seconds that the readout of a frame takes, and who says so: the user, the gyroscope's log, or the table.
+
+    By camera; those of which nothing is known are missing. A camera's make and model are those of its first photo, or
+    the video's.
+    """
+    if given_s is not None:
+        return dict.fromkeys(range(len(cameras)), (given_s, "given"))
+    if log is not None and log.readout_s is not None:
+        return dict.fromkeys(range(len(cameras)), (log.readout_s, "the gyroscope's log"))
+    index = np.asarray(camera_idx).tolist()
+    found = {}
+    for k, camera in enumerate(cameras):
+        body = read_exif(folder / names[index.index(k)]) if frames is None else frames
+        readout = readout_time(body.make or "", body.model or "", camera.width, camera.height) if body.model else None
+        if readout is not None:
+            found[k] = readout
+    return found
+
+
+def gyro_motions(folder: Path, gyro: GyroOptions, log: GyroLog, readout_s: Mapping[str, float | None]) -> Known:
+    """Motions of the photos that have a time, as `RunOptions.known` takes them; `readout_s` by photo."""
+    table = Path(gyro.times) if gyro.times is not None else folder / FRAME_TABLE
+    if gyro.times is None and not table.is_file():
+        raise InputError(f"{gyro.file}: when were the photos taken? Give a table of name, time_s with --photo-times")
+    times = {name: time for name, time in read_photo_times(table).items() if name in readout_s}
+    if not times:
+        raise InputError(f"{table} has the time of none of the photos, such as {next(iter(readout_s))}")
+    if unknown := [name for name in times if readout_s[name] is None]:
+        raise InputError(
+            f"{gyro.file}: how long does the camera of {unknown[0]} take to read a frame? Give --readout-ms"
+        )
+    return motions_from_gyro(log, times, {name: readout_s[name] or 0.0 for name in times}, offset_s=gyro.offset_s)
+
+
+def gyro_contradiction(rec: Reconstruction, known: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> str | None:
+    """A warning, if a solution is far from the motions that it was told to be known."""
+    span = rec.frame_span()
+    misses = [
+        (rec.phi[i] * span[i] - np.asarray(known[name][0])) / np.asarray(known[name][1])
+        for i, name in enumerate(rec.image_names)
+        if name in known
+    ]
+    far = float(np.sqrt(np.mean(np.square(misses)))) if misses and rec.shutter_model != "global" else 0.0
+    if far <= _FAR:
+        return None
+    return (
+        f"the photos contradict the gyroscope, by {far:.0f} times its uncertainty; check the offset of its clock "
+        "(--gyro-offset), its axes (--gyro-axes) and the time of the readout (--readout-ms)"
+    )
