@@ -181,14 +181,55 @@ def distort_points(
     return raw.reshape(shape)
 
 
-def largest_shift_px(camera: Camera, motion: RowMotion, shutter_model: str = "rotation") -> float:
+def largest_shift_px(
+    camera: Camera,
+    motion: RowMotion,
+    shutter_model: str = "rotation",
+    depth: Depth | None = None,
+    new_camera: Camera | None = None,
+) -> float:
     """Largest displacement in pixels that the shutter causes anywhere in a photo.
 
-    It is looked for on a grid of 33 x 33 raw pixels that holds the border and the corners.
+    It is looked for on a grid of 33 x 33 raw pixels that holds the border and the corners; with a depth, on one of 97 x
+    65 pixels of the rectified photo (`new_camera`, else of the camera's own size and K).
     """
-    u, v = np.meshgrid(np.linspace(0, camera.width - 1, 33), np.linspace(0, camera.height - 1, 33))
-    raw = np.column_stack([u.ravel(), v.ravel()])
-    ideal, valid = unproject_points(raw, camera, motion, shutter_model)
-    still, seen = project_points(np.column_stack([ideal, np.ones(len(ideal))])[valid], camera, None, "global")
-    shift = np.linalg.norm(still - raw[valid], axis=1)[seen]
-    return float(check_finite(shift, (None,), "shift").max(initial=0.0))
+    if depth is None or isinstance(depth, AtInfinity) or shutter_model != "constant-motion":
+        u, v = np.meshgrid(np.linspace(0, camera.width - 1, 33), np.linspace(0, camera.height - 1, 33))
+        raw = np.column_stack([u.ravel(), v.ravel()])
+        ideal, valid = unproject_points(raw, camera, motion, shutter_model)
+        still, seen = project_points(_homogeneous(ideal)[valid], camera, None, "global")
+        shift = np.linalg.norm(still - raw[valid], axis=1)[seen]
+        return float(check_finite(shift, (None,), "shift").max(initial=0.0))
+    xy, K = _rectified_grid(camera, new_camera)
+    raw = distort_points(xy, camera, motion, shutter_model, P=K, depth=depth)
+    return _largest(camera, raw, distort_points(xy, camera, P=K))
+
+
+def translation_shift_px(camera: Camera, motion: RowMotion, depth: Depth, new_camera: Camera | None = None) -> float:
+    """Largest displacement in pixels that the translation causes in a photo, against what is at infinity.
+
+    Parameters
+    ----------
+    camera, motion, depth
+        As in `init_rectify_map`, of the constant-motion model.
+    new_camera : Camera, optional
+        Of the rectified photo.
+    """
+    xy, K = _rectified_grid(camera, new_camera)
+    at_depth, far = (distort_points(xy, camera, motion, "constant-motion", P=K, depth=d) for d in (depth, None))
+    return _largest(camera, at_depth, far)
+
+
+def _rectified_grid(camera: Camera, new_camera: Camera | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pixels (n, 2) over a rectified photo, its border among them, and its K."""
+    new = new_camera or camera.pinhole()
+    u, v = np.meshgrid(np.linspace(0, new.width - 1, 97), np.linspace(0, new.height - 1, 65))
+    return np.column_stack([u.ravel(), v.ravel()]), new.K
+
+
+def _largest(camera: Camera, raw: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """Largest distance of raw pixels (n, 2) from others, of those that lie in the photo."""
+    with np.errstate(invalid="ignore"):
+        inside = ((raw >= 0) & (raw <= [camera.width - 1, camera.height - 1])).all(1)
+    shift = np.linalg.norm(raw - other, axis=1)[inside]
+    return float(shift[np.isfinite(shift)].max(initial=0.0))
