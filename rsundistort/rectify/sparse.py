@@ -29,8 +29,8 @@ def _believed(xy: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArray[
     num = min(_NEIGHBOURS + 1, len(xy))
     if num <= _SUPPORT:
         return np.ones(len(xy), bool)
-    _, neighbours = cKDTree(xy).query(xy, k=num)
-    apart = np.abs(inverse[neighbours[:, 1:]] - inverse[:, None])
+    neighbours = np.asarray(cKDTree(xy).query(xy, k=num)[1])[:, 1:]
+    apart = np.abs(inverse[neighbours] - inverse[:, None])
     tolerance = _SHARE * np.maximum(inverse, np.median(inverse))[:, None]
     believed = (apart < tolerance).sum(1) >= _SUPPORT
     return believed if believed.any() else np.ones(len(xy), bool)
@@ -43,8 +43,7 @@ def _interpolate(
     from scipy.interpolate import LinearNDInterpolator
     from scipy.spatial import QhullError, cKDTree
 
-    _, nearest = cKDTree(xy).query(wanted)
-    found = inverse[nearest]
+    found = inverse[np.asarray(cKDTree(xy).query(wanted)[1])]
     if len(xy) < 3:
         return found
     try:
@@ -84,7 +83,7 @@ def depth_from_points(xy: NDArray[np.float64], depth: NDArray[np.float64], size:
     centres = [(np.arange(num) + 0.5) * side / num - 0.5 for num, side in zip(shape, size, strict=True)]
     wanted = np.stack(np.meshgrid(*centres), -1).reshape(-1, 2)
     smooth = _interpolate(xy[believed], inverse[believed], wanted).reshape(shape[::-1])
-    return DepthMap(1.0 / smooth, size)
+    return DepthMap((1.0 / smooth).astype(np.float32), size)
 
 
 def fit_plane(points_w: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
@@ -125,11 +124,7 @@ def plane_in_camera(
 
 
 def prefers_plane(
-    plane: Plane,
-    xy: NDArray[np.float64],
-    rays_c: NDArray[np.float64],
-    depth: NDArray[np.float64],
-    size: tuple[int, int],
+    plane: Plane, xy: NDArray[np.float64], rays_c: NDArray[np.float64], depth: NDArray[np.float64]
 ) -> bool:
     """Whether a plane foretells the depths of half of the points at least as well as a map of the other half does.
 
