@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import zlib
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -59,3 +61,13 @@ def test_png_is_written_whoever_comes_first(tmp_path, first):
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "done"
+
+
+def test_every_package_is_installed():
+    """A package that `pyproject.toml` forgets is missing from what pip installs, and present here."""
+    root = Path(__file__).parent.parent
+    there = {
+        path.parent.relative_to(root).as_posix().replace("/", ".") for path in root.glob("rsundistort/**/__init__.py")
+    }
+    block = (root / "pyproject.toml").read_text(encoding="utf-8").partition("\npackages = [")[2].partition("]")[0]
+    assert there | {"rsundistort_cli"} == set(re.findall(r'"([.\w]+)"', block))

@@ -19,7 +19,7 @@ from PIL import Image, ImageCms
 
 from rsundistort import MetadataWarning
 from rsundistort.io import Metadata, read_photo, write_image
-from rsundistort.io.exif import corrected_exif, exif_of_tiff
+from rsundistort.io.photos.exif import corrected_exif, exif_of_tiff
 from rsundistort.model.orientation import turn_pixels
 
 SUFFIXES = (".jpg", ".png", ".webp", ".tif")
@@ -81,7 +81,7 @@ def test_tags_are_kept_in_every_kind(tmp_path, suffix, order):
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_opencv_and_pillow_follow_what_is_written(tmp_path, suffix):
     photo = write(tmp_path / f"a{suffix}", Metadata(camera_exif(">"), XMP, ICC))
-    if suffix != ".tif":  # OpenCV 5 fails on any TIFF whose orientation exchanges the sides
+    if suffix in (".jpg", ".png"):  # OpenCV 5 fails on any TIFF whose tag exchanges the sides, 4 knows none of WebP
         assert cv2.imread(str(tmp_path / f"a{suffix}"), cv2.IMREAD_COLOR).shape == (64, 48, 3)  # turned by the tag
     with Image.open(tmp_path / f"a{suffix}") as image:
         exif = image.getexif()

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, InputError, RsUndistortError, RsUndistortWarning
-from .exif import ORIENTATION, pack_ifd
-from .images import write_image
-from .metadata import Metadata
 from .outputs import output_folder
+from .photos.exif import ORIENTATION, pack_ifd
+from .photos.images import write_image
+from .photos.metadata import Metadata
 
 __all__ = ["FRAME_TABLE", "VIDEO_SUFFIXES", "VideoFrames", "extract_frames", "is_video"]
 

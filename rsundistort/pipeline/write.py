@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, InputError, MetadataWarning, SkippedPhotoWarning
 from ..io import MAX_MEGAPIXELS, Photo, find_masks, output_name, read_mask, read_photo, write_image
-from ..io.exif import read_orientation
+from ..io.photos.exif import read_orientation
 from ..model import Reconstruction, Solution, SolvedImage
 from ..model.orientation import split_mirror, turn_pixels
 from ..rectify import rectify

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import RsUndistortError
-from ..model import Camera
+from ...errors import RsUndistortError
+from ...model import Camera
 from .containers import metadata_of
 from .exif import EXIF_IFD, ORIENTATION, Damaged, TiffStructure
 from .heif import heif_metadata

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError
+from ...errors import FileError
 from .containers import metadata_of
 from .exif import COLOR_SPACE
 from .metadata import Metadata

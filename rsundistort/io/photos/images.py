@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, FileKindWarning, InputError, MetadataWarning
+from ...errors import FileError, FileKindWarning, InputError, MetadataWarning
 from .containers import metadata_of, with_metadata
 from .heif import read_heif
 from .kinds import (

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError
-from ..model.orientation import INVERSE, compose_orientations, turn_pixels
+from ...errors import FileError
+from ...model.orientation import INVERSE, compose_orientations, turn_pixels
 from .boxes import primary_properties
 from .metadata import Metadata
 
