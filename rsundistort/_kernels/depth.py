@@ -13,6 +13,8 @@ from ._jit import kernel
 # Things that stand next to each other hide nothing: a claim counts from this displacement (pixels) on.
 _LEAST_PX = 1.0
 _STEP_PX = 0.5
+# Where a surface falls back so many times faster than the line of sight comes nearer, it ends.
+_EDGE = 4.0
 
 
 @kernel(forceinline=True)
@@ -51,7 +53,8 @@ def mark_hidden(field, scale, nearest, epipole, axis, sign, intr, row0, map_x, m
     A raw pixel is read at one moment t, from one place t * velocity. The line from a point at inverse depth w to that
     place runs, in the rectified photo, over the pixels ((u, v, 1) + m t e) / (1 + m t e_z), m > 0, at the inverse
     depths (w + m) / (1 + m t e_z), where e = `epipole` is the velocity in homogeneous pixels. The point is hidden if
-    the field is nearer somewhere on that line. `nearest` is the largest inverse depth of the field.
+    the line comes out of the front of something on its way; it may pass behind a thing and come out at its edge.
+    `nearest` is the largest inverse depth of the field.
     """
     rows, cols = map_x.shape
     for i in range(rows):
@@ -68,9 +71,21 @@ def mark_hidden(field, scale, nearest, epipole, axis, sign, intr, row0, map_x, m
             if not last * pixels_per_m > _LEAST_PX:
                 continue
             m, step = _LEAST_PX / pixels_per_m, _STEP_PX / pixels_per_m
+            behind = False
+            surface = line = fall = 0.0
             while m < last and 1.0 + m * e2 > 0.0:
                 inverse = 1.0 / (1.0 + m * e2)
-                if _sample(field, scale, (u + m * e0) * inverse, (v + m * e1) * inverse) > (w + m) * inverse:
-                    map_x[i, j] = map_y[i, j] = -1e6
-                    break
+                surface_before, line_before = surface, line
+                surface = _sample(field, scale, (u + m * e0) * inverse, (v + m * e1) * inverse)
+                line = (w + m) * inverse
+                fall_before, fall = fall, surface_before - surface
+                if behind and surface <= line:
+                    behind = False
+                    if max(fall, fall_before) <= _EDGE * (line - line_before):
+                        behind = True
+                        break
+                elif surface > line:
+                    behind = True
                 m += step
+            if behind:
+                map_x[i, j] = map_y[i, j] = -1e6
