@@ -48,12 +48,13 @@ R = Rotation.from_rotvec([0.02, -0.05, 0.1]).as_matrix()
 MODEL = "constant-motion"
 
 all_directions = pytest.mark.parametrize("readout", DIRECTIONS)
-with_and_without_lens = pytest.mark.parametrize("dist", [[], LENS], ids=["pinhole", "lens"])
+FISHEYE = (0.02, -0.01, 0.003, -0.001)
+with_and_without_lens = pytest.mark.parametrize("dist", [[], LENS, FISHEYE], ids=["pinhole", "lens", "fisheye"])
 depths = pytest.mark.parametrize("kind", ["plane", "map", "points"])
 
 
 def make_camera(dist=(), readout="top-to-bottom"):
-    return Camera(W, H, K, dist, readout)
+    return Camera(W, H, K, dist, readout, "fisheye" if dist is FISHEYE else "pinhole")
 
 
 def pixel_grid(width=W, height=H):
@@ -297,6 +298,17 @@ def test_raw_pixels_show_the_nearer_of_two_walls(rng):
     # as the map at the same pixels has it: nothing that is hidden is found
     hidden = init_rectify_map(camera, motion, MODEL, depth=DepthMap(depth))[0] < -1e5
     assert not cv2.erode(hidden.astype(np.uint8), np.ones((3, 3)))[tuple(np.rint(xy.T[::-1]).astype(int))].any()
+
+
+def test_raw_pixels_beside_a_pole_show_the_wall():
+    motion = RowMotion(velocity=[2.0, 0, 0])
+    depth = np.full((H, W), 8.0)
+    depth[:, 100:104] = 2.0
+    beside = np.column_stack([np.arange(104.0, 158.0), np.full(54, 5.0)])  # up to where the pole hides the wall
+    raw = distort_points(beside, make_camera(), motion, MODEL, P=K, depth=np.full(54, 8.0))
+    back = undistort_points(raw, make_camera(), motion, MODEL, P=K, depth=DepthMap(depth))
+    wrong = np.abs(back - beside).max(1) > 1e-6
+    assert not wrong[2:].any()  # two pixels from the pole
 
 
 def test_depths_that_make_no_sense_are_refused():

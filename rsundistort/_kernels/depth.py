@@ -14,7 +14,7 @@ from ._jit import kernel
 _LEAST_PX = 1.0
 _STEP_PX = 0.5
 # Where a surface falls back so many times faster than the line of sight comes nearer, it ends.
-_EDGE = 4.0
+EDGE = 4.0
 
 
 @kernel(forceinline=True)
@@ -81,7 +81,7 @@ def mark_hidden(field, scale, nearest, epipole, axis, sign, intr, row0, map_x, m
                 fall_before, fall = fall, surface_before - surface
                 if behind and surface <= line:
                     behind = False
-                    if max(fall, fall_before) <= _EDGE * (line - line_before):
+                    if max(fall, fall_before) <= EDGE * (line - line_before):
                         behind = True
                         break
                 elif surface > line:

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Lock
 from typing import NamedTuple
 
 import numpy as np
@@ -128,6 +129,8 @@ class PhotoDepths:
         moving = solution.shutter_model == "constant-motion"
         self._moving = {image.name for image in solution.registered if moving and image.posed}
         self._maps = find_depth_maps(Path(depth), sorted(self._moving)) if self._how == "map" and self._moving else {}
+        # not every threading layer of numba lets parallel kernels be called from several threads at once
+        self._one_at_a_time = Lock()
         self._facts: dict[str, tuple[str, float, float]] = {}
         if self._how in ("plane", "points") and points is None and self._moving:
             raise InputError(f"depth {self._how!r} needs the points of the scene, and there are none")
@@ -146,10 +149,11 @@ class PhotoDepths:
         camera = self._solution.cameras[image.camera_id]
         new_camera = self._solution.rectified_cameras[image.camera_id]
         depth, kind = self._choose(image, new_camera)
-        shift = translation_shift_px(camera, motion, depth, new_camera)
-        if self._how == "auto" and not shift > _LEAST_SHIFT_PX:
-            depth, kind = AtInfinity(), "infinity"
-        whole = largest_shift_px(camera, motion, "constant-motion", depth, new_camera)
+        with self._one_at_a_time:
+            shift = translation_shift_px(camera, motion, depth, new_camera)
+            if self._how == "auto" and not shift > _LEAST_SHIFT_PX:
+                depth, kind = AtInfinity(), "infinity"
+            whole = largest_shift_px(camera, motion, "constant-motion", depth, new_camera)
         self._facts[name] = kind, shift, whole
         return PhotoDepth(depth, motion, kind, shift)
 

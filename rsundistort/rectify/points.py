@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .._kernels.depth import EDGE
 from ..errors import InputError
 from ..model import AtInfinity, Camera, Depth, DepthMap, Plane, RowMotion
 from ..model.checks import check_array, check_finite
@@ -88,23 +90,32 @@ def _rectified(
 def _first_hit(
     depth: DepthMap, on_line: Callable[[NDArray[np.float64]], NDArray[np.float64]], num: int, steps: int
 ) -> NDArray[np.float64]:
-    """Inverse depths (n,) where lines that come from the camera first meet a depth map: a march, then bisection."""
+    """Inverse depths (n,) where lines that come from the camera first meet a depth map: a march, then bisection.
 
-    def is_behind(w: NDArray[np.float64]) -> NDArray[np.bool_]:
-        return inverse_depth_at(depth, on_line(w), np.eye(3)) >= w
+    A line may pass behind the edge of a thing; it meets it there only if it does not come out again.
+    """
+
+    def field(w: NDArray[np.float64]) -> NDArray[np.float64]:
+        return inverse_depth_at(depth, on_line(w), np.eye(3))
 
     marks = np.linspace(float(depth.inverse.max()), 0.0, steps + 1)
-    behind, before = np.zeros(num), np.full(num, marks[0])
-    hit = np.zeros(num, bool)
-    for last, mark in zip(marks[[0, *range(steps)]], marks, strict=True):
-        met = ~hit & is_behind(np.full(num, mark))
-        behind[met], before[met] = mark, last
-        hit |= met
+    rise_of_edge = EDGE * marks[0] / steps
+    surface = field(np.full(num, marks[0]))
+    behind = surface >= marks[0]
+    # brackets of the first place that counts, and whether that is a surface
+    near, far, met = np.full(num, marks[0]), np.full(num, marks[0]), behind.copy()
+    for last, mark in pairwise(marks):
+        before, surface = surface, field(np.full(num, mark))
+        now = surface >= mark
+        enters = now & ~behind & ~met
+        near[enters], far[enters] = last, mark
+        met |= enters & (surface - before <= rise_of_edge)
+        behind = now
     for _ in range(_BISECTIONS):
-        w = 0.5 * (before + behind)
-        met = is_behind(w)
-        behind, before = np.where(met, w, behind), np.where(met, before, w)
-    return behind
+        w = 0.5 * (near + far)
+        now = field(w) >= w
+        far, near = np.where(now, w, far), np.where(now, near, w)
+    return far
 
 
 def undistort_points(
@@ -135,7 +146,8 @@ def undistort_points(
     Returns
     -------
     array of the shape of `points`
-        NaN where the lens or the shutter model has no inverse.
+        NaN where the lens or the shutter model has no inverse. Where the rectified photo hides what a raw pixel shows,
+        the edge of what hides it.
     """
     xy, shape = _as_list(points, "points")
     depth = AtInfinity() if depth is None else depth
