@@ -15,6 +15,8 @@ _LEAST_PX = 1.0
 _STEP_PX = 0.5
 # Where a surface falls back so many times faster than the line of sight comes nearer, it ends.
 EDGE = 4.0
+# Slopes of the field are known for tiles of so many pixels of the photo.
+TILE_PX = 16
 
 
 @kernel(forceinline=True)
@@ -47,14 +49,14 @@ def sample_rows(field, scale, row0, out):
 
 
 @kernel()
-def mark_hidden(field, scale, nearest, epipole, axis, sign, intr, row0, map_x, map_y):
+def mark_hidden(field, scale, nearest, slopes, epipole, axis, sign, intr, row0, map_x, map_y):
     """Point the map far outside at pixels that the camera could not see when it read the row that shows them.
 
     A raw pixel is read at one moment t, from one place t * velocity. The line from a point at inverse depth w to that
     place runs, in the rectified photo, over the pixels ((u, v, 1) + m t e) / (1 + m t e_z), m > 0, at the inverse
     depths (w + m) / (1 + m t e_z), where e = `epipole` is the velocity in homogeneous pixels. The point is hidden if
     the line comes out of the front of something on its way; it may pass behind a thing and come out at its edge.
-    `nearest` is the largest inverse depth of the field.
+    `nearest` is the largest inverse depth of the field, `slopes` what it changes by at most per pixel around each tile.
     """
     rows, cols = map_x.shape
     for i in range(rows):
@@ -67,6 +69,9 @@ def mark_hidden(field, scale, nearest, epipole, axis, sign, intr, row0, map_x, m
             e0, e1, e2 = t * epipole[0], t * epipole[1], t * epipole[2]
             pixels_per_m = math.sqrt((e0 - u * e2) ** 2 + (e1 - v * e2) ** 2)
             w = _sample(field, scale, u, v)
+            # the inverse depth of the line rises by the same amount at every pixel; nothing that rises less hides it
+            if slopes[(row0 + i) // TILE_PX, j // TILE_PX] * pixels_per_m < 1.0 - w * e2:
+                continue
             last = (nearest - w) / max(1.0 - nearest * e2, 1e-9)
             if not last * pixels_per_m > _LEAST_PX:
                 continue

@@ -40,12 +40,12 @@ def fill_rows(
     """Fill the rows `row0 ...` of a grid; where no raw pixel answers, the grid points far outside."""
     intr, lens, axis, sign = camera.kernel_args
     model = check_shutter_model(shutter_model)
-    if depth is not None and depth.matters(motion, shutter_model):
+    if depth is not None and depth.matters(shutter_model):
         inverse = depth.inverse(row0, map_x.shape)
         kernels.fill_map_at_depth(
             axis, sign, intr, lens, motion.phi, motion.velocity, rays, inverse, row0, 0, map_x, map_y
         )
-        depth.mark_hidden(camera, motion, row0, map_x, map_y)
+        depth.mark_hidden(row0, map_x, map_y)
         return
     kernels.fill_map(model, axis, sign, intr, lens, motion.phi, rays, row0, 0, map_x, map_y)
 
@@ -104,8 +104,9 @@ def init_rectify_map(
     map_x = np.empty((height, width), np.float32)
     map_y = np.empty((height, width), np.float32)
     rays = rectified_rays(new_K, R, camera)
-    rows = DepthRows(depth or AtInfinity(), rays, (width, height))
-    fill_rows(camera, motion or RowMotion(), shutter_model, rays, 0, map_x, map_y, rows)
+    motion = motion or RowMotion()
+    rows = DepthRows(depth or AtInfinity(), camera, motion, rays, (width, height))
+    fill_rows(camera, motion, shutter_model, rays, 0, map_x, map_y, rows)
     if m1type == cv2.CV_32FC1:
         return map_x, map_y
     if m1type == cv2.CV_32FC2:

@@ -89,7 +89,7 @@ def rectify(
     motion = motion or RowMotion()
     rays = rectified_rays(target.K, None, camera)
     shape = (target.height, target.width)
-    depth_rows = DepthRows(depth or AtInfinity(), rays, (target.width, target.height))
+    depth_rows = DepthRows(depth or AtInfinity(), camera, motion, rays, (target.width, target.height))
     rectified = np.empty(shape + photo.shape[2:], photo.dtype)
     valid = np.empty(shape, np.uint8)
     flag = INTERPOLATIONS[interpolation]
