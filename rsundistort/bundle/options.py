@@ -121,7 +121,7 @@ class BundleOptions:
     lengths: Sequence[KnownLength] = ()
     refine: tuple[str, ...] = ()
     guessed: GuessedCameras | None = None
-    factor_limit: float = 1e11
+    factor_limit: float | None = None
     cg_tolerance: float = 0.01
 
     def __post_init__(self) -> None:
