@@ -24,6 +24,7 @@ from .terminal import errors_for_people, progress_bars
     type=click.Path(exists=True, file_okay=False, path_type=Path),
     help="Folder of masks, a.png for a.jpg: what is black in them is black in OUT/masks.",
 )
+@opt.depth_option
 @opt.interpolation_option
 @opt.quality_option
 @opt.raw_as_option
@@ -38,6 +39,7 @@ def command(
     solution: Path,
     out: Path,
     masks: Path | None,
+    depth: str,
     interpolation: str,
     quality: int,
     raw_as: str,
@@ -55,7 +57,7 @@ def command(
         solved, left_out = rectify_folder(
             photos, solution, out,
             interpolation=interpolation, quality=quality, jobs=jobs, overwrite=overwrite, masks=masks,
-            progress=progress, raw_as=raw_as, apply_orientation=apply_orientation, again=again,
+            progress=progress, depth=depth, raw_as=raw_as, apply_orientation=apply_orientation, again=again,
             max_megapixels=max_megapixels,
         )  # fmt: skip
     if not quiet:

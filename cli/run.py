@@ -115,6 +115,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Features of a photo.",
 )
+@opt.depth_option
 @opt.interpolation_option
 @opt.quality_option
 @opt.raw_as_option
@@ -145,6 +146,7 @@ def command(
     photo_times: Path | None,
     remedy: str,
     max_features: int,
+    depth: str,
     interpolation: str,
     quality: int,
     raw_as: str,
@@ -177,6 +179,7 @@ def command(
                 seed=seed,
                 jobs=jobs,
                 max_features=max_features,
+                depth=depth,
                 interpolation=interpolation,
                 quality=quality,
                 raw_as=raw_as,
@@ -260,6 +263,7 @@ def closing_table(solution: Solution, out: Path) -> str:
         *_video(solution),
         *_intrinsics(solution),
         *_readout(solution),
+        *_depths(solution),
         f"rms residual       {quality['global_rms_px']:.2f} px with a global shutter, {quality['rms_px']:.2f} px now",
         f"outputs            {out}  ({total:.0f} s)",
     ]
@@ -342,6 +346,14 @@ def _readout(solution: Solution) -> list[str]:
         f"rates of turn      median {rates[len(rates) // 2]:.1f}, largest {rates[-1]:.1f} deg/s, by a readout of",
         *(f"{'':19}{each}" for each in said),
     ]
+
+
+def _depths(solution: Solution) -> list[str]:
+    """A line on how far away the photos of a camera that travelled were taken to show things."""
+    used = [image.depth for image in solution.images if image.depth is not None]
+    kinds = {"points": "as the points", "plane": "on a plane", "map": "by maps", "infinity": "at infinity"}
+    counts = [f"{text} in {used.count(kind)} photos" for kind, text in kinds.items() if kind in used]
+    return [f"depth              {', '.join(counts)}"] if counts else []
 
 
 def _held_out(rms_px: Mapping[str, float]) -> list[str]:

@@ -17,6 +17,7 @@ from ..io.photos.exif import read_orientation
 from ..model import Reconstruction, Solution, SolvedImage
 from ..model.orientation import split_mirror, turn_pixels
 from ..rectify import rectify
+from .depth import PhotoDepths
 from .progress import StageLog
 
 __all__ = ["PointColors", "check_not_rectified", "mask_names", "rectify_photos", "turn_of"]
@@ -54,6 +55,7 @@ def rectify_photos(
     quality: int,
     jobs: int,
     log: StageLog,
+    depths: PhotoDepths,
     masks: Path | None = None,
     raw_as: str = "tif",
     apply_orientation: bool = False,
@@ -63,8 +65,9 @@ def rectify_photos(
     """Rectify photos into `out/images` and `out/masks`, and yield each raw photo by the way.
 
     Photos that cannot be read, are of another size than their camera, or (unless `again`) are rectified already, are
-    skipped with a warning. With `apply_orientation` photo and mask are turned as `turn_of` says. What the users' own
-    masks (a folder, as `io.find_masks` takes it) leave out is left out of `out/masks`.
+    skipped with a warning. `depths` says how far away what they show is. With `apply_orientation` photo and mask are
+    turned as `turn_of` says. What the users' own masks (a folder, as `io.find_masks` takes it) leave out is left out of
+    `out/masks`.
     """
     (out / "images").mkdir()
     (out / "masks").mkdir()
@@ -80,9 +83,10 @@ def rectify_photos(
             if not again:
                 check_not_rectified(photo)
             own = read_mask(mask_of[name], camera.width, camera.height) if name in mask_of else None
+            seen = depths.of(name)
             pixels, mask = rectify(
-                photo.pixels, camera, image.motion, solution.map_model,
-                solution.rectified_cameras[image.camera_id], interpolation, mask=own,
+                photo.pixels, camera, seen.motion, solution.shutter_model,
+                solution.rectified_cameras[image.camera_id], interpolation, mask=own, depth=seen.depth,
             )  # fmt: skip
             metadata = photo.metadata.marked(mark)
             if apply_orientation:

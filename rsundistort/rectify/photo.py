@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..model import Camera, RowMotion
+from ..model import AtInfinity, Camera, Depth, RowMotion
+from .depth import DepthRows
 from .maps import EDGE_PX, fill_rows, rectified_rays
 
 __all__ = ["INTERPOLATIONS", "rectify"]
@@ -36,6 +37,7 @@ def rectify(
     interpolation: str = "cubic",
     jobs: int = 1,
     mask: NDArray[np.uint8] | None = None,
+    depth: Depth | None = None,
 ) -> tuple[NDArray[Any], NDArray[np.uint8]]:
     """A photo as a global shutter without lens distortion would have taken it, and which pixels were seen.
 
@@ -55,13 +57,16 @@ def rectify(
         Threads; the result does not depend on them.
     mask : (h, w) uint8 array, optional
         0 where pixels of the photo do not count: they are rectified, but not in the mask of the result.
+    depth : AtInfinity, Plane or DepthMap, optional
+        As in `init_rectify_map`.
 
     Returns
     -------
     rectified : array
         As `photo`, of the new camera's size; 0 where nothing was seen.
     valid : (h, w) uint8 array
-        255 where a raw pixel (that counts) answers, else 0.
+        255 where a raw pixel (that counts) answers, else 0: outside of the photo, and where something nearer hid what
+        the pixel would show.
     """
     photo = np.asarray(photo)
     if photo.dtype not in (np.uint8, np.uint16, np.float32) or photo.ndim not in (2, 3):
@@ -84,6 +89,7 @@ def rectify(
     motion = motion or RowMotion()
     rays = rectified_rays(target.K, None, camera)
     shape = (target.height, target.width)
+    depth_rows = DepthRows(depth or AtInfinity(), camera, motion, rays, (target.width, target.height))
     rectified = np.empty(shape + photo.shape[2:], photo.dtype)
     valid = np.empty(shape, np.uint8)
     flag = INTERPOLATIONS[interpolation]
@@ -92,7 +98,7 @@ def rectify(
         rows = slice(row0, min(row0 + _STRIP_ROWS, target.height))
         map_x = np.empty((rows.stop - row0, target.width), np.float32)
         map_y = np.empty_like(map_x)
-        fill_rows(camera, motion, shutter_model, rays, row0, map_x, map_y)
+        fill_rows(camera, motion, shutter_model, rays, row0, map_x, map_y, depth_rows)
         seen = (map_x >= -EDGE_PX) & (map_x <= camera.width - 1 + EDGE_PX)
         seen &= (map_y >= -EDGE_PX) & (map_y <= camera.height - 1 + EDGE_PX)
         # taps beyond the border repeat it, so that seen pixels at the edge keep their brightness
