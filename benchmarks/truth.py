@@ -56,7 +56,7 @@ def median_and_worst(values: list[float]) -> dict[str, float]:
 def against_twin(raw: np.ndarray, twin: np.ndarray, camera: Camera, motion: RowMotion) -> float:
     """PSNR in dB, over valid pixels, of a photo freed of shutter and lens against its twin freed of the lens."""
     rectified, mask = rectify(raw, camera, motion)
-    if camera.dist.any():
+    if not camera.is_pinhole:
         twin, seen = rectify(twin, camera)
         mask = np.minimum(mask, seen)
     return psnr(rectified, twin, mask)
@@ -175,7 +175,7 @@ def rendering_time(repeat: int = 3) -> None:
     factor = (1e6 / (small.width * small.height)) ** 0.5
     K = np.array(small.K)
     K[:2] *= factor
-    camera = Camera(round(small.width * factor), round(small.height * factor), K, small.dist, small.readout)
+    camera = replace(small, width=round(small.width * factor), height=round(small.height * factor), K=K)
     options = {key: value for key, value in recipe.render_options.items() if key != "samples"}
     render_view(recipe.scene, small, view, samples=1, **options)  # compiles, and makes the textures
     for samples, target in ((4, "<= 2 s on two cores"), (16, "none")):

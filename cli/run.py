@@ -44,8 +44,9 @@ if TYPE_CHECKING:
 @click.option(
     "--refine",
     metavar="NAMES",
-    help="Intrinsics to solve for with the rest: some of f (or fx, fy), cx, cy, k1, k2, p1, p2, k3 with commas "
-    "between, or none. By default none of a camera that was given, f,k1,k2 of one that EXIF guessed.",
+    help="Intrinsics to solve for with the rest: some of f (or fx, fy), cx, cy, k1, k2, p1, p2, k3 (of a "
+    "fisheye k1 to k4) with commas between, or none. By default none of a camera that was given, f,k1,k2 of one that "
+    "EXIF guessed.",
 )
 @click.option(
     "--still",
@@ -289,9 +290,9 @@ def _intrinsics(solution: Solution) -> list[str]:
             "cx": camera.K[0, 2],
             "cy": camera.K[1, 2],
         }
-        values |= dict(zip(("k1", "k2", "p1", "p2", "k3"), camera.dist, strict=False))
+        values |= camera.coefficients
         found = [
-            f"{name} {values.get(name, 0.0):.{4 if name[0] in 'kp' else 1}f} +- {sigma:.{4 if name[0] in 'kp' else 1}f}"
+            f"{name} {values[name]:.{4 if name[0] in 'kp' else 1}f} +- {sigma:.{4 if name[0] in 'kp' else 1}f}"
             for name, sigma in sigmas.items()
         ]
         lines += [f"{'refined' if i == 0 else '':19}{', '.join(found[i : i + 3])}" for i in range(0, len(found), 3)]

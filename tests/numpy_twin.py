@@ -28,8 +28,19 @@ def clock(readout, xy):
     }[readout]
 
 
+class Fisheye(tuple):
+    """Coefficients k1 k2 k3 k4 of a fisheye, where else those of the pinhole lens model stand."""
+
+
+def lens_of(dist):
+    """The lens model that coefficients belong to."""
+    return "fisheye" if isinstance(dist, Fisheye) else "pinhole"
+
+
 def lens(dist, xy):
     """OpenCV's lens on normalised coordinates (n, 2)."""
+    if isinstance(dist, Fisheye):
+        return cv2.fisheye.distortPoints(xy[:, None], np.eye(3), np.array(dist or np.zeros(4)))[:, 0]
     rays = np.column_stack([xy, np.ones(len(xy))])
     coefficients = np.asarray(dist, float) if len(dist) else None
     return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), coefficients)[0][:, 0]
@@ -39,6 +50,9 @@ def undistort_with_opencv(pixels, K, dist, R=None, P=None):
     """`cv2.undistortPoints` of pixels (n, 2), iterated to the end; the two majors of OpenCV name it differently."""
     tight = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
     R, P = np.eye(3) if R is None else R, np.eye(3) if P is None else P
+    if isinstance(dist, Fisheye):
+        return cv2.fisheye.undistortPoints(pixels[:, None], K, np.array(dist), R=R, P=P, criteria=tight)[:, 0]
+    dist = np.array(dist, float) if len(dist) else None
     if hasattr(cv2, "undistortPointsIter"):
         return cv2.undistortPointsIter(pixels[:, None], K, dist, R, P, tight)[:, 0]
     return cv2.undistortPoints(pixels[:, None], K, dist, R=R, P=P, criteria=tight)[:, 0]
@@ -76,7 +90,7 @@ def linearized(xy, phi, readout):
 
 def exact(points_c, phi, velocity_c, dist, readout):
     """Paper Eq. 2 by the generator of measurements; in units of a camera with K = 1."""
-    unit = Camera(1, 1, np.eye(3), dist, readout)
+    unit = Camera(1, 1, np.eye(3), dist, readout, lens_of(dist))
     return project_rows(points_c, np.eye(3), np.zeros(3), RowMotion(phi, velocity_c), unit)[0]
 
 

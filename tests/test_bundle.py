@@ -9,10 +9,19 @@ import numba
 import numpy as np
 import pytest
 from critical_scenes import named_scene
-from numpy_twin import DIRECTIONS, MODELS, project
+from numpy_twin import DIRECTIONS, MODELS, Fisheye, lens_of, project
 from scipy.spatial.transform import Rotation
 
-from rsundistort import BundleOptions, Camera, InputError, Observations, Reconstruction, bundle_adjust, climb
+from rsundistort import (
+    BundleOptions,
+    Camera,
+    InputError,
+    Observations,
+    Reconstruction,
+    RowMotion,
+    bundle_adjust,
+    climb,
+)
 from rsundistort.bundle import (
     LADDER,
     GuessedCameras,
@@ -26,8 +35,10 @@ from rsundistort.bundle.choice import hold_out
 from rsundistort.bundle.intrinsics import moved_camera
 from rsundistort.bundle.problem import BundleProblem, Spreads
 from rsundistort.model import READOUTS
+from rsundistort.synthetic import project_rows
 
 LENS = [-0.12, 0.03, 0.001, -0.002]
+FISHEYE = Fisheye([0.05, -0.02, 0.01, -0.004])
 SHUTTERS = ("two-step", "linearized", "rotation", "constant-motion")
 
 
@@ -38,7 +49,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def make_cameras(dist=()):
     """One camera for each readout direction, of different focal lengths."""
     return [
-        Camera(800, 600, [[700 + 10 * i, 0, 402], [0, 690 + 5 * i, 297], [0, 0, 1]], dist, readout)
+        Camera(800, 600, [[700 + 10 * i, 0, 402], [0, 690 + 5 * i, 297], [0, 0, 1]], dist, readout, lens_of(dist))
         for i, readout in enumerate(DIRECTIONS)
     ]
 
@@ -133,8 +144,12 @@ RATIONAL = [*LENS, 0.01, 0.05, -0.02, 0.01]
 
 
 @pytest.mark.parametrize(
-    ("refine", "dist"), [((), LENS), (REFINE, LENS), (("fx", "fy", "k1"), []), (REFINE, RATIONAL)],
-    ids=["calibrated", "refined", "pinhole", "rational"],
+    ("refine", "dist"),
+    [
+        ((), LENS), (REFINE, LENS), (("fx", "fy", "k1"), []), (REFINE, RATIONAL),
+        (("f", "cx", "cy", "k1", "k2", "k3", "k4"), FISHEYE), (("fx", "k1"), Fisheye()),
+    ],
+    ids=["calibrated", "refined", "pinhole", "rational", "fisheye", "bare fisheye"],
 )  # fmt: skip
 @pytest.mark.parametrize("model", MODELS)
 def test_jacobian_equals_central_differences_through_the_step(model, refine, dist, rng):
@@ -335,7 +350,7 @@ def test_known_lengths_join_the_system(damping, refine, rng):
         assert variance == pytest.approx(b @ whole[points, points] @ b, rel=1e-6)
 
 
-@pytest.mark.parametrize("dist", [[], LENS], ids=["pinhole", "lens"])
+@pytest.mark.parametrize("dist", [[], LENS, FISHEYE], ids=["pinhole", "lens", "fisheye"])
 @pytest.mark.parametrize("model", MODELS)
 def test_residuals_and_gradient_vanish_at_the_truth_of_the_twin(model, dist, rng):
     rec = make_scene(rng, model, dist=dist)
@@ -381,10 +396,17 @@ def spoilt_cameras(rec, refine):
     return replace(rec, cameras=[replace(c, dist=np.zeros(0)) if lens else c for c in moved])
 
 
-@pytest.mark.parametrize("refine", [("f", "k1", "k2", "p1", "p2"), ("fx", "fy", "cx", "cy")], ids=" ".join)
+@pytest.mark.parametrize(
+    ("refine", "dist"),
+    [
+        (("f", "k1", "k2", "p1", "p2"), LENS), (("fx", "fy", "cx", "cy"), LENS),
+        (("f", "k1", "k2"), Fisheye([0.05, -0.02, 0.0, 0.0])),
+    ],
+    ids=["f-k1-k2-p1-p2", "fx-fy-cx-cy", "fisheye"],
+)  # fmt: skip
 @pytest.mark.parametrize("model", ["global", "two-step", "rotation", "constant-motion"])
-def test_intrinsics_are_recovered_without_noise(model, refine, rng):
-    truth = make_scene(rng, model, num_images=12, num_points=120, dist=LENS)
+def test_intrinsics_are_recovered_without_noise(model, refine, dist, rng):
+    truth = make_scene(rng, model, num_images=12, num_points=120, dist=dist)
     options = BundleOptions(
         loss="squared", sigma_px=0.5, phi_sigma=10.0, velocity_sigma=10.0, outlier_rounds=0, cost_tolerance=1e-12,
         refine=refine,
@@ -481,6 +503,30 @@ def test_impossible_priors_on_intrinsics_are_refused(sigma, named):
         GuessedCameras((), sigma)
 
 
+@pytest.mark.parametrize(
+    ("name", "dist", "message"),
+    [
+        ("p1", FISHEYE, "p1 of a fisheye lens, expected some of k1, k2, k3, k4"),
+        ("k4", RATIONAL, "k4 of a pinhole lens"),
+    ],
+    ids=["fisheye", "pinhole"],
+)
+def test_intrinsics_that_a_lens_lacks_are_refused(name, dist, message, rng):
+    with pytest.raises(InputError, match=message):
+        bundle_adjust(make_scene(rng, "global", dist=dist), "global", BundleOptions(refine=(name,)))
+
+
+def test_a_pinhole_lens_among_fisheyes_stays_what_it_is(rng):
+    rec = make_scene(rng, "rotation", dist=FISHEYE)
+    both = make_scene(rng, "rotation", dist=LENS)
+    mixed = replace(both, cameras=[*both.cameras[:3], rec.cameras[3]])
+    res, valid = reprojection_residuals(mixed)
+    assert valid.all()
+    fisheye = both.camera_idx[both.observations.frame_idx] == 3
+    assert np.abs(res[~fisheye]).max() < 1e-9  # px, as above
+    assert np.abs(res[fisheye]).max() > 1
+
+
 def test_ladder_ends_at_the_truth_and_climbs_in_order(rng):
     truth = make_scene(rng, "constant-motion")
     seen = []
@@ -493,6 +539,35 @@ def test_ladder_ends_at_the_truth_and_climbs_in_order(rng):
     assert (results["rotation"].reconstruction.velocity == 0).all()
     # noise is taken for 0.02 px at least, so phi's deviation for 1e-4; the prior pulls by a small part of that
     np.testing.assert_allclose(results["constant-motion"].reconstruction.phi, truth.phi, atol=1e-4)
+
+
+def test_motions_of_a_wide_fisheye_are_recovered(rng):
+    """From amid the scene, up to 80 degrees from the axis, in all four directions; a global shutter leaves 2 px."""
+    base = make_scene(rng, "global", num_images=8, num_points=1)
+    cameras = [Camera(800, 600, [[260, 0, 402], [0, 262, 297], [0, 0, 1]], FISHEYE, r, "fisheye") for r in DIRECTIONS]
+    points_w = rng.normal(size=(400, 3))
+    points_w *= rng.uniform(2, 5, (400, 1)) / np.linalg.norm(points_w, axis=1, keepdims=True)
+    center_w, phi = rng.uniform(-1, 1, (8, 3)), rng.uniform(-0.05, 0.05, (8, 3))
+    frame_idx, point_idx, xy = [], [], []
+    for i in range(8):
+        in_camera = (points_w - center_w[i]) @ base.R_cw[i].T
+        some = np.flatnonzero(in_camera[:, 2] > np.cos(np.deg2rad(80)) * np.linalg.norm(in_camera, axis=1))
+        uv, valid = project_rows(points_w[some], base.R_cw[i], center_w[i], RowMotion(phi[i]), cameras[i % 4])
+        inside = valid & ((uv >= 0) & (uv <= [799, 599])).all(1)
+        frame_idx += [i] * inside.sum()
+        point_idx += some[inside].tolist()
+        xy += (uv[inside] + 0.5 * rng.normal(size=(inside.sum(), 2))).tolist()
+    truth = replace(
+        base, cameras=cameras, center_w=center_w, points_w=points_w, phi=phi,
+        observations=Observations(frame_idx, point_idx, xy),
+    )  # fmt: skip
+    truth = truth.take_points(truth.track_lengths(np.ones(len(xy), bool)) >= 2)
+    results = climb(perturbed(truth, rng), ("global", "two-step", "rotation"))
+    result = results["rotation"]
+    assert results["global"].rms_px > 1.5
+    assert 0.25 < result.rms_px < 0.5  # 0.5 px but for what the unknowns take up, a third
+    assert 0.6 < np.sqrt(np.mean(((result.reconstruction.phi - phi) / result.sigma_phi) ** 2)) < 1.6  # 24 values
+    assert np.abs(result.reconstruction.phi - phi).max() < 0.005
 
 
 def test_spreads_of_the_priors_do_not_depend_on_their_start(rng):

@@ -103,7 +103,7 @@ def test_rows_fold_where_the_map_to_directions_turns_over(readout, dist, rng):
     v, u = np.mgrid[0:479:33j, 0:639:33j]
     uv = np.stack([u, v], -1)[:, :, None] + 0.01 * np.array([[0, 0], [1, 0], [0, 1]])
     clock = sign * (uv[..., axis] - K[axis, 2]) / K[axis, axis]
-    rays = np.concatenate([undistort_to_rays(uv, K, camera.dist), np.ones((*uv.shape[:-1], 1))], -1)
+    rays = np.concatenate([undistort_to_rays(uv, camera), np.ones((*uv.shape[:-1], 1))], -1)
 
     def turns_over(phi):
         turn = Rotation.from_rotvec(-clock.reshape(-1, 1) * phi)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from numpy_twin import DIRECTIONS, MODELS, undistort_with_opencv
+from numpy_twin import DIRECTIONS, MODELS, Fisheye, lens, lens_of, undistort_with_opencv
 from scipy.spatial.transform import Rotation
 
 from rsundistort import (
@@ -25,18 +25,27 @@ from rsundistort.synthetic.warp import warp_photo
 W, H = 200, 160
 K = np.array([[210.0, 0, 97.3], [0, 205.0, 81.6], [0, 0, 1]])
 LENS = [-0.12, 0.03, 0.001, -0.002]
+FISHEYE = Fisheye([0.03, -0.01, 0.004, -0.001])
 RATIONAL = [0.1, -0.05, 0.001, -0.002, 0.01, 0.25, 0.02, 0.005, 0.002, -0.001, 0.001, 0.0015]
 MOTION = RowMotion([0.09, -0.06, 0.08])
 STRONG = RowMotion(np.array([0.7, -0.5, 0.6]) / np.linalg.norm([0.7, -0.5, 0.6]) * 0.2)
 
 all_models = pytest.mark.parametrize("model", MODELS)
 all_directions = pytest.mark.parametrize("readout", DIRECTIONS)
-lenses = pytest.mark.parametrize("dist", [[], LENS, RATIONAL], ids=["pinhole", "4-parameters", "12-parameters"])
-with_and_without_lens = pytest.mark.parametrize("dist", [[], LENS], ids=["pinhole", "lens"])
+lenses = pytest.mark.parametrize(
+    "dist", [[], LENS, RATIONAL, FISHEYE], ids=["pinhole", "4-parameters", "12-parameters", "fisheye"]
+)
+with_and_without_lens = pytest.mark.parametrize("dist", [[], LENS, FISHEYE], ids=["pinhole", "lens", "fisheye"])
 
 
 def make_camera(dist=(), readout="top-to-bottom"):
-    return Camera(W, H, K, dist, readout)
+    return Camera(W, H, K, dist, readout, lens_of(dist))
+
+
+def opencv_map(dist, R, new_K, size):
+    """`cv2.initUndistortRectifyMap` of either lens model."""
+    of = cv2.fisheye if isinstance(dist, Fisheye) else cv2
+    return of.initUndistortRectifyMap(K, np.array(dist), R, new_K, size, cv2.CV_32FC1)
 
 
 def smooth_photo(rng, channels=1, dtype=np.float32, sigma=3.0):
@@ -61,7 +70,7 @@ def inside(map_x, map_y):
 def test_without_motion_the_map_is_opencvs(model, dist):
     R = Rotation.from_rotvec([0.02, -0.05, 0.1]).as_matrix()
     new_K, size = np.array([[273.0, 0, 135.5], [0, 246, 93.0], [0, 0, 1]]), (260, 190)
-    expected = cv2.initUndistortRectifyMap(K, np.array(dist), R, new_K, size, cv2.CV_32FC1)
+    expected = opencv_map(dist, R, new_K, size)
     maps = init_rectify_map(make_camera(dist), None, model, R, new_K, size)
     for found, opencv in zip(maps, expected, strict=True):
         assert found.shape == (190, 260)
@@ -142,13 +151,11 @@ def test_points_keep_the_shapes_of_opencv(function, rng):
 def test_without_motion_points_are_opencvs(dist, rng):
     raw = rng.uniform([0, 0], [W - 1, H - 1], (100, 2))
     R, P = Rotation.from_rotvec([0.02, -0.05, 0.1]).as_matrix(), K * [[1.3], [1.2], [1]]
-    coefficients = np.array(dist) if dist else None
-    expected = undistort_with_opencv(raw, K, coefficients, R, P)
+    expected = undistort_with_opencv(raw, K, dist, R, P)
     # px; both iterate to rounding
     np.testing.assert_allclose(undistort_points(raw, make_camera(dist), R=R, P=P), expected, rtol=0, atol=1e-9)
     rays = rng.uniform(-0.4, 0.4, (100, 2))
-    still = np.zeros(3)
-    expected = cv2.projectPoints(np.column_stack([rays, np.ones(100)]), still, still, K, coefficients)[0][:, 0]
+    expected = lens(dist, rays) * np.diag(K)[:2] + K[:2, 2]
     np.testing.assert_allclose(distort_points(rays, make_camera(dist)), expected, rtol=0, atol=1e-9)
 
 
@@ -311,7 +318,7 @@ def test_warped_photo_is_rectified_back_to_the_original(motion, readout, dist, r
     rectified, mask = rectify(raw, camera, motion)
     target = original
     if dist:  # rectified photos have no lens
-        maps = cv2.initUndistortRectifyMap(K, np.array(dist), np.eye(3), K, (W, H), cv2.CV_32FC1)
+        maps = opencv_map(dist, np.eye(3), K, (W, H))
         target = cv2.remap(original, *maps, cv2.INTER_CUBIC)
     known, _ = rectify(raw_mask, camera, motion, interpolation="nearest")  # the warp repeats its border
     valid = cv2.erode(np.minimum(mask, known), np.ones((7, 7), np.uint8), borderValue=0) > 0

@@ -89,7 +89,7 @@ def test_warped_photo_is_rectified_to_the_scene_itself(camera, rotation, seed):
     motion = turned_per_frame(camera, rotation)
     u, v = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
     wavelength = 16 / camera.K[0, 0]  # 16 pixels
-    ray = undistort_to_rays(np.dstack([u, v]), np.array(camera.K), np.array(camera.dist))
+    ray = undistort_to_rays(np.dstack([u, v]), camera)
     taken_still = scene(ray[..., 0], ray[..., 1], seed, wavelength)
     K = camera.K
     expected = scene((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], seed, wavelength)

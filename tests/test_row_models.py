@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from numpy_twin import DIRECTIONS, MODELS, project_normalised, undistort_with_opencv
+from numpy_twin import DIRECTIONS, MODELS, Fisheye, lens, lens_of, project_normalised, undistort_with_opencv
 
 from rsundistort import Camera, InputError, RowMotion, project_points, unproject_points
 from rsundistort.model.projection import project_points_with_jacobians
@@ -20,6 +19,7 @@ LENSES = {
     "k1-k2-p1-p2": [-0.12, 0.03, 0.001, -0.002],
     "8-parameters": RATIONAL,
     "12-parameters": [*RATIONAL, 0.002, -0.001, 0.001, 0.0015],
+    "fisheye": Fisheye([0.03, -0.01, 0.004, -0.001]),
 }
 all_models = pytest.mark.parametrize("model", MODELS)
 all_directions = pytest.mark.parametrize("readout", DIRECTIONS)
@@ -27,7 +27,7 @@ all_lenses = pytest.mark.parametrize("dist", LENSES.values(), ids=LENSES)
 
 
 def make_camera(dist=(), readout="top-to-bottom"):
-    return Camera(400, 300, K, dist, readout)
+    return Camera(400, 300, K, dist, readout, lens_of(dist))
 
 
 def draw_points(rng, n=60, field=0.6):
@@ -108,12 +108,11 @@ def test_jacobians_equal_central_differences(model, readout, dist, rng):
 @all_models
 def test_without_motion_points_lie_where_opencv_puts_them(model, dist, rng):
     camera, points = make_camera(dist), draw_points(rng)
-    coefficients = np.array(dist) if dist else None
-    expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, coefficients)[0][:, 0]
+    expected = lens(dist, points[:, :2] / points[:, 2:]) * FOCAL + K[:2, 2]
     xy, valid = project_points(points, camera, shutter_model=model)
     assert valid.all()
     np.testing.assert_allclose(xy, expected, rtol=0, atol=1e-9)  # px; rounding of the same formula
-    ideal = undistort_with_opencv(expected, K, coefficients)
+    ideal = undistort_with_opencv(expected, K, dist)
     back, valid = unproject_points(expected, camera, shutter_model=model)
     assert valid.all()
     # px; OpenCV's iteration shrinks its error by 0.1-0.2 a step at these lenses and takes up to 100
@@ -200,6 +199,63 @@ def test_point_that_no_row_sees_is_nan():
     xy, valid = project_points([[0.0, 0.4, 1.0]], camera, RowMotion([-3.0, 0, 0]), "linearized")
     assert not valid[0]
     assert np.isnan(xy).all()
+
+
+@all_directions
+@pytest.mark.parametrize("model", ["global", "rotation", "constant-motion"])
+def test_fisheye_up_to_the_side(model, readout, rng):
+    dist = LENSES["fisheye"]
+    camera = make_camera(dist, readout)
+    angle, around = rng.uniform(0, np.deg2rad(84), 40), rng.uniform(0, 2 * np.pi, 40)
+    rays = np.column_stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)])
+    h = 1e-6
+    for phi in 0.05 * rng.uniform(-1, 1, (5, 3)):
+        motion = RowMotion(phi, 0.05 * rng.uniform(-1, 1, 3))
+        points = rays * rng.uniform(1, 2, (40, 1))
+        xy, valid, J = project_points_with_jacobians(points, camera, motion, model)
+        assert valid.all()
+        twin = project_normalised(points, phi, model, readout, dist, motion.velocity)
+        # at 84 degrees x/z is 10, and its rounding ten times that of the tests above
+        assert np.abs((xy - K[:2, 2]) / FOCAL - twin).max() <= 1e-12
+        for j, step in enumerate(h * np.eye(3)):
+            ends = [project_points(points + s * step, camera, motion, model)[0] for s in (1, -1)]
+            # z is down to 0.1: the third derivative over h^2 leaves 1e-9 of the focal length, rounding 1e-7
+            assert np.abs(J.point[:, :, j] - (ends[0] - ends[1]) / (2 * h)).max() <= 1e-6 * 400
+        if model != "constant-motion":
+            ideal, valid = unproject_points(xy, camera, motion, model)
+            assert valid.all()
+            back = np.column_stack([ideal, np.ones(40)])
+            assert np.abs(np.cross(rays, back / np.linalg.norm(back, axis=1, keepdims=True))).max() <= 1e-12
+
+
+def test_fisheye_is_that_of_colmap(rng):
+    import pycolmap  # after cv2
+
+    dist, c = LENSES["fisheye"], K[:2, 2] + 0.5  # COLMAP's pixel centres
+    theirs = pycolmap.Camera(model="OPENCV_FISHEYE", width=400, height=300, params=[*FOCAL, *c, *dist])
+    points = draw_points(rng, field=5)
+    xy, valid = project_points(points, make_camera(dist), shutter_model="global")
+    assert valid.all()
+    np.testing.assert_allclose(xy, [theirs.img_from_cam(point) - 0.5 for point in points], rtol=0, atol=1e-9)
+
+
+@all_directions
+@pytest.mark.parametrize("model", ["global", "rotation", "constant-motion"])
+def test_fisheye_ends_at_the_side_and_at_its_fold(model, readout):
+    motion = RowMotion([0.05, -0.03, 0.04])
+    unbent = make_camera(Fisheye(np.zeros(4)), readout)
+    folding = make_camera(Fisheye([-0.3, 0, 0, 0]), readout)  # a (1 - 0.3 a^2) turns back at a = 1.054, to 0.703
+    points = [[0, 0, 1], [-1, 0.1, 0.1], [0.1, 0.2, -1], [0.1, 0.2, 0]]
+    for camera, expected in ((unbent, [True, True, False, False]), (folding, [True, False, False, False])):
+        xy, valid = project_points(points, camera, motion, model)
+        assert valid.tolist() == expected
+        assert (np.isfinite(xy).all(1) == valid).all()
+    np.testing.assert_array_equal(project_points(points, unbent)[0][0], K[:2, 2])
+    pixels = np.array([[0, 0], [0.3, 0.4], [0.6, 0.6], [-1.5, 0.1], [0.1, 1.6]]) * FOCAL + K[:2, 2]
+    for camera, expected in ((unbent, [True] * 4 + [False]), (folding, [True] * 2 + [False] * 3)):
+        ideal, valid = unproject_points(pixels, camera, motion, model)
+        assert valid.tolist() == expected
+        assert np.isnan(ideal[~valid]).all()
 
 
 def test_no_points_give_no_points():

@@ -11,12 +11,15 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..model import Camera
 
-__all__ = ["INTRINSICS", "GuessedCameras", "check_refined", "deviation", "moved_camera", "pixels_of"]
+__all__ = ["INTRINSICS", "GuessedCameras", "check_lenses", "check_refined", "deviation", "moved_camera", "pixels_of"]
 
 #: Intrinsics that can be refined and their codes in the kernels: `f` keeps the ratio of fx and fy.
 INTRINSICS: dict[str, int] = {
-    name: code for code, name in enumerate(("f", "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"))
+    name: code for code, name in enumerate(("f", "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4"))
 }
+
+# of the lens coefficients: OpenCV's k4 of a pinhole lens divides
+_OF_LENS = {"pinhole": ("k1", "k2", "p1", "p2", "k3"), "fisheye": ("k1", "k2", "k3", "k4")}
 
 
 @dataclass(frozen=True)
@@ -54,11 +57,19 @@ def check_refined(names: Sequence[str]) -> tuple[str, ...]:
     return names
 
 
+def check_lenses(names: Sequence[str], cameras: Sequence[Camera]) -> None:
+    """Refuse names that are checked, but that the lens of some camera lacks."""
+    for name in names:
+        for camera in cameras:
+            if INTRINSICS[name] >= INTRINSICS["k1"] and name not in _OF_LENS[camera.lens]:
+                raise InputError(
+                    f"cannot refine {name} of a {camera.lens} lens, expected some of {', '.join(_OF_LENS[camera.lens])}"
+                )
+
+
 def moved_camera(camera: Camera, names: Sequence[str], step: NDArray[np.float64]) -> Camera:
     """The camera after a step (len(names),): of log f, of cx / fx and cy / fy, and of the lens coefficients."""
-    K = np.array(camera.K)
-    dist = np.zeros(max(len(camera.dist), 5 if "k3" in names else 4))
-    dist[: len(camera.dist)] = camera.dist
+    K, lens = np.array(camera.K), camera.coefficients
     # a step of e^10 is as astray as any
     for name, value in zip(names, np.clip(step, -10, 10), strict=True):
         if name in ("f", "fx"):
@@ -69,8 +80,9 @@ def moved_camera(camera: Camera, names: Sequence[str], step: NDArray[np.float64]
             K[0, 2] += camera.K[0, 0] * value
         if name == "cy":
             K[1, 2] += camera.K[1, 1] * value
-        if INTRINSICS[name] >= INTRINSICS["k1"]:
-            dist[INTRINSICS[name] - INTRINSICS["k1"]] += value
+        if name in lens:
+            lens[name] += value
+    dist = np.array(list(lens.values())[: max(len(camera.dist), 5 if "k3" in names else 4)])
     return replace(camera, K=K, dist=dist if dist.any() else camera.dist)
 
 

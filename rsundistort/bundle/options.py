@@ -85,7 +85,8 @@ class BundleOptions:
     lengths : sequence of KnownLength
         Known lengths in the scene, two or more: their ratios are residuals.
     refine : tuple of str
-        Intrinsics of each camera that are solved for with the rest: some of f (or fx, fy), cx, cy, k1, k2, p1, p2, k3.
+        Intrinsics of each camera that are solved for with the rest: some of f (or fx, fy), cx, cy, k1, k2, p1, p2, k3;
+        of a fisheye k1 to k4.
     guessed : GuessedCameras, optional
         Prior on these intrinsics; without it they follow the photos alone.
     factor_limit : float

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from .._kernels import projection
 from ..errors import InputError
 from ..model import Camera, Reconstruction, check_shutter_model
-from .intrinsics import INTRINSICS, deviation, moved_camera
+from .intrinsics import INTRINSICS, check_lenses, deviation, moved_camera
 from .lengths import LengthResiduals
 from .options import LOSSES, BundleOptions
 from .reduced import Border, Elimination, NormalEquations, Step, Structure, by_first_photo
@@ -37,6 +37,8 @@ class State:
 def _camera_arrays(camera_idx: NDArray[np.int64], cameras: Sequence[Camera]) -> tuple[NDArray[Any], ...]:
     """Photo-to-camera indices, clock axes, signs, intrinsics and lenses as the kernels take them."""
     intr, lens, axis, sign = zip(*(camera.kernel_args for camera in cameras), strict=True)
+    if any(each.ndim == 2 for each in lens):  # among fisheyes a pinhole lens is one that is none
+        lens = tuple(each if each.ndim == 2 else np.append(each, 0.0)[None] for each in lens)
     return camera_idx, np.array(axis), np.array(sign), np.array(intr), np.array(lens)
 
 
@@ -127,6 +129,7 @@ class BundleProblem:
         # the rows that the last cost predicted, where the next Jacobians look for them
         self._clock = np.full(len(obs), np.nan)
         self._clock_of: State | None = None
+        check_lenses(options.refine, reconstruction.cameras)
         self._refine = options.refine
         self._refine_codes = np.array([INTRINSICS[name] for name in options.refine], np.int64)
         span = reconstruction.frame_span()[:, None]

@@ -22,24 +22,34 @@ READOUTS: dict[str, tuple[int, float]] = {
     "right-to-left": (0, -1.0),
 }
 
-#: Lens models, and how many numbers their distortion may have.
-LENSES: dict[str, tuple[int, ...]] = {
-    "pinhole": (0, 4, 5, 8, 12),
-    "fisheye": (0, 4),
+#: Lens models, and the names of their coefficients in the order of `Camera.dist`.
+LENSES: dict[str, tuple[str, ...]] = {
+    "pinhole": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
 }
 
+_DIST_LENGTHS = {"pinhole": (0, 4, 5, 8, 12), "fisheye": (0, 4)}
 
-def _fold_radius_squared(dist: NDArray[np.float64]) -> float:
+
+def _first_positive(*polynomials: np.polynomial.Polynomial) -> float:
+    """The smallest positive real root of some polynomials; inf without one."""
+    roots = np.concatenate([each.trim().roots() for each in polynomials])
+    real = roots.real[(np.abs(roots.imag) < 1e-12 * (1 + np.abs(roots.real))) & (roots.real > 0)]
+    return float(real.min()) if real.size else np.inf
+
+
+def _fold_radius_squared(lens: str, dist: NDArray[np.float64]) -> float:
     """Squared undistorted radius up to which the radial part of the lens model is monotonic."""
     k1, k2, _, _, k3, k4, k5, k6 = dist[:8]
+    if lens == "fisheye":
+        # d/dt [t (1 + k1 t^2 + ...)] = 0 in s = t^2, where t is the angle from the axis
+        angle = np.sqrt(_first_positive(np.polynomial.Polynomial([1.0, 3 * k1, 5 * k2, 7 * k3, 9 * k4])))
+        return float(np.tan(angle)) ** 2 if angle < np.pi / 2 else np.inf
     # d/dr [r num(r^2)/den(r^2)] = 0  <=>  (num + 2 s num') den - 2 s num den' = 0 with s = r^2
     num = np.polynomial.Polynomial([1.0, k1, k2, k3])
     den = np.polynomial.Polynomial([1.0, k4, k5, k6])
     s = np.polynomial.Polynomial([0.0, 1.0])
-    slope = (num + 2 * s * num.deriv()) * den - 2 * s * num * den.deriv()
-    roots = np.concatenate([slope.trim().roots(), den.trim().roots()])
-    real = roots.real[(np.abs(roots.imag) < 1e-12 * (1 + np.abs(roots.real))) & (roots.real > 0)]
-    return float(real.min()) if real.size else np.inf
+    return _first_positive((num + 2 * s * num.deriv()) * den - 2 * s * num * den.deriv(), den)
 
 
 @dataclass(frozen=True)
@@ -53,7 +63,7 @@ class Camera:
     K : (3, 3) array
         Pinhole matrix in pixels with integer pixel centres (OpenCV); no skew.
     dist : (0 | 4 | 5 | 8 | 12,) array
-        OpenCV's distortion k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]; of a fisheye k1 k2 k3 k4.
+        OpenCV's distortion k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]; of a fisheye k1 k2 k3 k4. Empty is all zero.
     readout : str
         One of `READOUTS`, in the stored pixel frame.
     lens : {"pinhole", "fisheye"}
@@ -89,10 +99,9 @@ class Camera:
         if self.lens not in LENSES:
             raise InputError(f"lens={self.lens!r}, expected one of {', '.join(LENSES)}")
         dist = check_finite(np.ravel(self.dist), (None,), "dist")
-        if len(dist) not in LENSES[self.lens]:
-            raise InputError(
-                f"dist has {len(dist)} numbers, a {self.lens} lens has one of {LENSES[self.lens]} in OpenCV's order"
-            )
+        lengths = _DIST_LENGTHS[self.lens]
+        if len(dist) not in lengths:
+            raise InputError(f"dist has {len(dist)} numbers, a {self.lens} lens has one of {lengths} in OpenCV's order")
         if self.readout not in READOUTS:
             raise InputError(f"readout={self.readout!r}, expected one of {', '.join(READOUTS)}")
         object.__setattr__(self, "K", frozen(K))
@@ -119,13 +128,27 @@ class Camera:
 
     @cached_property
     def kernel_args(self) -> tuple[Any, ...]:
-        """(intrinsics (4,), lens (13,), axis, sign) as the kernels take them."""
+        """(intrinsics (4,), lens (13,) or (1, 14), axis, sign) as the kernels take them."""
         lens = np.zeros(13)
-        lens[: len(self.dist)] = self.dist
-        lens[12] = _fold_radius_squared(lens)
+        for name, value in self.coefficients.items():
+            lens[LENSES["pinhole"].index(name)] = value
+        lens[12] = _fold_radius_squared(self.lens, lens)
+        if self.lens == "fisheye":
+            lens = np.append(lens, 1.0)[None]
         axis, sign = READOUTS[self.readout]
         K = self.K
         return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]), lens, axis, sign
+
+    @property
+    def coefficients(self) -> dict[str, float]:
+        """The lens coefficients by name, in the order of `LENSES`; zero where `dist` ends before."""
+        names = LENSES[self.lens]
+        return dict.fromkeys(names, 0.0) | dict(zip(names, self.dist.tolist(), strict=False))
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether the photo is a pinhole's: no lens distortion."""
+        return self.lens == "pinhole" and not self.dist.any()
 
     def pinhole(self) -> Camera:
         """The pinhole camera of the same K, without lens distortion: the default camera of rectified photos."""

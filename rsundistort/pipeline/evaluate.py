@@ -85,7 +85,7 @@ def _without_lens(
     taken_by = truth.cameras[by_name[image.name].camera_id] if image.name in by_name else None
     rectified = solution.rectified_cameras[image.camera_id]
     whole = np.full(twin.shape[:2], 255, np.uint8)
-    if taken_by is None or not taken_by.dist.any():
+    if taken_by is None or taken_by.is_pinhole:
         return twin, whole
     return rectify(twin, taken_by, RowMotion(), "global", rectified)
 

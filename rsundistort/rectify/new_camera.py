@@ -60,6 +60,11 @@ def optimal_new_camera(
     left, right, top, bottom = (unproject_points(b, camera, motion, shutter_model)[0] for b in _border(camera))
     edges = np.vstack([left, right, top, bottom])
     if not np.isfinite(edges).all():
+        if camera.lens == "fisheye":
+            raise InputError(
+                "the photo's border has no place in a pinhole photo: it lies 90 degrees or more from the axis, or the "
+                "lens folds before; check dist, or make a camera of your own, as camera.pinhole() does with the same K"
+            )
         raise InputError("the photo's border has no place without lens and shutter; check dist and phi")
     inner_lo = np.array([left[:, 0].max(), top[:, 1].max()])
     inner_hi = np.array([right[:, 0].min(), bottom[:, 1].min()])

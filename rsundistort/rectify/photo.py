@@ -74,7 +74,7 @@ def rectify(
     if interpolation not in INTERPOLATIONS:
         raise InputError(f"interpolation={interpolation!r}, expected one of {', '.join(INTERPOLATIONS)}")
     target = new_camera or camera.pinhole()
-    if target.dist.any():
+    if not target.is_pinhole:
         raise InputError("new_camera has lens distortion; a rectified photo has none")
     motion = motion or RowMotion()
     rays = rectified_rays(target.K, None, camera)

@@ -1,7 +1,9 @@
 """Matching, verification, mapping and re-triangulation by pycolmap, on keypoints that we correct.
 
 Everything that pycolmap sees is a pinhole camera: keypoints are freed of lens and shutter as far as these are known
-and written into its database. The measurements of the adjustment remain the raw pixels.
+and written into its database. Only a fisheye keeps its lens, which pycolmap has too: in a pinhole photo the noise of a
+keypoint would grow with the square of the distance from the centre, 33 times at 80 degrees from the axis. The
+measurements of the adjustment remain the raw pixels.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..errors import ReconstructionError
 from ..model import Camera, Observations, Reconstruction, RowMotion
-from ..model.projection import unproject_points
+from ..model.projection import project_points, unproject_points
 from .features import Features
 
 __all__ = ["MatchedPhotos", "map_photos", "match_photos", "retriangulate"]
@@ -70,11 +72,14 @@ def _pycolmap() -> Any:
 def _database_camera(camera: Camera, calibrated: bool, camera_id: int) -> Any:
     K = camera.K
     cx, cy = K[0, 2] + _HALF, K[1, 2] + _HALF
-    if calibrated:
-        model, params = "PINHOLE", [K[0, 0], K[1, 1], cx, cy]
+    fisheye = camera.lens == "fisheye"
+    if not calibrated:
+        model = "SIMPLE_RADIAL_FISHEYE" if fisheye else "SIMPLE_RADIAL"
+        params = [K[0, 0], cx, cy, camera.coefficients["k1"]]
+    elif fisheye:
+        model, params = "OPENCV_FISHEYE", [K[0, 0], K[1, 1], cx, cy, *camera.coefficients.values()]
     else:
-        k1 = camera.dist[0] if len(camera.dist) else 0.0
-        model, params = "SIMPLE_RADIAL", [K[0, 0], cx, cy, k1]
+        model, params = "PINHOLE", [K[0, 0], K[1, 1], cx, cy]
     result = _pycolmap().Camera(
         model=model, width=camera.width, height=camera.height, params=params, camera_id=camera_id
     )
@@ -82,12 +87,16 @@ def _database_camera(camera: Camera, calibrated: bool, camera_id: int) -> Any:
     return result
 
 
-def _pinhole_keypoints(features: Features, camera: Camera, motion: RowMotion, model: str) -> NDArray[np.float32]:
-    """Keypoints of the ideal pinhole photo, COLMAP's centres; where none exists, the raw pixel far outside."""
+def _ideal_keypoints(features: Features, camera: Camera, motion: RowMotion, model: str) -> NDArray[np.float32]:
+    """Keypoints without shutter in the camera of the database, COLMAP's centres; where none exists, far outside."""
     ideal, valid = unproject_points(features.xy_raw, camera, motion, model)
-    xy = ideal @ camera.K[:2, :2].T + camera.K[:2, 2] + _HALF
+    if camera.lens == "fisheye":
+        rays = np.column_stack([np.where(valid[:, None], ideal, 0.0), np.ones(len(ideal))])
+        xy = project_points(rays, camera, None, "global")[0]
+    else:
+        xy = ideal @ camera.K[:2, :2].T + camera.K[:2, 2]
     xy[~valid] = -1e4
-    return xy.astype(np.float32)
+    return (xy + _HALF).astype(np.float32)
 
 
 def match_photos(
@@ -147,7 +156,7 @@ def _write_photos(db: Any, matched: MatchedPhotos, limit: int | None = None) -> 
         frame.add_data_id(image.data_id)
         db.write_frame(frame)
         if matched.calibrated:
-            keypoints = _pinhole_keypoints(found, matched.cameras[camera_index], RowMotion(), "global")
+            keypoints = _ideal_keypoints(found, matched.cameras[camera_index], RowMotion(), "global")
         else:
             keypoints = (found.xy_raw + _HALF).astype(np.float32)
         db.write_keypoints(index + 1, keypoints[:limit])
@@ -295,7 +304,7 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction) -> Rec
             model, motion = "global", RowMotion()
             if name in index_of:
                 model, motion = reconstruction.shutter_model, reconstruction.motion(index_of[name])
-            db.update_keypoints(index + 1, _pinhole_keypoints(matched.features[index], camera, motion, model))
+            db.update_keypoints(index + 1, _ideal_keypoints(matched.features[index], camera, motion, model))
         db.clear_two_view_geometries()
     pycolmap.geometric_verification(matched.database, two_view_geometry_options=_verification(_TIGHT_PX, matched.seed))
     empty = _posed_model(matched, reconstruction, cameras)
@@ -385,7 +394,7 @@ def _from_pycolmap(model: Any, matched: MatchedPhotos, posed: Reconstruction | N
 
 
 def _refined_camera(refined: Any, camera: Camera) -> Camera:
-    """Our camera of a SIMPLE_RADIAL camera that mapping refined."""
+    """Our camera of a SIMPLE_RADIAL or SIMPLE_RADIAL_FISHEYE camera that mapping refined."""
     f, cx, cy, k1 = refined.params
     K = [[f, 0, cx - _HALF], [0, f, cy - _HALF], [0, 0, 1]]
-    return Camera(camera.width, camera.height, np.array(K), np.array([k1, 0, 0, 0]), camera.readout)
+    return replace(camera, K=np.array(K), dist=np.array([k1, 0, 0, 0]))

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import InputError
 from ..model.camera import READOUTS, Camera
 from ..model.checks import check_finite
-from .lens import undistort_to_rays
+from .lens import distort_rays, undistort_to_rays
 
 __all__ = ["check_no_fold"]
 
@@ -110,10 +110,10 @@ def _line_speed(
     camera: Camera, uv: NDArray[np.float64], phi: NDArray[np.float64], velocity_per_depth: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Lines (n,) by which the image of what pixels (n, 2) see runs on while one line is read; NaN beyond the lens."""
-    K, dist = np.array(camera.K), np.array(camera.dist)
+    K = camera.K
     axis, sign = READOUTS[camera.readout]
     clock = sign * (uv[:, axis] - K[axis, 2]) / K[axis, axis]
-    norm = undistort_to_rays(uv, K, dist) if dist.any() else (uv - K[:2, 2]) / np.diag(K)[:2]
+    norm = undistort_to_rays(uv, camera)
     known = np.asarray(np.isfinite(norm).all(axis=1))
     rays = np.column_stack([np.where(known[:, None], norm, 0.0), np.ones(len(uv))])
     # small against the distance of what comes towards the camera
@@ -124,8 +124,7 @@ def _line_speed(
         moved = Rotation.from_rotvec(late * phi).apply(rays)
         # X(t) = Exp(t phi) (X(0) - t velocity), so the camera's way is turned by all of the time gone
         moved -= late * Rotation.from_rotvec((clock + late)[:, None] * phi).apply(velocity_per_depth)
-        points = cv2.projectPoints(moved, np.zeros(3), np.zeros(3), K, dist if dist.size else None)[0]
-        return np.asarray(points, np.float64).reshape(-1, 2)
+        return distort_rays(moved, camera)
 
     known &= np.linalg.norm(position(0.0) - uv, axis=1) < _LENS_PX
     moved_px = (position(step) - position(-step))[:, axis]

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..model import Camera, Observations, RowMotion
+from .lens import distort_rays
 
 __all__ = ["Measured", "clock_of", "measure", "project_rows"]
 
@@ -57,7 +57,6 @@ def project_rows(
         The point lies before the camera, and the fixed point was reached.
     """
     points, R, center = (np.asarray(a, np.float64) for a in (points_w, R_cw, center_w))
-    dist = np.array(camera.dist) if len(camera.dist) else None
     q = (points - center) @ R.T
     ahead = q[:, 2] > 1e-9
     seen = np.zeros((len(points), 2))
@@ -70,7 +69,7 @@ def project_rows(
         q = Rotation.from_rotvec(tau[:, None] * motion.phi).apply(moved @ R.T)
         ahead &= q[:, 2] > 1e-9
         q[~ahead] = (0.0, 0.0, 1.0)
-        before, seen = seen, cv2.projectPoints(q, np.zeros(3), np.zeros(3), np.eye(3), dist)[0][:, 0]
+        before, seen = seen, distort_rays(q, camera, np.eye(3))
         reached = np.abs(seen - before).max(1) < _STILL
         if reached.all():
             break

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, fields
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from ..model.checks import check_finite, check_rotations, frozen
 from ..model.motion import RowMotion
 from .entries import number, take
 from .flight import Pose, motions_of, poses_of
+from .lens import undistort_to_rays
 from .scene import Light, Patch, Scene
 from .surfaces import surface_patches
 from .textures import Texture
@@ -26,6 +28,7 @@ from .textures import Texture
 __all__ = ["Noise", "Recipe", "View", "load_recipe"]
 
 _FORMAT, _VERSION = "rsundistort-recipe", 1
+_FOOTPRINT_PX = 5.0
 
 
 @dataclass(frozen=True)
@@ -157,7 +160,16 @@ def _cameras(data: dict[str, Any]) -> dict[str, Camera]:
         raise FormatError("recipe: cameras is empty")
     keys = ("width", "height", "K", "dist", "readout")
     where = {id_: "camera" if "camera" in data else f"cameras.{id_}" for id_ in entries}
-    return {id_: Camera(**take(entry, where[id_], keys)) for id_, entry in entries.items()}
+    cameras = {id_: Camera(**take(entry, where[id_], keys, ("lens",))) for id_, entry in entries.items()}
+    for id_, camera in cameras.items():
+        # the footprints of the outermost pixels reach beyond the photo
+        reach = [(-_FOOTPRINT_PX, side - 1 + _FOOTPRINT_PX) for side in (camera.width, camera.height)]
+        if not np.isfinite(undistort_to_rays(list(product(*reach)), camera)).all():
+            raise FormatError(
+                f"{where[id_]}: no rays within 90 degrees of the axis belong to the corners of a photo by this "
+                f"{camera.lens} lens; give a longer focal length or a smaller photo"
+            )
+    return cameras
 
 
 def _shutter(entry: Any) -> tuple[float | None, float]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from math import gcd
 from statistics import NormalDist
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
@@ -18,7 +17,7 @@ from .._kernels import raycast
 from ..errors import InputError
 from ..model.camera import READOUTS, Camera
 from ..model.checks import check_finite
-from .lens import undistort_to_rays
+from .lens import distort_rays, undistort_to_rays
 from .recipe import Noise, View
 from .scene import Scene
 
@@ -53,14 +52,6 @@ def line_poses(camera: Camera, view: View, delay: float = 0.0) -> tuple[NDArray[
     return turn @ view.R_cw, view.center_w + tau[:, None] * view.motion.velocity
 
 
-def _normalised(camera: Camera, uv_raw: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Ideal normalised coordinates (..., 2) of raw pixels: the lens undone, not the shutter."""
-    K = camera.K
-    if not camera.dist.any():
-        return (uv_raw - K[:2, 2]) / np.diag(K)[:2]
-    return undistort_to_rays(uv_raw, K, camera.dist)
-
-
 def pixel_rays(camera: Camera, view: View, uv_raw: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """World rays along which the centres of raw pixels see.
 
@@ -81,7 +72,7 @@ def pixel_rays(camera: Camera, view: View, uv_raw: ArrayLike) -> tuple[NDArray[n
     uv = check_finite(uv_raw, (None, 2), "uv_raw")
     axis, sign = READOUTS[camera.readout]
     tau = sign * (uv[:, axis] - camera.K[axis, 2]) / camera.K[axis, axis]
-    rays_c = np.column_stack([_normalised(camera, uv), np.ones(len(uv))])
+    rays_c = np.column_stack([undistort_to_rays(uv, camera), np.ones(len(uv))])
     turn = Rotation.from_rotvec(tau[:, None] * view.motion.phi)
     return view.center_w + tau[:, None] * view.motion.velocity, turn.inv().apply(rays_c) @ view.R_cw
 
@@ -150,7 +141,7 @@ def render_view(
         strip = image[row : row + _STRIP_ROWS]
         v, u = np.mgrid[row : row + len(strip), : camera.width].astype(float)
         # All samples of a pixel have the pose of its line, whatever their offset: that is how a line exposes.
-        xy_norm = _normalised(camera, np.stack([u, v], -1)[:, :, None] + offsets)
+        xy_norm = undistort_to_rays(np.stack([u, v], -1)[:, :, None] + offsets, camera)
         raycast.render_rows(scene.geometry, scene.look, R_cw, center_w, by_column, row, xy_norm, spacing, suns, strip)
     return _develop(image, exposure)
 
@@ -167,9 +158,8 @@ def rs_shift_px(scene: Scene, camera: Camera, view: View) -> float:
         distance = scene.cast(origins, directions)[1]
         met = np.isfinite(distance)
         directions[met] = origins[met] + distance[met, None] * directions[met] - view.center_w
-    R_cw = np.ascontiguousarray(view.R_cw)
-    ideal = cv2.projectPoints(directions, cv2.Rodrigues(R_cw)[0], np.zeros(3), camera.K, camera.dist)[0]
-    return float(np.linalg.norm(ideal[:, 0] - uv, axis=1).max())
+    ideal = distort_rays(directions @ view.R_cw.T, camera)
+    return float(np.linalg.norm(ideal - uv, axis=1).max())
 
 
 def render_depth(scene: Scene, camera: Camera, view: View) -> NDArray[np.float32]:

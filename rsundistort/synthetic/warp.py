@@ -6,6 +6,7 @@ The truth of the round trip: plain NumPy and SciPy, closed form per row, and no 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -15,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..model import READOUTS, Camera
-from .lens import undistort_to_rays
+from .lens import distort_rays, undistort_to_rays
 
 __all__ = ["crop_camera", "largest_rectangle", "random_phi", "warp_mask", "warp_photo"]
 
@@ -94,27 +95,21 @@ def warp_mask(camera: Camera, phi: NDArray[np.float64]) -> NDArray[np.uint8]:
 def _lookup(camera: Camera, phi: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Pixel (h, w, 2) of the photo without motion whose direction each warped pixel saw, and whether it has it."""
     w, h = camera.width, camera.height
-    K, dist = np.array(camera.K), np.array(camera.dist)
+    K = camera.K
     axis, sign = READOUTS[camera.readout]
     u, v = np.arange(w, dtype=float), np.arange(h, dtype=float)
     if axis == 1:
         clock = np.repeat((sign * (v - K[1, 2]) / K[1, 1])[:, None], w, axis=1)
     else:
         clock = np.repeat((sign * (u - K[0, 2]) / K[0, 0])[None, :], h, axis=0)
-    uu, vv = np.meshgrid(u, v)
-    if dist.any():
-        ray = undistort_to_rays(np.dstack([uu, vv]), K, dist)
-        x, y = ray[..., 0], ray[..., 1]
-    else:
-        x, y = (uu - K[0, 2]) / K[0, 0], (vv - K[1, 2]) / K[1, 1]
+    ideal = undistort_to_rays(np.dstack(np.meshgrid(u, v)), camera)
     # one rotation a row (or column): turn its rays by it
     steps = clock[:, 0] if axis == 1 else clock[0]
     R = Rotation.from_rotvec(-steps[:, None] * phi).as_matrix()
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+    rays = np.dstack([ideal, np.ones((h, w))])
     turned = np.einsum("vij,vuj->vui" if axis == 1 else "uij,vuj->vui", R, rays)
-    points = cv2.projectPoints(turned.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), K, dist if dist.size else None)[0]
-    source = points.reshape(h, w, 2)
-    ahead = turned[..., 2] > 0
+    source = distort_rays(turned, camera).reshape(h, w, 2)
+    ahead = turned[..., 2] > 0  # not where the lens sees nothing
     inside = ahead & (source >= 0).all(-1) & (source[..., 0] <= w - 1) & (source[..., 1] <= h - 1)
     return np.where(ahead[..., None], source, -1e6).astype(np.float32), inside
 
@@ -164,4 +159,4 @@ def crop_camera(camera: Camera, rectangle: tuple[int, int, int, int]) -> Camera:
     x, y, width, height = rectangle
     K = np.array(camera.K)
     K[:2, 2] -= x, y
-    return Camera(width, height, K, camera.dist, camera.readout)
+    return replace(camera, width=width, height=height, K=K)
