@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -9,9 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .._kernels import projection as kernels
 from ..errors import InputError
 from ..model import Camera, RowMotion
-from .maps import EDGE_PX, fill_rows, rectified_rays
+from .coarse import coarse_grid
+from .maps import rectified_rays
 
 __all__ = ["INTERPOLATIONS", "rectify"]
 
@@ -23,7 +26,8 @@ INTERPOLATIONS: dict[str, int] = {
     "lanczos": cv2.INTER_LANCZOS4,
 }
 
-_STRIP_ROWS = 64
+# OpenCV remaps so few pixels on the thread that asks, whatever `cv2.setNumThreads` says, and the map stays in the cache.
+_STRIP_PIXELS = 1 << 16
 
 
 def rectify(
@@ -49,7 +53,7 @@ def rectify(
     new_camera : Camera, optional
         Pinhole camera of the result (its distortion must be empty); the photo's size and K when left out.
     interpolation : {"cubic", "linear", "lanczos", "nearest"}
-        OpenCV positions cubic and lanczos to 1/32 pixel.
+        OpenCV positions cubic and lanczos to 1/32 pixel, and linear of uint8 photos, as in `cv2.undistort`.
     jobs : int
         Threads; the result does not depend on them.
     mask : (h, w) uint8 array, optional
@@ -76,29 +80,57 @@ def rectify(
     target = new_camera or camera.pinhole()
     if not target.is_pinhole:
         raise InputError("new_camera has lens distortion; a rectified photo has none")
-    motion = motion or RowMotion()
     rays = rectified_rays(target.K, None, camera)
-    shape = (target.height, target.width)
-    rectified = np.empty(shape + photo.shape[2:], photo.dtype)
-    valid = np.empty(shape, np.uint8)
-    flag = INTERPOLATIONS[interpolation]
+    size = (target.width, target.height)
+    grid = coarse_grid(camera, motion or RowMotion(), shutter_model, rays, size)
+    return remap_strips(photo, grid.fill, size, INTERPOLATIONS[interpolation], jobs, mask)
+
+
+def _fixed_point(
+    map_x: NDArray[np.float32], map_y: NDArray[np.float32]
+) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+    """OpenCV's CV_16SC2 map."""
+    xy, fraction = np.empty((*map_x.shape, 2), np.int16), np.empty(map_x.shape, np.uint16)
+    kernels.fixed_point(map_x, map_y, xy.view(np.int32)[..., 0], fraction)
+    return xy, fraction
+
+
+#: Fills rows of a map, from a first one on, and of the mask of what is seen; says whether all of it is.
+FillRows = Callable[[int, NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]], bool]
+
+
+def remap_strips(
+    photo: NDArray[Any],
+    fill: FillRows,
+    size: tuple[int, int],
+    flag: int,
+    jobs: int,
+    mask: NDArray[np.uint8] | None = None,
+) -> tuple[NDArray[Any], NDArray[np.uint8]]:
+    """A photo through a map of `size` that is made strip by strip, and its mask; see `rectify`."""
+    width, height = size
+    rectified = np.empty((height, width, *photo.shape[2:]), photo.dtype)
+    valid = np.empty((height, width), np.uint8)
+    # OpenCV 5 is exact with float maps, and takes half as long again
+    fixed = photo.dtype == np.uint8 and flag == cv2.INTER_LINEAR
+    strip_rows = max(1, _STRIP_PIXELS // width)
 
     def strip(row0: int) -> None:
-        rows = slice(row0, min(row0 + _STRIP_ROWS, target.height))
-        map_x = np.empty((rows.stop - row0, target.width), np.float32)
+        rows = slice(row0, min(row0 + strip_rows, height))
+        map_x = np.empty((rows.stop - row0, width), np.float32)
         map_y = np.empty_like(map_x)
-        fill_rows(camera, motion, shutter_model, rays, row0, map_x, map_y)
-        seen = (map_x >= -EDGE_PX) & (map_x <= camera.width - 1 + EDGE_PX)
-        seen &= (map_y >= -EDGE_PX) & (map_y <= camera.height - 1 + EDGE_PX)
+        values, seen = rectified[rows], valid[rows]
+        all_seen = fill(row0, map_x, map_y, seen)
         # taps beyond the border repeat it, so that seen pixels at the edge keep their brightness
-        values = cv2.remap(photo, map_x, map_y, flag, borderMode=cv2.BORDER_REPLICATE)
-        values[~seen] = 0
-        rectified[rows] = values.reshape(rectified[rows].shape)
+        maps = _fixed_point(map_x, map_y) if fixed else (map_x, map_y)
+        cv2.remap(photo, *maps, flag, dst=values, borderMode=cv2.BORDER_REPLICATE)
+        if not all_seen:
+            kernels.clear_unseen(seen, values.reshape(*seen.shape, -1).view(np.uint8))
         if mask is not None:
-            seen &= cv2.remap(mask, map_x, map_y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE) > 0
-        valid[rows] = np.where(seen, 255, 0)
+            counts = cv2.remap(mask, map_x, map_y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+            seen[counts == 0] = 0
 
-    starts = range(0, target.height, _STRIP_ROWS)
+    starts = range(0, height, strip_rows)
     if jobs == 1:
         for row0 in starts:
             strip(row0)
