@@ -39,11 +39,13 @@ from .pipeline import (
     simulate_warp,
 )
 from .rectify import (
+    RemapGrid,
     distort_points,
     init_rectify_map,
     largest_shift_px,
     optimal_new_camera,
     rectify,
+    remap_grid,
     undistort_points,
 )
 
@@ -62,6 +64,7 @@ __all__ = [
     "Observations",
     "Reconstruction",
     "ReconstructionError",
+    "RemapGrid",
     "RowMotion",
     "RsUndistortError",
     "RsUndistortWarning",
@@ -87,6 +90,7 @@ __all__ = [
     "read_solution",
     "rectify",
     "rectify_folder",
+    "remap_grid",
     "run",
     "simulate_scene",
     "simulate_warp",

@@ -538,27 +538,75 @@ def interpolate_map(
                     near += 0 if safe else 1
             if near == 0:
                 continue
+            t1 = t2 = math.nan
             for j in range(n):
                 x, y = float(row_x[j]), float(row_y[j])
                 if smooth[p, q]:
                     if row_seen[j]:
+                        t1 = math.nan
                         continue
                     if x < low - band or x > right + band or y < low - band or y > bottom + band:
+                        t1 = math.nan
                         unseen += 1
                         continue
                 u = start + j
                 x = rays[0, 0] * u + rays[0, 1] * v + rays[0, 2]
                 y = rays[1, 0] * u + rays[1, 1] * v + rays[1, 2]
                 z = rays[2, 0] * u + rays[2, 1] * v + rays[2, 2]
-                if _project(model, axis, sign, lens, x, y, z, phi, vel, math.nan, out, False):
-                    x, y = intr[0] * out[0] + intr[2], intr[1] * out[1] + intr[3]
-                else:
-                    x, y = -1e6, -1e6
+                ok = _project(model, axis, sign, lens, x, y, z, phi, vel, 2.0 * t1 - t2, out, False)
+                t2 = t1
+                t1 = sign * out[axis] if ok else math.nan
+                x = intr[0] * out[0] + intr[2] if ok else -1e6
+                y = intr[1] * out[1] + intr[3] if ok else -1e6
                 row_x[j] = x
                 row_y[j] = y
                 row_seen[j] = 255 if low <= x <= right and low <= y <= bottom else 0
                 unseen += 0 if row_seen[j] else 1
     return unseen
+
+
+@kernel()
+def invert_map(map_x, map_y, back_x, back_y):
+    """For the pixels of the source of a map, where the map points to them: back_x, back_y of the source's size.
+
+    Each cell of four neighbours is a bilinear patch that holds some pixels of the source. Those that no cell holds, or
+    that an earlier cell held, are left as they are; back_x must be below -1e5 at first.
+    """
+    rows, cols = map_x.shape
+    height, width = back_x.shape
+    slack = 1e-3  # of a cell: float32 rounds
+    for i in range(rows - 1):
+        for j in range(cols - 1):
+            x0, y0 = float(map_x[i, j]), float(map_y[i, j])
+            x1, y1 = float(map_x[i, j + 1]), float(map_y[i, j + 1])
+            x2, y2 = float(map_x[i + 1, j]), float(map_y[i + 1, j])
+            x3, y3 = float(map_x[i + 1, j + 1]), float(map_y[i + 1, j + 1])
+            if min(min(x0, x1), min(x2, x3)) < -1e5:
+                continue
+            left, right = min(min(x0, x1), min(x2, x3)), max(max(x0, x1), max(x2, x3))
+            top, bottom = min(min(y0, y1), min(y2, y3)), max(max(y0, y1), max(y2, y3))
+            if not (right > -1.0 and left < width and bottom > -1.0 and top < height):
+                continue
+            ax, ay, bx, by, cx, cy = x1 - x0, y1 - y0, x2 - x0, y2 - y0, x0 - x1 - x2 + x3, y0 - y1 - y2 + y3
+            # a pixel on the rim may lie outside by a rounding
+            for v in range(max(0, math.ceil(top - slack)), min(height - 1, math.floor(bottom + slack)) + 1):
+                for u in range(max(0, math.ceil(left - slack)), min(width - 1, math.floor(right + slack)) + 1):
+                    if back_x[v, u] > -1e5:
+                        continue
+                    s = t = 0.5
+                    for _ in range(8):
+                        ex = x0 + s * ax + t * bx + s * t * cx - u
+                        ey = y0 + s * ay + t * by + s * t * cy - v
+                        xs, xt, ys, yt = ax + t * cx, bx + s * cx, ay + t * cy, by + s * cy
+                        det = xs * yt - xt * ys
+                        ds, dt = (yt * ex - xt * ey) / det, (xs * ey - ys * ex) / det
+                        s -= ds
+                        t -= dt
+                        if not abs(ds) + abs(dt) > 1e-9:
+                            break
+                    if -slack <= s <= 1.0 + slack and -slack <= t <= 1.0 + slack:
+                        back_x[v, u] = j + s
+                        back_y[v, u] = i + t
 
 
 _5, _16, _31, _LOW_HALF, _BIAS = np.int32(5), np.int32(16), np.int32(31), np.int32(0xFFFF), np.int32(1 << 20)

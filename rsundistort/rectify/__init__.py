@@ -1,5 +1,7 @@
 """Rectification: grids, photos and points, both ways."""
 
+from .coarse import TOLERANCE_PX, CoarseGrid, coarse_grid
+from .grid import MAP_KINDS, RemapGrid, remap_grid
 from .maps import init_rectify_map
 from .new_camera import optimal_new_camera
 from .photo import INTERPOLATIONS, rectify
@@ -7,10 +9,16 @@ from .points import distort_points, largest_shift_px, undistort_points
 
 __all__ = [
     "INTERPOLATIONS",
+    "MAP_KINDS",
+    "TOLERANCE_PX",
+    "CoarseGrid",
+    "RemapGrid",
+    "coarse_grid",
     "distort_points",
     "init_rectify_map",
     "largest_shift_px",
     "optimal_new_camera",
     "rectify",
+    "remap_grid",
     "undistort_points",
 ]

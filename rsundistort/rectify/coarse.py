@@ -1,8 +1,9 @@
-"""Maps by interpolation: the exact model at the nodes of a coarse grid, cubics between them, and how far they are off."""
+"""Maps by interpolation: the exact model at the nodes of a coarse grid, cubics between, and how far they are off."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,9 +52,7 @@ class CoarseGrid:
     spacing: int
     error_px: float
 
-    def fill(
-        self, row0: int, map_x: NDArray[np.float32], map_y: NDArray[np.float32], seen: NDArray[np.uint8]
-    ) -> bool:
+    def fill(self, row0: int, map_x: NDArray[np.float32], map_y: NDArray[np.float32], seen: NDArray[np.uint8]) -> bool:
         """Fill the rows `row0 ...` of a map and of a mask (255 where the raw photo answers); True if it does all over.
 
         The mask is exact: pixels within the error of the border of the raw photo are evaluated one by one.
@@ -87,7 +86,7 @@ def coarse_grid(
     intr, lens, axis, sign = camera.kernel_args
     model = check_shutter_model(shutter_model)
 
-    def at_nodes(rows: int, cols: int, spacing: int, offset: float) -> tuple[NDArray[np.float64], ...]:
+    def at_nodes(rows: int, cols: int, spacing: int, offset: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         step = np.array([[spacing, 0, offset], [0, spacing, offset], [0, 0, 1.0]])
         x, y = np.empty((rows, cols)), np.empty((rows, cols))
         kernels.fill_map(model, axis, sign, intr, lens, motion.phi, rays @ step, 0, 0, x, y)
@@ -95,24 +94,24 @@ def coarse_grid(
 
     for spacing in _SPACINGS:
         n, m = (-(-length // (3 * spacing)) for length in size)
-        nodes = at_nodes(3 * m + 1, 3 * n + 1, spacing, 0.0)
-        between = at_nodes(3 * m, 3 * n, spacing, spacing / 2)
-        answers = _blocks(between[0] > -1e5).all((1, 3)) & _corners(nodes[0] > -1e5).all((1, 3))
-        errors = [_blocks(np.abs(_interpolated(f) - g)).max((1, 3)) for f, g in zip(nodes, between, strict=True)]
-        error = _SAFETY * np.maximum(*errors)
+        nodes_x, nodes_y = at_nodes(3 * m + 1, 3 * n + 1, spacing, 0.0)
+        between_x, between_y = at_nodes(3 * m, 3 * n, spacing, spacing / 2)
+        answers = _corners(nodes_x > -1e5).all((1, 3)) & _blocks(between_x > -1e5).all((1, 3))
+        off = np.maximum(abs(_interpolated(nodes_x) - between_x), abs(_interpolated(nodes_y) - between_y))
+        error = _SAFETY * _blocks(off).max((1, 3))
         smooth = answers & (error <= TOLERANCE_PX)
         if (answers & ~smooth).sum() <= _MAX_ROUGH * answers.sum():
             break
     bound = float(error[smooth].max(initial=0.0))
-    return CoarseGrid(camera, motion, shutter_model, rays, *nodes, smooth, spacing, bound)
+    return CoarseGrid(camera, motion, shutter_model, rays, nodes_x, nodes_y, smooth, spacing, bound)
 
 
-def _blocks(values: NDArray[np.generic]) -> NDArray[np.generic]:
+def _blocks(values: NDArray[Any]) -> NDArray[Any]:
     """(3 m, 3 n) values by patches: (m, 3, n, 3)."""
     return values.reshape(values.shape[0] // 3, 3, -1, 3)
 
 
-def _corners(values: NDArray[np.generic]) -> NDArray[np.generic]:
+def _corners(values: NDArray[Any]) -> NDArray[Any]:
     """(3 m + 1, 3 n + 1) nodes by patches, which share those at their rims: (m, 4, n, 4)."""
     rows, cols = (3 * np.arange(length // 3)[:, None] + np.arange(4) for length in values.shape)
     return values[rows][:, :, cols]

@@ -26,8 +26,25 @@ INTERPOLATIONS: dict[str, int] = {
     "lanczos": cv2.INTER_LANCZOS4,
 }
 
-# OpenCV remaps so few pixels on the thread that asks, whatever `cv2.setNumThreads` says, and the map stays in the cache.
+# So few pixels OpenCV remaps on the thread that asks, whatever `cv2.setNumThreads` says; the map stays in the cache.
 _STRIP_PIXELS = 1 << 16
+
+
+def check_photo(photo: NDArray[Any], width: int, height: int) -> NDArray[Any]:
+    """The photo, refused if it is of a kind that cannot be remapped or of another size."""
+    photo = np.asarray(photo)
+    if photo.dtype not in (np.uint8, np.uint16, np.float32) or photo.ndim not in (2, 3):
+        raise InputError(f"photo is {photo.dtype} {photo.shape}, expected uint8, uint16 or float32 (h, w[, channels])")
+    if photo.shape[:2] != (height, width):
+        raise InputError(f"photo has {photo.shape[1]}x{photo.shape[0]} pixels, its camera {width}x{height}")
+    return photo
+
+
+def check_interpolation(name: str) -> int:
+    """OpenCV's flag of an interpolation."""
+    if name not in INTERPOLATIONS:
+        raise InputError(f"interpolation={name!r}, expected one of {', '.join(INTERPOLATIONS)}")
+    return INTERPOLATIONS[name]
 
 
 def rectify(
@@ -66,29 +83,20 @@ def rectify(
     valid : (h, w) uint8 array
         255 where a raw pixel (that counts) answers, else 0.
     """
-    photo = np.asarray(photo)
-    if photo.dtype not in (np.uint8, np.uint16, np.float32) or photo.ndim not in (2, 3):
-        raise InputError(f"photo is {photo.dtype} {photo.shape}, expected uint8, uint16 or float32 (h, w[, channels])")
-    if photo.shape[:2] != (camera.height, camera.width):
-        raise InputError(
-            f"photo has {photo.shape[1]}x{photo.shape[0]} pixels, its camera {camera.width}x{camera.height}"
-        )
+    photo = check_photo(photo, camera.width, camera.height)
     if mask is not None and (mask.dtype != np.uint8 or mask.shape != photo.shape[:2]):
         raise InputError(f"mask is {mask.dtype} {mask.shape}, expected uint8 {photo.shape[:2]}")
-    if interpolation not in INTERPOLATIONS:
-        raise InputError(f"interpolation={interpolation!r}, expected one of {', '.join(INTERPOLATIONS)}")
+    flag = check_interpolation(interpolation)
     target = new_camera or camera.pinhole()
     if not target.is_pinhole:
         raise InputError("new_camera has lens distortion; a rectified photo has none")
     rays = rectified_rays(target.K, None, camera)
     size = (target.width, target.height)
     grid = coarse_grid(camera, motion or RowMotion(), shutter_model, rays, size)
-    return remap_strips(photo, grid.fill, size, INTERPOLATIONS[interpolation], jobs, mask)
+    return remap_strips(photo, grid.fill, size, flag, jobs, mask)
 
 
-def _fixed_point(
-    map_x: NDArray[np.float32], map_y: NDArray[np.float32]
-) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+def _fixed_point(map_x: NDArray[np.float32], map_y: NDArray[np.float32]) -> tuple[NDArray[Any], NDArray[Any]]:
     """OpenCV's CV_16SC2 map."""
     xy, fraction = np.empty((*map_x.shape, 2), np.int16), np.empty(map_x.shape, np.uint16)
     kernels.fixed_point(map_x, map_y, xy.view(np.int32)[..., 0], fraction)
@@ -122,8 +130,8 @@ def remap_strips(
         values, seen = rectified[rows], valid[rows]
         all_seen = fill(row0, map_x, map_y, seen)
         # taps beyond the border repeat it, so that seen pixels at the edge keep their brightness
-        maps = _fixed_point(map_x, map_y) if fixed else (map_x, map_y)
-        cv2.remap(photo, *maps, flag, dst=values, borderMode=cv2.BORDER_REPLICATE)
+        map1, map2 = _fixed_point(map_x, map_y) if fixed else (map_x, map_y)
+        cv2.remap(photo, map1, map2, flag, dst=values, borderMode=cv2.BORDER_REPLICATE)
         if not all_seen:
             kernels.clear_unseen(seen, values.reshape(*seen.shape, -1).view(np.uint8))
         if mask is not None:
