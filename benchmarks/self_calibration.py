@@ -30,7 +30,7 @@ from rsundistort.pipeline.progress import StageLog
 from rsundistort.pipeline.run import use_threads
 from rsundistort.pipeline.solve import solve_photos
 
-import pycolmap  # isort: skip  # after rsundistort: see rsundistort/io/images.py
+import pycolmap  # isort: skip  # after rsundistort: see rsundistort/io/photos/images.py
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -52,6 +52,28 @@ quiet_option: Decorator = click.option("-q", "--quiet", is_flag=True, help="Noth
 quality_option: Decorator = click.option(
     "--quality", type=click.IntRange(1, 100), default=98, show_default=True, help="Of JPEG and WebP."
 )
+raw_as_option: Decorator = click.option(
+    "--raw-as",
+    type=click.Choice(("tif", "jpg", "png")),
+    default="tif",
+    show_default=True,
+    help="What RAW and HEIC are written as; jpg has 8 bits, the others 16.",
+)
+apply_orientation_option: Decorator = click.option(
+    "--apply-orientation",
+    is_flag=True,
+    help="Turn photos, masks, cameras and poses by the EXIF orientation, which otherwise is carried along.",
+)
+again_option: Decorator = click.option("--again", is_flag=True, help="Take photos that are rectified already.")
+max_pixels_option: Decorator = click.option(
+    "--max-pixels",
+    "max_megapixels",
+    type=click.FloatRange(min=0, min_open=True),
+    default=250.0,
+    show_default=True,
+    metavar="MILLIONS",
+    help="Photos with more pixels are left out: a small file can claim to be a huge picture.",
+)
 interpolation_option: Decorator = click.option(
     "--interpolation", type=click.Choice(INTERPOLATION_NAMES), default="cubic", show_default=True
 )

@@ -26,6 +26,10 @@ from .terminal import errors_for_people, progress_bars
 )
 @opt.interpolation_option
 @opt.quality_option
+@opt.raw_as_option
+@opt.apply_orientation_option
+@opt.again_option
+@opt.max_pixels_option
 @opt.jobs_option
 @opt.overwrite_option
 @opt.quiet_option
@@ -36,6 +40,10 @@ def command(
     masks: Path | None,
     interpolation: str,
     quality: int,
+    raw_as: str,
+    apply_orientation: bool,
+    again: bool,
+    max_megapixels: float,
     jobs: int,
     overwrite: bool,
     quiet: bool,
@@ -47,7 +55,8 @@ def command(
         solved, left_out = rectify_folder(
             photos, solution, out,
             interpolation=interpolation, quality=quality, jobs=jobs, overwrite=overwrite, masks=masks,
-            progress=progress,
+            progress=progress, raw_as=raw_as, apply_orientation=apply_orientation, again=again,
+            max_megapixels=max_megapixels,
         )  # fmt: skip
     if not quiet:
         count = len(list((out / "images").iterdir()))

@@ -117,6 +117,10 @@ if TYPE_CHECKING:
 )
 @opt.interpolation_option
 @opt.quality_option
+@opt.raw_as_option
+@opt.apply_orientation_option
+@opt.again_option
+@opt.max_pixels_option
 @opt.seed_option
 @opt.jobs_option
 @opt.overwrite_option
@@ -143,6 +147,10 @@ def command(
     max_features: int,
     interpolation: str,
     quality: int,
+    raw_as: str,
+    apply_orientation: bool,
+    again: bool,
+    max_megapixels: float,
     seed: int,
     jobs: int,
     overwrite: bool,
@@ -171,6 +179,10 @@ def command(
                 max_features=max_features,
                 interpolation=interpolation,
                 quality=quality,
+                raw_as=raw_as,
+                apply_orientation=apply_orientation,
+                again=again,
+                max_megapixels=max_megapixels,
                 refine=_names(refine),
                 still=_anchors(still),
                 known={} if known is None else read_known_motions(known, readout_s),
@@ -271,11 +283,14 @@ def closing_table(solution: Solution, out: Path) -> str:
 
 
 def _cameras(solution: Solution) -> list[str]:
-    """Where the cameras come from and which way they are read out; a line on each group where there are several."""
+    """Where the cameras come from, which way they are read out by group where they differ, and what was guessed."""
     source, readout = solution.options["camera"], solution.options["readout"]
     if isinstance(readout, str):
-        return [f"camera             {source}, readout {readout}"]
-    return [f"cameras            {source}", *(f"  {group}: readout {each}" for group, each in readout.items())]
+        lines = [f"camera             {source}, readout {readout}"]
+    else:
+        lines = [f"cameras            {source}", *(f"  {group}: readout {each}" for group, each in readout.items())]
+    guesses = solution.options.get("guesses", ())
+    return lines + [f"  {line}" for text in guesses for line in textwrap.wrap(text, 78)]
 
 
 def _intrinsics(solution: Solution) -> list[str]:

@@ -14,6 +14,7 @@ from .bundle import BundleOptions, BundleResult, bundle_adjust, climb
 from .critical import CriticalMotion, critical_motion
 from .errors import (
     FileError,
+    FileKindWarning,
     FormatError,
     InputError,
     MetadataWarning,
@@ -57,6 +58,7 @@ __all__ = [
     "Camera",
     "CriticalMotion",
     "FileError",
+    "FileKindWarning",
     "FormatError",
     "GyroOptions",
     "InputError",

@@ -31,3 +31,7 @@ class SkippedPhotoWarning(RsUndistortWarning):
 
 class MetadataWarning(RsUndistortWarning):
     """A photo's metadata could not be kept."""
+
+
+class FileKindWarning(RsUndistortWarning):
+    """A file's content is of another kind than its ending says."""

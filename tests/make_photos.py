@@ -75,3 +75,104 @@ def half_courtyard(folder: Path, names: list[str] | None = None) -> Path:
     truth["images"] = [image for image in truth["images"] if image["name"] in names]
     (folder / "ground_truth.json").write_text(json.dumps(truth))
     return photos
+
+
+# What a camera's EXIF says beside its sizes: IFD0, the Exif IFD and the GPS IFD, as (tag, type, values).
+_ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED = 2, 3, 4, 5, 7
+MAKER_NOTE = b"Maker\0\1" + bytes(range(120)) + b"END"
+THUMBNAIL = bytes(cv2.imencode(".jpg", np.full((12, 16, 3), 90, np.uint8))[1])
+
+
+def camera_exif(order: str, orientation: int = 6, width: int = 64, height: int = 48, thumbnail: bool = True) -> bytes:
+    """A block as a camera writes it: strings, rationals, maker note, GPS, a thumbnail; in a byte order, < or >."""
+    ifd0 = [
+        (0x0100, _LONG, [width]),
+        (0x0101, _SHORT, [height]),
+        (0x010F, _ASCII, b"A Maker\0\0\0"),  # NULs behind the string, as some pad
+        (0x0110, _ASCII, b"Model 7\0"),
+        (0x0112, _SHORT, [orientation]),
+        (0x011A, _RATIONAL, [72, 1]),
+        (0x0131, _ASCII, b"their own software\0"),
+        (0x8769, _LONG, "exif"),
+        (0x8825, _LONG, "gps"),
+    ]
+    exif = [
+        (0x829A, _RATIONAL, [1, 250]),
+        (0x9003, _ASCII, b"2024:05:06 07:08:09\0"),
+        (0x920A, _RATIONAL, [43, 10]),
+        (0x927C, _UNDEFINED, MAKER_NOTE),
+        (0x9286, _UNDEFINED, b"ASCII\0\0\0a comment"),
+        (0xA001, _SHORT, [1]),
+        (0xA002, _SHORT, [width]),
+        (0xA003, _LONG, [height]),
+        (0xA405, _SHORT, [35]),
+    ]
+    gps = [
+        (0x0000, 1, bytes([2, 3, 0, 0])),
+        (0x0001, _ASCII, b"N\0"),
+        (0x0002, _RATIONAL, [55, 1, 41, 1, 267, 5]),
+    ]
+    ifd1 = [(0x0103, _SHORT, [6]), (0x0201, _LONG, "thumbnail"), (0x0202, _LONG, [len(THUMBNAIL)])]
+    blocks = {"ifd0": ifd0, "exif": exif, "gps": gps, **({"ifd1": ifd1} if thumbnail else {})}
+    forms = {_SHORT: "H", _LONG: "I", _RATIONAL: "I"}
+
+    def size(entries):
+        # at most 4 bytes fit into an entry
+        values = [
+            len(v) if isinstance(v, bytes) else 4 * (t != _SHORT) * len(v)
+            for _, t, v in entries
+            if not isinstance(v, str)
+        ]
+        return 2 + 12 * len(entries) + 4 + sum(n + n % 2 for n in values if n > 4)
+
+    starts, at = {}, 8
+    for name, entries in blocks.items():
+        starts[name] = at
+        at += size(entries)
+    starts["thumbnail"] = at
+    out = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "I", 8)
+    for name, entries in blocks.items():
+        head, tail = struct.pack(order + "H", len(entries)), b""
+        behind = starts[name] + 2 + 12 * len(entries) + 4
+        for tag, kind, values in entries:
+            if isinstance(values, str):
+                values = [starts[values]]
+            raw = values if isinstance(values, bytes) else struct.pack(f"{order}{len(values)}{forms[kind]}", *values)
+            count = len(values) // 2 if kind == _RATIONAL else len(values)
+            field = raw.ljust(4, b"\0") if len(raw) <= 4 else struct.pack(order + "I", behind + len(tail))
+            tail += b"" if len(raw) <= 4 else raw + bytes(len(raw) % 2)
+            head += struct.pack(order + "HHI", tag, kind, count) + field
+        following = starts["ifd1"] if name == "ifd0" and thumbnail else 0
+        out += head + struct.pack(order + "I", following) + tail
+    return out + (THUMBNAIL if thumbnail else b"")
+
+
+def tagged_jpeg(pixels: np.ndarray, segments: list[tuple[int, bytes]], quality: int = 95) -> bytes:
+    """A JPEG with segments (marker, content) behind its start."""
+    data = bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
+    block = b"".join(struct.pack(">BBH", 0xFF, marker, len(content) + 2) + content for marker, content in segments)
+    return data[:2] + block + data[2:]
+
+
+def small_dng(orientation: int = 1, width: int = 64, height: int = 48) -> bytes:
+    """A Bayer DNG of a smooth slope, with a maker note and an Exif IFD."""
+    base = camera_exif("<", orientation, width, height, thumbnail=False)
+    y, x = np.mgrid[:height, :width]
+    mosaic = (20000 + 200 * x + 300 * y).astype("<u2").tobytes()
+    strip_at = len(base) + len(base) % 2
+    ifd_at = strip_at + len(mosaic)
+    count = struct.unpack_from("<H", base, 8)[0]
+    kept = [struct.unpack_from("<HHI4s", base, 10 + 12 * k) for k in range(count)]
+    wide = b"".join(struct.pack("<ii", int(v), 1) for v in np.eye(3).ravel())
+    neutral = struct.pack("<6I", *[1, 1] * 3)
+    tail_at = ifd_at + 2 + 12 * (len(kept) + 15) + 4
+    shorts = {0x0102: 16, 0x0103: 1, 0x0106: 32803, 0x0115: 1, 0xC65A: 21}
+    entries = kept + [(tag, 3, 1, struct.pack("<HH", value, 0)) for tag, value in shorts.items()]
+    longs = {0x00FE: 0, 0x0111: strip_at, 0x0116: height, 0x0117: len(mosaic), 0xC61D: 65535}
+    entries += [(tag, 4, 1, struct.pack("<I", value)) for tag, value in longs.items()]
+    entries += [(0x828D, 3, 2, struct.pack("<HH", 2, 2)), (0x828E, 1, 4, bytes([0, 1, 1, 2]))]
+    entries += [(0xC612, 1, 4, bytes([1, 4, 0, 0])), (0xC621, 10, 9, struct.pack("<I", tail_at))]
+    entries += [(0xC628, 5, 3, struct.pack("<I", tail_at + len(wide)))]
+    ifd = struct.pack("<H", len(entries)) + b"".join(struct.pack("<HHI4s", *e) for e in sorted(entries))
+    data = base[:4] + struct.pack("<I", ifd_at) + base[8:]
+    return data.ljust(strip_at, b"\0") + mosaic + ifd + bytes(4) + wide + neutral

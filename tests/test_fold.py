@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from numpy_twin import Fisheye, lens_of
 from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, InputError
@@ -15,10 +16,11 @@ K = [[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]]
 # farthest pixel from the principal row: 240 rows above it, the last one is 239 below
 R_MAX, C_MAX = 240 / 500, 320 / 500
 LENS = [-0.12, 0.03, 0.001, -0.002]
+FISHEYE = Fisheye([0.03, -0.01, 0.004, -0.001])
 
 
 def camera_of(readout="top-to-bottom", dist=()):
-    return Camera(640, 480, K, np.array(dist), readout)
+    return Camera(640, 480, K, np.array(dist), readout, lens_of(dist))
 
 
 def folds(*args, **kwargs):
@@ -30,7 +32,7 @@ def folds(*args, **kwargs):
 
 
 @pytest.mark.parametrize("readout", READOUTS)
-@pytest.mark.parametrize("dist", [(), LENS])
+@pytest.mark.parametrize("dist", [(), LENS, FISHEYE], ids=["pinhole", "lens", "fisheye"])
 def test_motions_of_a_hand_pass(readout, dist, rng):
     camera = camera_of(readout, dist)
     for _ in range(5):
@@ -95,7 +97,7 @@ def test_nearest_thing_of_a_depth_map_counts():
 
 
 @pytest.mark.parametrize("readout", READOUTS)
-@pytest.mark.parametrize("dist", [(), LENS])
+@pytest.mark.parametrize("dist", [(), LENS, FISHEYE], ids=["pinhole", "lens", "fisheye"])
 def test_rows_fold_where_the_map_to_directions_turns_over(readout, dist, rng):
     """Counted another way: small triangles of pixels whose directions go round the other way."""
     camera = camera_of(readout, dist)

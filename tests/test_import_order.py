@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+import zlib
+from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 ROUND_TRIP = """
 import sys
 from pathlib import Path
 import numpy as np
-from rsundistort.io import read_photo, write_image
+from rsundistort.io import Metadata, read_photo, write_image
 for dtype in (np.uint8, np.uint16):
     for shape in ((300, 400), (300, 400, 3)):
         pixels = np.random.default_rng(0).integers(0, np.iinfo(dtype).max + 1, shape, dtype=dtype)
@@ -20,6 +25,14 @@ for dtype in (np.uint8, np.uint16):
         write_image(path, pixels)
         back = read_photo(path).pixels
         assert back.dtype == dtype and np.array_equal(back, pixels)
+metadata = Metadata(b"II*\\0\\x08\\0\\0\\0" + bytes(6), b"<x/>", bytes(16) + b"RGB " + bytes(70000))
+write_image(path, pixels, metadata)
+assert read_photo(path).metadata == metadata
+import struct
+profile = b"iCCPp\\0\\0" + PROFILE
+data = SMALL
+path.write_bytes(data[:33] + struct.pack(">I", len(profile) - 4) + profile + bytes(4) + data[33:])
+assert read_photo(path).metadata.icc == bytes(70000)  # inflated
 print("done")
 """
 
@@ -36,8 +49,11 @@ print("done")
     ids=lambda text: text.replace("import ", "").replace("\n", "-"),
 )
 def test_png_is_written_whoever_comes_first(tmp_path, first):
+    # compressed here, since the process may not be able to
+    small = bytes(cv2.imencode(".png", np.zeros((2, 2), np.uint8))[1])
+    given = f"\nSMALL = {small!r}\nPROFILE = {zlib.compress(bytes(70000))!r}\n"
     done = subprocess.run(
-        [sys.executable, "-c", first + ROUND_TRIP, str(tmp_path)],
+        [sys.executable, "-c", first + given + ROUND_TRIP, str(tmp_path)],
         capture_output=True,
         text=True,
         timeout=120,
@@ -45,3 +61,13 @@ def test_png_is_written_whoever_comes_first(tmp_path, first):
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "done"
+
+
+def test_every_package_is_installed():
+    """A package that `pyproject.toml` forgets is missing from what pip installs, and present here."""
+    root = Path(__file__).parent.parent
+    there = {
+        path.parent.relative_to(root).as_posix().replace("/", ".") for path in root.glob("rsundistort/**/__init__.py")
+    }
+    block = (root / "pyproject.toml").read_text(encoding="utf-8").partition("\npackages = [")[2].partition("]")[0]
+    assert there | {"rsundistort_cli"} == set(re.findall(r'"([.\w]+)"', block))

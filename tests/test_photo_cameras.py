@@ -12,9 +12,9 @@ import pytest
 from make_photos import COURTYARD_NAMES, exif_block, half_courtyard, save_png, texture
 
 from rsundistort import Camera, FileError, InputError, RowMotion, RunOptions, rectify, rectify_folder, run
-from rsundistort.io import find_masks, read_mask, write_image
+from rsundistort.io import Metadata, find_masks, read_exif, read_mask, write_image
 from rsundistort.io.cameras import camera_to_json
-from rsundistort.pipeline.cameras import find_cameras
+from rsundistort.pipeline import cameras as photo_cameras
 from rsundistort.sfm import detect_features
 
 HANDHELD = Path(__file__).parent.parent / "sample_scenes" / "handheld"
@@ -34,6 +34,12 @@ def folder(tmp_path):
     for name, (width, height) in zip("abcd", (WIDE, WIDE, WIDE, TALL), strict=True):
         save_png(photos / f"{name}.png", texture(width, height))
     return photos
+
+
+def find_cameras(folder, names, sizes, camera=None, readout=None):
+    """As a run calls it, with what EXIF says."""
+    facts = [read_exif(folder / name) for name in names]
+    return photo_cameras.find_cameras(folder, names, sizes, facts, camera, readout)
 
 
 NAMES, SIZES = ["a.png", "b.png", "c.png", "d.png"], [WIDE, WIDE, WIDE, TALL]
@@ -100,7 +106,7 @@ def test_directions_that_nobody_told_are_guesses(folder, tmp_path):
 def test_exif_groups_photos_and_turned_ones_are_read_out_across(tmp_path):
     for name, (width, height) in zip(NAMES, SIZES, strict=True):
         path = tmp_path / name.replace("png", "jpg")
-        write_image(path, texture(width, height), [(0, exif_block(1, focal_35mm=28))])
+        write_image(path, texture(width, height), Metadata(exif=bytes(exif_block(1, focal_35mm=28))))
     names = [name.replace("png", "jpg") for name in NAMES]
     found = find_cameras(tmp_path, names, SIZES)
     assert [camera.readout for camera in found.cameras] == ["top-to-bottom", "left-to-right"]

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy_twin import Fisheye, lens, lens_of
 from scipy.spatial.transform import Rotation
 
 from rsundistort.errors import FileError, FormatError, InputError
@@ -23,6 +24,7 @@ from rsundistort.synthetic.textures import Texture
 COURTYARD = Path(__file__).parents[1] / "sample_scenes" / "courtyard"
 K = np.array([[410.0, 0, 201.0], [0, 400.0, 148.5], [0, 0, 1]])
 LENS = [-0.12, 0.03, 0.001, -0.002, 0.01]
+FISHEYE = Fisheye([0.03, -0.01, 0.004, -0.001])
 DIRECTIONS = {
     "top-to-bottom": (1, 1),
     "bottom-to-top": (1, -1),
@@ -65,13 +67,14 @@ def grid_uv(camera, step):
     return np.stack([u.ravel(), v.ravel()], 1)
 
 
-@pytest.mark.parametrize("dist", [[], LENS], ids=["pinhole", "lens"])
+@pytest.mark.parametrize("dist", [[], LENS, FISHEYE], ids=["pinhole", "lens", "fisheye"])
 def test_rays_without_motion_meet_the_points_that_opencv_projects(dist):
-    camera, v = Camera(400, 300, K, dist), view()
+    camera, v = Camera(400, 300, K, dist, lens=lens_of(dist)), view()
     rng = np.random.default_rng(5)
     points = np.column_stack([rng.uniform(-2, 2, 200), np.full(200, 8.0), rng.uniform(-1.5, 1.5, 200)])
-    uv = cv2.projectPoints(points, cv2.Rodrigues(np.array(v.R_cw))[0], -v.R_cw @ v.center_w, K, np.array(dist))[0]
-    origins, directions = pixel_rays(camera, v, uv[:, 0])
+    in_camera = (points - v.center_w) @ v.R_cw.T
+    uv = lens(dist, in_camera[:, :2] / in_camera[:, 2:]) * np.diag(K)[:2] + K[:2, 2]
+    origins, directions = pixel_rays(camera, v, uv)
     scene = Scene((Patch([-20, 8, -20], [40, 0, 0], [0, 0, 40], "grey"),), {"grey": GREY})
     patch, distance = scene.cast(origins, directions)
     assert (patch == 0).all()
@@ -79,9 +82,9 @@ def test_rays_without_motion_meet_the_points_that_opencv_projects(dist):
 
 
 @pytest.mark.parametrize("readout", DIRECTIONS)
-@pytest.mark.parametrize("dist", [[], LENS], ids=["pinhole", "lens"])
+@pytest.mark.parametrize("dist", [[], LENS, FISHEYE], ids=["pinhole", "lens", "fisheye"])
 def test_what_a_pixel_sees_projects_back_to_it(readout, dist):
-    camera = Camera(400, 300, K, dist, readout)
+    camera = Camera(400, 300, K, dist, readout, lens_of(dist))
     v = view((0.07, -0.05, 0.09), (0.11, -0.06, 0.08))
     uv = grid_uv(camera, 17)
     scene = small_scene()
@@ -122,8 +125,8 @@ def test_rendered_spots_lie_where_their_points_project():
     half = 0.06
     spots = [Patch(p - [half, 0.001, half], [2 * half, 0, 0], [0, 0, 2 * half], "grey") for p in points]
     scene = Scene((Patch([-9, 4, -9], [18, 0, 0], [0, 0, 18], "dark"), *spots), textures, Light(clouds=0.0))
-    for readout in ("top-to-bottom", "right-to-left"):
-        camera = Camera(400, 300, K, LENS, readout)
+    for readout, dist in (("top-to-bottom", LENS), ("right-to-left", LENS), ("bottom-to-top", FISHEYE)):
+        camera = Camera(400, 300, K, dist, readout, lens_of(dist))
         v = view((0.07, -0.05, 0.09), (0.11, -0.06, 0.08))
         image = render_view(scene, camera, v).astype(float)[..., 1]
         uv = project_forward(camera, v, points)
@@ -332,6 +335,12 @@ def test_the_same_recipe_gives_the_same_bytes(tmp_path):
         (("textures",), 3, "wrong type"),
         (("seed",), -1, "seed=-1"),
         (("cameras",), {}, "either camera or cameras"),
+        # the corner is 1.48 rad from the axis, but not that of the outermost pixel's footprint
+        (
+            ("camera",),
+            {**TINY["camera"], "K": [[19, 0, 23.5], [0, 19, 15.5], [0, 0, 1]], "lens": "fisheye"},
+            "camera: no rays within 90 degrees of the axis belong to the corners",
+        ),
         (("path", 1, "camera"), "2", r"path\[1\]: camera '2', expected one of 1"),
         (("path",), [], "no places"),
         (("path",), {"kind": "spiral"}, "kind 'spiral'"),

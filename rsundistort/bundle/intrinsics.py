@@ -90,13 +90,13 @@ def deviation(
     camera: Camera, guess: Camera, names: Sequence[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
     """How far (len(names),) a camera is from a guess, in the units of `GuessedCameras`; derivatives in the unknowns."""
-    (fx, fy, cx, cy), dist, *_ = camera.kernel_args
-    (gx, gy, gcx, gcy), guess_dist, *_ = guess.kernel_args
+    fx, fy, cx, cy = camera.kernel_args[0]
+    gx, gy, gcx, gcy = guess.kernel_args[0]
     apart = {"f": np.log(fx / gx), "fx": np.log(fx / gx), "fy": np.log(fy / gy), "cx": (cx - gcx) / gx}
     apart["cy"] = (cy - gcy) / gy
     slope = {"cx": fx / gx, "cy": fy / gy}
-    for name, value in zip(("k1", "k2", "p1", "p2", "k3"), dist[:5] - guess_dist[:5], strict=True):
-        apart[name] = value
+    guessed = guess.coefficients
+    apart |= {name: value - guessed[name] for name, value in camera.coefficients.items()}
     return np.array([apart[name] for name in names]), np.array([slope.get(name, 1.0) for name in names])
 
 

@@ -2,23 +2,27 @@
 
 from .cameras import CameraFile, check_camera_fits, parse_camera, read_camera_file
 from .colmap import read_colmap_cameras, read_colmap_poses, write_colmap_model
-from .exif_facts import ExifFacts, camera_from_exif, facts_of_exif, focal_from_exif, read_exif
 from .groups import group_of, guess_readouts
 from .gyro import GyroLog, gyro_offset, motions_from_gyro, read_gyro, read_photo_times
-from .images import Photo, list_photos, output_name, read_photo, write_image
 from .lengths import read_known_lengths
 from .masks import find_masks, read_mask
 from .motions import read_known_motions
 from .nerfstudio import read_transforms, write_transforms
 from .outputs import output_folder
+from .photos.exif_facts import ExifFacts, camera_from_exif, facts_of_exif, focal_from_exif, read_exif
+from .photos.images import MAX_MEGAPIXELS, RAW_AS, Photo, list_photos, output_name, read_photo, write_image
+from .photos.metadata import Metadata
 from .readout_times import readout_time
 from .solution import read_solution, write_solution
 from .video import VideoFrames, extract_frames, is_video
 
 __all__ = [
+    "MAX_MEGAPIXELS",
+    "RAW_AS",
     "CameraFile",
     "ExifFacts",
     "GyroLog",
+    "Metadata",
     "Photo",
     "VideoFrames",
     "camera_from_exif",

@@ -208,7 +208,10 @@ def write_colmap_model(
     import pycolmap
 
     model = pycolmap.Reconstruction()
+    used = set(reconstruction.camera_idx.tolist())
     for index, camera in enumerate(rectified):
+        if index not in used:
+            continue
         K = camera.K
         params = [K[0, 0], K[1, 1], K[0, 2] + _HALF, K[1, 2] + _HALF]
         model.add_camera_with_trivial_rig(

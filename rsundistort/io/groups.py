@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ..model import READOUTS
-from .exif_facts import ExifFacts
+from .photos.exif_facts import ExifFacts
 
 __all__ = ["group_of", "guess_readouts"]
 

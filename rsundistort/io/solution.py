@@ -66,6 +66,8 @@ def solution_to_json(solution: Solution) -> dict[str, Any]:
             entry["aspect"], entry["skew"] = _imaginary_camera(image.motion, solution.cameras[image.camera_id])
         if image.reason is not None:
             entry["reason"] = image.reason
+        if image.turned != 1:
+            entry["turned"] = image.turned
         images.append(entry)
     value = {
         "format": FORMAT,
@@ -126,6 +128,13 @@ def read_solution(path: Path) -> Solution:
         raise FormatError(f"{path} is garbled: {error}") from error
 
 
+def _orientation(entry: dict[str, Any]) -> int:
+    turned = entry.get("turned", 1)
+    if turned not in range(1, 9):
+        raise InputError(f"photo {entry['name']} was turned by {turned!r}, expected an EXIF orientation, 1 to 8")
+    return int(turned)
+
+
 def _solution_from_json(value: dict[str, Any], where: str) -> Solution:
     cameras = {k: camera_from_json(c, f"camera {k}") for k, c in value["cameras"].items()}
     rectified = {k: Camera(c["width"], c["height"], c["K"]) for k, c in value["rectified_cameras"].items()}
@@ -148,6 +157,7 @@ def _solution_from_json(value: dict[str, Any], where: str) -> Solution:
                 rms_px=entry.get("rms_px"),
                 rs_shift_px=entry.get("rs_shift_px"),
                 reason=entry.get("reason"),
+                turned=_orientation(entry),
             )
         )
     return Solution(

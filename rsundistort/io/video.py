@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, InputError, RsUndistortError, RsUndistortWarning
-from .images import write_image
 from .outputs import output_folder
+from .photos.exif import ORIENTATION, pack_ifd
+from .photos.images import write_image
+from .photos.metadata import Metadata
 
 __all__ = ["FRAME_TABLE", "VIDEO_SUFFIXES", "VideoFrames", "extract_frames", "is_video"]
 
@@ -172,8 +174,7 @@ def _extract(
         nonlocal orientation
         orientation = _ORIENTATIONS.get(frame.picture.rotation, 1)
         names.append(f"{video.stem}_{frame.number:06d}.png")
-        metadata = _exif(orientation, make, model) if hasattr(cv2, "imencodeWithMetadata") else ()
-        write_image(folder / names[-1], _pixels(frame.picture), metadata)
+        write_image(folder / names[-1], _pixels(frame.picture), _metadata(orientation, make, model))
         rows.append(_Frame(frame.number, frame.time_s, frame.sharpness, None))
 
     for number, time_s, picture in decoded:
@@ -295,16 +296,9 @@ def _sharpness(picture: Any) -> float:
     return float(cv2.Laplacian(grey, cv2.CV_32F).var())
 
 
-def _exif(orientation: int, make: str, model: str) -> tuple[tuple[int, NDArray[np.uint8]], ...]:
-    """An EXIF block, little-endian TIFF: orientation, and make and model if known."""
+def _metadata(orientation: int, make: str, model: str) -> Metadata:
+    """EXIF with the orientation, and make and model if known."""
     texts = [(tag, text.encode("ascii", "replace") + b"\0") for tag, text in ((0x010F, make), (0x0110, model)) if text]
-    entries, heap = b"", b""
-    at = 8 + 2 + 12 * (len(texts) + 1) + 4
-    for tag, text in texts:
-        inline = len(text) <= 4
-        value = text.ljust(4, b"\0") if inline else struct.pack("<I", at + len(heap))
-        entries += struct.pack("<HHI", tag, 2, len(text)) + value
-        heap += b"" if inline else text
-    entries += struct.pack("<HHIHH", 0x0112, 3, 1, orientation, 0)
-    block = b"II*\0" + struct.pack("<IH", 8, len(texts) + 1) + entries + struct.pack("<I", 0) + heap
-    return ((cv2.IMAGE_METADATA_EXIF, np.frombuffer(block, np.uint8)),)
+    entries: list[tuple[int, int, int, bytes | int]] = [(tag, 2, len(text), text) for tag, text in texts]
+    entries.append((ORIENTATION, 3, 1, struct.pack("<H", orientation)))
+    return Metadata(exif=b"II*\0" + struct.pack("<I", 8) + pack_ifd("<", entries, 8))

@@ -48,7 +48,8 @@ def project_points(
     xy_raw : (n, 2) array
         Pixels, integer centres; NaN where invalid.
     valid : (n,) bool array
-        False for points behind the camera, beyond the fold of the lens model, or seen by no single row.
+        False for points not ahead of the camera (also of a fisheye: 90 degrees and more from the axis), beyond the fold
+        of the lens model, or seen by no single row.
 
     Examples
     --------
@@ -99,7 +100,8 @@ def unproject_points(
     xy_norm : (n, 2) array
         Global-shutter, lens-free coordinates x/z, y/z; NaN where invalid.
     valid : (n,) bool array
-        False beyond the fold of the lens model and where the row model has no inverse.
+        False beyond the fold of the lens model, for pixels of a fisheye 90 degrees or more from the axis, and where the
+        row model has no inverse.
     """
     xy = np.ascontiguousarray(check_array(xy_raw, (None, 2), "xy_raw"))
     motion = motion or RowMotion()

@@ -39,6 +39,9 @@ class SolvedImage:
         Largest displacement that the shutter caused in this photo.
     reason : str or None
         Why the photo did not register.
+    turned : int
+        EXIF orientation by which the photo was turned after it was rectified: pose, motion and cameras are those of
+        the turned frame. 1 in the stored frame.
     """
 
     name: str
@@ -51,6 +54,7 @@ class SolvedImage:
     rms_px: float | None = None
     rs_shift_px: float | None = None
     reason: str | None = None
+    turned: int = 1
 
     def __post_init__(self) -> None:
         if self.R_cw is not None:

@@ -11,6 +11,7 @@ from ..critical import advise_poses, critical_motion
 from ..errors import FileError, InputError
 from ..io import read_colmap_poses, read_solution, read_transforms
 from ..model import READOUTS
+from ..model.orientation import in_stored_frame
 
 __all__ = ["analyze"]
 
@@ -46,7 +47,7 @@ def analyze(path: Path | str, readout: str | None = None) -> dict[str, Any]:
         R_cw, center_w = read_transforms(path)
         directions = [readout or "top-to-bottom"] * len(R_cw)
     else:
-        solution = read_solution(path)
+        solution = in_stored_frame(read_solution(path))
         posed = [image for image in solution.registered if image.posed]
         R_cw = np.array([image.R_cw for image in posed]).reshape(-1, 3, 3)
         center_w = np.array([image.center_w for image in posed]).reshape(-1, 3)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from ..errors import InputError, SkippedPhotoWarning
-from ..io import list_photos, output_folder, read_solution, write_solution
+from ..errors import InputError, MetadataWarning, SkippedPhotoWarning
+from ..io import MAX_MEGAPIXELS, list_photos, output_folder, read_solution, write_solution
 from ..model import Solution
+from ..model.orientation import in_stored_frame, split_mirror, turn_solution
 from .progress import ProgressCallback, StageLog
 from .run import use_threads
-from .write import rectify_photos
+from .write import rectify_photos, turn_of
 
 __all__ = ["rectify_folder"]
 
@@ -27,6 +28,10 @@ def rectify_folder(
     jobs: int = 0,
     overwrite: bool = False,
     masks: Path | str | None = None,
+    raw_as: str = "tif",
+    apply_orientation: bool = False,
+    again: bool = False,
+    max_megapixels: float = MAX_MEGAPIXELS,
     progress: ProgressCallback | None = None,
 ) -> tuple[Solution, Sequence[str]]:
     """Rectify the photos of a folder with the motions of a solution, into `out/images` and `out/masks`.
@@ -35,8 +40,11 @@ def rectify_folder(
     ----------
     photos, solution, out : path
         Folder of the raw photos; `solution.json` or a ground-truth file; folder for the outputs.
-    interpolation, quality, jobs, overwrite, masks, progress
+    interpolation, quality, jobs, overwrite, masks, raw_as, again, max_megapixels, progress
         As in `run`.
+    apply_orientation : bool
+        Turn photos, masks and the cameras and poses of the solution by the photos' EXIF orientation. Mirrored photos
+        are mirrored, and lose their pose: no camera takes a mirror image.
 
     Returns
     -------
@@ -46,8 +54,8 @@ def rectify_folder(
         Photos of the folder that were not rectified; a warning says why.
     """
     photos, out = Path(photos), Path(out)
-    solved = read_solution(Path(solution))
-    listed = list_photos(photos)
+    solved = in_stored_frame(read_solution(Path(solution)))
+    listed = list_photos(photos, raw_as)
     motions = {image.name for image in solved.registered}
     names = [name for name in listed if name in motions]
     if not names:
@@ -57,22 +65,35 @@ def rectify_folder(
             warnings.warn(f"skipped: {name} has no motion in {solution}", SkippedPhotoWarning, stacklevel=2)
     log = StageLog(progress)
     jobs = use_threads(jobs)
+    # a photo without a pose may be mirrored
+    unposed = replace(solved, images=[replace(image, R_cw=None, center_w=None) for image in solved.images])
+    turns: dict[str, int] = {}
     with output_folder(out, overwrite=overwrite, apart_from=[photos]) as scratch:
-        written = [
-            name
-            for name, _ in rectify_photos(
-                photos,
-                solved,
-                names,
-                scratch,
-                interpolation=interpolation,
-                quality=quality,
-                jobs=jobs,
-                log=log,
-                masks=None if masks is None else Path(masks),
-            )
-        ]
-        if not written:
+        rectified = rectify_photos(
+            photos, unposed, names, scratch,
+            interpolation=interpolation, quality=quality, jobs=jobs, log=log,
+            raw_as=raw_as, apply_orientation=apply_orientation, again=again, max_megapixels=max_megapixels,
+            masks=None if masks is None else Path(masks),
+        )  # fmt: skip
+        for name, photo in rectified:
+            turns[name] = turn_of(unposed.image(name), photo)[0]
+        if not turns:
             raise InputError(f"none of the {len(names)} photos of {photos} could be rectified; see the warnings")
+        if apply_orientation:
+            solved = turn_solution(_without_mirrored_poses(solved, turns), turns)
+        solved = replace(solved, options={**solved.options, "raw_as": raw_as})
         write_solution(scratch / "solution.json", replace(solved, stages=tuple(log.stages)))
-    return solved, [name for name in listed if name not in written]
+    return solved, [name for name in listed if name not in turns]
+
+
+def _without_mirrored_poses(solution: Solution, turns: Mapping[str, int]) -> Solution:
+    images = []
+    for image in solution.images:
+        if image.posed and split_mirror(turns.get(image.name, 1))[1] != 1:
+            text = (
+                f"{image.name} is mirrored by its EXIF orientation and loses its pose: no camera takes a mirror image"
+            )
+            warnings.warn(text, MetadataWarning, stacklevel=3)
+            image = replace(image, R_cw=None, center_w=None)
+        images.append(image)
+    return replace(solution, images=tuple(images))

@@ -18,7 +18,6 @@ from ..io import (
     group_of,
     guess_readouts,
     read_camera_file,
-    read_exif,
 )
 from ..model import READOUTS, Camera
 
@@ -77,6 +76,7 @@ def find_cameras(
     folder: Path,
     names: Sequence[str],
     sizes: Sequence[tuple[int, int]],
+    facts: Sequence[ExifFacts],
     camera: str | None = None,
     readout: str | Mapping[str, str] | None = None,
 ) -> PhotoCameras:
@@ -86,8 +86,8 @@ def find_cameras(
     ----------
     folder : Path
         Of the photos.
-    names, sizes : sequences of length m
-        Photos and their (width, height).
+    names, sizes, facts : sequences of length m
+        Photos, their (width, height) and what their EXIF says.
     camera : str, optional
         As `io.read_camera_file` takes it.
     readout : str or mapping, optional
@@ -98,7 +98,6 @@ def find_cameras(
     InputError
         When a photo has no camera, or one of another size.
     """
-    facts = [read_exif(folder / name) for name in names]
     groups = [group_of(fact, *size) for fact, size in zip(facts, sizes, strict=True)]
     if camera is None:
         beside = (parent / name for parent in (folder, folder.parent) for name in _BESIDE)

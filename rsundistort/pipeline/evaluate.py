@@ -13,6 +13,7 @@ from ..errors import FileError, InputError
 from ..evaluation import motion_errors, pose_errors, psnr
 from ..io import output_name, read_photo, read_solution
 from ..model import RowMotion, Solution, SolvedImage
+from ..model.orientation import INVERSE, in_stored_frame, turn_pixels
 from ..rectify import rectify
 from .progress import ProgressCallback, StageLog
 from .write import mask_names
@@ -59,7 +60,9 @@ def evaluate(
         `psnr_before_db` with median, min and each photo's. What cannot be compared is left out.
     """
     out, truth = Path(out), Path(truth)
-    solution, true_solution = read_solution(out / "solution.json"), read_solution(truth)
+    written, true_solution = read_solution(out / "solution.json"), read_solution(truth)
+    solution = in_stored_frame(written)
+    turns = {image.name: image.turned for image in written.images}
     result: dict[str, Any] = {"photos": len(solution.images), "registered": len(solution.registered)}
     pose_truth = read_solution(Path(poses)) if poses is not None else true_solution
     if any(image.posed for image in pose_truth.images):
@@ -73,7 +76,7 @@ def evaluate(
         if given is not None and not chosen[key].is_dir():
             raise FileError(f"{chosen[key]} is no folder; give the folder of the {key} photos")
     if chosen["twins"].is_dir():
-        result.update(_image_errors(out, solution, true_solution, chosen, StageLog(progress)))
+        result.update(_image_errors(out, solution, turns, true_solution, chosen, StageLog(progress)))
     return result
 
 
@@ -91,10 +94,16 @@ def _without_lens(
 
 
 def _image_errors(
-    out: Path, solution: Solution, truth: Solution, folders: Mapping[str, Path], log: StageLog
+    out: Path,
+    solution: Solution,
+    turns: Mapping[str, int],
+    truth: Solution,
+    folders: Mapping[str, Path],
+    log: StageLog,
 ) -> dict[str, Any]:
     twins, raw = folders["twins"], folders["raw"]
     masks = mask_names([image.name for image in solution.images])
+    raw_as = solution.options.get("raw_as", "tif")
     after: dict[str, float] = {}
     before: dict[str, float] = {}
     registered = solution.registered
@@ -102,10 +111,11 @@ def _image_errors(
     for done, image in enumerate(registered, start=1):
         name = output_name(image.name)
         taken = read_photo(twins / name).pixels
-        mask = read_photo(out / "masks" / masks[image.name]).pixels
+        files = out / "images" / output_name(image.name, raw_as), out / "masks" / masks[image.name]
+        photo, mask = (turn_pixels(read_photo(path).pixels, INVERSE[turns[image.name]]) for path in files)
         try:
             twin, shown = _without_lens(taken, image, solution, truth)
-            after[image.name] = psnr(read_photo(out / "images" / name).pixels, twin, np.minimum(mask, shown))
+            after[image.name] = psnr(photo, twin, np.minimum(mask, shown))
             if (raw / image.name).is_file():
                 # photo and twin have the same lens
                 before[image.name] = psnr(read_photo(raw / image.name).pixels, taken, mask)

@@ -20,9 +20,18 @@ from numpy.typing import ArrayLike, NDArray
 from ..bundle import BundleOptions, GuessedCameras, KnownLength, reprojection_residuals
 from ..critical import with_remedy
 from ..errors import InputError, RsUndistortWarning
-from ..io import output_folder, output_name, write_colmap_model, write_solution, write_transforms
+from ..io import (
+    MAX_MEGAPIXELS,
+    RAW_AS,
+    output_folder,
+    output_name,
+    write_colmap_model,
+    write_solution,
+    write_transforms,
+)
 from ..io.motions import Known
 from ..model import READOUTS, Reconstruction, Solution, SolvedImage, check_shutter_model
+from ..model.orientation import turn_reconstruction, turn_solution
 from ..rectify import INTERPOLATIONS, largest_shift_px
 from .cameras import PhotoCameras, check_readouts
 from .frames import find_photos
@@ -30,7 +39,7 @@ from .gyro import GyroOptions, gyro_contradiction, gyro_motions, known_readouts
 from .load import LoadedPhotos, load_photos
 from .progress import ProgressCallback, StageLog
 from .solve import Solved, solve_photos
-from .write import PointColors, mask_names, rectify_photos
+from .write import PointColors, mask_names, rectify_photos, turn_of
 
 __all__ = ["RunOptions", "run", "use_threads", "versions"]
 
@@ -66,6 +75,15 @@ class RunOptions:
         Per photo.
     interpolation, quality
         Of the rectified photos.
+    raw_as : {"tif", "jpg", "png"}
+        What RAW and HEIC are written as: 16 bit, but for jpg.
+    apply_orientation : bool
+        Turn the rectified photos, their masks, cameras and poses by the EXIF orientation, which then is 1. Photos that
+        it mirrors are turned only, and keep the mirror as their orientation: no camera takes a mirror image.
+    again : bool
+        Take photos that are rectified already.
+    max_megapixels : float
+        Photos with more pixels are left out before they are decoded.
     refine : tuple of str, optional
         Intrinsics that are solved for with the rest, as in `BundleOptions`; by default none where the camera is given,
         f, k1 and k2 where EXIF had to guess it.
@@ -97,6 +115,10 @@ class RunOptions:
     max_features: int = 16384
     interpolation: str = "cubic"
     quality: int = 98
+    raw_as: str = "tif"
+    apply_orientation: bool = False
+    again: bool = False
+    max_megapixels: float = MAX_MEGAPIXELS
     refine: tuple[str, ...] | None = None
     still: Mapping[str, float] = field(default_factory=dict)
     known: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
@@ -115,6 +137,8 @@ class RunOptions:
         with_remedy(self.bundle_options(), self.remedy)
         if self.interpolation not in INTERPOLATIONS:
             raise InputError(f"interpolation={self.interpolation!r}, expected one of {', '.join(INTERPOLATIONS)}")
+        if self.raw_as not in RAW_AS:
+            raise InputError(f"raw_as={self.raw_as!r}, expected one of {', '.join(RAW_AS)}")
         if self.jobs < 0 or self.max_features < 100 or not 1 <= self.quality <= 100:
             raise InputError("jobs must be 0 or more, max_features at least 100, quality 1 to 100")
         if self.readout_s is not None and not 0 < self.readout_s < np.inf:
@@ -196,7 +220,8 @@ def run(
         source = find_photos(photos, scratch, options.camera, options.every, options.sharpest, log)
         folder = source.folder
         loaded = load_photos(
-            folder, source.camera, options.readout, options.max_features, jobs, log, options.masks
+            folder, source.camera, options.readout, options.max_features, jobs, log, options.masks,
+            options.raw_as, options.again, options.max_megapixels,
         )  # fmt: skip
         cameras = loaded.cameras
         readouts = known_readouts(
@@ -225,16 +250,23 @@ def run(
         rectified = rectify_photos(
             folder, solution, list(rec.image_names), scratch,
             interpolation=options.interpolation, quality=options.quality, jobs=jobs, log=log,
-            masks=options.masks,
+            masks=options.masks, raw_as=options.raw_as, apply_orientation=options.apply_orientation,
+            max_megapixels=options.max_megapixels,
         )  # fmt: skip
+        turns: dict[str, int] = {}
         for name, photo in rectified:
             colors.add(name, photo)
+            turns[name] = turn_of(solution.image(name), photo)[0]
         log.begin("writing")
-        names = [output_name(name) for name in rec.image_names]
+        if options.apply_orientation:
+            solution, rec = turn_solution(solution, turns), turn_reconstruction(rec, turns)
+        names = [output_name(name, options.raw_as) for name in rec.image_names]
         new_cameras = [solution.rectified_cameras[str(k + 1)] for k in range(len(rec.cameras))]
         write_colmap_model(scratch / "sparse", rec, new_cameras, names, colors.rgb())
         masks = mask_names([image.name for image in solution.images])
-        files = {name: (f"images/{output_name(name)}", f"masks/{masks[name]}") for name in rec.image_names}
+        files = {
+            name: (f"images/{output_name(name, options.raw_as)}", f"masks/{masks[name]}") for name in rec.image_names
+        }
         write_transforms(scratch / "transforms.json", solution, files)
         log.end("writing")
         solution = replace(solution, stages=tuple(log.stages))
@@ -246,6 +278,20 @@ def _readouts(rec: Reconstruction, cameras: PhotoCameras) -> str | dict[str, str
     """Direction of the readout of all cameras, or by group where they differ."""
     directions = {label: camera.readout for label, camera in zip(cameras.labels, rec.cameras, strict=True)}
     return rec.cameras[0].readout if len(set(directions.values())) == 1 else directions
+
+
+def _guesses(solved: Solved, cameras: PhotoCameras) -> list[str]:
+    """What was guessed of the cameras, and what the photos said of it, for people."""
+    choice = solved.readouts
+    found = [] if choice is None else choice.turned
+    said = [] if found else list(cameras.notes)
+    for k in found:
+        assert choice is not None
+        said.append(
+            f"{cameras.labels[k]} fits better as read out {choice.reconstruction.cameras[k].readout} "
+            f"(by {choice.gain[k]:.0f} standard errors); --readout settles it"
+        )
+    return said
 
 
 def _image_rms(rec: Reconstruction) -> NDArray[np.float64]:
@@ -335,10 +381,12 @@ def _solution(
             "camera": loaded.cameras.source,
             "shutter_model": options.shutter_model,
             "readout": _readouts(rec, loaded.cameras),
+            "guesses": _guesses(solved, loaded.cameras),
             "seed": options.seed,
             "max_features": options.max_features,
             "interpolation": options.interpolation,
             "quality": options.quality,
+            "raw_as": options.raw_as,
             "refine": list(solved.result.sigma_intrinsics[0]),
             "still": dict(options.still),
             "known": sorted(options.known),

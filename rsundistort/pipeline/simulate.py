@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FileError, FormatError, InputError
-from ..io import list_photos, output_folder, output_name, read_photo, write_image, write_solution
+from ..io import facts_of_exif, list_photos, output_folder, output_name, read_photo, write_image, write_solution
 from ..io.cameras import camera_to_json
 from ..model import Camera, RowMotion, Solution, SolvedImage
 from ..model.checks import check_finite
@@ -119,9 +119,10 @@ def simulate_warp(
     log = StageLog(progress)
     jobs = use_threads(options.jobs)
     with output_folder(out, overwrite=options.overwrite, apart_from=[photos]) as scratch:
-        first = [read_photo(photos / name).pixels.shape for name in names[:1]]
-        size = (first[0][1], first[0][0])
-        found = find_cameras(photos, names[:1], [size], options.camera, options.readout)
+        first = read_photo(photos / names[0])
+        height, width = first.pixels.shape[:2]
+        facts = [facts_of_exif(first.metadata.exif)]
+        found = find_cameras(photos, names[:1], [(width, height)], facts, options.camera, options.readout)
         camera, source = found.of(0), found.source
         if options.motion is None:
             phi = random_phi(names, [camera.frame_span] * len(names), options.sigma_rad, options.seed, options.still)

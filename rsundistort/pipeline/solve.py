@@ -15,6 +15,7 @@ from ..bundle import (
     BundleOptions,
     BundleResult,
     ModelChoice,
+    ReadoutChoice,
     bundle_adjust,
     choose_model,
     choose_readouts,
@@ -51,6 +52,8 @@ class Solved:
         What was done about a critical motion; None for a global shutter.
     advice : sequence of Advice
         For the next shoot, where the poses are critical.
+    readouts : ReadoutChoice or None
+        What the photos say of directions of the readout that nobody told.
     """
 
     result: BundleResult
@@ -58,6 +61,7 @@ class Solved:
     choice: ModelChoice | None = None
     remedy: Remedy | None = None
     advice: Sequence[Advice] = ()
+    readouts: ReadoutChoice | None = None
 
 
 def rungs_to(shutter_model: str) -> tuple[str, ...]:
@@ -98,11 +102,13 @@ def _of_joined(options: BundleOptions, mapped: Reconstruction) -> BundleOptions:
     )
 
 
-def _read_out(mapped: Reconstruction, photos: LoadedPhotos, options: BundleOptions, log: StageLog) -> Reconstruction:
-    """The reconstruction with the directions of readout that nobody told as the measurements have them."""
+def _read_out(
+    mapped: Reconstruction, photos: LoadedPhotos, options: BundleOptions, log: StageLog
+) -> ReadoutChoice | None:
+    """The directions of readout that nobody told, as the measurements have them; None if all were told."""
     guessed = [k for k, told in enumerate(photos.cameras.readout_told) if not told]
     if not guessed:
-        return mapped
+        return None
     log.begin("readout")
     choice = choose_readouts(mapped, guessed, options, progress=partial(_tell_model, log))
     log.end(
@@ -110,7 +116,7 @@ def _read_out(mapped: Reconstruction, photos: LoadedPhotos, options: BundleOptio
         directions={photos.cameras.labels[k]: choice.reconstruction.cameras[k].readout for k in guessed},
         gain_of_other_axis={photos.cameras.labels[k]: gain for k, gain in choice.gain.items()},
     )
-    return choice.reconstruction
+    return choice
 
 
 def solve_photos(
@@ -156,7 +162,9 @@ def solve_photos(
             f"only {mapped.num_images} of {len(photos.names)} photos could be joined, the shutter needs three; "
             "use photos that share more of the scene"
         )
-    mapped = _read_out(mapped, photos, options_of(mapped), log)
+    readouts = _read_out(mapped, photos, options_of(mapped), log)
+    if readouts is not None:
+        mapped = readouts.reconstruction
     options = _of_joined(with_remedy(options_of(mapped), remedy), mapped)
     auto = shutter_model == "auto"
     shutter_model = "rotation" if auto else shutter_model
@@ -208,6 +216,5 @@ def solve_photos(
     )
     global_result = bundle_adjust(result.reconstruction, "global", plain)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
-    return Solved(
-        replace(result, reconstruction=result.reconstruction.normalized()), global_result, choice, mended, advice
-    )
+    normalized = replace(result, reconstruction=result.reconstruction.normalized())
+    return Solved(normalized, global_result, choice, mended, advice, readouts)

@@ -5,19 +5,21 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, InputError, SkippedPhotoWarning
-from ..io import find_masks, output_name, read_mask, read_photo, write_image
-from ..io.images import Photo
-from ..model import Reconstruction, Solution
+from ..errors import FileError, InputError, MetadataWarning, SkippedPhotoWarning
+from ..io import MAX_MEGAPIXELS, Photo, find_masks, output_name, read_mask, read_photo, write_image
+from ..io.photos.exif import read_orientation
+from ..model import Reconstruction, Solution, SolvedImage
+from ..model.orientation import split_mirror, turn_pixels
 from ..rectify import rectify
 from .progress import StageLog
 
-__all__ = ["PointColors", "mask_names", "rectify_photos"]
+__all__ = ["PointColors", "check_not_rectified", "mask_names", "rectify_photos", "turn_of"]
 
 
 def mask_names(names: Sequence[str]) -> dict[str, str]:
@@ -27,6 +29,19 @@ def mask_names(names: Sequence[str]) -> dict[str, str]:
         name: f"{stem}.png" if stems.count(stem) == 1 else f"{name}.png"
         for name, stem in zip(names, stems, strict=True)
     }
+
+
+def check_not_rectified(photo: Photo) -> None:
+    """Refuse a photo that is rectified already."""
+    by = photo.metadata.rectified_by
+    if by is not None:
+        raise InputError(f"it was rectified already, by rsundistort {by}; --again rectifies it once more")
+
+
+def turn_of(image: SolvedImage, photo: Photo) -> tuple[int, int]:
+    """How a photo's orientation is applied, and what is left of it: mirrors are left where there is a pose."""
+    orientation = photo.metadata.orientation
+    return split_mirror(orientation) if image.posed else (orientation, 1)
 
 
 def rectify_photos(
@@ -40,29 +55,45 @@ def rectify_photos(
     jobs: int,
     log: StageLog,
     masks: Path | None = None,
+    raw_as: str = "tif",
+    apply_orientation: bool = False,
+    again: bool = True,
+    max_megapixels: float = MAX_MEGAPIXELS,
 ) -> Iterator[tuple[str, Photo]]:
     """Rectify photos into `out/images` and `out/masks`, and yield each raw photo by the way.
 
-    What the users' own masks (a folder, as `io.find_masks` takes it) leave out is left out of `out/masks`.
-
-    Photos that cannot be read, or are of another size than their camera, are skipped with a warning.
+    Photos that cannot be read, are of another size than their camera, or (unless `again`) are rectified already, are
+    skipped with a warning. With `apply_orientation` photo and mask are turned as `turn_of` says. What the users' own
+    masks (a folder, as `io.find_masks` takes it) leave out is left out of `out/masks`.
     """
     (out / "images").mkdir()
     (out / "masks").mkdir()
     mask_name = mask_names([image.name for image in solution.images])
     mask_of = {} if masks is None else find_masks(masks, names)
+    mark = version("rsundistort")
 
     def work(name: str) -> tuple[str, Photo | None, str]:
         image = solution.image(name)
         camera = solution.cameras[image.camera_id]
         try:
-            photo = read_photo(folder / name)
+            photo = read_photo(folder / name, max_megapixels)
+            if not again:
+                check_not_rectified(photo)
             own = read_mask(mask_of[name], camera.width, camera.height) if name in mask_of else None
             pixels, mask = rectify(
                 photo.pixels, camera, image.motion, solution.map_model,
                 solution.rectified_cameras[image.camera_id], interpolation, mask=own,
             )  # fmt: skip
-            write_image(out / "images" / output_name(name), pixels, photo.metadata, quality)
+            metadata = photo.metadata.marked(mark)
+            if apply_orientation:
+                turn, rest = turn_of(image, photo)
+                pixels, mask, metadata = (
+                    turn_pixels(pixels, turn),
+                    turn_pixels(mask, turn),
+                    metadata.with_orientation(rest),
+                )
+                _warn_of_orientation(name, photo, rest)
+            write_image(out / "images" / output_name(name, raw_as), pixels, metadata, quality)
             write_image(out / "masks" / mask_name[name], mask)
         except (FileError, InputError) as error:
             return name, None, str(error)
@@ -83,6 +114,19 @@ def rectify_photos(
                     written += 1
                     yield name, photo
     log.end("rectifying", photos=written)
+
+
+def _warn_of_orientation(name: str, photo: Photo, rest: int) -> None:
+    stored = read_orientation(photo.metadata.exif)
+    if stored != photo.metadata.orientation:
+        text = f"{name}: its EXIF orientation {stored} means nothing and is taken for 1"
+    elif rest != 1:
+        text = (
+            f"{name}: mirrored by its EXIF orientation {stored}, it was turned and keeps the mirror as its orientation"
+        )
+    else:
+        return
+    warnings.warn(text, MetadataWarning, stacklevel=2)
 
 
 class PointColors:

@@ -52,12 +52,15 @@ def init_rectify_map(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
     """Maps for `cv2.remap` that take lens and shutter out of a photo, in the manner of `cv2.initUndistortRectifyMap`.
 
+    A fisheye's photo becomes a pinhole's like any other; `R` turns the view towards what lies far from the axis.
+
     Parameters
     ----------
     camera : Camera
         Of the raw photo.
     motion : RowMotion, optional
-        Rotation during the readout; without it the result is `cv2.initUndistortRectifyMap`'s.
+        Rotation during the readout; without it the result is `cv2.initUndistortRectifyMap`'s, or that of the
+        same name in `cv2.fisheye`.
     shutter_model : {"rotation", "two-step", "linearized", "global"}
         Row model.
     R : (3, 3) array, optional

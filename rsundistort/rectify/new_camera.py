@@ -34,7 +34,8 @@ def optimal_new_camera(
     """Pinhole camera of the rectified photo, in the manner of `cv2.getOptimalNewCameraMatrix`.
 
     The borders of the raw photo are walked pixel by pixel, so that the answer is exact also with strong motion. Pixels
-    keep the shape (fx : fy) that they have in the raw photo.
+    keep the shape (fx : fy) that they have in the raw photo. The wider a fisheye, the less this is what one wants: the
+    middle shrinks as the border is stretched, and a border 90 degrees from the axis is refused.
 
     Parameters
     ----------

@@ -28,6 +28,7 @@ INTERPOLATIONS: dict[str, int] = {
 
 # So few pixels OpenCV remaps on the thread that asks, whatever `cv2.setNumThreads` says; the map stays in the cache.
 _STRIP_PIXELS = 1 << 16
+_MAX_SIDE = 32766  # cv2.remap counts in 16 bits
 
 
 def check_photo(photo: NDArray[Any], width: int, height: int) -> NDArray[Any]:
@@ -37,6 +38,8 @@ def check_photo(photo: NDArray[Any], width: int, height: int) -> NDArray[Any]:
         raise InputError(f"photo is {photo.dtype} {photo.shape}, expected uint8, uint16 or float32 (h, w[, channels])")
     if photo.shape[:2] != (height, width):
         raise InputError(f"photo has {photo.shape[1]}x{photo.shape[0]} pixels, its camera {width}x{height}")
+    if max(photo.shape[:2]) > _MAX_SIDE:
+        raise InputError(f"photo has {width}x{height} pixels, and OpenCV rectifies sides up to {_MAX_SIDE}")
     return photo
 
 

@@ -62,7 +62,7 @@ class MatchedPhotos:
 
 
 def _pycolmap() -> Any:
-    """Pycolmap, quiet, and imported late: it takes half a second, and cv2 must come first (see `io.images`)."""
+    """Pycolmap, quiet, and imported late: it takes half a second, and cv2 must come first (see `io.photos.images`)."""
     import pycolmap
 
     pycolmap.logging.minloglevel = 3

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from ..model import Camera
+from ...errors import RsUndistortError
+from ...model import Camera
+from .containers import metadata_of
+from .exif import EXIF_IFD, ORIENTATION, Damaged, TiffStructure
+from .heif import heif_metadata
+from .kinds import kind_of_content
 
 __all__ = ["ExifFacts", "camera_from_exif", "facts_of_exif", "focal_from_exif", "read_exif"]
 
 # diagonal of the 36 x 24 mm frame that 35-mm equivalents refer to (CIPA DCG-001)
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
+_MAKE, _MODEL, _FOCAL_LENGTH, _DIGITAL_ZOOM_RATIO = 0x010F, 0x0110, 0x920A, 0xA404
+_FOCAL_LENGTH_IN35MM_FILM, _BODY_SERIAL_NUMBER, _LENS_MODEL = 0xA405, 0xA431, 0xA434
+_EXIF_IMAGE_WIDTH, _EXIF_IMAGE_HEIGHT = 0xA002, 0xA003
+_FOCAL_PLANE_X_RESOLUTION, _FOCAL_PLANE_RESOLUTION_UNIT = 0xA20E, 0xA210
 # mm per FocalPlaneResolutionUnit: inch, cm, mm, micrometre
 _UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 
@@ -60,64 +65,35 @@ class ExifFacts:
 def read_exif(path: Path) -> ExifFacts:
     """The facts of a JPEG, PNG, WebP, TIFF, HEIC, DNG or another RAW file that is a TIFF.
 
-    Never raises: what is missing, damaged or not to be believed is None. It changes Python's filters of warnings while
-    it reads, so it is not for several threads at once.
+    Never raises: what is missing, damaged or not to be believed is None.
     """
-    with _quiet():
-        try:
-            block = _exif_block(Path(path))
-        except Exception:  # Pillow raises whatever it tripped over
-            block = b""
-    return facts_of_exif(block)
+    try:
+        data = Path(path).read_bytes()
+    except OSError:
+        return ExifFacts()
+    kind = kind_of_content(data, Path(path).name)
+    if data[:2] in (b"II", b"MM"):
+        return facts_of_exif(data)
+    try:
+        metadata = heif_metadata(data, Path(path).name) if kind == "HEIC" else metadata_of(data, kind)
+    except (KeyError, RsUndistortError):  # a kind without EXIF, or one that needs an extra
+        return ExifFacts()
+    return facts_of_exif(metadata.exif)
 
 
 def facts_of_exif(block: bytes) -> ExifFacts:
     """The facts of an EXIF block, a TIFF structure with or without the head that it has in a JPEG; as `read_exif`."""
-    from PIL import Image
-    from PIL.ExifTags import IFD
-
-    exif = Image.Exif()
-    with _quiet():
-        try:
-            exif.load(block)
-            return _facts({**_entries(exif.get_ifd(IFD.Exif)), **_entries(exif)})
-        except Exception:  # as above; what was read before is good
-            return _facts(_entries(exif))
+    try:
+        structure = TiffStructure(block.removeprefix(b"Exif\0\0"))
+        main = structure.main()[0]
+        entries = {**structure.sub(main, EXIF_IFD, "the Exif IFD"), **main}
+        return _facts({tag: structure.first_value(entry) for tag, entry in entries.items()})
+    except Damaged:
+        return ExifFacts()
 
 
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Without the warnings that Pillow gives of damage."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
-
-
-def _exif_block(path: Path) -> bytes:
-    """The EXIF block of a photo; empty if there is none."""
-    from PIL import ImageFile, JpegImagePlugin, PngImagePlugin, WebPImagePlugin
-
-    # not Image.open, which refuses photos of 180 megapixels and more before it has read their EXIF
-    openers: dict[bytes, type[ImageFile.ImageFile]] = {
-        b"\xff\xd8": JpegImagePlugin.JpegImageFile,
-        b"\x89P": PngImagePlugin.PngImageFile,
-        b"RI": WebPImagePlugin.WebPImageFile,
-    }
-    with path.open("rb") as file:
-        head = file.read(12)
-        file.seek(0)
-        if head[:2] in (b"II", b"MM"):
-            return file.read()
-        if head[4:8] == b"ftyp":  # with the extra that reads it
-            import pillow_heif
-
-            return bytes(pillow_heif.open_heif(file).info.get("exif") or b"")
-        return bytes(openers[head[:2]](file).info.get("exif", b"")) if head[:2] in openers else b""
-
-
-def _facts(tags: dict[int, Any]) -> ExifFacts:
+def _facts(tags: dict[int, bytes | float | None]) -> ExifFacts:
     """What the tags of the main and of the EXIF directory say."""
-    from PIL.ExifTags import Base
 
     def text(tag: int) -> str | None:
         return _text(tags.get(tag))
@@ -129,12 +105,12 @@ def _facts(tags: dict[int, Any]) -> ExifFacts:
         value = number(tag, low, high)
         return int(value) if value is not None and value == int(value) else None
 
-    focal_mm = number(Base.FocalLength, 0.5, 3000)
-    focal_35mm = number(Base.FocalLengthIn35mmFilm, 4, 5000)
-    width, height = whole(Base.ExifImageWidth, 1, 10**6), whole(Base.ExifImageHeight, 1, 10**6)
+    focal_mm = number(_FOCAL_LENGTH, 0.5, 3000)
+    focal_35mm = number(_FOCAL_LENGTH_IN35MM_FILM, 4, 5000)
+    width, height = whole(_EXIF_IMAGE_WIDTH, 1, 10**6), whole(_EXIF_IMAGE_HEIGHT, 1, 10**6)
     sensor = None
-    per_unit = number(Base.FocalPlaneXResolution, 1e-3, 1e9)
-    unit_mm = _UNITS_MM.get(whole(Base.FocalPlaneResolutionUnit, 0, 100) or 2)
+    per_unit = number(_FOCAL_PLANE_X_RESOLUTION, 1e-3, 1e9)
+    unit_mm = _UNITS_MM.get(whole(_FOCAL_PLANE_RESOLUTION_UNIT, 0, 100) or 2)
     if per_unit and unit_mm and width and height:
         sensor = _number(max(width, height) / per_unit * unit_mm, 1, 100)
     if sensor and focal_mm and focal_35mm:
@@ -142,55 +118,36 @@ def _facts(tags: dict[int, Any]) -> ExifFacts:
         ratio = focal_mm * 36 / sensor / focal_35mm
         sensor = sensor if 0.75 < ratio < 1.33 else None
     return ExifFacts(
-        make=text(Base.Make),
-        model=text(Base.Model),
-        lens=text(Base.LensModel),
-        serial=text(Base.BodySerialNumber),
+        make=text(_MAKE),
+        model=text(_MODEL),
+        lens=text(_LENS_MODEL),
+        serial=text(_BODY_SERIAL_NUMBER),
         focal_mm=focal_mm,
         focal_35mm=focal_35mm,
         sensor_width_mm=sensor,
-        digital_zoom=number(Base.DigitalZoomRatio, 1, 100),
-        orientation=whole(Base.Orientation, 1, 8),
+        digital_zoom=number(_DIGITAL_ZOOM_RATIO, 1, 100),
+        orientation=whole(ORIENTATION, 1, 8),
         width=width,
         height=height,
     )
 
 
-def _entries(directory: Any) -> dict[int, Any]:
-    """A directory without the entries that cannot be read."""
-    found = {}
-    for tag in list(directory):
-        try:
-            found[tag] = directory[tag]
-        except Exception:  # as above; the other entries may be good
-            continue
-    return found
-
-
-def _text(value: Any) -> str | None:
+def _text(value: bytes | float | None) -> str | None:
     """A text without the padding of fixed-length fields; None if nothing is left."""
-    if isinstance(value, bytes):
-        value = value.decode("latin-1")
-    if not isinstance(value, str):
+    if not isinstance(value, bytes):
         return None
-    value = value.split("\0")[0]
-    with contextlib.suppress(UnicodeError):  # Pillow takes every text for Latin-1, cameras write UTF-8 too
-        value = value.encode("latin-1").decode()
-    value = " ".join("".join(c for c in value if c.isprintable()).split())[:100]
-    return value if any(c.isalnum() for c in value) and value.lower() not in ("unknown", "n/a", "none") else None
-
-
-def _number(value: Any, low: float, high: float) -> float | None:
-    """The number, or the first of several, if it lies between the bounds."""
-    if isinstance(value, tuple) and value:
-        value = value[0]
-    if isinstance(value, str):  # of another type than it should be
-        return None
+    stored = value.split(b"\0")[0]
     try:
-        number = float(value)
-    except (TypeError, ValueError, ArithmeticError):
-        return None
-    return number if low <= number <= high else None
+        text = stored.decode()
+    except UnicodeDecodeError:  # old cameras
+        text = stored.decode("latin-1")
+    text = " ".join("".join(c for c in text if c.isprintable()).split())[:100]
+    return text if any(c.isalnum() for c in text) and text.lower() not in ("unknown", "n/a", "none") else None
+
+
+def _number(value: bytes | float | None, low: float, high: float) -> float | None:
+    """The number, if it lies between the bounds."""
+    return value if isinstance(value, float) and low <= value <= high else None
 
 
 def focal_from_exif(facts: ExifFacts, width: int, height: int) -> float | None:

@@ -1,0 +1,282 @@
+"""Photos in and out, always in the stored pixel frame of the sensor: the EXIF orientation is carried, never applied."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+
+# Before cv2 and before anybody's pycolmap. pycolmap exports a zlib of its own; if the system's zlib is first loaded
+# after it, the two get mixed and whatever compresses (PNG, Python's own zlib) aborts the process.
+import zlib  # noqa: F401
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import FileError, FileKindWarning, InputError, MetadataWarning
+from .containers import metadata_of, with_metadata
+from .heif import read_heif
+from .kinds import (
+    HEIF_SUFFIXES,
+    PHOTO_SUFFIXES,
+    RAW_SUFFIXES,
+    is_whole,
+    kind_of_content,
+    kind_of_name,
+    picture_size,
+)
+from .metadata import Metadata
+from .raw import read_raw
+from .tiff import as_stored, encode_tiff, tiff_metadata
+
+__all__ = [
+    "MAX_MEGAPIXELS",
+    "RAW_AS",
+    "Photo",
+    "list_photos",
+    "output_name",
+    "read_photo",
+    "write_image",
+]
+
+#: Photos of more pixels are refused, unless told otherwise: a small file can claim to be a huge picture.
+MAX_MEGAPIXELS = 250.0
+
+#: Kinds that RAW and HEIC can be written as.
+RAW_AS = ("tif", "jpg", "png")
+
+_MAX_SIDE = 32766  # of cv2.remap
+
+
+@dataclass(frozen=True)
+class Photo:
+    """Pixels of a photo with its metadata.
+
+    Attributes
+    ----------
+    pixels : (h, w) or (h, w, 3 | 4) array
+        uint8, uint16 or float32 in OpenCV's channel order (BGR), in the stored frame.
+    metadata : Metadata
+        EXIF, XMP and ICC.
+    """
+
+    pixels: NDArray[Any]
+    metadata: Metadata = field(default_factory=Metadata)
+
+
+def list_photos(folder: Path, raw_as: str = "tif") -> list[str]:
+    """Names of the photos in a folder, sorted; files of other kinds and hidden ones are passed over."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise FileError(f"{folder} is no folder; give the folder that holds the photos")
+    suffixes = PHOTO_SUFFIXES + HEIF_SUFFIXES + RAW_SUFFIXES
+    names = sorted(
+        entry.name
+        for entry in folder.iterdir()
+        if entry.suffix.lower() in suffixes and not entry.name.startswith(".") and entry.is_file()
+    )
+    outputs: dict[str, str] = {}
+    for name in names:
+        other = outputs.setdefault(output_name(name, raw_as), name)
+        if other != name:
+            raise InputError(
+                f"{other} and {name} would both be rectified to {output_name(name, raw_as)}; move one away"
+            )
+    if not names:
+        kinds = ", ".join(s[1:] for s in PHOTO_SUFFIXES) + ", heic and RAW"
+        raise FileError(f"no photos in {folder}; it should hold files of the kinds {kinds}")
+    return names
+
+
+def output_name(name: str, raw_as: str = "tif") -> str:
+    """Name of a rectified photo: the photo's own; RAW and HEIC become one of `RAW_AS`."""
+    return f"{Path(name).stem}.{raw_as}" if kind_of_name(name) in ("RAW", "HEIC") else name
+
+
+def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> Photo:
+    """A photo as the sensor stored it.
+
+    The content says what kind it is of; a warning says so where the name's ending says another, unless that is RAW.
+
+    Parameters
+    ----------
+    path : Path
+        JPEG, PNG, TIFF, WebP (8 or 16 bit, float TIFF), RAW, or HEIC (extra `heif`). RAW is developed to 16 bit with
+        the camera's white balance; HEIC comes as 16 bit too.
+    max_megapixels : float
+        Photos with more are refused before they are decoded.
+
+    Raises
+    ------
+    FileError
+        When the file is missing, cut short, no photo or too large.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise FileError(f"{path.name} cannot be read: {error.strerror}") from error
+    kind = kind_of_content(data, path.name)
+    if not data or not is_whole(data):
+        raise FileError(f"{path.name} is cut short or empty; copy it again from the camera")
+    if not kind:
+        raise FileError(f"{path.name} cannot be decoded; it is no photo of a known kind")
+    named = kind_of_name(path.name)
+    if named == "RAW" != kind:
+        # turned or cropped by whoever made it of the RAW, perhaps: no longer what the sensor's rows saw
+        raise FileError(f"{path.name} is {kind} by its content, not RAW; if it is a photo of its own, rename it")
+
+    def check_size(width: int, height: int) -> None:
+        if width * height > max_megapixels * 1e6:
+            raise FileError(
+                f"{path.name} has {width}x{height} pixels, more than the limit of {max_megapixels:g} million; "
+                "raise it with --max-pixels if that is true"
+            )
+        if max(width, height) > _MAX_SIDE:
+            raise FileError(
+                f"{path.name} has {width}x{height} pixels; sides above {_MAX_SIDE} cannot be rectified: cut it up"
+            )
+
+    size = picture_size(data, kind)
+    if size is not None:
+        check_size(*size)
+    if kind == "RAW":
+        pixels, metadata = read_raw(data, path.name, check_size)
+    elif kind == "HEIC":
+        pixels, metadata = read_heif(data, path.name)
+    else:
+        pixels = _decode(as_stored(data) if kind == "TIFF" else data, path.name)
+        metadata = tiff_metadata(data) if kind == "TIFF" else metadata_of(data, kind)
+    if kind != named:
+        warnings.warn(
+            f"{path.name} is {kind} by its content{f', not {named}' if named else ''}; it is read as that",
+            FileKindWarning,
+            stacklevel=2,
+        )
+    return Photo(pixels, metadata)
+
+
+def _decode(data: bytes, name: str) -> NDArray[Any]:
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise FileError(f"{name} cannot be decoded: {error.err}") from error
+    if pixels is None or pixels.size == 0:
+        raise FileError(f"{name} cannot be decoded; it is no whole photo of a known kind")
+    return pixels
+
+
+def _encode_params(suffix: str, quality: int) -> list[int]:
+    if suffix in (".jpg", ".jpeg"):
+        # colour at full resolution: halved again after the camera halved it, it costs 2 to 4 dB (measured)
+        full = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+        return [cv2.IMWRITE_JPEG_QUALITY, quality, *full]
+    if suffix == ".webp":
+        return [cv2.IMWRITE_WEBP_QUALITY, quality]
+    if suffix == ".png":
+        return [cv2.IMWRITE_PNG_COMPRESSION, 3]
+    return []
+
+
+def write_image(
+    path: Path,
+    pixels: NDArray[Any],
+    metadata: Metadata | None = None,
+    quality: int = 95,
+) -> None:
+    """Write an image of the kind that the path's ending says, whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    pixels, metadata
+        As in `Photo`. JPEG and WebP hold 8 bits: 16-bit pixels are rounded to them. What the metadata says of the size
+        is made true; its thumbnail, and what it says of other pictures that were in the file, is left out.
+    quality : int
+        Of JPEG and WebP, 1 to 100; above 100, WebP is stored without loss.
+
+    Raises
+    ------
+    InputError
+        When a file of that kind cannot hold such pixels.
+    FileError
+        When it cannot be written.
+    """
+    path = Path(path)
+    data = _encode(path, np.asarray(pixels), metadata or Metadata(), quality)
+    aside = path.with_name(f".{path.name}.partial")
+    try:
+        aside.write_bytes(data)
+        aside.replace(path)
+    except OSError as error:
+        aside.unlink(missing_ok=True)
+        raise FileError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def _encode(path: Path, pixels: NDArray[Any], metadata: Metadata, quality: int) -> bytes:
+    suffix, kind = path.suffix.lower(), kind_of_name(path.name)
+    depths = {"PNG": "uint8 uint16", "TIFF": "uint8 uint16 float32", "JPEG": "uint8 uint16", "WebP": "uint8 uint16"}
+    if str(pixels.dtype) not in depths.get(kind, "").split():
+        raise InputError(
+            f"an image {pixels.shape} {pixels.dtype} cannot be stored as {suffix or 'a file without kind'}"
+        )
+    if kind in ("JPEG", "WebP") and pixels.dtype == np.uint16:
+        pixels = np.rint(pixels / np.float32(257)).astype(np.uint8)
+    channels = 1 if pixels.ndim == 2 else 3 if kind == "JPEG" else pixels.shape[2]
+    metadata, problems = metadata.fitted(pixels.shape[1], pixels.shape[0], channels)
+    try:
+        if kind == "TIFF":
+            data, lost = encode_tiff(pixels, metadata)
+        else:
+            if kind == "PNG" and _compression_is_broken():
+                data = _encode_elsewhere(suffix, pixels, quality)
+            else:
+                done, array = cv2.imencode(suffix, pixels, _encode_params(suffix, quality))
+                if not done:
+                    raise InputError(f"an image {pixels.shape} {pixels.dtype} cannot be stored as {suffix}")
+                data = bytes(array)
+            data, lost = with_metadata(data, kind, metadata)
+    except cv2.error as error:
+        raise InputError(f"an image {pixels.shape} {pixels.dtype} cannot be stored as {suffix}: {error.err}") from error
+    if lost:
+        problems = [*problems, f"not kept: {', '.join(lost)}"]
+    if problems:
+        warnings.warn(f"{path.name}: {'; '.join(problems)}", MetadataWarning, stacklevel=3)
+    return data
+
+
+def _compression_is_broken() -> bool:
+    """Whether pycolmap was imported before zlib (see the top of this file): then compressing aborts this process."""
+    order = list(sys.modules)
+    if "pycolmap" not in order:
+        return False
+    loaded = [order.index(name) for name in ("zlib", "cv2") if name in order]
+    return order.index("pycolmap") < min(loaded, default=len(order))
+
+
+def _encode_elsewhere(suffix: str, pixels: NDArray[Any], quality: int) -> bytes:
+    """Encode in a clean process; slower, but this one would abort."""
+    code = (
+        "import sys, cv2, numpy as np;"
+        "shape, dtype, suffix, params = eval(sys.argv[1]);"
+        "pixels = np.frombuffer(sys.stdin.buffer.read(), dtype).reshape(shape);"
+        "sys.stdout.buffer.write(bytes(cv2.imencode(suffix, pixels, params)[1]))"
+    )
+    job = repr((pixels.shape, pixels.dtype.str, suffix, _encode_params(suffix, quality)))
+    done = subprocess.run(
+        [sys.executable, "-c", code, job],
+        input=np.ascontiguousarray(pixels).tobytes(),
+        capture_output=True,
+        check=False,
+    )
+    if done.returncode or not done.stdout:
+        raise InputError(
+            "PNG cannot be written because pycolmap was imported before rsundistort in this program; "
+            "import rsundistort first"
+        )
+    return done.stdout

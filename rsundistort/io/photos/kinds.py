@@ -1,0 +1,133 @@
+"""What a photo file is by its content, how large its picture is, and whether it is whole: all from its headers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from .boxes import primary_properties
+from .exif import Damaged, TiffStructure
+
+__all__ = [
+    "HEIF_SUFFIXES",
+    "PHOTO_SUFFIXES",
+    "RAW_SUFFIXES",
+    "is_whole",
+    "kind_of_content",
+    "kind_of_name",
+    "picture_size",
+]
+
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
+RAW_SUFFIXES = (".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
+HEIF_SUFFIXES = (".heic", ".heif", ".hif")
+
+_KINDS = {".jpg": "JPEG", ".jpeg": "JPEG", ".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF", ".webp": "WebP"}
+_HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
+
+_COLOUR_FILTER = 32803
+_DNG_VERSION, _SUB_IFDS, _PHOTOMETRIC = 0xC612, 0x014A, 0x0106
+
+
+def kind_of_name(name: str) -> str:
+    """The kind that a file's ending says: "JPEG", "PNG", "TIFF", "WebP", "HEIC", "RAW", or "" for others."""
+    suffix = Path(name).suffix.lower()
+    if suffix in RAW_SUFFIXES:
+        return "RAW"
+    return "HEIC" if suffix in HEIF_SUFFIXES else _KINDS.get(suffix, "")
+
+
+def kind_of_content(data: bytes, name: str) -> str:
+    """The kind that the content is of, as in `kind_of_name`; the ending tells RAW from what looks like TIFF."""
+    if data[:3] == b"\xff\xd8\xff":
+        return "JPEG"
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        return "PNG"
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        return "WebP"
+    if data[4:8] == b"ftyp":
+        return "RAW" if data[8:12] == b"crx " else "HEIC" if data[8:12] in _HEIF_BRANDS else ""
+    if data[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        return "RAW" if _is_raw(data, kind_of_name(name) == "RAW") else "TIFF"
+    # the others of many makers: LibRaw knows them
+    return "RAW" if kind_of_name(name) == "RAW" else ""
+
+
+def _is_raw(data: bytes, named_raw: bool) -> bool:
+    """Whether a TIFF structure holds what the sensor saw, rather than a picture."""
+    try:
+        structure = TiffStructure(data)
+        entries = structure.main()[0]
+    except Damaged:
+        return named_raw
+    photometric = structure.number(entries[_PHOTOMETRIC]) if _PHOTOMETRIC in entries else None
+    if _DNG_VERSION in entries or photometric == _COLOUR_FILTER:
+        return True
+    # RAW files of TIFF structure begin with a preview; a picture under the name of a RAW has no others in it
+    is_picture = photometric is not None and _SUB_IFDS not in entries and data[8:10] != b"CR"
+    return named_raw and not is_picture
+
+
+def is_whole(data: bytes) -> bool:
+    """Whether a JPEG or PNG has its end; some decoders fill what is missing with grey and say nothing."""
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        return data.rfind(b"IEND") > 0
+    if data[:2] != b"\xff\xd8":
+        return True
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:  # segments before the pixels
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return data.find(b"\xff\xd9", at) > 0
+
+
+def picture_size(data: bytes, kind: str) -> tuple[int, int] | None:
+    """Width and height in pixels by the header, before anything is decoded; None where it does not say."""
+    size = {"JPEG": _jpeg_size, "PNG": _png_size, "WebP": _webp_size, "TIFF": _tiff_size, "HEIC": _heif_size}.get(kind)
+    return None if size is None else size(data)
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    at = 2
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF:  # padding
+            at += 1
+        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame
+            return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
+        else:
+            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return None
+
+
+def _png_size(data: bytes) -> tuple[int, int] | None:
+    if len(data) < 24:
+        return None
+    return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+
+
+def _webp_size(data: bytes) -> tuple[int, int] | None:
+    chunk = data[12:16]
+    if len(data) < 30:
+        return None
+    if chunk == b"VP8X":
+        return int.from_bytes(data[24:27], "little") + 1, int.from_bytes(data[27:30], "little") + 1
+    if chunk == b"VP8L":
+        bits = int.from_bytes(data[21:25], "little")
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    return int.from_bytes(data[26:28], "little") & 0x3FFF, int.from_bytes(data[28:30], "little") & 0x3FFF
+
+
+def _tiff_size(data: bytes) -> tuple[int, int] | None:
+    try:
+        structure = TiffStructure(data)
+        entries = structure.main()[0]
+        width, height = (structure.number(entries[tag]) for tag in (0x0100, 0x0101))
+    except (Damaged, KeyError):
+        return None
+    return None if width is None or height is None else (width, height)
+
+
+def _heif_size(data: bytes) -> tuple[int, int] | None:
+    for name, content in primary_properties(data):
+        if name == b"ispe" and len(content) >= 12:
+            return int.from_bytes(content[4:8], "big"), int.from_bytes(content[8:12], "big")
+    return None

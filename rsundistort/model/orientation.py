@@ -1,0 +1,213 @@
+"""The eight EXIF orientations: what they do to pixels, cameras, poses and motions.
+
+An orientation o takes the stored frame to the shown one by a signed permutation of the axes, `MATRICES[o]`: a turn by a
+multiple of 90 degrees, after which 2, 4, 5 and 7 mirror. A turn of the image is a turn of the camera about its optical
+axis. A mirror image is no camera's: photos with a pose are turned, and what is left of their tag is to mirror (tag 2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError
+from .camera import READOUTS, Camera
+from .checks import check_finite
+from .motion import RowMotion
+from .reconstruction import Reconstruction
+from .solution import Solution, SolvedImage
+
+__all__ = [
+    "INVERSE",
+    "MATRICES",
+    "compose_orientations",
+    "in_stored_frame",
+    "split_mirror",
+    "turn_camera",
+    "turn_image",
+    "turn_pixels",
+    "turn_points",
+    "turn_reconstruction",
+    "turn_solution",
+]
+
+#: Of each EXIF orientation, the (2, 2) matrix that takes x right, y down of the stored frame to those of the shown one.
+MATRICES: dict[int, NDArray[np.int64]] = {
+    1: np.array([[1, 0], [0, 1]]),
+    2: np.array([[-1, 0], [0, 1]]),
+    3: np.array([[-1, 0], [0, -1]]),
+    4: np.array([[1, 0], [0, -1]]),
+    5: np.array([[0, 1], [1, 0]]),
+    6: np.array([[0, -1], [1, 0]]),
+    7: np.array([[0, -1], [-1, 0]]),
+    8: np.array([[0, 1], [-1, 0]]),
+}
+
+#: The orientation that undoes each.
+INVERSE: dict[int, int] = {1: 1, 2: 2, 3: 3, 4: 4, 5: 5, 6: 8, 7: 7, 8: 6}
+
+
+def compose_orientations(first: int, then: int) -> int:
+    """The orientation that does `first`, then `then`."""
+    both = MATRICES[then] @ MATRICES[first]
+    return next(o for o, matrix in MATRICES.items() if np.array_equal(matrix, both))
+
+
+def split_mirror(orientation: int) -> tuple[int, int]:
+    """An orientation as a turn (1, 3, 6 or 8) and what is left after it: 1, or 2 to mirror left and right."""
+    if np.linalg.det(MATRICES[orientation]) > 0:
+        return orientation, 1
+    return compose_orientations(orientation, 2), 2
+
+
+def _swaps(orientation: int) -> bool:
+    return bool(MATRICES[orientation][0, 0] == 0)
+
+
+def turn_pixels(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """(h, w[, channels]) stored pixels as the orientation shows them; 5 to 8 exchange the sides."""
+    if _swaps(orientation):
+        pixels = np.swapaxes(pixels, 0, 1)
+    across, down = MATRICES[orientation].sum(1)
+    return np.ascontiguousarray(pixels[:: int(down), :: int(across)])
+
+
+def turn_points(xy: ArrayLike, width: int, height: int, orientation: int) -> NDArray[np.float64]:
+    """(n, 2) pixels of a stored photo of that size where the orientation shows them; integer centres in both."""
+    xy = check_finite(xy, (None, 2), "xy")
+    matrix = MATRICES[orientation]
+    last = np.array([width - 1.0, height - 1.0])
+    # an axis that is reversed runs from the last pixel
+    return xy @ matrix.T + (matrix < 0) @ last
+
+
+def turn_camera(camera: Camera, orientation: int) -> Camera:
+    """The camera whose photos are those of `camera`, shown by the orientation; exact, also for mirrored ones."""
+    matrix, swaps = MATRICES[orientation], _swaps(orientation)
+    width, height = (camera.height, camera.width) if swaps else (camera.width, camera.height)
+    K = np.eye(3)
+    K[[0, 1], [0, 1]] = np.abs(matrix) @ np.diag(camera.K)[:2]
+    K[:2, 2] = turn_points(camera.K[None, :2, 2], camera.width, camera.height, orientation)[0]
+    axis, sign = READOUTS[camera.readout]
+    clock = sign * matrix[:, axis]
+    along = int(np.flatnonzero(clock)[0])
+    readout = next(name for name, way in READOUTS.items() if way == (along, float(clock[along])))
+    dist = np.array(camera.dist)
+    if len(dist) >= 4 and getattr(camera, "lens", "pinhole") == "pinhole":
+        # decentering shifts by 2 x (p . x) + p r^2 with p = (p2, p1): p turns with the axes, and so does a thin prism
+        dist[[3, 2]] = matrix @ dist[[3, 2]]
+        if len(dist) == 12:
+            dist[[8, 10]], dist[[9, 11]] = matrix @ dist[[8, 10]], matrix @ dist[[9, 11]]
+    return replace(camera, width=width, height=height, K=K, dist=dist, readout=readout)
+
+
+def turn_image(image: SolvedImage, orientation: int, camera_id: str) -> SolvedImage:
+    """A photo of a solution with the pose and motion of its shown frame; world and velocity stay.
+
+    Raises
+    ------
+    InputError
+        When the photo has a pose and the orientation mirrors.
+    """
+    matrix = np.eye(3)
+    matrix[:2, :2] = MATRICES[orientation]
+    hand = float(np.linalg.det(matrix))
+    if hand < 0 and image.R_cw is not None:
+        raise InputError(f"{image.name} has a pose, and no camera takes its mirror image")
+    motion = image.motion
+    if motion is not None:
+        # phi is an axial vector: a mirror reverses it
+        motion = RowMotion(hand * matrix @ motion.phi, motion.velocity)
+    return replace(
+        image,
+        camera_id=camera_id,
+        R_cw=None if image.R_cw is None else matrix @ image.R_cw,
+        motion=motion,
+        sigma_phi=None if image.sigma_phi is None else np.abs(matrix) @ image.sigma_phi,
+        turned=compose_orientations(image.turned, orientation),
+    )
+
+
+def _new_places(pairs: set[tuple[int, int]], count: int) -> dict[tuple[int, int], int]:
+    """Place of each (camera, orientation): the camera's own when it is not turned, else one after all cameras."""
+    turned = sorted(pair for pair in pairs if pair[1] != 1)
+    return {pair: pair[0] for pair in pairs} | {pair: count + k for k, pair in enumerate(turned)}
+
+
+def turn_solution(solution: Solution, orientations: Mapping[str, int]) -> Solution:
+    """A solution of photos that were turned after they were rectified.
+
+    Parameters
+    ----------
+    solution : Solution
+        Of the photos as they were.
+    orientations : mapping of photo name to int
+        How each was turned; those left out were not.
+
+    Returns
+    -------
+    Solution
+        Raw and rectified cameras, poses and motions in the frames of the turned photos. Each camera and orientation
+        that occur together get a camera of their own; `SolvedImage.turned` says how the frame was turned.
+
+    Raises
+    ------
+    InputError
+        When a photo that has a pose would be mirrored.
+    """
+    ids = list(solution.cameras)
+    pairs = {image.name: (ids.index(image.camera_id), orientations.get(image.name, 1)) for image in solution.images}
+    place = _new_places(set(pairs.values()), len(ids))
+    numbers = (str(k) for k in range(1, 2 * len(ids) + len(place) + 1))
+    ids += [key for key in numbers if key not in solution.cameras][: len(place)]
+    cameras, rectified = dict(solution.cameras), dict(solution.rectified_cameras)
+    for (old, orientation), new in sorted(place.items(), key=lambda item: item[1]):
+        if orientation != 1:
+            cameras[ids[new]] = turn_camera(solution.cameras[ids[old]], orientation)
+            rectified[ids[new]] = turn_camera(solution.rectified_cameras[ids[old]], orientation)
+    images = tuple(turn_image(image, pairs[image.name][1], ids[place[pairs[image.name]]]) for image in solution.images)
+    return replace(solution, cameras=cameras, rectified_cameras=rectified, images=images)
+
+
+def in_stored_frame(solution: Solution) -> Solution:
+    """The solution of the photos as the sensor stored them, of one whose photos may have been turned."""
+    return turn_solution(solution, {image.name: INVERSE[image.turned] for image in solution.images})
+
+
+def turn_reconstruction(reconstruction: Reconstruction, orientations: Mapping[str, int]) -> Reconstruction:
+    """A reconstruction from turned photos: cameras, poses, motions and measurements; the scene stays.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        From the photos as they were.
+    orientations : mapping of photo name to int
+        As in `turn_solution`, whose cameras come in the same order. None may mirror.
+    """
+    rec = reconstruction
+    turns = [orientations.get(name, 1) for name in rec.image_names]
+    pairs = [(int(k), o) for k, o in zip(rec.camera_idx, turns, strict=True)]
+    place = _new_places(set(pairs), len(rec.cameras))
+    new = sorted((k, pair) for pair, k in place.items() if pair[1] != 1)
+    matrix = np.tile(np.eye(3), (rec.num_images, 1, 1))
+    matrix[:, :2, :2] = [MATRICES[o] for o in turns]
+    if (np.linalg.det(matrix) < 0).any():
+        raise InputError("a reconstruction cannot be mirrored")
+    obs = rec.observations
+    xy = np.array(obs.xy_raw)
+    for i, orientation in enumerate(turns):
+        of_photo = obs.frame_idx == i
+        camera = rec.camera(i)
+        xy[of_photo] = turn_points(xy[of_photo], camera.width, camera.height, orientation)
+    return replace(
+        rec,
+        cameras=(*rec.cameras, *(turn_camera(rec.cameras[old], o) for _, (old, o) in new)),
+        camera_idx=np.array([place[pair] for pair in pairs], np.int64),
+        R_cw=matrix @ rec.R_cw,
+        phi=np.einsum("mij,mj->mi", matrix, rec.phi),
+        observations=replace(obs, xy_raw=xy),
+    )
