@@ -115,6 +115,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Features of a photo.",
 )
+@opt.view_options
 @opt.interpolation_option
 @opt.quality_option
 @opt.raw_as_option
@@ -145,6 +146,9 @@ def command(
     photo_times: Path | None,
     remedy: str,
     max_features: int,
+    alpha: float | str | None,
+    scale: float,
+    max_size: int | None,
     interpolation: str,
     quality: int,
     raw_as: str,
@@ -164,6 +168,7 @@ def command(
     with errors_for_people(), progress_bars(quiet) as progress:
         from rsundistort.io import read_known_lengths, read_known_motions
         from rsundistort.pipeline import GyroOptions, RunOptions, run
+        from rsundistort.rectify import ViewOptions
 
         readout_s = readout_ms and readout_ms / 1e3
         solution = run(
@@ -177,6 +182,7 @@ def command(
                 seed=seed,
                 jobs=jobs,
                 max_features=max_features,
+                view=ViewOptions(alpha, scale, max_size),
                 interpolation=interpolation,
                 quality=quality,
                 raw_as=raw_as,

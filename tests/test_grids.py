@@ -189,7 +189,7 @@ def test_inverse_of_a_fold_takes_one_of_the_two():
 
 def test_grid_is_applied_as_rectify_does(rng):
     camera, photo = make_camera(LENS), np.rint(255 * smooth_photo(rng)).astype(np.uint8)
-    new = Camera(500, 300, [[400, 0, 250], [0, 410, 140], [0, 0, 1]])
+    new = Camera(500, 300, [[500, 0, 250], [0, 510, 140], [0, 0, 1]])
     grid = remap_grid(camera, MOTION, new_camera=new)
     expected, mask = rectify(photo, camera, MOTION, new_camera=new, interpolation="linear")
     for jobs in (1, 3):

@@ -3,7 +3,7 @@
 from .coarse import TOLERANCE_PX, CoarseGrid, coarse_grid
 from .grid import MAP_KINDS, RemapGrid, remap_grid
 from .maps import init_rectify_map
-from .new_camera import optimal_new_camera
+from .new_camera import ViewOptions, optimal_new_camera, rectified_roi, rectified_view
 from .photo import INTERPOLATIONS, rectify
 from .points import distort_points, largest_shift_px, undistort_points
 
@@ -13,11 +13,14 @@ __all__ = [
     "TOLERANCE_PX",
     "CoarseGrid",
     "RemapGrid",
+    "ViewOptions",
     "coarse_grid",
     "distort_points",
     "init_rectify_map",
     "largest_shift_px",
     "optimal_new_camera",
+    "rectified_roi",
+    "rectified_view",
     "rectify",
     "remap_grid",
     "undistort_points",

@@ -79,7 +79,10 @@ class RemapGrid:
     def apply(
         self, image: NDArray[Any], interpolation: str = "cubic", jobs: int = 1
     ) -> tuple[NDArray[Any], NDArray[np.uint8]]:
-        """An image of the source's size through the grid, and which pixels were seen; as `rectify`."""
+        """An image of the source's size through the grid, and which pixels were seen; as `rectify`.
+
+        Without its averaging of photos that get smaller: each pixel is one sample.
+        """
         image = check_photo(image, self.source_width, self.source_height)
 
         def fill(row0: int, map_x: NDArray[np.float32], map_y: NDArray[np.float32], seen: NDArray[np.uint8]) -> bool:

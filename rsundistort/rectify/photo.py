@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -28,6 +29,8 @@ INTERPOLATIONS: dict[str, int] = {
 
 # So few pixels OpenCV remaps on the thread that asks, whatever `cv2.setNumThreads` says; the map stays in the cache.
 _STRIP_PIXELS = 1 << 16
+# Raw pixels from one rectified pixel to the next, up to which single samples do.
+_MAX_STEP = 1.25
 _MAX_SIDE = 32766  # cv2.remap counts in 16 bits
 
 
@@ -73,7 +76,8 @@ def rectify(
     new_camera : Camera, optional
         Pinhole camera of the result (its distortion must be empty); the photo's size and K when left out.
     interpolation : {"cubic", "linear", "lanczos", "nearest"}
-        OpenCV positions cubic and lanczos to 1/32 pixel, and linear of uint8 photos, as in `cv2.undistort`.
+        Photos that get smaller are averaged over the area of each new pixel (not with nearest). OpenCV positions cubic
+        and lanczos to 1/32 pixel, and linear of uint8 photos, as in `cv2.undistort`.
     jobs : int
         Threads; the result does not depend on them.
     mask : (h, w) uint8 array, optional
@@ -95,8 +99,15 @@ def rectify(
         raise InputError("new_camera has lens distortion; a rectified photo has none")
     rays = rectified_rays(target.K, None, camera)
     size = (target.width, target.height)
-    grid = coarse_grid(camera, motion or RowMotion(), shutter_model, rays, size)
-    return remap_strips(photo, grid.fill, size, flag, jobs, mask)
+
+    def fill(factor: int) -> FillRows:
+        # of a photo of so many times the pixels, whose corner is the same
+        finer = np.array([[1, 0, 0.5 - 0.5 * factor], [0, 1, 0.5 - 0.5 * factor], [0, 0, factor]]) / factor
+        finer_size = (factor * size[0], factor * size[1])
+        return coarse_grid(camera, motion or RowMotion(), shutter_model, rays @ finer, finer_size).fill
+
+    samples = 1 if flag == cv2.INTER_NEAREST else _samples(camera, target)
+    return remap_strips(photo, fill(1), size, flag, jobs, mask, samples, fill(samples) if samples > 1 else None)
 
 
 def _fixed_point(map_x: NDArray[np.float32], map_y: NDArray[np.float32]) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -104,6 +115,12 @@ def _fixed_point(map_x: NDArray[np.float32], map_y: NDArray[np.float32]) -> tupl
     xy, fraction = np.empty((*map_x.shape, 2), np.int16), np.empty(map_x.shape, np.uint16)
     kernels.fixed_point(map_x, map_y, xy.view(np.int32)[..., 0], fraction)
     return xy, fraction
+
+
+def _samples(camera: Camera, target: Camera) -> int:
+    """Samples across a rectified pixel: as many as it covers raw pixels, going by the focal lengths."""
+    shrink = max(float(camera.K[k, k] / target.K[k, k]) for k in (0, 1))
+    return 1 if shrink <= _MAX_STEP else max(1, min(math.ceil(shrink), _MAX_SIDE // target.width))
 
 
 #: Fills rows of a map, from a first one on, and of the mask of what is seen; says whether all of it is.
@@ -117,14 +134,24 @@ def remap_strips(
     flag: int,
     jobs: int,
     mask: NDArray[np.uint8] | None = None,
+    samples: int = 1,
+    fill_samples: FillRows | None = None,
 ) -> tuple[NDArray[Any], NDArray[np.uint8]]:
-    """A photo through a map of `size` that is made strip by strip, and its mask; see `rectify`."""
+    """A photo through a map of `size` that is made strip by strip, and its mask; see `rectify`.
+
+    With `samples` a pixel is the mean of samples x samples points, whose map `fill_samples` makes.
+    """
     width, height = size
     rectified = np.empty((height, width, *photo.shape[2:]), photo.dtype)
     valid = np.empty((height, width), np.uint8)
     # OpenCV 5 is exact with float maps, and takes half as long again
     fixed = photo.dtype == np.uint8 and flag == cv2.INTER_LINEAR
-    strip_rows = max(1, _STRIP_PIXELS // width)
+    strip_rows = max(1, _STRIP_PIXELS // (width * samples**2))
+
+    def interpolate(map_x: NDArray[np.float32], map_y: NDArray[np.float32], values: NDArray[Any]) -> None:
+        map1, map2 = _fixed_point(map_x, map_y) if fixed else (map_x, map_y)
+        # taps beyond the border repeat it, so that seen pixels at the edge keep their brightness
+        cv2.remap(photo, map1, map2, flag, dst=values, borderMode=cv2.BORDER_REPLICATE)
 
     def strip(row0: int) -> None:
         rows = slice(row0, min(row0 + strip_rows, height))
@@ -132,9 +159,18 @@ def remap_strips(
         map_y = np.empty_like(map_x)
         values, seen = rectified[rows], valid[rows]
         all_seen = fill(row0, map_x, map_y, seen)
-        # taps beyond the border repeat it, so that seen pixels at the edge keep their brightness
-        map1, map2 = _fixed_point(map_x, map_y) if fixed else (map_x, map_y)
-        cv2.remap(photo, map1, map2, flag, dst=values, borderMode=cv2.BORDER_REPLICATE)
+        if fill_samples is None:
+            interpolate(map_x, map_y, values)
+        else:
+            fine_x = np.empty((samples * len(map_x), samples * width), np.float32)
+            fine_y, fine_seen = np.empty_like(fine_x), np.empty(fine_x.shape, np.uint8)
+            fine = np.empty((*fine_x.shape, *photo.shape[2:]), photo.dtype)
+            if not fill_samples(samples * row0, fine_x, fine_y, fine_seen) and fine_x.min() < -1e5:
+                nowhere = (fine_x < -1e5).reshape(len(map_x), samples, width, samples).any((1, 3))
+                seen[nowhere] = 0
+                all_seen = False
+            interpolate(fine_x, fine_y, fine)
+            cv2.resize(fine, (width, len(map_x)), dst=values, interpolation=cv2.INTER_AREA)
         if not all_seen:
             kernels.clear_unseen(seen, values.reshape(*seen.shape, -1).view(np.uint8))
         if mask is not None:
