@@ -25,6 +25,21 @@ from .terminal import errors_for_people, progress_bars
     help="Folder of masks, a.png for a.jpg: what is black in them is black in OUT/masks.",
 )
 @opt.depth_option
+@opt.view_options
+@click.option(
+    "--maps",
+    type=click.Choice(opt.MAP_KIND_NAMES),
+    help="Write each photo's map and its inverse into OUT/maps: NumPy (npz), OpenEXR in pixels, or the ST map of "
+    "compositing programs (extra exr).",
+)
+@click.option(
+    "--also",
+    multiple=True,
+    metavar="FOLDER[=INTERPOLATION]",
+    callback=opt.also_folders,
+    help="Rectify other images of the same frames alike (a.png for a.jpg): labels, depth, near infrared; by nearest, "
+    "which makes up no values, or as told. May be repeated.",
+)
 @opt.interpolation_option
 @opt.quality_option
 @opt.raw_as_option
@@ -40,6 +55,11 @@ def command(
     out: Path,
     masks: Path | None,
     depth: str,
+    alpha: float | str | None,
+    scale: float,
+    max_size: int | None,
+    maps: str | None,
+    also: tuple[tuple[Path, str], ...],
     interpolation: str,
     quality: int,
     raw_as: str,
@@ -53,12 +73,13 @@ def command(
     """Rectify the photos of a folder with the motions of a solution."""
     with errors_for_people(), progress_bars(quiet) as progress:
         from rsundistort.pipeline import rectify_folder
+        from rsundistort.rectify import ViewOptions
 
         solved, left_out = rectify_folder(
             photos, solution, out,
             interpolation=interpolation, quality=quality, jobs=jobs, overwrite=overwrite, masks=masks,
             progress=progress, depth=depth, raw_as=raw_as, apply_orientation=apply_orientation, again=again,
-            max_megapixels=max_megapixels,
+            max_megapixels=max_megapixels, view=ViewOptions(alpha, scale, max_size), maps=maps, also=also,
         )  # fmt: skip
     if not quiet:
         count = len(list((out / "images").iterdir()))

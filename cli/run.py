@@ -116,6 +116,7 @@ if TYPE_CHECKING:
     help="Features of a photo.",
 )
 @opt.depth_option
+@opt.view_options
 @opt.interpolation_option
 @opt.quality_option
 @opt.raw_as_option
@@ -147,6 +148,9 @@ def command(
     remedy: str,
     max_features: int,
     depth: str,
+    alpha: float | str | None,
+    scale: float,
+    max_size: int | None,
     interpolation: str,
     quality: int,
     raw_as: str,
@@ -166,6 +170,7 @@ def command(
     with errors_for_people(), progress_bars(quiet) as progress:
         from rsundistort.io import read_known_lengths, read_known_motions
         from rsundistort.pipeline import GyroOptions, RunOptions, run
+        from rsundistort.rectify import ViewOptions
 
         readout_s = readout_ms and readout_ms / 1e3
         solution = run(
@@ -180,6 +185,7 @@ def command(
                 jobs=jobs,
                 max_features=max_features,
                 depth=depth,
+                view=ViewOptions(alpha, scale, max_size),
                 interpolation=interpolation,
                 quality=quality,
                 raw_as=raw_as,

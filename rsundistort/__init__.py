@@ -40,11 +40,13 @@ from .pipeline import (
     simulate_warp,
 )
 from .rectify import (
+    RemapGrid,
     distort_points,
     init_rectify_map,
     largest_shift_px,
     optimal_new_camera,
     rectify,
+    remap_grid,
     undistort_points,
 )
 
@@ -67,6 +69,7 @@ __all__ = [
     "Plane",
     "Reconstruction",
     "ReconstructionError",
+    "RemapGrid",
     "RowMotion",
     "RsUndistortError",
     "RsUndistortWarning",
@@ -92,6 +95,7 @@ __all__ = [
     "read_solution",
     "rectify",
     "rectify_folder",
+    "remap_grid",
     "run",
     "simulate_scene",
     "simulate_warp",

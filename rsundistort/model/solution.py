@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .camera import Camera
-from .checks import check_finite, check_rotations, frozen
+from .checks import check_file_name, check_finite, check_rotations, frozen
 from .motion import RowMotion, check_shutter_model
 
 __all__ = ["Solution", "SolvedImage"]
@@ -24,7 +24,7 @@ class SolvedImage:
     Attributes
     ----------
     name, camera_id : str
-        Photo and its camera.
+        Photo, a file below its folder, and its camera.
     R_cw, center_w : (3, 3), (3,) array or None
         Pose at the principal row; None for a photo that did not register.
     motion : RowMotion or None
@@ -46,6 +46,8 @@ class SolvedImage:
     turned : int
         EXIF orientation by which the photo was turned after it was rectified: pose, motion and cameras are those of
         the turned frame. 1 in the stored frame.
+    roi : (x, y, width, height) or None
+        Rectangle of the rectified photo without empty pixels, if there is one.
     """
 
     name: str
@@ -61,8 +63,10 @@ class SolvedImage:
     translation_shift_px: float | None = None
     reason: str | None = None
     turned: int = 1
+    roi: tuple[int, int, int, int] | None = None
 
     def __post_init__(self) -> None:
+        check_file_name(self.name, "photo")
         if self.R_cw is not None:
             R = check_rotations(np.asarray(self.R_cw, np.float64)[None], 1, f"R_cw of {self.name}")[0]
             object.__setattr__(self, "R_cw", frozen(R))

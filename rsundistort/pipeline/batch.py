@@ -11,9 +11,12 @@ from ..errors import InputError, MetadataWarning, RsUndistortWarning, SkippedPho
 from ..io import MAX_MEGAPIXELS, list_photos, output_folder, read_solution, write_solution
 from ..model import Solution
 from ..model.orientation import in_stored_frame, split_mirror, turn_solution
+from ..rectify import ViewOptions
 from .depth import PhotoDepths, ScenePoints, check_depth
+from .extras import find_extras
 from .progress import ProgressCallback, StageLog
 from .run import use_threads
+from .views import with_view
 from .write import rectify_photos, turn_of
 
 __all__ = ["rectify_folder"]
@@ -34,6 +37,9 @@ def rectify_folder(
     apply_orientation: bool = False,
     again: bool = False,
     max_megapixels: float = MAX_MEGAPIXELS,
+    view: ViewOptions | None = None,
+    maps: str | None = None,
+    also: Sequence[tuple[Path, str]] = (),
     progress: ProgressCallback | None = None,
 ) -> tuple[Solution, Sequence[str]]:
     """Rectify the photos of a folder with the motions of a solution, into `out/images` and `out/masks`.
@@ -47,6 +53,13 @@ def rectify_folder(
     apply_orientation : bool
         Turn photos, masks and the cameras and poses of the solution by the photos' EXIF orientation. Mirrored photos
         are mirrored, and lose their pose: no camera takes a mirror image.
+    view : ViewOptions, optional
+        What the rectified photos show and how large they are; as the solution has it when left out.
+    maps : {"npz", "exr", "stmap"}, optional
+        Write each photo's remap grid and its inverse into `out/maps`, as `RemapGrid.save` does.
+    also : sequence of (folder, interpolation)
+        Folders of other images of the same frames (labels, depth, near infrared), of the photos' stems and sizes: they
+        are rectified alike into `out/also`.
 
     Returns
     -------
@@ -66,18 +79,20 @@ def rectify_folder(
     for name in listed:
         if name not in motions:
             warnings.warn(f"skipped: {name} has no motion in {solution}", SkippedPhotoWarning, stacklevel=2)
+    extras = find_extras(maps, also, names)
+    solved = with_view(solved, view or ViewOptions())
     depths = PhotoDepths(solved, depth, _points_beside(Path(solution), solved, depth))
     log = StageLog(progress)
     jobs = use_threads(jobs)
     # a photo without a pose may be mirrored
     unposed = replace(solved, images=[replace(image, R_cw=None, center_w=None) for image in solved.images])
     turns: dict[str, int] = {}
-    with output_folder(out, overwrite=overwrite, apart_from=[photos]) as scratch:
+    with output_folder(out, overwrite=overwrite, apart_from=[photos, *(folder for folder, _ in also)]) as scratch:
         rectified = rectify_photos(
             photos, unposed, names, scratch,
             interpolation=interpolation, quality=quality, jobs=jobs, log=log, depths=depths,
             raw_as=raw_as, apply_orientation=apply_orientation, again=again, max_megapixels=max_megapixels,
-            masks=None if masks is None else Path(masks),
+            masks=None if masks is None else Path(masks), extras=extras,
         )  # fmt: skip
         for name, photo in rectified:
             turns[name] = turn_of(unposed.image(name), photo)[0]

@@ -32,7 +32,7 @@ from ..io import (
 from ..io.motions import Known
 from ..model import READOUTS, Reconstruction, Solution, SolvedImage, check_shutter_model
 from ..model.orientation import turn_reconstruction, turn_solution
-from ..rectify import INTERPOLATIONS, largest_shift_px
+from ..rectify import INTERPOLATIONS, ViewOptions, largest_shift_px
 from .cameras import PhotoCameras, check_readouts
 from .depth import PhotoDepths, ScenePoints, check_depth
 from .frames import find_photos
@@ -40,6 +40,7 @@ from .gyro import GyroOptions, gyro_contradiction, gyro_motions, known_readouts
 from .load import LoadedPhotos, load_photos
 from .progress import ProgressCallback, StageLog
 from .solve import Solved, solve_photos
+from .views import with_view
 from .write import PointColors, mask_names, rectify_photos, turn_of
 
 __all__ = ["RunOptions", "run", "use_threads", "versions"]
@@ -108,6 +109,8 @@ class RunOptions:
         A gyroscope's log, for the motions that are neither `known` nor those of `still` photos.
     readout_s : float, optional
         Time of the readout of a frame; else the log's, else that of the camera in the table, if it is there.
+    view : ViewOptions
+        What the rectified photos show, and how large they are.
     overwrite : bool
         Replace the outputs of an earlier run.
     """
@@ -135,6 +138,7 @@ class RunOptions:
     sharpest: int | None = None
     gyro: GyroOptions | None = None
     readout_s: float | None = None
+    view: ViewOptions = field(default_factory=ViewOptions)
     overwrite: bool = False
 
     def __post_init__(self) -> None:
@@ -253,7 +257,7 @@ def run(
         rec = solved.result.reconstruction
         if contradiction := gyro_contradiction(rec, from_gyro):
             warnings.warn(contradiction, RsUndistortWarning, stacklevel=2)
-        solution = _solution(loaded, solved, options, readouts, source.video)
+        solution = with_view(_solution(loaded, solved, options, readouts, source.video), options.view)
         depths = PhotoDepths(solution, options.depth, ScenePoints.of_reconstruction(rec))
         colors = PointColors(rec)
         rectified = rectify_photos(

@@ -18,6 +18,7 @@ from ..model import Reconstruction, Solution, SolvedImage
 from ..model.orientation import split_mirror, turn_pixels
 from ..rectify import rectify
 from .depth import PhotoDepths
+from .extras import Extras
 from .progress import StageLog
 
 __all__ = ["PointColors", "check_not_rectified", "mask_names", "rectify_photos", "turn_of"]
@@ -61,13 +62,14 @@ def rectify_photos(
     apply_orientation: bool = False,
     again: bool = True,
     max_megapixels: float = MAX_MEGAPIXELS,
+    extras: Extras | None = None,
 ) -> Iterator[tuple[str, Photo]]:
     """Rectify photos into `out/images` and `out/masks`, and yield each raw photo by the way.
 
     Photos that cannot be read, are of another size than their camera, or (unless `again`) are rectified already, are
     skipped with a warning. `depths` says how far away what they show is. With `apply_orientation` photo and mask are
     turned as `turn_of` says. What the users' own masks (a folder, as `io.find_masks` takes it) leave out is left out of
-    `out/masks`.
+    `out/masks`. `extras` are written beside them.
     """
     (out / "images").mkdir()
     (out / "masks").mkdir()
@@ -89,6 +91,12 @@ def rectify_photos(
                 solution.rectified_cameras[image.camera_id], interpolation, mask=own, depth=seen.depth,
             )  # fmt: skip
             metadata = photo.metadata.marked(mark)
+            if extras is not None:
+                extras.write(
+                    out, name, Path(mask_name[name]).stem, camera, seen, solution.shutter_model,
+                    solution.rectified_cameras[image.camera_id],
+                    turn_of(image, photo)[0] if apply_orientation else 1, max_megapixels,
+                )  # fmt: skip
             if apply_orientation:
                 turn, rest = turn_of(image, photo)
                 pixels, mask, metadata = (
