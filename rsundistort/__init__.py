@@ -29,6 +29,7 @@ from .model import Camera, Observations, Reconstruction, RowMotion, Solution, So
 from .model.projection import project_points, unproject_points
 from .pipeline import (
     GyroOptions,
+    RectifyOptions,
     RunOptions,
     SceneOptions,
     WarpOptions,
@@ -64,6 +65,7 @@ __all__ = [
     "Observations",
     "Reconstruction",
     "ReconstructionError",
+    "RectifyOptions",
     "RowMotion",
     "RsUndistortError",
     "RsUndistortWarning",
