@@ -462,7 +462,8 @@ def test_rectify(invoke, tmp_path):
     assert "3 photos rectified" in result.stdout
     assert result.stderr == ""
     names = {path for path, content in tree(tmp_path / "out").items() if content is not None}
-    assert names == {f"{kind}/{name}" for kind in ("images", "masks") for name in THREE} | {"solution.json"}
+    files = {"solution.json", ".rectified.jsonl"}  # the second is what --resume goes by
+    assert names == {f"{kind}/{name}" for kind in ("images", "masks") for name in THREE} | files
     assert invoke("rectify", "photos", "--solution", "s.json", "-o", "quiet", "-q").stdout == ""
 
 
@@ -472,14 +473,17 @@ def test_rectify_leaves_out_photos_of_another_size(invoke, tmp_path):
     (tmp_path / "photos" / "c.png").write_bytes(b"cut")
     solution_of(tmp_path / "s.json", THREE)
     result = invoke("rectify", "photos", "--solution", "s.json", "-o", "out")
-    assert result.exit_code == 0, result.stderr
+    assert result.exit_code == 3, result.stderr
+    assert result.stdout.splitlines()[-3] == "failed:"
+    assert [line.split(":")[0] for line in result.stdout.splitlines()[-2:]] == ["  b.png", "  c.png"]
     warnings = result.stderr.splitlines()
     assert len(warnings) == 2
     assert warnings[0].startswith("warning: skipped: b.png")
     assert warnings[1].startswith("warning: skipped: c.png")
     assert "1 photo rectified" in result.stdout
     assert "2 left out" in result.stdout
-    assert set(tree(tmp_path / "out")) == {"images", "images/a.png", "masks", "masks/a.png", "solution.json"}
+    files = {"images", "images/a.png", "masks", "masks/a.png", "solution.json", ".rectified.jsonl"}
+    assert set(tree(tmp_path / "out")) == files
 
 
 def test_rectify_refuses_photos_that_are_all_of_another_size(invoke, tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -42,7 +43,7 @@ class SolvedImage:
     translation_shift_px : float or None
         Largest displacement that the translation alone caused, by that depth.
     reason : str or None
-        Why the photo did not register.
+        Why the photo did not register; of one that did, why it could not be rectified.
     turned : int
         EXIF orientation by which the photo was turned after it was rectified: pose, motion and cameras are those of
         the turned frame. 1 in the stored frame.
@@ -126,10 +127,14 @@ class Solution:
 
     def image(self, name: str) -> SolvedImage:
         """The photo of a name."""
-        for image in self.images:
-            if image.name == name:
-                return image
-        raise InputError(f"the solution has no photo {name!r}")
+        try:
+            return self._by_name[name]
+        except KeyError:
+            raise InputError(f"the solution has no photo {name!r}") from None
+
+    @cached_property
+    def _by_name(self) -> dict[str, SolvedImage]:
+        return {image.name: image for image in self.images}
 
     @property
     def registered(self) -> list[SolvedImage]:
