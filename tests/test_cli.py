@@ -467,6 +467,15 @@ def test_rectify(invoke, tmp_path):
     assert invoke("rectify", "photos", "--solution", "s.json", "-o", "quiet", "-q").stdout == ""
 
 
+def test_rectify_refuses_a_depth_that_is_none(invoke, tmp_path):
+    save_textures(tmp_path / "photos", THREE)
+    solution_of(tmp_path / "s.json", THREE)
+    result = invoke("rectify", "photos", "--solution", "s.json", "-o", "out", "--depth", "deep")
+    assert result.exit_code == 1
+    assert result.stderr.splitlines() == ["error: depth 'deep' is no folder, nor one of auto, infinity, plane, points"]
+    assert not (tmp_path / "out").exists()
+
+
 def test_rectify_leaves_out_photos_of_another_size(invoke, tmp_path):
     save_textures(tmp_path / "photos", THREE)
     save_png(tmp_path / "photos" / "b.png", texture(240, 320))
