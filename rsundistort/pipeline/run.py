@@ -6,7 +6,7 @@ import platform
 import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -125,6 +125,10 @@ class RunOptions(RectifyOptions):
         if self.readout_s is not None and not 0 < self.readout_s < np.inf:
             raise InputError(f"readout_s={self.readout_s!r}, expected a positive number of seconds")
 
+    def rectify_options(self) -> RectifyOptions:
+        """Those of the last stage, alone."""
+        return RectifyOptions(**{each.name: getattr(self, each.name) for each in fields(RectifyOptions)})
+
     def bundle_options(self, readout: Mapping[str, str] | None = None) -> BundleOptions:
         """Options of the adjustments of photos with these readout directions, top-to-bottom where none is named."""
         soft, hard = {}, {}
@@ -233,7 +237,16 @@ def run(
     go_on = f"whole; go on with: rsundistort rectify {folder} --solution {out / 'solution.json'} -o {out} --resume"
     with batch_folder(out, overwrite=True) as journal:
         done = rectify_photos(
-            folder, solution, list(rec.image_names), out, options, workers, log, journal, colors=colors, go_on=go_on
+            folder,
+            solution,
+            list(rec.image_names),
+            out,
+            options.rectify_options(),
+            workers,
+            log,
+            journal,
+            colors=colors,
+            go_on=go_on,
         )
     log.begin("writing")
     left_out = {name: each.problem for name, each in done.items() if each.problem}
