@@ -145,12 +145,14 @@ class PhotoJob:
         Files count with size and time of change, all else with its value; a missing photo has no fingerprint ("").
         """
         digest = hashlib.sha256(f"{version('rsundistort')} {cv2.__version__}".encode())
-        # where things lie, and which photos are let in, does not change what comes of them
+        # where things lie, and which photos are let in, does not change what comes of them; nor does a pose, but for
+        # how the photo is turned
         options = replace(
             self.options, masks=None, again=False, max_megapixels=MAX_MEGAPIXELS, depth="", view=ViewOptions(), also=()
         )  # fmt: skip
+        posed = self.posed and options.apply_orientation
         try:
-            _feed(digest, replace(self, out=Path(), options=options, sample_xy=None))
+            _feed(digest, replace(self, out=Path(), posed=posed, options=options, sample_xy=None))
         except OSError:
             return ""
         return digest.hexdigest()[:32]
@@ -178,7 +180,7 @@ def _feed(digest: Any, value: Any) -> None:
         for each in value:
             _feed(digest, each)
     else:
-        digest.update(f"{value!r};".encode())
+        digest.update(f"{value.item() if isinstance(value, np.generic) else value!r};".encode())
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import platform
 import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -128,6 +128,10 @@ class RunOptions(RectifyOptions):
         if self.readout_s is not None and not 0 < self.readout_s < np.inf:
             raise InputError(f"readout_s={self.readout_s!r}, expected a positive number of seconds")
 
+    def rectify_options(self) -> RectifyOptions:
+        """Those of the last stage, alone."""
+        return RectifyOptions(**{each.name: getattr(self, each.name) for each in fields(RectifyOptions)})
+
     def bundle_options(self, readout: Mapping[str, str] | None = None) -> BundleOptions:
         """Options of the adjustments of photos with these readout directions, top-to-bottom where none is named."""
         soft, hard = {}, {}
@@ -241,7 +245,7 @@ def run(
             solution,
             list(rec.image_names),
             out,
-            options,
+            options.rectify_options(),
             depths,
             workers,
             log,
