@@ -39,6 +39,7 @@ from .terminal import errors_for_people, progress_bars
     help="Rectify other images of the same frames alike (a.png for a.jpg): labels, depth, near infrared; by nearest, "
     "which makes up no values, or as told. May be repeated.",
 )
+@opt.depth_option
 @opt.interpolation_option
 @opt.quality_option
 @opt.raw_as_option
@@ -58,6 +59,7 @@ def command(
     max_size: int | None,
     maps: str | None,
     also: tuple[tuple[Path, str], ...],
+    depth: str,
     interpolation: str,
     quality: int,
     raw_as: str,
@@ -76,7 +78,7 @@ def command(
         solved, left_out = rectify_folder(
             photos, solution, out,
             interpolation=interpolation, quality=quality, jobs=jobs, overwrite=overwrite, masks=masks,
-            progress=progress, raw_as=raw_as, apply_orientation=apply_orientation, again=again,
+            progress=progress, depth=depth, raw_as=raw_as, apply_orientation=apply_orientation, again=again,
             max_megapixels=max_megapixels, view=ViewOptions(alpha, scale, max_size), maps=maps, also=also,
         )  # fmt: skip
     if not quiet:

@@ -116,6 +116,7 @@ if TYPE_CHECKING:
     help="Features of a photo.",
 )
 @opt.view_options
+@opt.depth_option
 @opt.interpolation_option
 @opt.quality_option
 @opt.raw_as_option
@@ -149,6 +150,7 @@ def command(
     alpha: float | str | None,
     scale: float,
     max_size: int | None,
+    depth: str,
     interpolation: str,
     quality: int,
     raw_as: str,
@@ -183,6 +185,7 @@ def command(
                 jobs=jobs,
                 max_features=max_features,
                 view=ViewOptions(alpha, scale, max_size),
+                depth=depth,
                 interpolation=interpolation,
                 quality=quality,
                 raw_as=raw_as,
@@ -266,6 +269,7 @@ def closing_table(solution: Solution, out: Path) -> str:
         *_video(solution),
         *_intrinsics(solution),
         *_readout(solution),
+        *_depths(solution),
         f"rms residual       {quality['global_rms_px']:.2f} px with a global shutter, {quality['rms_px']:.2f} px now",
         f"outputs            {out}  ({total:.0f} s)",
     ]
@@ -348,6 +352,14 @@ def _readout(solution: Solution) -> list[str]:
         f"rates of turn      median {rates[len(rates) // 2]:.1f}, largest {rates[-1]:.1f} deg/s, by a readout of",
         *(f"{'':19}{each}" for each in said),
     ]
+
+
+def _depths(solution: Solution) -> list[str]:
+    """A line on how far away the photos of a camera that travelled were taken to show things."""
+    used = [image.depth for image in solution.images if image.depth is not None]
+    kinds = {"points": "as the points", "plane": "on a plane", "map": "by maps", "infinity": "at infinity"}
+    counts = [f"{text} in {used.count(kind)} photos" for kind, text in kinds.items() if kind in used]
+    return [f"depth              {', '.join(counts)}"] if counts else []
 
 
 def _held_out(rms_px: Mapping[str, float]) -> list[str]:

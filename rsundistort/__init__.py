@@ -25,7 +25,7 @@ from .errors import (
 )
 from .evaluation import motion_errors, pose_errors, psnr
 from .io import read_solution, write_solution
-from .model import Camera, Observations, Reconstruction, RowMotion, Solution, SolvedImage
+from .model import AtInfinity, Camera, DepthMap, Observations, Plane, Reconstruction, RowMotion, Solution, SolvedImage
 from .model.projection import project_points, unproject_points
 from .pipeline import (
     GyroOptions,
@@ -53,10 +53,12 @@ from .rectify import (
 __version__ = "0.1.0"
 
 __all__ = [
+    "AtInfinity",
     "BundleOptions",
     "BundleResult",
     "Camera",
     "CriticalMotion",
+    "DepthMap",
     "FileError",
     "FileKindWarning",
     "FormatError",
@@ -64,6 +66,7 @@ __all__ = [
     "InputError",
     "MetadataWarning",
     "Observations",
+    "Plane",
     "Reconstruction",
     "ReconstructionError",
     "RemapGrid",

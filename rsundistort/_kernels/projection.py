@@ -670,6 +670,32 @@ def fill_map(model, axis, sign, intr, lens, phi, rays, row0, col0, map_x, map_y)
                 map_y[i, j] = -1e6
 
 
+@kernel()
+def fill_map_at_depth(axis, sign, intr, lens, phi, vel, rays, inverse_depth, row0, col0, map_x, map_y):
+    """As `fill_map`, of the constant-motion model: what pixel [i, j] shows lies at its ray / inverse_depth[i, j].
+
+    vel is in the camera frame; at an inverse depth of zero it moves nothing.
+    """
+    out = np.empty(20)
+    rows, cols = map_x.shape
+    for i in range(rows):
+        v = row0 + i
+        t1 = t2 = math.nan
+        for j in range(cols):
+            u = col0 + j
+            x = rays[0, 0] * u + rays[0, 1] * v + rays[0, 2]
+            y = rays[1, 0] * u + rays[1, 1] * v + rays[1, 2]
+            z = rays[2, 0] * u + rays[2, 1] * v + rays[2, 2]
+            # the scale of a scene does not show: the ray, and the velocity times the inverse depth
+            ok = z > 0.0 and _project_exact(
+                axis, sign, lens, x, y, z, phi, vel, float(inverse_depth[i, j]), 2.0 * t1 - t2, out, False
+            )
+            t2 = t1
+            t1 = sign * out[axis] if ok else math.nan
+            map_x[i, j] = intr[0] * out[0] + intr[2] if ok else -1e6
+            map_y[i, j] = intr[1] * out[1] + intr[3] if ok else -1e6
+
+
 @kernel(forceinline=True)
 def _loss(kind, s, scale2):
     """Robust loss rho(s) of a squared residual, rho'(s), and the share of curvature that it takes away along r.

@@ -64,6 +64,8 @@ def solution_to_json(solution: Solution) -> dict[str, Any]:
         if image.motion is not None:
             entry["phi"], entry["velocity"] = image.motion.phi, image.motion.velocity
             entry["aspect"], entry["skew"] = _imaginary_camera(image.motion, solution.cameras[image.camera_id])
+        if image.depth is not None:
+            entry["depth"], entry["translation_shift_px"] = image.depth, image.translation_shift_px
         if image.reason is not None:
             entry["reason"] = image.reason
         if image.turned != 1:
@@ -168,6 +170,8 @@ def _solution_from_json(value: dict[str, Any], where: str) -> Solution:
                 num_observations=entry.get("num_observations") or 0,
                 rms_px=entry.get("rms_px"),
                 rs_shift_px=entry.get("rs_shift_px"),
+                depth=entry.get("depth"),
+                translation_shift_px=entry.get("translation_shift_px"),
                 reason=entry.get("reason"),
                 turned=_orientation(entry),
                 roi=_roi(entry),

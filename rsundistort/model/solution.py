@@ -37,6 +37,10 @@ class SolvedImage:
         Root mean square of the residuals' x and y parts.
     rs_shift_px : float or None
         Largest displacement that the shutter caused in this photo.
+    depth : str or None
+        What the photo was rectified with, of a camera that moved: "infinity", "plane", "points" or "map".
+    translation_shift_px : float or None
+        Largest displacement that the translation alone caused, by that depth.
     reason : str or None
         Why the photo did not register.
     turned : int
@@ -55,6 +59,8 @@ class SolvedImage:
     num_observations: int = 0
     rms_px: float | None = None
     rs_shift_px: float | None = None
+    depth: str | None = None
+    translation_shift_px: float | None = None
     reason: str | None = None
     turned: int = 1
     roi: tuple[int, int, int, int] | None = None
@@ -117,11 +123,6 @@ class Solution:
         for image in self.images:
             if image.camera_id not in self.cameras:
                 raise InputError(f"photo {image.name} has camera {image.camera_id!r}, which the solution lacks")
-
-    @property
-    def map_model(self) -> str:
-        """Shutter model of the remap grids: without depth, translation is left and rotation taken out."""
-        return "rotation" if self.shutter_model == "constant-motion" else self.shutter_model
 
     def image(self, name: str) -> SolvedImage:
         """The photo of a name."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ..errors import FileError, InputError
 from ..io import MAX_MEGAPIXELS, find_masks, output_name, read_photo, write_image
-from ..model import Camera, RowMotion
+from ..model import Camera, Depth, RowMotion
 from ..model.orientation import turn_pixels
 from ..rectify import INTERPOLATIONS, MAP_KINDS, RemapGrid, rectify, remap_grid
 
@@ -39,6 +39,7 @@ class Extras:
         motion: RowMotion | None,
         shutter_model: str,
         new_camera: Camera,
+        depth: Depth,
         orientation: int = 1,
         max_megapixels: float = MAX_MEGAPIXELS,
     ) -> None:
@@ -55,14 +56,14 @@ class Extras:
             path = files[name]
             try:
                 image = read_photo(path, max_megapixels)
-                pixels, _ = rectify(image.pixels, camera, motion, shutter_model, new_camera, interpolation)
+                pixels, _ = rectify(image.pixels, camera, motion, shutter_model, new_camera, interpolation, depth=depth)
                 target = out / "also" / folder.name
                 target.mkdir(parents=True, exist_ok=True)
                 write_image(target / output_name(path.name), turn_pixels(pixels, orientation), image.metadata, 98)
             except (FileError, InputError) as error:
                 raise InputError(f"{folder.name}/{path.name}: {error}") from error
         if self.maps is not None:
-            grid = remap_grid(camera, motion, shutter_model, new_camera)
+            grid = remap_grid(camera, motion, shutter_model, new_camera, depth)
             if orientation != 1:
                 map_x, map_y = (turn_pixels(each, orientation) for each in (grid.map_x, grid.map_y))
                 grid = RemapGrid(map_x, map_y, grid.source_width, grid.source_height)

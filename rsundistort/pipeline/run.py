@@ -34,6 +34,7 @@ from ..model import READOUTS, Reconstruction, Solution, SolvedImage, check_shutt
 from ..model.orientation import turn_reconstruction, turn_solution
 from ..rectify import INTERPOLATIONS, ViewOptions, largest_shift_px
 from .cameras import PhotoCameras, check_readouts
+from .depth import PhotoDepths, ScenePoints, check_depth
 from .frames import find_photos
 from .gyro import GyroOptions, gyro_contradiction, gyro_motions, known_readouts
 from .load import LoadedPhotos, load_photos
@@ -97,6 +98,11 @@ class RunOptions:
         Lengths measured in the scene, as in `BundleOptions.lengths`.
     remedy : str
         What to do about a critical motion: "auto", "prior" or "none"; see `critical.heal`.
+    depth : str or Path
+        How far away what the photos show is, for the constant-motion model: "auto", "infinity", "plane", "points", or a
+        folder of depth maps, as `io.find_depth_maps` takes it. "auto" is the plane nearest to most points where it
+        foretells the depths as well as a map between the points does, else that map; and infinity for photos that it
+        would change by half a pixel at most.
     every, sharpest : int, optional
         Of a video: each N-th frame, or the sharpest of each N frames, as in `io.extract_frames`.
     gyro : GyroOptions, optional
@@ -127,6 +133,7 @@ class RunOptions:
     known: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
     lengths: Sequence[KnownLength] = ()
     remedy: str = "auto"
+    depth: str | Path = "auto"
     every: int | None = None
     sharpest: int | None = None
     gyro: GyroOptions | None = None
@@ -138,6 +145,7 @@ class RunOptions:
         if self.shutter_model != "auto":
             check_shutter_model(self.shutter_model)
         check_readouts(self.readout)
+        check_depth(self.depth)
         with_remedy(self.bundle_options(), self.remedy)
         if self.interpolation not in INTERPOLATIONS:
             raise InputError(f"interpolation={self.interpolation!r}, expected one of {', '.join(INTERPOLATIONS)}")
@@ -250,10 +258,11 @@ def run(
         if contradiction := gyro_contradiction(rec, from_gyro):
             warnings.warn(contradiction, RsUndistortWarning, stacklevel=2)
         solution = with_view(_solution(loaded, solved, options, readouts, source.video), options.view)
+        depths = PhotoDepths(solution, options.depth, ScenePoints.of_reconstruction(rec))
         colors = PointColors(rec)
         rectified = rectify_photos(
             folder, solution, list(rec.image_names), scratch,
-            interpolation=options.interpolation, quality=options.quality, jobs=jobs, log=log,
+            interpolation=options.interpolation, quality=options.quality, jobs=jobs, log=log, depths=depths,
             masks=options.masks, raw_as=options.raw_as, apply_orientation=options.apply_orientation,
             max_megapixels=options.max_megapixels,
         )  # fmt: skip
@@ -262,6 +271,7 @@ def run(
             colors.add(name, photo)
             turns[name] = turn_of(solution.image(name), photo)[0]
         log.begin("writing")
+        solution = depths.noted(solution)
         if options.apply_orientation:
             solution, rec = turn_solution(solution, turns), turn_reconstruction(rec, turns)
         names = [output_name(name, options.raw_as) for name in rec.image_names]
@@ -396,6 +406,7 @@ def _solution(
             "known": sorted(options.known),
             "lengths": len(options.lengths),
             "remedy": options.remedy,
+            "depth": str(options.depth),
             "video": video,
             "gyro": options.gyro and options.gyro.facts(),
         },

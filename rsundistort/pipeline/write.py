@@ -17,6 +17,7 @@ from ..io.photos.exif import read_orientation
 from ..model import Reconstruction, Solution, SolvedImage
 from ..model.orientation import split_mirror, turn_pixels
 from ..rectify import rectify
+from .depth import PhotoDepths
 from .extras import Extras
 from .progress import StageLog
 
@@ -55,6 +56,7 @@ def rectify_photos(
     quality: int,
     jobs: int,
     log: StageLog,
+    depths: PhotoDepths,
     masks: Path | None = None,
     raw_as: str = "tif",
     apply_orientation: bool = False,
@@ -65,9 +67,9 @@ def rectify_photos(
     """Rectify photos into `out/images` and `out/masks`, and yield each raw photo by the way.
 
     Photos that cannot be read, are of another size than their camera, or (unless `again`) are rectified already, are
-    skipped with a warning. With `apply_orientation` photo and mask are turned as `turn_of` says. What the users' own
-    masks (a folder, as `io.find_masks` takes it) leave out is left out of `out/masks`. `extras` are written
-    beside them.
+    skipped with a warning. `depths` says how far away what they show is. With `apply_orientation` photo and mask are
+    turned as `turn_of` says. What the users' own masks (a folder, as `io.find_masks` takes it) leave out is left out of
+    `out/masks`. `extras` are written beside them.
     """
     (out / "images").mkdir()
     (out / "masks").mkdir()
@@ -83,15 +85,16 @@ def rectify_photos(
             if not again:
                 check_not_rectified(photo)
             own = read_mask(mask_of[name], camera.width, camera.height) if name in mask_of else None
+            seen = depths.of(name)
             pixels, mask = rectify(
-                photo.pixels, camera, image.motion, solution.map_model,
-                solution.rectified_cameras[image.camera_id], interpolation, mask=own,
+                photo.pixels, camera, seen.motion, solution.shutter_model,
+                solution.rectified_cameras[image.camera_id], interpolation, mask=own, depth=seen.depth,
             )  # fmt: skip
             metadata = photo.metadata.marked(mark)
             if extras is not None:
                 extras.write(
-                    out, name, Path(mask_name[name]).stem, camera, image.motion, solution.map_model,
-                    solution.rectified_cameras[image.camera_id],
+                    out, name, Path(mask_name[name]).stem, camera, seen.motion, solution.shutter_model,
+                    solution.rectified_cameras[image.camera_id], seen.depth,
                     turn_of(image, photo)[0] if apply_orientation else 1, max_megapixels,
                 )  # fmt: skip
             if apply_orientation:

@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from .._kernels import projection as kernels
 from ..errors import FileError, FormatError, InputError
-from ..model import Camera, RowMotion
+from ..model import Camera, Depth, RowMotion
 from ..model.checks import check_array, frozen
-from .maps import EDGE_PX, init_rectify_map
+from .maps import init_rectify_map, seen_by
 from .photo import check_interpolation, check_photo, remap_strips
 
 __all__ = ["MAP_KINDS", "RemapGrid", "remap_grid"]
@@ -74,7 +73,7 @@ class RemapGrid:
     @property
     def seen(self) -> NDArray[np.uint8]:
         """(height, width): 255 where a pixel of the source answers, else 0."""
-        return _seen(self.map_x, self.map_y, self.source_width, self.source_height)
+        return seen_by(self.map_x, self.map_y, self.source_width, self.source_height)
 
     def apply(
         self, image: NDArray[Any], interpolation: str = "cubic", jobs: int = 1
@@ -88,7 +87,7 @@ class RemapGrid:
         def fill(row0: int, map_x: NDArray[np.float32], map_y: NDArray[np.float32], seen: NDArray[np.uint8]) -> bool:
             rows = slice(row0, row0 + len(map_x))
             map_x[:], map_y[:] = self.map_x[rows], self.map_y[rows]
-            seen[:] = _seen(map_x, map_y, self.source_width, self.source_height)
+            seen[:] = seen_by(map_x, map_y, self.source_width, self.source_height)
             return bool(seen.all())
 
         return remap_strips(image, fill, self.size, check_interpolation(interpolation), jobs)
@@ -215,24 +214,20 @@ def remap_grid(
     motion: RowMotion | None = None,
     shutter_model: str = "rotation",
     new_camera: Camera | None = None,
+    depth: Depth | None = None,
 ) -> RemapGrid:
     """The grid that `rectify` uses, of full size and exact.
 
     Parameters
     ----------
-    camera, motion, shutter_model, new_camera
+    camera, motion, shutter_model, new_camera, depth
         As in `rectify`.
     """
     target = new_camera or camera.pinhole()
     size = (target.width, target.height)
-    map_x, map_y = init_rectify_map(camera, motion, shutter_model, new_K=target.K, size=size)
+    map_x, map_y = init_rectify_map(camera, motion, shutter_model, new_K=target.K, size=size, depth=depth)
     assert map_y is not None
     return RemapGrid(map_x, map_y, camera.width, camera.height)
-
-
-def _seen(map_x: NDArray[np.float32], map_y: NDArray[np.float32], width: int, height: int) -> NDArray[np.uint8]:
-    seen = cv2.inRange(map_x, -EDGE_PX, width - 1 + EDGE_PX)
-    return np.asarray(cv2.bitwise_and(seen, cv2.inRange(map_y, -EDGE_PX, height - 1 + EDGE_PX)))
 
 
 def _openexr() -> Any:

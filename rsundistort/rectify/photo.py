@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -13,9 +14,10 @@ from numpy.typing import NDArray
 
 from .._kernels import projection as kernels
 from ..errors import InputError
-from ..model import Camera, RowMotion
+from ..model import AtInfinity, Camera, Depth, DepthMap, RowMotion
 from .coarse import coarse_grid
-from .maps import rectified_rays
+from .depth import DepthRows
+from .maps import fill_rows, rectified_rays, seen_by
 
 __all__ = ["INTERPOLATIONS", "rectify"]
 
@@ -62,6 +64,7 @@ def rectify(
     interpolation: str = "cubic",
     jobs: int = 1,
     mask: NDArray[np.uint8] | None = None,
+    depth: Depth | None = None,
 ) -> tuple[NDArray[Any], NDArray[np.uint8]]:
     """A photo as a global shutter without lens distortion would have taken it, and which pixels were seen.
 
@@ -82,13 +85,16 @@ def rectify(
         Threads; the result does not depend on them.
     mask : (h, w) uint8 array, optional
         0 where pixels of the photo do not count: they are rectified, but not in the mask of the result.
+    depth : AtInfinity, Plane or DepthMap, optional
+        As in `init_rectify_map`.
 
     Returns
     -------
     rectified : array
         As `photo`, of the new camera's size; 0 where nothing was seen.
     valid : (h, w) uint8 array
-        255 where a raw pixel (that counts) answers, else 0.
+        255 where a raw pixel (that counts) answers, else 0: outside of the photo, and where something nearer hid what
+        the pixel would show.
     """
     photo = check_photo(photo, camera.width, camera.height)
     if mask is not None and (mask.dtype != np.uint8 or mask.shape != photo.shape[:2]):
@@ -103,8 +109,12 @@ def rectify(
     def fill(factor: int) -> FillRows:
         # of a photo of so many times the pixels, whose corner is the same
         finer = np.array([[1, 0, 0.5 - 0.5 * factor], [0, 1, 0.5 - 0.5 * factor], [0, 0, factor]]) / factor
-        finer_size = (factor * size[0], factor * size[1])
-        return coarse_grid(camera, motion or RowMotion(), shutter_model, rays @ finer, finer_size).fill
+        return _fill_rows(
+            camera, motion or RowMotion(), shutter_model, rays @ finer, (factor * size[0], factor * size[1]),
+            replace(depth, size=(factor * size[0], factor * size[1]))
+            if isinstance(depth, DepthMap) and depth.size == size
+            else depth or AtInfinity(),
+        )  # fmt: skip
 
     samples = 1 if flag == cv2.INTER_NEAREST else _samples(camera, target)
     return remap_strips(photo, fill(1), size, flag, jobs, mask, samples, fill(samples) if samples > 1 else None)
@@ -125,6 +135,27 @@ def _samples(camera: Camera, target: Camera) -> int:
 
 #: Fills rows of a map, from a first one on, and of the mask of what is seen; says whether all of it is.
 FillRows = Callable[[int, NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]], bool]
+
+
+def _fill_rows(
+    camera: Camera,
+    motion: RowMotion,
+    shutter_model: str,
+    rays: NDArray[np.float64],
+    size: tuple[int, int],
+    depth: Depth,
+) -> FillRows:
+    """What fills the rows of the map of a photo of `size`: interpolated, but exact where depths make it rough."""
+    depth_rows = DepthRows(depth, camera, motion, rays, size)
+    if not depth_rows.matters(shutter_model):
+        return coarse_grid(camera, motion, shutter_model, rays, size).fill
+
+    def fill(row0: int, map_x: NDArray[np.float32], map_y: NDArray[np.float32], seen: NDArray[np.uint8]) -> bool:
+        fill_rows(camera, motion, shutter_model, rays, row0, map_x, map_y, depth_rows)
+        seen[:] = seen_by(map_x, map_y, camera.width, camera.height)
+        return bool(seen.all())
+
+    return fill
 
 
 def remap_strips(
