@@ -7,7 +7,17 @@ import numpy as np
 import pytest
 from numpy_twin import DIRECTIONS
 
-from rsundistort import Camera, InputError, RowMotion, Solution, SolvedImage, optimal_new_camera, rectify
+from rsundistort import (
+    Camera,
+    DepthMap,
+    InputError,
+    Plane,
+    RowMotion,
+    Solution,
+    SolvedImage,
+    optimal_new_camera,
+    rectify,
+)
 from rsundistort import undistort_points as undistort
 from rsundistort.model.orientation import in_stored_frame, turn_pixels, turn_solution
 from rsundistort.pipeline.views import with_view
@@ -150,6 +160,20 @@ def test_labels_are_not_averaged(rng):
     new = rectified_view(camera, MOTIONS, "rotation", ViewOptions(scale=0.3), camera.pinhole())
     found, mask = rectify(labels, camera, MOTIONS[0], new_camera=new, interpolation="nearest")
     assert set(np.unique(found[mask > 0])) == {3, 90, 200}
+
+
+def test_depth_shrinks_with_the_photo(rng):
+    camera = make_camera()
+    motion = RowMotion([0.05, 0.02, -0.03], [0.4, 0.1, 0.2])
+    photo = cv2.GaussianBlur(rng.normal(size=(H, W)).astype(np.float32), (0, 0), 1.0)
+    new = rectified_view(camera, [motion], "constant-motion", ViewOptions(scale=0.5), camera.pinhole())
+    depths = Plane([0, 0, 1], 5.0), DepthMap(np.full((new.height, new.width), 5.0, np.float32))
+    by_plane, by_map = (
+        rectify(photo, camera, motion, "constant-motion", new_camera=new, depth=each)[0] for each in depths
+    )
+    np.testing.assert_allclose(by_map, by_plane, rtol=0, atol=1e-3 * np.ptp(photo))
+    far, _ = rectify(photo, camera, motion, "constant-motion", new_camera=new)
+    assert abs(far - by_plane).max() > 0.1 * np.ptp(photo)
 
 
 def test_pixels_beside_what_the_lens_cannot_see_are_not_mixed_with_it():
