@@ -45,6 +45,7 @@ bench: $(VENV)/.installed
 	$(BIN)/python benchmarks/truth.py
 	$(BIN)/python benchmarks/depth.py
 	$(BIN)/python benchmarks/speed.py
+	$(BIN)/python benchmarks/rectify.py
 
 clean:
 	rm -rf $(VENV) $(OUT) build *.egg-info

@@ -119,7 +119,7 @@ depth_option: Decorator = click.option(
     default="auto",
     show_default=True,
     help="How far away what the photos show is, which matters where the camera travelled during the readout: on a "
-    "plane, as the known points, or as maps of your own (a.npy, .npz or float .tif for a.jpg: docs/rectification.md).",
+    "plane, as the known points, or as maps of your own (a.npy, .npz or float .tif for a.jpg: docs/depth.md).",
 )
 interpolation_option: Decorator = click.option(
     "--interpolation", type=click.Choice(INTERPOLATION_NAMES), default="cubic", show_default=True

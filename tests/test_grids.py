@@ -13,6 +13,7 @@ from rsundistort import (
     FileError,
     FormatError,
     InputError,
+    Plane,
     RemapGrid,
     RowMotion,
     init_rectify_map,
@@ -179,6 +180,19 @@ def test_inverse_is_where_undistort_points_sends_the_pixels(model, readout, dist
     inner = (expected > 0.01).all(1) & (expected < [W - 1.01, H - 1.01]).all(1)
     assert known.ravel()[inner].all()
     assert inner.mean() > 0.5
+
+
+def test_inverse_knows_the_depth_of_its_grid():
+    camera, motion = make_camera(LENS), RowMotion([0.05, 0.02, -0.03], [0.4, 0.1, 0.2])
+    ground = Plane([0.1, 0.9, 0.5], 3.0)
+    inverse = remap_grid(camera, motion, "constant-motion", depth=ground).inverse()
+    known = inverse.seen > 0
+    raw = np.argwhere(known)[:, ::-1].astype(float)
+    expected = undistort_points(raw, camera, motion, "constant-motion", P=K, depth=ground)
+    found = np.column_stack([inverse.map_x[known], inverse.map_y[known]])
+    smooth = raw[:, 1] > 200  # px; below the horizon, where the map has an edge
+    assert abs(found - expected)[smooth].max() <= 5e-3  # bilinear, and float32
+    assert smooth.sum() > 1e5
 
 
 def test_inverse_of_a_fold_takes_one_of_the_two():

@@ -10,7 +10,8 @@ from types import TracebackType
 from typing import IO
 
 from ..errors import InputError
-from .aside import check_photo_name, write_aside
+from ..model.checks import check_photo_name
+from .aside import write_aside
 
 __all__ = ["Journal", "JournalEntry"]
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 
-__all__ = ["check_array", "check_file_name", "check_finite", "check_index", "check_rotations", "frozen"]
+__all__ = ["check_array", "check_finite", "check_index", "check_photo_name", "check_rotations", "frozen"]
 
 
 def _shape_text(shape: tuple[int | None, ...]) -> str:
@@ -46,11 +46,17 @@ def check_index(value: ArrayLike, length: int, upper: int, name: str) -> NDArray
     return array
 
 
-def check_file_name(value: Any, name: str) -> str:
-    """A name of a file below some folder: relative, and never above it."""
+def check_photo_name(value: Any) -> str:
+    """The name of a photo inside its folder, sub-folders with forward slashes; an error for one that leads elsewhere.
+
+    Examples
+    --------
+    >>> check_photo_name("walk/0001.jpg")
+    'walk/0001.jpg'
+    """
     path = PurePath(value) if isinstance(value, str) and "\0" not in value else PurePath()
-    if path.anchor or ".." in path.parts or not path.name:
-        raise InputError(f"{name} {value!r} is no name of a file below a folder")
+    if path.anchor or ".." in path.parts or path.as_posix() != value or not path.name:
+        raise InputError(f"a photo is called {value!r}; expected a name inside the folder of photos")
     return str(value)
 
 

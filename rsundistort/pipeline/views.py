@@ -15,7 +15,8 @@ def with_view(solution: Solution, view: ViewOptions) -> Solution:
     """The solution with the rectified cameras that were asked for, and each photo's rectangle without empty pixels.
 
     A rectified camera serves all photos of its physical camera: with alpha 0 none of them has an empty pixel, with
-    alpha 1 none loses one.
+    alpha 1 none loses one. That goes by lens and rotation: what depth and translation move besides is a matter of each
+    photo.
     """
     cameras = {}
     for key, old in solution.rectified_cameras.items():
