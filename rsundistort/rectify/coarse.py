@@ -16,8 +16,8 @@ __all__ = ["TOLERANCE_PX", "CoarseGrid", "coarse_grid"]
 
 #: How far an interpolated map may be off, in raw pixels.
 TOLERANCE_PX = 0.01
-# The error is measured in the middle between nodes, where that of a cubic is 0.94 or 0.56 of the largest around it
-# (0.56 of 0.56 in the middle of a patch), and doubled: it may grow between the measurements, or cancel there.
+# The error is measured in the middle between nodes, where that of a cubic is largest, or 0.94 of that in the outer
+# cells; and doubled, since it may be larger between the measurements, or those in x and y may cancel there.
 _SAFETY = 2.0
 _SPACINGS = (64, 32, 16, 8)
 # A finer grid is worth it while more patches than this would be evaluated pixel by pixel.

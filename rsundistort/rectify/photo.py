@@ -109,12 +109,9 @@ def rectify(
     def fill(factor: int) -> FillRows:
         # of a photo of so many times the pixels, whose corner is the same
         finer = np.array([[1, 0, 0.5 - 0.5 * factor], [0, 1, 0.5 - 0.5 * factor], [0, 0, factor]]) / factor
-        return _fill_rows(
-            camera, motion or RowMotion(), shutter_model, rays @ finer, (factor * size[0], factor * size[1]),
-            replace(depth, size=(factor * size[0], factor * size[1]))
-            if isinstance(depth, DepthMap) and depth.size == size
-            else depth or AtInfinity(),
-        )  # fmt: skip
+        finer_size = (factor * size[0], factor * size[1])
+        at = replace(depth, size=finer_size) if isinstance(depth, DepthMap) and depth.size == size else depth
+        return _fill_rows(camera, motion or RowMotion(), shutter_model, rays @ finer, finer_size, at or AtInfinity())
 
     samples = 1 if flag == cv2.INTER_NEAREST else _samples(camera, target)
     return remap_strips(photo, fill(1), size, flag, jobs, mask, samples, fill(samples) if samples > 1 else None)
