@@ -43,6 +43,7 @@ format: $(VENV)/.installed
 bench: $(VENV)/.installed
 	$(BIN)/python benchmarks/accuracy.py
 	$(BIN)/python benchmarks/truth.py
+	$(BIN)/python benchmarks/depth.py
 	$(BIN)/python benchmarks/speed.py
 
 clean:

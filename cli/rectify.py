@@ -24,6 +24,22 @@ from .terminal import errors_for_people, list_failed, progress_bars
     type=click.Path(exists=True, file_okay=False, path_type=Path),
     help="Folder of masks, a.png for a.jpg: what is black in them is black in OUT/masks.",
 )
+@opt.depth_option
+@opt.view_options
+@click.option(
+    "--maps",
+    type=click.Choice(opt.MAP_KIND_NAMES),
+    help="Write each photo's map and its inverse into OUT/maps: NumPy (npz), OpenEXR in pixels, or the ST map of "
+    "compositing programs (extra exr).",
+)
+@click.option(
+    "--also",
+    multiple=True,
+    metavar="FOLDER[=INTERPOLATION]",
+    callback=opt.also_folders,
+    help="Rectify other images of the same frames alike (a.png for a.jpg): labels, depth, near infrared; by nearest, "
+    "which makes up no values, or as told. May be repeated.",
+)
 @opt.interpolation_option
 @opt.quality_option
 @opt.raw_as_option
@@ -45,6 +61,12 @@ def command(
     solution: Path,
     out: Path,
     masks: Path | None,
+    depth: str,
+    alpha: float | str | None,
+    scale: float,
+    max_size: int | None,
+    maps: str | None,
+    also: tuple[tuple[Path, str], ...],
     interpolation: str,
     quality: int,
     raw_as: str,
@@ -67,6 +89,7 @@ def command(
     kept = "what is done is whole, the same command with --resume goes on"
     with errors_for_people(kept), progress_bars(quiet, progress_form) as progress:
         from rsundistort.pipeline import RectifyOptions, rectify_folder
+        from rsundistort.rectify import ViewOptions
 
         options = RectifyOptions(
             interpolation=interpolation,
@@ -76,6 +99,10 @@ def command(
             again=again,
             max_megapixels=max_megapixels,
             masks=masks,
+            depth=depth,
+            view=ViewOptions(alpha, scale, max_size),
+            maps=maps,
+            also=also,
         )
         solved, left_out = rectify_folder(
             photos, solution, out, options,

@@ -115,6 +115,8 @@ if TYPE_CHECKING:
     show_default=True,
     help="Features of a photo.",
 )
+@opt.depth_option
+@opt.view_options
 @opt.interpolation_option
 @opt.quality_option
 @opt.raw_as_option
@@ -147,6 +149,10 @@ def command(
     photo_times: Path | None,
     remedy: str,
     max_features: int,
+    depth: str,
+    alpha: float | str | None,
+    scale: float,
+    max_size: int | None,
     interpolation: str,
     quality: int,
     raw_as: str,
@@ -171,6 +177,7 @@ def command(
     with errors_for_people(), progress_bars(quiet, progress_form) as progress:
         from rsundistort.io import read_known_lengths, read_known_motions
         from rsundistort.pipeline import GyroOptions, RunOptions, run
+        from rsundistort.rectify import ViewOptions
 
         readout_s = readout_ms and readout_ms / 1e3
         solution = run(
@@ -184,6 +191,8 @@ def command(
                 seed=seed,
                 jobs=jobs,
                 max_features=max_features,
+                depth=depth,
+                view=ViewOptions(alpha, scale, max_size),
                 interpolation=interpolation,
                 quality=quality,
                 raw_as=raw_as,
@@ -270,6 +279,7 @@ def closing_table(solution: Solution, out: Path) -> str:
         *_video(solution),
         *_intrinsics(solution),
         *_readout(solution),
+        *_depths(solution),
         f"rms residual       {quality['global_rms_px']:.2f} px with a global shutter, {quality['rms_px']:.2f} px now",
         f"outputs            {out}  ({total:.0f} s)",
     ]
@@ -352,6 +362,14 @@ def _readout(solution: Solution) -> list[str]:
         f"rates of turn      median {rates[len(rates) // 2]:.1f}, largest {rates[-1]:.1f} deg/s, by a readout of",
         *(f"{'':19}{each}" for each in said),
     ]
+
+
+def _depths(solution: Solution) -> list[str]:
+    """A line on how far away the photos of a camera that travelled were taken to show things."""
+    used = [image.depth for image in solution.images if image.depth is not None]
+    kinds = {"points": "as the points", "plane": "on a plane", "map": "by maps", "infinity": "at infinity"}
+    counts = [f"{text} in {used.count(kind)} photos" for kind, text in kinds.items() if kind in used]
+    return [f"depth              {', '.join(counts)}"] if counts else []
 
 
 def _held_out(rms_px: Mapping[str, float]) -> list[str]:

@@ -134,13 +134,14 @@ def test_wrong_use_is_exit_code_2(invoke, tmp_path, args):
 
 
 def test_choices_are_those_of_the_library():
-    from rsundistort_cli.options import INTERPOLATION_NAMES, READOUT_NAMES
+    from rsundistort_cli.options import INTERPOLATION_NAMES, MAP_KIND_NAMES, READOUT_NAMES
 
     from rsundistort.model import READOUTS
-    from rsundistort.rectify import INTERPOLATIONS
+    from rsundistort.rectify import INTERPOLATIONS, MAP_KINDS
 
     assert set(READOUT_NAMES) == set(READOUTS)
     assert set(INTERPOLATION_NAMES) == set(INTERPOLATIONS)
+    assert set(MAP_KIND_NAMES) == set(MAP_KINDS)
 
 
 # ---------------------------------------------------------------- run: what is refused
@@ -464,6 +465,15 @@ def test_rectify(invoke, tmp_path):
     files = {"solution.json", ".rectified.jsonl"}  # the second is what --resume goes by
     assert names == {f"{kind}/{name}" for kind in ("images", "masks") for name in THREE} | files
     assert invoke("rectify", "photos", "--solution", "s.json", "-o", "quiet", "-q").stdout == ""
+
+
+def test_rectify_refuses_a_depth_that_is_none(invoke, tmp_path):
+    save_textures(tmp_path / "photos", THREE)
+    solution_of(tmp_path / "s.json", THREE)
+    result = invoke("rectify", "photos", "--solution", "s.json", "-o", "out", "--depth", "deep")
+    assert result.exit_code == 1
+    assert result.stderr.splitlines() == ["error: depth 'deep' is no folder, nor one of auto, infinity, plane, points"]
+    assert not (tmp_path / "out").exists()
 
 
 def test_rectify_leaves_out_photos_of_another_size(invoke, tmp_path):

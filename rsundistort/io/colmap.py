@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, FormatError, InputError
 from ..model import Camera, Reconstruction
-from ..model.projection import unproject_points
+from ..model.projection import at_depth, unproject_points
 from .aside import check_photo_name
 
 __all__ = ["read_colmap_cameras", "read_colmap_poses", "rectified_keypoints", "write_colmap_model"]
@@ -181,12 +181,15 @@ def rectified_keypoints(reconstruction: Reconstruction, rectified: list[Camera])
     xy = np.full((len(obs), 2), np.nan)
     for i in range(reconstruction.num_images):
         of_photo = obs.frame_idx == i
+        motion = reconstruction.motion(i).in_camera(reconstruction.R_cw[i])
         ideal, _ = unproject_points(
-            obs.xy_raw[of_photo],
-            reconstruction.camera(i),
-            reconstruction.motion(i),
-            reconstruction.shutter_model,
+            obs.xy_raw[of_photo], reconstruction.camera(i), motion, reconstruction.shutter_model
         )
+        if reconstruction.shutter_model == "constant-motion":
+            # where the rectified photo shows the point depends on how far away it is
+            X_w = reconstruction.points_w[obs.point_idx[of_photo]]
+            depth = (X_w - reconstruction.center_w[i]) @ reconstruction.R_cw[i, 2]
+            ideal = at_depth(ideal, obs.xy_raw[of_photo], reconstruction.camera(i), motion, depth)
         K = rectified[int(reconstruction.camera_idx[i])].K
         xy[of_photo] = ideal @ K[:2, :2].T + K[:2, 2]
     return xy

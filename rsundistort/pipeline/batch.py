@@ -8,13 +8,15 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from ..errors import InputError, MetadataWarning, SkippedPhotoWarning
+from ..errors import InputError, MetadataWarning, RsUndistortWarning, SkippedPhotoWarning
 from ..io import list_photos, read_solution, write_solution
 from ..io.outputs import batch_folder
 from ..model import Solution
 from ..model.orientation import in_stored_frame, split_mirror, turn_solution
+from .depth import PhotoDepths, ScenePoints, check_depth
 from .photo import RectifyOptions
 from .progress import ProgressCallback, StageLog
+from .views import with_view
 from .workers import Workers, use_threads
 from .write import rectify_photos
 
@@ -46,7 +48,7 @@ def rectify_folder(
         are those that the solution names as "sub/photo.jpg".
     options : RectifyOptions, optional
         What is done to each photo. With `apply_orientation` mirrored photos are mirrored, and lose their pose: no
-        camera takes a mirror image.
+        camera takes a mirror image. The points that depths are taken from are those of `sparse/` beside the solution.
     jobs : int
         Threads; 0 for all cores.
     overwrite : bool
@@ -71,6 +73,7 @@ def rectify_folder(
     """
     photos, out = Path(photos), Path(out)
     options = replace(options or RectifyOptions(), **named)
+    check_depth(options.depth)
     solved = in_stored_frame(read_solution(Path(solution)))
     motions = {image.name for image in solved.registered}
     listed = list_photos(photos, options.raw_as, {PurePosixPath(name).parent.as_posix() for name in motions} - {"."})
@@ -80,24 +83,49 @@ def rectify_folder(
     left_out = {name: f"it has no motion in {solution}" for name in listed if name not in motions}
     for name in left_out:
         warnings.warn(f"skipped: {name} has no motion in {solution}", SkippedPhotoWarning, stacklevel=2)
+    solved = with_view(solved, options.view)
+    depths = PhotoDepths(solved, options.depth, _points_beside(Path(solution), solved, options.depth))
     # a photo without a pose may be mirrored
     unposed = replace(solved, images=[replace(image, R_cw=None, center_w=None) for image in solved.images])
     workers = Workers(use_threads(jobs), scheduler)
-    inputs = [photos] if options.masks is None else [photos, Path(options.masks)]
+    inputs = [
+        photos,
+        *([] if options.masks is None else [Path(options.masks)]),
+        *(folder for folder, _ in options.also),
+    ]
     with batch_folder(out, overwrite=overwrite, resume=resume, apart_from=inputs) as journal:
         done = rectify_photos(
-            photos, unposed, names, out, options, workers, StageLog(progress), journal,
+            photos, unposed, names, out, options, depths, workers, StageLog(progress), journal,
             resume=resume, go_on="whole; the same command with --resume goes on",
         )  # fmt: skip
         turns = {name: each.turn for name, each in done.items() if not each.problem}
         left_out |= {name: each.problem for name, each in done.items() if each.problem}
         if not turns:
             raise InputError(f"none of the {len(names)} photos of {photos} could be rectified; see the warnings")
+        solved = depths.noted(solved)
         if options.apply_orientation:
             solved = turn_solution(_without_mirrored_poses(solved, turns), turns)
         solved = replace(solved, options={**solved.options, "raw_as": options.raw_as})
         write_solution(out / "solution.json", solved)
     return solved, dict(sorted(left_out.items()))
+
+
+def _points_beside(solution: Path, solved: Solution, depth: str | Path) -> ScenePoints | None:
+    """The points of the COLMAP model that a run wrote beside its solution, where a camera moved."""
+    moves = any(image.posed and image.motion is not None and image.motion.velocity.any() for image in solved.images)
+    if solved.shutter_model != "constant-motion" or not moves or str(depth) == "infinity":
+        return None
+    folder = solution.parent / "sparse"
+    if folder.is_dir():
+        names = [image.name for image in solved.registered]
+        return ScenePoints.of_colmap_model(folder, names, solved.options.get("raw_as") or "tif")
+    text = f"{folder} is missing, and with it the points of the scene"
+    if str(depth) in ("plane", "points"):
+        raise InputError(f"{text}; depth {depth} needs them")
+    if str(depth) == "auto":
+        text += ": photos are rectified as if all were far away, which leaves the effect of the translation in them"
+        warnings.warn(text, RsUndistortWarning, stacklevel=3)
+    return None
 
 
 def _without_mirrored_poses(solution: Solution, turns: Mapping[str, int]) -> Solution:

@@ -22,7 +22,7 @@ class PhotoSource:
     folder : Path
         Of the photos.
     camera : str or None
-        As `find_camera` takes it.
+        As `find_cameras` takes it.
     frames : VideoFrames or None
         Of the video, if they are frames of one.
     video : dict or None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -19,9 +19,10 @@ from ..errors import FileError, InputError, MetadataWarning
 from ..io import MAX_MEGAPIXELS, RAW_AS, Photo, read_mask, read_photo, write_image
 from ..io.outputs import CANNOT_WRITE
 from ..io.photos.exif import read_orientation
-from ..model import Camera, RowMotion
+from ..model import Camera, Depth, RowMotion
 from ..model.orientation import split_mirror, turn_pixels
-from ..rectify import INTERPOLATIONS, rectify
+from ..rectify import INTERPOLATIONS, MAP_KINDS, RemapGrid, ViewOptions, rectify, remap_grid
+from .extras import AlsoImage
 
 __all__ = ["PhotoDone", "PhotoJob", "RectifyOptions", "check_not_rectified", "rectify_photo", "turn_of"]
 
@@ -47,6 +48,18 @@ class RectifyOptions:
     masks : path, optional
         Folder of masks, as `io.find_masks` takes it: nothing of what is black in them is in the masks of the rectified
         photos.
+    depth : str or Path
+        How far away what the photos show is, for the constant-motion model: "auto", "infinity", "plane", "points", or a
+        folder of depth maps, as `io.find_depth_maps` takes it. "auto" is the plane nearest to most points where it
+        foretells the depths as well as a map between the points does, else that map; and infinity for photos that it
+        would change by half a pixel at most.
+    view : ViewOptions
+        What the rectified photos show and how large they are; by default as the solution has it.
+    maps : {"npz", "exr", "stmap"}, optional
+        Write each photo's remap grid and its inverse into `maps`, as `RemapGrid.save` does.
+    also : sequence of (folder, interpolation)
+        Folders of other images of the same frames (labels, depth, near infrared), of the photos' stems and sizes: they
+        are rectified alike into `also`.
     """
 
     interpolation: str = "cubic"
@@ -56,10 +69,17 @@ class RectifyOptions:
     again: bool = False
     max_megapixels: float = MAX_MEGAPIXELS
     masks: Path | str | None = None
+    depth: str | Path = "auto"
+    view: ViewOptions = field(default_factory=ViewOptions)
+    maps: str | None = None
+    also: Sequence[tuple[Path, str]] = ()
 
     def __post_init__(self) -> None:
-        if self.interpolation not in INTERPOLATIONS:
-            raise InputError(f"interpolation={self.interpolation!r}, expected one of {', '.join(INTERPOLATIONS)}")
+        for interpolation in (self.interpolation, *(each for _, each in self.also)):
+            if interpolation not in INTERPOLATIONS:
+                raise InputError(f"interpolation={interpolation!r}, expected one of {', '.join(INTERPOLATIONS)}")
+        if self.maps is not None and self.maps not in MAP_KINDS:
+            raise InputError(f"maps={self.maps!r}, expected one of {', '.join(MAP_KINDS)}")
         if self.raw_as not in RAW_AS:
             raise InputError(f"raw_as={self.raw_as!r}, expected one of {', '.join(RAW_AS)}")
         if not 1 <= self.quality <= 100:
@@ -83,15 +103,21 @@ class PhotoJob:
     camera, new_camera : Camera
         Of the raw photo, and the pinhole of the rectified one.
     motion : RowMotion
-        During the readout.
+        During the readout, its velocity in the camera frame.
     shutter_model : str
         Of the remap grid.
+    depth : Depth
+        Of what the rectified photo shows.
     posed : bool
         Whether the photo has a pose, which no mirror image has.
     options : RectifyOptions
         See there.
     own_mask : Path or None
         The user's mask of it.
+    also : tuple of AlsoImage
+        Other images of its frame.
+    maps : str or None
+        Beginning of the names of the files of its grid, in `out`.
     sample_xy : (k, 2) int array or None
         Raw pixels whose colours are asked for.
     """
@@ -105,9 +131,12 @@ class PhotoJob:
     new_camera: Camera
     motion: RowMotion
     shutter_model: str
+    depth: Depth
     posed: bool
     options: RectifyOptions
     own_mask: Path | None = None
+    also: tuple[AlsoImage, ...] = ()
+    maps: str | None = None
     sample_xy: NDArray[np.int64] | None = None
 
     def fingerprint(self) -> str:
@@ -118,7 +147,9 @@ class PhotoJob:
         digest = hashlib.sha256(f"{version('rsundistort')} {cv2.__version__}".encode())
         # where things lie, and which photos are let in, does not change what comes of them; nor does a pose, but for
         # how the photo is turned
-        options = replace(self.options, masks=None, again=False, max_megapixels=MAX_MEGAPIXELS)
+        options = replace(
+            self.options, masks=None, again=False, max_megapixels=MAX_MEGAPIXELS, depth="", view=ViewOptions(), also=()
+        )  # fmt: skip
         posed = self.posed and options.apply_orientation
         try:
             _feed(digest, replace(self, out=Path(), posed=posed, options=options, sample_xy=None))
@@ -208,8 +239,9 @@ def rectify_photo(job: PhotoJob) -> PhotoDone:
             check_not_rectified(photo)
         own = None if job.own_mask is None else read_mask(job.own_mask, camera.width, camera.height)
         pixels, mask = rectify(
-            photo.pixels, camera, job.motion, job.shutter_model, job.new_camera, options.interpolation, mask=own
-        )
+            photo.pixels, camera, job.motion, job.shutter_model, job.new_camera, options.interpolation, mask=own,
+            depth=job.depth,
+        )  # fmt: skip
         colors = None if job.sample_xy is None else _colors(photo, job.sample_xy)
         metadata, turn = photo.metadata.marked(version("rsundistort")), 1
         if options.apply_orientation:
@@ -223,6 +255,8 @@ def rectify_photo(job: PhotoJob) -> PhotoDone:
         files[job.image] = (job.out / job.image).stat().st_size
         write_image(job.out / job.mask, mask, flat=True)
         files[job.mask] = (job.out / job.mask).stat().st_size
+        for name in _write_extras(job, turn):
+            files[name] = (job.out / name).stat().st_size
     except (FileError, InputError, MemoryError, cv2.error) as error:
         if writing and getattr(error.__cause__, "errno", None) in CANNOT_WRITE:
             raise
@@ -230,6 +264,31 @@ def rectify_photo(job: PhotoJob) -> PhotoDone:
             (job.out / name).unlink(missing_ok=True)
         return PhotoDone(job.name, " ".join(str(error).split()) or "it does not fit into the memory")
     return PhotoDone(job.name, "", fingerprint, files, turn, colors)
+
+
+def _write_extras(job: PhotoJob, turn: int) -> Iterator[str]:
+    """Write the other images of a photo's frame and its grids; their names, each when it is there."""
+    grid_of = (job.camera, job.motion, job.shutter_model, job.new_camera)
+    for each in job.also:
+        try:
+            image = read_photo(each.source, job.options.max_megapixels)
+            pixels, _ = rectify(image.pixels, *grid_of, each.interpolation, depth=job.depth)
+            write_image(job.out / each.target, turn_pixels(pixels, turn), image.metadata, 98)
+        except (FileError, InputError) as error:
+            if getattr(error.__cause__, "errno", None) in CANNOT_WRITE:
+                raise
+            raise InputError(f"{each.source.parent.name}/{each.source.name}: {error}") from error
+        yield each.target
+    if job.maps is not None and job.options.maps is not None:
+        grid = remap_grid(*grid_of, job.depth)
+        if turn != 1:
+            map_x, map_y = (turn_pixels(m, turn) for m in (grid.map_x, grid.map_y))
+            grid = RemapGrid(map_x, map_y, grid.source_width, grid.source_height)
+        ending = MAP_KINDS[job.options.maps]
+        for way, each_way in (("forward", grid), ("inverse", grid.inverse())):
+            name = f"{job.maps}.{way}{ending}"
+            each_way.save(job.out / name, job.options.maps)
+            yield name
 
 
 def _warn_of_orientation(name: str, photo: Photo, rest: int) -> None:

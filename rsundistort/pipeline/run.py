@@ -31,12 +31,14 @@ from ..model import READOUTS, Reconstruction, Solution, SolvedImage, check_shutt
 from ..model.orientation import turn_reconstruction, turn_solution
 from ..rectify import largest_shift_px
 from .cameras import PhotoCameras, check_readouts
+from .depth import PhotoDepths, ScenePoints, check_depth
 from .frames import find_photos
 from .gyro import GyroOptions, gyro_contradiction, gyro_motions, known_readouts
 from .load import LoadedPhotos, load_photos
 from .photo import RectifyOptions, turn_of
 from .progress import ProgressCallback, StageLog
 from .solve import Solved, solve_photos
+from .views import with_view
 from .workers import Workers, use_threads
 from .write import PointColors, mask_names, rectify_photos
 
@@ -119,6 +121,7 @@ class RunOptions(RectifyOptions):
         if self.shutter_model != "auto":
             check_shutter_model(self.shutter_model)
         check_readouts(self.readout)
+        check_depth(self.depth)
         with_remedy(self.bundle_options(), self.remedy)
         if self.jobs < 0 or self.max_features < 100:
             raise InputError("jobs must be 0 or more, max_features at least 100")
@@ -221,7 +224,8 @@ def run(
         rec = solved.result.reconstruction
         if contradiction := gyro_contradiction(rec, from_gyro):
             warnings.warn(contradiction, RsUndistortWarning, stacklevel=2)
-        solution = _solution(loaded, solved, options, readouts, source.video)
+        solution = with_view(_solution(loaded, solved, options, readouts, source.video), options.view)
+        depths = PhotoDepths(solution, options.depth, ScenePoints.of_reconstruction(rec))
         turns: dict[str, int] = {}
         if options.apply_orientation:
             turns = {name: turn_of(loaded.orientations[name], True)[0] for name in rec.image_names}
@@ -242,6 +246,7 @@ def run(
             list(rec.image_names),
             out,
             options.rectify_options(),
+            depths,
             workers,
             log,
             journal,
@@ -253,7 +258,7 @@ def run(
     if len(left_out) == len(done):
         raise InputError(f"none of the {len(done)} photos of {photos} could be rectified; see the warnings")
     images = [replace(image, reason=left_out.get(image.name, image.reason)) for image in solution.images]
-    solution = replace(solution, images=tuple(images))
+    solution = depths.noted(replace(solution, images=tuple(images)))
     with output_folder(out, overwrite=True) as scratch:
         turned = _write_models(scratch, solution, rec, turns, options, left_out, colors.rgb())
         log.end("writing")
@@ -408,6 +413,7 @@ def _solution(
             "known": sorted(options.known),
             "lengths": len(options.lengths),
             "remedy": options.remedy,
+            "depth": str(options.depth),
             "video": video,
             "gyro": options.gyro and options.gyro.facts(),
         },

@@ -16,6 +16,8 @@ from ..io import find_masks, output_name
 from ..io.journal import Journal, JournalEntry
 from ..io.outputs import make_inside
 from ..model import Reconstruction, Solution
+from .depth import PhotoDepths
+from .extras import find_extras
 from .photo import PhotoDone, PhotoJob, RectifyOptions, rectify_photo
 from .progress import StageLog
 from .workers import Workers
@@ -36,6 +38,7 @@ def rectify_photos(
     names: Sequence[str],
     out: Path,
     options: RectifyOptions,
+    depths: PhotoDepths,
     workers: Workers,
     log: StageLog,
     journal: Journal,
@@ -56,8 +59,8 @@ def rectify_photos(
         Of the raw photos, their motions, and which of them.
     out : Path
         `batch_folder` made it ready, and gave `journal`.
-    options, workers, log
-        What is done to each, where, and who is told.
+    options, depths, workers, log
+        What is done to each, how far away what it shows is, where, and who is told.
     journal : Journal
         Takes what is done.
     resume : bool
@@ -74,16 +77,19 @@ def rectify_photos(
     """
     before = journal.read()
     done: dict[str, PhotoDone] = {}
-    jobs = _Jobs(folder, solution, names, out, options, colors)
+    jobs = _Jobs(folder, solution, names, out, options, depths, colors)
     if resume:
         for name in names:
             entry = before.get(name)
             if entry and entry.fingerprint and entry.fingerprint == jobs[name].fingerprint() and entry.is_whole(out):
                 done[name] = PhotoDone(name, "", entry.fingerprint, entry.files, entry.turn)
     todo = [name for name in names if name not in done]
+    kinds = ("images", "masks", *(["maps"] if options.maps is not None else []))
     for within in sorted({PurePosixPath(name).parent for name in todo}):
-        for kind in ("images", "masks"):
+        for kind in kinds:
             make_inside(out, (kind / within).as_posix())
+    for within in sorted({PurePosixPath(each.target).parent for name in todo for each in jobs.extras.of(name)}):
+        make_inside(out, within.as_posix())
 
     def begin() -> Iterator[PhotoJob]:
         for name in todo:
@@ -129,18 +135,21 @@ class _Jobs:
         names: Sequence[str],
         out: Path,
         options: RectifyOptions,
+        depths: PhotoDepths,
         colors: PointColors | None,
     ) -> None:
         # absolute: workers elsewhere have another working directory
         self._folder, self._out = folder.absolute(), out.absolute()
-        self._solution, self._options, self._colors = solution, options, colors
+        self._solution, self._options, self._depths, self._colors = solution, options, depths, colors
+        self.extras = find_extras(options.maps, options.also, names)
         self._mask_name = mask_names([image.name for image in solution.images])
         self._own = {} if options.masks is None else find_masks(Path(options.masks).absolute(), names)
 
     def __getitem__(self, name: str) -> PhotoJob:
         solution = self._solution
         image = solution.image(name)
-        assert image.motion is not None
+        seen = self._depths.of(name)
+        stem = PurePosixPath(self._mask_name[name]).with_suffix("").as_posix()
         return PhotoJob(
             name=name,
             source=self._folder / name,
@@ -149,11 +158,14 @@ class _Jobs:
             mask=f"masks/{self._mask_name[name]}",
             camera=solution.cameras[image.camera_id],
             new_camera=solution.rectified_cameras[image.camera_id],
-            motion=image.motion,
-            shutter_model=solution.map_model,
+            motion=seen.motion,
+            shutter_model=solution.shutter_model,
+            depth=seen.depth,
             posed=image.posed,
             options=self._options,
             own_mask=self._own.get(name),
+            also=self.extras.of(name),
+            maps=None if self._options.maps is None else f"maps/{stem}",
             sample_xy=None if self._colors is None else self._colors.pixels(name),
         )
 
