@@ -32,5 +32,5 @@ def write_aside(path: Path, data: bytes) -> None:
 
 def remove_partial(folder: Path) -> None:
     """Delete what a killed process left half-written in a folder and its sub-folders."""
-    for path in folder.rglob(".*.partial"):
+    for path in folder.rglob(".*.partial*"):
         path.unlink(missing_ok=True)
