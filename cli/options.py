@@ -73,6 +73,20 @@ jobs_option: Decorator = click.option(
     "--jobs", type=click.IntRange(min=0), default=0, help="Threads; 0, the default, takes all cores."
 )
 overwrite_option: Decorator = click.option("--overwrite", is_flag=True, help="Replace outputs that are in OUT.")
+scheduler_option: Decorator = click.option(
+    "--scheduler",
+    metavar="ADDRESS",
+    help="Work on photos by the workers of the Dask cluster at tcp://host:8786; they see PHOTOS and OUT "
+    "under the same paths.",
+)
+progress_option: Decorator = click.option(
+    "--progress",
+    "progress_form",
+    type=click.Choice(("bar", "json")),
+    default="bar",
+    show_default=True,
+    help="json: lines on stdout for other programs, and nothing else there.",
+)
 quiet_option: Decorator = click.option("-q", "--quiet", is_flag=True, help="Nothing but warnings and errors.")
 quality_option: Decorator = click.option(
     "--quality", type=click.IntRange(1, 100), default=98, show_default=True, help="Of JPEG and WebP."

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from . import options as opt
-from .terminal import errors_for_people, progress_bars, table
+from .terminal import errors_for_people, list_failed, progress_bars, table
 
 if TYPE_CHECKING:
     from rsundistort.model import Solution
@@ -115,8 +115,8 @@ if TYPE_CHECKING:
     show_default=True,
     help="Features of a photo.",
 )
-@opt.view_options
 @opt.depth_option
+@opt.view_options
 @opt.interpolation_option
 @opt.quality_option
 @opt.raw_as_option
@@ -125,7 +125,9 @@ if TYPE_CHECKING:
 @opt.max_pixels_option
 @opt.seed_option
 @opt.jobs_option
+@opt.scheduler_option
 @opt.overwrite_option
+@opt.progress_option
 @opt.quiet_option
 def command(
     photos: Path,
@@ -147,10 +149,10 @@ def command(
     photo_times: Path | None,
     remedy: str,
     max_features: int,
+    depth: str,
     alpha: float | str | None,
     scale: float,
     max_size: int | None,
-    depth: str,
     interpolation: str,
     quality: int,
     raw_as: str,
@@ -159,15 +161,20 @@ def command(
     max_megapixels: float,
     seed: int,
     jobs: int,
+    scheduler: str | None,
     overwrite: bool,
+    progress_form: str,
     quiet: bool,
 ) -> None:
     """Find how the camera moved during each photo's readout, and take it out.
 
     PHOTOS is a folder of photos that one camera took of one scene, in any order, or a video. OUT gets images/, masks/,
     sparse/ (COLMAP), transforms.json (nerfstudio) and solution.json; of a video frames/, too.
+
+    OUT stays as it was until the motions are solved. If the rest is interrupted, `rectify --resume` goes on with it.
+    Exit code 3 says that photos with a motion could not be rectified; they are listed, and the others are done.
     """
-    with errors_for_people(), progress_bars(quiet) as progress:
+    with errors_for_people(), progress_bars(quiet, progress_form) as progress:
         from rsundistort.io import read_known_lengths, read_known_motions
         from rsundistort.pipeline import GyroOptions, RunOptions, run
         from rsundistort.rectify import ViewOptions
@@ -184,8 +191,8 @@ def command(
                 seed=seed,
                 jobs=jobs,
                 max_features=max_features,
-                view=ViewOptions(alpha, scale, max_size),
                 depth=depth,
+                view=ViewOptions(alpha, scale, max_size),
                 interpolation=interpolation,
                 quality=quality,
                 raw_as=raw_as,
@@ -202,11 +209,14 @@ def command(
                 gyro=None if gyro is None else GyroOptions(gyro, gyro_offset, gyro_axes, photo_times),
                 readout_s=readout_s,
                 overwrite=overwrite,
+                scheduler=scheduler,
             ),
             progress,
         )
-    if not quiet:
+    silent = quiet or progress_form == "json"
+    if not silent:
         click.echo(closing_table(solution, out))
+    list_failed({image.name: image.reason for image in solution.registered if image.reason}, err=silent)
 
 
 def _names(refine: str | None) -> tuple[str, ...] | None:

@@ -29,6 +29,7 @@ from .model import AtInfinity, Camera, DepthMap, Observations, Plane, Reconstruc
 from .model.projection import project_points, unproject_points
 from .pipeline import (
     GyroOptions,
+    RectifyOptions,
     RunOptions,
     SceneOptions,
     WarpOptions,
@@ -69,6 +70,7 @@ __all__ = [
     "Plane",
     "Reconstruction",
     "ReconstructionError",
+    "RectifyOptions",
     "RemapGrid",
     "RowMotion",
     "RsUndistortError",

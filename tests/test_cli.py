@@ -472,8 +472,18 @@ def test_rectify(invoke, tmp_path):
     assert "3 photos rectified" in result.stdout
     assert result.stderr == ""
     names = {path for path, content in tree(tmp_path / "out").items() if content is not None}
-    assert names == {f"{kind}/{name}" for kind in ("images", "masks") for name in THREE} | {"solution.json"}
+    files = {"solution.json", ".rectified.jsonl"}  # the second is what --resume goes by
+    assert names == {f"{kind}/{name}" for kind in ("images", "masks") for name in THREE} | files
     assert invoke("rectify", "photos", "--solution", "s.json", "-o", "quiet", "-q").stdout == ""
+
+
+def test_rectify_refuses_a_depth_that_is_none(invoke, tmp_path):
+    save_textures(tmp_path / "photos", THREE)
+    solution_of(tmp_path / "s.json", THREE)
+    result = invoke("rectify", "photos", "--solution", "s.json", "-o", "out", "--depth", "deep")
+    assert result.exit_code == 1
+    assert result.stderr.splitlines() == ["error: depth 'deep' is no folder, nor one of auto, infinity, plane, points"]
+    assert not (tmp_path / "out").exists()
 
 
 def test_rectify_to_another_view(invoke, tmp_path):
@@ -581,7 +591,7 @@ def test_names_that_leave_their_folder_are_refused(invoke, tmp_path, name):
     (tmp_path / "s.json").write_text(json.dumps(value))
     before = tree(tmp_path)
     for args in (["rectify", "photos", "--solution", "s.json", "-o", "out"], ["analyze", "s.json"]):
-        assert "no name of a file below a folder" in error_line(invoke(*args))
+        assert ("garbled" if name == 7 else "expected a name inside") in error_line(invoke(*args))
     assert tree(tmp_path) == before
 
 
@@ -589,14 +599,19 @@ def test_nothing_is_written_through_links(invoke, tmp_path):
     save_textures(tmp_path / "photos", THREE)
     solution_of(tmp_path / "s.json", THREE)
     save_textures(tmp_path / "elsewhere", ["a.png"])
+    save_textures(tmp_path / "labels", ["a.png"])
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "images").symlink_to(tmp_path / "elsewhere")
     (tmp_path / "out" / "solution.json").symlink_to(tmp_path / "s.json")
     before = tree(tmp_path / "elsewhere"), (tmp_path / "s.json").read_bytes()
-    assert invoke("rectify", "photos", "--solution", "s.json", "-o", "out", "--overwrite").exit_code == 0
+    args = ["rectify", "photos", "--solution", "s.json", "-o", "out", "--overwrite", "--also", "labels"]
+    assert "leads out of out" in error_line(invoke(*args))
+    (tmp_path / "out" / "images").unlink()
+    (tmp_path / "out" / "also").symlink_to(tmp_path / "elsewhere")
+    assert "leads out of out" in error_line(invoke(*args))
+    (tmp_path / "out" / "also").unlink()
+    assert invoke(*args).exit_code == 0
     assert (tree(tmp_path / "elsewhere"), (tmp_path / "s.json").read_bytes()) == before
-    assert not (tmp_path / "out" / "images").is_symlink()
-    assert sorted(tree(tmp_path / "out" / "images")) == THREE
 
 
 def test_rectify_leaves_out_photos_of_another_size(invoke, tmp_path):
@@ -605,14 +620,17 @@ def test_rectify_leaves_out_photos_of_another_size(invoke, tmp_path):
     (tmp_path / "photos" / "c.png").write_bytes(b"cut")
     solution_of(tmp_path / "s.json", THREE)
     result = invoke("rectify", "photos", "--solution", "s.json", "-o", "out")
-    assert result.exit_code == 0, result.stderr
+    assert result.exit_code == 3, result.stderr
+    assert result.stdout.splitlines()[-3] == "failed:"
+    assert [line.split(":")[0] for line in result.stdout.splitlines()[-2:]] == ["  b.png", "  c.png"]
     warnings = result.stderr.splitlines()
     assert len(warnings) == 2
     assert warnings[0].startswith("warning: skipped: b.png")
     assert warnings[1].startswith("warning: skipped: c.png")
     assert "1 photo rectified" in result.stdout
     assert "2 left out" in result.stdout
-    assert set(tree(tmp_path / "out")) == {"images", "images/a.png", "masks", "masks/a.png", "solution.json"}
+    files = {"images", "images/a.png", "masks", "masks/a.png", "solution.json", ".rectified.jsonl"}
+    assert set(tree(tmp_path / "out")) == files
 
 
 def test_rectify_refuses_photos_that_are_all_of_another_size(invoke, tmp_path):

@@ -25,11 +25,14 @@ from rsundistort import (
     Solution,
     SolvedImage,
     distort_points,
+    evaluate,
     init_rectify_map,
     largest_shift_px,
+    psnr,
     read_solution,
     rectify,
     rectify_folder,
+    run,
     undistort_points,
     write_solution,
 )
@@ -411,6 +414,40 @@ def test_plane_is_preferred_where_all_is_flat_only(rng):
     assert prefers_plane(plane, xy, rays, flat * noise)
     hills = flat * (1 + 0.08 * np.sin(xy[:, 0] / 15))
     assert not prefers_plane(plane, xy, rays, hills * noise)
+
+
+# ---------------------------------------------------------------- rendered scenes
+
+FLYOVER = Path(__file__).parent.parent / "sample_scenes" / "flyover"
+
+
+def test_flight_with_true_motion_and_points_comes_near_its_twin():
+    """The renderer knows nothing of the row models; the points are 300 or so that a photo shows."""
+    truth, tracks = read_solution(FLYOVER / "ground_truth.json"), np.load(FLYOVER / "tracks.npz")
+    image = truth.images[1]
+    camera, motion = truth.cameras["1"], image.motion.in_camera(image.R_cw)
+    X_c = (tracks["points_w"][tracks["point_idx"][tracks["frame_idx"] == 1]] - image.center_w) @ image.R_cw.T
+    xy = X_c[:, :2] / X_c[:, 2:] * np.diag(camera.K)[:2] + camera.K[:2, 2]
+    depth = depth_from_points(xy, X_c[:, 2], (camera.width, camera.height))
+    raw, twin = (cv2.imread(str(FLYOVER / kind / image.name)) for kind in ("photos", "global"))
+    far, seen = rectify(raw, camera, motion, MODEL)
+    near, mask = rectify(raw, camera, motion, MODEL, depth=depth)
+    both = np.minimum(seen, mask)
+    assert psnr(near, twin, both) > 35  # dB; the true depths reach 38.6
+    assert psnr(near, twin, both) > psnr(far, twin, both) + 8
+
+
+@pytest.mark.slow
+def test_flight_is_rectified_by_what_the_photos_say(tmp_path):
+    import pycolmap
+
+    solution = run(FLYOVER / "photos", tmp_path / "out")
+    rectify_folder(FLYOVER / "photos", tmp_path / "out" / "solution.json", tmp_path / "far", depth="infinity")
+    near, far = (evaluate(tmp_path / out, FLYOVER / "ground_truth.json")["psnr_db"] for out in ("out", "far"))
+    assert near["median"] > far["median"] + 4
+    assert near["min"] > far["min"] + 4
+    mean = pycolmap.Reconstruction(tmp_path / "out" / "sparse").compute_mean_reprojection_error()
+    assert 0.8 < mean / solution.quality["rms_px"] < 1.4  # between a mean length and the rms of its parts
 
 
 # ---------------------------------------------------------------- folders

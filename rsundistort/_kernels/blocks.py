@@ -46,12 +46,13 @@ def multiply(unknowns, row_start, cols, S, x, parts, y):
 
 
 @parallel_kernel(fastmath=SUMS)
-def project_blocks(unknowns, turn, free, functions, rows, pair_start, block, left, right, S, E):
+def project_blocks(unknowns, turn, free, functions, pair_start, block, left, right, S, E):
     """E (pairs, q nb, q nb) = Z_c' S Z_d of each pair of clusters, from the entries that belong to it.
 
     Z is functions[f, k] (m, q) times the unknowns of photo f, of which the first three are turned by turn[f] (m, 3, 3)
     and those that are held (free[f, a] is 0) vanish. Entry s is the part of S between the photos left[s] and right[s],
-    block[s] or its transpose; entries pair_start[p] to pair_start[p + 1] belong to pair p, those of one photo together.
+    block[s] or, below the diagonal, its transpose; entries pair_start[p] to pair_start[p + 1] belong to pair p, those
+    of one photo together.
     """
     nb = len(unknowns)
     q = functions.shape[1]
@@ -66,10 +67,9 @@ def project_blocks(unknowns, turn, free, functions, rows, pair_start, block, lef
             H[:] = 0.0
             while s < pair_start[pair + 1] and left[s] == f:
                 i, g = block[s], right[s]
-                above = rows[i] == f
                 for a in range(nb):
                     for b in range(nb):
-                        value = S[i, a, b] if above else S[i, b, a]
+                        value = S[i, a, b] if f <= g else S[i, b, a]
                         G[a, b] = value * free[f, a] * free[g, b]
                     for b in range(3):
                         turned[b] = G[a, 0] * turn[g, 0, b] + G[a, 1] * turn[g, 1, b] + G[a, 2] * turn[g, 2, b]

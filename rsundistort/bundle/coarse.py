@@ -48,8 +48,6 @@ class CoarseSpace:
         World to camera, for the first three unknowns.
     free : (m, nb) bool array
         Unknowns that are not held.
-    rows : (blocks,) int array
-        Block rows of the photos' pattern.
     entries : tuple of int arrays
         As `project_blocks` takes them: ranges of the pairs of clusters, block, left and right photo.
     envelope : Envelope
@@ -62,7 +60,6 @@ class CoarseSpace:
     functions: Array
     turn: Array
     free: NDArray[np.bool_]
-    rows: Index
     entries: tuple[Index, Index, Index, Index]
     envelope: Envelope
 
@@ -80,25 +77,12 @@ class CoarseSpace:
         for photos in np.split(by_cluster, start[1:]):
             values = _smooth_functions(center_w[photos])
             functions[photos, : values.shape[1]] = values
-        rows, cols = pattern.rows, pattern.cols
-        off = np.flatnonzero(rows != cols)
-        block = np.concatenate([np.arange(len(rows)), off])
-        left, right = np.concatenate([rows, cols[off]]), np.concatenate([cols, rows[off]])
-        upper = cluster[left] <= cluster[right]
-        block, left, right = block[upper], left[upper], right[upper]
-        order = np.lexsort((right, left, cluster[right], cluster[left]))
-        block, left, right = block[order], left[order], right[order]
-        pair = cluster[left] * num + cluster[right]
-        pair_start = np.flatnonzero(np.diff(pair, prepend=-1))
-        row_start = np.searchsorted(pair[pair_start] // num, np.arange(num + 1))
         # columns of held unknowns, and of the functions that a small cluster does not have
         moved = np.hstack([np.einsum("mba,mb->ma", R_cw**2, free[:, :3]), free[:, 3:]])
         size = np.add.reduceat((functions**2)[by_cluster, :, None] * moved[by_cluster, None], start)
-        envelope = Envelope.smallest(
-            BlockPattern(row_start, pair[pair_start] % num), size.reshape(num, _FUNCTIONS * nb) > _RIDGE
-        )
-        entries = np.append(pair_start, len(pair)), block, left, right
-        return cls(cluster, by_cluster, start, functions, R_cw, free, rows, entries, envelope)
+        of_clusters, entries = _pairs_of_clusters(pattern, cluster)
+        envelope = Envelope.smallest(of_clusters, size.reshape(num, _FUNCTIONS * nb) > _RIDGE)
+        return cls(cluster, by_cluster, start, functions, R_cw, free, entries, envelope)
 
     def project(self, reduced: Reduced) -> Reduced:
         """The system of the clusters; the cameras' unknowns stay."""
@@ -106,7 +90,7 @@ class CoarseSpace:
         E = np.empty((len(self.envelope.pattern.cols), _FUNCTIONS * nb, _FUNCTIONS * nb))
         with numba.parallel_chunksize(1):
             blocks.project_blocks(
-                (0.0,) * nb, self.turn, self.free.astype(float), self.functions, self.rows, *self.entries, reduced.S, E
+                (0.0,) * nb, self.turn, self.free.astype(float), self.functions, *self.entries, reduced.S, E
             )  # fmt: skip
         diagonal = np.einsum("caa->ca", E[self.envelope.pattern.diagonal])
         E[self.envelope.pattern.diagonal] += _RIDGE * diagonal[:, :, None] * np.eye(_FUNCTIONS * nb)
@@ -146,6 +130,23 @@ def _clusters(graph: scipy.sparse.csr_array, center_w: Array, max_photos: int) -
             cluster[photos] = num
             num += 1
     return cluster
+
+
+def _pairs_of_clusters(pattern: BlockPattern, cluster: Index) -> tuple[BlockPattern, tuple[Index, Index, Index, Index]]:
+    """Clusters that share points, and what of the photos' blocks belongs to each pair of them."""
+    rows, cols = pattern.rows, pattern.cols
+    off = np.flatnonzero(rows != cols)
+    block = np.concatenate([np.arange(len(rows)), off])
+    left, right = np.concatenate([rows, cols[off]]), np.concatenate([cols, rows[off]])
+    upper = cluster[left] <= cluster[right]
+    block, left, right = block[upper], left[upper], right[upper]
+    order = np.lexsort((right, left, cluster[right], cluster[left]))
+    block, left, right = block[order], left[order], right[order]
+    num = int(cluster.max()) + 1
+    pair = cluster[left] * num + cluster[right]
+    start = np.flatnonzero(np.diff(pair, prepend=-1))
+    row_start = np.searchsorted(pair[start] // num, np.arange(num + 1))
+    return BlockPattern(row_start, pair[start] % num), (np.append(start, len(pair)), block, left, right)
 
 
 def _smooth_functions(center_w: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -10,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, FormatError
+from ..errors import FileError, FormatError, InputError
 from ..model import Camera, Reconstruction
 from ..model.projection import at_depth, unproject_points
+from .aside import check_photo_name
 
 __all__ = ["read_colmap_cameras", "read_colmap_poses", "rectified_keypoints", "write_colmap_model"]
 
@@ -74,7 +76,14 @@ def read_colmap_cameras(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
             cameras[str(camera_id)] = Camera(found.width, found.height, K, dist, lens=lens)
         except ValueError as error:
             raise FormatError(f"{where}: {error}") from error
-    return cameras, {image.name: str(image.camera_id) for image in model.images.values()}
+    return cameras, {_name(image, path): str(image.camera_id) for image in model.images.values()}
+
+
+def _name(image: Any, where: Path) -> str:
+    try:
+        return check_photo_name(image.name)
+    except InputError as error:
+        raise FormatError(f"{where}: {error}") from error
 
 
 def _read_model(path: Path) -> Any:
@@ -148,7 +157,7 @@ def read_colmap_poses(folder: Path, any_lens: bool = False) -> tuple[Any, ...]:
             point.append(number)
     return (
         cameras,
-        [image.name for image in images],
+        [_name(image, folder) for image in images],
         np.array([ids.index(image.camera_id) for image in images], np.int64),
         poses[:, :, :3],
         -np.einsum("mji,mj->mi", poses[:, :, :3], poses[:, :, 3]),
@@ -190,7 +199,7 @@ def write_colmap_model(
     folder: Path,
     reconstruction: Reconstruction,
     rectified: list[Camera],
-    names: list[str],
+    names: Sequence[str | None],
     colors: NDArray[np.uint8] | None = None,
 ) -> None:
     """Write `cameras.bin`, `images.bin`, `points3D.bin` (and rigs, frames) of PINHOLE cameras without distortion.
@@ -203,8 +212,8 @@ def write_colmap_model(
         Poses, motions, points and raw measurements.
     rectified : list of Camera
         New camera of each camera of the reconstruction.
-    names : list of str
-        File names of the rectified photos.
+    names : sequence of str or None
+        File names of the rectified photos; those without are left out.
     colors : (n, 3) uint8 array, optional
         Red, green, blue of the points.
     """
@@ -227,6 +236,8 @@ def write_colmap_model(
     usable = np.isfinite(xy).all(1)
     place = np.full(len(obs), -1)
     for i, name in enumerate(names):
+        if name is None:
+            continue
         of_photo = np.flatnonzero((obs.frame_idx == i) & usable)
         place[of_photo] = np.arange(len(of_photo))
         image = pycolmap.Image(

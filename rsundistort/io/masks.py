@@ -35,13 +35,14 @@ def find_masks(folder: Path, names: Sequence[str], what: str = "mask") -> dict[s
     """
     if not folder.is_dir():
         raise FileError(f"{folder} is no folder; give the folder that holds the {what}s")
-    files = {path.name: path for path in sorted(folder.iterdir()) if path.suffix.lower() in _SUFFIXES}
-    by_stem: dict[str, list[Path]] = {}
-    for path in files.values():
-        by_stem.setdefault(path.stem, []).append(path)
+    by_stem: dict[Path, list[Path]] = {}
+    for within in sorted({folder / Path(name).parent for name in names}):
+        for path in sorted(within.iterdir()) if within.is_dir() else ():
+            if path.suffix.lower() in _SUFFIXES:
+                by_stem.setdefault(path.with_suffix(""), []).append(path)
     found: dict[str, Path] = {}
     for name in names:
-        fitting = by_stem.get(name) or by_stem.get(Path(name).stem) or []
+        fitting = by_stem.get(folder / name) or by_stem.get((folder / name).with_suffix("")) or []
         if len(fitting) > 1:
             raise InputError(
                 f"{name} has several {what}s: {', '.join(path.name for path in fitting)}; keep one of them"

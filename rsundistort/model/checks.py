@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 
-__all__ = ["check_array", "check_file_name", "check_finite", "check_index", "check_rotations", "frozen"]
+__all__ = ["check_array", "check_finite", "check_index", "check_rotations", "frozen"]
 
 
 def _shape_text(shape: tuple[int | None, ...]) -> str:
@@ -44,14 +43,6 @@ def check_index(value: ArrayLike, length: int, upper: int, name: str) -> NDArray
     if length and (array.min() < 0 or array.max() >= upper):
         raise InputError(f"{name} goes from {array.min()} to {array.max()}, expected 0 to {upper - 1}")
     return array
-
-
-def check_file_name(value: Any, name: str) -> str:
-    """A name of a file below some folder: relative, and never above it."""
-    path = PurePath(value) if isinstance(value, str) and "\0" not in value else PurePath()
-    if path.anchor or ".." in path.parts or not path.name:
-        raise InputError(f"{name} {value!r} is no name of a file below a folder")
-    return str(value)
 
 
 def check_rotations(value: ArrayLike, length: int, name: str) -> NDArray[np.float64]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .camera import Camera
-from .checks import check_file_name, check_finite, check_rotations, frozen
+from .checks import check_finite, check_rotations, frozen
 from .motion import RowMotion, check_shutter_model
 
 __all__ = ["Solution", "SolvedImage"]
@@ -42,7 +43,7 @@ class SolvedImage:
     translation_shift_px : float or None
         Largest displacement that the translation alone caused, by that depth.
     reason : str or None
-        Why the photo did not register.
+        Why the photo did not register; of one that did, why it could not be rectified.
     turned : int
         EXIF orientation by which the photo was turned after it was rectified: pose, motion and cameras are those of
         the turned frame. 1 in the stored frame.
@@ -66,7 +67,6 @@ class SolvedImage:
     roi: tuple[int, int, int, int] | None = None
 
     def __post_init__(self) -> None:
-        check_file_name(self.name, "photo")
         if self.R_cw is not None:
             R = check_rotations(np.asarray(self.R_cw, np.float64)[None], 1, f"R_cw of {self.name}")[0]
             object.__setattr__(self, "R_cw", frozen(R))
@@ -126,10 +126,14 @@ class Solution:
 
     def image(self, name: str) -> SolvedImage:
         """The photo of a name."""
-        for image in self.images:
-            if image.name == name:
-                return image
-        raise InputError(f"the solution has no photo {name!r}")
+        try:
+            return self._by_name[name]
+        except KeyError:
+            raise InputError(f"the solution has no photo {name!r}") from None
+
+    @cached_property
+    def _by_name(self) -> dict[str, SolvedImage]:
+        return {image.name: image for image in self.images}
 
     @property
     def registered(self) -> list[SolvedImage]:
