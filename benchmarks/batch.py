@@ -3,8 +3,8 @@
     python benchmarks/batch.py [--count N] [--repeat N] [--interpolation cubic|linear]
 
 - `rectify` against the least that the work takes: decode, `cv2.remap` with ready maps, encode, in a pool of as many
-  threads, with the same interpolation, quality and sampling of colours. Ours makes grids and masks, too, and carries the
-  metadata. The ratio is ours to theirs in photos a second.
+  threads, with the same interpolation, quality and sampling of colours. Ours makes grids and masks, too. The ratio is
+  that of photos a second.
 - `rectify` of a lens alone against `pycolmap.undistort_images`, same quality; ratio of the times.
 - Resident memory of `rectify`, in a process of its own, against 150 MB and 120 MB a worker.
 
@@ -57,7 +57,8 @@ photos, maps, out, interpolation, quality, jobs = sys.argv[1:]
 cv2.setNumThreads(1)
 maps = np.load(maps)
 Path(out).mkdir()
-params = [cv2.IMWRITE_JPEG_QUALITY, int(quality), cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+full = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+params = [cv2.IMWRITE_JPEG_QUALITY, int(quality), *full]
 flag = {"cubic": cv2.INTER_CUBIC, "linear": cv2.INTER_LINEAR}[interpolation]
 def work(path):
     photo = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
@@ -165,20 +166,17 @@ def main() -> None:
 
         def ours(kind: str, turn: int) -> dict[str, float]:
             out = folder / f"{kind}-{turn}"
-            found = measured(
-                OURS, folder / "photos", folder / f"{kind}.json", out, warm, args.interpolation, QUALITY, jobs
-            )  # fmt: skip
-            return found | {"each": found["s"] / len(names)}
+            how = (args.interpolation, QUALITY, jobs)
+            return measured(OURS, folder / "photos", folder / f"{kind}.json", out, warm, *how)
 
         moved, still, floor, peer, peak = [], [], [], [], []
         for turn in range(args.repeat):
             found = ours("moved", turn)
             moved.append(found["s"])
             peak.append(found["mb"])
-            least = measured(
-                FLOOR, folder / "photos", folder / "maps.npy", folder / f"floor-{turn}", args.interpolation, QUALITY, jobs
-            )  # fmt: skip
-            floor.append(least["s"])
+            out = folder / f"floor-{turn}"
+            how = (args.interpolation, QUALITY, jobs)
+            floor.append(measured(FLOOR, folder / "photos", folder / "maps.npy", out, *how)["s"])
             still.append(ours("still", turn)["s"])
             peer.append(measured(PEER, folder / "photos", folder / "model", folder / f"peer-{turn}", QUALITY)["s"])
             for path in [*folder.glob(f"*-{turn}"), *folder.glob(f"*-{turn}-warm")]:

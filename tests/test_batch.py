@@ -324,6 +324,53 @@ def test_a_photo_that_does_not_fit_the_memory_is_left_out(four, monkeypatch):
     assert "b.png" in left_out
 
 
+@pytest.fixture
+def travelling(four):
+    """Of the four photos a solution whose camera travelled, and depth maps of them, one of which is no picture."""
+    solution = read_solution(four / "s.json")
+    motion = RowMotion([0.02, -0.01, 0.0], [0.05, 0.0, 0.0])
+    images = [replace(i, motion=motion, R_cw=np.eye(3), center_w=np.ones(3)) for i in solution.images]
+    write_solution(four / "s.json", replace(solution, shutter_model="constant-motion", images=tuple(images)))
+    (four / "depth").mkdir()
+    for name in FOUR:
+        np.save(four / "depth" / f"{Path(name).stem}.npy", np.full((240, 320), 3.0, np.float32))
+    return four
+
+
+def test_a_bad_depth_map_does_not_stop_the_others(travelling):
+    (travelling / "depth" / "b.npy").write_bytes(b"none")
+    with pytest.warns(SkippedPhotoWarning, match=r"b\.png: .*b\.npy"):
+        solution, left_out = rectify_folder(
+            travelling / "in", travelling / "s.json", travelling / "out", depth=travelling / "depth"
+        )
+    assert list(left_out) == ["b.png"]
+    assert [image.depth for image in solution.images] == ["map", None, "map", "map"]
+
+
+def test_depths_are_known_of_photos_that_are_passed_over(travelling):
+    """A changed map makes its photo stale, the others are left as they are."""
+    work = (travelling / "in", travelling / "s.json", travelling / "out")
+    first, _ = rectify_folder(*work, depth=travelling / "depth")
+    before = made(travelling / "out")
+    np.save(travelling / "depth" / "b.npy", np.full((240, 320), 2.5, np.float32))
+    second, _ = rectify_folder(*work, depth=travelling / "depth", resume=True)
+    assert {name for name, file in made(travelling / "out").items() if file != before[name]} == {"b.png"}
+    for a, b in zip(first.images, second.images, strict=True):
+        assert a.depth == b.depth == "map"
+        assert (a.translation_shift_px == b.translation_shift_px) == (a.name != "b.png")
+
+
+def test_images_that_go_along_are_not_replaced_by_themselves(four):
+    (four / "out" / "also").mkdir(parents=True)
+    shutil.copytree(four / "in", four / "out" / "also" / "labels")
+    before = tree(four)
+    with pytest.raises(FileError, match="would be replaced by the outputs"):
+        rectify_folder(
+            four / "in", four / "s.json", four / "out", overwrite=True, also=((four / "out/also/labels", "nearest"),)
+        )
+    assert tree(four) == before
+
+
 # ---------------------------------------------------------------- the folder of outputs
 
 

@@ -591,7 +591,7 @@ def test_names_that_leave_their_folder_are_refused(invoke, tmp_path, name):
     (tmp_path / "s.json").write_text(json.dumps(value))
     before = tree(tmp_path)
     for args in (["rectify", "photos", "--solution", "s.json", "-o", "out"], ["analyze", "s.json"]):
-        assert ("garbled" if name == 7 else "expected a name inside") in error_line(invoke(*args))
+        assert "expected a name inside the folder of photos" in error_line(invoke(*args))
     assert tree(tmp_path) == before
 
 
@@ -599,19 +599,15 @@ def test_nothing_is_written_through_links(invoke, tmp_path):
     save_textures(tmp_path / "photos", THREE)
     solution_of(tmp_path / "s.json", THREE)
     save_textures(tmp_path / "elsewhere", ["a.png"])
-    save_textures(tmp_path / "labels", ["a.png"])
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "images").symlink_to(tmp_path / "elsewhere")
     (tmp_path / "out" / "solution.json").symlink_to(tmp_path / "s.json")
     before = tree(tmp_path / "elsewhere"), (tmp_path / "s.json").read_bytes()
-    args = ["rectify", "photos", "--solution", "s.json", "-o", "out", "--overwrite", "--also", "labels"]
-    assert "leads out of out" in error_line(invoke(*args))
-    (tmp_path / "out" / "images").unlink()
-    (tmp_path / "out" / "also").symlink_to(tmp_path / "elsewhere")
-    assert "leads out of out" in error_line(invoke(*args))
-    (tmp_path / "out" / "also").unlink()
-    assert invoke(*args).exit_code == 0
+    assert "images" in error_line(invoke("rectify", "photos", "--solution", "s.json", "-o", "out", "--overwrite"))
     assert (tree(tmp_path / "elsewhere"), (tmp_path / "s.json").read_bytes()) == before
+    (tmp_path / "out" / "images").unlink()
+    assert invoke("rectify", "photos", "--solution", "s.json", "-o", "out", "--overwrite").exit_code == 0
+    assert (tmp_path / "s.json").read_bytes() == before[1]
 
 
 def test_rectify_leaves_out_photos_of_another_size(invoke, tmp_path):

@@ -5,11 +5,9 @@ from __future__ import annotations
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path, PurePath
+from pathlib import Path
 
-from ..errors import InputError
-
-__all__ = ["check_photo_name", "remove_partial", "write_aside", "written_aside"]
+__all__ = ["remove_partial", "write_aside", "written_aside"]
 
 
 @contextmanager
@@ -34,20 +32,5 @@ def write_aside(path: Path, data: bytes) -> None:
 
 def remove_partial(folder: Path) -> None:
     """Delete what a killed process left half-written in a folder and its sub-folders."""
-    for path in folder.rglob(".*.partial"):
+    for path in folder.rglob(".*.partial*"):
         path.unlink(missing_ok=True)
-
-
-def check_photo_name(name: str) -> str:
-    """The name of a photo inside its folder, sub-folders with forward slashes; an error for one that leads elsewhere.
-
-    Examples
-    --------
-    >>> check_photo_name("walk/0001.jpg")
-    'walk/0001.jpg'
-    """
-    path = PurePath(name)
-    inside = not path.is_absolute() and not path.drive and ".." not in path.parts
-    if not inside or path.as_posix() != name or "\0" in name or not path.name:
-        raise InputError(f"a photo is called {name!r}; expected a name inside the folder of photos")
-    return name

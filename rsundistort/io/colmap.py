@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, FormatError, InputError
 from ..model import Camera, Reconstruction
+from ..model.checks import check_photo_name
 from ..model.projection import at_depth, unproject_points
-from .aside import check_photo_name
 
 __all__ = ["read_colmap_cameras", "read_colmap_poses", "rectified_keypoints", "write_colmap_model"]
 

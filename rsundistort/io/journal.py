@@ -7,10 +7,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import IO
+from typing import IO, Any
 
 from ..errors import InputError
-from .aside import check_photo_name, write_aside
+from ..model.checks import check_photo_name
+from .aside import write_aside
 
 __all__ = ["Journal", "JournalEntry"]
 
@@ -29,12 +30,15 @@ class JournalEntry:
         How many bytes each has.
     turn : int
         EXIF orientation that was applied.
+    depth : (kind, shift_px, whole_shift_px) or None
+        How far away what the photo shows was taken to be, and what the shutter did to it, px.
     """
 
     name: str
     fingerprint: str
     files: Mapping[str, int]
     turn: int = 1
+    depth: tuple[str, float, float] | None = None
 
     def is_whole(self, folder: Path) -> bool:
         """Whether all of them are there, as long as they were."""
@@ -68,7 +72,7 @@ class Journal:
             for line in self.path.read_text(encoding="utf-8", errors="replace").splitlines():
                 try:
                     entry = _entry(json.loads(line))
-                except (ValueError, TypeError, KeyError, AttributeError):
+                except (ValueError, TypeError, KeyError, IndexError, AttributeError):
                     continue
                 entries[entry.name] = entry
         return entries
@@ -99,8 +103,9 @@ def _line(entry: JournalEntry) -> str:
     return json.dumps(asdict(entry), sort_keys=True) + "\n"
 
 
-def _entry(value: dict[str, object]) -> JournalEntry:
-    name, fingerprint, files, turn = (value[key] for key in ("name", "fingerprint", "files", "turn"))
-    if not (isinstance(name, str) and isinstance(fingerprint, str) and isinstance(files, dict)):
+def _entry(value: dict[str, Any]) -> JournalEntry:
+    name, fingerprint, turn, depth = (value[key] for key in ("name", "fingerprint", "turn", "depth"))
+    if not (isinstance(name, str) and isinstance(fingerprint, str) and turn in range(1, 9)):
         raise InputError("no entry of a journal")
-    return JournalEntry(name, fingerprint, {check_photo_name(k): int(v) for k, v in files.items()}, int(str(turn)))
+    files = {check_photo_name(path): int(size) for path, size in value["files"].items()}
+    return JournalEntry(name, fingerprint, files, turn, depth and (str(depth[0]), float(depth[1]), float(depth[2])))

@@ -90,7 +90,7 @@ def batch_folder(
         When the folder is in use or cannot be written.
     """
     folder = Path(folder)
-    made = _prepare(folder, apart_from, ("images", "masks"))
+    made = _prepare(folder, apart_from, ("images", "masks", "maps", "also"))
     new: list[Path] = []
     with Journal(folder) as journal:
         try:
@@ -106,7 +106,9 @@ def batch_folder(
                     raise FileError(f"{folder} is not empty{mend}")
                 new = [path for path in (folder / "images", folder / "masks", journal.path) if not path.exists()]
                 for name in ("images", "masks"):
-                    remove_partial(make_inside(folder, name))
+                    make_inside(folder, name)
+                for name in ("images", "masks", "maps", "also"):
+                    remove_partial(folder / name)
                 for aside in folder.glob(".*.partial"):
                     aside.unlink()
                 # a last line cut short must not run into the next

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import FileError, FormatError, InputError
 from ..model import READOUTS, Camera, RowMotion, Solution, SolvedImage
-from .aside import check_photo_name, write_aside
+from .aside import write_aside
 from .cameras import camera_from_json, camera_to_json
 
 __all__ = ["FORMAT", "VERSION", "read_solution", "solution_to_json", "write_solution"]
@@ -152,7 +152,6 @@ def _solution_from_json(value: dict[str, Any], where: str) -> Solution:
     rectified = {k: Camera(c["width"], c["height"], c["K"]) for k, c in value["rectified_cameras"].items()}
     images = []
     for entry in value["images"]:
-        check_photo_name(entry["name"])
         if entry["camera_id"] not in rectified:
             raise InputError(f"photo {entry['name']} has camera {entry['camera_id']!r}, which is not rectified")
         motion = None

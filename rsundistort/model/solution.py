@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .camera import Camera
-from .checks import check_finite, check_rotations, frozen
+from .checks import check_finite, check_photo_name, check_rotations, frozen
 from .motion import RowMotion, check_shutter_model
 
 __all__ = ["Solution", "SolvedImage"]
@@ -67,6 +67,7 @@ class SolvedImage:
     roi: tuple[int, int, int, int] | None = None
 
     def __post_init__(self) -> None:
+        check_photo_name(self.name)
         if self.R_cw is not None:
             R = check_rotations(np.asarray(self.R_cw, np.float64)[None], 1, f"R_cw of {self.name}")[0]
             object.__setattr__(self, "R_cw", frozen(R))

@@ -13,7 +13,7 @@ from ..io import list_photos, read_solution, write_solution
 from ..io.outputs import batch_folder
 from ..model import Solution
 from ..model.orientation import in_stored_frame, split_mirror, turn_solution
-from .depth import PhotoDepths, ScenePoints, check_depth
+from .depth import PhotoDepths, ScenePoints, check_depth, with_depths
 from .photo import RectifyOptions
 from .progress import ProgressCallback, StageLog
 from .views import with_view
@@ -102,7 +102,7 @@ def rectify_folder(
         left_out |= {name: each.problem for name, each in done.items() if each.problem}
         if not turns:
             raise InputError(f"none of the {len(names)} photos of {photos} could be rectified; see the warnings")
-        solved = depths.noted(solved)
+        solved = with_depths(solved, {name: each.depth for name, each in done.items() if each.depth is not None})
         if options.apply_orientation:
             solved = turn_solution(_without_mirrored_poses(solved, turns), turns)
         solved = replace(solved, options={**solved.options, "raw_as": options.raw_as})

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, InputError, RsUndistortWarning
 from ..io import find_depth_maps, output_name, read_colmap_poses, read_depth_map
-from ..model import AtInfinity, Camera, Depth, DepthMap, Plane, Reconstruction, RowMotion, Solution, SolvedImage
+from ..model import AtInfinity, Camera, Depth, DepthMap, Reconstruction, RowMotion, Solution
 from ..rectify import (
     depth_from_points,
     fit_plane,
@@ -24,7 +24,7 @@ from ..rectify import (
     translation_shift_px,
 )
 
-__all__ = ["DEPTHS", "PhotoDepth", "PhotoDepths", "ScenePoints", "check_depth"]
+__all__ = ["DEPTHS", "DepthJob", "PhotoDepth", "PhotoDepths", "ScenePoints", "check_depth", "with_depths"]
 
 #: What `--depth` may say besides a folder.
 DEPTHS = ("auto", "infinity", "plane", "points")
@@ -100,107 +100,98 @@ class PhotoDepth:
         "infinity", "plane", "points" or "map".
     shift_px : float
         Largest displacement that the translation alone caused.
+    whole_shift_px : float or None
+        Largest displacement that the shutter caused; None of a photo whose camera did not travel.
     """
 
     depth: Depth
     motion: RowMotion
     kind: str
-    shift_px: float
+    shift_px: float = 0.0
+    whole_shift_px: float | None = None
 
 
-class PhotoDepths:
-    """Depths of the photos of a solution, made when they are asked for; safe to ask from several threads.
+# Not every threading layer of numba lets parallel kernels be called from several threads at once.
+_ONE_AT_A_TIME = Lock()
 
-    Parameters
+
+@dataclass(frozen=True)
+class DepthJob:
+    """All that the depth of one photo takes; small, and sent to where the photo is rectified.
+
+    Attributes
     ----------
-    solution : Solution
-        In the stored frames of the photos.
-    depth : str or Path
-        One of `DEPTHS`, or a folder of depth maps.
-    points : ScenePoints, optional
-        For "auto", "plane" and "points"; without them, "auto" is at infinity.
+    name : str
+        Of the photo, for people.
+    motion : RowMotion
+        Its velocity in the world frame.
+    R_cw, center_w : (3, 3), (3,) array or None
+        Pose; None for a photo whose camera did not travel, which is rectified at infinity.
+    camera, new_camera : Camera
+        Of the raw photo, and the pinhole of the rectified one.
+    how : str
+        One of `DEPTHS`, or "map".
+    points_w : (n, 3) array or None
+        Points that the photo measured.
+    plane : (normal (3,), offset) or None
+        The plane nearest to most points of the scene, as of `fit_plane`.
+    own_map : Path or None
+        The user's depth map of it.
     """
 
-    def __init__(self, solution: Solution, depth: str | Path, points: ScenePoints | None) -> None:
-        check_depth(depth)
-        self._solution = solution
-        self._how = str(depth) if str(depth) in DEPTHS else "map"
-        self._points = points
-        moving = solution.shutter_model == "constant-motion"
-        self._moving = {image.name for image in solution.registered if moving and image.posed}
-        self._maps = find_depth_maps(Path(depth), sorted(self._moving)) if self._how == "map" and self._moving else {}
-        # not every threading layer of numba lets parallel kernels be called from several threads at once
-        self._one_at_a_time = Lock()
-        self._facts: dict[str, tuple[str, float, float]] = {}
-        if self._how in ("plane", "points") and points is None and self._moving:
-            raise InputError(f"depth {self._how!r} needs the points of the scene, and there are none")
-        self._plane: tuple[NDArray[np.float64], float] | None = None
-        if self._moving and points is not None and len(points.points_w) >= 3 and self._how in ("auto", "plane"):
-            self._plane = fit_plane(points.points_w)
+    name: str
+    motion: RowMotion
+    R_cw: NDArray[np.float64] | None
+    center_w: NDArray[np.float64] | None
+    camera: Camera
+    new_camera: Camera
+    how: str
+    points_w: NDArray[np.float64] | None = None
+    plane: tuple[NDArray[np.float64], float] | None = None
+    own_map: Path | None = None
 
-    def of(self, name: str) -> PhotoDepth:
-        """What a photo is rectified with."""
-        image = self._solution.image(name)
-        motion = image.motion or RowMotion()
-        if name not in self._moving or not motion.velocity.any():
-            return PhotoDepth(AtInfinity(), motion, "infinity", 0.0)
-        assert image.R_cw is not None
-        motion = motion.in_camera(image.R_cw)
-        camera = self._solution.cameras[image.camera_id]
-        new_camera = self._solution.rectified_cameras[image.camera_id]
-        depth, kind = self._choose(image, new_camera)
-        with self._one_at_a_time:
-            shift = translation_shift_px(camera, motion, depth, new_camera)
-            if self._how == "auto" and not shift > _LEAST_SHIFT_PX:
+    def find(self) -> PhotoDepth:
+        """What the photo is rectified with."""
+        if self.R_cw is None or self.center_w is None:
+            return PhotoDepth(AtInfinity(), self.motion, "infinity")
+        motion = self.motion.in_camera(self.R_cw)
+        depth, kind = self._choose(self.R_cw, self.center_w)
+        with _ONE_AT_A_TIME:
+            shift = translation_shift_px(self.camera, motion, depth, self.new_camera)
+            if self.how == "auto" and not shift > _LEAST_SHIFT_PX:
                 depth, kind = AtInfinity(), "infinity"
-            whole = largest_shift_px(camera, motion, "constant-motion", depth, new_camera)
-        self._facts[name] = kind, shift, whole
-        return PhotoDepth(depth, motion, kind, shift)
+            whole = largest_shift_px(self.camera, motion, "constant-motion", depth, self.new_camera)
+        return PhotoDepth(depth, motion, kind, shift, whole)
 
-    def noted(self, solution: Solution) -> Solution:
-        """The solution with the depths that were used, and the shifts that they mean."""
-        images = []
-        for image in solution.images:
-            if image.name in self._facts:
-                kind, shift, whole = self._facts[image.name]
-                image = replace(image, depth=kind, translation_shift_px=shift, rs_shift_px=whole)
-            images.append(image)
-        return replace(solution, images=tuple(images))
-
-    def _choose(self, image: SolvedImage, new_camera: Camera) -> tuple[Depth, str]:
-        size = (new_camera.width, new_camera.height)
-        seen = self._seen(image, new_camera.K)
-        if self._how == "map":
-            return self._own_map(image, size, seen)
-        plane = self._plane_of(image)
-        if plane is not None and self._how == "auto" and seen is not None:
+    def _choose(self, R_cw: NDArray[np.float64], center_w: NDArray[np.float64]) -> tuple[Depth, str]:
+        size = (self.new_camera.width, self.new_camera.height)
+        seen = self._seen(R_cw, center_w)
+        if self.how == "map":
+            return self._own_map(size, seen)
+        plane = None if self.plane is None else plane_in_camera(*self.plane, R_cw, center_w)
+        if plane is not None and self.how == "auto" and seen is not None:
             plane = plane if prefers_plane(plane, *seen) else None
         if plane is not None:
             return plane, "plane"
-        if seen is not None and self._how in ("auto", "points"):
+        if seen is not None and self.how in ("auto", "points"):
             return depth_from_points(seen.xy, seen.depth, size), "points"
         return AtInfinity(), "infinity"
 
-    def _plane_of(self, image: SolvedImage) -> Plane | None:
-        if self._plane is None or image.R_cw is None or image.center_w is None:
+    def _seen(self, R_cw: NDArray[np.float64], center_w: NDArray[np.float64]) -> _Seen | None:
+        if self.points_w is None:
             return None
-        return plane_in_camera(*self._plane, image.R_cw, image.center_w)
-
-    def _seen(self, image: SolvedImage, K: NDArray[np.float64]) -> _Seen | None:
-        if self._points is None or image.R_cw is None or image.center_w is None:
-            return None
-        X_w = self._points.points_w[self._points.seen.get(image.name, np.zeros(0, np.int64))]
-        X_c = (X_w - image.center_w) @ image.R_cw.T
+        K = self.new_camera.K
+        X_c = (self.points_w - center_w) @ R_cw.T
         X_c = X_c[X_c[:, 2] > 0]
         rays = X_c / X_c[:, 2:]
         return _Seen(rays[:, :2] @ K[:2, :2].T + K[:2, 2], rays, X_c[:, 2]) if len(X_c) else None
 
-    def _own_map(self, image: SolvedImage, size: tuple[int, int], seen: _Seen | None) -> tuple[Depth, str]:
-        if image.name not in self._maps:
-            text = f"{image.name} has no depth map and is rectified at infinity"
+    def _own_map(self, size: tuple[int, int], seen: _Seen | None) -> tuple[Depth, str]:
+        path = self.own_map
+        if path is None:
+            text = f"{self.name} has no depth map and is rectified at infinity"
             warnings.warn(text, RsUndistortWarning, stacklevel=2)
             return AtInfinity(), "infinity"
-        path = self._maps[image.name]
         values = read_depth_map(path)
         rows, cols = values.shape
         # of another size, but of the same shape to a pixel
@@ -220,3 +211,63 @@ class PhotoDepths:
                 text = f"{path}: depths are {times:.3g} times those of the solution's points; is their unit another?"
                 warnings.warn(text, RsUndistortWarning, stacklevel=2)
         return depth, "map"
+
+
+class PhotoDepths:
+    """Depths of the photos of a solution.
+
+    Parameters
+    ----------
+    solution : Solution
+        In the stored frames of the photos.
+    depth : str or Path
+        One of `DEPTHS`, or a folder of depth maps.
+    points : ScenePoints, optional
+        For "auto", "plane" and "points"; without them, "auto" is at infinity.
+    """
+
+    def __init__(self, solution: Solution, depth: str | Path, points: ScenePoints | None) -> None:
+        check_depth(depth)
+        self._solution = solution
+        self._how = str(depth) if str(depth) in DEPTHS else "map"
+        self._points = points
+        moving = solution.shutter_model == "constant-motion"
+        self._moving = {image.name for image in solution.registered if moving and image.posed}
+        own = self._how == "map" and self._moving
+        self._maps = find_depth_maps(Path(depth).absolute(), sorted(self._moving)) if own else {}
+        if self._how in ("plane", "points") and points is None and self._moving:
+            raise InputError(f"depth {self._how!r} needs the points of the scene, and there are none")
+        self._plane: tuple[NDArray[np.float64], float] | None = None
+        if self._moving and points is not None and len(points.points_w) >= 3 and self._how in ("auto", "plane"):
+            self._plane = fit_plane(points.points_w)
+
+    def job(self, name: str) -> DepthJob:
+        """How to find what a photo is rectified with."""
+        image = self._solution.image(name)
+        motion = image.motion or RowMotion()
+        camera = self._solution.cameras[image.camera_id]
+        new_camera = self._solution.rectified_cameras[image.camera_id]
+        if name not in self._moving or not motion.velocity.any():
+            return DepthJob(name, motion, None, None, camera, new_camera, "infinity")
+        points_w = None
+        if self._points is not None:
+            points_w = self._points.points_w[self._points.seen.get(name, np.zeros(0, np.int64))]
+        return DepthJob(
+            name, motion, image.R_cw, image.center_w, camera, new_camera, self._how, points_w, self._plane,
+            self._maps.get(name),
+        )  # fmt: skip
+
+    def of(self, name: str) -> PhotoDepth:
+        """What a photo is rectified with."""
+        return self.job(name).find()
+
+
+def with_depths(solution: Solution, found: Mapping[str, tuple[str, float, float]]) -> Solution:
+    """The solution with the depths that were used, and the shifts that they mean."""
+    images = []
+    for image in solution.images:
+        if image.name in found:
+            kind, shift, whole = found[image.name]
+            image = replace(image, depth=kind, translation_shift_px=shift, rs_shift_px=whole)
+        images.append(image)
+    return replace(solution, images=tuple(images))

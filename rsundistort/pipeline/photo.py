@@ -19,9 +19,9 @@ from ..errors import FileError, InputError, MetadataWarning
 from ..io import MAX_MEGAPIXELS, RAW_AS, Photo, read_mask, read_photo, write_image
 from ..io.outputs import CANNOT_WRITE
 from ..io.photos.exif import read_orientation
-from ..model import Camera, Depth, RowMotion
 from ..model.orientation import split_mirror, turn_pixels
 from ..rectify import INTERPOLATIONS, MAP_KINDS, RemapGrid, ViewOptions, rectify, remap_grid
+from .depth import DepthJob, PhotoDepth
 from .extras import AlsoImage
 
 __all__ = ["PhotoDone", "PhotoJob", "RectifyOptions", "check_not_rectified", "rectify_photo", "turn_of"]
@@ -100,14 +100,10 @@ class PhotoJob:
         Folder of the outputs.
     image, mask : str
         Rectified photo and its mask, in `out`.
-    camera, new_camera : Camera
-        Of the raw photo, and the pinhole of the rectified one.
-    motion : RowMotion
-        During the readout, its velocity in the camera frame.
+    depth : DepthJob
+        Its cameras and motion, and how far away what it shows is.
     shutter_model : str
         Of the remap grid.
-    depth : Depth
-        Of what the rectified photo shows.
     posed : bool
         Whether the photo has a pose, which no mirror image has.
     options : RectifyOptions
@@ -127,11 +123,8 @@ class PhotoJob:
     out: Path
     image: str
     mask: str
-    camera: Camera
-    new_camera: Camera
-    motion: RowMotion
+    depth: DepthJob
     shutter_model: str
-    depth: Depth
     posed: bool
     options: RectifyOptions
     own_mask: Path | None = None
@@ -199,6 +192,8 @@ class PhotoDone:
         What was written, and how many bytes it has.
     turn : int
         EXIF orientation that was applied.
+    depth : (kind, shift_px, whole_shift_px) or None
+        As in `PhotoDepth`, of a photo whose camera travelled.
     colors : (k, 3) array or None
         Red, green, blue of `PhotoJob.sample_xy`, 0 to 255.
     """
@@ -208,6 +203,7 @@ class PhotoDone:
     fingerprint: str = ""
     files: Mapping[str, int] = field(default_factory=dict)
     turn: int = 1
+    depth: tuple[str, float, float] | None = None
     colors: NDArray[np.float64] | None = None
 
 
@@ -229,7 +225,7 @@ def rectify_photo(job: PhotoJob) -> PhotoDone:
     What is wrong with the photo is in the result. That the outputs cannot be written (a full disk) is an error: the
     others would fare no better.
     """
-    options, camera = job.options, job.camera
+    options, camera = job.options, job.depth.camera
     fingerprint = job.fingerprint()  # before it is read: should it change meanwhile, the result is stale
     files: dict[str, int] = {}
     writing = False
@@ -238,10 +234,9 @@ def rectify_photo(job: PhotoJob) -> PhotoDone:
         if not options.again:
             check_not_rectified(photo)
         own = None if job.own_mask is None else read_mask(job.own_mask, camera.width, camera.height)
-        pixels, mask = rectify(
-            photo.pixels, camera, job.motion, job.shutter_model, job.new_camera, options.interpolation, mask=own,
-            depth=job.depth,
-        )  # fmt: skip
+        seen = job.depth.find()
+        grid_of = (camera, seen.motion, job.shutter_model, job.depth.new_camera)
+        pixels, mask = rectify(photo.pixels, *grid_of, options.interpolation, mask=own, depth=seen.depth)
         colors = None if job.sample_xy is None else _colors(photo, job.sample_xy)
         metadata, turn = photo.metadata.marked(version("rsundistort")), 1
         if options.apply_orientation:
@@ -255,7 +250,7 @@ def rectify_photo(job: PhotoJob) -> PhotoDone:
         files[job.image] = (job.out / job.image).stat().st_size
         write_image(job.out / job.mask, mask, flat=True)
         files[job.mask] = (job.out / job.mask).stat().st_size
-        for name in _write_extras(job, turn):
+        for name in _write_extras(job, seen, turn):
             files[name] = (job.out / name).stat().st_size
     except (FileError, InputError, MemoryError, cv2.error) as error:
         if writing and getattr(error.__cause__, "errno", None) in CANNOT_WRITE:
@@ -263,16 +258,17 @@ def rectify_photo(job: PhotoJob) -> PhotoDone:
         for name in files:  # no photo without its mask
             (job.out / name).unlink(missing_ok=True)
         return PhotoDone(job.name, " ".join(str(error).split()) or "it does not fit into the memory")
-    return PhotoDone(job.name, "", fingerprint, files, turn, colors)
+    note = None if seen.whole_shift_px is None else (seen.kind, seen.shift_px, seen.whole_shift_px)
+    return PhotoDone(job.name, "", fingerprint, files, turn, note, colors)
 
 
-def _write_extras(job: PhotoJob, turn: int) -> Iterator[str]:
+def _write_extras(job: PhotoJob, seen: PhotoDepth, turn: int) -> Iterator[str]:
     """Write the other images of a photo's frame and its grids; their names, each when it is there."""
-    grid_of = (job.camera, job.motion, job.shutter_model, job.new_camera)
+    grid_of = (job.depth.camera, seen.motion, job.shutter_model, job.depth.new_camera)
     for each in job.also:
         try:
             image = read_photo(each.source, job.options.max_megapixels)
-            pixels, _ = rectify(image.pixels, *grid_of, each.interpolation, depth=job.depth)
+            pixels, _ = rectify(image.pixels, *grid_of, each.interpolation, depth=seen.depth)
             write_image(job.out / each.target, turn_pixels(pixels, turn), image.metadata, 98)
         except (FileError, InputError) as error:
             if getattr(error.__cause__, "errno", None) in CANNOT_WRITE:
@@ -280,7 +276,7 @@ def _write_extras(job: PhotoJob, turn: int) -> Iterator[str]:
             raise InputError(f"{each.source.parent.name}/{each.source.name}: {error}") from error
         yield each.target
     if job.maps is not None and job.options.maps is not None:
-        grid = remap_grid(*grid_of, job.depth)
+        grid = remap_grid(*grid_of, seen.depth)
         if turn != 1:
             map_x, map_y = (turn_pixels(m, turn) for m in (grid.map_x, grid.map_y))
             grid = RemapGrid(map_x, map_y, grid.source_width, grid.source_height)

@@ -31,7 +31,7 @@ from ..model import READOUTS, Reconstruction, Solution, SolvedImage, check_shutt
 from ..model.orientation import turn_reconstruction, turn_solution
 from ..rectify import largest_shift_px
 from .cameras import PhotoCameras, check_readouts
-from .depth import PhotoDepths, ScenePoints, check_depth
+from .depth import PhotoDepths, ScenePoints, check_depth, with_depths
 from .frames import find_photos
 from .gyro import GyroOptions, gyro_contradiction, gyro_motions, known_readouts
 from .load import LoadedPhotos, load_photos
@@ -258,7 +258,8 @@ def run(
     if len(left_out) == len(done):
         raise InputError(f"none of the {len(done)} photos of {photos} could be rectified; see the warnings")
     images = [replace(image, reason=left_out.get(image.name, image.reason)) for image in solution.images]
-    solution = depths.noted(replace(solution, images=tuple(images)))
+    found = {name: each.depth for name, each in done.items() if each.depth is not None}
+    solution = with_depths(replace(solution, images=tuple(images)), found)
     with output_folder(out, overwrite=True) as scratch:
         turned = _write_models(scratch, solution, rec, turns, options, left_out, colors.rgb())
         log.end("writing")

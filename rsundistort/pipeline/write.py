@@ -82,7 +82,7 @@ def rectify_photos(
         for name in names:
             entry = before.get(name)
             if entry and entry.fingerprint and entry.fingerprint == jobs[name].fingerprint() and entry.is_whole(out):
-                done[name] = PhotoDone(name, "", entry.fingerprint, entry.files, entry.turn)
+                done[name] = PhotoDone(name, "", entry.fingerprint, entry.files, entry.turn, entry.depth)
     todo = [name for name in names if name not in done]
     kinds = ("images", "masks", *(["maps"] if options.maps is not None else []))
     for within in sorted({PurePosixPath(name).parent for name in todo}):
@@ -118,8 +118,8 @@ def rectify_photos(
     if any(not each.problem for each in done.values()):
         kept = {name: before[name] for name in before.keys() - done.keys()} if resume else {}
         kept |= {name: _entry(each) for name, each in done.items() if not each.problem}
-        earlier = (path for name in before for path in before[name].files) if resume else _outputs(out)
-        _delete(out, set(earlier) - {path for entry in kept.values() for path in entry.files})
+        earlier = {path for name in before for path in before[name].files} | set(() if resume else _outputs(out))
+        _delete(out, earlier - {path for entry in kept.values() for path in entry.files})
         journal.write(kept[name] for name in sorted(kept))
     log.end("rectifying", photos=sum(not each.problem for each in done.values()))
     return {name: done[name] for name in names}
@@ -148,7 +148,6 @@ class _Jobs:
     def __getitem__(self, name: str) -> PhotoJob:
         solution = self._solution
         image = solution.image(name)
-        seen = self._depths.of(name)
         stem = PurePosixPath(self._mask_name[name]).with_suffix("").as_posix()
         return PhotoJob(
             name=name,
@@ -156,11 +155,8 @@ class _Jobs:
             out=self._out,
             image=f"images/{output_name(name, self._options.raw_as)}",
             mask=f"masks/{self._mask_name[name]}",
-            camera=solution.cameras[image.camera_id],
-            new_camera=solution.rectified_cameras[image.camera_id],
-            motion=seen.motion,
+            depth=self._depths.job(name),
             shutter_model=solution.shutter_model,
-            depth=seen.depth,
             posed=image.posed,
             options=self._options,
             own_mask=self._own.get(name),
@@ -171,7 +167,7 @@ class _Jobs:
 
 
 def _entry(done: PhotoDone) -> JournalEntry:
-    return JournalEntry(done.name, done.fingerprint, done.files, done.turn)
+    return JournalEntry(done.name, done.fingerprint, done.files, done.turn, done.depth)
 
 
 def _outputs(out: Path) -> Iterator[str]:

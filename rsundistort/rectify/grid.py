@@ -14,7 +14,7 @@ from .._kernels import projection as kernels
 from ..errors import FileError, FormatError, InputError
 from ..model import Camera, Depth, RowMotion
 from ..model.checks import check_array, frozen
-from .maps import init_rectify_map, seen_mask
+from .maps import init_rectify_map, seen_by
 from .photo import check_interpolation, check_photo, remap_strips
 
 __all__ = ["MAP_KINDS", "RemapGrid", "remap_grid"]
@@ -73,7 +73,7 @@ class RemapGrid:
     @property
     def seen(self) -> NDArray[np.uint8]:
         """(height, width): 255 where a pixel of the source answers, else 0."""
-        return seen_mask(self.map_x, self.map_y, self.source_width, self.source_height)
+        return seen_by(self.map_x, self.map_y, self.source_width, self.source_height)
 
     def apply(
         self, image: NDArray[Any], interpolation: str = "cubic", jobs: int = 1
@@ -87,7 +87,7 @@ class RemapGrid:
         def fill(row0: int, map_x: NDArray[np.float32], map_y: NDArray[np.float32], seen: NDArray[np.uint8]) -> bool:
             rows = slice(row0, row0 + len(map_x))
             map_x[:], map_y[:] = self.map_x[rows], self.map_y[rows]
-            seen[:] = seen_mask(map_x, map_y, self.source_width, self.source_height)
+            seen[:] = seen_by(map_x, map_y, self.source_width, self.source_height)
             return bool(seen.all())
 
         return remap_strips(image, fill, self.size, check_interpolation(interpolation), jobs)

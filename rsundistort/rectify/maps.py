@@ -12,7 +12,7 @@ from ..model import AtInfinity, Camera, Depth, RowMotion, check_shutter_model
 from ..model.checks import check_finite, check_rotations
 from .depth import DepthRows
 
-__all__ = ["fill_rows", "init_rectify_map", "rectified_rays", "seen_mask"]
+__all__ = ["fill_rows", "init_rectify_map", "rectified_rays", "seen_by"]
 
 #: A raw position this far (pixels) beyond the outermost pixel centre still counts as seen: rounding of float32 maps.
 EDGE_PX = 1e-3
@@ -48,6 +48,12 @@ def fill_rows(
         depth.mark_hidden(row0, map_x, map_y)
         return
     kernels.fill_map(model, axis, sign, intr, lens, motion.phi, rays, row0, 0, map_x, map_y)
+
+
+def seen_by(map_x: NDArray[np.float32], map_y: NDArray[np.float32], width: int, height: int) -> NDArray[np.uint8]:
+    """255 where a map points into a photo of width x height pixels, else 0."""
+    seen = cv2.inRange(map_x, -EDGE_PX, width - 1 + EDGE_PX)
+    return np.asarray(cv2.bitwise_and(seen, cv2.inRange(map_y, -EDGE_PX, height - 1 + EDGE_PX)))
 
 
 def init_rectify_map(
@@ -115,11 +121,3 @@ def init_rectify_map(
         fixed: tuple[NDArray[np.float32], NDArray[np.float32]] = cv2.convertMaps(map_x, map_y, cv2.CV_16SC2)
         return fixed
     raise InputError(f"m1type={m1type}, expected cv2.CV_32FC1, cv2.CV_32FC2 or cv2.CV_16SC2")
-
-
-def seen_mask(
-    map_x: NDArray[np.float32], map_y: NDArray[np.float32], width: int, height: int
-) -> NDArray[np.uint8]:  # fmt: skip
-    """255 where a grid points into a photo of that size, else 0."""
-    seen = cv2.inRange(map_x, -EDGE_PX, width - 1 + EDGE_PX)
-    return np.asarray(cv2.bitwise_and(seen, cv2.inRange(map_y, -EDGE_PX, height - 1 + EDGE_PX)))

@@ -17,7 +17,7 @@ from ..errors import InputError
 from ..model import AtInfinity, Camera, Depth, DepthMap, RowMotion
 from .coarse import coarse_grid
 from .depth import DepthRows
-from .maps import fill_rows, rectified_rays, seen_mask
+from .maps import fill_rows, rectified_rays, seen_by
 
 __all__ = ["INTERPOLATIONS", "rectify"]
 
@@ -105,27 +105,13 @@ def rectify(
         raise InputError("new_camera has lens distortion; a rectified photo has none")
     rays = rectified_rays(target.K, None, camera)
     size = (target.width, target.height)
-    motion = motion or RowMotion()
 
     def fill(factor: int) -> FillRows:
         # of a photo of so many times the pixels, whose corner is the same
         finer = np.array([[1, 0, 0.5 - 0.5 * factor], [0, 1, 0.5 - 0.5 * factor], [0, 0, factor]]) / factor
         finer_size = (factor * size[0], factor * size[1])
-        stretched = depth
-        if isinstance(depth, DepthMap) and depth.size == size:
-            stretched = replace(depth, size=finer_size)
-        rows = DepthRows(stretched or AtInfinity(), camera, motion, rays @ finer, finer_size)
-        if not rows.matters(shutter_model):
-            return coarse_grid(camera, motion, shutter_model, rows.rays, finer_size).fill
-
-        def fill_exactly(
-            row0: int, map_x: NDArray[np.float32], map_y: NDArray[np.float32], seen: NDArray[np.uint8]
-        ) -> bool:
-            fill_rows(camera, motion, shutter_model, rows.rays, row0, map_x, map_y, rows)
-            seen[:] = seen_mask(map_x, map_y, camera.width, camera.height)
-            return bool(seen.all())
-
-        return fill_exactly
+        at = replace(depth, size=finer_size) if isinstance(depth, DepthMap) and depth.size == size else depth
+        return _fill_rows(camera, motion or RowMotion(), shutter_model, rays @ finer, finer_size, at or AtInfinity())
 
     samples = 1 if flag == cv2.INTER_NEAREST else _samples(camera, target)
     return remap_strips(photo, fill(1), size, flag, jobs, mask, samples, fill(samples) if samples > 1 else None)
@@ -146,6 +132,27 @@ def _samples(camera: Camera, target: Camera) -> int:
 
 #: Fills rows of a map, from a first one on, and of the mask of what is seen; says whether all of it is.
 FillRows = Callable[[int, NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]], bool]
+
+
+def _fill_rows(
+    camera: Camera,
+    motion: RowMotion,
+    shutter_model: str,
+    rays: NDArray[np.float64],
+    size: tuple[int, int],
+    depth: Depth,
+) -> FillRows:
+    """What fills the rows of the map of a photo of `size`: interpolated, but exact where depths make it rough."""
+    depth_rows = DepthRows(depth, camera, motion, rays, size)
+    if not depth_rows.matters(shutter_model):
+        return coarse_grid(camera, motion, shutter_model, rays, size).fill
+
+    def fill(row0: int, map_x: NDArray[np.float32], map_y: NDArray[np.float32], seen: NDArray[np.uint8]) -> bool:
+        fill_rows(camera, motion, shutter_model, rays, row0, map_x, map_y, depth_rows)
+        seen[:] = seen_by(map_x, map_y, camera.width, camera.height)
+        return bool(seen.all())
+
+    return fill
 
 
 def remap_strips(
