@@ -266,7 +266,12 @@ def test_killed_at_twenty_random_moments(many, rng):
 
 def test_an_interrupt_leaves_whole_files_and_says_how_to_go_on(many):
     folder, truth = many
-    _, err = stop_after(process := begin(folder), folder / "out", 5, signal.SIGINT, truth)
+    # on a busy machine the batch can end before the signal is sent
+    for _ in range(10):
+        shutil.rmtree(folder / "out", ignore_errors=True)
+        _, err = stop_after(process := begin(folder, "--jobs", "1"), folder / "out", 5, signal.SIGINT, truth)
+        if process.returncode != 0:
+            break
     assert process.returncode == 130
     assert err.startswith("stopped; ")
     assert "--resume goes on" in err
