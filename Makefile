@@ -46,6 +46,7 @@ bench: $(VENV)/.installed
 	$(BIN)/python benchmarks/depth.py
 	$(BIN)/python benchmarks/speed.py
 	$(BIN)/python benchmarks/rectify.py
+	$(BIN)/python benchmarks/batch.py
 
 clean:
 	rm -rf $(VENV) $(OUT) build *.egg-info

@@ -103,6 +103,10 @@ def rectify_folder(
         if not turns:
             raise InputError(f"none of the {len(names)} photos of {photos} could be rectified; see the warnings")
         solved = with_depths(solved, {name: each.depth for name, each in done.items() if each.depth is not None})
+        told = [
+            replace(image, reason=left_out.get(image.name)) if image.name in done else image for image in solved.images
+        ]
+        solved = replace(solved, images=tuple(told))
         if options.apply_orientation:
             solved = turn_solution(_without_mirrored_poses(solved, turns), turns)
         solved = replace(solved, options={**solved.options, "raw_as": options.raw_as})
