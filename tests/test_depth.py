@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy_twin import DIRECTIONS
+from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial.transform import Rotation
 
 from rsundistort import (
@@ -360,6 +361,16 @@ def test_map_of_points_reproduces_a_slope_and_is_constant_beyond(rng):
     assert made.inverse.max() <= inverse.max() * (1 + 1e-6)
 
 
+def test_map_of_points_is_scipys_linear_interpolation(rng):
+    xy, inverse = rng.uniform([-20, -20], [W + 20, H + 20], (300, 2)), rng.uniform(0.1, 0.104, 300)
+    made = depth_from_points(xy, 1 / inverse, (W, H)).inverse
+    rows, cols = made.shape
+    centres = np.dstack(np.meshgrid((np.arange(cols) + 0.5) * W / cols - 0.5, (np.arange(rows) + 0.5) * H / rows - 0.5))
+    # triangles of Delaunay do not change with the unit, but with the scale of one axis they do
+    unit = [cols / W, rows / H]
+    np.testing.assert_allclose(made, LinearNDInterpolator(xy * unit, inverse)(centres * unit), rtol=1e-6)
+
+
 def test_stray_points_are_not_believed_and_edges_are(rng):
     xy = rng.uniform([0, 0], [W, H], (600, 2))
     depth = np.where(xy[:, 0] < 100, 4.0, 10.0)
@@ -411,9 +422,9 @@ def test_plane_is_preferred_where_all_is_flat_only(rng):
     plane = Plane([0.1, 0.2, 1.0], 10.0)
     flat = 1 / plane.inverse_depth(rays)
     noise = rng.normal(1, 0.003, 500)
-    assert prefers_plane(plane, xy, rays, flat * noise)
+    assert prefers_plane(plane, xy, rays, flat * noise, (W, H))
     hills = flat * (1 + 0.08 * np.sin(xy[:, 0] / 15))
-    assert not prefers_plane(plane, xy, rays, hills * noise)
+    assert not prefers_plane(plane, xy, rays, hills * noise, (W, H))
 
 
 # ---------------------------------------------------------------- rendered scenes

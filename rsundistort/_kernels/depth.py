@@ -94,3 +94,24 @@ def mark_hidden(field, scale, nearest, slopes, epipole, axis, sign, intr, row0, 
                 m += step
             if behind:
                 map_x[i, j] = map_y[i, j] = -1e6
+
+
+@kernel()
+def fill_triangles(xy, values, triangles, out):
+    """Interpolate values (n,) of points (n, 2) linearly within triangles (m, 3) of them, at the pixels of out."""
+    rows, cols = out.shape
+    for k in range(len(triangles)):
+        a, b, c = triangles[k, 0], triangles[k, 1], triangles[k, 2]
+        x, y = xy[a, 0], xy[a, 1]
+        bx, by, cx, cy = xy[b, 0] - x, xy[b, 1] - y, xy[c, 0] - x, xy[c, 1] - y
+        det = bx * cy - by * cx
+        if det == 0.0:
+            continue
+        low_x, high_x = x + min(bx, cx, 0.0), x + max(bx, cx, 0.0)
+        low_y, high_y = y + min(by, cy, 0.0), y + max(by, cy, 0.0)
+        for i in range(max(math.ceil(low_y), 0), min(math.floor(high_y), rows - 1) + 1):
+            for j in range(max(math.ceil(low_x), 0), min(math.floor(high_x), cols - 1) + 1):
+                beta = ((j - x) * cy - (i - y) * cx) / det
+                gamma = ((i - y) * bx - (j - x) * by) / det
+                if beta >= 0.0 and gamma >= 0.0 and beta + gamma <= 1.0:
+                    out[i, j] = values[a] + beta * (values[b] - values[a]) + gamma * (values[c] - values[a])

@@ -170,7 +170,7 @@ class DepthJob:
             return self._own_map(size, seen)
         plane = None if self.plane is None else plane_in_camera(*self.plane, R_cw, center_w)
         if plane is not None and self.how == "auto" and seen is not None:
-            plane = plane if prefers_plane(plane, *seen) else None
+            plane = plane if prefers_plane(plane, *seen, size) else None
         if plane is not None:
             return plane, "plane"
         if seen is not None and self.how in ("auto", "points"):

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 from numpy.typing import NDArray
 
+from .._kernels import depth as kernels
 from ..errors import InputError
 from ..model import DepthMap, Plane
+from .depth import inverse_depth_at
 
 __all__ = ["depth_from_points", "fit_plane", "plane_in_camera", "prefers_plane"]
 
@@ -36,21 +40,22 @@ def _believed(xy: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArray[
     return believed if believed.any() else np.ones(len(xy), bool)
 
 
-def _interpolate(
-    xy: NDArray[np.float64], inverse: NDArray[np.float64], wanted: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Inverse depths (m,) at pixels (m, 2): linear in the triangles between the points, that of the nearest beyond."""
-    from scipy.interpolate import LinearNDInterpolator
-    from scipy.spatial import QhullError, cKDTree
+def _interpolate(xy: NDArray[np.float64], inverse: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
+    """Coarse map (rows, cols): linear in the triangles between the points, that of the nearest point beyond them."""
+    from scipy.spatial import Delaunay, QhullError, cKDTree
 
-    found = inverse[np.asarray(cKDTree(xy).query(wanted)[1])]
-    if len(xy) < 3:
-        return found
-    try:
-        between = LinearNDInterpolator(xy, inverse)(wanted)
-    except QhullError:  # all on one line
-        return found
-    return np.where(np.isfinite(between), between, found)
+    cell = max(max(size) / _MAX_CELLS, _CELL_PX)
+    cols, rows = (max(int(np.ceil(side / cell)), 1) for side in size)
+    # points in the pixels of the map, which is stretched over the photo as `cv2.resize` does
+    at = (xy + 0.5) * [cols / size[0], rows / size[1]] - 0.5
+    centres = np.stack(np.meshgrid(np.arange(cols), np.arange(rows)), -1)
+    field = inverse[np.asarray(cKDTree(at).query(centres)[1])]
+    if len(xy) >= 3:
+        # SciPy's LinearNDInterpolator solves each triangle by LAPACK, whose threads wait for each other: five to twenty
+        # times as long where several photos are at work
+        with suppress(QhullError):  # all on one line
+            kernels.fill_triangles(at, inverse, Delaunay(at).simplices, field)
+    return field
 
 
 def depth_from_points(xy: NDArray[np.float64], depth: NDArray[np.float64], size: tuple[int, int]) -> DepthMap:
@@ -77,12 +82,7 @@ def depth_from_points(xy: NDArray[np.float64], depth: NDArray[np.float64], size:
         raise InputError("no point to take depths from")
     inverse = 1.0 / depth
     believed = _believed(xy, inverse)
-    cell = max(max(size) / _MAX_CELLS, _CELL_PX)
-    shape = [max(int(np.ceil(side / cell)), 1) for side in size]
-    # centres of the cells that the map is stretched over
-    centres = [(np.arange(num) + 0.5) * side / num - 0.5 for num, side in zip(shape, size, strict=True)]
-    wanted = np.stack(np.meshgrid(*centres), -1).reshape(-1, 2)
-    smooth = _interpolate(xy[believed], inverse[believed], wanted).reshape(shape[::-1])
+    smooth = _interpolate(xy[believed], inverse[believed], size)
     return DepthMap((1.0 / smooth).astype(np.float32), size)
 
 
@@ -124,7 +124,11 @@ def plane_in_camera(
 
 
 def prefers_plane(
-    plane: Plane, xy: NDArray[np.float64], rays_c: NDArray[np.float64], depth: NDArray[np.float64]
+    plane: Plane,
+    xy: NDArray[np.float64],
+    rays_c: NDArray[np.float64],
+    depth: NDArray[np.float64],
+    size: tuple[int, int],
 ) -> bool:
     """Whether a plane foretells the depths of half of the points at least as well as a map of the other half does.
 
@@ -132,7 +136,7 @@ def prefers_plane(
     ----------
     plane : Plane
         In the camera frame.
-    xy, depth
+    xy, depth, size
         As in `depth_from_points`.
     rays_c : (n, 3) array
         Directions of the points in the camera frame, of z = 1.
@@ -142,6 +146,7 @@ def prefers_plane(
     fitted, held = believed[::2], believed[1::2]
     if not len(held):
         return True
-    by_map = np.abs(_interpolate(xy[fitted], inverse[fitted], xy[held]) - inverse[held])
+    half = DepthMap((1.0 / _interpolate(xy[fitted], inverse[fitted], size)).astype(np.float32), size)
+    by_map = np.abs(inverse_depth_at(half, xy[held], np.eye(3)) - inverse[held])
     by_plane = np.abs(plane.inverse_depth(rays_c[held]) - inverse[held])
     return bool(by_plane.mean() <= by_map.mean())
