@@ -43,7 +43,10 @@ format: $(VENV)/.installed
 bench: $(VENV)/.installed
 	$(BIN)/python benchmarks/accuracy.py
 	$(BIN)/python benchmarks/truth.py
+	$(BIN)/python benchmarks/depth.py
 	$(BIN)/python benchmarks/speed.py
+	$(BIN)/python benchmarks/rectify.py
+	$(BIN)/python benchmarks/batch.py
 
 clean:
 	rm -rf $(VENV) $(OUT) build *.egg-info

@@ -8,9 +8,10 @@ from typing import Any
 
 import click
 
-# as `rsundistort.model.READOUTS` and `rsundistort.rectify.INTERPOLATIONS`, which must not be imported for --help
+# as `rsundistort.model.READOUTS`, `rsundistort.rectify.INTERPOLATIONS` and `MAP_KINDS`: not to be imported for --help
 READOUT_NAMES = ("top-to-bottom", "bottom-to-top", "left-to-right", "right-to-left")
 INTERPOLATION_NAMES = ("cubic", "linear", "lanczos", "nearest")
+MAP_KIND_NAMES = ("npz", "exr", "stmap")
 
 
 def readout_by_group(
@@ -25,6 +26,30 @@ def readout_by_group(
         if directions.setdefault(group, direction) != direction:
             raise click.BadParameter(f"{text!r}: another direction was given before")
     return directions or None
+
+
+def view_alpha(_context: click.Context, _option: click.Parameter, value: str | None) -> float | str | None:
+    """A number from 0 to 1, or keep."""
+    if value in (None, "keep"):
+        return value
+    try:
+        alpha = float(value)
+    except ValueError:
+        alpha = -1.0
+    if not 0.0 <= alpha <= 1.0:
+        raise click.BadParameter(f"{value!r} is neither keep nor a number from 0 to 1")
+    return alpha
+
+
+def also_folders(
+    _context: click.Context, _option: click.Parameter, value: tuple[str, ...]
+) -> tuple[tuple[Path, str], ...]:
+    """Folders and their interpolation, of FOLDER or FOLDER=INTERPOLATION; nearest makes up no values."""
+    found = []
+    for text in value:
+        folder, _, name = text.rpartition("=")
+        found.append((Path(folder), name) if name in INTERPOLATION_NAMES else (Path(text), "nearest"))
+    return tuple(found)
 
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
@@ -48,6 +73,20 @@ jobs_option: Decorator = click.option(
     "--jobs", type=click.IntRange(min=0), default=0, help="Threads; 0, the default, takes all cores."
 )
 overwrite_option: Decorator = click.option("--overwrite", is_flag=True, help="Replace outputs that are in OUT.")
+scheduler_option: Decorator = click.option(
+    "--scheduler",
+    metavar="ADDRESS",
+    help="Work on photos by the workers of the Dask cluster at tcp://host:8786; they see PHOTOS and OUT "
+    "under the same paths.",
+)
+progress_option: Decorator = click.option(
+    "--progress",
+    "progress_form",
+    type=click.Choice(("bar", "json")),
+    default="bar",
+    show_default=True,
+    help="json: lines on stdout for other programs, and nothing else there.",
+)
 quiet_option: Decorator = click.option("-q", "--quiet", is_flag=True, help="Nothing but warnings and errors.")
 quality_option: Decorator = click.option(
     "--quality", type=click.IntRange(1, 100), default=98, show_default=True, help="Of JPEG and WebP."
@@ -74,6 +113,39 @@ max_pixels_option: Decorator = click.option(
     metavar="MILLIONS",
     help="Photos with more pixels are left out: a small file can claim to be a huge picture.",
 )
+depth_option: Decorator = click.option(
+    "--depth",
+    metavar="auto|infinity|plane|points|DIR",
+    default="auto",
+    show_default=True,
+    help="How far away what the photos show is, which matters where the camera travelled during the readout: on a "
+    "plane, as the known points, or as maps of your own (a.npy, .npz or float .tif for a.jpg: docs/depth.md).",
+)
 interpolation_option: Decorator = click.option(
     "--interpolation", type=click.Choice(INTERPOLATION_NAMES), default="cubic", show_default=True
 )
+
+
+def view_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """What rectified photos show, and how large they are."""
+    for option in (
+        click.option(
+            "--max-size", type=click.IntRange(min=2), metavar="PIXELS", help="Longest side of the rectified photos."
+        ),
+        click.option(
+            "--scale",
+            type=click.FloatRange(min=0, min_open=True),
+            default=1.0,
+            show_default=True,
+            help="Size of the rectified photos in that of the raw ones; what shrinks is averaged.",
+        ),
+        click.option(
+            "--alpha",
+            metavar="keep|0..1",
+            callback=view_alpha,
+            help="keep: K and size of the raw photos; 0: no empty pixel in any photo of a camera; 1: every pixel of "
+            "all of them is kept; between: between. Default: keep, or as the solution has it.",
+        ),
+    ):
+        function = option(function)
+    return function

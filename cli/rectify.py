@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from . import options as opt
-from .terminal import errors_for_people, progress_bars
+from .terminal import errors_for_people, list_failed, progress_bars
 
 
 @click.command()
@@ -24,6 +24,22 @@ from .terminal import errors_for_people, progress_bars
     type=click.Path(exists=True, file_okay=False, path_type=Path),
     help="Folder of masks, a.png for a.jpg: what is black in them is black in OUT/masks.",
 )
+@opt.depth_option
+@opt.view_options
+@click.option(
+    "--maps",
+    type=click.Choice(opt.MAP_KIND_NAMES),
+    help="Write each photo's map and its inverse into OUT/maps: NumPy (npz), OpenEXR in pixels, or the ST map of "
+    "compositing programs (extra exr).",
+)
+@click.option(
+    "--also",
+    multiple=True,
+    metavar="FOLDER[=INTERPOLATION]",
+    callback=opt.also_folders,
+    help="Rectify other images of the same frames alike (a.png for a.jpg): labels, depth, near infrared; by nearest, "
+    "which makes up no values, or as told. May be repeated.",
+)
 @opt.interpolation_option
 @opt.quality_option
 @opt.raw_as_option
@@ -31,13 +47,26 @@ from .terminal import errors_for_people, progress_bars
 @opt.again_option
 @opt.max_pixels_option
 @opt.jobs_option
+@opt.scheduler_option
 @opt.overwrite_option
+@click.option(
+    "--resume",
+    is_flag=True,
+    help="Go on with the batch in OUT: pass over what is whole and current, make the rest.",
+)
+@opt.progress_option
 @opt.quiet_option
 def command(
     photos: Path,
     solution: Path,
     out: Path,
     masks: Path | None,
+    depth: str,
+    alpha: float | str | None,
+    scale: float,
+    max_size: int | None,
+    maps: str | None,
+    also: tuple[tuple[Path, str], ...],
     interpolation: str,
     quality: int,
     raw_as: str,
@@ -45,20 +74,46 @@ def command(
     again: bool,
     max_megapixels: float,
     jobs: int,
+    scheduler: str | None,
     overwrite: bool,
+    resume: bool,
+    progress_form: str,
     quiet: bool,
 ) -> None:
-    """Rectify the photos of a folder with the motions of a solution."""
-    with errors_for_people(), progress_bars(quiet) as progress:
-        from rsundistort.pipeline import rectify_folder
+    """Rectify the photos of a folder with the motions of a solution.
 
-        solved, left_out = rectify_folder(
-            photos, solution, out,
-            interpolation=interpolation, quality=quality, jobs=jobs, overwrite=overwrite, masks=masks,
-            progress=progress, raw_as=raw_as, apply_orientation=apply_orientation, again=again,
+    Exit code 3 says that some photos failed; they are listed, and the others are done.
+    """
+    if overwrite and resume:
+        raise click.UsageError("--overwrite begins anew and --resume goes on; give one of them")
+    kept = "what is done is whole, the same command with --resume goes on"
+    with errors_for_people(kept), progress_bars(quiet, progress_form) as progress:
+        from rsundistort.pipeline import RectifyOptions, rectify_folder
+        from rsundistort.rectify import ViewOptions
+
+        options = RectifyOptions(
+            interpolation=interpolation,
+            quality=quality,
+            raw_as=raw_as,
+            apply_orientation=apply_orientation,
+            again=again,
             max_megapixels=max_megapixels,
+            masks=masks,
+            depth=depth,
+            view=ViewOptions(alpha, scale, max_size),
+            maps=maps,
+            also=also,
+        )
+        solved, left_out = rectify_folder(
+            photos, solution, out, options,
+            jobs=jobs, overwrite=overwrite, resume=resume, scheduler=scheduler, progress=progress,
         )  # fmt: skip
-    if not quiet:
-        count = len(list((out / "images").iterdir()))
+    silent = quiet or progress_form == "json"
+    # of photos that the solution could not join it says so itself
+    known = {image.name for image in solved.images if not image.registered}
+    failed = {name: why for name, why in left_out.items() if name not in known}
+    if not silent:
+        count = sum(1 for path in (out / "images").rglob("*") if path.is_file())
         done = f"{count} photo{'s' * (count != 1)} rectified with the {solved.shutter_model} model"
         click.echo(f"{done}, {len(left_out)} left out: {out}")
+    list_failed(failed, err=silent)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from . import options as opt
-from .terminal import errors_for_people, progress_bars, table
+from .terminal import errors_for_people, list_failed, progress_bars, table
 
 if TYPE_CHECKING:
     from rsundistort.model import Solution
@@ -115,6 +115,8 @@ if TYPE_CHECKING:
     show_default=True,
     help="Features of a photo.",
 )
+@opt.depth_option
+@opt.view_options
 @opt.interpolation_option
 @opt.quality_option
 @opt.raw_as_option
@@ -123,7 +125,9 @@ if TYPE_CHECKING:
 @opt.max_pixels_option
 @opt.seed_option
 @opt.jobs_option
+@opt.scheduler_option
 @opt.overwrite_option
+@opt.progress_option
 @opt.quiet_option
 def command(
     photos: Path,
@@ -145,6 +149,10 @@ def command(
     photo_times: Path | None,
     remedy: str,
     max_features: int,
+    depth: str,
+    alpha: float | str | None,
+    scale: float,
+    max_size: int | None,
     interpolation: str,
     quality: int,
     raw_as: str,
@@ -153,17 +161,23 @@ def command(
     max_megapixels: float,
     seed: int,
     jobs: int,
+    scheduler: str | None,
     overwrite: bool,
+    progress_form: str,
     quiet: bool,
 ) -> None:
     """Find how the camera moved during each photo's readout, and take it out.
 
     PHOTOS is a folder of photos that one camera took of one scene, in any order, or a video. OUT gets images/, masks/,
     sparse/ (COLMAP), transforms.json (nerfstudio) and solution.json; of a video frames/, too.
+
+    OUT stays as it was until the motions are solved. If the rest is interrupted, `rectify --resume` goes on with it.
+    Exit code 3 says that photos with a motion could not be rectified; they are listed, and the others are done.
     """
-    with errors_for_people(), progress_bars(quiet) as progress:
+    with errors_for_people(), progress_bars(quiet, progress_form) as progress:
         from rsundistort.io import read_known_lengths, read_known_motions
         from rsundistort.pipeline import GyroOptions, RunOptions, run
+        from rsundistort.rectify import ViewOptions
 
         readout_s = readout_ms and readout_ms / 1e3
         solution = run(
@@ -177,6 +191,8 @@ def command(
                 seed=seed,
                 jobs=jobs,
                 max_features=max_features,
+                depth=depth,
+                view=ViewOptions(alpha, scale, max_size),
                 interpolation=interpolation,
                 quality=quality,
                 raw_as=raw_as,
@@ -193,11 +209,14 @@ def command(
                 gyro=None if gyro is None else GyroOptions(gyro, gyro_offset, gyro_axes, photo_times),
                 readout_s=readout_s,
                 overwrite=overwrite,
+                scheduler=scheduler,
             ),
             progress,
         )
-    if not quiet:
+    silent = quiet or progress_form == "json"
+    if not silent:
         click.echo(closing_table(solution, out))
+    list_failed({image.name: image.reason for image in solution.registered if image.reason}, err=silent)
 
 
 def _names(refine: str | None) -> tuple[str, ...] | None:
@@ -260,6 +279,7 @@ def closing_table(solution: Solution, out: Path) -> str:
         *_video(solution),
         *_intrinsics(solution),
         *_readout(solution),
+        *_depths(solution),
         f"rms residual       {quality['global_rms_px']:.2f} px with a global shutter, {quality['rms_px']:.2f} px now",
         f"outputs            {out}  ({total:.0f} s)",
     ]
@@ -342,6 +362,14 @@ def _readout(solution: Solution) -> list[str]:
         f"rates of turn      median {rates[len(rates) // 2]:.1f}, largest {rates[-1]:.1f} deg/s, by a readout of",
         *(f"{'':19}{each}" for each in said),
     ]
+
+
+def _depths(solution: Solution) -> list[str]:
+    """A line on how far away the photos of a camera that travelled were taken to show things."""
+    used = [image.depth for image in solution.images if image.depth is not None]
+    kinds = {"points": "as the points", "plane": "on a plane", "map": "by maps", "infinity": "at infinity"}
+    counts = [f"{text} in {used.count(kind)} photos" for kind, text in kinds.items() if kind in used]
+    return [f"depth              {', '.join(counts)}"] if counts else []
 
 
 def _held_out(rms_px: Mapping[str, float]) -> list[str]:

@@ -25,10 +25,11 @@ from .errors import (
 )
 from .evaluation import motion_errors, pose_errors, psnr
 from .io import read_solution, write_solution
-from .model import Camera, Observations, Reconstruction, RowMotion, Solution, SolvedImage
+from .model import AtInfinity, Camera, DepthMap, Observations, Plane, Reconstruction, RowMotion, Solution, SolvedImage
 from .model.projection import project_points, unproject_points
 from .pipeline import (
     GyroOptions,
+    RectifyOptions,
     RunOptions,
     SceneOptions,
     WarpOptions,
@@ -40,21 +41,25 @@ from .pipeline import (
     simulate_warp,
 )
 from .rectify import (
+    RemapGrid,
     distort_points,
     init_rectify_map,
     largest_shift_px,
     optimal_new_camera,
     rectify,
+    remap_grid,
     undistort_points,
 )
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "AtInfinity",
     "BundleOptions",
     "BundleResult",
     "Camera",
     "CriticalMotion",
+    "DepthMap",
     "FileError",
     "FileKindWarning",
     "FormatError",
@@ -62,8 +67,11 @@ __all__ = [
     "InputError",
     "MetadataWarning",
     "Observations",
+    "Plane",
     "Reconstruction",
     "ReconstructionError",
+    "RectifyOptions",
+    "RemapGrid",
     "RowMotion",
     "RsUndistortError",
     "RsUndistortWarning",
@@ -89,6 +97,7 @@ __all__ = [
     "read_solution",
     "rectify",
     "rectify_folder",
+    "remap_grid",
     "run",
     "simulate_scene",
     "simulate_warp",

@@ -285,7 +285,7 @@ def test_conjugate_gradients_of_several_clusters_give_the_factored_step(model, r
     for factor_limit in (1e10, -1):
         options = BundleOptions(loss="squared", factor_limit=factor_limit, cg_tolerance=1e-13, refine=refine)
         problem = BundleProblem(start, model, options, 0.5, Spreads(0.03, 0.1))
-        assert (problem._elimination.clusters is not None) == (factor_limit < 0)
+        assert (problem._elimination.space is not None) == (factor_limit < 0)
         steps.append(problem.linearize(problem.initial_state()).solve(1e-4)[0])
     for factored, iterated in zip(*steps, strict=True):
         np.testing.assert_allclose(iterated, factored, rtol=0, atol=1e-7 * np.abs(factored).max(initial=0))

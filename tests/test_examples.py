@@ -10,6 +10,7 @@ MODULES = (
     "rsundistort.io.groups",
     "rsundistort.io.readout_times",
     "rsundistort.model.camera",
+    "rsundistort.model.checks",
     "rsundistort.model.motion",
     "rsundistort.model.projection",
     "rsundistort.rectify.maps",

@@ -19,3 +19,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 kernel = partial(numba.njit, cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 parallel_kernel = partial(kernel, parallel=True)
 prange = numba.prange
+
+# fastmath of sums whose order the compiler may choose, so that they use vectors; infinities and NaN keep their meaning.
+SUMS = {"reassoc", "contract", "nsz"}

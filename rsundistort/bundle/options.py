@@ -89,12 +89,13 @@ class BundleOptions:
         of a fisheye k1 to k4.
     guessed : GuessedCameras, optional
         Prior on these intrinsics; without it they follow the photos alone.
-    factor_limit : float
+    factor_limit : float or None
         Reduced systems whose factorisation takes at most this many multiply-adds are factored, others are solved by
-        preconditioned conjugate gradients.
+        preconditioned conjugate gradients. None: what is expected to take less time, judged by the multiply-adds of
+        the one and the bytes of the other.
     cg_tolerance : float
         Conjugate gradients stop when the residual, in the norm of the preconditioner, falls below `cg_tolerance` times
-        the right-hand side.
+        the solution, in the norm of the matrix: a step then lacks about the square of it of its decrease of the cost.
     """
 
     max_iterations: int = 100
@@ -121,7 +122,7 @@ class BundleOptions:
     lengths: Sequence[KnownLength] = ()
     refine: tuple[str, ...] = ()
     guessed: GuessedCameras | None = None
-    factor_limit: float = 1e11
+    factor_limit: float | None = None
     cg_tolerance: float = 0.01
 
     def __post_init__(self) -> None:

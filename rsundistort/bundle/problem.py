@@ -14,10 +14,12 @@ from scipy.spatial.transform import Rotation
 from .._kernels import projection
 from ..errors import InputError
 from ..model import Camera, Reconstruction, check_shutter_model
+from .elimination import Elimination
 from .intrinsics import INTRINSICS, check_lenses, deviation, moved_camera
 from .lengths import LengthResiduals
+from .normal_equations import Border, NormalEquations, Step
 from .options import LOSSES, BundleOptions
-from .reduced import Border, Elimination, NormalEquations, Step, Structure, by_first_photo
+from .structure import Structure, by_first_photo
 
 __all__ = ["BundleProblem", "Spreads", "State", "reprojection_residuals"]
 
@@ -138,8 +140,9 @@ class BundleProblem:
         self._lengths = LengthResiduals(self._start, options.lengths)
         self._known, self._known_weight = self._known_motions(span)
         self._free = self._free_unknowns()
+        poses = reconstruction.R_cw, reconstruction.center_w
         self._elimination = Elimination.of(
-            self._structure, self._free, options.factor_limit, options.cg_tolerance
+            self._structure, self._free, poses, options.factor_limit, options.cg_tolerance
         )  # fmt: skip
         self._size = reconstruction.size
 

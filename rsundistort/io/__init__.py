@@ -2,6 +2,7 @@
 
 from .cameras import CameraFile, check_camera_fits, parse_camera, read_camera_file
 from .colmap import read_colmap_cameras, read_colmap_poses, write_colmap_model
+from .depth_maps import find_depth_maps, read_depth_map
 from .groups import group_of, guess_readouts
 from .gyro import GyroLog, gyro_offset, motions_from_gyro, read_gyro, read_photo_times
 from .lengths import read_known_lengths
@@ -29,6 +30,7 @@ __all__ = [
     "check_camera_fits",
     "extract_frames",
     "facts_of_exif",
+    "find_depth_maps",
     "find_masks",
     "focal_from_exif",
     "group_of",
@@ -43,6 +45,7 @@ __all__ = [
     "read_camera_file",
     "read_colmap_cameras",
     "read_colmap_poses",
+    "read_depth_map",
     "read_exif",
     "read_gyro",
     "read_known_lengths",

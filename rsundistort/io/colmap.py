@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -10,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, FormatError
+from ..errors import FileError, FormatError, InputError
 from ..model import Camera, Reconstruction
-from ..model.projection import unproject_points
+from ..model.checks import check_photo_name
+from ..model.projection import at_depth, unproject_points
 
 __all__ = [
     "camera_from_colmap",
@@ -62,7 +64,14 @@ def read_colmap_cameras(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
     cameras = {}
     for camera_id in sorted(model.cameras):
         cameras[str(camera_id)] = camera_from_colmap(model.cameras[camera_id], f"{path}: camera {camera_id}")
-    return cameras, {image.name: str(image.camera_id) for image in model.images.values()}
+    return cameras, {_name(image, path): str(image.camera_id) for image in model.images.values()}
+
+
+def _name(image: Any, where: Path) -> str:
+    try:
+        return check_photo_name(image.name)
+    except InputError as error:
+        raise FormatError(f"{where}: {error}") from error
 
 
 def camera_from_colmap(found: Any, where: str) -> Camera:
@@ -155,7 +164,7 @@ def read_colmap_poses(folder: Path, any_lens: bool = False) -> tuple[Any, ...]:
             point.append(number)
     return (
         cameras,
-        [image.name for image in images],
+        [_name(image, folder) for image in images],
         np.array([ids.index(image.camera_id) for image in images], np.int64),
         poses[:, :, :3],
         -np.einsum("mji,mj->mi", poses[:, :, :3], poses[:, :, 3]),
@@ -179,12 +188,15 @@ def rectified_keypoints(reconstruction: Reconstruction, rectified: list[Camera])
     xy = np.full((len(obs), 2), np.nan)
     for i in range(reconstruction.num_images):
         of_photo = obs.frame_idx == i
+        motion = reconstruction.motion(i).in_camera(reconstruction.R_cw[i])
         ideal, _ = unproject_points(
-            obs.xy_raw[of_photo],
-            reconstruction.camera(i),
-            reconstruction.motion(i),
-            reconstruction.shutter_model,
+            obs.xy_raw[of_photo], reconstruction.camera(i), motion, reconstruction.shutter_model
         )
+        if reconstruction.shutter_model == "constant-motion":
+            # where the rectified photo shows the point depends on how far away it is
+            X_w = reconstruction.points_w[obs.point_idx[of_photo]]
+            depth = (X_w - reconstruction.center_w[i]) @ reconstruction.R_cw[i, 2]
+            ideal = at_depth(ideal, obs.xy_raw[of_photo], reconstruction.camera(i), motion, depth)
         K = rectified[int(reconstruction.camera_idx[i])].K
         xy[of_photo] = ideal @ K[:2, :2].T + K[:2, 2]
     return xy
@@ -194,7 +206,7 @@ def write_colmap_model(
     folder: Path,
     reconstruction: Reconstruction,
     rectified: list[Camera],
-    names: list[str],
+    names: Sequence[str | None],
     colors: NDArray[np.uint8] | None = None,
 ) -> None:
     """Write `cameras.bin`, `images.bin`, `points3D.bin` (and rigs, frames) of PINHOLE cameras without distortion.
@@ -207,8 +219,8 @@ def write_colmap_model(
         Poses, motions, points and raw measurements.
     rectified : list of Camera
         New camera of each camera of the reconstruction.
-    names : list of str
-        File names of the rectified photos.
+    names : sequence of str or None
+        File names of the rectified photos; those without are left out.
     colors : (n, 3) uint8 array, optional
         Red, green, blue of the points.
     """
@@ -231,6 +243,8 @@ def write_colmap_model(
     usable = np.isfinite(xy).all(1)
     place = np.full(len(obs), -1)
     for i, name in enumerate(names):
+        if name is None:
+            continue
         of_photo = np.flatnonzero((obs.frame_idx == i) & usable)
         place[of_photo] = np.arange(len(of_photo))
         image = pycolmap.Image(

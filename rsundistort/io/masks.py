@@ -16,7 +16,7 @@ __all__ = ["find_masks", "read_mask"]
 _SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".webp", ".jpg", ".jpeg")
 
 
-def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
+def find_masks(folder: Path, names: Sequence[str], what: str = "mask") -> dict[str, Path]:
     """Masks of photos: files of the same stem (`a.png` for `a.jpg`), or of the whole name, as COLMAP has them.
 
     Parameters
@@ -25,6 +25,8 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
         Of the masks. A photo need not have one.
     names : sequence of str
         Photos.
+    what : str
+        What errors call them; other images of the same frames are found alike.
 
     Raises
     ------
@@ -32,20 +34,23 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
         When the folder is missing, or no mask in it is of one of the photos.
     """
     if not folder.is_dir():
-        raise FileError(f"{folder} is no folder; give the folder that holds the masks")
-    files = {path.name: path for path in sorted(folder.iterdir()) if path.suffix.lower() in _SUFFIXES}
-    by_stem: dict[str, list[Path]] = {}
-    for path in files.values():
-        by_stem.setdefault(path.stem, []).append(path)
+        raise FileError(f"{folder} is no folder; give the folder that holds the {what}s")
+    by_stem: dict[Path, list[Path]] = {}
+    for within in sorted({folder / Path(name).parent for name in names}):
+        for path in sorted(within.iterdir()) if within.is_dir() else ():
+            if path.suffix.lower() in _SUFFIXES:
+                by_stem.setdefault(path.with_suffix(""), []).append(path)
     found: dict[str, Path] = {}
     for name in names:
-        fitting = by_stem.get(name) or by_stem.get(Path(name).stem) or []
+        fitting = by_stem.get(folder / name) or by_stem.get((folder / name).with_suffix("")) or []
         if len(fitting) > 1:
-            raise InputError(f"{name} has several masks: {', '.join(path.name for path in fitting)}; keep one of them")
+            raise InputError(
+                f"{name} has several {what}s: {', '.join(path.name for path in fitting)}; keep one of them"
+            )
         if fitting:
             found[name] = fitting[0]
     if not found:
-        raise InputError(f"{folder} holds no mask of any photo; it should hold {Path(names[0]).stem}.png and so on")
+        raise InputError(f"{folder} holds no {what} of any photo; it should hold {Path(names[0]).stem}.png and so on")
     return found
 
 

@@ -61,9 +61,9 @@ def write_transforms(path: Path, solution: Solution, files: dict[str, tuple[str,
     solution : Solution
         Poses and rectified cameras.
     files : dict of photo name to (image path, mask path)
-        Relative to the file's folder.
+        Relative to the file's folder; photos without are left out.
     """
-    images = [image for image in solution.registered if image.posed]
+    images = [image for image in solution.registered if image.posed and image.name in files]
     used: Sequence[str] = sorted({image.camera_id for image in images})
     value: dict[str, Any] = _intrinsics(solution.rectified_cameras[used[0]]) if len(used) == 1 else {}
     frames = []

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import FileError, FormatError, InputError
 from ..model import READOUTS, Camera, RowMotion, Solution, SolvedImage
+from .aside import write_aside
 from .cameras import camera_from_json, camera_to_json
 
 __all__ = ["FORMAT", "VERSION", "read_solution", "solution_to_json", "write_solution"]
@@ -64,10 +65,14 @@ def solution_to_json(solution: Solution) -> dict[str, Any]:
         if image.motion is not None:
             entry["phi"], entry["velocity"] = image.motion.phi, image.motion.velocity
             entry["aspect"], entry["skew"] = _imaginary_camera(image.motion, solution.cameras[image.camera_id])
+        if image.depth is not None:
+            entry["depth"], entry["translation_shift_px"] = image.depth, image.translation_shift_px
         if image.reason is not None:
             entry["reason"] = image.reason
         if image.turned != 1:
             entry["turned"] = image.turned
+        if image.roi is not None:
+            entry["roi"] = image.roi
         images.append(entry)
     value = {
         "format": FORMAT,
@@ -90,10 +95,7 @@ def solution_to_json(solution: Solution) -> dict[str, Any]:
 
 def write_solution(path: Path, solution: Solution) -> None:
     """Write `solution.json`, whole or not at all."""
-    path = Path(path)
-    aside = path.with_name(f".{path.name}.partial")
-    aside.write_text(json.dumps(solution_to_json(solution), indent=1) + "\n", encoding="utf-8")
-    aside.replace(path)
+    write_aside(Path(path), (json.dumps(solution_to_json(solution), indent=1) + "\n").encode())
 
 
 def read_solution(path: Path) -> Solution:
@@ -135,6 +137,16 @@ def _orientation(entry: dict[str, Any]) -> int:
     return int(turned)
 
 
+def _roi(entry: dict[str, Any]) -> tuple[int, int, int, int] | None:
+    roi = entry.get("roi")
+    if roi is None:
+        return None
+    whole = isinstance(roi, list) and len(roi) == 4 and all(isinstance(v, int) and v >= 0 for v in roi)
+    if not whole or not (roi[2] and roi[3]):
+        raise InputError(f"photo {entry['name']} has the roi {roi!r}, expected [x, y, width, height]")
+    return roi[0], roi[1], roi[2], roi[3]
+
+
 def _solution_from_json(value: dict[str, Any], where: str) -> Solution:
     cameras = {k: camera_from_json(c, f"camera {k}") for k, c in value["cameras"].items()}
     rectified = {k: Camera(c["width"], c["height"], c["K"]) for k, c in value["rectified_cameras"].items()}
@@ -156,8 +168,11 @@ def _solution_from_json(value: dict[str, Any], where: str) -> Solution:
                 num_observations=entry.get("num_observations") or 0,
                 rms_px=entry.get("rms_px"),
                 rs_shift_px=entry.get("rs_shift_px"),
+                depth=entry.get("depth"),
+                translation_shift_px=entry.get("translation_shift_px"),
                 reason=entry.get("reason"),
                 turned=_orientation(entry),
+                roi=_roi(entry),
             )
         )
     return Solution(

@@ -1,6 +1,7 @@
 """What data looks like between the stages: frozen dataclasses of arrays."""
 
 from .camera import READOUTS, Camera
+from .depth import AtInfinity, Depth, DepthMap, Plane
 from .motion import SHUTTER_MODELS, RowMotion, check_shutter_model
 from .reconstruction import Observations, Reconstruction
 from .solution import Solution, SolvedImage
@@ -8,8 +9,12 @@ from .solution import Solution, SolvedImage
 __all__ = [
     "READOUTS",
     "SHUTTER_MODELS",
+    "AtInfinity",
     "Camera",
+    "Depth",
+    "DepthMap",
     "Observations",
+    "Plane",
     "Reconstruction",
     "RowMotion",
     "Solution",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 
-__all__ = ["check_array", "check_finite", "check_index", "check_rotations", "frozen"]
+__all__ = ["check_array", "check_finite", "check_index", "check_photo_name", "check_rotations", "frozen"]
 
 
 def _shape_text(shape: tuple[int | None, ...]) -> str:
@@ -43,6 +44,20 @@ def check_index(value: ArrayLike, length: int, upper: int, name: str) -> NDArray
     if length and (array.min() < 0 or array.max() >= upper):
         raise InputError(f"{name} goes from {array.min()} to {array.max()}, expected 0 to {upper - 1}")
     return array
+
+
+def check_photo_name(value: Any) -> str:
+    """The name of a photo inside its folder, sub-folders with forward slashes; an error for one that leads elsewhere.
+
+    Examples
+    --------
+    >>> check_photo_name("walk/0001.jpg")
+    'walk/0001.jpg'
+    """
+    path = PurePath(value) if isinstance(value, str) and "\0" not in value else PurePath()
+    if path.anchor or ".." in path.parts or path.as_posix() != value or not path.name:
+        raise InputError(f"a photo is called {value!r}; expected a name inside the folder of photos")
+    return str(value)
 
 
 def check_rotations(value: ArrayLike, length: int, name: str) -> NDArray[np.float64]:

@@ -47,6 +47,10 @@ class RowMotion:
         for name in ("phi", "velocity"):
             object.__setattr__(self, name, frozen(check_finite(getattr(self, name), (3,), name)))
 
+    def in_camera(self, R_cw: NDArray[np.float64]) -> RowMotion:
+        """The motion with its velocity in the camera frame at the reference row, as projection takes it."""
+        return RowMotion(self.phi, np.asarray(R_cw, np.float64) @ self.velocity)
+
     @property
     def aspect(self) -> float:
         """Aspect ratio of the paper's imaginary camera, 1 - phi1 (row readout)."""

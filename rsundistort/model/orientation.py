@@ -85,6 +85,16 @@ def turn_points(xy: ArrayLike, width: int, height: int, orientation: int) -> NDA
     return xy @ matrix.T + (matrix < 0) @ last
 
 
+def turn_rectangle(
+    rectangle: tuple[int, int, int, int], width: int, height: int, orientation: int
+) -> tuple[int, int, int, int]:
+    """Pixels (x, y, width, height) of a stored photo of that size where the orientation shows them."""
+    x, y, w, h = rectangle
+    corners = turn_points([[x, y], [x + w - 1, y + h - 1]], width, height, orientation)
+    (left, top), (right, bottom) = corners.min(0), corners.max(0)
+    return int(left), int(top), int(right - left) + 1, int(bottom - top) + 1
+
+
 def turn_camera(camera: Camera, orientation: int) -> Camera:
     """The camera whose photos are those of `camera`, shown by the orientation; exact, also for mirrored ones."""
     matrix, swaps = MATRICES[orientation], _swaps(orientation)
@@ -169,8 +179,14 @@ def turn_solution(solution: Solution, orientations: Mapping[str, int]) -> Soluti
         if orientation != 1:
             cameras[ids[new]] = turn_camera(solution.cameras[ids[old]], orientation)
             rectified[ids[new]] = turn_camera(solution.rectified_cameras[ids[old]], orientation)
-    images = tuple(turn_image(image, pairs[image.name][1], ids[place[pairs[image.name]]]) for image in solution.images)
-    return replace(solution, cameras=cameras, rectified_cameras=rectified, images=images)
+    images = []
+    for image in solution.images:
+        old, orientation = pairs[image.name]
+        if image.roi is not None:
+            target = solution.rectified_cameras[ids[old]]
+            image = replace(image, roi=turn_rectangle(image.roi, target.width, target.height, orientation))
+        images.append(turn_image(image, orientation, ids[place[old, orientation]]))
+    return replace(solution, cameras=cameras, rectified_cameras=rectified, images=tuple(images))
 
 
 def in_stored_frame(solution: Solution) -> Solution:

@@ -12,7 +12,14 @@ from .camera import Camera
 from .checks import check_array
 from .motion import RowMotion, check_shutter_model
 
-__all__ = ["ProjectionJacobians", "project_points", "project_points_with_jacobians", "unproject_points"]
+__all__ = [
+    "ProjectionJacobians",
+    "at_depth",
+    "clock_of",
+    "project_points",
+    "project_points_with_jacobians",
+    "unproject_points",
+]
 
 
 @dataclass(frozen=True)
@@ -81,6 +88,35 @@ def project_points_with_jacobians(
         model, axis, sign, intr, lens, points, motion.phi, motion.velocity, xy, J_point, J_phi, J_velocity, valid
     )
     return xy, valid, ProjectionJacobians(J_point, J_phi, J_velocity)
+
+
+def clock_of(camera: Camera, xy_raw: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n,) clock r at which a camera read raw pixels (n, 2); 0 at the line of the principal point."""
+    intr, _, axis, sign = camera.kernel_args
+    return np.asarray(sign * (xy_raw[:, axis] - intr[2 + axis]) / intr[axis])
+
+
+def at_depth(
+    ideal: NDArray[np.float64],
+    xy_raw: NDArray[np.float64],
+    camera: Camera,
+    motion: RowMotion,
+    depth: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Ideal coordinates (n, 2) under the constant-motion model, of those that `unproject_points` found at infinity.
+
+    Parameters
+    ----------
+    ideal, xy_raw : (n, 2) array
+        Normalised coordinates at infinity, and the pixels that they are of.
+    camera, motion
+        As in `project_points`.
+    depth : (n,) array
+        z of the points at the reference row.
+    """
+    # when its row was read, the camera stood at r v and saw the point r v + s (x', y', 1)
+    moved = clock_of(camera, xy_raw)[:, None] * motion.velocity / depth[:, None]
+    return np.asarray(ideal * (1.0 - moved[:, 2:]) + moved[:, :2])
 
 
 def unproject_points(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .camera import Camera
-from .checks import check_finite, check_rotations, frozen
+from .checks import check_finite, check_photo_name, check_rotations, frozen
 from .motion import RowMotion, check_shutter_model
 
 __all__ = ["Solution", "SolvedImage"]
@@ -24,7 +25,7 @@ class SolvedImage:
     Attributes
     ----------
     name, camera_id : str
-        Photo and its camera.
+        Photo, a file below its folder, and its camera.
     R_cw, center_w : (3, 3), (3,) array or None
         Pose at the principal row; None for a photo that did not register.
     motion : RowMotion or None
@@ -37,11 +38,17 @@ class SolvedImage:
         Root mean square of the residuals' x and y parts.
     rs_shift_px : float or None
         Largest displacement that the shutter caused in this photo.
+    depth : str or None
+        What the photo was rectified with, of a camera that moved: "infinity", "plane", "points" or "map".
+    translation_shift_px : float or None
+        Largest displacement that the translation alone caused, by that depth.
     reason : str or None
-        Why the photo did not register.
+        Why the photo did not register; of one that did, why it could not be rectified.
     turned : int
         EXIF orientation by which the photo was turned after it was rectified: pose, motion and cameras are those of
         the turned frame. 1 in the stored frame.
+    roi : (x, y, width, height) or None
+        Rectangle of the rectified photo without empty pixels, if there is one.
     """
 
     name: str
@@ -53,10 +60,14 @@ class SolvedImage:
     num_observations: int = 0
     rms_px: float | None = None
     rs_shift_px: float | None = None
+    depth: str | None = None
+    translation_shift_px: float | None = None
     reason: str | None = None
     turned: int = 1
+    roi: tuple[int, int, int, int] | None = None
 
     def __post_init__(self) -> None:
+        check_photo_name(self.name)
         if self.R_cw is not None:
             R = check_rotations(np.asarray(self.R_cw, np.float64)[None], 1, f"R_cw of {self.name}")[0]
             object.__setattr__(self, "R_cw", frozen(R))
@@ -114,17 +125,16 @@ class Solution:
             if image.camera_id not in self.cameras:
                 raise InputError(f"photo {image.name} has camera {image.camera_id!r}, which the solution lacks")
 
-    @property
-    def map_model(self) -> str:
-        """Shutter model of the remap grids: without depth, translation is left and rotation taken out."""
-        return "rotation" if self.shutter_model == "constant-motion" else self.shutter_model
-
     def image(self, name: str) -> SolvedImage:
         """The photo of a name."""
-        for image in self.images:
-            if image.name == name:
-                return image
-        raise InputError(f"the solution has no photo {name!r}")
+        try:
+            return self._by_name[name]
+        except KeyError:
+            raise InputError(f"the solution has no photo {name!r}") from None
+
+    @cached_property
+    def _by_name(self) -> dict[str, SolvedImage]:
+        return {image.name: image for image in self.images}
 
     @property
     def registered(self) -> list[SolvedImage]:

@@ -4,12 +4,15 @@ from .analyze import analyze
 from .batch import rectify_folder
 from .evaluate import evaluate
 from .gyro import GyroOptions
-from .run import RunOptions, run, use_threads, versions
+from .photo import RectifyOptions
+from .run import RunOptions, run, versions
 from .scene import SceneOptions, simulate_scene
 from .simulate import WarpOptions, read_motion_file, simulate_warp
+from .workers import use_threads
 
 __all__ = [
     "GyroOptions",
+    "RectifyOptions",
     "RunOptions",
     "SceneOptions",
     "WarpOptions",

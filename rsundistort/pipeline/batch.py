@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import Any
 
-from ..errors import InputError, MetadataWarning, SkippedPhotoWarning
-from ..io import MAX_MEGAPIXELS, list_photos, output_folder, read_solution, write_solution
+from ..errors import InputError, MetadataWarning, RsUndistortWarning, SkippedPhotoWarning
+from ..io import list_photos, read_solution, write_solution
+from ..io.outputs import batch_folder
 from ..model import Solution
 from ..model.orientation import in_stored_frame, split_mirror, turn_solution
+from .depth import PhotoDepths, ScenePoints, check_depth, with_depths
+from .photo import RectifyOptions
 from .progress import ProgressCallback, StageLog
-from .run import use_threads
-from .write import rectify_photos, turn_of
+from .views import with_view
+from .workers import Workers, use_threads
+from .write import rectify_photos
 
 __all__ = ["rectify_folder"]
 
@@ -22,68 +27,109 @@ def rectify_folder(
     photos: Path | str,
     solution: Path | str,
     out: Path | str,
+    options: RectifyOptions | None = None,
     *,
-    interpolation: str = "cubic",
-    quality: int = 98,
     jobs: int = 0,
     overwrite: bool = False,
-    masks: Path | str | None = None,
-    raw_as: str = "tif",
-    apply_orientation: bool = False,
-    again: bool = False,
-    max_megapixels: float = MAX_MEGAPIXELS,
+    resume: bool = False,
+    scheduler: str | None = None,
     progress: ProgressCallback | None = None,
-) -> tuple[Solution, Sequence[str]]:
+    **named: Any,
+) -> tuple[Solution, dict[str, str]]:
     """Rectify the photos of a folder with the motions of a solution, into `out/images` and `out/masks`.
+
+    Outputs appear file by file, whole; what is there when the work is interrupted stays, and `resume` goes on with it.
+    What is wrong with one photo does not stop the others.
 
     Parameters
     ----------
     photos, solution, out : path
-        Folder of the raw photos; `solution.json` or a ground-truth file; folder for the outputs.
-    interpolation, quality, jobs, overwrite, masks, raw_as, again, max_megapixels, progress
-        As in `run`.
-    apply_orientation : bool
-        Turn photos, masks and the cameras and poses of the solution by the photos' EXIF orientation. Mirrored photos
-        are mirrored, and lose their pose: no camera takes a mirror image.
+        Folder of the raw photos; `solution.json` or a ground-truth file; folder for the outputs. Photos in sub-folders
+        are those that the solution names as "sub/photo.jpg".
+    options : RectifyOptions, optional
+        What is done to each photo. With `apply_orientation` mirrored photos are mirrored, and lose their pose: no
+        camera takes a mirror image. The points that depths are taken from are those of `sparse/` beside the solution.
+    jobs : int
+        Threads; 0 for all cores.
+    overwrite : bool
+        Replace the outputs that are in `out`.
+    resume : bool
+        Go on with an earlier batch: photos whose outputs are whole, and made of the same photo with the same motion
+        and options, are passed over; other outputs of that batch are made again or deleted.
+    scheduler : str, optional
+        Address of a Dask scheduler (tcp://host:8786) whose workers do the work, instead of threads. They see `photos`
+        and `out` under the same absolute paths.
+    progress : callable, optional
+        Called as (stage, done, total).
+    **named
+        Fields of `RectifyOptions`, instead of or on top of `options`.
 
     Returns
     -------
     solution : Solution
         As copied to `out/solution.json`.
-    left_out : sequence of str
-        Photos of the folder that were not rectified; a warning says why.
+    left_out : dict of name to reason
+        Photos of the folder that were not rectified; a warning says so, too.
     """
     photos, out = Path(photos), Path(out)
+    options = replace(options or RectifyOptions(), **named)
+    check_depth(options.depth)
     solved = in_stored_frame(read_solution(Path(solution)))
-    listed = list_photos(photos, raw_as)
     motions = {image.name for image in solved.registered}
+    listed = list_photos(photos, options.raw_as, {PurePosixPath(name).parent.as_posix() for name in motions} - {"."})
     names = [name for name in listed if name in motions]
     if not names:
         raise InputError(f"{solution} has no motion for any photo of {photos}, such as {listed[0]}; is it theirs?")
-    for name in listed:
-        if name not in motions:
-            warnings.warn(f"skipped: {name} has no motion in {solution}", SkippedPhotoWarning, stacklevel=2)
-    log = StageLog(progress)
-    jobs = use_threads(jobs)
+    left_out = {name: f"it has no motion in {solution}" for name in listed if name not in motions}
+    for name in left_out:
+        warnings.warn(f"skipped: {name} has no motion in {solution}", SkippedPhotoWarning, stacklevel=2)
+    solved = with_view(solved, options.view)
+    depths = PhotoDepths(solved, options.depth, _points_beside(Path(solution), solved, options.depth))
     # a photo without a pose may be mirrored
     unposed = replace(solved, images=[replace(image, R_cw=None, center_w=None) for image in solved.images])
-    turns: dict[str, int] = {}
-    with output_folder(out, overwrite=overwrite, apart_from=[photos]) as scratch:
-        rectified = rectify_photos(
-            photos, unposed, names, scratch,
-            interpolation=interpolation, quality=quality, jobs=jobs, log=log,
-            raw_as=raw_as, apply_orientation=apply_orientation, again=again, max_megapixels=max_megapixels,
-            masks=None if masks is None else Path(masks),
+    workers = Workers(use_threads(jobs), scheduler)
+    inputs = [
+        photos,
+        *([] if options.masks is None else [Path(options.masks)]),
+        *(folder for folder, _ in options.also),
+    ]
+    with batch_folder(out, overwrite=overwrite, resume=resume, apart_from=inputs) as journal:
+        done = rectify_photos(
+            photos, unposed, names, out, options, depths, workers, StageLog(progress), journal,
+            resume=resume, go_on="whole; the same command with --resume goes on",
         )  # fmt: skip
-        for name, photo in rectified:
-            turns[name] = turn_of(unposed.image(name), photo)[0]
+        turns = {name: each.turn for name, each in done.items() if not each.problem}
+        left_out |= {name: each.problem for name, each in done.items() if each.problem}
         if not turns:
             raise InputError(f"none of the {len(names)} photos of {photos} could be rectified; see the warnings")
-        if apply_orientation:
+        solved = with_depths(solved, {name: each.depth for name, each in done.items() if each.depth is not None})
+        told = [
+            replace(image, reason=left_out.get(image.name)) if image.name in done else image for image in solved.images
+        ]
+        solved = replace(solved, images=tuple(told))
+        if options.apply_orientation:
             solved = turn_solution(_without_mirrored_poses(solved, turns), turns)
-        solved = replace(solved, options={**solved.options, "raw_as": raw_as})
-        write_solution(scratch / "solution.json", replace(solved, stages=tuple(log.stages)))
-    return solved, [name for name in listed if name not in turns]
+        solved = replace(solved, options={**solved.options, "raw_as": options.raw_as})
+        write_solution(out / "solution.json", solved)
+    return solved, dict(sorted(left_out.items()))
+
+
+def _points_beside(solution: Path, solved: Solution, depth: str | Path) -> ScenePoints | None:
+    """The points of the COLMAP model that a run wrote beside its solution, where a camera moved."""
+    moves = any(image.posed and image.motion is not None and image.motion.velocity.any() for image in solved.images)
+    if solved.shutter_model != "constant-motion" or not moves or str(depth) == "infinity":
+        return None
+    folder = solution.parent / "sparse"
+    if folder.is_dir():
+        names = [image.name for image in solved.registered]
+        return ScenePoints.of_colmap_model(folder, names, solved.options.get("raw_as") or "tif")
+    text = f"{folder} is missing, and with it the points of the scene"
+    if str(depth) in ("plane", "points"):
+        raise InputError(f"{text}; depth {depth} needs them")
+    if str(depth) == "auto":
+        text += ": photos are rectified as if all were far away, which leaves the effect of the translation in them"
+        warnings.warn(text, RsUndistortWarning, stacklevel=3)
+    return None
 
 
 def _without_mirrored_poses(solution: Solution, turns: Mapping[str, int]) -> Solution:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import closing
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from ..errors import FileError, InputError, SkippedPhotoWarning
-from ..io import MAX_MEGAPIXELS, ExifFacts, facts_of_exif, find_masks, list_photos, read_mask, read_photo
+from ..io import ExifFacts, facts_of_exif, find_masks, list_photos, read_mask, read_photo
 from ..sfm import Features, detect_features
 from .cameras import PhotoCameras, find_cameras
+from .photo import RectifyOptions, check_not_rectified
 from .progress import StageLog
-from .write import check_not_rectified
+from .workers import Workers
 
 __all__ = ["LoadedPhotos", "load_photos"]
 
@@ -30,12 +31,54 @@ class LoadedPhotos:
         Unreadable ones.
     cameras : PhotoCameras
         Which camera took which.
+    orientations : mapping of name to int
+        Their EXIF orientations.
     """
 
     names: list[str]
     features: list[Features]
     skipped: dict[str, str]
     cameras: PhotoCameras
+    orientations: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class _LoadJob:
+    """All that reading one photo takes."""
+
+    name: str
+    source: Path
+    own_mask: Path | None
+    max_features: int
+    options: RectifyOptions
+
+
+@dataclass(frozen=True)
+class _Loaded:
+    """What was found in a photo; or only the problem with it, or with its mask."""
+
+    features: Features | None = None
+    width: int = 0
+    height: int = 0
+    orientation: int = 1
+    facts: ExifFacts = field(default_factory=ExifFacts)
+    problem: str = ""
+
+
+def _load(job: _LoadJob) -> _Loaded:
+    try:
+        photo = read_photo(job.source, job.options.max_megapixels)
+        if not job.options.again:
+            check_not_rectified(photo)
+    except FileError as error:
+        return _Loaded(problem=str(error))
+    except InputError as error:
+        return _Loaded(problem=f"{job.name}: {error}")
+    height, width = photo.pixels.shape[:2]
+    # a mask that cannot be used stops the run: without it, what it hides would be measured
+    mask = None if job.own_mask is None else read_mask(job.own_mask, width, height)
+    features = detect_features(photo.pixels, job.max_features, mask)
+    return _Loaded(features, width, height, photo.metadata.orientation, facts_of_exif(photo.metadata.exif))
 
 
 def load_photos(
@@ -43,12 +86,9 @@ def load_photos(
     camera: str | None,
     readout: str | Mapping[str, str] | None,
     max_features: int,
-    jobs: int,
+    workers: Workers,
     log: StageLog,
-    masks: Path | None = None,
-    raw_as: str = "tif",
-    again: bool = True,
-    max_megapixels: float = MAX_MEGAPIXELS,
+    options: RectifyOptions,
 ) -> LoadedPhotos:
     """Read every photo of a folder once, for its size and features; unusable ones are skipped with a warning.
 
@@ -60,61 +100,43 @@ def load_photos(
         As in `find_cameras`.
     max_features : int
         Of a photo.
-    jobs : int
-        Threads.
+    workers : Workers
+        Where it is done.
     log : StageLog
         Told the progress.
-    masks : Path, optional
-        Folder of the users' masks, as `io.find_masks` takes it.
-    raw_as, again, max_megapixels
-        As in `RunOptions`.
+    options : RectifyOptions
+        Of which masks, raw_as, again and max_megapixels matter.
     """
-    listed = list_photos(folder, raw_as)
+    listed = list_photos(folder, options.raw_as)
     if len(listed) < 3:
         raise InputError(
             f"{folder} holds {len(listed)} photo{'s' * (len(listed) > 1)}; the shutter needs at least three"
         )
-    mask_of = {} if masks is None else find_masks(masks, listed)
+    mask_of = {} if options.masks is None else find_masks(Path(options.masks).absolute(), listed)
+    jobs = (_LoadJob(name, folder.absolute() / name, mask_of.get(name), max_features, options) for name in listed)
     log.begin("features", len(listed))
-    done = 0
-
-    def load(name: str) -> tuple[tuple[int, int], ExifFacts, Features] | str:
-        try:
-            photo = read_photo(folder / name, max_megapixels)
-            if not again:
-                check_not_rectified(photo)
-            pixels = photo.pixels
-        except FileError as error:
-            return str(error)
-        except InputError as error:
-            return f"{name}: {error}"
-        # a mask that cannot be used stops the run: without it, what it hides would be measured
-        size = pixels.shape[1], pixels.shape[0]
-        mask = read_mask(mask_of[name], *size) if name in mask_of else None
-        return size, facts_of_exif(photo.metadata.exif), detect_features(pixels, max_features, mask)
-
     names: list[str] = []
-    sizes: list[tuple[int, int]] = []
-    facts: list[ExifFacts] = []
     features: list[Features] = []
+    found: list[_Loaded] = []
     skipped: dict[str, str] = {}
-    with ThreadPoolExecutor(jobs) as pool:
-        for name, found in zip(listed, pool.map(load, listed), strict=True):
-            done += 1
-            log.tell("features", done, len(listed))
-            if isinstance(found, str):
-                skipped[name] = found
-                warnings.warn(f"skipped: {found}", SkippedPhotoWarning, stacklevel=2)
+    results = workers.map(_load, jobs, lambda job, why: _Loaded(problem=f"{job.name}: {why}"))
+    with closing(results):
+        for name, each in zip(listed, results, strict=True):
+            if each.features is None:
+                skipped[name] = each.problem
+                warnings.warn(f"skipped: {each.problem}", SkippedPhotoWarning, stacklevel=2)
             else:
                 names.append(name)
-                sizes.append(found[0])
-                facts.append(found[1])
-                features.append(found[2])
+                features.append(each.features)
+                found.append(each)
+            log.tell("features", len(names) + len(skipped), len(listed))
     if len(names) < 3:
         raise InputError(
             f"{folder} holds {len(names)} readable photo{'s' * (len(names) != 1)} of {len(listed)}; "
             f"the shutter needs at least three ({next(iter(skipped.values()))})"
         )
+    sizes, facts = [(each.width, each.height) for each in found], [each.facts for each in found]
     cameras = find_cameras(folder, names, sizes, facts, camera, readout)
     log.end("features", photos=len(names), keypoints=sum(len(f.xy_raw) for f in features))
-    return LoadedPhotos(names, features, skipped, cameras)
+    orientations = {name: each.orientation for name, each in zip(names, found, strict=True)}
+    return LoadedPhotos(names, features, skipped, cameras, orientations)

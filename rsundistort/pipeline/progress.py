@@ -9,6 +9,7 @@ from typing import Any
 __all__ = ["ProgressCallback", "StageLog"]
 
 #: Called as (stage, done, total); total is 0 where it is not known.
+#: The first call of a stage tells what was done before.
 ProgressCallback = Callable[[str, int, int], None]
 
 
@@ -31,10 +32,10 @@ class StageLog:
         if self._callback is not None:
             self._callback(stage, done, total)
 
-    def begin(self, stage: str, total: int = 0) -> None:
-        """Start the clock of a stage."""
+    def begin(self, stage: str, total: int = 0, done: int = 0) -> None:
+        """Start the clock of a stage, of which some may be done already."""
         self._began = time.perf_counter()
-        self.tell(stage, 0, total)
+        self.tell(stage, done, total)
 
     def end(self, stage: str, **counts: Any) -> None:
         """Note what a stage took and counted."""

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -21,27 +18,31 @@ from ..bundle import BundleOptions, GuessedCameras, KnownLength, reprojection_re
 from ..critical import with_remedy
 from ..errors import InputError, RsUndistortWarning
 from ..io import (
-    MAX_MEGAPIXELS,
-    RAW_AS,
     output_folder,
     output_name,
     write_colmap_model,
     write_solution,
     write_transforms,
 )
+from ..io.journal import Journal
 from ..io.motions import Known
+from ..io.outputs import batch_folder
 from ..model import READOUTS, Reconstruction, Solution, SolvedImage, check_shutter_model
 from ..model.orientation import turn_reconstruction, turn_solution
-from ..rectify import INTERPOLATIONS, largest_shift_px
+from ..rectify import largest_shift_px
 from .cameras import PhotoCameras, check_readouts
+from .depth import PhotoDepths, ScenePoints, check_depth, with_depths
 from .frames import find_photos
 from .gyro import GyroOptions, gyro_contradiction, gyro_motions, known_readouts
 from .load import LoadedPhotos, load_photos
+from .photo import RectifyOptions, turn_of
 from .progress import ProgressCallback, StageLog
 from .solve import Solved, solve_photos
-from .write import PointColors, mask_names, rectify_photos, turn_of
+from .views import with_view
+from .workers import Workers, use_threads
+from .write import PointColors, mask_names, rectify_photos
 
-__all__ = ["RunOptions", "run", "use_threads", "versions"]
+__all__ = ["RunOptions", "run", "versions"]
 
 
 # What EXIF does not know, and a set of photos tells; and how far it may be off (relative f, lens coefficients):
@@ -50,9 +51,12 @@ _GUESSED = ("f", "k1", "k2")
 _GUESS_SIGMA = {"f": 0.05, "k1": 0.2, "k2": 0.4}
 
 
-@dataclass(frozen=True)
-class RunOptions:
-    """Options of `run`.
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(RectifyOptions):
+    """Options of `run`: those of `RectifyOptions` for its last stage, and the following.
+
+    There are no features where the `masks` are black. With `apply_orientation` photos that it mirrors are turned only,
+    and keep the mirror as their orientation: no camera takes a mirror image.
 
     Parameters
     ----------
@@ -61,9 +65,6 @@ class RunOptions:
         in or beside the folder of photos, else EXIF.
     readout : str or mapping of group to str, optional
         Readout direction of all photos, or of groups; else the camera file's; else it is guessed, and told by the fit.
-    masks : path, optional
-        Folder of masks, as `io.find_masks` takes it: no features where they are black, and nothing of it in the masks
-        of the rectified photos.
     shutter_model : str
         "constant-motion", "rotation", "linearized", "two-step", "global", or "auto": the one that foretells held-out
         measurements best.
@@ -73,17 +74,6 @@ class RunOptions:
         Threads; 0 for all cores.
     max_features : int
         Per photo.
-    interpolation, quality
-        Of the rectified photos.
-    raw_as : {"tif", "jpg", "png"}
-        What RAW and HEIC are written as: 16 bit, but for jpg.
-    apply_orientation : bool
-        Turn the rectified photos, their masks, cameras and poses by the EXIF orientation, which then is 1. Photos that
-        it mirrors are turned only, and keep the mirror as their orientation: no camera takes a mirror image.
-    again : bool
-        Take photos that are rectified already.
-    max_megapixels : float
-        Photos with more pixels are left out before they are decoded.
     refine : tuple of str, optional
         Intrinsics that are solved for with the rest, as in `BundleOptions`; by default none where the camera is given,
         f, k1 and k2 where EXIF had to guess it.
@@ -104,21 +94,16 @@ class RunOptions:
         Time of the readout of a frame; else the log's, else that of the camera in the table, if it is there.
     overwrite : bool
         Replace the outputs of an earlier run.
+    scheduler : str, optional
+        Address of a Dask scheduler whose workers find the features and rectify the photos, as in `rectify_folder`.
     """
 
     camera: str | None = None
     readout: str | Mapping[str, str] | None = None
-    masks: Path | None = None
     shutter_model: str = "auto"
     seed: int = 0
     jobs: int = 0
     max_features: int = 16384
-    interpolation: str = "cubic"
-    quality: int = 98
-    raw_as: str = "tif"
-    apply_orientation: bool = False
-    again: bool = False
-    max_megapixels: float = MAX_MEGAPIXELS
     refine: tuple[str, ...] | None = None
     still: Mapping[str, float] = field(default_factory=dict)
     known: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
@@ -129,20 +114,23 @@ class RunOptions:
     gyro: GyroOptions | None = None
     readout_s: float | None = None
     overwrite: bool = False
+    scheduler: str | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.shutter_model != "auto":
             check_shutter_model(self.shutter_model)
         check_readouts(self.readout)
+        check_depth(self.depth)
         with_remedy(self.bundle_options(), self.remedy)
-        if self.interpolation not in INTERPOLATIONS:
-            raise InputError(f"interpolation={self.interpolation!r}, expected one of {', '.join(INTERPOLATIONS)}")
-        if self.raw_as not in RAW_AS:
-            raise InputError(f"raw_as={self.raw_as!r}, expected one of {', '.join(RAW_AS)}")
-        if self.jobs < 0 or self.max_features < 100 or not 1 <= self.quality <= 100:
-            raise InputError("jobs must be 0 or more, max_features at least 100, quality 1 to 100")
+        if self.jobs < 0 or self.max_features < 100:
+            raise InputError("jobs must be 0 or more, max_features at least 100")
         if self.readout_s is not None and not 0 < self.readout_s < np.inf:
             raise InputError(f"readout_s={self.readout_s!r}, expected a positive number of seconds")
+
+    def rectify_options(self) -> RectifyOptions:
+        """Those of the last stage, alone."""
+        return RectifyOptions(**{each.name: getattr(self, each.name) for each in fields(RectifyOptions)})
 
     def bundle_options(self, readout: Mapping[str, str] | None = None) -> BundleOptions:
         """Options of the adjustments of photos with these readout directions, top-to-bottom where none is named."""
@@ -178,15 +166,6 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), **{name: version(name) for name in names}}
 
 
-def use_threads(jobs: int) -> int:
-    """Hold OpenCV and the kernels to a number of threads; 0 for all cores. Returns the number."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    jobs = jobs or cores
-    cv2.setNumThreads(jobs)
-    numba.set_num_threads(min(jobs, numba.config.NUMBA_NUM_THREADS))
-    return jobs
-
-
 def run(
     photos: Path | str,
     out: Path | str,
@@ -200,7 +179,8 @@ def run(
     photos : path
         Folder of photos of one camera, or a video, whose frames go to `out/frames`.
     out : path
-        Folder for the outputs; it gets all of them or stays as it was.
+        Folder for the outputs. It stays as it was until the motions are solved; then it gets the solution, and the
+        rectified photos one by one. Should that be interrupted, `rectify_folder(..., resume=True)` goes on.
     options : RunOptions, optional
         See there.
     progress : callable, optional
@@ -214,15 +194,14 @@ def run(
     options = options or RunOptions()
     photos, out = Path(photos), Path(out)
     log = StageLog(progress)
-    jobs = use_threads(options.jobs)
-    with output_folder(out, overwrite=options.overwrite, apart_from=[photos]) as scratch:
+    workers = Workers(use_threads(options.jobs), options.scheduler)
+    inputs = [photos] if options.masks is None else [photos, Path(options.masks)]
+    replaced = ("images", "masks", "sparse")
+    with output_folder(out, overwrite=options.overwrite, apart_from=inputs, replaced=replaced) as scratch:
         gyro_log = None if options.gyro is None else options.gyro.log()
         source = find_photos(photos, scratch, options.camera, options.every, options.sharpest, log)
         folder = source.folder
-        loaded = load_photos(
-            folder, source.camera, options.readout, options.max_features, jobs, log, options.masks,
-            options.raw_as, options.again, options.max_megapixels,
-        )  # fmt: skip
+        loaded = load_photos(folder, source.camera, options.readout, options.max_features, workers, log, options)
         cameras = loaded.cameras
         readouts = known_readouts(
             folder, loaded.names, cameras.cameras, cameras.camera_idx, source.frames, options.readout_s, gyro_log
@@ -245,32 +224,74 @@ def run(
         rec = solved.result.reconstruction
         if contradiction := gyro_contradiction(rec, from_gyro):
             warnings.warn(contradiction, RsUndistortWarning, stacklevel=2)
-        solution = _solution(loaded, solved, options, readouts, source.video)
-        colors = PointColors(rec)
-        rectified = rectify_photos(
-            folder, solution, list(rec.image_names), scratch,
-            interpolation=options.interpolation, quality=options.quality, jobs=jobs, log=log,
-            masks=options.masks, raw_as=options.raw_as, apply_orientation=options.apply_orientation,
-            max_megapixels=options.max_megapixels,
-        )  # fmt: skip
+        solution = with_view(_solution(loaded, solved, options, readouts, source.video), options.view)
+        depths = PhotoDepths(solution, options.depth, ScenePoints.of_reconstruction(rec))
         turns: dict[str, int] = {}
-        for name, photo in rectified:
-            colors.add(name, photo)
-            turns[name] = turn_of(solution.image(name), photo)[0]
-        log.begin("writing")
         if options.apply_orientation:
-            solution, rec = turn_solution(solution, turns), turn_reconstruction(rec, turns)
-        names = [output_name(name, options.raw_as) for name in rec.image_names]
-        new_cameras = [solution.rectified_cameras[str(k + 1)] for k in range(len(rec.cameras))]
-        write_colmap_model(scratch / "sparse", rec, new_cameras, names, colors.rgb())
-        masks = mask_names([image.name for image in solution.images])
-        files = {
-            name: (f"images/{output_name(name, options.raw_as)}", f"masks/{masks[name]}") for name in rec.image_names
-        }
-        write_transforms(scratch / "transforms.json", solution, files)
+            turns = {name: turn_of(loaded.orientations[name], True)[0] for name in rec.image_names}
+        # whole but for the photos and the points' colours: what comes after can be gone on with
+        for name in ("images", "masks"):
+            (scratch / name).mkdir()
+        Journal(scratch).write(())
+        turned = _write_models(scratch, solution, rec, turns, options, {})
+        write_solution(scratch / "solution.json", replace(turned, stages=tuple(log.stages)))
+    if source.frames is not None:
+        folder = out / "frames"
+    colors = PointColors(rec)
+    go_on = f"whole; go on with: rsundistort rectify {folder} --solution {out / 'solution.json'} -o {out} --resume"
+    with batch_folder(out, overwrite=True) as journal:
+        done = rectify_photos(
+            folder,
+            solution,
+            list(rec.image_names),
+            out,
+            options.rectify_options(),
+            depths,
+            workers,
+            log,
+            journal,
+            colors=colors,
+            go_on=go_on,
+        )
+    log.begin("writing")
+    left_out = {name: each.problem for name, each in done.items() if each.problem}
+    if len(left_out) == len(done):
+        raise InputError(f"none of the {len(done)} photos of {photos} could be rectified; see the warnings")
+    images = [replace(image, reason=left_out.get(image.name, image.reason)) for image in solution.images]
+    found = {name: each.depth for name, each in done.items() if each.depth is not None}
+    solution = with_depths(replace(solution, images=tuple(images)), found)
+    with output_folder(out, overwrite=True) as scratch:
+        turned = _write_models(scratch, solution, rec, turns, options, left_out, colors.rgb())
         log.end("writing")
-        solution = replace(solution, stages=tuple(log.stages))
-        write_solution(scratch / "solution.json", solution)
+        turned = replace(turned, stages=tuple(log.stages))
+        write_solution(scratch / "solution.json", turned)
+    if not left_out:
+        journal.path.unlink()  # nothing to go on with
+    return turned
+
+
+def _write_models(
+    folder: Path,
+    solution: Solution,
+    rec: Reconstruction,
+    turns: Mapping[str, int],
+    options: RunOptions,
+    left_out: Mapping[str, str],
+    rgb: NDArray[np.uint8] | None = None,
+) -> Solution:
+    """Write the models for COLMAP and nerfstudio; returns the solution as they have it, turned."""
+    if turns:
+        solution, rec = turn_solution(solution, turns), turn_reconstruction(rec, turns)
+    names = [None if name in left_out else output_name(name, options.raw_as) for name in rec.image_names]
+    new_cameras = [solution.rectified_cameras[str(k + 1)] for k in range(len(rec.cameras))]
+    write_colmap_model(folder / "sparse", rec, new_cameras, names, rgb)
+    masks = mask_names([image.name for image in solution.images])
+    files = {
+        name: (f"images/{written}", f"masks/{masks[name]}")
+        for name, written in zip(rec.image_names, names, strict=True)
+        if written is not None
+    }
+    write_transforms(folder / "transforms.json", solution, files)
     return solution
 
 
@@ -337,14 +358,15 @@ def _solution(
     rms = _image_rms(rec)
     counts = np.bincount(rec.observations.frame_idx, minlength=rec.num_images)
     cameras = {str(k + 1): camera for k, camera in enumerate(rec.cameras)}
+    places = {name: i for i, name in enumerate(rec.image_names)}
     images = []
     for name in sorted([*loaded.names, *loaded.skipped]):
         if name in loaded.skipped:
             images.append(SolvedImage(name, "1", reason=loaded.skipped[name]))
-        elif name not in rec.image_names:
+        elif name not in places:
             images.append(SolvedImage(name, "1", reason="shares too little with the other photos"))
         else:
-            i = rec.image_names.index(name)
+            i = places[name]
             images.append(
                 SolvedImage(
                     name=name,
@@ -392,6 +414,7 @@ def _solution(
             "known": sorted(options.known),
             "lengths": len(options.lengths),
             "remedy": options.remedy,
+            "depth": str(options.depth),
             "video": video,
             "gyro": options.gyro and options.gyro.facts(),
         },

@@ -20,7 +20,7 @@ from ..model import Solution, SolvedImage
 from ..synthetic import Recipe, TruePoints, add_noise, check_recipe, load_recipe, render_depth, render_view, true_points
 from ..synthetic import rs_shift_px as shift_in_scene
 from .progress import ProgressCallback, StageLog
-from .run import use_threads
+from .workers import use_threads
 
 __all__ = ["SceneOptions", "simulate_scene"]
 

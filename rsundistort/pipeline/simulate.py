@@ -22,7 +22,8 @@ from ..synthetic.fold import check_no_fold
 from ..synthetic.warp import crop_camera, largest_rectangle, random_phi, warp_mask, warp_photo
 from .cameras import find_cameras
 from .progress import ProgressCallback, StageLog
-from .run import use_threads, versions
+from .run import versions
+from .workers import use_threads
 from .write import mask_names
 
 __all__ = ["WarpOptions", "read_motion_file", "simulate_warp"]

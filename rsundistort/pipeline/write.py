@@ -3,45 +3,33 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from importlib.metadata import version
-from pathlib import Path
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, InputError, MetadataWarning, SkippedPhotoWarning
-from ..io import MAX_MEGAPIXELS, Photo, find_masks, output_name, read_mask, read_photo, write_image
-from ..io.photos.exif import read_orientation
-from ..model import Reconstruction, Solution, SolvedImage
-from ..model.orientation import split_mirror, turn_pixels
-from ..rectify import rectify
+from ..errors import FileError, SkippedPhotoWarning
+from ..io import find_masks, output_name
+from ..io.journal import Journal, JournalEntry
+from ..io.outputs import make_inside
+from ..model import Reconstruction, Solution
+from .depth import PhotoDepths
+from .extras import find_extras
+from .photo import PhotoDone, PhotoJob, RectifyOptions, rectify_photo
 from .progress import StageLog
+from .workers import Workers
 
-__all__ = ["PointColors", "check_not_rectified", "mask_names", "rectify_photos", "turn_of"]
+__all__ = ["PointColors", "mask_names", "rectify_photos"]
 
 
 def mask_names(names: Sequence[str]) -> dict[str, str]:
     """Name of each photo's mask: its stem, unless two photos share it (a.jpg and a.png)."""
-    stems = [Path(name).stem for name in names]
-    return {
-        name: f"{stem}.png" if stems.count(stem) == 1 else f"{name}.png"
-        for name, stem in zip(names, stems, strict=True)
-    }
-
-
-def check_not_rectified(photo: Photo) -> None:
-    """Refuse a photo that is rectified already."""
-    by = photo.metadata.rectified_by
-    if by is not None:
-        raise InputError(f"it was rectified already, by rsundistort {by}; --again rectifies it once more")
-
-
-def turn_of(image: SolvedImage, photo: Photo) -> tuple[int, int]:
-    """How a photo's orientation is applied, and what is left of it: mirrors are left where there is a pose."""
-    orientation = photo.metadata.orientation
-    return split_mirror(orientation) if image.posed else (orientation, 1)
+    stems = {name: PurePosixPath(name).with_suffix("").as_posix() for name in names}
+    counts = Counter(stems.values())
+    return {name: f"{stem}.png" if counts[stem] == 1 else f"{name}.png" for name, stem in stems.items()}
 
 
 def rectify_photos(
@@ -49,106 +37,177 @@ def rectify_photos(
     solution: Solution,
     names: Sequence[str],
     out: Path,
-    *,
-    interpolation: str,
-    quality: int,
-    jobs: int,
+    options: RectifyOptions,
+    depths: PhotoDepths,
+    workers: Workers,
     log: StageLog,
-    masks: Path | None = None,
-    raw_as: str = "tif",
-    apply_orientation: bool = False,
-    again: bool = True,
-    max_megapixels: float = MAX_MEGAPIXELS,
-) -> Iterator[tuple[str, Photo]]:
-    """Rectify photos into `out/images` and `out/masks`, and yield each raw photo by the way.
+    journal: Journal,
+    *,
+    resume: bool = False,
+    colors: PointColors | None = None,
+    go_on: str = "",
+) -> dict[str, PhotoDone]:
+    """Rectify photos into `out/images` and `out/masks`, each file whole or not at all.
 
-    Photos that cannot be read, are of another size than their camera, or (unless `again`) are rectified already, are
-    skipped with a warning. With `apply_orientation` photo and mask are turned as `turn_of` says. What the users' own
-    masks (a folder, as `io.find_masks` takes it) leave out is left out of `out/masks`.
+    Photos that cannot be read, are of another size than their camera, or are rectified already, are skipped with a
+    warning. At the end, what else is in the two folders is deleted; with `resume` only what an earlier batch made of
+    these photos, and is not true any more.
+
+    Parameters
+    ----------
+    folder, solution, names
+        Of the raw photos, their motions, and which of them.
+    out : Path
+        `batch_folder` made it ready, and gave `journal`.
+    options, depths, workers, log
+        What is done to each, how far away what it shows is, where, and who is told.
+    journal : Journal
+        Takes what is done.
+    resume : bool
+        Pass over what is whole and current by the journal.
+    colors : PointColors, optional
+        Takes the colours of the points.
+    go_on : str
+        How to go on after an interruption, for people.
+
+    Returns
+    -------
+    dict of name to PhotoDone
+        Of every photo; those that were left out have a `problem`.
     """
-    (out / "images").mkdir()
-    (out / "masks").mkdir()
-    mask_name = mask_names([image.name for image in solution.images])
-    mask_of = {} if masks is None else find_masks(masks, names)
-    mark = version("rsundistort")
+    before = journal.read()
+    done: dict[str, PhotoDone] = {}
+    jobs = _Jobs(folder, solution, names, out, options, depths, colors)
+    if resume:
+        for name in names:
+            entry = before.get(name)
+            if entry and entry.fingerprint and entry.fingerprint == jobs[name].fingerprint() and entry.is_whole(out):
+                done[name] = PhotoDone(name, "", entry.fingerprint, entry.files, entry.turn, entry.depth)
+    todo = [name for name in names if name not in done]
+    kinds = ("images", "masks", *(["maps"] if options.maps is not None else []))
+    for within in sorted({PurePosixPath(name).parent for name in todo}):
+        for kind in kinds:
+            make_inside(out, (kind / within).as_posix())
+    for within in sorted({PurePosixPath(each.target).parent for name in todo for each in jobs.extras.of(name)}):
+        make_inside(out, within.as_posix())
 
-    def work(name: str) -> tuple[str, Photo | None, str]:
-        image = solution.image(name)
-        camera = solution.cameras[image.camera_id]
-        try:
-            photo = read_photo(folder / name, max_megapixels)
-            if not again:
-                check_not_rectified(photo)
-            own = read_mask(mask_of[name], camera.width, camera.height) if name in mask_of else None
-            pixels, mask = rectify(
-                photo.pixels, camera, image.motion, solution.map_model,
-                solution.rectified_cameras[image.camera_id], interpolation, mask=own,
-            )  # fmt: skip
-            metadata = photo.metadata.marked(mark)
-            if apply_orientation:
-                turn, rest = turn_of(image, photo)
-                pixels, mask, metadata = (
-                    turn_pixels(pixels, turn),
-                    turn_pixels(mask, turn),
-                    metadata.with_orientation(rest),
-                )
-                _warn_of_orientation(name, photo, rest)
-            write_image(out / "images" / output_name(name, raw_as), pixels, metadata, quality)
-            write_image(out / "masks" / mask_name[name], mask)
-        except (FileError, InputError) as error:
-            return name, None, str(error)
-        return name, photo, ""
+    def begin() -> Iterator[PhotoJob]:
+        for name in todo:
+            if name in before:
+                # from here on its outputs may be of either making
+                journal.add(JournalEntry(name, "", before[name].files))
+            yield jobs[name]
 
-    log.begin("rectifying", len(names))
-    done = 0
-    written = 0
-    with ThreadPoolExecutor(jobs) as pool:
-        # a few photos ahead of the consumer, never the whole folder
-        for start in range(0, len(names), 2 * jobs):
-            for name, photo, problem in pool.map(work, names[start : start + 2 * jobs]):
-                done += 1
-                log.tell("rectifying", done, len(names))
-                if photo is None:
-                    warnings.warn(f"skipped: {name}: {problem}", SkippedPhotoWarning, stacklevel=2)
+    log.begin("rectifying", len(names), len(done))
+    results = workers.map(rectify_photo, begin(), lambda job, why: PhotoDone(job.name, why))
+    try:
+        with closing(results):
+            for result in results:
+                if result.problem:
+                    warnings.warn(f"skipped: {result.name}: {result.problem}", SkippedPhotoWarning, stacklevel=2)
                 else:
-                    written += 1
-                    yield name, photo
-    log.end("rectifying", photos=written)
+                    journal.add(_entry(result))
+                    if colors is not None and result.colors is not None:
+                        colors.add(result.name, result.colors)
+                done[result.name] = result
+                log.tell("rectifying", len(done), len(names))
+    except FileError as error:
+        raise FileError(f"{error}; {len(done)} of {len(names)} photos are done, {go_on}") from error
+    except KeyboardInterrupt as stop:
+        raise KeyboardInterrupt(f"{len(done)} of {len(names)} photos are done, {go_on}") from stop
+    if any(not each.problem for each in done.values()):
+        kept = {name: before[name] for name in before.keys() - done.keys()} if resume else {}
+        kept |= {name: _entry(each) for name, each in done.items() if not each.problem}
+        earlier = {path for name in before for path in before[name].files} | set(() if resume else _outputs(out))
+        _delete(out, earlier - {path for entry in kept.values() for path in entry.files})
+        journal.write(kept[name] for name in sorted(kept))
+    log.end("rectifying", photos=sum(not each.problem for each in done.values()))
+    return {name: done[name] for name in names}
 
 
-def _warn_of_orientation(name: str, photo: Photo, rest: int) -> None:
-    stored = read_orientation(photo.metadata.exif)
-    if stored != photo.metadata.orientation:
-        text = f"{name}: its EXIF orientation {stored} means nothing and is taken for 1"
-    elif rest != 1:
-        text = (
-            f"{name}: mirrored by its EXIF orientation {stored}, it was turned and keeps the mirror as its orientation"
+class _Jobs:
+    """What is to be done to each photo, by name; made when asked for."""
+
+    def __init__(
+        self,
+        folder: Path,
+        solution: Solution,
+        names: Sequence[str],
+        out: Path,
+        options: RectifyOptions,
+        depths: PhotoDepths,
+        colors: PointColors | None,
+    ) -> None:
+        # absolute: workers elsewhere have another working directory
+        self._folder, self._out = folder.absolute(), out.absolute()
+        self._solution, self._options, self._depths, self._colors = solution, options, depths, colors
+        self.extras = find_extras(options.maps, options.also, names)
+        self._mask_name = mask_names([image.name for image in solution.images])
+        self._own = {} if options.masks is None else find_masks(Path(options.masks).absolute(), names)
+
+    def __getitem__(self, name: str) -> PhotoJob:
+        solution = self._solution
+        image = solution.image(name)
+        stem = PurePosixPath(self._mask_name[name]).with_suffix("").as_posix()
+        return PhotoJob(
+            name=name,
+            source=self._folder / name,
+            out=self._out,
+            image=f"images/{output_name(name, self._options.raw_as)}",
+            mask=f"masks/{self._mask_name[name]}",
+            depth=self._depths.job(name),
+            shutter_model=solution.shutter_model,
+            posed=image.posed,
+            options=self._options,
+            own_mask=self._own.get(name),
+            also=self.extras.of(name),
+            maps=None if self._options.maps is None else f"maps/{stem}",
+            sample_xy=None if self._colors is None else self._colors.pixels(name),
         )
-    else:
-        return
-    warnings.warn(text, MetadataWarning, stacklevel=2)
+
+
+def _entry(done: PhotoDone) -> JournalEntry:
+    return JournalEntry(done.name, done.fingerprint, done.files, done.turn, done.depth)
+
+
+def _outputs(out: Path) -> Iterator[str]:
+    """Rectified photos and masks that are in a folder of outputs."""
+    for kind in ("images", "masks"):
+        yield from (path.relative_to(out).as_posix() for path in (out / kind).rglob("*") if not path.is_dir())
+
+
+def _delete(out: Path, paths: Iterable[str]) -> None:
+    for path in paths:
+        # they may come of a journal, which is a file that anybody may have changed
+        if (out / path).parent.resolve().is_relative_to(out.resolve()):
+            (out / path).unlink(missing_ok=True)
 
 
 class PointColors:
     """Mean colour of each point over the photos that see it."""
 
     def __init__(self, reconstruction: Reconstruction) -> None:
-        self._rec = reconstruction
+        obs = reconstruction.observations
+        self._place = {name: i for i, name in enumerate(reconstruction.image_names)}
+        self._order = np.argsort(obs.frame_idx, kind="stable")
+        self._bounds = np.searchsorted(obs.frame_idx[self._order], np.arange(reconstruction.num_images + 1))
+        self._xy, self._point_idx = obs.xy_raw, obs.point_idx
         self._sum = np.zeros((reconstruction.num_points, 3))
         self._count = np.zeros(reconstruction.num_points)
 
-    def add(self, name: str, photo: Photo) -> None:
-        """Take the colours of one photo."""
-        obs = self._rec.observations
-        of_photo = obs.frame_idx == self._rec.image_names.index(name)
-        xy = np.rint(obs.xy_raw[of_photo]).astype(int)
-        h, w = photo.pixels.shape[:2]
-        values = photo.pixels[np.clip(xy[:, 1], 0, h - 1), np.clip(xy[:, 0], 0, w - 1)].astype(float)
-        if values.ndim == 1:
-            values = np.repeat(values[:, None], 3, axis=1)
-        scale = 255.0 / np.iinfo(photo.pixels.dtype).max if photo.pixels.dtype.kind == "u" else 255.0
-        np.add.at(self._sum, obs.point_idx[of_photo], scale * values[:, 2::-1])
-        np.add.at(self._count, obs.point_idx[of_photo], 1)
+    def _of(self, name: str) -> NDArray[np.int64]:
+        i = self._place[name]
+        return np.asarray(self._order[self._bounds[i] : self._bounds[i + 1]])
+
+    def pixels(self, name: str) -> NDArray[np.int64]:
+        """(k, 2) raw pixels where a photo shows points."""
+        return np.rint(self._xy[self._of(name)]).astype(np.int64)
+
+    def add(self, name: str, colors: NDArray[np.float64]) -> None:
+        """Take the (k, 3) colours at those pixels, 0 to 255."""
+        points = self._point_idx[self._of(name)]
+        np.add.at(self._sum, points, colors)
+        np.add.at(self._count, points, 1)
 
     def rgb(self) -> NDArray[np.uint8]:
         """(n, 3) red, green, blue."""

@@ -1,16 +1,33 @@
 """Rectification: grids, photos and points, both ways."""
 
+from .coarse import TOLERANCE_PX, CoarseGrid, coarse_grid
+from .grid import MAP_KINDS, RemapGrid, remap_grid
 from .maps import init_rectify_map
-from .new_camera import optimal_new_camera
+from .new_camera import ViewOptions, optimal_new_camera, rectified_roi, rectified_view
 from .photo import INTERPOLATIONS, rectify
-from .points import distort_points, largest_shift_px, undistort_points
+from .points import distort_points, largest_shift_px, translation_shift_px, undistort_points
+from .sparse import depth_from_points, fit_plane, plane_in_camera, prefers_plane
 
 __all__ = [
     "INTERPOLATIONS",
+    "MAP_KINDS",
+    "TOLERANCE_PX",
+    "CoarseGrid",
+    "RemapGrid",
+    "ViewOptions",
+    "coarse_grid",
+    "depth_from_points",
     "distort_points",
+    "fit_plane",
     "init_rectify_map",
     "largest_shift_px",
     "optimal_new_camera",
+    "plane_in_camera",
+    "prefers_plane",
+    "rectified_roi",
+    "rectified_view",
     "rectify",
+    "remap_grid",
+    "translation_shift_px",
     "undistort_points",
 ]

@@ -8,10 +8,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._kernels import projection as kernels
 from ..errors import InputError
-from ..model import Camera, RowMotion, check_shutter_model
+from ..model import AtInfinity, Camera, Depth, RowMotion, check_shutter_model
 from ..model.checks import check_finite, check_rotations
+from .depth import DepthRows
 
-__all__ = ["fill_rows", "init_rectify_map", "rectified_rays"]
+__all__ = ["fill_rows", "init_rectify_map", "rectified_rays", "seen_by"]
 
 #: A raw position this far (pixels) beyond the outermost pixel centre still counts as seen: rounding of float32 maps.
 EDGE_PX = 1e-3
@@ -34,11 +35,25 @@ def fill_rows(
     row0: int,
     map_x: NDArray[np.float32],
     map_y: NDArray[np.float32],
+    depth: DepthRows | None = None,
 ) -> None:
     """Fill the rows `row0 ...` of a grid; where no raw pixel answers, the grid points far outside."""
     intr, lens, axis, sign = camera.kernel_args
     model = check_shutter_model(shutter_model)
+    if depth is not None and depth.matters(shutter_model):
+        inverse = depth.inverse(row0, map_x.shape)
+        kernels.fill_map_at_depth(
+            axis, sign, intr, lens, motion.phi, motion.velocity, rays, inverse, row0, 0, map_x, map_y
+        )
+        depth.mark_hidden(row0, map_x, map_y)
+        return
     kernels.fill_map(model, axis, sign, intr, lens, motion.phi, rays, row0, 0, map_x, map_y)
+
+
+def seen_by(map_x: NDArray[np.float32], map_y: NDArray[np.float32], width: int, height: int) -> NDArray[np.uint8]:
+    """255 where a map points into a photo of width x height pixels, else 0."""
+    seen = cv2.inRange(map_x, -EDGE_PX, width - 1 + EDGE_PX)
+    return np.asarray(cv2.bitwise_and(seen, cv2.inRange(map_y, -EDGE_PX, height - 1 + EDGE_PX)))
 
 
 def init_rectify_map(
@@ -49,6 +64,7 @@ def init_rectify_map(
     new_K: ArrayLike | None = None,
     size: tuple[int, int] | None = None,
     m1type: int = cv2.CV_32FC1,
+    depth: Depth | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
     """Maps for `cv2.remap` that take lens and shutter out of a photo, in the manner of `cv2.initUndistortRectifyMap`.
 
@@ -59,10 +75,10 @@ def init_rectify_map(
     camera : Camera
         Of the raw photo.
     motion : RowMotion, optional
-        Rotation during the readout; without it the result is `cv2.initUndistortRectifyMap`'s, or that of the
-        same name in `cv2.fisheye`.
-    shutter_model : {"rotation", "two-step", "linearized", "global"}
-        Row model.
+        During the readout, its velocity in the camera frame (`RowMotion.in_camera`); without it the result is
+        `cv2.initUndistortRectifyMap`'s, or that of the same name in `cv2.fisheye`.
+    shutter_model : {"rotation", "constant-motion", "two-step", "linearized", "global"}
+        Row model; constant-motion alone heeds the velocity.
     R : (3, 3) array, optional
         Rotation from the camera frame to the rectified one.
     new_K : (3, 3) array, optional
@@ -71,12 +87,15 @@ def init_rectify_map(
         Size of the rectified photo; the camera's own when left out.
     m1type : {cv2.CV_32FC1, cv2.CV_32FC2, cv2.CV_16SC2}
         Kind of the maps.
+    depth : AtInfinity, Plane or DepthMap, optional
+        How far what the photo shows is, on which the effect of the velocity depends; at infinity when left out.
 
     Returns
     -------
     map1, map2 : arrays
         Raw pixel of each rectified pixel: x and y (CV_32FC1), xy and None (CV_32FC2), or OpenCV's fixed point
-        (CV_16SC2). Where no raw pixel answers they point far outside of every photo.
+        (CV_16SC2). Where no raw pixel answers, or something nearer hid what it should show when its row was read, they
+        point far outside of every photo.
 
     Examples
     --------
@@ -90,7 +109,10 @@ def init_rectify_map(
         raise InputError(f"size={size}, expected positive (width, height)")
     map_x = np.empty((height, width), np.float32)
     map_y = np.empty((height, width), np.float32)
-    fill_rows(camera, motion or RowMotion(), shutter_model, rectified_rays(new_K, R, camera), 0, map_x, map_y)
+    rays = rectified_rays(new_K, R, camera)
+    motion = motion or RowMotion()
+    rows = DepthRows(depth or AtInfinity(), camera, motion, rays, (width, height))
+    fill_rows(camera, motion, shutter_model, rays, 0, map_x, map_y, rows)
     if m1type == cv2.CV_32FC1:
         return map_x, map_y
     if m1type == cv2.CV_32FC2:

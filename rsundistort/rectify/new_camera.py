@@ -1,6 +1,9 @@
-"""The camera of a rectified photo: how much to keep, how much to crop."""
+"""The camera of a rectified photo: how much to keep, how much to crop, how large."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +12,111 @@ from ..errors import InputError
 from ..model import Camera, RowMotion
 from ..model.projection import unproject_points
 
-__all__ = ["optimal_new_camera"]
+__all__ = ["ViewOptions", "optimal_new_camera", "rectified_roi", "rectified_view"]
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """What rectified photos show, and how large they are.
+
+    Parameters
+    ----------
+    alpha : float or "keep", optional
+        0: no empty pixel in any photo of a camera; 1: every pixel of all of them; between: between, as in
+        `optimal_new_camera`. "keep": K and size of the raw photos. None: as the solution has it, "keep" for a new one.
+    scale : float
+        Size of the rectified photos in that of the raw ones.
+    max_size : int, optional
+        Longest side, in pixels; smaller photos stay.
+    """
+
+    alpha: float | str | None = None
+    scale: float = 1.0
+    max_size: int | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.alpha, str):
+            if self.alpha != "keep":
+                raise InputError(f"alpha={self.alpha!r}, expected 'keep' or a number from 0 to 1")
+        elif self.alpha is not None and not 0.0 <= self.alpha <= 1.0:
+            raise InputError(f"alpha={self.alpha}, expected 'keep' or a number from 0 to 1")
+        if not 0.0 < self.scale < np.inf:
+            raise InputError(f"scale={self.scale}, expected a positive number")
+        if self.max_size is not None and self.max_size < 2:
+            raise InputError(f"max_size={self.max_size}, expected at least 2 pixels")
+
+
+def rectified_view(
+    camera: Camera, motions: Sequence[RowMotion], shutter_model: str, view: ViewOptions, as_it_was: Camera
+) -> Camera:
+    """The camera of the rectified photos of one physical camera.
+
+    Parameters
+    ----------
+    camera : Camera
+        Of the raw photos.
+    motions : sequence of RowMotion
+        Of all of them: one camera has to do for all.
+    shutter_model : str
+        As in `init_rectify_map`.
+    view : ViewOptions
+        What is asked for.
+    as_it_was : Camera
+        The rectified camera where `view.alpha` is None.
+    """
+    old = as_it_was if view.alpha is None else camera.pinhole()
+    scale = view.scale
+    if view.max_size is not None:
+        scale = min(scale, view.max_size / max(old.width, old.height))
+    # cut off, so that no pixel's centre lies beyond the last of the old ones
+    width, height = (int(scale * side + 1e-9) for side in (old.width, old.height))
+    if min(width, height) < 2:
+        raise InputError(f"scale={scale:g} leaves {width}x{height} pixels of {old.width}x{old.height}")
+    if view.alpha is None or view.alpha == "keep" or not motions:
+        if scale == 1.0:
+            return old
+        K = np.array(old.K)
+        K[:2, 2] += 0.5  # the corner of the photo stays, not the centre of its first pixel
+        K[:2] *= scale
+        K[:2, 2] -= 0.5
+        return Camera(width, height, K, readout=old.readout)
+    return optimal_new_camera(camera, motions, shutter_model, float(view.alpha), (width, height))[0]
+
+
+@dataclass(frozen=True)
+class _Outline:
+    """The border of a photo in ideal normalised coordinates: the rectangle within it, and that around it."""
+
+    inner_lo: NDArray[np.float64]
+    inner_hi: NDArray[np.float64]
+    outer_lo: NDArray[np.float64]
+    outer_hi: NDArray[np.float64]
+
+    def roi(self, new_camera: Camera) -> tuple[int, int, int, int] | None:
+        """The pixels (x, y, width, height) of a rectified photo within the inner rectangle."""
+        f, c = np.diag(new_camera.K)[:2], new_camera.K[:2, 2]
+        last = np.array([new_camera.width - 1, new_camera.height - 1])
+        # a border that was put on a pixel is on it, whatever the rounding
+        lo = np.maximum(np.ceil(f * self.inner_lo + c - 1e-6), 0)
+        hi = np.minimum(np.floor(f * self.inner_hi + c + 1e-6), last)
+        if not (hi >= lo).all():
+            return None
+        x, y, right, bottom = (int(v) for v in (*lo, *hi))
+        return x, y, right - x + 1, bottom - y + 1
+
+
+def _outline(camera: Camera, motion: RowMotion | None, shutter_model: str) -> _Outline | None:
+    """The outline of a photo, every pixel of its border walked; None where some have no place in a pinhole photo."""
+    left, right, top, bottom = (unproject_points(b, camera, motion, shutter_model)[0] for b in _border(camera))
+    edges = np.vstack([left, right, top, bottom])
+    if not np.isfinite(edges).all():
+        return None
+    return _Outline(
+        np.array([left[:, 0].max(), top[:, 1].max()]),
+        np.array([right[:, 0].min(), bottom[:, 1].min()]),
+        edges.min(0),
+        edges.max(0),
+    )
 
 
 def _border(camera: Camera) -> list[NDArray[np.float64]]:
@@ -24,9 +131,20 @@ def _border(camera: Camera) -> list[NDArray[np.float64]]:
     ]
 
 
+def rectified_roi(
+    camera: Camera, motion: RowMotion | None, shutter_model: str, new_camera: Camera
+) -> tuple[int, int, int, int] | None:
+    """Rectangle (x, y, width, height) of a rectified photo without empty pixels: within its border's innermost points.
+
+    None where there is no such rectangle, or the border has no place in a pinhole photo.
+    """
+    outline = _outline(camera, motion, shutter_model)
+    return None if outline is None else outline.roi(new_camera)
+
+
 def optimal_new_camera(
     camera: Camera,
-    motion: RowMotion | None = None,
+    motion: RowMotion | Sequence[RowMotion] | None = None,
     shutter_model: str = "rotation",
     alpha: float = 0.0,
     size: tuple[int, int] | None = None,
@@ -40,9 +158,9 @@ def optimal_new_camera(
     Parameters
     ----------
     camera, motion, shutter_model
-        As in `init_rectify_map`.
+        As in `init_rectify_map`; or the motions of several photos, for all of which the new camera has to do.
     alpha : float
-        0: no empty pixel; 1: every raw pixel is kept; between: between.
+        0: no empty pixel in any of them; 1: every pixel of all of them is kept; between: between.
     size : (width, height), optional
         Size of the rectified photo; the camera's own when left out.
 
@@ -51,25 +169,25 @@ def optimal_new_camera(
     new_camera : Camera
         Without distortion.
     roi : (x, y, width, height)
-        Rectangle of the rectified photo without empty pixels.
+        Rectangle without empty pixels in any of the rectified photos.
     """
     if not 0.0 <= alpha <= 1.0:
         raise InputError(f"alpha={alpha}, expected 0 to 1")
     width, height = size or (camera.width, camera.height)
     if width < 2 or height < 2:
         raise InputError(f"size={size}, expected (width, height) of at least 2")
-    left, right, top, bottom = (unproject_points(b, camera, motion, shutter_model)[0] for b in _border(camera))
-    edges = np.vstack([left, right, top, bottom])
-    if not np.isfinite(edges).all():
+    motions = motion if isinstance(motion, Sequence) else [motion]
+    outlines = [_outline(camera, each, shutter_model) for each in motions]
+    found = [each for each in outlines if each is not None]
+    if not found or len(found) < len(outlines):
         if camera.lens == "fisheye":
             raise InputError(
                 "the photo's border has no place in a pinhole photo: it lies 90 degrees or more from the axis, or the "
                 "lens folds before; check dist, or make a camera of your own, as camera.pinhole() does with the same K"
             )
         raise InputError("the photo's border has no place without lens and shutter; check dist and phi")
-    inner_lo = np.array([left[:, 0].max(), top[:, 1].max()])
-    inner_hi = np.array([right[:, 0].min(), bottom[:, 1].min()])
-    outer_lo, outer_hi = edges.min(0), edges.max(0)
+    inner_lo, inner_hi = np.max([o.inner_lo for o in found], 0), np.min([o.inner_hi for o in found], 0)
+    outer_lo, outer_hi = np.min([o.outer_lo for o in found], 0), np.max([o.outer_hi for o in found], 0)
     if (inner_hi <= inner_lo).any():
         raise InputError("no rectangle without empty pixels exists; check dist and phi")
     span = np.array([width - 1.0, height - 1.0])
@@ -82,6 +200,7 @@ def optimal_new_camera(
     f = zoom * shape
     c = span / 2 - f * middle
     new = Camera(width, height, np.array([[f[0], 0, c[0]], [0, f[1], c[1]], [0, 0, 1]]), readout=camera.readout)
-    lo = np.clip(np.ceil(f * inner_lo + c - 1e-6), 0, span).astype(int)
-    hi = np.clip(np.floor(f * inner_hi + c + 1e-6), 0, span).astype(int)
-    return new, (int(lo[0]), int(lo[1]), int(hi[0] - lo[0] + 1), int(hi[1] - lo[1] + 1))
+    roi = _Outline(inner_lo, inner_hi, outer_lo, outer_hi).roi(new)
+    if roi is None:
+        raise InputError("no rectangle without empty pixels exists; check dist and phi")
+    return new, roi

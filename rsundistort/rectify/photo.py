@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .._kernels import projection as kernels
 from ..errors import InputError
-from ..model import Camera, RowMotion
-from .maps import EDGE_PX, fill_rows, rectified_rays
+from ..model import AtInfinity, Camera, Depth, DepthMap, RowMotion
+from .coarse import coarse_grid
+from .depth import DepthRows
+from .maps import fill_rows, rectified_rays, seen_by
 
 __all__ = ["INTERPOLATIONS", "rectify"]
 
@@ -23,8 +29,30 @@ INTERPOLATIONS: dict[str, int] = {
     "lanczos": cv2.INTER_LANCZOS4,
 }
 
-_STRIP_ROWS = 64
+# So few pixels OpenCV remaps on the thread that asks, whatever `cv2.setNumThreads` says; the map stays in the cache.
+_STRIP_PIXELS = 1 << 16
+# Raw pixels from one rectified pixel to the next, up to which single samples do.
+_MAX_STEP = 1.25
 _MAX_SIDE = 32766  # cv2.remap counts in 16 bits
+
+
+def check_photo(photo: NDArray[Any], width: int, height: int) -> NDArray[Any]:
+    """The photo, refused if it is of a kind that cannot be remapped or of another size."""
+    photo = np.asarray(photo)
+    if photo.dtype not in (np.uint8, np.uint16, np.float32) or photo.ndim not in (2, 3):
+        raise InputError(f"photo is {photo.dtype} {photo.shape}, expected uint8, uint16 or float32 (h, w[, channels])")
+    if photo.shape[:2] != (height, width):
+        raise InputError(f"photo has {photo.shape[1]}x{photo.shape[0]} pixels, its camera {width}x{height}")
+    if max(photo.shape[:2]) > _MAX_SIDE:
+        raise InputError(f"photo has {width}x{height} pixels, and OpenCV rectifies sides up to {_MAX_SIDE}")
+    return photo
+
+
+def check_interpolation(name: str) -> int:
+    """OpenCV's flag of an interpolation."""
+    if name not in INTERPOLATIONS:
+        raise InputError(f"interpolation={name!r}, expected one of {', '.join(INTERPOLATIONS)}")
+    return INTERPOLATIONS[name]
 
 
 def rectify(
@@ -36,6 +64,7 @@ def rectify(
     interpolation: str = "cubic",
     jobs: int = 1,
     mask: NDArray[np.uint8] | None = None,
+    depth: Depth | None = None,
 ) -> tuple[NDArray[Any], NDArray[np.uint8]]:
     """A photo as a global shutter without lens distortion would have taken it, and which pixels were seen.
 
@@ -50,60 +79,133 @@ def rectify(
     new_camera : Camera, optional
         Pinhole camera of the result (its distortion must be empty); the photo's size and K when left out.
     interpolation : {"cubic", "linear", "lanczos", "nearest"}
-        OpenCV positions cubic and lanczos to 1/32 pixel.
+        Photos that get smaller are averaged over the area of each new pixel (not with nearest). OpenCV positions cubic
+        and lanczos to 1/32 pixel, and linear of uint8 photos, as in `cv2.undistort`.
     jobs : int
         Threads; the result does not depend on them.
     mask : (h, w) uint8 array, optional
         0 where pixels of the photo do not count: they are rectified, but not in the mask of the result.
+    depth : AtInfinity, Plane or DepthMap, optional
+        As in `init_rectify_map`.
 
     Returns
     -------
     rectified : array
         As `photo`, of the new camera's size; 0 where nothing was seen.
     valid : (h, w) uint8 array
-        255 where a raw pixel (that counts) answers, else 0.
+        255 where a raw pixel (that counts) answers, else 0: outside of the photo, and where something nearer hid what
+        the pixel would show.
     """
-    photo = np.asarray(photo)
-    if photo.dtype not in (np.uint8, np.uint16, np.float32) or photo.ndim not in (2, 3):
-        raise InputError(f"photo is {photo.dtype} {photo.shape}, expected uint8, uint16 or float32 (h, w[, channels])")
-    if photo.shape[:2] != (camera.height, camera.width):
-        raise InputError(
-            f"photo has {photo.shape[1]}x{photo.shape[0]} pixels, its camera {camera.width}x{camera.height}"
-        )
+    photo = check_photo(photo, camera.width, camera.height)
     if mask is not None and (mask.dtype != np.uint8 or mask.shape != photo.shape[:2]):
         raise InputError(f"mask is {mask.dtype} {mask.shape}, expected uint8 {photo.shape[:2]}")
-    if max(photo.shape[:2]) > _MAX_SIDE:
-        raise InputError(
-            f"photo has {photo.shape[1]}x{photo.shape[0]} pixels, and OpenCV rectifies sides up to {_MAX_SIDE}"
-        )
-    if interpolation not in INTERPOLATIONS:
-        raise InputError(f"interpolation={interpolation!r}, expected one of {', '.join(INTERPOLATIONS)}")
+    flag = check_interpolation(interpolation)
     target = new_camera or camera.pinhole()
     if not target.is_pinhole:
         raise InputError("new_camera has lens distortion; a rectified photo has none")
-    motion = motion or RowMotion()
     rays = rectified_rays(target.K, None, camera)
-    shape = (target.height, target.width)
-    rectified = np.empty(shape + photo.shape[2:], photo.dtype)
-    valid = np.empty(shape, np.uint8)
-    flag = INTERPOLATIONS[interpolation]
+    size = (target.width, target.height)
+
+    def fill(factor: int) -> FillRows:
+        # of a photo of so many times the pixels, whose corner is the same
+        finer = np.array([[1, 0, 0.5 - 0.5 * factor], [0, 1, 0.5 - 0.5 * factor], [0, 0, factor]]) / factor
+        finer_size = (factor * size[0], factor * size[1])
+        at = replace(depth, size=finer_size) if isinstance(depth, DepthMap) and depth.size == size else depth
+        return _fill_rows(camera, motion or RowMotion(), shutter_model, rays @ finer, finer_size, at or AtInfinity())
+
+    samples = 1 if flag == cv2.INTER_NEAREST else _samples(camera, target)
+    return remap_strips(photo, fill(1), size, flag, jobs, mask, samples, fill(samples) if samples > 1 else None)
+
+
+def _fixed_point(map_x: NDArray[np.float32], map_y: NDArray[np.float32]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """OpenCV's CV_16SC2 map."""
+    xy, fraction = np.empty((*map_x.shape, 2), np.int16), np.empty(map_x.shape, np.uint16)
+    kernels.fixed_point(map_x, map_y, xy.view(np.int32)[..., 0], fraction)
+    return xy, fraction
+
+
+def _samples(camera: Camera, target: Camera) -> int:
+    """Samples across a rectified pixel: as many as it covers raw pixels, going by the focal lengths."""
+    shrink = max(float(camera.K[k, k] / target.K[k, k]) for k in (0, 1))
+    return 1 if shrink <= _MAX_STEP else max(1, min(math.ceil(shrink), _MAX_SIDE // target.width))
+
+
+#: Fills rows of a map, from a first one on, and of the mask of what is seen; says whether all of it is.
+FillRows = Callable[[int, NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]], bool]
+
+
+def _fill_rows(
+    camera: Camera,
+    motion: RowMotion,
+    shutter_model: str,
+    rays: NDArray[np.float64],
+    size: tuple[int, int],
+    depth: Depth,
+) -> FillRows:
+    """What fills the rows of the map of a photo of `size`: interpolated, but exact where depths make it rough."""
+    depth_rows = DepthRows(depth, camera, motion, rays, size)
+    if not depth_rows.matters(shutter_model):
+        return coarse_grid(camera, motion, shutter_model, rays, size).fill
+
+    def fill(row0: int, map_x: NDArray[np.float32], map_y: NDArray[np.float32], seen: NDArray[np.uint8]) -> bool:
+        fill_rows(camera, motion, shutter_model, rays, row0, map_x, map_y, depth_rows)
+        seen[:] = seen_by(map_x, map_y, camera.width, camera.height)
+        return bool(seen.all())
+
+    return fill
+
+
+def remap_strips(
+    photo: NDArray[Any],
+    fill: FillRows,
+    size: tuple[int, int],
+    flag: int,
+    jobs: int,
+    mask: NDArray[np.uint8] | None = None,
+    samples: int = 1,
+    fill_samples: FillRows | None = None,
+) -> tuple[NDArray[Any], NDArray[np.uint8]]:
+    """A photo through a map of `size` that is made strip by strip, and its mask; see `rectify`.
+
+    With `samples` a pixel is the mean of samples x samples points, whose map `fill_samples` makes.
+    """
+    width, height = size
+    rectified = np.empty((height, width, *photo.shape[2:]), photo.dtype)
+    valid = np.empty((height, width), np.uint8)
+    # OpenCV 5 is exact with float maps, and takes half as long again
+    fixed = photo.dtype == np.uint8 and flag == cv2.INTER_LINEAR
+    strip_rows = max(1, _STRIP_PIXELS // (width * samples**2))
+
+    def interpolate(map_x: NDArray[np.float32], map_y: NDArray[np.float32], values: NDArray[Any]) -> None:
+        map1, map2 = _fixed_point(map_x, map_y) if fixed else (map_x, map_y)
+        # taps beyond the border repeat it, so that seen pixels at the edge keep their brightness
+        cv2.remap(photo, map1, map2, flag, dst=values, borderMode=cv2.BORDER_REPLICATE)
 
     def strip(row0: int) -> None:
-        rows = slice(row0, min(row0 + _STRIP_ROWS, target.height))
-        map_x = np.empty((rows.stop - row0, target.width), np.float32)
+        rows = slice(row0, min(row0 + strip_rows, height))
+        map_x = np.empty((rows.stop - row0, width), np.float32)
         map_y = np.empty_like(map_x)
-        fill_rows(camera, motion, shutter_model, rays, row0, map_x, map_y)
-        seen = (map_x >= -EDGE_PX) & (map_x <= camera.width - 1 + EDGE_PX)
-        seen &= (map_y >= -EDGE_PX) & (map_y <= camera.height - 1 + EDGE_PX)
-        # taps beyond the border repeat it, so that seen pixels at the edge keep their brightness
-        values = cv2.remap(photo, map_x, map_y, flag, borderMode=cv2.BORDER_REPLICATE)
-        values[~seen] = 0
-        rectified[rows] = values.reshape(rectified[rows].shape)
+        values, seen = rectified[rows], valid[rows]
+        all_seen = fill(row0, map_x, map_y, seen)
+        if fill_samples is None:
+            interpolate(map_x, map_y, values)
+        else:
+            fine_x = np.empty((samples * len(map_x), samples * width), np.float32)
+            fine_y, fine_seen = np.empty_like(fine_x), np.empty(fine_x.shape, np.uint8)
+            fine = np.empty((*fine_x.shape, *photo.shape[2:]), photo.dtype)
+            if not fill_samples(samples * row0, fine_x, fine_y, fine_seen) and fine_x.min() < -1e5:
+                nowhere = (fine_x < -1e5).reshape(len(map_x), samples, width, samples).any((1, 3))
+                seen[nowhere] = 0
+                all_seen = False
+            interpolate(fine_x, fine_y, fine)
+            cv2.resize(fine, (width, len(map_x)), dst=values, interpolation=cv2.INTER_AREA)
+        if not all_seen:
+            kernels.clear_unseen(seen, values.reshape(*seen.shape, -1).view(np.uint8))
         if mask is not None:
-            seen &= cv2.remap(mask, map_x, map_y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE) > 0
-        valid[rows] = np.where(seen, 255, 0)
+            counts = cv2.remap(mask, map_x, map_y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+            seen[counts == 0] = 0
 
-    starts = range(0, target.height, _STRIP_ROWS)
+    starts = range(0, height, strip_rows)
     if jobs == 1:
         for row0 in starts:
             strip(row0)

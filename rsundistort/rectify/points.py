@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .._kernels.depth import EDGE
 from ..errors import InputError
-from ..model import Camera, RowMotion
-from ..model.checks import check_finite
-from ..model.projection import project_points, unproject_points
+from ..model import AtInfinity, Camera, Depth, DepthMap, Plane, RowMotion
+from ..model.checks import check_array, check_finite
+from ..model.projection import clock_of, project_points, unproject_points
+from .depth import inverse_depth_at
 from .maps import rectified_rays
 
 __all__ = ["distort_points", "largest_shift_px", "undistort_points"]
+
+# A line through a depth map is followed in steps of half a pixel; bisection ends at rounding.
+_STEPS_PER_PX = 2
+_BISECTIONS = 50
 
 
 def _as_list(points: ArrayLike, name: str) -> tuple[NDArray[np.float64], tuple[int, ...]]:
@@ -22,6 +31,93 @@ def _as_list(points: ArrayLike, name: str) -> tuple[NDArray[np.float64], tuple[i
     return array.reshape(-1, 2), array.shape
 
 
+def _homogeneous(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.column_stack([xy, np.ones(len(xy))])
+
+
+def _inverse_depths(
+    depth: Depth | ArrayLike, xy: NDArray[np.float64], rays: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(n,) inverse depths of rectified pixels (n, 2)."""
+    if isinstance(depth, AtInfinity | Plane | DepthMap):
+        return inverse_depth_at(depth, xy, rays)
+    given = check_array(depth, (len(xy),), "depth")
+    if not (given > 0).all():
+        raise InputError("depth holds a number that is not positive; inf is far")
+    return np.asarray(1.0 / given)
+
+
+def _check_map(depth: Depth | ArrayLike, P: ArrayLike | None) -> None:
+    if isinstance(depth, DepthMap) and P is None:
+        raise InputError("a depth map has the pixels of the rectified photo: P is needed")
+
+
+def _rectified(
+    xy: NDArray[np.float64],
+    camera: Camera,
+    motion: RowMotion,
+    shutter_model: str,
+    rays: NDArray[np.float64],
+    depth: Depth | ArrayLike,
+) -> NDArray[np.float64]:
+    """Rectified pixels (n, 2) of raw pixels; rays (3, 3) as of `rectified_rays`."""
+    ideal, _ = unproject_points(xy, camera, motion, shutter_model)
+    q = _homogeneous(ideal) @ np.linalg.inv(rays).T
+    with np.errstate(invalid="ignore"):
+        q[~(q[:, 2] > 0)] = np.nan
+    xy_rect = q[:, :2] / q[:, 2:]
+    if shutter_model != "constant-motion" or not motion.velocity.any() or isinstance(depth, AtInfinity):
+        return xy_rect
+    # Where the camera had got to when it read the row, in homogeneous pixels; what the raw pixel shows lies on the line
+    # from there, which starts at infinity where the rotation alone takes the pixel.
+    moved = clock_of(camera, xy)[:, None] * np.linalg.solve(rays, motion.velocity)
+
+    def on_line(inverse: NDArray[np.float64]) -> NDArray[np.float64]:
+        w = inverse[:, None]
+        return xy_rect * (1 - w * moved[:, 2:]) + w * moved[:, :2]
+
+    if isinstance(depth, Plane):
+        # the point moved + s q of the plane has the depth moved_z + s
+        normal = depth.normal @ rays / depth.distance
+        along, start = _homogeneous(xy_rect) @ normal, moved @ normal
+        return on_line(np.where(along > 0, along / (1 - start + along * moved[:, 2]), 0.0))
+    if isinstance(depth, DepthMap):
+        longest = np.nanmax(np.hypot(*(moved[:, :2] - moved[:, 2:] * xy_rect).T), initial=0.0) * depth.inverse.max()
+        return on_line(_first_hit(depth, on_line, len(xy), int(_STEPS_PER_PX * longest) + 1))
+    return on_line(_inverse_depths(depth, xy, rays))
+
+
+def _first_hit(
+    depth: DepthMap, on_line: Callable[[NDArray[np.float64]], NDArray[np.float64]], num: int, steps: int
+) -> NDArray[np.float64]:
+    """Inverse depths (n,) where lines that come from the camera first meet a depth map: a march, then bisection.
+
+    A line may pass behind the edge of a thing; it meets it there only if it does not come out again.
+    """
+
+    def field(w: NDArray[np.float64]) -> NDArray[np.float64]:
+        return inverse_depth_at(depth, on_line(w), np.eye(3))
+
+    marks = np.linspace(float(depth.inverse.max()), 0.0, steps + 1)
+    rise_of_edge = EDGE * marks[0] / steps
+    surface = field(np.full(num, marks[0]))
+    behind = surface >= marks[0]
+    # brackets of the first place that counts, and whether that is a surface
+    near, far, met = np.full(num, marks[0]), np.full(num, marks[0]), behind.copy()
+    for last, mark in pairwise(marks):
+        before, surface = surface, field(np.full(num, mark))
+        now = surface >= mark
+        enters = now & ~behind & ~met
+        near[enters], far[enters] = last, mark
+        met |= enters & (surface - before <= rise_of_edge)
+        behind = now
+    for _ in range(_BISECTIONS):
+        w = 0.5 * (near + far)
+        now = field(w) >= w
+        far, near = np.where(now, w, far), np.where(now, near, w)
+    return far
+
+
 def undistort_points(
     points: ArrayLike,
     camera: Camera,
@@ -29,6 +125,7 @@ def undistort_points(
     shutter_model: str = "rotation",
     R: ArrayLike | None = None,
     P: ArrayLike | None = None,
+    depth: Depth | ArrayLike | None = None,
 ) -> NDArray[np.float64]:
     """Where raw pixels lie without lens and shutter, in the manner of `cv2.undistortPoints`.
 
@@ -42,19 +139,21 @@ def undistort_points(
         Rotation from the camera frame to the rectified one.
     P : (3, 3) array, optional
         Pinhole matrix of the rectified photo. Without it the result is in normalised coordinates.
+    depth : AtInfinity, Plane, DepthMap or (n,) array, optional
+        How far the points are, which constant-motion needs: as in `init_rectify_map` (a map needs P, of which it has
+        the pixels), or each point's z in the rectified frame at the reference row. At infinity when left out.
 
     Returns
     -------
     array of the shape of `points`
-        NaN where the lens or the shutter model has no inverse.
+        NaN where the lens or the shutter model has no inverse. Where the rectified photo hides what a raw pixel shows,
+        the edge of what hides it.
     """
     xy, shape = _as_list(points, "points")
-    ideal, _ = unproject_points(xy, camera, motion, shutter_model)
-    to_rectified = np.linalg.inv(rectified_rays(np.eye(3) if P is None else P, R, camera))
-    q = np.column_stack([ideal, np.ones(len(ideal))]) @ to_rectified.T
-    with np.errstate(invalid="ignore"):
-        q[~(q[:, 2] > 0)] = np.nan
-    return (q[:, :2] / q[:, 2:]).reshape(shape)
+    depth = AtInfinity() if depth is None else depth
+    _check_map(depth, P)
+    rays = rectified_rays(np.eye(3) if P is None else P, R, camera)
+    return _rectified(xy, camera, motion or RowMotion(), shutter_model, rays, depth).reshape(shape)
 
 
 def distort_points(
@@ -64,6 +163,7 @@ def distort_points(
     shutter_model: str = "rotation",
     R: ArrayLike | None = None,
     P: ArrayLike | None = None,
+    depth: Depth | ArrayLike | None = None,
 ) -> NDArray[np.float64]:
     """Raw pixels that show points of the rectified photo: the inverse of `undistort_points`.
 
@@ -71,7 +171,7 @@ def distort_points(
     ----------
     points : (n, 2), (n, 1, 2) or (1, n, 2) array
         Pixels of the rectified photo if `P` is given, else normalised coordinates.
-    camera, motion, shutter_model, R, P
+    camera, motion, shutter_model, R, P, depth
         As in `undistort_points`.
 
     Returns
@@ -80,19 +180,68 @@ def distort_points(
         Pixels of the raw photo; NaN where none shows the point.
     """
     xy, shape = _as_list(points, "points")
+    depth = AtInfinity() if depth is None else depth
+    _check_map(depth, P)
     rays = rectified_rays(np.eye(3) if P is None else P, R, camera)
-    raw, _ = project_points(np.column_stack([xy, np.ones(len(xy))]) @ rays.T, camera, motion, shutter_model)
+    points_c = _homogeneous(xy) @ rays.T
+    if shutter_model != "constant-motion":
+        return project_points(points_c, camera, motion, shutter_model)[0].reshape(shape)
+    inverse = _inverse_depths(depth, xy, rays)
+    raw, _ = project_points(points_c, camera, motion, "rotation")
+    near = inverse > 0
+    raw[near], _ = project_points(points_c[near] / inverse[near, None], camera, motion, shutter_model)
     return raw.reshape(shape)
 
 
-def largest_shift_px(camera: Camera, motion: RowMotion, shutter_model: str = "rotation") -> float:
+def largest_shift_px(
+    camera: Camera,
+    motion: RowMotion,
+    shutter_model: str = "rotation",
+    depth: Depth | None = None,
+    new_camera: Camera | None = None,
+) -> float:
     """Largest displacement in pixels that the shutter causes anywhere in a photo.
 
-    It is looked for on a grid of 33 x 33 raw pixels that holds the border and the corners.
+    It is looked for on a grid of 33 x 33 raw pixels that holds the border and the corners; with a depth, on one of 97 x
+    65 pixels of the rectified photo (`new_camera`, else of the camera's own size and K).
     """
-    u, v = np.meshgrid(np.linspace(0, camera.width - 1, 33), np.linspace(0, camera.height - 1, 33))
-    raw = np.column_stack([u.ravel(), v.ravel()])
-    ideal, valid = unproject_points(raw, camera, motion, shutter_model)
-    still, seen = project_points(np.column_stack([ideal, np.ones(len(ideal))])[valid], camera, None, "global")
-    shift = np.linalg.norm(still - raw[valid], axis=1)[seen]
-    return float(check_finite(shift, (None,), "shift").max(initial=0.0))
+    if depth is None or isinstance(depth, AtInfinity) or shutter_model != "constant-motion":
+        u, v = np.meshgrid(np.linspace(0, camera.width - 1, 33), np.linspace(0, camera.height - 1, 33))
+        raw = np.column_stack([u.ravel(), v.ravel()])
+        ideal, valid = unproject_points(raw, camera, motion, shutter_model)
+        still, seen = project_points(_homogeneous(ideal)[valid], camera, None, "global")
+        shift = np.linalg.norm(still - raw[valid], axis=1)[seen]
+        return float(check_finite(shift, (None,), "shift").max(initial=0.0))
+    xy, K = _rectified_grid(camera, new_camera)
+    raw = distort_points(xy, camera, motion, shutter_model, P=K, depth=depth)
+    return _largest(camera, raw, distort_points(xy, camera, P=K))
+
+
+def translation_shift_px(camera: Camera, motion: RowMotion, depth: Depth, new_camera: Camera | None = None) -> float:
+    """Largest displacement in pixels that the translation causes in a photo, against what is at infinity.
+
+    Parameters
+    ----------
+    camera, motion, depth
+        As in `init_rectify_map`, of the constant-motion model.
+    new_camera : Camera, optional
+        Of the rectified photo.
+    """
+    xy, K = _rectified_grid(camera, new_camera)
+    at_depth, far = (distort_points(xy, camera, motion, "constant-motion", P=K, depth=d) for d in (depth, None))
+    return _largest(camera, at_depth, far)
+
+
+def _rectified_grid(camera: Camera, new_camera: Camera | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pixels (n, 2) over a rectified photo, its border among them, and its K."""
+    new = new_camera or camera.pinhole()
+    u, v = np.meshgrid(np.linspace(0, new.width - 1, 97), np.linspace(0, new.height - 1, 65))
+    return np.column_stack([u.ravel(), v.ravel()]), new.K
+
+
+def _largest(camera: Camera, raw: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """Largest distance of raw pixels (n, 2) from others, of those that lie in the photo."""
+    with np.errstate(invalid="ignore"):
+        inside = ((raw >= 0) & (raw <= [camera.width - 1, camera.height - 1])).all(1)
+    shift = np.linalg.norm(raw - other, axis=1)[inside]
+    return float(shift[np.isfinite(shift)].max(initial=0.0))

@@ -9,6 +9,7 @@ import warnings
 # Before cv2 and before anybody's pycolmap. pycolmap exports a zlib of its own; if the system's zlib is first loaded
 # after it, the two get mixed and whatever compresses (PNG, Python's own zlib) aborts the process.
 import zlib  # noqa: F401
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import FileError, FileKindWarning, InputError, MetadataWarning
+from ..aside import write_aside
 from .containers import metadata_of, with_metadata
 from .heif import read_heif
 from .kinds import (
@@ -68,15 +70,20 @@ class Photo:
     metadata: Metadata = field(default_factory=Metadata)
 
 
-def list_photos(folder: Path, raw_as: str = "tif") -> list[str]:
-    """Names of the photos in a folder, sorted; files of other kinds and hidden ones are passed over."""
+def list_photos(folder: Path, raw_as: str = "tif", sub_folders: Collection[str] = ()) -> list[str]:
+    """Names of the photos in a folder, sorted; files of other kinds and hidden ones are passed over.
+
+    Of sub-folders only those named are looked into ("a", "a/b"), if they are there; their photos are "a/name.jpg".
+    """
     folder = Path(folder)
     if not folder.is_dir():
         raise FileError(f"{folder} is no folder; give the folder that holds the photos")
     suffixes = PHOTO_SUFFIXES + HEIF_SUFFIXES + RAW_SUFFIXES
     names = sorted(
-        entry.name
-        for entry in folder.iterdir()
+        entry.relative_to(folder).as_posix()
+        for within in (folder, *(folder / name for name in sorted(sub_folders)))
+        if within.is_dir()
+        for entry in within.iterdir()
         if entry.suffix.lower() in suffixes and not entry.name.startswith(".") and entry.is_file()
     )
     outputs: dict[str, str] = {}
@@ -94,7 +101,7 @@ def list_photos(folder: Path, raw_as: str = "tif") -> list[str]:
 
 def output_name(name: str, raw_as: str = "tif") -> str:
     """Name of a rectified photo: the photo's own; RAW and HEIC become one of `RAW_AS`."""
-    return f"{Path(name).stem}.{raw_as}" if kind_of_name(name) in ("RAW", "HEIC") else name
+    return Path(name).with_suffix(f".{raw_as}").as_posix() if kind_of_name(name) in ("RAW", "HEIC") else name
 
 
 def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> Photo:
@@ -170,13 +177,17 @@ def _decode(data: bytes, name: str) -> NDArray[Any]:
     return pixels
 
 
-def _encode_params(suffix: str, quality: int) -> list[int]:
+def _encode_params(suffix: str, quality: int, flat: bool) -> list[int]:
     if suffix in (".jpg", ".jpeg"):
         # colour at full resolution: halved again after the camera halved it, it costs 2 to 4 dB (measured)
         full = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
         return [cv2.IMWRITE_JPEG_QUALITY, quality, *full]
     if suffix == ".webp":
         return [cv2.IMWRITE_WEBP_QUALITY, quality]
+    if suffix == ".png" and flat:
+        # runs of the difference to the row above: 12 megapixels in 21 ms, not 54, and 18 kB, not 66 (measured)
+        up = [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP] if hasattr(cv2, "IMWRITE_PNG_FILTER") else []
+        return [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE, *up]
     if suffix == ".png":
         return [cv2.IMWRITE_PNG_COMPRESSION, 3]
     return []
@@ -187,6 +198,7 @@ def write_image(
     pixels: NDArray[Any],
     metadata: Metadata | None = None,
     quality: int = 95,
+    flat: bool = False,
 ) -> None:
     """Write an image of the kind that the path's ending says, whole or not at all.
 
@@ -199,6 +211,8 @@ def write_image(
         is made true; its thumbnail, and what it says of other pictures that were in the file, is left out.
     quality : int
         Of JPEG and WebP, 1 to 100; above 100, WebP is stored without loss.
+    flat : bool
+        Whether it is of plain areas, as masks are: a PNG is then made in half the time, and smaller.
 
     Raises
     ------
@@ -208,17 +222,14 @@ def write_image(
         When it cannot be written.
     """
     path = Path(path)
-    data = _encode(path, np.asarray(pixels), metadata or Metadata(), quality)
-    aside = path.with_name(f".{path.name}.partial")
+    data = _encode(path, np.asarray(pixels), metadata or Metadata(), quality, flat)
     try:
-        aside.write_bytes(data)
-        aside.replace(path)
+        write_aside(path, data)
     except OSError as error:
-        aside.unlink(missing_ok=True)
         raise FileError(f"{path} cannot be written: {error.strerror}") from error
 
 
-def _encode(path: Path, pixels: NDArray[Any], metadata: Metadata, quality: int) -> bytes:
+def _encode(path: Path, pixels: NDArray[Any], metadata: Metadata, quality: int, flat: bool) -> bytes:
     suffix, kind = path.suffix.lower(), kind_of_name(path.name)
     depths = {"PNG": "uint8 uint16", "TIFF": "uint8 uint16 float32", "JPEG": "uint8 uint16", "WebP": "uint8 uint16"}
     if str(pixels.dtype) not in depths.get(kind, "").split():
@@ -234,9 +245,9 @@ def _encode(path: Path, pixels: NDArray[Any], metadata: Metadata, quality: int) 
             data, lost = encode_tiff(pixels, metadata)
         else:
             if kind == "PNG" and _compression_is_broken():
-                data = _encode_elsewhere(suffix, pixels, quality)
+                data = _encode_elsewhere(suffix, pixels, _encode_params(suffix, quality, flat))
             else:
-                done, array = cv2.imencode(suffix, pixels, _encode_params(suffix, quality))
+                done, array = cv2.imencode(suffix, pixels, _encode_params(suffix, quality, flat))
                 if not done:
                     raise InputError(f"an image {pixels.shape} {pixels.dtype} cannot be stored as {suffix}")
                 data = bytes(array)
@@ -259,7 +270,7 @@ def _compression_is_broken() -> bool:
     return order.index("pycolmap") < min(loaded, default=len(order))
 
 
-def _encode_elsewhere(suffix: str, pixels: NDArray[Any], quality: int) -> bytes:
+def _encode_elsewhere(suffix: str, pixels: NDArray[Any], params: list[int]) -> bytes:
     """Encode in a clean process; slower, but this one would abort."""
     code = (
         "import sys, cv2, numpy as np;"
@@ -267,7 +278,7 @@ def _encode_elsewhere(suffix: str, pixels: NDArray[Any], quality: int) -> bytes:
         "pixels = np.frombuffer(sys.stdin.buffer.read(), dtype).reshape(shape);"
         "sys.stdout.buffer.write(bytes(cv2.imencode(suffix, pixels, params)[1]))"
     )
-    job = repr((pixels.shape, pixels.dtype.str, suffix, _encode_params(suffix, quality)))
+    job = repr((pixels.shape, pixels.dtype.str, suffix, params))
     done = subprocess.run(
         [sys.executable, "-c", code, job],
         input=np.ascontiguousarray(pixels).tobytes(),

@@ -1,0 +1,140 @@
+"""Cholesky factor of a symmetric matrix inside its envelope.
+
+Rows of the factor L are kept in bands of four, each band from its first column (a multiple of four) to its diagonal,
+rows one after the other: entry (4 g + r, c) is data[offset[g] + r * (4 g + 4 - first[g]) + c - first[g]].
+"""
+
+from __future__ import annotations
+
+import math
+
+from ._jit import SUMS, kernel, parallel_kernel, prange
+
+# Bands that take a column of the factor together: with their own rows they fit in the cache of a processor.
+_TOGETHER = 8
+
+
+@parallel_kernel()
+def fill_envelope(place, row_start, cols, S, scale, first, offset, data):
+    """Blocks into the envelope, scaled on both sides; place (m, nb) is each unknown's row, -1 if held.
+
+    Rows past the last unknown, up to a multiple of four, are those of the identity.
+    """
+    data[:] = 0.0
+    nb = place.shape[1]
+    for g in range(len(first)):
+        for r in range(4):
+            data[offset[g] + r * (4 * g + 4 - first[g]) + 4 * g + r - first[g]] = 1.0
+    for f in prange(len(row_start) - 1):
+        for i in range(row_start[f], row_start[f + 1]):
+            for a in range(nb):
+                for b in range(nb):
+                    row, col = place[f, a], place[cols[i], b]
+                    value = S[i, a, b]
+                    if row < col:
+                        row, col = col, row
+                        if cols[i] == f:
+                            continue
+                    g = row // 4
+                    if col >= 0:
+                        at = offset[g] + (row - 4 * g) * (4 * g + 4 - first[g]) + col - first[g]
+                        data[at] = value * scale[row] * scale[col]
+
+
+@kernel(fastmath=SUMS)
+def _band_tile(data, first, offset, g, c):
+    """Columns 4c to 4c + 3 of band g of the factor, from the columns before them; False if it is not positive."""
+    fg, fc = first[g], first[c]
+    wg, wc = 4 * g + 4 - fg, 4 * c + 4 - fc
+    low = max(fg, fc)
+    width = 4 * c - low
+    a = offset[g] + low - fg
+    b = offset[c] + low - fc
+    a0, a1, a2, a3 = data[a:], data[a + wg :], data[a + 2 * wg :], data[a + 3 * wg :]
+    b0, b1, b2, b3 = data[b:], data[b + wc :], data[b + 2 * wc :], data[b + 3 * wc :]
+    s00 = s01 = s02 = s03 = s10 = s11 = s12 = s13 = 0.0
+    s20 = s21 = s22 = s23 = s30 = s31 = s32 = s33 = 0.0
+    for k in range(width):
+        x0, x1, x2, x3 = a0[k], a1[k], a2[k], a3[k]
+        y0, y1, y2, y3 = b0[k], b1[k], b2[k], b3[k]
+        s00 += x0 * y0
+        s01 += x0 * y1
+        s02 += x0 * y2
+        s03 += x0 * y3
+        s10 += x1 * y0
+        s11 += x1 * y1
+        s12 += x1 * y2
+        s13 += x1 * y3
+        s20 += x2 * y0
+        s21 += x2 * y1
+        s22 += x2 * y2
+        s23 += x2 * y3
+        s30 += x3 * y0
+        s31 += x3 * y1
+        s32 += x3 * y2
+        s33 += x3 * y3
+    sums = ((s00, s01, s02, s03), (s10, s11, s12, s13), (s20, s21, s22, s23), (s30, s31, s32, s33))
+    at, dia = offset[g] + 4 * c - fg, offset[c] + 4 * c - fc
+    for i in range(4):
+        row = at + i * wg
+        for j in range(i + 1 if g == c else 4):
+            v = data[row + j] - sums[i][j]
+            for k in range(j):
+                v -= data[row + k] * data[dia + j * wc + k]
+            if g == c and i == j:
+                if not v > 1e-15:  # of a unit diagonal
+                    return False
+                data[row + j] = math.sqrt(v)
+            else:
+                data[row + j] = v / data[dia + j * wc + j]
+    return True
+
+
+@parallel_kernel()
+def factor_envelope(first, offset, panel, data):
+    """Cholesky factor in place, `panel` bands at a time; False if the matrix is not positive."""
+    bands = len(first)
+    for start in range(0, bands, panel):
+        stop = min(bands, start + panel)
+        # bands of a panel do not need each other up to its first column; a few of them take each column together,
+        # while it is at hand
+        begin = first[start:stop].min() // 4
+        if start > begin:
+            for part in prange((stop - start + _TOGETHER - 1) // _TOGETHER):
+                low = start + part * _TOGETHER
+                for c in range(begin, start):
+                    for g in range(low, min(stop, low + _TOGETHER)):
+                        if first[g] <= 4 * c:
+                            _band_tile(data, first, offset, g, c)
+        for g in range(start, stop):
+            for c in range(max(first[g] // 4, start), g + 1):
+                if not _band_tile(data, first, offset, g, c):
+                    return False
+    return True
+
+
+@parallel_kernel(fastmath=SUMS)
+def solve_envelope(first, offset, data, B):
+    """B (k, n): right-hand sides become solutions, n a multiple of four."""
+    for j in prange(len(B)):
+        x = B[j]
+        begun = False
+        for i in range(len(x)):
+            if not begun and x[i] == 0.0:  # columns of the identity begin late
+                continue
+            begun = True
+            g = i // 4
+            fg = first[g]
+            at = offset[g] + (i - 4 * g) * (4 * g + 4 - fg)
+            t = 0.0
+            for k in range(i - fg):
+                t += data[at + k] * x[fg + k]
+            x[i] = (x[i] - t) / data[at + i - fg]
+        for i in range(len(x) - 1, -1, -1):
+            g = i // 4
+            fg = first[g]
+            at = offset[g] + (i - 4 * g) * (4 * g + 4 - fg)
+            t = x[i] / data[at + i - fg]
+            x[i] = t
+            for k in range(i - fg):
+                x[fg + k] -= t * data[at + k]

@@ -1,0 +1,269 @@
+"""Normal equations of photos, points and shared intrinsics; the points are eliminated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from .._kernels import schur
+from .elimination import Elimination
+from .reduced import Reduced, products
+
+__all__ = ["Border", "NormalEquations", "Step"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Step = tuple[Array, Array, Array]
+
+
+@dataclass(frozen=True)
+class Border:
+    """Intrinsics that photos share: nc unknowns of each camera.
+
+    Attributes
+    ----------
+    J : (o, 2, nc) array
+        Weighted Jacobians of the observations, nc may be 0.
+    camera_of_frame : (m,) int array
+        Camera of each photo.
+    prior_diag, prior_gradient : (cameras, nc) array
+        Diagonal Hessian and gradient of the priors of the cameras.
+    """
+
+    J: Array
+    camera_of_frame: Index
+    prior_diag: Array
+    prior_gradient: Array
+
+    @property
+    def num_cameras(self) -> int:
+        """Number of cameras."""
+        return len(self.prior_diag)
+
+    def sum_photos(self, x: Array) -> Array:
+        """Values of the photos (m, nc, ...) summed over those of each camera, (cameras * nc, ...)."""
+        total = np.zeros((self.num_cameras, *x.shape[1:]))
+        np.add.at(total, self.camera_of_frame, x)
+        return total.reshape(self.num_cameras * x.shape[1], *x.shape[2:])
+
+
+class NormalEquations:
+    """Block normal equations at one state; `solve` eliminates the points and solves for the photos.
+
+    Parameters
+    ----------
+    elimination : Elimination
+        Which photo sees which point, and how the reduced system is solved.
+    cost : float
+        Cost at the state.
+    res, J_frame : (o, 2), (o, 2, nb) array
+        Weighted residuals and Jacobians; that of the point is minus that of the centre.
+    prior_diag, prior_gradient : (m, nb) array
+        Diagonal Hessian and gradient of the priors of the photos.
+    border : Border
+        What the photos share.
+    lengths : tuple of (q,) and (q, n, 3) arrays
+        Residuals on few points and their Jacobian: they join points, which the elimination takes one by one, so their
+        share of the Hessian is added to its inverse (Woodbury).
+
+    Attributes
+    ----------
+    blocks : tuple of array
+        res and J_frame.
+    """
+
+    def __init__(
+        self,
+        elimination: Elimination,
+        cost: float,
+        res: Array,
+        J_frame: Array,
+        prior_diag: Array,
+        prior_gradient: Array,
+        border: Border,
+        lengths: tuple[Array, Array],
+    ) -> None:
+        self.cost = cost
+        self._elimination = elimination
+        s = self._s = elimination.structure
+        nb = prior_diag.shape[1]
+        n = len(s.point_of)
+        self._J = J_frame
+        self.blocks = res, J_frame
+        self._unknowns = (0.0,) * nb
+        self._prior_diag = prior_diag
+        self._V = np.empty((n, 3, 3))
+        self._g_point = np.empty((n, 3))
+        schur.point_blocks(s.track_start, s.point_of, res, J_frame, self._V, self._g_point)
+        self._diagonal, self._g_frame = self._gradients(res, J_frame)
+        self._diagonal += prior_diag
+        self._g_frame += prior_gradient
+        self._border = border
+        diagonal, g_camera = self._gradients(res, border.J)
+        self._camera_diagonal = border.sum_photos(diagonal)
+        self._g_camera = border.sum_photos(g_camera) + border.prior_gradient.ravel()
+        self._lengths = lengths[1]
+        self._g_point += np.einsum("q,qna->na", *lengths)
+
+    def _gradients(self, res: Array, J: Array) -> tuple[Array, Array]:
+        """Diagonal of J'J and J'res, summed over each photo (m, unknowns)."""
+        s = self._s
+        diagonal, gradient = np.zeros((2, len(s.frame_start) - 1, J.shape[2]))
+        if J.shape[2]:
+            with numba.parallel_chunksize(1):
+                schur.frame_gradients(s.frame_start, s.frame_order, res, J, diagonal, gradient)
+        return diagonal, gradient
+
+    def reduce(
+        self, damping: float, g_frame: Array | None = None, g_point: Array | None = None, g_camera: Array | None = None
+    ) -> tuple[Reduced, Array]:
+        """The damped system without the points, and V^-1 (n, 3, 3); for another gradient than its own, if given."""
+        s = self._s
+        g_frame = self._g_frame if g_frame is None else g_frame
+        g_point = self._g_point if g_point is None else g_point
+        g_camera = self._g_camera if g_camera is None else g_camera
+        m, nb = g_frame.shape
+        V_inv = np.empty_like(self._V)
+        schur.invert_points(self._V, damping, V_inv)
+        S = np.empty((len(s.pattern.cols), nb, nb))
+        rhs = np.empty_like(g_frame)
+        with numba.parallel_chunksize(1):
+            schur.reduced_system(
+                self._unknowns, s.frame_start, s.frame_order, s.frame_idx, s.track_idx, s.track_start, s.point_of,
+                s.pattern.row_start, s.pattern.cols, self._J, V_inv, g_point, g_frame,
+                self._prior_diag + damping * self._diagonal, S, rhs,
+            )  # fmt: skip
+        nc = self._border.J.shape[2]
+        k = len(g_camera)
+        rows, rhs_camera = np.zeros((m, nb + nc, k)), np.zeros((m, nc))
+        if nc:
+            with numba.parallel_chunksize(1):
+                schur.border_rows(
+                    s.frame_start, s.frame_order, s.frame_idx, s.track_idx, s.track_start, s.point_of,
+                    self._border.camera_of_frame, self._J, self._border.J, V_inv, g_point, rows, rhs_camera,
+                )  # fmt: skip
+        # nothing pulls at a camera that took none of the photos, whatever holds it
+        unused = np.repeat(np.bincount(self._border.camera_of_frame, minlength=self._border.num_cameras) == 0, nc)
+        held = self._border.prior_diag.ravel() + damping * self._camera_diagonal + unused
+        corner = self._border.sum_photos(rows[:, nb:]) + np.diag(held)
+        border = np.where(self._elimination.free, rows[:, :nb].transpose(2, 0, 1), 0.0)
+        c = -g_camera - self._border.sum_photos(rhs_camera)
+        return Reduced(S, -rhs, border, (corner + corner.T) / 2, c), V_inv
+
+    def marginal_covariances(self) -> tuple[Array, Array]:
+        """Covariances of the unknowns of each photo (m, nb, nb) and of all cameras (k, k), all others being free.
+
+        0 where held; NaN where the system cannot be factored.
+        """
+        photos, cameras = self._elimination.marginal_covariances(self.reduce(0.0)[0])
+        if len(self._lengths):
+            frame, _, camera, inner = self._of_lengths(0.0, exact=True)
+            photos = photos - np.einsum("qma,qp,pmb->mab", frame, inner, frame)
+            cameras = cameras - np.einsum("qk,qp,pl->kl", camera, inner, camera)
+        return photos, cameras
+
+    def covariance(self) -> Callable[[Array], Array]:
+        """Covariance of the photos' unknowns, all others being free, as a function of vectors (k, m, nb)."""
+        factored = self._elimination.factored(self.reduce(0.0)[0])
+        if factored is None:
+            return lambda vectors: np.full_like(vectors, np.nan)
+        if not len(self._lengths):
+            return factored.covariance_times
+        frame, _, _, inner = self._of_lengths(0.0, exact=True)
+        return lambda vectors: (
+            factored.covariance_times(vectors) - np.tensordot(products(vectors, frame) @ inner, frame, 1)
+        )
+
+    def variance_of_points(self, weights: Array) -> tuple[float, Array]:
+        """Variance of sum(weights * points), weights (n, 3), and its covariance (m, nb) with the photos' unknowns."""
+        zero = np.zeros_like(self._g_frame), np.zeros_like(self._g_camera)
+        solved = self._solve(0.0, zero[0], -weights, zero[1], exact=True)
+        if solved is None:
+            return np.nan, np.full_like(zero[0], np.nan)
+        frame, point = solved[:2]
+        return float((weights * point).sum()), frame
+
+    def solve(self, damping: float) -> tuple[Step, float] | None:
+        """Step of the photos (m, nb), points (n, 3) and cameras (c, nc), and the decrease of cost that it predicts."""
+        solved = self._solve(damping, self._g_frame, self._g_point, self._g_camera)
+        if solved is None:
+            return None
+        frame, point, camera, residual, camera_residual = solved
+        # of the system that was solved: an unfinished solution leaves (H + damping D) step + g = -residual.
+        # Sums, not np.vdot: threads of BLAS that wait for work take the processors from ours
+        diag_point = np.diagonal(self._V, axis1=1, axis2=2)
+        predicted = 0.5 * float(
+            (frame * (damping * self._diagonal * frame - self._g_frame + residual)).sum()
+            + (point * (damping * diag_point * point - self._g_point)).sum()
+            + (camera * (damping * self._camera_diagonal * camera - self._g_camera + camera_residual)).sum()
+        )
+        return (frame, point, camera.reshape(self._border.num_cameras, self._border.J.shape[2])), predicted
+
+    def _solve(
+        self, damping: float, g_frame: Array, g_point: Array, g_camera: Array, exact: bool = False
+    ) -> tuple[Array, Array, Array, Array, Array] | None:
+        """Solution of the photos, points and cameras for a gradient, with the residuals of photos and cameras."""
+        solved = self._solve_without_lengths(damping, g_frame, g_point, g_camera, exact)
+        if solved is None or not len(self._lengths):
+            return solved
+        frame, point, camera, *residuals = solved
+        of_lengths = self._of_lengths(damping, exact)
+        share = of_lengths[3] @ np.einsum("qna,na->q", self._lengths, point)
+        frame, point, camera = (
+            x - np.tensordot(share, u, 1) for x, u in zip((frame, point, camera), of_lengths[:3], strict=True)
+        )
+        return frame, point, camera, residuals[0], residuals[1]
+
+    def _of_lengths(self, damping: float, exact: bool) -> tuple[Array, Array, Array, Array]:
+        """H^-1 J' of the lengths' Jacobian J, for photos, points and cameras, and (1 + J H^-1 J')^-1."""
+        zero = np.zeros_like(self._g_frame), np.zeros_like(self._g_camera)
+        columns = [self._solve_without_lengths(damping, zero[0], -J, zero[1], exact) for J in self._lengths]
+        if any(column is None for column in columns):
+            nan = np.nan
+            q = len(columns)
+            return (
+                np.full((q, *zero[0].shape), nan), np.full((q, *self._g_point.shape), nan),
+                np.full((q, *zero[1].shape), nan), np.full((q, q), nan),
+            )  # fmt: skip
+        frame, point, camera = (np.array([column[k] for column in columns if column is not None]) for k in range(3))
+        inner = np.linalg.inv(np.eye(len(columns)) + np.einsum("qna,pna->qp", self._lengths, point))
+        return frame, point, camera, inner
+
+    def _solve_without_lengths(
+        self, damping: float, g_frame: Array, g_point: Array, g_camera: Array, exact: bool
+    ) -> tuple[Array, Array, Array, Array, Array] | None:
+        """As `_solve`, of the measurements and priors alone."""
+        reduced, V_inv = self.reduce(damping, g_frame, g_point, g_camera)
+        solved = self._elimination.solve(reduced, exact)
+        if solved is None:
+            return None
+        frame, camera, residual, camera_residual = solved
+        point = np.empty_like(g_point)
+        schur.back_substitute(
+            self._unknowns, self._s.track_start, self._s.point_of, self._s.frame_idx, V_inv,
+            self._pulled(g_point, camera), self._J, frame, point,
+        )  # fmt: skip
+        if not all(np.isfinite(part).all() for part in (frame, point, camera)):
+            return None
+        return frame, point, camera, residual, camera_residual
+
+    def _pulled(self, g_point: Array, step_camera: Array) -> Array:
+        """Gradient of the points (n, 3) after a step of all cameras (k,)."""
+        if not step_camera.size:
+            return g_point
+        s = self._s
+        steps = step_camera.reshape(self._border.num_cameras, -1)
+        V, pull = np.empty_like(self._V), np.empty_like(g_point)
+        moved = np.einsum("oij,oj->oi", self._border.J, steps[self._border.camera_of_frame[s.frame_idx]])
+        schur.point_blocks(s.track_start, s.point_of, moved, self._J, V, pull)
+        return g_point + pull
+
+    def point_steps(self) -> Array:
+        """Gauss-Newton steps (n, 3) of the points alone, the photos being held."""
+        V_inv = np.empty_like(self._V)
+        schur.invert_points(self._V, 0.0, V_inv)
+        return -np.einsum("nij,nj->ni", V_inv, self._g_point)

@@ -1,0 +1,107 @@
+"""Which photo sees which point, and which photos share points: fixed while a problem is solved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from .._kernels import schur
+
+__all__ = ["BlockPattern", "Structure", "by_first_photo"]
+
+Index = NDArray[np.int64]
+
+
+def by_first_photo(frame_idx: Index, point_idx: Index, num_frames: int, num_points: int) -> Index:
+    """Points in the order of the first photo that sees each."""
+    first = np.full(num_points, num_frames)
+    np.minimum.at(first, point_idx, frame_idx)
+    return np.argsort(first, kind="stable")
+
+
+@dataclass(frozen=True)
+class BlockPattern:
+    """Where a symmetric matrix of blocks has any: its upper triangle in block rows.
+
+    Attributes
+    ----------
+    row_start, cols : (m + 1,), (blocks,) int array
+        Ranges of the block rows, and block columns, ascending in each row from its diagonal block.
+    """
+
+    row_start: Index
+    cols: Index
+
+    @property
+    def size(self) -> int:
+        """Number of block rows."""
+        return len(self.row_start) - 1
+
+    @property
+    def rows(self) -> Index:
+        """(blocks,) block rows."""
+        return np.repeat(np.arange(self.size), np.diff(self.row_start))
+
+    @property
+    def diagonal(self) -> Index:
+        """(m,) the diagonal blocks."""
+        return self.row_start[:-1]
+
+    def graph(self) -> scipy.sparse.csr_array:
+        """The whole pattern, below the diagonal too, as (m, m) ones."""
+        upper = scipy.sparse.csr_array((np.ones(len(self.cols)), self.cols, self.row_start), shape=(self.size,) * 2)
+        return (upper + upper.T).tocsr()
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Which photo sees which point.
+
+    Attributes
+    ----------
+    order : (o,) int array
+        The observations as they were given, by track and then by photo; tracks by their first photo, so that what a
+        photo sees lies together. All else is in this order.
+    frame_idx, point_idx, track_idx : (o,) int array
+        Photo, point and track.
+    track_start, point_of : (n + 1,), (n,) int array
+        Ranges of the tracks in the observations, and their points.
+    frame_start, frame_order : (m + 1,), (o,) int array
+        The observations of each photo.
+    pattern : BlockPattern
+        Photos that share points: the blocks of the reduced system.
+    """
+
+    order: Index
+    frame_idx: Index
+    point_idx: Index
+    track_idx: Index
+    track_start: Index
+    point_of: Index
+    frame_start: Index
+    frame_order: Index
+    pattern: BlockPattern
+
+    @classmethod
+    def from_observations(cls, frame_idx: Index, point_idx: Index, num_frames: int, num_points: int) -> Structure:
+        """Structure of observations in any order."""
+        point_of = by_first_photo(frame_idx, point_idx, num_frames, num_points)
+        track = np.empty(num_points, np.int64)
+        track[point_of] = np.arange(num_points)
+        order = np.argsort(track[point_idx] * num_frames + frame_idx, kind="stable")
+        frame_idx, point_idx = frame_idx[order], point_idx[order]
+        track_idx = track[point_idx]
+        track_start = np.searchsorted(track_idx, np.arange(num_points + 1))
+        frame_order = np.argsort(frame_idx, kind="stable")
+        frame_start = np.concatenate([[0], np.cumsum(np.bincount(frame_idx, minlength=num_frames))])
+        counts = np.empty(num_frames, np.int64)
+        lists = (frame_start, frame_order, frame_idx, track_idx, track_start)
+        schur.covisible_counts(*lists, counts)
+        row_start = np.concatenate([[0], np.cumsum(counts)])
+        cols = np.empty(row_start[-1], np.int64)
+        schur.covisible_columns(*lists, row_start, cols)
+        pattern = BlockPattern(row_start, cols)
+        return cls(order, frame_idx, point_idx, track_idx, track_start, point_of, frame_start, frame_order, pattern)

@@ -1,0 +1,273 @@
+"""How far away what each photo shows is, for the photos of a camera that moved."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from threading import Lock
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FileError, InputError, RsUndistortWarning
+from ..io import find_depth_maps, output_name, read_colmap_poses, read_depth_map
+from ..model import AtInfinity, Camera, Depth, DepthMap, Reconstruction, RowMotion, Solution
+from ..rectify import (
+    depth_from_points,
+    fit_plane,
+    largest_shift_px,
+    plane_in_camera,
+    prefers_plane,
+    translation_shift_px,
+)
+
+__all__ = ["DEPTHS", "DepthJob", "PhotoDepth", "PhotoDepths", "ScenePoints", "check_depth", "with_depths"]
+
+#: What `--depth` may say besides a folder.
+DEPTHS = ("auto", "infinity", "plane", "points")
+
+# Below this the translation of the camera is not seen, and depths could only do harm.
+_LEAST_SHIFT_PX = 0.5
+# Maps whose depths are this many times those of the points have another scale.
+_OTHER_SCALE = 1.5
+
+
+def check_depth(depth: str | Path) -> None:
+    """Refuse what is neither of `DEPTHS` nor a folder."""
+    if str(depth) not in DEPTHS and not Path(depth).is_dir():
+        raise FileError(f"depth {str(depth)!r} is no folder, nor one of {', '.join(DEPTHS)}")
+
+
+@dataclass(frozen=True)
+class ScenePoints:
+    """Points of a scene, and which of them each photo sees.
+
+    Attributes
+    ----------
+    points_w : (n, 3) array
+        World frame of the solution.
+    seen : mapping of photo name to index array
+        Points that a photo measured.
+    """
+
+    points_w: NDArray[np.float64]
+    seen: Mapping[str, NDArray[np.int64]]
+
+    @classmethod
+    def of_reconstruction(cls, rec: Reconstruction) -> ScenePoints:
+        """Points of a reconstruction."""
+        return cls(rec.points_w, _by_photo(rec.image_names, rec.observations.frame_idx, rec.observations.point_idx))
+
+    @classmethod
+    def of_colmap_model(cls, folder: Path, names: Sequence[str], raw_as: str) -> ScenePoints:
+        """Points of the COLMAP model that a run wrote, by the names of the raw photos."""
+        _, written, _, _, _, points_w, frame_idx, point_idx = read_colmap_poses(folder)
+        seen = _by_photo(written, frame_idx, point_idx)
+        mine = {name: seen.get(output_name(name, raw_as)) for name in names}
+        return cls(points_w, {name: points for name, points in mine.items() if points is not None})
+
+
+def _by_photo(
+    names: Sequence[str], frame_idx: NDArray[np.int64], point_idx: NDArray[np.int64]
+) -> dict[str, NDArray[np.int64]]:
+    order = np.argsort(frame_idx, kind="stable")
+    bounds = np.searchsorted(frame_idx[order], np.arange(len(names) + 1))
+    return {name: np.unique(point_idx[order[bounds[i] : bounds[i + 1]]]) for i, name in enumerate(names)}
+
+
+class _Seen(NamedTuple):
+    """Points that a photo measured: rectified pixels (n, 2), directions (n, 3) of z = 1, depths (n,)."""
+
+    xy: NDArray[np.float64]
+    rays_c: NDArray[np.float64]
+    depth: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PhotoDepth:
+    """What one photo is rectified with.
+
+    Attributes
+    ----------
+    depth : Depth
+        For `rectify`.
+    motion : RowMotion
+        With its velocity in the camera frame.
+    kind : str
+        "infinity", "plane", "points" or "map".
+    shift_px : float
+        Largest displacement that the translation alone caused.
+    whole_shift_px : float or None
+        Largest displacement that the shutter caused; None of a photo whose camera did not travel.
+    """
+
+    depth: Depth
+    motion: RowMotion
+    kind: str
+    shift_px: float = 0.0
+    whole_shift_px: float | None = None
+
+
+# Not every threading layer of numba lets parallel kernels be called from several threads at once.
+_ONE_AT_A_TIME = Lock()
+
+
+@dataclass(frozen=True)
+class DepthJob:
+    """All that the depth of one photo takes; small, and sent to where the photo is rectified.
+
+    Attributes
+    ----------
+    name : str
+        Of the photo, for people.
+    motion : RowMotion
+        Its velocity in the world frame.
+    R_cw, center_w : (3, 3), (3,) array or None
+        Pose; None for a photo whose camera did not travel, which is rectified at infinity.
+    camera, new_camera : Camera
+        Of the raw photo, and the pinhole of the rectified one.
+    how : str
+        One of `DEPTHS`, or "map".
+    points_w : (n, 3) array or None
+        Points that the photo measured.
+    plane : (normal (3,), offset) or None
+        The plane nearest to most points of the scene, as of `fit_plane`.
+    own_map : Path or None
+        The user's depth map of it.
+    """
+
+    name: str
+    motion: RowMotion
+    R_cw: NDArray[np.float64] | None
+    center_w: NDArray[np.float64] | None
+    camera: Camera
+    new_camera: Camera
+    how: str
+    points_w: NDArray[np.float64] | None = None
+    plane: tuple[NDArray[np.float64], float] | None = None
+    own_map: Path | None = None
+
+    def find(self) -> PhotoDepth:
+        """What the photo is rectified with."""
+        if self.R_cw is None or self.center_w is None:
+            return PhotoDepth(AtInfinity(), self.motion, "infinity")
+        motion = self.motion.in_camera(self.R_cw)
+        depth, kind = self._choose(self.R_cw, self.center_w)
+        with _ONE_AT_A_TIME:
+            shift = translation_shift_px(self.camera, motion, depth, self.new_camera)
+            if self.how == "auto" and not shift > _LEAST_SHIFT_PX:
+                depth, kind = AtInfinity(), "infinity"
+            whole = largest_shift_px(self.camera, motion, "constant-motion", depth, self.new_camera)
+        return PhotoDepth(depth, motion, kind, shift, whole)
+
+    def _choose(self, R_cw: NDArray[np.float64], center_w: NDArray[np.float64]) -> tuple[Depth, str]:
+        size = (self.new_camera.width, self.new_camera.height)
+        seen = self._seen(R_cw, center_w)
+        if self.how == "map":
+            return self._own_map(size, seen)
+        plane = None if self.plane is None else plane_in_camera(*self.plane, R_cw, center_w)
+        if plane is not None and self.how == "auto" and seen is not None:
+            plane = plane if prefers_plane(plane, *seen, size) else None
+        if plane is not None:
+            return plane, "plane"
+        if seen is not None and self.how in ("auto", "points"):
+            return depth_from_points(seen.xy, seen.depth, size), "points"
+        return AtInfinity(), "infinity"
+
+    def _seen(self, R_cw: NDArray[np.float64], center_w: NDArray[np.float64]) -> _Seen | None:
+        if self.points_w is None:
+            return None
+        K = self.new_camera.K
+        X_c = (self.points_w - center_w) @ R_cw.T
+        X_c = X_c[X_c[:, 2] > 0]
+        rays = X_c / X_c[:, 2:]
+        return _Seen(rays[:, :2] @ K[:2, :2].T + K[:2, 2], rays, X_c[:, 2]) if len(X_c) else None
+
+    def _own_map(self, size: tuple[int, int], seen: _Seen | None) -> tuple[Depth, str]:
+        path = self.own_map
+        if path is None:
+            text = f"{self.name} has no depth map and is rectified at infinity"
+            warnings.warn(text, RsUndistortWarning, stacklevel=2)
+            return AtInfinity(), "infinity"
+        values = read_depth_map(path)
+        rows, cols = values.shape
+        # of another size, but of the same shape to a pixel
+        if abs(cols * size[1] - rows * size[0]) > max(size[0], size[1], rows, cols):
+            raise InputError(f"depth map {path} has {cols}x{rows} pixels, the rectified photo {size[0]}x{size[1]}")
+        try:
+            depth = DepthMap(values, size)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+        if seen is not None:
+            at = np.floor((seen.xy + 0.5) * [cols / size[0], rows / size[1]]).astype(int)
+            inside = (at >= 0).all(1) & (at < [cols, rows]).all(1)
+            ratio = values[at[inside, 1], at[inside, 0]] / seen.depth[inside]
+            ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
+            times = float(np.median(ratio)) if len(ratio) else 1.0
+            if not 1 / _OTHER_SCALE < times < _OTHER_SCALE:
+                text = f"{path}: depths are {times:.3g} times those of the solution's points; is their unit another?"
+                warnings.warn(text, RsUndistortWarning, stacklevel=2)
+        return depth, "map"
+
+
+class PhotoDepths:
+    """Depths of the photos of a solution.
+
+    Parameters
+    ----------
+    solution : Solution
+        In the stored frames of the photos.
+    depth : str or Path
+        One of `DEPTHS`, or a folder of depth maps.
+    points : ScenePoints, optional
+        For "auto", "plane" and "points"; without them, "auto" is at infinity.
+    """
+
+    def __init__(self, solution: Solution, depth: str | Path, points: ScenePoints | None) -> None:
+        check_depth(depth)
+        self._solution = solution
+        self._how = str(depth) if str(depth) in DEPTHS else "map"
+        self._points = points
+        moving = solution.shutter_model == "constant-motion"
+        self._moving = {image.name for image in solution.registered if moving and image.posed}
+        own = self._how == "map" and self._moving
+        self._maps = find_depth_maps(Path(depth).absolute(), sorted(self._moving)) if own else {}
+        if self._how in ("plane", "points") and points is None and self._moving:
+            raise InputError(f"depth {self._how!r} needs the points of the scene, and there are none")
+        self._plane: tuple[NDArray[np.float64], float] | None = None
+        if self._moving and points is not None and len(points.points_w) >= 3 and self._how in ("auto", "plane"):
+            self._plane = fit_plane(points.points_w)
+
+    def job(self, name: str) -> DepthJob:
+        """How to find what a photo is rectified with."""
+        image = self._solution.image(name)
+        motion = image.motion or RowMotion()
+        camera = self._solution.cameras[image.camera_id]
+        new_camera = self._solution.rectified_cameras[image.camera_id]
+        if name not in self._moving or not motion.velocity.any():
+            return DepthJob(name, motion, None, None, camera, new_camera, "infinity")
+        points_w = None
+        if self._points is not None:
+            points_w = self._points.points_w[self._points.seen.get(name, np.zeros(0, np.int64))]
+        return DepthJob(
+            name, motion, image.R_cw, image.center_w, camera, new_camera, self._how, points_w, self._plane,
+            self._maps.get(name),
+        )  # fmt: skip
+
+    def of(self, name: str) -> PhotoDepth:
+        """What a photo is rectified with."""
+        return self.job(name).find()
+
+
+def with_depths(solution: Solution, found: Mapping[str, tuple[str, float, float]]) -> Solution:
+    """The solution with the depths that were used, and the shifts that they mean."""
+    images = []
+    for image in solution.images:
+        if image.name in found:
+            kind, shift, whole = found[image.name]
+            image = replace(image, depth=kind, translation_shift_px=shift, rs_shift_px=whole)
+        images.append(image)
+    return replace(solution, images=tuple(images))

@@ -1,0 +1,310 @@
+"""What is done to one photo, wherever it is done."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FileError, InputError, MetadataWarning
+from ..io import MAX_MEGAPIXELS, RAW_AS, Photo, read_mask, read_photo, write_image
+from ..io.outputs import CANNOT_WRITE
+from ..io.photos.exif import read_orientation
+from ..model.orientation import split_mirror, turn_pixels
+from ..rectify import INTERPOLATIONS, MAP_KINDS, RemapGrid, ViewOptions, rectify, remap_grid
+from .depth import DepthJob, PhotoDepth
+from .extras import AlsoImage
+
+__all__ = ["PhotoDone", "PhotoJob", "RectifyOptions", "check_not_rectified", "rectify_photo", "turn_of"]
+
+
+@dataclass(frozen=True)
+class RectifyOptions:
+    """What is done to each photo.
+
+    Parameters
+    ----------
+    interpolation : {"cubic", "linear", "lanczos", "nearest"}
+        Of the rectified photos.
+    quality : int
+        Of JPEG and WebP, 1 to 100.
+    raw_as : {"tif", "jpg", "png"}
+        What RAW and HEIC are written as: 16 bit, but for jpg.
+    apply_orientation : bool
+        Turn the rectified photos, their masks, cameras and poses by the EXIF orientation, which then is 1.
+    again : bool
+        Take photos that are rectified already.
+    max_megapixels : float
+        Photos with more pixels are left out before they are decoded.
+    masks : path, optional
+        Folder of masks, as `io.find_masks` takes it: nothing of what is black in them is in the masks of the rectified
+        photos.
+    depth : str or Path
+        How far away what the photos show is, for the constant-motion model: "auto", "infinity", "plane", "points", or a
+        folder of depth maps, as `io.find_depth_maps` takes it. "auto" is the plane nearest to most points where it
+        foretells the depths as well as a map between the points does, else that map; and infinity for photos that it
+        would change by half a pixel at most.
+    view : ViewOptions
+        What the rectified photos show and how large they are; by default as the solution has it.
+    maps : {"npz", "exr", "stmap"}, optional
+        Write each photo's remap grid and its inverse into `maps`, as `RemapGrid.save` does.
+    also : sequence of (folder, interpolation)
+        Folders of other images of the same frames (labels, depth, near infrared), of the photos' stems and sizes: they
+        are rectified alike into `also`.
+    """
+
+    interpolation: str = "cubic"
+    quality: int = 98
+    raw_as: str = "tif"
+    apply_orientation: bool = False
+    again: bool = False
+    max_megapixels: float = MAX_MEGAPIXELS
+    masks: Path | str | None = None
+    depth: str | Path = "auto"
+    view: ViewOptions = field(default_factory=ViewOptions)
+    maps: str | None = None
+    also: Sequence[tuple[Path, str]] = ()
+
+    def __post_init__(self) -> None:
+        for interpolation in (self.interpolation, *(each for _, each in self.also)):
+            if interpolation not in INTERPOLATIONS:
+                raise InputError(f"interpolation={interpolation!r}, expected one of {', '.join(INTERPOLATIONS)}")
+        if self.maps is not None and self.maps not in MAP_KINDS:
+            raise InputError(f"maps={self.maps!r}, expected one of {', '.join(MAP_KINDS)}")
+        if self.raw_as not in RAW_AS:
+            raise InputError(f"raw_as={self.raw_as!r}, expected one of {', '.join(RAW_AS)}")
+        if not 1 <= self.quality <= 100:
+            raise InputError(f"quality={self.quality!r}, expected 1 to 100")
+
+
+@dataclass(frozen=True)
+class PhotoJob:
+    """All that rectifying one photo takes; small, and sent to where it is done.
+
+    Attributes
+    ----------
+    name : str
+        Of the photo, for people.
+    source : Path
+        The raw photo.
+    out : Path
+        Folder of the outputs.
+    image, mask : str
+        Rectified photo and its mask, in `out`.
+    depth : DepthJob
+        Its cameras and motion, and how far away what it shows is.
+    shutter_model : str
+        Of the remap grid.
+    posed : bool
+        Whether the photo has a pose, which no mirror image has.
+    options : RectifyOptions
+        See there.
+    own_mask : Path or None
+        The user's mask of it.
+    also : tuple of AlsoImage
+        Other images of its frame.
+    maps : str or None
+        Beginning of the names of the files of its grid, in `out`.
+    sample_xy : (k, 2) int array or None
+        Raw pixels whose colours are asked for.
+    """
+
+    name: str
+    source: Path
+    out: Path
+    image: str
+    mask: str
+    depth: DepthJob
+    shutter_model: str
+    posed: bool
+    options: RectifyOptions
+    own_mask: Path | None = None
+    also: tuple[AlsoImage, ...] = ()
+    maps: str | None = None
+    sample_xy: NDArray[np.int64] | None = None
+
+    def fingerprint(self) -> str:
+        """What the outputs depend on, as a number: if it is another one, they are stale.
+
+        Files count with size and time of change, all else with its value; a missing photo has no fingerprint ("").
+        """
+        digest = hashlib.sha256(f"{version('rsundistort')} {cv2.__version__}".encode())
+        # where things lie, and which photos are let in, does not change what comes of them; nor does a pose, but for
+        # how the photo is turned
+        options = replace(
+            self.options, masks=None, again=False, max_megapixels=MAX_MEGAPIXELS, depth="", view=ViewOptions(), also=()
+        )  # fmt: skip
+        posed = self.posed and options.apply_orientation
+        try:
+            _feed(digest, replace(self, out=Path(), posed=posed, options=options, sample_xy=None))
+        except OSError:
+            return ""
+        return digest.hexdigest()[:32]
+
+
+def _feed(digest: Any, value: Any) -> None:
+    """Take a value of plain types, arrays, dataclasses and files into a digest."""
+    if is_dataclass(value) and not isinstance(value, type):
+        for each in fields(value):
+            _feed(digest, each.name)
+            _feed(digest, getattr(value, each.name))
+    elif isinstance(value, np.ndarray):
+        digest.update(f"{value.dtype.str} {value.shape} ".encode())
+        digest.update(np.ascontiguousarray(value).data)
+    elif isinstance(value, os.PathLike):
+        if os.fspath(value) != ".":
+            found = os.stat(value)
+            digest.update(f"{found.st_size} {found.st_mtime_ns};".encode())
+    elif isinstance(value, Mapping):
+        for key in sorted(value):
+            _feed(digest, key)
+            _feed(digest, value[key])
+    elif isinstance(value, (list, tuple)):
+        digest.update(f"{len(value)} ".encode())
+        for each in value:
+            _feed(digest, each)
+    else:
+        digest.update(f"{value.item() if isinstance(value, np.generic) else value!r};".encode())
+
+
+@dataclass(frozen=True)
+class PhotoDone:
+    """What came of one photo.
+
+    Attributes
+    ----------
+    name : str
+        Of the photo.
+    problem : str
+        Why it was left out; empty if it was not.
+    fingerprint : str
+        See `PhotoJob.fingerprint`.
+    files : mapping of path in the folder of outputs to int
+        What was written, and how many bytes it has.
+    turn : int
+        EXIF orientation that was applied.
+    depth : (kind, shift_px, whole_shift_px) or None
+        As in `PhotoDepth`, of a photo whose camera travelled.
+    colors : (k, 3) array or None
+        Red, green, blue of `PhotoJob.sample_xy`, 0 to 255.
+    """
+
+    name: str
+    problem: str = ""
+    fingerprint: str = ""
+    files: Mapping[str, int] = field(default_factory=dict)
+    turn: int = 1
+    depth: tuple[str, float, float] | None = None
+    colors: NDArray[np.float64] | None = None
+
+
+def check_not_rectified(photo: Photo) -> None:
+    """Refuse a photo that is rectified already."""
+    by = photo.metadata.rectified_by
+    if by is not None:
+        raise InputError(f"it was rectified already, by rsundistort {by}; --again rectifies it once more")
+
+
+def turn_of(orientation: int, posed: bool) -> tuple[int, int]:
+    """How a photo's orientation is applied, and what is left of it: mirrors are left where there is a pose."""
+    return split_mirror(orientation) if posed else (orientation, 1)
+
+
+def rectify_photo(job: PhotoJob) -> PhotoDone:
+    """Rectify a photo into the folder of the outputs.
+
+    What is wrong with the photo is in the result. That the outputs cannot be written (a full disk) is an error: the
+    others would fare no better.
+    """
+    options, camera = job.options, job.depth.camera
+    fingerprint = job.fingerprint()  # before it is read: should it change meanwhile, the result is stale
+    files: dict[str, int] = {}
+    writing = False
+    try:
+        photo = read_photo(job.source, options.max_megapixels)
+        if not options.again:
+            check_not_rectified(photo)
+        own = None if job.own_mask is None else read_mask(job.own_mask, camera.width, camera.height)
+        seen = job.depth.find()
+        grid_of = (camera, seen.motion, job.shutter_model, job.depth.new_camera)
+        pixels, mask = rectify(photo.pixels, *grid_of, options.interpolation, mask=own, depth=seen.depth)
+        colors = None if job.sample_xy is None else _colors(photo, job.sample_xy)
+        metadata, turn = photo.metadata.marked(version("rsundistort")), 1
+        if options.apply_orientation:
+            turn, rest = turn_of(metadata.orientation, job.posed)
+            pixels, mask = turn_pixels(pixels, turn), turn_pixels(mask, turn)
+            _warn_of_orientation(job.name, photo, rest)
+            metadata = metadata.with_orientation(rest)
+        del photo, own  # not beside the encoded one
+        writing = True
+        write_image(job.out / job.image, pixels, metadata, options.quality)
+        files[job.image] = (job.out / job.image).stat().st_size
+        write_image(job.out / job.mask, mask, flat=True)
+        files[job.mask] = (job.out / job.mask).stat().st_size
+        for name in _write_extras(job, seen, turn):
+            files[name] = (job.out / name).stat().st_size
+    except (FileError, InputError, MemoryError, cv2.error) as error:
+        if writing and getattr(error.__cause__, "errno", None) in CANNOT_WRITE:
+            raise
+        for name in files:  # no photo without its mask
+            (job.out / name).unlink(missing_ok=True)
+        return PhotoDone(job.name, " ".join(str(error).split()) or "it does not fit into the memory")
+    note = None if seen.whole_shift_px is None else (seen.kind, seen.shift_px, seen.whole_shift_px)
+    return PhotoDone(job.name, "", fingerprint, files, turn, note, colors)
+
+
+def _write_extras(job: PhotoJob, seen: PhotoDepth, turn: int) -> Iterator[str]:
+    """Write the other images of a photo's frame and its grids; their names, each when it is there."""
+    grid_of = (job.depth.camera, seen.motion, job.shutter_model, job.depth.new_camera)
+    for each in job.also:
+        try:
+            image = read_photo(each.source, job.options.max_megapixels)
+            pixels, _ = rectify(image.pixels, *grid_of, each.interpolation, depth=seen.depth)
+            write_image(job.out / each.target, turn_pixels(pixels, turn), image.metadata, 98)
+        except (FileError, InputError) as error:
+            if getattr(error.__cause__, "errno", None) in CANNOT_WRITE:
+                raise
+            raise InputError(f"{each.source.parent.name}/{each.source.name}: {error}") from error
+        yield each.target
+    if job.maps is not None and job.options.maps is not None:
+        grid = remap_grid(*grid_of, seen.depth)
+        if turn != 1:
+            map_x, map_y = (turn_pixels(m, turn) for m in (grid.map_x, grid.map_y))
+            grid = RemapGrid(map_x, map_y, grid.source_width, grid.source_height)
+        ending = MAP_KINDS[job.options.maps]
+        for way, each_way in (("forward", grid), ("inverse", grid.inverse())):
+            name = f"{job.maps}.{way}{ending}"
+            each_way.save(job.out / name, job.options.maps)
+            yield name
+
+
+def _warn_of_orientation(name: str, photo: Photo, rest: int) -> None:
+    stored = read_orientation(photo.metadata.exif)
+    if stored != photo.metadata.orientation:
+        text = f"{name}: its EXIF orientation {stored} means nothing and is taken for 1"
+    elif rest != 1:
+        text = (
+            f"{name}: mirrored by its EXIF orientation {stored}, it was turned and keeps the mirror as its orientation"
+        )
+    else:
+        return
+    warnings.warn(text, MetadataWarning, stacklevel=2)
+
+
+def _colors(photo: Photo, xy: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(k, 3) red, green, blue at pixels, 0 to 255."""
+    h, w = photo.pixels.shape[:2]
+    values = photo.pixels[np.clip(xy[:, 1], 0, h - 1), np.clip(xy[:, 0], 0, w - 1)].astype(float)
+    if values.ndim == 1:
+        values = np.repeat(values[:, None], 3, axis=1)
+    scale = 255.0 / np.iinfo(photo.pixels.dtype).max if photo.pixels.dtype.kind == "u" else 255.0
+    return np.asarray(scale * values[:, 2::-1], np.float64)
