@@ -32,9 +32,9 @@ from rsundistort import (
     run,
     simulate_warp,
 )
+from rsundistort.pipeline.ladder import solve_photos
 from rsundistort.pipeline.load import load_photos
 from rsundistort.pipeline.progress import StageLog
-from rsundistort.pipeline.solve import solve_photos
 
 ROOT = Path(__file__).resolve().parent.parent
 

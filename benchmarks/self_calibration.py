@@ -25,10 +25,10 @@ from rsundistort import BundleOptions, BundleResult, Reconstruction, RsUndistort
 from rsundistort.bundle import Posterior, bundle_adjust
 from rsundistort.bundle.choice import clipped_errors, standard_errors
 from rsundistort.critical.cost import row_phi
+from rsundistort.pipeline import use_threads
+from rsundistort.pipeline.ladder import solve_photos
 from rsundistort.pipeline.load import load_photos
 from rsundistort.pipeline.progress import StageLog
-from rsundistort.pipeline.run import use_threads
-from rsundistort.pipeline.solve import solve_photos
 
 import pycolmap  # isort: skip  # after rsundistort: see rsundistort/io/photos/images.py
 

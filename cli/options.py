@@ -113,6 +113,68 @@ max_pixels_option: Decorator = click.option(
     metavar="MILLIONS",
     help="Photos with more pixels are left out: a small file can claim to be a huge picture.",
 )
+readout_groups_option: Decorator = click.option(
+    "--readout",
+    multiple=True,
+    metavar="[GROUP=]DIRECTION",
+    callback=readout_by_group,
+    help=f"Direction of the readout in the stored pixels: {', '.join(READOUT_NAMES)}; of all photos, or of a "
+    "group (as the closing table names it). By default the camera file's, else guessed and settled by the photos.",
+)
+masks_option: Decorator = click.option(
+    "--masks",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    help="Folder of masks, a.png for a.jpg: what is black in them is not looked at, nor kept in OUT/masks.",
+)
+model_option: Decorator = click.option(
+    "--model",
+    "shutter_model",
+    type=click.Choice(("auto", "constant-motion", "rotation", "linearized", "two-step", "global")),
+    default="auto",
+    show_default=True,
+    help="How the shutter is modelled; auto is the model that foretells measurements held out from its fit.",
+)
+refine_option: Decorator = click.option(
+    "--refine",
+    metavar="NAMES",
+    help="Intrinsics to solve for with the rest: some of f (or fx, fy), cx, cy, k1, k2, p1, p2, k3 (of a "
+    "fisheye k1 to k4) with commas between, or none. By default none of a camera that was given, f,k1,k2 of one that "
+    "EXIF guessed.",
+)
+still_option: Decorator = click.option(
+    "--still",
+    "--anchor",
+    multiple=True,
+    metavar="NAME[=MRAD]",
+    help="A photo known not to have moved: its phi1 is held at zero, or near zero with so many mrad per frame of "
+    "standard deviation. May be repeated.",
+)
+known_option: Decorator = click.option(
+    "--known",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    metavar="CSV",
+    help="Motions known from elsewhere: name, phi1, phi2, phi3 (rad per frame; or omega1.. in rad/s) and sigma.",
+)
+lengths_option: Decorator = click.option(
+    "--lengths",
+    "--length",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    metavar="CSV",
+    help="Lengths measured in the scene, two or more: photo1, x1, y1, photo2, x2, y2, length, sigma.",
+)
+readout_ms_option: Decorator = click.option(
+    "--readout-ms",
+    type=click.FloatRange(min=0, min_open=True),
+    help="Time of the readout of a frame. Default: the gyroscope's log, or a table of cameras.",
+)
+remedy_option: Decorator = click.option(
+    "--remedy",
+    type=click.Choice(("auto", "prior", "none")),
+    default="auto",
+    show_default=True,
+    help="Where all cameras are level: auto looks for a photo that did not move, prior takes the motions to be zero "
+    "in the mean, none does neither.",
+)
 depth_option: Decorator = click.option(
     "--depth",
     metavar="auto|infinity|plane|points|DIR",
@@ -149,3 +211,32 @@ def view_options(function: Callable[..., Any]) -> Callable[..., Any]:
     ):
         function = option(function)
     return function
+
+
+def names_between_commas(refine: str | None) -> tuple[str, ...] | None:
+    """Names between commas; () for none, None where nothing was said."""
+    if refine is None:
+        return None
+    names = tuple(name.strip() for name in refine.split(",") if name.strip())
+    return () if names == ("none",) else names
+
+
+def anchors(still: tuple[str, ...]) -> dict[str, float]:
+    """Photos and their standard deviations, radians per frame, of NAME or NAME=MRAD."""
+    from rsundistort import InputError
+
+    anchors: dict[str, float] = {}
+    for text in still:
+        name, equals, number = text.rpartition("=")
+        try:
+            sigma = float(number) / 1e3 if equals else 0.0
+        except ValueError:  # a name with = in it
+            name, sigma = text, 0.0
+        if not equals:
+            name = text
+        if equals and not sigma > 0 and name != text:
+            raise InputError(f"--still {text}: the standard deviation must be positive")
+        if anchors.get(name, sigma) != sigma:
+            raise InputError(f"--still {name} is named twice, with different standard deviations")
+        anchors[name] = sigma
+    return anchors

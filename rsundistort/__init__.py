@@ -32,6 +32,7 @@ from .pipeline import (
     RectifyOptions,
     RunOptions,
     SceneOptions,
+    SolveOptions,
     WarpOptions,
     analyze,
     evaluate,
@@ -39,6 +40,8 @@ from .pipeline import (
     run,
     simulate_scene,
     simulate_warp,
+    solve,
+    solve_model,
 )
 from .rectify import (
     RemapGrid,
@@ -79,6 +82,7 @@ __all__ = [
     "SceneOptions",
     "SkippedPhotoWarning",
     "Solution",
+    "SolveOptions",
     "SolvedImage",
     "WarpOptions",
     "analyze",
@@ -101,6 +105,8 @@ __all__ = [
     "run",
     "simulate_scene",
     "simulate_warp",
+    "solve",
+    "solve_model",
     "undistort_points",
     "unproject_points",
     "write_solution",

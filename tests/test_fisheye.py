@@ -14,7 +14,8 @@ from rsundistort.errors import InputError
 from rsundistort.model.projection import project_points
 from rsundistort.pipeline import SceneOptions, simulate_scene
 from rsundistort.sfm import Features
-from rsundistort.sfm.mapping import _database_camera, _ideal_keypoints, _refined_camera
+from rsundistort.sfm.database import database_camera, ideal_keypoints
+from rsundistort.sfm.mapping import _refined_camera
 from rsundistort.synthetic.lens import distort_rays, undistort_to_rays
 
 K = np.array([[260.0, 0, 402], [0, 262, 297], [0, 0, 1]])
@@ -52,8 +53,8 @@ def test_colmap_sees_the_rays_of_the_keypoints(camera, rng):
     motion = RowMotion([0.05, -0.03, 0.04])
     xy = rng.uniform([100, 50], [700, 550], (50, 2))
     features = Features(np.vstack([xy, [[-2000.0, 300.0]]]), np.ones(51), np.zeros((51, 128), np.uint8))
-    keypoints = _ideal_keypoints(features, camera, motion, "rotation")
-    theirs = _database_camera(camera, True, 1).cam_from_img(keypoints.astype(float)[:50])
+    keypoints = ideal_keypoints(features, camera, motion, "rotation")
+    theirs = database_camera(camera, True, 1).cam_from_img(keypoints.astype(float)[:50])
     ideal, valid = unproject_points(xy, camera, motion)
     assert valid.all()
     # float32 of some hundred pixels, over the focal length, and the tangent's slope of up to 30 at 80 degrees
@@ -67,7 +68,7 @@ def test_colmap_sees_the_rays_of_the_keypoints(camera, rng):
 def test_colmap_refines_the_lens_that_a_camera_has(lens, rng):
     K_round = [[260.0, 0, 402], [0, 260, 297], [0, 0, 1]]
     camera = Camera(800, 600, K_round, [0.04, 0, 0, 0], "left-to-right", lens)
-    guessed = _database_camera(camera, False, 1)
+    guessed = database_camera(camera, False, 1)
     assert _refined_camera(guessed, camera) == camera
     points = rng.uniform([-1, -1, 1], [1, 1, 2], (20, 3))
     theirs = [guessed.img_from_cam(point) - 0.5 for point in points]

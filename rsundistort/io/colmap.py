@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from ..errors import FileError, FormatError, InputError
 from ..model import Camera, Reconstruction
 from ..model.checks import check_photo_name
-from ..model.projection import at_depth, unproject_points
+from ..model.projection import at_depth, project_points, unproject_points
 
 __all__ = [
+    "ModelIds",
     "camera_from_colmap",
+    "colmap_model",
     "read_colmap_cameras",
     "read_colmap_poses",
     "rectified_keypoints",
@@ -41,6 +45,30 @@ _LENSES = {
     "RADIAL_FISHEYE": ("fisheye", 4),
     "OPENCV_FISHEYE": ("fisheye", 4),
 }
+
+
+@dataclass(frozen=True)
+class ModelIds:
+    """Names by which COLMAP knows the parts of a reconstruction.
+
+    Attributes
+    ----------
+    cameras, images, points : sequences of int
+        Ids of its cameras, photos and points.
+    """
+
+    cameras: Sequence[int]
+    images: Sequence[int]
+    points: Sequence[int]
+
+    @classmethod
+    def in_order(cls, rec: Reconstruction) -> ModelIds:
+        """Counted from one."""
+        return cls(*(range(1, 1 + count) for count in (len(rec.cameras), rec.num_images, rec.num_points)))
+
+
+#: How far a camera that is fitted to one of another model may be off anywhere in the photo.
+_FIT_PX = 0.05
 
 
 def read_colmap_cameras(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
@@ -77,7 +105,7 @@ def _name(image: Any, where: Path) -> str:
 def camera_from_colmap(found: Any, where: str) -> Camera:
     """Our camera of a `pycolmap.Camera`; `where` names it in errors."""
     if found.model_name not in _LENSES:
-        raise FormatError(f"{where} is {found.model_name}; expected one of {', '.join(_LENSES)}")
+        return _fitted_camera(found, where)
     lens, length = _LENSES[found.model_name]
     extra = np.array(found.params)[list(found.extra_params_idxs())]
     dist = np.zeros(length)
@@ -91,6 +119,43 @@ def camera_from_colmap(found: Any, where: str) -> Camera:
         return Camera(found.width, found.height, np.array(K), dist, lens=lens)
     except ValueError as error:
         raise FormatError(f"{where}: {error}") from error
+
+
+def _fitted_camera(found: Any, where: str) -> Camera:
+    """The camera of ours nearest to one of a model that is not, if no ray of its photo misses by more than 0.05 px.
+
+    Lenses of FOV or a division model bend rays by a smooth function of the radius, which four coefficients of a fisheye
+    or six of a rational lens follow closely; prisms they do not.
+    """
+    width, height = found.width, found.height
+    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(0, width, 41), np.linspace(0, height, 31)))
+    xy = np.column_stack([x, y])
+    rays = np.array(found.cam_from_img(xy), np.float64) if found.model_name != "EQUIRECTANGULAR" else xy[:0]
+    best, miss = None, np.inf
+    if len(rays) and rays.shape[1] == 2 and np.isfinite(rays).all():
+        K0 = [found.mean_focal_length(), found.mean_focal_length(), found.principal_point_x, found.principal_point_y]
+        for lens, length in (("fisheye", 4), ("pinhole", 8)):
+
+            def camera_of(p: NDArray[np.float64], lens: str = lens) -> Camera:
+                K = np.array([[p[0], 0, p[2] - _HALF], [0, p[1], p[3] - _HALF], [0, 0, 1]])
+                return Camera(width, height, K, p[4:], lens=lens)
+
+            def error_px(p: NDArray[np.float64], camera_of: Any = camera_of) -> NDArray[np.float64]:
+                ahead = np.column_stack([rays, np.ones(len(rays))])
+                seen = project_points(ahead, camera_of(p), None, "global")[0] + _HALF
+                return np.nan_to_num(seen - xy, nan=1e3, posinf=1e3, neginf=-1e3).ravel()
+
+            try:
+                p = least_squares(error_px, [*K0, *np.zeros(length)], x_scale="jac", max_nfev=200).x
+                now = float(np.abs(error_px(p)).max())
+                if now < miss:
+                    best, miss = camera_of(p), now
+            except ValueError:
+                continue
+    if best is None or miss > _FIT_PX:
+        near = "" if best is None else f", which no camera of ours follows to {_FIT_PX} px (to {miss:.2g} px)"
+        raise FormatError(f"{where} is {found.model_name}{near}; expected one of {', '.join(_LENSES)}")
+    return best
 
 
 def _read_model(path: Path) -> Any:
@@ -202,19 +267,17 @@ def rectified_keypoints(reconstruction: Reconstruction, rectified: list[Camera])
     return xy
 
 
-def write_colmap_model(
-    folder: Path,
+def colmap_model(
     reconstruction: Reconstruction,
     rectified: list[Camera],
     names: Sequence[str | None],
     colors: NDArray[np.uint8] | None = None,
-) -> None:
-    """Write `cameras.bin`, `images.bin`, `points3D.bin` (and rigs, frames) of PINHOLE cameras without distortion.
+    ids: ModelIds | None = None,
+) -> Any:
+    """The `pycolmap.Reconstruction` of the rectified photos: PINHOLE cameras, and where the photos show the points.
 
     Parameters
     ----------
-    folder : Path
-        Made if missing.
     reconstruction : Reconstruction
         Poses, motions, points and raw measurements.
     rectified : list of Camera
@@ -223,9 +286,12 @@ def write_colmap_model(
         File names of the rectified photos; those without are left out.
     colors : (n, 3) uint8 array, optional
         Red, green, blue of the points.
+    ids : ModelIds, optional
+        Counted from one when left out.
     """
     import pycolmap
 
+    ids = ids or ModelIds.in_order(reconstruction)
     model = pycolmap.Reconstruction()
     used = set(reconstruction.camera_idx.tolist())
     for index, camera in enumerate(rectified):
@@ -235,7 +301,7 @@ def write_colmap_model(
         params = [K[0, 0], K[1, 1], K[0, 2] + _HALF, K[1, 2] + _HALF]
         model.add_camera_with_trivial_rig(
             pycolmap.Camera(
-                model="PINHOLE", width=camera.width, height=camera.height, params=params, camera_id=index + 1
+                model="PINHOLE", width=camera.width, height=camera.height, params=params, camera_id=ids.cameras[index]
             )
         )
     obs = reconstruction.observations
@@ -250,8 +316,8 @@ def write_colmap_model(
         image = pycolmap.Image(
             name=name,
             keypoints=xy[of_photo] + _HALF,
-            camera_id=int(reconstruction.camera_idx[i]) + 1,
-            image_id=i + 1,
+            camera_id=ids.cameras[int(reconstruction.camera_idx[i])],
+            image_id=ids.images[i],
         )
         R = reconstruction.R_cw[i]
         pose = pycolmap.Rigid3d(np.column_stack([R, -R @ reconstruction.center_w[i]]))
@@ -262,10 +328,18 @@ def write_colmap_model(
         track = pycolmap.Track()
         for k in order[bounds[p] : bounds[p + 1]]:
             if place[k] >= 0:
-                track.add_element(int(obs.frame_idx[k]) + 1, int(place[k]))
+                track.add_element(ids.images[int(obs.frame_idx[k])], int(place[k]))
         color = np.zeros(3, np.uint8) if colors is None else colors[p]
         if track.length() >= 2:
-            model.add_point3D(reconstruction.points_w[p], track, color)
+            point = pycolmap.Point3D(xyz=reconstruction.points_w[p], color=color, track=track)
+            model.add_point3D_with_id(ids.points[p], point)
+            for element in track.elements:
+                model.images[element.image_id].set_point3D_for_point2D(element.point2D_idx, ids.points[p])
     model.update_point_3d_errors()
+    return model
+
+
+def write_colmap_model(folder: Path, *model: Any) -> None:
+    """Write `cameras.bin`, `images.bin`, `points3D.bin`, and rigs, frames, of `colmap_model(*model)`."""
     folder.mkdir(parents=True, exist_ok=True)
-    model.write(folder)
+    colmap_model(*model).write(folder)

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bundle import reprojection_residuals
-from ..errors import FileError, FormatError
+from ..errors import FileError, FormatError, InputError
 from ..model import Observations, Reconstruction
-from .colmap import camera_from_colmap
+from ..model.checks import check_photo_name
+from .colmap import ModelIds, camera_from_colmap
 
-__all__ = ["ColmapModel", "colmap_model_of", "read_colmap_model"]
+__all__ = ["ColmapModel", "colmap_model_of", "read_colmap_model", "surviving_points"]
 
 # COLMAP's pixel centres are at 0.5, ours at 0
 _HALF = 0.5
@@ -37,6 +38,9 @@ class ColmapModel:
         Red, green, blue of the points.
     unregistered : sequence of str
         Photos without a pose.
+    self_calibrated : bool
+        Whether a camera is of a model that COLMAP refines by default: any but PINHOLE. Without a model of the shutter
+        its intrinsics took up some of it.
     """
 
     reconstruction: Reconstruction
@@ -46,6 +50,48 @@ class ColmapModel:
     keypoint_idx: NDArray[np.int64]
     colors: NDArray[np.uint8]
     unregistered: Sequence[str]
+    self_calibrated: bool = False
+
+    def ids_of(self, points: NDArray[np.int64], names: Sequence[str]) -> ModelIds:
+        """Ids of a reconstruction's parts, of which these old points (-1: none) and photos became.
+
+        Points without an old one get ids above all that there are.
+        """
+        image_id = dict(zip(self.reconstruction.image_names, self.image_ids.tolist(), strict=True))
+        new = points < 0
+        ids = np.where(new, 0, self.point_ids[points])
+        ids[new] = self.point_ids.max() + 1 + np.arange(new.sum())
+        return ModelIds(self.camera_ids.tolist(), [image_id[name] for name in names], ids.tolist())
+
+
+def surviving_points(before: Reconstruction, after: Reconstruction) -> NDArray[np.int64]:
+    """(n,) for each point of `after` the point of `before` that it continues, or -1.
+
+    It is the one most of its measurements belonged to; an old point goes on in the new one that has most of them.
+    """
+    place = {name: i for i, name in enumerate(before.image_names)}
+    of_photo = np.array([place.get(name, -1) for name in after.image_names], np.int64)
+    old, new = before.observations, after.observations
+    frame = np.concatenate([old.frame_idx, of_photo[new.frame_idx]])
+    x, y = np.concatenate([old.xy_raw, new.xy_raw]).T
+    is_new = np.arange(len(frame)) >= len(old)
+    order = np.lexsort((is_new, y, x, frame))
+    same = (frame[order][1:] == frame[order][:-1]) & (x[order][1:] == x[order][:-1]) & (y[order][1:] == y[order][:-1])
+    pairs = np.flatnonzero(same & ~is_new[order][:-1] & is_new[order][1:])
+    old_of = old.point_idx[order[pairs]]
+    new_of = new.point_idx[order[pairs + 1] - len(old)]
+    votes, count = np.unique(new_of * before.num_points + old_of, return_counts=True)
+    of_new, of_old = np.divmod(votes, before.num_points)
+    survivors = np.full(after.num_points, -1)
+    by_votes = np.lexsort((of_old, of_new, -count))
+    # with most votes first, the first pair of a point is its own, if neither is in an earlier one
+    first_new = np.zeros(len(votes), bool)
+    first_new[np.unique(of_new[by_votes], return_index=True)[1]] = True
+    candidates = by_votes[first_new]
+    first_old = np.unique(of_old[candidates], return_index=True)[1]
+    chosen = candidates[first_old]
+    survivors[of_new[chosen]] = of_old[chosen]
+    return survivors
 
 
 def read_colmap_model(folder: Path) -> ColmapModel:
@@ -112,7 +158,7 @@ def colmap_model_of(model: Any, where: str = "the model") -> ColmapModel:
     R_cw = poses[:, :, :3]
     rec = Reconstruction(
         cameras,
-        [image.name for image in images],
+        [_checked_name(image.name, where) for image in images],
         np.array([place[image.camera_id] for image in images], np.int64),
         R_cw,
         -np.einsum("mji,mj->mi", R_cw, poses[:, :, 3]),
@@ -131,7 +177,15 @@ def colmap_model_of(model: Any, where: str = "the model") -> ColmapModel:
         np.concatenate(keypoint)[kept],
         colors[alive],
         tuple(unregistered),
+        any(model.cameras[k].model_name != "PINHOLE" for k in camera_ids),
     )
+
+
+def _checked_name(name: str, where: str) -> str:
+    try:
+        return check_photo_name(name)
+    except InputError as error:
+        raise FormatError(f"{where}: {error}") from error
 
 
 def _once_a_photo(rec: Reconstruction) -> NDArray[np.bool_]:

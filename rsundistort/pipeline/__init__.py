@@ -3,9 +3,12 @@
 from .analyze import analyze
 from .batch import rectify_folder
 from .evaluate import evaluate
+from .from_model import solve, solve_model
 from .gyro import GyroOptions
+from .options import RunOptions, SolveOptions
+from .outcome import versions
 from .photo import RectifyOptions
-from .run import RunOptions, run, versions
+from .run import run
 from .scene import SceneOptions, simulate_scene
 from .simulate import WarpOptions, read_motion_file, simulate_warp
 from .workers import use_threads
@@ -15,6 +18,7 @@ __all__ = [
     "RectifyOptions",
     "RunOptions",
     "SceneOptions",
+    "SolveOptions",
     "WarpOptions",
     "analyze",
     "evaluate",
@@ -23,6 +27,8 @@ __all__ = [
     "run",
     "simulate_scene",
     "simulate_warp",
+    "solve",
+    "solve_model",
     "use_threads",
     "versions",
 ]

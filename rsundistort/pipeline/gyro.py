@@ -59,7 +59,7 @@ class GyroOptions:
 
 
 def known_readouts(
-    folder: Path,
+    folder: Path | None,
     names: Sequence[str],
     cameras: Sequence[Camera],
     camera_idx: ArrayLike,
@@ -69,8 +69,8 @@ def known_readouts(
 ) -> dict[int, tuple[float, str]]:
     """Seconds that the readout of a frame takes, and who says so: the user, the gyroscope's log, or the table.
 
-    By camera; those of which nothing is known are missing. A camera's make and model are those of its first photo, or
-    the video's.
+    By camera; those of which nothing is known are missing, as all are without a folder or a video. A camera's make and
+    model are those of its first photo, or the video's.
     """
     if given_s is not None:
         return dict.fromkeys(range(len(cameras)), (given_s, "given"))
@@ -79,7 +79,9 @@ def known_readouts(
     index = np.asarray(camera_idx).tolist()
     found = {}
     for k, camera in enumerate(cameras):
-        body = read_exif(folder / names[index.index(k)]) if frames is None else frames
+        if k not in index or (folder is None and frames is None):
+            continue
+        body = read_exif((folder or Path()) / names[index.index(k)]) if frames is None else frames
         readout = readout_time(body.make or "", body.model or "", camera.width, camera.height) if body.model else None
         if readout is not None:
             found[k] = readout

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,6 +40,11 @@ class LoadedPhotos:
     skipped: dict[str, str]
     cameras: PhotoCameras
     orientations: Mapping[str, int]
+
+    def unregistered(self, joined: Sequence[str]) -> dict[str, str]:
+        """Photos that are not among those that were joined, and why."""
+        lost = sorted({*self.names} - {*joined})
+        return {**self.skipped, **dict.fromkeys(lost, "shares too little with the other photos")}
 
 
 @dataclass(frozen=True)

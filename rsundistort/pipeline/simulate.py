@@ -21,8 +21,8 @@ from ..rectify import largest_shift_px
 from ..synthetic.fold import check_no_fold
 from ..synthetic.warp import crop_camera, largest_rectangle, random_phi, warp_mask, warp_photo
 from .cameras import find_cameras
+from .outcome import versions
 from .progress import ProgressCallback, StageLog
-from .run import versions
 from .workers import use_threads
 from .write import mask_names
 

@@ -1,6 +1,18 @@
 """Structure from motion around pycolmap: features, matching, mapping, re-triangulation."""
 
+from .database import MatchedPhotos
 from .features import Features, detect_features
-from .mapping import MatchedPhotos, map_photos, match_photos, retriangulate
+from .imported import matched_of_database
+from .mapping import map_photos
+from .matching import match_photos
+from .retriangulation import retriangulate
 
-__all__ = ["Features", "MatchedPhotos", "detect_features", "map_photos", "match_photos", "retriangulate"]
+__all__ = [
+    "Features",
+    "MatchedPhotos",
+    "detect_features",
+    "map_photos",
+    "match_photos",
+    "matched_of_database",
+    "retriangulate",
+]

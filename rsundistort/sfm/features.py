@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Features", "detect_features"]
+__all__ = ["Features", "detect_features", "size_sigma"]
 
 # Residuals by size of the feature, in the adjusted herz-jesus-8: 0.117 px below 2.3 px, 0.122 to 3.5, 0.143 to 7,
 # 0.264 above; and large blobs are biased by perspective besides.
@@ -33,6 +33,11 @@ class Features:
     xy_raw: NDArray[np.float64]
     sigma: NDArray[np.float64]
     descriptors: NDArray[np.uint8]
+
+
+def size_sigma(size: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Standard deviations of the positions of features of these diameters, relative to the finest ones."""
+    return np.asarray(np.hypot(1.0, size / _COARSE_PX))
 
 
 def detect_features(
@@ -64,7 +69,7 @@ def detect_features(
     xy, raw, size = xy[order], raw[order], size[order]
     root = np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-12))
     descriptors = np.clip(np.rint(512.0 * root), 0, 255).astype(np.uint8)
-    return Features(xy, np.hypot(1.0, size / _COARSE_PX), descriptors)
+    return Features(xy, size_sigma(size), descriptors)
 
 
 def _gray_u8(photo: NDArray[Any]) -> NDArray[np.uint8]:

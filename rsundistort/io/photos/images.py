@@ -42,6 +42,7 @@ __all__ = [
     "list_photos",
     "output_name",
     "read_photo",
+    "stored_size",
     "write_image",
 ]
 
@@ -102,6 +103,22 @@ def list_photos(folder: Path, raw_as: str = "tif", sub_folders: Collection[str] 
 def output_name(name: str, raw_as: str = "tif") -> str:
     """Name of a rectified photo: the photo's own; RAW and HEIC become one of `RAW_AS`."""
     return Path(name).with_suffix(f".{raw_as}").as_posix() if kind_of_name(name) in ("RAW", "HEIC") else name
+
+
+def stored_size(path: Path) -> tuple[int, int] | None:
+    """Width and height of the pixels in a photo's file by its header; None where that does not say, as of RAW.
+
+    Raises
+    ------
+    FileError
+        When the file cannot be read.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise FileError(f"{path} cannot be read: {error.strerror}") from error
+    return picture_size(data, kind_of_content(data, path.name))
 
 
 def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> Photo:

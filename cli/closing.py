@@ -1,0 +1,162 @@
+"""The table that closes a run."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .terminal import table
+
+if TYPE_CHECKING:
+    from rsundistort.model import Solution
+
+__all__ = ["closing_table"]
+
+
+def closing_table(solution: Solution, out: Path) -> str:
+    """What was found, a line a photo, in 80 columns."""
+    rows = [("photo", "measurements", "rms px", "deg/frame", "shift px")]
+    for image in solution.images:
+        name = image.name if len(image.name) <= 32 else f"...{image.name[-29:]}"
+        if image.motion is None:
+            rows.append((name, "-", "-", "-", "not joined"))
+            continue
+        span = solution.cameras[image.camera_id].frame_span
+        turn = float((image.motion.phi**2).sum() ** 0.5) * span * 57.29577951308232
+        rows.append(
+            (
+                name,
+                str(image.num_observations),
+                f"{image.rms_px:.2f}",
+                f"{turn:.2f}",
+                f"{image.rs_shift_px:.1f}",
+            )
+        )
+    quality = solution.quality
+    total = sum(stage["seconds"] for stage in solution.stages)
+    lines = [
+        table(rows),
+        "",
+        f"photos registered  {len(solution.registered)} of {len(solution.images)}",
+        f"shutter model      {solution.shutter_model}",
+        *_held_out(quality["held_out_rms_px"]),
+        *_cameras(solution),
+        *_video(solution),
+        *_intrinsics(solution),
+        *_readout(solution),
+        *_depths(solution),
+        f"rms residual       {quality['global_rms_px']:.2f} px with a global shutter, {quality['rms_px']:.2f} px now",
+        f"outputs            {out}  ({total:.0f} s)",
+    ]
+    critical = solution.critical_motion
+    if critical is not None:
+        said = [critical["sentence"]]
+        if critical["flagged"]:
+            said += ["at the next shoot:", *critical["advice"]]
+        lines += ["", *(line for text in said for line in textwrap.wrap(text, 80))]
+    doubtful = _doubtful(solution)
+    if doubtful:
+        lines += [
+            "",
+            "doubtful (few measurements, or a motion far from the others'; check these, or leave them out):",
+            f"  {', '.join(doubtful)}",
+        ]
+    lost = [image for image in solution.images if not image.registered]
+    if lost:
+        lines += ["", "not joined:", *(f"  {image.name}: {image.reason}" for image in lost)]
+    return "\n".join(lines)
+
+
+def _cameras(solution: Solution) -> list[str]:
+    """Where the cameras come from, which way they are read out by group where they differ, and what was guessed."""
+    source, readout = solution.options["camera"], solution.options["readout"]
+    if isinstance(readout, str):
+        lines = [f"camera             {source}, readout {readout}"]
+    else:
+        lines = [f"cameras            {source}", *(f"  {group}: readout {each}" for group, each in readout.items())]
+    guesses = solution.options.get("guesses", ())
+    return lines + [f"  {line}" for text in guesses for line in textwrap.wrap(text, 78)]
+
+
+def _intrinsics(solution: Solution) -> list[str]:
+    """A line on each camera whose intrinsics were solved for, with standard deviations."""
+    lines = []
+    for key, sigmas in solution.quality["sigma_intrinsics"].items():
+        camera = solution.cameras[key]
+        values = {
+            "f": camera.K[0, 0],
+            "fx": camera.K[0, 0],
+            "fy": camera.K[1, 1],
+            "cx": camera.K[0, 2],
+            "cy": camera.K[1, 2],
+        }
+        values |= camera.coefficients
+        found = [
+            f"{name} {values[name]:.{4 if name[0] in 'kp' else 1}f} +- {sigma:.{4 if name[0] in 'kp' else 1}f}"
+            for name, sigma in sigmas.items()
+        ]
+        lines += [f"{'refined' if i == 0 else '':19}{', '.join(found[i : i + 3])}" for i in range(0, len(found), 3)]
+    return lines
+
+
+def _video(solution: Solution) -> list[str]:
+    """A line on the video whose frames the photos are."""
+    video = solution.options.get("video")
+    if not video:
+        return []
+    turned = {3: 180, 6: 90, 8: 270}.get(video["orientation"])
+    said = f", players turn them by {turned} degrees clockwise, the files do not" if turned else ""
+    return [f"video              {len(solution.images)} of {video['frames']} frames{said}"]
+
+
+def _readout(solution: Solution) -> list[str]:
+    """Lines on how fast the photos turned, where the time of the readout is known."""
+    times = solution.quality.get("readout_times") or {}
+    rates = sorted(
+        float((image.motion.phi**2).sum() ** 0.5)
+        * solution.cameras[image.camera_id].frame_span
+        / times[image.camera_id]["ms"]
+        * 57295.77951308232
+        for image in solution.registered
+        if image.motion is not None and image.camera_id in times
+    )
+    if not rates:
+        return []
+    said = dict.fromkeys(f"{time['ms']:g} ms ({time['source']})" for time in times.values())
+    return [
+        f"rates of turn      median {rates[len(rates) // 2]:.1f}, largest {rates[-1]:.1f} deg/s, by a readout of",
+        *(f"{'':19}{each}" for each in said),
+    ]
+
+
+def _depths(solution: Solution) -> list[str]:
+    """A line on how far away the photos of a camera that travelled were taken to show things."""
+    used = [image.depth for image in solution.images if image.depth is not None]
+    kinds = {"points": "as the points", "plane": "on a plane", "map": "by maps", "infinity": "at infinity"}
+    counts = [f"{text} in {used.count(kind)} photos" for kind, text in kinds.items() if kind in used]
+    return [f"depth              {', '.join(counts)}"] if counts else []
+
+
+def _held_out(rms_px: Mapping[str, float]) -> list[str]:
+    """A line on how well each rung of the ladder foretold measurements that it was not fitted to."""
+    if not rms_px:
+        return []
+    return ["held-out residual  " + ", ".join(f"{model} {rms:.3f}" for model, rms in rms_px.items()) + " px"]
+
+
+def _doubtful(solution: Solution) -> list[str]:
+    """Photos whose motion is known to no better than two pixels, or lies beyond five spreads of all of them."""
+    spread = solution.quality["phi_sigma_rad_per_frame"]
+    names = []
+    for image in solution.registered:
+        if image.motion is None or image.sigma_phi is None:
+            continue
+        camera = solution.cameras[image.camera_id]
+        largest = float(abs(image.motion.phi).max()) * camera.frame_span
+        # over half the frame a rotation by an angle moves pixels by about the angle times half the focal length
+        uncertain_px = float(image.sigma_phi.max()) * camera.frame_span * float(camera.K[0, 0]) / 2
+        if uncertain_px > 2.0 or largest > 5.0 * spread:
+            names.append(image.name)
+    return names

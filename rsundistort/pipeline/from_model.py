@@ -1,0 +1,246 @@
+"""The same job from a COLMAP model: its tracks in, motions, rectified photos and a model without shutter out."""
+
+from __future__ import annotations
+
+import tempfile
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError, ReconstructionError, RsUndistortWarning
+from ..io import ExifFacts, guess_readouts, output_folder, output_name, read_exif
+from ..io.colmap import ModelIds, colmap_model
+from ..io.colmap_model import ColmapModel, colmap_model_of, read_colmap_model, surviving_points
+from ..io.photos.images import stored_size
+from ..model import Reconstruction, Solution
+from ..model.orientation import INVERSE, turn_reconstruction
+from ..sfm import matched_of_database
+from .cameras import PhotoCameras, check_readouts
+from .gyro import known_readouts
+from .ladder import solve_tracks
+from .options import SolveOptions
+from .outcome import Outcome
+from .outputs import Outputs, PointRgb
+from .progress import ProgressCallback, StageLog
+from .workers import Workers, use_threads
+
+__all__ = ["solve", "solve_model"]
+
+
+def solve_model(
+    model: Path | str,
+    out: Path | str,
+    options: SolveOptions | None = None,
+    *,
+    images: Path | str | None = None,
+    database: Path | str | None = None,
+    progress: ProgressCallback | None = None,
+) -> Solution:
+    """Recover how the camera moved during each photo's readout from a COLMAP model; write what `run` writes.
+
+    Parameters
+    ----------
+    model : path
+        Folder of a COLMAP model, text or binary.
+    out : path
+        Folder for the outputs, as of `run`.
+    options : SolveOptions, optional
+        See there. Groups are cameras of the model: "camera 1".
+    images : path, optional
+        Folder of the photos that the model names. Without it none are rectified.
+    database : path, optional
+        COLMAP's database behind the model: the matches in it are verified again with the motions found, and the tracks
+        rebuilt.
+    progress : callable, optional
+        Called as (stage, done, total). What it raises stops the work.
+
+    Returns
+    -------
+    Solution
+        As written to `out/solution.json`.
+    """
+    options = options or SolveOptions()
+    model, out = Path(model), Path(out)
+    folder = None if images is None else Path(images)
+    log = StageLog(progress)
+    workers = Workers(use_threads(options.jobs), options.scheduler)
+    inputs = [path for path in (model, folder, options.masks) if path is not None]
+    with output_folder(
+        out, overwrite=options.overwrite, apart_from=[Path(path) for path in inputs],
+        replaced=("images", "masks", "sparse"),
+    ) as scratch:  # fmt: skip
+        log.begin("model")
+        given = read_colmap_model(model)
+        photos = {} if folder is None else _look_at(folder, given.reconstruction)
+        given, said = _in_stored_frame(given, photos)
+        log.end("model", photos=given.reconstruction.num_images, points=given.reconstruction.num_points)
+        facts = {name: fact for name, (_, fact) in photos.items()}
+        outcome, ids, rgb = _solve(given, str(model), facts, options, None if database is None else Path(database), log)
+        outcome = replace(outcome, options={"model_frame": said} if said else {})
+        orientations = {name: fact.orientation or 1 for name, fact in facts.items()}
+        outputs = Outputs.of_outcome(outcome, options, orientations, ids, rgb, with_photos=folder is not None)
+        solution = outputs.begin(scratch, log)
+    return solution if folder is None else outputs.rectify(folder, out, workers, log)
+
+
+def solve(
+    reconstruction: Any,
+    options: SolveOptions | None = None,
+    *,
+    database: Path | str | None = None,
+    progress: ProgressCallback | None = None,
+) -> tuple[Any, Solution]:
+    """Recover how the camera moved during each photo's readout from a `pycolmap.Reconstruction`.
+
+    Nothing global is changed, and several threads may each solve one.
+
+    Parameters
+    ----------
+    reconstruction : pycolmap.Reconstruction
+        It stays as it is. Its keypoints must be pixels of the photos as the sensor stored them.
+    options : SolveOptions, optional
+        See there; what concerns files is not looked at.
+    database : path, optional
+        As in `solve_model`.
+    progress : callable, optional
+        Called as (stage, done, total). What it raises stops the work.
+
+    Returns
+    -------
+    rectified : pycolmap.Reconstruction
+        Poses, points and tracks without shutter, in PINHOLE cameras: the model of the rectified photos.
+    solution : Solution
+        The motions.
+    """
+    options = options or SolveOptions()
+    log = StageLog(progress)
+    given = colmap_model_of(reconstruction)
+    outcome, ids, rgb = _solve(given, "the model", {}, options, None if database is None else Path(database), log)
+    outputs = Outputs.of_outcome(outcome, options, {}, ids, rgb)
+    rec, solution = outputs.reconstruction, outputs.solution
+    names = [output_name(name, options.raw_as) for name in rec.image_names]
+    cameras = [solution.rectified_cameras[str(key)] for key in ids.cameras]
+    return colmap_model(rec, cameras, names, rgb.values, ids), replace(solution, stages=tuple(log.stages))
+
+
+def _look_at(folder: Path, rec: Reconstruction) -> dict[str, tuple[tuple[int, int] | None, ExifFacts]]:
+    """Size and EXIF facts of each photo of a model."""
+    missing = [name for name in rec.image_names if not (folder / name).is_file()]
+    if missing:
+        raise InputError(
+            f"{folder} lacks {len(missing)} of {rec.num_images} photos of the model, such as {missing[0]}; "
+            "give the folder that the model was made from"
+        )
+    return {name: (stored_size(folder / name), read_exif(folder / name)) for name in rec.image_names}
+
+
+def _in_stored_frame(
+    given: ColmapModel, photos: Mapping[str, tuple[tuple[int, int] | None, ExifFacts]]
+) -> tuple[ColmapModel, str]:
+    """The model in the frames of the stored photos, and what was found of that, for people.
+
+    Some programs turn photos by their EXIF orientation before they look at them: the sizes tell.
+    """
+    rec = given.reconstruction
+    turns: dict[str, int] = {}
+    unsure = []
+    for i, name in enumerate(rec.image_names):
+        size, facts = photos.get(name, (None, ExifFacts()))
+        if size is None:
+            continue
+        camera, orientation = rec.camera(i), facts.orientation or 1
+        if (camera.width, camera.height) == size:
+            if orientation in (2, 3, 4) or (orientation > 4 and camera.width == camera.height):
+                unsure.append(name)
+        elif (camera.height, camera.width) == size and orientation > 4:
+            turns[name] = INVERSE[orientation]
+        else:
+            raise InputError(
+                f"{name} has {size[0]}x{size[1]} pixels, its camera in the model {camera.width}x{camera.height}; "
+                "give the photos that the model was made from"
+            )
+    if unsure:
+        warnings.warn(
+            f"{len(unsure)} photos, such as {unsure[0]}, have an EXIF orientation that keeps their size: the model is "
+            "taken to show them as they are stored", RsUndistortWarning, stacklevel=3,
+        )  # fmt: skip
+    if not turns:
+        return given, "stored" if photos else ""
+    said = f"turned by the EXIF orientation in {len(turns)} of {rec.num_images} photos"
+    turned = turn_reconstruction(rec, turns)
+    ids = list(given.camera_ids)
+    free = (k for k in range(1, 2 + max(ids) + len(turned.cameras)) if k not in ids)
+    ids += [next(free) for _ in range(len(turned.cameras) - len(ids))]
+    return replace(given, reconstruction=turned, camera_ids=np.array(ids, np.int64)), said
+
+
+def _photo_cameras(
+    given: ColmapModel, source: str, facts: Mapping[str, ExifFacts], options: SolveOptions
+) -> PhotoCameras:
+    """The model's cameras, with the directions of readout that were told or are guessed."""
+    rec = given.reconstruction
+    labels = [f"camera {key}" for key in given.camera_ids]
+    told = check_readouts(options.readout)
+    unknown = sorted(told.keys() - {"", *labels})
+    if unknown:
+        raise InputError(f"readout of {unknown[0]!r}: no such camera, there are {', '.join(labels)}")
+    of_photo = [labels[k] for k in rec.camera_idx.tolist()]
+    sizes = [(rec.camera(i).width, rec.camera(i).height) for i in range(rec.num_images)]
+    guessed, notes = guess_readouts([facts.get(name, ExifFacts()) for name in rec.image_names], sizes, of_photo)
+    cameras = []
+    for label, camera in zip(labels, rec.cameras, strict=True):
+        direction = told.get(label, told.get("", guessed.get(label, camera.readout)))
+        cameras.append(replace(camera, readout=direction))
+    return PhotoCameras(
+        tuple(cameras),
+        tuple(labels),
+        rec.camera_idx,
+        calibrated=not given.self_calibrated,
+        readout_told=tuple(label in told or "" in told for label in labels),
+        source=f"{source}, refined" if given.self_calibrated else source,
+        notes=() if told else tuple(notes),
+    )
+
+
+def _solve(
+    given: ColmapModel,
+    source: str,
+    facts: Mapping[str, ExifFacts],
+    options: SolveOptions,
+    database: Path | None,
+    log: StageLog,
+) -> tuple[Outcome, ModelIds, PointRgb]:
+    if given.reconstruction.num_images < 3:
+        raise ReconstructionError(
+            f"the model holds {given.reconstruction.num_images} registered photos, the shutter needs three"
+        )
+    cameras = _photo_cameras(given, source, facts, options)
+    rec = replace(given.reconstruction, cameras=cameras.cameras)
+    for name in (*options.still, *options.known):
+        if name not in rec.image_names:
+            raise InputError(f"anchor {name!r} is not among the photos of the model")
+    guessed = {k: label for k, label in enumerate(cameras.labels) if not cameras.readout_told[k]}
+    used = set(rec.camera_idx.tolist())
+    guessed = {k: label for k, label in guessed.items() if k in used}
+    with tempfile.TemporaryDirectory() as work:
+        matched = None
+        if database is not None:
+            log.begin("database")
+            matched = matched_of_database(database, Path(work) / "database.db", rec, options.seed)
+            log.end("database", keypoints=sum(len(found.xy_raw) for found in matched.features))
+        solved = solve_tracks(
+            rec, guessed, options.shutter_model, options.seed, lambda each: options.options_for(each, cameras), log,
+            options.remedy, matched,
+        )  # fmt: skip
+    after = solved.result.reconstruction
+    lost = dict.fromkeys(given.unregistered, "it is not registered in the model")
+    lost |= dict.fromkeys(set(rec.image_names) - set(after.image_names), "no measurement of it survived")
+    readouts = known_readouts(None, after.image_names, after.cameras, after.camera_idx, None, options.readout_s, None)
+    old = surviving_points(given.reconstruction, after)
+    ids = given.ids_of(old, after.image_names)
+    rgb = PointRgb(np.where(old[:, None] >= 0, given.colors[old], 0).astype(np.uint8), old >= 0)
+    return Outcome(solved, cameras, ids.cameras, lost, readouts), ids, rgb

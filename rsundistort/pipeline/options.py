@@ -1,0 +1,149 @@
+"""Options of the commands that solve for motions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..bundle import BundleOptions, GuessedCameras, KnownLength
+from ..critical import with_remedy
+from ..errors import InputError
+from ..model import READOUTS, Reconstruction, check_shutter_model
+from .cameras import PhotoCameras, check_readouts
+from .depth import check_depth
+from .gyro import GyroOptions
+from .photo import RectifyOptions
+
+__all__ = ["GUESSED", "GUESS_SIGMA", "RunOptions", "SolveOptions"]
+
+#: What EXIF does not know, and a set of photos tells; and how far it may be off (relative f, lens coefficients):
+# equivalent focal lengths are rounded to millimetres, focusing and stabilising crop a little, phones hardly distort.
+GUESSED = ("f", "k1", "k2")
+GUESS_SIGMA = {"f": 0.05, "k1": 0.2, "k2": 0.4}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolveOptions(RectifyOptions):
+    """Options of `solve_model`: those of `RectifyOptions` for its last stage, and the following.
+
+    With `apply_orientation` photos that it mirrors are turned only, and keep the mirror as their orientation: no camera
+    takes a mirror image.
+
+    Parameters
+    ----------
+    readout : str or mapping of group to str, optional
+        Readout direction of all photos, or of groups; else the camera file's; else it is guessed, and told by the fit.
+    shutter_model : str
+        "constant-motion", "rotation", "linearized", "two-step", "global", or "auto": the one that foretells held-out
+        measurements best.
+    seed : int
+        Of every random choice.
+    jobs : int
+        Threads; 0 for all cores.
+    refine : tuple of str, optional
+        Intrinsics that are solved for with the rest, as in `BundleOptions`; by default none where the camera is given,
+        f, k1 and k2 where EXIF had to guess it.
+    still : mapping of photo name to float
+        Photos known not to have moved: phi1 is held at zero in them (the paper's remedy), or, where the number is
+        positive, near zero with that standard deviation, radians per frame.
+    known : mapping of photo name to (phi, sigma)
+        Motions known from elsewhere, as in `BundleOptions.known_phi`.
+    lengths : sequence of KnownLength
+        Lengths measured in the scene, as in `BundleOptions.lengths`.
+    remedy : str
+        What to do about a critical motion: "auto", "prior" or "none"; see `critical.heal`.
+    readout_s : float, optional
+        Time of the readout of a frame; else the log's, else that of the camera in the table, if it is there.
+    overwrite : bool
+        Replace the outputs of an earlier run.
+    scheduler : str, optional
+        Address of a Dask scheduler whose workers rectify the photos, as in `rectify_folder`.
+    """
+
+    readout: str | Mapping[str, str] | None = None
+    shutter_model: str = "auto"
+    seed: int = 0
+    jobs: int = 0
+    refine: tuple[str, ...] | None = None
+    still: Mapping[str, float] = field(default_factory=dict)
+    known: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
+    lengths: Sequence[KnownLength] = ()
+    remedy: str = "auto"
+    readout_s: float | None = None
+    overwrite: bool = False
+    scheduler: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.shutter_model != "auto":
+            check_shutter_model(self.shutter_model)
+        check_readouts(self.readout)
+        check_depth(self.depth)
+        with_remedy(self.bundle_options(), self.remedy)
+        if self.jobs < 0:
+            raise InputError(f"jobs={self.jobs!r}, expected 0 or more")
+        if self.readout_s is not None and not 0 < self.readout_s < np.inf:
+            raise InputError(f"readout_s={self.readout_s!r}, expected a positive number of seconds")
+
+    def rectify_options(self) -> RectifyOptions:
+        """Those of the last stage, alone."""
+        return RectifyOptions(**{each.name: getattr(self, each.name) for each in fields(RectifyOptions)})
+
+    def bundle_options(self, readout: Mapping[str, str] | None = None) -> BundleOptions:
+        """Options of the adjustments of photos with these readout directions, top-to-bottom where none is named."""
+        soft, hard = {}, {}
+        for name, sigma in self.still.items():
+            # the rotation that stretches the photo along its readout
+            phi1 = 0 if READOUTS[(readout or {}).get(name, "top-to-bottom")][0] == 1 else 1
+            if not 0 <= sigma < np.inf:
+                raise InputError(f"still photo {name!r}: sigma {sigma!r}, expected 0 or a positive number")
+            if sigma > 0 and name in self.known:
+                raise InputError(f"photo {name!r} is said to be still and its motion to be known; give one of them")
+            if sigma > 0:
+                soft[name] = (np.zeros(3), np.where(np.arange(3) == phi1, sigma, np.inf))
+            else:
+                hard[name] = (phi1,)
+        return BundleOptions(
+            held_phi=hard, known_phi={**self.known, **soft}, lengths=self.lengths, refine=self.refine or ()
+        )  # fmt: skip
+
+    def options_for(self, reconstruction: Reconstruction, cameras: PhotoCameras) -> BundleOptions:
+        """Options of the adjustments of a reconstruction, by its readout directions and by whether EXIF guessed."""
+        rec = reconstruction
+        options = self.bundle_options({name: rec.camera(i).readout for i, name in enumerate(rec.image_names)})
+        if cameras.calibrated:
+            return options
+        refine = GUESSED if self.refine is None else self.refine
+        return replace(options, refine=refine, guessed=GuessedCameras(cameras.cameras, GUESS_SIGMA))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(SolveOptions):
+    """Options of `run`: those of `SolveOptions`, and the following. There are no features where the `masks` are black.
+
+    Parameters
+    ----------
+    camera : str, optional
+        File or folder of cameras, or numbers, as `io.read_camera_file` takes them; else `camera.json` or `cameras.json`
+        in or beside the folder of photos, else EXIF.
+    max_features : int
+        Per photo.
+    every, sharpest : int, optional
+        Of a video: each N-th frame, or the sharpest of each N frames, as in `io.extract_frames`.
+    gyro : GyroOptions, optional
+        A gyroscope's log, for the motions that are neither `known` nor those of `still` photos.
+    """
+
+    camera: str | None = None
+    max_features: int = 16384
+    every: int | None = None
+    sharpest: int | None = None
+    gyro: GyroOptions | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.max_features < 100:
+            raise InputError(f"max_features={self.max_features!r}, expected at least 100")

@@ -1,0 +1,178 @@
+"""What was found, as a solution."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..bundle import reprojection_residuals
+from ..model import Reconstruction, Solution, SolvedImage
+from ..rectify import largest_shift_px
+from .cameras import PhotoCameras
+from .ladder import Solved
+from .options import SolveOptions
+
+__all__ = ["Outcome", "solution_of", "versions"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a reconstruction came to, and what is to be said beside it.
+
+    Attributes
+    ----------
+    solved : Solved
+        The reconstruction.
+    cameras : PhotoCameras
+        The cameras that it began with, and where they come from.
+    camera_ids : sequence of int
+        Of the reconstruction's cameras, in all outputs.
+    unregistered : mapping of name to reason
+        Photos that are not in it.
+    readouts : mapping of camera index to (seconds, source)
+        Times of the readout, as far as they are known.
+    options : mapping
+        What else `solution.json` says of how it was made.
+    """
+
+    solved: Solved
+    cameras: PhotoCameras
+    camera_ids: Sequence[int]
+    unregistered: Mapping[str, str] = field(default_factory=dict)
+    readouts: Mapping[int, tuple[float, str]] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def reconstruction(self) -> Reconstruction:
+        """With poses, motions and points."""
+        return self.solved.result.reconstruction
+
+
+def versions() -> dict[str, str]:
+    """Versions of what a result depends on."""
+    names = ("rsundistort", "opencv-contrib-python-headless", "numpy", "scipy", "numba", "pycolmap")
+    return {"python": platform.python_version(), **{name: version(name) for name in names}}
+
+
+def _readouts(rec: Reconstruction, cameras: PhotoCameras) -> str | dict[str, str]:
+    """Direction of the readout of all cameras, or by group where they differ."""
+    directions = {label: camera.readout for label, camera in zip(cameras.labels, rec.cameras, strict=True)}
+    return rec.cameras[0].readout if len(set(directions.values())) == 1 else directions
+
+
+def _guesses(solved: Solved, cameras: PhotoCameras) -> list[str]:
+    """What was guessed of the cameras, and what the photos said of it, for people."""
+    choice = solved.readouts
+    found = [] if choice is None else choice.turned
+    said = [] if found else list(cameras.notes)
+    for k in found:
+        assert choice is not None
+        said.append(
+            f"{cameras.labels[k]} fits better as read out {choice.reconstruction.cameras[k].readout} "
+            f"(by {choice.gain[k]:.0f} standard errors); --readout settles it"
+        )
+    return said
+
+
+def _image_rms(rec: Reconstruction) -> NDArray[np.float64]:
+    """(m,) root mean square residual of each photo in pixels."""
+    res, valid = reprojection_residuals(rec)
+    frame = rec.observations.frame_idx[valid]
+    square = np.bincount(frame, np.mean(res[valid] ** 2, axis=1), minlength=rec.num_images)
+    return np.sqrt(square / np.maximum(np.bincount(frame, minlength=rec.num_images), 1))
+
+
+def _critical(solved: Solved) -> dict[str, Any]:
+    """What `solution.json` says of critical motions."""
+    remedy = solved.remedy
+    assert remedy is not None
+    after = remedy.after
+    return {
+        "singular_values": after.meter.singular_values.tolist(),
+        "null_vector": after.meter.null_vector.tolist(),
+        "y_axis_spread_deg": after.meter.y_axis_spread_deg,
+        "meaning": after.meter.meaning,
+        "sigma_log_k": after.sigma_log_k,
+        "sigma_log_k_before": remedy.before.sigma_log_k,
+        "weakest_sigma": after.weakest_sigma,
+        "weakest_share": after.weakest_share,
+        "flagged": after.is_flagged,
+        "remedy": remedy.name,
+        "anchors": dict(remedy.anchors),
+        "sentence": remedy.sentence,
+        "warnings": list(remedy.warnings),
+        "advice": [each.sentence for each in solved.advice],
+    }
+
+
+def solution_of(outcome: Outcome, options: SolveOptions) -> Solution:
+    """The solution of an adjusted reconstruction, with every photo in it; its views are those of the raw photos."""
+    solved, rec = outcome.solved, outcome.reconstruction
+    rms = _image_rms(rec)
+    counts = np.bincount(rec.observations.frame_idx, minlength=rec.num_images)
+    keys = [str(key) for key in outcome.camera_ids]
+    cameras = dict(zip(keys, rec.cameras, strict=True))
+    places = {name: i for i, name in enumerate(rec.image_names)}
+    images = []
+    for name in sorted([*rec.image_names, *outcome.unregistered]):
+        if name in outcome.unregistered:
+            images.append(SolvedImage(name, keys[0], reason=outcome.unregistered[name]))
+            continue
+        i = places[name]
+        images.append(
+            SolvedImage(
+                name=name,
+                camera_id=keys[int(rec.camera_idx[i])],
+                R_cw=rec.R_cw[i],
+                center_w=rec.center_w[i],
+                motion=rec.motion(i),
+                sigma_phi=None if rec.shutter_model == "global" else solved.result.sigma_phi[i],
+                num_observations=int(counts[i]),
+                rms_px=float(rms[i]),
+                rs_shift_px=largest_shift_px(rec.camera(i), rec.motion(i), rec.shutter_model),
+            )
+        )
+    quality = {
+        "num_points": rec.num_points,
+        "num_observations": len(rec.observations),
+        "rms_px": solved.result.rms_px,
+        "global_rms_px": solved.global_result.rms_px,
+        "held_out_rms_px": {} if solved.choice is None else solved.choice.held_out_rms_px,
+        "sigma_intrinsics": dict(zip(cameras, solved.result.sigma_intrinsics, strict=True)),
+        "phi_sigma_rad_per_frame": solved.result.phi_sigma,
+        "stop_reason": solved.result.stop_reason,
+        "readout_times": {keys[k]: {"ms": 1e3 * s, "source": source} for k, (s, source) in outcome.readouts.items()},
+    }
+    return Solution(
+        shutter_model=rec.shutter_model,
+        cameras=cameras,
+        # same size and K, so that raw and rectified compare pixel by pixel
+        rectified_cameras={key: camera.pinhole() for key, camera in cameras.items()},
+        images=tuple(images),
+        quality=quality,
+        critical_motion=None if solved.remedy is None else _critical(solved),
+        options={
+            "camera": outcome.cameras.source,
+            "shutter_model": options.shutter_model,
+            "readout": _readouts(rec, outcome.cameras),
+            "guesses": _guesses(solved, outcome.cameras),
+            "seed": options.seed,
+            "interpolation": options.interpolation,
+            "quality": options.quality,
+            "raw_as": options.raw_as,
+            "refine": list(solved.result.sigma_intrinsics[0]),
+            "still": dict(options.still),
+            "known": sorted(options.known),
+            "lengths": len(options.lengths),
+            "remedy": options.remedy,
+            "depth": str(options.depth),
+            **outcome.options,
+        },
+        generator=versions(),
+    )

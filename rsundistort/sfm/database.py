@@ -1,0 +1,210 @@
+"""The pycolmap database of a set of photos, whose keypoints we correct.
+
+Everything that pycolmap sees is a pinhole camera: keypoints are freed of lens and shutter as far as these are known
+and written into its database. Only a fisheye keeps its lens, which pycolmap has too: in a pinhole photo the noise of a
+keypoint would grow with the square of the distance from the centre, 33 times at 80 degrees from the axis. The
+measurements of the adjustment remain the raw pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ReconstructionError
+from ..model import Camera, Observations, Reconstruction, RowMotion
+from ..model.projection import project_points, unproject_points
+from .features import Features
+
+__all__ = [
+    "HALF",
+    "LOOSE",
+    "MatchedPhotos",
+    "database_camera",
+    "from_pycolmap",
+    "ideal_keypoints",
+    "pipeline_options",
+    "quiet_pycolmap",
+    "verification_options",
+    "write_photos",
+]
+
+#: COLMAP's pixel centres are at 0.5.
+HALF = 0.5
+#: A shutter that turns by 0.05 rad over the frame moves pixels by tens; epipolar geometry absorbs most of it. With
+#: thresholds four times COLMAP's own, all photos register and tracks stay whole; with its own, a third is cut off.
+LOOSE = 4.0
+
+
+@dataclass(frozen=True)
+class MatchedPhotos:
+    """Features and matches of a folder, and the pycolmap database that holds them.
+
+    Attributes
+    ----------
+    database : Path
+        pycolmap's database; image ids are 1 + index of the photo.
+    names, features : sequences of length m
+        Photos.
+    cameras, camera_idx : cameras, and the camera of each photo
+        Intrinsics; a guess where `calibrated` is False.
+    calibrated : bool
+        Whether the intrinsics are known; if not, mapping refines focal length and k1.
+    seed : int
+        Seed of every random choice of pycolmap.
+    """
+
+    database: Path
+    names: Sequence[str]
+    features: Sequence[Features]
+    cameras: Sequence[Camera]
+    camera_idx: NDArray[np.int64]
+    calibrated: bool
+    seed: int
+
+
+def quiet_pycolmap() -> Any:
+    """Pycolmap, quiet, and imported late: it takes half a second, and cv2 must come first (see `io.photos.images`)."""
+    import pycolmap
+
+    pycolmap.logging.minloglevel = 3
+    return pycolmap
+
+
+def database_camera(camera: Camera, calibrated: bool, camera_id: int) -> Any:
+    """The camera of the corrected keypoints; one that mapping can refine, if it is a guess."""
+    K = camera.K
+    cx, cy = K[0, 2] + HALF, K[1, 2] + HALF
+    fisheye = camera.lens == "fisheye"
+    if not calibrated:
+        model = "SIMPLE_RADIAL_FISHEYE" if fisheye else "SIMPLE_RADIAL"
+        params = [K[0, 0], cx, cy, camera.coefficients["k1"]]
+    elif fisheye:
+        model, params = "OPENCV_FISHEYE", [K[0, 0], K[1, 1], cx, cy, *camera.coefficients.values()]
+    else:
+        model, params = "PINHOLE", [K[0, 0], K[1, 1], cx, cy]
+    result = quiet_pycolmap().Camera(
+        model=model, width=camera.width, height=camera.height, params=params, camera_id=camera_id
+    )
+    result.has_prior_focal_length = True
+    return result
+
+
+def ideal_keypoints(features: Features, camera: Camera, motion: RowMotion, model: str) -> NDArray[np.float32]:
+    """Keypoints without shutter in the camera of the database, COLMAP's centres; where none exists, far outside."""
+    ideal, valid = unproject_points(features.xy_raw, camera, motion, model)
+    if camera.lens == "fisheye":
+        rays = np.column_stack([np.where(valid[:, None], ideal, 0.0), np.ones(len(ideal))])
+        xy = project_points(rays, camera, None, "global")[0]
+    else:
+        xy = ideal @ camera.K[:2, :2].T + camera.K[:2, 2]
+    xy[~valid] = -1e4
+    return (xy + HALF).astype(np.float32)
+
+
+def write_photos(db: Any, matched: MatchedPhotos, limit: int | None = None) -> None:
+    """Cameras, photos and their first `limit` keypoints into an empty database."""
+    pycolmap = quiet_pycolmap()
+    rig_ids = []
+    for index, camera in enumerate(matched.cameras):
+        colmap_camera = database_camera(camera, matched.calibrated, index + 1)
+        db.write_camera(colmap_camera, use_camera_id=True)
+        rig = pycolmap.Rig()
+        rig.add_ref_sensor(colmap_camera.sensor_id)
+        rig_ids.append(db.write_rig(rig))
+    for index, (name, found) in enumerate(zip(matched.names, matched.features, strict=True)):
+        camera_index = int(matched.camera_idx[index])
+        image = pycolmap.Image(name=name, camera_id=camera_index + 1, image_id=index + 1)
+        db.write_image(image, use_image_id=True)
+        frame = pycolmap.Frame()
+        frame.rig_id = rig_ids[camera_index]
+        frame.add_data_id(image.data_id)
+        db.write_frame(frame)
+        if matched.calibrated:
+            keypoints = ideal_keypoints(found, matched.cameras[camera_index], RowMotion(), "global")
+        else:
+            keypoints = (found.xy_raw + HALF).astype(np.float32)
+        db.write_keypoints(index + 1, keypoints[:limit])
+
+
+def verification_options(max_error_px: float, seed: int) -> Any:
+    """Of the geometric verification of pairs."""
+    options = quiet_pycolmap().TwoViewGeometryOptions()
+    options.ransac.max_error = max_error_px
+    options.ransac.random_seed = seed
+    options.detect_watermark = False
+    return options
+
+
+def pipeline_options(loose: float, seed: int, refine_intrinsics: bool, num_photos: int) -> Any:
+    """Of mapping and triangulation, with thresholds `loose` times COLMAP's own."""
+    options = quiet_pycolmap().IncrementalPipelineOptions()
+    options.random_seed = seed
+    # one thread: with more, the same seed now and then takes another first pair; small problems are no slower
+    options.num_threads = options.mapper.num_threads = 1
+    options.extract_colors = False
+    # smaller models are given up and another first pair is tried
+    options.min_model_size = min(10, max(3, num_photos // 2))
+    options.ba_refine_focal_length = refine_intrinsics
+    options.ba_refine_extra_params = refine_intrinsics
+    mapper, triangulation = options.mapper, options.triangulation
+    mapper.random_seed = triangulation.random_seed = seed
+    mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = refine_intrinsics
+    mapper.init_max_error *= loose
+    mapper.abs_pose_max_error *= loose
+    mapper.filter_max_reproj_error *= loose
+    triangulation.create_max_angle_error *= loose
+    triangulation.continue_max_angle_error *= loose
+    triangulation.merge_max_reproj_error *= loose
+    triangulation.complete_max_reproj_error *= loose
+    triangulation.re_max_angle_error *= loose
+    return options
+
+
+def from_pycolmap(model: Any, matched: MatchedPhotos, posed: Reconstruction | None) -> Reconstruction:
+    """Our reconstruction of a pycolmap model, with the raw pixels as measurements.
+
+    Poses, cameras and motions are `posed`'s when it is given (triangulation leaves them alone), else the model's.
+    """
+    ids = sorted(i for i in model.reg_image_ids())
+    names = [model.images[i].name for i in ids]
+    frame_idx, point_idx, keypoint, track_points = [], [], [], []
+    frame_of = {image_id: k for k, image_id in enumerate(ids)}
+    for number, point_id in enumerate(sorted(model.point3D_ids())):
+        point = model.points3D[point_id]
+        track_points.append(point.xyz)
+        seen = set()
+        for element in sorted((e.image_id, e.point2D_idx) for e in point.track.elements):
+            if element[0] in seen:  # COLMAP tracks can hold a photo twice
+                continue
+            seen.add(element[0])
+            frame_idx.append(frame_of[element[0]])
+            point_idx.append(number)
+            keypoint.append(element[1])
+    if not track_points:
+        raise ReconstructionError("the photos were joined, but no scene point could be triangulated")
+    frame = np.array(frame_idx)
+    kp = np.array(keypoint)
+    xy_raw, sigma = np.empty((len(frame), 2)), np.empty(len(frame))
+    for k, image_id in enumerate(ids):
+        of_photo = frame == k
+        xy_raw[of_photo] = matched.features[image_id - 1].xy_raw[kp[of_photo]]
+        sigma[of_photo] = matched.features[image_id - 1].sigma[kp[of_photo]]
+    observations = Observations(frame, np.array(point_idx), xy_raw, sigma)
+    points_w = np.array(track_points)
+    if posed is not None:
+        at = [posed.image_names.index(name) for name in names]
+        return Reconstruction(
+            posed.cameras, names, posed.camera_idx[at], posed.R_cw[at], posed.center_w[at], points_w, observations,
+            posed.phi[at], posed.velocity[at], posed.shutter_model,
+        )  # fmt: skip
+    poses = np.array([model.images[i].cam_from_world().matrix() for i in ids])
+    R_cw = poses[:, :, :3]
+    center_w = -np.einsum("mji,mj->mi", R_cw, poses[:, :, 3])
+    camera_idx = np.array([matched.camera_idx[i - 1] for i in ids])
+    return Reconstruction(matched.cameras, names, camera_idx, R_cw, center_w, points_w, observations)

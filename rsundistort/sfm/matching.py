@@ -1,0 +1,53 @@
+"""Which photos are matched with each other, and the matching."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model import Camera
+from .database import LOOSE, MatchedPhotos, quiet_pycolmap, verification_options, write_photos
+from .features import Features
+
+__all__ = ["match_photos"]
+
+
+def match_photos(
+    database: Path,
+    names: Sequence[str],
+    features: Sequence[Features],
+    cameras: Sequence[Camera],
+    camera_idx: NDArray[np.int64],
+    *,
+    calibrated: bool = True,
+    seed: int = 0,
+) -> MatchedPhotos:
+    """Match all photos with each other and verify the pairs, with room for shutter distortion.
+
+    Parameters
+    ----------
+    database : Path
+        File to make.
+    names, features, cameras, camera_idx
+        As in `MatchedPhotos`.
+    calibrated : bool
+        Whether the cameras are known.
+    seed : int
+        Seed of the verification.
+    """
+    pycolmap = quiet_pycolmap()
+    matched = MatchedPhotos(database, tuple(names), tuple(features), tuple(cameras), camera_idx, calibrated, seed)
+    with pycolmap.Database.open(database) as db:
+        write_photos(db, matched)
+        sift = pycolmap.FeatureExtractorType.SIFT
+        for index, found in enumerate(features):
+            db.write_descriptors(index + 1, pycolmap.FeatureDescriptors(type=sift, data=found.descriptors))
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    pycolmap.match_exhaustive(
+        database, matching, verification_options=verification_options(4.0 * LOOSE, seed), device=pycolmap.Device.cpu
+    )
+    return matched
