@@ -74,23 +74,33 @@ def surviving_points(before: Reconstruction, after: Reconstruction) -> NDArray[n
     old, new = before.observations, after.observations
     frame = np.concatenate([old.frame_idx, of_photo[new.frame_idx]])
     x, y = np.concatenate([old.xy_raw, new.xy_raw]).T
-    is_new = np.arange(len(frame)) >= len(old)
-    order = np.lexsort((is_new, y, x, frame))
-    same = (frame[order][1:] == frame[order][:-1]) & (x[order][1:] == x[order][:-1]) & (y[order][1:] == y[order][:-1])
-    pairs = np.flatnonzero(same & ~is_new[order][:-1] & is_new[order][1:])
-    old_of = old.point_idx[order[pairs]]
-    new_of = new.point_idx[order[pairs + 1] - len(old)]
+    order = np.lexsort((y, x, frame))
+    fresh = np.ones(len(order), bool)
+    fresh[1:] = (np.diff(frame[order]) != 0) | (np.diff(x[order]) != 0) | (np.diff(y[order]) != 0)
+    place_of = np.empty(len(order), np.int64)
+    place_of[order] = np.cumsum(fresh) - 1
+    old_place, new_place = place_of[: len(old)], place_of[len(old) :]
+    by_place = np.argsort(old_place, kind="stable")
+    first = np.searchsorted(old_place[by_place], new_place, "left")
+    end = np.searchsorted(old_place[by_place], new_place, "right")
+    pairs = []
+    # keypoints of several directions share a place: each votes
+    for k in range(int((end - first).max(initial=0))):
+        has = np.flatnonzero(first + k < end)
+        pairs.append(np.column_stack([new.point_idx[has], old.point_idx[by_place[first[has] + k]]]))
+    new_of, old_of = np.concatenate(pairs).T if pairs else np.zeros((2, 0), np.int64)
     votes, count = np.unique(new_of * before.num_points + old_of, return_counts=True)
     of_new, of_old = np.divmod(votes, before.num_points)
     survivors = np.full(after.num_points, -1)
-    by_votes = np.lexsort((of_old, of_new, -count))
-    # with most votes first, the first pair of a point is its own, if neither is in an earlier one
-    first_new = np.zeros(len(votes), bool)
-    first_new[np.unique(of_new[by_votes], return_index=True)[1]] = True
-    candidates = by_votes[first_new]
-    first_old = np.unique(of_old[candidates], return_index=True)[1]
-    chosen = candidates[first_old]
-    survivors[of_new[chosen]] = of_old[chosen]
+    gone_on = np.zeros(before.num_points, bool)
+    # each new point takes the old one with most votes that is left; of several that want one, the first
+    open_pairs = np.lexsort((of_old, of_new, -count))
+    while len(open_pairs):
+        of_each = open_pairs[np.sort(np.unique(of_new[open_pairs], return_index=True)[1])]
+        chosen = of_each[np.unique(of_old[of_each], return_index=True)[1]]
+        survivors[of_new[chosen]] = of_old[chosen]
+        gone_on[of_old[chosen]] = True
+        open_pairs = open_pairs[(survivors[of_new[open_pairs]] < 0) & ~gone_on[of_old[open_pairs]]]
     return survivors
 
 

@@ -47,7 +47,7 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction) -> Rec
                 model, motion = reconstruction.shutter_model, reconstruction.motion(index_of[name])
             db.update_keypoints(index + 1, ideal_keypoints(matched.features[index], camera, motion, model))
         db.clear_two_view_geometries()
-    pycolmap.geometricverification_options(
+    pycolmap.geometric_verification(
         matched.database, two_view_geometry_options=verification_options(_TIGHT_PX, matched.seed)
     )
     empty = _posed_model(matched, reconstruction, cameras)
