@@ -26,15 +26,13 @@ def _mapping_database(matched: MatchedPhotos, folder: Path, limit: int | None) -
     path = folder / "mapping.db"
     with pycolmap.Database.open(matched.database) as db, pycolmap.Database.open(path) as small:
         write_photos(small, matched, limit)
-        for i in range(1, len(matched.names) + 1):
-            for j in range(i + 1, len(matched.names) + 1):
-                if not db.exists_two_view_geometry(i, j):
-                    continue
-                pair = db.read_two_view_geometry(i, j)
-                matches = np.asarray(pair.inlier_matches)
-                if limit is not None and len(matches):
-                    pair.inlier_matches = matches[(matches < limit).all(1)]
-                small.write_two_view_geometry(i, j, pair)
+        for pair_id in sorted(db.read_two_view_geometry_num_inliers()[0]):
+            i, j = pycolmap.pair_id_to_image_pair(pair_id)
+            pair = db.read_two_view_geometry(i, j)
+            matches = np.asarray(pair.inlier_matches)
+            if limit is not None and len(matches):
+                pair.inlier_matches = matches[(matches < limit).all(1)]
+            small.write_two_view_geometry(i, j, pair)
     return path
 
 
