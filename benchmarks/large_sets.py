@@ -2,7 +2,7 @@
 
     python benchmarks/large_sets.py [--sizes 125 250 500 1000] [--features 600] [--gps] [--exhaustive]
 
-A synthetic street, walked down twice with a photo every three metres, which look to either side by turns. Its facades
+A synthetic street, walked down twice with a photo every four metres, which look to either side by turns. Its facades
 hold points with random descriptors, which each photo sees with noise, among clutter that no other photo has; a fifth of
 the points look like many others, as windows do. So no photo has to be rendered, and none is: the time of `features` is
 that of a photo times their number.
@@ -26,15 +26,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-WIDTH, HEIGHT, FOCAL = 1000, 750, 800.0
+WIDTH, HEIGHT, FOCAL = 1000, 750, 500.0
 # metres: between photos, between the two walks, to the facades, how far a point is seen, half the height of the facades
-STEP, APART, TO_FACADE, REACH, UP = 3.0, 1.0, 8.0, 30.0, 3.5
+STEP, APART, TO_FACADE, REACH, UP = 4.0, 1.0, 8.0, 30.0, 3.5
 # of visible points that are detected; clutter for each of them; noise of pixels and of descriptors
 DETECTED, CLUTTER, NOISE_PX, NOISE_BYTES = 0.7, 0.4, 0.5, 6.0
 # of points that look like others, and how many kinds of them there are; standard deviation of GPS in metres
 REPEATED, KINDS, GPS_M = 0.2, 30, 4.0
 # points of a metre of street for a photo to have a feature
-PER_METRE = 0.078
+PER_METRE = 0.056
 COMMON = 30
 
 
@@ -72,7 +72,7 @@ def make_street(num_photos: int, per_photo: int, seed: int = 0) -> Street:
     number, half = np.arange(num_photos), -(-num_photos // 2)
     center_w = np.column_stack([number % half * STEP, number // half * APART, np.zeros(num_photos)])
     center_w += rng.normal(0, 0.1, (num_photos, 3))
-    turn = np.where(number % 2, 1.0, -1.0) * np.deg2rad(40) + rng.normal(0, 0.05, num_photos)
+    turn = np.where(number % 2, 1.0, -1.0) * np.deg2rad(20) + rng.normal(0, 0.05, num_photos)
     tilt = rng.normal(0, 0.05, num_photos)
     z = np.column_stack([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)])
     x = np.cross(z, [0.0, 0.0, 1.0])

@@ -45,11 +45,10 @@ def capture_sequences(
     """
     sequences = []
     for camera in range(int(camera_idx.max()) + 1):
-        mine = np.flatnonzero(camera_idx == camera)
-        times = [facts[k].taken_s for k in mine]
-        clock = [0.0 if None in times or time is None else time for time in times]
-        order = sorted(range(len(mine)), key=lambda k: (clock[k], _natural(names[mine[k]])))
-        sequences.append(mine[order])
+        mine = np.flatnonzero(camera_idx == camera).tolist()
+        timed = all(facts[k].taken_s is not None for k in mine)
+        order = sorted(mine, key=lambda k: ((facts[k].taken_s or 0.0) if timed else 0.0, _natural(names[k])))
+        sequences.append(np.array(order, np.int64))
     return sequences
 
 
