@@ -132,6 +132,8 @@ def global_descriptors(descriptors: Sequence[NDArray[np.uint8]], seed: int = 0) 
     All about VLAD, CVPR 2013.
     """
     words = _codebook(descriptors, seed)
+    if not len(words):
+        return np.zeros((len(descriptors), 1), np.int16)
     return np.array([_aggregated(each[:_STRONGEST].astype(np.float32), words) for each in descriptors])
 
 
@@ -142,7 +144,7 @@ def _codebook(descriptors: Sequence[NDArray[np.uint8]], seed: int) -> NDArray[np
     strongest = [each[:_STRONGEST] for each in descriptors]
     sample = np.concatenate([each[rng.permutation(len(each))[:share]] for each in strongest]).astype(np.float32)
     words = sample[rng.permutation(len(sample))[:_WORDS]]
-    for _ in range(_ROUNDS):
+    for _ in range(_ROUNDS if len(words) else 0):
         sums, counts = _sums(sample, _word_of(sample, words), len(words))
         # a word that nothing is nearest to stays where it is
         words = np.where(counts[:, None] > 0, np.rint(sums / np.maximum(counts, 1)[:, None]), words).astype(np.float32)
