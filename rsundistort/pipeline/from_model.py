@@ -6,14 +6,14 @@ import tempfile
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
 from ..bundle import BundleOptions
-from ..errors import InputError, ReconstructionError, RsUndistortWarning
-from ..io import ExifFacts, guess_readouts, output_folder, output_name, read_exif
+from ..errors import FileError, InputError, ReconstructionError, RsUndistortWarning
+from ..io import ExifFacts, guess_readouts, list_photos, output_folder, output_name, read_exif
 from ..io.colmap import ModelIds, colmap_model
 from ..io.colmap_model import ColmapModel, colmap_model_of, read_colmap_model, surviving_points
 from ..io.photos.images import stored_size
@@ -82,6 +82,8 @@ def solve_model(
         given = read_colmap_model(model)
         photos = {} if folder is None else _look_at(folder, given.reconstruction)
         given, said = _in_stored_frame(given, photos)
+        if folder is not None:
+            given = replace(given, unregistered=_others_in(folder, given, options.raw_as))
         log.end("model", photos=given.reconstruction.num_images, points=given.reconstruction.num_points)
         facts = {name: fact for name, (_, fact) in photos.items()}
         outcome, ids, rgb = _solve(given, str(model), facts, options, None if database is None else Path(database), log)
@@ -141,6 +143,16 @@ def _look_at(folder: Path, rec: Reconstruction) -> dict[str, tuple[tuple[int, in
             "give the folder that the model was made from"
         )
     return {name: (stored_size(folder / name), read_exif(folder / name)) for name in rec.image_names}
+
+
+def _others_in(folder: Path, given: ColmapModel, raw_as: str) -> list[str]:
+    """Photos beside those of a model, which it did not register: its files do not name them."""
+    names = given.reconstruction.image_names
+    try:
+        listed = list_photos(folder, raw_as, {PurePosixPath(name).parent.as_posix() for name in names} - {"."})
+    except (FileError, InputError):  # what is wrong with others is no matter here
+        listed = []
+    return sorted({*listed, *given.unregistered} - set(names))
 
 
 def _in_stored_frame(
