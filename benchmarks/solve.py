@@ -24,7 +24,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from bundle import make_problem
+import bundle
 
 import rsundistort as rs
 from rsundistort.io.colmap import write_colmap_model
@@ -160,7 +160,8 @@ def rs_of(model: Path, out: Path) -> Path:
 
 def large_model(observations: int, work: Path) -> None:
     """A street of many photos."""
-    rec = make_problem("street", observations)
+    bundle.PER_PHOTO = 5000
+    rec = bundle.make_problem("street", observations)
     folder = work / "street"
     # raw pixels in a model of pinholes, as COLMAP would have them of such photos
     as_global = rs.Reconstruction(
