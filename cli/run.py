@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import click
 
 from . import options as opt
-from .closing import closing_table
-from .terminal import errors_for_people, list_failed, progress_bars
+from .closing import close
+from .terminal import Talk, errors_for_people, progress_bars
 
 if TYPE_CHECKING:
     pass
@@ -73,8 +73,7 @@ if TYPE_CHECKING:
 @opt.jobs_option
 @opt.scheduler_option
 @opt.overwrite_option
-@opt.progress_option
-@opt.quiet_option
+@opt.talk_options
 def command(
     photos: Path,
     out: Path,
@@ -109,8 +108,7 @@ def command(
     jobs: int,
     scheduler: str | None,
     overwrite: bool,
-    progress_form: str,
-    quiet: bool,
+    talk: Talk,
 ) -> None:
     """Find how the camera moved during each photo's readout, and take it out.
 
@@ -120,7 +118,7 @@ def command(
     OUT stays as it was until the motions are solved. If the rest is interrupted, `rectify --resume` goes on with it.
     Exit code 3 says that photos with a motion could not be rectified; they are listed, and the others are done.
     """
-    with errors_for_people(), progress_bars(quiet, progress_form) as progress:
+    with errors_for_people() as warned, progress_bars(talk) as progress:
         from rsundistort.io import read_known_lengths, read_known_motions
         from rsundistort.pipeline import GyroOptions, RunOptions, run
         from rsundistort.rectify import ViewOptions
@@ -159,7 +157,4 @@ def command(
             ),
             progress,
         )
-    silent = quiet or progress_form == "json"
-    if not silent:
-        click.echo(closing_table(solution, out))
-    list_failed({image.name: image.reason for image in solution.registered if image.reason}, err=silent)
+    close(solution, out, warned, talk)

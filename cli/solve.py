@@ -7,8 +7,8 @@ from pathlib import Path
 import click
 
 from . import options as opt
-from .closing import closing_table
-from .terminal import errors_for_people, list_failed, progress_bars
+from .closing import close
+from .terminal import Talk, errors_for_people, progress_bars
 
 
 @click.command()
@@ -47,8 +47,7 @@ from .terminal import errors_for_people, list_failed, progress_bars
 @opt.jobs_option
 @opt.scheduler_option
 @opt.overwrite_option
-@opt.progress_option
-@opt.quiet_option
+@opt.talk_options
 def command(
     model: Path,
     out: Path,
@@ -77,8 +76,7 @@ def command(
     jobs: int,
     scheduler: str | None,
     overwrite: bool,
-    progress_form: str,
-    quiet: bool,
+    talk: Talk,
 ) -> None:
     """Find how the camera moved during each photo's readout, from a COLMAP model.
 
@@ -86,7 +84,7 @@ def command(
     --images says where the photos are. Cameras of the model are the groups of --readout: --readout "camera
     1=left-to-right".
     """
-    with errors_for_people(), progress_bars(quiet, progress_form) as progress:
+    with errors_for_people() as warned, progress_bars(talk) as progress:
         from rsundistort.io import read_known_lengths, read_known_motions
         from rsundistort.pipeline import SolveOptions, solve_model
         from rsundistort.rectify import ViewOptions
@@ -122,7 +120,4 @@ def command(
             database=database,
             progress=progress,
         )
-    silent = quiet or progress_form == "json"
-    if not silent:
-        click.echo(closing_table(solution, out))
-    list_failed({image.name: image.reason for image in solution.registered if image.reason}, err=silent)
+    close(solution, out, warned, talk)
