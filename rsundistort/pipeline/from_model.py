@@ -24,7 +24,7 @@ from .gyro import known_readouts
 from .ladder import solve_tracks
 from .options import SolveOptions
 from .outcome import Outcome
-from .outputs import Outputs, PointRgb
+from .outputs import REPLACED, Outputs, PointRgb, photo_times
 from .progress import ProgressCallback, StageLog
 from .workers import Workers, use_threads
 
@@ -71,7 +71,7 @@ def solve_model(
     inputs = [path for path in (model, folder, options.masks) if path is not None]
     with output_folder(
         out, overwrite=options.overwrite, apart_from=[Path(path) for path in inputs],
-        replaced=("images", "masks", "sparse"),
+        replaced=REPLACED,
     ) as scratch:  # fmt: skip
         log.begin("model")
         given = read_colmap_model(model)
@@ -82,7 +82,8 @@ def solve_model(
         outcome, ids, rgb = _solve(given, str(model), facts, options, None if database is None else Path(database), log)
         outcome = replace(outcome, options={"model_frame": said} if said else {})
         orientations = {name: fact.orientation or 1 for name, fact in facts.items()}
-        outputs = Outputs.of_outcome(outcome, options, orientations, ids, rgb, with_photos=folder is not None)
+        times = {} if folder is None else photo_times(folder)
+        outputs = Outputs.of_outcome(outcome, options, orientations, ids, rgb, folder is not None, times)
         solution = outputs.begin(scratch, log)
     return solution if folder is None else outputs.rectify(folder, out, workers, log)
 
