@@ -84,9 +84,10 @@ def command(
     progress_form: str,
     quiet: bool,
 ) -> None:
-    """Find how the camera moved during each photo's readout, from a COLMAP model.
+    """Find how the camera moved during each photo's readout, from a model of COLMAP, OpenMVG or OpenSfM.
 
-    MODEL is the folder of a model, text or binary. OUT gets what `rsundistort run` writes; images/ and masks/ if
+    MODEL is the folder of a COLMAP model, text or binary, OpenMVG's sfm_data.json, or OpenSfM's reconstruction.json
+    with tracks.csv beside it. OUT gets what `rsundistort run` writes; images/ and masks/ if
     --images says where the photos are. Cameras of the model are the groups of --readout: --readout "camera
     1=left-to-right".
     """

@@ -1,4 +1,4 @@
-"""The same job from a COLMAP model: its tracks in, motions, rectified photos and a model without shutter out."""
+"""The same job from a model of COLMAP or others: its tracks in; motions, rectified photos, an unwarped model out."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ import numpy as np
 from ..errors import InputError, ReconstructionError, RsUndistortWarning
 from ..io import ExifFacts, guess_readouts, output_folder, output_name, read_exif
 from ..io.colmap import ModelIds, colmap_model
-from ..io.colmap_model import ColmapModel, colmap_model_of, read_colmap_model, surviving_points
+from ..io.colmap_model import ColmapModel, colmap_model_of, surviving_points
+from ..io.models import read_model
 from ..io.photos.images import stored_size
 from ..model import Reconstruction, Solution
 from ..model.orientation import INVERSE, turn_reconstruction
@@ -45,7 +46,8 @@ def solve_model(
     Parameters
     ----------
     model : path
-        Folder of a COLMAP model, text or binary.
+        Folder of a COLMAP model, text or binary; or `sfm_data.json` of OpenMVG, or `reconstruction.json` of OpenSfM
+        with `tracks.csv` beside it.
     out : path
         Folder for the outputs, as of `run`.
     options : SolveOptions, optional
@@ -66,6 +68,8 @@ def solve_model(
     options = options or SolveOptions()
     model, out = Path(model), Path(out)
     folder = None if images is None else Path(images)
+    if database is not None and model.is_file():
+        raise InputError(f"{model} is no COLMAP model, and --database is COLMAP's; leave it out")
     log = StageLog(progress)
     workers = Workers(use_threads(options.jobs), options.scheduler)
     inputs = [path for path in (model, folder, options.masks) if path is not None]
@@ -74,7 +78,7 @@ def solve_model(
         replaced=REPLACED,
     ) as scratch:  # fmt: skip
         log.begin("model")
-        given = read_colmap_model(model)
+        given = read_model(model)
         photos = {} if folder is None else _look_at(folder, given.reconstruction)
         given, said = _in_stored_frame(given, photos)
         log.end("model", photos=given.reconstruction.num_images, points=given.reconstruction.num_points)
@@ -243,5 +247,6 @@ def _solve(
     readouts = known_readouts(None, after.image_names, after.cameras, after.camera_idx, None, options.readout_s, None)
     old = surviving_points(given.reconstruction, after)
     ids = given.ids_of(old, after.image_names)
-    rgb = PointRgb(np.where(old[:, None] >= 0, given.colors[old], 0).astype(np.uint8), old >= 0)
+    known = (old >= 0) & given.has_colors
+    rgb = PointRgb(np.where(known[:, None], given.colors[old], 0).astype(np.uint8), known)
     return Outcome(solved, cameras, ids.cameras, lost, readouts), ids, rgb

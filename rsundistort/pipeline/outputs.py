@@ -181,10 +181,17 @@ class Outputs:
         rec, ids, options = self.reconstruction, self.ids, self.options
         names = [None if name in left_out else output_name(name, options.raw_as) for name in rec.image_names]
         written = {name: new for name, new in zip(rec.image_names, names, strict=True) if new is not None}
+        last = photos is not None or not self.with_photos
+        cut = [new for new in written.values() if " " in new]
+        if options.sparse_format == "txt" and cut and last:
+            warnings.warn(
+                f"sparse/: names end at a space in text, such as {cut[0]}; --sparse-format bin "
+                "keeps them", RsUndistortWarning, stacklevel=3,
+            )  # fmt: skip
         if options.rs_poses:
             originals = {name: name if photos is None else (photos / name).as_posix() for name in written}
             problem = write_shutter_poses(folder / "rs-poses", solution, originals, "../points.ply")
-            if problem and (photos is not None or not self.with_photos):
+            if problem and last:
                 warnings.warn(f"rs-poses is without transforms.json: {problem}", RsUndistortWarning, stacklevel=3)
         if self.turns:
             solution, rec = turn_solution(solution, self.turns), turn_reconstruction(rec, self.turns)
