@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..bundle import BundleOptions
 from ..errors import InputError, ReconstructionError, RsUndistortWarning
 from ..io import ExifFacts, guess_readouts, output_folder, output_name, read_exif
 from ..io.colmap import ModelIds, colmap_model
@@ -30,6 +31,10 @@ from .progress import ProgressCallback, StageLog
 from .workers import Workers, use_threads
 
 __all__ = ["solve", "solve_model"]
+
+# Others' keypoints have longer tails than ours, whose large ones weigh less: at 4.5 deviations 5 % of the measurements
+# of the warped herz-jesus-8 are lost and the poses are off by 0.017 deg, at this by 0.013, with 2 % more.
+_OUTLIER_SIGMA = 6.0
 
 
 def solve_model(
@@ -231,6 +236,10 @@ def _solve(
     guessed = {k: label for k, label in enumerate(cameras.labels) if not cameras.readout_told[k]}
     used = set(rec.camera_idx.tolist())
     guessed = {k: label for k, label in guessed.items() if k in used}
+
+    def options_of(each: Reconstruction) -> BundleOptions:
+        return replace(options.options_for(each, cameras), outlier_sigma=_OUTLIER_SIGMA)
+
     with tempfile.TemporaryDirectory() as work:
         matched = None
         if database is not None:
@@ -238,9 +247,8 @@ def _solve(
             matched = matched_of_database(database, Path(work) / "database.db", rec, options.seed)
             log.end("database", keypoints=sum(len(found.xy_raw) for found in matched.features))
         solved = solve_tracks(
-            rec, guessed, options.shutter_model, options.seed, lambda each: options.options_for(each, cameras), log,
-            options.remedy, matched,
-        )  # fmt: skip
+            rec, guessed, options.shutter_model, options.seed, options_of, log, options.remedy, matched
+        )
     after = solved.result.reconstruction
     lost = dict.fromkeys(given.unregistered, "it is not registered in the model")
     lost |= dict.fromkeys(set(rec.image_names) - set(after.image_names), "no measurement of it survived")
