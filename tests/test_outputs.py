@@ -139,6 +139,39 @@ def test_text_that_cuts_names_is_said(tmp_path, rng):
         outputs_of(rng, tmp_path, SolveOptions(sparse_format="txt"), with_photos=False)
 
 
+def write_colmap_array(path, array):
+    """A (channels, height, width) map as COLMAP's stereo writes it."""
+    channels, height, width = array.shape
+    path.write_bytes(f"{width}&{height}&{channels}&".encode() + array.astype("<f4").tobytes())
+
+
+def test_dense_fusion_of_colmap_runs_in_the_workspace(tmp_path, rng):
+    import pycolmap
+
+    rec, solution = solved(rng, [camera_of()])
+    K = np.array([[75.0, 0, 47.2], [0, 76.0, 35.1], [0, 0, 1]])
+    small = Camera(96, 72, K)
+    solution = replace(solution, rectified_cameras={"1": small})
+    Outputs(solution, rec, SolveOptions(), ModelIds.in_order(rec), {}).begin(tmp_path, StageLog(None))
+    v, u = np.mgrid[:72, :96]
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T
+    for image in solution.images:  # stereo itself needs a graphics card; its maps of the plane z = 8 do not
+        (tmp_path / "images" / image.name).parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / "images" / image.name), np.full((72, 96, 3), 90, np.uint8))
+        depth = (8 - image.center_w[2]) / (rays @ image.R_cw)[..., 2]
+        normal = np.broadcast_to((image.R_cw @ [0, 0, -1.0])[:, None, None], (3, 72, 96))
+        for kind, array in (("depth", depth[None]), ("normal", normal)):
+            write_colmap_array(tmp_path / "stereo" / f"{kind}_maps" / f"{image.name}.geometric.bin", array)
+    options = pycolmap.StereoFusionOptions()
+    options.min_num_pixels = 3
+    fused = pycolmap.stereo_fusion(tmp_path / "fused.ply", tmp_path, options=options, output_type="PLY")
+    points = np.array([point.xyz for point in fused.points3D.values()])
+    assert len(points) > 1000
+    # COLMAP's stereo takes pixels half a pixel off; the plane is nearly square to the cameras
+    assert np.median(np.abs(points[:, 2] - 8)) < 0.02
+    assert (tmp_path / "fused.ply").stat().st_size > 15 * len(points)
+
+
 def test_workspace_only_where_there_are_photos(tmp_path, rng):
     outputs_of(rng, tmp_path, with_photos=False)
     assert {path.name for path in tmp_path.iterdir()} == {
