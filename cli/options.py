@@ -192,6 +192,19 @@ depth_option: Decorator = click.option(
     help="How far away what the photos show is, which matters where the camera travelled during the readout: on a "
     "plane, as the known points, or as maps of your own (a.npy, .npz or float .tif for a.jpg: docs/depth.md).",
 )
+sparse_format_option: Decorator = click.option(
+    "--sparse-format",
+    type=click.Choice(("bin", "txt")),
+    default="bin",
+    show_default=True,
+    help="How the COLMAP model is written.",
+)
+rs_poses_option: Decorator = click.option(
+    "--rs-poses",
+    is_flag=True,
+    help="OUT/rs-poses: the original photos' cameras and poses with the shutter, for gsplat, instant-ngp and "
+    "3dgs-deblur (docs/outputs.md).",
+)
 interpolation_option: Decorator = click.option(
     "--interpolation", type=click.Choice(INTERPOLATION_NAMES), default="cubic", show_default=True
 )

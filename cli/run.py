@@ -66,6 +66,8 @@ if TYPE_CHECKING:
 @opt.interpolation_option
 @opt.quality_option
 @opt.raw_as_option
+@opt.sparse_format_option
+@opt.rs_poses_option
 @opt.apply_orientation_option
 @opt.again_option
 @opt.max_pixels_option
@@ -101,6 +103,8 @@ def command(
     interpolation: str,
     quality: int,
     raw_as: str,
+    sparse_format: str,
+    rs_poses: bool,
     apply_orientation: bool,
     again: bool,
     max_megapixels: float,
@@ -140,6 +144,8 @@ def command(
                 interpolation=interpolation,
                 quality=quality,
                 raw_as=raw_as,
+                sparse_format=sparse_format,
+                rs_poses=rs_poses,
                 apply_orientation=apply_orientation,
                 again=again,
                 max_megapixels=max_megapixels,

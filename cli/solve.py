@@ -40,6 +40,8 @@ from .terminal import Talk, errors_for_people, progress_bars
 @opt.interpolation_option
 @opt.quality_option
 @opt.raw_as_option
+@opt.sparse_format_option
+@opt.rs_poses_option
 @opt.apply_orientation_option
 @opt.again_option
 @opt.max_pixels_option
@@ -69,6 +71,8 @@ def command(
     interpolation: str,
     quality: int,
     raw_as: str,
+    sparse_format: str,
+    rs_poses: bool,
     apply_orientation: bool,
     again: bool,
     max_megapixels: float,
@@ -78,9 +82,10 @@ def command(
     overwrite: bool,
     talk: Talk,
 ) -> None:
-    """Find how the camera moved during each photo's readout, from a COLMAP model.
+    """Find how the camera moved during each photo's readout, from a model of COLMAP, OpenMVG or OpenSfM.
 
-    MODEL is the folder of a model, text or binary. OUT gets what `rsundistort run` writes; images/ and masks/ if
+    MODEL is the folder of a COLMAP model, text or binary, OpenMVG's sfm_data.json, or OpenSfM's reconstruction.json
+    with tracks.csv beside it. OUT gets what `rsundistort run` writes; images/ and masks/ if
     --images says where the photos are. Cameras of the model are the groups of --readout: --readout "camera
     1=left-to-right".
     """
@@ -104,6 +109,8 @@ def command(
                 interpolation=interpolation,
                 quality=quality,
                 raw_as=raw_as,
+                sparse_format=sparse_format,
+                rs_poses=rs_poses,
                 apply_orientation=apply_orientation,
                 again=again,
                 max_megapixels=max_megapixels,
