@@ -360,8 +360,8 @@ def test_a_model_of_turned_photos_is_turned_back(tmp_path, rng):
     solution = rs.solve_model(model, tmp_path / "out", OPTIONS, images=photos)
     # the shutter runs over the rows of the sensor, whichever way people hold the camera
     assert np.abs(phi_errors(solution, scene)).max() < 2.5e-3
-    assert "turned" in solution.options["model_frame"]
-    assert "3 of 6" in solution.options["model_frame"]
+    assert "turned" in solution.options["model"]["frame"]
+    assert "3 of 6" in solution.options["model"]["frame"]
 
 
 def test_photos_of_another_size_are_refused(tmp_path, rng):
