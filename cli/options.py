@@ -87,6 +87,9 @@ progress_option: Decorator = click.option(
     show_default=True,
     help="json: lines on stdout for other programs, and nothing else there.",
 )
+report_option: Decorator = click.option(
+    "--report/--no-report", default=True, help="Write OUT/report.html; rsundistort report makes it later, too."
+)
 quiet_option: Decorator = click.option("-q", "--quiet", is_flag=True, help="Nothing but warnings and errors.")
 quality_option: Decorator = click.option(
     "--quality", type=click.IntRange(1, 100), default=98, show_default=True, help="Of JPEG and WebP."

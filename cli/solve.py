@@ -47,6 +47,7 @@ from .terminal import errors_for_people, list_failed, progress_bars
 @opt.jobs_option
 @opt.scheduler_option
 @opt.overwrite_option
+@opt.report_option
 @opt.progress_option
 @opt.quiet_option
 def command(
@@ -77,6 +78,7 @@ def command(
     jobs: int,
     scheduler: str | None,
     overwrite: bool,
+    report: bool,
     progress_form: str,
     quiet: bool,
 ) -> None:
@@ -117,6 +119,7 @@ def command(
                 readout_s=readout_s,
                 overwrite=overwrite,
                 scheduler=scheduler,
+                report=report,
             ),
             images=images,
             database=database,

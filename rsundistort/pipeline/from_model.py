@@ -84,7 +84,10 @@ def solve_model(
         orientations = {name: fact.orientation or 1 for name, fact in facts.items()}
         outputs = Outputs.of_outcome(outcome, options, orientations, ids, rgb, with_photos=folder is not None)
         solution = outputs.begin(scratch, log)
-    return solution if folder is None else outputs.rectify(folder, out, workers, log)
+    if folder is not None:
+        return outputs.rectify(folder, out, workers, log)
+    outputs.report(out, log)
+    return solution
 
 
 def solve(

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import InputError, RsUndistortWarning
 from ..io import output_folder, output_name, write_colmap_model, write_solution, write_transforms
 from ..io.colmap import ModelIds
 from ..io.journal import Journal
 from ..io.outputs import batch_folder
 from ..model import Reconstruction, Solution
 from ..model.orientation import turn_reconstruction, turn_solution
+from ..report import Diagnostics, relative_folder, write_diagnostics, write_report
 from .depth import PhotoDepths, ScenePoints, with_depths
+from .ladder import Solved
 from .options import SolveOptions
 from .outcome import Outcome, solution_of
 from .photo import turn_of
@@ -52,8 +57,8 @@ class Outputs:
     ----------
     solution : Solution
         In the stored frame, with the rectified cameras that were asked for.
-    reconstruction : Reconstruction
-        Poses, motions, points and measurements.
+    solved : Solved
+        Poses, motions, points and measurements, and those of a global shutter.
     options : SolveOptions
         How the outputs are to be.
     ids : ModelIds
@@ -67,7 +72,7 @@ class Outputs:
     """
 
     solution: Solution
-    reconstruction: Reconstruction
+    solved: Solved
     options: SolveOptions
     ids: ModelIds
     turns: Mapping[str, int]
@@ -90,7 +95,16 @@ class Outputs:
         turns: dict[str, int] = {}
         if options.apply_orientation:
             turns = {name: turn_of(orientations.get(name, 1), True)[0] for name in rec.image_names}
-        return cls(solution, rec, options, ids or ModelIds.in_order(rec), turns, rgb, with_photos)
+        return cls(solution, outcome.solved, options, ids or ModelIds.in_order(rec), turns, rgb, with_photos)
+
+    @property
+    def reconstruction(self) -> Reconstruction:
+        """Poses, motions, points and measurements."""
+        return self.solved.result.reconstruction
+
+    @cached_property
+    def _diagnostics(self) -> Diagnostics:
+        return Diagnostics.of_results(self.solved.result, self.solved.global_result, self.ids.cameras)
 
     def begin(self, folder: Path, log: StageLog) -> Solution:
         """Write all but the photos and the colours that they tell, so that what comes after can be gone on with."""
@@ -101,7 +115,19 @@ class Outputs:
         rgb = None if self.rgb is None else self.rgb.values
         turned = replace(self._models(folder, self.solution, {}, rgb), stages=tuple(log.stages))
         write_solution(folder / "solution.json", turned)
+        with _only_warned_of():
+            write_diagnostics(folder / "report.npz", self._diagnostics.with_colors(rgb))
         return turned
+
+    def report(self, out: Path, log: StageLog, photos: Path | None = None) -> None:
+        """Write the report of what is in `out`, if it is asked for; a failure is no more than warned of."""
+        if not self.options.report:
+            return
+        try:
+            with _only_warned_of():
+                write_report(out, photos, jobs=self.options.jobs, progress=log.tell)
+        except KeyboardInterrupt as stop:
+            raise KeyboardInterrupt(f"all but the report is written; go on with: rsundistort report {out}") from stop
 
     def rectify(self, photos: Path, out: Path, workers: Workers, log: StageLog) -> Solution:
         """Rectify the photos of a folder into `out`, which `begin` has filled, and write the rest again."""
@@ -122,12 +148,17 @@ class Outputs:
         found = {name: each.depth for name, each in done.items() if each.depth is not None}
         solution = with_depths(replace(solution, images=tuple(images)), found)
         with output_folder(out, overwrite=True) as scratch:
-            turned = self._models(scratch, solution, left_out, self._rgb(colors))
+            rgb = self._rgb(colors)
+            turned = self._models(scratch, solution, left_out, rgb)
+            with _only_warned_of():
+                told = replace(self._diagnostics.with_colors(rgb), photos=relative_folder(photos, out))
+                write_diagnostics(scratch / "report.npz", told)
             log.end("writing")
             turned = replace(turned, stages=tuple(log.stages))
             write_solution(scratch / "solution.json", turned)
         if not left_out:
             journal.path.unlink()  # nothing to go on with
+        self.report(out, log, photos)
         return turned
 
     def _rgb(self, colors: PointColors | None) -> NDArray[np.uint8] | None:
@@ -155,3 +186,13 @@ class Outputs:
         }
         write_transforms(folder / "transforms.json", solution, files)
         return solution
+
+
+@contextmanager
+def _only_warned_of() -> Iterator[None]:
+    """Trouble with the report loses no run."""
+    try:
+        yield
+    except Exception as error:
+        said = " ".join(str(error).split()) or type(error).__name__
+        warnings.warn(f"no report was written: {said}", RsUndistortWarning, stacklevel=4)
