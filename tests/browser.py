@@ -81,7 +81,7 @@ class Browser:
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600
         )
 
-    def open(self, path: Path, ready: str = "document.readyState === 'complete'") -> None:
+    def open(self, path: Path, ready: str) -> None:
         """Open a file and wait until an expression holds."""
         self._call("Page.navigate", url=path.as_uri())
         self.wait(ready)
@@ -139,9 +139,9 @@ class Browser:
     def _note(self, event: str, params: dict[str, Any]) -> None:
         if event == "Runtime.exceptionThrown":
             self.errors.append(json.dumps(params["exceptionDetails"])[:2000])
-        elif event == "Runtime.consoleAPICalled" and params["type"] in ("error", "assert", "warning"):
+        elif event == "Runtime.consoleAPICalled" and params["type"] in ("error", "assert"):
             self.errors.append(str([arg.get("value", arg.get("description")) for arg in params["args"]]))
-        elif event == "Log.entryAdded" and params["entry"]["level"] in ("error", "warning"):
+        elif event == "Log.entryAdded" and params["entry"]["level"] == "error":
             self.errors.append(params["entry"]["text"])
         elif event == "Network.requestWillBeSent":
             self.requests.append(params["request"]["url"])

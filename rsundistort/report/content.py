@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 # Factors by which arrows may be drawn longer than they are, and the part of a cell that a long one should fill.
-_LONGER = (1, 2, 5, 10, 20, 50)
+_LONGER = (1, 2, 3, 4, 6, 8, 10, 15, 20, 30, 50)
 _ACROSS = 14
 
 
@@ -99,7 +99,7 @@ def view_of(source: Source, pictures: Mapping[str, Picture]) -> list[dict[str, A
 def longer(largest: Sequence[float]) -> int:
     """By what arrows are to be drawn longer than they are, all alike, by the longest of each photo in photo widths."""
     long = float(np.quantile(largest, 0.9)) if len(largest) else 0.0
-    return max((factor for factor in _LONGER if factor * long <= 1.6 / _ACROSS), default=1) if long > 0 else 1
+    return max((factor for factor in _LONGER if factor * long <= 1.2 / _ACROSS), default=1) if long > 0 else 1
 
 
 def arrows_of(

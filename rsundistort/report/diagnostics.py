@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -157,7 +158,7 @@ def read_diagnostics(path: Path) -> Diagnostics:
     """
     path = Path(path)
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             if str(file["format"]) != _FORMAT:
                 raise FormatError(f"{path} is not of the format {_FORMAT!r}")
             if int(file["version"]) != _VERSION:
@@ -167,7 +168,7 @@ def read_diagnostics(path: Path) -> Diagnostics:
         raise
     except OSError as error:
         raise FileError(f"{path} cannot be read: {error.strerror or error}") from error
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, AttributeError, TypeError) as error:
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, AttributeError, TypeError) as error:
         raise FormatError(f"{path} is garbled: {' '.join(str(error).split())}") from error
     for name in ("names", "camera_ids"):
         values[name] = tuple(str(each) for each in values[name].ravel())

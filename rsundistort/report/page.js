@@ -116,7 +116,7 @@
 
   // ---------------------------------------------------------------- plots
 
-  const quiet = {displayModeBar: false, responsive: true, scrollZoom: false};
+  const quiet = {displayModeBar: false, responsive: true, scrollZoom: false, displaylogo: false};
   const axis = (title, more = {}) => ({
     title: {text: title, font: {size: 13}}, gridcolor: color("line"), zerolinecolor: color("line"), linecolor: color("line"),
     tickcolor: color("line"), automargin: true, fixedrange: true, ...more,
@@ -170,8 +170,8 @@
         margin: {l: 0, r: 0, t: 0, b: 0}, dragmode: "orbit", uirevision: "kept",
         scene: {
           xaxis: {...plain, range: x}, yaxis: {...plain, range: y}, zaxis: {...plain, range: z}, aspectmode: "manual",
-          aspectratio: {x: 1.7 * spans[0] / longest, y: 1.7 * spans[1] / longest, z: 1.7 * spans[2] / longest},
-          camera: {eye: {x: -0.25, y: -1.3, z: 0.6}, up: {x: 0, y: 0, z: 1}},
+          aspectratio: {x: 1.5 * spans[0] / longest, y: 1.5 * spans[1] / longest, z: 1.5 * spans[2] / longest},
+          camera: {eye: {x: -0.25, y: -1.55, z: 0.85}, up: {x: 0, y: 0, z: 1}},
         },
       }), {scrollZoom: true}];
     });

@@ -15,7 +15,7 @@ from ..io.aside import write_aside
 from . import content
 from .pictures import Picture, PictureJob, make_pictures
 from .source import Source, read_source
-from .verdict import meter_of, verdict_of
+from .verdict import advice_of, meter_of, verdict_of
 
 __all__ = ["write_report"]
 
@@ -87,7 +87,7 @@ def _page(source: Source, pictures: dict[str, Picture]) -> str:
     }
     here = files(__package__)
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters |= {"number": _number, "seconds": _seconds}
+    environment.filters |= {"number": _number, "seconds": _seconds, "signs": _signs}
     template = environment.from_string((here / "page.html").read_text("utf-8"))
     return template.render(
         name=source.out.resolve().name,
@@ -95,6 +95,7 @@ def _page(source: Source, pictures: dict[str, Picture]) -> str:
         verdict=verdict_of(solution),
         meter=meter_of(solution),
         critical=solution.critical_motion or {},
+        advice=advice_of(solution),
         notes=source.notes,
         photos=content.photos(source),
         views=views,
@@ -124,3 +125,8 @@ def _number(value: Any, digits: int = 2) -> str:
 def _seconds(value: Any) -> str:
     seconds = float(value or 0)
     return f"{seconds:.1f} s" if seconds < 60 else f"{int(seconds // 60)} min {seconds % 60:.0f} s"
+
+
+def _signs(text: Any) -> str:
+    """Text of the terminal with the signs of print."""
+    return str(text).replace("+-", "±")

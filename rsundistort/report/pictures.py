@@ -61,7 +61,7 @@ def make_pictures(
     jobs: Sequence[PictureJob], threads: int, progress: Callable[[int], None] | None = None
 ) -> list[Picture]:
     """Small pictures of photos, the smaller the more there are; one photo a thread is in the memory at a time."""
-    num_bytes = int(np.clip(_ALL_BYTES / max(2 * len(jobs), 1), *_BYTES))
+    num_bytes = _bytes_of_each(len(jobs))
     pictures = []
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         for picture in pool.map(lambda job: _picture(job, num_bytes), jobs):
@@ -69,6 +69,11 @@ def make_pictures(
             if progress is not None:
                 progress(len(pictures))
     return pictures
+
+
+def _bytes_of_each(count: int) -> int:
+    """Bytes that each side of so many photos may take."""
+    return int(np.clip(_ALL_BYTES / max(2 * count, 1), *_BYTES))
 
 
 def _picture(job: PictureJob, num_bytes: int) -> Picture:

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from ..critical import CriticalMotion
+from ..critical import CriticalMotion, advise_poses
 from ..model import Solution
+from ..model.orientation import in_stored_frame
 
-__all__ = ["Verdict", "meter_of", "verdict_of"]
+__all__ = ["Verdict", "advice_of", "meter_of", "verdict_of"]
 
 # Displacements below this are lost in the interpolation of a photo.
 _UNSEEN_PX = 1.0
@@ -51,6 +52,18 @@ def meter_of(solution: Solution) -> CriticalMotion | None:
     except (KeyError, TypeError, ValueError):
         return None
     return CriticalMotion(values, null, spread, sum(image.posed for image in solution.registered))
+
+
+def advice_of(solution: Solution) -> list[str]:
+    """What to photograph at the next shoot, where the poses are critical: as the solution says, else by the poses."""
+    meter = meter_of(solution)
+    said = (solution.critical_motion or {}).get("advice")
+    if said or meter is None or not meter.is_low or meter.num_photos < 2:
+        return [str(each) for each in said or ()]
+    images = [image for image in in_stored_frame(solution).registered if image.posed]
+    R, centers = np.array([image.R_cw for image in images]), np.array([image.center_w for image in images])
+    cameras = in_stored_frame(solution).cameras
+    return [each.sentence for each in advise_poses(R, centers, [cameras[image.camera_id].readout for image in images])]
 
 
 def verdict_of(solution: Solution) -> Verdict:
@@ -102,10 +115,9 @@ def _shape(solution: Solution, largest: float | None) -> tuple[str, str, str]:
     percent = _percent(said)
     sentence = _sentence(str(said.get("sentence") or ""))
     if meter.is_low and said.get("remedy") == "none":
-        # what is left is the second order of the exact model, which is asked for by name only
         text = (
-            f"Do not trust the height of the scene: {_level(meter)}, which hides it from a first look at the shutter, "
-            f"and the remedy was switched off, so that only the model's finest terms hold it ({_deviation(percent)})."
+            f"Do not trust the height of the scene: {_level(meter)}, which leaves it open to first order, and with the "
+            f"remedy switched off only the model's second-order terms hold it ({_deviation(percent)})."
         )
         return "doubt", "Do not trust the height", text
     if said["flagged"] and percent > _LARGE_PERCENT:
