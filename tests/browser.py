@@ -86,7 +86,7 @@ class Browser:
         self._call("Page.navigate", url=path.as_uri())
         self.wait(ready)
 
-    def wait(self, expression: str, seconds: float = 60.0) -> None:
+    def wait(self, expression: str, seconds: float = 180.0) -> None:
         """Wait until an expression holds."""
         end = time.monotonic() + seconds
         while not self.run(expression):
@@ -127,7 +127,7 @@ class Browser:
 
     def _next(self) -> dict[str, Any]:
         while b"\0" not in self._buffer:
-            if not select.select([self._read], [], [], 60)[0]:
+            if not select.select([self._read], [], [], 180)[0]:
                 raise TimeoutError("Chromium says nothing")
             data = os.read(self._read, 1 << 20)
             if not data:

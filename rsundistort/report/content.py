@@ -144,6 +144,7 @@ def scene(source: Source, upright: Mapping[str, int]) -> dict[str, Any] | None:
     if told is not None:
         place = {name: i for i, name in enumerate(told.names)}
         rows = [place[image.name] for image in images]
+        value["shown"] = int(_is_near(told.points_w, centers, reach).sum())
         value["points"] = _packed(_near(told.points_w, centers, reach) @ V.T)
         value["colors"] = [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in _near_rgb(told, centers, reach).tolist()]
         value["global"] = {
@@ -225,7 +226,7 @@ def cameras(solution: Solution) -> list[dict[str, Any]]:
 
 
 def settings(solution: Solution) -> list[tuple[str, str]]:
-    """Options by name, those that were left empty last."""
+    """Options by name; empty where nothing was said."""
     said = []
     for name, value in solution.options.items():
         if isinstance(value, Mapping):
@@ -234,8 +235,8 @@ def settings(solution: Solution) -> list[tuple[str, str]]:
             text = ", ".join(str(each) for each in value)
         else:
             text = "" if value is None else str(value)
-        said.append((name.replace("_", " "), text or "-"))
-    return sorted(said, key=lambda item: item[1] == "-")
+        said.append((name.replace("_", " "), text))
+    return said
 
 
 def _value(name: str, value: float, sigma: float | None, digits: int) -> str:

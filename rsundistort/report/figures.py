@@ -161,13 +161,13 @@ def _paths(figure: Figure, source: Source) -> bool:
         place = {name: i for i, name in enumerate(told.names)}
         plain = told.global_center_w[[place[image.name] for image in images]]
     figure.set_size_inches(6.2, 2.8)
-    for number, (label, pair) in enumerate((("from above", (0, 1)), ("from behind", (0, 2))), 1):
+    for number, (label, pair) in enumerate((("ahead", (0, 1)), ("up", (0, 2))), 1):
         axes = figure.add_subplot(1, 2, number)
         _mark(axes, told, V, pair, centers)
         if plain is not None:
             axes.plot(*(plain @ V.T)[:, pair].T, "o--", color=_GLOBAL, ms=2.5, label="global shutter")
         axes.plot(*(centers @ V.T)[:, pair].T, "o-", color=_OURS, ms=2.5, label="rolling shutter")
-        axes.set(aspect="equal", title=label, xlabel="right (world units)", ylabel=("ahead", "up")[number - 1])
+        axes.set(aspect="equal", xlabel="right in the photos (world units)", ylabel=label)
     figure.legend(*axes.get_legend_handles_labels(), fontsize=7, loc="outside upper center", ncols=2)
     return True
 

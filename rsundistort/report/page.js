@@ -165,12 +165,12 @@
       if (scene.global) side(scene.global, "global", "global", true, which !== "ours");
       const plain = {visible: false, showspikes: false};
       const [x, y, z] = scene.box;
-      const spans = [x, y, z].map(([low, high]) => high - low), longest = Math.max(...spans);
+      const spans = [x, y, z].map(([low, high]) => high - low), size = 2 / Math.hypot(...spans);
       return [traces, layout({
         margin: {l: 0, r: 0, t: 0, b: 0}, dragmode: "orbit", uirevision: "kept",
         scene: {
           xaxis: {...plain, range: x}, yaxis: {...plain, range: y}, zaxis: {...plain, range: z}, aspectmode: "manual",
-          aspectratio: {x: 1.5 * spans[0] / longest, y: 1.5 * spans[1] / longest, z: 1.5 * spans[2] / longest},
+          aspectratio: {x: size * spans[0], y: size * spans[1], z: size * spans[2]},
           camera: {eye: {x: -0.25, y: -1.55, z: 0.85}, up: {x: 0, y: 0, z: 1}},
         },
       }), {scrollZoom: true}];

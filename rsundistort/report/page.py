@@ -119,7 +119,9 @@ def _json(value: Any) -> str:
 
 def _number(value: Any, digits: int = 2) -> str:
     """A number for people; a dash where there is none."""
-    return "–" if value is None else f"{float(value):.{digits}f}".replace("-", "−")
+    if value is None:
+        return "–"
+    return f"{round(float(value), digits) + 0.0:.{digits}f}".replace("-", "−")  # no minus before zero
 
 
 def _seconds(value: Any) -> str:
