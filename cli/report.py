@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from . import options as opt
-from .terminal import errors_for_people, progress_bars
+from .terminal import Talk, errors_for_people, progress_bars
 
 
 @click.command()
@@ -32,7 +32,7 @@ def command(out: Path, photos: Path | None, figures: Path | None, jobs: int, qui
 
     What is missing, such as photos that were moved, is said, and the rest is shown.
     """
-    with errors_for_people(), progress_bars(quiet) as progress:
+    with errors_for_people(), progress_bars(Talk(quiet)) as progress:
         from rsundistort.report import write_figures, write_report
 
         if figures is not None:
