@@ -81,8 +81,8 @@ class Outputs:
     ----------
     solution : Solution
         In the stored frame, with the rectified cameras that were asked for.
-    solved : Solved
-        Poses, motions, points and measurements, and those of a global shutter.
+    reconstruction : Reconstruction
+        Poses, motions, points and measurements.
     options : SolveOptions
         How the outputs are to be.
     ids : ModelIds
@@ -95,16 +95,19 @@ class Outputs:
         Whether there are photos to rectify.
     times : mapping of name to float
         When photos were taken, in seconds.
+    solved : Solved or None
+        What the report compares; None where there is nothing to.
     """
 
     solution: Solution
-    solved: Solved
+    reconstruction: Reconstruction
     options: SolveOptions
     ids: ModelIds
     turns: Mapping[str, int]
     rgb: PointRgb | None = None
     with_photos: bool = True
     times: Mapping[str, float] = field(default_factory=dict)
+    solved: Solved | None = None
 
     @classmethod
     def of_outcome(
@@ -124,16 +127,7 @@ class Outputs:
         if options.apply_orientation:
             turns = {name: turn_of(orientations.get(name, 1), True)[0] for name in rec.image_names}
         ids = ids or ModelIds.in_order(rec)
-        return cls(solution, outcome.solved, options, ids, turns, rgb, with_photos, times or {})
-
-    @property
-    def reconstruction(self) -> Reconstruction:
-        """Poses, motions, points and measurements."""
-        return self.solved.result.reconstruction
-
-    @cached_property
-    def _diagnostics(self) -> Diagnostics:
-        return Diagnostics.of_results(self.solved.result, self.solved.global_result, self.ids.cameras)
+        return cls(solution, rec, options, ids, turns, rgb, with_photos, times or {}, outcome.solved)
 
     def begin(self, folder: Path, log: StageLog) -> Solution:
         """Write all but the photos and the colours that they tell, so that what comes after can be gone on with."""
@@ -144,8 +138,7 @@ class Outputs:
         rgb = None if self.rgb is None else self.rgb.values
         turned = replace(self._models(folder, self.solution, {}, rgb, None), stages=tuple(log.stages))
         write_solution(folder / "solution.json", turned)
-        with _only_warned_of():
-            write_diagnostics(folder / "report.npz", self._diagnostics.with_colors(rgb))
+        self._tell_report(folder, rgb)
         return turned
 
     def report(self, out: Path, log: StageLog, photos: Path | None = None) -> None:
@@ -179,9 +172,7 @@ class Outputs:
         with output_folder(out, overwrite=True) as scratch:
             rgb = self._rgb(colors)
             turned = self._models(scratch, solution, left_out, rgb, relative_to(photos, out / "rs-poses"))
-            with _only_warned_of():
-                told = replace(self._diagnostics.with_colors(rgb), photos=relative_folder(photos, out))
-                write_diagnostics(scratch / "report.npz", told)
+            self._tell_report(scratch, rgb, relative_folder(photos, out))
             log.end("writing")
             turned = replace(turned, stages=tuple(log.stages))
             write_solution(scratch / "solution.json", turned)
@@ -189,6 +180,19 @@ class Outputs:
             journal.path.unlink()  # nothing to go on with
         self.report(out, log, photos)
         return turned
+
+    @cached_property
+    def _diagnostics(self) -> Diagnostics | None:
+        if self.solved is None:
+            return None
+        return Diagnostics.of_results(self.solved.result, self.solved.global_result, self.ids.cameras)
+
+    def _tell_report(self, folder: Path, rgb: NDArray[np.uint8] | None, photos: str = "") -> None:
+        """Keep what the report shows beyond the solution."""
+        with _only_warned_of():
+            if self._diagnostics is not None:
+                told = replace(self._diagnostics.with_colors(rgb), photos=photos)
+                write_diagnostics(folder / "report.npz", told)
 
     def _rgb(self, colors: PointColors | None) -> NDArray[np.uint8] | None:
         """Colours as the photos tell them, where they were not known."""
