@@ -101,7 +101,10 @@ def solve_model(
         times = {} if folder is None else photo_times(folder)
         outputs = Outputs.of_outcome(outcome, options, orientations, ids, rgb, folder is not None, times)
         solution = outputs.begin(scratch, log)
-    return solution if folder is None else outputs.rectify(folder, out, workers, log)
+    if folder is not None:
+        return outputs.rectify(folder, out, workers, log)
+    outputs.report(out, log)
+    return solution
 
 
 def solve(
