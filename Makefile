@@ -21,6 +21,7 @@ demo: $(VENV)/.installed
 	@echo "Look at: sample_scenes/courtyard/photos/0003.jpg (the rolling shutter bent it)"
 	@echo "         $(OUT)/images/0003.jpg (rectified)"
 	@echo "         sample_scenes/courtyard/global/0003.jpg (the truth)"
+	@echo "Open $(OUT)/report.html in a browser: before and after, the cameras in 3-D, whether to trust it."
 	@echo "Open $(OUT)/sparse in COLMAP, or $(OUT)/transforms.json in nerfstudio."
 
 test: $(VENV)/.installed
