@@ -68,8 +68,7 @@ def main() -> None:
     axes.patch.set_visible(False)
     scale, A, shift = in_world(found)
     world = scale * points @ A.T + shift
-    low, high = np.percentile(world, (4, 96), axis=0)
-    near = ((world > low - 0.4) & (world < high + 0.4)).all(axis=1)
+    near = (np.abs(world[:, 0]) < 10) & (world[:, 1] < 16) & (world[:, 2] < 8)  # the house and what is before it
     axes.scatter(*world[near].T, c=colours[near], s=2.5, linewidths=0, depthshade=False)
     for solution, colour in ((plain, GREY), (found, RUST)):
         scale, A, shift = in_world(solution)

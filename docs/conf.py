@@ -6,7 +6,9 @@ import importlib
 import inspect
 from typing import TYPE_CHECKING
 
+import click
 from docutils import nodes
+from rsundistort_cli.main import cli
 from sphinx.util.docutils import SphinxDirective
 
 import rsundistort
@@ -21,6 +23,11 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphin
 exclude_patterns = ["_build"]
 
 myst_heading_anchors = 3  # links to headings, as code hosts make them
+
+for _name in cli.list_commands(click.Context(cli)):  # by which they are called; their functions are all `command`
+    cli.get_command(click.Context(cli), _name).name = _name
+
+default_role = "literal"  # single backticks of docstrings
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # the docstrings say types and shapes

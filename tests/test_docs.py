@@ -32,7 +32,7 @@ PAGES = {
 }
 #: What a block may be: Python and commands run, JSON is read, text is not looked at (but as what Python prints); the
 #: others are directives of Sphinx.
-LANGUAGES = {"python", "sh", "json", "text", "{toctree}", "{public}", "{click}"}
+LANGUAGES = {"python", "sh", "json", "text", "{toctree}", "{public}", "{eval-rst}"}
 #: Programs that are not ours and not run.
 OTHERS = {"colmap", "ns-train", "pip", "mkdir", "cp"}
 #: Commands that are understood but not run: what they need is not here.

@@ -151,7 +151,8 @@ def critical_motion(
     vectors = np.zeros((m, 5))
     for reference in range(m):
         rows = _equations(turn, centers / spread, by_column, reference) / np.sqrt(m - 1)
-        _, found, Vt = np.linalg.svd(rows, full_matrices=True)
+        # of the triangle: with all rows it would grow with the cube of the number of photos
+        _, found, Vt = np.linalg.svd(np.linalg.qr(rows, mode="r"), full_matrices=True)
         values[reference, : len(found)] = found
         vectors[reference] = Vt[-1]
     # rounding must not choose among references that hide the same

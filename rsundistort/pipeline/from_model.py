@@ -6,13 +6,14 @@ import tempfile
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, ReconstructionError, RsUndistortWarning
-from ..io import ExifFacts, guess_readouts, output_folder, output_name, read_exif
+from ..bundle import BundleOptions
+from ..errors import FileError, InputError, ReconstructionError, RsUndistortWarning
+from ..io import ExifFacts, guess_readouts, list_photos, output_folder, output_name, read_exif
 from ..io.colmap import ModelIds, colmap_model
 from ..io.colmap_model import ColmapModel, colmap_model_of, read_colmap_model, surviving_points
 from ..io.photos.images import stored_size
@@ -29,6 +30,10 @@ from .progress import ProgressCallback, StageLog
 from .workers import Workers, use_threads
 
 __all__ = ["solve", "solve_model"]
+
+# Others' keypoints have longer tails than ours, whose large ones weigh less: at 4.5 deviations 5 % of the measurements
+# of the warped herz-jesus-8 are lost and the poses are off by 0.017 deg, at this by 0.013, with 2 % more.
+_OUTLIER_SIGMA = 6.0
 
 
 def solve_model(
@@ -77,6 +82,8 @@ def solve_model(
         given = read_colmap_model(model)
         photos = {} if folder is None else _look_at(folder, given.reconstruction)
         given, said = _in_stored_frame(given, photos)
+        if folder is not None:
+            given = replace(given, unregistered=_others_in(folder, given, options.raw_as))
         log.end("model", photos=given.reconstruction.num_images, points=given.reconstruction.num_points)
         facts = {name: fact for name, (_, fact) in photos.items()}
         outcome, ids, rgb = _solve(given, str(model), facts, options, None if database is None else Path(database), log)
@@ -136,6 +143,16 @@ def _look_at(folder: Path, rec: Reconstruction) -> dict[str, tuple[tuple[int, in
             "give the folder that the model was made from"
         )
     return {name: (stored_size(folder / name), read_exif(folder / name)) for name in rec.image_names}
+
+
+def _others_in(folder: Path, given: ColmapModel, raw_as: str) -> list[str]:
+    """Photos beside those of a model, which it did not register: its files do not name them."""
+    names = given.reconstruction.image_names
+    try:
+        listed = list_photos(folder, raw_as, {PurePosixPath(name).parent.as_posix() for name in names} - {"."})
+    except (FileError, InputError):  # what is wrong with others is no matter here
+        listed = []
+    return sorted({*listed, *given.unregistered} - set(names))
 
 
 def _in_stored_frame(
@@ -226,6 +243,10 @@ def _solve(
     guessed = {k: label for k, label in enumerate(cameras.labels) if not cameras.readout_told[k]}
     used = set(rec.camera_idx.tolist())
     guessed = {k: label for k, label in guessed.items() if k in used}
+
+    def options_of(each: Reconstruction) -> BundleOptions:
+        return replace(options.options_for(each, cameras), outlier_sigma=_OUTLIER_SIGMA)
+
     with tempfile.TemporaryDirectory() as work:
         matched = None
         if database is not None:
@@ -233,9 +254,8 @@ def _solve(
             matched = matched_of_database(database, Path(work) / "database.db", rec, options.seed)
             log.end("database", keypoints=sum(len(found.xy_raw) for found in matched.features))
         solved = solve_tracks(
-            rec, guessed, options.shutter_model, options.seed, lambda each: options.options_for(each, cameras), log,
-            options.remedy, matched,
-        )  # fmt: skip
+            rec, guessed, options.shutter_model, options.seed, options_of, log, options.remedy, matched
+        )
     after = solved.result.reconstruction
     lost = dict.fromkeys(given.unregistered, "it is not registered in the model")
     lost |= dict.fromkeys(set(rec.image_names) - set(after.image_names), "no measurement of it survived")
