@@ -34,7 +34,7 @@ PAGES = {
 #: others are directives of Sphinx.
 LANGUAGES = {"python", "sh", "json", "text", "{toctree}", "{public}", "{eval-rst}"}
 #: Programs that are not ours and not run.
-OTHERS = {"colmap", "ns-train", "pip", "mkdir", "cp"}
+OTHERS = {"colmap", "gsplat", "ns-train", "pip", "mkdir", "cp"}
 #: Commands that are understood but not run: what they need is not here.
 NOT_RUN = {
     "simulate scene": "renders for a minute; tests/test_synthetic_scene.py runs it",
@@ -48,9 +48,10 @@ NOT_RUN = {
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block of a page."""
+    """A fenced block of a page; "python gsplat" is Python that needs gsplat."""
 
     language: str
+    needs: str
     text: str
     line: int
     follows: int | None  # the block that ends right before it, if there is nothing between
@@ -65,12 +66,13 @@ def blocks_of(page: str) -> list[Block]:
         if not fence:
             continue
         if begun is None:
-            begun = number, fence[1].split(maxsplit=1)[0] if fence[1].strip() else ""
+            begun = number, fence[1].split()
             continue
-        start, language = begun
+        start, info = begun
         near = bool(found) and not any(text.strip() for text in lines[end + 1 : start])
         text = "\n".join(lines[start + 1 : number])
-        found.append(Block(language, text, start + 1, len(found) - 1 if near else None))
+        language, needs = [*info, "", ""][:2]
+        found.append(Block(language, needs, text, start + 1, len(found) - 1 if near else None))
         begun, end = None, number
     assert begun is None, f"{page}: the block of line {begun[0] + 1} has no end"
     return found
@@ -185,13 +187,16 @@ def test_blocks_say_what_they_are(page):
 
 @pytest.mark.parametrize("page", with_blocks("python"))
 def test_python_runs(page, place):
-    """In order and in one namespace; a text block right after one is what it prints."""
+    """In order and in one namespace; a text block right after one is what it prints. What needs others is compiled."""
     blocks = blocks_of(page)
     printed = {block.follows: block.text for block in blocks if block.language == "text"}
     namespace: dict[str, object] = {}
     for k, block in enumerate(blocks):
         if block.language == "python":
             code = compile("\n" * block.line + block.text, str(PAGES[page]), "exec")
+            if block.needs:
+                assert block.needs in OTHERS
+                continue
             with contextlib.redirect_stdout(io.StringIO()) as out:
                 exec(code, namespace)
             if k in printed:

@@ -339,7 +339,11 @@ def colmap_model(
     return model
 
 
-def write_colmap_model(folder: Path, *model: Any) -> None:
-    """Write `cameras.bin`, `images.bin`, `points3D.bin`, and rigs, frames, of `colmap_model(*model)`."""
+def write_colmap_model(folder: Path, *model: Any, text: bool = False) -> None:
+    """Write cameras, images, points3D, and rigs, frames, of `colmap_model(*model)`, as `.bin` or as `.txt`."""
     folder.mkdir(parents=True, exist_ok=True)
-    colmap_model(*model).write(folder)
+    found = colmap_model(*model)
+    if text:
+        found.write_text(folder)
+    else:
+        found.write(folder)

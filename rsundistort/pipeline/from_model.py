@@ -1,4 +1,4 @@
-"""The same job from a COLMAP model: its tracks in, motions, rectified photos and a model without shutter out."""
+"""The same job from a model of COLMAP or others: its tracks in; motions, rectified photos, an unwarped model out."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from ..bundle import BundleOptions
 from ..errors import FileError, InputError, ReconstructionError, RsUndistortWarning
 from ..io import ExifFacts, guess_readouts, list_photos, output_folder, output_name, read_exif
 from ..io.colmap import ModelIds, colmap_model
-from ..io.colmap_model import ColmapModel, colmap_model_of, read_colmap_model, surviving_points
+from ..io.colmap_model import ColmapModel, colmap_model_of, surviving_points
+from ..io.models import read_model
 from ..io.photos.images import stored_size
 from ..model import Reconstruction, Solution
 from ..model.orientation import INVERSE, turn_reconstruction
@@ -25,7 +26,7 @@ from .gyro import known_readouts
 from .ladder import solve_tracks
 from .options import SolveOptions
 from .outcome import Outcome
-from .outputs import Outputs, PointRgb
+from .outputs import REPLACED, Outputs, PointRgb, photo_times
 from .progress import ProgressCallback, StageLog
 from .workers import Workers, use_threads
 
@@ -50,7 +51,8 @@ def solve_model(
     Parameters
     ----------
     model : path
-        Folder of a COLMAP model, text or binary.
+        Folder of a COLMAP model, text or binary; or `sfm_data.json` of OpenMVG, or `reconstruction.json` of OpenSfM
+        with `tracks.csv` beside it.
     out : path
         Folder for the outputs, as of `run`.
     options : SolveOptions, optional
@@ -71,15 +73,17 @@ def solve_model(
     options = options or SolveOptions()
     model, out = Path(model), Path(out)
     folder = None if images is None else Path(images)
+    if database is not None and model.is_file():
+        raise InputError(f"{model} is no COLMAP model, and --database is COLMAP's; leave it out")
     log = StageLog(progress)
     workers = Workers(use_threads(options.jobs), options.scheduler)
     inputs = [path for path in (model, folder, options.masks) if path is not None]
     with output_folder(
         out, overwrite=options.overwrite, apart_from=[Path(path) for path in inputs],
-        replaced=("images", "masks", "sparse"),
+        replaced=REPLACED,
     ) as scratch:  # fmt: skip
         log.begin("model")
-        given = read_colmap_model(model)
+        given = read_model(model)
         photos = {} if folder is None else _look_at(folder, given.reconstruction)
         given, said = _in_stored_frame(given, photos)
         if folder is not None:
@@ -89,7 +93,8 @@ def solve_model(
         outcome, ids, rgb = _solve(given, str(model), facts, options, None if database is None else Path(database), log)
         outcome = replace(outcome, options={"model_frame": said} if said else {})
         orientations = {name: fact.orientation or 1 for name, fact in facts.items()}
-        outputs = Outputs.of_outcome(outcome, options, orientations, ids, rgb, with_photos=folder is not None)
+        times = {} if folder is None else photo_times(folder)
+        outputs = Outputs.of_outcome(outcome, options, orientations, ids, rgb, folder is not None, times)
         solution = outputs.begin(scratch, log)
     return solution if folder is None else outputs.rectify(folder, out, workers, log)
 
@@ -262,5 +267,6 @@ def _solve(
     readouts = known_readouts(None, after.image_names, after.cameras, after.camera_idx, None, options.readout_s, None)
     old = surviving_points(given.reconstruction, after)
     ids = given.ids_of(old, after.image_names)
-    rgb = PointRgb(np.where(old[:, None] >= 0, given.colors[old], 0).astype(np.uint8), old >= 0)
+    known = (old >= 0) & given.has_colors
+    rgb = PointRgb(np.where(known[:, None], given.colors[old], 0).astype(np.uint8), known)
     return Outcome(solved, cameras, ids.cameras, lost, readouts), ids, rgb
