@@ -280,6 +280,11 @@ def test_prose_names_what_exists(page):
                 assert flag in known, f"{page}: {span}: no {flag}"
 
 
+def test_the_readme_names_all_commands():
+    named = {span.split()[0] for span in spans_of("README.md")}
+    assert not set(cli.list_commands(click.Context(cli))) - named
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_links_lead_somewhere(page):
     """On the disk, so that pages can be read where the code is; of headings Sphinx takes care."""
