@@ -83,6 +83,7 @@ def closing_table(solution: Solution, out: Path) -> str:
         f"shutter model      {solution.shutter_model}",
         *_held_out(quality["held_out_rms_px"]),
         *_cameras(solution),
+        *_model(solution),
         *_video(solution),
         *_intrinsics(solution),
         *_readout(solution),
@@ -133,6 +134,19 @@ def _cameras(solution: Solution) -> list[str]:
         lines = [f"cameras            {source}", *(f"  {group}: readout {each}" for group, each in readout.items())]
     guesses = solution.options.get("guesses", ())
     return lines + [f"  {line}" for text in guesses for line in textwrap.wrap(text, 78)]
+
+
+def _model(solution: Solution) -> list[str]:
+    """Lines on the model that the measurements come from: how many they were, and in which frame."""
+    model = solution.options.get("model")
+    if not model:
+        return []
+    frames = {"stored": "the model shows the photos as they are stored", "not looked at": "taken for the stored one"}
+    return [
+        f"measurements       {solution.quality['num_observations']} of {solution.quality['num_points']} points now, "
+        f"{model['observations']} of {model['points']} in the model",
+        f"pixel frame        {frames.get(model['frame'], model['frame'] + ', and turned back')}",
+    ]
 
 
 def _intrinsics(solution: Solution) -> list[str]:

@@ -20,7 +20,7 @@ from ..io.models import read_model
 from ..io.photos.images import stored_size
 from ..model import Reconstruction, Solution
 from ..model.orientation import INVERSE, turn_reconstruction
-from ..sfm import matched_of_database
+from ..sfm import kept_log_level, matched_of_database
 from .cameras import PhotoCameras, check_readouts
 from .gyro import known_readouts
 from .ladder import solve_tracks
@@ -91,7 +91,12 @@ def solve_model(
         log.end("model", photos=given.reconstruction.num_images, points=given.reconstruction.num_points)
         facts = {name: fact for name, (_, fact) in photos.items()}
         outcome, ids, rgb = _solve(given, str(model), facts, options, None if database is None else Path(database), log)
-        outcome = replace(outcome, options={"model_frame": said} if said else {})
+        facts_of_model = {
+            "frame": said,
+            "points": given.reconstruction.num_points,
+            "observations": len(given.reconstruction.observations),
+        }
+        outcome = replace(outcome, options={"model": facts_of_model})
         orientations = {name: fact.orientation or 1 for name, fact in facts.items()}
         times = {} if folder is None else photo_times(folder)
         outputs = Outputs.of_outcome(outcome, options, orientations, ids, rgb, folder is not None, times)
@@ -131,7 +136,8 @@ def solve(
     options = options or SolveOptions()
     log = StageLog(progress)
     given = colmap_model_of(reconstruction)
-    outcome, ids, rgb = _solve(given, "the model", {}, options, None if database is None else Path(database), log)
+    with kept_log_level():
+        outcome, ids, rgb = _solve(given, "the model", {}, options, None if database is None else Path(database), log)
     outputs = Outputs.of_outcome(outcome, options, {}, ids, rgb)
     rec, solution = outputs.reconstruction, outputs.solution
     names = [output_name(name, options.raw_as) for name in rec.image_names]
@@ -191,7 +197,7 @@ def _in_stored_frame(
             "taken to show them as they are stored", RsUndistortWarning, stacklevel=3,
         )  # fmt: skip
     if not turns:
-        return given, "stored" if photos else ""
+        return given, "stored" if photos else "not looked at"
     said = f"turned by the EXIF orientation in {len(turns)} of {rec.num_images} photos"
     turned = turn_reconstruction(rec, turns)
     ids = list(given.camera_ids)
