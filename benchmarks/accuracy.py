@@ -35,6 +35,7 @@ from rsundistort import (
 from rsundistort.pipeline.ladder import solve_photos
 from rsundistort.pipeline.load import load_photos
 from rsundistort.pipeline.progress import StageLog
+from rsundistort.pipeline.workers import Workers
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -112,7 +113,7 @@ def spread_of_halves(photos: Path, draws: int = 16) -> np.ndarray:
     """
     log = StageLog(None)
     with tempfile.TemporaryDirectory() as folder:
-        loaded = load_photos(photos, None, None, RunOptions().max_features, 2, log)
+        loaded = load_photos(photos, None, None, RunOptions().max_features, Workers(2), log, RunOptions())
         solved = solve_photos(loaded, "rotation", 0, lambda _: BundleOptions(), Path(folder), log)
     rec, rng = solved.result.reconstruction, np.random.default_rng(0)
     options = BundleOptions(phi_sigma_start=solved.result.phi_sigma)

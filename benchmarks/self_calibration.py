@@ -29,6 +29,7 @@ from rsundistort.pipeline import use_threads
 from rsundistort.pipeline.ladder import solve_photos
 from rsundistort.pipeline.load import load_photos
 from rsundistort.pipeline.progress import StageLog
+from rsundistort.pipeline.workers import Workers
 
 import pycolmap  # isort: skip  # after rsundistort: see rsundistort/io/photos/images.py
 
@@ -67,7 +68,8 @@ def solve(photos: Path) -> tuple[BundleResult, BundleOptions]:
     log, options = StageLog(None), RunOptions()
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore", RsUndistortWarning)
-        loaded = load_photos(photos, None, None, options.max_features, use_threads(0), log)
+        workers = Workers(use_threads(0))
+        loaded = load_photos(photos, None, None, options.max_features, workers, log, options)
 
         def of(rec: Reconstruction) -> BundleOptions:
             return options.options_for(rec, loaded.cameras)

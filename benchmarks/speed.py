@@ -76,6 +76,7 @@ def main() -> None:
         "ours_s": round(a, 2),
         "peer_s": round(b, 2),
         "ratio": round(a / b, 3),
+        "floor_s": None,
         "target": 1.2,
         "ok": a <= 1.2 * b,
     }

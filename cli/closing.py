@@ -2,17 +2,57 @@
 
 from __future__ import annotations
 
+import json
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from .terminal import table
+import click
+
+from .terminal import Talk, list_failed, table
 
 if TYPE_CHECKING:
     from rsundistort.model import Solution
 
-__all__ = ["closing_table"]
+__all__ = ["close", "closing_table", "summary"]
+
+
+_COLUMNS = 80
+# where what is said of a label begins
+_LABEL = 19
+
+
+def close(solution: Solution, out: Path, warned: Sequence[str], talk: Talk) -> None:
+    """Say what was found; exit code 3 if photos that have a motion could not be rectified."""
+    if talk.as_json:
+        click.echo(json.dumps(summary(solution, out, warned)))
+    elif talk.to_people:
+        click.echo(closing_table(solution, out))
+    list_failed({image.name: image.reason for image in solution.registered if image.reason}, talk)
+
+
+def summary(solution: Solution, out: Path, warned: Sequence[str]) -> dict[str, Any]:
+    """What was found, for other programs; all of it is in solution.json."""
+    shifts = sorted(image.rs_shift_px or 0.0 for image in solution.registered)
+    critical = solution.critical_motion
+    return {
+        "out": str(out),
+        "photos": len(solution.images),
+        "registered": len(solution.registered),
+        "shutter_model": solution.shutter_model,
+        "rms_px": solution.quality["rms_px"],
+        "global_rms_px": solution.quality["global_rms_px"],
+        "shift_px": {"median": shifts[len(shifts) // 2], "largest": shifts[-1]} if shifts else None,
+        "critical_motion": None
+        if critical is None
+        else {key: critical[key] for key in ("flagged", "sigma_log_k", "remedy", "sentence")},
+        "doubtful": _doubtful(solution),
+        "not_joined": {image.name: image.reason for image in solution.images if not image.registered},
+        "failed": {image.name: image.reason for image in solution.registered if image.reason},
+        "warnings": list(warned),
+        "seconds": round(sum(stage["seconds"] for stage in solution.stages), 3),
+    }
 
 
 def closing_table(solution: Solution, out: Path) -> str:
@@ -43,6 +83,7 @@ def closing_table(solution: Solution, out: Path) -> str:
         f"shutter model      {solution.shutter_model}",
         *_held_out(quality["held_out_rms_px"]),
         *_cameras(solution),
+        *_model(solution),
         *_video(solution),
         *_intrinsics(solution),
         *_readout(solution),
@@ -66,7 +107,22 @@ def closing_table(solution: Solution, out: Path) -> str:
     lost = [image for image in solution.images if not image.registered]
     if lost:
         lines += ["", "not joined:", *(f"  {image.name}: {image.reason}" for image in lost)]
-    return "\n".join(lines)
+    return "\n".join(part for line in lines for part in _fitted(line))
+
+
+def _fitted(text: str) -> list[str]:
+    """Lines of 80 columns; what belongs to a label is indented as its first line is."""
+    lines = []
+    for line in text.splitlines() or [""]:
+        indent = _LABEL if line[:_LABEL].endswith("  ") or not line[:_LABEL].strip() else 4
+        lines += (
+            [line]
+            if len(line) <= _COLUMNS
+            else textwrap.wrap(
+                line, _COLUMNS, subsequent_indent=" " * indent, break_long_words=False, break_on_hyphens=False
+            )
+        )
+    return lines
 
 
 def _cameras(solution: Solution) -> list[str]:
@@ -78,6 +134,19 @@ def _cameras(solution: Solution) -> list[str]:
         lines = [f"cameras            {source}", *(f"  {group}: readout {each}" for group, each in readout.items())]
     guesses = solution.options.get("guesses", ())
     return lines + [f"  {line}" for text in guesses for line in textwrap.wrap(text, 78)]
+
+
+def _model(solution: Solution) -> list[str]:
+    """Lines on the model that the measurements come from: how many they were, and in which frame."""
+    model = solution.options.get("model")
+    if not model:
+        return []
+    frames = {"stored": "the model shows the photos as they are stored", "not looked at": "taken for the stored one"}
+    return [
+        f"measurements       {solution.quality['num_observations']} of {solution.quality['num_points']} points now, "
+        f"{model['observations']} of {model['points']} in the model",
+        f"pixel frame        {frames.get(model['frame'], model['frame'] + ', and turned back')}",
+    ]
 
 
 def _intrinsics(solution: Solution) -> list[str]:

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from . import options as opt
-from .terminal import errors_for_people, progress_bars, table
+from .terminal import Talk, errors_for_people, progress_bars, table
 
 
 @click.command()
@@ -30,7 +30,7 @@ def command(
     quiet: bool,
 ) -> None:
     """Compare the outputs of a run, in the folder OUT, with the truth."""
-    with errors_for_people(), progress_bars(quiet or as_json) as progress:
+    with errors_for_people(), progress_bars(Talk(quiet, as_json=as_json)) as progress:
         from rsundistort.pipeline import evaluate
 
         result = evaluate(out, truth, poses=poses, twins=twins, raw=raw, progress=progress)

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from . import options as opt
-from .terminal import errors_for_people, progress_bars, table
+from .terminal import Talk, errors_for_people, progress_bars, table
 
 
 @click.group()
@@ -45,7 +45,7 @@ def one(
 
     OUT gets trials.jsonl, summary.json, summary.csv and histograms.png; trials that it already holds are not repeated.
     """
-    with errors_for_people("the same command goes on where it was"), progress_bars(quiet) as progress:
+    with errors_for_people("the same command goes on where it was"), progress_bars(Talk(quiet)) as progress:
         from rsundistort.experiments import OneOptions, experiment_one
 
         kinds: dict[str, Any] = {"methods": methods} if methods else {}
@@ -97,7 +97,7 @@ def two(
     the outputs of three runs (still/, swung/ and, without a shutter model, swung-global/), summary.json, photos.csv
     and paths.png.
     """
-    with errors_for_people(), progress_bars(quiet) as progress:
+    with errors_for_people(), progress_bars(Talk(quiet)) as progress:
         from rsundistort.experiments import TwoOptions, experiment_two
 
         options = TwoOptions(camera, readout, shutter_model, seed, jobs, overwrite)

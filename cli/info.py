@@ -2,21 +2,63 @@
 
 from __future__ import annotations
 
+import json
+import re
+from importlib.metadata import PackageNotFoundError, requires, version
+
 import click
 
+from . import options as opt
 from .terminal import errors_for_people, table
+
+# extras for those who work on the project
+_OURS = ("dev", "docs")
 
 
 @click.command()
-def command() -> None:
+@opt.json_option
+def command(as_json: bool) -> None:
     """Versions, threads and optional parts."""
     with errors_for_people():
         import cv2
 
         from rsundistort.pipeline import use_threads, versions
 
-        rows = [(name, number) for name, number in versions().items()]
-        rows.append(("threads", str(use_threads(0))))
-        keeps = "kept" if hasattr(cv2, "imdecodeWithMetadata") else "lost (needs OpenCV 5)"
-        rows.append(("EXIF, XMP, ICC of JPEG, PNG, WebP", keeps))
-    click.echo(table(rows))
+        found: dict[str, object] = {
+            "versions": versions(),
+            "threads": use_threads(0),
+            "keeps_metadata": hasattr(cv2, "imdecodeWithMetadata"),
+            "extras": _extras(),
+        }
+    click.echo(json.dumps(found) if as_json else _text(found))
+
+
+def _extras() -> dict[str, dict[str, str | None]]:
+    """Packages of each optional part, with their versions; None of those that are not installed."""
+    extras: dict[str, dict[str, str | None]] = {}
+    for requirement in requires("rsundistort") or ():
+        match = re.fullmatch(r"""([\w.-]+).*;.*extra == ["']([\w-]+)["']""", requirement)
+        if match and match[2] not in _OURS:
+            extras.setdefault(match[2], {})[match[1]] = _version(match[1])
+    return extras
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _text(found: dict[str, object]) -> str:
+    versions, extras = found["versions"], found["extras"]
+    assert isinstance(versions, dict)
+    assert isinstance(extras, dict)
+    rows = [*versions.items(), ("threads", str(found["threads"]))]
+    rows.append(("EXIF, XMP, ICC of JPEG, PNG, WebP", "kept" if found["keeps_metadata"] else "lost (needs OpenCV 5)"))
+    optional = [("optional part", "")]
+    for extra, packages in sorted(extras.items()):
+        lost = [name for name, number in packages.items() if number is None]
+        has = ", ".join(f"{name} {number}" for name, number in packages.items())
+        optional.append((extra, f'no: pip install "rsundistort[{extra}]"' if lost else has))
+    return f"{table(rows)}\n\n{table(optional)}"

@@ -9,13 +9,15 @@ import click
 # name: one line for the list of commands; the command itself is in the module of that name
 _COMMANDS = {
     "run": "Photos in, rectified photos and camera poses out.",
-    "solve": "A COLMAP model in, the model without the shutter and rectified photos out.",
+    "solve": "A COLMAP model in, the same without the shutter out.",
     "rectify": "Rectify a folder of photos with a solution.",
     "analyze": "Whether poses let the shutter be told from the scene's shape.",
     "simulate": "Photos with a known shutter motion.",
     "evaluate": "Errors of a run against the truth.",
     "experiment": "The paper's experiments, on any scene.",
+    "report": "The report of a run again, or its figures for papers.",
     "info": "Versions, threads and optional parts.",
+    "completion": "What makes a shell complete commands and options.",
 }
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import click
+
+from .terminal import Talk
 
 # as in `model`, `rectify` and `pipeline`: not to be imported for --help
 READOUT_NAMES = ("top-to-bottom", "bottom-to-top", "left-to-right", "right-to-left")
@@ -88,7 +91,16 @@ progress_option: Decorator = click.option(
     show_default=True,
     help="json: lines on stdout for other programs, and nothing else there.",
 )
+report_option: Decorator = click.option(
+    "--report/--no-report", default=True, help="Write OUT/report.html; rsundistort report makes it later, too."
+)
+json_option: Decorator = click.option(
+    "--json", "as_json", is_flag=True, help="One JSON object on stdout at the end, instead of what is for people."
+)
 quiet_option: Decorator = click.option("-q", "--quiet", is_flag=True, help="Nothing but warnings and errors.")
+verbose_option: Decorator = click.option(
+    "-v", "--verbose", is_flag=True, help="A line for each step, also where stderr is no terminal."
+)
 quality_option: Decorator = click.option(
     "--quality", type=click.IntRange(1, 100), default=98, show_default=True, help="Of JPEG and WebP."
 )
@@ -184,9 +196,37 @@ depth_option: Decorator = click.option(
     help="How far away what the photos show is, which matters where the camera travelled during the readout: on a "
     "plane, as the known points, or as maps of your own (a.npy, .npz or float .tif for a.jpg: docs/depth.md).",
 )
+sparse_format_option: Decorator = click.option(
+    "--sparse-format",
+    type=click.Choice(("bin", "txt")),
+    default="bin",
+    show_default=True,
+    help="How the COLMAP model is written.",
+)
+rs_poses_option: Decorator = click.option(
+    "--rs-poses",
+    is_flag=True,
+    help="OUT/rs-poses: the original photos' cameras and poses with the shutter, for gsplat, instant-ngp and "
+    "3dgs-deblur (docs/outputs.md).",
+)
 interpolation_option: Decorator = click.option(
     "--interpolation", type=click.Choice(INTERPOLATION_NAMES), default="cubic", show_default=True
 )
+
+
+def talk_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """How much the command says: it gets one `Talk`."""
+
+    @functools.wraps(function)
+    def with_talk(*args: Any, progress_form: str, as_json: bool, quiet: bool, verbose: bool, **named: Any) -> Any:
+        if quiet and verbose:
+            raise click.UsageError("--quiet and --verbose contradict each other")
+        return function(*args, talk=Talk(quiet, verbose, as_json, progress_form), **named)
+
+    decorated: Callable[..., Any] = with_talk
+    for option in (verbose_option, quiet_option, json_option, progress_option):
+        decorated = option(decorated)
+    return decorated
 
 
 def view_options(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import click
 
 from . import options as opt
-from .terminal import errors_for_people, list_failed, progress_bars
+from .terminal import Talk, errors_for_people, list_failed, progress_bars
 
 
 @click.command()
@@ -54,8 +55,7 @@ from .terminal import errors_for_people, list_failed, progress_bars
     is_flag=True,
     help="Go on with the batch in OUT: pass over what is whole and current, make the rest.",
 )
-@opt.progress_option
-@opt.quiet_option
+@opt.talk_options
 def command(
     photos: Path,
     solution: Path,
@@ -77,8 +77,7 @@ def command(
     scheduler: str | None,
     overwrite: bool,
     resume: bool,
-    progress_form: str,
-    quiet: bool,
+    talk: Talk,
 ) -> None:
     """Rectify the photos of a folder with the motions of a solution.
 
@@ -87,7 +86,7 @@ def command(
     if overwrite and resume:
         raise click.UsageError("--overwrite begins anew and --resume goes on; give one of them")
     kept = "what is done is whole, the same command with --resume goes on"
-    with errors_for_people(kept), progress_bars(quiet, progress_form) as progress:
+    with errors_for_people(kept) as warned, progress_bars(talk) as progress:
         from rsundistort.pipeline import RectifyOptions, rectify_folder
         from rsundistort.rectify import ViewOptions
 
@@ -108,12 +107,14 @@ def command(
             photos, solution, out, options,
             jobs=jobs, overwrite=overwrite, resume=resume, scheduler=scheduler, progress=progress,
         )  # fmt: skip
-    silent = quiet or progress_form == "json"
     # of photos that the solution could not join it says so itself
     known = {image.name for image in solved.images if not image.registered}
     failed = {name: why for name, why in left_out.items() if name not in known}
-    if not silent:
-        count = sum(1 for path in (out / "images").rglob("*") if path.is_file())
+    count = sum(1 for path in (out / "images").rglob("*") if path.is_file())
+    if talk.as_json:
+        summary = {"out": str(out), "rectified": count, "shutter_model": solved.shutter_model, "left_out": left_out}
+        click.echo(json.dumps({**summary, "warnings": warned}))
+    elif talk.to_people:
         done = f"{count} photo{'s' * (count != 1)} rectified with the {solved.shutter_model} model"
         click.echo(f"{done}, {len(left_out)} left out: {out}")
-    list_failed(failed, err=silent)
+    list_failed(failed, talk)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import click
 
 from . import options as opt
-from .closing import closing_table
-from .terminal import errors_for_people, list_failed, progress_bars
+from .closing import close
+from .terminal import Talk, errors_for_people, progress_bars
 
 if TYPE_CHECKING:
     pass
@@ -74,6 +74,8 @@ if TYPE_CHECKING:
 @opt.interpolation_option
 @opt.quality_option
 @opt.raw_as_option
+@opt.sparse_format_option
+@opt.rs_poses_option
 @opt.apply_orientation_option
 @opt.again_option
 @opt.max_pixels_option
@@ -81,8 +83,8 @@ if TYPE_CHECKING:
 @opt.jobs_option
 @opt.scheduler_option
 @opt.overwrite_option
-@opt.progress_option
-@opt.quiet_option
+@opt.report_option
+@opt.talk_options
 def command(
     photos: Path,
     out: Path,
@@ -111,6 +113,8 @@ def command(
     interpolation: str,
     quality: int,
     raw_as: str,
+    sparse_format: str,
+    rs_poses: bool,
     apply_orientation: bool,
     again: bool,
     max_megapixels: float,
@@ -118,18 +122,18 @@ def command(
     jobs: int,
     scheduler: str | None,
     overwrite: bool,
-    progress_form: str,
-    quiet: bool,
+    report: bool,
+    talk: Talk,
 ) -> None:
     """Find how the camera moved during each photo's readout, and take it out.
 
     PHOTOS is a folder of photos that one camera took of one scene, in any order, or a video. OUT gets images/, masks/,
-    sparse/ (COLMAP), transforms.json (nerfstudio) and solution.json; of a video frames/, too.
+    sparse/ (COLMAP), transforms.json (nerfstudio), solution.json and report.html; of a video frames/, too.
 
     OUT stays as it was until the motions are solved. If the rest is interrupted, `rectify --resume` goes on with it.
     Exit code 3 says that photos with a motion could not be rectified; they are listed, and the others are done.
     """
-    with errors_for_people(), progress_bars(quiet, progress_form) as progress:
+    with errors_for_people() as warned, progress_bars(talk) as progress:
         from rsundistort.io import read_known_lengths, read_known_motions
         from rsundistort.pipeline import GyroOptions, RunOptions, run
         from rsundistort.rectify import ViewOptions
@@ -152,6 +156,8 @@ def command(
                 interpolation=interpolation,
                 quality=quality,
                 raw_as=raw_as,
+                sparse_format=sparse_format,
+                rs_poses=rs_poses,
                 apply_orientation=apply_orientation,
                 again=again,
                 max_megapixels=max_megapixels,
@@ -166,10 +172,8 @@ def command(
                 readout_s=readout_s,
                 overwrite=overwrite,
                 scheduler=scheduler,
+                report=report,
             ),
             progress,
         )
-    silent = quiet or progress_form == "json"
-    if not silent:
-        click.echo(closing_table(solution, out))
-    list_failed({image.name: image.reason for image in solution.registered if image.reason}, err=silent)
+    close(solution, out, warned, talk)

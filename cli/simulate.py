@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from . import options as opt
-from .terminal import errors_for_people, progress_bars, table
+from .terminal import Talk, errors_for_people, progress_bars, table
 
 
 @click.group()
@@ -63,7 +63,7 @@ def warp(
     OUT gets photos/, masks/ (what the originals hold), camera.json and ground_truth.json; with --crop also global/,
     and camera and truth of the cut photos. --sigma is of the whole frame, also with --crop.
     """
-    with errors_for_people(), progress_bars(quiet) as progress:
+    with errors_for_people(), progress_bars(Talk(quiet)) as progress:
         from rsundistort.pipeline import WarpOptions, read_motion_file, simulate_warp
 
         truth = simulate_warp(
@@ -102,7 +102,7 @@ def scene(recipe: Path, out: Path, depth: bool, jobs: int, overwrite: bool, quie
     OUT gets photos/, global/ (the twins), depth/, global-depth/, tracks.npz, camera.json (cameras.json if there are
     several), ground_truth.json and the recipe.
     """
-    with errors_for_people(), progress_bars(quiet) as progress:
+    with errors_for_people(), progress_bars(Talk(quiet)) as progress:
         from rsundistort.pipeline import SceneOptions, simulate_scene
 
         truth = simulate_scene(recipe, out, SceneOptions(depth=depth, jobs=jobs, overwrite=overwrite), progress)

@@ -7,8 +7,8 @@ from pathlib import Path
 import click
 
 from . import options as opt
-from .closing import closing_table
-from .terminal import errors_for_people, list_failed, progress_bars
+from .closing import close
+from .terminal import Talk, errors_for_people, progress_bars
 
 
 @click.command()
@@ -40,6 +40,8 @@ from .terminal import errors_for_people, list_failed, progress_bars
 @opt.interpolation_option
 @opt.quality_option
 @opt.raw_as_option
+@opt.sparse_format_option
+@opt.rs_poses_option
 @opt.apply_orientation_option
 @opt.again_option
 @opt.max_pixels_option
@@ -47,8 +49,8 @@ from .terminal import errors_for_people, list_failed, progress_bars
 @opt.jobs_option
 @opt.scheduler_option
 @opt.overwrite_option
-@opt.progress_option
-@opt.quiet_option
+@opt.report_option
+@opt.talk_options
 def command(
     model: Path,
     out: Path,
@@ -70,6 +72,8 @@ def command(
     interpolation: str,
     quality: int,
     raw_as: str,
+    sparse_format: str,
+    rs_poses: bool,
     apply_orientation: bool,
     again: bool,
     max_megapixels: float,
@@ -77,16 +81,17 @@ def command(
     jobs: int,
     scheduler: str | None,
     overwrite: bool,
-    progress_form: str,
-    quiet: bool,
+    report: bool,
+    talk: Talk,
 ) -> None:
-    """Find how the camera moved during each photo's readout, from a COLMAP model.
+    """Find how the camera moved during each photo's readout, from a model of COLMAP, OpenMVG or OpenSfM.
 
-    MODEL is the folder of a model, text or binary. OUT gets what `rsundistort run` writes; images/ and masks/ if
+    MODEL is the folder of a COLMAP model, text or binary, OpenMVG's sfm_data.json, or OpenSfM's reconstruction.json
+    with tracks.csv beside it. OUT gets what `rsundistort run` writes; images/ and masks/ if
     --images says where the photos are. Cameras of the model are the groups of --readout: --readout "camera
     1=left-to-right".
     """
-    with errors_for_people(), progress_bars(quiet, progress_form) as progress:
+    with errors_for_people() as warned, progress_bars(talk) as progress:
         from rsundistort.io import read_known_lengths, read_known_motions
         from rsundistort.pipeline import SolveOptions, solve_model
         from rsundistort.rectify import ViewOptions
@@ -106,6 +111,8 @@ def command(
                 interpolation=interpolation,
                 quality=quality,
                 raw_as=raw_as,
+                sparse_format=sparse_format,
+                rs_poses=rs_poses,
                 apply_orientation=apply_orientation,
                 again=again,
                 max_megapixels=max_megapixels,
@@ -117,12 +124,10 @@ def command(
                 readout_s=readout_s,
                 overwrite=overwrite,
                 scheduler=scheduler,
+                report=report,
             ),
             images=images,
             database=database,
             progress=progress,
         )
-    silent = quiet or progress_form == "json"
-    if not silent:
-        click.echo(closing_table(solution, out))
-    list_failed({image.name: image.reason for image in solution.registered if image.reason}, err=silent)
+    close(solution, out, warned, talk)

@@ -3,25 +3,59 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import click
 
-__all__ = ["SOME_FAILED", "errors_for_people", "list_failed", "progress_bars", "table"]
+__all__ = ["SOME_FAILED", "Talk", "errors_for_people", "list_failed", "progress_bars", "table"]
 
 #: Exit code when some photos failed, and the others are done.
 SOME_FAILED = 3
 
 
+@dataclass(frozen=True)
+class Talk:
+    """How much a command says, and in which form.
+
+    Attributes
+    ----------
+    quiet : bool
+        Nothing but warnings and errors.
+    verbose : bool
+        A line for each step of a stage, also where stderr is no terminal.
+    as_json : bool
+        One JSON object on stdout at the end, instead of what is for people.
+    progress : str
+        "bar", or "json" for lines on stdout.
+    """
+
+    quiet: bool = False
+    verbose: bool = False
+    as_json: bool = False
+    progress: str = "bar"
+
+    @property
+    def to_people(self) -> bool:
+        """Whether stdout is for people."""
+        return not (self.quiet or self.as_json or self.progress == "json")
+
+
+def say(text: str, **style: Any) -> None:
+    """A line on stderr; styled if that is a terminal and nobody asked for NO_COLOR."""
+    click.secho(text, err=True, color=False if os.environ.get("NO_COLOR") else None, **style)
+
+
 @contextmanager
-def errors_for_people(kept: str = "nothing was written") -> Iterator[None]:
-    """Known errors become one line and exit code 1; warnings become one line each."""
+def errors_for_people(kept: str = "nothing was written") -> Iterator[list[str]]:
+    """Known errors become one line and exit code 1; warnings become one line each, and are listed."""
     import cv2
 
     from rsundistort.errors import RsUndistortError
@@ -29,27 +63,30 @@ def errors_for_people(kept: str = "nothing was written") -> Iterator[None]:
     # OpenCV's and libtiff's own lines about broken files: ours say it once, with the name. 0 is silent; the function's
     # place is OpenCV 4's, or 5's
     (cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel)(0)
+    said: list[str] = []
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        click.echo(f"warning: {message}", err=True)
+        said.append(str(message))
+        say(f"warning: {message}", fg="yellow")
 
     with warnings.catch_warnings():
         warnings.simplefilter("default")
         warnings.showwarning = show
         try:
-            yield
+            yield said
         except RsUndistortError as error:
-            click.echo(f"error: {error}", err=True)
+            say(f"error: {error}", fg="red")
             sys.exit(1)
         except KeyboardInterrupt as stop:
-            click.echo(f"stopped; {stop or kept}", err=True)
+            say(f"stopped; {stop or kept}")
             sys.exit(130)
 
 
-def list_failed(failed: Mapping[str, str], err: bool) -> None:
+def list_failed(failed: Mapping[str, str], talk: Talk) -> None:
     """What failed and why, and the exit code that says so; nothing if nothing did."""
     if failed:
-        click.echo("\n".join(["", "failed:", *(f"  {name}: {why}" for name, why in failed.items())]), err=err)
+        lines = ["", "failed:", *(f"  {name}: {why}" for name, why in failed.items())]
+        click.echo("\n".join(lines), err=not talk.to_people)
         sys.exit(SOME_FAILED)
 
 
@@ -57,15 +94,17 @@ _NO_TOTAL = "{desc:<34} {elapsed}"
 
 
 class _Bars:
-    """One bar a stage on stderr; nothing when it is no terminal."""
+    """On stderr a bar for the stage at work, and a line for each stage, or each step of one, that has ended."""
 
-    def __init__(self, shown: bool) -> None:
-        self._shown = shown
+    def __init__(self, bars: bool, lines: bool, steps: bool) -> None:
+        self._bars, self._lines, self._steps = bars, lines, steps
         self._bar: Any = None
         self._stage = ""
+        self._count = 0
+        self._began = time.perf_counter()
         self._lock = threading.Lock()
         self._ended = threading.Event()
-        if shown:
+        if bars:
             # a stage inside pycolmap says nothing for a while: its clock must go on
             threading.Thread(target=self._tick, daemon=True).start()
 
@@ -76,29 +115,44 @@ class _Bars:
                     self._bar.refresh()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        if not self._shown:
+        if not self._lines:
+            return
+        with self._lock:
+            # "ladder: rotation" is a step of the stage "ladder"
+            name = stage if self._steps else stage.partition(":")[0]
+            if name != self._stage:
+                self._end()
+                self._stage, self._began = name, time.perf_counter()
+                self._begin(name, done, total)
+            self._count = total
+            if self._bar is not None:
+                self._bar.n = done
+                self._bar.refresh()
+
+    def _begin(self, name: str, done: int, total: int) -> None:
+        if not self._bars:
             return
         from tqdm import tqdm
 
-        with self._lock:
-            if stage != self._stage:
-                if self._bar is not None:
-                    self._bar.close()
-                self._stage = stage
-                form = "{desc:<34} {n_fmt}/{total_fmt} {bar} {rate_fmt}, {remaining} left" if total else _NO_TOTAL
-                self._bar = tqdm(
-                    total=total or None, desc=stage, leave=False, file=sys.stderr, bar_format=form, initial=done,
-                    unit=" photos" if total else "it",
-                )  # fmt: skip
-            self._bar.n = done
-            self._bar.refresh()
+        form = "{desc:<34} {n_fmt}/{total_fmt} {bar} {rate_fmt}, {remaining} left" if total else _NO_TOTAL
+        self._bar = tqdm(
+            total=total or None, desc=name, leave=False, file=sys.stderr, bar_format=form, initial=done,
+            unit=" photos" if total else "it",
+        )  # fmt: skip
+
+    def _end(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+        if self._stage:
+            count = f"{self._count:>8}" if self._count else ""
+            say(f"{self._stage:<34} {time.perf_counter() - self._began:8.1f} s{count}")
 
     def close(self) -> None:
         self._ended.set()
         with self._lock:
-            if self._bar is not None:
-                self._bar.close()
-                self._bar = None
+            self._end()
+            self._stage = ""
 
 
 class _Lines:
@@ -135,9 +189,11 @@ class _Lines:
 
 
 @contextmanager
-def progress_bars(quiet: bool, form: str = "bar") -> Iterator[Callable[[str, int, int], None]]:
-    """A progress callback: bars, unless told to be quiet or stderr is no terminal; or JSON, if that was asked for."""
-    bars = _Lines() if form == "json" else _Bars(not quiet and sys.stderr.isatty())
+def progress_bars(talk: Talk) -> Iterator[Callable[[str, int, int], None]]:
+    """A progress callback: bars and lines on a terminal, lines where asked for, or JSON."""
+    shown = sys.stderr.isatty() and not talk.quiet
+    lines = shown or (talk.verbose and not talk.quiet)
+    bars = _Lines() if talk.progress == "json" else _Bars(shown, lines, talk.verbose)
     try:
         yield bars
     finally:

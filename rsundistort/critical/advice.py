@@ -97,10 +97,8 @@ def advise(result: BundleResult, options: BundleOptions | None = None) -> list[A
     obs = rec.observations
     pivots = np.array(
         [
-            np.median(rec.points_w[obs.point_idx[obs.frame_idx == i]], axis=0)
-            if (obs.frame_idx == i).any()
-            else rec.points_w.mean(0)
-            for i in range(rec.num_images)
+            np.median(rec.points_w[obs.point_idx[mine]], axis=0) if len(mine) else rec.points_w.mean(0)
+            for mine in obs.by_photo(rec.num_images)
         ]
     )
     found = []

@@ -114,7 +114,7 @@ def critical_motion(
 
     To first order a turning rolling-shutter camera is one whose skew and aspect ratio are unknown in every photo (Ito
     and Okatani, Eq. 9). What is then known of each photo, focal length and principal point, gives three equations for
-    the reference photo's skew and aspect ratio and the plane at infinity (their Eqs. 15 and 16, linearised where the
+    the reference photo's skew and aspect ratio and the plane at infinity (their Eqs. 15 and 18, linearised where the
     camera stands still); `docs/critical-motions.md` derives them.
 
     Parameters
@@ -151,7 +151,8 @@ def critical_motion(
     vectors = np.zeros((m, 5))
     for reference in range(m):
         rows = _equations(turn, centers / spread, by_column, reference) / np.sqrt(m - 1)
-        _, found, Vt = np.linalg.svd(rows, full_matrices=True)
+        # of the triangle: with all rows it would grow with the cube of the number of photos
+        _, found, Vt = np.linalg.svd(np.linalg.qr(rows, mode="r"), full_matrices=True)
         values[reference, : len(found)] = found
         vectors[reference] = Vt[-1]
     # rounding must not choose among references that hide the same

@@ -2,6 +2,7 @@
 
 from .cameras import CameraFile, check_camera_fits, parse_camera, read_camera_file
 from .colmap import read_colmap_cameras, read_colmap_poses, write_colmap_model
+from .colmap_workspace import write_colmap_workspace
 from .depth_maps import find_depth_maps, read_depth_map
 from .groups import group_of, guess_readouts
 from .gyro import GyroLog, gyro_offset, motions_from_gyro, read_gyro, read_photo_times
@@ -14,7 +15,9 @@ from .photos.exif_facts import ExifFacts, camera_from_exif, facts_of_exif, focal
 from .photos.images import MAX_MEGAPIXELS, RAW_AS, Photo, list_photos, output_name, read_photo, write_image
 from .photos.metadata import Metadata
 from .readout_times import readout_time
+from .shutter_poses import write_shutter_poses
 from .solution import read_solution, write_solution
+from .trajectory import write_point_cloud, write_trajectory
 from .video import VideoFrames, extract_frames, is_video
 
 __all__ = [
@@ -57,7 +60,11 @@ __all__ = [
     "read_transforms",
     "readout_time",
     "write_colmap_model",
+    "write_colmap_workspace",
     "write_image",
+    "write_point_cloud",
+    "write_shutter_poses",
     "write_solution",
+    "write_trajectory",
     "write_transforms",
 ]

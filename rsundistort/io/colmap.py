@@ -251,8 +251,7 @@ def rectified_keypoints(reconstruction: Reconstruction, rectified: list[Camera])
     """
     obs = reconstruction.observations
     xy = np.full((len(obs), 2), np.nan)
-    for i in range(reconstruction.num_images):
-        of_photo = obs.frame_idx == i
+    for i, of_photo in enumerate(obs.by_photo(reconstruction.num_images)):
         motion = reconstruction.motion(i).in_camera(reconstruction.R_cw[i])
         ideal, _ = unproject_points(
             obs.xy_raw[of_photo], reconstruction.camera(i), motion, reconstruction.shutter_model
@@ -306,12 +305,13 @@ def colmap_model(
         )
     obs = reconstruction.observations
     xy = rectified_keypoints(reconstruction, rectified)
-    usable = np.isfinite(xy).all(1)
+    usable = np.asarray(np.isfinite(xy).all(1))
+    by_photo = obs.by_photo(reconstruction.num_images)
     place = np.full(len(obs), -1)
     for i, name in enumerate(names):
         if name is None:
             continue
-        of_photo = np.flatnonzero((obs.frame_idx == i) & usable)
+        of_photo = by_photo[i][usable[by_photo[i]]]
         place[of_photo] = np.arange(len(of_photo))
         image = pycolmap.Image(
             name=name,
@@ -339,7 +339,11 @@ def colmap_model(
     return model
 
 
-def write_colmap_model(folder: Path, *model: Any) -> None:
-    """Write `cameras.bin`, `images.bin`, `points3D.bin`, and rigs, frames, of `colmap_model(*model)`."""
+def write_colmap_model(folder: Path, *model: Any, text: bool = False) -> None:
+    """Write cameras, images, points3D, and rigs, frames, of `colmap_model(*model)`, as `.bin` or as `.txt`."""
     folder.mkdir(parents=True, exist_ok=True)
-    colmap_model(*model).write(folder)
+    found = colmap_model(*model)
+    if text:
+        found.write_text(folder)
+    else:
+        found.write(folder)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from ..model import Observations, Reconstruction
 from ..model.checks import check_photo_name
 from .colmap import ModelIds, camera_from_colmap
 
-__all__ = ["ColmapModel", "colmap_model_of", "read_colmap_model", "surviving_points"]
+__all__ = ["ColmapModel", "checked_name", "colmap_model_of", "read_colmap_model", "surviving_points"]
 
 # COLMAP's pixel centres are at 0.5, ours at 0
 _HALF = 0.5
@@ -41,6 +41,8 @@ class ColmapModel:
     self_calibrated : bool
         Whether a camera is of a model that COLMAP refines by default: any but PINHOLE. Without a model of the shutter
         its intrinsics took up some of it.
+    has_colors : bool
+        Whether the colours are known.
     """
 
     reconstruction: Reconstruction
@@ -51,6 +53,20 @@ class ColmapModel:
     colors: NDArray[np.uint8]
     unregistered: Sequence[str]
     self_calibrated: bool = False
+    has_colors: bool = True
+
+    def once_a_photo(self) -> ColmapModel:
+        """The model with one measurement of a point in a photo, the nearest, and the points that two photos see."""
+        rec = self.reconstruction
+        once = _once_a_photo(rec)
+        alive = rec.track_lengths(once) >= 2
+        return replace(
+            self,
+            reconstruction=rec.with_points(once),
+            point_ids=self.point_ids[alive],
+            keypoint_idx=self.keypoint_idx[once & alive[rec.observations.point_idx]],
+            colors=self.colors[alive],
+        )
 
     def ids_of(self, points: NDArray[np.int64], names: Sequence[str]) -> ModelIds:
         """Ids of a reconstruction's parts, of which these old points (-1: none) and photos became.
@@ -168,30 +184,28 @@ def colmap_model_of(model: Any, where: str = "the model") -> ColmapModel:
     R_cw = poses[:, :, :3]
     rec = Reconstruction(
         cameras,
-        [_checked_name(image.name, where) for image in images],
+        [checked_name(image.name, where) for image in images],
         np.array([place[image.camera_id] for image in images], np.int64),
         R_cw,
         -np.einsum("mji,mj->mi", R_cw, poses[:, :, 3]),
         points_w,
         Observations(frame, point, np.concatenate(xy)),
     )
-    once = _once_a_photo(rec)
-    alive = rec.track_lengths(once) >= 2
-    kept = once & alive[point]
     unregistered = sorted({image.name for image in model.images.values()} - set(rec.image_names))
     return ColmapModel(
-        rec.with_points(once),
+        rec,
         np.array(camera_ids, np.int64),
         np.array([image.image_id for image in images], np.int64),
-        point_ids[alive],
-        np.concatenate(keypoint)[kept],
-        colors[alive],
+        point_ids,
+        np.concatenate(keypoint),
+        colors,
         tuple(unregistered),
         any(model.cameras[k].model_name != "PINHOLE" for k in camera_ids),
-    )
+    ).once_a_photo()
 
 
-def _checked_name(name: str, where: str) -> str:
+def checked_name(name: str, where: str) -> str:
+    """The name of a photo of the model that `where` names."""
     try:
         return check_photo_name(name)
     except InputError as error:

@@ -3,35 +3,55 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, FormatError
+from ..errors import FileError, FormatError, InputError
 from ..model import Camera, Solution
 
 __all__ = ["read_transforms", "write_transforms"]
 
 
-def _intrinsics(camera: Camera) -> dict[str, Any]:
-    # nerfstudio takes COLMAP's principal point: pixel centres at 0.5
-    K = camera.K
-    return {
-        "camera_model": "OPENCV",
+def intrinsics(camera: Camera) -> dict[str, Any]:
+    """What `transforms.json` says of a camera: nerfstudio's keys, and `is_fisheye` of instant-ngp.
+
+    Raises
+    ------
+    InputError
+        When its lens has more coefficients than k1, k2, p1, p2 and k3; of a fisheye four.
+    """
+    # both take COLMAP's principal point: pixel centres at 0.5
+    K, lens = camera.K, camera.coefficients
+    value: dict[str, Any] = {
+        "camera_model": "OPENCV_FISHEYE" if camera.lens == "fisheye" else "OPENCV",
         "w": camera.width,
         "h": camera.height,
         "fl_x": K[0, 0],
         "fl_y": K[1, 1],
         "cx": K[0, 2] + 0.5,
         "cy": K[1, 2] + 0.5,
-        "k1": 0.0,
-        "k2": 0.0,
-        "p1": 0.0,
-        "p2": 0.0,
     }
+    if camera.lens == "fisheye":
+        # no p1, p2: instant-ngp keeps them where a fisheye has k3 and k4
+        return value | {"is_fisheye": True} | lens
+    others = [name for name, number in lens.items() if number and name not in ("k1", "k2", "p1", "p2", "k3")]
+    if others:
+        raise InputError(f"transforms.json has no room for the lens coefficients {', '.join(others)}")
+    return value | {name: lens[name] for name in ("k1", "k2", "p1", "p2")} | ({"k3": lens["k3"]} if lens["k3"] else {})
+
+
+def camera_to_world(R_cw: NDArray[np.float64], center_w: NDArray[np.float64]) -> list[list[float]]:
+    """The (4, 4) `transform_matrix` of a pose."""
+    matrix = np.eye(4)
+    # OpenCV looks along +z with y down, OpenGL along -z with y up
+    matrix[:3, :3] = R_cw.T @ np.diag([1.0, -1.0, -1.0])
+    matrix[:3, 3] = center_w
+    found: list[list[float]] = matrix.tolist()
+    return found
 
 
 def read_transforms(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -51,7 +71,9 @@ def read_transforms(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64
     return (axes / length).transpose(0, 2, 1), matrices[:, :3, 3]
 
 
-def write_transforms(path: Path, solution: Solution, files: dict[str, tuple[str, str]]) -> None:
+def write_transforms(
+    path: Path, solution: Solution, files: Mapping[str, tuple[str, str]], points: str | None = None
+) -> None:
     """Write `transforms.json` of the rectified photos: OpenGL axes, a mask for every photo.
 
     Parameters
@@ -60,24 +82,40 @@ def write_transforms(path: Path, solution: Solution, files: dict[str, tuple[str,
         File to write.
     solution : Solution
         Poses and rectified cameras.
-    files : dict of photo name to (image path, mask path)
+    files : mapping of photo name to (image path, mask path)
         Relative to the file's folder; photos without are left out.
+    points : str, optional
+        PLY file of points in the frame of the poses, relative too: splatfacto starts from them.
     """
     images = [image for image in solution.registered if image.posed and image.name in files]
-    used: Sequence[str] = sorted({image.camera_id for image in images})
-    value: dict[str, Any] = _intrinsics(solution.rectified_cameras[used[0]]) if len(used) == 1 else {}
     frames = []
     for image in images:
         assert image.R_cw is not None
         assert image.center_w is not None
-        matrix = np.eye(4)
-        # OpenCV looks along +z with y down, OpenGL along -z with y up
-        matrix[:3, :3] = image.R_cw.T @ np.diag([1.0, -1.0, -1.0])
-        matrix[:3, 3] = image.center_w
-        frame: dict[str, Any] = {"file_path": files[image.name][0], "mask_path": files[image.name][1]}
-        if len(used) > 1:
-            frame.update(_intrinsics(solution.rectified_cameras[image.camera_id]))
-        frame["transform_matrix"] = matrix.tolist()
-        frames.append(frame)
-    value["frames"] = frames
+        image_path, mask_path = files[image.name]
+        matrix = camera_to_world(image.R_cw, image.center_w)
+        frames.append({"file_path": image_path, "mask_path": mask_path, "transform_matrix": matrix})
+    write_frames(path, frames, [solution.rectified_cameras[image.camera_id] for image in images], points)
+
+
+def write_frames(
+    path: Path,
+    frames: Sequence[Mapping[str, Any]],
+    cameras: Sequence[Camera],
+    points: str | None = None,
+    common: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a `transforms.json` with what is `common`: intrinsics too if all frames share a camera, else with each."""
+    value: dict[str, Any] = dict(common or {})
+    if points is not None:
+        value["ply_file_path"] = points
+    shared = len(set(cameras)) == 1
+    if cameras:
+        # nerfstudio looks for the model nowhere else
+        value["camera_model"] = intrinsics(cameras[0])["camera_model"]
+    if shared:
+        value |= intrinsics(cameras[0])
+        value["frames"] = [dict(frame) for frame in frames]
+    else:
+        value["frames"] = [{**intrinsics(camera), **frame} for frame, camera in zip(frames, cameras, strict=True)]
     path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")

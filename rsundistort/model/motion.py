@@ -51,6 +51,28 @@ class RowMotion:
         """The motion with its velocity in the camera frame at the reference row, as projection takes it."""
         return RowMotion(self.phi, np.asarray(R_cw, np.float64) @ self.velocity)
 
+    def pose_at(
+        self, clock: float, R_cw: NDArray[np.float64], center_w: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Pose when the clock shows r, exact for the rotation and constant-motion models (paper Eq. 2).
+
+        Parameters
+        ----------
+        clock : float
+            r, as `clock_of` gives it of a pixel.
+        R_cw, center_w : (3, 3), (3,) array
+            Pose at r = 0. The velocity is in the world here.
+
+        Returns
+        -------
+        R_cw, center_w : (3, 3), (3,) array
+            Exp(r phi) R_cw, and the centre moved by r velocity.
+        """
+        from scipy.spatial.transform import Rotation
+
+        turn = Rotation.from_rotvec(clock * self.phi).as_matrix()
+        return turn @ np.asarray(R_cw, np.float64), np.asarray(center_w, np.float64) + clock * self.velocity
+
     @property
     def aspect(self) -> float:
         """Aspect ratio of the paper's imaginary camera, 1 - phi1 (row readout)."""

@@ -215,8 +215,7 @@ def turn_reconstruction(reconstruction: Reconstruction, orientations: Mapping[st
         raise InputError("a reconstruction cannot be mirrored")
     obs = rec.observations
     xy = np.array(obs.xy_raw)
-    for i, orientation in enumerate(turns):
-        of_photo = obs.frame_idx == i
+    for i, (orientation, of_photo) in enumerate(zip(turns, obs.by_photo(rec.num_images), strict=True)):
         camera = rec.camera(i)
         xy[of_photo] = turn_points(xy[of_photo], camera.width, camera.height, orientation)
     return replace(

@@ -50,6 +50,11 @@ class Observations:
     def __len__(self) -> int:
         return len(self.xy_raw)
 
+    def by_photo(self, num_images: int) -> list[NDArray[np.int64]]:
+        """Indices of the measurements of each photo."""
+        order = np.argsort(self.frame_idx, kind="stable")
+        return np.split(order, np.searchsorted(self.frame_idx[order], np.arange(1, num_images)))
+
     def select(self, keep: NDArray[Any]) -> Observations:
         """The observations that a mask or an index array names."""
         return Observations(self.frame_idx[keep], self.point_idx[keep], self.xy_raw[keep], self.sigma[keep])
@@ -166,8 +171,11 @@ class Reconstruction:
     def track_lengths(self, keep_obs: NDArray[np.bool_]) -> NDArray[np.int64]:
         """(n,) number of photos that see each point among some observations; a photo counts once."""
         obs = self.observations
-        key = np.unique((obs.point_idx * self.num_images + obs.frame_idx)[keep_obs])
-        return np.bincount(key // self.num_images, minlength=self.num_points)
+        # np.unique by hashes takes many times as long
+        key = np.sort((obs.point_idx * self.num_images + obs.frame_idx)[keep_obs])
+        first = np.ones(len(key), bool)
+        first[1:] = key[1:] != key[:-1]
+        return np.bincount(key[first] // self.num_images, minlength=self.num_points)
 
     def take_points(self, keep_point: NDArray[np.bool_]) -> Reconstruction:
         """The reconstruction with some points only, and all their observations."""

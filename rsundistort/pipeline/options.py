@@ -58,10 +58,16 @@ class SolveOptions(RectifyOptions):
         What to do about a critical motion: "auto", "prior" or "none"; see `critical.heal`.
     readout_s : float, optional
         Time of the readout of a frame; else the log's, else that of the camera in the table, if it is there.
+    sparse_format : str
+        "bin" or "txt": how the COLMAP model is written.
+    rs_poses : bool
+        Whether the poses of the original photos with their shutter are written, for renderers that model it.
     overwrite : bool
         Replace the outputs of an earlier run.
     scheduler : str, optional
         Address of a Dask scheduler whose workers rectify the photos, as in `rectify_folder`.
+    report : bool
+        Write `report.html`. What it needs is kept in any case: `report.write_report` makes it later.
     """
 
     readout: str | Mapping[str, str] | None = None
@@ -74,8 +80,11 @@ class SolveOptions(RectifyOptions):
     lengths: Sequence[KnownLength] = ()
     remedy: str = "auto"
     readout_s: float | None = None
+    sparse_format: str = "bin"
+    rs_poses: bool = False
     overwrite: bool = False
     scheduler: str | None = None
+    report: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -86,6 +95,8 @@ class SolveOptions(RectifyOptions):
         with_remedy(self.bundle_options(), self.remedy)
         if self.jobs < 0:
             raise InputError(f"jobs={self.jobs!r}, expected 0 or more")
+        if self.sparse_format not in ("bin", "txt"):
+            raise InputError(f"sparse_format={self.sparse_format!r}, expected bin or txt")
         if self.readout_s is not None and not 0 < self.readout_s < np.inf:
             raise InputError(f"readout_s={self.readout_s!r}, expected a positive number of seconds")
 

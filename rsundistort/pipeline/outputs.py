@@ -2,21 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from pathlib import Path
+import os
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path, PurePath
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..io import output_folder, output_name, write_colmap_model, write_solution, write_transforms
+from ..errors import FileError, InputError, RsUndistortWarning
+from ..io import (
+    output_folder,
+    output_name,
+    read_photo_times,
+    write_colmap_model,
+    write_colmap_workspace,
+    write_point_cloud,
+    write_shutter_poses,
+    write_solution,
+    write_trajectory,
+    write_transforms,
+)
 from ..io.colmap import ModelIds
 from ..io.journal import Journal
 from ..io.outputs import batch_folder
+from ..io.video import FRAME_TABLE
 from ..model import Reconstruction, Solution
 from ..model.orientation import turn_reconstruction, turn_solution
+from ..report import Diagnostics, relative_folder, write_diagnostics, write_report
 from .depth import PhotoDepths, ScenePoints, with_depths
+from .ladder import Solved
 from .options import SolveOptions
 from .outcome import Outcome, solution_of
 from .photo import turn_of
@@ -25,7 +43,18 @@ from .views import with_view
 from .workers import Workers
 from .write import PointColors, mask_names, rectify_photos
 
-__all__ = ["Outputs"]
+__all__ = ["REPLACED", "Outputs", "photo_times"]
+
+#: Folders that a run replaces.
+REPLACED = ("images", "masks", "sparse", "stereo", "rs-poses")
+
+
+def photo_times(folder: Path) -> dict[str, float]:
+    """When the photos of a folder were taken, by the `frames.csv` that lies with frames of a video; {} without one."""
+    try:
+        return read_photo_times(folder / FRAME_TABLE)
+    except (FileError, ValueError):  # no such table, or another's
+        return {}
 
 
 @dataclass(frozen=True)
@@ -64,6 +93,10 @@ class Outputs:
         Colours of points; None where the photos tell them all.
     with_photos : bool
         Whether there are photos to rectify.
+    times : mapping of name to float
+        When photos were taken, in seconds.
+    solved : Solved or None
+        What the report compares; None where there is nothing to.
     """
 
     solution: Solution
@@ -73,6 +106,8 @@ class Outputs:
     turns: Mapping[str, int]
     rgb: PointRgb | None = None
     with_photos: bool = True
+    times: Mapping[str, float] = field(default_factory=dict)
+    solved: Solved | None = None
 
     @classmethod
     def of_outcome(
@@ -83,6 +118,7 @@ class Outputs:
         ids: ModelIds | None = None,
         rgb: PointRgb | None = None,
         with_photos: bool = True,
+        times: Mapping[str, float] | None = None,
     ) -> Outputs:
         """Outputs of an outcome, whose photos have these EXIF orientations."""
         rec = outcome.reconstruction
@@ -90,7 +126,8 @@ class Outputs:
         turns: dict[str, int] = {}
         if options.apply_orientation:
             turns = {name: turn_of(orientations.get(name, 1), True)[0] for name in rec.image_names}
-        return cls(solution, rec, options, ids or ModelIds.in_order(rec), turns, rgb, with_photos)
+        ids = ids or ModelIds.in_order(rec)
+        return cls(solution, rec, options, ids, turns, rgb, with_photos, times or {}, outcome.solved)
 
     def begin(self, folder: Path, log: StageLog) -> Solution:
         """Write all but the photos and the colours that they tell, so that what comes after can be gone on with."""
@@ -99,9 +136,20 @@ class Outputs:
                 (folder / name).mkdir()
             Journal(folder).write(())
         rgb = None if self.rgb is None else self.rgb.values
-        turned = replace(self._models(folder, self.solution, {}, rgb), stages=tuple(log.stages))
+        turned = replace(self._models(folder, self.solution, {}, rgb, None), stages=tuple(log.stages))
         write_solution(folder / "solution.json", turned)
+        self._tell_report(folder, rgb)
         return turned
+
+    def report(self, out: Path, log: StageLog, photos: Path | None = None) -> None:
+        """Write the report of what is in `out`, if it is asked for; a failure is no more than warned of."""
+        if not self.options.report:
+            return
+        try:
+            with _only_warned_of():
+                write_report(out, photos, jobs=self.options.jobs, progress=log.tell)
+        except KeyboardInterrupt as stop:
+            raise KeyboardInterrupt(f"all but the report is written; go on with: rsundistort report {out}") from stop
 
     def rectify(self, photos: Path, out: Path, workers: Workers, log: StageLog) -> Solution:
         """Rectify the photos of a folder into `out`, which `begin` has filled, and write the rest again."""
@@ -122,13 +170,29 @@ class Outputs:
         found = {name: each.depth for name, each in done.items() if each.depth is not None}
         solution = with_depths(replace(solution, images=tuple(images)), found)
         with output_folder(out, overwrite=True) as scratch:
-            turned = self._models(scratch, solution, left_out, self._rgb(colors))
+            rgb = self._rgb(colors)
+            turned = self._models(scratch, solution, left_out, rgb, relative_to(photos, out / "rs-poses"))
+            self._tell_report(scratch, rgb, relative_folder(photos, out))
             log.end("writing")
             turned = replace(turned, stages=tuple(log.stages))
             write_solution(scratch / "solution.json", turned)
         if not left_out:
             journal.path.unlink()  # nothing to go on with
+        self.report(out, log, photos)
         return turned
+
+    @cached_property
+    def _diagnostics(self) -> Diagnostics | None:
+        if self.solved is None:
+            return None
+        return Diagnostics.of_results(self.solved.result, self.solved.global_result, self.ids.cameras)
+
+    def _tell_report(self, folder: Path, rgb: NDArray[np.uint8] | None, photos: str = "") -> None:
+        """Keep what the report shows beyond the solution."""
+        with _only_warned_of():
+            if self._diagnostics is not None:
+                told = replace(self._diagnostics.with_colors(rgb), photos=photos)
+                write_diagnostics(folder / "report.npz", told)
 
     def _rgb(self, colors: PointColors | None) -> NDArray[np.uint8] | None:
         """Colours as the photos tell them, where they were not known."""
@@ -138,20 +202,72 @@ class Outputs:
         return np.where(self.rgb.known[:, None], self.rgb.values, told)
 
     def _models(
-        self, folder: Path, solution: Solution, left_out: Mapping[str, str], rgb: NDArray[np.uint8] | None
+        self,
+        folder: Path,
+        solution: Solution,
+        left_out: Mapping[str, str],
+        rgb: NDArray[np.uint8] | None,
+        photos: PurePath | None,
     ) -> Solution:
-        """Write the models for other programs; returns the solution as they have it, turned."""
-        rec, raw_as = self.reconstruction, self.options.raw_as
+        """Write the models for other programs; returns the solution as they have it, turned.
+
+        `photos` is where the original ones are, seen from the folder of their poses.
+        """
+        rec, ids, options = self.reconstruction, self.ids, self.options
+        names = [None if name in left_out else output_name(name, options.raw_as) for name in rec.image_names]
+        written = {name: new for name, new in zip(rec.image_names, names, strict=True) if new is not None}
+        last = photos is not None or not self.with_photos
+        cut = [new for new in written.values() if " " in new]
+        if options.sparse_format == "txt" and cut and last:
+            warnings.warn(
+                f"sparse/: names end at a space in text, such as {cut[0]}; --sparse-format bin "
+                "keeps them", RsUndistortWarning, stacklevel=3,
+            )  # fmt: skip
+        if options.rs_poses:
+            originals = {name: name if photos is None else (photos / name).as_posix() for name in written}
+            problem = write_shutter_poses(folder / "rs-poses", solution, originals, "../points.ply")
+            if problem and last:
+                warnings.warn(f"rs-poses is without transforms.json: {problem}", RsUndistortWarning, stacklevel=3)
         if self.turns:
             solution, rec = turn_solution(solution, self.turns), turn_reconstruction(rec, self.turns)
-        names = [None if name in left_out else output_name(name, raw_as) for name in rec.image_names]
-        new_cameras = [solution.rectified_cameras[str(key)] for key in self.ids.cameras]
-        write_colmap_model(folder / "sparse", rec, new_cameras, names, rgb, self.ids)
+            # turned cameras are further ones, in the same order in both
+            ids = replace(ids, cameras=[int(key) for key in solution.cameras])
+        new_cameras = [solution.rectified_cameras[str(key)] for key in ids.cameras]
+        as_text = options.sparse_format == "txt"
+        write_colmap_model(folder / "sparse", rec, new_cameras, names, rgb, ids, text=as_text)
+        if self.with_photos:
+            by_id = sorted((ids.images[i], name) for i, name in enumerate(names) if name is not None)
+            write_colmap_workspace(folder, [name for _, name in by_id])
+        write_point_cloud(folder / "points.ply", rec.points_w, rgb)
+        self._trajectory(folder / "poses.txt", solution)
         masks = mask_names([image.name for image in solution.images])
-        files = {
-            name: (f"images/{written}", f"masks/{masks[name]}")
-            for name, written in zip(rec.image_names, names, strict=True)
-            if written is not None
-        }
-        write_transforms(folder / "transforms.json", solution, files)
+        files = {name: (f"images/{new}", f"masks/{masks[name]}") for name, new in written.items()}
+        write_transforms(folder / "transforms.json", solution, files, "points.ply")
         return solution
+
+    def _trajectory(self, path: Path, solution: Solution) -> None:
+        """Write the poses by time if that of all photos is known, else by their place among all photos."""
+        posed = {k: image for k, image in enumerate(solution.images) if image.posed}
+        times = [self.times.get(image.name, np.nan) for image in posed.values()]
+        if not np.isfinite(times).all():
+            times = list(posed)
+        poses = [(image.R_cw, image.center_w) for image in posed.values()]
+        write_trajectory(path, np.array(times), np.array([R for R, _ in poses]), np.array([c for _, c in poses]))
+
+
+def relative_to(folder: Path, start: Path) -> PurePath:
+    """A folder seen from another; whole where nothing leads there, as between drives."""
+    try:
+        return PurePath(os.path.relpath(folder.resolve(), start.resolve()))
+    except ValueError:
+        return folder.resolve()
+
+
+@contextmanager
+def _only_warned_of() -> Iterator[None]:
+    """Trouble with the report loses no run."""
+    try:
+        yield
+    except Exception as error:
+        said = " ".join(str(error).split()) or type(error).__name__
+        warnings.warn(f"no report was written: {said}", RsUndistortWarning, stacklevel=4)

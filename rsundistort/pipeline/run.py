@@ -17,7 +17,7 @@ from .ladder import solve_photos
 from .load import load_photos
 from .options import RunOptions
 from .outcome import Outcome
-from .outputs import Outputs
+from .outputs import REPLACED, Outputs, photo_times
 from .progress import ProgressCallback, StageLog
 from .workers import Workers, use_threads
 
@@ -54,8 +54,7 @@ def run(
     log = StageLog(progress)
     workers = Workers(use_threads(options.jobs), options.scheduler)
     inputs = [photos] if options.masks is None else [photos, Path(options.masks)]
-    replaced = ("images", "masks", "sparse")
-    with output_folder(out, overwrite=options.overwrite, apart_from=inputs, replaced=replaced) as scratch:
+    with output_folder(out, overwrite=options.overwrite, apart_from=inputs, replaced=REPLACED) as scratch:
         gyro_log = None if options.gyro is None else options.gyro.log()
         source = find_photos(photos, scratch, options.camera, options.every, options.sharpest, log)
         folder = source.folder
@@ -95,6 +94,6 @@ def run(
                 "gyro": options.gyro and options.gyro.facts(),
             },
         )
-        outputs = Outputs.of_outcome(outcome, options, loaded.orientations)
+        outputs = Outputs.of_outcome(outcome, options, loaded.orientations, times=photo_times(folder))
         outputs.begin(scratch, log)
     return outputs.rectify(folder if source.frames is None else out / "frames", out, workers, log)

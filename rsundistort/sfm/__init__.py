@@ -1,6 +1,6 @@
 """Structure from motion around pycolmap: features, pairs, matching, mapping, re-triangulation."""
 
-from .database import MatchedPhotos
+from .database import MatchedPhotos, kept_log_level
 from .features import Features, detect_features
 from .imported import matched_of_database
 from .mapping import map_photos
@@ -14,6 +14,7 @@ __all__ = [
     "choose_pairs",
     "detect_features",
     "global_descriptors",
+    "kept_log_level",
     "map_photos",
     "match_photos",
     "matched_of_database",

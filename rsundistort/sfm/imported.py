@@ -97,9 +97,9 @@ def _features(keypoints: NDArray[np.float32]) -> Features:
 def _check_keypoints(source: Path, rec: Reconstruction, features: Sequence[Features]) -> None:
     """Refuse a database of other keypoints than the model's."""
     obs = rec.observations
-    for i, (name, found) in enumerate(zip(rec.image_names, features, strict=True)):
+    for name, found, mine in zip(rec.image_names, features, obs.by_photo(rec.num_images), strict=True):
         known = {tuple(xy) for xy in found.xy_raw.tolist()}
-        if not all(tuple(xy) in known for xy in obs.xy_raw[obs.frame_idx == i].tolist()):
+        if not all(tuple(xy) in known for xy in obs.xy_raw[mine].tolist()):
             raise InputError(f"{source} holds other keypoints of {name} than the model; give the model's own")
 
 

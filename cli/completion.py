@@ -1,0 +1,21 @@
+"""`rsundistort completion`."""
+
+from __future__ import annotations
+
+import click
+from click.shell_completion import get_completion_class
+
+
+@click.command()
+@click.argument("shell", type=click.Choice(("bash", "zsh", "fish")))
+def command(shell: str) -> None:
+    """Print what makes a shell complete commands and options.
+
+    For bash, in ~/.bashrc: eval "$(rsundistort completion bash)"; for zsh likewise in ~/.zshrc; for fish: rsundistort
+    completion fish > ~/.config/fish/completions/rsundistort.fish
+    """
+    from .main import cli
+
+    kind = get_completion_class(shell)
+    assert kind is not None
+    click.echo(kind(cli, {}, "rsundistort", "_RSUNDISTORT_COMPLETE").source())

@@ -1,0 +1,46 @@
+"""Models of other programs, told by what they are."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from ..errors import FileError, FormatError, InputError
+from .colmap_model import ColmapModel, read_colmap_model
+from .openmvg import openmvg_model
+from .opensfm import opensfm_model
+
+__all__ = ["read_model"]
+
+
+def read_model(path: Path) -> ColmapModel:
+    """The model of a folder (COLMAP), or of a JSON file (OpenMVG's sfm_data.json, OpenSfM's reconstruction.json).
+
+    Raises
+    ------
+    FileError, FormatError
+        When there is none, or one that cannot be taken.
+    """
+    path = Path(path)
+    if not path.is_file():
+        return read_colmap_model(path)
+    mend = "give the folder of a COLMAP model, OpenMVG's sfm_data.json or OpenSfM's reconstruction.json"
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise FileError(f"{path} cannot be read: {error.strerror}") from error
+    except ValueError as error:  # no JSON, or no text
+        raise FormatError(f"{path} is no model; {mend}") from error
+    try:
+        if isinstance(value, dict) and "sfm_data_version" in value:
+            return openmvg_model(value, str(path)).once_a_photo()
+        if isinstance(value, list) and value and isinstance(value[0], dict) and "shots" in value[0]:
+            return opensfm_model(value, path).once_a_photo()
+    except (FileError, FormatError):
+        raise
+    except InputError as error:
+        raise FormatError(f"{path}: {error}") from error
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+        missing = f"{error} is missing" if isinstance(error, KeyError) else " ".join(str(error).split())
+        raise FormatError(f"{path} is not whole: {missing}; write it again") from error
+    raise FormatError(f"{path} is no model; {mend}")
