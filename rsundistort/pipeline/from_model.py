@@ -20,7 +20,7 @@ from ..io.models import read_model
 from ..io.photos.images import stored_size
 from ..model import Reconstruction, Solution
 from ..model.orientation import INVERSE, turn_reconstruction
-from ..sfm import matched_of_database
+from ..sfm import kept_log_level, matched_of_database
 from .cameras import PhotoCameras, check_readouts
 from .gyro import known_readouts
 from .ladder import solve_tracks
@@ -139,7 +139,8 @@ def solve(
     options = options or SolveOptions()
     log = StageLog(progress)
     given = colmap_model_of(reconstruction)
-    outcome, ids, rgb = _solve(given, "the model", {}, options, None if database is None else Path(database), log)
+    with kept_log_level():
+        outcome, ids, rgb = _solve(given, "the model", {}, options, None if database is None else Path(database), log)
     outputs = Outputs.of_outcome(outcome, options, {}, ids, rgb)
     rec, solution = outputs.reconstruction, outputs.solution
     names = [output_name(name, options.raw_as) for name in rec.image_names]
