@@ -11,10 +11,11 @@ import click
 
 from .terminal import Talk
 
-# as `rsundistort.model.READOUTS`, `rsundistort.rectify.INTERPOLATIONS` and `MAP_KINDS`: not to be imported for --help
+# as in `model`, `rectify` and `pipeline`: not to be imported for --help
 READOUT_NAMES = ("top-to-bottom", "bottom-to-top", "left-to-right", "right-to-left")
 INTERPOLATION_NAMES = ("cubic", "linear", "lanczos", "nearest")
 MAP_KIND_NAMES = ("npz", "exr", "stmap")
+MATCHING_NAMES = ("auto", "exhaustive", "neighbours")
 
 
 def readout_by_group(

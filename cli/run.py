@@ -61,6 +61,14 @@ if TYPE_CHECKING:
     show_default=True,
     help="Features of a photo.",
 )
+@click.option(
+    "--matching",
+    type=click.Choice(opt.MATCHING_NAMES),
+    default="auto",
+    show_default=True,
+    help="Photos matched with each other: all; neighbours in order of capture, by GPS or in looks; auto: these beyond "
+    "more than 60.",
+)
 @opt.depth_option
 @opt.view_options
 @opt.interpolation_option
@@ -97,6 +105,7 @@ def command(
     photo_times: Path | None,
     remedy: str,
     max_features: int,
+    matching: str,
     depth: str,
     alpha: float | str | None,
     scale: float,
@@ -141,6 +150,7 @@ def command(
                 seed=seed,
                 jobs=jobs,
                 max_features=max_features,
+                matching=matching,
                 depth=depth,
                 view=ViewOptions(alpha, scale, max_size),
                 interpolation=interpolation,

@@ -182,6 +182,65 @@ def test_a_focal_plane_that_belies_the_35_mm_equivalent(tmp_path):
     assert facts_of(tmp_path, phone(sub={**plane, WIDTH: long(1632), HEIGHT: long(1224)})).sensor_width_mm is None
 
 
+# ---------------------------------------------------------------- when and where
+
+TAKEN, SUB_SECOND, GPS_IFD = 0x9003, 0x9291, 0x8825
+
+
+def rationals(*numbers, order="<"):
+    return 5, len(numbers), b"".join(struct.pack(order + "II", *number) for number in numbers)
+
+
+@pytest.mark.parametrize(
+    ("date", "fraction", "taken_s"),
+    [
+        ("1970:01:02 00:00:01", None, 86401.0),
+        ("2026:11:21 16:08:42", "25", 1795277322.25),
+        ("2026:11:21 16:08:42", "007 ", 1795277322.007),
+        ("2026:11:21 16:08:42", "a", 1795277322.0),
+        ("0000:00:00 00:00:00", None, None),
+        ("2026:13:21 16:08:42", None, None),
+        ("    :  :     :  :  ", "1", None),
+    ],
+)
+def test_time_of_capture(date, fraction, taken_s):
+    sub = {TAKEN: ascii_(date), **({} if fraction is None else {SUB_SECOND: ascii_(fraction)})}
+    assert facts_of_exif(phone(sub=sub)).taken_s == pytest.approx(taken_s)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize(
+    ("gps", "place_deg"),
+    [
+        (
+            (b"N", [(55, 1), (42, 1), (36, 1)], b"E", [(13, 1), (11, 1), (2550, 100)]),
+            (55.71, 13 + 11 / 60 + 25.5 / 3600),
+        ),
+        ((b"S", [(5571, 100), (0, 1), (0, 1)], b"W", [(1319, 100)]), (-55.71, -13.19)),
+        ((b"N", [(0, 1)] * 3, b"E", [(0, 1)] * 3), None),
+        ((b"N", [(0, 0)] * 3, b"E", [(13, 1)] * 3), None),
+        ((b"N", [(91, 1)] * 3, b"E", [(13, 1)] * 3), None),
+        ((b"?", [(51, 1)] * 3, b"E", [(13, 1)] * 3), None),
+        ((b"N", [], b"E", [(13, 1)] * 3), None),
+    ],
+)
+def test_place_by_gps(order, gps, place_deg):
+    north, latitude, east, longitude = gps
+    entries = {
+        1: (2, 2, north + b"\0"), 2: rationals(*latitude, order=order),
+        3: (2, 2, east + b"\0"), 4: rationals(*longitude, order=order),
+    }  # fmt: skip
+    place = facts_of_exif(with_gps(entries, order)).place_deg
+    assert place == (None if place_deg is None else pytest.approx(place_deg, abs=1e-9))
+
+
+def with_gps(entries, order):
+    """A block whose second directory is that of GPS."""
+    block = bytearray(exif_block({}, entries, order))
+    struct.pack_into(order + "H", block, 10, GPS_IFD)
+    return bytes(block)
+
+
 # ---------------------------------------------------------------- damaged
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,6 +27,7 @@ from ..errors import ReconstructionError, RsUndistortWarning
 from ..model import Reconstruction
 from ..sfm import MatchedPhotos, map_photos, match_photos, retriangulate
 from .load import LoadedPhotos
+from .pairing import pairs_to_match
 from .progress import StageLog
 
 __all__ = ["Solved", "rungs_to", "solve_photos", "solve_tracks"]
@@ -126,6 +128,7 @@ def solve_photos(
     scratch: Path,
     log: StageLog,
     remedy: str = "auto",
+    matching: str = "auto",
 ) -> Solved:
     """Match, map, climb the ladder; then free the keypoints of the shutter, rebuild the tracks and adjust again.
 
@@ -145,14 +148,17 @@ def solve_photos(
         Told the progress.
     remedy : str
         What to do about a critical motion, of `critical.REMEDIES`.
+    matching : str
+        Which photos are matched with each other, of `pairing.MATCHINGS`.
     """
     cameras = photos.cameras
     log.begin("matching")
+    pairs, num_pairs = pairs_to_match(photos, matching, seed), math.comb(len(photos.names), 2)
     matched = match_photos(
         scratch / "database.db", photos.names, photos.features, cameras.cameras, cameras.camera_idx,
-        calibrated=cameras.calibrated, seed=seed,
+        calibrated=cameras.calibrated, seed=seed, pairs=pairs,
     )  # fmt: skip
-    log.end("matching")
+    log.end("matching", pairs=num_pairs if pairs is None else len(pairs), of_pairs=num_pairs)
     log.begin("mapping", len(photos.names))
     mapped = map_photos(matched, lambda done: log.tell("mapping", done, len(photos.names)))
     log.end("mapping", photos=mapped.num_images, points=mapped.num_points, observations=len(mapped.observations))

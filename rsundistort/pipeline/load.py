@@ -25,8 +25,8 @@ class LoadedPhotos:
 
     Attributes
     ----------
-    names, features : lists of length m
-        Readable photos.
+    names, features, facts : lists of length m
+        Readable photos, and what their EXIF says.
     skipped : dict of name to reason
         Unreadable ones.
     cameras : PhotoCameras
@@ -37,6 +37,7 @@ class LoadedPhotos:
 
     names: list[str]
     features: list[Features]
+    facts: list[ExifFacts]
     skipped: dict[str, str]
     cameras: PhotoCameras
     orientations: Mapping[str, int]
@@ -144,4 +145,4 @@ def load_photos(
     cameras = find_cameras(folder, names, sizes, facts, camera, readout)
     log.end("features", photos=len(names), keypoints=sum(len(f.xy_raw) for f in features))
     orientations = {name: each.orientation for name, each in zip(names, found, strict=True)}
-    return LoadedPhotos(names, features, skipped, cameras, orientations)
+    return LoadedPhotos(names, features, facts, skipped, cameras, orientations)

@@ -15,6 +15,7 @@ from ..model import READOUTS, Reconstruction, check_shutter_model
 from .cameras import PhotoCameras, check_readouts
 from .depth import check_depth
 from .gyro import GyroOptions
+from .pairing import MATCHINGS
 from .photo import RectifyOptions
 
 __all__ = ["GUESSED", "GUESS_SIGMA", "RunOptions", "SolveOptions"]
@@ -144,6 +145,9 @@ class RunOptions(SolveOptions):
         Per photo.
     every, sharpest : int, optional
         Of a video: each N-th frame, or the sharpest of each N frames, as in `io.extract_frames`.
+    matching : str
+        Photos matched with each other: "exhaustive", all; "neighbours", those taken one after the other, near by GPS,
+        or that look alike; "auto", neighbours in sets of more than 60.
     gyro : GyroOptions, optional
         A gyroscope's log, for the motions that are neither `known` nor those of `still` photos.
     """
@@ -152,9 +156,12 @@ class RunOptions(SolveOptions):
     max_features: int = 16384
     every: int | None = None
     sharpest: int | None = None
+    matching: str = "auto"
     gyro: GyroOptions | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.max_features < 100:
             raise InputError(f"max_features={self.max_features!r}, expected at least 100")
+        if self.matching not in MATCHINGS:
+            raise InputError(f"matching={self.matching!r}, expected one of {', '.join(MATCHINGS)}")

@@ -76,7 +76,7 @@ def run(
         with tempfile.TemporaryDirectory() as work:
             solved = solve_photos(
                 loaded, options.shutter_model, options.seed, lambda rec: options.options_for(rec, cameras),
-                Path(work), log, options.remedy,
+                Path(work), log, options.remedy, options.matching,
             )  # fmt: skip
         rec = solved.result.reconstruction
         if contradiction := gyro_contradiction(rec, from_gyro):
@@ -89,6 +89,7 @@ def run(
             readouts,
             {
                 "max_features": options.max_features,
+                "matching": options.matching,
                 "video": source.video,
                 "gyro": options.gyro and options.gyro.facts(),
             },

@@ -1,16 +1,19 @@
-"""Structure from motion around pycolmap: features, matching, mapping, re-triangulation."""
+"""Structure from motion around pycolmap: features, pairs, matching, mapping, re-triangulation."""
 
 from .database import MatchedPhotos, kept_log_level
 from .features import Features, detect_features
 from .imported import matched_of_database
 from .mapping import map_photos
 from .matching import match_photos
+from .pairs import choose_pairs, global_descriptors
 from .retriangulation import retriangulate
 
 __all__ = [
     "Features",
     "MatchedPhotos",
+    "choose_pairs",
     "detect_features",
+    "global_descriptors",
     "kept_log_level",
     "map_photos",
     "match_photos",

@@ -51,7 +51,7 @@ class MatchedPhotos:
     Attributes
     ----------
     database : Path
-        pycolmap's database; image ids are 1 + index of the photo.
+        pycolmap's database; image ids are 1 + index of the photo, and so are its images' names.
     names, features : sequences of length m
         Photos.
     cameras, camera_idx : cameras, and the camera of each photo
@@ -142,9 +142,10 @@ def write_photos(db: Any, matched: MatchedPhotos, limit: int | None = None) -> N
         rig = pycolmap.Rig()
         rig.add_ref_sensor(colmap_camera.sensor_id)
         rig_ids.append(db.write_rig(rig))
-    for index, (name, found) in enumerate(zip(matched.names, matched.features, strict=True)):
+    for index, found in enumerate(matched.features):
         camera_index = int(matched.camera_idx[index])
-        image = pycolmap.Image(name=name, camera_id=camera_index + 1, image_id=index + 1)
+        # lists of pairs are of names between spaces: the photo's own may hold some
+        image = pycolmap.Image(name=str(index + 1), camera_id=camera_index + 1, image_id=index + 1)
         db.write_image(image, use_image_id=True)
         frame = pycolmap.Frame()
         frame.rig_id = rig_ids[camera_index]
@@ -197,7 +198,7 @@ def from_pycolmap(model: Any, matched: MatchedPhotos, posed: Reconstruction | No
     Poses, cameras and motions are `posed`'s when it is given (triangulation leaves them alone), else the model's.
     """
     ids = sorted(i for i in model.reg_image_ids())
-    names = [model.images[i].name for i in ids]
+    names = [matched.names[i - 1] for i in ids]
     frame_idx, point_idx, keypoint, track_points = [], [], [], []
     frame_of = {image_id: k for k, image_id in enumerate(ids)}
     for number, point_id in enumerate(sorted(model.point3D_ids())):
@@ -214,19 +215,19 @@ def from_pycolmap(model: Any, matched: MatchedPhotos, posed: Reconstruction | No
     if not track_points:
         raise ReconstructionError("the photos were joined, but no scene point could be triangulated")
     frame = np.array(frame_idx)
-    kp = np.array(keypoint)
-    xy_raw, sigma = np.empty((len(frame), 2)), np.empty(len(frame))
-    for k, image_id in enumerate(ids):
-        of_photo = frame == k
-        xy_raw[of_photo] = matched.features[image_id - 1].xy_raw[kp[of_photo]]
-        sigma[of_photo] = matched.features[image_id - 1].sigma[kp[of_photo]]
+    found = [matched.features[image_id - 1] for image_id in ids]
+    start = np.concatenate([[0], np.cumsum([len(each.sigma) for each in found])])
+    at = start[frame] + keypoint
+    xy_raw = np.concatenate([each.xy_raw for each in found])[at]
+    sigma = np.concatenate([each.sigma for each in found])[at]
     observations = Observations(frame, np.array(point_idx), xy_raw, sigma)
     points_w = np.array(track_points)
     if posed is not None:
-        at = [posed.image_names.index(name) for name in names]
+        index_of = {name: i for i, name in enumerate(posed.image_names)}
+        of = [index_of[name] for name in names]
         return Reconstruction(
-            posed.cameras, names, posed.camera_idx[at], posed.R_cw[at], posed.center_w[at], points_w, observations,
-            posed.phi[at], posed.velocity[at], posed.shutter_model,
+            posed.cameras, names, posed.camera_idx[of], posed.R_cw[of], posed.center_w[of], points_w, observations,
+            posed.phi[of], posed.velocity[of], posed.shutter_model,
         )  # fmt: skip
     poses = np.array([model.images[i].cam_from_world().matrix() for i in ids])
     R_cw = poses[:, :, :3]

@@ -19,6 +19,11 @@ __all__ = ["map_photos"]
 # when the tracks are rebuilt. (herz-jesus-8: 16384 keypoints map in 4.7 s, 4096 of them in 1.1 s, poses alike.)
 _MAPPING_KEYPOINTS = 4096
 
+# Beyond this many photos all of them are adjusted together whenever there are 1.4 times as many, not 1.1 times as pycolmap
+# has it, and less far: along a street each adjustment takes the longer, and our own follows. (250 photos of
+# benchmarks/large_sets.py: 96 s with pycolmap's, SECONDS s.)
+_LARGE = 60
+
 
 def _mapping_database(matched: MatchedPhotos, folder: Path, limit: int | None) -> Path:
     """A database of the strongest keypoints (all: None) and the verified matches among them."""
@@ -26,15 +31,13 @@ def _mapping_database(matched: MatchedPhotos, folder: Path, limit: int | None) -
     path = folder / "mapping.db"
     with pycolmap.Database.open(matched.database) as db, pycolmap.Database.open(path) as small:
         write_photos(small, matched, limit)
-        for i in range(1, len(matched.names) + 1):
-            for j in range(i + 1, len(matched.names) + 1):
-                if not db.exists_two_view_geometry(i, j):
-                    continue
-                pair = db.read_two_view_geometry(i, j)
-                matches = np.asarray(pair.inlier_matches)
-                if limit is not None and len(matches):
-                    pair.inlier_matches = matches[(matches < limit).all(1)]
-                small.write_two_view_geometry(i, j, pair)
+        for pair_id in sorted(db.read_two_view_geometry_num_inliers()[0]):
+            i, j = pycolmap.pair_id_to_image_pair(pair_id)
+            pair = db.read_two_view_geometry(i, j)
+            matches = np.asarray(pair.inlier_matches)
+            if limit is not None and len(matches):
+                pair.inlier_matches = matches[(matches < limit).all(1)]
+            small.write_two_view_geometry(i, j, pair)
     return path
 
 
@@ -96,7 +99,7 @@ def _best_model(
             _mapping_database(matched, work, limit),
             work,
             work,
-            pipeline_options(loose, matched.seed, not matched.calibrated, total),
+            _mapping_options(loose, matched),
             next_image_callback=on_next_image,
         )
         for model in models.values():
@@ -106,6 +109,15 @@ def _best_model(
         if best_count[0] == total:
             break
     return best
+
+
+def _mapping_options(loose: float, matched: MatchedPhotos) -> Any:
+    options = pipeline_options(loose, matched.seed, not matched.calibrated, len(matched.names))
+    if len(matched.names) > _LARGE:
+        options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
+        options.ba_global_function_tolerance = 1e-4
+        options.ba_global_max_refinements = 2
+    return options
 
 
 def _refined_camera(refined: Any, camera: Camera) -> Camera:

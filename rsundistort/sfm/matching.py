@@ -24,8 +24,9 @@ def match_photos(
     *,
     calibrated: bool = True,
     seed: int = 0,
+    pairs: NDArray[np.int64] | None = None,
 ) -> MatchedPhotos:
-    """Match all photos with each other and verify the pairs, with room for shutter distortion.
+    """Match photos with each other and verify the pairs, with room for shutter distortion.
 
     Parameters
     ----------
@@ -37,6 +38,8 @@ def match_photos(
         Whether the cameras are known.
     seed : int
         Seed of the verification.
+    pairs : (p, 2) int array, optional
+        Photos to match with each other, as `choose_pairs` gives them; by default each with all others.
     """
     pycolmap = quiet_pycolmap()
     matched = MatchedPhotos(database, tuple(names), tuple(features), tuple(cameras), camera_idx, calibrated, seed)
@@ -47,7 +50,14 @@ def match_photos(
             db.write_descriptors(index + 1, pycolmap.FeatureDescriptors(type=sift, data=found.descriptors))
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
-    pycolmap.match_exhaustive(
-        database, matching, verification_options=verification_options(4.0 * LOOSE, seed), device=pycolmap.Device.cpu
-    )
+    verification = verification_options(4.0 * LOOSE, seed)
+    if pairs is None:
+        pycolmap.match_exhaustive(database, matching, verification_options=verification, device=pycolmap.Device.cpu)
+    else:
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = database.with_name("pairs.txt")
+        np.savetxt(pairing.match_list_path, np.asarray(pairs) + 1, fmt="%d")
+        pycolmap.match_image_pairs(
+            database, matching, pairing, verification_options=verification, device=pycolmap.Device.cpu
+        )
     return matched

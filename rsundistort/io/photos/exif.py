@@ -13,6 +13,7 @@ from dataclasses import dataclass
 __all__ = [
     "COLOR_SPACE",
     "EXIF_IFD",
+    "GPS_IFD",
     "MAKER_NOTE",
     "ORIENTATION",
     "Damaged",
@@ -155,6 +156,14 @@ class TiffStructure:
         """All values of an entry of whole numbers."""
         form = {1: "B", _SHORT: "H", _LONG: "I", 16: "Q"}[entry.kind]
         return struct.unpack_from(f"{self.order}{entry.count}{form}", self.data, entry.value_at)
+
+    def fractions(self, entry: Entry) -> tuple[float, ...]:
+        """All values of an entry of fractions; none if it is of another type, or if one is over nothing."""
+        if entry.kind not in (5, 10):
+            return ()
+        numbers = struct.unpack_from(f"{self.order}{_FORMS[entry.kind] * entry.count}", self.data, entry.value_at)
+        pairs = list(zip(numbers[::2], numbers[1::2], strict=True))
+        return tuple(a / b for a, b in pairs) if all(b for _, b in pairs) else ()
 
     def main(self) -> tuple[dict[int, Entry], int, int]:
         """The entries of IFD0 by tag; its link to the next IFD and where that leads."""

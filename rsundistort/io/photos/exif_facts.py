@@ -1,9 +1,10 @@
-"""What a photo's EXIF says of its camera."""
+"""What a photo's EXIF says of its camera, and of when and where it was taken."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from ...errors import RsUndistortError
 from ...model import Camera
 from .containers import metadata_of
-from .exif import EXIF_IFD, ORIENTATION, Damaged, TiffStructure
+from .exif import EXIF_IFD, GPS_IFD, ORIENTATION, Damaged, Entry, TiffStructure
 from .heif import heif_metadata
 from .kinds import kind_of_content
 
@@ -23,13 +24,16 @@ _MAKE, _MODEL, _FOCAL_LENGTH, _DIGITAL_ZOOM_RATIO = 0x010F, 0x0110, 0x920A, 0xA4
 _FOCAL_LENGTH_IN35MM_FILM, _BODY_SERIAL_NUMBER, _LENS_MODEL = 0xA405, 0xA431, 0xA434
 _EXIF_IMAGE_WIDTH, _EXIF_IMAGE_HEIGHT = 0xA002, 0xA003
 _FOCAL_PLANE_X_RESOLUTION, _FOCAL_PLANE_RESOLUTION_UNIT = 0xA20E, 0xA210
+_DATE_TIME_ORIGINAL, _SUB_SEC_TIME_ORIGINAL = 0x9003, 0x9291
+# of the GPS IFD: the letter of a hemisphere, and behind it degrees, minutes and seconds
+_LATITUDE_REF, _LONGITUDE_REF = 0x0001, 0x0003
 # mm per FocalPlaneResolutionUnit: inch, cm, mm, micrometre
 _UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 
 
 @dataclass(frozen=True)
 class ExifFacts:
-    """What a photo's EXIF says of its camera; None where it says nothing that can be believed.
+    """What a photo's EXIF says of its camera and of its capture; None where it says nothing that can be believed.
 
     Attributes
     ----------
@@ -47,6 +51,10 @@ class ExifFacts:
         1 to 8; how to turn the stored pixels for a person.
     width, height : int or None
         Size of the photo in pixels, as EXIF claims it.
+    taken_s : float or None
+        When it was taken, by the camera's clock: seconds since the beginning of 1970 there.
+    place_deg : (float, float) or None
+        Latitude and longitude by GPS, north and east positive.
     """
 
     make: str | None = None
@@ -60,6 +68,8 @@ class ExifFacts:
     orientation: int | None = None
     width: int | None = None
     height: int | None = None
+    taken_s: float | None = None
+    place_deg: tuple[float, float] | None = None
 
 
 def read_exif(path: Path) -> ExifFacts:
@@ -87,7 +97,9 @@ def facts_of_exif(block: bytes) -> ExifFacts:
         structure = TiffStructure(block.removeprefix(b"Exif\0\0"))
         main = structure.main()[0]
         entries = {**structure.sub(main, EXIF_IFD, "the Exif IFD"), **main}
-        return _facts({tag: structure.first_value(entry) for tag, entry in entries.items()})
+        gps = structure.sub(main, GPS_IFD, "the GPS IFD")
+        facts = _facts({tag: structure.first_value(entry) for tag, entry in entries.items()})
+        return replace(facts, place_deg=_place(structure, gps))
     except Damaged:
         return ExifFacts()
 
@@ -129,7 +141,33 @@ def _facts(tags: dict[int, bytes | float | None]) -> ExifFacts:
         orientation=whole(ORIENTATION, 1, 8),
         width=width,
         height=height,
+        taken_s=_taken(text(_DATE_TIME_ORIGINAL), text(_SUB_SEC_TIME_ORIGINAL)),
     )
+
+
+def _taken(date: str | None, fraction: str | None) -> float | None:
+    """Seconds of "2026:11:21 16:08:42" and the digits behind the seconds."""
+    try:
+        whole = datetime.strptime(date or "", "%Y:%m:%d %H:%M:%S") - datetime(1970, 1, 1)
+    except ValueError:
+        return None
+    digits = (fraction or "").strip()
+    return whole.total_seconds() + (float(f"0.{digits}") if digits.isascii() and digits.isdigit() else 0.0)
+
+
+def _place(structure: TiffStructure, gps: dict[int, Entry]) -> tuple[float, float] | None:
+    """Latitude and longitude; None for the place in the Atlantic where cameras without a fix are."""
+    degrees = []
+    for ref, positive, negative, most in ((_LATITUDE_REF, b"N", b"S", 90), (_LONGITUDE_REF, b"E", b"W", 180)):
+        if ref not in gps or ref + 1 not in gps:
+            return None
+        parts = structure.fractions(gps[ref + 1])
+        value = sum(part / 60**k for k, part in enumerate(parts))
+        letter = structure.value(gps[ref])[:1].upper()
+        if not 1 <= len(parts) <= 3 or letter not in (positive, negative) or not 0 <= value <= most:
+            return None
+        degrees.append(value if letter == positive else -value)
+    return None if degrees == [0, 0] else (degrees[0], degrees[1])
 
 
 def _text(value: bytes | float | None) -> str | None:

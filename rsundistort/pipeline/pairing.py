@@ -1,0 +1,66 @@
+"""Which photos of a run are matched with each other."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..io import ExifFacts
+from ..sfm import choose_pairs, global_descriptors
+from .load import LoadedPhotos
+
+__all__ = ["MATCHINGS", "capture_sequences", "pairs_to_match", "places_of"]
+
+#: "auto" is "exhaustive" for small sets, and "neighbours" where that spares half of the pairs or more.
+MATCHINGS = ("auto", "exhaustive", "neighbours")
+
+# neighbours are about 25 for each photo
+_EXHAUSTIVE_TO = 60
+_EARTH_RADIUS_M = 6371e3
+
+
+def pairs_to_match(photos: LoadedPhotos, matching: str, seed: int) -> NDArray[np.int64] | None:
+    """Photos that are neighbours in the order of capture, by GPS or in looks; None for all pairs there are."""
+    num_photos = len(photos.names)
+    if matching == "exhaustive" or (matching == "auto" and num_photos <= _EXHAUSTIVE_TO):
+        return None
+    return choose_pairs(
+        num_photos,
+        capture_sequences(photos.names, photos.cameras.camera_idx, photos.facts),
+        places_of(photos.facts),
+        global_descriptors([each.descriptors for each in photos.features], seed),
+    )
+
+
+def capture_sequences(
+    names: Sequence[str], camera_idx: NDArray[np.int64], facts: Sequence[ExifFacts]
+) -> list[NDArray[np.int64]]:
+    """The photos of each camera in the order of capture: by its clock, else by the numbers in their names.
+
+    Clocks of several cameras differ, so each has a sequence of its own. Of a camera some of whose photos hold no time,
+    only the names count; they also tell apart what was taken in the same second.
+    """
+    sequences = []
+    for camera in range(int(camera_idx.max()) + 1):
+        mine = np.flatnonzero(camera_idx == camera).tolist()
+        timed = all(facts[k].taken_s is not None for k in mine)
+        order = sorted(mine, key=lambda k: ((facts[k].taken_s or 0.0) if timed else 0.0, _natural(names[k])))
+        sequences.append(np.array(order, np.int64))
+    return sequences
+
+
+def _natural(name: str) -> tuple[tuple[int, str], ...]:
+    """What sorts 9.jpg before 10.jpg."""
+    parts = re.split(r"([0-9]+)", name)
+    return (*((int(part), "") if k % 2 else (-1, part) for k, part in enumerate(parts)), (-1, name))
+
+
+def places_of(facts: Sequence[ExifFacts]) -> NDArray[np.float64]:
+    """(m, 3) places by GPS at sea level, metres from the centre of the Earth; NaN where a photo has none."""
+    latitude, longitude = np.deg2rad([fact.place_deg or (np.nan, np.nan) for fact in facts]).T
+    return _EARTH_RADIUS_M * np.column_stack(
+        [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)]
+    )
