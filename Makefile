@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= demo-out
 
-.PHONY: demo test test-all check format bench figures clean
+.PHONY: demo test test-all check format docs bench figures clean
 
 # made again when the dependencies change
 $(VENV)/.installed: pyproject.toml
@@ -21,6 +21,7 @@ demo: $(VENV)/.installed
 	@echo "Look at: sample_scenes/courtyard/photos/0003.jpg (the rolling shutter bent it)"
 	@echo "         $(OUT)/images/0003.jpg (rectified)"
 	@echo "         sample_scenes/courtyard/global/0003.jpg (the truth)"
+	@echo "Open $(OUT)/report.html in a browser: before and after, the cameras in 3-D, whether to trust it."
 	@echo "Open $(OUT)/sparse in COLMAP, or $(OUT)/transforms.json in nerfstudio."
 
 test: $(VENV)/.installed
@@ -29,11 +30,15 @@ test: $(VENV)/.installed
 test-all: $(VENV)/.installed
 	$(BIN)/python -m pytest -m "slow or not slow"
 
-check: $(VENV)/.installed
+check: $(VENV)/.installed docs
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# Markdown of docs/ as a site, in docs/_build/html; a warning is an error, and so is a link to what is not there
+docs: $(VENV)/.installed
+	$(BIN)/sphinx-build -q -E -W --keep-going -b html docs docs/_build/html
 
 format: $(VENV)/.installed
 	$(BIN)/ruff format .
@@ -46,9 +51,10 @@ bench: $(VENV)/.installed
 # the other figures of the README; needs ../shared
 figures: $(VENV)/.installed
 	$(BIN)/python benchmarks/accuracy.py
+	$(BIN)/python benchmarks/worth.py
 	$(BIN)/python benchmarks/truth.py
 	$(BIN)/python benchmarks/depth.py
 	$(BIN)/python benchmarks/solve.py
 
 clean:
-	rm -rf $(VENV) $(OUT) build *.egg-info
+	rm -rf $(VENV) $(OUT) docs/_build build *.egg-info

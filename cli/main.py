@@ -15,6 +15,7 @@ _COMMANDS = {
     "simulate": "Photos with a known shutter motion.",
     "evaluate": "Errors of a run against the truth.",
     "experiment": "The paper's experiments, on any scene.",
+    "report": "The report of a run again, or its figures for papers.",
     "info": "Versions, threads and optional parts.",
     "completion": "What makes a shell complete commands and options.",
 }

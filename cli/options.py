@@ -111,6 +111,9 @@ progress_option: Decorator = click.option(
     show_default=True,
     help="json: lines on stdout for other programs, and nothing else there.",
 )
+report_option: Decorator = click.option(
+    "--report/--no-report", default=True, help="Write OUT/report.html; rsundistort report makes it later, too."
+)
 json_option: Decorator = click.option(
     "--json", "as_json", is_flag=True, help="One JSON object on stdout at the end, instead of what is for people."
 )

@@ -75,6 +75,7 @@ if TYPE_CHECKING:
 @opt.jobs_option
 @opt.scheduler_option
 @opt.overwrite_option
+@opt.report_option
 @opt.talk_options
 def command(
     photos: Path,
@@ -112,12 +113,13 @@ def command(
     jobs: int,
     scheduler: str | None,
     overwrite: bool,
+    report: bool,
     talk: Talk,
 ) -> None:
     """Find how the camera moved during each photo's readout, and take it out.
 
     PHOTOS is a folder of photos that one camera took of one scene, in any order, or a video. OUT gets images/, masks/,
-    sparse/ (COLMAP), transforms.json (nerfstudio) and solution.json; of a video frames/, too.
+    sparse/ (COLMAP), transforms.json (nerfstudio), solution.json and report.html; of a video frames/, too.
 
     OUT stays as it was until the motions are solved. If the rest is interrupted, `rectify --resume` goes on with it.
     Exit code 3 says that photos with a motion could not be rectified; they are listed, and the others are done.
@@ -160,6 +162,7 @@ def command(
                 readout_s=readout_s,
                 overwrite=overwrite,
                 scheduler=scheduler,
+                report=report,
             ),
             progress,
         )

@@ -49,6 +49,7 @@ from .terminal import Talk, errors_for_people, progress_bars
 @opt.jobs_option
 @opt.scheduler_option
 @opt.overwrite_option
+@opt.report_option
 @opt.talk_options
 def command(
     model: Path,
@@ -80,6 +81,7 @@ def command(
     jobs: int,
     scheduler: str | None,
     overwrite: bool,
+    report: bool,
     talk: Talk,
 ) -> None:
     """Find how the camera moved during each photo's readout, from a model of COLMAP, OpenMVG or OpenSfM.
@@ -122,6 +124,7 @@ def command(
                 readout_s=readout_s,
                 overwrite=overwrite,
                 scheduler=scheduler,
+                report=report,
             ),
             images=images,
             database=database,

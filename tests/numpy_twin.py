@@ -71,7 +71,7 @@ def two_step(xy, phi, readout):
 
 
 def linearized(xy, phi, readout):
-    """Paper Eq. 6: the pixel at (I + t [phi]x) x', whose own clock is t; bisection on t."""
+    """Paper Eq. 5: the pixel at (I + t [phi]x) x', whose own clock is t; bisection on t."""
     rays = np.column_stack([xy, np.ones(len(xy))])
 
     def turned(t):

@@ -650,7 +650,7 @@ def test_what_was_done_before_is_not_in_the_rate(capsys, monkeypatch):
 
     clock = iter([0.0, 2.0])
     monkeypatch.setattr(terminal.time, "perf_counter", lambda: next(clock))
-    with terminal.progress_bars(False, "json") as progress:
+    with terminal.progress_bars(terminal.Talk(progress="json")) as progress:
         progress("rectifying", 80, 100)
         progress("rectifying", 90, 100)
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]

@@ -113,7 +113,7 @@ def test_meter_equals_finite_differences_of_the_equations_of_self_calibration(se
         rows = []
 
         def equations(x, reference=reference):
-            """Eqs. 15 and 16 of the paper, f = 1, omega of the others scaled to omega_33 = 1."""
+            """Eqs. 15 and 18 of the paper, f = 1, omega of the others scaled to omega_33 = 1."""
             K = np.array([[1, x[0], 0], [0, 1 + x[1], 0], [0, 0, 1]])
             # their skew is s f and their aspect ratio alpha f with alpha = 1 + da: omega = K K'
             omega = K @ K.T

@@ -2,19 +2,15 @@
 
 import doctest
 import importlib
+from pathlib import Path
 
 import pytest
 
-MODULES = (
-    "rsundistort",
-    "rsundistort.io.groups",
-    "rsundistort.io.readout_times",
-    "rsundistort.model.camera",
-    "rsundistort.model.checks",
-    "rsundistort.model.motion",
-    "rsundistort.model.projection",
-    "rsundistort.rectify.maps",
-    "rsundistort.testing",
+ROOT = Path(__file__).resolve().parent.parent
+MODULES = sorted(
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    for path in (ROOT / "rsundistort").rglob("*.py")
+    if "\n    >>> " in path.read_text(encoding="utf-8") or "\n>>> " in path.read_text(encoding="utf-8")
 )
 
 

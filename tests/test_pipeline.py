@@ -121,8 +121,8 @@ def test_twins_are_nearer_to_the_rectified_photos(courtyard, solved, tmp_path):
 def test_outputs_of_a_run(solved):
     solution, out, _ = solved
     assert sorted(p.name for p in out.iterdir()) == [
-        "images", "masks", "points.ply", "poses.txt", "run-colmap-geometric.sh", "run-colmap-photometric.sh",
-        "solution.json", "sparse", "stereo", "transforms.json",
+        "images", "masks", "points.ply", "poses.txt", "report.html", "report.npz", "run-colmap-geometric.sh",
+        "run-colmap-photometric.sh", "solution.json", "sparse", "stereo", "transforms.json",
     ]  # fmt: skip
     assert sorted(p.name for p in (out / "images").iterdir()) == COURTYARD_NAMES
     assert sorted(p.name for p in (out / "masks").iterdir()) == COURTYARD_NAMES

@@ -277,7 +277,9 @@ def test_measurements_that_colmap_threw_away_come_back(tmp_path, rng):
                 scene.model.delete_observation(image.image_id, k)
     cut = scene.model.compute_num_observations()
     assert cut < 0.75 * whole
+    level = pycolmap.logging.minloglevel
     out, solution = rs.solve(scene.model, OPTIONS, database=database)
+    assert pycolmap.logging.minloglevel == level
     assert out.compute_num_observations() >= 0.95 * whole
     assert np.abs(phi_errors(solution, scene)).max() < 2.5e-3
     assert len(set(out.point3D_ids()) & set(scene.model.point3D_ids())) >= 0.9 * scene.model.num_points3D()

@@ -336,15 +336,20 @@ def test_the_folder_must_be_empty_or_hold_a_batch(remote):
 
 
 @pytest.mark.parametrize(
-    ("photos", "out", "said"),
+    ("source", "out", "said"),
     [
-        ("memory://b/in", "memory://b/in/", "holds the photos"),
-        ("memory://b/out/images", "memory://b/out", "would be replaced by the outputs"),
-        ("memory://b/out/images/sub", "memory:///b/out", "would be replaced by the outputs"),
+        ("memory://bucket/in", "memory:///bucket/in/", "memory:///bucket/in holds the photos"),
+        ("memory://bucket/out/images", "memory://bucket/out", "images would be replaced by the outputs"),
+        ("memory://bucket/out/also/in", "memory:///bucket/out", "also/in would be replaced by the outputs"),
     ],
 )
-def test_outputs_do_not_replace_the_photos(photos, memory, out, said, request):
-    folder, _ = request.getfixturevalue("photos") if not isinstance(photos, str) else (None, None)
+def test_photos_among_the_outputs_are_not_replaced(photos, memory, source, out, said):
+    folder, _ = photos
+    put(memory, folder / "in", source)
+    before = held(memory, "memory://")
+    with pytest.raises(FileError, match=said):
+        rectify_folder(source, folder / "s.json", out, overwrite=True)
+    assert held(memory, "memory://") == before
 
 
 def test_names_that_leave_the_folder_are_refused(remote):

@@ -227,7 +227,7 @@ def _shutter_two_step(X, Y, q0, q1, q2, d):
 
 @kernel(forceinline=True)
 def _shutter_linearized(X, Y, q0, q1, q2, d):
-    """Paper Eq. 6 for row readout, with the implicit row solved in closed form; d as in the two-step model."""
+    """Paper Eq. 5 for row readout, with the implicit row solved in closed form; d as in the two-step model."""
     a = q0 * Y - q1 * X
     b = 1.0 + q0 - q2 * X
     disc = b * b + 4.0 * a * Y

@@ -114,7 +114,7 @@ def critical_motion(
 
     To first order a turning rolling-shutter camera is one whose skew and aspect ratio are unknown in every photo (Ito
     and Okatani, Eq. 9). What is then known of each photo, focal length and principal point, gives three equations for
-    the reference photo's skew and aspect ratio and the plane at infinity (their Eqs. 15 and 16, linearised where the
+    the reference photo's skew and aspect ratio and the plane at infinity (their Eqs. 15 and 18, linearised where the
     camera stands still); `docs/critical-motions.md` derives them.
 
     Parameters

@@ -103,8 +103,15 @@ def solution_to_bytes(solution: Solution) -> bytes:
     return (json.dumps(solution_to_json(solution), indent=1) + "\n").encode()
 
 
-def read_solution(path: Path) -> Solution:
+def read_solution(path: Path, newer: bool = False) -> Solution:
     """Read a solution or a ground-truth file.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    newer : bool
+        Read one of a newer version as if it were of this, as far as that goes.
 
     Raises
     ------
@@ -120,10 +127,10 @@ def read_solution(path: Path) -> Solution:
         raise FormatError(f"{path} is no valid JSON: {error}") from error
     if not isinstance(value, dict) or value.get("format") != FORMAT:
         raise FormatError(f"{path} is no solution: its format is not {FORMAT!r}")
-    if value.get("version") != VERSION:
+    version = value.get("version")
+    if version != VERSION and not (newer and isinstance(version, int) and version > VERSION):
         raise FormatError(
-            f"{path} has version {value.get('version')!r} of the format, this program reads {VERSION}; "
-            "update rsundistort"
+            f"{path} has version {version!r} of the format, this program reads {VERSION}; update rsundistort"
         )
     try:
         return _solution_from_json(value, str(path))

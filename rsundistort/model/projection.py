@@ -48,7 +48,7 @@ def project_points(
     motion : RowMotion, optional
         Motion during the readout, its velocity in the camera frame too; none when left out.
     shutter_model : {"global", "two-step", "linearized", "rotation", "constant-motion"}
-        Row model: paper Eqs. 8-9, Eq. 6, Eq. 2 without translation, or Eq. 2 whole, which alone heeds the velocity.
+        Row model: paper Eqs. 8-9, Eq. 5, Eq. 2 without translation, or Eq. 2 whole, which alone heeds the velocity.
 
     Returns
     -------

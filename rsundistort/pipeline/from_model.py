@@ -21,7 +21,7 @@ from ..io.photos.images import stored_size
 from ..io.places import local_place
 from ..model import Reconstruction, Solution
 from ..model.orientation import INVERSE, turn_reconstruction
-from ..sfm import matched_of_database
+from ..sfm import kept_log_level, matched_of_database
 from .cameras import PhotoCameras, check_readouts
 from .gyro import known_readouts
 from .ladder import solve_tracks
@@ -99,7 +99,10 @@ def solve_model(
         times = {} if folder is None else photo_times(folder)
         outputs = Outputs.of_outcome(outcome, options, orientations, ids, rgb, folder is not None, times)
         solution = outputs.begin(scratch, log)
-    return solution if folder is None else outputs.rectify(folder, out, workers, log)
+    if folder is not None:
+        return outputs.rectify(folder, out, workers, log)
+    outputs.report(out, log)
+    return solution
 
 
 def solve(
@@ -134,7 +137,8 @@ def solve(
     options = options or SolveOptions()
     log = StageLog(progress)
     given = colmap_model_of(reconstruction)
-    outcome, ids, rgb = _solve(given, "the model", {}, options, None if database is None else Path(database), log)
+    with kept_log_level():
+        outcome, ids, rgb = _solve(given, "the model", {}, options, None if database is None else Path(database), log)
     outputs = Outputs.of_outcome(outcome, options, {}, ids, rgb)
     rec, solution = outputs.reconstruction, outputs.solution
     names = [output_name(name, options.raw_as) for name in rec.image_names]

@@ -65,6 +65,8 @@ class SolveOptions(RectifyOptions):
         Replace the outputs of an earlier run.
     scheduler : str, optional
         Address of a Dask scheduler whose workers rectify the photos, as in `rectify_folder`.
+    report : bool
+        Write `report.html`. What it needs is kept in any case: `report.write_report` makes it later.
     """
 
     readout: str | Mapping[str, str] | None = None
@@ -81,6 +83,7 @@ class SolveOptions(RectifyOptions):
     rs_poses: bool = False
     overwrite: bool = False
     scheduler: str | None = None
+    report: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path, PurePath
 
 import numpy as np
@@ -30,7 +32,9 @@ from ..io.outputs import batch_folder
 from ..io.video import FRAME_TABLE
 from ..model import Reconstruction, Solution
 from ..model.orientation import turn_reconstruction, turn_solution
+from ..report import Diagnostics, relative_folder, write_diagnostics, write_report
 from .depth import PhotoDepths, ScenePoints, with_depths
+from .ladder import Solved
 from .options import SolveOptions
 from .outcome import Outcome, solution_of
 from .photo import turn_of
@@ -91,6 +95,8 @@ class Outputs:
         Whether there are photos to rectify.
     times : mapping of name to float
         When photos were taken, in seconds.
+    solved : Solved or None
+        What the report compares; None where there is nothing to.
     """
 
     solution: Solution
@@ -101,6 +107,7 @@ class Outputs:
     rgb: PointRgb | None = None
     with_photos: bool = True
     times: Mapping[str, float] = field(default_factory=dict)
+    solved: Solved | None = None
 
     @classmethod
     def of_outcome(
@@ -119,7 +126,8 @@ class Outputs:
         turns: dict[str, int] = {}
         if options.apply_orientation:
             turns = {name: turn_of(orientations.get(name, 1), True)[0] for name in rec.image_names}
-        return cls(solution, rec, options, ids or ModelIds.in_order(rec), turns, rgb, with_photos, times or {})
+        ids = ids or ModelIds.in_order(rec)
+        return cls(solution, rec, options, ids, turns, rgb, with_photos, times or {}, outcome.solved)
 
     def begin(self, folder: Path, log: StageLog) -> Solution:
         """Write all but the photos and the colours that they tell, so that what comes after can be gone on with."""
@@ -130,7 +138,18 @@ class Outputs:
         rgb = None if self.rgb is None else self.rgb.values
         turned = replace(self._models(folder, self.solution, {}, rgb, None), stages=tuple(log.stages))
         write_solution(folder / "solution.json", turned)
+        self._tell_report(folder, rgb)
         return turned
+
+    def report(self, out: Path, log: StageLog, photos: Path | None = None) -> None:
+        """Write the report of what is in `out`, if it is asked for; a failure is no more than warned of."""
+        if not self.options.report:
+            return
+        try:
+            with _only_warned_of():
+                write_report(out, photos, jobs=self.options.jobs, progress=log.tell)
+        except KeyboardInterrupt as stop:
+            raise KeyboardInterrupt(f"all but the report is written; go on with: rsundistort report {out}") from stop
 
     def rectify(self, photos: Path, out: Path, workers: Workers, log: StageLog) -> Solution:
         """Rectify the photos of a folder into `out`, which `begin` has filled, and write the rest again."""
@@ -151,13 +170,29 @@ class Outputs:
         found = {name: each.depth for name, each in done.items() if each.depth is not None}
         solution = with_depths(replace(solution, images=tuple(images)), found)
         with output_folder(out, overwrite=True) as scratch:
-            turned = self._models(scratch, solution, left_out, self._rgb(colors), relative_to(photos, out / "rs-poses"))
+            rgb = self._rgb(colors)
+            turned = self._models(scratch, solution, left_out, rgb, relative_to(photos, out / "rs-poses"))
+            self._tell_report(scratch, rgb, relative_folder(photos, out))
             log.end("writing")
             turned = replace(turned, stages=tuple(log.stages))
             write_solution(scratch / "solution.json", turned)
         if not left_out:
             journal.path.unlink()  # nothing to go on with
+        self.report(out, log, photos)
         return turned
+
+    @cached_property
+    def _diagnostics(self) -> Diagnostics | None:
+        if self.solved is None:
+            return None
+        return Diagnostics.of_results(self.solved.result, self.solved.global_result, self.ids.cameras)
+
+    def _tell_report(self, folder: Path, rgb: NDArray[np.uint8] | None, photos: str = "") -> None:
+        """Keep what the report shows beyond the solution."""
+        with _only_warned_of():
+            if self._diagnostics is not None:
+                told = replace(self._diagnostics.with_colors(rgb), photos=photos)
+                write_diagnostics(folder / "report.npz", told)
 
     def _rgb(self, colors: PointColors | None) -> NDArray[np.uint8] | None:
         """Colours as the photos tell them, where they were not known."""
@@ -226,3 +261,13 @@ def relative_to(folder: Path, start: Path) -> PurePath:
         return PurePath(os.path.relpath(folder.resolve(), start.resolve()))
     except ValueError:
         return folder.resolve()
+
+
+@contextmanager
+def _only_warned_of() -> Iterator[None]:
+    """Trouble with the report loses no run."""
+    try:
+        yield
+    except Exception as error:
+        said = " ".join(str(error).split()) or type(error).__name__
+        warnings.warn(f"no report was written: {said}", RsUndistortWarning, stacklevel=4)

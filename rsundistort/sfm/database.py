@@ -8,7 +8,9 @@ measurements of the adjustment remain the raw pixels.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,7 @@ __all__ = [
     "database_camera",
     "from_pycolmap",
     "ideal_keypoints",
+    "kept_log_level",
     "pipeline_options",
     "quiet_pycolmap",
     "verification_options",
@@ -66,6 +69,28 @@ class MatchedPhotos:
     camera_idx: NDArray[np.int64]
     calibrated: bool
     seed: int
+
+
+_level_lock = threading.Lock()
+_level: dict[str, int] = {"users": 0, "before": 0}
+
+
+@contextmanager
+def kept_log_level() -> Iterator[None]:
+    """What pycolmap logs is, after the last of these blocks in any thread, what it was before the first."""
+    import pycolmap
+
+    with _level_lock:
+        if not _level["users"]:
+            _level["before"] = pycolmap.logging.minloglevel
+        _level["users"] += 1
+    try:
+        yield
+    finally:
+        with _level_lock:
+            _level["users"] -= 1
+            if not _level["users"]:
+                pycolmap.logging.minloglevel = _level["before"]
 
 
 def quiet_pycolmap() -> Any:

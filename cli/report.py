@@ -1,0 +1,43 @@
+"""`rsundistort report`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from . import options as opt
+from .terminal import Talk, errors_for_people, progress_bars
+
+
+@click.command()
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option(
+    "--photos",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Folder of the original photos. Default: where it was, seen from OUT.",
+)
+@click.option(
+    "--figures",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Write figures for papers into DIR instead, as PNG and PDF: the models, the displacement fields, the paths of "
+    "the cameras and the sphere of the critical motion.",
+)
+@opt.jobs_option
+@opt.quiet_option
+def command(out: Path, photos: Path | None, figures: Path | None, jobs: int, quiet: bool) -> None:
+    """Write OUT/report.html from what a run left in the folder OUT.
+
+    What is missing, such as photos that were moved, is said, and the rest is shown.
+    """
+    with errors_for_people(), progress_bars(Talk(quiet)) as progress:
+        from rsundistort.report import write_figures, write_report
+
+        if figures is not None:
+            written = write_figures(out, figures)
+        else:
+            written = [write_report(out, photos, jobs=jobs, progress=progress)]
+    if not quiet:
+        click.echo("\n".join(str(path) for path in written))

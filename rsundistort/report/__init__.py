@@ -1,0 +1,18 @@
+"""The report: what a person looks at."""
+
+from .diagnostics import Diagnostics, read_diagnostics, write_diagnostics
+from .figures import write_figures
+from .page import write_report
+from .source import relative_folder
+from .verdict import Verdict, verdict_of
+
+__all__ = [
+    "Diagnostics",
+    "Verdict",
+    "read_diagnostics",
+    "relative_folder",
+    "verdict_of",
+    "write_diagnostics",
+    "write_figures",
+    "write_report",
+]

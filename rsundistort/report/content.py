@@ -1,0 +1,332 @@
+"""What a report says, as plain values: for the template, and for the scripts in the page."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..critical.meter import readout_axes
+from ..io import output_name
+from ..model import SHUTTER_MODELS, Camera, Solution, SolvedImage
+from ..model.orientation import MATRICES, in_stored_frame, split_mirror, turn_points
+from .diagnostics import Diagnostics
+from .displacement import displacement_field
+from .pictures import Picture
+from .source import Source, relative_folder
+
+__all__ = [
+    "arrows_of",
+    "cameras",
+    "ladder",
+    "longer",
+    "photos",
+    "residuals",
+    "scene",
+    "settings",
+    "view_frame",
+    "view_of",
+]
+
+# Factors by which arrows may be drawn longer than they are, and the part of a cell that a long one should fill.
+_LONGER = (1, 2, 3, 4, 6, 8, 10, 15, 20, 30, 50)
+_ACROSS = 14
+
+
+def photos(source: Source) -> list[dict[str, Any]]:
+    """A row of each photo, in the order of the solution; angles in degrees per frame."""
+    solution, told = source.solution, source.diagnostics
+    place = {} if told is None else {name: i for i, name in enumerate(told.names)}
+    raw_as = str(solution.options.get("raw_as") or "tif")
+    raw_folder = "" if source.photos is None else relative_folder(source.photos, source.out)
+    rows = []
+    for number, image in enumerate(solution.images):
+        span = np.degrees(solution.cameras[image.camera_id].frame_span)
+        i = place.get(image.name)
+        phi = None if image.motion is None else image.motion.phi * span
+        written = f"images/{output_name(image.name, raw_as)}"
+        rows.append(
+            {
+                "number": number,
+                "name": image.name,
+                "registered": image.registered,
+                "reason": image.reason or "",
+                "camera": image.camera_id,
+                "phi": None if phi is None else phi.tolist(),
+                "sigma": None if image.sigma_phi is None else (image.sigma_phi * span).tolist(),
+                "turn": None if phi is None else float(np.linalg.norm(phi)),
+                "shift": image.rs_shift_px,
+                "measurements": image.num_observations,
+                "rms_before": None if i is None or told is None else float(told.rms_px[0, i]),
+                "rms_after": image.rms_px,
+                "after": quote(written) if image.registered and source.after(image.name) else "",
+                "before": quote(f"{raw_folder}/{image.name}") if raw_folder and source.before(image.name) else "",
+            }
+        )
+    return rows
+
+
+def view_of(source: Source, pictures: Mapping[str, Picture]) -> list[dict[str, Any]]:
+    """The registered photos with their pictures as data addresses and their arrows, thousandths of the width."""
+    solution, told = source.solution, source.diagnostics
+    depths = {} if told is None else dict(zip(told.names, told.depth.tolist(), strict=True))
+    found = []
+    for number, image in enumerate(solution.images):
+        picture = pictures.get(image.name)
+        if not image.registered or picture is None:
+            continue
+        raw, still, (width, height) = arrows_of(solution, image, depths.get(image.name), picture.orientation)
+        ends = np.concatenate([raw, still], axis=1) * 1000 / width
+        found.append(
+            {
+                "number": number,
+                "name": image.name,
+                "size": [width, height],
+                "shift": image.rs_shift_px,
+                "before": _address(picture.before),
+                "after": _address(picture.after),
+                "arrows": np.round(ends, 1).tolist(),
+                "longest": float(np.linalg.norm(still - raw, axis=1).max(initial=0.0)) / width,
+            }
+        )
+    return found
+
+
+def longer(largest: Sequence[float]) -> int:
+    """By what arrows are to be drawn longer than they are, all alike, by the longest of each photo in photo widths."""
+    long = float(np.quantile(largest, 0.9)) if len(largest) else 0.0
+    return max((factor for factor in _LONGER if factor * long <= 1.2 / _ACROSS), default=1) if long > 0 else 1
+
+
+def arrows_of(
+    solution: Solution, image: SolvedImage, depth: float | None, orientation: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[int, int]]:
+    """A photo's displacement field in the pixels of its upright picture, whose size comes with it."""
+    # to the stored frame, then upright: `orientation` goes all the way
+    stored = in_stored_frame(Solution(
+        solution.shutter_model, {image.camera_id: solution.cameras[image.camera_id]},
+        {image.camera_id: solution.rectified_cameras[image.camera_id]}, (image,),
+    ))  # fmt: skip
+    camera = stored.cameras[stored.images[0].camera_id]
+    ends = displacement_field(stored, stored.images[0], depth, _ACROSS)
+    raw, still = (turn_points(each, camera.width, camera.height, orientation) for each in ends)
+    swaps = MATRICES[orientation][0, 0] == 0
+    return raw, still, (camera.height, camera.width) if swaps else (camera.width, camera.height)
+
+
+def scene(source: Source, upright: Mapping[str, int]) -> dict[str, Any] | None:
+    """Cameras and points, the z axis up by the photos' orientations; None without poses."""
+    told = source.diagnostics
+    solution = in_stored_frame(source.solution)
+    images = [image for image in solution.registered if image.posed]
+    if not images:
+        return None
+    R = np.array([image.R_cw for image in images])
+    centers = np.array([image.center_w for image in images])
+    lenses = [solution.cameras[image.camera_id] for image in images]
+    turn = np.tile(np.eye(3), (len(images), 1, 1))
+    turn[:, :2, :2] = [MATRICES[split_mirror(upright.get(image.name, 1))[0]] for image in images]
+    V = view_frame(turn @ R)
+    points = np.zeros((0, 3)) if told is None else told.points_w
+    reach = _size(centers, points)
+    side = min(0.5 * _spacing(centers), 0.12 * reach) or 0.12 * reach
+    value: dict[str, Any] = {
+        "names": [image.name for image in images],
+        "centers": _packed((centers) @ V.T),
+        "frusta": _packed(_frusta(R, centers, lenses, side) @ V.T),
+        "axes": _packed(readout_axes(R, [lens.readout for lens in lenses]) @ V.T),
+        "box": _box(points @ V.T, centers @ V.T),
+    }
+    if told is not None:
+        place = {name: i for i, name in enumerate(told.names)}
+        rows = [place[image.name] for image in images]
+        value["shown"] = int(_is_near(told.points_w, centers, reach).sum())
+        value["points"] = _packed(_near(told.points_w, centers, reach) @ V.T)
+        value["colors"] = [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in _near_rgb(told, centers, reach).tolist()]
+        value["global"] = {
+            "points": _packed(_near(told.global_points_w, centers, reach) @ V.T),
+            "centers": _packed(told.global_center_w[rows] @ V.T),
+            "frusta": _packed(_frusta(told.global_R_cw[rows], told.global_center_w[rows], lenses, side) @ V.T),
+        }
+    return value
+
+
+def residuals(source: Source) -> dict[str, Any] | None:
+    """The statistics of residuals, for the plots."""
+    told = source.diagnostics
+    if told is None:
+        return None
+    cameras = source.solution.cameras
+    return {
+        "names": list(told.names),
+        "edges": _numbers(told.histogram_px),
+        "histogram": told.histogram.tolist(),
+        "rows": _numbers(told.row_rms_px),
+        "photo_rows": _numbers(told.row_mean_px),
+        "cells": _numbers(told.cell_mean_px),
+        "cameras": list(told.camera_ids),
+        "sizes": [
+            [cameras[key].width, cameras[key].height] if key in cameras else [4, 3] for key in told.camera_ids
+        ],
+    }  # fmt: skip
+
+
+def ladder(solution: Solution) -> list[dict[str, Any]]:
+    """A row of each shutter model that was tried: residuals when it was climbed, and of held-out measurements."""
+    held_out = solution.quality.get("held_out_rms_px") or {}
+    rungs = {
+        str(rung.get("model")): rung
+        for stage in solution.stages
+        if stage.get("name") == "ladder"
+        for rung in stage.get("rungs") or ()
+    }
+    names = [name for name in SHUTTER_MODELS if name in held_out or name in rungs]
+    largest = max((float(value) for value in held_out.values() if value is not None), default=0.0)
+    return [
+        {
+            "name": name,
+            "rms": rungs.get(name, {}).get("rms_px"),
+            "iterations": rungs.get(name, {}).get("iterations"),
+            "held_out": held_out.get(name),
+            "share": 100 * float(held_out.get(name) or 0) / largest if largest else 0,
+            "chosen": name == solution.shutter_model,
+        }
+        for name in names
+    ]
+
+
+def cameras(solution: Solution) -> list[dict[str, Any]]:
+    """A row of each camera, with the standard deviations of what was solved for."""
+    sigmas = solution.quality.get("sigma_intrinsics") or {}
+    times = solution.quality.get("readout_times") or {}
+    rows = []
+    for key, camera in solution.cameras.items():
+        K = camera.K
+        sigma = sigmas.get(key) or {}
+        lens = {name: value for name, value in camera.coefficients.items() if value or name in sigma}
+        values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+        told = {name: sigma.get(name, sigma.get("f") if name[0] == "f" else None) for name in values}
+        rows.append(
+            {
+                "id": key,
+                "size": f"{camera.width} x {camera.height}",
+                "intrinsics": [_value(name, value, told[name], 1) for name, value in values.items()],
+                "lens": [_value(name, value, sigma.get(name), 4) for name, value in lens.items()],
+                "model": camera.lens,
+                "readout": camera.readout,
+                "time": times.get(key),
+                "photos": sum(image.camera_id == key for image in solution.images),
+            }
+        )
+    return rows
+
+
+def settings(solution: Solution) -> list[tuple[str, str]]:
+    """Options by name; empty where nothing was said."""
+    said = []
+    for name, value in solution.options.items():
+        if isinstance(value, Mapping):
+            text = ", ".join(f"{k}: {v}" for k, v in value.items())
+        elif isinstance(value, (list, tuple)):
+            text = ", ".join(str(each) for each in value)
+        else:
+            text = "" if value is None else str(value)
+        said.append((name.replace("_", " "), text))
+    return said
+
+
+def _value(name: str, value: float, sigma: float | None, digits: int) -> str:
+    text = f"{name} {value:.{digits}f}"
+    return text if sigma is None else f"{text} ± {sigma:.{digits}f}"
+
+
+def _address(data: bytes | None) -> str | None:
+    return None if data is None else f"data:image/webp;base64,{base64.b64encode(data).decode()}"
+
+
+def _packed(values: NDArray[np.float64]) -> dict[str, str]:
+    """Points (n, 3) as three arrays in the form that plotly.js takes."""
+    return {
+        axis: base64.b64encode(np.ascontiguousarray(values[:, k], "<f4").tobytes()).decode()
+        for k, axis in enumerate("xyz")
+    }
+
+
+def _numbers(values: NDArray[np.float64]) -> Any:
+    """Nested lists of rounded numbers, None where there is none."""
+    rounded = np.round(values, 4).astype(object)
+    rounded[~np.isfinite(values)] = None
+    return rounded.tolist()
+
+
+def view_frame(R_cw: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation from the world to a frame with z up, x to the right of the first photos, by upright cameras."""
+    up = -R_cw[:, 1].mean(0)
+    if np.linalg.norm(up) < 0.3:  # cameras look at all sides, or down in all directions
+        up = -R_cw[0, 1]
+    up /= np.linalg.norm(up)
+    right = R_cw[:, 0].mean(0)
+    right -= up * (up @ right)
+    if np.linalg.norm(right) < 0.3:
+        right = R_cw[0, 0] - up * (up @ R_cw[0, 0])
+    right /= max(float(np.linalg.norm(right)), 1e-12)
+    return np.stack([right, np.cross(up, right), up])
+
+
+def _size(centers: NDArray[np.float64], points: NDArray[np.float64]) -> float:
+    """How far the scene reaches from the middle of the cameras, but for its farthest points."""
+    middle = np.median(centers, axis=0)
+    every = centers if not len(points) else points
+    distance = np.linalg.norm(every - middle, axis=1)
+    return max(float(np.quantile(distance, 0.9)), float(np.linalg.norm(centers - middle, axis=1).max()), 1e-9)
+
+
+def _spacing(centers: NDArray[np.float64]) -> float:
+    """Median distance of a camera from the nearest other; of some, where they are many."""
+    some = centers[np.unique(np.linspace(0, len(centers) - 1, 200).astype(int))]
+    distance = np.linalg.norm(some[:, None] - centers[None], axis=2)
+    distance[distance < 1e-9] = np.inf
+    nearest = distance.min(1, initial=np.inf)
+    return float(np.median(nearest[np.isfinite(nearest)])) if np.isfinite(nearest).any() else 0.0
+
+
+def _is_near(points: NDArray[np.float64], centers: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
+    near: NDArray[np.bool_] = np.linalg.norm(points - np.median(centers, axis=0), axis=1) < 2 * reach
+    return near
+
+
+def _near(points: NDArray[np.float64], centers: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
+    return points[_is_near(points, centers, reach)]
+
+
+def _near_rgb(told: Diagnostics, centers: NDArray[np.float64], reach: float) -> NDArray[np.uint8]:
+    return told.rgb[_is_near(told.points_w, centers, reach)] if len(told.rgb) else told.rgb
+
+
+def _box(points: NDArray[np.float64], centers: NDArray[np.float64]) -> list[list[float]]:
+    """Ranges of the three axes that hold the cameras, and all but the farthest points."""
+    low, high = centers.min(0), centers.max(0)
+    if len(points):
+        nearest, farthest = np.quantile(points, [0.02, 0.98], axis=0)
+        low, high = np.minimum(low, nearest), np.maximum(high, farthest)
+    pad = 0.05 * float((high - low).max()) + 1e-9
+    return np.round(np.stack([low - pad, high + pad], axis=1), 5).tolist()
+
+
+def _frusta(
+    R_cw: NDArray[np.float64], centers: NDArray[np.float64], lenses: Sequence[Camera], side: float
+) -> NDArray[np.float64]:
+    """(k, 3) polylines with NaN between them: a pyramid for each camera."""
+    half = np.array([[lens.width / lens.K[0, 0] / 2, lens.height / lens.K[1, 1] / 2] for lens in lenses])
+    half = np.minimum(half, 1.5)
+    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    corners = np.concatenate([half[:, None] * signs, np.ones((len(lenses), 4, 1))], axis=2)
+    world = centers[:, None] + side * corners @ R_cw
+    apex, gap = centers[:, None], np.full((len(lenses), 1, 3), np.nan)
+    a, b, c, d = (world[:, k : k + 1] for k in range(4))
+    line = [apex, a, b, apex, c, d, apex, gap, b, c, gap, d, a, gap]
+    return np.concatenate(line, axis=1).reshape(-1, 3)

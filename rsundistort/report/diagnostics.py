@@ -1,0 +1,280 @@
+"""What a report shows beyond `solution.json`: residuals and the global-shutter result, small enough to keep."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..bundle import BundleResult, reprojection_residuals
+from ..errors import FileError, FormatError
+from ..evaluation import align_points
+from ..io.aside import write_aside
+from ..model import READOUTS, Reconstruction
+
+__all__ = ["Diagnostics", "read_diagnostics", "write_diagnostics"]
+
+_FORMAT = "rsundistort-report"
+_VERSION = 1
+
+# Points that are kept: what a phone turns smoothly.
+_MAX_POINTS = 15_000
+# Bins along the readout, of all photos and of one; cells across and down the photo; bars of the histogram.
+_ROWS, _ROWS_OF_PHOTO = 32, 12
+_CELLS = (12, 9)
+_BARS = 61
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """How a solution and a global-shutter adjustment of the same measurements fit; first axes of 2 are in that order.
+
+    Attributes
+    ----------
+    names : tuple of str, length m
+        Registered photos.
+    rms_px : (2, m) array
+        Root mean square of the residuals' x and y parts in each photo.
+    depth : (m,) array
+        Median depth of what each photo measured, world units.
+    row_rms_px : (2, b) array
+        The same over all photos by when in the readout a measurement was read, first to last; NaN where there is none.
+    row_mean_px : (2, m, c, 2) array
+        Mean residual (x, y) of each photo likewise: what a shutter that is not modelled leaves is a trend.
+    cell_mean_px : (2, cameras, down, across, 2) array
+        Mean residual over the photos of a camera, by where in the photo.
+    camera_ids : tuple of str
+        Of those cameras, in the solution.
+    histogram_px : (n,) array
+        Edges of the bars.
+    histogram : (2, n - 1) int array
+        Numbers of residuals' parts.
+    points_w, global_points_w : (k, 3), (l, 3) array
+        Some of the scene's points; those of the global-shutter adjustment are aligned with the solution by a similarity
+        of the cameras.
+    point_idx : (k,) int array
+        Their indices among all points.
+    rgb : (k, 3) uint8 array
+        Their colours; empty where none are known.
+    global_R_cw, global_center_w : (m, 3, 3), (m, 3) array
+        Poses of the global-shutter adjustment, aligned.
+    photos : str
+        Folder of the photos relative to that of the outputs; empty if not known.
+    """
+
+    names: tuple[str, ...]
+    rms_px: NDArray[np.float64]
+    depth: NDArray[np.float64]
+    row_rms_px: NDArray[np.float64]
+    row_mean_px: NDArray[np.float64]
+    cell_mean_px: NDArray[np.float64]
+    camera_ids: tuple[str, ...]
+    histogram_px: NDArray[np.float64]
+    histogram: NDArray[np.int64]
+    points_w: NDArray[np.float64]
+    global_points_w: NDArray[np.float64]
+    point_idx: NDArray[np.int64]
+    rgb: NDArray[np.uint8]
+    global_R_cw: NDArray[np.float64]
+    global_center_w: NDArray[np.float64]
+    photos: str = ""
+
+    def __post_init__(self) -> None:
+        m, k, num_global = len(self.names), len(self.points_w), len(self.global_points_w)
+        b, c, n = self.row_rms_px.shape[-1], self.row_mean_px.shape[2], len(self.histogram_px)
+        shapes: Mapping[str, tuple[tuple[int, ...], ...]] = {
+            "rms_px": ((2, m),),
+            "depth": ((m,),),
+            "row_rms_px": ((2, b),),
+            "row_mean_px": ((2, m, c, 2),),
+            "cell_mean_px": ((2, len(self.camera_ids), *self.cell_mean_px.shape[2:4], 2),),
+            "histogram": ((2, n - 1),),
+            "points_w": ((k, 3),),
+            "global_points_w": ((num_global, 3),),
+            "point_idx": ((k,),),
+            "rgb": ((k, 3), (0, 3)),
+            "global_R_cw": ((m, 3, 3),),
+            "global_center_w": ((m, 3),),
+        }
+        for name, allowed in shapes.items():
+            if getattr(self, name).shape not in allowed:
+                raise FormatError(f"{name} has the shape {getattr(self, name).shape}, expected {allowed[0]}")
+
+    @classmethod
+    def of_results(cls, result: BundleResult, global_result: BundleResult, camera_ids: ArrayLike) -> Diagnostics:
+        """Those of an adjustment and its global-shutter counterpart, whose cameras are called so in the solution."""
+        rec, plain = result.reconstruction, _aligned(global_result.reconstruction, result.reconstruction)
+        both = [_Residuals.of(each) for each in (plain, rec)]
+        chosen, of_plain = (_some(each.num_points) for each in (rec, plain))
+        reach = max(*(np.quantile(np.abs(each.xy), 0.995) for each in both if each.xy.size), 0.1)
+        edges = np.linspace(-reach, reach, _BARS)
+        return cls(
+            names=tuple(rec.image_names),
+            rms_px=np.array([each.by_photo() for each in both]),
+            depth=_median_depth(rec),
+            row_rms_px=np.array([each.by_row() for each in both]),
+            row_mean_px=np.array([each.by_photo_and_row() for each in both]),
+            cell_mean_px=np.array([each.by_cell() for each in both]),
+            camera_ids=tuple(str(key) for key in np.atleast_1d(np.asarray(camera_ids)).tolist()),
+            histogram_px=edges,
+            histogram=np.array([np.histogram(each.xy, edges)[0] for each in both]),
+            points_w=rec.points_w[chosen],
+            global_points_w=plain.points_w[of_plain],
+            point_idx=chosen,
+            rgb=np.zeros((0, 3), np.uint8),
+            global_R_cw=plain.R_cw,
+            global_center_w=plain.center_w,
+        )
+
+    def with_colors(self, rgb: NDArray[np.uint8] | None) -> Diagnostics:
+        """The same with the colours (n, 3) of all points, where they are known."""
+        return self if rgb is None else replace(self, rgb=rgb[self.point_idx])
+
+
+def write_diagnostics(path: Path, diagnostics: Diagnostics) -> None:
+    """Write `report.npz`, whole or not at all."""
+    values: dict[str, Any] = {each.name: getattr(diagnostics, each.name) for each in fields(diagnostics)}
+    # what is only looked at needs no more digits
+    values = {name: v.astype(np.float32) if _is_float(v) else np.array(v) for name, v in values.items()}
+    file = io.BytesIO()
+    np.savez_compressed(file, format=np.array(_FORMAT), version=np.array(_VERSION), **values)
+    write_aside(Path(path), file.getvalue())
+
+
+def read_diagnostics(path: Path) -> Diagnostics:
+    """Read `report.npz`.
+
+    Raises
+    ------
+    FileError, FormatError
+        When it is missing, of another version, or garbled.
+    """
+    path = Path(path)
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+            if str(file["format"]) != _FORMAT:
+                raise FormatError(f"{path} is not of the format {_FORMAT!r}")
+            if int(file["version"]) != _VERSION:
+                raise FormatError(f"{path} has version {int(file['version'])}, this program reads {_VERSION}")
+            values: dict[str, Any] = {each.name: file[each.name] for each in fields(Diagnostics)}
+    except FormatError:
+        raise
+    except OSError as error:
+        raise FileError(f"{path} cannot be read: {error.strerror or error}") from error
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, AttributeError, TypeError) as error:
+        raise FormatError(f"{path} is garbled: {' '.join(str(error).split())}") from error
+    for name in ("names", "camera_ids"):
+        values[name] = tuple(str(each) for each in values[name].ravel())
+    values["photos"] = str(values["photos"])
+    try:
+        return Diagnostics(**{name: v.astype(np.float64) if _is_float(v) else v for name, v in values.items()})
+    except IndexError as error:
+        raise FormatError(f"{path} is garbled: {error}") from error
+
+
+def _is_float(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype.kind == "f"
+
+
+def _some(count: int) -> NDArray[np.int64]:
+    """Indices of some of so many things, evenly."""
+    return np.unique(np.linspace(0, max(count - 1, 0), min(count, _MAX_POINTS)).astype(np.int64))
+
+
+def _aligned(rec: Reconstruction, like: Reconstruction) -> Reconstruction:
+    """A reconstruction of the same photos in the frame of another: cameras, with the way they look, compare."""
+    reach = like.size if like.num_points else like.baseline
+
+    def marks(each: Reconstruction, unit: float) -> NDArray[np.float64]:
+        ahead = each.center_w[:, None] + unit * each.R_cw
+        return np.concatenate([each.center_w[:, None], ahead], axis=1).reshape(-1, 3)
+
+    own = reach * rec.baseline / like.baseline
+    scale, S, shift = align_points(marks(rec, own), marks(like, reach))
+    return replace(
+        rec,
+        R_cw=rec.R_cw @ S.T,
+        center_w=scale * rec.center_w @ S.T + shift,
+        points_w=scale * rec.points_w @ S.T + shift,
+    )
+
+
+def _median_depth(rec: Reconstruction) -> NDArray[np.float64]:
+    obs = rec.observations
+    ahead = rec.R_cw[obs.frame_idx, 2]
+    z = ((rec.points_w[obs.point_idx] - rec.center_w[obs.frame_idx]) * ahead).sum(1)
+    of_photo = np.split(z[np.argsort(obs.frame_idx, kind="stable")], np.cumsum(_counts(rec))[:-1])
+    return np.array([np.median(each) if len(each) else np.nan for each in of_photo])
+
+
+def _counts(rec: Reconstruction) -> NDArray[np.int64]:
+    return np.bincount(rec.observations.frame_idx, minlength=rec.num_images)
+
+
+@dataclass(frozen=True)
+class _Residuals:
+    """Residuals (o, 2) of a reconstruction that could be projected, and where they are.
+
+    `clock` (o,) runs from 0, read first, to 1; `place` (o, 2) from 0 to 1 across and down the photo.
+    """
+
+    rec: Reconstruction
+    xy: NDArray[np.float64]
+    frame_idx: NDArray[np.int64]
+    clock: NDArray[np.float64]
+    place: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, rec: Reconstruction) -> _Residuals:
+        residuals, valid = reprojection_residuals(rec)
+        obs = rec.observations
+        frame = obs.frame_idx[valid]
+        camera = rec.camera_idx[frame]
+        sizes = np.array([(each.width, each.height) for each in rec.cameras], float)
+        place = np.clip((obs.xy_raw[valid] + 0.5) / sizes[camera], 0, 1)
+        axis = np.array([READOUTS[each.readout][0] for each in rec.cameras])[camera]
+        sign = np.array([READOUTS[each.readout][1] for each in rec.cameras])[camera]
+        along = place[np.arange(len(place)), axis]
+        return cls(rec, residuals[valid], frame, np.where(sign > 0, along, 1 - along), place)
+
+    def by_photo(self) -> NDArray[np.float64]:
+        """(m,) root mean square."""
+        return np.sqrt(_means(self.frame_idx, (self.xy**2).mean(1), self.rec.num_images))
+
+    def by_row(self) -> NDArray[np.float64]:
+        """(b,) root mean square."""
+        return np.sqrt(_means(_bin(self.clock, _ROWS), (self.xy**2).mean(1), _ROWS))
+
+    def by_photo_and_row(self) -> NDArray[np.float64]:
+        """(m, c, 2) mean."""
+        m = self.rec.num_images
+        where = self.frame_idx * _ROWS_OF_PHOTO + _bin(self.clock, _ROWS_OF_PHOTO)
+        mean = [_means(where, part, m * _ROWS_OF_PHOTO) for part in self.xy.T]
+        return np.stack(mean, axis=-1).reshape(m, _ROWS_OF_PHOTO, 2)
+
+    def by_cell(self) -> NDArray[np.float64]:
+        """(cameras, down, across, 2) mean."""
+        across, down = _CELLS
+        num = len(self.rec.cameras) * down * across
+        cell = _bin(self.place[:, 1], down) * across + _bin(self.place[:, 0], across)
+        where = self.rec.camera_idx[self.frame_idx] * down * across + cell
+        mean = [_means(where, part, num) for part in self.xy.T]
+        return np.stack(mean, axis=-1).reshape(-1, down, across, 2)
+
+
+def _bin(place: NDArray[np.float64], num: int) -> NDArray[np.int64]:
+    return np.minimum((place * num).astype(np.int64), num - 1)
+
+
+def _means(where: NDArray[np.int64], values: NDArray[np.float64], num: int) -> NDArray[np.float64]:
+    """(num,) mean of the values of each index; NaN where there is none."""
+    count = np.bincount(where, minlength=num)
+    total = np.bincount(where, values, minlength=num)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)

@@ -1,0 +1,175 @@
+"""What a solution is worth, in three sentences."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..critical import CriticalMotion, advise_poses
+from ..model import Solution
+from ..model.orientation import in_stored_frame
+
+__all__ = ["Verdict", "advice_of", "meter_of", "verdict_of"]
+
+# Displacements below this are lost in the interpolation of a photo.
+_UNSEEN_PX = 1.0
+# A shutter that lowers the error of held-out measurements by less than this share may as well be noise.
+_LEAST_GAIN = 0.01
+# Of the scene's height: up to the first it is as good as photos measure, beyond the second it is no measure. Reported
+# deviations of real photos are two to three times too small (docs/critical-motions.md).
+_SMALL_PERCENT, _LARGE_PERCENT = 0.5, 2.0
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What to believe of a solution.
+
+    Attributes
+    ----------
+    level : str
+        "trust", "care" (with a reservation), "doubt" (do not trust the height of the scene) or "still" (there was
+        nothing to correct).
+    headline : str
+        In a few words.
+    sentences : tuple of three str
+        How many photos, how strong the shutter was, and whether the shape of the scene can be trusted and why.
+    """
+
+    level: str
+    headline: str
+    sentences: tuple[str, str, str]
+
+
+def meter_of(solution: Solution) -> CriticalMotion | None:
+    """The meter of critical motions as the solution has it; None where it has none."""
+    said = solution.critical_motion or {}
+    try:
+        values = np.array(said["singular_values"], float).reshape(5)
+        null = np.array(said["null_vector"], float).reshape(5)
+        spread = float(said["y_axis_spread_deg"])
+    except (KeyError, TypeError, ValueError):
+        return None
+    return CriticalMotion(values, null, spread, sum(image.posed for image in solution.registered))
+
+
+def advice_of(solution: Solution) -> list[str]:
+    """What to photograph at the next shoot, where the poses are critical: as the solution says, else by the poses."""
+    meter = meter_of(solution)
+    said = (solution.critical_motion or {}).get("advice")
+    if said or meter is None or not meter.is_low or meter.num_photos < 2:
+        return [str(each) for each in said or ()]
+    images = [image for image in in_stored_frame(solution).registered if image.posed]
+    R, centers = np.array([image.R_cw for image in images]), np.array([image.center_w for image in images])
+    cameras = in_stored_frame(solution).cameras
+    return [each.sentence for each in advise_poses(R, centers, [cameras[image.camera_id].readout for image in images])]
+
+
+def verdict_of(solution: Solution) -> Verdict:
+    """The verdict on a solution."""
+    shifts = [image.rs_shift_px for image in solution.registered if image.rs_shift_px is not None]
+    level, headline, shape = _shape(solution, max(shifts, default=None))
+    return Verdict(level, headline, (_photos(solution), _strength(solution, shifts), shape))
+
+
+def _photos(solution: Solution) -> str:
+    count, registered = len(solution.images), len(solution.registered)
+    if registered == count:
+        return f"All {count} photos were joined into one scene." if count > 1 else "The only photo has a motion."
+    left = "1 was" if count - registered == 1 else f"{count - registered} were"
+    return f"{registered} of {count} photos were joined into one scene; {left} left out."
+
+
+def _not_asked(solution: Solution) -> bool:
+    return solution.shutter_model == "global" and solution.options.get("shutter_model") == "global"
+
+
+def _strength(solution: Solution, shifts: list[float]) -> str:
+    if not shifts:
+        return "How far the shutter moved pixels is not known."
+    if _not_asked(solution):
+        return "The shutter was not modelled, as you asked (--model global)."
+    if solution.shutter_model == "global":
+        return "No model of a rolling shutter foretold measurements better than a global shutter does."
+    largest, median = max(shifts), float(np.median(shifts))
+    said = f"The rolling shutter moved pixels by up to {_px(largest)}"
+    if len(shifts) > 1:
+        said += f", in half of the photos by more than {_px(median)}"
+    before, after = solution.quality.get("global_rms_px"), solution.quality.get("rms_px")
+    if before is None or after is None:
+        return f"{said}."
+    return f"{said}; modelling it took the residuals from {before:.2f} px to {after:.2f} px."
+
+
+def _shape(solution: Solution, largest: float | None) -> tuple[str, str, str]:
+    if _not_asked(solution):
+        text = "Whether the shape of the scene can be trusted is not known either: --model auto would say."
+        return "care", "The shutter was not looked at", text
+    if reason := _unneeded(solution, largest):
+        text = f"No correction is needed: {reason}, and the shape of the scene is as good as that of a global shutter."
+        return "still", "No correction needed", text
+    said, meter = solution.critical_motion or {}, meter_of(solution)
+    if meter is None or "flagged" not in said:
+        return "care", "The shape was not examined", "How far the shape of the scene can be trusted was not examined."
+    percent = _percent(said)
+    sentence = _sentence(str(said.get("sentence") or ""))
+    if meter.is_low and said.get("remedy") == "none":
+        text = (
+            f"Do not trust the height of the scene: {_level(meter)}, which leaves it open to first order, and with the "
+            f"remedy switched off only the model's second-order terms hold it ({_deviation(percent)})."
+        )
+        return "doubt", "Do not trust the height", text
+    if said["flagged"] and percent > _LARGE_PERCENT:
+        return "doubt", "Do not trust the height", f"Do not trust the height of the scene. {sentence}"
+    if percent > _SMALL_PERCENT:
+        return "care", "Take the height with care", f"Take the height of the scene with care. {sentence}"
+    why = "the cameras were turned enough against each other to tell the shutter from the shape"
+    if meter.is_low:
+        why = f"although {_level(meter)}, the measurements hold its height"
+    return "trust", "The shape can be trusted", f"The shape of the scene can be trusted: {why}. {sentence}"
+
+
+def _unneeded(solution: Solution, largest: float | None) -> str:
+    """Why no correction is needed; empty if it is."""
+    if solution.shutter_model == "global":
+        return "a global shutter explains the photos as well"
+    if largest is not None and largest < _UNSEEN_PX:
+        return "the shutter moved no pixel by as much as one"
+    held_out = solution.quality.get("held_out_rms_px") or {}
+    plain, ours = held_out.get("global"), held_out.get(solution.shutter_model)
+    if plain and ours and ours > (1 - _LEAST_GAIN) * plain:
+        return "without the shutter, measurements that were held out are foretold as well"
+    return ""
+
+
+def _percent(said: Any) -> float:
+    """Standard deviation of the height, per cent; infinite where it is left open."""
+    sigma = said.get("sigma_log_k")
+    return float("inf") if sigma is None else 100 * float(sigma)
+
+
+def _deviation(percent: float) -> str:
+    return f"to +-{percent:.2g} %" if np.isfinite(percent) else "and they leave it open"
+
+
+def _level(meter: CriticalMotion) -> str:
+    if meter.num_photos < 3:
+        return "there are too few photos"
+    if meter.y_axis_spread_deg < 1:
+        return "all cameras were held level"
+    if meter.y_axis_spread_deg < 15:
+        return "the cameras were held nearly level"
+    return "the cameras were hardly turned against each other"
+
+
+def _sentence(text: str) -> str:
+    """With a capital and a full stop; names of photos keep their letters."""
+    text = text.strip()
+    if text.split(" ")[0] in ("the", "no", "with"):
+        text = text[0].upper() + text[1:]
+    return f"{text}." if text and not text.endswith(".") else text
+
+
+def _px(value: float) -> str:
+    return f"{value:.0f} px" if value >= 10 else f"{value:.1f} px"

@@ -1,0 +1,42 @@
+"""Outputs of a sample scene in seconds: its true tracks, measured with noise, instead of features."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from rsundistort import Observations, Reconstruction, Solution, SolveOptions, read_solution
+from rsundistort.io import output_folder
+from rsundistort.pipeline.cameras import PhotoCameras
+from rsundistort.pipeline.ladder import solve_tracks
+from rsundistort.pipeline.outcome import Outcome
+from rsundistort.pipeline.outputs import Outputs
+from rsundistort.pipeline.progress import StageLog
+from rsundistort.pipeline.workers import Workers
+
+SCENES = Path(__file__).parent.parent / "sample_scenes"
+
+
+def solve_scene(name: str, out: Path, *, unwarped: bool = False, **options) -> Solution:
+    """What `run` would write of a sample scene, or of its global-shutter twin; `options` as of `SolveOptions`."""
+    asked = SolveOptions(jobs=2, **options)
+    truth, tracks = read_solution(SCENES / name / "ground_truth.json"), np.load(SCENES / name / "tracks.npz")
+    xy = tracks["xy_global" if unwarped else "xy_raw"]
+    seen = np.isfinite(xy).all(1)
+    xy = xy + np.random.default_rng(0).normal(0, 0.2, xy.shape)
+    camera = truth.cameras["1"]
+    rec = Reconstruction(
+        [camera], tracks["image_names"].tolist(), np.zeros(len(tracks["R_cw"]), int), tracks["R_cw"],
+        tracks["center_w"], tracks["points_w"],
+        Observations(tracks["frame_idx"][seen], tracks["point_idx"][seen], xy[seen]),
+    )  # fmt: skip
+    cameras = PhotoCameras((camera,), ("camera",), rec.camera_idx, True, (True,), "camera.json")
+    log = StageLog(None)
+    solved = solve_tracks(
+        rec, {}, asked.shutter_model, 0, lambda each: asked.options_for(each, cameras), log, asked.remedy
+    )
+    outputs = Outputs.of_outcome(Outcome(solved, cameras, (1,)), asked, {})
+    with output_folder(out) as scratch:
+        outputs.begin(scratch, log)
+    return outputs.rectify(SCENES / name / ("global" if unwarped else "photos"), out, Workers(2), log)
