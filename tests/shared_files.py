@@ -1,4 +1,4 @@
-"""A file system for `fsspec` that several processes see: a folder of this machine, whose files are renamed as on SMB."""
+"""A file system for `fsspec` that several processes see: a folder of this machine, with renaming as on SMB."""
 
 from __future__ import annotations
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import warnings
 from pathlib import Path
 
@@ -47,17 +48,28 @@ def held(fs, url):
     return {path: data for path, data in found.items() if not path.rpartition("/")[2].startswith(".")}
 
 
-@pytest.fixture
-def photos(tmp_path):
+@pytest.fixture(scope="module")
+def made_locally(tmp_path_factory):
     """Photos, their solution, a mask, and what comes of them in folders."""
-    (tmp_path / "in" / "left").mkdir(parents=True)
-    save_textures(tmp_path / "in", NAMES)
-    save_png(tmp_path / "in" / ".hidden.png", texture(320, 240))
-    save_solution(tmp_path / "s.json", NAMES)
-    (tmp_path / "black").mkdir()
-    save_png(tmp_path / "black" / "b.png", np.zeros((240, 320), np.uint8))
-    rectify_folder(tmp_path / "in", tmp_path / "s.json", tmp_path / "truth", masks=tmp_path / "black", maps="npz")
-    return tmp_path, tree(tmp_path / "truth")
+    folder = tmp_path_factory.mktemp("photos")
+    (folder / "in" / "left").mkdir(parents=True)
+    save_textures(folder / "in", NAMES)
+    save_png(folder / "in" / ".hidden.png", texture(320, 240))
+    save_solution(folder / "s.json", NAMES)
+    (folder / "black").mkdir()
+    save_png(folder / "black" / "b.png", np.zeros((240, 320), np.uint8))
+    rectify_folder(folder / "in", folder / "s.json", folder / "truth", masks=folder / "black", maps="npz")
+    return folder, tree(folder / "truth")
+
+
+@pytest.fixture
+def photos(made_locally, tmp_path):
+    """A copy of them for the test, and what comes of them."""
+    folder, truth = made_locally
+    for name in ("in", "black"):
+        shutil.copytree(folder / name, tmp_path / name)
+    shutil.copy(folder / "s.json", tmp_path)
+    return tmp_path, truth
 
 
 @pytest.fixture
@@ -82,7 +94,7 @@ def versions(fs, url="memory://bucket/out"):
 
 def test_by_url_as_in_folders(remote):
     folder, truth, fs = remote
-    solved, left_out = rectify_folder("memory://bucket/in", folder / "s.json", "memory://bucket/out/", **MADE)
+    _, left_out = rectify_folder("memory://bucket/in", folder / "s.json", "memory://bucket/out/", **MADE)
     assert not left_out
     assert held(fs, "memory://bucket/out") == truth
     journal = [json.loads(line) for line in fs.cat_file("/bucket/out/.rectified.jsonl").splitlines()]
@@ -242,13 +254,13 @@ def test_a_new_batch_leaves_nothing_of_the_old_one(remote):
 
 
 def test_one_bad_photo_does_not_stop_the_others(remote):
-    folder, truth, fs = remote
+    folder, _truth, fs = remote
     fs.pipe_file("/bucket/in/b.png", b"cut")
     result = invoke("rectify", "memory://bucket/in", "--solution", folder / "s.json", "-o", "memory://bucket/out")
     assert result.exit_code == 3
     assert "4 photos rectified" in result.stdout
     assert "memory://bucket/out" in result.stdout
-    assert result.stdout.splitlines()[-1].startswith("  b.png: b.png is cut short")
+    assert result.stdout.splitlines()[-1].startswith("  b.png: b.png cannot be decoded")
     assert {"images/b.png", "masks/b.png"}.isdisjoint(held(fs, "memory://bucket/out"))
 
 
@@ -391,7 +403,9 @@ def test_urls_that_cannot_be_photos(remote, url, said):
 def test_a_package_that_is_missing_is_named(remote, monkeypatch):
     folder, _, _ = remote
     missing = {"class": "no_such_package.FileSystem", "err": "Install no-such-package to access it"}
-    monkeypatch.setitem(fsspec.registry.known_implementations, "absent", missing)
+    from fsspec.registry import known_implementations
+
+    monkeypatch.setitem(known_implementations, "absent", missing)
     result = invoke("rectify", "absent://x/in", "--solution", folder / "s.json", "-o", folder / "out")
     assert result.exit_code == 1
     said = "error: absent://x/in: a package is missing: Install no-such-package to access it"
@@ -408,7 +422,7 @@ def test_what_must_be_local_says_so(remote, what):
     assert len(result.stderr.splitlines()) == 1
 
 
-@pytest.mark.parametrize("command", ["run", "solve", "simulate"])
+@pytest.mark.parametrize("command", ["run", "solve"])
 def test_other_commands_take_paths(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = invoke(command, tmp_path, "-o", "s3://bucket/out")
