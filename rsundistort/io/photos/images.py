@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ...errors import FileError, FileKindWarning, InputError, MetadataWarning
 from ..aside import write_aside
-from ..places import Place, files_in
+from ..places import Place, files_in, place_of
 from .containers import metadata_of, with_metadata
 from .heif import read_heif
 from .kinds import (
@@ -72,11 +72,12 @@ class Photo:
     metadata: Metadata = field(default_factory=Metadata)
 
 
-def list_photos(folder: Place, raw_as: str = "tif", sub_folders: Collection[str] = ()) -> list[str]:
-    """Names of the photos in a folder, sorted; files of other kinds and hidden ones are passed over.
+def list_photos(folder: Place | str, raw_as: str = "tif", sub_folders: Collection[str] = ()) -> list[str]:
+    """Names of the photos in a folder, by path or URL, sorted; files of other kinds and hidden ones are passed over.
 
     Of sub-folders only those named are looked into ("a", "a/b"), if they are there; their photos are "a/name.jpg".
     """
+    folder = place_of(folder)
     top = files_in(folder)
     if top is None:
         raise FileError(f"{folder} is no folder; give the folder that holds the photos")
