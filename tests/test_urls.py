@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import shutil
+import tempfile
 import warnings
 from pathlib import Path
 
@@ -317,6 +318,29 @@ def test_a_folder_that_may_not_be_written_is_told_before_any_work(remote, monkey
     said = "error: memory://bucket/out/.rectified.jsonl cannot be written: no permission (Access Denied)"
     assert result.stderr.splitlines() == [said]
     assert held(fs, "memory://") == before
+
+
+def test_a_temporary_folder_that_cannot_be_written_stops_the_batch(remote, monkeypatch):
+    folder, _, _ = remote
+    monkeypatch.setattr(tempfile, "tempdir", str(folder / "none"))
+    for out in ("memory://bucket/out", folder / "out"):
+        with pytest.raises(FileError, match="none cannot be written: No such file or directory"):
+            rectify_folder("memory://bucket/in", folder / "s.json", out)
+
+
+def test_nothing_is_left_of_a_first_photo_that_could_not_be_put(remote, monkeypatch):
+    folder, _, fs = remote
+    pipe = type(fs).pipe_file
+
+    def full(self, path, value, **kwargs):
+        if "/images/" in path:
+            raise OSError(errno.EDQUOT, os.strerror(errno.EDQUOT))
+        pipe(self, path, value, **kwargs)
+
+    monkeypatch.setattr(type(fs), "pipe_file", full)
+    with pytest.raises(FileError, match="Disk quota exceeded; 0 of 5 photos are done"):
+        rectify_folder("memory://bucket/in", folder / "s.json", "memory://bucket/out")
+    assert not fs.exists("/bucket/out")
 
 
 def test_nothing_is_left_where_nothing_could_be_done(remote):

@@ -146,8 +146,10 @@ def _remote_batch(
         _check_goes_on(folder, going_on, resume)
     partial = (path for path in folder.sizes_under(BATCH_FOLDERS) if path.endswith(".partial"))
     folder.delete([*partial, *(name for name in held if name.endswith(".partial"))])
-    journal = RemoteJournal(folder)
-    with journal:
+    here = Path(tempfile.gettempdir())
+    with _errors_of(here, "; set TMPDIR to another folder"):
+        journal = RemoteJournal(folder)
+    with _errors_of(here), journal:
         if going_on:
             journal.fetch()
         try:
@@ -158,6 +160,7 @@ def _remote_batch(
             if not going_on and not journal.read():
                 with suppress(FileError):
                     journal.drop()
+                    folder.delete(() if held else folder.sizes_under(BATCH_FOLDERS))
             raise
 
 

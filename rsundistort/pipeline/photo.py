@@ -20,7 +20,7 @@ from ..errors import FileError, InputError, MetadataWarning
 from ..io import MAX_MEGAPIXELS, RAW_AS, Photo, read_mask, read_photo, write_image
 from ..io.outputs import CANNOT_WRITE
 from ..io.photos.exif import read_orientation
-from ..io.places import File, Place, RemoteFile, RemoteFolder, fetched
+from ..io.places import File, Place, RemoteFile, fetched
 from ..model.orientation import split_mirror, turn_pixels
 from ..rectify import INTERPOLATIONS, MAP_KINDS, RemapGrid, ViewOptions, rectify, remap_grid
 from .depth import DepthJob, PhotoDepth
@@ -234,21 +234,33 @@ def rectify_photo(job: PhotoJob) -> PhotoDone:
     fingerprint = job.fingerprint()  # before it is read: should it change meanwhile, the result is stale
     if isinstance(job.source, Path) and isinstance(job.out, Path) and not isinstance(job.own_mask, RemoteFile):
         return replace(_rectify(job, job.source, job.own_mask, job.out), fingerprint=fingerprint)
-    with tempfile.TemporaryDirectory(prefix="rsundistort-") as work:
-        try:
-            source = fetched(job.source, Path(work, "photo"))
-            own_mask = None if job.own_mask is None else fetched(job.own_mask, Path(work, "masks"))
-        except FileError as error:
-            return PhotoDone(job.name, str(error))
-        out = job.out if isinstance(job.out, Path) else Path(work, "out")
-        if out is not job.out:
-            for name in (job.image, job.mask, *(each.target for each in job.also), *([job.maps] if job.maps else [])):
-                (out / name).parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with tempfile.TemporaryDirectory(prefix="rsundistort-") as work:
+            return replace(_rectify_in(Path(work), job), fingerprint=fingerprint)
+    except FileError:
+        raise
+    except OSError as error:
+        here = tempfile.gettempdir()
+        raise FileError(f"{here} cannot be written: {error.strerror}; set TMPDIR to another folder") from error
+
+
+def _rectify_in(work: Path, job: PhotoJob) -> PhotoDone:
+    """The same by way of a folder that is here; without the fingerprint."""
+    try:
+        source = fetched(job.source, work / "photo")
+        own_mask = None if job.own_mask is None else fetched(job.own_mask, work / "masks")
+    except FileError as error:
+        return PhotoDone(job.name, str(error))
+    if isinstance(job.out, Path):
+        done = _rectify(job, source, own_mask, job.out)
+    else:
+        out = work / "out"
+        for name in (job.image, job.mask, *(each.target for each in job.also), *([job.maps] if job.maps else [])):
+            (out / name).parent.mkdir(parents=True, exist_ok=True)
         done = _rectify(job, source, own_mask, out)
-        if isinstance(job.out, RemoteFolder):
-            for name in reversed([*done.files]):  # the photo last: it is never without its mask
-                job.out.write(name, (out / name).read_bytes())
-        return replace(done, fingerprint=fingerprint, problem=done.problem.replace(f"{work}{os.sep}", ""))
+        for name in reversed([*done.files]):  # the photo last: it is never without its mask
+            job.out.write(name, (out / name).read_bytes())
+    return replace(done, problem=done.problem.replace(f"{work}{os.sep}", ""))
 
 
 def _rectify(job: PhotoJob, source: Path, own_mask: Path | None, out: Path) -> PhotoDone:
