@@ -695,29 +695,6 @@ def test_a_scheduler_that_is_not_there_is_refused_in_one_line(four, monkeypatch)
     assert not (four / "out").exists()
 
 
-@pytest.fixture
-def cluster(tmp_path):
-    """Address of a scheduler, and its two workers, processes of one thread each."""
-    pytest.importorskip("distributed")
-    file = tmp_path / "scheduler.json"
-    base = [sys.executable, "-m", "dask"]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": tmp_path}
-    local = ["--host", "127.0.0.1", "--no-dashboard"]
-    command = [*base, "scheduler", "--port", "0", "--scheduler-file", str(file), *local]
-    worker = [*base, "worker", "--scheduler-file", str(file), "--nthreads", "1", "--no-nanny", *local]
-    processes = [subprocess.Popen(each, **quiet) for each in (command, worker, worker)]
-    try:
-        until = time.monotonic() + 60
-        while not file.is_file() or not file.read_text().strip():
-            assert time.monotonic() < until
-            time.sleep(0.05)
-        yield json.loads(file.read_text())["address"], processes[1:]
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()
-
-
 @pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_does_the_same_work(many, cluster):
     """Warnings come back from the workers; those of a lost one are made by the other."""
