@@ -9,13 +9,32 @@ from typing import Any
 
 import click
 
-from .terminal import Talk
+from .terminal import Talk, errors_for_people
 
 # as in `model`, `rectify` and `pipeline`: not to be imported for --help
 READOUT_NAMES = ("top-to-bottom", "bottom-to-top", "left-to-right", "right-to-left")
 INTERPOLATION_NAMES = ("cubic", "linear", "lanczos", "nearest")
 MAP_KIND_NAMES = ("npz", "exr", "stmap")
 MATCHING_NAMES = ("auto", "exhaustive", "neighbours")
+
+
+class LocalPath(click.Path):
+    """A path, also as a file:// URL; other URLs are refused."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if isinstance(value, str) and "://" in value:
+            with errors_for_people():
+                from rsundistort.io.places import local_place
+
+                value = local_place(value)
+        return super().convert(value, param, ctx)
+
+
+class PathOrUrl(click.Path):
+    """A path, or a URL as it is."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        return value if isinstance(value, str) and "://" in value else super().convert(value, param, ctx)
 
 
 def readout_by_group(
@@ -46,21 +65,23 @@ def view_alpha(_context: click.Context, _option: click.Parameter, value: str | N
 
 
 def also_folders(
-    _context: click.Context, _option: click.Parameter, value: tuple[str, ...]
+    context: click.Context, option: click.Parameter, value: tuple[str, ...]
 ) -> tuple[tuple[Path, str], ...]:
     """Folders and their interpolation, of FOLDER or FOLDER=INTERPOLATION; nearest makes up no values."""
     found = []
     for text in value:
         folder, _, name = text.rpartition("=")
-        found.append((Path(folder), name) if name in INTERPOLATION_NAMES else (Path(text), "nearest"))
+        if name not in INTERPOLATION_NAMES:
+            folder, name = text, "nearest"
+        found.append((LocalPath(path_type=Path).convert(folder, option, context), name))
     return tuple(found)
 
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
-photos_argument: Decorator = click.argument("photos", type=click.Path(path_type=Path))
+photos_argument: Decorator = click.argument("photos", type=LocalPath(path_type=Path))
 out_option: Decorator = click.option(
-    "-o", "--out", type=click.Path(path_type=Path), required=True, help="Folder for the outputs."
+    "-o", "--out", type=LocalPath(path_type=Path), required=True, help="Folder for the outputs."
 )
 camera_option: Decorator = click.option(
     "--camera",
@@ -81,7 +102,7 @@ scheduler_option: Decorator = click.option(
     "--scheduler",
     metavar="ADDRESS",
     help="Work on photos by the workers of the Dask cluster at tcp://host:8786; they see PHOTOS and OUT "
-    "under the same paths.",
+    "under the same paths or URLs.",
 )
 progress_option: Decorator = click.option(
     "--progress",
@@ -136,7 +157,7 @@ readout_groups_option: Decorator = click.option(
 )
 masks_option: Decorator = click.option(
     "--masks",
-    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    type=LocalPath(exists=True, file_okay=False, path_type=Path),
     help="Folder of masks, a.png for a.jpg: what is black in them is not looked at, nor kept in OUT/masks.",
 )
 model_option: Decorator = click.option(

@@ -12,17 +12,19 @@ from .terminal import Talk, errors_for_people, list_failed, progress_bars
 
 
 @click.command()
-@opt.photos_argument
+@click.argument("photos", type=opt.PathOrUrl(path_type=Path))
 @click.option(
     "--solution",
-    type=click.Path(path_type=Path),
+    type=opt.LocalPath(path_type=Path),
     required=True,
     help="solution.json, or a ground-truth file.",
 )
-@opt.out_option
+@click.option(
+    "-o", "--out", type=opt.PathOrUrl(path_type=Path), required=True, help="Folder for the outputs, or its URL."
+)
 @click.option(
     "--masks",
-    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    type=opt.PathOrUrl(exists=True, file_okay=False, path_type=Path),
     help="Folder of masks, a.png for a.jpg: what is black in them is black in OUT/masks.",
 )
 @opt.depth_option
@@ -57,10 +59,10 @@ from .terminal import Talk, errors_for_people, list_failed, progress_bars
 )
 @opt.talk_options
 def command(
-    photos: Path,
+    photos: Path | str,
     solution: Path,
-    out: Path,
-    masks: Path | None,
+    out: Path | str,
+    masks: Path | str | None,
     depth: str,
     alpha: float | str | None,
     scale: float,
@@ -81,12 +83,14 @@ def command(
 ) -> None:
     """Rectify the photos of a folder with the motions of a solution.
 
+    PHOTOS, OUT and the masks are folders, by path or by a URL that fsspec knows (s3://bucket/folder, gs://...).
     Exit code 3 says that some photos failed; they are listed, and the others are done.
     """
     if overwrite and resume:
         raise click.UsageError("--overwrite begins anew and --resume goes on; give one of them")
     kept = "what is done is whole, the same command with --resume goes on"
     with errors_for_people(kept) as warned, progress_bars(talk) as progress:
+        from rsundistort.io.places import place_of, sizes_under
         from rsundistort.pipeline import RectifyOptions, rectify_folder
         from rsundistort.rectify import ViewOptions
 
@@ -107,10 +111,10 @@ def command(
             photos, solution, out, options,
             jobs=jobs, overwrite=overwrite, resume=resume, scheduler=scheduler, progress=progress,
         )  # fmt: skip
+        count = len(sizes_under(place_of(out), ["images"]))
     # of photos that the solution could not join it says so itself
     known = {image.name for image in solved.images if not image.registered}
     failed = {name: why for name, why in left_out.items() if name not in known}
-    count = sum(1 for path in (out / "images").rglob("*") if path.is_file())
     if talk.as_json:
         summary = {"out": str(out), "rectified": count, "shutter_model": solved.shutter_model, "left_out": left_out}
         click.echo(json.dumps({**summary, "warnings": warned}))

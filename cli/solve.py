@@ -12,11 +12,11 @@ from .terminal import Talk, errors_for_people, progress_bars
 
 
 @click.command()
-@click.argument("model", type=click.Path(path_type=Path))
+@click.argument("model", type=opt.LocalPath(path_type=Path))
 @opt.out_option
 @click.option(
     "--images",
-    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    type=opt.LocalPath(exists=True, file_okay=False, path_type=Path),
     help="Folder of the photos that the model names; without it none are rectified.",
 )
 @click.option(

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+import time
 import zlib
 
 import hypothesis
@@ -26,3 +30,26 @@ def one_thread():
     numba.set_num_threads(1)
     yield
     numba.set_num_threads(threads)
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """Address of a scheduler, and its two workers, processes of one thread each."""
+    pytest.importorskip("distributed")
+    file = tmp_path / "scheduler.json"
+    base = [sys.executable, "-m", "dask"]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": tmp_path}
+    local = ["--host", "127.0.0.1", "--no-dashboard"]
+    command = [*base, "scheduler", "--port", "0", "--scheduler-file", str(file), *local]
+    worker = [*base, "worker", "--scheduler-file", str(file), "--nthreads", "1", "--no-nanny", *local]
+    processes = [subprocess.Popen(each, **quiet) for each in (command, worker, worker)]
+    try:
+        until = time.monotonic() + 60
+        while not file.is_file() or not file.read_text().strip():
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        yield json.loads(file.read_text())["address"], processes[1:]
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()

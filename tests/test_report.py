@@ -28,6 +28,7 @@ from rsundistort import (
     read_solution,
     write_solution,
 )
+from rsundistort.io import Metadata, write_image
 from rsundistort.pipeline import outputs
 from rsundistort.report import diagnostics as diagnostics_module
 from rsundistort.report import read_diagnostics, verdict_of, write_diagnostics, write_figures, write_report
@@ -196,9 +197,7 @@ def test_rotated_photos_are_shown_upright(tmp_path):
     quietly(out, tmp_path / "photos")
     (upright, *_) = page_of(out).data["views"]
     for folder in (tmp_path / "photos", out / "images"):
-        pixels = cv2.imread(str(folder / "a.jpg"))
-        done = cv2.imencodeWithMetadata(".jpg", pixels, [cv2.IMAGE_METADATA_EXIF], [exif_block(6)])[1]
-        (folder / "a.jpg").write_bytes(bytes(done))
+        write_image(folder / "a.jpg", cv2.imread(str(folder / "a.jpg")), Metadata(exif_block(6).tobytes()))
     quietly(out, tmp_path / "photos")
     (turned, *_) = page_of(out).data["views"]
     assert (upright["size"], turned["size"]) == ([320, 240], [240, 320])

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+import tempfile
+import time
 from collections.abc import Iterable, Mapping
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
-from ..errors import InputError
+from ..errors import FileError, InputError
 from ..model.checks import check_photo_name
 from .aside import write_aside
+from .places import RemoteFolder
 
-__all__ = ["Journal", "JournalEntry"]
+__all__ = ["Journal", "JournalEntry", "RemoteJournal"]
 
 
 @dataclass(frozen=True)
@@ -40,12 +44,9 @@ class JournalEntry:
     turn: int = 1
     depth: tuple[str, float, float] | None = None
 
-    def is_whole(self, folder: Path) -> bool:
-        """Whether all of them are there, as long as they were."""
-        try:
-            return all((folder / path).stat().st_size == size for path, size in self.files.items())
-        except OSError:
-            return False
+    def is_whole(self, sizes: Mapping[str, int]) -> bool:
+        """Whether all of them are there by the sizes of what is, as long as they were."""
+        return all(sizes.get(path) == size for path, size in self.files.items())
 
 
 class Journal:
@@ -88,6 +89,9 @@ class Journal:
         self._file.write(_line(entry))
         self._file.flush()
 
+    def settle(self) -> None:
+        """Make sure that what was added stays, whatever happens to this process."""
+
     def __enter__(self) -> Journal:
         return self
 
@@ -97,6 +101,64 @@ class Journal:
         if self._file is not None:
             self._file.close()
             self._file = None
+
+
+class RemoteJournal(Journal):
+    """A journal that is kept here, and put into a remote folder now and then, and at the end.
+
+    What a killed process did not put is done again. What it is about to do again must not pass for done: `settle`.
+    """
+
+    # Seconds from one put to the next; and how many times as long as the last one took, for long journals.
+    _EVERY_S, _TIMES = 5.0, 20.0
+
+    def __init__(self, folder: RemoteFolder) -> None:
+        self._work = tempfile.TemporaryDirectory(prefix="rsundistort-")
+        super().__init__(Path(self._work.name))
+        self._folder = folder
+        self._due = 0.0
+        self._told = True
+
+    def fetch(self) -> None:
+        """Begin with what is in the folder."""
+        self.path.write_bytes(self._folder.read(self.NAME))
+
+    def write(self, entries: Iterable[JournalEntry]) -> None:
+        """Begin anew with these, in one stroke."""
+        super().write(entries)
+        self._told = False
+        self.settle()
+
+    def add(self, entry: JournalEntry) -> None:
+        """Note that a photo is done."""
+        super().add(entry)
+        self._told = False
+        if time.monotonic() > self._due:
+            self.settle()
+
+    def settle(self) -> None:
+        """Put it."""
+        if not self._told:
+            began = time.monotonic()
+            self._folder.write(self.NAME, self.path.read_bytes())
+            ended = time.monotonic()
+            self._due, self._told = ended + max(self._EVERY_S, self._TIMES * (ended - began)), True
+
+    def drop(self) -> None:
+        """Leave no journal in the folder."""
+        self._told = True
+        self._folder.delete([self.NAME])
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        super().__exit__(kind, error, trace)
+        try:
+            # what ended the block matters more than that this failed, too
+            with suppress(FileError) if error is not None else nullcontext():
+                self.settle()
+        finally:
+            self._work.cleanup()
 
 
 def _line(entry: JournalEntry) -> str:

@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import overload
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, InputError
+from .places import File, Place, files_in
 
 __all__ = ["find_masks", "read_mask"]
 
 _SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".webp", ".jpg", ".jpeg")
 
 
-def find_masks(folder: Path, names: Sequence[str], what: str = "mask") -> dict[str, Path]:
+@overload
+def find_masks(folder: Path, names: Sequence[str], what: str = ...) -> dict[str, Path]: ...
+@overload
+def find_masks(folder: Place, names: Sequence[str], what: str = ...) -> Mapping[str, File]: ...
+def find_masks(folder: Place, names: Sequence[str], what: str = "mask") -> Mapping[str, File]:
     """Masks of photos: files of the same stem (`a.png` for `a.jpg`), or of the whole name, as COLMAP has them.
 
     Parameters
     ----------
-    folder : Path
+    folder : Path or RemoteFolder
         Of the masks. A photo need not have one.
     names : sequence of str
         Photos.
@@ -33,16 +39,18 @@ def find_masks(folder: Path, names: Sequence[str], what: str = "mask") -> dict[s
     FileError, InputError
         When the folder is missing, or no mask in it is of one of the photos.
     """
-    if not folder.is_dir():
+    if files_in(folder) is None:
         raise FileError(f"{folder} is no folder; give the folder that holds the {what}s")
-    by_stem: dict[Path, list[Path]] = {}
-    for within in sorted({folder / Path(name).parent for name in names}):
-        for path in sorted(within.iterdir()) if within.is_dir() else ():
+    by_stem: dict[PurePosixPath, list[File]] = {}
+    for within in sorted({PurePosixPath(name).parent for name in names}):
+        for each, file in (files_in(folder, within.as_posix()) or {}).items():
+            path = within / each
             if path.suffix.lower() in _SUFFIXES:
-                by_stem.setdefault(path.with_suffix(""), []).append(path)
-    found: dict[str, Path] = {}
+                by_stem.setdefault(path.with_suffix(""), []).append(file)
+    found: dict[str, File] = {}
     for name in names:
-        fitting = by_stem.get(folder / name) or by_stem.get((folder / name).with_suffix("")) or []
+        path = PurePosixPath(name)
+        fitting = by_stem.get(path) or by_stem.get(path.with_suffix("")) or []
         if len(fitting) > 1:
             raise InputError(
                 f"{name} has several {what}s: {', '.join(path.name for path in fitting)}; keep one of them"

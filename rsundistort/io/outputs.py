@@ -6,14 +6,18 @@ import errno
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ..errors import FileError
 from .aside import remove_partial
-from .journal import Journal
+from .journal import Journal, RemoteJournal
+from .places import Place, RemoteFolder
 
-__all__ = ["CANNOT_WRITE", "batch_folder", "make_inside", "output_folder"]
+__all__ = ["BATCH_FOLDERS", "CANNOT_WRITE", "batch_folder", "make_inside", "output_folder"]
+
+#: What a batch fills.
+BATCH_FOLDERS = ("images", "masks", "maps", "also")
 
 #: What a full disk, a read-only one, a limit say: anything else is not OUT's fault.
 CANNOT_WRITE = (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EPERM, errno.EDQUOT, errno.EIO)
@@ -70,13 +74,13 @@ def output_folder(
 
 @contextmanager
 def batch_folder(
-    folder: Path, *, overwrite: bool = False, resume: bool = False, apart_from: Sequence[Path] = ()
+    folder: Place, *, overwrite: bool = False, resume: bool = False, apart_from: Sequence[Place] = ()
 ) -> Iterator[Journal]:
     """The journal of a folder of outputs that fills file by file, and keeps what it has if the block ends badly.
 
     Parameters
     ----------
-    folder : Path
+    folder : Path or RemoteFolder
         Made if missing, and removed again if nothing was done. Must be empty unless `overwrite` or `resume`.
     overwrite, resume : bool
         See `folder`; `resume` only if the journal of a batch is in it. What a killed process left half-written is
@@ -89,25 +93,24 @@ def batch_folder(
     FileError
         When the folder is in use or cannot be written.
     """
+    if isinstance(folder, RemoteFolder):
+        with _remote_batch(folder, overwrite, resume, apart_from) as journal:
+            yield journal
+        return
     folder = Path(folder)
-    made = _prepare(folder, apart_from, ("images", "masks", "maps", "also"))
+    made = _prepare(folder, [other for other in apart_from if isinstance(other, Path)], BATCH_FOLDERS)
     new: list[Path] = []
     with Journal(folder) as journal:
         try:
             with _errors_of(folder, "; give another folder"):
                 folder.mkdir(parents=True, exist_ok=True)
                 going_on = journal.path.is_file()
-                if any(folder.iterdir()) and not overwrite and not (resume and going_on):
-                    mend = "; give another folder, or --overwrite to replace its outputs"
-                    if going_on:
-                        mend += ", or --resume to go on with them"
-                    elif resume:
-                        mend = ", and holds no batch that --resume could go on with" + mend
-                    raise FileError(f"{folder} is not empty{mend}")
+                if any(folder.iterdir()) and not overwrite:
+                    _check_goes_on(folder, going_on, resume)
                 new = [path for path in (folder / "images", folder / "masks", journal.path) if not path.exists()]
                 for name in ("images", "masks"):
                     make_inside(folder, name)
-                for name in ("images", "masks", "maps", "also"):
+                for name in BATCH_FOLDERS:
                     remove_partial(folder / name)
                 for aside in folder.glob(".*.partial"):
                     aside.unlink()
@@ -126,6 +129,53 @@ def batch_folder(
             raise
 
 
+@contextmanager
+def _remote_batch(
+    folder: RemoteFolder, overwrite: bool, resume: bool, apart_from: Sequence[Place]
+) -> Iterator[Journal]:
+    """As `batch_folder`; remote folders are there when something is in them."""
+    for other in apart_from:
+        if isinstance(other, RemoteFolder):
+            _check_apart(
+                folder, other, folder.holds(other) and other.holds(folder),
+                any(RemoteFolder(f"{folder}/{name}").holds(other) for name in BATCH_FOLDERS),
+            )  # fmt: skip
+    held = folder.listing() or {}
+    going_on = Journal.NAME in held
+    if held and not overwrite:
+        _check_goes_on(folder, going_on, resume)
+    partial = (path for path in folder.sizes_under(BATCH_FOLDERS) if path.endswith(".partial"))
+    folder.delete([*partial, *(name for name in held if name.endswith(".partial"))])
+    here = Path(tempfile.gettempdir())
+    with _errors_of(here, "; set TMPDIR to another folder"):
+        journal = RemoteJournal(folder)
+    with _errors_of(here), journal:
+        if going_on:
+            journal.fetch()
+        try:
+            # a folder that cannot be written shows itself now
+            journal.write(journal.read().values())
+            yield journal
+        except BaseException:
+            if not going_on and not journal.read():
+                with suppress(FileError):
+                    journal.drop()
+                    folder.delete(() if held else folder.sizes_under(BATCH_FOLDERS))
+            raise
+
+
+def _check_goes_on(folder: Place, going_on: bool, resume: bool) -> None:
+    """Refuse a folder that is not empty, unless an earlier batch in it is to be gone on with."""
+    if resume and going_on:
+        return
+    mend = "; give another folder, or --overwrite to replace its outputs"
+    if going_on:
+        mend += ", or --resume to go on with them"
+    elif resume:
+        mend = ", and holds no batch that --resume could go on with" + mend
+    raise FileError(f"{folder} is not empty{mend}")
+
+
 def make_inside(folder: Path, name: str) -> Path:
     """The folder `name` in `folder`, made if missing; refused if a link would lead it elsewhere."""
     path = folder / name
@@ -140,13 +190,18 @@ def _prepare(folder: Path, apart_from: Sequence[Path], replaced: Sequence[str]) 
     place = folder.resolve()
     for other in apart_from:
         inside = Path(other).resolve()
-        if place == inside:
-            raise FileError(f"{folder} holds the photos; give another folder for the outputs")
-        if any(inside.is_relative_to((folder / name).resolve()) for name in replaced):
-            raise FileError(f"{other} would be replaced by the outputs; give another folder for them")
+        among = any(inside.is_relative_to((folder / name).resolve()) for name in replaced)
+        _check_apart(folder, other, place == inside, among)
     if folder.exists() and not folder.is_dir():
         raise FileError(f"{folder} is a file; give a folder for the outputs")
     return _first_missing(folder)
+
+
+def _check_apart(folder: Place, other: Place, same: bool, among: bool) -> None:
+    if same:
+        raise FileError(f"{folder} holds the photos; give another folder for the outputs")
+    if among:
+        raise FileError(f"{other} would be replaced by the outputs; give another folder for them")
 
 
 @contextmanager

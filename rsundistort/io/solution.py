@@ -13,7 +13,7 @@ from ..model import READOUTS, Camera, RowMotion, Solution, SolvedImage
 from .aside import write_aside
 from .cameras import camera_from_json, camera_to_json
 
-__all__ = ["FORMAT", "VERSION", "read_solution", "solution_to_json", "write_solution"]
+__all__ = ["FORMAT", "VERSION", "read_solution", "solution_to_bytes", "solution_to_json", "write_solution"]
 
 FORMAT = "rsundistort-solution"
 VERSION = 1
@@ -95,7 +95,12 @@ def solution_to_json(solution: Solution) -> dict[str, Any]:
 
 def write_solution(path: Path, solution: Solution) -> None:
     """Write `solution.json`, whole or not at all."""
-    write_aside(Path(path), (json.dumps(solution_to_json(solution), indent=1) + "\n").encode())
+    write_aside(Path(path), solution_to_bytes(solution))
+
+
+def solution_to_bytes(solution: Solution) -> bytes:
+    """The content of `solution.json`."""
+    return (json.dumps(solution_to_json(solution), indent=1) + "\n").encode()
 
 
 def read_solution(path: Path, newer: bool = False) -> Solution:

@@ -9,8 +9,10 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from ..errors import InputError, MetadataWarning, RsUndistortWarning, SkippedPhotoWarning
-from ..io import list_photos, read_solution, write_solution
+from ..io import list_photos, read_solution
 from ..io.outputs import batch_folder
+from ..io.places import RemoteFolder, local_place, place_of, write_in
+from ..io.solution import solution_to_bytes
 from ..model import Solution
 from ..model.orientation import in_stored_frame, split_mirror, turn_solution
 from .depth import PhotoDepths, ScenePoints, check_depth, with_depths
@@ -45,7 +47,8 @@ def rectify_folder(
     ----------
     photos, solution, out : path
         Folder of the raw photos; `solution.json` or a ground-truth file; folder for the outputs. Photos in sub-folders
-        are those that the solution names as "sub/photo.jpg".
+        are those that the solution names as "sub/photo.jpg". `photos` and `out`, and the masks of the options, may be
+        URLs that `fsspec` knows ("s3://bucket/folder").
     options : RectifyOptions, optional
         What is done to each photo. With `apply_orientation` mirrored photos are mirrored, and lose their pose: no
         camera takes a mirror image. The points that depths are taken from are those of `sparse/` beside the solution.
@@ -58,7 +61,7 @@ def rectify_folder(
         and options, are passed over; other outputs of that batch are made again or deleted.
     scheduler : str, optional
         Address of a Dask scheduler (tcp://host:8786) whose workers do the work, instead of threads. They see `photos`
-        and `out` under the same absolute paths.
+        and `out` under the same absolute paths or URLs.
     progress : callable, optional
         Called as (stage, done, total).
     **named
@@ -71,12 +74,18 @@ def rectify_folder(
     left_out : dict of name to reason
         Photos of the folder that were not rectified; a warning says so, too.
     """
-    photos, out = Path(photos), Path(out)
     options = replace(options or RectifyOptions(), **named)
     check_depth(options.depth)
-    solved = in_stored_frame(read_solution(Path(solution)))
+    solution = local_place(solution)
+    also = [local_place(each) for each, _ in options.also]
+    folder, target = place_of(photos), place_of(out)
+    masks = [] if options.masks is None else [place_of(options.masks)]
+    for place in (folder, target, *masks):
+        if scheduler is not None and isinstance(place, RemoteFolder) and place.protocol == "memory":
+            raise InputError(f"{place} is in the memory of this process, which the workers of a scheduler do not see")
+    solved = in_stored_frame(read_solution(solution))
     motions = {image.name for image in solved.registered}
-    listed = list_photos(photos, options.raw_as, {PurePosixPath(name).parent.as_posix() for name in motions} - {"."})
+    listed = list_photos(folder, options.raw_as, {PurePosixPath(name).parent.as_posix() for name in motions} - {"."})
     names = [name for name in listed if name in motions]
     if not names:
         raise InputError(f"{solution} has no motion for any photo of {photos}, such as {listed[0]}; is it theirs?")
@@ -84,18 +93,13 @@ def rectify_folder(
     for name in left_out:
         warnings.warn(f"skipped: {name} has no motion in {solution}", SkippedPhotoWarning, stacklevel=2)
     solved = with_view(solved, options.view)
-    depths = PhotoDepths(solved, options.depth, _points_beside(Path(solution), solved, options.depth))
+    depths = PhotoDepths(solved, options.depth, _points_beside(solution, solved, options.depth))
     # a photo without a pose may be mirrored
     unposed = replace(solved, images=[replace(image, R_cw=None, center_w=None) for image in solved.images])
     workers = Workers(use_threads(jobs), scheduler)
-    inputs = [
-        photos,
-        *([] if options.masks is None else [Path(options.masks)]),
-        *(folder for folder, _ in options.also),
-    ]
-    with batch_folder(out, overwrite=overwrite, resume=resume, apart_from=inputs) as journal:
+    with batch_folder(target, overwrite=overwrite, resume=resume, apart_from=[folder, *masks, *also]) as journal:
         done = rectify_photos(
-            photos, unposed, names, out, options, depths, workers, StageLog(progress), journal,
+            folder, unposed, names, target, options, depths, workers, StageLog(progress), journal,
             resume=resume, go_on="whole; the same command with --resume goes on",
         )  # fmt: skip
         turns = {name: each.turn for name, each in done.items() if not each.problem}
@@ -110,7 +114,7 @@ def rectify_folder(
         if options.apply_orientation:
             solved = turn_solution(_without_mirrored_poses(solved, turns), turns)
         solved = replace(solved, options={**solved.options, "raw_as": options.raw_as})
-        write_solution(out / "solution.json", solved)
+        write_in(target, "solution.json", solution_to_bytes(solved))
     return solved, dict(sorted(left_out.items()))
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, InputError, RsUndistortWarning
 from ..io import find_depth_maps, output_name, read_colmap_poses, read_depth_map
+from ..io.places import local_place
 from ..model import AtInfinity, Camera, Depth, DepthMap, Reconstruction, RowMotion, Solution
 from ..rectify import (
     depth_from_points,
@@ -37,6 +38,7 @@ _OTHER_SCALE = 1.5
 
 def check_depth(depth: str | Path) -> None:
     """Refuse what is neither of `DEPTHS` nor a folder."""
+    depth = local_place(depth)
     if str(depth) not in DEPTHS and not Path(depth).is_dir():
         raise FileError(f"depth {str(depth)!r} is no folder, nor one of {', '.join(DEPTHS)}")
 

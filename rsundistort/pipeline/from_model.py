@@ -18,6 +18,7 @@ from ..io.colmap import ModelIds, colmap_model
 from ..io.colmap_model import ColmapModel, colmap_model_of, surviving_points
 from ..io.models import read_model
 from ..io.photos.images import stored_size
+from ..io.places import local_place
 from ..model import Reconstruction, Solution
 from ..model.orientation import INVERSE, turn_reconstruction
 from ..sfm import kept_log_level, matched_of_database
@@ -71,17 +72,14 @@ def solve_model(
         As written to `out/solution.json`.
     """
     options = options or SolveOptions()
-    model, out = Path(model), Path(out)
-    folder = None if images is None else Path(images)
+    model, out = local_place(model), local_place(out)
+    folder, masks = (None if path is None else local_place(path) for path in (images, options.masks))
     if database is not None and model.is_file():
         raise InputError(f"{model} is no COLMAP model, and --database is COLMAP's; leave it out")
     log = StageLog(progress)
     workers = Workers(use_threads(options.jobs), options.scheduler)
-    inputs = [path for path in (model, folder, options.masks) if path is not None]
-    with output_folder(
-        out, overwrite=options.overwrite, apart_from=[Path(path) for path in inputs],
-        replaced=REPLACED,
-    ) as scratch:  # fmt: skip
+    inputs = [path for path in (model, folder, masks) if path is not None]
+    with output_folder(out, overwrite=options.overwrite, apart_from=inputs, replaced=REPLACED) as scratch:
         log.begin("model")
         given = read_model(model)
         photos = {} if folder is None else _look_at(folder, given.reconstruction)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ..errors import FileError, InputError, SkippedPhotoWarning
 from ..io import ExifFacts, facts_of_exif, find_masks, list_photos, read_mask, read_photo
+from ..io.places import local_place
 from ..sfm import Features, detect_features
 from .cameras import PhotoCameras, find_cameras
 from .photo import RectifyOptions, check_not_rectified
@@ -118,7 +119,7 @@ def load_photos(
         raise InputError(
             f"{folder} holds {len(listed)} photo{'s' * (len(listed) > 1)}; the shutter needs at least three"
         )
-    mask_of = {} if options.masks is None else find_masks(Path(options.masks).absolute(), listed)
+    mask_of = {} if options.masks is None else find_masks(local_place(options.masks).absolute(), listed)
     jobs = (_LoadJob(name, folder.absolute() / name, mask_of.get(name), max_features, options) for name in listed)
     log.begin("features", len(listed))
     names: list[str] = []

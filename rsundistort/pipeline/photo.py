@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import tempfile
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
@@ -19,6 +20,7 @@ from ..errors import FileError, InputError, MetadataWarning
 from ..io import MAX_MEGAPIXELS, RAW_AS, Photo, read_mask, read_photo, write_image
 from ..io.outputs import CANNOT_WRITE
 from ..io.photos.exif import read_orientation
+from ..io.places import File, Place, RemoteFile, fetched
 from ..model.orientation import split_mirror, turn_pixels
 from ..rectify import INTERPOLATIONS, MAP_KINDS, RemapGrid, ViewOptions, rectify, remap_grid
 from .depth import DepthJob, PhotoDepth
@@ -45,7 +47,7 @@ class RectifyOptions:
         Take photos that are rectified already.
     max_megapixels : float
         Photos with more pixels are left out before they are decoded.
-    masks : path, optional
+    masks : path or URL, optional
         Folder of masks, as `io.find_masks` takes it: nothing of what is black in them is in the masks of the rectified
         photos.
     depth : str or Path
@@ -94,9 +96,9 @@ class PhotoJob:
     ----------
     name : str
         Of the photo, for people.
-    source : Path
+    source : Path or RemoteFile
         The raw photo.
-    out : Path
+    out : Path or RemoteFolder
         Folder of the outputs.
     image, mask : str
         Rectified photo and its mask, in `out`.
@@ -108,7 +110,7 @@ class PhotoJob:
         Whether the photo has a pose, which no mirror image has.
     options : RectifyOptions
         See there.
-    own_mask : Path or None
+    own_mask : Path, RemoteFile or None
         The user's mask of it.
     also : tuple of AlsoImage
         Other images of its frame.
@@ -119,15 +121,15 @@ class PhotoJob:
     """
 
     name: str
-    source: Path
-    out: Path
+    source: File
+    out: Place
     image: str
     mask: str
     depth: DepthJob
     shutter_model: str
     posed: bool
     options: RectifyOptions
-    own_mask: Path | None = None
+    own_mask: File | None = None
     also: tuple[AlsoImage, ...] = ()
     maps: str | None = None
     sample_xy: NDArray[np.int64] | None = None
@@ -153,7 +155,11 @@ class PhotoJob:
 
 def _feed(digest: Any, value: Any) -> None:
     """Take a value of plain types, arrays, dataclasses and files into a digest."""
-    if is_dataclass(value) and not isinstance(value, type):
+    if isinstance(value, RemoteFile):
+        if not value.version:
+            raise FileError(f"{value} is missing, or nobody knows when it changed")
+        digest.update(f"{value.version};".encode())
+    elif is_dataclass(value) and not isinstance(value, type):
         for each in fields(value):
             _feed(digest, each.name)
             _feed(digest, getattr(value, each.name))
@@ -223,17 +229,50 @@ def rectify_photo(job: PhotoJob) -> PhotoDone:
     """Rectify a photo into the folder of the outputs.
 
     What is wrong with the photo is in the result. That the outputs cannot be written (a full disk) is an error: the
-    others would fare no better.
+    others would fare no better. Remote files pass through a folder of their own here.
     """
-    options, camera = job.options, job.depth.camera
     fingerprint = job.fingerprint()  # before it is read: should it change meanwhile, the result is stale
+    if isinstance(job.source, Path) and isinstance(job.out, Path) and not isinstance(job.own_mask, RemoteFile):
+        return replace(_rectify(job, job.source, job.own_mask, job.out), fingerprint=fingerprint)
+    try:
+        with tempfile.TemporaryDirectory(prefix="rsundistort-") as work:
+            return replace(_rectify_in(Path(work), job), fingerprint=fingerprint)
+    except FileError:
+        raise
+    except OSError as error:
+        here = tempfile.gettempdir()
+        raise FileError(f"{here} cannot be written: {error.strerror}; set TMPDIR to another folder") from error
+
+
+def _rectify_in(work: Path, job: PhotoJob) -> PhotoDone:
+    """The same by way of a folder that is here; without the fingerprint."""
+    try:
+        source = fetched(job.source, work / "photo")
+        own_mask = None if job.own_mask is None else fetched(job.own_mask, work / "masks")
+    except FileError as error:
+        return PhotoDone(job.name, str(error))
+    if isinstance(job.out, Path):
+        done = _rectify(job, source, own_mask, job.out)
+    else:
+        out = work / "out"
+        for name in (job.image, job.mask, *(each.target for each in job.also), *([job.maps] if job.maps else [])):
+            (out / name).parent.mkdir(parents=True, exist_ok=True)
+        done = _rectify(job, source, own_mask, out)
+        for name in reversed([*done.files]):  # the photo last: it is never without its mask
+            job.out.write(name, (out / name).read_bytes())
+    return replace(done, problem=done.problem.replace(f"{work}{os.sep}", ""))
+
+
+def _rectify(job: PhotoJob, source: Path, own_mask: Path | None, out: Path) -> PhotoDone:
+    """The same with local files; without the fingerprint."""
+    options, camera = job.options, job.depth.camera
     files: dict[str, int] = {}
     writing = False
     try:
-        photo = read_photo(job.source, options.max_megapixels)
+        photo = read_photo(source, options.max_megapixels)
         if not options.again:
             check_not_rectified(photo)
-        own = None if job.own_mask is None else read_mask(job.own_mask, camera.width, camera.height)
+        own = None if own_mask is None else read_mask(own_mask, camera.width, camera.height)
         seen = job.depth.find()
         grid_of = (camera, seen.motion, job.shutter_model, job.depth.new_camera)
         pixels, mask = rectify(photo.pixels, *grid_of, options.interpolation, mask=own, depth=seen.depth)
@@ -246,30 +285,30 @@ def rectify_photo(job: PhotoJob) -> PhotoDone:
             metadata = metadata.with_orientation(rest)
         del photo, own  # not beside the encoded one
         writing = True
-        write_image(job.out / job.image, pixels, metadata, options.quality)
-        files[job.image] = (job.out / job.image).stat().st_size
-        write_image(job.out / job.mask, mask, flat=True)
-        files[job.mask] = (job.out / job.mask).stat().st_size
-        for name in _write_extras(job, seen, turn):
-            files[name] = (job.out / name).stat().st_size
+        write_image(out / job.image, pixels, metadata, options.quality)
+        files[job.image] = (out / job.image).stat().st_size
+        write_image(out / job.mask, mask, flat=True)
+        files[job.mask] = (out / job.mask).stat().st_size
+        for name in _write_extras(job, out, seen, turn):
+            files[name] = (out / name).stat().st_size
     except (FileError, InputError, MemoryError, cv2.error) as error:
         if writing and getattr(error.__cause__, "errno", None) in CANNOT_WRITE:
             raise
         for name in files:  # no photo without its mask
-            (job.out / name).unlink(missing_ok=True)
+            (out / name).unlink(missing_ok=True)
         return PhotoDone(job.name, " ".join(str(error).split()) or "it does not fit into the memory")
     note = None if seen.whole_shift_px is None else (seen.kind, seen.shift_px, seen.whole_shift_px)
-    return PhotoDone(job.name, "", fingerprint, files, turn, note, colors)
+    return PhotoDone(job.name, "", "", files, turn, note, colors)
 
 
-def _write_extras(job: PhotoJob, seen: PhotoDepth, turn: int) -> Iterator[str]:
+def _write_extras(job: PhotoJob, out: Path, seen: PhotoDepth, turn: int) -> Iterator[str]:
     """Write the other images of a photo's frame and its grids; their names, each when it is there."""
     grid_of = (job.depth.camera, seen.motion, job.shutter_model, job.depth.new_camera)
     for each in job.also:
         try:
             image = read_photo(each.source, job.options.max_megapixels)
             pixels, _ = rectify(image.pixels, *grid_of, each.interpolation, depth=seen.depth)
-            write_image(job.out / each.target, turn_pixels(pixels, turn), image.metadata, 98)
+            write_image(out / each.target, turn_pixels(pixels, turn), image.metadata, 98)
         except (FileError, InputError) as error:
             if getattr(error.__cause__, "errno", None) in CANNOT_WRITE:
                 raise
@@ -283,7 +322,7 @@ def _write_extras(job: PhotoJob, seen: PhotoDepth, turn: int) -> Iterator[str]:
         ending = MAP_KINDS[job.options.maps]
         for way, each_way in (("forward", grid), ("inverse", grid.inverse())):
             name = f"{job.maps}.{way}{ending}"
-            each_way.save(job.out / name, job.options.maps)
+            each_way.save(out / name, job.options.maps)
             yield name
 
 

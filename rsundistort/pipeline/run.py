@@ -10,6 +10,7 @@ from pathlib import Path
 from ..errors import InputError, RsUndistortWarning
 from ..io import output_folder
 from ..io.motions import Known
+from ..io.places import local_place
 from ..model import Solution
 from .frames import find_photos
 from .gyro import gyro_contradiction, gyro_motions, known_readouts
@@ -50,10 +51,10 @@ def run(
         As written to `out/solution.json`; photos that did not register are in it, with the reason.
     """
     options = options or RunOptions()
-    photos, out = Path(photos), Path(out)
+    photos, out = local_place(photos), local_place(out)
     log = StageLog(progress)
     workers = Workers(use_threads(options.jobs), options.scheduler)
-    inputs = [photos] if options.masks is None else [photos, Path(options.masks)]
+    inputs = [photos] if options.masks is None else [photos, local_place(options.masks)]
     with output_folder(out, overwrite=options.overwrite, apart_from=inputs, replaced=REPLACED) as scratch:
         gyro_log = None if options.gyro is None else options.gyro.log()
         source = find_photos(photos, scratch, options.camera, options.every, options.sharpest, log)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path, PurePosixPath
 
@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from ..errors import FileError, SkippedPhotoWarning
 from ..io import find_masks, output_name
 from ..io.journal import Journal, JournalEntry
-from ..io.outputs import make_inside
+from ..io.outputs import BATCH_FOLDERS, make_inside
+from ..io.places import Place, absolute, delete_in, files_of, place_of, sizes_under
 from ..model import Reconstruction, Solution
 from .depth import PhotoDepths
 from .extras import find_extras
@@ -33,10 +34,10 @@ def mask_names(names: Sequence[str]) -> dict[str, str]:
 
 
 def rectify_photos(
-    folder: Path,
+    folder: Place,
     solution: Solution,
     names: Sequence[str],
-    out: Path,
+    out: Place,
     options: RectifyOptions,
     depths: PhotoDepths,
     workers: Workers,
@@ -57,7 +58,7 @@ def rectify_photos(
     ----------
     folder, solution, names
         Of the raw photos, their motions, and which of them.
-    out : Path
+    out : Path or RemoteFolder
         `batch_folder` made it ready, and gave `journal`.
     options, depths, workers, log
         What is done to each, how far away what it shows is, where, and who is told.
@@ -79,27 +80,22 @@ def rectify_photos(
     done: dict[str, PhotoDone] = {}
     jobs = _Jobs(folder, solution, names, out, options, depths, colors)
     if resume:
+        sizes = sizes_under(out, BATCH_FOLDERS)
         for name in names:
             entry = before.get(name)
-            if entry and entry.fingerprint and entry.fingerprint == jobs[name].fingerprint() and entry.is_whole(out):
+            if entry and entry.fingerprint and entry.fingerprint == jobs[name].fingerprint() and entry.is_whole(sizes):
                 done[name] = PhotoDone(name, "", entry.fingerprint, entry.files, entry.turn, entry.depth)
     todo = [name for name in names if name not in done]
-    kinds = ("images", "masks", *(["maps"] if options.maps is not None else []))
-    for within in sorted({PurePosixPath(name).parent for name in todo}):
-        for kind in kinds:
-            make_inside(out, (kind / within).as_posix())
-    for within in sorted({PurePosixPath(each.target).parent for name in todo for each in jobs.extras.of(name)}):
-        make_inside(out, within.as_posix())
-
-    def begin() -> Iterator[PhotoJob]:
-        for name in todo:
-            if name in before:
-                # from here on its outputs may be of either making
-                journal.add(JournalEntry(name, "", before[name].files))
-            yield jobs[name]
-
+    if isinstance(out, Path):  # remote ones are made with what is in them
+        for within in jobs.folders(todo):
+            make_inside(out, within)
+    for name in todo:
+        if name in before:
+            # from here on its outputs may be of either making
+            journal.add(JournalEntry(name, "", before[name].files))
+    journal.settle()
     log.begin("rectifying", len(names), len(done))
-    results = workers.map(rectify_photo, begin(), lambda job, why: PhotoDone(job.name, why))
+    results = workers.map(rectify_photo, (jobs[name] for name in todo), lambda job, why: PhotoDone(job.name, why))
     try:
         with closing(results):
             for result in results:
@@ -118,8 +114,11 @@ def rectify_photos(
     if any(not each.problem for each in done.values()):
         kept = {name: before[name] for name in before.keys() - done.keys()} if resume else {}
         kept |= {name: _entry(each) for name, each in done.items() if not each.problem}
-        earlier = {path for name in before for path in before[name].files} | set(() if resume else _outputs(out))
-        _delete(out, earlier - {path for entry in kept.values() for path in entry.files})
+        earlier = {path for entry in before.values() for path in entry.files}
+        if not resume:
+            earlier |= sizes_under(out, ("images", "masks")).keys()
+        # they may come of a journal, which is a file that anybody may have changed: nothing outside is deleted
+        delete_in(out, earlier - {path for entry in kept.values() for path in entry.files})
         journal.write(kept[name] for name in sorted(kept))
     log.end("rectifying", photos=sum(not each.problem for each in done.values()))
     return {name: done[name] for name in names}
@@ -130,20 +129,21 @@ class _Jobs:
 
     def __init__(
         self,
-        folder: Path,
+        folder: Place,
         solution: Solution,
         names: Sequence[str],
-        out: Path,
+        out: Place,
         options: RectifyOptions,
         depths: PhotoDepths,
         colors: PointColors | None,
     ) -> None:
         # absolute: workers elsewhere have another working directory
-        self._folder, self._out = folder.absolute(), out.absolute()
+        self._folder, self._out = absolute(folder), absolute(out)
+        self._files = files_of(self._folder, names)
         self._solution, self._options, self._depths, self._colors = solution, options, depths, colors
         self.extras = find_extras(options.maps, options.also, names)
         self._mask_name = mask_names([image.name for image in solution.images])
-        self._own = {} if options.masks is None else find_masks(Path(options.masks).absolute(), names)
+        self._own = {} if options.masks is None else find_masks(absolute(place_of(options.masks)), names)
 
     def __getitem__(self, name: str) -> PhotoJob:
         solution = self._solution
@@ -151,7 +151,7 @@ class _Jobs:
         stem = PurePosixPath(self._mask_name[name]).with_suffix("").as_posix()
         return PhotoJob(
             name=name,
-            source=self._folder / name,
+            source=self._files[name],
             out=self._out,
             image=f"images/{output_name(name, self._options.raw_as)}",
             mask=f"masks/{self._mask_name[name]}",
@@ -165,22 +165,16 @@ class _Jobs:
             sample_xy=None if self._colors is None else self._colors.pixels(name),
         )
 
+    def folders(self, names: Sequence[str]) -> list[str]:
+        """Folders of the outputs of photos."""
+        kinds = ("images", "masks", *(["maps"] if self._options.maps is not None else []))
+        found = [kind / within for within in {PurePosixPath(name).parent for name in names} for kind in kinds]
+        found += {PurePosixPath(each.target).parent for name in names for each in self.extras.of(name)}
+        return sorted(path.as_posix() for path in found)
+
 
 def _entry(done: PhotoDone) -> JournalEntry:
     return JournalEntry(done.name, done.fingerprint, done.files, done.turn, done.depth)
-
-
-def _outputs(out: Path) -> Iterator[str]:
-    """Rectified photos and masks that are in a folder of outputs."""
-    for kind in ("images", "masks"):
-        yield from (path.relative_to(out).as_posix() for path in (out / kind).rglob("*") if not path.is_dir())
-
-
-def _delete(out: Path, paths: Iterable[str]) -> None:
-    for path in paths:
-        # they may come of a journal, which is a file that anybody may have changed
-        if (out / path).parent.resolve().is_relative_to(out.resolve()):
-            (out / path).unlink(missing_ok=True)
 
 
 class PointColors:

@@ -102,7 +102,8 @@ def _solution(path: Path) -> tuple[Solution, list[str]]:
 
 def _missing(source: Source) -> list[str]:
     """What photos are not there."""
-    names = [image.name for image in source.solution.registered]
+    # of those that could not be rectified the solution says why
+    names = [image.name for image in source.solution.registered if image.reason is None]
     if not (source.out / "images").is_dir():
         return []  # solved without photos
     notes = []

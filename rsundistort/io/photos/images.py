@@ -11,7 +11,7 @@ import warnings
 import zlib  # noqa: F401
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import cv2
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ...errors import FileError, FileKindWarning, InputError, MetadataWarning
 from ..aside import write_aside
+from ..places import Place, files_in, place_of
 from .containers import metadata_of, with_metadata
 from .heif import read_heif
 from .kinds import (
@@ -71,21 +72,21 @@ class Photo:
     metadata: Metadata = field(default_factory=Metadata)
 
 
-def list_photos(folder: Path, raw_as: str = "tif", sub_folders: Collection[str] = ()) -> list[str]:
-    """Names of the photos in a folder, sorted; files of other kinds and hidden ones are passed over.
+def list_photos(folder: Place | str, raw_as: str = "tif", sub_folders: Collection[str] = ()) -> list[str]:
+    """Names of the photos in a folder, by path or URL, sorted; files of other kinds and hidden ones are passed over.
 
     Of sub-folders only those named are looked into ("a", "a/b"), if they are there; their photos are "a/name.jpg".
     """
-    folder = Path(folder)
-    if not folder.is_dir():
+    folder = place_of(folder)
+    top = files_in(folder)
+    if top is None:
         raise FileError(f"{folder} is no folder; give the folder that holds the photos")
     suffixes = PHOTO_SUFFIXES + HEIF_SUFFIXES + RAW_SUFFIXES
     names = sorted(
-        entry.relative_to(folder).as_posix()
-        for within in (folder, *(folder / name for name in sorted(sub_folders)))
-        if within.is_dir()
-        for entry in within.iterdir()
-        if entry.suffix.lower() in suffixes and not entry.name.startswith(".") and entry.is_file()
+        (PurePosixPath(within) / name).as_posix()
+        for within, files in ((".", top), *((each, files_in(folder, each)) for each in sorted(sub_folders)))
+        for name in files or ()
+        if PurePosixPath(name).suffix.lower() in suffixes and not name.startswith(".")
     )
     outputs: dict[str, str] = {}
     for name in names:
