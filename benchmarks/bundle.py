@@ -77,7 +77,7 @@ def make_problem(layout: str, size: int, seed: int = 0) -> Any:
     m = max(4, round(size / PER_PHOTO))
     n = round(size / TRACK * (1 + 20 / m if layout == "street" else 1))
     centers, ahead, down, points, reach = {"street": street, "block": block}[layout](m, n, rng)
-    camera = Camera(WIDTH, HEIGHT, [[FOCAL, 0, 500], [0, FOCAL, 375], [0, 0, 1]])
+    camera = Camera(WIDTH, HEIGHT, [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
     ahead = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
     right = np.cross(np.broadcast_to(down, ahead.shape), ahead)
     right /= np.linalg.norm(right, axis=1, keepdims=True)
@@ -160,7 +160,7 @@ def ours(folder: Path, model: str, repeat: int) -> dict[str, Any]:
         return {}
     loaded = peak_mb()
     data = dict(np.load(folder / "problem.npz"))
-    camera = Camera(WIDTH, HEIGHT, [[FOCAL, 0, 500], [0, FOCAL, 375], [0, 0, 1]])
+    camera = Camera(WIDTH, HEIGHT, [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
     m = len(data["R_cw"])
     rec = Reconstruction(
         cameras=[camera],
