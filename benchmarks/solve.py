@@ -59,14 +59,31 @@ print(json.dumps({"photos": best.num_reg_images(), "points": best.num_points3D()
                   "error_px": best.compute_mean_reprojection_error()}))
 """
 
-# database, model with poses: errors of points triangulated anew
+# database, photos, model with poses: errors of points triangulated anew, with the database's ids
 REFIT = """
 import json, sys
 import numpy as np
 import pycolmap
 database, photos, model = sys.argv[1:]
 pycolmap.logging.minloglevel = 2
-found = pycolmap.triangulate_points(pycolmap.Reconstruction(model), database, photos, photos + "/../refit")
+poses = {image.name: image.cam_from_world() for image in pycolmap.Reconstruction(model).images.values()}
+posed = pycolmap.Reconstruction()
+with pycolmap.Database.open(database) as db:
+    for camera in db.read_all_cameras():
+        posed.add_camera(camera)
+    for rig in db.read_all_rigs():
+        posed.add_rig(rig)
+    frames = {data.id: frame for frame in db.read_all_frames() for data in frame.data_ids}
+    for image in db.read_all_images():
+        frame = frames[image.image_id]
+        frame.rig_from_world = poses[image.name]
+        posed.add_frame(frame)
+        image.frame_id = frame.frame_id
+        keypoints = db.read_keypoints(image.image_id)[:, :2].astype(np.float64)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in keypoints])
+        posed.add_image(image)
+        posed.register_frame(frame.frame_id)
+found = pycolmap.triangulate_points(posed, database, photos, photos + "/../refit")
 errors = [np.linalg.norm(image.project_point(found.points3D[p.point3D_id].xyz) - p.xy)
           for image in found.images.values() for p in image.points2D if p.has_point3D()]
 print(json.dumps({"median_px": float(np.median(errors)), "measurements": len(errors)}))
