@@ -36,7 +36,7 @@ QUALITY = 98
 
 # prints the seconds of the work itself, without imports and compiled kernels' loading, and the largest resident set
 OURS = """
-import sys, time, resource, json
+import sys, time, json
 from pathlib import Path
 from rsundistort.pipeline import rectify_folder
 photos, solution, out, warm, interpolation, quality, jobs = sys.argv[1:]
@@ -45,7 +45,8 @@ rectify_folder(warm, solution, out + "-warm", **options)
 began = time.perf_counter()
 rectify_folder(photos, solution, out, **options)
 seconds = time.perf_counter() - began
-peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform == "linux" else 1024**2)
+# not ru_maxrss: that of a young process is its parent's
+peak = int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]) / 1024
 print(json.dumps({"s": seconds, "mb": peak}))
 """
 

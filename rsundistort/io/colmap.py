@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from ..errors import FileError, FormatError, InputError
 from ..model import Camera, Reconstruction
@@ -127,6 +126,8 @@ def _fitted_camera(found: Any, where: str) -> Camera:
     Lenses of FOV or a division model bend rays by a smooth function of the radius, which four coefficients of a fisheye
     or six of a rational lens follow closely; prisms they do not.
     """
+    from scipy.optimize import least_squares  # late: ten megabytes that hardly anybody needs
+
     width, height = found.width, found.height
     x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(0, width, 41), np.linspace(0, height, 31)))
     xy = np.column_stack([x, y])

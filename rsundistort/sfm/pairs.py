@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 __all__ = ["choose_pairs", "global_descriptors"]
 
@@ -72,6 +71,8 @@ def _next_in(order: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def _nearest(positions: NDArray[np.float64]) -> NDArray[np.int64]:
     """Each photo with those nearest to it."""
+    from scipy.spatial import cKDTree  # late: ten megabytes that few need
+
     known = np.flatnonzero(np.isfinite(positions).all(1))
     if len(known) < 2:
         return np.zeros((0, 2), np.int64)
