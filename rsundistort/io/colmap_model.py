@@ -21,6 +21,9 @@ __all__ = ["ColmapModel", "checked_name", "colmap_model_of", "read_colmap_model"
 # COLMAP's pixel centres are at 0.5, ours at 0
 _HALF = 0.5
 
+# files of every model, text or binary; newer ones have rigs and frames, too
+_PARTS = ("cameras", "images", "points3D")
+
 
 @dataclass(frozen=True)
 class ColmapModel:
@@ -134,6 +137,8 @@ def read_colmap_model(folder: Path) -> ColmapModel:
     folder = Path(folder)
     if not folder.is_dir():
         raise FileError(f"{folder} is no folder; give the folder with cameras, images and points3D of a COLMAP model")
+    if not any(all((folder / f"{part}.{kind}").is_file() for part in _PARTS) for kind in ("bin", "txt")):
+        raise FileError(f"{folder} is no COLMAP model; give the folder with its cameras, images and points3D")
     try:
         model = pycolmap.Reconstruction(folder)
     except Exception as error:  # pycolmap raises what its C++ raised
