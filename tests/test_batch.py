@@ -387,11 +387,11 @@ def no_room_after(monkeypatch, count, code=errno.ENOSPC):
     written = []
     write = images.write_aside
 
-    def full(path, data):
+    def full(path, *parts):
         if len(written) >= count:
             raise OSError(code, os.strerror(code), str(path))
         written.append(path)
-        write(path, data)
+        write(path, *parts)
 
     monkeypatch.setattr(images, "write_aside", full)
 

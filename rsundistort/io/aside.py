@@ -24,10 +24,10 @@ def written_aside(path: Path) -> Iterator[Path]:
         aside.unlink(missing_ok=True)
 
 
-def write_aside(path: Path, data: bytes) -> None:
-    """Write a file, whole or not at all."""
-    with written_aside(path) as aside:
-        aside.write_bytes(data)
+def write_aside(path: Path, *parts: bytes | memoryview) -> None:
+    """Write a file of these parts, whole or not at all."""
+    with written_aside(path) as aside, aside.open("wb") as file:
+        file.writelines(parts)
 
 
 def remove_partial(folder: Path) -> None:

@@ -28,6 +28,8 @@ from .extras import AlsoImage
 
 __all__ = ["PhotoDone", "PhotoJob", "RectifyOptions", "check_not_rectified", "rectify_photo", "turn_of"]
 
+_VERSION = version("rsundistort")  # once: looking it up takes milliseconds, which every photo would wait for
+
 
 @dataclass(frozen=True)
 class RectifyOptions:
@@ -139,7 +141,7 @@ class PhotoJob:
 
         Files count with size and time of change, all else with its value; a missing photo has no fingerprint ("").
         """
-        digest = hashlib.sha256(f"{version('rsundistort')} {cv2.__version__}".encode())
+        digest = hashlib.sha256(f"{_VERSION} {cv2.__version__}".encode())
         # where things lie, and which photos are let in, does not change what comes of them; nor does a pose, but for
         # how the photo is turned
         options = replace(
@@ -277,7 +279,7 @@ def _rectify(job: PhotoJob, source: Path, own_mask: Path | None, out: Path) -> P
         grid_of = (camera, seen.motion, job.shutter_model, job.depth.new_camera)
         pixels, mask = rectify(photo.pixels, *grid_of, options.interpolation, mask=own, depth=seen.depth)
         colors = None if job.sample_xy is None else _colors(photo, job.sample_xy)
-        metadata, turn = photo.metadata.marked(version("rsundistort")), 1
+        metadata, turn = photo.metadata.marked(_VERSION), 1
         if options.apply_orientation:
             turn, rest = turn_of(metadata.orientation, job.posed)
             pixels, mask = turn_pixels(pixels, turn), turn_pixels(mask, turn)

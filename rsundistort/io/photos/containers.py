@@ -10,7 +10,7 @@ from .exif import MAKER_NOTE, Damaged, exif_of_tiff
 from .kinds import picture_size
 from .metadata import Metadata
 
-__all__ = ["metadata_of", "with_metadata"]
+__all__ = ["Parts", "metadata_of", "with_metadata"]
 
 _EXIF_HEAD = b"Exif\0\0"
 _XMP_HEAD = b"http://ns.adobe.com/xap/1.0/\0"
@@ -21,6 +21,9 @@ _SEGMENT = 65533  # most bytes in one segment of a JPEG
 # a profile of colours is some kilobytes; a bomb is not
 _MOST_INFLATED = 64 << 20
 
+# one behind another; pictures are megabytes, which nobody should copy without need
+Parts = list[bytes | memoryview]
+
 
 def metadata_of(data: bytes, kind: str) -> Metadata:
     """EXIF, XMP and ICC of a file of a kind; what is damaged beyond finding is left out."""
@@ -30,9 +33,9 @@ def metadata_of(data: bytes, kind: str) -> Metadata:
     return readers[kind](data)
 
 
-def with_metadata(encoded: bytes, kind: str, metadata: Metadata) -> tuple[bytes, list[str]]:
-    """An encoded picture with metadata put in, and what could not be kept."""
-    writers: dict[str, Callable[[bytes, Metadata], tuple[bytes, list[str]]]] = {
+def with_metadata(encoded: memoryview, kind: str, metadata: Metadata) -> tuple[Parts, list[str]]:
+    """An encoded picture with metadata put in, as the parts of its file, and what could not be kept."""
+    writers: dict[str, Callable[[memoryview, Metadata], tuple[Parts, list[str]]]] = {
         "JPEG": _into_jpeg, "PNG": _into_png, "WebP": _into_webp,
     }  # fmt: skip
     return writers[kind](encoded, metadata)
@@ -71,7 +74,7 @@ def _of_jpeg(data: bytes) -> Metadata:
     return Metadata(exif, xmp, b"".join(profile[k] for k in sorted(profile)))
 
 
-def _into_jpeg(encoded: bytes, metadata: Metadata) -> tuple[bytes, list[str]]:
+def _into_jpeg(encoded: memoryview, metadata: Metadata) -> tuple[Parts, list[str]]:
     exif, xmp, icc = metadata.exif, metadata.xmp, metadata.icc
     lost = []
     if len(exif) > _SEGMENT - len(_EXIF_HEAD):
@@ -96,7 +99,7 @@ def _into_jpeg(encoded: bytes, metadata: Metadata) -> tuple[bytes, list[str]]:
     block = b"".join(struct.pack(">BBH", 0xFF, marker, len(content) + 2) + content for marker, content in contents)
     # behind JFIF's own segment, where readers look for it
     at = 2 + 2 + int.from_bytes(encoded[4:6], "big") if encoded[2:4] == b"\xff\xe0" else 2
-    return encoded[:at] + block + encoded[at:], lost
+    return [encoded[:at], block, encoded[at:]], lost
 
 
 # ---------------------------------------------------------------- PNG
@@ -142,7 +145,7 @@ def _stored(data: bytes) -> bytes:
     return out + struct.pack(">I", zlib.adler32(data))
 
 
-def _into_png(encoded: bytes, metadata: Metadata) -> tuple[bytes, list[str]]:
+def _into_png(encoded: memoryview, metadata: Metadata) -> tuple[Parts, list[str]]:
     chunks = [(b"iCCP", b"ICC profile\0\0" + _stored(metadata.icc))] if metadata.icc else []
     chunks += [(b"iTXt", _PNG_XMP_HEAD + b"\0\0\0\0" + metadata.xmp)] if metadata.xmp else []
     chunks += [(b"eXIf", metadata.exif)] if metadata.exif else []
@@ -151,7 +154,7 @@ def _into_png(encoded: bytes, metadata: Metadata) -> tuple[bytes, list[str]]:
         for name, content in chunks
     )
     at = 8 + 25  # behind the header chunk
-    return encoded[:at] + block + encoded[at:], []
+    return [encoded[:at], block, encoded[at:]], []
 
 
 # ---------------------------------------------------------------- WebP
@@ -170,7 +173,8 @@ def _of_webp(data: bytes) -> Metadata:
     return Metadata(_bare(chunks.get(b"EXIF", b"")), chunks.get(b"XMP ", b""), chunks.get(b"ICCP", b""))
 
 
-def _into_webp(encoded: bytes, metadata: Metadata) -> tuple[bytes, list[str]]:
+def _into_webp(picture: memoryview, metadata: Metadata) -> tuple[Parts, list[str]]:
+    encoded = bytes(picture)
     size = picture_size(encoded, "WebP")
     assert size is not None
     chunks = list(_riff_chunks(encoded))
@@ -188,4 +192,4 @@ def _into_webp(encoded: bytes, metadata: Metadata) -> tuple[bytes, list[str]]:
     body = b"".join(
         name + struct.pack("<I", len(content)) + content + b"\0" * (len(content) % 2) for name, content in every
     )
-    return b"RIFF" + struct.pack("<I", 4 + len(body)) + b"WEBP" + body, []
+    return [b"RIFF" + struct.pack("<I", 4 + len(body)) + b"WEBP", body], []

@@ -76,7 +76,7 @@ def is_whole(data: bytes) -> bool:
     at = 2
     while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:  # segments before the pixels
         at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    return data.find(b"\xff\xd9", at) > 0
+    return data.rfind(b"\xff\xd9", at) > 0  # from behind, where it mostly is
 
 
 def picture_size(data: bytes, kind: str) -> tuple[int, int] | None:
