@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -35,20 +35,6 @@ class PathOrUrl(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         return value if isinstance(value, str) and "://" in value else super().convert(value, param, ctx)
-
-
-def readout_by_group(
-    _context: click.Context, _option: click.Parameter, value: tuple[str, ...]
-) -> dict[str, str] | None:
-    """Directions by group, the empty name for all others, of DIRECTION or GROUP=DIRECTION."""
-    directions: dict[str, str] = {}
-    for text in value:
-        group, _, direction = text.rpartition("=")
-        if direction not in READOUT_NAMES:
-            raise click.BadParameter(f"{direction!r} is not one of {', '.join(READOUT_NAMES)}")
-        if directions.setdefault(group, direction) != direction:
-            raise click.BadParameter(f"{text!r}: another direction was given before")
-    return directions or None
 
 
 def view_alpha(_context: click.Context, _option: click.Parameter, value: str | None) -> float | str | None:
@@ -112,9 +98,6 @@ progress_option: Decorator = click.option(
     show_default=True,
     help="json: lines on stdout for other programs, and nothing else there.",
 )
-report_option: Decorator = click.option(
-    "--report/--no-report", default=True, help="Write OUT/report.html; rsundistort report makes it later, too."
-)
 json_option: Decorator = click.option(
     "--json", "as_json", is_flag=True, help="One JSON object on stdout at the end, instead of what is for people."
 )
@@ -147,68 +130,6 @@ max_pixels_option: Decorator = click.option(
     metavar="MILLIONS",
     help="Photos with more pixels are left out: a small file can claim to be a huge picture.",
 )
-readout_groups_option: Decorator = click.option(
-    "--readout",
-    multiple=True,
-    metavar="[GROUP=]DIRECTION",
-    callback=readout_by_group,
-    help=f"Direction of the readout in the stored pixels: {', '.join(READOUT_NAMES)}; of all photos, or of a "
-    "group (as the closing table names it). By default the camera file's, else guessed and settled by the photos.",
-)
-masks_option: Decorator = click.option(
-    "--masks",
-    type=LocalPath(exists=True, file_okay=False, path_type=Path),
-    help="Folder of masks, a.png for a.jpg: what is black in them is not looked at, nor kept in OUT/masks.",
-)
-model_option: Decorator = click.option(
-    "--model",
-    "shutter_model",
-    type=click.Choice(("auto", "constant-motion", "rotation", "linearized", "two-step", "global")),
-    default="auto",
-    show_default=True,
-    help="How the shutter is modelled; auto is the model that foretells measurements held out from its fit.",
-)
-refine_option: Decorator = click.option(
-    "--refine",
-    metavar="NAMES",
-    help="Intrinsics to solve for with the rest: some of f (or fx, fy), cx, cy, k1, k2, p1, p2, k3 (of a "
-    "fisheye k1 to k4) with commas between, or none. By default none of a camera that was given, f,k1,k2 of one that "
-    "EXIF guessed.",
-)
-still_option: Decorator = click.option(
-    "--still",
-    "--anchor",
-    multiple=True,
-    metavar="NAME[=MRAD]",
-    help="A photo known not to have moved: its phi1 is held at zero, or near zero with so many mrad per frame of "
-    "standard deviation. May be repeated.",
-)
-known_option: Decorator = click.option(
-    "--known",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    metavar="CSV",
-    help="Motions known from elsewhere: name, phi1, phi2, phi3 (rad per frame; or omega1.. in rad/s) and sigma.",
-)
-lengths_option: Decorator = click.option(
-    "--lengths",
-    "--length",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    metavar="CSV",
-    help="Lengths measured in the scene, two or more: photo1, x1, y1, photo2, x2, y2, length, sigma.",
-)
-readout_ms_option: Decorator = click.option(
-    "--readout-ms",
-    type=click.FloatRange(min=0, min_open=True),
-    help="Time of the readout of a frame. Default: the gyroscope's log, or a table of cameras.",
-)
-remedy_option: Decorator = click.option(
-    "--remedy",
-    type=click.Choice(("auto", "prior", "none")),
-    default="auto",
-    show_default=True,
-    help="Where all cameras are level: auto looks for a photo that did not move, prior takes the motions to be zero "
-    "in the mean, none does neither.",
-)
 depth_option: Decorator = click.option(
     "--depth",
     metavar="auto|infinity|plane|points|DIR",
@@ -216,19 +137,6 @@ depth_option: Decorator = click.option(
     show_default=True,
     help="How far away what the photos show is, which matters where the camera travelled during the readout: on a "
     "plane, as the known points, or as maps of your own (a.npy, .npz or float .tif for a.jpg: docs/depth.md).",
-)
-sparse_format_option: Decorator = click.option(
-    "--sparse-format",
-    type=click.Choice(("bin", "txt")),
-    default="bin",
-    show_default=True,
-    help="How the COLMAP model is written.",
-)
-rs_poses_option: Decorator = click.option(
-    "--rs-poses",
-    is_flag=True,
-    help="OUT/rs-poses: the original photos' cameras and poses with the shutter, for gsplat, instant-ngp and "
-    "3dgs-deblur (docs/outputs.md).",
 )
 interpolation_option: Decorator = click.option(
     "--interpolation", type=click.Choice(INTERPOLATION_NAMES), default="cubic", show_default=True
@@ -248,6 +156,25 @@ def talk_options(function: Callable[..., Any]) -> Callable[..., Any]:
     for option in (verbose_option, quiet_option, json_option, progress_option):
         decorated = option(decorated)
     return decorated
+
+
+def gathered(name: str, *options: Decorator) -> Decorator:
+    """Options whose values the command gets as one mapping."""
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(function)
+        def with_mapping(*args: Any, **named: Any) -> Any:
+            given = {key: named.pop(key) for key in keys}
+            return function(*args, **named, **{name: given})
+
+        decorated: Callable[..., Any] = with_mapping
+        before = len(getattr(function, "__click_params__", ()))
+        for option in reversed(options):
+            decorated = option(decorated)
+        keys = [each.name for each in decorated.__click_params__[before:]]  # type: ignore[attr-defined]
+        return decorated
+
+    return decorate
 
 
 def view_options(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -275,30 +202,23 @@ def view_options(function: Callable[..., Any]) -> Callable[..., Any]:
     return function
 
 
-def names_between_commas(refine: str | None) -> tuple[str, ...] | None:
-    """Names between commas; () for none, None where nothing was said."""
-    if refine is None:
-        return None
-    names = tuple(name.strip() for name in refine.split(",") if name.strip())
-    return () if names == ("none",) else names
+#: What is done to each photo; for `photo_fields`.
+PHOTO_OPTIONS: tuple[Decorator, ...] = (
+    depth_option,
+    view_options,
+    interpolation_option,
+    quality_option,
+    raw_as_option,
+    apply_orientation_option,
+    again_option,
+    max_pixels_option,
+)
 
 
-def anchors(still: tuple[str, ...]) -> dict[str, float]:
-    """Photos and their standard deviations, radians per frame, of NAME or NAME=MRAD."""
-    from rsundistort import InputError
+def photo_fields(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of `RectifyOptions` of what was given, and the rest as it is."""
+    from rsundistort.rectify import ViewOptions
 
-    anchors: dict[str, float] = {}
-    for text in still:
-        name, equals, number = text.rpartition("=")
-        try:
-            sigma = float(number) / 1e3 if equals else 0.0
-        except ValueError:  # a name with = in it
-            name, sigma = text, 0.0
-        if not equals:
-            name = text
-        if equals and not sigma > 0 and name != text:
-            raise InputError(f"--still {text}: the standard deviation must be positive")
-        if anchors.get(name, sigma) != sigma:
-            raise InputError(f"--still {name} is named twice, with different standard deviations")
-        anchors[name] = sigma
-    return anchors
+    fields = dict(given)
+    view = ViewOptions(*(fields.pop(key) for key in ("alpha", "scale", "max_size")))
+    return {**fields, "view": view}

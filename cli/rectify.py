@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -27,8 +28,7 @@ from .terminal import Talk, errors_for_people, list_failed, progress_bars
     type=opt.PathOrUrl(exists=True, file_okay=False, path_type=Path),
     help="Folder of masks, a.png for a.jpg: what is black in them is black in OUT/masks.",
 )
-@opt.depth_option
-@opt.view_options
+@opt.gathered("photo", *opt.PHOTO_OPTIONS)
 @click.option(
     "--maps",
     type=click.Choice(opt.MAP_KIND_NAMES),
@@ -43,12 +43,6 @@ from .terminal import Talk, errors_for_people, list_failed, progress_bars
     help="Rectify other images of the same frames alike (a.png for a.jpg): labels, depth, near infrared; by nearest, "
     "which makes up no values, or as told. May be repeated.",
 )
-@opt.interpolation_option
-@opt.quality_option
-@opt.raw_as_option
-@opt.apply_orientation_option
-@opt.again_option
-@opt.max_pixels_option
 @opt.jobs_option
 @opt.scheduler_option
 @opt.overwrite_option
@@ -63,18 +57,9 @@ def command(
     solution: Path,
     out: Path | str,
     masks: Path | str | None,
-    depth: str,
-    alpha: float | str | None,
-    scale: float,
-    max_size: int | None,
+    photo: dict[str, Any],
     maps: str | None,
     also: tuple[tuple[Path, str], ...],
-    interpolation: str,
-    quality: int,
-    raw_as: str,
-    apply_orientation: bool,
-    again: bool,
-    max_megapixels: float,
     jobs: int,
     scheduler: str | None,
     overwrite: bool,
@@ -92,21 +77,8 @@ def command(
     with errors_for_people(kept) as warned, progress_bars(talk) as progress:
         from rsundistort.io.places import place_of, sizes_under
         from rsundistort.pipeline import RectifyOptions, rectify_folder
-        from rsundistort.rectify import ViewOptions
 
-        options = RectifyOptions(
-            interpolation=interpolation,
-            quality=quality,
-            raw_as=raw_as,
-            apply_orientation=apply_orientation,
-            again=again,
-            max_megapixels=max_megapixels,
-            masks=masks,
-            depth=depth,
-            view=ViewOptions(alpha, scale, max_size),
-            maps=maps,
-            also=also,
-        )
+        options = RectifyOptions(masks=masks, maps=maps, also=also, **opt.photo_fields(photo))
         solved, left_out = rectify_folder(
             photos, solution, out, options,
             jobs=jobs, overwrite=overwrite, resume=resume, scheduler=scheduler, progress=progress,

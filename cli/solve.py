@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
 from . import options as opt
 from .closing import close
+from .solve_options import solve_fields, solve_options
 from .terminal import Talk, errors_for_people, progress_bars
 
 
@@ -26,62 +28,14 @@ from .terminal import Talk, errors_for_people, progress_bars
     help="COLMAP's database behind the model: matches in it that the shutter spoiled are tried again with the motions "
     "found, and the tracks rebuilt.",
 )
-@opt.readout_groups_option
-@opt.masks_option
-@opt.model_option
-@opt.refine_option
-@opt.still_option
-@opt.known_option
-@opt.lengths_option
-@opt.readout_ms_option
-@opt.remedy_option
-@opt.depth_option
-@opt.view_options
-@opt.interpolation_option
-@opt.quality_option
-@opt.raw_as_option
-@opt.sparse_format_option
-@opt.rs_poses_option
-@opt.apply_orientation_option
-@opt.again_option
-@opt.max_pixels_option
-@opt.seed_option
-@opt.jobs_option
-@opt.scheduler_option
-@opt.overwrite_option
-@opt.report_option
+@solve_options
 @opt.talk_options
 def command(
     model: Path,
     out: Path,
     images: Path | None,
     database: Path | None,
-    readout: dict[str, str] | None,
-    masks: Path | None,
-    shutter_model: str,
-    refine: str | None,
-    still: tuple[str, ...],
-    known: Path | None,
-    lengths: Path | None,
-    readout_ms: float | None,
-    remedy: str,
-    depth: str,
-    alpha: float | str | None,
-    scale: float,
-    max_size: int | None,
-    interpolation: str,
-    quality: int,
-    raw_as: str,
-    sparse_format: str,
-    rs_poses: bool,
-    apply_orientation: bool,
-    again: bool,
-    max_megapixels: float,
-    seed: int,
-    jobs: int,
-    scheduler: str | None,
-    overwrite: bool,
-    report: bool,
+    solving: dict[str, Any],
     talk: Talk,
 ) -> None:
     """Find how the camera moved during each photo's readout, from a model of COLMAP, OpenMVG or OpenSfM.
@@ -92,42 +46,8 @@ def command(
     1=left-to-right".
     """
     with errors_for_people() as warned, progress_bars(talk) as progress:
-        from rsundistort.io import read_known_lengths, read_known_motions
         from rsundistort.pipeline import SolveOptions, solve_model
-        from rsundistort.rectify import ViewOptions
 
-        readout_s = readout_ms and readout_ms / 1e3
-        solution = solve_model(
-            model,
-            out,
-            SolveOptions(
-                readout=readout,
-                masks=masks,
-                shutter_model=shutter_model,
-                seed=seed,
-                jobs=jobs,
-                depth=depth,
-                view=ViewOptions(alpha, scale, max_size),
-                interpolation=interpolation,
-                quality=quality,
-                raw_as=raw_as,
-                sparse_format=sparse_format,
-                rs_poses=rs_poses,
-                apply_orientation=apply_orientation,
-                again=again,
-                max_megapixels=max_megapixels,
-                refine=opt.names_between_commas(refine),
-                still=opt.anchors(still),
-                known={} if known is None else read_known_motions(known, readout_s),
-                lengths=() if lengths is None else read_known_lengths(lengths),
-                remedy=remedy,
-                readout_s=readout_s,
-                overwrite=overwrite,
-                scheduler=scheduler,
-                report=report,
-            ),
-            images=images,
-            database=database,
-            progress=progress,
-        )
+        options = SolveOptions(**solve_fields(solving))
+        solution = solve_model(model, out, options, images=images, database=database, progress=progress)
     close(solution, out, warned, talk)

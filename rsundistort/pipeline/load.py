@@ -10,14 +10,18 @@ from pathlib import Path
 
 from ..errors import FileError, InputError, SkippedPhotoWarning
 from ..io import ExifFacts, facts_of_exif, find_masks, list_photos, read_mask, read_photo
+from ..io.photos.images import stored_size
 from ..io.places import local_place
-from ..sfm import Features, detect_features
+from ..sfm import Features, detect_features, detection_bytes
 from .cameras import PhotoCameras, find_cameras
 from .photo import RectifyOptions, check_not_rectified
 from .progress import StageLog
 from .workers import Workers
 
 __all__ = ["LoadedPhotos", "load_photos"]
+
+# What a decoded photo takes for each pixel, at most but for floats; and the size of one whose header does not say.
+_BYTES_PER_PIXEL, _SIZE_OF_OTHERS = 16, (8000, 6000)
 
 
 @dataclass(frozen=True)
@@ -88,6 +92,19 @@ def _load(job: _LoadJob) -> _Loaded:
     return _Loaded(features, width, height, photo.metadata.orientation, facts_of_exif(photo.metadata.exif))
 
 
+def _most_bytes(folder: Path, names: Sequence[str]) -> float:
+    """What the largest of the photos takes, about."""
+
+    def bytes_of(name: str) -> float:
+        try:
+            width, height = stored_size(folder / name) or _SIZE_OF_OTHERS
+        except FileError:  # it is told when its turn comes
+            return 1.0
+        return detection_bytes(width, height) + _BYTES_PER_PIXEL * width * height
+
+    return max(map(bytes_of, names))
+
+
 def load_photos(
     folder: Path,
     camera: str | None,
@@ -126,7 +143,8 @@ def load_photos(
     features: list[Features] = []
     found: list[_Loaded] = []
     skipped: dict[str, str] = {}
-    results = workers.map(_load, jobs, lambda job, why: _Loaded(problem=f"{job.name}: {why}"))
+    fitting = workers if workers.scheduler else workers.fitting("features", _most_bytes(folder, listed))
+    results = fitting.map(_load, jobs, lambda job, why: _Loaded(problem=f"{job.name}: {why}"))
     with closing(results):
         for name, each in zip(listed, results, strict=True):
             if each.features is None:

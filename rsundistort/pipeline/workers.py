@@ -9,13 +9,14 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import cv2
 import numba
 
 from ..errors import InputError, RsUndistortWarning
+from .memory import free_memory
 
 __all__ = ["Workers", "use_threads"]
 
@@ -24,6 +25,8 @@ R = TypeVar("R")
 
 # Seconds that a scheduler has to answer.
 _TIMEOUT_S = 10
+# Share of the free memory that photos take together: what they need is an estimate.
+_SHARE = 0.75
 # How often Dask does a photo again whose function failed; that of a lost worker it gives to another by itself.
 _RETRIES = 2
 
@@ -47,10 +50,33 @@ class Workers:
         Threads of this process: decoding, remapping and encoding release Python's lock.
     scheduler : str or None
         Address of a Dask scheduler, whose workers do it instead. They see the same files under the same paths.
+    threads_each : int
+        Of OpenCV, in each of them.
     """
 
     jobs: int = 1
     scheduler: str | None = None
+    threads_each: int = 1
+
+    def fitting(self, what: str, bytes_each: float) -> Workers:
+        """Only as many threads as have room in the memory that is free, but one at least, and no core idle for it.
+
+        Parameters
+        ----------
+        what : str
+            What they do, for people: a warning says when there are fewer.
+        bytes_each : float
+            What the largest photo takes while it is worked on.
+        """
+        if self.scheduler is not None:  # its workers have memories, and limits, of their own
+            return self
+        free = free_memory()
+        jobs = max(1, min(self.jobs, int(_SHARE * free / bytes_each)))
+        if jobs < self.jobs:
+            need, left = (round(each / 2**30, 1) for each in (bytes_each, free))
+            text = f"{what}: {jobs} of {self.jobs} photos at once, since each may take {need} GB, and {left} GB are free"
+            warnings.warn(text, RsUndistortWarning, stacklevel=2)
+        return replace(self, jobs=jobs, threads_each=self.jobs // jobs)
 
     def map(
         self, function: Callable[[T], R], items: Iterable[T], lost: Callable[[T, str], R]
@@ -69,7 +95,7 @@ class Workers:
         To be closed: then what has not begun is dropped, and what has begun is waited for.
         """
         if self.scheduler is None:
-            with _one_thread_each(), ThreadPoolExecutor(self.jobs) as pool:
+            with _threads_each(self.threads_each), ThreadPoolExecutor(self.jobs) as pool:
                 yield from _in_order(pool, function, items, 2 * self.jobs, (), lost)
         else:
             yield from _map_on_cluster(self.scheduler, function, items, lost)
@@ -105,10 +131,10 @@ def _in_order(
 
 
 @contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """OpenCV without threads of its own: photos side by side take all cores already."""
+def _threads_each(count: int) -> Iterator[None]:
+    """OpenCV with one thread, where photos side by side take all cores already, or a few."""
     before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
+    cv2.setNumThreads(count)
     try:
         yield
     finally:

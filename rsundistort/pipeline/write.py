@@ -15,6 +15,7 @@ from ..errors import FileError, SkippedPhotoWarning
 from ..io import find_masks, output_name
 from ..io.journal import Journal, JournalEntry
 from ..io.outputs import BATCH_FOLDERS, make_inside
+from ..io.photos.kinds import kind_of_name
 from ..io.places import Place, absolute, delete_in, files_of, place_of, sizes_under
 from ..model import Reconstruction, Solution
 from .depth import PhotoDepths
@@ -24,6 +25,10 @@ from .progress import StageLog
 from .workers import Workers
 
 __all__ = ["PointColors", "mask_names", "rectify_photos"]
+
+# What a photo takes at its peak, from decoding to encoding, for each pixel (measured, 7 to 30); and its grids besides.
+_BYTES_PER_PIXEL = {"JPEG": 10, "WebP": 10, "PNG": 20}
+_BYTES_OF_OTHERS, _BYTES_OF_GRIDS = 30, 24
 
 
 def mask_names(names: Sequence[str]) -> dict[str, str]:
@@ -95,7 +100,8 @@ def rectify_photos(
             journal.add(JournalEntry(name, "", before[name].files))
     journal.settle()
     log.begin("rectifying", len(names), len(done))
-    results = workers.map(rectify_photo, (jobs[name] for name in todo), lambda job, why: PhotoDone(job.name, why))
+    fitting = workers.fitting("rectifying", _most_bytes(solution, todo, options))
+    results = fitting.map(rectify_photo, (jobs[name] for name in todo), lambda job, why: PhotoDone(job.name, why))
     try:
         with closing(results):
             for result in results:
@@ -171,6 +177,18 @@ class _Jobs:
         found = [kind / within for within in {PurePosixPath(name).parent for name in names} for kind in kinds]
         found += {PurePosixPath(each.target).parent for name in names for each in self.extras.of(name)}
         return sorted(path.as_posix() for path in found)
+
+
+def _most_bytes(solution: Solution, names: Sequence[str], options: RectifyOptions) -> float:
+    """What the largest of the photos takes, about."""
+
+    def bytes_of(name: str) -> float:
+        camera_id = solution.image(name).camera_id
+        cameras = (solution.cameras[camera_id], solution.rectified_cameras[camera_id])
+        each = _BYTES_PER_PIXEL.get(kind_of_name(name), _BYTES_OF_OTHERS) + _BYTES_OF_GRIDS * bool(options.maps)
+        return float(each) * max(camera.width * camera.height for camera in cameras)
+
+    return max(map(bytes_of, names), default=1.0)
 
 
 def _entry(done: PhotoDone) -> JournalEntry:

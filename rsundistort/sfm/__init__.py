@@ -1,7 +1,7 @@
 """Structure from motion around pycolmap: features, pairs, matching, mapping, re-triangulation."""
 
 from .database import MatchedPhotos, kept_log_level
-from .features import Features, detect_features
+from .features import Features, detect_features, detection_bytes
 from .imported import matched_of_database
 from .mapping import map_photos
 from .matching import match_photos
@@ -13,6 +13,7 @@ __all__ = [
     "MatchedPhotos",
     "choose_pairs",
     "detect_features",
+    "detection_bytes",
     "global_descriptors",
     "kept_log_level",
     "map_photos",

@@ -9,11 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Features", "detect_features", "size_sigma"]
+__all__ = ["Features", "detect_features", "detection_bytes", "size_sigma"]
 
 # Residuals by size of the feature, in the adjusted herz-jesus-8: 0.117 px below 2.3 px, 0.122 to 3.5, 0.143 to 7,
 # 0.264 above; and large blobs are biased by perspective besides.
 _COARSE_PX = 3.0
+# What OpenCV's SIFT holds for each pixel (measured); and at the finest scales of larger photos it mostly finds noise.
+_BYTES_PER_PIXEL, _MOST_PIXELS = 240, 16_000_000
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ def size_sigma(size: NDArray[np.float64]) -> NDArray[np.float64]:
 def detect_features(
     photo: NDArray[Any], max_features: int = 16384, mask: NDArray[np.uint8] | None = None
 ) -> Features:  # fmt: skip
-    """The strongest SIFT features of a photo.
+    """The strongest SIFT features of a photo; photos of more than 16 megapixels are halved before, or more.
 
     Parameters
     ----------
@@ -59,7 +61,10 @@ def detect_features(
         nfeatures=max_features, nOctaveLayers=3, contrastThreshold=0.02, edgeThreshold=10, sigma=1.6,
         enable_precise_upscale=True,
     )  # fmt: skip
-    keypoints, raw = sift.detectAndCompute(_gray_u8(photo), mask)
+    gray, factor = _gray_u8(photo), 1
+    while gray.size > _MOST_PIXELS:
+        gray, mask, factor = _halved(gray), None if mask is None else _halved_mask(mask), 2 * factor
+    keypoints, raw = sift.detectAndCompute(gray, mask)
     if not keypoints:
         return Features(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.uint8))
     xy = np.asarray(cv2.KeyPoint.convert(keypoints), np.float64)
@@ -69,7 +74,28 @@ def detect_features(
     xy, raw, size = xy[order], raw[order], size[order]
     root = np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-12))
     descriptors = np.clip(np.rint(512.0 * root), 0, 255).astype(np.uint8)
-    return Features(xy, size_sigma(size), descriptors)
+    return Features(factor * xy + (factor - 1) / 2, factor * size_sigma(size), descriptors)
+
+
+def detection_bytes(width: int, height: int) -> float:
+    """What `detect_features` takes for a photo of this size, about."""
+    pixels = float(width * height)
+    while pixels > _MOST_PIXELS:
+        pixels /= 4
+    return _BYTES_PER_PIXEL * pixels
+
+
+def _halved(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height, width = (length // 2 for length in gray.shape)
+    even = gray[: 2 * height, : 2 * width]
+    return np.asarray(cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _halved_mask(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """0 wherever one of the four pixels is."""
+    height, width = (length // 2 for length in mask.shape)
+    blocks = mask[: 2 * height, : 2 * width].reshape(height, 2, width, 2)
+    return np.asarray(blocks.min((1, 3)))
 
 
 def _gray_u8(photo: NDArray[Any]) -> NDArray[np.uint8]:

@@ -54,6 +54,7 @@ MAX_MEGAPIXELS = 250.0
 RAW_AS = ("tif", "jpg", "png")
 
 _MAX_SIDE = 32766  # of cv2.remap
+_HEAD = 1 << 18  # bytes that mostly hold the header
 
 
 @dataclass(frozen=True)
@@ -116,10 +117,15 @@ def stored_size(path: Path) -> tuple[int, int] | None:
     """
     path = Path(path)
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            data = file.read(_HEAD)
+            size = picture_size(data, kind_of_content(data, path.name))
+            if size is None and kind_of_name(path.name) != "RAW":
+                data += file.read()
+                size = picture_size(data, kind_of_content(data, path.name))
     except OSError as error:
         raise FileError(f"{path} cannot be read: {error.strerror}") from error
-    return picture_size(data, kind_of_content(data, path.name))
+    return size
 
 
 def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> Photo:

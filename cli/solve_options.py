@@ -1,0 +1,173 @@
+"""Options of the commands that solve: `run` and `solve`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+from . import options as opt
+
+
+def _readout_by_group(
+    _context: click.Context, _option: click.Parameter, value: tuple[str, ...]
+) -> dict[str, str] | None:
+    """Directions by group, the empty name for all others, of DIRECTION or GROUP=DIRECTION."""
+    directions: dict[str, str] = {}
+    for text in value:
+        group, _, direction = text.rpartition("=")
+        if direction not in opt.READOUT_NAMES:
+            raise click.BadParameter(f"{direction!r} is not one of {', '.join(opt.READOUT_NAMES)}")
+        if directions.setdefault(group, direction) != direction:
+            raise click.BadParameter(f"{text!r}: another direction was given before")
+    return directions or None
+
+
+_readout_groups_option = click.option(
+    "--readout",
+    multiple=True,
+    metavar="[GROUP=]DIRECTION",
+    callback=_readout_by_group,
+    help=f"Direction of the readout in the stored pixels: {', '.join(opt.READOUT_NAMES)}; of all photos, or of a "
+    "group (as the closing table names it). By default the camera file's, else guessed and settled by the photos.",
+)
+_masks_option = click.option(
+    "--masks",
+    type=opt.LocalPath(exists=True, file_okay=False, path_type=Path),
+    help="Folder of masks, a.png for a.jpg: what is black in them is not looked at, nor kept in OUT/masks.",
+)
+_model_option = click.option(
+    "--model",
+    "shutter_model",
+    type=click.Choice(("auto", "constant-motion", "rotation", "linearized", "two-step", "global")),
+    default="auto",
+    show_default=True,
+    help="How the shutter is modelled; auto is the model that foretells measurements held out from its fit.",
+)
+_refine_option = click.option(
+    "--refine",
+    metavar="NAMES",
+    help="Intrinsics to solve for with the rest: some of f (or fx, fy), cx, cy, k1, k2, p1, p2, k3 (of a "
+    "fisheye k1 to k4) with commas between, or none. By default none of a camera that was given, f,k1,k2 of one that "
+    "EXIF guessed.",
+)
+_still_option = click.option(
+    "--still",
+    "--anchor",
+    multiple=True,
+    metavar="NAME[=MRAD]",
+    help="A photo known not to have moved: its phi1 is held at zero, or near zero with so many mrad per frame of "
+    "standard deviation. May be repeated.",
+)
+_known_option = click.option(
+    "--known",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    metavar="CSV",
+    help="Motions known from elsewhere: name, phi1, phi2, phi3 (rad per frame; or omega1.. in rad/s) and sigma.",
+)
+_lengths_option = click.option(
+    "--lengths",
+    "--length",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    metavar="CSV",
+    help="Lengths measured in the scene, two or more: photo1, x1, y1, photo2, x2, y2, length, sigma.",
+)
+_readout_ms_option = click.option(
+    "--readout-ms",
+    type=click.FloatRange(min=0, min_open=True),
+    help="Time of the readout of a frame. Default: the gyroscope's log, or a table of cameras.",
+)
+_remedy_option = click.option(
+    "--remedy",
+    type=click.Choice(("auto", "prior", "none")),
+    default="auto",
+    show_default=True,
+    help="Where all cameras are level: auto looks for a photo that did not move, prior takes the motions to be zero "
+    "in the mean, none does neither.",
+)
+_sparse_format_option = click.option(
+    "--sparse-format",
+    type=click.Choice(("bin", "txt")),
+    default="bin",
+    show_default=True,
+    help="How the COLMAP model is written.",
+)
+_rs_poses_option = click.option(
+    "--rs-poses",
+    is_flag=True,
+    help="OUT/rs-poses: the original photos' cameras and poses with the shutter, for gsplat, instant-ngp and "
+    "3dgs-deblur (docs/outputs.md).",
+)
+_report_option = click.option(
+    "--report/--no-report", default=True, help="Write OUT/report.html; rsundistort report makes it later, too."
+)
+
+#: How the motions are found and what is done to each photo; the command gets them as `solving`, for `solve_fields`.
+solve_options = opt.gathered(
+    "solving",
+    _readout_groups_option,
+    _masks_option,
+    _model_option,
+    _refine_option,
+    _still_option,
+    _known_option,
+    _lengths_option,
+    _readout_ms_option,
+    _remedy_option,
+    *opt.PHOTO_OPTIONS,
+    _sparse_format_option,
+    _rs_poses_option,
+    opt.seed_option,
+    opt.jobs_option,
+    opt.scheduler_option,
+    opt.overwrite_option,
+    _report_option,
+)
+
+
+def solve_fields(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of `SolveOptions` of what was given."""
+    from rsundistort.io import read_known_lengths, read_known_motions
+
+    fields = opt.photo_fields(given)
+    readout_ms, known, lengths = fields.pop("readout_ms"), fields["known"], fields["lengths"]
+    readout_s = readout_ms and readout_ms / 1e3
+    return {
+        **fields,
+        "refine": _names_between_commas(fields["refine"]),
+        "still": _anchors(fields["still"]),
+        "known": {} if known is None else read_known_motions(known, readout_s),
+        "lengths": () if lengths is None else read_known_lengths(lengths),
+        "readout_s": readout_s,
+    }
+
+
+def _names_between_commas(refine: str | None) -> tuple[str, ...] | None:
+    """Names between commas; () for none, None where nothing was said."""
+    if refine is None:
+        return None
+    names = tuple(name.strip() for name in refine.split(",") if name.strip())
+    return () if names == ("none",) else names
+
+
+def _anchors(still: tuple[str, ...]) -> dict[str, float]:
+    """Photos and their standard deviations, radians per frame, of NAME or NAME=MRAD."""
+    from rsundistort import InputError
+
+    anchors: dict[str, float] = {}
+    for text in still:
+        name, equals, number = text.rpartition("=")
+        try:
+            sigma = float(number) / 1e3 if equals else 0.0
+        except ValueError:  # a name with = in it
+            name, sigma = text, 0.0
+        if not equals:
+            name = text
+        if equals and not sigma > 0 and name != text:
+            raise InputError(f"--still {text}: the standard deviation must be positive")
+        if anchors.get(name, sigma) != sigma:
+            raise InputError(f"--still {name} is named twice, with different standard deviations")
+        anchors[name] = sigma
+    return anchors
