@@ -74,7 +74,7 @@ class Workers:
         jobs = max(1, min(self.jobs, int(_SHARE * free / bytes_each)))
         if jobs < self.jobs:
             need, left = (round(each / 2**30, 1) for each in (bytes_each, free))
-            text = f"{what}: {jobs} of {self.jobs} photos at once, since each may take {need} GB, and {left} GB are free"
+            text = f"{what}: {jobs} of {self.jobs} photos at once; each may take {need} GB, and {left} GB are free"
             warnings.warn(text, RsUndistortWarning, stacklevel=2)
         return replace(self, jobs=jobs, threads_each=self.jobs // jobs)
 

@@ -1,0 +1,133 @@
+"""Photos side by side take no more memory than there is."""
+
+from __future__ import annotations
+
+import warnings
+
+import cv2
+import numpy as np
+import psutil
+import pytest
+from make_photos import texture
+
+from rsundistort import Camera, RowMotion, RsUndistortWarning, Solution, SolvedImage, rectify_folder, write_solution
+from rsundistort.io.photos.images import stored_size
+from rsundistort.pipeline import workers as workers_module
+from rsundistort.pipeline.memory import free_memory
+from rsundistort.pipeline.workers import Workers
+from rsundistort.sfm import detect_features, detection_bytes, features
+
+
+def make_group(root, path, limit, used, cache=0):
+    folder = root / "sys/fs/cgroup" / path
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in (("max", limit), ("current", used), ("stat", f"anon 7\ninactive_file {cache}")):
+        (folder / f"memory.{name}").write_text(f"{text}\n")
+
+
+@pytest.fixture
+def machine(tmp_path, monkeypatch):
+    """One of 1,000 free bytes, and a process in the control group a/b."""
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 1000}))
+    (tmp_path / "proc/self").mkdir(parents=True)
+    (tmp_path / "proc/self/cgroup").write_text("1:name=systemd:/old\n0::/a/b\n")
+    return tmp_path
+
+
+def test_memory_is_what_the_machine_has(machine):
+    assert free_memory(machine / "of another system") == 1000
+    assert free_memory(machine) == 1000
+    make_group(machine, "a/b", "max", 400)
+    assert free_memory(machine) == 1000
+
+
+@pytest.mark.parametrize("path", ["a/b", "a", "."])
+def test_memory_is_what_control_groups_leave(machine, path):
+    make_group(machine, path, 500, 300, cache=50)
+    assert free_memory(machine) == 250
+    make_group(machine, path, 500, 600)
+    assert free_memory(machine) == 0
+
+
+def test_this_machine_has_memory():
+    assert 0 < free_memory() <= psutil.virtual_memory().total
+
+
+@pytest.mark.parametrize(("each", "jobs", "threads_each"), [(50, 8, 1), (94, 7, 1), (200, 3, 2), (5000, 1, 8)])
+def test_only_as_many_photos_as_fit(monkeypatch, each, jobs, threads_each):
+    monkeypatch.setattr(workers_module, "free_memory", lambda: 1000)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        fitting = Workers(8).fitting("rectifying", each)
+    assert fitting == Workers(jobs, None, threads_each)
+    told = [str(each.message).split(" at once")[0] for each in said]
+    assert told == [f"rectifying: {jobs} of 8 photos"] * (jobs < 8)
+
+
+def test_a_cluster_minds_its_own_memory(monkeypatch):
+    monkeypatch.setattr(workers_module, "free_memory", lambda: 0)
+    assert Workers(8, "tcp://there:8786").fitting("rectifying", 1e9) == Workers(8, "tcp://there:8786")
+
+
+def test_little_memory_changes_no_result(tmp_path, monkeypatch):
+    camera = Camera(90, 60, [[80, 0, 44.5], [0, 80, 29.5], [0, 0, 1]])
+    names = [f"{k}.png" for k in range(4)]
+    (tmp_path / "in").mkdir()
+    for k, name in enumerate(names):
+        cv2.imwrite(str(tmp_path / "in" / name), np.roll(texture(90, 60), 5 * k, axis=1))
+    images = tuple(SolvedImage(name, "1", motion=RowMotion([0.02, 0.01 * k, 0.0])) for k, name in enumerate(names))
+    write_solution(tmp_path / "s.json", Solution("rotation", {"1": camera}, {"1": camera.pinhole()}, images))
+    rectify_folder(tmp_path / "in", tmp_path / "s.json", tmp_path / "much", jobs=4)
+    monkeypatch.setattr(workers_module, "free_memory", lambda: 400_000)
+    with pytest.warns(RsUndistortWarning, match="rectifying: 2 of 4 photos at once"):
+        rectify_folder(tmp_path / "in", tmp_path / "s.json", tmp_path / "little", jobs=4)
+    for name in names:
+        assert (tmp_path / "little/images" / name).read_bytes() == (tmp_path / "much/images" / name).read_bytes()
+
+
+@pytest.mark.parametrize("height", [200, 1200])  # of noise: the larger are longer than what is read at first
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp"])
+def test_sizes_are_read_from_the_headers(tmp_path, suffix, height):
+    path = tmp_path / f"a{suffix}"
+    cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 256, (height, 300, 3), np.uint8))
+    assert stored_size(path) == (300, height)
+
+
+# ---------------------------------------------------------------- features of large photos
+
+
+def dots(width, height, seed=0):
+    """Gaussian dots, bright and dark, and where they are."""
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(np.arange(40, width - 40, 60), np.arange(40, height - 40, 60))
+    xy = np.stack([x.ravel(), y.ravel()], 1) + rng.uniform(-5, 5, (x.size, 2))
+    sign = rng.choice([-1.0, 1.0], len(xy))
+    u, v = np.arange(width)[None, :], np.arange(height)[:, None]
+    photo = np.full((height, width), 128.0)
+    for (cx, cy), s in zip(xy, sign, strict=True):
+        photo += 90 * s * np.exp(-((u - cx) ** 2) / 50) * np.exp(-((v - cy) ** 2) / 50)
+    return np.rint(photo).astype(np.uint8), xy
+
+
+@pytest.mark.parametrize(("limit", "factor"), [(10**9, 1), (150_000, 2), (40_000, 4)])
+def test_features_of_halved_photos_are_where_they_should_be(monkeypatch, limit, factor):
+    photo, truth = dots(601, 403)
+    monkeypatch.setattr(features, "_MOST_PIXELS", limit)
+    found = detect_features(photo)
+    off = np.linalg.norm(truth[:, None] - found.xy_raw[None], axis=2).min(1)
+    # half a pixel of the halved photo, were its corner forgotten
+    assert np.median(off) < 0.1
+    assert off.max() < 0.2
+    assert found.sigma.min() >= factor
+    assert detection_bytes(601, 403) == 240 * 601 * 403 / factor**2
+
+
+def test_masks_of_halved_photos_hide_what_they_did(monkeypatch):
+    photo, truth = dots(601, 403)
+    mask = np.full(photo.shape, 255, np.uint8)
+    mask[:, 300:] = 0
+    monkeypatch.setattr(features, "_MOST_PIXELS", 100_000)
+    xy = detect_features(photo, mask=mask).xy_raw
+    assert len(xy) > 20
+    assert xy[:, 0].max() < 300
+    assert (truth[:, 0] > 300).any()
