@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 
 import cv2
@@ -10,18 +11,33 @@ import psutil
 import pytest
 from make_photos import texture
 
-from rsundistort import Camera, RowMotion, RsUndistortWarning, Solution, SolvedImage, rectify_folder, write_solution
+from rsundistort import (
+    Camera,
+    RectifyOptions,
+    RowMotion,
+    RsUndistortWarning,
+    SkippedPhotoWarning,
+    Solution,
+    SolvedImage,
+    rectify_folder,
+    write_solution,
+)
+from rsundistort.io import read_photo
 from rsundistort.io.photos.images import stored_size
 from rsundistort.pipeline import workers as workers_module
+from rsundistort.pipeline.load import load_photos
 from rsundistort.pipeline.memory import free_memory
+from rsundistort.pipeline.progress import StageLog
 from rsundistort.pipeline.workers import Workers
 from rsundistort.sfm import detect_features, detection_bytes, features
 
 
-def make_group(root, path, limit, used, cache=0):
-    folder = root / "sys/fs/cgroup" / path
+def make_group(root, path, limit, used, cache=0, version=2):
+    folder = root / "sys/fs/cgroup" / ("." if version == 2 else "memory") / path
     folder.mkdir(parents=True, exist_ok=True)
-    for name, text in (("max", limit), ("current", used), ("stat", f"anon 7\ninactive_file {cache}")):
+    names = ("max", "current") if version == 2 else ("limit_in_bytes", "usage_in_bytes")
+    files = [f"{'' if version == 2 else 'total_'}{how}active_file {cache // 2}" for how in ("in", "")]
+    for name, text in (*zip(names, (limit, used), strict=True), ("stat", "\n".join(["anon 7", *files]))):
         (folder / f"memory.{name}").write_text(f"{text}\n")
 
 
@@ -30,7 +46,7 @@ def machine(tmp_path, monkeypatch):
     """One of 1,000 free bytes, and a process in the control group a/b."""
     monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 1000}))
     (tmp_path / "proc/self").mkdir(parents=True)
-    (tmp_path / "proc/self/cgroup").write_text("1:name=systemd:/old\n0::/a/b\n")
+    (tmp_path / "proc/self/cgroup").write_text("4:cpu,memory:/a/b\n1:name=systemd:/old\n0::/a/b\n")
     return tmp_path
 
 
@@ -42,11 +58,14 @@ def test_memory_is_what_the_machine_has(machine):
 
 
 @pytest.mark.parametrize("path", ["a/b", "a", "."])
-def test_memory_is_what_control_groups_leave(machine, path):
-    make_group(machine, path, 500, 300, cache=50)
+@pytest.mark.parametrize("version", [1, 2])
+def test_memory_is_what_control_groups_leave(machine, path, version):
+    make_group(machine, path, 500, 300, 50, version)
     assert free_memory(machine) == 250
-    make_group(machine, path, 500, 600)
+    make_group(machine, path, 500, 600, 0, version)
     assert free_memory(machine) == 0
+    make_group(machine, path, 9223372036854771712, 600, 0, version)
+    assert free_memory(machine) == 1000
 
 
 def test_this_machine_has_memory():
@@ -64,6 +83,10 @@ def test_only_as_many_photos_as_fit(monkeypatch, each, jobs, threads_each):
     assert told == [f"rectifying: {jobs} of 8 photos"] * (jobs < 8)
 
 
+def test_photos_of_no_size_need_no_memory():
+    assert Workers(8).fitting("features", 0.0).jobs == 8
+
+
 def test_a_cluster_minds_its_own_memory(monkeypatch):
     monkeypatch.setattr(workers_module, "free_memory", lambda: 0)
     assert Workers(8, "tcp://there:8786").fitting("rectifying", 1e9) == Workers(8, "tcp://there:8786")
@@ -78,25 +101,55 @@ def test_little_memory_changes_no_result(tmp_path, monkeypatch):
     images = tuple(SolvedImage(name, "1", motion=RowMotion([0.02, 0.01 * k, 0.0])) for k, name in enumerate(names))
     write_solution(tmp_path / "s.json", Solution("rotation", {"1": camera}, {"1": camera.pinhole()}, images))
     rectify_folder(tmp_path / "in", tmp_path / "s.json", tmp_path / "much", jobs=4)
-    monkeypatch.setattr(workers_module, "free_memory", lambda: 400_000)
+    monkeypatch.setattr(workers_module, "free_memory", lambda: 500_000)
     with pytest.warns(RsUndistortWarning, match="rectifying: 2 of 4 photos at once"):
         rectify_folder(tmp_path / "in", tmp_path / "s.json", tmp_path / "little", jobs=4)
     for name in names:
         assert (tmp_path / "little/images" / name).read_bytes() == (tmp_path / "much/images" / name).read_bytes()
 
 
-@pytest.mark.parametrize("height", [200, 1200])  # of noise: the larger are longer than what is read at first
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp"])
-def test_sizes_are_read_from_the_headers(tmp_path, suffix, height):
+def test_sizes_are_read_from_the_headers(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
-    cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 256, (height, 300, 3), np.uint8))
-    assert stored_size(path) == (300, height)
+    cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 256, (200, 300, 3), np.uint8))
+    assert stored_size(path) == (300, 200)
+    path.unlink()  # nothing holds it
+    path.write_bytes(b"")
+    assert stored_size(path) is None
+
+
+def test_photos_that_are_refused_do_not_count(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(Workers, "fitting", lambda self, what, each: asked.append(each) or self)
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), texture(90, 60))
+    cv2.imwrite(str(tmp_path / "large.png"), texture(400, 300))
+    with pytest.warns(SkippedPhotoWarning, match=r"large\.png has 400x300 pixels"):
+        load_photos(
+            tmp_path, "80,80,44.5,29.5", None, 500, Workers(1), StageLog(None), RectifyOptions(max_megapixels=0.1)
+        )
+    assert asked == [90 * 60 * (240 + 16)]
+
+
+def test_a_photo_that_changes_while_it_is_read_is_what_was_checked(tmp_path, monkeypatch):
+    path = tmp_path / "a.png"
+    before, after = texture(90, 60), 255 - texture(90, 60)
+    cv2.imwrite(str(path), before)
+    read = cv2.imread
+
+    def too_late(*args):
+        cv2.imwrite(str(path), after)
+        os.utime(path, ns=(1, 1))
+        return read(*args)
+
+    monkeypatch.setattr(cv2, "imread", too_late)
+    np.testing.assert_array_equal(read_photo(path).pixels, before)
 
 
 # ---------------------------------------------------------------- features of large photos
 
 
-def dots(width, height, seed=0):
+def dots(width, height, sigma, seed=0):
     """Gaussian dots, bright and dark, and where they are."""
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(np.arange(40, width - 40, 60), np.arange(40, height - 40, 60))
@@ -105,25 +158,27 @@ def dots(width, height, seed=0):
     u, v = np.arange(width)[None, :], np.arange(height)[:, None]
     photo = np.full((height, width), 128.0)
     for (cx, cy), s in zip(xy, sign, strict=True):
-        photo += 90 * s * np.exp(-((u - cx) ** 2) / 50) * np.exp(-((v - cy) ** 2) / 50)
+        photo += 90 * s * np.exp(-((u - cx) ** 2) / (2 * sigma**2)) * np.exp(-((v - cy) ** 2) / (2 * sigma**2))
     return np.rint(photo).astype(np.uint8), xy
 
 
-@pytest.mark.parametrize(("limit", "factor"), [(10**9, 1), (150_000, 2), (40_000, 4)])
-def test_features_of_halved_photos_are_where_they_should_be(monkeypatch, limit, factor):
-    photo, truth = dots(601, 403)
+@pytest.mark.parametrize(
+    ("limit", "factor"), [(10**9, 1), (200_000, 1.1), (150_000, 1.27), (60_000, 2), (40_000, 2.46)]
+)
+def test_features_of_shrunk_photos_are_where_they_should_be(monkeypatch, limit, factor):
+    photo, truth = dots(601, 403, 3.0 * factor)  # of one size for SIFT
     monkeypatch.setattr(features, "_MOST_PIXELS", limit)
     found = detect_features(photo)
     off = np.linalg.norm(truth[:, None] - found.xy_raw[None], axis=2).min(1)
-    # half a pixel of the halved photo, were its corner forgotten
-    assert np.median(off) < 0.1
-    assert off.max() < 0.2
+    # half a pixel of a halved photo, were its corner forgotten
+    assert np.median(off) < 0.05
+    assert off.max() < 0.1 * factor
     assert found.sigma.min() >= factor
-    assert detection_bytes(601, 403) == 240 * 601 * 403 / factor**2
+    assert detection_bytes(601, 403) == pytest.approx(240 * 601 * 403 / factor**2, rel=0.02)
 
 
-def test_masks_of_halved_photos_hide_what_they_did(monkeypatch):
-    photo, truth = dots(601, 403)
+def test_masks_of_shrunk_photos_hide_what_they_did(monkeypatch):
+    photo, truth = dots(601, 403, 4.0)
     mask = np.full(photo.shape, 255, np.uint8)
     mask[:, 300:] = 0
     monkeypatch.setattr(features, "_MOST_PIXELS", 100_000)

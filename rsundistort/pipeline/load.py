@@ -92,14 +92,16 @@ def _load(job: _LoadJob) -> _Loaded:
     return _Loaded(features, width, height, photo.metadata.orientation, facts_of_exif(photo.metadata.exif))
 
 
-def _most_bytes(folder: Path, names: Sequence[str]) -> float:
-    """What the largest of the photos takes, about."""
+def _most_bytes(folder: Path, names: Sequence[str], options: RectifyOptions) -> float:
+    """What the largest of the photos takes, about; of those that will be taken."""
 
     def bytes_of(name: str) -> float:
         try:
             width, height = stored_size(folder / name) or _SIZE_OF_OTHERS
         except FileError:  # it is told when its turn comes
-            return 1.0
+            return 0.0
+        if width * height > options.max_megapixels * 1e6:
+            return 0.0
         return detection_bytes(width, height) + _BYTES_PER_PIXEL * width * height
 
     return max(map(bytes_of, names))
@@ -143,7 +145,7 @@ def load_photos(
     features: list[Features] = []
     found: list[_Loaded] = []
     skipped: dict[str, str] = {}
-    fitting = workers if workers.scheduler else workers.fitting("features", _most_bytes(folder, listed))
+    fitting = workers if workers.scheduler else workers.fitting("features", _most_bytes(folder, listed, options))
     results = fitting.map(_load, jobs, lambda job, why: _Loaded(problem=f"{job.name}: {why}"))
     with closing(results):
         for name, each in zip(listed, results, strict=True):

@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
 
 __all__ = ["free_memory"]
+
+# Files that say limit and use, and lines of memory.stat with pages of files, which the system gives up: of version 2
+# of control groups, and of version 1.
+_NAMES = {
+    "": ("memory.max", "memory.current", ("inactive_file", "active_file")),
+    "memory": (
+        "memory.limit_in_bytes",
+        "memory.usage_in_bytes",
+        ("total_inactive_file", "total_active_file"),
+    ),
+}
 
 
 def free_memory(root: Path = Path("/")) -> int:
@@ -15,25 +27,29 @@ def free_memory(root: Path = Path("/")) -> int:
     On Linux, containers and batch systems limit it by control groups, which the machine's own figures do not show.
     `root` is where the system's files are.
     """
-    free = int(psutil.virtual_memory().available)
+    return max(0, min([int(psutil.virtual_memory().available), *_left_in_groups(root)]))
+
+
+def _left_in_groups(root: Path) -> Iterator[int]:
+    """What each control group that this process is in leaves, where it has a limit."""
     try:
         lines = (root / "proc/self/cgroup").read_text().splitlines()
     except OSError:
-        return free
-    group = next((line[3:].strip("/") for line in lines if line.startswith("0::")), "")
-    top = root / "sys/fs/cgroup"
-    for folder in (top / group, *(top / group).parents):
-        if folder.is_relative_to(top):
-            free = min(free, _free_in_group(folder))
-    return max(free, 0)
-
-
-def _free_in_group(folder: Path) -> int:
-    """Of one control group (version 2), with the files' pages that the system would give up."""
-    try:
-        limit = int((folder / "memory.max").read_text())
-        used = int((folder / "memory.current").read_text())
-        stat = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
-        return limit - used + int(stat.get("inactive_file", 0))
-    except (OSError, ValueError):  # no such file, or no limit ("max")
-        return 1 << 62
+        return
+    for line in lines:
+        _, controllers, group = line.split(":", 2)
+        kind = "memory" if "memory" in controllers.split(",") else controllers
+        if kind not in _NAMES:
+            continue
+        limit_name, used_name, files = _NAMES[kind]
+        top = root / "sys/fs/cgroup" / kind
+        # within a container the group's own folder may be missing, and the top is its own
+        for folder in (top / group.strip("/"), *(top / group.strip("/")).parents):
+            if not folder.is_relative_to(top):
+                break
+            try:
+                limit, used = (int((folder / name).read_text()) for name in (limit_name, used_name))
+                stat = dict(each.split() for each in (folder / "memory.stat").read_text().splitlines())
+            except (OSError, ValueError):  # no such file, or no limit ("max")
+                continue
+            yield limit - used + sum(int(stat.get(name, 0)) for name in files)

@@ -59,7 +59,7 @@ class Workers:
     threads_each: int = 1
 
     def fitting(self, what: str, bytes_each: float) -> Workers:
-        """Only as many threads as have room in the memory that is free, but one at least, and no core idle for it.
+        """Only as many threads as have room in the memory that is free, but one at least; OpenCV gets what is left.
 
         Parameters
         ----------
@@ -71,7 +71,7 @@ class Workers:
         if self.scheduler is not None:  # its workers have memories, and limits, of their own
             return self
         free = free_memory()
-        jobs = max(1, min(self.jobs, int(_SHARE * free / bytes_each)))
+        jobs = max(1, min(self.jobs, int(_SHARE * free / max(bytes_each, 1.0))))
         if jobs < self.jobs:
             need, left = (round(each / 2**30, 1) for each in (bytes_each, free))
             text = f"{what}: {jobs} of {self.jobs} photos at once; each may take {need} GB, and {left} GB are free"

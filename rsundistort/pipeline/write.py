@@ -18,7 +18,7 @@ from ..io.outputs import BATCH_FOLDERS, make_inside
 from ..io.photos.kinds import kind_of_name
 from ..io.places import Place, absolute, delete_in, files_of, place_of, sizes_under
 from ..model import Reconstruction, Solution
-from .depth import PhotoDepths
+from .depth import DEPTHS, PhotoDepths
 from .extras import find_extras
 from .photo import PhotoDone, PhotoJob, RectifyOptions, rectify_photo
 from .progress import StageLog
@@ -26,9 +26,10 @@ from .workers import Workers
 
 __all__ = ["PointColors", "mask_names", "rectify_photos"]
 
-# What a photo takes at its peak, from decoding to encoding, for each pixel (measured, 7 to 30); and its grids besides.
-_BYTES_PER_PIXEL = {"JPEG": 10, "WebP": 10, "PNG": 20}
-_BYTES_OF_OTHERS, _BYTES_OF_GRIDS = 30, 24
+# What a photo takes at its peak, from decoding to encoding, for each pixel (measured: 7 to 9, 18, 31, 56; RAW and HEIC,
+# which become TIFF, 40); and besides its grids, full maps of depth, and another image of its frame.
+_BYTES_PER_PIXEL = {"JPEG": 10, "WebP": 20, "PNG": 32, "TIFF": 60}
+_BYTES_OF_OTHERS, _BYTES_OF_GRIDS, _BYTES_OF_DEPTH = 40, 40, 32
 
 
 def mask_names(names: Sequence[str]) -> dict[str, str]:
@@ -181,11 +182,14 @@ class _Jobs:
 
 def _most_bytes(solution: Solution, names: Sequence[str], options: RectifyOptions) -> float:
     """What the largest of the photos takes, about."""
+    own_depth = str(options.depth) not in DEPTHS
+    besides = _BYTES_OF_GRIDS * bool(options.maps) + _BYTES_OF_DEPTH * own_depth
+    besides += _BYTES_PER_PIXEL["PNG"] * bool(options.also)
 
     def bytes_of(name: str) -> float:
         camera_id = solution.image(name).camera_id
         cameras = (solution.cameras[camera_id], solution.rectified_cameras[camera_id])
-        each = _BYTES_PER_PIXEL.get(kind_of_name(name), _BYTES_OF_OTHERS) + _BYTES_OF_GRIDS * bool(options.maps)
+        each = _BYTES_PER_PIXEL.get(kind_of_name(name), _BYTES_OF_OTHERS) + besides
         return float(each) * max(camera.width * camera.height for camera in cameras)
 
     return max(map(bytes_of, names), default=1.0)

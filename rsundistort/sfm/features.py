@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,8 +15,8 @@ __all__ = ["Features", "detect_features", "detection_bytes", "size_sigma"]
 # Residuals by size of the feature, in the adjusted herz-jesus-8: 0.117 px below 2.3 px, 0.122 to 3.5, 0.143 to 7,
 # 0.264 above; and large blobs are biased by perspective besides.
 _COARSE_PX = 3.0
-# What OpenCV's SIFT holds for each pixel (measured); and at the finest scales of larger photos it mostly finds noise.
-_BYTES_PER_PIXEL, _MOST_PIXELS = 240, 16_000_000
+# What OpenCV's SIFT holds for each pixel (measured), and what it gets to see of larger photos: 6 GB.
+_BYTES_PER_PIXEL, _MOST_PIXELS = 240, 25_000_000
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ def size_sigma(size: NDArray[np.float64]) -> NDArray[np.float64]:
 def detect_features(
     photo: NDArray[Any], max_features: int = 16384, mask: NDArray[np.uint8] | None = None
 ) -> Features:  # fmt: skip
-    """The strongest SIFT features of a photo; photos of more than 16 megapixels are halved before, or more.
+    """The strongest SIFT features of a photo; photos of more than 25 megapixels are shrunk to that before.
 
     Parameters
     ----------
@@ -61,9 +62,10 @@ def detect_features(
         nfeatures=max_features, nOctaveLayers=3, contrastThreshold=0.02, edgeThreshold=10, sigma=1.6,
         enable_precise_upscale=True,
     )  # fmt: skip
-    gray, factor = _gray_u8(photo), 1
-    while gray.size > _MOST_PIXELS:
-        gray, mask, factor = _halved(gray), None if mask is None else _halved_mask(mask), 2 * factor
+    gray = _gray_u8(photo)
+    shrink = math.sqrt(max(1.0, gray.size / _MOST_PIXELS))
+    if shrink > 1.0:
+        gray, mask = _shrunk(gray, mask, shrink)
     keypoints, raw = sift.detectAndCompute(gray, mask)
     if not keypoints:
         return Features(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.uint8))
@@ -74,28 +76,28 @@ def detect_features(
     xy, raw, size = xy[order], raw[order], size[order]
     root = np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-12))
     descriptors = np.clip(np.rint(512.0 * root), 0, 255).astype(np.uint8)
-    return Features(factor * xy + (factor - 1) / 2, factor * size_sigma(size), descriptors)
+    step = np.array(photo.shape[1::-1]) / gray.shape[::-1]
+    return Features(step * (xy + 0.5) - 0.5, shrink * size_sigma(size), descriptors)
 
 
 def detection_bytes(width: int, height: int) -> float:
     """What `detect_features` takes for a photo of this size, about."""
-    pixels = float(width * height)
-    while pixels > _MOST_PIXELS:
-        pixels /= 4
-    return _BYTES_PER_PIXEL * pixels
+    return float(_BYTES_PER_PIXEL * min(width * height, _MOST_PIXELS))
 
 
-def _halved(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    height, width = (length // 2 for length in gray.shape)
-    even = gray[: 2 * height, : 2 * width]
-    return np.asarray(cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+def _shrunk(
+    gray: NDArray[np.uint8], mask: NDArray[np.uint8] | None, shrink: float
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+    """A photo averaged over areas, and its mask: 0 wherever one of the pixels is."""
+    height, width = (max(1, int(length / shrink)) for length in gray.shape)
 
+    def resize(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
-def _halved_mask(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """0 wherever one of the four pixels is."""
-    height, width = (length // 2 for length in mask.shape)
-    blocks = mask[: 2 * height, : 2 * width].reshape(height, 2, width, 2)
-    return np.asarray(blocks.min((1, 3)))
+    if mask is None:
+        return resize(gray), None
+    everywhere = resize(np.where(mask == 0, np.uint8(0), np.uint8(255))) == 255
+    return resize(gray), np.where(everywhere, np.uint8(255), np.uint8(0))
 
 
 def _gray_u8(photo: NDArray[Any]) -> NDArray[np.uint8]:
