@@ -55,6 +55,7 @@ figures: $(VENV)/.installed
 	$(BIN)/python benchmarks/truth.py
 	$(BIN)/python benchmarks/depth.py
 	$(BIN)/python benchmarks/solve.py
+	$(BIN)/python benchmarks/memory.py
 
 clean:
 	rm -rf $(VENV) $(OUT) docs/_build build *.egg-info

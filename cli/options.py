@@ -161,18 +161,18 @@ def talk_options(function: Callable[..., Any]) -> Callable[..., Any]:
 def gathered(name: str, *options: Decorator) -> Decorator:
     """Options whose values the command gets as one mapping."""
 
+    def with_options(function: Callable[..., Any]) -> Callable[..., Any]:
+        return functools.reduce(lambda inner, option: option(inner), reversed(options), function)
+
+    keys = [str(each.name) for each in click.command()(with_options(lambda: None)).params]
+
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(function)
         def with_mapping(*args: Any, **named: Any) -> Any:
             given = {key: named.pop(key) for key in keys}
             return function(*args, **named, **{name: given})
 
-        decorated: Callable[..., Any] = with_mapping
-        before = len(getattr(function, "__click_params__", ()))
-        for option in reversed(options):
-            decorated = option(decorated)
-        keys = [each.name for each in decorated.__click_params__[before:]]  # type: ignore[attr-defined]
-        return decorated
+        return with_options(with_mapping)
 
     return decorate
 

@@ -128,7 +128,7 @@ def test_photos_that_are_refused_do_not_count(tmp_path, monkeypatch):
         load_photos(
             tmp_path, "80,80,44.5,29.5", None, 500, Workers(1), StageLog(None), RectifyOptions(max_megapixels=0.1)
         )
-    assert asked == [90 * 60 * (240 + 16)]
+    assert asked == [90 * 60 * (245 + 16)]
 
 
 def test_a_photo_that_changes_while_it_is_read_is_what_was_checked(tmp_path, monkeypatch):
@@ -174,7 +174,7 @@ def test_features_of_shrunk_photos_are_where_they_should_be(monkeypatch, limit, 
     assert np.median(off) < 0.05
     assert off.max() < 0.1 * factor
     assert found.sigma.min() >= factor
-    assert detection_bytes(601, 403) == pytest.approx(240 * 601 * 403 / factor**2, rel=0.02)
+    assert detection_bytes(601, 403) == pytest.approx(245 * 601 * 403 / factor**2, rel=0.02)
 
 
 def test_masks_of_shrunk_photos_hide_what_they_did(monkeypatch):

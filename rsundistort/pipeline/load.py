@@ -145,6 +145,7 @@ def load_photos(
     features: list[Features] = []
     found: list[_Loaded] = []
     skipped: dict[str, str] = {}
+    # the headers are not looked at for workers elsewhere, which mind their own memory
     fitting = workers if workers.scheduler else workers.fitting("features", _most_bytes(folder, listed, options))
     results = fitting.map(_load, jobs, lambda job, why: _Loaded(problem=f"{job.name}: {why}"))
     with closing(results):

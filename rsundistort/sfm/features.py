@@ -16,7 +16,7 @@ __all__ = ["Features", "detect_features", "detection_bytes", "size_sigma"]
 # 0.264 above; and large blobs are biased by perspective besides.
 _COARSE_PX = 3.0
 # What OpenCV's SIFT holds for each pixel (measured), and what it gets to see of larger photos: 6 GB.
-_BYTES_PER_PIXEL, _MOST_PIXELS = 240, 25_000_000
+_BYTES_PER_PIXEL, _MOST_PIXELS = 245, 25_000_000
 
 
 @dataclass(frozen=True)
