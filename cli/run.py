@@ -46,9 +46,17 @@ from .terminal import Talk, errors_for_people, progress_bars
 @click.option(
     "--max-features",
     type=click.IntRange(min=100),
-    default=16384,
+    default=8192,
     show_default=True,
-    help="Features of a photo.",
+    help="Features of a photo, the largest.",
+)
+@click.option(
+    "--feature-megapixels",
+    type=click.FloatRange(min=0.05),
+    default=2.0,
+    show_default=True,
+    metavar="MP",
+    help="Larger photos are shrunk to this to find their features.",
 )
 @click.option(
     "--matching",
@@ -71,6 +79,7 @@ def command(
     gyro_axes: str | None,
     photo_times: Path | None,
     max_features: int,
+    feature_megapixels: float,
     matching: str,
     solving: dict[str, Any],
     talk: Talk,
@@ -92,6 +101,7 @@ def command(
             sharpest=sharpest,
             gyro=None if gyro is None else GyroOptions(gyro, gyro_offset, gyro_axes, photo_times),
             max_features=max_features,
+            feature_megapixels=feature_megapixels,
             matching=matching,
             **solve_fields(solving),
         )

@@ -29,7 +29,7 @@ from rsundistort.pipeline.load import load_photos
 from rsundistort.pipeline.memory import free_memory
 from rsundistort.pipeline.progress import StageLog
 from rsundistort.pipeline.workers import Workers
-from rsundistort.sfm import detect_features, detection_bytes, features
+from rsundistort.sfm import detect_features, detection_bytes
 
 
 def make_group(root, path, limit, used, cache=0, version=2):
@@ -165,24 +165,22 @@ def dots(width, height, sigma, seed=0):
 @pytest.mark.parametrize(
     ("limit", "factor"), [(10**9, 1), (200_000, 1.1), (150_000, 1.27), (60_000, 2), (40_000, 2.46)]
 )
-def test_features_of_shrunk_photos_are_where_they_should_be(monkeypatch, limit, factor):
+def test_features_of_shrunk_photos_are_where_they_should_be(limit, factor):
     photo, truth = dots(601, 403, 3.0 * factor)  # of one size for SIFT
-    monkeypatch.setattr(features, "_MOST_PIXELS", limit)
-    found = detect_features(photo)
+    found = detect_features(photo, megapixels=limit / 1e6)
     off = np.linalg.norm(truth[:, None] - found.xy_raw[None], axis=2).min(1)
     # half a pixel of a halved photo, were its corner forgotten
     assert np.median(off) < 0.05
     assert off.max() < 0.1 * factor
     assert found.sigma.min() >= factor
-    assert detection_bytes(601, 403) == pytest.approx(245 * 601 * 403 / factor**2, rel=0.02)
+    assert detection_bytes(601, 403, limit / 1e6) == pytest.approx(245 * 601 * 403 / factor**2, rel=0.02)
 
 
-def test_masks_of_shrunk_photos_hide_what_they_did(monkeypatch):
+def test_masks_of_shrunk_photos_hide_what_they_did():
     photo, truth = dots(601, 403, 4.0)
     mask = np.full(photo.shape, 255, np.uint8)
     mask[:, 300:] = 0
-    monkeypatch.setattr(features, "_MOST_PIXELS", 100_000)
-    xy = detect_features(photo, mask=mask).xy_raw
+    xy = detect_features(photo, mask=mask, megapixels=0.1).xy_raw
     assert len(xy) > 20
     assert xy[:, 0].max() < 300
     assert (truth[:, 0] > 300).any()

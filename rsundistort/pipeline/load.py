@@ -12,7 +12,7 @@ from ..errors import FileError, InputError, SkippedPhotoWarning
 from ..io import ExifFacts, facts_of_exif, find_masks, list_photos, read_mask, read_photo
 from ..io.photos.images import stored_size
 from ..io.places import local_place
-from ..sfm import Features, detect_features, detection_bytes
+from ..sfm import DETECTION_MEGAPIXELS, Features, detect_features, detection_bytes
 from .cameras import PhotoCameras, find_cameras
 from .photo import RectifyOptions, check_not_rectified
 from .progress import StageLog
@@ -61,6 +61,7 @@ class _LoadJob:
     source: Path
     own_mask: Path | None
     max_features: int
+    megapixels: float
     options: RectifyOptions
 
 
@@ -88,11 +89,11 @@ def _load(job: _LoadJob) -> _Loaded:
     height, width = photo.pixels.shape[:2]
     # a mask that cannot be used stops the run: without it, what it hides would be measured
     mask = None if job.own_mask is None else read_mask(job.own_mask, width, height)
-    features = detect_features(photo.pixels, job.max_features, mask)
+    features = detect_features(photo.pixels, job.max_features, mask, job.megapixels)
     return _Loaded(features, width, height, photo.metadata.orientation, facts_of_exif(photo.metadata.exif))
 
 
-def _most_bytes(folder: Path, names: Sequence[str], options: RectifyOptions) -> float:
+def _most_bytes(folder: Path, names: Sequence[str], megapixels: float, options: RectifyOptions) -> float:
     """What the largest of the photos takes, about; of those that will be taken."""
 
     def bytes_of(name: str) -> float:
@@ -102,7 +103,7 @@ def _most_bytes(folder: Path, names: Sequence[str], options: RectifyOptions) -> 
             return 0.0
         if width * height > options.max_megapixels * 1e6:
             return 0.0
-        return detection_bytes(width, height) + _BYTES_PER_PIXEL * width * height
+        return detection_bytes(width, height, megapixels) + _BYTES_PER_PIXEL * width * height
 
     return max(map(bytes_of, names))
 
@@ -115,6 +116,7 @@ def load_photos(
     workers: Workers,
     log: StageLog,
     options: RectifyOptions,
+    megapixels: float = DETECTION_MEGAPIXELS,
 ) -> LoadedPhotos:
     """Read every photo of a folder once, for its size and features; unusable ones are skipped with a warning.
 
@@ -132,6 +134,8 @@ def load_photos(
         Told the progress.
     options : RectifyOptions
         Of which masks, raw_as, again and max_megapixels matter.
+    megapixels : float
+        As in `detect_features`.
     """
     listed = list_photos(folder, options.raw_as)
     if len(listed) < 3:
@@ -139,14 +143,19 @@ def load_photos(
             f"{folder} holds {len(listed)} photo{'s' * (len(listed) > 1)}; the shutter needs at least three"
         )
     mask_of = {} if options.masks is None else find_masks(local_place(options.masks).absolute(), listed)
-    jobs = (_LoadJob(name, folder.absolute() / name, mask_of.get(name), max_features, options) for name in listed)
+    jobs = (
+        _LoadJob(name, folder.absolute() / name, mask_of.get(name), max_features, megapixels, options)
+        for name in listed
+    )
     log.begin("features", len(listed))
     names: list[str] = []
     features: list[Features] = []
     found: list[_Loaded] = []
     skipped: dict[str, str] = {}
     # the headers are not looked at for workers elsewhere, which mind their own memory
-    fitting = workers if workers.scheduler else workers.fitting("features", _most_bytes(folder, listed, options))
+    fitting = (
+        workers if workers.scheduler else workers.fitting("features", _most_bytes(folder, listed, megapixels, options))
+    )
     results = fitting.map(_load, jobs, lambda job, why: _Loaded(problem=f"{job.name}: {why}"))
     with closing(results):
         for name, each in zip(listed, results, strict=True):

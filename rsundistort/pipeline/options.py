@@ -12,6 +12,7 @@ from ..bundle import BundleOptions, GuessedCameras, KnownLength
 from ..critical import with_remedy
 from ..errors import InputError
 from ..model import READOUTS, Reconstruction, check_shutter_model
+from ..sfm import DETECTION_MEGAPIXELS
 from .cameras import PhotoCameras, check_readouts
 from .depth import check_depth
 from .gyro import GyroOptions
@@ -142,7 +143,9 @@ class RunOptions(SolveOptions):
         File or folder of cameras, or numbers, as `io.read_camera_file` takes them; else `camera.json` or `cameras.json`
         in or beside the folder of photos, else EXIF.
     max_features : int
-        Per photo.
+        Per photo, the largest.
+    feature_megapixels : float
+        Larger photos are shrunk to this to find their features.
     every, sharpest : int, optional
         Of a video: each N-th frame, or the sharpest of each N frames, as in `io.extract_frames`.
     matching : str
@@ -153,7 +156,8 @@ class RunOptions(SolveOptions):
     """
 
     camera: str | None = None
-    max_features: int = 16384
+    max_features: int = 8192
+    feature_megapixels: float = DETECTION_MEGAPIXELS
     every: int | None = None
     sharpest: int | None = None
     matching: str = "auto"
@@ -163,5 +167,7 @@ class RunOptions(SolveOptions):
         super().__post_init__()
         if self.max_features < 100:
             raise InputError(f"max_features={self.max_features!r}, expected at least 100")
+        if not 0.05 <= self.feature_megapixels < np.inf:
+            raise InputError(f"feature_megapixels={self.feature_megapixels!r}, expected at least 0.05")
         if self.matching not in MATCHINGS:
             raise InputError(f"matching={self.matching!r}, expected one of {', '.join(MATCHINGS)}")

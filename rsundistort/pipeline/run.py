@@ -59,7 +59,10 @@ def run(
         gyro_log = None if options.gyro is None else options.gyro.log()
         source = find_photos(photos, scratch, options.camera, options.every, options.sharpest, log)
         folder = source.folder
-        loaded = load_photos(folder, source.camera, options.readout, options.max_features, workers, log, options)
+        loaded = load_photos(
+            folder, source.camera, options.readout, options.max_features, workers, log, options,
+            options.feature_megapixels,
+        )  # fmt: skip
         cameras = loaded.cameras
         readouts = known_readouts(
             folder, loaded.names, cameras.cameras, cameras.camera_idx, source.frames, options.readout_s, gyro_log
@@ -90,6 +93,7 @@ def run(
             readouts,
             {
                 "max_features": options.max_features,
+                "feature_megapixels": options.feature_megapixels,
                 "matching": options.matching,
                 "video": source.video,
                 "gyro": options.gyro and options.gyro.facts(),

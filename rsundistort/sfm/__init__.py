@@ -1,7 +1,7 @@
 """Structure from motion around pycolmap: features, pairs, matching, mapping, re-triangulation."""
 
 from .database import MatchedPhotos, kept_log_level
-from .features import Features, detect_features, detection_bytes
+from .features import DETECTION_MEGAPIXELS, Features, detect_features, detection_bytes
 from .imported import matched_of_database
 from .mapping import map_photos
 from .matching import match_photos
@@ -9,6 +9,7 @@ from .pairs import choose_pairs, global_descriptors
 from .retriangulation import retriangulate
 
 __all__ = [
+    "DETECTION_MEGAPIXELS",
     "Features",
     "MatchedPhotos",
     "choose_pairs",

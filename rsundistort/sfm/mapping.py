@@ -64,7 +64,11 @@ def map_photos(matched: MatchedPhotos, progress: Callable[[int], None] | None = 
     if not matched.calibrated:
         best = _best_model(matched, [(None, 1.0), (None, 2.0)], progress)
         if best is not None:
-            cameras = [_refined_camera(best.cameras[k + 1], camera) for k, camera in enumerate(matched.cameras)]
+            # a camera that took none of the joined photos is not in the model
+            cameras = [
+                _refined_camera(best.cameras[k + 1], camera) if k + 1 in best.cameras else camera
+                for k, camera in enumerate(matched.cameras)
+            ]
             matched = replace(matched, cameras=tuple(cameras), calibrated=True)
     attempts = [(_MAPPING_KEYPOINTS, LOOSE), (None, LOOSE), (None, 2.0), (None, 1.0)]
     found = _best_model(matched, attempts, progress)
