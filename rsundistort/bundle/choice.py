@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model import Observations, Reconstruction
-from .adjust import LADDER, bundle_adjust
+from .adjust import LADDER, bundle_adjust, objective
 from .options import BundleOptions
 from .problem import reprojection_residuals
 
@@ -120,18 +120,20 @@ def choose_model(
         base, outlier_rounds=0, spread_rounds=4, spread_tolerance=0.05, loss="squared", sigma_px=sigma_px,
         cost_tolerance=1e-5, lengths=(),
     )  # fmt: skip
-    current = replace(reconstruction, observations=reconstruction.observations.select(fitted))
+    given = replace(reconstruction, observations=reconstruction.observations.select(fitted))
     held_out = reconstruction.observations.select(held)
+    starts = [given]
     chosen, best = rungs[0], np.zeros(0)
     rms: dict[str, float] = {}
     gain: dict[str, float] = {}
     for model in rungs:
         step = None if progress is None else (lambda cost, model=model: progress(model, cost))
-        result = bundle_adjust(current, model, rough, step)
-        # the next rung starts from this one's shape, but keeps a motion that the rung does not model
-        moved = result.reconstruction
-        current = replace(moved, phi=current.phi) if model == "global" else moved
-        errors, rms[model] = clipped_errors(moved, held_out, sigma_px)
+        # the motions given belong to the poses and the lens given: with those of another rung they fit nothing. A rung
+        # that starts at the cheaper of the two never ends above the simpler one, which it holds as a case
+        start = min(starts, key=lambda rec, model=model: objective(rec, model, rough))
+        found = bundle_adjust(start, model, rough, step).reconstruction
+        starts = [found, given]
+        errors, rms[model] = clipped_errors(found, held_out, sigma_px)
         if model == rungs[0]:
             best = errors
             continue
