@@ -766,7 +766,9 @@ def test_the_model_that_made_the_measurements_is_chosen(model, rng):
     start = climb(perturbed(truth, rng), LADDER[: max(LADDER.index(model) + 1, 3)])["rotation"].reconstruction
     choice = choose_model(start, sigma_px=0.3)
     assert choice.shutter_model == model
-    assert list(choice.held_out_rms_px) == list(LADDER)
+    assert list(choice.held_out_rms_px) == list(choice.held_out_error) == list(LADDER)
+    assert choice.kept[0] == "global"
+    assert choice.kept[-1] == model
     # what it was made from foretells to the noise, and to what the point's own uncertainty adds
     assert 0.25 < choice.held_out_rms_px[model] < 0.5
     assert 140 <= choice.num_held_out <= 150  # a tenth of them, one a track; the ladder dropped a few
