@@ -81,7 +81,7 @@ def closing_table(solution: Solution, out: Path) -> str:
         "",
         f"photos registered  {len(solution.registered)} of {len(solution.images)}",
         f"shutter model      {solution.shutter_model}",
-        *_held_out(quality["held_out_rms_px"]),
+        *_held_out(quality),
         *_cameras(solution),
         *_model(solution),
         *_video(solution),
@@ -208,11 +208,18 @@ def _depths(solution: Solution) -> list[str]:
     return [f"depth              {', '.join(counts)}"] if counts else []
 
 
-def _held_out(rms_px: Mapping[str, float]) -> list[str]:
+def _held_out(quality: Mapping[str, Any]) -> list[str]:
     """A line on how well each rung of the ladder foretold measurements that it was not fitted to."""
-    if not rms_px:
-        return []
-    return ["held-out residual  " + ", ".join(f"{model} {rms:.3f}" for model, rms in rms_px.items()) + " px"]
+    said, unit = [], " standard errors"
+    for model, error in quality["held_out_error"].items():
+        gain = quality["held_out_gain"].get(model)
+        if gain is None:
+            said.append(f"{model} {error:.3f}")
+            continue
+        kept = "" if model in quality["held_out_kept"] else ": not kept"
+        said.append(f"{model} {error:.3f} ({'better' if gain > 0 else 'worse'} by {abs(gain):.1f}{unit}{kept})")
+        unit = ""
+    return [f"held-out error     {', '.join(said)}"] if said else []
 
 
 def _doubtful(solution: Solution) -> list[str]:

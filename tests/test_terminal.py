@@ -53,7 +53,9 @@ def solution(names, reason=None, advice=()):
         quality={
             "rms_px": 0.2,
             "global_rms_px": 12.3,
-            "held_out_rms_px": {"global": 12.345, "two-step": 1.234, "rotation": 0.23, "constant-motion": 0.22},
+            "held_out_error": {"global": 12.345, "two-step": 1.234, "rotation": 1.23, "constant-motion": 1.35},
+            "held_out_gain": {"two-step": 123.45, "rotation": 1.2, "constant-motion": -4.5},
+            "held_out_kept": ["global", "two-step"],
             "sigma_intrinsics": {"1": {"f": 1.0, "k1": 0.001, "k2": 0.002, "cx": 1.0, "cy": 1.0}},
             "phi_sigma_rad_per_frame": 0.03,
             "readout_times": {"1": {"ms": 30.0, "source": "the table of readout times, a phone of some maker"}},
@@ -100,6 +102,13 @@ def in_a_terminal(code, *args, environment=None):
         reader.join(timeout=10)
     os.close(ours)
     return b"".join(said).decode(), process.returncode
+
+
+def test_closing_table_tells_what_the_model_was_chosen_by():
+    assert (
+        "held-out error global 12.345, two-step 1.234 (better by 123.5 standard errors), rotation 1.230 "
+        "(better by 1.2: not kept), constant-motion 1.350 (worse by 4.5: not kept) camera"
+    ) in " ".join(closing_table(solution(["0001.jpg"]), Path("out")).split())
 
 
 def test_closing_table_fits_80_columns():

@@ -733,6 +733,12 @@ def _camera_frame(R, center, velocity, point, vel_c):
     )
 
 
+@kernel(forceinline=True)
+def _measured_row(axis, sign, intr, xy):
+    """Where the search for a measurement's row starts: from elsewhere, what one kernel sees another may not."""
+    return sign * (xy[axis] - intr[2 + axis]) / intr[axis]
+
+
 @parallel_kernel()
 def residuals(
     model, camera_of_frame, axes, signs, intrs, lenses, R_cw, center_w, phi, vel_w, points_w,
@@ -747,7 +753,8 @@ def residuals(
             f = frame_idx[k]
             c = camera_of_frame[f]
             x, y, z = _camera_frame(R_cw[f], center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
-            valid[k] = _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, math.nan, out, False)
+            row = _measured_row(axes[c], signs[c], intrs[c], xy_raw[k])
+            valid[k] = _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, row, out, False)
             for i in range(2):
                 res[k, i] = intrs[c, i] * out[i] + intrs[c, 2 + i] - xy_raw[k, i] if valid[k] else _INVALID_PX
 
@@ -773,8 +780,7 @@ def residual_costs(
             c = camera_of_frame[f]
             x, y, z = _camera_frame(R_cw[f], center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
             s = 2.0 * (_INVALID_PX / sigma_px[k]) ** 2
-            # the row is near where it was measured
-            row = signs[c] * (xy_raw[k, axes[c]] - intrs[c, 2 + axes[c]]) / intrs[c, axes[c]]
+            row = _measured_row(axes[c], signs[c], intrs[c], xy_raw[k])
             if _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, row, out, False):
                 ex = intrs[c, 0] * out[0] + intrs[c, 2] - xy_raw[k, 0]
                 ey = intrs[c, 1] * out[1] + intrs[c, 3] - xy_raw[k, 1]
@@ -795,8 +801,8 @@ def residual_blocks(
 
     J_frame is (o, 2, nb): rotation increment (left, camera frame), centre, phi from nb = 9 on, and velocity (world
     frame) when nb = 12. The Jacobian of the point is minus that of the centre. `clock` (o,) is where the search for
-    the row starts, NaN: afresh; sigma_px is (o,). Observations that cannot be projected get zero Jacobians and cost
-    100 px.
+    the row starts, NaN: where it was measured; sigma_px is (o,). Observations that cannot be projected get zero
+    Jacobians and cost 100 px.
     """
     o = len(frame_idx)
     nb = J_frame.shape[2]
@@ -811,7 +817,8 @@ def residual_blocks(
             c = camera_of_frame[f]
             R = R_cw[f]
             x, y, z = _camera_frame(R, center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
-            if not _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, clock[k], out, True):
+            row = clock[k] if clock[k] == clock[k] else _measured_row(axes[c], signs[c], intrs[c], xy_raw[k])
+            if not _project(model, axes[c], signs[c], lenses[c], x, y, z, phi[f], vel_c, row, out, True):
                 total += 0.5 * _loss(loss_kind, 2.0 * (_INVALID_PX / sigma_px[k]) ** 2, scale2)[0]
                 res[k] = 0.0
                 J_frame[k] = 0.0
@@ -936,7 +943,8 @@ def intrinsic_blocks(
             axis, sign, lens = axes[c], signs[c], lenses[c]
             J_camera[k] = 0.0
             x, y, z = _camera_frame(R_cw[f], center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
-            if not _project(model, axis, sign, lens, x, y, z, phi[f], vel_c, math.nan, out, False):
+            row = _measured_row(axis, sign, intrs[c], xy_raw[k])
+            if not _project(model, axis, sign, lens, x, y, z, phi[f], vel_c, row, out, False):
                 continue
             xd, yd = out[0], out[1]
             r0 = (intrs[c, 0] * xd + intrs[c, 2] - xy_raw[k, 0]) / sigma_px[k]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model import Observations, Reconstruction
-from .adjust import LADDER, bundle_adjust
+from .adjust import LADDER, bundle_adjust, objective
 from .options import BundleOptions
 from .problem import reprojection_residuals
 
@@ -32,19 +32,28 @@ class ModelChoice:
     ----------
     shutter_model : str
         The last rung that explained the held-out measurements better than the one kept before it.
+    held_out_error : dict of model to float
+        Mean over the held-out measurements of half the squared residual in units of the noise, clipped: 1 for noise
+        alone. This decides.
     held_out_rms_px : dict of model to float
         Root mean square of the held-out residuals' parts, long ones clipped.
     gain : dict of model to float
-        How much the held-out error (half a clipped sum of squares in units of the noise, per measurement) fell against
-        the rung kept before, in units of the standard error of that fall. The first rung has none.
+        How much the held-out error fell against the rung kept before, in units of the standard error of that fall. The
+        first rung has none.
     num_held_out : int
         Measurements held out.
     """
 
     shutter_model: str
+    held_out_error: dict[str, float]
     held_out_rms_px: dict[str, float]
     gain: dict[str, float]
     num_held_out: int
+
+    @property
+    def kept(self) -> tuple[str, ...]:
+        """Rungs that were kept: the first, and those whose gain was large enough."""
+        return tuple(model for model in self.held_out_error if self.gain.get(model, np.inf) > _MIN_GAIN)
 
 
 def hold_out(
@@ -120,22 +129,26 @@ def choose_model(
         base, outlier_rounds=0, spread_rounds=4, spread_tolerance=0.05, loss="squared", sigma_px=sigma_px,
         cost_tolerance=1e-5, lengths=(),
     )  # fmt: skip
-    current = replace(reconstruction, observations=reconstruction.observations.select(fitted))
+    given = replace(reconstruction, observations=reconstruction.observations.select(fitted))
     held_out = reconstruction.observations.select(held)
+    starts = [given]
     chosen, best = rungs[0], np.zeros(0)
+    error: dict[str, float] = {}
     rms: dict[str, float] = {}
     gain: dict[str, float] = {}
     for model in rungs:
         step = None if progress is None else (lambda cost, model=model: progress(model, cost))
-        result = bundle_adjust(current, model, rough, step)
-        # the next rung starts from this one's shape, but keeps a motion that the rung does not model
-        moved = result.reconstruction
-        current = replace(moved, phi=current.phi) if model == "global" else moved
-        errors, rms[model] = clipped_errors(moved, held_out, sigma_px)
+        # the motions given belong to the poses and the lens given: with those of another rung they fit nothing. A rung
+        # that starts at the cheaper of the two never ends above the simpler one, which it holds as a case
+        cost = [objective(start, model, rough) for start in starts]
+        found = bundle_adjust(starts[int(np.argmin(cost))], model, rough, step).reconstruction
+        starts = [found, given]
+        errors, rms[model] = clipped_errors(found, held_out, sigma_px)
+        error[model] = float(errors.mean())
         if model == rungs[0]:
             best = errors
             continue
         gain[model] = standard_errors(best - errors)
         if gain[model] > _MIN_GAIN:
             chosen, best = model, errors
-    return ModelChoice(chosen, rms, gain, int(held.sum()))
+    return ModelChoice(chosen, error, rms, gain, int(held.sum()))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bundle import reprojection_residuals
+from ..bundle import ModelChoice, reprojection_residuals
 from ..model import Reconstruction, Solution, SolvedImage
 from ..rectify import largest_shift_px
 from .cameras import PhotoCameras
@@ -143,7 +143,7 @@ def solution_of(outcome: Outcome, options: SolveOptions) -> Solution:
         "num_observations": len(rec.observations),
         "rms_px": solved.result.rms_px,
         "global_rms_px": solved.global_result.rms_px,
-        "held_out_rms_px": {} if solved.choice is None else solved.choice.held_out_rms_px,
+        **_held_out(solved.choice),
         "sigma_intrinsics": dict(zip(cameras, solved.result.sigma_intrinsics, strict=True)),
         "phi_sigma_rad_per_frame": solved.result.phi_sigma,
         "stop_reason": solved.result.stop_reason,
@@ -176,3 +176,13 @@ def solution_of(outcome: Outcome, options: SolveOptions) -> Solution:
         },
         generator=versions(),
     )
+
+
+def _held_out(choice: ModelChoice | None) -> dict[str, Any]:
+    """What the model was chosen by, by model; empty where it was named."""
+    return {
+        "held_out_rms_px": {} if choice is None else choice.held_out_rms_px,
+        "held_out_error": {} if choice is None else choice.held_out_error,
+        "held_out_gain": {} if choice is None else choice.gain,
+        "held_out_kept": [] if choice is None else list(choice.kept),
+    }

@@ -176,8 +176,11 @@ def residuals(source: Source) -> dict[str, Any] | None:
 
 
 def ladder(solution: Solution) -> list[dict[str, Any]]:
-    """A row of each shutter model that was tried: residuals when it was climbed, and of held-out measurements."""
-    held_out = solution.quality.get("held_out_rms_px") or {}
+    """A row of each shutter model that was tried: residuals when it was climbed, errors of held-out measurements."""
+    quality = solution.quality
+    held_out, errors = quality.get("held_out_rms_px") or {}, quality.get("held_out_error") or {}
+    gains, kept = quality.get("held_out_gain") or {}, quality.get("held_out_kept") or ()
+    bars = errors or held_out  # solutions of earlier versions have no errors
     rungs = {
         str(rung.get("model")): rung
         for stage in solution.stages
@@ -185,14 +188,17 @@ def ladder(solution: Solution) -> list[dict[str, Any]]:
         for rung in stage.get("rungs") or ()
     }
     names = [name for name in SHUTTER_MODELS if name in held_out or name in rungs]
-    largest = max((float(value) for value in held_out.values() if value is not None), default=0.0)
+    largest = max((float(value) for value in bars.values() if value is not None), default=0.0)
     return [
         {
             "name": name,
             "rms": rungs.get(name, {}).get("rms_px"),
             "iterations": rungs.get(name, {}).get("iterations"),
             "held_out": held_out.get(name),
-            "share": 100 * float(held_out.get(name) or 0) / largest if largest else 0,
+            "error": errors.get(name),
+            "gain": gains.get(name),
+            "kept": name in kept,
+            "share": 100 * float(bars.get(name) or 0) / largest if largest else 0,
             "chosen": name == solution.shutter_model,
         }
         for name in names

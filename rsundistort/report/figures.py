@@ -100,8 +100,8 @@ def _ladder(figure: Figure, source: Source) -> bool:
     rungs = [rung for rung in ladder(source.solution) if rung["held_out"] or rung["rms"]]
     if not rungs:
         return False
-    held_out = any(rung["held_out"] for rung in rungs)
-    key = "held_out" if held_out else "rms"
+    labels = {"error": "held-out error", "held_out": "held-out residual (px)", "rms": "residual (px)"}
+    key = next(key for key in labels if any(rung[key] for rung in rungs))
     rungs = [rung for rung in rungs if rung[key]]
     figure.set_size_inches(3.4, 0.6 + 0.32 * len(rungs))
     axes = figure.add_subplot()
@@ -116,7 +116,7 @@ def _ladder(figure: Figure, source: Source) -> bool:
     axes.invert_yaxis()
     axes.set_xlim(0, 1.15 * max(values))
     axes.tick_params(axis="y", length=0)
-    axes.set_xlabel("held-out residual (px)" if held_out else "residual (px)")
+    axes.set_xlabel(labels[key])
     return True
 
 
