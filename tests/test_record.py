@@ -16,6 +16,7 @@ from click.testing import CliRunner
 from make_photos import save_textures
 from rsundistort_cli.main import cli
 from test_batch import save_solution
+from test_cli import solution_of
 from test_synthetic_scene import TINY
 
 from rsundistort import FileError, rectify_folder
@@ -267,6 +268,7 @@ def test_resuming_keeps_what_lies_where_the_rest_would(invoke, inputs, tmp_path)
 
 def test_reports_and_figures_of_others_stay(invoke, inputs, tmp_path):
     out = tmp_path / "out"
+    solution_of(inputs / "s.json", THREE)
     assert invoke(*commands(inputs)[0], "-o", out).exit_code == 0
     for _ in range(2):
         assert invoke("report", out, "-q").exit_code == 0
@@ -276,7 +278,7 @@ def test_reports_and_figures_of_others_stay(invoke, inputs, tmp_path):
     pytest.importorskip("matplotlib")
     for _ in range(2):
         assert invoke("report", out, "--figures", tmp_path / "figures", "-q").exit_code == 0
-    assert (tmp_path / "figures" / "displacement.pdf").is_file()
+    assert (tmp_path / "figures" / "paths.pdf").is_file()
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "ladder.png").write_bytes(b"mine")
     refused(invoke("report", out, "--figures", tmp_path / "other"), "ladder.png would be replaced")
@@ -340,6 +342,7 @@ def test_a_killed_process_leaves_a_record_by_which_its_files_are_known(tmp_path)
     with after.writing(["a.txt"]):
         pass
     (tmp_path / "c.txt").write_text("mine")
+    assert (tmp_path / Record.NAME).read_bytes().count(b"\n") == 2
     assert Record(tmp_path).ours(["a.txt", "b.txt", "c.txt", "d.txt"]) == {"a.txt", "b.txt"}
 
 
@@ -350,6 +353,13 @@ def test_a_record_says_nothing_of_what_lies_elsewhere(tmp_path):
     facts = (tmp_path / "mine.txt").stat()
     (out / Record.NAME).write_text(json.dumps(["../mine.txt", f"{facts.st_size} {facts.st_mtime_ns}"]) + "\n")
     assert Record(out).ours([".."]) == set()
+    (tmp_path / "mine.txt").rename(tmp_path / "mine.jsonl")
+    (out / Record.NAME).unlink()
+    (out / Record.NAME).symlink_to(tmp_path / "mine.jsonl")
+    with Record(out).writing(["a.txt"]):
+        (out / "a.txt").write_text("a")
+    assert (tmp_path / "mine.jsonl").read_text() == "mine"
+    assert Record(out).ours(["a.txt"]) == {"a.txt"}
     (out / "images").symlink_to(tmp_path)
     with pytest.raises(FileError, match="leads out of"):
         Record(out).check(["images/new.txt"])

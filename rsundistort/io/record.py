@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 
@@ -100,8 +100,8 @@ class Record:
 
     def claim(self, paths: Iterable[str]) -> None:
         """Note that files are about to be written; `check` let them pass."""
-        if not self._begun and not self._own():
-            self._append((path, stamp) for path, stamps in self._of_journal().items() for stamp in stamps)
+        if not self._begun:  # anew: a link is not followed, and a last line cut short does not run into the next
+            self._write(self._own() or self._of_journal())
         self._begun = True
         new = [path for path in paths if path not in self._claimed]
         self._claimed.update(new)
@@ -116,9 +116,9 @@ class Record:
     def _note(self, paths: Collection[str]) -> None:
         there = stamps_of(self._place, paths)
         self._claimed.difference_update(paths)
-        self._append((path, there.get(path)) for path in paths)
+        self._append((path, there.get(path) or None) for path in paths)
 
-    def remove(self, paths: Iterable[str]) -> None:
+    def remove(self, paths: Collection[str]) -> None:
         """Delete those of these files that are ours, and folders that this leaves empty."""
         gone = self.ours({path.split("/")[0] for path in paths}) & {*paths}
         delete_in(self._place, gone)
@@ -143,11 +143,10 @@ class Record:
         """Note what became of the claimed files, and forget what is not there any more."""
         self._note({*self._claimed, *(path for path, stamps in self._own().items() if _ANY in stamps)})
         known = self._own()
-        there = stamps_of(self._place, known)
-        lines = [_line(path, stamp) for path in sorted(there) for stamp in sorted({*known[path]} - {_ANY})]
+        there = [path for path, stamp in stamps_of(self._place, known).items() if stamp]
         self._lines = []
-        if lines:
-            write_in(self._place, self.NAME, "".join(lines).encode())
+        if there:
+            self._write({path: known[path] for path in there})
         else:
             delete_in(self._place, [self.NAME])
 
@@ -156,8 +155,24 @@ class Record:
         if isinstance(self._place, RemoteFolder):
             self._lines += lines
         elif lines:
-            with (self._place / self.NAME).open("a", encoding="utf-8") as file:
+            with self._errors(), (self._place / self.NAME).open("a", encoding="utf-8") as file:
                 file.write("".join(lines))
+
+    def _write(self, known: Mapping[str, Collection[str]]) -> None:
+        """Begin anew, in one stroke."""
+        lines = (_line(path, stamp) for path in sorted(known) for stamp in sorted(known[path]))
+        with self._errors():
+            write_in(self._place, self.NAME, "".join(lines).encode())
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        """What the system says of a folder that cannot be written, in one line."""
+        try:
+            yield
+        except FileError:
+            raise
+        except OSError as error:
+            raise FileError(f"{self._place} cannot be written: {error.strerror}") from error
 
     def _put(self) -> None:
         """Put a remote record with what was added to it."""
