@@ -83,7 +83,9 @@ seed_option: Decorator = click.option("--seed", type=click.IntRange(min=0), defa
 jobs_option: Decorator = click.option(
     "--jobs", type=click.IntRange(min=0), default=0, help="Threads; 0, the default, takes all cores."
 )
-overwrite_option: Decorator = click.option("--overwrite", is_flag=True, help="Replace outputs that are in OUT.")
+overwrite_option: Decorator = click.option(
+    "--overwrite", is_flag=True, help="Replace what rsundistort wrote in OUT; other files stay."
+)
 scheduler_option: Decorator = click.option(
     "--scheduler",
     metavar="ADDRESS",

@@ -518,15 +518,6 @@ def test_links_that_lead_out_of_the_folder_are_refused(tmp_path, link):
     assert tree(tmp_path / "elsewhere") == before
 
 
-def test_links_in_the_place_of_an_output_are_replaced_not_followed(four):
-    (four / "mine.png").write_bytes(b"mine")
-    (four / "out" / "images").mkdir(parents=True)
-    (four / "out" / "images" / "a.png").symlink_to(four / "mine.png")
-    rectify_folder(four / "in", four / "s.json", four / "out", overwrite=True)
-    assert (four / "mine.png").read_bytes() == b"mine"
-    assert not (four / "out" / "images" / "a.png").is_symlink()
-
-
 def test_a_forged_journal_deletes_nothing_elsewhere(four):
     (four / "mine.png").write_bytes(b"mine")
     rectify_folder(four / "in", four / "s.json", four / "out")

@@ -24,6 +24,7 @@ from rsundistort import (
     rectify,
     write_solution,
 )
+from rsundistort.io.record import Record
 
 COMMAND = Path(sys.executable).with_name("rsundistort")
 CAMERA = "300,300,160,120"
@@ -417,6 +418,8 @@ def test_a_failing_run_leaves_what_it_was_to_overwrite(invoke, tmp_path):
     (tmp_path / "out" / "images").mkdir(parents=True)
     (tmp_path / "out" / "images" / "a.png").write_bytes(b"earlier")
     (tmp_path / "out" / "solution.json").write_text("earlier")
+    with Record(tmp_path / "out").writing(["images/a.png", "solution.json"]):
+        pass
     before = tree(tmp_path)
     error_line(invoke("run", "photos", "-o", "out", "--camera", CAMERA, "--overwrite", *FEW))
     assert tree(tmp_path) == before
@@ -474,7 +477,8 @@ def test_rectify(invoke, tmp_path):
     assert "3 photos rectified" in result.stdout
     assert result.stderr == ""
     names = {path for path, content in tree(tmp_path / "out").items() if content is not None}
-    files = {"solution.json", ".rectified.jsonl"}  # the second is what --resume goes by
+    # the second is what --resume goes by, the third what --overwrite does
+    files = {"solution.json", ".rectified.jsonl", ".rsundistort-written"}
     assert names == {f"{kind}/{name}" for kind in ("images", "masks") for name in THREE} | files
     assert invoke("rectify", "photos", "--solution", "s.json", "-o", "quiet", "-q").stdout == ""
 
@@ -608,6 +612,9 @@ def test_nothing_is_written_through_links(invoke, tmp_path):
     assert "images" in error_line(invoke("rectify", "photos", "--solution", "s.json", "-o", "out", "--overwrite"))
     assert (tree(tmp_path / "elsewhere"), (tmp_path / "s.json").read_bytes()) == before
     (tmp_path / "out" / "images").unlink()
+    said = error_line(invoke("rectify", "photos", "--solution", "s.json", "-o", "out", "--overwrite"))
+    assert "out/solution.json is a folder or a link" in said
+    (tmp_path / "out" / "solution.json").unlink()
     assert invoke("rectify", "photos", "--solution", "s.json", "-o", "out", "--overwrite").exit_code == 0
     assert (tmp_path / "s.json").read_bytes() == before[1]
 
@@ -627,8 +634,8 @@ def test_rectify_leaves_out_photos_of_another_size(invoke, tmp_path):
     assert warnings[1].startswith("warning: skipped: c.png")
     assert "1 photo rectified" in result.stdout
     assert "2 left out" in result.stdout
-    files = {"images", "images/a.png", "masks", "masks/a.png", "solution.json", ".rectified.jsonl"}
-    assert set(tree(tmp_path / "out")) == files
+    files = {"images", "images/a.png", "masks", "masks/a.png", "solution.json"}
+    assert set(tree(tmp_path / "out")) == files | {".rectified.jsonl", ".rsundistort-written"}
 
 
 def test_rectify_refuses_photos_that_are_all_of_another_size(invoke, tmp_path):

@@ -655,7 +655,7 @@ def test_experiment_two_writes_what_it_promises(folders, made_up, tmp_path):
         )  # fmt: skip
     assert [stage for stage, _, _ in told] == ["still: matching", "swung: matching", "swung-global: matching"]
     assert sorted(path.name for path in out.iterdir()) == [
-        "paths.png", "photos.csv", "still", "summary.json", "swung", "swung-global",
+        ".rsundistort-written", "paths.png", "photos.csv", "still", "summary.json", "swung", "swung-global",
     ]  # fmt: skip
     assert json.loads((out / "summary.json").read_text()) == summary
     assert summary["photos"] == 6
@@ -686,8 +686,14 @@ def test_experiment_two_keeps_outputs_unless_told(folders, made_up, tmp_path):
         experiment_two(*folders, out)
     assert made_up == []
     assert (out / "summary.json").read_text() == "precious"
-    experiment_two(*folders, out, TwoOptions(overwrite=True))
-    assert (out / "summary.json").read_text() != "precious"
+    with pytest.raises(FileError, match=r"summary\.json would be replaced"):
+        experiment_two(*folders, out, TwoOptions(overwrite=True))
+    assert made_up == []
+    assert (out / "summary.json").read_text() == "precious"
+    (out / "summary.json").unlink()
+    for _ in range(2):
+        experiment_two(*folders, out, TwoOptions(overwrite=True))
+    assert (out / "summary.json").is_file()
 
 
 def test_experiment_two_leaves_nothing_where_too_few_are_joined(folders, made_up, monkeypatch, poses, tmp_path):

@@ -33,6 +33,7 @@ from rsundistort.io import (
 )
 from rsundistort.io.cameras import camera_to_json
 from rsundistort.io.colmap import rectified_keypoints
+from rsundistort.io.record import Record
 
 K = [[500.0, 0, 322.5], [0, 510.0, 235.25], [0, 0, 1]]
 CAMERA = {"width": 640, "height": 480, "K": K, "dist": [-0.1, 0.02, 0.001, -0.002], "readout": "bottom-to-top"}
@@ -407,7 +408,8 @@ def test_outputs_appear_at_the_end(tmp_path):
         (scratch / "solution.json").write_bytes(b"s")
         assert not (out / "images").exists()
         assert not (out / "solution.json").exists()
-    assert tree(out) == {"images": None, "images/a.png": b"a", "solution.json": b"s"}
+    record = {Record.NAME: (out / Record.NAME).read_bytes()}
+    assert tree(out) == {"images": None, "images/a.png": b"a", "solution.json": b"s"} | record
 
 
 def write_and_fail(out, error, overwrite=False):
@@ -444,16 +446,21 @@ def test_folder_in_use_is_refused(tmp_path):
 
 
 def test_overwrite_replaces_outputs_and_keeps_the_rest(tmp_path):
+    with output_folder(tmp_path) as scratch:
+        (scratch / "images" / "sub").mkdir(parents=True)
+        (scratch / "images" / "sub" / "old.png").write_bytes(b"old")
+        (scratch / "solution.json").write_bytes(b"old")
     (tmp_path / "mine.txt").write_text("mine")
-    (tmp_path / "images").mkdir()
-    (tmp_path / "images" / "old.png").write_bytes(b"old")
-    (tmp_path / "solution.json").write_bytes(b"old")
+    (tmp_path / "images" / "mine.png").write_bytes(b"mine")
     with output_folder(tmp_path, overwrite=True) as scratch:
         (scratch / "images").mkdir()
         (scratch / "images" / "new.png").write_bytes(b"new")
         (scratch / "solution.json").write_bytes(b"new")
-    assert tree(tmp_path) == {
+    found = tree(tmp_path)
+    assert b"old.png" not in found.pop(Record.NAME)
+    assert found == {
         "images": None,
+        "images/mine.png": b"mine",
         "images/new.png": b"new",
         "mine.txt": b"mine",
         "solution.json": b"new",
@@ -461,11 +468,24 @@ def test_overwrite_replaces_outputs_and_keeps_the_rest(tmp_path):
 
 
 def test_overwrite_replaces_a_file_by_a_folder_of_its_name(tmp_path):
-    (tmp_path / "sparse").write_bytes(b"old")
+    with output_folder(tmp_path) as scratch:
+        (scratch / "sparse").write_bytes(b"old")
     with output_folder(tmp_path, overwrite=True) as scratch:
         (scratch / "images").mkdir()
         (scratch / "sparse").mkdir()
     assert tree(tmp_path) == {"images": None, "sparse": None}
+
+
+def write_sparse_into(out):
+    with output_folder(out, overwrite=True) as scratch:
+        (scratch / "sparse").mkdir()
+
+
+def test_a_file_of_others_in_the_place_of_a_folder_is_refused(tmp_path):
+    (tmp_path / "sparse").write_bytes(b"mine")
+    with pytest.raises(FileError, match="sparse is in the way of a folder"):
+        write_sparse_into(tmp_path)
+    assert tree(tmp_path) == {"sparse": b"mine"}
 
 
 def test_the_photos_folder_is_refused(tmp_path):

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from rsundistort import InputError, RsUndistortWarning
 from rsundistort.io import (
+    output_folder,
     read_transforms,
     write_colmap_workspace,
     write_point_cloud,
@@ -28,6 +29,7 @@ from rsundistort.model.projection import clock_of, project_points, unproject_poi
 from rsundistort.pipeline import SolveOptions
 from rsundistort.pipeline.outputs import Outputs, photo_times
 from rsundistort.pipeline.progress import StageLog
+from rsundistort.pipeline.workers import Workers
 
 W, H = 640, 480
 LENS = (-0.12, 0.03, 1e-3, -8e-4, 0.01)
@@ -170,6 +172,21 @@ def test_dense_fusion_of_colmap_runs_in_the_workspace(tmp_path, rng):
     # COLMAP's stereo takes pixels half a pixel off; the plane is nearly square to the cameras
     assert np.median(np.abs(points[:, 2] - 8)) < 0.02
     assert (tmp_path / "fused.ply").stat().st_size > 15 * len(points)
+
+
+def test_depth_maps_of_an_earlier_result_stay_and_are_told_of(tmp_path, rng):
+    """COLMAP made them, and would take them for those of the new photos."""
+    made, _ = outputs_of(rng, tmp_path / "first", SolveOptions(report=False), names=[f"{k}.png" for k in range(4)])
+    for name in made.reconstruction.image_names:
+        (tmp_path / "photos").mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / "photos" / name), np.full((H, W, 3), 90, np.uint8))
+    (tmp_path / "out" / "stereo").mkdir(parents=True)
+    (tmp_path / "out" / "stereo" / "0.png.geometric.bin").write_bytes(b"map")
+    with output_folder(tmp_path / "out", overwrite=True) as scratch:
+        made.begin(scratch, StageLog(None))
+    with pytest.warns(RsUndistortWarning, match="stereo holds maps that COLMAP made of an earlier result"):
+        made.rectify(tmp_path / "photos", tmp_path / "out", Workers(1), StageLog(None))
+    assert (tmp_path / "out" / "stereo" / "0.png.geometric.bin").read_bytes() == b"map"
 
 
 def test_workspace_only_where_there_are_photos(tmp_path, rng):

@@ -31,7 +31,9 @@ from rsundistort import (
     write_solution,
 )
 from rsundistort.io import read_photo
+from rsundistort.io.record import Record
 from rsundistort.model import READOUTS
+from rsundistort.pipeline.outputs import files_of_run
 from rsundistort.synthetic.warp import largest_rectangle
 
 CAMERA = "300,300,160,120"
@@ -121,11 +123,14 @@ def test_twins_are_nearer_to_the_rectified_photos(courtyard, solved, tmp_path):
 def test_outputs_of_a_run(solved):
     solution, out, _ = solved
     assert sorted(p.name for p in out.iterdir()) == [
-        "images", "masks", "points.ply", "poses.txt", "report.html", "report.npz", "run-colmap-geometric.sh",
-        "run-colmap-photometric.sh", "solution.json", "sparse", "stereo", "transforms.json",
+        ".rsundistort-written", "images", "masks", "points.ply", "poses.txt", "report.html", "report.npz",
+        "run-colmap-geometric.sh", "run-colmap-photometric.sh", "solution.json", "sparse", "stereo", "transforms.json",
     ]  # fmt: skip
     assert sorted(p.name for p in (out / "images").iterdir()) == COURTYARD_NAMES
     assert sorted(p.name for p in (out / "masks").iterdir()) == COURTYARD_NAMES
+    # what is in their way is refused before the work
+    written = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file() and not p.name.startswith(".")}
+    assert written == {*files_of_run(COURTYARD_NAMES, RunOptions())}
     for name in COURTYARD_NAMES:
         image = read_photo(out / "images" / name).pixels
         mask = read_photo(out / "masks" / name).pixels
@@ -273,6 +278,8 @@ def test_failing_run_leaves_out_as_it_was(tmp_path):
     out = tmp_path / "out"
     (out / "images").mkdir(parents=True)
     (out / "images" / "a.png").write_bytes(b"earlier")
+    with Record(out).writing(["images/a.png"]):
+        pass
     (out / "mine.txt").write_text("mine")
     before = tree(tmp_path)
     with pytest.raises(ReconstructionError):
@@ -396,7 +403,7 @@ def test_simulate_warp_follows_its_seed(tmp_path):
         truths[out] = simulate_warp(photos, tmp_path / out, options)
     contents = {out: tree(tmp_path / out) for out in truths}
     for name in contents["first"]:
-        if name != "ground_truth.json":  # it holds the time that the warping took
+        if name not in ("ground_truth.json", ".rsundistort-written"):  # they hold times
             assert contents["again"][name] == contents["first"][name], name
     for name in names:
         first, again = truths["first"].image(name).motion.phi, truths["again"].image(name).motion.phi

@@ -565,7 +565,7 @@ def test_figures_for_papers(courtyard, invoke, tmp_path):
     names = [
         f"{name}.{kind}" for name in ("ladder", "displacement", "paths", "critical-motion") for kind in ("png", "pdf")
     ]
-    assert sorted(path.name for path in (tmp_path / "figures").iterdir()) == sorted(names)
+    assert sorted(path.name for path in (tmp_path / "figures").glob("[!.]*")) == sorted(names)
     for path in (tmp_path / "figures").glob("*.png"):
         pixels = cv2.imread(str(path))
         assert 0.2 < pixels.mean() / 255 < 0.999

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from ..bundle import BundleOptions, bundle_adjust, objective
 from ..errors import FileError, FormatError, InputError
 from ..evaluation import align_points, rotation_angles_deg
+from ..io.record import Record
 from ..model import Observations, Reconstruction, RowMotion
 from ..pipeline.progress import ProgressCallback
 from ..synthetic import project_rows
@@ -36,6 +37,7 @@ METHODS: dict[str, tuple[str, bool]] = {
     "rotation": ("rotation", False),
     "constant-motion": ("constant-motion", False),
 }
+_FILES = ("settings.json", "trials.jsonl", "summary.json", "summary.csv", "histograms.png")
 _METRICS = ("rotation_deg", "translation", "structure")
 # no prior: a spread of so many radians or baselines a frame
 _FREE = 1e4
@@ -301,7 +303,22 @@ def experiment_one(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise FileError(f"{out} cannot be made: {error.strerror}; give another folder") from error
-    _check_settings(out / "settings.json", _settings(options), {scene.name: scene.digest for scene in loaded})
+    settings = _settings(options)
+    digests = {scene.name: scene.digest for scene in loaded}
+    known = _check_settings(out / "settings.json", settings, digests)
+    record = Record(out)
+    if not known:  # settings of this experiment: the rest is of it, too
+        record.check(_FILES, map(Path, scenes))
+    with record.writing(_FILES):
+        text = json.dumps({**settings, "scenes": {**known, **digests}}, indent=1)
+        (out / "settings.json").write_text(text + "\n", encoding="utf-8")
+        return _experiment_one(loaded, out, options, progress)
+
+
+def _experiment_one(
+    loaded: Sequence[KnownScene], out: Path, options: OneOptions, progress: ProgressCallback | None
+) -> dict[str, Any]:
+    """The trials that are missing in a folder, and what comes of all of them."""
     trials = out / "trials.jsonl"
     _cut_torn_line(trials)
     done = _done(trials)
@@ -350,8 +367,11 @@ def experiment_one(
     return summary
 
 
-def _check_settings(path: Path, settings: dict[str, Any], digests: dict[str, str]) -> None:
-    """Refuse to mix trials of different settings, or of different scenes of one name, in one folder."""
+def _check_settings(path: Path, settings: dict[str, Any], digests: dict[str, str]) -> dict[str, str]:
+    """Refuse to mix trials of different settings, or of different scenes of one name, in one folder.
+
+    The scenes that are in it, with what tells them apart.
+    """
     known: dict[str, str] = {}
     if path.is_file():
         try:
@@ -368,8 +388,7 @@ def _check_settings(path: Path, settings: dict[str, Any], digests: dict[str, str
         other = [name for name, digest in digests.items() if known.get(name, digest) != digest]
         if other:
             raise InputError(f"{path.parent} holds trials of another scene called {other[0]}; give another folder")
-    text = json.dumps({**settings, "scenes": {**known, **digests}}, indent=1)
-    path.write_text(text + "\n", encoding="utf-8")
+    return known
 
 
 def _write_csv(path: Path, summary: dict[str, Any]) -> None:

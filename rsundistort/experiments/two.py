@@ -15,8 +15,11 @@ from numpy.typing import NDArray
 from ..errors import InputError, ReconstructionError
 from ..evaluation import align_points, pose_errors
 from ..io import list_photos, output_folder
+from ..io.record import Record
 from ..model import Solution, check_shutter_model
 from ..pipeline import RunOptions, run, versions
+from ..pipeline.cameras import camera_file_of
+from ..pipeline.outputs import files_of_run
 from ..pipeline.progress import ProgressCallback
 from .figures import camera_paths, need_matplotlib
 
@@ -192,7 +195,12 @@ def experiment_two(
     names = check_same_names(still, swung)
     common = RunOptions(camera=options.camera, readout=options.readout, seed=options.seed, jobs=options.jobs)
     solutions: dict[str, Solution] = {}
-    with output_folder(out, overwrite=options.overwrite, apart_from=[still, swung]) as scratch:
+    camera_files = [file for each in (still, swung) if (file := camera_file_of(each, options.camera)) is not None]
+    inputs, folders = [still, swung, *camera_files], (_STILL, _WITH, _WITHOUT)
+    with output_folder(out, overwrite=options.overwrite, apart_from=inputs, replaced=folders) as scratch:
+        files = files_of_run(names, common)
+        made = ["summary.json", "photos.csv", "paths.png", *(f"{key}/{file}" for key in folders for file in files)]
+        Record(out).check(made, inputs)
         for key, photos, model in (
             (_STILL, still, "global"),
             (_WITH, swung, options.shutter_model),

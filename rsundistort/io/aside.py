@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["remove_partial", "write_aside", "written_aside"]
+__all__ = ["is_partial", "remove_partial", "write_aside", "written_aside"]
 
 
 @contextmanager
@@ -30,7 +31,13 @@ def write_aside(path: Path, *parts: bytes | memoryview) -> None:
         file.writelines(parts)
 
 
-def remove_partial(folder: Path) -> None:
-    """Delete what a killed process left half-written in a folder and its sub-folders."""
-    for path in folder.rglob(".*.partial*"):
-        path.unlink(missing_ok=True)
+def is_partial(name: str) -> bool:
+    """Whether a name is one of those that files have here while they are written; others' may look alike."""
+    return re.fullmatch(r"\.[0-9a-f]{16}\.partial(\.\w+)?", name) is not None
+
+
+def remove_partial(folder: Path, *, deep: bool = True) -> None:
+    """Delete what a killed process left half-written in a folder, and in its sub-folders if `deep`."""
+    for path in (folder.rglob if deep else folder.glob)(".*.partial*"):
+        if is_partial(path.name):
+            path.unlink(missing_ok=True)

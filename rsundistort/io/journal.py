@@ -17,7 +17,7 @@ from ..model.checks import check_photo_name
 from .aside import write_aside
 from .places import RemoteFolder
 
-__all__ = ["Journal", "JournalEntry", "RemoteJournal"]
+__all__ = ["Journal", "JournalEntry", "RemoteJournal", "entries_of"]
 
 
 @dataclass(frozen=True)
@@ -68,15 +68,8 @@ class Journal:
 
     def read(self) -> dict[str, JournalEntry]:
         """What was done, by photo; the last word on each counts."""
-        entries = {}
-        if self.path.is_file():
-            for line in self.path.read_text(encoding="utf-8", errors="replace").splitlines():
-                try:
-                    entry = _entry(json.loads(line))
-                except (ValueError, TypeError, KeyError, IndexError, AttributeError):
-                    continue
-                entries[entry.name] = entry
-        return entries
+        text = self.path.read_text(encoding="utf-8", errors="replace") if self.path.is_file() else ""
+        return entries_of(text)
 
     def write(self, entries: Iterable[JournalEntry]) -> None:
         """Begin anew with these, in one stroke."""
@@ -159,6 +152,18 @@ class RemoteJournal(Journal):
                 self.settle()
         finally:
             self._work.cleanup()
+
+
+def entries_of(text: str) -> dict[str, JournalEntry]:
+    """What was done, by photo, by the text of a journal; the last word on each counts."""
+    entries = {}
+    for line in text.splitlines():
+        try:
+            entry = _entry(json.loads(line))
+        except (ValueError, TypeError, KeyError, IndexError, AttributeError):
+            continue
+        entries[entry.name] = entry
+    return entries
 
 
 def _line(entry: JournalEntry) -> str:

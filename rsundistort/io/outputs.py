@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import errno
+import os
+import platform
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import psutil
+
 from ..errors import FileError
-from .aside import remove_partial
+from .aside import is_partial, remove_partial
 from .journal import Journal, RemoteJournal
 from .places import Place, RemoteFolder
+from .record import Record, is_inside
 
 __all__ = ["BATCH_FOLDERS", "CANNOT_WRITE", "batch_folder", "make_inside", "output_folder"]
 
@@ -21,6 +27,10 @@ BATCH_FOLDERS = ("images", "masks", "maps", "also")
 
 #: What a full disk, a read-only one, a limit say: anything else is not OUT's fault.
 CANNOT_WRITE = (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EPERM, errno.EDQUOT, errno.EIO)
+
+# Hidden names in OUT that are no outputs: scratch folders, with machine and process, and the record.
+_HIDDEN = ".rsundistort-"
+_SCRATCH = f"{_HIDDEN}{re.sub(r'[^0-9A-Za-z]', '_', platform.node())}-"
 
 
 @contextmanager
@@ -32,19 +42,21 @@ def output_folder(
     Parameters
     ----------
     folder : Path
-        Made if missing. Must be empty unless `overwrite`; then entries of the same names are replaced, and
-        everything else in it stays.
+        Made if missing. Must be empty unless `overwrite`.
     overwrite : bool
-        See `folder`.
+        Replace what was written here before: files of the same names, and in the folders that are written again all
+        the others that were. What rsundistort did not write, or somebody changed since, stays; where such a file is in
+        the way, nothing is touched.
     apart_from : sequence of Path
-        Inputs that `folder` must not be.
+        Inputs, files or folders of them: `folder` must not be one of them, and none of them is replaced or removed.
     replaced : sequence of str
         Folders in it that must not hold the inputs either.
 
     Raises
     ------
     FileError
-        Before the block is entered, when the folder is in use or cannot be written.
+        Before the block is entered, when the folder is in use or cannot be written; at its end, when a file that is not
+        ours is in the way. `Record.check` tells that earlier, of names that are known.
     """
     folder = Path(folder)
     made = _prepare(folder, apart_from, replaced)
@@ -52,24 +64,48 @@ def output_folder(
     try:
         with _errors_of(folder, "; give another folder"):
             folder.mkdir(parents=True, exist_ok=True)
-            if any(folder.iterdir()) and not overwrite:
+            if _has_content(folder) and not overwrite:
                 raise FileError(f"{folder} is not empty; give another folder, or --overwrite to replace its outputs")
-            scratch = Path(tempfile.mkdtemp(prefix=".rsundistort-", dir=folder))
+            _remove_stale(folder)
+            scratch = Path(tempfile.mkdtemp(prefix=f"{_SCRATCH}{os.getpid()}-", dir=folder))
         with _errors_of(folder):
             yield scratch
-            for entry in sorted(scratch.iterdir()):
-                target = folder / entry.name
-                if target.is_dir() and not target.is_symlink():
-                    shutil.rmtree(target)
-                else:
-                    target.unlink(missing_ok=True)
-                entry.replace(target)
+            _move(scratch, folder, apart_from)
         made = None
     finally:
         if scratch is not None:
             shutil.rmtree(scratch, ignore_errors=True)
         if made is not None:
             shutil.rmtree(made, ignore_errors=True)
+
+
+def _move(scratch: Path, folder: Path, inputs: Sequence[Path]) -> None:
+    """Move everything into a folder, in the place of what was written there before."""
+    record = Record(folder)
+    entries = sorted(scratch.rglob("*"))
+    new = {path.relative_to(scratch).as_posix(): path for path in entries if not path.is_dir()}
+    folders = [path.relative_to(scratch).as_posix() for path in entries if path.is_dir()]
+    old = record.ours({path.name for path in scratch.iterdir()}) - new.keys()
+    record.check({*new, *old}, inputs, folders=folders)
+    with record.writing(new):
+        record.remove(old)
+        for name in folders:
+            (folder / name).mkdir(exist_ok=True)
+        for name, path in new.items():
+            path.replace(folder / name)
+
+
+def _has_content(folder: Path) -> bool:
+    """Whether there is more in a folder than what a killed process left behind."""
+    return any(not path.name.startswith(_HIDDEN) for path in folder.iterdir())
+
+
+def _remove_stale(folder: Path) -> None:
+    """Delete the scratch folders of processes of this machine that are gone."""
+    for path in folder.glob(f"{_SCRATCH}*"):
+        process = re.fullmatch(r"(\d+)-\w+", path.name.removeprefix(_SCRATCH))
+        if process and path.is_dir() and not psutil.pid_exists(int(process[1])):
+            shutil.rmtree(path, ignore_errors=True)
 
 
 @contextmanager
@@ -84,7 +120,7 @@ def batch_folder(
         Made if missing, and removed again if nothing was done. Must be empty unless `overwrite` or `resume`.
     overwrite, resume : bool
         See `folder`; `resume` only if the journal of a batch is in it. What a killed process left half-written is
-        deleted.
+        deleted. Which files may be written is for `Record.check` to say.
     apart_from : sequence of Path
         Inputs that `folder` must not be, nor hold among its rectified photos and masks.
 
@@ -105,15 +141,15 @@ def batch_folder(
             with _errors_of(folder, "; give another folder"):
                 folder.mkdir(parents=True, exist_ok=True)
                 going_on = journal.path.is_file()
-                if any(folder.iterdir()) and not overwrite:
+                if _has_content(folder) and not overwrite:
                     _check_goes_on(folder, going_on, resume)
+                _remove_stale(folder)
                 new = [path for path in (folder / "images", folder / "masks", journal.path) if not path.exists()]
                 for name in ("images", "masks"):
                     make_inside(folder, name)
                 for name in BATCH_FOLDERS:
                     remove_partial(folder / name)
-                for aside in folder.glob(".*.partial"):
-                    aside.unlink()
+                remove_partial(folder, deep=False)
                 # a last line cut short must not run into the next
                 journal.write(journal.read().values())
             with _errors_of(folder):
@@ -124,6 +160,8 @@ def batch_folder(
                     shutil.rmtree(path, ignore_errors=True)  # of folders only
                 if journal.path in new:
                     journal.path.unlink(missing_ok=True)
+                with suppress(OSError):
+                    Record(folder).settle()
                 if made is not None:
                     shutil.rmtree(made, ignore_errors=True)
             raise
@@ -140,12 +178,11 @@ def _remote_batch(
                 folder, other, folder.holds(other) and other.holds(folder),
                 any(RemoteFolder(f"{folder}/{name}").holds(other) for name in BATCH_FOLDERS),
             )  # fmt: skip
-    held = folder.listing() or {}
+    held = {name: entry for name, entry in (folder.listing() or {}).items() if not name.startswith(_HIDDEN)}
     going_on = Journal.NAME in held
     if held and not overwrite:
         _check_goes_on(folder, going_on, resume)
-    partial = (path for path in folder.sizes_under(BATCH_FOLDERS) if path.endswith(".partial"))
-    folder.delete([*partial, *(name for name in held if name.endswith(".partial"))])
+    folder.delete(path for path in (*folder.sizes_under(BATCH_FOLDERS), *held) if is_partial(path.rpartition("/")[2]))
     here = Path(tempfile.gettempdir())
     with _errors_of(here, "; set TMPDIR to another folder"):
         journal = RemoteJournal(folder)
@@ -161,6 +198,7 @@ def _remote_batch(
                 with suppress(FileError):
                     journal.drop()
                     folder.delete(() if held else folder.sizes_under(BATCH_FOLDERS))
+                    Record(folder).settle()
             raise
 
 
@@ -179,7 +217,7 @@ def _check_goes_on(folder: Place, going_on: bool, resume: bool) -> None:
 def make_inside(folder: Path, name: str) -> Path:
     """The folder `name` in `folder`, made if missing; refused if a link would lead it elsewhere."""
     path = folder / name
-    if not path.resolve().is_relative_to(folder.resolve()):
+    if not is_inside(path, folder):
         raise FileError(f"{path} leads out of {folder}; remove that link")
     path.mkdir(parents=True, exist_ok=True)
     return path
@@ -189,7 +227,7 @@ def _prepare(folder: Path, apart_from: Sequence[Path], replaced: Sequence[str]) 
     """Refuse a folder that is in the way of the inputs; the topmost folder that has to be made for it to exist."""
     place = folder.resolve()
     for other in apart_from:
-        inside = Path(other).resolve()
+        inside = other.resolve()
         among = any(inside.is_relative_to((folder / name).resolve()) for name in replaced)
         _check_apart(folder, other, place == inside, among)
     if folder.exists() and not folder.is_dir():

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import secrets
+import stat
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -26,6 +28,8 @@ __all__ = [
     "local_place",
     "place_of",
     "sizes_under",
+    "stamps_of",
+    "text_in",
     "write_in",
 ]
 
@@ -241,6 +245,35 @@ def sizes_under(place: Place, within: Collection[str]) -> dict[str, int]:
         return place.sizes_under(within)
     paths = (path for each in within for path in (place / each).rglob("*") if not path.is_dir())
     return {path.relative_to(place).as_posix(): path.lstat().st_size for path in paths}
+
+
+def stamps_of(place: Place, paths: Iterable[str]) -> dict[str, str]:
+    """Of files of a folder that are there, their size and what tells that they changed; "" for links and folders."""
+    if isinstance(place, RemoteFolder):
+        listings: dict[str, Mapping[str, Any]] = {}
+        found = {}
+        for path in paths:
+            within, _, name = path.rpartition("/")
+            if within not in listings:
+                listings[within] = place.listing(within or ".") or {}
+            if (entry := listings[within].get(name)) is not None:
+                found[path] = f"{entry['size']} {_version(entry)}" if entry["type"] == "file" else ""
+        return found
+    stamps = {}
+    for path in paths:
+        with suppress(FileNotFoundError, NotADirectoryError):
+            facts = os.lstat(place / path)
+            stamps[path] = f"{facts.st_size} {facts.st_mtime_ns}" if stat.S_ISREG(facts.st_mode) else ""
+    return stamps
+
+
+def text_in(place: Place, path: str) -> str:
+    """The text of a file of a folder; empty if there is none."""
+    if isinstance(place, RemoteFolder):
+        within, _, name = path.rpartition("/")
+        return place.read(path).decode(errors="replace") if name in (place.listing(within or ".") or {}) else ""
+    file = place / path
+    return file.read_text(encoding="utf-8", errors="replace") if file.is_file() else ""
 
 
 def write_in(place: Place, path: str, data: bytes) -> None:

@@ -11,11 +11,12 @@ from typing import Any
 from ..errors import InputError, MetadataWarning, RsUndistortWarning, SkippedPhotoWarning
 from ..io import list_photos, read_solution
 from ..io.outputs import batch_folder
-from ..io.places import RemoteFolder, local_place, place_of, write_in
+from ..io.places import Place, RemoteFolder, local_place, place_of, write_in
+from ..io.record import Record
 from ..io.solution import solution_to_bytes
 from ..model import Solution
 from ..model.orientation import in_stored_frame, split_mirror, turn_solution
-from .depth import PhotoDepths, ScenePoints, check_depth, with_depths
+from .depth import DEPTHS, PhotoDepths, ScenePoints, check_depth, with_depths
 from .photo import RectifyOptions
 from .progress import ProgressCallback, StageLog
 from .views import with_view
@@ -78,6 +79,7 @@ def rectify_folder(
     check_depth(options.depth)
     solution = local_place(solution)
     also = [local_place(each) for each, _ in options.also]
+    depth = [] if str(options.depth) in DEPTHS else [local_place(options.depth)]
     folder, target = place_of(photos), place_of(out)
     masks = [] if options.masks is None else [place_of(options.masks)]
     for place in (folder, target, *masks):
@@ -97,7 +99,11 @@ def rectify_folder(
     # a photo without a pose may be mirrored
     unposed = replace(solved, images=[replace(image, R_cw=None, center_w=None) for image in solved.images])
     workers = Workers(use_threads(jobs), scheduler)
-    with batch_folder(target, overwrite=overwrite, resume=resume, apart_from=[folder, *masks, *also]) as journal:
+    inputs = [folder, *masks, *also, *depth]
+    with batch_folder(target, overwrite=overwrite, resume=resume, apart_from=inputs) as journal:
+        record = Record(target)
+        # a solution of ours is brought up to date in its place
+        record.check(["solution.json"], [] if _is_of(solution, target) else [solution], again=resume)
         done = rectify_photos(
             folder, unposed, names, target, options, depths, workers, StageLog(progress), journal,
             resume=resume, go_on="whole; the same command with --resume goes on",
@@ -114,8 +120,18 @@ def rectify_folder(
         if options.apply_orientation:
             solved = turn_solution(_without_mirrored_poses(solved, turns), turns)
         solved = replace(solved, options={**solved.options, "raw_as": options.raw_as})
-        write_in(target, "solution.json", solution_to_bytes(solved))
+        with record.writing(["solution.json"]):
+            write_in(target, "solution.json", solution_to_bytes(solved))
     return solved, dict(sorted(left_out.items()))
+
+
+def _is_of(solution: Path, target: Place) -> bool:
+    """Whether a solution is the one in a folder of outputs."""
+    return (
+        isinstance(target, Path)
+        and (target / "solution.json").is_file()
+        and solution.samefile(target / "solution.json")
+    )
 
 
 def _points_beside(solution: Path, solved: Solution, depth: str | Path) -> ScenePoints | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +22,7 @@ from ..io import (
 )
 from ..model import READOUTS, Camera
 
-__all__ = ["PhotoCameras", "check_readouts", "find_cameras"]
+__all__ = ["PhotoCameras", "camera_file_of", "check_readouts", "find_cameras"]
 
 #: What `camera.json` files are called where none is named.
 _BESIDE = ("camera.json", "cameras.json")
@@ -72,6 +73,14 @@ def check_readouts(readout: str | Mapping[str, str] | None) -> dict[str, str]:
     return told
 
 
+def camera_file_of(folder: Path, camera: str | None) -> Path | None:
+    """The file or folder that tells the cameras of a folder's photos; None where numbers or EXIF do."""
+    if camera is not None:
+        return Path(camera) if os.path.exists(camera) else None
+    beside = (parent / name for parent in (folder, folder.parent) for name in _BESIDE)
+    return next((path for path in beside if path.is_file()), None)
+
+
 def find_cameras(
     folder: Path,
     names: Sequence[str],
@@ -99,9 +108,8 @@ def find_cameras(
         When a photo has no camera, or one of another size.
     """
     groups = [group_of(fact, *size) for fact, size in zip(facts, sizes, strict=True)]
-    if camera is None:
-        beside = (parent / name for parent in (folder, folder.parent) for name in _BESIDE)
-        camera = next((str(path) for path in beside if path.is_file()), None)
+    if camera is None and (beside := camera_file_of(folder, None)) is not None:
+        camera = str(beside)
     if camera is not None:
         file = read_camera_file(camera, *sizes[0])
         keys = _keys_in(file, camera, names, sizes, groups)

@@ -19,6 +19,7 @@ from ..io.colmap_model import ColmapModel, colmap_model_of, surviving_points
 from ..io.models import read_model
 from ..io.photos.images import stored_size
 from ..io.places import local_place
+from ..io.record import Record
 from ..model import Reconstruction, Solution
 from ..model.orientation import INVERSE, turn_reconstruction
 from ..sfm import kept_log_level, matched_of_database
@@ -27,7 +28,7 @@ from .gyro import known_readouts
 from .ladder import solve_tracks
 from .options import SolveOptions
 from .outcome import Outcome
-from .outputs import REPLACED, Outputs, PointRgb, photo_times
+from .outputs import REPLACED, Outputs, PointRgb, files_of_run, inputs_of, photo_times
 from .progress import ProgressCallback, StageLog
 from .workers import Workers, use_threads
 
@@ -73,15 +74,16 @@ def solve_model(
     """
     options = options or SolveOptions()
     model, out = local_place(model), local_place(out)
-    folder, masks = (None if path is None else local_place(path) for path in (images, options.masks))
+    folder = None if images is None else local_place(images)
     if database is not None and model.is_file():
         raise InputError(f"{model} is no COLMAP model, and --database is COLMAP's; leave it out")
     log = StageLog(progress)
     workers = Workers(use_threads(options.jobs), options.scheduler)
-    inputs = [path for path in (model, folder, masks) if path is not None]
+    inputs = inputs_of(options, model, folder, database)
     with output_folder(out, overwrite=options.overwrite, apart_from=inputs, replaced=REPLACED) as scratch:
         log.begin("model")
         given = read_model(model)
+        Record(out).check(files_of_run([] if folder is None else given.reconstruction.image_names, options), inputs)
         photos = {} if folder is None else _look_at(folder, given.reconstruction)
         given, said = _in_stored_frame(given, photos)
         if folder is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -29,11 +29,12 @@ from ..io import (
 from ..io.colmap import ModelIds
 from ..io.journal import Journal
 from ..io.outputs import batch_folder
+from ..io.places import local_place
 from ..io.video import FRAME_TABLE
 from ..model import Reconstruction, Solution
 from ..model.orientation import turn_reconstruction, turn_solution
 from ..report import Diagnostics, relative_folder, write_diagnostics, write_report
-from .depth import PhotoDepths, ScenePoints, with_depths
+from .depth import DEPTHS, PhotoDepths, ScenePoints, with_depths
 from .ladder import Solved
 from .options import SolveOptions
 from .outcome import Outcome, solution_of
@@ -43,10 +44,34 @@ from .views import with_view
 from .workers import Workers
 from .write import PointColors, mask_names, rectify_photos
 
-__all__ = ["REPLACED", "Outputs", "photo_times"]
+__all__ = ["REPLACED", "Outputs", "files_of_run", "inputs_of", "photo_times"]
 
 #: Folders that a run replaces.
 REPLACED = ("images", "masks", "sparse", "stereo", "rs-poses")
+
+# What it writes besides the photos.
+_FILES = (
+    "solution.json", "report.npz", "poses.txt", "points.ply", "transforms.json", "run-colmap-geometric.sh",
+    "run-colmap-photometric.sh", "stereo/fusion.cfg", "stereo/patch-match.cfg",
+)  # fmt: skip
+_RS_POSES = ("rs-poses/gsplat.npz", "rs-poses/transforms.json")
+_PARTS = ("cameras", "images", "points3D", "rigs", "frames")
+
+
+def files_of_run(names: Sequence[str], options: SolveOptions) -> list[str]:
+    """All files that the outputs of photos may have: what is in their way is to be told before the work, not after."""
+    files = [*_FILES, *(f"sparse/{part}.{options.sparse_format}" for part in _PARTS)]
+    files += [*_RS_POSES] * options.rs_poses + ["report.html"] * options.report
+    masks = mask_names(names)
+    return files + [each for n in names for each in (f"images/{output_name(n, options.raw_as)}", f"masks/{masks[n]}")]
+
+
+def inputs_of(options: SolveOptions, *given: Path | str | None) -> list[Path]:
+    """Files and folders that are read: those given, and those that the options name."""
+    found = [*given, options.masks, *(folder for folder, _ in options.also)]
+    if str(options.depth) not in DEPTHS:
+        found.append(options.depth)
+    return [local_place(path) for path in found if path is not None]
 
 
 def photo_times(folder: Path) -> dict[str, float]:
@@ -176,6 +201,11 @@ class Outputs:
             log.end("writing")
             turned = replace(turned, stages=tuple(log.stages))
             write_solution(scratch / "solution.json", turned)
+        if any((out / "stereo").rglob("*.bin")):
+            warnings.warn(
+                f"{out / 'stereo'} holds maps that COLMAP made of an earlier result, and would take for those of this "
+                "one; remove them before you run it", RsUndistortWarning, stacklevel=2,
+            )  # fmt: skip
         if not left_out:
             journal.path.unlink()  # nothing to go on with
         self.report(out, log, photos)

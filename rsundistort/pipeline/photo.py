@@ -28,6 +28,8 @@ from .extras import AlsoImage
 
 __all__ = ["PhotoDone", "PhotoJob", "RectifyOptions", "check_not_rectified", "rectify_photo", "turn_of"]
 
+# the two files of a photo's grid
+_WAYS = ("forward", "inverse")
 _VERSION = version("rsundistort")  # once: looking it up takes milliseconds, which every photo would wait for
 
 
@@ -135,6 +137,20 @@ class PhotoJob:
     also: tuple[AlsoImage, ...] = ()
     maps: str | None = None
     sample_xy: NDArray[np.int64] | None = None
+
+    @property
+    def inputs(self) -> list[File]:
+        """The files that are read."""
+        given = (self.source, self.own_mask, self.depth.own_map, *(each.source for each in self.also))
+        return [each for each in given if each is not None]
+
+    @property
+    def targets(self) -> list[str]:
+        """The files that are written, in `out`."""
+        maps = []
+        if self.maps is not None and self.options.maps is not None:
+            maps = [f"{self.maps}.{way}{MAP_KINDS[self.options.maps]}" for way in _WAYS]
+        return [self.image, self.mask, *(each.target for each in self.also), *maps]
 
     def fingerprint(self) -> str:
         """What the outputs depend on, as a number: if it is another one, they are stale.
@@ -257,7 +273,7 @@ def _rectify_in(work: Path, job: PhotoJob) -> PhotoDone:
         done = _rectify(job, source, own_mask, job.out)
     else:
         out = work / "out"
-        for name in (job.image, job.mask, *(each.target for each in job.also), *([job.maps] if job.maps else [])):
+        for name in job.targets:
             (out / name).parent.mkdir(parents=True, exist_ok=True)
         done = _rectify(job, source, own_mask, out)
         for name in reversed([*done.files]):  # the photo last: it is never without its mask
@@ -321,9 +337,7 @@ def _write_extras(job: PhotoJob, out: Path, seen: PhotoDepth, turn: int) -> Iter
         if turn != 1:
             map_x, map_y = (turn_pixels(m, turn) for m in (grid.map_x, grid.map_y))
             grid = RemapGrid(map_x, map_y, grid.source_width, grid.source_height)
-        ending = MAP_KINDS[job.options.maps]
-        for way, each_way in (("forward", grid), ("inverse", grid.inverse())):
-            name = f"{job.maps}.{way}{ending}"
+        for name, each_way in zip(job.targets[-len(_WAYS) :], (grid, grid.inverse()), strict=True):
             each_way.save(out / name, job.options.maps)
             yield name
 

@@ -8,17 +8,19 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..errors import InputError, RsUndistortWarning
-from ..io import output_folder
+from ..io import is_video, list_photos, output_folder
 from ..io.motions import Known
 from ..io.places import local_place
+from ..io.record import Record
 from ..model import Solution
+from .cameras import camera_file_of
 from .frames import find_photos
 from .gyro import gyro_contradiction, gyro_motions, known_readouts
 from .ladder import solve_photos
 from .load import load_photos
 from .options import RunOptions
 from .outcome import Outcome
-from .outputs import REPLACED, Outputs, photo_times
+from .outputs import REPLACED, Outputs, files_of_run, inputs_of, photo_times
 from .progress import ProgressCallback, StageLog
 from .workers import Workers, use_threads
 
@@ -54,11 +56,15 @@ def run(
     photos, out = local_place(photos), local_place(out)
     log = StageLog(progress)
     workers = Workers(use_threads(options.jobs), options.scheduler)
-    inputs = [photos] if options.masks is None else [photos, local_place(options.masks)]
-    with output_folder(out, overwrite=options.overwrite, apart_from=inputs, replaced=REPLACED) as scratch:
+    gyro_files = () if options.gyro is None else (options.gyro.file, options.gyro.times)
+    inputs = inputs_of(options, photos, *gyro_files, camera_file_of(photos, options.camera))
+    replaced = (*REPLACED, "frames") if is_video(photos) else REPLACED
+    with output_folder(out, overwrite=options.overwrite, apart_from=inputs, replaced=replaced) as scratch:
         gyro_log = None if options.gyro is None else options.gyro.log()
         source = find_photos(photos, scratch, options.camera, options.every, options.sharpest, log)
         folder = source.folder
+        frames = [] if source.frames is None else [f"frames/{path.name}" for path in folder.iterdir()]
+        Record(out).check([*frames, *files_of_run(list_photos(folder, options.raw_as), options)], inputs)
         loaded = load_photos(
             folder, source.camera, options.readout, options.max_features, workers, log, options,
             options.feature_megapixels,

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..io import output_folder, write_solution
 from ..io.cameras import camera_to_json
+from ..io.record import Record
 from ..model import Solution, SolvedImage
 from ..synthetic import Recipe, TruePoints, add_noise, check_recipe, load_recipe, render_depth, render_view, true_points
 from ..synthetic import rs_shift_px as shift_in_scene
@@ -23,6 +24,9 @@ from .progress import ProgressCallback, StageLog
 from .workers import use_threads
 
 __all__ = ["SceneOptions", "simulate_scene"]
+
+# What is written besides the photos and depth maps.
+_FILES = ("tracks.npz", "ground_truth.json")
 
 
 @dataclass(frozen=True)
@@ -87,11 +91,20 @@ def simulate_scene(
     log.begin("checking")
     check_recipe(loaded)
     log.end("checking")
-    with output_folder(out, overwrite=options.overwrite) as scratch:
+    read = {} if source is None else {"recipe.json": source, **{name: source.parent / name for name in loaded.files}}
+    # a recipe is also rendered where it was copied to
+    copied = {name: file for name, file in read.items() if not ((out / name).exists() and file.samefile(out / name))}
+    folders = ("photos", "global", *(("depth", "global-depth") if options.depth else ()))
+    with output_folder(out, overwrite=options.overwrite, apart_from=list(read.values())) as scratch:
+        made = [
+            f"{folder}/{_map_of(view.name) if 'depth' in folder else view.name}"
+            for folder in folders
+            for view in loaded.views
+        ]
+        Record(out).check([*made, *_FILES, _cameras_file(loaded), *copied], read.values())
         log.begin("points")
         points = true_points(loaded)
         log.end("points")
-        folders = ("photos", "global", *(("depth", "global-depth") if options.depth else ()))
         for folder in folders:
             (scratch / folder).mkdir()
         log.begin("rendering", len(loaded.views))
@@ -103,7 +116,7 @@ def simulate_scene(
                     photo = add_noise(photo, loaded.noise, loaded.scene.seed, number)
                 (scratch / folder / view.name).write_bytes(_encode_jpeg(photo, loaded.jpeg_quality))
                 if options.depth:
-                    to = scratch / ("depth" if folder == "photos" else "global-depth") / f"{Path(view.name).stem}.tif"
+                    to = scratch / ("depth" if folder == "photos" else "global-depth") / _map_of(view.name)
                     to.write_bytes(bytes(cv2.imencode(".tif", render_depth(loaded.scene, camera, each))[1]))
             log.tell("rendering", number + 1, len(loaded.views))
         log.end("rendering")
@@ -112,12 +125,15 @@ def simulate_scene(
         arrays: dict[str, Any] = _tracks(loaded, points)
         np.savez_compressed(scratch / "tracks.npz", **arrays)
         write_solution(scratch / "ground_truth.json", truth)
-        if source is not None:
-            shutil.copyfile(source, scratch / "recipe.json")
-            for name in loaded.files:
-                (scratch / name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(source.parent / name, scratch / name)
+        for name, file in copied.items():
+            (scratch / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, scratch / name)
     return truth
+
+
+def _map_of(name: str) -> str:
+    """Name of a photo's depth map."""
+    return f"{Path(name).stem}.tif"
 
 
 def _truth(recipe: Recipe, points: TruePoints) -> Solution:
@@ -168,17 +184,20 @@ def _tracks(recipe: Recipe, points: TruePoints) -> dict[str, NDArray[Any]]:
     }
 
 
+def _cameras_file(recipe: Recipe) -> str:
+    return "camera.json" if len(recipe.cameras) == 1 else "cameras.json"
+
+
 def _write_cameras(folder: Path, recipe: Recipe) -> None:
     """`camera.json`, or all cameras with the photos they took."""
     if len(recipe.cameras) == 1:
-        name, value = "camera.json", camera_to_json(next(iter(recipe.cameras.values())))
+        value = camera_to_json(next(iter(recipe.cameras.values())))
     else:
-        name = "cameras.json"
         value = {
             "cameras": {key: camera_to_json(camera) for key, camera in recipe.cameras.items()},
             "images": {view.name: view.camera_id for view in recipe.views},
         }
-    (folder / name).write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
+    (folder / _cameras_file(recipe)).write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
 
 
 def _encode_jpeg(photo: NDArray[np.uint8], quality: int) -> bytes:

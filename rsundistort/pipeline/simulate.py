@@ -15,12 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import FileError, FormatError, InputError
 from ..io import facts_of_exif, list_photos, output_folder, output_name, read_photo, write_image, write_solution
 from ..io.cameras import camera_to_json
+from ..io.record import Record
 from ..model import Camera, RowMotion, Solution, SolvedImage
 from ..model.checks import check_finite
 from ..rectify import largest_shift_px
 from ..synthetic.fold import check_no_fold
 from ..synthetic.warp import crop_camera, largest_rectangle, random_phi, warp_mask, warp_photo
-from .cameras import find_cameras
+from .cameras import camera_file_of, find_cameras
 from .outcome import versions
 from .progress import ProgressCallback, StageLog
 from .workers import use_threads
@@ -119,7 +120,14 @@ def simulate_warp(
     names = list_photos(photos)
     log = StageLog(progress)
     jobs = use_threads(options.jobs)
-    with output_folder(out, overwrite=options.overwrite, apart_from=[photos]) as scratch:
+    masks = mask_names(names)
+    folders = ("photos", "masks", *(["global"] if options.crop else []))
+    camera_file = camera_file_of(photos, options.camera)
+    inputs = [photos] if camera_file is None else [photos, camera_file]
+    with output_folder(out, overwrite=options.overwrite, apart_from=inputs, replaced=folders) as scratch:
+        twins = [f"{folder}/{output_name(name)}" for folder in folders if folder != "masks" for name in names]
+        made = ["camera.json", "ground_truth.json", *twins, *(f"masks/{name}" for name in masks.values())]
+        Record(out).check(made, inputs)
         first = read_photo(photos / names[0])
         height, width = first.pixels.shape[:2]
         facts = [facts_of_exif(first.metadata.exif)]
@@ -141,9 +149,8 @@ def simulate_warp(
             crop = _common_rectangle(whole, motions, jobs, log)
             camera = crop_camera(whole, crop)
         kept = np.s_[crop[1] : crop[1] + crop[3], crop[0] : crop[0] + crop[2]]
-        for folder in ("photos", "masks", *(["global"] if options.crop else [])):
+        for folder in folders:
             (scratch / folder).mkdir()
-        masks = mask_names(names)
 
         def work(name: str) -> None:
             photo = read_photo(photos / name)

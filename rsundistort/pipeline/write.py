@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,8 @@ from ..io import find_masks, output_name
 from ..io.journal import Journal, JournalEntry
 from ..io.outputs import BATCH_FOLDERS, make_inside
 from ..io.photos.kinds import kind_of_name
-from ..io.places import Place, absolute, delete_in, files_of, place_of, sizes_under
+from ..io.places import Place, RemoteFolder, absolute, files_of, place_of, sizes_under
+from ..io.record import Record
 from ..model import Reconstruction, Solution
 from .depth import DEPTHS, PhotoDepths
 from .extras import find_extras
@@ -57,8 +58,8 @@ def rectify_photos(
     """Rectify photos into `out/images` and `out/masks`, each file whole or not at all.
 
     Photos that cannot be read, are of another size than their camera, or are rectified already, are skipped with a
-    warning. At the end, what else is in the two folders is deleted; with `resume` only what an earlier batch made of
-    these photos, and is not true any more.
+    warning. At the end, what else an earlier batch wrote is deleted; with `resume` only what it made of these photos,
+    and is not true any more. What is not ours stays, and is refused before anything is written where it is in the way.
 
     Parameters
     ----------
@@ -92,9 +93,26 @@ def rectify_photos(
             if entry and entry.fingerprint and entry.fingerprint == jobs[name].fingerprint() and entry.is_whole(sizes):
                 done[name] = PhotoDone(name, "", entry.fingerprint, entry.files, entry.turn, entry.depth)
     todo = [name for name in names if name not in done]
-    if isinstance(out, Path):  # remote ones are made with what is in them
+    record = Record(out)
+    earlier = {path for entry in before.values() for path in entry.files}
+    if not resume:
+        earlier |= record.ours(BATCH_FOLDERS)
+    earlier &= record.ours(BATCH_FOLDERS)
+    targets = {name: jobs[name].targets for name in todo}
+    inputs = [each for name in names for each in jobs[name].inputs]
+    # what was cut short, or changed, since it was made is made again by `resume`
+    record.check(earlier.union(*targets.values()), inputs, again=resume)
+    if isinstance(out, RemoteFolder):  # its record is put as a whole: once for all photos
+        record.claim(path for name in todo for path in targets[name])
+    else:  # remote folders are made with what is in them
         for within in jobs.folders(todo):
             make_inside(out, within)
+
+    def begun() -> Iterator[PhotoJob]:
+        for name in todo:
+            record.claim(targets[name])
+            yield jobs[name]
+
     for name in todo:
         if name in before:
             # from here on its outputs may be of either making
@@ -102,10 +120,11 @@ def rectify_photos(
     journal.settle()
     log.begin("rectifying", len(names), len(done))
     fitting = workers.fitting("rectifying", _most_bytes(solution, todo, options))
-    results = fitting.map(rectify_photo, (jobs[name] for name in todo), lambda job, why: PhotoDone(job.name, why))
+    results = fitting.map(rectify_photo, begun(), lambda job, why: PhotoDone(job.name, why))
     try:
-        with closing(results):
+        with record.writing(), closing(results):
             for result in results:
+                record.add(targets[result.name])
                 if result.problem:
                     warnings.warn(f"skipped: {result.name}: {result.problem}", SkippedPhotoWarning, stacklevel=2)
                 else:
@@ -121,11 +140,8 @@ def rectify_photos(
     if any(not each.problem for each in done.values()):
         kept = {name: before[name] for name in before.keys() - done.keys()} if resume else {}
         kept |= {name: _entry(each) for name, each in done.items() if not each.problem}
-        earlier = {path for entry in before.values() for path in entry.files}
-        if not resume:
-            earlier |= sizes_under(out, ("images", "masks")).keys()
-        # they may come of a journal, which is a file that anybody may have changed: nothing outside is deleted
-        delete_in(out, earlier - {path for entry in kept.values() for path in entry.files})
+        record.remove(earlier - {path for entry in kept.values() for path in entry.files})
+        record.settle()
         journal.write(kept[name] for name in sorted(kept))
     log.end("rectifying", photos=sum(not each.problem for each in done.values()))
     return {name: done[name] for name in names}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -123,7 +124,7 @@ class RemapGrid:
             raise InputError(f"kind={kind!r}, expected one of {', '.join(MAP_KINDS)}")
         if path.suffix.lower() != MAP_KINDS[kind]:
             raise InputError(f"{path.name}: a grid of kind {kind!r} has the ending {MAP_KINDS[kind]}")
-        aside = path.with_name(f".{path.stem}.partial{path.suffix}")
+        aside = path.with_name(f".{secrets.token_hex(8)}.partial{path.suffix}")
         try:
             if kind == "npz":
                 with aside.open("wb") as file:

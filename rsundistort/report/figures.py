@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..critical.meter import readout_axes
 from ..errors import FileError, InputError
 from ..io.aside import written_aside
+from ..io.record import Record
 from ..model import Solution
 from .content import arrows_of, ladder, longer, view_frame
 from .diagnostics import Diagnostics
@@ -71,24 +72,26 @@ def write_figures(out: Path | str, figures: Path | str) -> list[Path]:
         "paths": _paths,
         "critical-motion": _sphere,
     }
+    record = Record(folder)
+    record.check(f"{name}.{ending}" for name in drawings for ending in ("png", "pdf"))
     written = []
     with mpl.rc_context(_STYLE):
         for name, draw in drawings.items():
             figure = Figure(figsize=(3.4, 2.6))
             if draw(figure, source):
-                written += _save(figure, folder, name)
+                written += _save(figure, folder, name, record)
     if not written:
         raise InputError(f"{out} holds no registered photo: there is nothing to draw")
     return written
 
 
-def _save(figure: Figure, folder: Path, name: str) -> list[Path]:
+def _save(figure: Figure, folder: Path, name: str, record: Record) -> list[Path]:
     paths = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for ending, metadata in (("png", {"Software": None}), ("pdf", {"CreationDate": None, "Producer": None})):
             path = folder / f"{name}.{ending}"
-            with written_aside(path) as aside:
+            with record.writing([path.name]), written_aside(path) as aside:
                 figure.savefig(aside, format=ending, metadata=metadata)
             paths.append(path)
     except OSError as error:

@@ -12,12 +12,15 @@ from typing import Any
 
 from ..errors import RsUndistortWarning
 from ..io.aside import write_aside
+from ..io.record import Record
 from . import content
 from .pictures import Picture, PictureJob, make_pictures
 from .source import Source, read_source
 from .verdict import advice_of, meter_of, verdict_of
 
 __all__ = ["write_report"]
+
+_NAME = "report.html"
 
 
 def write_report(
@@ -50,15 +53,18 @@ def write_report(
     Raises
     ------
     FileError, FormatError
-        When there is no solution, or it cannot be understood.
+        When there is no solution, or it cannot be understood; when a report is there that was not written here.
     """
     source = read_source(Path(out), None if photos is None else Path(photos))
     for note in source.notes:
         warnings.warn(note, RsUndistortWarning, stacklevel=2)
+    record = Record(source.out)
+    record.check([_NAME])
     pictures = _pictures(source, jobs or os.cpu_count() or 1, progress)
-    path = source.out / "report.html"
-    write_aside(path, _page(source, pictures).encode())
-    return path
+    page = _page(source, pictures).encode()
+    with record.writing([_NAME]):
+        write_aside(source.out / _NAME, page)
+    return source.out / _NAME
 
 
 def _pictures(

@@ -1,7 +1,8 @@
 """Structure from motion around pycolmap: features, pairs, matching, mapping, re-triangulation."""
 
+from .alignment import PatchPlaces, PatchSource, align_tracks, allowed_patches, cut_patches
 from .database import MatchedPhotos, kept_log_level
-from .features import DETECTION_MEGAPIXELS, Features, detect_features, detection_bytes
+from .features import DETECTION_MEGAPIXELS, Features, detect_features, detection_bytes, grey_8_bit
 from .imported import matched_of_database
 from .mapping import map_photos
 from .matching import match_photos
@@ -12,10 +13,16 @@ __all__ = [
     "DETECTION_MEGAPIXELS",
     "Features",
     "MatchedPhotos",
+    "PatchPlaces",
+    "PatchSource",
+    "align_tracks",
+    "allowed_patches",
     "choose_pairs",
+    "cut_patches",
     "detect_features",
     "detection_bytes",
     "global_descriptors",
+    "grey_8_bit",
     "kept_log_level",
     "map_photos",
     "match_photos",

@@ -8,19 +8,20 @@ feature was.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .._kernels.alignment import HALF, align
-from ..model import Camera, Observations, Reconstruction
+from .._kernels.alignment import align
+from ..model import Observations, Reconstruction
 from ..model.projection import project_points
-from .features import SIFT_PX
+from .features import SIFT_PX, size_of_sigma
 
-__all__ = ["PatchPlaces", "align_tracks", "cut_patches"]
+__all__ = ["PatchPlaces", "PatchSource", "align_tracks", "allowed_patches", "cut_patches"]
 
 # Half the side of the cut-outs: a window turned by 45 degrees and stretched by a half, and room for the shift.
 _MARGIN = 24
@@ -38,6 +39,9 @@ _MOST_ANGLE_DEG, _MOST_SCALE = 30.0, 1.7
 _LEAST_CONTRAST = 3.0
 # No alignment is trusted to better than this, in pixels of the finer window's level: interpolation, compression.
 _FLOOR_PX = 0.03
+# Photos that have so many points in common are asked for each other's, so many of them at most; nearer to the border
+# nothing is sought.
+_LEAST_COMMON, _MOST_PARTNERS, _BORDER_PX = 15, 30, 8
 # Patches in memory at a time (2.4 kB each).
 _BLOCK = 120_000
 
@@ -75,6 +79,26 @@ def cut_patches(gray: NDArray[np.uint8], places: PatchPlaces) -> NDArray[np.uint
     return out
 
 
+def allowed_patches(mask: NDArray[np.uint8] | None, places: PatchPlaces) -> NDArray[np.bool_]:
+    """(n,) whether nothing of the cut-outs' middle parts, where windows lie, is masked."""
+    allowed = np.ones(len(places.level), bool)
+    if mask is None:
+        return allowed
+    hidden = cv2.integral((mask == 0).astype(np.uint8))
+    scale = (1 << places.level)[:, None]
+    low = np.clip((places.corner + _MARGIN // 2) * scale, 0, [mask.shape[1], mask.shape[0]])
+    high = np.clip((places.corner + _SIDE - _MARGIN // 2) * scale, 0, [mask.shape[1], mask.shape[0]])
+    inside = (
+        hidden[high[:, 1], high[:, 0]] - hidden[low[:, 1], high[:, 0]]
+        - hidden[high[:, 1], low[:, 0]] + hidden[low[:, 1], low[:, 0]]
+    )  # fmt: skip
+    return np.asarray(inside == 0)
+
+
+#: What reads photos: places by photo to (photo, patches, which of them its mask allows).
+PatchSource = Callable[[Mapping[int, PatchPlaces]], Iterable[tuple[int, NDArray[np.uint8], NDArray[np.bool_]]]]
+
+
 @dataclass(frozen=True)
 class _Windows:
     """Windows of points in photos; a row each.
@@ -84,7 +108,7 @@ class _Windows:
     frame, point : (n,) int array
         Of the reconstruction.
     xy : (n, 2) array
-        Their centres, pixels of the photo.
+        Their centres, pixels of the photo; NaN where a photo cannot see a point.
     M : (n, 2, 2) array
         Pixels of the photo to a sample.
     """
@@ -94,21 +118,30 @@ class _Windows:
     xy: NDArray[np.float64]
     M: NDArray[np.float64]
 
-    def select(self, keep: NDArray[np.bool_] | NDArray[np.int64]) -> _Windows:
+    def select(self, keep: NDArray[Any]) -> _Windows:
         return _Windows(self.frame[keep], self.point[keep], self.xy[keep], self.M[keep])
 
     @property
+    def spacing(self) -> NDArray[np.float64]:
+        """(n,) pixels from sample to sample."""
+        return np.asarray(np.sqrt(np.abs(np.linalg.det(self.M))))
+
+    @property
     def level(self) -> NDArray[np.int64]:
-        """(n,) halvings of the photo after which a sample is about a pixel."""
-        spacing = np.sqrt(np.abs(np.linalg.det(self.M)))
-        return np.asarray(np.clip(np.floor(np.log2(np.maximum(spacing, 1.0)) + 0.5), 0, 6), np.int64)
+        """(n,) halvings of the photo after which that is about one."""
+        return np.asarray(np.clip(np.floor(np.log2(np.maximum(self.spacing, 1.0)) + 0.5), 0, 6), np.int64)
 
 
-def align_tracks(
-    reconstruction: Reconstruction,
-    steps_px: Sequence[float],
-    patches_of: Callable[[dict[int, PatchPlaces]], Iterable[tuple[int, NDArray[np.uint8], NDArray[np.bool_] | None]]],
-) -> Reconstruction:
+@dataclass(frozen=True)
+class _Aligned:
+    """What came of windows: their places, correlations, and deviations in pixels; NaN where nothing did."""
+
+    xy: NDArray[np.float64]
+    correlation: NDArray[np.float64]
+    sigma_px: NDArray[np.float64]
+
+
+def align_tracks(reconstruction: Reconstruction, steps_px: Sequence[float], patches_of: PatchSource) -> Reconstruction:
     """The reconstruction with measurements aligned at full size, and such where no feature was.
 
     Parameters
@@ -118,92 +151,188 @@ def align_tracks(
     steps_px : (m,) sequence of float
         `Features.step_px` of each photo.
     patches_of : callable
-        Given the places of patches by photo, gives (photo, patches as `cut_patches` cuts them, which of them are allowed
-        by its mask or None) for each of these photos, in any order.
+        Given the places of patches by photo, gives (photo, patches as `cut_patches` cuts them, which of them its mask
+        allows) for each of these photos, in any order.
 
     Returns
     -------
     Reconstruction
-        With new observations, in the order of photos: aligned ones with the deviations that the alignment shows, those
-        that could not be aligned as they were. Points, poses and motions stay.
+        With new observations; those that could not be aligned are as they were. Points, poses and motions stay.
     """
-    rec = reconstruction
-    step = np.asarray(steps_px, np.float64)
-    best, windows = _best_views(rec, step)
-    wanted = _wanted(rec, best, windows)
-    aligned = _Aligned.nothing(len(wanted.frame))
-    order = np.argsort(best.frame[wanted.point], kind="stable")
-    for block in np.array_split(order, max(1, -(-2 * len(order) // _BLOCK))):
-        aligned.fill(block, _align_block(wanted.select(block), best, patches_of))
-    return _measured(rec, step, best, wanted, aligned)
-
-
-def _best_views(rec: Reconstruction, step: NDArray[np.float64]) -> tuple[_Windows, _Windows]:
-    """The window of each point in the photo that sees it best, and that of each measurement.
-
-    The best view is the one from which the others differ least in direction and in scale.
-    """
-    obs = rec.observations
-    windows = _windows_at(rec, obs.frame_idx, obs.point_idx, None)
-    ahead = rec.points_w[obs.point_idx] - rec.center_w[obs.frame_idx]
-    direction = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
-    n = rec.num_points
-    counts = np.maximum(np.bincount(obs.point_idx, minlength=n), 1)
-    middle = np.stack([np.bincount(obs.point_idx, direction[:, k], n) for k in range(3)], 1)
-    middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-12)
-    scale = 0.5 * np.log(np.maximum(np.abs(np.linalg.det(windows.M)), 1e-12))
-    mean_scale = np.bincount(obs.point_idx, scale, n) / counts
-    apart = 2.0 - 2.0 * (direction * middle[obs.point_idx]).sum(1) + (scale - mean_scale[obs.point_idx]) ** 2
-    first = np.lexsort((obs.frame_idx, apart, obs.point_idx))
-    of_point = first[np.unique(obs.point_idx[first], return_index=True)[1]]
-    # where the feature lies, and samples of its size; SIFT's deviation of a position is a measure of the size
-    size = 3.0 * step[obs.frame_idx] * np.sqrt(np.maximum((obs.sigma / step[obs.frame_idx]) ** 2 - 1.0, 0.25))
-    spacing = np.maximum(size / _PER_SIZE, 1.0)[of_point]
-    per_pixel = np.sqrt(np.abs(np.linalg.det(windows.M[of_point])))
-    unit = np.full(n, np.nan)
-    unit[obs.point_idx[of_point]] = spacing / per_pixel
-    best = _Windows(
-        obs.frame_idx[of_point],
-        obs.point_idx[of_point],
-        obs.xy_raw[of_point],
-        windows.M[of_point] * unit[obs.point_idx[of_point], None, None],
+    rec, step = reconstruction, np.asarray(steps_px, np.float64)
+    normal = _facing(rec)
+    measured = replace(
+        _windows_at(rec, rec.observations.frame_idx, rec.observations.point_idx, normal), xy=rec.observations.xy_raw
     )
-    return best, replace(windows, xy=obs.xy_raw, M=windows.M * unit[obs.point_idx, None, None])
+    of_point, unit = _best_views(rec, step, measured)
+    measured = replace(measured, M=measured.M * unit[measured.point, None, None])
+    best = measured.select(of_point)
+    wanted = _joined([measured, *_further(rec, best, unit, normal)])
+    aligned = _Aligned(*(np.full((len(wanted.frame), *shape), np.nan) for shape in ((2,), (), ())))
+    # photos of a point are near each other in the order of their best views: few have to be read twice
+    order = np.argsort(best.frame[wanted.point], kind="stable")
+    order = order[_looks_alike(rec, best, wanted)[order]]
+    for block in np.array_split(order, -(-2 * len(order) // _BLOCK) or 1):
+        _align_block(wanted, block, best, patches_of, aligned)
+    return _with_aligned(rec, step, of_point, wanted, aligned)
 
 
-def _windows_at(
-    rec: Reconstruction, frame: NDArray[np.int64], point: NDArray[np.int64], normal: NDArray[np.float64] | None
-) -> _Windows:
-    """Windows of points where the model predicts them, on planes that face the middle of the photos that see them.
-
-    A sample is a unit of length of the scene times the point's distance from its mean photo; NaN where a photo does not
-    see a point.
-    """
-    if normal is None:
-        normal = _facing(rec)
-    across = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]]))
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    down = np.cross(normal, across)
-    xy, M = np.full((len(frame), 2), np.nan), np.full((len(frame), 2, 2), np.nan)
-    for i in np.unique(frame):
-        mine = np.flatnonzero(frame == i)
-        camera, motion = rec.camera(int(i)), rec.motion(int(i)).in_camera(rec.R_cw[i])
-        X = rec.points_w[point[mine]]
-        small = 1e-4 * np.linalg.norm(X - rec.center_w[i], axis=1, keepdims=True)
-        ends = [X, X + small * across[point[mine]], X + small * down[point[mine]]]
-        places = [
-            project_points((end - rec.center_w[i]) @ rec.R_cw[i].T, camera, motion, rec.shutter_model)[0]
-            for end in ends
-        ]
-        xy[mine] = places[0]
-        M[mine] = np.stack([places[1] - places[0], places[2] - places[0]], axis=2) / small[:, :, None]
-    return _Windows(frame, point, xy, M)
+def _joined(parts: Sequence[_Windows]) -> _Windows:
+    return _Windows(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(_Windows)))
 
 
 def _facing(rec: Reconstruction) -> NDArray[np.float64]:
     """(n, 3) mean direction from which the photos see each point."""
     obs = rec.observations
-    ahead = rec.center_w[obs.frame_idx] - rec.points_w[obs.point_idx]
-    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
-    total = np.stack([np.bincount(obs.point_idx, ahead[:, k], rec.num_points) for k in range(3)], 1)
+    back = _directions(rec, obs.frame_idx, obs.point_idx)
+    total = -np.stack([np.bincount(obs.point_idx, back[:, k], rec.num_points) for k in range(3)], 1)
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12))
+
+
+def _directions(rec: Reconstruction, frame: NDArray[np.int64], point: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(n, 3) unit vectors from photos to points."""
+    ahead = rec.points_w[point] - rec.center_w[frame]
+    return np.asarray(ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12))
+
+
+def _windows_at(
+    rec: Reconstruction, frame: NDArray[np.int64], point: NDArray[np.int64], normal: NDArray[np.float64]
+) -> _Windows:
+    """Windows of points where the model predicts them, on planes with these normals; a sample is a unit of length."""
+    across = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]]))
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+    down = np.cross(normal, across)
+    xy, M = np.full((len(frame), 2), np.nan), np.full((len(frame), 2, 2), np.nan)
+    for i in np.unique(frame).tolist():
+        mine = np.flatnonzero(frame == i)
+        k = point[mine]
+        X = rec.points_w[k] - rec.center_w[i]
+        small = 1e-4 * np.linalg.norm(X, axis=1, keepdims=True)
+        at, right, below = (
+            project_points(
+                each @ rec.R_cw[i].T, rec.camera(i), rec.motion(i).in_camera(rec.R_cw[i]), rec.shutter_model
+            )[0]
+            for each in (X, X + small * across[k], X + small * down[k])
+        )
+        xy[mine] = at
+        M[mine] = np.stack([right - at, below - at], axis=2) / small[:, :, None]
+    return _Windows(frame, point, xy, M)
+
+
+def _best_views(
+    rec: Reconstruction, step: NDArray[np.float64], measured: _Windows
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """(n,) measurement of each point from which the others differ least in direction and scale, and samples' lengths.
+
+    A sample is as long as gives the window of that photo the size of the feature.
+    """
+    obs, n = rec.observations, rec.num_points
+    direction, middle = _directions(rec, obs.frame_idx, obs.point_idx), -_facing(rec)
+    scale = np.log(np.maximum(measured.spacing, 1e-300))
+    counts = np.maximum(np.bincount(obs.point_idx, minlength=n), 1)
+    mean = (np.bincount(obs.point_idx, scale, n) / counts)[obs.point_idx]
+    apart = 2.0 - 2.0 * (direction * middle[obs.point_idx]).sum(1) + (scale - mean) ** 2
+    apart[~np.isfinite(apart)] = np.inf
+    order = np.lexsort((obs.frame_idx, apart, obs.point_idx))
+    of_point = order[np.unique(obs.point_idx[order], return_index=True)[1]]
+    size = size_of_sigma(obs.sigma[of_point], step[obs.frame_idx[of_point]])
+    return of_point, np.maximum(size / _PER_SIZE, 1.0) / measured.spacing[of_point]
+
+
+def _further(
+    rec: Reconstruction, best: _Windows, unit: NDArray[np.float64], normal: NDArray[np.float64]
+) -> Iterator[_Windows]:
+    """Windows of points in photos that may show them, but measured none there; a photo at a time."""
+    from scipy.sparse import coo_array  # late: few need it
+
+    obs, m = rec.observations, rec.num_images
+    ones = np.ones(len(obs), np.int64)
+    seen = coo_array((ones, (obs.frame_idx, obs.point_idx)), shape=(m, rec.num_points)).tocsr()
+    for i in range(m):
+        mine = seen.indices[seen.indptr[i] : seen.indptr[i + 1]]
+        common = np.bincount(obs.frame_idx[np.isin(obs.point_idx, mine)], minlength=m)
+        common[i] = 0
+        partners = np.argsort(-common, kind="stable")[:_MOST_PARTNERS]
+        open_ = np.isin(best.frame, partners[common[partners] >= _LEAST_COMMON])
+        open_[mine] = False
+        points = np.flatnonzero(open_)
+        windows = _windows_at(rec, np.full(len(points), i), points, normal)
+        size = np.array([rec.camera(i).width, rec.camera(i).height])
+        # NaN is not inside
+        inside = ((windows.xy >= _BORDER_PX) & (windows.xy <= size - 1 - _BORDER_PX)).all(1)
+        yield replace(windows, M=windows.M * unit[points, None, None]).select(inside)
+
+
+def _looks_alike(rec: Reconstruction, best: _Windows, windows: _Windows) -> NDArray[np.bool_]:
+    """Windows that may be aligned with the best view of their points: seen from a similar direction and distance."""
+    of = best.select(windows.point)
+    cosine = (_directions(rec, windows.frame, windows.point) * _directions(rec, of.frame, of.point)).sum(1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = np.abs(np.log(windows.spacing / of.spacing))
+        alike = (cosine > np.cos(np.deg2rad(_MOST_ANGLE_DEG))) & (ratio < np.log(_MOST_SCALE))
+    return alike & np.isfinite(windows.xy).all(1) & np.isfinite(of.M).all((1, 2)) & (windows.frame != of.frame)
+
+
+def _align_block(
+    wanted: _Windows, rows: NDArray[np.int64], best: _Windows, patches_of: PatchSource, aligned: _Aligned
+) -> None:
+    """Align these rows of the wanted windows with the best views of their points."""
+    points, number = np.unique(wanted.point[rows], return_inverse=True)
+    # patches of the best views first, then those of the rows
+    windows = _joined([best.select(points), wanted.select(rows)])
+    level = windows.level
+    scale = np.exp2(level)[:, None]
+    at = windows.xy / scale
+    corner = np.asarray(np.rint(at), np.int64) - _MARGIN
+    places, mine = {}, {}
+    for frame in np.unique(windows.frame).tolist():
+        mine[frame] = np.flatnonzero(windows.frame == frame)
+        places[frame] = PatchPlaces(level[mine[frame]], corner[mine[frame]])
+    patches = np.zeros((len(level), _SIDE, _SIDE), np.uint8)
+    allowed = np.zeros(len(level), bool)
+    for frame, cut, unmasked in patches_of(places):
+        patches[mine[frame]], allowed[mine[frame]] = cut, unmasked
+    first, second = number, len(points) + np.arange(len(rows))
+    both = allowed[first] & allowed[second]
+    rows, first, second = rows[both], first[both], second[both]
+    place, M = at - corner, windows.M / scale[:, :, None]
+    n = len(rows)
+    centre, correlation, covariance = np.empty((n, 2)), np.empty(n), np.empty((n, 2, 2))
+    align(
+        patches, first, second, np.stack([place[first], place[second]], 1), np.stack([M[first], M[second]], 1),
+        _LEAST_CONTRAST, centre, correlation, covariance,
+    )  # fmt: skip
+    aligned.xy[rows] = (centre + corner[second]) * scale[second]
+    aligned.correlation[rows] = correlation
+    variance = 0.5 * np.trace(covariance, axis1=1, axis2=2) + _FLOOR_PX**2
+    aligned.sigma_px[rows] = scale[second, 0] * np.sqrt(variance)
+
+
+def _with_aligned(
+    rec: Reconstruction, step: NDArray[np.float64], of_point: NDArray[np.int64], wanted: _Windows, aligned: _Aligned
+) -> Reconstruction:
+    """The reconstruction with the alignments that are believed."""
+    obs = rec.observations
+    old = len(obs)
+    sigma = aligned.sigma_px / SIFT_PX
+    shift = np.linalg.norm(aligned.xy - wanted.xy, axis=1)
+    expected = obs.sigma[of_point][wanted.point] / step[obs.frame_idx[of_point]][wanted.point] * step[wanted.frame]
+    least = np.where(np.arange(len(shift)) < old, _LEAST_MEASURED, _LEAST_NEW)
+    # NaN is not believed
+    good = (aligned.correlation >= least) & (shift <= _MOST_SHIFT * expected) & (sigma <= expected)
+    xy, sigmas = obs.xy_raw.copy(), obs.sigma.copy()
+    xy[good[:old]], sigmas[good[:old]] = aligned.xy[:old][good[:old]], sigma[:old][good[:old]]
+    # the best view says which point is meant: it is as good as those that were aligned with it
+    told = np.flatnonzero(good)
+    log_mean = np.bincount(wanted.point[told], np.log(sigma[told]), rec.num_points)
+    count = np.bincount(wanted.point[told], minlength=rec.num_points)
+    known = count > 0
+    sigmas[of_point[known]] = np.exp(log_mean[known] / count[known])
+    new = np.flatnonzero(good[old:]) + old
+    observations = Observations(
+        np.concatenate([obs.frame_idx, wanted.frame[new]]),
+        np.concatenate([obs.point_idx, wanted.point[new]]),
+        np.concatenate([xy, aligned.xy[new]]),
+        np.concatenate([sigmas, sigma[new]]),
+    )
+    return replace(rec, observations=observations)

@@ -10,10 +10,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Features", "detect_features", "detection_bytes", "size_sigma"]
+__all__ = [
+    "DETECTION_MEGAPIXELS",
+    "SIFT_PX",
+    "Features",
+    "detect_features",
+    "detection_bytes",
+    "grey_8_bit",
+    "size_of_sigma",
+    "size_sigma",
+]
 
 #: Megapixels that a photo is shrunk to before features are looked for in it, unless told otherwise.
 DETECTION_MEGAPIXELS = 2.0
+
+#: Standard deviation of the position of the finest features, whose relative one is 1, in pixels.
+SIFT_PX = 0.12
 
 # Residuals by size of the feature, in the adjusted herz-jesus-8: 0.117 px below 2.3 px, 0.122 to 3.5, 0.143 to 7,
 # 0.264 above; and large blobs are biased by perspective besides.
@@ -49,6 +61,11 @@ def size_sigma(size: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.hypot(1.0, size / _COARSE_PX))
 
 
+def size_of_sigma(sigma: NDArray[np.float64], step_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Diameters of features in pixels of the photo, from `Features.sigma` and `Features.step_px`."""
+    return np.asarray(_COARSE_PX * np.sqrt(np.maximum(sigma**2 - step_px**2, (0.5 * step_px) ** 2)))
+
+
 def detect_features(
     photo: NDArray[Any],
     max_features: int = 8192,
@@ -75,7 +92,7 @@ def detect_features(
     sift = cv2.SIFT.create(
         nfeatures=0, nOctaveLayers=3, contrastThreshold=0.02, edgeThreshold=10, sigma=1.6, enable_precise_upscale=True
     )
-    gray = _gray_u8(photo)
+    gray = grey_8_bit(photo)
     shrink = _shrinking(gray.size, megapixels)
     if shrink > 1.0:
         gray, mask = _shrunk(gray, mask, shrink)
@@ -123,7 +140,7 @@ def _shrunk(
     return resize(gray), np.where(everywhere, np.uint8(255), np.uint8(0))
 
 
-def _gray_u8(photo: NDArray[Any]) -> NDArray[np.uint8]:
+def grey_8_bit(photo: NDArray[Any]) -> NDArray[np.uint8]:
     """8-bit grey version of a photo of any depth and number of channels."""
     gray = photo
     if photo.ndim == 3:
