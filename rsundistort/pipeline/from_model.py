@@ -25,7 +25,7 @@ from ..model.orientation import INVERSE, turn_reconstruction
 from ..sfm import kept_log_level, matched_of_database
 from .cameras import PhotoCameras, check_readouts
 from .gyro import known_readouts
-from .ladder import solve_tracks
+from .ladder import Feedback, solve_tracks
 from .options import SolveOptions
 from .outcome import Outcome
 from .outputs import REPLACED, Outputs, PointRgb, files_of_run, inputs_of, photo_times
@@ -268,7 +268,14 @@ def _solve(
             matched = matched_of_database(database, Path(work) / "database.db", rec, options.seed)
             log.end("database", keypoints=sum(len(found.xy_raw) for found in matched.features))
         solved = solve_tracks(
-            rec, guessed, options.shutter_model, options.seed, options_of, log, options.remedy, matched
+            rec,
+            guessed,
+            options.shutter_model,
+            options.seed,
+            options_of,
+            log,
+            options.remedy,
+            None if matched is None else Feedback(matched),
         )
     after = solved.result.reconstruction
     lost = dict.fromkeys(given.unregistered, "it is not registered in the model")

@@ -25,17 +25,22 @@ from ..bundle import (
 from ..critical import Advice, Remedy, advise, heal, with_remedy
 from ..errors import ReconstructionError, RsUndistortWarning
 from ..model import Reconstruction
-from ..sfm import MatchedPhotos, map_photos, match_photos, retriangulate
+from ..model.projection import unproject_points
+from ..sfm import MatchedPhotos, align_tracks, map_photos, match_photos, retriangulate
 from .load import LoadedPhotos
 from .pairing import pairs_to_match
+from .patches import patch_source
 from .progress import StageLog
+from .workers import Workers
 
-__all__ = ["Solved", "rungs_to", "solve_photos", "solve_tracks"]
+__all__ = ["Feedback", "Solved", "rungs_to", "solve_photos", "solve_tracks"]
 
-# Feedback ends when no photo's rotation over the frame changes by more than this angle times the focal length between
-# two rounds; a pixel at the border then moves by less than half of it.
+# Feedback ends when no rectified pixel of any photo moves by more than this between two rounds, in pixels of the images
+# that the features were found in.
 _SETTLED_PX = 0.2
 _MAX_ROUNDS = 4
+# Places on each side of a photo where that is looked at.
+_LOOKED_AT = 5
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,38 @@ class Solved:
     readouts: ReadoutChoice | None = None
 
 
+@dataclass(frozen=True)
+class Feedback:
+    """What the tracks of photos are rebuilt from.
+
+    Attributes
+    ----------
+    matched : MatchedPhotos
+        Their features and matches.
+    photos : LoadedPhotos or None
+        The photos themselves.
+    workers : Workers or None
+        Who reads them again to align the tracks at full size; None where that is not wanted.
+    """
+
+    matched: MatchedPhotos
+    photos: LoadedPhotos | None = None
+    workers: Workers | None = None
+
+    @property
+    def step_px(self) -> float:
+        """Pixels of the photos to one of those that the features were found in."""
+        return float(np.median([each.step_px for each in self.matched.features]))
+
+    def aligned(self, reconstruction: Reconstruction, log: StageLog) -> Reconstruction:
+        """The tracks of a reconstruction, aligned at full size."""
+        assert self.photos is not None and self.workers is not None
+        names = reconstruction.image_names
+        found = dict(zip(self.matched.names, self.matched.features, strict=True))
+        source = patch_source(self.photos, names, self.workers, lambda done: log.tell("alignment", done, len(names)))
+        return align_tracks(reconstruction, [found[name].step_px for name in names], source)
+
+
 def rungs_to(shutter_model: str) -> tuple[str, ...]:
     """Ladder that ends at a shutter model."""
     if shutter_model == "global":
@@ -86,10 +123,22 @@ def _tell(log: StageLog, stage: str, _cost: float) -> None:
 
 
 def _moved_px(before: Reconstruction, after: Reconstruction) -> float:
-    """Largest change of a shutter rotation over the frame, in pixels."""
-    focal = max(float(camera.K[0, 0]) for camera in after.cameras)
-    change = np.abs(after.phi - before.phi).max(1) * after.frame_span()
-    return float(change.max() * focal)
+    """By how much rectified pixels of the same photos changed, the largest; inf if they are others."""
+    if after.image_names != before.image_names:
+        return np.inf
+    return max(_change_px(before, after, i) for i in range(after.num_images))
+
+
+def _change_px(before: Reconstruction, after: Reconstruction, image: int) -> float:
+    """Largest change of a photo's rectified pixels."""
+    camera = after.camera(image)
+    across, down = (np.linspace(0, side - 1, _LOOKED_AT) for side in (camera.width, camera.height))
+    xy = np.stack(np.meshgrid(across, down), axis=2).reshape(-1, 2)
+    (old, seen), (new, still_seen) = (
+        unproject_points(xy, rec.camera(image), rec.motion(image), rec.shutter_model) for rec in (before, after)
+    )
+    change = (new * camera.K[0, 0] - old * before.camera(image).K[0, 0])[seen & still_seen]
+    return float(np.linalg.norm(change, axis=1).max(initial=0.0))
 
 
 def _of_joined(options: BundleOptions, mapped: Reconstruction) -> BundleOptions:
@@ -129,6 +178,7 @@ def solve_photos(
     log: StageLog,
     remedy: str = "auto",
     matching: str = "auto",
+    workers: Workers | None = None,
 ) -> Solved:
     """Match, map, climb the ladder; then free the keypoints of the shutter, rebuild the tracks and adjust again.
 
@@ -150,6 +200,8 @@ def solve_photos(
         What to do about a critical motion, of `critical.REMEDIES`.
     matching : str
         Which photos are matched with each other, of `pairing.MATCHINGS`.
+    workers : Workers, optional
+        Who reads the photos again, to align the tracks at full size; they stay as the features have them without.
     """
     cameras = photos.cameras
     log.begin("matching")
@@ -168,7 +220,9 @@ def solve_photos(
             "use photos that share more of the scene"
         )
     guessed = {k: cameras.labels[k] for k, told in enumerate(cameras.readout_told) if not told}
-    solved = solve_tracks(mapped, guessed, shutter_model, seed, options_of, log, remedy, matched)
+    solved = solve_tracks(
+        mapped, guessed, shutter_model, seed, options_of, log, remedy, Feedback(matched, photos, workers)
+    )
     # which frame a mapping ends in is chance
     return replace(solved, result=replace(solved.result, reconstruction=solved.result.reconstruction.normalized()))
 
@@ -181,7 +235,7 @@ def solve_tracks(
     options_of: Callable[[Reconstruction], BundleOptions],
     log: StageLog,
     remedy: str = "auto",
-    matched: MatchedPhotos | None = None,
+    feedback: Feedback | None = None,
 ) -> Solved:
     """Climb the ladder from a global-shutter reconstruction, in its frame.
 
@@ -193,7 +247,7 @@ def solve_tracks(
         Cameras whose direction of readout nobody told, and their names for people.
     shutter_model, seed, options_of, log, remedy
         As in `solve_photos`.
-    matched : MatchedPhotos, optional
+    feedback : Feedback, optional
         The matches behind it: its tracks are then rebuilt with the motions found, until these settle.
     """
     readouts = _read_out(mapped, guessed, options_of(mapped), log)
@@ -210,8 +264,8 @@ def solve_tracks(
         rungs=[{"model": k, "rms_px": r.rms_px, "iterations": r.num_iterations} for k, r in results.items()],
     )
     tracks = result.reconstruction
-    if matched is not None:
-        result, tracks = _fed_back(matched, result, options, log)
+    if feedback is not None:
+        result, tracks = _fed_back(feedback, result, options, log)
     options = replace(options, phi_sigma_start=result.phi_sigma)
     choice = None
     if auto:
@@ -243,23 +297,27 @@ def solve_tracks(
 
 
 def _fed_back(
-    matched: MatchedPhotos, result: BundleResult, options: BundleOptions, log: StageLog
+    feedback: Feedback, result: BundleResult, options: BundleOptions, log: StageLog
 ) -> tuple[BundleResult, Reconstruction]:
-    """Free keypoints of the shutter, rebuild the tracks and adjust, until the motions settle; and the last tracks."""
+    """Free keypoints of the shutter, rebuild the tracks and adjust, until the photos settle; and the last tracks."""
     shutter_model = result.reconstruction.shutter_model
-    for number in range(1, _MAX_ROUNDS + 1):
-        stage = f"feedback {number}"
+    stages = [f"feedback {number}" for number in range(1, _MAX_ROUNDS + 1)]
+    if feedback.workers is not None:
+        stages.append("alignment")
+    settled = False
+    for stage in stages:
+        if settled and stage != "alignment":
+            continue
         log.begin(stage)
         before = result.reconstruction
-        tracks = retriangulate(matched, before)
+        tracks = feedback.aligned(before, log) if stage == "alignment" else retriangulate(feedback.matched, before)
         options = replace(options, phi_sigma_start=result.phi_sigma)
         result = bundle_adjust(tracks, shutter_model, options, partial(_tell, log, stage))
         after = result.reconstruction
-        moved = np.inf if after.image_names != before.image_names else _moved_px(before, after)
+        moved = _moved_px(before, after)
         log.end(
             stage, points=after.num_points, observations=len(after.observations), rms_px=result.rms_px,
             iterations=result.num_iterations, stop_reason=result.stop_reason, moved_px=moved,
         )  # fmt: skip
-        if moved < _SETTLED_PX:
-            break
+        settled = moved < _SETTLED_PX * feedback.step_px
     return result, tracks

@@ -38,6 +38,12 @@ class LoadedPhotos:
         Which camera took which.
     orientations : mapping of name to int
         Their EXIF orientations.
+    folder : Path
+        Where they are.
+    mask_of : mapping of name to Path
+        Their masks.
+    max_megapixels : float
+        As in `RectifyOptions`.
     """
 
     names: list[str]
@@ -46,6 +52,9 @@ class LoadedPhotos:
     skipped: dict[str, str]
     cameras: PhotoCameras
     orientations: Mapping[str, int]
+    folder: Path
+    mask_of: Mapping[str, Path]
+    max_megapixels: float
 
     def unregistered(self, joined: Sequence[str]) -> dict[str, str]:
         """Photos that are not among those that were joined, and why."""
@@ -176,4 +185,6 @@ def load_photos(
     cameras = find_cameras(folder, names, sizes, facts, camera, readout)
     log.end("features", photos=len(names), keypoints=sum(len(f.xy_raw) for f in features))
     orientations = {name: each.orientation for name, each in zip(names, found, strict=True)}
-    return LoadedPhotos(names, features, facts, skipped, cameras, orientations)
+    return LoadedPhotos(
+        names, features, facts, skipped, cameras, orientations, folder.absolute(), mask_of, options.max_megapixels
+    )  # fmt: skip

@@ -86,7 +86,7 @@ def run(
         with tempfile.TemporaryDirectory() as work:
             solved = solve_photos(
                 loaded, options.shutter_model, options.seed, lambda rec: options.options_for(rec, cameras),
-                Path(work), log, options.remedy, options.matching,
+                Path(work), log, options.remedy, options.matching, workers,
             )  # fmt: skip
         rec = solved.result.reconstruction
         if contradiction := gyro_contradiction(rec, from_gyro):

@@ -270,7 +270,8 @@ def _looks_alike(rec: Reconstruction, best: _Windows, windows: _Windows) -> NDAr
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = np.abs(np.log(windows.spacing / of.spacing))
         alike = (cosine > np.cos(np.deg2rad(_MOST_ANGLE_DEG))) & (ratio < np.log(_MOST_SCALE))
-    return alike & np.isfinite(windows.xy).all(1) & np.isfinite(of.M).all((1, 2)) & (windows.frame != of.frame)
+    finite = np.isfinite(windows.xy).all(1) & np.isfinite(windows.M).all((1, 2)) & np.isfinite(of.M).all((1, 2))
+    return np.asarray(alike & finite & (windows.frame != of.frame))
 
 
 def _align_block(
