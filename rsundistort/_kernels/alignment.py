@@ -25,7 +25,7 @@ _AT_REST, _LOST = 0.003, 4.0
 @kernel(forceinline=True)
 def _cubic(patch, x, y):
     """Bicubic (Keys, a = -1/2) value at a place; the caller sees to it that four pixels lie around."""
-    j, i = int(math.floor(x)), int(math.floor(y))
+    j, i = math.floor(x), math.floor(y)
     a, b = x - j, y - i
     u0, u1 = a * (-0.5 + a * (1.0 - 0.5 * a)), 1.0 + a * a * (-2.5 + 1.5 * a)
     u2, u3 = a * (0.5 + a * (2.0 - 1.5 * a)), a * a * (-0.5 + 0.5 * a)

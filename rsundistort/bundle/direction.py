@@ -66,10 +66,10 @@ def choose_readouts(
     progress : callable, optional
         Called as (model, cost).
     """
-    # anchors are meant for one axis; neither they nor a lens decide between two
+    # anchors are meant for one axis; they do not decide between two
     rough = replace(
         options or BundleOptions(), outlier_rounds=0, spread_rounds=1, spread_tolerance=0.1, cost_tolerance=1e-3,
-        held_phi={}, known_phi={}, lengths=(), refine=(),
+        held_phi={}, known_phi={}, lengths=(),
     )  # fmt: skip
 
     def fit(rec: Reconstruction) -> BundleResult:

@@ -189,3 +189,25 @@ class Reconstruction:
         """The reconstruction with some observations only, without points left with under `min_track` photos."""
         alive = self.track_lengths(keep_obs) >= min_track
         return replace(self, observations=self.observations.select(keep_obs)).take_points(alive)
+
+    def without_photos(self, least: int) -> Reconstruction:
+        """The reconstruction without photos of fewer than `least` measurements, and what only they showed."""
+        rec = self
+        while True:
+            counts = np.bincount(rec.observations.frame_idx, minlength=rec.num_images)
+            keep = counts >= least
+            if keep.all():
+                return rec
+            obs = rec.observations.select(keep[rec.observations.frame_idx])
+            place = np.flatnonzero(keep)
+            rec = replace(
+                rec,
+                image_names=[rec.image_names[i] for i in place],
+                camera_idx=rec.camera_idx[keep],
+                R_cw=rec.R_cw[keep],
+                center_w=rec.center_w[keep],
+                phi=rec.phi[keep],
+                velocity=rec.velocity[keep],
+                observations=replace(obs, frame_idx=(np.cumsum(keep) - 1)[obs.frame_idx]),
+            )
+            rec = rec.with_points(np.ones(len(rec.observations), bool))

@@ -26,7 +26,7 @@ from ..critical import Advice, Remedy, advise, heal, with_remedy
 from ..errors import ReconstructionError, RsUndistortWarning
 from ..model import Reconstruction
 from ..model.projection import unproject_points
-from ..sfm import MatchedPhotos, align_tracks, map_photos, match_photos, retriangulate
+from ..sfm import LEAST_MEASUREMENTS, MatchedPhotos, align_tracks, map_photos, match_photos, retriangulate
 from .load import LoadedPhotos
 from .pairing import pairs_to_match
 from .patches import patch_source
@@ -96,7 +96,8 @@ class Feedback:
 
     def aligned(self, reconstruction: Reconstruction, log: StageLog) -> Reconstruction:
         """The tracks of a reconstruction, aligned at full size."""
-        assert self.photos is not None and self.workers is not None
+        assert self.photos is not None
+        assert self.workers is not None
         names = reconstruction.image_names
         found = dict(zip(self.matched.names, self.matched.features, strict=True))
         source = patch_source(self.photos, names, self.workers, lambda done: log.tell("alignment", done, len(names)))
@@ -310,7 +311,10 @@ def _fed_back(
             continue
         log.begin(stage)
         before = result.reconstruction
-        tracks = feedback.aligned(before, log) if stage == "alignment" else retriangulate(feedback.matched, before)
+        tracks = retriangulate(feedback.matched, before, of_two=stage == "alignment")
+        if stage == "alignment":
+            tracks = feedback.aligned(tracks, log)
+        tracks = tracks.without_photos(LEAST_MEASUREMENTS)
         options = replace(options, phi_sigma_start=result.phi_sigma)
         result = bundle_adjust(tracks, shutter_model, options, partial(_tell, log, stage))
         after = result.reconstruction

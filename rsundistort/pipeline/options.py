@@ -23,8 +23,8 @@ __all__ = ["GUESSED", "GUESS_SIGMA", "RunOptions", "SolveOptions"]
 
 #: What EXIF does not know, and a set of photos tells; and how far it may be off (relative f, lens coefficients):
 # equivalent focal lengths are rounded to millimetres, focusing and stabilising crop a little, phones hardly distort.
-GUESSED = ("f", "k1", "k2")
-GUESS_SIGMA = {"f": 0.05, "k1": 0.2, "k2": 0.4}
+GUESSED = ("f", "cx", "cy", "k1", "k2", "k3", "p1", "p2")
+GUESS_SIGMA = {"f": 0.05, "cx": 0.01, "cy": 0.01, "k1": 0.2, "k2": 0.4, "k3": 0.4, "p1": 2e-3, "p2": 2e-3}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,13 +4,14 @@ from .alignment import PatchPlaces, PatchSource, align_tracks, allowed_patches, 
 from .database import MatchedPhotos, kept_log_level
 from .features import DETECTION_MEGAPIXELS, Features, detect_features, detection_bytes, grey_8_bit
 from .imported import matched_of_database
-from .mapping import map_photos
+from .mapping import LEAST_MEASUREMENTS, map_photos
 from .matching import match_photos
 from .pairs import choose_pairs, global_descriptors
 from .retriangulation import retriangulate
 
 __all__ = [
     "DETECTION_MEGAPIXELS",
+    "LEAST_MEASUREMENTS",
     "Features",
     "MatchedPhotos",
     "PatchPlaces",

@@ -34,7 +34,7 @@ _LEAST_MEASURED, _LEAST_NEW = 0.7, 0.85
 _MOST_SHIFT = 1.5
 # A photo is asked for a point that it does not show by a feature if it looks at it from within this angle of the
 # best view, and no more than this factor farther or nearer.
-_MOST_ANGLE_DEG, _MOST_SCALE = 30.0, 1.7
+_MOST_ANGLE_DEG, _MOST_SCALE = 50.0, 2.5
 # Windows with less contrast (standard deviation in grey levels) hold nothing but noise.
 _LEAST_CONTRAST = 3.0
 # No alignment is trusted to better than this, in pixels of the finer window's level: interpolation, compression.
@@ -157,7 +157,8 @@ def align_tracks(reconstruction: Reconstruction, steps_px: Sequence[float], patc
     Returns
     -------
     Reconstruction
-        With new observations; those that could not be aligned are as they were. Points, poses and motions stay.
+        With new observations; those that could not be aligned are as they were, and points that only two photos show
+        are left out: nothing checks these. Points, poses and motions stay.
     """
     rec, step = reconstruction, np.asarray(steps_px, np.float64)
     normal = _facing(rec)
@@ -336,4 +337,5 @@ def _with_aligned(
         np.concatenate([xy, aligned.xy[new]]),
         np.concatenate([sigmas, sigma[new]]),
     )
-    return replace(rec, observations=observations)
+    found = replace(rec, observations=observations)
+    return found.with_points(np.ones(len(observations), bool), min_track=3)

@@ -1,8 +1,8 @@
-"""Mapping by pycolmap, with room for shutter distortion."""
+"""Mapping by pycolmap, with room for shutter distortion: all photos at once, or one after the other."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,12 @@ from ..errors import ReconstructionError
 from ..model import Camera, Reconstruction
 from .database import HALF, LOOSE, MatchedPhotos, from_pycolmap, pipeline_options, quiet_pycolmap, write_photos
 
-__all__ = ["map_photos"]
+__all__ = ["LEAST_MEASUREMENTS", "map_photos"]
 
-# Mapping only has to place the photos: it gets this many of the strongest keypoints of each. All of them come back
+#: A photo with fewer measurements is not joined: a wrong place is worse than none.
+LEAST_MEASUREMENTS = 20
+
+# Mapping one after the other only has to place the photos: it gets this many of the largest keypoints of each. All of them come back
 # when the tracks are rebuilt. (herz-jesus-8: 16384 keypoints map in 4.7 s, 4096 of them in 1.1 s, poses alike.)
 _MAPPING_KEYPOINTS = 4096
 
@@ -26,7 +29,7 @@ _LARGE = 60
 
 
 def _mapping_database(matched: MatchedPhotos, folder: Path, limit: int | None) -> Path:
-    """A database of the strongest keypoints (all: None) and the verified matches among them."""
+    """A database of the largest keypoints (all: None) and the verified matches among them."""
     pycolmap = quiet_pycolmap()
     path = folder / "mapping.db"
     with pycolmap.Database.open(matched.database) as db, pycolmap.Database.open(path) as small:
@@ -42,11 +45,10 @@ def _mapping_database(matched: MatchedPhotos, folder: Path, limit: int | None) -
 
 
 def map_photos(matched: MatchedPhotos, progress: Callable[[int], None] | None = None) -> Reconstruction:
-    """Global-shutter reconstruction by incremental mapping with loosened thresholds.
+    """Global-shutter reconstruction with room for shutter distortion.
 
-    Only photos that registered are in it. Mapping is tried with the strongest keypoints first, then with all, then
-    with less loose thresholds, until all photos are in one model; the attempt with the most photos is returned. A
-    camera that is only a guess is refined first, with tight thresholds: loose ones let the focal length run away.
+    All photos are placed at once (pycolmap's global mapper). Where that leaves some out, they are also placed one after
+    the other with loosened thresholds, and the attempt that joins more counts. A camera that is only a guess is refined.
 
     Parameters
     ----------
@@ -55,29 +57,78 @@ def map_photos(matched: MatchedPhotos, progress: Callable[[int], None] | None = 
     progress : callable, optional
         Called with the number of photos registered so far.
 
+    Returns
+    -------
+    Reconstruction
+        The photos that could be joined.
+
     Raises
     ------
     ReconstructionError
         When no two photos could be joined.
     """
-    best = None
-    if not matched.calibrated:
-        best = _best_model(matched, [(None, 1.0), (None, 2.0)], progress)
-        if best is not None:
-            # a camera that took none of the joined photos is not in the model
-            cameras = [
-                _refined_camera(best.cameras[k + 1], camera) if k + 1 in best.cameras else camera
-                for k, camera in enumerate(matched.cameras)
-            ]
-            matched = replace(matched, cameras=tuple(cameras), calibrated=True)
-    attempts = [(_MAPPING_KEYPOINTS, LOOSE), (None, LOOSE), (None, 2.0), (None, 1.0)]
-    found = _best_model(matched, attempts, progress)
+    found = _mapped_at_once(matched)
+    if found is None or found.num_images < len(matched.names):
+        one_by_one = _mapped_one_by_one(matched, progress)
+        found = max(
+            (each for each in (one_by_one, found) if each is not None), key=lambda each: each.num_images, default=None
+        )
     if found is None:
         raise ReconstructionError(
             f"none of the {len(matched.names)} photos overlap enough to be joined; "
             "use photos that share more of the scene, or check the camera's focal length"
         )
-    return from_pycolmap(found, matched, None)
+    return found
+
+
+def _mapped_at_once(matched: MatchedPhotos) -> Reconstruction | None:
+    """What the global mapper joins, without photos that hang on by few measurements."""
+    work = matched.database.parent / "mapping-global"
+    work.mkdir()
+    options = _global_options(matched)
+    models = quiet_pycolmap().global_mapping(_mapping_database(matched, work, None), work, work, options)
+    return _firmly_joined(_largest(models.values()), matched)
+
+
+def _mapped_one_by_one(matched: MatchedPhotos, progress: Callable[[int], None] | None) -> Reconstruction | None:
+    """What incremental mapping joins.
+
+    With the largest keypoints first, then with all, then with less loose thresholds, until all photos are in one model
+    or nothing is gained. A guessed camera is refined first, with tight thresholds: loose ones let the focal length run
+    away; and believed if half of the photos say so.
+    """
+    if not matched.calibrated:
+        attempts = [(_MAPPING_KEYPOINTS, 1.0), (None, 1.0), (None, 2.0)]
+        refined = _best_model(matched, attempts, progress)
+        if refined is not None and 2 * refined.num_reg_images() >= len(matched.names):
+            matched = _refined(matched, refined)
+        matched = replace(matched, calibrated=True)
+    attempts = [(_MAPPING_KEYPOINTS, LOOSE), (None, LOOSE), (None, 2.0), (None, 1.0)]
+    return _firmly_joined(_best_model(matched, attempts, progress), matched)
+
+
+def _firmly_joined(model: Any, matched: MatchedPhotos) -> Reconstruction | None:
+    """Our reconstruction of a pycolmap model, or of none; photos that hang on by few measurements are left out."""
+    if model is None or not model.num_points3D():
+        return None
+    if not matched.calibrated:
+        matched = _refined(matched, model)
+    rec = from_pycolmap(model, matched, None)
+    return rec.without_photos(LEAST_MEASUREMENTS)
+
+
+def _refined(matched: MatchedPhotos, model: Any) -> MatchedPhotos:
+    """The photos with the cameras that mapping refined; one that took none of the joined photos stays a guess."""
+    cameras = [
+        _refined_camera(model.cameras[k + 1], camera) if k + 1 in model.cameras else camera
+        for k, camera in enumerate(matched.cameras)
+    ]
+    return replace(matched, cameras=tuple(cameras), calibrated=True)
+
+
+def _largest(models: Iterable[Any]) -> Any:
+    """The model with the most photos, of equals with the most points; None of none."""
+    return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
 
 
 def _best_model(
@@ -85,10 +136,13 @@ def _best_model(
     attempts: Sequence[tuple[int | None, float]],
     progress: Callable[[int], None] | None,
 ) -> Any:
-    """The pycolmap model with the most photos over attempts (number of keypoints, looseness), or None."""
+    """The pycolmap model with the most photos over attempts (number of keypoints, looseness), or None.
+
+    They end when all photos are joined, or when one with all keypoints gains nothing.
+    """
     pycolmap = quiet_pycolmap()
     total = len(matched.names)
-    best, best_count = None, (0, 0)
+    best, count = None, 0
     for number, (limit, loose) in enumerate(attempts):
         registered = [2]
 
@@ -106,13 +160,24 @@ def _best_model(
             _mapping_options(loose, matched),
             next_image_callback=on_next_image,
         )
-        for model in models.values():
-            count = (model.num_reg_images(), model.num_points3D())
-            if count > best_count:
-                best, best_count = model, count
-        if best_count[0] == total:
+        before, best = count, _largest([*models.values(), *([] if best is None else [best])])
+        count = 0 if best is None else best.num_reg_images()
+        if count == total or (number > 1 and count and count <= before):
             break
     return best
+
+
+def _global_options(matched: MatchedPhotos) -> Any:
+    """Of the global mapper; seeds and threads as in `pipeline_options`."""
+    options = quiet_pycolmap().GlobalPipelineOptions()
+    mapper = options.mapper
+    options.num_threads = mapper.num_threads = 1
+    mapper.bundle_adjustment.ceres.solver_options.num_threads = 1
+    for each in (options, mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
+        each.random_seed = matched.seed
+    mapper.bundle_adjustment.refine_focal_length = not matched.calibrated
+    mapper.bundle_adjustment.refine_extra_params = not matched.calibrated
+    return options
 
 
 def _mapping_options(loose: float, matched: MatchedPhotos) -> Any:

@@ -27,11 +27,21 @@ _TIGHT_PX = 2.0
 _MIN_EXPLAINED = 15
 
 
-def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction) -> Reconstruction:
+def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction, *, of_two: bool = False) -> Reconstruction:
     """New tracks and points for a reconstruction's poses, from keypoints freed of the shutter.
 
-    The keypoints are corrected by the reconstruction's motion; matches that its poses explain are triangulated with tight
-    thresholds: measurements that the shutter had cut off return, false ones that the loose thresholds had let in go.
+    The keypoints are corrected by the reconstruction's motion; matches that its poses explain are triangulated with
+    tight thresholds: measurements that the shutter had cut off return, false ones that the loose thresholds had let in
+    go.
+
+    Parameters
+    ----------
+    matched : MatchedPhotos
+        Keypoints and matches of at least the reconstruction's photos.
+    reconstruction : Reconstruction
+        Poses, motions and cameras.
+    of_two : bool
+        Whether points that only two photos show are among the new ones: `align_tracks` may find them in others.
 
     Returns
     -------
@@ -59,6 +69,7 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction) -> Rec
     options.mapper.filter_max_reproj_error = tight_px
     options.triangulation.merge_max_reproj_error = tight_px
     options.triangulation.complete_max_reproj_error = tight_px
+    options.triangulation.ignore_two_view_tracks = not of_two
     # poses and cameras are held: once through is enough, our own adjustment follows
     options.ba_global_max_refinements = 1
     model = pycolmap.triangulate_points(
@@ -121,7 +132,7 @@ def sampson_distance(
     Returns
     -------
     (n,) array
-        In normalized coordinates; NaN where these are. Inf for two photos from one place, which have no epipolar planes.
+        In normalized coordinates; NaN where these are. Inf for two photos from one place, which have no planes.
     """
     length = float(np.linalg.norm(t_21))
     if length == 0.0:
