@@ -202,7 +202,7 @@ class Reconstruction:
             place = np.flatnonzero(keep)
             rec = replace(
                 rec,
-                image_names=[rec.image_names[i] for i in place],
+                image_names=[rec.image_names[i] for i in place.tolist()],
                 camera_idx=rec.camera_idx[keep],
                 R_cw=rec.R_cw[keep],
                 center_w=rec.center_w[keep],

@@ -260,7 +260,7 @@ def _further(
         windows = _windows_at(rec, np.full(len(points), i), points, normal)
         size = np.array([rec.camera(i).width, rec.camera(i).height])
         # NaN is not inside
-        inside = ((windows.xy >= _BORDER_PX) & (windows.xy <= size - 1 - _BORDER_PX)).all(1)
+        inside = np.all((windows.xy >= _BORDER_PX) & (windows.xy <= size - 1 - _BORDER_PX), axis=1)
         yield replace(windows, M=windows.M * unit[points, None, None]).select(inside)
 
 
@@ -299,7 +299,7 @@ def _align_block(
     rows, first, second = rows[both], first[both], second[both]
     place, M = at - corner, windows.M / scale[:, :, None]
     n = len(rows)
-    centre, correlation, covariance = np.empty((n, 2)), np.empty(n), np.empty((n, 2, 2))
+    centre, correlation, covariance = np.full((n, 2), np.nan), np.empty(n), np.full((n, 2, 2), np.nan)
     align(
         patches, first, second, np.stack([place[first], place[second]], 1), np.stack([M[first], M[second]], 1),
         _LEAST_CONTRAST, centre, correlation, covariance,

@@ -18,8 +18,8 @@ __all__ = ["LEAST_MEASUREMENTS", "map_photos"]
 #: A photo with fewer measurements is not joined: a wrong place is worse than none.
 LEAST_MEASUREMENTS = 20
 
-# Mapping one after the other only has to place the photos: it gets this many of the largest keypoints of each. All of them come back
-# when the tracks are rebuilt. (herz-jesus-8: 16384 keypoints map in 4.7 s, 4096 of them in 1.1 s, poses alike.)
+# Mapping one after the other only has to place the photos: it gets this many of the largest keypoints of each. All of
+# them come back when the tracks are rebuilt. (herz-jesus-8: 16384 keypoints map in 4.7 s, 4096 of them in 1.1 s, poses alike.)
 _MAPPING_KEYPOINTS = 4096
 
 # Beyond this many photos all are adjusted together whenever there are 1.4 times as many, not 1.1 times as pycolmap has
@@ -48,7 +48,7 @@ def map_photos(matched: MatchedPhotos, progress: Callable[[int], None] | None = 
     """Global-shutter reconstruction with room for shutter distortion.
 
     All photos are placed at once (pycolmap's global mapper). Where that leaves some out, they are also placed one after
-    the other with loosened thresholds, and the attempt that joins more counts. A camera that is only a guess is refined.
+    the other with loosened thresholds, and the attempt that joins more counts. A camera that is a guess is refined.
 
     Parameters
     ----------
