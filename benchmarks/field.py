@@ -242,7 +242,7 @@ def survey(folder: Path, num: int) -> None:
     from rsundistort.io.cameras import camera_to_json
 
     width, height, focal, above, texel, margin = 480, 360, 400.0, 30.0, 0.075, 30.0
-    step, apart, line = 5.0, 9.0, 50
+    step, apart, line = 6.0, 10.0, 50
     rng = np.random.default_rng(5)
     size = (np.array([line * step, -(-num // line) * apart]) + 2 * margin) / texel
 
@@ -250,8 +250,8 @@ def survey(folder: Path, num: int) -> None:
         small = rng.standard_normal((int(size[1] / cell) + 2, int(size[0] / cell) + 2), np.float32)
         return cv2.resize(small, size.astype(int).tolist(), interpolation=cv2.INTER_CUBIC)
 
-    ground = sum(1.5**octave * noise(2.0**octave) for octave in range(1, 7))
-    ground = np.clip(128 + 5 * ground, 0, 255).astype(np.uint8)
+    ground = sum(1.5**octave * noise(2.0**octave) for octave in range(3, 8))
+    ground = np.clip(128 + 2.5 * ground, 0, 255).astype(np.uint8)
     hills = 1.5 * noise(15 / texel)
     camera = Camera(width, height, [[focal, 0, 241.0], [0, focal, 178.5], [0, 0, 1]])
     (folder / "camera.json").write_text(json.dumps(camera_to_json(camera), default=np.ndarray.tolist))
