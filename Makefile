@@ -56,6 +56,7 @@ figures: $(VENV)/.installed
 	$(BIN)/python benchmarks/depth.py
 	$(BIN)/python benchmarks/solve.py
 	$(BIN)/python benchmarks/memory.py
+	$(BIN)/python benchmarks/field.py
 
 clean:
 	rm -rf $(VENV) $(OUT) docs/_build build *.egg-info
