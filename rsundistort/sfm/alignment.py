@@ -42,6 +42,8 @@ _FLOOR_PX = 0.03
 # Photos that have so many points in common are asked for each other's, so many of them at most; nearer to the border
 # nothing is sought.
 _LEAST_COMMON, _MOST_PARTNERS, _BORDER_PX = 15, 30, 8
+# Photos with so many measurements are asked for no more.
+_ENOUGH = 4000
 # Patches in memory at a time (2.4 kB each).
 _BLOCK = 120_000
 
@@ -249,7 +251,8 @@ def _further(
     obs, m = rec.observations, rec.num_images
     ones = np.ones(len(obs), np.int64)
     seen = coo_array((ones, (obs.frame_idx, obs.point_idx)), shape=(m, rec.num_points)).tocsr()
-    for i in range(m):
+    counts = np.bincount(obs.frame_idx, minlength=m)
+    for i in np.flatnonzero(counts < _ENOUGH).tolist():
         mine = seen.indices[seen.indptr[i] : seen.indptr[i + 1]]
         common = np.bincount(obs.frame_idx[np.isin(obs.point_idx, mine)], minlength=m)
         common[i] = 0

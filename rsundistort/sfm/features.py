@@ -22,7 +22,7 @@ __all__ = [
 ]
 
 #: Megapixels that a photo is shrunk to before features are looked for in it, unless told otherwise.
-DETECTION_MEGAPIXELS = 2.0
+DETECTION_MEGAPIXELS = 1.5
 
 #: Standard deviation of the position of the finest features, whose relative one is 1, in pixels.
 SIFT_PX = 0.12
@@ -82,7 +82,7 @@ def detect_features(
     photo : (h, w) or (h, w, 3 | 4) array
         8-bit, 16-bit or float (0 to 1) pixels in OpenCV's channel order.
     max_features : int
-        Keep this many, the largest first; those of several orientations are there several times.
+        Keep this many, the largest first; those of several orientations count several times.
     mask : (h, w) uint8 array, optional
         No features where it is 0.
     megapixels : float
@@ -101,11 +101,7 @@ def detect_features(
         return Features(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.uint8), shrink)
     x, y, size, angle, response = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints]).T
     # ties by strength and place: the order in which OpenCV's threads found them must not matter
-    order = np.lexsort((angle, x, y, -response, -size))
-    # one of several orientations is the same feature
-    place = np.column_stack([x, y])[order]
-    number = np.cumsum(np.r_[True, (place[1:] != place[:-1]).any(1)])
-    order = order[number <= max_features]
+    order = np.lexsort((angle, x, y, -response, -size))[:max_features]
     # twice the pyramid costs less than descriptors of all
     kept, raw = sift.compute(gray, [keypoints[k] for k in order])
     root = np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-12))
