@@ -34,7 +34,7 @@ _LEAST_MEASURED, _LEAST_NEW = 0.7, 0.85
 _MOST_SHIFT = 1.5
 # A photo is asked for a point that it does not show by a feature if it looks at it from within this angle of the
 # best view, and no more than this factor farther or nearer.
-_MOST_ANGLE_DEG, _MOST_SCALE = 50.0, 2.5
+_MOST_ANGLE_DEG, _MOST_SCALE = 30.0, 1.7
 # Windows with less contrast (standard deviation in grey levels) hold nothing but noise.
 _LEAST_CONTRAST = 3.0
 # No alignment is trusted to better than this, in pixels of the finer window's level: interpolation, compression.

@@ -18,8 +18,9 @@ __all__ = ["LEAST_MEASUREMENTS", "map_photos"]
 #: A photo with fewer measurements is not joined: a wrong place is worse than none.
 LEAST_MEASUREMENTS = 20
 
-# Mapping only has to place the photos; the tracks are rebuilt afterwards. All at once this many of the largest keypoints
-# of each do, or all (seconds of processor time with 2048 / all: herz-jesus-8 2.1 / 4.6, 16 photos of a phone 2.0 / 4.4).
+# Mapping only has to place the photos; the tracks are rebuilt afterwards. All at once this many of the largest
+# keypoints of each do, or all (seconds of processor time with 2048 / all: herz-jesus-8 2.1 / 4.6, a phone's 16 photos
+# 2.0 / 4.4).
 # It takes others than incremental mapping does where photos hang together weakly: 13 instead of 8 of a drone's 14, 29
 # instead of 27 in lund; so the other way is tried only where it leaves out more than a quarter.
 _PLACING_KEYPOINTS, _ENOUGH_JOINED = 2048, 0.75
