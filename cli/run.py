@@ -53,7 +53,7 @@ from .terminal import Talk, errors_for_people, progress_bars
 @click.option(
     "--feature-megapixels",
     type=click.FloatRange(min=0.05),
-    default=1.5,
+    default=1.0,
     show_default=True,
     metavar="MP",
     help="Larger photos are shrunk to this to find their features.",

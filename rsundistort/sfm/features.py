@@ -22,7 +22,7 @@ __all__ = [
 ]
 
 #: Megapixels that a photo is shrunk to before features are looked for in it, unless told otherwise.
-DETECTION_MEGAPIXELS = 1.5
+DETECTION_MEGAPIXELS = 1.0
 
 #: Standard deviation of the position of the finest features, whose relative one is 1, in pixels.
 SIFT_PX = 0.12
