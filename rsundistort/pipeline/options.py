@@ -47,7 +47,7 @@ class SolveOptions(RectifyOptions):
         Threads; 0 for all cores.
     refine : tuple of str, optional
         Intrinsics that are solved for with the rest, as in `BundleOptions`; by default none where the camera is given,
-        f, k1 and k2 where EXIF had to guess it.
+        f, cx, cy, k1, k2, k3, p1 and p2 where EXIF had to guess it.
     still : mapping of photo name to float
         Photos known not to have moved: phi1 is held at zero in them (the paper's remedy), or, where the number is
         positive, near zero with that standard deviation, radians per frame.
