@@ -174,7 +174,9 @@ def photos_of(num):
     rng = np.random.default_rng(0)
     found = [Features(np.zeros((20, 2)), np.ones(20), rng.integers(0, 90, (20, 128), dtype=np.uint8))] * num
     cameras = PhotoCameras([], [], np.zeros(num, int), True, (), "")
-    return LoadedPhotos([f"{k}.jpg" for k in range(num)], found, [ExifFacts()] * num, {}, cameras, {})
+    return LoadedPhotos(
+        [f"{k}.jpg" for k in range(num)], found, [ExifFacts()] * num, {}, cameras, {}, Path(), {}, 100.0
+    )
 
 
 def test_small_sets_are_matched_exhaustively_unless_told():
