@@ -266,7 +266,7 @@ def solve_tracks(
     )
     tracks = result.reconstruction
     if feedback is not None:
-        result, tracks = _fed_back(feedback, result, options, log)
+        result, tracks, options = _fed_back(feedback, result, options, log)
     options = replace(options, phi_sigma_start=result.phi_sigma)
     choice = None
     if auto:
@@ -299,8 +299,11 @@ def solve_tracks(
 
 def _fed_back(
     feedback: Feedback, result: BundleResult, options: BundleOptions, log: StageLog
-) -> tuple[BundleResult, Reconstruction]:
-    """Free keypoints of the shutter, rebuild the tracks and adjust, until the photos settle; and the last tracks."""
+) -> tuple[BundleResult, Reconstruction, BundleOptions]:
+    """Free keypoints of the shutter, rebuild the tracks and adjust, until the photos settle.
+
+    The last adjustment, its tracks, and the options without anchors of photos that nothing holds any more.
+    """
     shutter_model = result.reconstruction.shutter_model
     stages = [f"feedback {number}" for number in range(1, _MAX_ROUNDS + 1)]
     if feedback.workers is not None:
@@ -315,6 +318,7 @@ def _fed_back(
         if stage == "alignment":
             tracks = feedback.aligned(tracks, log)
         tracks = tracks.without_photos(LEAST_MEASUREMENTS)
+        options = _of_joined(options, tracks)
         options = replace(options, phi_sigma_start=result.phi_sigma)
         result = bundle_adjust(tracks, shutter_model, options, partial(_tell, log, stage))
         after = result.reconstruction
@@ -324,4 +328,4 @@ def _fed_back(
             iterations=result.num_iterations, stop_reason=result.stop_reason, moved_px=moved,
         )  # fmt: skip
         settled = moved < _SETTLED_PX * feedback.step_px
-    return result, tracks
+    return result, tracks, options

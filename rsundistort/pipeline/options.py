@@ -124,12 +124,13 @@ class SolveOptions(RectifyOptions):
         )  # fmt: skip
 
     def options_for(self, reconstruction: Reconstruction, cameras: PhotoCameras) -> BundleOptions:
-        """Options of the adjustments of a reconstruction, by its readout directions and by whether EXIF guessed."""
+        """Options of the adjustments of a reconstruction, by its readout directions and by what is to be refined."""
         rec = reconstruction
         options = self.bundle_options({name: rec.camera(i).readout for i, name in enumerate(rec.image_names)})
-        if cameras.calibrated:
+        refine = self.refine if self.refine is not None else () if cameras.calibrated else GUESSED
+        if not refine:
             return options
-        refine = GUESSED if self.refine is None else self.refine
+        # a calibration that is to be refined is not trusted: no better than a guess, but no worse
         return replace(options, refine=refine, guessed=GuessedCameras(cameras.cameras, GUESS_SIGMA))
 
 
