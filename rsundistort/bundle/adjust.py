@@ -70,8 +70,9 @@ def _spread(
 
 
 def _estimated(
-    spreads: Spreads, current: Reconstruction, covariances: NDArray[np.float64], options: BundleOptions
-) -> Spreads:
+    spreads: Spreads, current: Reconstruction, covariances: NDArray[np.float64], options: BundleOptions,
+    baseline: float,
+) -> Spreads:  # fmt: skip
     """The spreads of both priors that a solution shows; those that were given stay."""
     variances = np.diagonal(covariances, axis1=1, axis2=2)
     if not np.isfinite(variances).all():
@@ -82,7 +83,7 @@ def _estimated(
         phi = _spread(current.phi, variances[:, 6:9], span, spreads.phi) + _MIN_SPREAD
     if options.velocity_sigma is None and variances.shape[1] > 9:
         velocity = _spread(current.velocity, variances[:, 9:], span, spreads.velocity) + _MIN_SPREAD * current.baseline
-    return Spreads(phi, velocity)
+    return _bounded(Spreads(phi, velocity), options, baseline)
 
 
 def _estimates_spreads(shutter_model: str, options: BundleOptions) -> bool:
@@ -101,10 +102,18 @@ def _settled(before: Spreads, after: Spreads, tolerance: float) -> bool:
 
 
 def _starting_spreads(options: BundleOptions, baseline: float) -> Spreads:
-    return Spreads(
+    start = Spreads(
         options.phi_sigma or options.phi_sigma_start,
         (options.velocity_sigma or options.velocity_sigma_start) * baseline,
     )
+    return _bounded(start, options, baseline)
+
+
+def _bounded(spreads: Spreads, options: BundleOptions, baseline: float) -> Spreads:
+    """The spreads within their upper limits."""
+    phi = np.inf if options.phi_sigma_most is None else options.phi_sigma_most
+    velocity = np.inf if options.velocity_sigma_most is None else options.velocity_sigma_most * baseline
+    return Spreads(min(spreads.phi, phi), min(spreads.velocity, velocity))
 
 
 def objective(reconstruction: Reconstruction, shutter_model: str, options: BundleOptions) -> float:
@@ -192,7 +201,7 @@ def bundle_adjust(
         iterations += result.num_iterations
         current = problem.reconstruction(result.state)
         covariances, intrinsic_covariance = problem.covariances(result.state)
-        before, spreads = spreads, _estimated(spreads, current, covariances, options)
+        before, spreads = spreads, _estimated(spreads, current, covariances, options, baseline)
         revived = revive_points(current, shutter_model)
         if cleaning:
             sigma = options.sigma_px or _noise_px(current, shutter_model, options.min_sigma_px)

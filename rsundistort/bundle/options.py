@@ -67,6 +67,8 @@ class BundleOptions:
     velocity_sigma, velocity_sigma_start : float or None, float
         The same for each component of the velocity of the constant-motion model, in baselines per frame (a baseline is
         the mean distance of consecutive centres).
+    phi_sigma_most, velocity_sigma_most : float or None
+        Upper limits of the two spreads, where something else than the measurements says how far cameras can have moved.
     spread_rounds : int
         At most this many more solves settle the two spreads, until neither changes by more than `spread_tolerance`.
     spread_tolerance : float
@@ -112,6 +114,8 @@ class BundleOptions:
     phi_sigma_start: float = 0.03
     velocity_sigma: float | None = None
     velocity_sigma_start: float = 0.03
+    phi_sigma_most: float | None = None
+    velocity_sigma_most: float | None = None
     spread_rounds: int = 12
     spread_tolerance: float = 0.01
     outlier_rounds: int = 3
@@ -154,7 +158,7 @@ class BundleOptions:
                 raise InputError(f"{name}={getattr(self, name)!r}, expected a positive number")
         if self.sigma_px is not None and not self.sigma_px > 0:
             raise InputError(f"sigma_px={self.sigma_px!r}, expected a positive number or None")
-        for name in ("phi_sigma", "velocity_sigma"):
+        for name in ("phi_sigma", "velocity_sigma", "phi_sigma_most", "velocity_sigma_most"):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise InputError(f"{name}={value!r}, expected a positive number or None")

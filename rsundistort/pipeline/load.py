@@ -12,13 +12,16 @@ from ..errors import FileError, InputError, SkippedPhotoWarning
 from ..io import ExifFacts, facts_of_exif, find_masks, list_photos, read_mask, read_photo
 from ..io.photos.images import stored_size
 from ..io.places import local_place
-from ..sfm import DETECTION_MEGAPIXELS, Features, detect_features, detection_bytes
+from ..sfm import DETECTION_MEGAPIXELS, Features, detect_features, detection_bytes, edge_width_px, grey_8_bit
 from .cameras import PhotoCameras, find_cameras
 from .photo import RectifyOptions, check_not_rectified
 from .progress import StageLog
 from .workers import Workers
 
-__all__ = ["LoadedPhotos", "load_photos"]
+__all__ = ["LONG_EXPOSURE_S", "LoadedPhotos", "load_photos"]
+
+#: Exposures that are longer bound the motion: a camera that turned by a frame's shutter during them would have blurred.
+LONG_EXPOSURE_S = 1 / 250
 
 # What a decoded photo takes for each pixel, at most but for floats; and the size of one whose header does not say.
 _BYTES_PER_PIXEL, _SIZE_OF_OTHERS = 16, (8000, 6000)
@@ -44,6 +47,8 @@ class LoadedPhotos:
         Their masks.
     max_megapixels : float
         As in `RectifyOptions`.
+    edges_px : sequence of float or None
+        How wide the steepest edges of each photo are, where it was exposed so long that this tells anything.
     """
 
     names: list[str]
@@ -55,6 +60,7 @@ class LoadedPhotos:
     folder: Path
     mask_of: Mapping[str, Path]
     max_megapixels: float
+    edges_px: Sequence[float | None] = ()
 
     def unregistered(self, joined: Sequence[str]) -> dict[str, str]:
         """Photos that are not among those that were joined, and why."""
@@ -83,6 +89,7 @@ class _Loaded:
     height: int = 0
     orientation: int = 1
     facts: ExifFacts = field(default_factory=ExifFacts)
+    edge_px: float | None = None
     problem: str = ""
 
 
@@ -99,7 +106,11 @@ def _load(job: _LoadJob) -> _Loaded:
     # a mask that cannot be used stops the run: without it, what it hides would be measured
     mask = None if job.own_mask is None else read_mask(job.own_mask, width, height)
     features = detect_features(photo.pixels, job.max_features, mask, job.megapixels)
-    return _Loaded(features, width, height, photo.metadata.orientation, facts_of_exif(photo.metadata.exif))
+    facts = facts_of_exif(photo.metadata.exif)
+    edge_px = None
+    if facts.exposure_s is not None and facts.exposure_s > LONG_EXPOSURE_S:
+        edge_px = edge_width_px(grey_8_bit(photo.pixels))
+    return _Loaded(features, width, height, photo.metadata.orientation, facts, edge_px)
 
 
 def _most_bytes(folder: Path, names: Sequence[str], megapixels: float, options: RectifyOptions) -> float:
@@ -186,5 +197,6 @@ def load_photos(
     log.end("features", photos=len(names), keypoints=sum(len(f.xy_raw) for f in features))
     orientations = {name: each.orientation for name, each in zip(names, found, strict=True)}
     return LoadedPhotos(
-        names, features, facts, skipped, cameras, orientations, folder.absolute(), mask_of, options.max_megapixels
+        names, features, facts, skipped, cameras, orientations, folder.absolute(), mask_of, options.max_megapixels,
+        [each.edge_px for each in found],
     )  # fmt: skip

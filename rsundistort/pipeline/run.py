@@ -7,13 +7,15 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
+from ..bundle import BundleOptions
 from ..errors import InputError, RsUndistortWarning
 from ..io import is_video, list_photos, output_folder
 from ..io.motions import Known
 from ..io.places import local_place
 from ..io.record import Record
-from ..model import Solution
+from ..model import Reconstruction, Solution
 from .cameras import camera_file_of
+from .exposure import bounded_by_exposure
 from .frames import find_photos
 from .gyro import gyro_contradiction, gyro_motions, known_readouts
 from .ladder import solve_photos
@@ -83,9 +85,14 @@ def run(
             motions = gyro_motions(folder, options.gyro, gyro_log, dict(zip(loaded.names, times, strict=True)))
             from_gyro = {k: v for k, v in motions.items() if k not in options.known and k not in options.still}
             options = replace(options, known={**options.known, **from_gyro})
+        known_s = {k: seconds for k, (seconds, _) in readouts.items()}
+
+        def options_of(rec: Reconstruction) -> BundleOptions:
+            return bounded_by_exposure(options.options_for(rec, cameras), rec, loaded, known_s)
+
         with tempfile.TemporaryDirectory() as work:
             solved = solve_photos(
-                loaded, options.shutter_model, options.seed, lambda rec: options.options_for(rec, cameras),
+                loaded, options.shutter_model, options.seed, options_of,
                 Path(work), log, options.remedy, options.matching, workers,
             )  # fmt: skip
         rec = solved.result.reconstruction

@@ -8,6 +8,7 @@ from .mapping import LEAST_MEASUREMENTS, map_photos
 from .matching import match_photos
 from .pairs import choose_pairs, global_descriptors
 from .retriangulation import retriangulate
+from .sharpness import edge_width_px
 
 __all__ = [
     "DETECTION_MEGAPIXELS",
@@ -22,6 +23,7 @@ __all__ = [
     "cut_patches",
     "detect_features",
     "detection_bytes",
+    "edge_width_px",
     "global_descriptors",
     "grey_8_bit",
     "kept_log_level",

@@ -21,6 +21,7 @@ __all__ = ["ExifFacts", "camera_from_exif", "facts_of_exif", "focal_from_exif", 
 # diagonal of the 36 x 24 mm frame that 35-mm equivalents refer to (CIPA DCG-001)
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
 _MAKE, _MODEL, _FOCAL_LENGTH, _DIGITAL_ZOOM_RATIO = 0x010F, 0x0110, 0x920A, 0xA404
+_EXPOSURE_TIME = 0x829A
 _FOCAL_LENGTH_IN35MM_FILM, _BODY_SERIAL_NUMBER, _LENS_MODEL = 0xA405, 0xA431, 0xA434
 _EXIF_IMAGE_WIDTH, _EXIF_IMAGE_HEIGHT = 0xA002, 0xA003
 _FOCAL_PLANE_X_RESOLUTION, _FOCAL_PLANE_RESOLUTION_UNIT = 0xA20E, 0xA210
@@ -53,6 +54,8 @@ class ExifFacts:
         Size of the photo in pixels, as EXIF claims it.
     taken_s : float or None
         When it was taken, by the camera's clock: seconds since the beginning of 1970 there.
+    exposure_s : float or None
+        How long the shutter was open, seconds.
     place_deg : (float, float) or None
         Latitude and longitude by GPS, north and east positive.
     """
@@ -69,6 +72,7 @@ class ExifFacts:
     width: int | None = None
     height: int | None = None
     taken_s: float | None = None
+    exposure_s: float | None = None
     place_deg: tuple[float, float] | None = None
 
 
@@ -141,6 +145,7 @@ def _facts(tags: dict[int, bytes | float | None]) -> ExifFacts:
         orientation=whole(ORIENTATION, 1, 8),
         width=width,
         height=height,
+        exposure_s=number(_EXPOSURE_TIME, 1e-7, 3600),
         taken_s=_taken(text(_DATE_TIME_ORIGINAL), text(_SUB_SEC_TIME_ORIGINAL)),
     )
 

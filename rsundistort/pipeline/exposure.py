@@ -1,0 +1,48 @@
+"""What the exposure time says of the motion: a photo that is sharp did not move far while its shutter was open."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from ..bundle import BundleOptions
+from ..model import Reconstruction
+from .load import LoadedPhotos
+
+__all__ = ["bounded_by_exposure"]
+
+# Of cameras that the table of readout times lacks: the slowest that are in use.
+_LONGEST_READOUT_S = 0.05
+
+
+def bounded_by_exposure(
+    options: BundleOptions, reconstruction: Reconstruction, photos: LoadedPhotos, readout_s: Mapping[int, float]
+) -> BundleOptions:
+    """Options whose spreads of the motion are bounded by the exposure, where all photos were exposed for long.
+
+    The picture of a photo whose steepest edges are b pixels wide moved by about b at most while it was exposed, so by b
+    times readout / exposure during the readout: an angle of that over the focal length, or a way of that times the
+    distance of the scene over the focal length.
+
+    Parameters
+    ----------
+    options : BundleOptions
+        Of the adjustments.
+    reconstruction : Reconstruction
+        The photos that were joined, and how far away the scene is.
+    photos : LoadedPhotos
+        What their EXIF says, and how sharp they are.
+    readout_s : mapping of camera to float
+        Readout times that are known.
+    """
+    rec = reconstruction
+    place = {name: k for k, name in enumerate(photos.names)}
+    most = 0.0
+    for i, name in enumerate(rec.image_names):
+        exposure_s = photos.facts[place[name]].exposure_s
+        edge_px = photos.edges_px[place[name]] if photos.edges_px else None
+        if exposure_s is None or edge_px is None:
+            return options
+        readout = readout_s.get(int(rec.camera_idx[i]), _LONGEST_READOUT_S)
+        most = max(most, edge_px / float(rec.camera(i).K[0, 0]) * readout / exposure_s)
+    return replace(options, phi_sigma_most=most, velocity_sigma_most=most * rec.size / rec.baseline)
