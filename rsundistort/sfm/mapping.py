@@ -26,8 +26,8 @@ LEAST_MEASUREMENTS = 20
 _PLACING_KEYPOINTS, _ENOUGH_JOINED = 2048, 0.75
 
 # Mapping one after the other only has to place the photos: it gets this many of the largest keypoints of each. All of
-# them come back when the tracks are rebuilt. (herz-jesus-8: 16384 keypoints map in 4.7 s,
-# 4096 of them in 1.1 s, poses alike.)
+# them come back when the tracks are rebuilt. (herz-jesus-8: 16384 keypoints map in 4.7 s, 4096
+# of them in 1.1 s, poses alike.)
 _MAPPING_KEYPOINTS = 4096
 
 # Beyond this many photos all are adjusted together whenever there are 1.4 times as many, not 1.1 times as pycolmap has
