@@ -50,8 +50,14 @@ _refine_option = click.option(
     "--refine",
     metavar="NAMES",
     help="Intrinsics to solve for with the rest: some of f (or fx, fy), cx, cy, k1, k2, p1, p2, k3 (of a "
-    "fisheye k1 to k4) with commas between, or none. By default none of a camera that was given, f,k1,k2 of one that "
-    "EXIF guessed.",
+    "fisheye k1 to k4) with commas between, or none. By default all, as far from a camera that was given, or from "
+    "EXIF's guess, as these usually are off.",
+)
+_camera_sigma_option = click.option(
+    "--camera-sigma",
+    metavar="NAME=SIGMA,...",
+    help="How well the camera is known: standard deviations of some of f (or fx, fy), cx, cy in pixels, and of k1, k2, "
+    "k3, p1, p2. Default: the key sigma of camera.json, else what calibrations usually are off by.",
 )
 _still_option = click.option(
     "--still",
@@ -111,6 +117,7 @@ solve_options = opt.gathered(
     _masks_option,
     _model_option,
     _refine_option,
+    _camera_sigma_option,
     _still_option,
     _known_option,
     _lengths_option,
@@ -137,6 +144,7 @@ def solve_fields(given: Mapping[str, Any]) -> dict[str, Any]:
     return {
         **fields,
         "refine": _names_between_commas(fields["refine"]),
+        "camera_sigma": _sigmas(fields["camera_sigma"]),
         "still": _anchors(fields["still"]),
         "known": {} if known is None else read_known_motions(known, readout_s),
         "lengths": () if lengths is None else read_known_lengths(lengths),
@@ -150,6 +158,20 @@ def _names_between_commas(refine: str | None) -> tuple[str, ...] | None:
         return None
     names = tuple(name.strip() for name in refine.split(",") if name.strip())
     return () if names == ("none",) else names
+
+
+def _sigmas(text: str | None) -> dict[str, float]:
+    """Standard deviations by name, of NAME=SIGMA with commas between."""
+    found: dict[str, float] = {}
+    for each in (text or "").split(",") if text else []:
+        name, _, number = each.partition("=")
+        try:
+            found[name.strip()] = float(number)
+        except ValueError:
+            raise click.BadParameter(
+                f"{each!r}, expected NAME=SIGMA, such as f=1.5", param_hint="--camera-sigma"
+            ) from None
+    return found
 
 
 def _anchors(still: tuple[str, ...]) -> dict[str, float]:

@@ -108,15 +108,17 @@ def relative_poses(rec):
     return rec.R_cw @ rec.R_cw[0].T, centers / np.linalg.norm(centers[1])
 
 
-def noisy_problem(rng, model, loss="squared", factor_limit=1e10, sigma_px=0.5, refine=(), dist=LENS):
+def noisy_problem(rng, model, loss="squared", factor_limit=1e10, sigma_px=0.5, refine=(), dist=LENS, varying=False):
     """A small problem at a state that is nowhere near a minimum: residuals of tens of pixels."""
     num_images = 5 if refine else 4  # of four cameras: two photos share one
     rec = make_scene(rng, model, num_images=num_images, num_points=30, noise_px=1.0, dist=dist)
     start = replace(perturbed(rec, rng, 0.01, 0.02), phi=rec.phi + 0.02 * rng.normal(size=rec.phi.shape))
     sigma = rng.uniform(1, 3, len(rec.observations))
     start = replace(start, observations=replace(rec.observations, sigma=sigma))
-    options = BundleOptions(loss=loss, factor_limit=factor_limit, cg_tolerance=1e-13, refine=refine)
-    problem = BundleProblem(start, model, options, sigma_px, Spreads(0.03, 0.1))
+    if varying:
+        start = replace(start, variation=rng.normal(size=(num_images, 3)) * [0.05, 0.02, 0.02])
+    options = BundleOptions(loss=loss, factor_limit=factor_limit, cg_tolerance=1e-13, refine=refine, varying=varying)
+    problem = BundleProblem(start, model, options, sigma_px, Spreads(0.03, 0.1, 0.02, 0.01))
     return problem, problem.initial_state()
 
 
@@ -152,9 +154,10 @@ RATIONAL = [*LENS, 0.01, 0.05, -0.02, 0.01]
     ],
     ids=["calibrated", "refined", "pinhole", "rational", "fisheye", "bare fisheye"],
 )  # fmt: skip
+@pytest.mark.parametrize("varying", [False, True], ids=["shared", "varying"])
 @pytest.mark.parametrize("model", MODELS)
-def test_jacobian_equals_central_differences_through_the_step(model, refine, dist, rng):
-    problem, state = noisy_problem(rng, model, refine=refine, dist=dist)
+def test_jacobian_equals_central_differences_through_the_step(model, varying, refine, dist, rng):
+    problem, state = noisy_problem(rng, model, refine=refine, dist=dist, varying=varying)
     order = problem._structure.order
     obs = problem._start.observations.select(order)
     _, J_frame, J_point, _ = problem._blocks(state)

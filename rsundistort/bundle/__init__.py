@@ -3,7 +3,7 @@
 from .adjust import LADDER, bundle_adjust, climb, objective
 from .choice import ModelChoice, choose_model
 from .direction import ReadoutChoice, choose_readouts
-from .intrinsics import GuessedCameras
+from .intrinsics import GuessedCameras, deviation, pixels_of
 from .lengths import KnownLength
 from .options import BundleOptions, BundleResult
 from .posterior import Posterior, gauge_directions
@@ -22,7 +22,9 @@ __all__ = [
     "choose_model",
     "choose_readouts",
     "climb",
+    "deviation",
     "gauge_directions",
     "objective",
+    "pixels_of",
     "reprojection_residuals",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ LADDER = ("global", "two-step", "rotation", "constant-motion")
 
 # Radians per frame: a hundredth of a pixel at any focal length in use. Keeps the prior's weight finite.
 _MIN_SPREAD = 1e-6
+# Spreads below this (radians, focal lengths) need not settle: a tenth of a pixel.
+_SETTLED_AT = 2e-5
 
 # Of a spread, between two solves.
 _LARGEST_CHANGE = 4.0
@@ -78,33 +80,40 @@ def _estimated(
     if not np.isfinite(variances).all():
         return spreads
     span = current.frame_span()
-    phi, velocity = spreads.phi, spreads.velocity
-    if options.phi_sigma is None and variances.shape[1] > 6:
-        phi = _spread(current.phi, variances[:, 6:9], span, spreads.phi) + _MIN_SPREAD
-    if options.velocity_sigma is None and variances.shape[1] > 9:
-        velocity = _spread(current.velocity, variances[:, 9:], span, spreads.velocity) + _MIN_SPREAD * current.baseline
-    return _bounded(Spreads(phi, velocity), options, baseline)
+    motion = variances[:, 6 : variances.shape[1] - 3 * options.varying]
+    phi, velocity, focal, centre = spreads.phi, spreads.velocity, spreads.focal, spreads.centre
+    if options.phi_sigma is None and motion.shape[1] > 0:
+        phi = _spread(current.phi, motion[:, :3], span, spreads.phi) + _MIN_SPREAD
+    if options.velocity_sigma is None and motion.shape[1] > 3:
+        velocity = _spread(current.velocity, motion[:, 3:], span, spreads.velocity) + _MIN_SPREAD * current.baseline
+    if options.varying:
+        ones, varied = np.ones(len(span)), current.variation
+        focal = _spread(varied[:, :1], variances[:, -3:-2], ones, spreads.focal) + _MIN_SPREAD
+        centre = _spread(varied[:, 1:], variances[:, -2:], ones, spreads.centre) + _MIN_SPREAD
+    return _bounded(Spreads(phi, velocity, focal, centre), options, baseline)
 
 
 def _estimates_spreads(shutter_model: str, options: BundleOptions) -> bool:
     """Whether a spread is to be estimated."""
-    return (shutter_model != "global" and options.phi_sigma is None) or (
-        shutter_model == "constant-motion" and options.velocity_sigma is None
-    )
+    of_turn = shutter_model != "global" and options.phi_sigma is None
+    return of_turn or (shutter_model == "constant-motion" and options.velocity_sigma is None) or options.varying
 
 
 def _settled(before: Spreads, after: Spreads, tolerance: float) -> bool:
-    """Whether neither spread changed by more than a share."""
+    """Whether no spread changed by more than a share; what is as good as nothing may go on falling."""
+    none = Spreads(_SETTLED_AT, 0.0, _SETTLED_AT, _SETTLED_AT)
     return all(
-        abs(new - old) <= tolerance * new
-        for old, new in ((before.phi, after.phi), (before.velocity, after.velocity))
-    )  # fmt: skip
+        abs(new - old) <= tolerance * new or max(old, new) < least
+        for old, new, least in zip(astuple(before), astuple(after), astuple(none), strict=True)
+    )
 
 
 def _starting_spreads(options: BundleOptions, baseline: float) -> Spreads:
     start = Spreads(
         options.phi_sigma or options.phi_sigma_start,
         (options.velocity_sigma or options.velocity_sigma_start) * baseline,
+        options.focal_sigma_start,
+        options.centre_sigma_start,
     )
     return _bounded(start, options, baseline)
 
@@ -113,7 +122,7 @@ def _bounded(spreads: Spreads, options: BundleOptions, baseline: float) -> Sprea
     """The spreads within their upper limits."""
     phi = np.inf if options.phi_sigma_most is None else options.phi_sigma_most
     velocity = np.inf if options.velocity_sigma_most is None else options.velocity_sigma_most * baseline
-    return Spreads(min(spreads.phi, phi), min(spreads.velocity, velocity))
+    return replace(spreads, phi=min(spreads.phi, phi), velocity=min(spreads.velocity, velocity))
 
 
 def objective(reconstruction: Reconstruction, shutter_model: str, options: BundleOptions) -> float:
@@ -217,6 +226,7 @@ def bundle_adjust(
     res, valid = reprojection_residuals(current)
     rms = float(np.sqrt(np.mean(res[valid] ** 2))) if valid.any() else float("nan")
     dropped = len(reconstruction.observations) - len(current.observations)
+    nb, own = covariances.shape[1], 3 * options.varying
     return BundleResult(
         current,
         result.stop_reason,
@@ -225,7 +235,9 @@ def bundle_adjust(
         sigma,
         spreads.phi,
         spreads.velocity / baseline,
-        covariances,
+        spreads.focal if options.varying else 0.0,
+        spreads.centre if options.varying else 0.0,
+        covariances[:, : nb - own, : nb - own],
         _sigma_intrinsics(current, options.refine, intrinsic_covariance),
         rms,
         dropped,

@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..model import Camera
 
-__all__ = ["INTRINSICS", "GuessedCameras", "check_lenses", "check_refined", "deviation", "moved_camera", "pixels_of"]
+__all__ = [
+    "INTRINSICS",
+    "GuessedCameras",
+    "check_lenses",
+    "check_refined",
+    "deviation",
+    "moved_camera",
+    "pixels_of",
+    "prior_weight",
+]
 
 #: Intrinsics that can be refined and their codes in the kernels: `f` keeps the ratio of fx and fy.
 INTRINSICS: dict[str, int] = {
@@ -26,22 +35,52 @@ _OF_LENS = {"pinhole": ("k1", "k2", "p1", "p2", "k3"), "fisheye": ("k1", "k2", "
 class GuessedCameras:
     """What was believed of the cameras before the photos were looked at: a prior on the intrinsics that are refined.
 
+    Its tails are heavy (`prior_weight`): a calibration that the photos contradict by many standard deviations is given
+    up for what they say.
+
     Parameters
     ----------
     cameras : sequence of Camera
         Guesses, one for each camera of the reconstruction.
-    sigma : mapping of intrinsic to float
-        Standard deviations: of f (fx, fy) relative, of cx and cy in focal lengths, of the lens coefficients.
-        Intrinsics that are not named have no prior.
+    sigma : mapping of intrinsic to float, or a sequence of them
+        Standard deviations, of all cameras or of each: of f (fx, fy) relative, of cx and cy in focal lengths, of the
+        lens coefficients. Intrinsics that are not named have no prior.
     """
 
     cameras: Sequence[Camera]
-    sigma: Mapping[str, float]
+    sigma: Mapping[str, float] | Sequence[Mapping[str, float]]
 
     def __post_init__(self) -> None:
-        for name, value in self.sigma.items():
-            if name not in INTRINSICS or not value > 0:
+        if not isinstance(self.sigma, Mapping) and len(self.sigma) != len(self.cameras):
+            raise InputError(f"{len(self.cameras)} guessed cameras and the sigmas of {len(self.sigma)}")
+        for name, value in (each for sigma in self.sigmas for each in sigma.items()):
+            if name not in INTRINSICS or not 0 < value < np.inf:
                 raise InputError(f"guessed {name!r}: sigma {value!r}, expected a positive one of an intrinsic")
+
+    @property
+    def sigmas(self) -> Sequence[Mapping[str, float]]:
+        """The standard deviations of each camera."""
+        return [self.sigma] * len(self.cameras) if isinstance(self.sigma, Mapping) else self.sigma
+
+    def surprises(self, cameras: Sequence[Camera], least: float = 3.0) -> list[tuple[int, str, float]]:
+        """Intrinsics that lie more than `least` standard deviations off: (camera, name, how many)."""
+        found = []
+        for k, (camera, guess, sigma) in enumerate(zip(cameras, self.cameras, self.sigmas, strict=True)):
+            names = [name for name in sigma if name in ("f", "fx", "fy", "cx", "cy") or name in camera.coefficients]
+            for name, apart in zip(names, deviation(camera, guess, names)[0].tolist(), strict=True):
+                if abs(apart) > least * sigma[name]:
+                    found.append((k, name, abs(apart) / sigma[name]))
+        return found
+
+
+# Degrees of freedom of the priors on intrinsics: normal near the middle, but what lies ten deviations off pulls as
+# hard as what lies two.
+_TAIL = 4.0
+
+
+def prior_weight(square: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Costs of squared deviations in units of sigma under a prior with heavy tails (Cauchy's loss), and weights."""
+    return 0.5 * _TAIL * np.log1p(square / _TAIL), 1.0 / (1.0 + square / _TAIL)
 
 
 def check_refined(names: Sequence[str]) -> tuple[str, ...]:
@@ -58,13 +97,14 @@ def check_refined(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def check_lenses(names: Sequence[str], cameras: Sequence[Camera]) -> None:
-    """Refuse names that are checked, but that the lens of some camera lacks."""
+    """Refuse names that are checked, but that the lenses of all cameras lack."""
+    lenses = sorted({camera.lens for camera in cameras})
+    known = [name for lens in lenses for name in _OF_LENS[lens]]
     for name in names:
-        for camera in cameras:
-            if INTRINSICS[name] >= INTRINSICS["k1"] and name not in _OF_LENS[camera.lens]:
-                raise InputError(
-                    f"cannot refine {name} of a {camera.lens} lens, expected some of {', '.join(_OF_LENS[camera.lens])}"
-                )
+        if INTRINSICS[name] >= INTRINSICS["k1"] and name not in known:
+            raise InputError(
+                f"cannot refine {name} of a {' or '.join(lenses)} lens, expected some of {', '.join(known)}"
+            )
 
 
 def moved_camera(camera: Camera, names: Sequence[str], step: NDArray[np.float64]) -> Camera:
@@ -80,7 +120,7 @@ def moved_camera(camera: Camera, names: Sequence[str], step: NDArray[np.float64]
             K[0, 2] += camera.K[0, 0] * value
         if name == "cy":
             K[1, 2] += camera.K[1, 1] * value
-        if name in lens:
+        if name in _OF_LENS[camera.lens]:
             lens[name] += value
     dist = np.array(list(lens.values())[: max(len(camera.dist), 5 if "k3" in names else 4)])
     return replace(camera, K=K, dist=dist if dist.any() else camera.dist)
@@ -97,7 +137,8 @@ def deviation(
     slope = {"cx": fx / gx, "cy": fy / gy}
     guessed = guess.coefficients
     apart |= {name: value - guessed[name] for name, value in camera.coefficients.items()}
-    return np.array([apart[name] for name in names]), np.array([slope.get(name, 1.0) for name in names])
+    # a lens lacks some coefficients of another
+    return np.array([apart.get(name, 0.0) for name in names]), np.array([slope.get(name, 1.0) for name in names])
 
 
 def pixels_of(camera: Camera, names: Sequence[str]) -> NDArray[np.float64]:

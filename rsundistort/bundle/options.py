@@ -69,8 +69,13 @@ class BundleOptions:
         the mean distance of consecutive centres).
     phi_sigma_most, velocity_sigma_most : float or None
         Upper limits of the two spreads, where something else than the measurements says how far cameras can have moved.
+    varying : bool
+        Whether the intrinsics of each photo may differ from its camera's: log f, as a focusing lens changes it, and the
+        principal point, as a stabiliser moves it, each with a zero-mean prior whose spread is estimated.
+    focal_sigma_start, centre_sigma_start : float
+        Where these estimates start: of log f, and of the principal point in focal lengths.
     spread_rounds : int
-        At most this many more solves settle the two spreads, until neither changes by more than `spread_tolerance`.
+        At most this many more solves settle the spreads, until neither changes by more than `spread_tolerance`.
     spread_tolerance : float
         See `spread_rounds`; a share.
     outlier_rounds : int
@@ -116,6 +121,9 @@ class BundleOptions:
     velocity_sigma_start: float = 0.03
     phi_sigma_most: float | None = None
     velocity_sigma_most: float | None = None
+    varying: bool = False
+    focal_sigma_start: float = 2e-3
+    centre_sigma_start: float = 3e-3
     spread_rounds: int = 12
     spread_tolerance: float = 0.01
     outlier_rounds: int = 3
@@ -150,6 +158,8 @@ class BundleOptions:
             "min_sigma_px",
             "phi_sigma_start",
             "velocity_sigma_start",
+            "focal_sigma_start",
+            "centre_sigma_start",
             "spread_tolerance",
             "cg_tolerance",
         )
@@ -186,6 +196,8 @@ class BundleResult:
         Standard deviation of the prior on phi, radians per frame: as given, or as estimated.
     velocity_sigma : float
         Standard deviation of the prior on the velocity, baselines per frame; for constant-motion only.
+    focal_sigma, centre_sigma : float
+        Standard deviations of the variation of log f, and of the principal point in focal lengths; 0 where none varies.
     covariances : (m, nb, nb) array
         Covariance of each photo's unknowns, the rest being free: rotation (left, radians, camera frame), centre, phi,
         velocity, as far as the model has them (nb = 6, 9 or 12). The gauge is that of the solve: the photo with the
@@ -205,6 +217,8 @@ class BundleResult:
     sigma_px: float
     phi_sigma: float
     velocity_sigma: float
+    focal_sigma: float
+    centre_sigma: float
     covariances: NDArray[np.float64]
     sigma_intrinsics: tuple[dict[str, float], ...]
     rms_px: float

@@ -28,22 +28,27 @@ class Posterior:
 
     def __init__(self, result: BundleResult, options: BundleOptions | None = None) -> None:
         rec = result.reconstruction
-        spreads = Spreads(result.phi_sigma, max(result.velocity_sigma * rec.baseline, 1e-300))
+        spreads = Spreads(
+            result.phi_sigma, max(result.velocity_sigma * rec.baseline, 1e-300),
+            max(result.focal_sigma, 1e-300), max(result.centre_sigma, 1e-300),
+        )  # fmt: skip
         plain = replace(options or BundleOptions(), loss="squared")
         self._problem = BundleProblem(rec, rec.shutter_model, plain, result.sigma_px, spreads)
         self._state = self._problem.initial_state()
         self._covariance = self._problem.linearize(self._state).covariance()
+        self._own = 3 * plain.varying
 
     def of_photos(self, vectors: Array) -> Array:
         """Covariance of the photos' unknowns times vectors (k, m, nb), as in `BundleResult.covariances`."""
-        return self._covariance(vectors)
+        return self._covariance(np.pad(vectors, [(0, 0), (0, 0), (0, self._own)]))[:, :, : vectors.shape[2]]
 
     def of_points(self, weights: Array) -> tuple[float, Array]:
         """Variance of a linear function of the points, `sum(weights * points_w)` with weights (n, 3).
 
         And its covariance (m, nb) with the photos' unknowns. NaN where the system cannot be factored.
         """
-        return self._problem.variance_of_points(self._state, weights)
+        variance, with_photos = self._problem.variance_of_points(self._state, weights)
+        return variance, with_photos[:, : with_photos.shape[1] - self._own]
 
 
 def gauge_directions(result: BundleResult) -> Array:

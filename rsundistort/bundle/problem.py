@@ -15,7 +15,7 @@ from .._kernels import projection
 from ..errors import InputError
 from ..model import Camera, Reconstruction, check_shutter_model
 from .elimination import Elimination
-from .intrinsics import INTRINSICS, check_lenses, deviation, moved_camera
+from .intrinsics import INTRINSICS, check_lenses, deviation, moved_camera, prior_weight
 from .lengths import LengthResiduals
 from .normal_equations import Border, NormalEquations, Step
 from .options import LOSSES, BundleOptions
@@ -26,22 +26,34 @@ __all__ = ["BundleProblem", "Spreads", "State", "reprojection_residuals"]
 
 @dataclass(frozen=True)
 class State:
-    """What a step changes: cameras, poses, shutter motion and points, as in `Reconstruction`."""
+    """What a step changes: cameras, poses, shutter motion, variation and points, as in `Reconstruction`."""
 
     cameras: tuple[Camera, ...]
     R_cw: NDArray[np.float64]
     center_w: NDArray[np.float64]
     phi: NDArray[np.float64]
     velocity: NDArray[np.float64]
+    variation: NDArray[np.float64]
     points_w: NDArray[np.float64]
 
 
-def _camera_arrays(camera_idx: NDArray[np.int64], cameras: Sequence[Camera]) -> tuple[NDArray[Any], ...]:
-    """Photo-to-camera indices, clock axes, signs, intrinsics and lenses as the kernels take them."""
+def _camera_arrays(
+    camera_idx: NDArray[np.int64], cameras: Sequence[Camera], variation: NDArray[np.float64]
+) -> tuple[NDArray[Any], ...]:
+    """Photo-to-camera indices, clock axes, signs, intrinsics and lenses as the kernels take them.
+
+    Of cameras that vary from photo to photo (m, 3) each photo has its own.
+    """
     intr, lens, axis, sign = zip(*(camera.kernel_args for camera in cameras), strict=True)
     if any(each.ndim == 2 for each in lens):  # among fisheyes a pinhole lens is one that is none
         lens = tuple(each if each.ndim == 2 else np.append(each, 0.0)[None] for each in lens)
-    return camera_idx, np.array(axis), np.array(sign), np.array(intr), np.array(lens)
+    arrays = np.array(axis), np.array(sign), np.array(intr), np.array(lens)
+    if not variation.any():
+        return camera_idx, *arrays
+    axes, signs, intrs, lenses = (each[camera_idx] for each in arrays)
+    intrs[:, 2:] += intrs[:, :2] * variation[:, 1:]
+    intrs[:, :2] *= np.exp(variation[:, :1])
+    return np.arange(len(camera_idx)), axes, signs, intrs, lenses
 
 
 def reprojection_residuals(
@@ -61,7 +73,7 @@ def reprojection_residuals(
     res = np.empty((len(obs), 2))
     valid = np.empty(len(obs), bool)
     projection.residuals(
-        model, *_camera_arrays(reconstruction.camera_idx, reconstruction.cameras),
+        model, *_camera_arrays(reconstruction.camera_idx, reconstruction.cameras, reconstruction.variation),
         reconstruction.R_cw, reconstruction.center_w, reconstruction.phi, reconstruction.velocity,
         reconstruction.points_w, obs.frame_idx, obs.point_idx, obs.xy_raw, res, valid,
     )  # fmt: skip
@@ -70,7 +82,7 @@ def reprojection_residuals(
 
 @dataclass(frozen=True)
 class Spreads:
-    """Standard deviations of the zero-mean priors on the shutter's motion.
+    """Standard deviations of the zero-mean priors on what each photo has of its own.
 
     Attributes
     ----------
@@ -78,24 +90,32 @@ class Spreads:
         Radians per frame.
     velocity : float
         World units per frame.
+    focal : float
+        Of the variation of log f.
+    centre : float
+        Of the variation of the principal point, focal lengths.
     """
 
     phi: float
     velocity: float
+    focal: float = 1.0
+    centre: float = 1.0
 
 
 # Observations that a thread takes at a time, and whose costs are summed together.
 _CHUNK = 1024
 
-# Unknowns of a photo: pose, phi, velocity.
+# Unknowns of a photo: pose, phi, velocity; behind them the variation of its intrinsics, if any.
 _BLOCK = {"global": 6, "constant-motion": 12}
+_VARIATION = np.array([INTRINSICS[name] for name in ("f", "cx", "cy")], np.int64)
 
 
 class BundleProblem:
     """Robust reprojection errors and the priors on phi and velocity, with the gauge and the anchors held.
 
     Unknowns of a photo: rotation increment (left, radians), centre (world units), phi (radians per unit of the clock)
-    unless the shutter is global, and velocity (world units per unit of the clock) if the motion is whole. Unknowns of a
+    unless the shutter is global, velocity (world units per unit of the clock) if the motion is whole, and the variation
+    of its intrinsics (log f, cx / fx, cy / fy) if the options say that they vary. Unknowns of a
     camera: the intrinsics that the options name, as in `moved_camera`. Seven unknowns are held for the gauge: the pose
     of the photo with the most observations, and one coordinate of the centre farthest from it.
     """
@@ -123,6 +143,7 @@ class BundleProblem:
         self._shutter_model = shutter_model
         self._options = options
         self._block = _BLOCK.get(shutter_model, 9)
+        self._full = self._block + 3 * options.varying
         self._structure = Structure.from_observations(
             obs.frame_idx, obs.point_idx, reconstruction.num_images, reconstruction.num_points
         )
@@ -137,6 +158,8 @@ class BundleProblem:
         span = reconstruction.frame_span()[:, None]
         weight = np.hstack([np.repeat((span / s) ** 2, 3, axis=1) for s in (spreads.phi, spreads.velocity)])
         self._motion_weight = weight[:, : self._block - 6]
+        varied = np.array([spreads.focal, spreads.centre, spreads.centre])[: 3 * options.varying] ** -2.0
+        self._variation_weight = np.tile(varied, (len(span), 1))
         self._lengths = LengthResiduals(self._start, options.lengths)
         self._known, self._known_weight = self._known_motions(span)
         self._free = self._free_unknowns()
@@ -164,7 +187,7 @@ class BundleProblem:
     def _free_unknowns(self) -> NDArray[np.bool_]:
         """(m, nb) unknowns that are solved for."""
         rec = self._start
-        free = np.ones((rec.num_images, self._block), bool)
+        free = np.ones((rec.num_images, self._full), bool)
         reference = int(np.argmax(np.bincount(self._structure.frame_idx, minlength=rec.num_images)))
         offset = np.abs(rec.center_w - rec.center_w[reference])
         far, axis = np.unravel_index(np.argmax(offset), offset.shape)
@@ -181,10 +204,11 @@ class BundleProblem:
         """The reconstruction's values; zero for held components of the motion and those that the model lacks."""
         motion = np.zeros((self._start.num_images, 6))
         found = np.hstack([self._start.phi, self._start.velocity])[:, : self._block - 6]
-        motion[:, : self._block - 6] = np.where(self._free[:, 6:], found, 0.0)
+        motion[:, : self._block - 6] = np.where(self._free[:, 6 : self._block], found, 0.0)
         start = self._start
+        variation = start.variation if self._options.varying else np.zeros_like(start.variation)
         return State(
-            tuple(start.cameras), start.R_cw, start.center_w, motion[:, :3], motion[:, 3:], start.points_w
+            tuple(start.cameras), start.R_cw, start.center_w, motion[:, :3], motion[:, 3:], variation, start.points_w
         )  # fmt: skip
 
     def covariances(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -212,6 +236,7 @@ class BundleProblem:
             center_w=state.center_w,
             phi=state.phi,
             velocity=state.velocity,
+            variation=state.variation,
             points_w=points_w,
             shutter_model=self._shutter_model,
         )
@@ -219,7 +244,7 @@ class BundleProblem:
     def _kernel_args(self, state: State) -> tuple[Any, ...]:
         s = self._structure
         return (
-            self._model, *_camera_arrays(self._start.camera_idx, state.cameras),
+            self._model, *_camera_arrays(self._start.camera_idx, state.cameras, state.variation),
             state.R_cw, state.center_w, state.phi, state.velocity, state.points_w,
             s.frame_idx, s.point_idx, self._xy, self._sigma_px, LOSSES[self._options.loss], self._options.loss_scale,
         )  # fmt: skip
@@ -232,31 +257,35 @@ class BundleProblem:
         motion = self._motion(state)
         known = self._known_weight * (motion - self._known) ** 2
         lengths = float(np.sum(self._lengths.residuals(state.points_w) ** 2))
-        cameras = float(np.sum(self._camera_priors(state)[0] ** 2))
-        return 0.5 * (float(np.sum(self._motion_weight * motion**2 + known)) + lengths + cameras)
+        varied = float(np.sum(self._variation_weight * state.variation[:, : 3 * self._options.varying] ** 2))
+        own = float(np.sum(self._motion_weight * motion**2 + known)) + varied
+        return 0.5 * (own + lengths) + self._camera_priors(state)[2]
 
-    def _camera_priors(self, state: State) -> NDArray[np.float64]:
-        """(2, cameras, nc) residuals of the prior on the intrinsics, and their derivatives."""
-        result = np.zeros((2, len(state.cameras), len(self._refine)))
+    def _camera_priors(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+        """(cameras, nc) weighted residuals of the prior on the intrinsics, their derivatives, and the cost."""
+        apart, slope = np.zeros((2, len(state.cameras), len(self._refine)))
         guessed = self._options.guessed
         if guessed is not None and self._refine:
-            sigma = np.array([guessed.sigma.get(name, np.inf) for name in self._refine])
-            for k, (camera, guess) in enumerate(zip(state.cameras, guessed.cameras, strict=True)):
-                result[:, k] = np.array(deviation(camera, guess, self._refine)) / sigma
-        return result
+            for k, (camera, guess, of) in enumerate(zip(state.cameras, guessed.cameras, guessed.sigmas, strict=True)):
+                sigma = np.array([of.get(name, np.inf) for name in self._refine])
+                apart[k], slope[k] = np.array(deviation(camera, guess, self._refine)) / sigma
+        cost, weight = prior_weight(apart**2)
+        return apart * np.sqrt(weight), slope * np.sqrt(weight), float(cost.sum())
 
     def _jacobians(
         self, state: State, spent: NormalEquations | None = None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
         """Weighted residuals (o, 2), Jacobians of the photos (o, 2, nb), and the cost without priors."""
         o = len(self._xy)
-        res, J_frame = spent.blocks if spent else (np.empty((o, 2)), np.empty((o, 2, self._block)))
+        res, J_frame = spent.blocks if spent else (np.empty((o, 2)), np.empty((o, 2, self._full)))
         if state is not self._clock_of:
             self._clock.fill(np.nan)
             self._clock_of = None
         cost = np.empty(-(-o // _CHUNK))
         with numba.parallel_chunksize(1):
             projection.residual_blocks(*self._kernel_args(state), self._clock, res, J_frame, cost)
+        if self._options.varying:
+            J_frame[:, :, self._block :] = self._variation_jacobians(state)
         return res, J_frame, float(cost.sum())
 
     def _blocks(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
@@ -267,11 +296,14 @@ class BundleProblem:
     def linearize(self, state: State, spent: NormalEquations | None = None) -> NormalEquations:
         """Normal equations and cost at a state, written over those of `spent`: fresh memory takes time to get."""
         res, J_frame, cost = self._jacobians(state, spent)
-        prior_diag = np.zeros((len(state.phi), self._block))
+        prior_diag = np.zeros((len(state.phi), self._full))
         prior_gradient = np.zeros_like(prior_diag)
         motion = self._motion(state)
-        prior_diag[:, 6:] = self._motion_weight + self._known_weight
-        prior_gradient[:, 6:] = self._motion_weight * motion + self._known_weight * (motion - self._known)
+        moving, own = np.s_[:, 6 : self._block], np.s_[:, self._block :]
+        prior_diag[moving] = self._motion_weight + self._known_weight
+        prior_gradient[moving] = self._motion_weight * motion + self._known_weight * (motion - self._known)
+        prior_diag[own] = self._variation_weight
+        prior_gradient[own] = self._variation_weight * state.variation[:, : 3 * self._options.varying]
         total = cost + self._prior_cost(state)
         prior = self._camera_priors(state)
         border = Border(self._camera_jacobians(state), self._start.camera_idx, prior[1] ** 2, prior[1] * prior[0])
@@ -283,6 +315,25 @@ class BundleProblem:
         J = np.empty((len(self._xy), 2, len(self._refine)))
         if self._refine:
             projection.intrinsic_blocks(*self._kernel_args(state), self._refine_codes, J)
+        if self._refine and self._options.varying:
+            own = state.variation[self._structure.frame_idx]
+            by_shift = self._variation_jacobians(state)[:, :, 1:]
+            for k, name in enumerate(self._refine):
+                if name in ("cx", "cy"):
+                    J[:, :, k] = by_shift[:, :, int(name == "cy")]
+                # shifts are in focal lengths
+                if name in ("f", "fx"):
+                    J[:, :, k] += by_shift[:, :, 0] * own[:, 1, None]
+                if name in ("f", "fy"):
+                    J[:, :, k] += by_shift[:, :, 1] * own[:, 2, None]
+        return J
+
+    def _variation_jacobians(self, state: State) -> NDArray[np.float64]:
+        """Weighted Jacobians (o, 2, 3) of the variation of each photo's intrinsics."""
+        J = np.empty((len(self._xy), 2, 3))
+        projection.intrinsic_blocks(*self._kernel_args(state), _VARIATION, J)
+        # a photo's principal point moves by focal lengths of its camera, not by its own
+        J[:, :, 1:] *= np.exp(-state.variation[self._structure.frame_idx, 0])[:, None, None]
         return J
 
     def cost(self, state: State) -> float:
@@ -319,14 +370,16 @@ class BundleProblem:
             Rotation.from_rotvec(frame[:, :3]).as_matrix() @ state.R_cw,
             state.center_w + frame[:, 3:6],
             state.phi + frame[:, 6:9] if self._block > 6 else state.phi,
-            state.velocity + frame[:, 9:] if self._block > 9 else state.velocity,
+            state.velocity + frame[:, 9:12] if self._block > 9 else state.velocity,
+            state.variation + frame[:, self._block :] if self._options.varying else state.variation,
             state.points_w + point,
         )
 
     def step_size(self, state: State, step: Step) -> float:
         """Largest change: angles in radians, lengths in sizes of the scene, intrinsics in their own units."""
         frame, point, intrinsics = step
-        angles = np.abs(frame[:, [0, 1, 2, *range(6, min(self._block, 9))]]).max()
+        own = range(self._block, self._full)
+        angles = np.abs(frame[:, [0, 1, 2, *range(6, min(self._block, 9)), *own]]).max()
         # a far point moves a lot along its ray without moving in any photo: its depth is its own yardstick
         far = state.points_w - state.center_w.mean(0)
         depth = np.maximum(np.sqrt(np.einsum("na,na->n", far, far)), self._size)

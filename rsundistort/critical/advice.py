@@ -137,6 +137,7 @@ def _with_view(
         center_w=np.concatenate([rec.center_w, center_w[None]]),
         phi=np.concatenate([rec.phi, np.zeros((1, 3))]),
         velocity=np.concatenate([rec.velocity, np.zeros((1, 3))]),
+        variation=np.concatenate([rec.variation, rec.variation[like][None]]),
         observations=Observations(
             np.concatenate([obs.frame_idx, np.full(len(mine), rec.num_images)]),
             np.concatenate([obs.point_idx, obs.point_idx[mine]]),

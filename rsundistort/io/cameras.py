@@ -17,26 +17,31 @@ from .calibrations import camera_from_calibration, is_calibration, parse_xml, pa
 from .colmap import read_colmap_cameras
 
 __all__ = [
+    "SIGMA_NAMES",
     "CameraFile",
     "camera_from_json",
     "camera_to_json",
     "check_camera_fits",
+    "check_sigma",
     "parse_camera",
     "read_camera_file",
 ]
 
+#: Intrinsics whose standard deviations a file may tell.
+SIGMA_NAMES = ("f", "fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
+
 _REQUIRED = {"width", "height", "K"}
-_KNOWN = _REQUIRED | {"dist", "readout", "lens"}
+_KNOWN = _REQUIRED | {"dist", "readout", "lens", "sigma"}
 
 
 def camera_from_json(value: Any, where: str) -> Camera:
     """A camera of a parsed `camera.json`; `where` names it in errors."""
     if not isinstance(value, dict):
-        raise FormatError(f"{where}: expected an object with width, height, K, dist, readout, lens")
+        raise FormatError(f"{where}: expected an object with width, height, K, dist, readout, lens, sigma")
     missing, unknown = _REQUIRED - value.keys(), value.keys() - _KNOWN
     if missing or unknown:
         what = f"lacks {', '.join(sorted(missing))}" if missing else f"has unknown {', '.join(sorted(unknown))}"
-        raise FormatError(f"{where} {what}; expected width, height, K, dist, readout, lens")
+        raise FormatError(f"{where} {what}; expected width, height, K, dist, readout, lens, sigma")
     try:
         return Camera(
             value["width"],
@@ -48,6 +53,26 @@ def camera_from_json(value: Any, where: str) -> Camera:
         )
     except (TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"{where}: {error}") from error
+
+
+def sigma_from_json(value: Any, where: str) -> dict[str, float]:
+    """Standard deviations by intrinsic, in pixels or of the coefficients, of a parsed `camera.json`; {} if none told."""
+    sigma = value.get("sigma") or {}
+    if not isinstance(sigma, dict):
+        raise FormatError(f'{where}: sigma is {sigma!r}, expected an object such as {{"f": 1.5, "k1": 0.003}}')
+    return check_sigma(sigma, where)
+
+
+def check_sigma(sigma: Mapping[str, Any], where: str) -> dict[str, float]:
+    """Standard deviations of intrinsics by name, refused where one is of no intrinsic or no positive number."""
+    for name, each in sigma.items():
+        if name not in SIGMA_NAMES:
+            raise FormatError(f"{where}: sigma of {name!r}, expected some of {', '.join(SIGMA_NAMES)}")
+        if isinstance(each, bool) or not isinstance(each, (int, float)) or not 0 < each < np.inf:
+            raise FormatError(f"{where}: sigma of {name} is {each!r}, expected a positive number")
+    if "f" in sigma and {"fx", "fy"} & sigma.keys():
+        raise FormatError(f"{where}: sigma of f and of fx or fy; give one or the other")
+    return {name: float(each) for name, each in sigma.items()}
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
@@ -78,12 +103,15 @@ class CameraFile:
         The file and its kind, for people.
     readout_told : set of id
         Cameras whose file says which way they are read out; of the others "top-to-bottom" is but a guess.
+    sigma : dict of id to standard deviations
+        Where the file says how well a camera is known: by intrinsic, in pixels or of the coefficients.
     """
 
     cameras: Mapping[str, Camera]
     camera_of_image: Mapping[str, str] = field(default_factory=dict)
     source: str = ""
     readout_told: frozenset[str] = frozenset()
+    sigma: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
 _KINDS = (
@@ -210,6 +238,7 @@ def _read_folder(folder: Path, width: int, height: int) -> CameraFile:
         raise FileError(f"{folder} holds no camera files; expected {_KINDS}")
     file_of: dict[str, Path] = {}
     cameras = {}
+    sigma = {}
     told = set()
     for file in files:
         other = file_of.setdefault(file.stem, file)
@@ -219,10 +248,11 @@ def _read_folder(folder: Path, width: int, height: int) -> CameraFile:
         if len(found.cameras) != 1:
             raise InputError(f"{file} holds {len(found.cameras)} cameras; in a folder each file holds one")
         (cameras[file.stem],) = found.cameras.values()
+        sigma[file.stem] = next(iter(found.sigma.values()), {})
         if found.readout_told:
             told.add(file.stem)
     source = f"{folder} ({len(cameras)} camera file{'s' * (len(cameras) > 1)})"
-    return CameraFile(cameras, source=source, readout_told=frozenset(told))
+    return CameraFile(cameras, source=source, readout_told=frozenset(told), sigma=sigma)
 
 
 def _read_file(path: Path, width: int, height: int) -> CameraFile:
@@ -253,7 +283,8 @@ def _read_file(path: Path, width: int, height: int) -> CameraFile:
     if "cameras" in tree:
         return _several_of_json(tree, path)
     told = frozenset({_ONLY} if "readout" in tree else ())
-    return CameraFile({_ONLY: camera_from_json(tree, str(path))}, source=str(path), readout_told=told)
+    camera, sigma = camera_from_json(tree, str(path)), sigma_from_json(tree, str(path))
+    return CameraFile({_ONLY: camera}, source=str(path), readout_told=told, sigma={_ONLY: sigma})
 
 
 def _parse(content: str) -> tuple[Any, str]:
@@ -286,7 +317,8 @@ def _several_of_json(value: dict[str, Any], path: Path) -> CameraFile:
         if not isinstance(key, str) or key not in cameras:
             raise FormatError(f"{path}: photo {name!r} has camera {key!r}, which is not among its cameras")
     found = {key: camera_from_json(each, f"{path}: camera {key}") for key, each in cameras.items()}
-    return CameraFile(found, images, str(path), frozenset(key for key in found if "readout" in cameras[key]))
+    sigma = {key: sigma_from_json(each, f"{path}: camera {key}") for key, each in cameras.items()}
+    return CameraFile(found, images, str(path), frozenset(key for key in found if "readout" in cameras[key]), sigma)
 
 
 def _is_colmap_text(content: str) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -118,6 +118,13 @@ class Camera:
 
     def __hash__(self) -> int:
         return hash((self.width, self.height, self.readout, self.lens, self.K.tobytes(), self.dist.tobytes()))
+
+    def varied(self, log_f: float, cx: float, cy: float) -> Camera:
+        """The camera with its focal lengths times exp(log_f), its principal point shifted by cx fx and cy fy."""
+        K = np.array(self.K)
+        K[:2, 2] += [cx * K[0, 0], cy * K[1, 1]]
+        K[[0, 1], [0, 1]] *= np.exp(log_f)
+        return replace(self, K=K)
 
     @property
     def frame_span(self) -> float:

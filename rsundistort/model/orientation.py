@@ -224,5 +224,8 @@ def turn_reconstruction(reconstruction: Reconstruction, orientations: Mapping[st
         camera_idx=np.array([place[pair] for pair in pairs], np.int64),
         R_cw=matrix @ rec.R_cw,
         phi=np.einsum("mij,mj->mi", matrix, rec.phi),
+        variation=np.concatenate(
+            [rec.variation[:, :1], np.einsum("mij,mj->mi", matrix[:, :2, :2], rec.variation[:, 1:])], axis=1
+        ),
         observations=replace(obs, xy_raw=xy),
     )

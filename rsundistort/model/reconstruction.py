@@ -82,6 +82,9 @@ class Reconstruction:
         Motion during readout per unit of the clock (`RowMotion`); zero when left out.
     shutter_model : str
         Model under which phi and velocity were solved.
+    variation : (m, 3) array
+        How the intrinsics of each photo differ from its camera's, where focusing or a stabiliser moved the lens: log f,
+        and the principal point in focal lengths (`Camera.varied`); zero when left out.
     """
 
     cameras: Sequence[Camera]
@@ -94,6 +97,7 @@ class Reconstruction:
     phi: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     shutter_model: str = "global"
+    variation: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         m = len(self.image_names)
@@ -109,7 +113,7 @@ class Reconstruction:
             "center_w": check_finite(self.center_w, (m, 3), "center_w"),
             "points_w": points_w,
         }
-        for name in ("phi", "velocity"):
+        for name in ("phi", "velocity", "variation"):
             value = getattr(self, name)
             fields[name] = check_finite(value if np.size(value) else np.zeros((m, 3)), (m, 3), name)
         for name, value in fields.items():
@@ -131,8 +135,16 @@ class Reconstruction:
         return len(self.points_w)
 
     def camera(self, image: int) -> Camera:
-        """The camera of a photo."""
-        return self.cameras[int(self.camera_idx[image])]
+        """The camera of a photo, as it was when that was taken."""
+        camera = self.cameras[int(self.camera_idx[image])]
+        return camera.varied(*self.variation[image].tolist()) if self.variation[image].any() else camera
+
+    @property
+    def cameras_of_photos(self) -> tuple[tuple[Camera, ...], NDArray[np.int64]]:
+        """Cameras with all that is known of them, and that of each photo (m,): shared, or one a photo if they vary."""
+        if not self.variation.any():
+            return tuple(self.cameras), self.camera_idx
+        return tuple(self.camera(i) for i in range(self.num_images)), np.arange(self.num_images)
 
     def motion(self, image: int) -> RowMotion:
         """The motion of a photo during its readout."""
@@ -208,6 +220,7 @@ class Reconstruction:
                 center_w=rec.center_w[keep],
                 phi=rec.phi[keep],
                 velocity=rec.velocity[keep],
+                variation=rec.variation[keep],
                 observations=replace(obs, frame_idx=(np.cumsum(keep) - 1)[obs.frame_idx]),
             )
             rec = rec.with_points(np.ones(len(rec.observations), bool))

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..bundle import BundleOptions, GuessedCameras, deviation, pixels_of
 from ..errors import InputError
 from ..io import (
     CameraFile,
@@ -22,7 +23,17 @@ from ..io import (
 )
 from ..model import READOUTS, Camera
 
-__all__ = ["PhotoCameras", "camera_file_of", "check_readouts", "find_cameras"]
+__all__ = ["GIVEN_SIGMA", "GUESS_SIGMA", "PhotoCameras", "camera_file_of", "check_readouts", "find_cameras"]
+
+#: How far EXIF may be off (relative f, principal point in focal lengths, lens coefficients): equivalent focal lengths
+#: are rounded to millimetres, focusing and stabilising crop a little, phones hardly distort.
+GUESS_SIGMA = {
+    "f": 0.05, "cx": 0.01, "cy": 0.01, "k1": 0.2, "k2": 0.4, "k3": 0.4, "k4": 0.4, "p1": 2e-3, "p2": 2e-3
+}  # fmt: skip
+#: How far a calibration may be off: published ones of good cameras were by half a pixel.
+GIVEN_SIGMA = {
+    "f": 1e-3, "cx": 4e-4, "cy": 4e-4, "k1": 3e-3, "k2": 1e-2, "k3": 1e-2, "k4": 1e-2, "p1": 3e-4, "p2": 3e-4
+}  # fmt: skip
 
 #: What `camera.json` files are called where none is named.
 _BESIDE = ("camera.json", "cameras.json")
@@ -48,6 +59,9 @@ class PhotoCameras:
         Where they come from, for people.
     notes : sequence of str
         What was guessed, for people.
+    sigma : sequence of mapping of intrinsic to float
+        Standard deviations of each camera that were told, in the units of `GuessedCameras`; others are the defaults of
+        `known_to`.
     """
 
     cameras: Sequence[Camera]
@@ -57,10 +71,53 @@ class PhotoCameras:
     readout_told: tuple[bool, ...]
     source: str
     notes: Sequence[str] = ()
+    sigma: Sequence[Mapping[str, float]] = ()
 
     def of(self, image: int) -> Camera:
         """The camera of a photo."""
         return self.cameras[int(self.camera_idx[image])]
+
+    @property
+    def intrinsics(self) -> tuple[str, ...]:
+        """What is always solved for with the rest, under the prior of `known_to`."""
+        lenses = {camera.lens for camera in self.cameras}
+        focal = ("fx", "fy") if any({"fx", "fy"} & each.keys() for each in self.sigma) else ("f",)
+        names = (*focal, "cx", "cy", "k1", "k2", "k3")
+        return (*names, *(["k4"] if "fisheye" in lenses else []), *(["p1", "p2"] if "pinhole" in lenses else []))
+
+    def known_to(self, loose: bool) -> GuessedCameras:
+        """How well the cameras are known before the photos are looked at: as told, else as calibrations or guesses."""
+        default = GUESS_SIGMA if loose or not self.calibrated else GIVEN_SIGMA
+        sigmas = []
+        for told in self.sigma or [{}] * len(self.cameras):
+            sigma = {**default, "fx": default["f"], "fy": default["f"], **told}
+            if "f" in told:
+                sigma |= {"fx": told["f"], "fy": told["f"]}
+            sigmas.append(sigma)
+        return GuessedCameras(self.cameras, sigmas)
+
+    def with_sigma(self, sigma: Mapping[str, float]) -> PhotoCameras:
+        """The same, all cameras known to these standard deviations, in pixels or of the coefficients."""
+        told = self.sigma or [{}] * len(self.cameras)
+        return replace(
+            self, sigma=[{**old, **_relative(sigma, c)} for old, c in zip(told, self.cameras, strict=True)]
+        )  # fmt: skip
+
+    def contradicted(self, cameras: Sequence[Camera], options: BundleOptions) -> list[str]:
+        """What a calibration says and the photos do not, for people; `cameras` are those found with these options."""
+        if options.guessed is None or not self.calibrated:
+            return []
+        said = []
+        for k, name, times in options.guessed.surprises(cameras):
+            if name not in options.refine:
+                continue
+            (apart,), _ = deviation(cameras[k], self.cameras[k], [name])
+            off = f"{apart * pixels_of(cameras[k], [name])[0]:+.3g}{' px' if name[0] in 'fc' else ''}"
+            said.append(
+                f"{self.source}: {name} is off by {off} by these photos ({times:.0f} standard deviations), which were "
+                "believed; calibrate again, or say --refine none"
+            )
+        return said
 
 
 def check_readouts(readout: str | Mapping[str, str] | None) -> dict[str, str]:
@@ -115,10 +172,10 @@ def find_cameras(
         keys = _keys_in(file, camera, names, sizes, groups)
         known = dict(file.cameras)
         calibrated, source, notes = True, file.source, list[str]()
-        in_file = file.readout_told
+        in_file, sigma_of = file.readout_told, file.sigma
     else:
         known, keys, notes = _from_exif(folder, names, sizes, facts, groups)
-        calibrated, source, in_file = False, "EXIF, refined", frozenset[str]()
+        calibrated, source, in_file, sigma_of = False, "EXIF, refined", frozenset[str](), {}
     labels = list(dict.fromkeys(keys))
     told = check_readouts(readout)
     unknown = sorted(told.keys() - {"", *labels})
@@ -138,7 +195,13 @@ def find_cameras(
         tuple(label in told or "" in told or label in in_file for label in labels),
         source,
         tuple(note for note in notes if not told),
+        [_relative(sigma_of.get(label, {}), known[label]) for label in labels],
     )
+
+
+def _relative(sigma: Mapping[str, float], camera: Camera) -> dict[str, float]:
+    """Standard deviations in pixels in the units of `GuessedCameras`."""
+    return {name: value / float(pixels_of(camera, [name])[0]) for name, value in sigma.items()}
 
 
 def _keys_in(

@@ -290,7 +290,13 @@ def solve_tracks(
         log.end("critical motion", remedy=mended.name, sigma_log_k=mended.after.sigma_log_k)
     log.begin("comparison with a global shutter")
     plain = BundleOptions(
-        outlier_rounds=0, loss="squared", cost_tolerance=1e-4, sigma_px=result.sigma_px, refine=options.refine
+        outlier_rounds=0,
+        loss="squared",
+        cost_tolerance=1e-4,
+        sigma_px=result.sigma_px,
+        refine=options.refine,
+        guessed=options.guessed,
+        varying=options.varying,
     )
     global_result = bundle_adjust(result.reconstruction, "global", plain)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..bundle import BundleOptions, GuessedCameras, KnownLength
+from ..bundle import BundleOptions, KnownLength
 from ..critical import with_remedy
 from ..errors import InputError
+from ..io.cameras import check_sigma
 from ..model import READOUTS, Reconstruction, check_shutter_model
 from ..sfm import DETECTION_MEGAPIXELS
 from .cameras import PhotoCameras, check_readouts
@@ -19,12 +20,7 @@ from .gyro import GyroOptions
 from .pairing import MATCHINGS
 from .photo import RectifyOptions
 
-__all__ = ["GUESSED", "GUESS_SIGMA", "RunOptions", "SolveOptions"]
-
-#: What EXIF does not know, and a set of photos tells; and how far it may be off (relative f, lens coefficients):
-# equivalent focal lengths are rounded to millimetres, focusing and stabilising crop a little, phones hardly distort.
-GUESSED = ("f", "cx", "cy", "k1", "k2", "k3", "p1", "p2")
-GUESS_SIGMA = {"f": 0.05, "cx": 0.01, "cy": 0.01, "k1": 0.2, "k2": 0.4, "k3": 0.4, "p1": 2e-3, "p2": 2e-3}
+__all__ = ["RunOptions", "SolveOptions"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,8 +42,11 @@ class SolveOptions(RectifyOptions):
     jobs : int
         Threads; 0 for all cores.
     refine : tuple of str, optional
-        Intrinsics that are solved for with the rest, as in `BundleOptions`; by default none where the camera is given,
-        f, cx, cy, k1, k2, k3, p1 and p2 where EXIF had to guess it.
+        Intrinsics that are solved for with the rest, as in `BundleOptions`, under a loose prior; () for none. By
+        default all, under a prior as tight as the camera is known: a calibration, or EXIF's guess.
+    camera_sigma : mapping of intrinsic to float
+        Standard deviations of the cameras, in pixels or of the coefficients; else those of the file, else what
+        calibrations, or EXIF, usually are off by.
     still : mapping of photo name to float
         Photos known not to have moved: phi1 is held at zero in them (the paper's remedy), or, where the number is
         positive, near zero with that standard deviation, radians per frame.
@@ -76,6 +75,7 @@ class SolveOptions(RectifyOptions):
     seed: int = 0
     jobs: int = 0
     refine: tuple[str, ...] | None = None
+    camera_sigma: Mapping[str, float] = field(default_factory=dict)
     still: Mapping[str, float] = field(default_factory=dict)
     known: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
     lengths: Sequence[KnownLength] = ()
@@ -93,6 +93,7 @@ class SolveOptions(RectifyOptions):
             check_shutter_model(self.shutter_model)
         check_readouts(self.readout)
         check_depth(self.depth)
+        check_sigma(self.camera_sigma, "camera_sigma")
         with_remedy(self.bundle_options(), self.remedy)
         if self.jobs < 0:
             raise InputError(f"jobs={self.jobs!r}, expected 0 or more")
@@ -127,11 +128,12 @@ class SolveOptions(RectifyOptions):
         """Options of the adjustments of a reconstruction, by its readout directions and by what is to be refined."""
         rec = reconstruction
         options = self.bundle_options({name: rec.camera(i).readout for i, name in enumerate(rec.image_names)})
-        refine = self.refine if self.refine is not None else () if cameras.calibrated else GUESSED
-        if not refine:
+        if self.refine == ():
             return options
         # a calibration that is to be refined is not trusted: no better than a guess, but no worse
-        return replace(options, refine=refine, guessed=GuessedCameras(cameras.cameras, GUESS_SIGMA))
+        cameras = cameras.with_sigma(self.camera_sigma)
+        known = cameras.known_to(loose=self.refine is not None)
+        return replace(options, refine=self.refine or cameras.intrinsics, guessed=known)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -120,9 +120,14 @@ def database_camera(camera: Camera, calibrated: bool, camera_id: int) -> Any:
     return result
 
 
-def ideal_keypoints(features: Features, camera: Camera, motion: RowMotion, model: str) -> NDArray[np.float32]:
-    """Keypoints without shutter in the camera of the database, COLMAP's centres; where none exists, far outside."""
-    ideal, valid = unproject_points(features.xy_raw, camera, motion, model)
+def ideal_keypoints(
+    features: Features, camera: Camera, motion: RowMotion, model: str, own: Camera | None = None
+) -> NDArray[np.float32]:
+    """Keypoints without shutter in the camera of the database, COLMAP's centres; where none exists, far outside.
+
+    `own` is the camera as it was when the photo was taken, if it differs.
+    """
+    ideal, valid = unproject_points(features.xy_raw, own or camera, motion, model)
     if camera.lens == "fisheye":
         rays = np.column_stack([np.where(valid[:, None], ideal, 0.0), np.ones(len(ideal))])
         xy = project_points(rays, camera, None, "global")[0]
@@ -227,7 +232,7 @@ def from_pycolmap(model: Any, matched: MatchedPhotos, posed: Reconstruction | No
         of = [index_of[name] for name in names]
         return Reconstruction(
             posed.cameras, names, posed.camera_idx[of], posed.R_cw[of], posed.center_w[of], points_w, observations,
-            posed.phi[of], posed.velocity[of], posed.shutter_model,
+            posed.phi[of], posed.velocity[of], posed.shutter_model, posed.variation[of],
         )  # fmt: skip
     poses = np.array([model.images[i].cam_from_world().matrix() for i in ids])
     R_cw = poses[:, :, :3]

@@ -58,10 +58,10 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction, *, of_
             db.update_camera(database_camera(camera, True, index + 1))
         for index, found in enumerate(matched.features):
             camera = cameras[matched.camera_idx[index]]
-            model, motion = "global", RowMotion()
-            if posed[index] >= 0:
-                model, motion = reconstruction.shutter_model, reconstruction.motion(int(posed[index]))
-            db.update_keypoints(index + 1, ideal_keypoints(found, camera, motion, model))
+            model, motion, own = "global", RowMotion(), camera
+            if (i := int(posed[index])) >= 0:
+                model, motion, own = reconstruction.shutter_model, reconstruction.motion(i), reconstruction.camera(i)
+            db.update_keypoints(index + 1, ideal_keypoints(found, camera, motion, model, own))
         db.clear_two_view_geometries()
         _write_explained(db, matched, reconstruction, posed)
     empty = _posed_model(matched, reconstruction, cameras)
