@@ -469,7 +469,7 @@ def test_gradient_of_the_prior_on_intrinsics_equals_central_differences(rng):
     state = problem.initial_state()
     equations = problem.linearize(state)
     expected = gradients(equations)[2]
-    h = 1e-5
+    h = 3e-6
     for kind, index, step in unit_steps(problem, state):
         if kind == 2:
             ahead, behind = (problem.cost(problem.retract(state, scaled(step, s))) for s in (h, -h))
