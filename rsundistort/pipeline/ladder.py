@@ -275,10 +275,14 @@ def solve_tracks(
             result.reconstruction, LADDER, options, sigma_px=result.sigma_px, seed=seed,
             progress=lambda model, _: log.tell(f"choice: {model}", 0),
         )  # fmt: skip
-        if choice.shutter_model != shutter_model:
+        if choice.shutter_model != shutter_model or choice.varying:
+            options = replace(options, varying=choice.varying)
             start = replace(tracks, shutter_model=choice.shutter_model)
             result = bundle_adjust(start, choice.shutter_model, options, partial(_tell, log, "choice"))
-        log.end("choice of the model", chosen=choice.shutter_model, gain=choice.gain, num_held_out=choice.num_held_out)
+        log.end(
+            "choice of the model", chosen=choice.shutter_model, varying_lens=choice.varying, shutter=choice.shutter,
+            agreement=choice.agreement, gain=choice.gain, num_held_out=choice.num_held_out,
+        )  # fmt: skip
     mended, advice = None, []
     if result.reconstruction.shutter_model != "global":
         log.begin("critical motion")

@@ -151,7 +151,7 @@ class Outputs:
         turns: dict[str, int] = {}
         if options.apply_orientation:
             turns = {name: turn_of(orientations.get(name, 1), True)[0] for name in rec.image_names}
-        ids = ids or ModelIds.in_order(rec)
+        ids = replace(ids or ModelIds.in_order(rec), cameras=outcome.camera_ids)
         return cls(solution, rec, options, ids, turns, rgb, with_photos, times or {}, outcome.solved)
 
     def begin(self, folder: Path, log: StageLog) -> Solution:
@@ -215,7 +215,11 @@ class Outputs:
     def _diagnostics(self) -> Diagnostics | None:
         if self.solved is None:
             return None
-        return Diagnostics.of_results(self.solved.result, self.solved.global_result, self.ids.cameras)
+        shared = self.solved.result.reconstruction
+        # photos that vary have cameras of their own: what they share goes by that of the first
+        first = [int(np.argmax(shared.camera_idx == k)) for k in range(len(shared.cameras))]
+        ids = [self.ids.cameras[k] for k in (first if shared.varies else range(len(shared.cameras)))]
+        return Diagnostics.of_results(self.solved.result, self.solved.global_result, ids)
 
     def _tell_report(self, folder: Path, rgb: NDArray[np.uint8] | None, photos: str = "") -> None:
         """Keep what the report shows beyond the solution."""
