@@ -51,6 +51,8 @@ class ModelChoice:
     ----------
     shutter_model : str
         The last model that explained the held-out measurements better than the one kept before it.
+    label : str
+        Its key in what follows.
     varying : bool
         Whether the intrinsics vary from photo to photo, as `BundleOptions.varying`.
     shutter : {"found", "not-found", "not-determined"}
@@ -76,6 +78,7 @@ class ModelChoice:
     """
 
     shutter_model: str
+    label: str
     varying: bool
     shutter: str
     held_out_error: dict[str, float]
@@ -362,6 +365,7 @@ def choose_model(
     shutter = "found" if best is not plain else "not-determined" if suspected or not len(fits.held_out) else "not-found"
     return ModelChoice(
         best.model,
+        best.label,
         best.varying,
         shutter,
         {label: float(fit.errors.mean()) if len(fit.errors) else float("nan") for label, fit in fits.done.items()},
