@@ -37,6 +37,8 @@ _PER_COEFFICIENT = 3
 _MIN_AGREEMENT = 0.5
 # Motions that move no pixel by as much as this, in half of the photos, are none.
 _UNSEEN_PX = 0.5
+# Of the limit of a spread: one that comes so near would be larger if it could.
+_AT_LIMIT = 0.99
 # Exchanges the axis of the readout; reversing it negates the motion and changes nothing else.
 _OTHER_AXIS = ("top-to-bottom", "left-to-right")
 
@@ -73,6 +75,8 @@ class ModelChoice:
     agreement : float or None
         Correlation of the motions that two halves of the scene tell, each alone; None where no shutter explained
         anything.
+    against : tuple of str
+        What speaks against a shutter that explained something and was not kept, for people.
     num_held_out : int
         Measurements held out.
     """
@@ -87,6 +91,7 @@ class ModelChoice:
     left: dict[str, float]
     kept: tuple[str, ...]
     agreement: float | None
+    against: tuple[str, ...]
     num_held_out: int
 
 
@@ -280,6 +285,13 @@ class _Fits:
         scale = float(np.sqrt((one**2).sum() * (other**2).sum()))
         return float((one * other).sum() / scale) if scale > 0 else 0.0
 
+    def at_limit(self, fit: _Fit) -> bool:
+        """Whether the motions would be larger than what is known from elsewhere allows."""
+        limits = [(fit.spreads.phi, self._rough.phi_sigma_most)]
+        if fit.model == "constant-motion":
+            limits.append((fit.spreads.velocity, self._rough.velocity_sigma_most))
+        return any(most is not None and spread >= _AT_LIMIT * most for spread, most in limits)
+
     def gain(self, before: _Fit, after: _Fit) -> float:
         """Fall of the held-out error from one fit to another, in standard errors."""
         return standard_errors(before.errors - after.errors, self._group)
@@ -336,25 +348,36 @@ def choose_model(
             best = vary
             kept.append(vary.label)
     plain = last = best
-    suspected = False
+    against: list[str] = []
     for model in rungs[1:]:
         last = fits.fit(model, plain.varying, [last.reconstruction, given])
         gain[last.label] = fits.gain(best, last)
-        if not fits.is_better(best, last):
+        # where the two do as well, the exact model of a turn is taken, not its approximation
+        exact = best.model == "two-step" and model == "rotation" and not fits.is_better(last, best)
+        if not exact and not fits.is_better(best, last):
             continue
-        suspected = True
-        if float((best.errors - last.errors).mean()) > last.left:
+        if exact or float((best.errors - last.errors).mean()) > last.left:
             best = last
             kept.append(last.label)
+        else:
+            against.append(f"{model} takes away less of what bends the photos than it leaves")
     agreement = None
+    if best is not plain:
+        against = []
     if best is not plain and np.median(moved_px(best.reconstruction)) < _UNSEEN_PX:
-        best, suspected = plain, False
+        best = plain
     if best is not plain:
         other = read_along_other_axis(plain.reconstruction)
         label = f"{best.label}, read along the other axis"
         gain[label] = fits.gain(best, fits.fit(best.model, best.varying, [other], label))
+        if not fits.is_better(fits.done[label], best):
+            against.append("a shutter that reads along the other axis explains the photos as well")
         agreement = fits.agreement(best)
-        if not fits.is_better(fits.done[label], best) or agreement < _MIN_AGREEMENT:
+        if agreement < _MIN_AGREEMENT:
+            against.append(f"two halves of the scene tell different motions (they agree to {agreement:.2f} of 1)")
+        if fits.at_limit(best):
+            against.append("the exposure times allow less motion than they would need")
+        if against:
             best = plain
         elif best.varying:
             shared = fits.fit(best.model, False, [best.reconstruction, given])
@@ -362,7 +385,9 @@ def choose_model(
             if not fits.is_better(shared, best):
                 best = shared
                 kept.append(shared.label)
-    shutter = "found" if best is not plain else "not-determined" if suspected or not len(fits.held_out) else "not-found"
+    if not len(fits.held_out):
+        against.append("no point is seen by three photos, so no measurement could be held out to judge by")
+    shutter = "found" if best is not plain else "not-determined" if against else "not-found"
     return ModelChoice(
         best.model,
         best.label,
@@ -374,5 +399,6 @@ def choose_model(
         {label: fit.left for label, fit in fits.done.items()},
         tuple(kept),
         agreement,
+        tuple(against),
         len(fits.held_out),
     )
