@@ -86,6 +86,7 @@ def closing_table(solution: Solution, out: Path) -> str:
         *_model(solution),
         *_video(solution),
         *_intrinsics(solution),
+        *_varying(solution),
         *_readout(solution),
         *_depths(solution),
         f"rms residual       {quality['global_rms_px']:.2f} px with a global shutter, {quality['rms_px']:.2f} px now",
@@ -152,22 +153,38 @@ def _model(solution: Solution) -> list[str]:
 def _intrinsics(solution: Solution) -> list[str]:
     """A line on each camera whose intrinsics were solved for, with standard deviations."""
     lines = []
-    for key, sigmas in solution.quality["sigma_intrinsics"].items():
-        camera = solution.cameras[key]
-        values = {
-            "f": camera.K[0, 0],
-            "fx": camera.K[0, 0],
-            "fy": camera.K[1, 1],
-            "cx": camera.K[0, 2],
-            "cy": camera.K[1, 2],
-        }
-        values |= camera.coefficients
+    # photos whose lens varied have cameras of their own: what they share is told once, with the medians
+    groups: dict[Any, list[str]] = {}
+    for key, camera in solution.cameras.items():
+        shared = (camera.width, camera.height, camera.lens, *camera.dist.tolist())
+        groups.setdefault(shared if _varies(solution) else key, []).append(key)
+    for keys in groups.values():
+        sigmas = solution.quality["sigma_intrinsics"].get(keys[0], {})
+        own = [solution.cameras[key].K for key in keys]
+        fx, fy, cx, cy = (sorted(float(K[at]) for K in own)[len(own) // 2] for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        values = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **solution.cameras[keys[0]].coefficients}
         found = [
             f"{name} {values[name]:.{4 if name[0] in 'kp' else 1}f} +- {sigma:.{4 if name[0] in 'kp' else 1}f}"
             for name, sigma in sigmas.items()
         ]
         lines += [f"{'refined' if i == 0 else '':19}{', '.join(found[i : i + 3])}" for i in range(0, len(found), 3)]
     return lines
+
+
+def _varies(solution: Solution) -> bool:
+    return bool(solution.quality.get("focal_sigma") or solution.quality.get("centre_sigma_focal_lengths"))
+
+
+def _varying(solution: Solution) -> list[str]:
+    """A line on how the lens differs from photo to photo, if it does."""
+    if not _varies(solution):
+        return []
+    focal, centre = solution.quality["focal_sigma"], solution.quality["centre_sigma_focal_lengths"]
+    camera = next(iter(solution.cameras.values()))
+    return [
+        f"varying lens       f by {100 * focal:.2g} %, principal point by {centre * camera.K[0, 0]:.1f} px from photo to "
+        "photo (focusing, a stabiliser)"
+    ]
 
 
 def _video(solution: Solution) -> list[str]:
