@@ -182,8 +182,8 @@ def _varying(solution: Solution) -> list[str]:
     focal, centre = solution.quality["focal_sigma"], solution.quality["centre_sigma_focal_lengths"]
     camera = next(iter(solution.cameras.values()))
     return [
-        f"varying lens       f by {100 * focal:.2g} %, principal point by {centre * camera.K[0, 0]:.1f} px from photo to "
-        "photo (focusing, a stabiliser)"
+        f"varying lens       f by {100 * focal:.2g} %, principal point by {centre * camera.K[0, 0]:.1f} px from photo "
+        "to photo (focusing, a stabiliser)"
     ]
 
 
