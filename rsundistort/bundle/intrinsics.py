@@ -74,9 +74,9 @@ class GuessedCameras:
         return found
 
 
-# Degrees of freedom of the priors on intrinsics: normal near the middle, but what lies ten deviations off pulls as
-# hard as what lies two.
-_TAIL = 4.0
+# Square of the deviation where the priors on intrinsics bend: normal near the middle, but what lies far off pulls no
+# harder than what lies five deviations off.
+_TAIL = 25.0
 
 
 def prior_weight(square: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
