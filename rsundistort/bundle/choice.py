@@ -13,7 +13,7 @@ from .adjust import LADDER, bundle_adjust, objective
 from .options import BundleOptions
 from .problem import reprojection_residuals
 
-__all__ = ["ModelChoice", "choose_model", "clipped_errors", "hold_out", "standard_errors"]
+__all__ = ["ModelChoice", "choose_model", "clipped_errors", "corners", "hold_out", "improves", "standard_errors"]
 
 # A track gives one measurement away if this many are left: two fix the point, the third checks them.
 _LEFT_OVER = 3
@@ -109,6 +109,11 @@ def standard_errors(fall: NDArray[np.float64], group: NDArray[np.int64] | None =
     return float(fall.mean() / spread) if spread > 0 else 0.0
 
 
+def improves(before: NDArray[np.float64], after: NDArray[np.float64], gain: float) -> bool:
+    """Whether a model whose errors fell so (n,), by `gain` standard errors, is kept."""
+    return gain > _MIN_GAIN and (before - after).mean() > max(_MIN_FALL * before.mean(), after.mean() - 1.0)
+
+
 def corners(rec: Reconstruction, measured: Observations) -> NDArray[np.int64]:
     """(n,) groups of measurements: those in one of 4 x 4 parts of one photo."""
     size = np.array([(camera.width, camera.height) for camera in rec.cameras])[rec.camera_idx][measured.frame_idx]
@@ -172,8 +177,7 @@ def choose_model(
         if model == rungs[0]:
             best = errors
             continue
-        fall = best - errors
-        gain[model] = standard_errors(fall, group)
-        if gain[model] > _MIN_GAIN and fall.mean() > max(_MIN_FALL * best.mean(), errors.mean() - 1.0):
+        gain[model] = standard_errors(best - errors, group)
+        if improves(best, errors, gain[model]):
             chosen, best = model, errors
     return ModelChoice(chosen, error, rms, gain, int(held.sum()))

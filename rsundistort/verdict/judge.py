@@ -1,0 +1,294 @@
+"""One verdict on a solution, from everything that speaks for it and against it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtr
+
+from ..bundle import BundleResult, ModelChoice
+from ..bundle.choice import clipped_errors, corners, improves, standard_errors
+from ..critical import Remedy
+from ..model import Reconstruction
+from ..sfm import LEAST_MEASUREMENTS
+from .photos import PhotoMotions, photo_motions
+from .residuals import left_along_readout, left_over_frame
+
+__all__ = ["Verdict", "judge"]
+
+# Displacements below this are lost in the interpolation of a photo.
+_UNSEEN_PX = 1.0
+# A motion that is known no better than this may do as much harm as good.
+_UNCERTAIN_PX = 2.0
+# Of the scene's height: as good as photos measure. Reported deviations of real photos are two to three times too small
+# (docs/critical-motions.md).
+_SMALL_PERCENT = 0.5
+# What may remain in the same places of all photos. A lens that makes motions wrong by half a pixel leaves 0.1 to 0.15
+# even where cameras are turned at will (k1 wrong by 0.03), and less where they are not.
+_LEFT_PX = 0.1
+# Held-out measurements may be off by this beyond their noise.
+_HELD_OUT_PX = 0.5
+# Fewer held-out measurements tell nothing.
+_LEAST_HELD_OUT = 30
+# A photo whose motion is so many times the spread of all, one with so few measurements, or with all of them in such a
+# share of its frame, is to be checked.
+_FAR = 5.0
+_FEW = 2 * LEAST_MEASUREMENTS
+_CORNER = 1 / 16
+# A hand does not repeat itself: motions whose mean is so many times what they differ by, in so many photos, and by
+# chance in one set of a thousand, are the camera's.
+_REPEATED, _LEAST_PHOTOS, _CHANCE = 2.0, 5, 0.001
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What to believe of a solution.
+
+    Attributes
+    ----------
+    shutter : str
+        "found" (a rolling shutter that can be seen, by evidence), "not-found" (none that can be seen), or
+        "not-determined" (the photos do not tell).
+    shape : str
+        "trusted", or "doubtful" as soon as a reason speaks against it.
+    reasons : tuple of str
+        What speaks against it, in sentences.
+    doubtful : mapping of photo name to reason
+        Photos whose motion is to be checked.
+    lens_only : tuple of str
+        Photos whose motion the measurements do not support at all: to take it out would do more harm than good.
+    """
+
+    shutter: str
+    shape: str
+    reasons: tuple[str, ...] = ()
+    doubtful: Mapping[str, str] = field(default_factory=dict)
+    lens_only: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """What `Solution.verdict` holds: of the whole; the photos have their own."""
+        return {"shutter": self.shutter, "shape": self.shape, "reasons": list(self.reasons)}
+
+
+def judge(
+    result: BundleResult,
+    global_result: BundleResult | None = None,
+    choice: ModelChoice | None = None,
+    remedy: Remedy | None = None,
+    tried: BundleResult | None = None,
+    most_phi: Mapping[str, float] | None = None,
+) -> Verdict:
+    """Weigh a solution.
+
+    Parameters
+    ----------
+    result : BundleResult
+        The solution.
+    global_result : BundleResult, optional
+        A global-shutter adjustment of the same measurements: what a model that somebody named is compared with.
+    choice : ModelChoice, optional
+        How the model was chosen; None where it was named.
+    remedy : Remedy, optional
+        What was done about a critical motion, and how well the height of the scene is known; None for a global shutter.
+    tried : BundleResult, optional
+        Of a shutter, where the model chosen has none: what motions it would have taken out.
+    most_phi : mapping of photo name to float, optional
+        How far each photo can have turned, radians per frame, by what else is known (its exposure).
+
+    Returns
+    -------
+    Verdict
+        "trusted" only if nothing speaks against it.
+    """
+    rec = result.reconstruction
+    reasons = _height(remedy) + _unexplained(result, choice)
+    if rec.shutter_model == "global":
+        shutter, why = _of_global(choice, tried)
+        return _verdict(shutter, reasons + why)
+    motions = photo_motions(result)
+    doubts, contradicting = _doubts(result, motions, most_phi or {})
+    shutter, why = _of_motions(result, global_result, choice, motions, contradicting)
+    reasons += why + _of_photos(rec, doubts, motions)
+    few = _counts(rec) < _FEW
+    lost = contradicting & (motions.difference_px >= 2 * motions.shift_px) | few & (
+        motions.sigma_px >= motions.shift_px
+    )
+    # what cannot be seen does no harm
+    lost &= motions.shift_px >= _UNSEEN_PX
+    lens_only = tuple(name for name, each in zip(rec.image_names, lost, strict=True) if each)
+    return _verdict(shutter, reasons, {name: "; ".join(why) for name, why in doubts.items() if why}, lens_only)
+
+
+def _verdict(
+    shutter: str,
+    reasons: list[str],
+    doubtful: Mapping[str, str] | None = None,
+    lens_only: tuple[str, ...] = (),
+) -> Verdict:
+    return Verdict(shutter, "doubtful" if reasons else "trusted", tuple(reasons), doubtful or {}, lens_only)
+
+
+def _counts(rec: Reconstruction) -> NDArray[np.int64]:
+    return np.bincount(rec.observations.frame_idx, minlength=rec.num_images)
+
+
+def _height(remedy: Remedy | None) -> list[str]:
+    if remedy is None:
+        return []
+    cost = remedy.after
+    if cost.meter.is_low and remedy.name == "none":
+        return [
+            "The cameras were not turned against each other, which leaves the height of the scene open, and the remedy "
+            "is switched off."
+        ]
+    if not 100 * cost.sigma_log_k <= _SMALL_PERCENT:
+        return [f"{cost.sentence[0].upper()}{cost.sentence[1:]}."]
+    return []
+
+
+def _unexplained(result: BundleResult, choice: ModelChoice | None) -> list[str]:
+    """What residuals say against the solution."""
+    reasons = []
+    if (left := left_over_frame(result.reconstruction)) >= _LEFT_PX:
+        reasons.append(
+            f"In the same places of all photos {left:.2f} px remain unexplained: the lens is not what it is taken for."
+        )
+    elif (left := left_along_readout(result.reconstruction)) >= _LEFT_PX:
+        reasons.append(
+            f"At the same times of the readout {left:.2f} px remain unexplained: the lens, or how the camera moves "
+            "during the readout, is not what it is taken for."
+        )
+    if choice is not None:
+        error = choice.held_out_error[choice.shutter_model]
+        beyond_px = result.sigma_px * float(np.sqrt(max(error - 1.0, 0.0)))
+        if error > 2.0 and beyond_px > _HELD_OUT_PX:
+            reasons.append(
+                f"Measurements that were held out are off by {beyond_px:.1f} px more than their noise explains."
+            )
+    return reasons
+
+
+def _of_global(choice: ModelChoice | None, tried: BundleResult | None) -> tuple[str, list[str]]:
+    """Whether there may be a shutter that was not taken out, and why."""
+    if choice is None:
+        return "not-determined", ["The shutter was not looked at, as you asked (--model global)."]
+    if choice.num_held_out < _LEAST_HELD_OUT:
+        return "not-determined", [
+            f"There are too few measurements to tell a rolling shutter: only {choice.num_held_out} could be held out."
+        ]
+    # a better fit by motions that nobody sees is no question
+    seen = tried is None or bool((photo_motions(tried).shift_px >= _UNSEEN_PX).any())
+    if len(choice.kept) > 1 and seen:
+        return "not-determined", [
+            "A rolling shutter would explain a part of what is left, but no more than remains unexplained even so: it "
+            "may be the lens, and nothing was taken out for it."
+        ]
+    return "not-found", []
+
+
+def _of_motions(
+    result: BundleResult,
+    global_result: BundleResult | None,
+    choice: ModelChoice | None,
+    motions: PhotoMotions,
+    contradicting: NDArray[np.bool_],
+) -> tuple[str, list[str]]:
+    """Whether a shutter was found, and why not."""
+    rec = result.reconstruction
+    if not (motions.shift_px >= _UNSEEN_PX).any():
+        return "not-found", []
+    reasons = []
+    if choice is None and not (global_result is not None and _explains(result, global_result)):
+        reasons.append(
+            f"The {rec.shutter_model} model, which you named, explains no more than remains unexplained even so: its "
+            "motions may be the lens."
+        )
+    if (axis := _repeated(rec)) is not None:
+        turn = np.degrees(np.mean(rec.phi[:, axis] * rec.frame_span()))
+        reasons.append(
+            f"All photos are said to have turned alike, by {abs(turn):.2f} degrees about {'xyz'[axis]}: so does an "
+            "error of the lens, or a camera on a mount, but no hand."
+        )
+    if 2 * contradicting.sum() > rec.num_images:
+        reasons.append("Most photos contradict themselves about their motion.")
+    return ("not-determined" if reasons else "found"), reasons
+
+
+def _explains(result: BundleResult, global_result: BundleResult) -> bool:
+    """Whether a model explains its measurements better than a global shutter does, as a chosen one must."""
+    rec, plain = result.reconstruction, global_result.reconstruction
+    if len(plain.observations) != len(rec.observations):
+        return False
+    # of fitted measurements, which noise alone leaves below 1 by half of each unknown: so that they compare with 1
+    num, free = len(rec.observations), {"global": 6, "constant-motion": 12}
+    before, after = (
+        clipped_errors(each, each.observations, result.sigma_px)[0]
+        + (free.get(each.shutter_model, 9) * each.num_images + 3 * each.num_points) / (2 * num)
+        for each in (plain, rec)
+    )
+    return improves(before, after, standard_errors(before - after, corners(rec, rec.observations)))
+
+
+def _repeated(rec: Reconstruction) -> int | None:
+    """The axis of the camera about which all photos turned alike; None if they did not, or not so that it is seen."""
+    m = rec.num_images
+    if m < _LEAST_PHOTOS:
+        return None
+    phi = rec.phi * rec.frame_span()[:, None]
+    mean, spread = phi.mean(0), phi.std(0, ddof=1)
+    chance = 2.0 * stdtr(m - 1, -np.abs(mean) / np.maximum(spread, 1e-12) * np.sqrt(m))
+    half_px = float(np.median([rec.camera(i).K[0, 0] for i in range(m)])) / 2
+    alike = (np.abs(mean) > _REPEATED * spread) & (3 * chance < _CHANCE) & (np.abs(mean) * half_px > _UNSEEN_PX)
+    return int(np.argmax(np.where(alike, np.abs(mean), 0.0))) if alike.any() else None
+
+
+def _doubts(
+    result: BundleResult, motions: PhotoMotions, most_phi: Mapping[str, float]
+) -> tuple[dict[str, list[str]], NDArray[np.bool_]]:
+    """What is to be said against each photo, and which contradict themselves."""
+    rec = result.reconstruction
+    turn = rec.phi * rec.frame_span()[:, None]
+    sigma = np.linalg.norm(result.sigma_phi, axis=1) * rec.frame_span()
+    times = np.abs(turn).max(1) / result.phi_sigma
+    counts = _counts(rec)
+    contradicting = motions.difference_px > _UNSEEN_PX
+    doubts: dict[str, list[str]] = {}
+    for i, name in enumerate(rec.image_names):
+        said = doubts[name] = []
+        if counts[i] < _FEW:
+            said.append(f"only {counts[i]} measurements")
+        if motions.covered[i] < _CORNER:
+            said.append(f"its measurements lie in {100 * motions.covered[i]:.0f} % of its frame")
+        if contradicting[i]:
+            said.append(f"halves of its measurements differ by {motions.difference_px[i]:.1f} px about its motion")
+        if motions.sigma_px[i] > _UNCERTAIN_PX:
+            said.append(f"its motion is only known to +-{motions.sigma_px[i]:.1f} px")
+        if times[i] > _FAR and motions.shift_px[i] > _UNSEEN_PX:
+            said.append(f"it moved {times[i]:.0f} times as much as photos of this set do")
+        if np.linalg.norm(turn[i]) - 2 * sigma[i] > most_phi.get(name, np.inf):
+            said.append(
+                f"it is said to have turned by {np.degrees(np.linalg.norm(turn[i])):.2f} degrees, but would be blurred "
+                f"by more than {np.degrees(most_phi[name]):.2f}"
+            )
+    return doubts, contradicting
+
+
+def _of_photos(rec: Reconstruction, doubts: Mapping[str, list[str]], motions: PhotoMotions) -> list[str]:
+    """What doubtful photos say against the whole."""
+    reasons = []
+    # a motion that is wrong by this stretches what a photo shows by its share of half the frame, and the scene as much
+    half_px = np.array([min(each.width, each.height) / 2 for each in rec.cameras])[rec.camera_idx]
+    percent = 100 * float(np.sqrt(np.mean((motions.difference_px / half_px) ** 2)))
+    if percent > _SMALL_PERCENT:
+        reasons.append(
+            f"Halves of the photos' measurements contradict each other about the motions, by {percent:.1f} % of the "
+            "frame in the mean."
+        )
+    doubtful = sum(bool(each) for each in doubts.values())
+    if 2 * doubtful > rec.num_images:
+        reasons.append(f"{doubtful} of {rec.num_images} photos are doubtful.")
+    return reasons
