@@ -106,7 +106,7 @@ def closing_table(solution: Solution, out: Path) -> str:
         lines += [f"  {image.name}: {image.doubtful}" for image in doubtful]
     lens_only = [image.name for image in solution.registered if image.lens_only]
     if lens_only:
-        lines += ["", "lens only (their measurements do not support a motion, so none was taken out):"]
+        lines += ["", "lens only (the measurements do not support the motion found: it was not taken out):"]
         lines += [f"  {', '.join(lens_only)}"]
     lost = [image for image in solution.images if not image.registered]
     if lost:

@@ -299,7 +299,7 @@ def solve_tracks(
     global_result = bundle_adjust(result.reconstruction, "global", plain)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
     log.begin("verdict")
-    verdict = judge(result, global_result, choice, mended, tried)
+    verdict = judge(result, global_result, choice, mended, tried, mapped if feedback is None else tracks)
     if verdict.lens_only:
         warnings.warn(_lens_only(verdict), RsUndistortWarning, stacklevel=3)
     log.end("verdict", shutter=verdict.shutter, shape=verdict.shape)
@@ -310,8 +310,8 @@ def _lens_only(verdict: Verdict) -> str:
     """The photos whose motion is not taken out, for people."""
     names = ", ".join(verdict.lens_only[:3]) + (", ..." if len(verdict.lens_only) > 3 else "")
     return (
-        f"{len(verdict.lens_only)} photos have the lens taken out only, since their measurements do not support the "
-        f"motion found in them: {names}"
+        f"{len(verdict.lens_only)} photos have the lens taken out only, since the measurements do not support the "
+        f"motions found in them: {names}"
     )
 
 

@@ -76,7 +76,8 @@ def verdict_of(solution: Solution) -> Verdict:
     It is the one that the solution holds. Those of earlier versions hold none: theirs goes by the height of the scene
     and the strength of the shutter alone.
     """
-    shifts = [image.rs_shift_px for image in solution.registered if image.rs_shift_px is not None]
+    taken_out = [image for image in solution.registered if not image.lens_only]
+    shifts = [image.rs_shift_px for image in taken_out if image.rs_shift_px is not None]
     largest = max(shifts, default=None)
     level, headline, shape = _shape(solution, solution.verdict or _by_height(solution, largest), largest)
     return Verdict(level, headline, (_photos(solution), _strength(solution, shifts), shape))
@@ -95,6 +96,8 @@ def _not_asked(solution: Solution) -> bool:
 
 
 def _strength(solution: Solution, shifts: list[float]) -> str:
+    if solution.registered and all(image.lens_only for image in solution.registered):
+        return "The lens was taken out of the photos, and no motion."
     if not shifts:
         return "How far the shutter moved pixels is not known."
     if _not_asked(solution):

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from scipy.special import stdtr
 
 from ..bundle import BundleResult, ModelChoice
@@ -34,14 +35,17 @@ _LEFT_PX = 0.1
 _HELD_OUT_PX = 0.5
 # Fewer held-out measurements tell nothing.
 _LEAST_HELD_OUT = 30
-# A photo whose motion is so many times the spread of all, one with so few measurements, or with all of them in such a
-# share of its frame, is to be checked.
+# A photo whose motion is so many times the spread of all, one with so few measurements, with all of them in such a
+# share of its frame, or with so many outliers, is to be checked.
 _FAR = 5.0
 _FEW = 2 * LEAST_MEASUREMENTS
 _CORNER = 1 / 16
+_OUTLIERS = 1 / 3
 # A hand does not repeat itself: motions whose mean is so many times what they differ by, in so many photos, and by
 # chance in one set of a thousand, are the camera's.
 _REPEATED, _LEAST_PHOTOS, _CHANCE = 2.0, 5, 0.001
+# Cosine between ways to turn that are the same.
+_SAME_WAY = 0.9
 
 
 @dataclass(frozen=True)
@@ -60,7 +64,8 @@ class Verdict:
     doubtful : mapping of photo name to reason
         Photos whose motion is to be checked.
     lens_only : tuple of str
-        Photos whose motion the measurements do not support at all: to take it out would do more harm than good.
+        Photos whose motion is not to be taken out, since their measurements do not support it: all of them where the
+        evidence that chose the model does not hold.
     """
 
     shutter: str
@@ -80,6 +85,7 @@ def judge(
     choice: ModelChoice | None = None,
     remedy: Remedy | None = None,
     tried: BundleResult | None = None,
+    tracks: Reconstruction | None = None,
     most_phi: Mapping[str, float] | None = None,
 ) -> Verdict:
     """Weigh a solution.
@@ -96,6 +102,8 @@ def judge(
         What was done about a critical motion, and how well the height of the scene is known; None for a global shutter.
     tried : BundleResult, optional
         Of a shutter, where the model chosen has none: what motions it would have taken out.
+    tracks : Reconstruction, optional
+        What was measured, before outliers were dropped.
     most_phi : mapping of photo name to float, optional
         How far each photo can have turned, radians per frame, by what else is known (its exposure).
 
@@ -110,15 +118,17 @@ def judge(
         shutter, why = _of_global(choice, tried)
         return _verdict(shutter, reasons + why)
     motions = photo_motions(result)
-    doubts, contradicting = _doubts(result, motions, most_phi or {})
-    shutter, why = _of_motions(result, global_result, choice, motions, contradicting)
+    outliers = _outliers(rec, tracks)
+    doubts = _doubts(result, motions, outliers, most_phi or {})
+    # the scene that is held pulls both halves to the motion that it was solved with: they differ by less than is wrong
+    torn = (motions.difference_px > np.maximum(_UNSEEN_PX, motions.shift_px / 2)) | (outliers > 0.5)
+    shutter, why = _of_motions(result, global_result, choice, motions, torn)
     reasons += why + _of_photos(rec, doubts, motions)
-    few = _counts(rec) < _FEW
-    lost = contradicting & (motions.difference_px >= 2 * motions.shift_px) | few & (
-        motions.sigma_px >= motions.shift_px
-    )
+    lost = torn | (_counts(rec) < _FEW) & (motions.sigma_px >= motions.shift_px)
     # what cannot be seen does no harm
     lost &= motions.shift_px >= _UNSEEN_PX
+    # a model that somebody named is obeyed
+    lost |= shutter == "not-determined" and choice is not None
     lens_only = tuple(name for name, each in zip(rec.image_names, lost, strict=True) if each)
     return _verdict(shutter, reasons, {name: "; ".join(why) for name, why in doubts.items() if why}, lens_only)
 
@@ -134,6 +144,14 @@ def _verdict(
 
 def _counts(rec: Reconstruction) -> NDArray[np.int64]:
     return np.bincount(rec.observations.frame_idx, minlength=rec.num_images)
+
+
+def _outliers(rec: Reconstruction, tracks: Reconstruction | None) -> NDArray[np.float64]:
+    """(m,) share of each photo's measurements that the solution does not explain."""
+    if tracks is None:
+        return np.zeros(rec.num_images)
+    before = dict(zip(tracks.image_names, _counts(tracks).tolist(), strict=True))
+    return 1.0 - _counts(rec) / np.maximum([before.get(name, 0) for name in rec.image_names], 1)
 
 
 def _height(remedy: Remedy | None) -> list[str]:
@@ -180,8 +198,8 @@ def _of_global(choice: ModelChoice | None, tried: BundleResult | None) -> tuple[
         return "not-determined", [
             f"There are too few measurements to tell a rolling shutter: only {choice.num_held_out} could be held out."
         ]
-    # a better fit by motions that nobody sees is no question
-    seen = tried is None or bool((photo_motions(tried).shift_px >= _UNSEEN_PX).any())
+    # a better fit by motions that are not seen in most photos is no question
+    seen = tried is None or float(np.median(photo_motions(tried).shift_px)) >= _UNSEEN_PX
     if len(choice.kept) > 1 and seen:
         return "not-determined", [
             "A rolling shutter would explain a part of what is left, but no more than remains unexplained even so: it "
@@ -195,7 +213,7 @@ def _of_motions(
     global_result: BundleResult | None,
     choice: ModelChoice | None,
     motions: PhotoMotions,
-    contradicting: NDArray[np.bool_],
+    torn: NDArray[np.bool_],
 ) -> tuple[str, list[str]]:
     """Whether a shutter was found, and why not."""
     rec = result.reconstruction
@@ -210,11 +228,11 @@ def _of_motions(
     if (axis := _repeated(rec)) is not None:
         turn = np.degrees(np.mean(rec.phi[:, axis] * rec.frame_span()))
         reasons.append(
-            f"All photos are said to have turned alike, by {abs(turn):.2f} degrees about {'xyz'[axis]}: so does an "
-            "error of the lens, or a camera on a mount, but no hand."
+            f"All photos are said to have turned alike, by {abs(turn):.2f} degrees about {'xyz'[axis]}: an error of "
+            "the lens looks like that, and no hand does it."
         )
-    if 2 * contradicting.sum() > rec.num_images:
-        reasons.append("Most photos contradict themselves about their motion.")
+    if 2 * torn.sum() > rec.num_images:
+        reasons.append("In most photos halves of the measurements do not agree that there was such a motion.")
     return ("not-determined" if reasons else "found"), reasons
 
 
@@ -234,7 +252,10 @@ def _explains(result: BundleResult, global_result: BundleResult) -> bool:
 
 
 def _repeated(rec: Reconstruction) -> int | None:
-    """The axis of the camera about which all photos turned alike; None if they did not, or not so that it is seen."""
+    """The axis of the camera about which all photos turned alike; None if they did not, or not so that it is seen.
+
+    Nor if the camera turned so from photo to photo, too: then it panned.
+    """
     m = rec.num_images
     if m < _LEAST_PHOTOS:
         return None
@@ -242,20 +263,22 @@ def _repeated(rec: Reconstruction) -> int | None:
     mean, spread = phi.mean(0), phi.std(0, ddof=1)
     chance = 2.0 * stdtr(m - 1, -np.abs(mean) / np.maximum(spread, 1e-12) * np.sqrt(m))
     half_px = float(np.median([rec.camera(i).K[0, 0] for i in range(m)])) / 2
+    between = Rotation.from_matrix(rec.R_cw[1:] @ rec.R_cw[:-1].transpose(0, 2, 1)).as_rotvec().mean(0)
+    if between @ mean > _SAME_WAY * np.linalg.norm(between) * np.linalg.norm(mean):
+        return None
     alike = (np.abs(mean) > _REPEATED * spread) & (3 * chance < _CHANCE) & (np.abs(mean) * half_px > _UNSEEN_PX)
     return int(np.argmax(np.where(alike, np.abs(mean), 0.0))) if alike.any() else None
 
 
 def _doubts(
-    result: BundleResult, motions: PhotoMotions, most_phi: Mapping[str, float]
-) -> tuple[dict[str, list[str]], NDArray[np.bool_]]:
-    """What is to be said against each photo, and which contradict themselves."""
+    result: BundleResult, motions: PhotoMotions, outliers: NDArray[np.float64], most_phi: Mapping[str, float]
+) -> dict[str, list[str]]:
+    """What is to be said against each photo."""
     rec = result.reconstruction
     turn = rec.phi * rec.frame_span()[:, None]
     sigma = np.linalg.norm(result.sigma_phi, axis=1) * rec.frame_span()
     times = np.abs(turn).max(1) / result.phi_sigma
     counts = _counts(rec)
-    contradicting = motions.difference_px > _UNSEEN_PX
     doubts: dict[str, list[str]] = {}
     for i, name in enumerate(rec.image_names):
         said = doubts[name] = []
@@ -263,7 +286,9 @@ def _doubts(
             said.append(f"only {counts[i]} measurements")
         if motions.covered[i] < _CORNER:
             said.append(f"its measurements lie in {100 * motions.covered[i]:.0f} % of its frame")
-        if contradicting[i]:
+        if outliers[i] > _OUTLIERS:
+            said.append(f"{100 * outliers[i]:.0f} % of its measurements contradict the others")
+        if motions.difference_px[i] > _UNSEEN_PX:
             said.append(f"halves of its measurements differ by {motions.difference_px[i]:.1f} px about its motion")
         if motions.sigma_px[i] > _UNCERTAIN_PX:
             said.append(f"its motion is only known to +-{motions.sigma_px[i]:.1f} px")
@@ -274,7 +299,7 @@ def _doubts(
                 f"it is said to have turned by {np.degrees(np.linalg.norm(turn[i])):.2f} degrees, but would be blurred "
                 f"by more than {np.degrees(most_phi[name]):.2f}"
             )
-    return doubts, contradicting
+    return doubts
 
 
 def _of_photos(rec: Reconstruction, doubts: Mapping[str, list[str]], motions: PhotoMotions) -> list[str]:
