@@ -98,6 +98,8 @@ def closing_table(solution: Solution, out: Path) -> str:
     ]
     critical, said = solution.critical_motion or {}, [verdict.sentences[2]]
     if critical.get("flagged"):
+        # the same but for its capital
+        said += [critical["sentence"]] * (critical["sentence"][1:] not in said[0])
         said += ["at the next shoot:", *critical["advice"]]
     lines += ["", *(line for text in said for line in textwrap.wrap(text, _COLUMNS))]
     doubtful = [image for image in solution.registered if image.doubtful]
@@ -106,8 +108,8 @@ def closing_table(solution: Solution, out: Path) -> str:
         lines += [f"  {image.name}: {image.doubtful}" for image in doubtful]
     lens_only = [image.name for image in solution.registered if image.lens_only]
     if lens_only:
-        lines += ["", "lens only (the measurements do not support the motion found: it was not taken out):"]
-        lines += [f"  {', '.join(lens_only)}"]
+        lines += ["", "lens only (the motion found is not supported, and was not taken out):"]
+        lines += ["  all photos" if len(lens_only) == len(solution.registered) else f"  {', '.join(lens_only)}"]
     lost = [image for image in solution.images if not image.registered]
     if lost:
         lines += ["", "not joined:", *(f"  {image.name}: {image.reason}" for image in lost)]

@@ -123,7 +123,9 @@ def judge(
     # the scene that is held pulls both halves to the motion that it was solved with: they differ by less than is wrong
     torn = (motions.difference_px > np.maximum(_UNSEEN_PX, motions.shift_px / 2)) | (outliers > 0.5)
     shutter, why = _of_motions(result, global_result, choice, motions, torn)
-    reasons += why + _of_photos(rec, doubts, motions)
+    reasons += why
+    if not reasons:
+        reasons = _of_photos(rec, doubts, motions)
     lost = torn | (_counts(rec) < _FEW) & (motions.sigma_px >= motions.shift_px)
     # what cannot be seen does no harm
     lost &= motions.shift_px >= _UNSEEN_PX
@@ -232,7 +234,7 @@ def _of_motions(
             "the lens looks like that, and no hand does it."
         )
     if 2 * torn.sum() > rec.num_images:
-        reasons.append("In most photos halves of the measurements do not agree that there was such a motion.")
+        reasons.append("In most photos halves of the measurements do not agree that there was the motion found.")
     return ("not-determined" if reasons else "found"), reasons
 
 
@@ -289,7 +291,7 @@ def _doubts(
         if outliers[i] > _OUTLIERS:
             said.append(f"{100 * outliers[i]:.0f} % of its measurements contradict the others")
         if motions.difference_px[i] > _UNSEEN_PX:
-            said.append(f"halves of its measurements differ by {motions.difference_px[i]:.1f} px about its motion")
+            said.append(f"its halves contradict each other by {motions.difference_px[i]:.1f} px")
         if motions.sigma_px[i] > _UNCERTAIN_PX:
             said.append(f"its motion is only known to +-{motions.sigma_px[i]:.1f} px")
         if times[i] > _FAR and motions.shift_px[i] > _UNSEEN_PX:
@@ -303,17 +305,14 @@ def _doubts(
 
 
 def _of_photos(rec: Reconstruction, doubts: Mapping[str, list[str]], motions: PhotoMotions) -> list[str]:
-    """What doubtful photos say against the whole."""
-    reasons = []
+    """What doubtful photos say against a whole that nothing else speaks against."""
     # a motion that is wrong by this stretches what a photo shows by its share of half the frame, and the scene as much
     half_px = np.array([min(each.width, each.height) / 2 for each in rec.cameras])[rec.camera_idx]
     percent = 100 * float(np.sqrt(np.mean((motions.difference_px / half_px) ** 2)))
     if percent > _SMALL_PERCENT:
-        reasons.append(
-            f"Halves of the photos' measurements contradict each other about the motions, by {percent:.1f} % of the "
-            "frame in the mean."
-        )
+        return [
+            "Halves of the photos' measurements contradict each other about the motions, by "
+            f"{percent:.1f} % of the frame in the mean."
+        ]
     doubtful = sum(bool(each) for each in doubts.values())
-    if 2 * doubtful > rec.num_images:
-        reasons.append(f"{doubtful} of {rec.num_images} photos are doubtful.")
-    return reasons
+    return [f"{doubtful} of {rec.num_images} photos are doubtful."] if 2 * doubtful > rec.num_images else []
