@@ -156,6 +156,11 @@ def test_motions_that_repeat_themselves_are_no_hands(rng):
     )
     assert _repeated(order) is None
     assert _repeated(replace(order, R_cw=order.R_cw[::-1])) == 2
+    # a gyroscope may say so, too
+    result = bundle_adjust(rec, "rotation")
+    assert judge(result, None, choice_of("rotation", gain=9.0)).lens_only == tuple(rec.image_names)
+    by_gyro = judge(result, None, choice_of("rotation", gain=9.0), known=rec.image_names)
+    assert (by_gyro.shutter, by_gyro.shape, by_gyro.lens_only) == ("found", "trusted", ())
     # of a few photos chance may do the same
     assert "alike" not in " ".join(named(measured(rng, swung(rng, 0.002, 4) + ROLL))[1].reasons)
 
@@ -275,6 +280,8 @@ def test_motions_that_most_photos_contradict_are_not_taken_out_if_evidence_chose
     assert torn.shutter == "not-determined"
     assert "halves of the measurements do not agree" in " ".join(torn.reasons)
     assert torn.lens_only == tuple(rec.image_names)
+    # who knows a motion from elsewhere knows better
+    assert "2.jpg" not in judge(result, None, choice_of("rotation", gain=9.0), known=["2.jpg"]).lens_only
 
 
 def test_a_photo_that_moved_two_ways_is_left_alone(rng):

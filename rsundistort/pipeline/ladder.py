@@ -299,7 +299,8 @@ def solve_tracks(
     global_result = bundle_adjust(result.reconstruction, "global", plain)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
     log.begin("verdict")
-    verdict = judge(result, global_result, choice, mended, tried, mapped if feedback is None else tracks)
+    measured = mapped if feedback is None else tracks
+    verdict = judge(result, global_result, choice, mended, tried, measured, {*options.known_phi, *options.held_phi})
     if verdict.lens_only:
         warnings.warn(_lens_only(verdict), RsUndistortWarning, stacklevel=3)
     log.end("verdict", shutter=verdict.shutter, shape=verdict.shape)

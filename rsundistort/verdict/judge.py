@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -86,6 +86,7 @@ def judge(
     remedy: Remedy | None = None,
     tried: BundleResult | None = None,
     tracks: Reconstruction | None = None,
+    known: Collection[str] = (),
     most_phi: Mapping[str, float] | None = None,
 ) -> Verdict:
     """Weigh a solution.
@@ -104,6 +105,8 @@ def judge(
         Of a shutter, where the model chosen has none: what motions it would have taken out.
     tracks : Reconstruction, optional
         What was measured, before outliers were dropped.
+    known : collection of photo names
+        Photos whose motion is known from elsewhere, and needs no support.
     most_phi : mapping of photo name to float, optional
         How far each photo can have turned, radians per frame, by what else is known (its exposure).
 
@@ -122,7 +125,7 @@ def judge(
     doubts = _doubts(result, motions, outliers, most_phi or {})
     # the scene that is held pulls both halves to the motion that it was solved with: they differ by less than is wrong
     torn = (motions.difference_px > np.maximum(_UNSEEN_PX, motions.shift_px / 2)) | (outliers > 0.5)
-    shutter, why = _of_motions(result, global_result, choice, motions, torn)
+    shutter, why = _of_motions(result, global_result, choice, motions, torn, known)
     reasons += why
     if not reasons:
         reasons = _of_photos(rec, doubts, motions)
@@ -131,7 +134,7 @@ def judge(
     lost &= motions.shift_px >= _UNSEEN_PX
     # a model that somebody named is obeyed
     lost |= shutter == "not-determined" and choice is not None
-    lens_only = tuple(name for name, each in zip(rec.image_names, lost, strict=True) if each)
+    lens_only = tuple(name for name, each in zip(rec.image_names, lost, strict=True) if each and name not in known)
     return _verdict(shutter, reasons, {name: "; ".join(why) for name, why in doubts.items() if why}, lens_only)
 
 
@@ -216,6 +219,7 @@ def _of_motions(
     choice: ModelChoice | None,
     motions: PhotoMotions,
     torn: NDArray[np.bool_],
+    known: Collection[str],
 ) -> tuple[str, list[str]]:
     """Whether a shutter was found, and why not."""
     rec = result.reconstruction
@@ -227,7 +231,7 @@ def _of_motions(
             f"The {rec.shutter_model} model, which you named, explains no more than remains unexplained even so: its "
             "motions may be the lens."
         )
-    if (axis := _repeated(rec)) is not None:
+    if (axis := _repeated(rec)) is not None and not {*known}.issuperset(rec.image_names):
         turn = np.degrees(np.mean(rec.phi[:, axis] * rec.frame_span()))
         reasons.append(
             f"All photos are said to have turned alike, by {abs(turn):.2f} degrees about {'xyz'[axis]}: an error of "
