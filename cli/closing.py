@@ -47,7 +47,9 @@ def summary(solution: Solution, out: Path, warned: Sequence[str]) -> dict[str, A
         "critical_motion": None
         if critical is None
         else {key: critical[key] for key in ("flagged", "sigma_log_k", "remedy", "sentence")},
-        "doubtful": _doubtful(solution),
+        "verdict": solution.verdict,
+        "doubtful": {image.name: image.doubtful for image in solution.registered if image.doubtful},
+        "lens_only": [image.name for image in solution.registered if image.lens_only],
         "not_joined": {image.name: image.reason for image in solution.images if not image.registered},
         "failed": {image.name: image.reason for image in solution.registered if image.reason},
         "warnings": list(warned),
@@ -57,6 +59,8 @@ def summary(solution: Solution, out: Path, warned: Sequence[str]) -> dict[str, A
 
 def closing_table(solution: Solution, out: Path) -> str:
     """What was found, a line a photo, in 80 columns."""
+    from rsundistort.report import verdict_of
+
     rows = [("photo", "measurements", "rms px", "deg/frame", "shift px")]
     for image in solution.images:
         name = image.name if len(image.name) <= 32 else f"...{image.name[-29:]}"
@@ -74,12 +78,13 @@ def closing_table(solution: Solution, out: Path) -> str:
                 f"{image.rs_shift_px:.1f}",
             )
         )
-    quality = solution.quality
+    quality, verdict = solution.quality, verdict_of(solution)
     total = sum(stage["seconds"] for stage in solution.stages)
     lines = [
         table(rows),
         "",
         f"photos registered  {len(solution.registered)} of {len(solution.images)}",
+        f"verdict            {verdict.headline}",
         f"shutter model      {solution.shutter_model}",
         *_held_out(quality),
         *_cameras(solution),
@@ -92,19 +97,20 @@ def closing_table(solution: Solution, out: Path) -> str:
         f"rms residual       {quality['global_rms_px']:.2f} px with a global shutter, {quality['rms_px']:.2f} px now",
         f"outputs            {out}  ({total:.0f} s)",
     ]
-    critical = solution.critical_motion
-    if critical is not None:
-        said = [critical["sentence"]]
-        if critical["flagged"]:
-            said += ["at the next shoot:", *critical["advice"]]
-        lines += ["", *(line for text in said for line in textwrap.wrap(text, 80))]
-    doubtful = _doubtful(solution)
+    critical, said = solution.critical_motion or {}, [verdict.sentences[2]]
+    if critical.get("flagged"):
+        # the same but for its capital
+        said += [critical["sentence"]] * (critical["sentence"][1:] not in said[0])
+        said += ["at the next shoot:", *critical["advice"]]
+    lines += ["", *(line for text in said for line in textwrap.wrap(text, _COLUMNS))]
+    doubtful = [image for image in solution.registered if image.doubtful]
     if doubtful:
-        lines += [
-            "",
-            "doubtful (few measurements, or a motion far from the others'; check these, or leave them out):",
-            f"  {', '.join(doubtful)}",
-        ]
+        lines += ["", "doubtful (check these, or leave them out):"]
+        lines += [f"  {image.name}: {image.doubtful}" for image in doubtful]
+    lens_only = [image.name for image in solution.registered if image.lens_only]
+    if lens_only:
+        lines += ["", "lens only (the motion found is not supported, and was not taken out):"]
+        lines += ["  all photos" if len(lens_only) == len(solution.registered) else f"  {', '.join(lens_only)}"]
     lost = [image for image in solution.images if not image.registered]
     if lost:
         lines += ["", "not joined:", *(f"  {image.name}: {image.reason}" for image in lost)]
@@ -237,19 +243,3 @@ def _held_out(quality: Mapping[str, Any]) -> list[str]:
         said.append(f"{model} {error:.3f} ({'better' if gain > 0 else 'worse'} by {abs(gain):.1f}{unit}{kept})")
         unit = ""
     return [f"held-out error     {', '.join(said)}"] if said else []
-
-
-def _doubtful(solution: Solution) -> list[str]:
-    """Photos whose motion is known to no better than two pixels, or lies beyond five spreads of all of them."""
-    spread = solution.quality["phi_sigma_rad_per_frame"]
-    names = []
-    for image in solution.registered:
-        if image.motion is None or image.sigma_phi is None:
-            continue
-        camera = solution.cameras[image.camera_id]
-        largest = float(abs(image.motion.phi).max()) * camera.frame_span
-        # over half the frame a rotation by an angle moves pixels by about the angle times half the focal length
-        uncertain_px = float(image.sigma_phi.max()) * camera.frame_span * float(camera.K[0, 0]) / 2
-        if uncertain_px > 2.0 or largest > 5.0 * spread:
-            names.append(image.name)
-    return names

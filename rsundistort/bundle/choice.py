@@ -15,7 +15,7 @@ from .adjust import LADDER, bundle_adjust, objective
 from .options import BundleOptions
 from .problem import Spreads, reprojection_residuals
 
-__all__ = ["ModelChoice", "choose_model", "clipped_errors", "hold_out", "standard_errors"]
+__all__ = ["ModelChoice", "choose_model", "clipped_errors", "corners", "hold_out", "improves", "standard_errors"]
 
 # A track gives one measurement away if this many are left: two fix the point, the third checks them.
 _LEFT_OVER = 3
@@ -139,6 +139,11 @@ def standard_errors(fall: NDArray[np.float64], group: NDArray[np.int64] | None =
         return 0.0
     spread = float(np.sqrt((sums**2).sum() * len(sums) / (len(sums) - 1))) / len(fall)
     return float(fall.mean() / spread) if spread > 0 else 0.0
+
+
+def improves(before: NDArray[np.float64], after: NDArray[np.float64], gain: float) -> bool:
+    """Whether a model whose errors fell so (n,), by `gain` standard errors, is kept."""
+    return gain > _MIN_GAIN and (before - after).mean() > max(_MIN_FALL * before.mean(), after.mean() - 1.0)
 
 
 def corners(rec: Reconstruction, measured: Observations) -> NDArray[np.int64]:

@@ -125,7 +125,8 @@ def _critical(solved: Solved) -> dict[str, Any]:
 
 def solution_of(outcome: Outcome, options: SolveOptions) -> Solution:
     """The solution of an adjusted reconstruction, with every photo in it; its views are those of the raw photos."""
-    solved, rec = outcome.solved, outcome.reconstruction
+    solved, rec, verdict = outcome.solved, outcome.reconstruction, outcome.solved.verdict
+    doubtful, lens_only = ({}, ()) if verdict is None else (verdict.doubtful, verdict.lens_only)
     rms = _image_rms(rec)
     counts = np.bincount(rec.observations.frame_idx, minlength=rec.num_images)
     keys = [str(key) for key in outcome.camera_ids]
@@ -138,6 +139,7 @@ def solution_of(outcome: Outcome, options: SolveOptions) -> Solution:
             images.append(SolvedImage(name, keys[0], reason=outcome.unregistered[name]))
             continue
         i = places[name]
+        shift_px = largest_shift_px(rec.camera(i), rec.motion(i), rec.shutter_model) if name not in lens_only else 0.0
         images.append(
             SolvedImage(
                 name=name,
@@ -148,7 +150,9 @@ def solution_of(outcome: Outcome, options: SolveOptions) -> Solution:
                 sigma_phi=None if rec.shutter_model == "global" else solved.result.sigma_phi[i],
                 num_observations=int(counts[i]),
                 rms_px=float(rms[i]),
-                rs_shift_px=largest_shift_px(rec.camera(i), rec.motion(i), rec.shutter_model),
+                rs_shift_px=shift_px,
+                doubtful=doubtful.get(name),
+                lens_only=name in lens_only,
             )
         )
     quality = {
@@ -196,6 +200,7 @@ def solution_of(outcome: Outcome, options: SolveOptions) -> Solution:
             **outcome.options,
         },
         generator=versions(),
+        verdict=None if verdict is None else verdict.to_json(),
     )
 
 

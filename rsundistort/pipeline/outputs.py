@@ -31,7 +31,7 @@ from ..io.journal import Journal
 from ..io.outputs import batch_folder
 from ..io.places import local_place
 from ..io.video import FRAME_TABLE
-from ..model import Reconstruction, Solution
+from ..model import Reconstruction, RowMotion, Solution
 from ..model.orientation import turn_reconstruction, turn_solution
 from ..report import Diagnostics, relative_folder, write_diagnostics, write_report
 from .depth import DEPTHS, PhotoDepths, ScenePoints, with_depths
@@ -107,7 +107,7 @@ class Outputs:
     solution : Solution
         In the stored frame, with the rectified cameras that were asked for.
     reconstruction : Reconstruction
-        Poses, motions, points and measurements.
+        Poses, points and measurements, and the motions that are taken out.
     options : SolveOptions
         How the outputs are to be.
     ids : ModelIds
@@ -152,6 +152,12 @@ class Outputs:
         if options.apply_orientation:
             turns = {name: turn_of(orientations.get(name, 1), True)[0] for name in rec.image_names}
         ids = replace(ids or ModelIds.in_order(rec), cameras=outcome.camera_ids)
+        taken_out = [solution.image(name).taken_out or RowMotion() for name in rec.image_names]
+        rec = replace(
+            rec,
+            phi=np.array([each.phi for each in taken_out]),
+            velocity=np.array([each.velocity for each in taken_out]),
+        )
         return cls(solution, rec, options, ids, turns, rgb, with_photos, times or {}, outcome.solved)
 
     def begin(self, folder: Path, log: StageLog) -> Solution:

@@ -55,6 +55,8 @@ def photos(source: Source) -> list[dict[str, Any]]:
                 "name": image.name,
                 "registered": image.registered,
                 "reason": image.reason or "",
+                "doubtful": image.doubtful or "",
+                "lens_only": image.lens_only,
                 "camera": image.camera_id,
                 "phi": None if phi is None else phi.tolist(),
                 "sigma": None if image.sigma_phi is None else (image.sigma_phi * span).tolist(),
