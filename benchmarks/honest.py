@@ -84,7 +84,7 @@ class Ran:
     def said(self) -> tuple[str, str]:
         """Whether a shutter was found, and what is said of the shape; by the report where there is no verdict."""
         if verdict := self.verdict:
-            return verdict["shutter"], verdict["shape"]
+            return str(verdict.get("shutter")), str(verdict.get("shape"))
         level = verdict_of(self.solution).level
         return "not-found" if self.solution.shutter_model == "global" or level == "still" else "found", level
 
