@@ -150,7 +150,7 @@ def choose_model(
     # the gross outliers are gone: squares, and no closer than tells one rung from the next
     rough = replace(
         base, outlier_rounds=0, spread_rounds=4, spread_tolerance=0.05, loss="squared", sigma_px=sigma_px,
-        cost_tolerance=1e-5, lengths=(),
+        cost_tolerance=1e-5, lengths=(), deviations="model",
     )  # fmt: skip
     given = replace(reconstruction, observations=reconstruction.observations.select(fitted))
     held_out = reconstruction.observations.select(held)
