@@ -266,13 +266,14 @@ def test_covariances_are_those_of_the_whole_inverse(factor_limit, refine, rng):
     reference = (whole[: m * nb, : m * nb] @ vector.ravel()).reshape(m, nb)
     np.testing.assert_allclose(found, reference, rtol=0, atol=1e-8 * np.abs(reference).max())
     weights = rng.normal(size=(problem._start.num_points, 3))
-    variance, with_photos = problem.variance_of_points(state, weights)
+    found = problem.function_of_points(state, weights)
+    variance, with_photos = found.variance, found.with_photos
     start, stop = m * nb, m * nb + weights.size
     b = weights[problem._points].ravel()
     assert variance == pytest.approx(b @ whole[start:stop, start:stop] @ b, rel=1e-7)
     reference = (whole[: m * nb, start:stop] @ b).reshape(m, nb)
     np.testing.assert_allclose(with_photos, reference, rtol=0, atol=1e-7 * np.abs(reference).max())
-    photos, cameras = problem.covariances(state)
+    photos, cameras, *_ = problem.covariances(state)
     np.testing.assert_array_less(np.abs(photos - expected), 1e-8 * size + 1e-300)  # as the step
     expected = whole[len(whole) - len(cameras) :, len(whole) - len(cameras) :]
     size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
@@ -342,14 +343,14 @@ def test_known_lengths_join_the_system(damping, refine, rng):
         reference = (whole[: m * nb, : m * nb] @ vector.ravel()).reshape(m, nb)
         found = equations.covariance()(vector)[0]
         np.testing.assert_allclose(found, reference, rtol=0, atol=1e-7 * np.abs(reference).max())
-        photos, cameras = equations.marginal_covariances()
+        photos, cameras, *_ = equations.marginal_covariances()
         for i in range(m):
             block = whole[nb * i : nb * i + nb, nb * i : nb * i + nb]
             np.testing.assert_allclose(photos[i], block, rtol=0, atol=1e-7 * np.abs(block).max())
         block = whole[len(whole) - len(cameras) :, len(whole) - len(cameras) :]
         np.testing.assert_allclose(cameras, block, rtol=0, atol=1e-7 * np.abs(block).max(initial=0))
         weights = rng.normal(size=(given.num_points, 3))
-        variance, _ = joined.variance_of_points(state, weights)
+        variance = joined.function_of_points(state, weights).variance
         b = weights[joined._points].ravel()
         assert variance == pytest.approx(b @ whole[points, points] @ b, rel=1e-6)
 

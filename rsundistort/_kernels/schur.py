@@ -279,6 +279,42 @@ def border_rows(
 
 
 @parallel_kernel(fastmath=SUMS)
+def group_gradients(
+    frame_start, frame_order, track_idx, track_start, point_of, res, J, J_camera, V_inv, group, g_frame, g_camera
+):  # fmt: skip
+    """What groups of measurements have in J'r - W V^-1 Jp'r: g_frame (m, groups, nb), g_camera (m, groups, nc).
+
+    A measurement k pulls at its point, and thereby at all photos n of its track: J_n' (1_nk - J_p,n V^-1 J_p,k') r_k.
+    """
+    nb, nc = J.shape[2], J_camera.shape[2]
+    for f in prange(len(g_frame)):
+        g_frame[f] = 0.0
+        g_camera[f] = 0.0
+        for s in range(frame_start[f], frame_start[f + 1]):
+            n = frame_order[s]
+            t = track_idx[n]
+            p = point_of[t]
+            # J_p is minus these: the sign of their product does not turn
+            u0, u1, u2 = _times(J[n, 0, 3], J[n, 0, 4], J[n, 0, 5], V_inv, p)
+            w0, w1, w2 = _times(J[n, 1, 3], J[n, 1, 4], J[n, 1, 5], V_inv, p)
+            for k in range(track_start[t], track_start[t + 1]):
+                r0, r1 = res[k, 0], res[k, 1]
+                e0 = J[k, 0, 3] * r0 + J[k, 1, 3] * r1
+                e1 = J[k, 0, 4] * r0 + J[k, 1, 4] * r1
+                e2 = J[k, 0, 5] * r0 + J[k, 1, 5] * r1
+                x = -(u0 * e0 + u1 * e1 + u2 * e2)
+                y = -(w0 * e0 + w1 * e1 + w2 * e2)
+                if k == n:
+                    x += r0
+                    y += r1
+                g = group[k]
+                for a in range(nb):
+                    g_frame[f, g, a] += J[n, 0, a] * x + J[n, 1, a] * y
+                for a in range(nc):
+                    g_camera[f, g, a] += J_camera[n, 0, a] * x + J_camera[n, 1, a] * y
+
+
+@parallel_kernel(fastmath=SUMS)
 def back_substitute(unknowns, track_start, point_of, frame_idx, V_inv, g_point, J, step_frame, step_point):
     """step_point (n, 3) = -V^-1 (g_point + sum Jp' J step_frame)."""
     nb = len(unknowns)

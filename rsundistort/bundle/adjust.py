@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..model import Reconstruction
 from .intrinsics import pixels_of
+from .jackknife import Inflation, inflated, inflation
 from .options import BundleOptions, BundleResult
 from .problem import BundleProblem, Spreads, reprojection_residuals
 from .solver import minimize
@@ -209,8 +210,8 @@ def bundle_adjust(
         )
         iterations += result.num_iterations
         current = problem.reconstruction(result.state)
-        covariances, intrinsic_covariance = problem.covariances(result.state)
-        before, spreads = spreads, _estimated(spreads, current, covariances, options, baseline)
+        marginals = problem.covariances(result.state)
+        before, spreads = spreads, _estimated(spreads, current, marginals.photos, options, baseline)
         revived = revive_points(current, shutter_model)
         if cleaning:
             sigma = options.sigma_px or _noise_px(current, shutter_model, options.min_sigma_px)
@@ -226,7 +227,11 @@ def bundle_adjust(
     res, valid = reprojection_residuals(current)
     rms = float(np.sqrt(np.mean(res[valid] ** 2))) if valid.any() else float("nan")
     dropped = len(reconstruction.observations) - len(current.observations)
-    nb, own = covariances.shape[1], 3 * options.varying
+    nb, own = marginals.photos.shape[1], 3 * options.varying
+    shared = Inflation(np.ones(nb), np.ones(len(options.refine)))
+    if options.deviations == "jackknife":
+        shared = inflation(problem.linearize(result.state), problem.partitions(result.state), marginals)
+    covariances, intrinsic_covariance = inflated(marginals, shared)
     return BundleResult(
         current,
         result.stop_reason,
@@ -241,6 +246,7 @@ def bundle_adjust(
         _sigma_intrinsics(current, options.refine, intrinsic_covariance),
         rms,
         dropped,
+        shared.photos,
     )
 
 
@@ -272,8 +278,9 @@ def climb(
     # every rung but the last is only a start: what its model cannot explain is no outlier, and it need not converge
     # a shutter that is not modelled yet would be blamed on the lens, and bend known lengths
     rough = replace(
-        options, outlier_rounds=0, spread_rounds=0, cost_tolerance=options.round_tolerance, refine=(), lengths=()
-    )
+        options, outlier_rounds=0, spread_rounds=0, cost_tolerance=options.round_tolerance, refine=(), lengths=(),
+        deviations="model",
+    )  # fmt: skip
     results: dict[str, BundleResult] = {}
     current = replace(reconstruction, phi=np.zeros((reconstruction.num_images, 3)))
     for model in rungs:

@@ -245,7 +245,7 @@ class _Fits:
         # the gross outliers are gone: squares, and no closer than tells one model from the next
         self._rough = replace(
             options, outlier_rounds=0, spread_rounds=4, spread_tolerance=0.05, loss="squared", sigma_px=sigma_px,
-            cost_tolerance=1e-5, lengths=(),
+            cost_tolerance=1e-5, lengths=(), deviations="model",
         )  # fmt: skip
         self.given = replace(reconstruction, observations=reconstruction.observations.select(fitted))
         self.held_out = reconstruction.observations.select(held)

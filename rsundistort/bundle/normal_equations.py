@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from .._kernels import schur
-from .elimination import Elimination
-from .reduced import Reduced, products
+from .elimination import Elimination, Marginals
+from .reduced import Factored, Reduced
 
-__all__ = ["Border", "NormalEquations", "Step"]
+__all__ = ["Border", "Function", "NormalEquations", "Step"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -49,6 +50,28 @@ class Border:
         total = np.zeros((self.num_cameras, *x.shape[1:]))
         np.add.at(total, self.camera_of_frame, x)
         return total.reshape(self.num_cameras * x.shape[1], *x.shape[2:])
+
+
+@dataclass(frozen=True)
+class Function:
+    """What is known of a linear function of the points.
+
+    Attributes
+    ----------
+    variance, of_priors, of_lengths : float
+        Its variance, and the shares of that that are the priors' and the known lengths' doing.
+    with_photos, with_photos_of_priors : (m, nb) array
+        Its covariance with the photos' unknowns, and the priors' share of that.
+    pulls : (o,) array
+        How far each measurement pulls it, up to the sign.
+    """
+
+    variance: float
+    of_priors: float
+    of_lengths: float
+    with_photos: Array
+    with_photos_of_priors: Array
+    pulls: Array
 
 
 class NormalEquations:
@@ -154,38 +177,108 @@ class NormalEquations:
         c = -g_camera - self._border.sum_photos(rhs_camera)
         return Reduced(S, -rhs, border, (corner + corner.T) / 2, c), V_inv
 
-    def marginal_covariances(self) -> tuple[Array, Array]:
-        """Covariances of the unknowns of each photo (m, nb, nb) and of all cameras (k, k), all others being free.
+    @property
+    def num_cameras(self) -> int:
+        """Number of cameras."""
+        return self._border.num_cameras
+
+    @cached_property
+    def inverse(self) -> Factored | None:
+        """The inverse of the whole system, for photos and cameras; None where it cannot be factored."""
+        factored = self._elimination.factored(self.reduce(0.0)[0])
+        if factored is None or not len(self._lengths):
+            return factored
+        frame, _, camera, inner = self._of_lengths(0.0, exact=True)
+        return factored.joined(frame, camera, -inner)
+
+    def marginal_covariances(self) -> Marginals:
+        """Covariances of the unknowns of each photo and of all cameras, all others being free.
 
         0 where held; NaN where the system cannot be factored.
         """
-        photos, cameras = self._elimination.marginal_covariances(self.reduce(0.0)[0])
-        if len(self._lengths):
-            frame, _, camera, inner = self._of_lengths(0.0, exact=True)
-            photos = photos - np.einsum("qma,qp,pmb->mab", frame, inner, frame)
-            cameras = cameras - np.einsum("qk,qp,pl->kl", camera, inner, camera)
-        return photos, cameras
+        return self._elimination.marginals(self.inverse, self._prior_diag, self._border.prior_diag.ravel())
 
-    def covariance(self) -> Callable[[Array], Array]:
-        """Covariance of the photos' unknowns, all others being free, as a function of vectors (k, m, nb)."""
-        factored = self._elimination.factored(self.reduce(0.0)[0])
-        if factored is None:
+    def covariance(self, inflation: Array | float = 1.0) -> Callable[[Array], Array]:
+        """Covariance of the photos' unknowns, all others being free, as a function of vectors (k, m, nb).
+
+        With `inflation` (nb,) the noise's share of the deviations is so much larger; that of the priors stays.
+        """
+        inverse = self.inverse
+        if inverse is None:
             return lambda vectors: np.full_like(vectors, np.nan)
-        if not len(self._lengths):
-            return factored.covariance_times
-        frame, _, _, inner = self._of_lengths(0.0, exact=True)
+
+        def times(vectors: Array) -> Array:
+            return inverse.times(vectors, np.zeros((len(vectors), len(self._g_camera))))[0]
+
+        if np.all(inflation == 1.0):
+            return times
         return lambda vectors: (
-            factored.covariance_times(vectors) - np.tensordot(products(vectors, frame) @ inner, frame, 1)
+            self._by_priors(vectors) + inflation * (times(inflation * vectors) - self._by_priors(inflation * vectors))
         )
 
-    def variance_of_points(self, weights: Array) -> tuple[float, Array]:
-        """Variance of sum(weights * points), weights (n, 3), and its covariance (m, nb) with the photos' unknowns."""
+    def _by_priors(self, vectors: Array) -> Array:
+        """H^-1 P H^-1 of the photos' unknowns times vectors (k, m, nb), P the priors' precision."""
+        assert self.inverse is not None
+        frame, camera = self.inverse.times(vectors, np.zeros((len(vectors), len(self._g_camera))))
+        return self.inverse.times(self._prior_diag * frame, self._border.prior_diag.ravel() * camera)[0]
+
+    def function_of_points(self, weights: Array) -> Function | None:
+        """What is known of sum(weights * points), weights (n, 3); None where the system cannot be factored."""
         zero = np.zeros_like(self._g_frame), np.zeros_like(self._g_camera)
         solved = self._solve(0.0, zero[0], -weights, zero[1], exact=True)
-        if solved is None:
-            return np.nan, np.full_like(zero[0], np.nan)
-        frame, point = solved[:2]
-        return float((weights * point).sum()), frame
+        if solved is None or self.inverse is None:
+            return None
+        frame, point, camera = solved[:3]
+        weighed = self._prior_diag * frame, self._border.prior_diag.ravel() * camera
+        by_lengths = np.einsum("qna,na->q", self._lengths, point)
+        s, res = self._s, self.blocks[0]
+        moved = np.einsum("oia,oa->oi", self._J, frame[s.frame_idx])
+        moved -= np.einsum("oia,oa->oi", self._J[:, :, 3:6], point[s.point_idx])
+        own = camera.reshape(self._border.num_cameras, -1)[self._border.camera_of_frame[s.frame_idx]]
+        moved += np.einsum("oia,oa->oi", self._border.J, own)
+        return Function(
+            variance=float((weights * point).sum()),
+            of_priors=float((weighed[0] * frame).sum() + (weighed[1] * camera).sum()),
+            of_lengths=float((by_lengths**2).sum()),
+            with_photos=frame,
+            with_photos_of_priors=self.inverse.times(weighed[0][None], weighed[1][None])[0][0],
+            pulls=(moved * res).sum(1),
+        )
+
+    def group_pulls(self, group: Index, sign: Array, num_groups: int) -> tuple[Array, Array]:
+        """How far groups of measurements pull photos (num_groups, m, nb) and cameras (num_groups, k): H^-1 of each
+        group's share of the gradient, points eliminated.
+
+        Parameters
+        ----------
+        group : (o,) int array
+            Group of each measurement.
+        sign : (o,) array
+            Factor of each.
+        num_groups : int
+            Number of groups.
+        """
+        assert self.inverse is not None
+        s, border = self._s, self._border
+        m, nb, nc = len(self._g_frame), self._J.shape[2], border.J.shape[2]
+        V_inv = np.empty_like(self._V)
+        schur.invert_points(self._V, 0.0, V_inv)
+        g_frame, g_camera = np.empty((m, num_groups, nb)), np.empty((m, num_groups, nc))
+        schur.group_gradients(
+            s.frame_start, s.frame_order, s.track_idx, s.track_start, s.point_of, self.blocks[0] * sign[:, None],
+            self._J, border.J, V_inv, group, g_frame, g_camera,
+        )  # fmt: skip
+        of_cameras = border.sum_photos(g_camera.transpose(0, 2, 1)).T
+        return self.inverse.times(g_frame.transpose(1, 0, 2), of_cameras)
+
+    def length_pulls(self) -> tuple[Array, Array]:
+        """The same of known lengths (q, m, nb) and (q, k), each wrong by its standard deviation."""
+        inverse = self.inverse
+        assert inverse is not None
+        # H^-1 J' = (H - J'J)^-1 J' (1 + J (H - J'J)^-1 J')^-1: the last of the inverse's changes
+        last = slice(len(inverse.weights) - len(self._lengths), None)
+        inner = -inverse.weights[last, last]
+        return np.tensordot(inner, inverse.frames[last], 1), inner @ inverse.cameras[last]
 
     def solve(self, damping: float) -> tuple[Step, float] | None:
         """Step of the photos (m, nb), points (n, 3) and cameras (c, nc), and the decrease of cost that it predicts."""

@@ -13,7 +13,10 @@ from ..model import Reconstruction
 from .intrinsics import GuessedCameras, check_refined
 from .lengths import KnownLength, check_lengths
 
-__all__ = ["LOSSES", "BundleOptions", "BundleResult"]
+__all__ = ["DEVIATIONS", "LOSSES", "BundleOptions", "BundleResult"]
+
+#: What standard deviations are read off: the model of independent noise, or the residuals.
+DEVIATIONS = ("jackknife", "model")
 
 #: Robust losses and their codes in the kernels.
 LOSSES: dict[str, int] = {"squared": 0, "huber": 1, "cauchy": 2, "soft-l1": 3}
@@ -103,6 +106,10 @@ class BundleOptions:
     cg_tolerance : float
         Conjugate gradients stop when the residual, in the norm of the preconditioner, falls below `cg_tolerance` times
         the solution, in the norm of the matrix: a step then lacks about the square of it of its decrease of the cost.
+    deviations : {"jackknife", "model"}
+        What the covariances of the result are read off: "model" takes measurements to be independent and as noisy as
+        `sigma_px` says, "jackknife" looks how residuals that go together, in corners of the scene and of the lens, pull
+        at the unknowns (never less than the model's).
     """
 
     max_iterations: int = 100
@@ -136,6 +143,7 @@ class BundleOptions:
     guessed: GuessedCameras | None = None
     factor_limit: float | None = None
     cg_tolerance: float = 0.01
+    deviations: str = "jackknife"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "refine", check_refined(self.refine))
@@ -149,6 +157,8 @@ class BundleOptions:
                 raise InputError(f"anchor {name!r} is held at zero and known from elsewhere; give one of them")
         if self.loss not in LOSSES:
             raise InputError(f"loss={self.loss!r}, expected one of {', '.join(LOSSES)}")
+        if self.deviations not in DEVIATIONS:
+            raise InputError(f"deviations={self.deviations!r}, expected one of {', '.join(DEVIATIONS)}")
         positive = (
             "cost_tolerance",
             "round_tolerance",
@@ -208,6 +218,9 @@ class BundleResult:
         Root mean square of the residuals' x and y parts.
     num_outliers : int
         Observations dropped.
+    inflation : (unknowns of a photo,) array
+        How many times larger than of independent measurements the noise's share of the deviations of each kind of
+        unknown is (`BundleOptions.deviations`), 1 or more. The covariances have it in them.
     """
 
     reconstruction: Reconstruction
@@ -223,6 +236,7 @@ class BundleResult:
     sigma_intrinsics: tuple[dict[str, float], ...]
     rms_px: float
     num_outliers: int
+    inflation: NDArray[np.float64]
 
     @property
     def sigma_phi(self) -> NDArray[np.float64]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from .jackknife import inflated_function
 from .options import BundleOptions, BundleResult
 from .problem import BundleProblem, Spreads
 
@@ -35,8 +36,11 @@ class Posterior:
         plain = replace(options or BundleOptions(), loss="squared")
         self._problem = BundleProblem(rec, rec.shutter_model, plain, result.sigma_px, spreads)
         self._state = self._problem.initial_state()
-        self._covariance = self._problem.linearize(self._state).covariance()
+        self._partitions = self._problem.partitions(self._state) if plain.deviations == "jackknife" else ()
+        self._inflation = result.inflation if self._partitions else np.ones_like(result.inflation)
+        self._covariance = self._problem.linearize(self._state).covariance(self._inflation)
         self._own = 3 * plain.varying
+        self._shape = rec.num_images, len(self._inflation) - self._own
 
     def of_photos(self, vectors: Array) -> Array:
         """Covariance of the photos' unknowns times vectors (k, m, nb), as in `BundleResult.covariances`."""
@@ -47,8 +51,11 @@ class Posterior:
 
         And its covariance (m, nb) with the photos' unknowns. NaN where the system cannot be factored.
         """
-        variance, with_photos = self._problem.variance_of_points(self._state, weights)
-        return variance, with_photos[:, : with_photos.shape[1] - self._own]
+        found = self._problem.function_of_points(self._state, weights)
+        if found is None:
+            return np.nan, np.full(self._shape, np.nan)
+        variance, with_photos = inflated_function(found, self._partitions, self._inflation)
+        return variance, with_photos[:, : self._shape[1]]
 
 
 def gauge_directions(result: BundleResult) -> Array:

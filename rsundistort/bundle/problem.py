@@ -14,10 +14,11 @@ from scipy.spatial.transform import Rotation
 from .._kernels import projection
 from ..errors import InputError
 from ..model import Camera, Reconstruction, check_shutter_model
-from .elimination import Elimination
+from .elimination import Elimination, Marginals
 from .intrinsics import INTRINSICS, check_lenses, deviation, moved_camera, prior_weight
+from .jackknife import Partition, by_corner, by_place
 from .lengths import LengthResiduals
-from .normal_equations import Border, NormalEquations, Step
+from .normal_equations import Border, Function, NormalEquations, Step
 from .options import LOSSES, BundleOptions
 from .structure import Structure, by_first_photo
 
@@ -211,18 +212,26 @@ class BundleProblem:
             tuple(start.cameras), start.R_cw, start.center_w, motion[:, :3], motion[:, 3:], variation, start.points_w
         )  # fmt: skip
 
-    def covariances(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def covariances(self, state: State) -> Marginals:
         """Covariances of each photo's unknowns (m, nb, nb), 0 where held (the gauge), and of all cameras' (k, k).
 
         All others being free. Order and units as the unknowns above. NaN where the system cannot be factored.
         """
         return self.linearize(state).marginal_covariances()
 
-    def variance_of_points(
-        self, state: State, weights: NDArray[np.float64]
-    ) -> tuple[float, NDArray[np.float64]]:  # fmt: skip
-        """Variance of sum(weights * points_w), weights (n, 3), and its covariance (m, nb) with the photos' unknowns."""
-        return self.linearize(state).variance_of_points(weights[self._points])
+    def function_of_points(self, state: State, weights: NDArray[np.float64]) -> Function | None:
+        """What is known of sum(weights * points_w), weights (n, 3); None where the system cannot be factored."""
+        return self.linearize(state).function_of_points(weights[self._points])
+
+    def partitions(self, state: State) -> tuple[Partition, ...]:
+        """Measurements that may go wrong together: of one corner of the scene, and of one corner of a lens."""
+        s, start = self._structure, self._start
+        camera = start.camera_idx[s.frame_idx]
+        size = np.array([(each.width, each.height) for each in start.cameras])[camera]
+        return (
+            by_place(state.points_w, s.point_idx, start.num_images),
+            by_corner(self._xy, size, camera),
+        )
 
     def reconstruction(self, state: State) -> Reconstruction:
         """The reconstruction at a state."""

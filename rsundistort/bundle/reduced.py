@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,44 +56,52 @@ def _positive_inverse(A: Array) -> Array | None:
 
 @dataclass(frozen=True)
 class Factored:
-    """A reduced system that is factored: for as many right-hand sides as one likes.
+    """A reduced system that is factored: its inverse, for as many right-hand sides as one likes.
+
+    That is the inverse of the photos' own part, the cameras being held, and what r changes that photos and cameras make
+    together add to it: frames and cameras Z, and their covariance M, as Z' M Z.
 
     Attributes
     ----------
     envelope : Envelope
-        Where its factor has entries.
+        Where the factor of the photos' part has entries.
     solve_rows : callable
-        Solves for right-hand sides (k, padded rows) in place, the cameras being held.
-    border : (k, m, nb) array
-        Of the reduced system.
-    border_solved : (k, m, nb) array
-        S^-1 B': what a change of the cameras does to the photos, up to its sign.
-    cameras : (k, k) array
-        Covariance of the cameras' unknowns.
+        Solves the photos' part for right-hand sides (n, padded rows) in place.
+    frames, cameras : (r, m, nb), (r, k) array
+        The changes. Of each of the cameras' unknowns: -S^-1 B' of the photos, and 1 of itself.
+    weights : (r, r) array
+        Their covariance.
     """
 
     envelope: Envelope
     solve_rows: Callable[[Array], None]
-    border: Array
-    border_solved: Array
+    frames: Array
     cameras: Array
+    weights: Array
 
     def solve(self, b: Array, c: Array) -> tuple[Array, Array]:
         """Solution of the photos (m, nb), 0 where held, and of the cameras (k,)."""
-        x = self.solve_photos(b[None])
-        y = self.cameras @ (c - products(self.border, x)[:, 0])
-        return x[0] - np.tensordot(y, self.border_solved, 1), y
+        x, y = self.times(b[None], c[None])
+        return x[0], y[0]
 
-    def solve_photos(self, b: Array) -> Array:
-        """S^-1 b for stacks (k, m, nb): the cameras being held."""
+    def times(self, b: Array, c: Array) -> tuple[Array, Array]:
+        """The inverse times stacks of photos' values (n, m, nb) and of cameras' (n, k)."""
+        shares = (products(b, self.frames) + c @ self.cameras.T) @ self.weights
         rows = self.envelope.gather(b)
         self.solve_rows(rows)
-        return self.envelope.scatter(rows)
+        return self.envelope.scatter(rows) + np.tensordot(shares, self.frames, 1), shares @ self.cameras
 
-    def covariance_times(self, vectors: Array) -> Array:
-        """Covariance of the photos' unknowns, the cameras being free, times vectors (k, m, nb)."""
-        found = self.solve_photos(vectors)
-        return found + np.tensordot(products(found, self.border) @ self.cameras, self.border_solved, 1)
+    def joined(self, frames: Array, cameras: Array, weights: Array) -> Factored:
+        """The inverse with more changes added."""
+        r = len(self.weights)
+        all_weights = np.zeros((r + len(weights),) * 2)
+        all_weights[:r, :r], all_weights[r:, r:] = self.weights, weights
+        return replace(
+            self,
+            frames=np.concatenate([self.frames, frames]),
+            cameras=np.concatenate([self.cameras, cameras]),
+            weights=all_weights,
+        )
 
 
 def factor(reduced: Reduced, envelope: Envelope) -> Factored | None:
@@ -105,4 +113,4 @@ def factor(reduced: Reduced, envelope: Envelope) -> Factored | None:
     solve(rows)
     X = envelope.scatter(rows)
     cameras = _positive_inverse(reduced.corner - products(reduced.border, X))
-    return None if cameras is None else Factored(envelope, solve, reduced.border, X, cameras)
+    return None if cameras is None else Factored(envelope, solve, -X, np.eye(len(X)), cameras)

@@ -305,6 +305,7 @@ def solve_tracks(
         refine=options.refine,
         guessed=options.guessed,
         varying=options.varying,
+        deviations="model",
     )
     global_result = bundle_adjust(result.reconstruction, "global", plain)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
