@@ -2,11 +2,11 @@
 
 What lens, scene or shutter model leave out bends neighbouring measurements alike, so that they tell less than as many
 independent ones, whose covariance is the inverse of the Hessian H. The infinitesimal delete-a-group jackknife (Jaeckel,
-"The infinitesimal jackknife", 1972; White's sandwich in groups) asks the residuals instead: with g the summed gradient of
-a group of measurements the noise's covariance is sum_g (H^-1 g)(H^-1 g)', whatever goes on inside the groups.
+"The infinitesimal jackknife", 1972; White's sandwich in groups) asks the residuals instead: with g the summed gradient
+of a group of measurements the noise's covariance is sum_g (H^-1 g)(H^-1 g)', whatever goes on inside the groups.
 
-Two partitions are asked, of points by their place (one corner of the scene: a track's measurements are aligned with each
-other, and share what the scene hides) and of measurements by their place in the photo, over all photos of a camera (one
+Two partitions are asked, of points by their place (one corner of the scene: a track's measurements are aligned with
+each other, and share what the scene hides) and of measurements by their place in the photo, over all photos of a camera (one
 corner of the lens). What each shows above independent noise is added (as Cameron, Gelbach and Miller do, "Robust
 inference with multiway clustering", 2011). Neighbours that a border parts are missed; groups are kept in families of
 four, and the products inside a family count twice, for as many pairs of neighbours belong to different families (a lag
@@ -121,6 +121,12 @@ class Inflation(NamedTuple):
     photos: Array
     cameras: Array
 
+    @property
+    def noise(self) -> float:
+        """One factor of the noise for all that has a prior of zero mean: the motion and what varies, else the lens."""
+        kinds = self.photos[6:] if len(self.photos) > 6 else self.cameras
+        return float(np.sqrt(np.mean(kinds**2))) if len(kinds) else 1.0
+
 
 def _pooled(seen: Array, noise: Array, total: Array) -> Array:
     """Excess (kinds,) of variances (units, kinds) seen over those of independent noise, a unit by its noise's share."""
@@ -130,8 +136,13 @@ def _pooled(seen: Array, noise: Array, total: Array) -> Array:
     return np.maximum(ratio - 1.0, 0.0)
 
 
-def inflation(equations: NormalEquations, partitions: tuple[Partition, ...], marginals: Marginals) -> Inflation:
-    """The factors, from the residuals at an optimum and the covariances there."""
+def inflation(
+    equations: NormalEquations, partitions: tuple[Partition, ...], marginals: Marginals, noise_factor: float = 1.0
+) -> Inflation:
+    """The factors, from the residuals at an optimum and the covariances there.
+
+    `noise_factor` is how many times larger than independent noise the noise is that weighs the measurements there.
+    """
     nb = marginals.photos.shape[1]
     num_cameras = equations.num_cameras
     totals = [np.einsum("maa->ma", marginals.photos), np.diagonal(marginals.cameras).reshape(num_cameras, -1)]
@@ -146,26 +157,35 @@ def inflation(equations: NormalEquations, partitions: tuple[Partition, ...], mar
     for partition in partitions:
         for k, pulls in enumerate(equations.group_pulls(*partition.sketch(_FAMILIES))):
             seen = (_squares(pulls) + of_lengths[k]).reshape(totals[k].shape)
-            excess[k] = excess[k] + _pooled(seen, totals[k] - priors[k], totals[k])
+            excess[k] = excess[k] + _pooled(seen, (totals[k] - priors[k]) / noise_factor**2, totals[k])
     return Inflation(*(np.sqrt(1.0 + each) for each in excess))
 
 
-def inflated(marginals: Marginals, factors: Inflation) -> tuple[Array, Array]:
-    """Covariances of the photos' unknowns (m, nb, nb) and of the cameras' (k, k), the noise's share being larger."""
-    of_cameras = np.tile(factors.cameras, len(marginals.cameras) // max(len(factors.cameras), 1))
-    parts = zip(marginals[:2], marginals[2:], (factors.photos, of_cameras), strict=True)
-    photos, cameras = (prior + by[:, None] * (total - prior) * by for total, prior, by in parts)
-    return photos, cameras
+def inflated(marginals: Marginals, photos: Array, cameras: Array) -> tuple[Array, Array]:
+    """Covariances of the photos' unknowns (m, nb, nb) and of the cameras' (k, k) with a larger share of the noise.
+
+    Its part of the deviations is larger by a factor for each kind of unknown, (nb,) and (nc,).
+    """
+    of_cameras = np.tile(cameras, len(marginals.cameras) // max(len(cameras), 1))
+    parts = zip(marginals[:2], marginals[2:], (photos, of_cameras), strict=True)
+    of_photos, of_all_cameras = (prior + by[:, None] * (total - prior) * by for total, prior, by in parts)
+    return of_photos, of_all_cameras
 
 
-def inflated_function(found: Function, partitions: tuple[Partition, ...], photos: Array) -> tuple[float, Array]:
-    """Variance of a function and its covariance with the photos (m, nb), whose factors are (nb,)."""
+def inflated_function(
+    found: Function, partitions: tuple[Partition, ...], photos: Array, noise_factor: float = 1.0
+) -> tuple[float, Array]:
+    """Variance of a function and its covariance with the photos (m, nb), whose factors are (nb,).
+
+    These are of the noise that weighs the measurements, which is `noise_factor` times the independent one.
+    """
     noise = found.variance - found.of_priors
-    excess = 0.0
+    ratio = 1.0
     for partition in partitions:
         sums = np.zeros(_FAMILY * partition.num_families)
         np.add.at(sums, partition.group, found.pulls)
-        excess += max((float(_squares(sums)) + found.of_lengths) / noise - 1.0, 0.0) if noise > 0 else 0.0
-    own = np.sqrt(1.0 + excess)
+        seen = float(_squares(sums)) + found.of_lengths
+        ratio += max(noise_factor**2 * seen / noise - 1.0, 0.0) if noise > 0 else 0.0
+    own = np.sqrt(ratio) / noise_factor
     rest = found.with_photos - found.with_photos_of_priors
     return found.of_priors + own**2 * noise, found.with_photos_of_priors + own * photos * rest

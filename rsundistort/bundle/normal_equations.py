@@ -246,8 +246,9 @@ class NormalEquations:
         )
 
     def group_pulls(self, group: Index, sign: Array, num_groups: int) -> tuple[Array, Array]:
-        """How far groups of measurements pull photos (num_groups, m, nb) and cameras (num_groups, k): H^-1 of each
-        group's share of the gradient, points eliminated.
+        """How far groups of measurements pull photos (num_groups, m, nb) and cameras (num_groups, k).
+
+        H^-1 of each group's share of the gradient, points eliminated.
 
         Parameters
         ----------

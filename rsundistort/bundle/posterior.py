@@ -34,10 +34,11 @@ class Posterior:
             max(result.focal_sigma, 1e-300), max(result.centre_sigma, 1e-300),
         )  # fmt: skip
         plain = replace(options or BundleOptions(), loss="squared")
-        self._problem = BundleProblem(rec, rec.shutter_model, plain, result.sigma_px, spreads)
+        self._problem = BundleProblem(rec, rec.shutter_model, plain, result.sigma_px * result.noise_factor, spreads)
         self._state = self._problem.initial_state()
         self._partitions = self._problem.partitions(self._state) if plain.deviations == "jackknife" else ()
-        self._inflation = result.inflation if self._partitions else np.ones_like(result.inflation)
+        self._factor = result.noise_factor
+        self._inflation = (result.inflation if self._partitions else np.ones_like(result.inflation)) / self._factor
         self._covariance = self._problem.linearize(self._state).covariance(self._inflation)
         self._own = 3 * plain.varying
         self._shape = rec.num_images, len(self._inflation) - self._own
@@ -54,7 +55,7 @@ class Posterior:
         found = self._problem.function_of_points(self._state, weights)
         if found is None:
             return np.nan, np.full(self._shape, np.nan)
-        variance, with_photos = inflated_function(found, self._partitions, self._inflation)
+        variance, with_photos = inflated_function(found, self._partitions, self._inflation, self._factor)
         return variance, with_photos[:, : self._shape[1]]
 
 
