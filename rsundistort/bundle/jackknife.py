@@ -6,8 +6,8 @@ independent ones, whose covariance is the inverse of the Hessian H. The infinite
 of a group of measurements the noise's covariance is sum_g (H^-1 g)(H^-1 g)', whatever goes on inside the groups.
 
 Two partitions are asked, of points by their place (one corner of the scene: a track's measurements are aligned with
-each other, and share what the scene hides) and of measurements by their place in the photo, over all photos of a camera (one
-corner of the lens). What each shows above independent noise is added (as Cameron, Gelbach and Miller do, "Robust
+each other, and share what the scene hides) and of measurements by their place in the photo, over all photos of a camera
+(one corner of the lens). What each shows above independent noise is added (as Cameron, Gelbach and Miller do, "Robust
 inference with multiway clustering", 2011). Neighbours that a border parts are missed; groups are kept in families of
 four, and the products inside a family count twice, for as many pairs of neighbours belong to different families (a lag
 window that errs to the safe side: Vats and Flegal, "Lugsail lag windows", 2022).
