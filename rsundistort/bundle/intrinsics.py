@@ -75,8 +75,8 @@ class GuessedCameras:
 
 
 # Square of the deviation where the priors on intrinsics bend: normal near the middle, but what lies far off pulls no
-# harder than what lies five deviations off.
-_TAIL = 25.0
+# harder than what lies three deviations off.
+_TAIL = 9.0
 
 
 def prior_weight(square: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
