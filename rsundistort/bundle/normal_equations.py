@@ -187,6 +187,22 @@ class NormalEquations:
         frame, point = solved[:2]
         return float((weights * point).sum()), frame
 
+    def influence(self, vector: Array) -> Array:
+        """(o, 2) how much sum(vector * photos' unknowns), vector (m, nb), follows each weighted residual.
+
+        NaN where the system cannot be factored.
+        """
+        solved = self._solve(0.0, vector, np.zeros_like(self._g_point), np.zeros_like(self._g_camera), exact=True)
+        if solved is None:
+            return np.full_like(self.blocks[0], np.nan)
+        frame, point, camera = solved[:3]
+        border, photo = self._border, self._s.frame_idx
+        of_camera = camera.reshape(border.num_cameras, border.J.shape[2])[border.camera_of_frame]
+        value: Array = np.einsum("oij,oj->oi", self._J, frame[photo])
+        value -= np.einsum("oij,oj->oi", self._J[:, :, 3:6], point[self._s.point_idx])
+        value += np.einsum("oij,oj->oi", border.J, of_camera[photo])
+        return value
+
     def solve(self, damping: float) -> tuple[Step, float] | None:
         """Step of the photos (m, nb), points (n, 3) and cameras (c, nc), and the decrease of cost that it predicts."""
         solved = self._solve(damping, self._g_frame, self._g_point, self._g_camera)
