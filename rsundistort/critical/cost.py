@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from ..bundle import BundleOptions, BundleResult, Posterior, gauge_directions
 from ..errors import InputError
-from ..model import READOUTS, Reconstruction
+from ..model import Reconstruction
+from .common import CommonMotion, common_motion
 from .meter import CriticalMotion, critical_motion, readout_axes
 
-__all__ = ["ShapeCost", "row_phi", "shape_cost"]
+__all__ = ["ShapeCost", "shape_cost"]
 
 # Below this standard deviation of log k there is nothing to mend: half a pixel over a thousand rows.
 _SMALL = 0.0005
@@ -36,12 +37,15 @@ class ShapeCost:
         How much of that mode is the vertical scale: square of the correlation of the two, 0 to 1.
     meter : CriticalMotion
         Of the solution's poses.
+    common : CommonMotion
+        How well the part of the motions is known that the photos share.
     """
 
     sigma_log_k: float
     weakest_sigma: float
     weakest_share: float
     meter: CriticalMotion
+    common: CommonMotion
 
     @property
     def is_flagged(self) -> bool:
@@ -51,6 +55,10 @@ class ShapeCost:
     @property
     def sentence(self) -> str:
         """For people."""
+        return f"{self._of_height}; {self.common.sentence}" if self.common.is_weak else self._of_height
+
+    @property
+    def _of_height(self) -> str:
         if not np.isfinite(self.sigma_log_k):
             return "the height of the scene is not determined: the measurements leave it entirely open"
         percent = 100 * self.sigma_log_k
@@ -65,12 +73,6 @@ class ShapeCost:
         if self.meter.y_axis_spread_deg < 15:
             return f"{said}, because all cameras were held nearly level"
         return f"{said}, because the cameras were not turned against each other"
-
-
-def row_phi(reconstruction: Reconstruction) -> NDArray[np.int64]:
-    """Components (m, 3) of phi that are each photo's phi1, phi2, phi3 of the paper, which reads rows."""
-    by_row = np.array([READOUTS[reconstruction.camera(i).readout][0] == 1 for i in range(reconstruction.num_images)])
-    return np.where(by_row[:, None], [0, 1, 2], [1, 0, 2]).astype(np.int64)
 
 
 def _log_scale(reconstruction: Reconstruction) -> NDArray[np.float64]:
@@ -135,4 +137,5 @@ def shape_cost(result: BundleResult, options: BundleOptions | None = None) -> Sh
         weakest_sigma=float(np.sqrt(value)),
         weakest_share=float(min(share, 1.0)),
         meter=critical_motion(rec.R_cw, rec.center_w, readout),
+        common=common_motion(result, options),
     )
