@@ -325,10 +325,11 @@ def solve_tracks(
 
 def _lens_only(verdict: Verdict) -> str:
     """The photos whose motion is not taken out, for people."""
-    names = ", ".join(verdict.lens_only[:3]) + (", ..." if len(verdict.lens_only) > 3 else "")
+    count = len(verdict.lens_only)
+    names = ", ".join(verdict.lens_only[:3]) + (", ..." if count > 3 else "")
     return (
-        f"{len(verdict.lens_only)} photos have the lens taken out only, since the measurements do not support the "
-        f"motions found in them: {names}"
+        f"the lens alone is taken out of {count} photo{'s' * (count > 1)}, since the measurements do not support the "
+        f"motion found: {names}"
     )
 
 
