@@ -75,11 +75,26 @@ class ShapeCost:
         return f"{said}, because the cameras were not turned against each other"
 
 
+def _uncertainty(reconstruction: Reconstruction) -> NDArray[np.float64]:
+    """(n,) how badly each point is known along its worst direction, in units of a ray's angle times its length.
+
+    Large where all who see a point stand in one place, as two copies of a photo do.
+    """
+    rec, obs = reconstruction, reconstruction.observations
+    ray = rec.points_w[obs.point_idx] - rec.center_w[obs.frame_idx]
+    square = np.maximum((ray**2).sum(1), 1e-300)[:, None, None]
+    across = (np.eye(3) - ray[:, :, None] * ray[:, None, :] / square) / square
+    information = np.zeros((rec.num_points, 3, 3))
+    np.add.at(information, obs.point_idx, across)
+    least = np.linalg.eigvalsh(information)[:, 0]
+    return np.asarray(1.0 / np.sqrt(np.maximum(least, 1e-24 * np.maximum(np.median(least), 1e-300))))
+
+
 def _log_scale(reconstruction: Reconstruction) -> NDArray[np.float64]:
     """(n, 3) the logarithm of the scene's scale along the axis of readout, as a linear function of small changes.
 
     Of the affine map B that takes the points to the changed ones best: log |B y| - log sqrt(det B / |B y|). Far points
-    hardly count: their own noise is larger than the scene.
+    hardly count, their own noise is larger than the scene, nor do points that were seen from one place only.
     """
     rec = reconstruction
     axes = readout_axes(rec.R_cw, [rec.camera(i).readout for i in range(rec.num_images)])
@@ -87,6 +102,8 @@ def _log_scale(reconstruction: Reconstruction) -> NDArray[np.float64]:
     x = rec.points_w - np.median(rec.points_w, axis=0)
     distance = np.linalg.norm(x, axis=1)
     weight = np.minimum(1.0, (np.median(distance) / np.maximum(distance, 1e-300)) ** 4)
+    uncertainty = _uncertainty(rec)
+    weight *= np.minimum(1.0, (np.median(uncertainty) / uncertainty) ** 2)
     x = rec.points_w - np.average(rec.points_w, axis=0, weights=weight)
     g = weight[:, None] * x @ np.linalg.pinv((weight[:, None] * x).T @ x)
     value: NDArray[np.float64] = 1.5 * (g @ vertical)[:, None] * vertical - 0.5 * g
