@@ -190,6 +190,7 @@ def bundle_adjust(
     sigma = options.sigma_px or _noise_px(base, shutter_model, options.min_sigma_px)
     baseline = reconstruction.baseline
     spreads = _starting_spreads(options, baseline)
+    jackknife, factor = options.deviations == "jackknife", 1.0
     for round_ in range(options.outlier_rounds + options.spread_rounds + 1):
         cleaning = round_ < options.outlier_rounds
         # where the first spreads are but a guess, their solution need not be exact
@@ -197,7 +198,7 @@ def bundle_adjust(
         # once the outliers are gone the noise is nearly normal: squares converge in a few steps and use it fully
         stage = options if round_ == 0 or not options.outlier_rounds else replace(options, loss="squared")
         believed = replace(base, observations=base.observations.select(keep))
-        problem = BundleProblem(believed, shutter_model, stage, sigma, spreads)
+        problem = BundleProblem(believed, shutter_model, stage, sigma * factor, spreads)
         result = minimize(
             problem,
             problem.initial_state(),
@@ -210,7 +211,13 @@ def bundle_adjust(
         )
         iterations += result.num_iterations
         current = problem.reconstruction(result.state)
-        marginals = problem.covariances(result.state)
+        equations = problem.linearize(result.state)
+        marginals = equations.marginal_covariances()
+        weighed, shared = factor, Inflation(np.ones(len(marginals.photos[0])), np.ones(len(options.refine)))
+        if jackknife and not rough:
+            shared = inflation(equations, problem.partitions(result.state), marginals, factor)
+            factor = shared.noise
+        del equations
         before, spreads = spreads, _estimated(spreads, current, marginals.photos, options, baseline)
         revived = revive_points(current, shutter_model)
         if cleaning:
@@ -220,7 +227,12 @@ def bundle_adjust(
             alive = base.track_lengths(keep) >= 2
             keep = keep[alive[base.observations.point_idx]]
             base = base.take_points(alive)
-        elif not rough and revived is current and _settled(before, spreads, options.spread_tolerance):
+        elif (
+            not rough
+            and revived is current
+            and _settled(before, spreads, options.spread_tolerance)
+            and abs(factor - weighed) < 0.1 * factor
+        ):
             break
         else:
             base = replace(revived, observations=base.observations)
@@ -228,10 +240,7 @@ def bundle_adjust(
     rms = float(np.sqrt(np.mean(res[valid] ** 2))) if valid.any() else float("nan")
     dropped = len(reconstruction.observations) - len(current.observations)
     nb, own = marginals.photos.shape[1], 3 * options.varying
-    shared = Inflation(np.ones(nb), np.ones(len(options.refine)))
-    if options.deviations == "jackknife":
-        shared = inflation(problem.linearize(result.state), problem.partitions(result.state), marginals)
-    covariances, intrinsic_covariance = inflated(marginals, shared)
+    covariances, intrinsic_covariance = inflated(marginals, shared.photos / weighed, shared.cameras / weighed)
     return BundleResult(
         current,
         result.stop_reason,
@@ -247,6 +256,7 @@ def bundle_adjust(
         rms,
         dropped,
         shared.photos,
+        weighed,
     )
 
 

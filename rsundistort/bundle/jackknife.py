@@ -2,18 +2,21 @@
 
 What lens, scene or shutter model leave out bends neighbouring measurements alike, so that they tell less than as many
 independent ones, whose covariance is the inverse of the Hessian H. The infinitesimal delete-a-group jackknife (Jaeckel,
-"The infinitesimal jackknife", 1972; White's sandwich in groups) asks the residuals instead: with g the summed gradient of
-a group of measurements the noise's covariance is sum_g (H^-1 g)(H^-1 g)', whatever goes on inside the groups.
+"The infinitesimal jackknife", 1972; White's sandwich, by groups) asks the residuals instead: with g the gradient of a
+group of measurements, the covariance of the noise's share is sum_g (H^-1 g)(H^-1 g)', whatever goes on in the groups.
 
-Two partitions are asked, of points by their place (one corner of the scene: a track's measurements are aligned with each
-other, and share what the scene hides) and of measurements by their place in the photo, over all photos of a camera (one
-corner of the lens). What each shows above independent noise is added (as Cameron, Gelbach and Miller do, "Robust
-inference with multiway clustering", 2011). Neighbours that a border parts are missed; groups are kept in families of
-four, and the products inside a family count twice, for as many pairs of neighbours belong to different families (a lag
-window that errs to the safe side: Vats and Flegal, "Lugsail lag windows", 2022).
+Two partitions are asked: points by their place (a corner of the scene: measurements of a track are aligned with each
+other, and its neighbours look at the same things) and measurements by their place in the photo, over all photos of a
+camera (a corner of the lens). What each shows above independent noise is added, as Cameron, Gelbach and Miller do
+("Robust inference with multiway clustering", 2011). Neighbours that a border parts are missed: groups come in families
+of four, and products inside a family count twice, for as many pairs of neighbours belong to different families (a lag
+window that errs to the safe side; Vats and Flegal, "Lugsail lag windows", 2022).
 
-A variance from few groups is itself noisy, by a third: so the factors are pooled over photos, one for each kind of
-unknown, and none is below 1. What the priors contribute is theirs, and stays.
+The fit follows the noise, most where few measurements decide, and what it has followed the residuals do not show. How
+much that is, the same question says of residuals that a fit would leave of independent noise, and of that noise itself.
+
+A variance from few groups is noisy: factors are pooled over photos, one for each kind of unknown, and none is below 1.
+What the priors contribute is theirs, and stays.
 """
 
 from __future__ import annotations
@@ -34,11 +37,13 @@ Index = NDArray[np.int64]
 
 _FAMILY = 4
 # Families of points that a photo sees: with fewer their variance is noise, with more they part what goes together.
-# (Groups of points on warped herz-jesus-8, whose photos see 4,000 points: deviations of phi grow by 2.0, 2.5, 2.8 and
-# 2.8 from 256 groups to 128, 64, 32 and 16.)
+# (Warped herz-jesus-8, whose photos see all of the scene: deviations of phi1 grow by 2.0, 2.2, 2.5, 2.7 and 2.8 for
+# 256, 128, 64, 32 and 16 groups without families.)
 _FAMILIES = 32
 # Families of the corners of a lens, on each side of the photo.
 _CORNERS = 4
+# A fit that leaves less than this share of a variance to see hides what it is of.
+_LEAST_SEEN = 0.2
 
 
 @dataclass(frozen=True)
@@ -87,9 +92,13 @@ def by_place(points_w: Array, point_idx: Index, num_frames: int) -> Partition:
 
 def _halves(points_w: Array, cell: Index) -> list[Index]:
     """A cell of points cut across its longest side, far points aside."""
+    if not len(cell):
+        return [cell, cell]
     x = points_w[cell]
-    axis = int(np.argmax(np.subtract(*np.percentile(x, (90, 10), axis=0)))) if len(x) > 1 else 0
-    return np.array_split(cell[np.argsort(x[:, axis], kind="stable")], 2)
+    order = np.argsort(x, axis=0, kind="stable")
+    tail = len(cell) // 10
+    sides = [x[order[-1 - tail, axis], axis] - x[order[tail, axis], axis] for axis in range(3)]
+    return np.array_split(cell[order[:, int(np.argmax(sides))]], 2)
 
 
 def by_corner(xy_raw: Array, size: Array, camera: Index) -> Partition:
@@ -107,6 +116,36 @@ def _squares(pulls: Array) -> Array:
     return value
 
 
+class _Residuals(NamedTuple):
+    """Those at hand (o, 2), independent noise of the size that weighs the measurements, and what a fit leaves of it."""
+
+    seen: Array
+    drawn: Array
+    left: Array
+
+    @classmethod
+    def of(cls, equations: NormalEquations) -> _Residuals:
+        """The residuals of a solution."""
+        rng = np.random.default_rng(0)
+        seen, J = equations.blocks
+        drawn = rng.normal(size=seen.shape)
+        photos = rng.normal(size=(equations.num_photos, J.shape[2]))
+        return cls(seen, drawn, equations.residuals_of(drawn, photos, rng.normal(size=equations.num_shared)))
+
+    @property
+    def square(self) -> float:
+        """Mean square of the noise, in the units of what weighs the measurements."""
+        return float((self.seen**2).sum() / (self.left**2).sum())
+
+
+def _ratio(variances: tuple[Array, Array, Array], noise: Array) -> Array:
+    """Variances seen over those of independent noise, by those of `_Residuals` and that of all of that noise."""
+    seen, drawn, left = variances
+    shown = np.divide(left, drawn, out=np.ones_like(left), where=drawn > 0)
+    ratio = np.divide(seen, noise * np.maximum(shown, _LEAST_SEEN), out=np.zeros_like(seen), where=noise > 0)
+    return ratio
+
+
 class Inflation(NamedTuple):
     """How many times larger than with independent noise its share of the deviations is; 1 or more.
 
@@ -121,51 +160,70 @@ class Inflation(NamedTuple):
     photos: Array
     cameras: Array
 
-
-def _pooled(seen: Array, noise: Array, total: Array) -> Array:
-    """Excess (kinds,) of variances (units, kinds) seen over those of independent noise, a unit by its noise's share."""
-    weight = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0)
-    expected = (weight * noise).sum(0)
-    ratio = np.divide((weight * seen).sum(0), expected, out=np.ones_like(expected), where=expected > 0)
-    return np.maximum(ratio - 1.0, 0.0)
+    @property
+    def noise(self) -> float:
+        """One factor for all that has a prior of mean zero: the motion and what varies of photos, else the lens."""
+        kinds = self.photos[6:] if len(self.photos) > 6 else self.cameras
+        return float(np.sqrt(np.mean(kinds**2))) if len(kinds) else 1.0
 
 
-def inflation(equations: NormalEquations, partitions: tuple[Partition, ...], marginals: Marginals) -> Inflation:
-    """The factors, from the residuals at an optimum and the covariances there."""
-    nb = marginals.photos.shape[1]
-    num_cameras = equations.num_cameras
-    totals = [np.einsum("maa->ma", marginals.photos), np.diagonal(marginals.cameras).reshape(num_cameras, -1)]
-    priors = [
-        np.einsum("maa->ma", marginals.photos_of_priors),
-        np.diagonal(marginals.cameras_of_priors).reshape(num_cameras, -1),
-    ]
-    excess = [np.zeros(nb), np.zeros(totals[1].shape[1])]
+def inflation(
+    equations: NormalEquations, partitions: tuple[Partition, ...], marginals: Marginals, noise_factor: float = 1.0
+) -> Inflation:
+    """The factors, from the residuals at an optimum and the covariances there.
+
+    `noise_factor` is how many times larger than independent noise the noise is that weighs the measurements there.
+    """
+    c = equations.num_cameras
+    totals, priors = (
+        (np.einsum("maa->ma", photos), np.diagonal(cameras).reshape(c, -1))
+        for photos, cameras in (marginals[:2], marginals[2:])
+    )
     if equations.inverse is None:
-        return Inflation(*(1.0 + each for each in excess))
+        return Inflation(*(np.ones(total.shape[1]) for total in totals))
+    residuals = _Residuals.of(equations)
     of_lengths = [(each**2).sum(0) for each in equations.length_pulls()]
+    # a unit counts by its noise's share
+    weights = [np.divide(1.0, total, out=np.zeros_like(total), where=total > 0) for total in totals]
+    noise = [(weight * (total - prior)).sum(0) for weight, total, prior in zip(weights, totals, priors, strict=True)]
+    square = residuals.square
+    ratios = [np.full_like(each, square) for each in noise]
     for partition in partitions:
-        for k, pulls in enumerate(equations.group_pulls(*partition.sketch(_FAMILIES))):
-            seen = (_squares(pulls) + of_lengths[k]).reshape(totals[k].shape)
-            excess[k] = excess[k] + _pooled(seen, totals[k] - priors[k], totals[k])
-    return Inflation(*(np.sqrt(1.0 + each) for each in excess))
+        group, sign, count = partition.sketch(_FAMILIES)
+        pulls = [equations.group_pulls(sign[:, None] * each, group, count) for each in residuals]
+        for k, weight in enumerate(weights):
+            variances = [(weight * (_squares(each[k]) + of_lengths[k]).reshape(weight.shape)).sum(0) for each in pulls]
+            ratios[k] = ratios[k] + np.maximum(_ratio((variances[0], variances[1], variances[2]), noise[k]) - square, 0)
+    return Inflation(*(np.sqrt(np.maximum(noise_factor**2 * each, 1.0)) for each in ratios))
 
 
-def inflated(marginals: Marginals, factors: Inflation) -> tuple[Array, Array]:
-    """Covariances of the photos' unknowns (m, nb, nb) and of the cameras' (k, k), the noise's share being larger."""
-    of_cameras = np.tile(factors.cameras, len(marginals.cameras) // max(len(factors.cameras), 1))
-    parts = zip(marginals[:2], marginals[2:], (factors.photos, of_cameras), strict=True)
-    photos, cameras = (prior + by[:, None] * (total - prior) * by for total, prior, by in parts)
-    return photos, cameras
+def inflated(marginals: Marginals, photos: Array, cameras: Array) -> tuple[Array, Array]:
+    """Covariances of photos (m, nb, nb) and cameras (k, k) with the noise's share of the deviations enlarged.
+
+    By a factor for each kind of unknown, (nb,) and (nc,).
+    """
+    of_cameras = np.tile(cameras, len(marginals.cameras) // max(len(cameras), 1))
+    parts = zip(marginals[:2], marginals[2:], (photos, of_cameras), strict=True)
+    of_photos, of_all_cameras = (prior + by[:, None] * (total - prior) * by for total, prior, by in parts)
+    return of_photos, of_all_cameras
 
 
-def inflated_function(found: Function, partitions: tuple[Partition, ...], photos: Array) -> tuple[float, Array]:
-    """Variance of a function and its covariance with the photos (m, nb), whose factors are (nb,)."""
-    noise = found.variance - found.of_priors
-    excess = 0.0
+def inflated_function(
+    found: Function, equations: NormalEquations, partitions: tuple[Partition, ...], photos: Array, noise_factor: float
+) -> tuple[float, Array]:
+    """Variance of a function and its covariance with the photos (m, nb), whose factors are (nb,).
+
+    These are of the noise that weighs the measurements, which is `noise_factor` times the independent one.
+    """
+    noise, residuals = found.variance - found.of_priors, _Residuals.of(equations)
+    ratio = square = residuals.square
     for partition in partitions:
-        sums = np.zeros(_FAMILY * partition.num_families)
-        np.add.at(sums, partition.group, found.pulls)
-        excess += max((float(_squares(sums)) + found.of_lengths) / noise - 1.0, 0.0) if noise > 0 else 0.0
-    own = np.sqrt(1.0 + excess)
+        variances = []
+        for each in residuals:
+            sums = np.zeros(_FAMILY * partition.num_families)
+            np.add.at(sums, partition.group, (found.pulls * each).sum(1))
+            variances.append(_squares(sums) + found.of_lengths)
+        ratio += max(float(_ratio((variances[0], variances[1], variances[2]), np.array(noise))) - square, 0.0)
+    own = np.sqrt(max(ratio, noise_factor**-2))
     rest = found.with_photos - found.with_photos_of_priors
     return found.of_priors + own**2 * noise, found.with_photos_of_priors + own * photos * rest

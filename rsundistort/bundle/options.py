@@ -237,6 +237,7 @@ class BundleResult:
     rms_px: float
     num_outliers: int
     inflation: NDArray[np.float64]
+    noise_factor: float
 
     @property
     def sigma_phi(self) -> NDArray[np.float64]:

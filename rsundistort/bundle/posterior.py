@@ -34,11 +34,14 @@ class Posterior:
             max(result.focal_sigma, 1e-300), max(result.centre_sigma, 1e-300),
         )  # fmt: skip
         plain = replace(options or BundleOptions(), loss="squared")
-        self._problem = BundleProblem(rec, rec.shutter_model, plain, result.sigma_px, spreads)
-        self._state = self._problem.initial_state()
-        self._partitions = self._problem.partitions(self._state) if plain.deviations == "jackknife" else ()
-        self._inflation = result.inflation if self._partitions else np.ones_like(result.inflation)
-        self._covariance = self._problem.linearize(self._state).covariance(self._inflation)
+        self._problem = BundleProblem(rec, rec.shutter_model, plain, result.sigma_px * result.noise_factor, spreads)
+        state = self._problem.initial_state()
+        self._equations = self._problem.linearize(state)
+        self._factor = result.noise_factor
+        self._partitions, self._inflation = self._problem.partitions(state), result.inflation / self._factor
+        if plain.deviations == "model":
+            self._partitions, self._inflation = (), np.full_like(result.inflation, 1.0 / self._factor)
+        self._covariance = self._equations.covariance(self._inflation)
         self._own = 3 * plain.varying
         self._shape = rec.num_images, len(self._inflation) - self._own
 
@@ -51,10 +54,12 @@ class Posterior:
 
         And its covariance (m, nb) with the photos' unknowns. NaN where the system cannot be factored.
         """
-        found = self._problem.function_of_points(self._state, weights)
+        found = self._equations.function_of_points(self._problem.in_order(weights))
         if found is None:
             return np.nan, np.full(self._shape, np.nan)
-        variance, with_photos = inflated_function(found, self._partitions, self._inflation)
+        variance, with_photos = inflated_function(
+            found, self._equations, self._partitions, self._inflation, self._factor
+        )
         return variance, with_photos[:, : self._shape[1]]
 
 
