@@ -47,7 +47,9 @@ def summary(solution: Solution, out: Path, warned: Sequence[str]) -> dict[str, A
         "critical_motion": None
         if critical is None
         else {key: critical[key] for key in ("flagged", "sigma_log_k", "remedy", "sentence")},
-        "doubtful": _doubtful(solution),
+        "verdict": solution.verdict,
+        "doubtful": {image.name: image.doubtful for image in solution.registered if image.doubtful},
+        "lens_only": [image.name for image in solution.registered if image.lens_only],
         "not_joined": {image.name: image.reason for image in solution.images if not image.registered},
         "failed": {image.name: image.reason for image in solution.registered if image.reason},
         "warnings": list(warned),
@@ -57,6 +59,8 @@ def summary(solution: Solution, out: Path, warned: Sequence[str]) -> dict[str, A
 
 def closing_table(solution: Solution, out: Path) -> str:
     """What was found, a line a photo, in 80 columns."""
+    from rsundistort.report import verdict_of
+
     rows = [("photo", "measurements", "rms px", "deg/frame", "shift px")]
     for image in solution.images:
         name = image.name if len(image.name) <= 32 else f"...{image.name[-29:]}"
@@ -74,36 +78,39 @@ def closing_table(solution: Solution, out: Path) -> str:
                 f"{image.rs_shift_px:.1f}",
             )
         )
-    quality = solution.quality
+    quality, verdict = solution.quality, verdict_of(solution)
     total = sum(stage["seconds"] for stage in solution.stages)
     lines = [
         table(rows),
         "",
         f"photos registered  {len(solution.registered)} of {len(solution.images)}",
+        f"verdict            {verdict.headline}",
         f"shutter model      {solution.shutter_model}",
         *_held_out(quality),
         *_cameras(solution),
         *_model(solution),
         *_video(solution),
         *_intrinsics(solution),
+        *_varying(solution),
         *_readout(solution),
         *_depths(solution),
         f"rms residual       {quality['global_rms_px']:.2f} px with a global shutter, {quality['rms_px']:.2f} px now",
         f"outputs            {out}  ({total:.0f} s)",
     ]
-    critical = solution.critical_motion
-    if critical is not None:
-        said = [critical["sentence"]]
-        if critical["flagged"]:
-            said += ["at the next shoot:", *critical["advice"]]
-        lines += ["", *(line for text in said for line in textwrap.wrap(text, 80))]
-    doubtful = _doubtful(solution)
+    critical, said = solution.critical_motion or {}, [verdict.sentences[2]]
+    if critical.get("flagged"):
+        # the same but for its capital
+        said += [critical["sentence"]] * (critical["sentence"][1:] not in said[0])
+        said += ["at the next shoot:", *critical["advice"]]
+    lines += ["", *(line for text in said for line in textwrap.wrap(text, _COLUMNS))]
+    doubtful = [image for image in solution.registered if image.doubtful]
     if doubtful:
-        lines += [
-            "",
-            "doubtful (few measurements, or a motion far from the others'; check these, or leave them out):",
-            f"  {', '.join(doubtful)}",
-        ]
+        lines += ["", "doubtful (check these, or leave them out):"]
+        lines += [f"  {image.name}: {image.doubtful}" for image in doubtful]
+    lens_only = [image.name for image in solution.registered if image.lens_only]
+    if lens_only:
+        lines += ["", "lens only (the motion found is not supported, and was not taken out):"]
+        lines += ["  all photos" if len(lens_only) == len(solution.registered) else f"  {', '.join(lens_only)}"]
     lost = [image for image in solution.images if not image.registered]
     if lost:
         lines += ["", "not joined:", *(f"  {image.name}: {image.reason}" for image in lost)]
@@ -152,22 +159,38 @@ def _model(solution: Solution) -> list[str]:
 def _intrinsics(solution: Solution) -> list[str]:
     """A line on each camera whose intrinsics were solved for, with standard deviations."""
     lines = []
-    for key, sigmas in solution.quality["sigma_intrinsics"].items():
-        camera = solution.cameras[key]
-        values = {
-            "f": camera.K[0, 0],
-            "fx": camera.K[0, 0],
-            "fy": camera.K[1, 1],
-            "cx": camera.K[0, 2],
-            "cy": camera.K[1, 2],
-        }
-        values |= camera.coefficients
+    # photos whose lens varied have cameras of their own: what they share is told once, with the medians
+    groups: dict[Any, list[str]] = {}
+    for key, camera in solution.cameras.items():
+        shared = (camera.width, camera.height, camera.lens, *camera.dist.tolist())
+        groups.setdefault(shared if _varies(solution) else key, []).append(key)
+    for keys in groups.values():
+        sigmas = solution.quality["sigma_intrinsics"].get(keys[0], {})
+        own = [solution.cameras[key].K for key in keys]
+        fx, fy, cx, cy = (sorted(float(K[at]) for K in own)[len(own) // 2] for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        values = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **solution.cameras[keys[0]].coefficients}
         found = [
             f"{name} {values[name]:.{4 if name[0] in 'kp' else 1}f} +- {sigma:.{4 if name[0] in 'kp' else 1}f}"
             for name, sigma in sigmas.items()
         ]
         lines += [f"{'refined' if i == 0 else '':19}{', '.join(found[i : i + 3])}" for i in range(0, len(found), 3)]
     return lines
+
+
+def _varies(solution: Solution) -> bool:
+    return bool(solution.quality.get("focal_sigma") or solution.quality.get("centre_sigma_focal_lengths"))
+
+
+def _varying(solution: Solution) -> list[str]:
+    """A line on how the lens differs from photo to photo, if it does."""
+    if not _varies(solution):
+        return []
+    focal, centre = solution.quality["focal_sigma"], solution.quality["centre_sigma_focal_lengths"]
+    camera = next(iter(solution.cameras.values()))
+    return [
+        f"varying lens       f by {100 * focal:.2g} %, principal point by {centre * camera.K[0, 0]:.1f} px from photo "
+        "to photo (focusing, a stabiliser)"
+    ]
 
 
 def _video(solution: Solution) -> list[str]:
@@ -220,19 +243,3 @@ def _held_out(quality: Mapping[str, Any]) -> list[str]:
         said.append(f"{model} {error:.3f} ({'better' if gain > 0 else 'worse'} by {abs(gain):.1f}{unit}{kept})")
         unit = ""
     return [f"held-out error     {', '.join(said)}"] if said else []
-
-
-def _doubtful(solution: Solution) -> list[str]:
-    """Photos whose motion is known to no better than two pixels, or lies beyond five spreads of all of them."""
-    spread = solution.quality["phi_sigma_rad_per_frame"]
-    names = []
-    for image in solution.registered:
-        if image.motion is None or image.sigma_phi is None:
-            continue
-        camera = solution.cameras[image.camera_id]
-        largest = float(abs(image.motion.phi).max()) * camera.frame_span
-        # over half the frame a rotation by an angle moves pixels by about the angle times half the focal length
-        uncertain_px = float(image.sigma_phi.max()) * camera.frame_span * float(camera.K[0, 0]) / 2
-        if uncertain_px > 2.0 or largest > 5.0 * spread:
-            names.append(image.name)
-    return names

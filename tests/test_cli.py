@@ -237,6 +237,14 @@ def _refine(folder):
     return ["--camera", CAMERA, "--refine", "f,zoom"]
 
 
+def _camera_sigma(text):
+    def make(folder):
+        save_textures(folder, THREE)
+        return ["--camera", CAMERA, "--camera-sigma", text]
+
+    return make
+
+
 def _contradicting(folder):
     save_textures(folder, THREE)
     return ["--camera", CAMERA, "--still", "a.png", "--still", "a.png=2"]
@@ -309,6 +317,11 @@ OTHER_SIZE = json.dumps({"width": 640, "height": 480, "K": [[600, 0, 320], [0, 6
         (_mixed_units, "mixes"),
         (_one_length, "need two"),
         (_refine, "cannot refine 'zoom'"),
+        (_camera_sigma("f=0"), "sigma of f is 0.0, expected a positive number"),
+        (_camera_sigma("f=1,cx=-2"), "sigma of cx is -2.0"),
+        (_camera_sigma("zoom=1"), "sigma of 'zoom'"),
+        (_camera_sigma("f=1,fx=1"), "give one or the other"),
+        (_camera_sigma("k1=nan"), "sigma of k1 is nan"),
     ],
 )
 def test_run_refuses_in_one_line_and_writes_nothing(invoke, tmp_path, make, says):

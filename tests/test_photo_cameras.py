@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 from make_photos import COURTYARD_NAMES, exif_block, half_courtyard, save_png, texture
 
-from rsundistort import Camera, FileError, InputError, RowMotion, RunOptions, rectify, rectify_folder, run
+from rsundistort import Camera, FileError, FormatError, InputError, RowMotion, RunOptions, rectify, rectify_folder, run
 from rsundistort.io import Metadata, find_masks, read_exif, read_mask, write_image
 from rsundistort.io.cameras import camera_to_json
 from rsundistort.pipeline import cameras as photo_cameras
@@ -48,6 +49,44 @@ NAMES, SIZES = ["a.png", "b.png", "c.png", "d.png"], [WIDE, WIDE, WIDE, TALL]
 def write_cameras(path, cameras, images=None):
     value = {"cameras": {key: camera_to_json(camera) for key, camera in cameras.items()}}
     path.write_text(json.dumps(value | ({} if images is None else {"images": images})))
+
+
+def with_sigma(camera, sigma):
+    return json.dumps({**camera_to_json(camera), "sigma": sigma})
+
+
+def test_a_calibration_is_known_as_well_as_its_file_says_and_others_as_calibrations_are(folder):
+    (folder / "camera.json").write_text(with_sigma(camera_of(WIDE, f=60.0), {"f": 1.2, "cx": 0.6, "k1": 0.01}))
+    known = find_cameras(folder, NAMES[:3], SIZES[:3]).known_to(loose=False)
+    assert known.sigmas[0]["f"] == pytest.approx(0.02)  # of the focal length
+    assert known.sigmas[0]["cx"] == pytest.approx(0.01)  # focal lengths
+    assert known.sigmas[0]["k1"] == 0.01
+    assert known.sigmas[0]["cy"] == photo_cameras.GIVEN_SIGMA["cy"]
+
+
+def test_the_command_line_knows_better_than_the_file(folder):
+    (folder / "camera.json").write_text(with_sigma(camera_of(WIDE), {"f": 1.2, "k1": 0.01}))
+    cameras = find_cameras(folder, NAMES[:3], SIZES[:3]).with_sigma({"fx": 0.6, "fy": 0.3})
+    known = cameras.known_to(loose=False)
+    assert cameras.intrinsics[:2] == ("fx", "fy")
+    assert (known.sigmas[0]["fx"], known.sigmas[0]["fy"]) == (pytest.approx(0.01), pytest.approx(0.005))
+    assert known.sigmas[0]["k1"] == 0.01
+
+
+@pytest.mark.parametrize(
+    ("sigma", "says"),
+    [
+        ({"f": 0}, "sigma of f is 0"),
+        ({"f": True}, "sigma of f is True"),
+        ({"f": "1"}, "sigma of f is '1'"),
+        ({"zoom": 1}, "sigma of 'zoom', expected some of f, fx"),
+        ([1, 2], "expected an object"),
+    ],
+)
+def test_standard_deviations_that_cannot_be_are_refused(folder, sigma, says):
+    (folder / "camera.json").write_text(with_sigma(camera_of(WIDE), sigma))
+    with pytest.raises(FormatError, match=re.escape(says)):
+        find_cameras(folder, NAMES[:3], SIZES[:3])
 
 
 def test_photos_take_the_cameras_that_a_file_names_for_them(folder):

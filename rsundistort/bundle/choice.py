@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model import Observations, Reconstruction
+from ..errors import InputError
+from ..model import READOUTS, Observations, Reconstruction
 from .adjust import LADDER, bundle_adjust, objective
 from .options import BundleOptions
-from .problem import reprojection_residuals
+from .problem import Spreads, reprojection_residuals
 
-__all__ = ["ModelChoice", "choose_model", "clipped_errors", "hold_out", "standard_errors"]
+__all__ = ["ModelChoice", "choose_model", "clipped_errors", "corners", "hold_out", "improves", "standard_errors"]
 
 # A track gives one measurement away if this many are left: two fix the point, the third checks them.
 _LEFT_OVER = 3
@@ -21,46 +23,76 @@ _LEFT_OVER = 3
 _CLIP = 5.0
 # Parts of a photo, across and down, whose measurements count once.
 _PARTS = 4
-# A rung is kept if the held-out error falls by this many standard errors: of rungs that explain nothing, one in six
+# A model is better if the held-out error falls by this many standard errors: of models that explain nothing, one in six
 # would pass with one, one in forty does with two.
 _MIN_GAIN = 2.0
-# And by this share, and by more than what it leaves unexplained: where lens, focus and focal length leave residuals of
-# some size, a motion that takes away less than that much may be one more guise of them. (The error is about 1 where
-# noise is all there is. Warped herz-jesus-8: 23.6 global, 7.5 two-step, 2.4 rotation; but 2.4 to 2.4 with translation,
-# which there was none of. A camera without rolling shutter: 3.05 global, 2.83 at best.)
+# And by this share.
 _MIN_FALL = 0.02
+# What a photo's residuals have in common is sought among polynomials of this degree in x and y, whatever bent it.
+_DEGREE = 3
+# Measurements for each coefficient of such a polynomial, at least.
+_PER_COEFFICIENT = 3
+# Two halves of a scene must tell the same motions: what they have in common is more than what they differ by. (Warped
+# photos: 0.98 and more; a camera without rolling shutter: 0.1 to 0.5.)
+_MIN_AGREEMENT = 0.5
+# Motions that move no pixel by as much as this, in half of the photos, are none.
+_UNSEEN_PX = 0.5
+# Of the limit of a spread: one that comes so near would be larger if it could.
+_AT_LIMIT = 0.99
+# Exchanges the axis of the readout; reversing it negates the motion and changes nothing else.
+_OTHER_AXIS = ("top-to-bottom", "left-to-right")
+
+_VARYING = ", varying lens"
 
 
 @dataclass(frozen=True)
 class ModelChoice:
-    """Outcome of `choose_model`.
+    """Outcome of `choose_model`. Keys are models, or say in words how a fit differs from the model alone.
 
     Attributes
     ----------
     shutter_model : str
-        The last rung that explained the held-out measurements better than the one kept before it.
-    held_out_error : dict of model to float
+        The last model that explained the held-out measurements better than the one kept before it.
+    label : str
+        Its key in what follows.
+    varying : bool
+        Whether the intrinsics vary from photo to photo, as `BundleOptions.varying`.
+    shutter : {"found", "not-found", "not-determined"}
+        Whether there is a rolling shutter: "not-determined" if something bends the photos that a model of the shutter
+        explains in part, or no better than one that is read along the other axis.
+    held_out_error : dict of str to float
         Mean over the held-out measurements of half the squared residual in units of the noise, clipped: 1 for noise
         alone. This decides.
-    held_out_rms_px : dict of model to float
+    held_out_rms_px : dict of str to float
         Root mean square of the held-out residuals' parts, long ones clipped.
-    gain : dict of model to float
-        How much the held-out error fell against the rung kept before, in units of the standard error of that fall. The
-        first rung has none.
+    gain : dict of str to float
+        How much the held-out error fell against the one kept before, in units of the standard error of that fall. The
+        first has none.
+    left : dict of str to float
+        Share of the held-out error that a smooth warp of each photo would take away yet.
+    kept : tuple of str
+        Those that were kept, in order.
+    agreement : float or None
+        Correlation of the motions that two halves of the scene tell, each alone; None where no shutter explained
+        anything.
+    against : tuple of str
+        What speaks against a shutter that explained something and was not kept, for people.
     num_held_out : int
         Measurements held out.
     """
 
     shutter_model: str
+    label: str
+    varying: bool
+    shutter: str
     held_out_error: dict[str, float]
     held_out_rms_px: dict[str, float]
     gain: dict[str, float]
+    left: dict[str, float]
+    kept: tuple[str, ...]
+    agreement: float | None
+    against: tuple[str, ...]
     num_held_out: int
-
-    @property
-    def kept(self) -> tuple[str, ...]:
-        """Rungs that were kept: the first, and those whose gain was large enough."""
-        return tuple(model for model in self.held_out_error if self.gain.get(model, np.inf) > _MIN_GAIN)
 
 
 def hold_out(
@@ -109,11 +141,172 @@ def standard_errors(fall: NDArray[np.float64], group: NDArray[np.int64] | None =
     return float(fall.mean() / spread) if spread > 0 else 0.0
 
 
+def improves(before: NDArray[np.float64], after: NDArray[np.float64], gain: float) -> bool:
+    """Whether a model whose errors fell so (n,), by `gain` standard errors, is kept."""
+    return gain > _MIN_GAIN and (before - after).mean() > max(_MIN_FALL * before.mean(), after.mean() - 1.0)
+
+
 def corners(rec: Reconstruction, measured: Observations) -> NDArray[np.int64]:
     """(n,) groups of measurements: those in one of 4 x 4 parts of one photo."""
     size = np.array([(camera.width, camera.height) for camera in rec.cameras])[rec.camera_idx][measured.frame_idx]
     x, y = np.clip(_PARTS * (measured.xy_raw + 0.5) / size, 0, _PARTS - 1).astype(np.int64).T
     return np.asarray((measured.frame_idx * _PARTS + y) * _PARTS + x)
+
+
+def _warps(rec: Reconstruction, measured: Observations) -> NDArray[np.float64]:
+    """(n, k) polynomials in the place of each measurement, products of Legendre's of up to `_DEGREE` together."""
+    size = np.array([(camera.width, camera.height) for camera in rec.cameras])[rec.camera_idx][measured.frame_idx]
+    along = 2 * (measured.xy_raw + 0.5) / size - 1
+    x, y = (np.polynomial.legendre.legvander(along[:, k], _DEGREE) for k in (0, 1))
+    return np.stack([x[:, i] * y[:, j] for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)], axis=1)
+
+
+def errors_without_warp(
+    rec: Reconstruction, fitted: Observations, measured: Observations, sigma_px: float
+) -> NDArray[np.float64]:
+    """As `clipped_errors`, once a smooth warp of each photo, fitted to other measurements, is taken out.
+
+    What it takes away is what the model left, whatever it is: lens, focus, motion. What stays is noise, and matches
+    that are wrong.
+    """
+    (res, valid), (rest, seen) = (reprojection_residuals(replace(rec, observations=obs)) for obs in (fitted, measured))
+    of_fitted, of_measured = _warps(rec, fitted), _warps(rec, measured)
+    rest = np.array(rest)
+    for mine, others in zip(fitted.by_photo(rec.num_images), measured.by_photo(rec.num_images), strict=True):
+        mine = mine[valid[mine]]
+        A, B = of_fitted[mine], of_measured[others]
+        if len(mine) < _PER_COEFFICIENT * A.shape[1]:
+            continue
+        noise = sigma_px * fitted.sigma[mine, None]
+        found = np.zeros((A.shape[1], 2))
+        for _ in range(4):  # reweighted, so that wrong matches count little
+            square = (((res[mine] - A @ found) / noise) ** 2).sum(1, keepdims=True)
+            weight = 1.0 / noise / np.sqrt(1.0 + square / _CLIP**2)
+            found = np.linalg.lstsq(A * weight, res[mine] * weight, rcond=None)[0]
+        rest[others] -= B @ found
+    square = np.where(seen, (rest**2).sum(1) / (sigma_px * measured.sigma) ** 2, np.inf)
+    return np.asarray(np.minimum(square, 2 * _CLIP**2) / 2)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """One model fitted, and what it says of the held-out measurements."""
+
+    label: str
+    model: str
+    varying: bool
+    reconstruction: Reconstruction
+    errors: NDArray[np.float64]
+    rms_px: float
+    left: float
+    spreads: Spreads
+
+
+def half_across_readout(reconstruction: Reconstruction) -> NDArray[np.bool_]:
+    """(n,) points on one side of the photos that show them, sides across the readout; half of all."""
+    obs = reconstruction.observations
+    of_photo = [reconstruction.camera(i) for i in range(reconstruction.num_images)]
+    axis = np.array([1 - READOUTS[camera.readout][0] for camera in of_photo])[obs.frame_idx]
+    size = np.array([(camera.width, camera.height) for camera in of_photo], float)[obs.frame_idx]
+    rows = np.arange(len(obs))
+    total = np.bincount(obs.point_idx, (obs.xy_raw / size)[rows, axis], reconstruction.num_points)
+    place = total / np.maximum(np.bincount(obs.point_idx, minlength=reconstruction.num_points), 1)
+    return np.asarray(place < np.median(place))
+
+
+def moved_px(reconstruction: Reconstruction) -> NDArray[np.float64]:
+    """(m,) about how far each photo's motion moves pixels half a frame from the principal row."""
+    rec = reconstruction
+    depth = np.linalg.norm(np.median(rec.points_w, axis=0) - rec.center_w, axis=1)
+    angle = np.linalg.norm(rec.phi, axis=1) + np.linalg.norm(rec.velocity, axis=1) / depth
+    focal = np.array([rec.camera(i).K[0, 0] for i in range(rec.num_images)])
+    return np.asarray(focal * angle * rec.frame_span() / 2)
+
+
+def read_along_other_axis(reconstruction: Reconstruction) -> Reconstruction:
+    """The same photos as if all cameras were read along the other axis; without motion."""
+    cameras = [replace(each, readout=_OTHER_AXIS[READOUTS[each.readout][0]]) for each in reconstruction.cameras]
+    still = np.zeros_like(reconstruction.phi)
+    return replace(reconstruction, cameras=cameras, phi=still, velocity=still)
+
+
+class _Fits:
+    """Models fitted to nine tenths of the measurements; the rest judges them."""
+
+    def __init__(
+        self,
+        reconstruction: Reconstruction,
+        options: BundleOptions,
+        sigma_px: float,
+        seed: int,
+        progress: Callable[[str, float], None] | None,
+    ) -> None:
+        fitted, held = hold_out(reconstruction, seed=seed)
+        # the gross outliers are gone: squares, and no closer than tells one model from the next
+        self._rough = replace(
+            options, outlier_rounds=0, spread_rounds=4, spread_tolerance=0.05, loss="squared", sigma_px=sigma_px,
+            cost_tolerance=1e-5, lengths=(), deviations="model",
+        )  # fmt: skip
+        self.given = replace(reconstruction, observations=reconstruction.observations.select(fitted))
+        self.held_out = reconstruction.observations.select(held)
+        self._group = corners(reconstruction, self.held_out)
+        self._sigma_px = sigma_px
+        self._progress = progress
+        self.done: dict[str, _Fit] = {}
+
+    def fit(self, model: str, varying: bool, starts: Sequence[Reconstruction], label: str | None = None) -> _Fit:
+        """Fit a model from the cheapest of some starts."""
+        label = label or model + _VARYING * varying
+        step = None if self._progress is None else partial(self._progress, label)
+        options = replace(self._rough, varying=varying)
+        # the motions given belong to the poses and the lens given: with those of another model they fit nothing. One
+        # that starts at the cheaper of the two never ends above the simpler one, which it holds as a case
+        cost = [objective(start, model, options) for start in starts]
+        result = bundle_adjust(starts[int(np.argmin(cost))], model, options, step)
+        found, spreads = result.reconstruction, Spreads(result.phi_sigma, result.velocity_sigma)
+        errors, rms_px = clipped_errors(found, self.held_out, self._sigma_px)
+        smooth = errors_without_warp(found, self.given.observations, self.held_out, self._sigma_px)
+        left = max(float(errors.mean() - smooth.mean()), 0.0) if len(errors) else 0.0
+        self.done[label] = _Fit(label, model, varying, found, errors, rms_px, left, spreads)
+        return self.done[label]
+
+    def agreement(self, fit: _Fit) -> float:
+        """Correlation over photos and axes of the motions (phi) that two halves of the scene tell, each fitted alone.
+
+        Halves across the readout, so that both see all of it. What a lens leaves bends them differently; only about
+        their means, which a lens can share.
+        """
+        rec = fit.reconstruction
+        options = replace(self._rough, varying=fit.varying, phi_sigma=fit.spreads.phi)
+        options = replace(options, velocity_sigma=fit.spreads.velocity or None)
+        first = half_across_readout(rec)
+        try:
+            halves = [bundle_adjust(rec.take_points(half), fit.model, options) for half in (first, ~first)]
+        except InputError:  # one without measurements
+            return 0.0
+        span = rec.frame_span()[:, None]
+        one, other = ((each.reconstruction.phi * span) for each in halves)
+        one, other = one - one.mean(0), other - other.mean(0)
+        scale = float(np.sqrt((one**2).sum() * (other**2).sum()))
+        return float((one * other).sum() / scale) if scale > 0 else 0.0
+
+    def at_limit(self, fit: _Fit) -> bool:
+        """Whether the motions would be larger than what is known from elsewhere allows."""
+        limits = [(fit.spreads.phi, self._rough.phi_sigma_most)]
+        if fit.model == "constant-motion":
+            limits.append((fit.spreads.velocity, self._rough.velocity_sigma_most))
+        return any(most is not None and spread >= _AT_LIMIT * most for spread, most in limits)
+
+    def gain(self, before: _Fit, after: _Fit) -> float:
+        """Fall of the held-out error from one fit to another, in standard errors."""
+        return standard_errors(before.errors - after.errors, self._group)
+
+    def is_better(self, before: _Fit, after: _Fit) -> bool:
+        """Whether that is more than chance, and more than nothing."""
+        if not len(self.held_out):
+            return False
+        fall = float((before.errors - after.errors).mean())
+        return self.gain(before, after) > _MIN_GAIN and fall > _MIN_FALL * float(before.errors.mean())
 
 
 def choose_model(
@@ -125,19 +318,22 @@ def choose_model(
     seed: int = 0,
     progress: Callable[[str, float], None] | None = None,
 ) -> ModelChoice:
-    """Fit each rung to nine tenths of the measurements, and keep it only if it foretells the rest better.
+    """Fit models to nine tenths of the measurements, and keep those that foretell the rest better.
 
-    Better means: the mean held-out error falls by more than two standard errors, measurements in the same part of the
-    same photo counted once, by more than two hundredths, and by more than it stays above what noise alone would give.
+    First a lens that varies from photo to photo, then the models of the shutter in order, so that these explain what no
+    lens does. Better means: the mean held-out error falls by more than two standard errors, measurements in the same
+    part of the same photo counted once, and by more than two hundredths. A model of the shutter must also take away
+    more than a smooth warp of each photo would yet, be better than itself read along the other axis (what bends photos
+    for another reason can be taken for either), and two halves of the scene must tell the same motions.
 
     Parameters
     ----------
     reconstruction : Reconstruction
         Measurements without gross outliers, and a start.
     rungs : sequence of str
-        Models in the order of the ladder.
+        Models in the order of the ladder, the first without a shutter.
     options : BundleOptions, optional
-        Of the fits, which are rough and of plain squares.
+        Of the fits, which are rough and of plain squares. Without refined intrinsics none vary either.
     sigma_px : float
         Noise of the measurements, as the last adjustment found it.
     seed : int
@@ -145,35 +341,69 @@ def choose_model(
     progress : callable, optional
         Called as (model, cost).
     """
-    fitted, held = hold_out(reconstruction, seed=seed)
-    base = options or BundleOptions()
-    # the gross outliers are gone: squares, and no closer than tells one rung from the next
-    rough = replace(
-        base, outlier_rounds=0, spread_rounds=4, spread_tolerance=0.05, loss="squared", sigma_px=sigma_px,
-        cost_tolerance=1e-5, lengths=(), deviations="model",
-    )  # fmt: skip
-    given = replace(reconstruction, observations=reconstruction.observations.select(fitted))
-    held_out = reconstruction.observations.select(held)
-    group = corners(reconstruction, held_out)
-    starts = [given]
-    chosen, best = rungs[0], np.zeros(0)
-    error: dict[str, float] = {}
-    rms: dict[str, float] = {}
-    gain: dict[str, float] = {}
-    for model in rungs:
-        step = None if progress is None else (lambda cost, model=model: progress(model, cost))
-        # the motions given belong to the poses and the lens given: with those of another rung they fit nothing. A rung
-        # that starts at the cheaper of the two never ends above the simpler one, which it holds as a case
-        cost = [objective(start, model, rough) for start in starts]
-        found = bundle_adjust(starts[int(np.argmin(cost))], model, rough, step).reconstruction
-        starts = [found, given]
-        errors, rms[model] = clipped_errors(found, held_out, sigma_px)
-        error[model] = float(errors.mean())
-        if model == rungs[0]:
-            best = errors
+    options = options or BundleOptions()
+    fits = _Fits(reconstruction, options, sigma_px, seed, progress)
+    given = fits.given
+    best = fits.fit(rungs[0], False, [given])
+    kept, gain = [best.label], dict[str, float]()
+    if options.refine:
+        vary = fits.fit(rungs[0], True, [best.reconstruction])
+        gain[vary.label] = fits.gain(best, vary)
+        if fits.is_better(best, vary):
+            best = vary
+            kept.append(vary.label)
+    plain = last = best
+    against: list[str] = []
+    for model in rungs[1:]:
+        last = fits.fit(model, plain.varying, [last.reconstruction, given])
+        gain[last.label] = fits.gain(best, last)
+        # where the two do as well, the exact model of a turn is taken, not its approximation
+        exact = best.model == "two-step" and model == "rotation" and not fits.is_better(last, best)
+        if not exact and not fits.is_better(best, last):
             continue
-        fall = best - errors
-        gain[model] = standard_errors(fall, group)
-        if gain[model] > _MIN_GAIN and fall.mean() > max(_MIN_FALL * best.mean(), errors.mean() - 1.0):
-            chosen, best = model, errors
-    return ModelChoice(chosen, error, rms, gain, int(held.sum()))
+        if exact or float((best.errors - last.errors).mean()) > last.left:
+            best = last
+            kept.append(last.label)
+        else:
+            against.append(f"{model} takes away less of what bends the photos than it leaves")
+    agreement = None
+    if best is not plain:
+        against = []
+    if best is not plain and np.median(moved_px(best.reconstruction)) < _UNSEEN_PX:
+        best = plain
+    if best is not plain:
+        other = read_along_other_axis(plain.reconstruction)
+        label = f"{best.label}, read along the other axis"
+        gain[label] = fits.gain(best, fits.fit(best.model, best.varying, [other], label))
+        if not fits.is_better(fits.done[label], best):
+            against.append("a shutter that reads along the other axis explains the photos as well")
+        agreement = fits.agreement(best)
+        if agreement < _MIN_AGREEMENT:
+            against.append(f"two halves of the scene tell different motions (they agree to {agreement:.2f} of 1)")
+        if fits.at_limit(best):
+            against.append("the exposure times allow less motion than they would need")
+        if against:
+            best = plain
+        elif best.varying:
+            shared = fits.fit(best.model, False, [best.reconstruction, given])
+            gain[best.label] = fits.gain(shared, best)
+            if not fits.is_better(shared, best):
+                best = shared
+                kept.append(shared.label)
+    if not len(fits.held_out):
+        against.append("no point is seen by three photos, so no measurement could be held out to judge by")
+    shutter = "found" if best is not plain else "not-determined" if against else "not-found"
+    return ModelChoice(
+        best.model,
+        best.label,
+        best.varying,
+        shutter,
+        {label: float(fit.errors.mean()) if len(fit.errors) else float("nan") for label, fit in fits.done.items()},
+        {label: fit.rms_px for label, fit in fits.done.items()},
+        gain,
+        {label: fit.left for label, fit in fits.done.items()},
+        tuple(kept),
+        agreement,
+        tuple(against),
+        len(fits.held_out),
+    )

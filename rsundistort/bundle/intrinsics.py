@@ -53,7 +53,8 @@ class GuessedCameras:
     def __post_init__(self) -> None:
         if not isinstance(self.sigma, Mapping) and len(self.sigma) != len(self.cameras):
             raise InputError(f"{len(self.cameras)} guessed cameras and the sigmas of {len(self.sigma)}")
-        for name, value in (each for sigma in self.sigmas for each in sigma.items()):
+        told = [self.sigma] if isinstance(self.sigma, Mapping) else self.sigma
+        for name, value in (each for sigma in told for each in sigma.items()):
             if name not in INTRINSICS or not 0 < value < np.inf:
                 raise InputError(f"guessed {name!r}: sigma {value!r}, expected a positive one of an intrinsic")
 
@@ -73,9 +74,9 @@ class GuessedCameras:
         return found
 
 
-# Degrees of freedom of the priors on intrinsics: normal near the middle, but what lies ten deviations off pulls as
-# hard as what lies two.
-_TAIL = 4.0
+# Square of the deviation where the priors on intrinsics bend: normal near the middle, but what lies far off pulls no
+# harder than what lies three deviations off.
+_TAIL = 9.0
 
 
 def prior_weight(square: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -56,7 +56,7 @@ def camera_from_json(value: Any, where: str) -> Camera:
 
 
 def sigma_from_json(value: Any, where: str) -> dict[str, float]:
-    """Standard deviations by intrinsic, in pixels or of the coefficients, of a parsed `camera.json`; {} if none told."""
+    """Standard deviations by intrinsic, in pixels or of coefficients, of a parsed `camera.json`; {} if none told."""
     sigma = value.get("sigma") or {}
     if not isinstance(sigma, dict):
         raise FormatError(f'{where}: sigma is {sigma!r}, expected an object such as {{"f": 1.5, "k1": 0.003}}')

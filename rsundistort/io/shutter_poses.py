@@ -80,11 +80,12 @@ def write_shutter_poses(folder: Path, solution: Solution, photos: Mapping[str, s
 
 
 def _motion(solution: Solution, image: SolvedImage) -> RowMotion:
-    """The motion that the solution's model heeds."""
-    assert image.motion is not None
+    """The motion that the solution's model heeds, as far as the measurements support it."""
+    motion = image.taken_out
+    assert motion is not None
     if solution.shutter_model == "global":
         return RowMotion()
-    return image.motion if solution.shutter_model == "constant-motion" else RowMotion(image.motion.phi)
+    return motion if solution.shutter_model == "constant-motion" else RowMotion(motion.phi)
 
 
 def _clock(camera: Camera, place: float, border: float = 0.5) -> float:

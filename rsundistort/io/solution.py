@@ -61,6 +61,8 @@ def solution_to_json(solution: Solution) -> dict[str, Any]:
             "num_observations": image.num_observations,
             "rms_px": image.rms_px,
             "rs_shift_px": image.rs_shift_px,
+            "doubtful": image.doubtful,
+            "lens_only": image.lens_only,
         }
         if image.motion is not None:
             entry["phi"], entry["velocity"] = image.motion.phi, image.motion.velocity
@@ -84,6 +86,7 @@ def solution_to_json(solution: Solution) -> dict[str, Any]:
             k: {"width": c.width, "height": c.height, "K": c.K} for k, c in solution.rectified_cameras.items()
         },
         "shutter_model": solution.shutter_model,
+        "verdict": solution.verdict,
         "images": images,
         "critical_motion": solution.critical_motion,
         "quality": dict(solution.quality),
@@ -159,6 +162,16 @@ def _roi(entry: dict[str, Any]) -> tuple[int, int, int, int] | None:
     return roi[0], roi[1], roi[2], roi[3]
 
 
+def _verdict(value: dict[str, Any]) -> dict[str, Any] | None:
+    said = value.get("verdict")
+    if said is None:
+        return None
+    words = [said.get("shutter"), said.get("shape"), *said.get("reasons", ())]
+    if not all(isinstance(word, str) for word in words):
+        raise InputError(f"the verdict is {said!r}, expected shutter, shape and reasons in words")
+    return {"shutter": words[0], "shape": words[1], "reasons": words[2:]}
+
+
 def _solution_from_json(value: dict[str, Any], where: str) -> Solution:
     cameras = {k: camera_from_json(c, f"camera {k}") for k, c in value["cameras"].items()}
     rectified = {k: Camera(c["width"], c["height"], c["K"]) for k, c in value["rectified_cameras"].items()}
@@ -185,6 +198,8 @@ def _solution_from_json(value: dict[str, Any], where: str) -> Solution:
                 reason=entry.get("reason"),
                 turned=_orientation(entry),
                 roi=_roi(entry),
+                doubtful=None if entry.get("doubtful") is None else str(entry["doubtful"]),
+                lens_only=bool(entry.get("lens_only")),
             )
         )
     return Solution(
@@ -197,4 +212,5 @@ def _solution_from_json(value: dict[str, Any], where: str) -> Solution:
         stages=value.get("stages") or (),
         options=value.get("options") or {},
         generator=value.get("generator") or {},
+        verdict=_verdict(value),
     )

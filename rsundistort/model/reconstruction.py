@@ -140,11 +140,16 @@ class Reconstruction:
         return camera.varied(*self.variation[image].tolist()) if self.variation[image].any() else camera
 
     @property
-    def cameras_of_photos(self) -> tuple[tuple[Camera, ...], NDArray[np.int64]]:
-        """Cameras with all that is known of them, and that of each photo (m,): shared, or one a photo if they vary."""
-        if not self.variation.any():
-            return tuple(self.cameras), self.camera_idx
-        return tuple(self.camera(i) for i in range(self.num_images)), np.arange(self.num_images)
+    def varies(self) -> bool:
+        """Whether photos of one camera differ in their intrinsics."""
+        return bool(self.variation.any())
+
+    def with_own_cameras(self) -> Reconstruction:
+        """The same with a camera for each photo, if they vary."""
+        if not self.varies:
+            return self
+        own = tuple(self.camera(i) for i in range(self.num_images))
+        return replace(self, cameras=own, camera_idx=np.arange(self.num_images), variation=np.zeros(0))
 
     def motion(self, image: int) -> RowMotion:
         """The motion of a photo during its readout."""

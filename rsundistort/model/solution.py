@@ -49,6 +49,11 @@ class SolvedImage:
         the turned frame. 1 in the stored frame.
     roi : (x, y, width, height) or None
         Rectangle of the rectified photo without empty pixels, if there is one.
+    doubtful : str or None
+        Why its motion is to be checked.
+    lens_only : bool
+        Whether the rectified photo has the lens taken out only, since the measurements do not support the motion that
+        was found: `motion` stays what was found, `taken_out` is none.
     """
 
     name: str
@@ -65,6 +70,8 @@ class SolvedImage:
     reason: str | None = None
     turned: int = 1
     roi: tuple[int, int, int, int] | None = None
+    doubtful: str | None = None
+    lens_only: bool = False
 
     def __post_init__(self) -> None:
         check_photo_name(self.name)
@@ -79,6 +86,11 @@ class SolvedImage:
     def registered(self) -> bool:
         """Whether the photo has a motion, and can be rectified."""
         return self.motion is not None
+
+    @property
+    def taken_out(self) -> RowMotion | None:
+        """The motion that the rectified photo is without; None of a photo that has none."""
+        return RowMotion() if self.lens_only and self.motion is not None else self.motion
 
     @property
     def posed(self) -> bool:
@@ -104,6 +116,8 @@ class Solution:
         Name and seconds of each stage, with what it counted.
     options, generator : mapping
         What it was made with.
+    verdict : mapping or None
+        What to believe of it: `shutter`, `shape` and `reasons`, as in `verdict.Verdict`; None where nobody judged.
     """
 
     shutter_model: str
@@ -115,6 +129,7 @@ class Solution:
     stages: Sequence[Mapping[str, Any]] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
     generator: Mapping[str, str] = field(default_factory=dict)
+    verdict: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         check_shutter_model(self.shutter_model)

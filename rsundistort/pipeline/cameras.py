@@ -92,7 +92,7 @@ class PhotoCameras:
         for told in self.sigma or [{}] * len(self.cameras):
             sigma = {**default, "fx": default["f"], "fy": default["f"], **told}
             if "f" in told:
-                sigma |= {"fx": told["f"], "fy": told["f"]}
+                sigma |= {name: told.get(name, told["f"]) for name in ("fx", "fy")}
             sigmas.append(sigma)
         return GuessedCameras(self.cameras, sigmas)
 

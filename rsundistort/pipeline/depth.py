@@ -246,7 +246,7 @@ class PhotoDepths:
     def job(self, name: str) -> DepthJob:
         """How to find what a photo is rectified with."""
         image = self._solution.image(name)
-        motion = image.motion or RowMotion()
+        motion = image.taken_out or RowMotion()
         camera = self._solution.cameras[image.camera_id]
         new_camera = self._solution.rectified_cameras[image.camera_id]
         if name not in self._moving or not motion.velocity.any():

@@ -278,6 +278,8 @@ def _solve(
             None if matched is None else Feedback(matched),
         )
     after = solved.result.reconstruction
+    for text in cameras.contradicted(after.cameras, options_of(after)):
+        warnings.warn(text, RsUndistortWarning, stacklevel=3)
     lost = dict.fromkeys(given.unregistered, "it is not registered in the model")
     lost |= dict.fromkeys(set(rec.image_names) - set(after.image_names), "no measurement of it survived")
     readouts = known_readouts(None, after.image_names, after.cameras, after.camera_idx, None, options.readout_s, None)

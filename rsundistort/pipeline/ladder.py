@@ -27,6 +27,7 @@ from ..errors import ReconstructionError, RsUndistortWarning
 from ..model import Reconstruction
 from ..model.projection import unproject_points
 from ..sfm import LEAST_MEASUREMENTS, MatchedPhotos, align_tracks, map_photos, match_photos, retriangulate
+from ..verdict import Verdict, judge
 from .load import LoadedPhotos
 from .pairing import pairs_to_match
 from .patches import patch_source
@@ -61,6 +62,8 @@ class Solved:
         For the next shoot, where the poses are critical.
     readouts : ReadoutChoice or None
         What the photos say of directions of the readout that nobody told.
+    verdict : Verdict or None
+        What to believe of all this.
     """
 
     result: BundleResult
@@ -69,6 +72,7 @@ class Solved:
     remedy: Remedy | None = None
     advice: Sequence[Advice] = ()
     readouts: ReadoutChoice | None = None
+    verdict: Verdict | None = None
 
 
 @dataclass(frozen=True)
@@ -275,10 +279,14 @@ def solve_tracks(
             result.reconstruction, LADDER, options, sigma_px=result.sigma_px, seed=seed,
             progress=lambda model, _: log.tell(f"choice: {model}", 0),
         )  # fmt: skip
-        if choice.shutter_model != shutter_model:
+        if choice.shutter_model != shutter_model or choice.varying:
+            options = replace(options, varying=choice.varying)
             start = replace(tracks, shutter_model=choice.shutter_model)
             result = bundle_adjust(start, choice.shutter_model, options, partial(_tell, log, "choice"))
-        log.end("choice of the model", chosen=choice.shutter_model, gain=choice.gain, num_held_out=choice.num_held_out)
+        log.end(
+            "choice of the model", chosen=choice.shutter_model, varying_lens=choice.varying, shutter=choice.shutter,
+            agreement=choice.agreement, gain=choice.gain, num_held_out=choice.num_held_out,
+        )  # fmt: skip
     mended, advice = None, []
     if result.reconstruction.shutter_model != "global":
         log.begin("critical motion")
@@ -301,7 +309,22 @@ def solve_tracks(
     )
     global_result = bundle_adjust(result.reconstruction, "global", plain)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
-    return Solved(result, global_result, choice, mended, advice, readouts)
+    log.begin("verdict")
+    measured = mapped if feedback is None else tracks
+    verdict = judge(result, global_result, choice, mended, measured, {*options.known_phi, *options.held_phi})
+    if verdict.lens_only:
+        warnings.warn(_lens_only(verdict), RsUndistortWarning, stacklevel=3)
+    log.end("verdict", shutter=verdict.shutter, shape=verdict.shape)
+    return Solved(result, global_result, choice, mended, advice, readouts, verdict)
+
+
+def _lens_only(verdict: Verdict) -> str:
+    """The photos whose motion is not taken out, for people."""
+    names = ", ".join(verdict.lens_only[:3]) + (", ..." if len(verdict.lens_only) > 3 else "")
+    return (
+        f"{len(verdict.lens_only)} photos have the lens taken out only, since the measurements do not support the "
+        f"motions found in them: {names}"
+    )
 
 
 def _fed_back(

@@ -31,8 +31,8 @@ class Outcome:
         The reconstruction.
     cameras : PhotoCameras
         The cameras that it began with, and where they come from.
-    camera_ids : sequence of int
-        Of the reconstruction's cameras, in all outputs.
+    shared_ids : sequence of int
+        Of the cameras that photos share, in all outputs; where they vary, the photos' own are numbered.
     unregistered : mapping of name to reason
         Photos that are not in it.
     readouts : mapping of camera index to (seconds, source)
@@ -43,21 +43,33 @@ class Outcome:
 
     solved: Solved
     cameras: PhotoCameras
-    camera_ids: Sequence[int]
+    shared_ids: Sequence[int]
     unregistered: Mapping[str, str] = field(default_factory=dict)
     readouts: Mapping[int, tuple[float, str]] = field(default_factory=dict)
     options: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def reconstruction(self) -> Reconstruction:
-        """With poses, motions and points."""
-        return self.solved.result.reconstruction
+        """With poses, motions and points, and a camera for each photo if they vary."""
+        return self.solved.result.reconstruction.with_own_cameras()
+
+    @property
+    def camera_ids(self) -> list[int]:
+        """Of the reconstruction's cameras, in all outputs."""
+        rec = self.solved.result.reconstruction
+        return list(range(1, 1 + rec.num_images)) if rec.varies else list(self.shared_ids)
 
 
 def versions() -> dict[str, str]:
     """Versions of what a result depends on."""
     names = ("rsundistort", "opencv-contrib-python-headless", "numpy", "scipy", "numba", "pycolmap")
     return {"python": platform.python_version(), **{name: version(name) for name in names}}
+
+
+def _by_camera(keys: Sequence[str], shared: Reconstruction, values: Sequence[Any]) -> dict[str, Any]:
+    """What shared cameras have, by the ids of the outputs: those of the photos, if they vary."""
+    of_photos = [values[k] for k in shared.camera_idx.tolist()]
+    return dict(zip(keys, of_photos if shared.varies else values, strict=True))
 
 
 def _readouts(rec: Reconstruction, cameras: PhotoCameras) -> str | dict[str, str]:
@@ -113,11 +125,13 @@ def _critical(solved: Solved) -> dict[str, Any]:
 
 def solution_of(outcome: Outcome, options: SolveOptions) -> Solution:
     """The solution of an adjusted reconstruction, with every photo in it; its views are those of the raw photos."""
-    solved, rec = outcome.solved, outcome.reconstruction
+    solved, rec, verdict = outcome.solved, outcome.reconstruction, outcome.solved.verdict
+    doubtful, lens_only = ({}, ()) if verdict is None else (verdict.doubtful, verdict.lens_only)
     rms = _image_rms(rec)
     counts = np.bincount(rec.observations.frame_idx, minlength=rec.num_images)
     keys = [str(key) for key in outcome.camera_ids]
     cameras = dict(zip(keys, rec.cameras, strict=True))
+    shared = solved.result.reconstruction
     places = {name: i for i, name in enumerate(rec.image_names)}
     images = []
     for name in sorted([*rec.image_names, *outcome.unregistered]):
@@ -125,6 +139,7 @@ def solution_of(outcome: Outcome, options: SolveOptions) -> Solution:
             images.append(SolvedImage(name, keys[0], reason=outcome.unregistered[name]))
             continue
         i = places[name]
+        shift_px = largest_shift_px(rec.camera(i), rec.motion(i), rec.shutter_model) if name not in lens_only else 0.0
         images.append(
             SolvedImage(
                 name=name,
@@ -135,7 +150,9 @@ def solution_of(outcome: Outcome, options: SolveOptions) -> Solution:
                 sigma_phi=None if rec.shutter_model == "global" else solved.result.sigma_phi[i],
                 num_observations=int(counts[i]),
                 rms_px=float(rms[i]),
-                rs_shift_px=largest_shift_px(rec.camera(i), rec.motion(i), rec.shutter_model),
+                rs_shift_px=shift_px,
+                doubtful=doubtful.get(name),
+                lens_only=name in lens_only,
             )
         )
     quality = {
@@ -144,23 +161,31 @@ def solution_of(outcome: Outcome, options: SolveOptions) -> Solution:
         "rms_px": solved.result.rms_px,
         "global_rms_px": solved.global_result.rms_px,
         **_held_out(solved.choice),
-        "sigma_intrinsics": dict(zip(cameras, solved.result.sigma_intrinsics, strict=True)),
+        "sigma_intrinsics": _by_camera(keys, shared, solved.result.sigma_intrinsics),
+        "focal_sigma": solved.result.focal_sigma,
+        "centre_sigma_focal_lengths": solved.result.centre_sigma,
         "phi_sigma_rad_per_frame": solved.result.phi_sigma,
         "stop_reason": solved.result.stop_reason,
-        "readout_times": {keys[k]: {"ms": 1e3 * s, "source": source} for k, (s, source) in outcome.readouts.items()},
+        "readout_times": {
+            key: {"ms": 1e3 * each[0], "source": each[1]}
+            for key, each in _by_camera(
+                keys, shared, [outcome.readouts.get(k) for k in range(len(shared.cameras))]
+            ).items()
+            if each is not None
+        },
     }
     return Solution(
         shutter_model=rec.shutter_model,
         cameras=cameras,
         # same size and K, so that raw and rectified compare pixel by pixel
-        rectified_cameras={key: camera.pinhole() for key, camera in cameras.items()},
+        rectified_cameras=_by_camera(keys, shared, [camera.pinhole() for camera in shared.cameras]),
         images=tuple(images),
         quality=quality,
         critical_motion=None if solved.remedy is None else _critical(solved),
         options={
             "camera": outcome.cameras.source,
             "shutter_model": options.shutter_model,
-            "readout": _readouts(rec, outcome.cameras),
+            "readout": _readouts(shared, outcome.cameras),
             "guesses": _guesses(solved, outcome.cameras),
             "seed": options.seed,
             "interpolation": options.interpolation,
@@ -175,6 +200,7 @@ def solution_of(outcome: Outcome, options: SolveOptions) -> Solution:
             **outcome.options,
         },
         generator=versions(),
+        verdict=None if verdict is None else verdict.to_json(),
     )
 
 
@@ -185,4 +211,7 @@ def _held_out(choice: ModelChoice | None) -> dict[str, Any]:
         "held_out_error": {} if choice is None else choice.held_out_error,
         "held_out_gain": {} if choice is None else choice.gain,
         "held_out_kept": [] if choice is None else list(choice.kept),
+        "held_out_chosen": None if choice is None else choice.label,
+        "held_out_left": {} if choice is None else choice.left,
+        "agreement_of_halves": None if choice is None else choice.agreement,
     }

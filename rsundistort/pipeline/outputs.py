@@ -31,7 +31,7 @@ from ..io.journal import Journal
 from ..io.outputs import batch_folder
 from ..io.places import local_place
 from ..io.video import FRAME_TABLE
-from ..model import Reconstruction, Solution
+from ..model import Reconstruction, RowMotion, Solution
 from ..model.orientation import turn_reconstruction, turn_solution
 from ..report import Diagnostics, relative_folder, write_diagnostics, write_report
 from .depth import DEPTHS, PhotoDepths, ScenePoints, with_depths
@@ -107,7 +107,7 @@ class Outputs:
     solution : Solution
         In the stored frame, with the rectified cameras that were asked for.
     reconstruction : Reconstruction
-        Poses, motions, points and measurements.
+        Poses, points and measurements, and the motions that are taken out.
     options : SolveOptions
         How the outputs are to be.
     ids : ModelIds
@@ -151,7 +151,13 @@ class Outputs:
         turns: dict[str, int] = {}
         if options.apply_orientation:
             turns = {name: turn_of(orientations.get(name, 1), True)[0] for name in rec.image_names}
-        ids = ids or ModelIds.in_order(rec)
+        ids = replace(ids or ModelIds.in_order(rec), cameras=outcome.camera_ids)
+        taken_out = [solution.image(name).taken_out or RowMotion() for name in rec.image_names]
+        rec = replace(
+            rec,
+            phi=np.array([each.phi for each in taken_out]),
+            velocity=np.array([each.velocity for each in taken_out]),
+        )
         return cls(solution, rec, options, ids, turns, rgb, with_photos, times or {}, outcome.solved)
 
     def begin(self, folder: Path, log: StageLog) -> Solution:
@@ -215,7 +221,11 @@ class Outputs:
     def _diagnostics(self) -> Diagnostics | None:
         if self.solved is None:
             return None
-        return Diagnostics.of_results(self.solved.result, self.solved.global_result, self.ids.cameras)
+        shared = self.solved.result.reconstruction
+        # photos that vary have cameras of their own: what they share goes by that of the first
+        first = [int(np.argmax(shared.camera_idx == k)) for k in range(len(shared.cameras))]
+        ids = [self.ids.cameras[k] for k in (first if shared.varies else range(len(shared.cameras)))]
+        return Diagnostics.of_results(self.solved.result, self.solved.global_result, ids)
 
     def _tell_report(self, folder: Path, rgb: NDArray[np.uint8] | None, photos: str = "") -> None:
         """Keep what the report shows beyond the solution."""

@@ -98,6 +98,8 @@ def run(
         rec = solved.result.reconstruction
         if contradiction := gyro_contradiction(rec, from_gyro):
             warnings.warn(contradiction, RsUndistortWarning, stacklevel=2)
+        for text in cameras.contradicted(solved.result.reconstruction.cameras, options_of(rec)):
+            warnings.warn(text, RsUndistortWarning, stacklevel=2)
         outcome = Outcome(
             solved,
             cameras,

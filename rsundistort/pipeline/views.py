@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ..errors import InputError
-from ..model import Solution
+from ..model import RowMotion, Solution
 from ..rectify import ViewOptions, rectified_roi, rectified_view
 
 __all__ = ["with_view"]
@@ -20,7 +20,7 @@ def with_view(solution: Solution, view: ViewOptions) -> Solution:
     """
     cameras = {}
     for key, old in solution.rectified_cameras.items():
-        motions = [each.motion for each in solution.registered if each.camera_id == key and each.motion is not None]
+        motions = [each.taken_out or RowMotion() for each in solution.registered if each.camera_id == key]
         try:
             cameras[key] = rectified_view(solution.cameras[key], motions, solution.shutter_model, view, old)
         except InputError as error:
@@ -29,7 +29,7 @@ def with_view(solution: Solution, view: ViewOptions) -> Solution:
         replace(
             image,
             roi=rectified_roi(
-                solution.cameras[image.camera_id], image.motion, solution.shutter_model, cameras[image.camera_id]
+                solution.cameras[image.camera_id], image.taken_out, solution.shutter_model, cameras[image.camera_id]
             ),
         )
         if image.registered

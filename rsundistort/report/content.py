@@ -55,6 +55,8 @@ def photos(source: Source) -> list[dict[str, Any]]:
                 "name": image.name,
                 "registered": image.registered,
                 "reason": image.reason or "",
+                "doubtful": image.doubtful or "",
+                "lens_only": image.lens_only,
                 "camera": image.camera_id,
                 "phi": None if phi is None else phi.tolist(),
                 "sigma": None if image.sigma_phi is None else (image.sigma_phi * span).tolist(),
@@ -187,7 +189,7 @@ def ladder(solution: Solution) -> list[dict[str, Any]]:
         if stage.get("name") == "ladder"
         for rung in stage.get("rungs") or ()
     }
-    names = [name for name in SHUTTER_MODELS if name in held_out or name in rungs]
+    names = [*bars, *(name for name in SHUTTER_MODELS if name in rungs and name not in bars)]
     largest = max((float(value) for value in bars.values() if value is not None), default=0.0)
     return [
         {
@@ -199,7 +201,7 @@ def ladder(solution: Solution) -> list[dict[str, Any]]:
             "gain": gains.get(name),
             "kept": name in kept,
             "share": 100 * float(bars.get(name) or 0) / largest if largest else 0,
-            "chosen": name == solution.shutter_model,
+            "chosen": name == (quality.get("held_out_chosen") or solution.shutter_model),
         }
         for name in names
     ]

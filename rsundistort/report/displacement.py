@@ -34,9 +34,10 @@ def displacement_field(
     """
     camera = solution.cameras[image.camera_id]
     still = _grid(camera, across)
-    if image.motion is None:
+    motion = image.taken_out
+    if motion is None:
         return still, still
-    motion = image.motion if image.R_cw is None else image.motion.in_camera(image.R_cw)
+    motion = motion if image.R_cw is None else motion.in_camera(image.R_cw)
     rays = undistort_points(still, camera, None, "global")
     seen = np.isfinite(rays).all(1)
     still, rays = still[seen], rays[seen]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +22,9 @@ _LEAST_GAIN = 0.01
 # deviations of real photos are two to three times too small (docs/critical-motions.md).
 _SMALL_PERCENT, _LARGE_PERCENT = 0.5, 2.0
 
+_HEADLINES = {"doubt": "Do not trust the height", "care": "Take the height with care"}
+_NOT_EXAMINED = "How far the shape of the scene can be trusted was not examined."
+
 
 @dataclass(frozen=True)
 class Verdict:
@@ -29,7 +33,7 @@ class Verdict:
     Attributes
     ----------
     level : str
-        "trust", "care" (with a reservation), "doubt" (do not trust the height of the scene) or "still" (there was
+        "trust", "care" (with a reservation), "doubt" (do not trust the shape of the scene) or "still" (there was
         nothing to correct).
     headline : str
         In a few words.
@@ -67,9 +71,15 @@ def advice_of(solution: Solution) -> list[str]:
 
 
 def verdict_of(solution: Solution) -> Verdict:
-    """The verdict on a solution."""
-    shifts = [image.rs_shift_px for image in solution.registered if image.rs_shift_px is not None]
-    level, headline, shape = _shape(solution, max(shifts, default=None))
+    """The verdict on a solution, in the words of the report and of the command's closing lines.
+
+    It is the one that the solution holds. Those of earlier versions hold none: theirs goes by the height of the scene
+    and the strength of the shutter alone.
+    """
+    taken_out = [image for image in solution.registered if not image.lens_only]
+    shifts = [image.rs_shift_px for image in taken_out if image.rs_shift_px is not None]
+    largest = max(shifts, default=None)
+    level, headline, shape = _shape(solution, solution.verdict or _by_height(solution, largest), largest)
     return Verdict(level, headline, (_photos(solution), _strength(solution, shifts), shape))
 
 
@@ -86,6 +96,8 @@ def _not_asked(solution: Solution) -> bool:
 
 
 def _strength(solution: Solution, shifts: list[float]) -> str:
+    if solution.registered and all(image.lens_only for image in solution.registered):
+        return "The lens was taken out of the photos, and no motion."
     if not shifts:
         return "How far the shutter moved pixels is not known."
     if _not_asked(solution):
@@ -102,32 +114,62 @@ def _strength(solution: Solution, shifts: list[float]) -> str:
     return f"{said}; modelling it took the residuals from {before:.2f} px to {after:.2f} px."
 
 
-def _shape(solution: Solution, largest: float | None) -> tuple[str, str, str]:
+def _by_height(solution: Solution, largest: float | None) -> dict[str, Any]:
+    """What a solution without a verdict says of shutter and shape."""
+    if _not_asked(solution):
+        return {"shutter": "not-determined", "shape": "doubtful", "reasons": []}
+    if _unneeded(solution, largest):
+        return {"shutter": "not-found", "shape": "trusted", "reasons": []}
+    level, sentence = _height(solution)
+    if meter_of(solution) is None or "flagged" not in (solution.critical_motion or {}):
+        level, sentence = "care", _NOT_EXAMINED
+    return {"shutter": "found", "shape": "doubtful" if level else "trusted", "reasons": [sentence] if level else []}
+
+
+def _shape(solution: Solution, said: Mapping[str, Any], largest: float | None) -> tuple[str, str, str]:
+    """Level, headline and third sentence of what a verdict says."""
+    shutter, trusted, reasons = said["shutter"], said["shape"] == "trusted", said["reasons"]
     if _not_asked(solution):
         text = "Whether the shape of the scene can be trusted is not known either: --model auto would say."
         return "care", "The shutter was not looked at", text
-    if reason := _unneeded(solution, largest):
+    if trusted and shutter == "not-found":
+        reason = _unneeded(solution, largest) or "no shutter can be seen"
         text = f"No correction is needed: {reason}, and the shape of the scene is as good as that of a global shutter."
         return "still", "No correction needed", text
+    level, sentence = _height(solution)
+    if trusted:
+        meter = meter_of(solution)
+        why = "the cameras were turned enough against each other to tell the shutter from the shape"
+        if meter is not None and meter.is_low:
+            why = f"although {_level(meter)}, the measurements hold its height"
+        return "trust", "The shape can be trusted", f"The shape of the scene can be trusted: {why}. {sentence}"
+    text = " ".join(reasons)
+    if shutter == "not-determined":
+        return "care" if solution.shutter_model == "global" else "doubt", "The shutter is not determined", text
+    if reasons == [_NOT_EXAMINED]:
+        return "care", "The shape was not examined", text
+    if level and len(reasons) == 1:
+        return level, _HEADLINES[level], sentence
+    return "doubt", "The shape is doubtful", f"Do not trust the shape of the scene. {text}"
+
+
+def _height(solution: Solution) -> tuple[str, str]:
+    """How far the height of the scene is in doubt ("doubt", "care" or "", if it is not), and a sentence on it."""
     said, meter = solution.critical_motion or {}, meter_of(solution)
-    if meter is None or "flagged" not in said:
-        return "care", "The shape was not examined", "How far the shape of the scene can be trusted was not examined."
+    if meter is None:
+        return "", ""
     percent = _percent(said)
     sentence = _sentence(str(said.get("sentence") or ""))
     if meter.is_low and said.get("remedy") == "none":
-        text = (
+        return "doubt", (
             f"Do not trust the height of the scene: {_level(meter)}, which leaves it open to first order, and with the "
             f"remedy switched off only the model's second-order terms hold it ({_deviation(percent)})."
         )
-        return "doubt", "Do not trust the height", text
-    if said["flagged"] and percent > _LARGE_PERCENT:
-        return "doubt", "Do not trust the height", f"Do not trust the height of the scene. {sentence}"
+    if said.get("flagged") and percent > _LARGE_PERCENT:
+        return "doubt", f"Do not trust the height of the scene. {sentence}"
     if percent > _SMALL_PERCENT:
-        return "care", "Take the height with care", f"Take the height of the scene with care. {sentence}"
-    why = "the cameras were turned enough against each other to tell the shutter from the shape"
-    if meter.is_low:
-        why = f"although {_level(meter)}, the measurements hold its height"
-    return "trust", "The shape can be trusted", f"The shape of the scene can be trusted: {why}. {sentence}"
+        return "care", f"Take the height of the scene with care. {sentence}"
+    return "", sentence
 
 
 def _unneeded(solution: Solution, largest: float | None) -> str:

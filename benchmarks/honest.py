@@ -1,0 +1,354 @@
+"""Nothing invented and nothing suppressed: where there is no shutter none is found, and where there is one it is.
+
+    python benchmarks/honest.py [--photos DIR] [--only PART ...] [--seeds N] [--first-seed K]
+
+Prints one JSON object a line and at the end a table with targets. Parts, with their own number of seeds:
+
+    nothing-invented  photos without rolling shutter (dslr, herz-jesus-8), and with a weak one (phone, lund, iphone6)
+    suppressed (2)    herz-jesus-8 warped by 0.003 to 0.05 rad: what is found of it, and what the photos are worth
+    coverage (10)     errors in units of the standard deviations that are reported: their root mean square is to be 1
+    better (5)        dB and degrees, of photos of a camera that turned, and of one that turned and travelled
+    directions        what is said of the axis of the readout where nobody tells it
+    strong (3)        herz-jesus-8 warped by 0.2 and 0.3 rad: no photo a degree wrong in a scene that is to be trusted
+
+Cameras are "given", the camera.json; "guessed", its focal length 5 % off and no lens, refined under the prior of EXIF's
+guesses; "wrong", with cx 5 px and k1 0.005 off, and believed. Poses of warped photos are held against the
+global-shutter reconstruction of the photos as they are, whose own errors count as the solution's. `verdict` is that of
+solution.json; where it has none, the table has the report's in brackets. Exits 1 if one crashes, never because a figure
+misses its target.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+from measures import against_twins, fountain_truth, library_sigmas, log_k_error, normalised_errors, pooled, with_poses
+
+import rsundistort as rs
+from rsundistort.model import READOUTS
+from rsundistort.pipeline.ladder import Solved, solve_photos
+from rsundistort.report.verdict import verdict_of
+
+ROOT = Path(__file__).resolve().parent.parent
+SCENES = ROOT / "sample_scenes"
+HERZ = "herz-jesus-8"
+GUESSED = ("f", "cx", "cy", "k1", "k2", "k3", "p1", "p2")
+CAMERAS = ("given", "guessed", "wrong")
+COLUMNS = ("part", "photos", "model", "shutter, shape", "figures", "target", "")
+
+
+def show(name: str, **figures: Any) -> None:
+    """Print one JSON line."""
+    print(json.dumps({"name": name, **figures}), flush=True)
+
+
+def summary(values: Iterable[float], worst: Callable[..., float] = max) -> dict[str, float]:
+    """Median and worst, rounded."""
+    values = list(values)
+    return {"median": round(float(np.median(values)), 2), "worst": round(worst(values), 2)}
+
+
+def counted(words: Iterable[str]) -> str:
+    """Words, and how often each was said."""
+    words = list(words)
+    return ", ".join(f"{words.count(each)}x {each}" if len(words) > 1 else each for each in dict.fromkeys(words))
+
+
+@dataclass(frozen=True)
+class Ran:
+    """A run: its folder, what it came to, and the options of its adjustments."""
+
+    out: Path
+    solution: rs.Solution
+    solved: Solved
+    options: rs.BundleOptions
+
+    @property
+    def verdict(self) -> dict[str, Any] | None:
+        """What solution.json says of shutter and shape."""
+        found: dict[str, Any] | None = json.loads((self.out / "solution.json").read_text()).get("verdict")
+        return found
+
+    @property
+    def said(self) -> tuple[str, str]:
+        """Whether a shutter was found, and what is said of the shape; by the report where there is no verdict."""
+        if verdict := self.verdict:
+            return str(verdict.get("shutter")), str(verdict.get("shape"))
+        level = verdict_of(self.solution).level
+        return "not-found" if self.solution.shutter_model == "global" or level == "still" else "found", level
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What every line has."""
+        joined = f"{len(self.solution.registered)}/{len(self.solution.images)}"
+        return {"model": self.solution.shutter_model, "joined": joined, "verdict": self.verdict, "said": self.said}
+
+
+@dataclass
+class Bench:
+    """Photos, the folder of work, and what came of it."""
+
+    photos: Path
+    work: Path
+    seeds: int | None
+    first_seed: int
+    rows: list[tuple[str, ...]] = field(default_factory=lambda: [COLUMNS])
+    failed: list[str] = field(default_factory=list)
+    ran: dict[str, Ran] = field(default_factory=dict)
+
+    @contextmanager
+    def case(self, name: str) -> Iterator[None]:
+        """What crashes in here is told, and the rest goes on."""
+        try:
+            yield
+        except Exception as error:
+            show(name, crash=f"{type(error).__name__}: {error}")
+            self.failed.append(name)
+
+    def row(self, name: str, ran: Sequence[Ran], figures: dict[str, Any], target: str, met: bool | None) -> None:
+        """A row of the table; `met` is None where there is no target."""
+        models = counted(each.solution.shutter_model for each in ran)
+        said = counted(("{}/{}" if each.verdict else "({}/{})").format(*each.said) for each in ran)
+        text = "; ".join(f"{key} {value}" for key, value in figures.items())
+        outcome = "" if met is None else "met" if met else "MISSED"
+        self.rows.append((*name.split(": ", 1), models, said, text, target, outcome))
+
+    def numbers(self, own: int) -> range:
+        """Seeds of a part."""
+        return range(self.first_seed, self.first_seed + (self.seeds or own))
+
+    def run(self, photos: Path, **options: Any) -> Ran:
+        """`run`, once for all parts, and what it keeps to itself."""
+        key, kept = f"{photos} {sorted(options.items())}", dict[str, Any]()
+
+        def solving(loaded: Any, model: str, seed: int, options_of: Any, *rest: Any, **more: Any) -> Solved:
+            solved = solve_photos(loaded, model, seed, options_of, *rest, **more)
+            kept.update(solved=solved, options=options_of(solved.result.reconstruction))
+            return solved
+
+        if key not in self.ran:
+            out = self.work / f"out-{len(self.ran)}"
+            with mock.patch("rsundistort.pipeline.run.solve_photos", solving):
+                solution = rs.run(photos, out, rs.RunOptions(report=False, overwrite=True, **options))
+            self.ran[key] = Ran(out, solution, **kept)
+        return self.ran[key]
+
+    def warped(self, sigma: float, seed: int) -> Path:
+        """Folder of herz-jesus-8 warped."""
+        out = self.work / f"warped-{sigma}-{seed}"
+        if not out.is_dir():
+            rs.simulate_warp(self.photos / HERZ, out, rs.WarpOptions(sigma_rad=sigma, seed=seed))
+        return out
+
+    def still(self) -> Ran:
+        """What its poses are held against: the photos as they are."""
+        return self.run(self.photos / HERZ, shutter_model="global")
+
+    def camera(self, which: str, file: Path) -> dict[str, Any]:
+        """Options for the camera or the cameras of a file beside the photos: given, guessed or wrong."""
+        value = json.loads(file.read_text())
+        if which == "given":
+            return {}
+        if which == "guessed":
+            K = np.array(value["K"])
+            return {"camera": f"{1.05 * K[0, 0]},{1.05 * K[1, 1]},{K[0, 2]},{K[1, 2]}", "refine": GUESSED}
+        for each in value.get("cameras", {"": value}).values():
+            each["K"][0][2] += 5.0
+            k1, *others = each["dist"] or [0.0] * 4
+            each["dist"] = [k1 + 0.005, *others]
+        return self.written(value)
+
+    def written(self, cameras: Any) -> dict[str, Any]:
+        """Option of a file of cameras."""
+        text = json.dumps(cameras)
+        path = self.work / f"cameras-{hash(text):x}.json"
+        path.write_text(text)
+        return {"camera": str(path)}
+
+
+def nothing_invented(bench: Bench) -> None:
+    """Shifts of photos that have none, or next to none."""
+    herz = bench.photos / HERZ
+    cases: list[tuple[str, Path, dict[str, Any], tuple[float, ...]]] = [("dslr", bench.photos / "dslr", {}, (0.5, 1.5))]
+    cases += [(f"{HERZ}, {each}", herz, bench.camera(each, herz / "camera.json"), (0.5, 1.5)) for each in CAMERAS]
+    cases += [
+        (name, bench.photos / name, {}, most) for name, most in (("phone", (3.0,)), ("lund", ()), ("iphone6", ()))
+    ]
+    for label, photos, options, most in cases:
+        name = f"nothing-invented: {label}"
+        with bench.case(name):
+            ran = bench.run(photos, **options)
+            shift = summary(image.rs_shift_px or 0.0 for image in ran.solution.registered)
+            show(name, **ran.facts, shift_px=shift, held_out_error=ran.solution.quality["held_out_error"])
+            target = ", ".join(f"{key} <= {value:g}" for key, value in zip(shift, most, strict=False))
+            met = all(value <= limit for value, limit in zip(shift.values(), most, strict=False)) if most else None
+            bench.row(name, [ran], {f"{key} px": value for key, value in shift.items()}, target, met)
+
+
+def brief(found: dict[str, Any]) -> dict[str, Any]:
+    """What `evaluate` said, shorter."""
+    figures = {"phi_mrad_per_frame": np.round(found["phi_mrad_per_frame"]["mean_per_component"], 3).tolist()}
+    if "rotation_deg" in found:
+        figures["rotation_deg"] = {key: round(value, 4) for key, value in found["rotation_deg"].items()}
+    return figures | {key: summary(found[key]["photos"].values(), min) for key in ("psnr_before_db", "psnr_db")}
+
+
+def suppressed(bench: Bench) -> None:
+    """What is found of a shutter that is there, by how strong it is and how well the camera is known."""
+    given, twins = np.nan, bench.photos / HERZ
+    for sigma, which in ((sigma, which) for sigma in (0.003, 0.01, 0.02, 0.05) for which in CAMERAS):
+        name, ran, found = f"suppressed: by {sigma}, {which}", list[Ran](), list[list[float]]()
+        with bench.case(name):
+            for seed in bench.numbers(2):
+                warp = bench.warped(sigma, seed)
+                each = bench.run(warp / "photos", **bench.camera(which, warp / "camera.json"))
+                figures = brief(rs.evaluate(each.out, warp / "ground_truth.json", twins=twins))
+                turned = against_twins(each.out, each.solution, rs.read_solution(warp / "ground_truth.json"), twins)
+                show(f"{name}, seed {seed}", **each.facts, **figures, turned=turned)
+                ran.append(each)
+                found.append([np.mean(figures["phi_mrad_per_frame"]), figures["psnr_db"]["median"], *turned.values()])
+            medians = np.median(found, axis=0).round(2).tolist()
+            said = dict(zip(("phi mrad", "dB", "turned dB", "left px"), medians, strict=True))
+            given = said["turned dB"] if which == "given" else given
+            target, met = ("found", all(each.said[0] == "found" for each in ran)) if sigma >= 0.01 else ("", None)
+            if sigma == 0.01 and which == "guessed":
+                target, met = f"found, turned dB >= {given - 2:.2f}", bool(met) and said["turned dB"] >= given - 2
+            bench.row(name, ran, said, target, met)
+
+
+def coverage(bench: Bench) -> None:
+    """Normalised errors of all whose truth is known."""
+    cases: list[tuple[str, Path, dict[str, Any], rs.Solution]] = []
+    for sigma in (0.02, 0.05):
+        for warp in (bench.warped(sigma, seed) for seed in bench.numbers(10)):
+            truth = with_poses(rs.read_solution(warp / "ground_truth.json"), bench.still().solution)
+            cases.append((f"{HERZ} by {sigma}", warp / "photos", {}, truth))
+    fountain = bench.photos / "fountain-small"
+    cases.append((fountain.name, fountain / "rs", {}, fountain_truth(fountain)))
+    for scene in (SCENES / each for each in ("courtyard", "colonnade", "handheld", "flyover")):
+        truth, (file,) = rs.read_solution(scene / "ground_truth.json"), scene.glob("camera*.json")
+        cases += [(f"{scene.name}, {w}", scene / "photos", bench.camera(w, file), truth) for w in ("given", "wrong")]
+    for label in dict.fromkeys(case[0] for case in cases):
+        name, ran, errors = f"coverage: {label}", list[Ran](), list[dict[str, Any]]()
+        with bench.case(name):
+            for photos, options, truth in (case[1:] for case in cases if case[0] == label):
+                ran.append(bench.run(photos, **options))
+                each = ran[-1]
+                sigmas, rec = library_sigmas(each.solved, each.options), each.solved.result.reconstruction
+                errors.append(normalised_errors(each.solution, truth, sigmas, log_k_error(rec, truth)))
+            rms, by_component = pooled(errors), pooled(errors, by_component=True)
+            show(name, **ran[0].facts, runs=len(ran), rms=rms, by_component=by_component)
+            met = all(value is not None and 0.7 <= value <= 1.4 for value in rms.values())
+            bench.row(name, ran, {k: "missing" if v is None else v for k, v in rms.items()}, "0.7 to 1.4", met)
+
+
+def better(bench: Bench) -> None:
+    """Photos and poses against the truth."""
+    name, ran, psnr_db = f"better: {HERZ} by 0.02", list[Ran](), list[float]()
+    with bench.case(name):
+        for seed in bench.numbers(5):
+            warp = bench.warped(0.02, seed)
+            ran.append(bench.run(warp / "photos"))
+            truth, still = warp / "ground_truth.json", bench.still().out / "solution.json"
+            found = rs.evaluate(ran[-1].out, truth, poses=still, twins=bench.photos / HERZ)
+            psnr_db += found["psnr_db"]["photos"].values()
+            show(f"{name}, seed {seed}", **ran[-1].facts, **brief(found))
+        dB = summary(psnr_db, min)
+        bench.row(name, ran, {"dB": list(dB.values())}, "dB >= 42, 39", dB["median"] >= 42 and dB["worst"] >= 39)
+    name, fountain = "better: fountain-small, depth of points", bench.photos / "fountain-small"
+    with bench.case(name):
+        rs.write_solution(bench.work / "fountain.json", fountain_truth(fountain))
+        moved = bench.run(fountain / "rs", depth="points")
+        found = rs.evaluate(moved.out, bench.work / "fountain.json", twins=fountain / "gs", raw=fountain / "rs")
+        figures = brief(found)
+        show(name, **moved.facts, **figures)
+        dB, degrees = figures["psnr_db"], figures["rotation_deg"]["mean"]
+        bench.row(name, [moved], {"dB": list(dB.values()), "deg": degrees}, "dB >= 36", dB["median"] >= 36)
+
+
+def directions(bench: Bench) -> None:
+    """Axes of the readout where nobody tells them; the DSLR has none, and the phone's photos are stored upright."""
+    value = json.loads((SCENES / "handheld" / "cameras.json").read_text())
+    axes = {key: READOUTS[each.pop("readout")][0] for key, each in value["cameras"].items()}
+    withheld, handheld = bench.written(value), SCENES / "handheld" / "photos"
+    cases: list[tuple[str, Path, dict[str, Any], dict[str, int] | None]] = [("handheld", handheld, withheld, axes)]
+    cases += [("dslr", bench.photos / "dslr", {}, None), ("phone", bench.photos / "phone", {}, {})]
+    for label, photos, options, true in cases:
+        name = f"directions: {label}"
+        with bench.case(name):
+            ran = bench.run(photos, **options)
+            (stage,) = (each for each in ran.solution.stages if each["name"] == "readout")
+            found = {key: READOUTS[direction][0] for key, direction in stage["directions"].items()}
+            gain = {key: round(value, 1) for key, value in stage["gain_of_other_axis"].items()}
+            guesses = ran.solution.options["guesses"]
+            show(name, **ran.facts, directions=stage["directions"], gain_of_other_axis=gain, guesses=guesses)
+            figures = {"axis": " ".join("xy"[axis] for axis in found.values())}
+            figures["gain of the other"] = " ".join(str(gain.get(key, "-")) for key in found)
+            wanted = "no axis claimed" if true is None else "right, or said to be open"
+            met = not guesses if true is None else all(axis == true.get(key, 0) for key, axis in found.items())
+            met |= ran.said[0] == "not-determined"
+            bench.row(name, [ran], figures, wanted, met)
+
+
+def strong(bench: Bench) -> None:
+    """Poses of photos that the shutter bent strongly; that it cannot be done is an answer too."""
+    for sigma in (0.2, 0.3):
+        name, ran, worst, honest = f"strong: by {sigma}", list[Ran](), list[Any](), True
+        with bench.case(name):
+            for seed in bench.numbers(3):
+                try:
+                    each = bench.run(bench.warped(sigma, seed) / "photos")
+                except rs.ReconstructionError as error:
+                    show(f"{name}, seed {seed}", refused=str(error))
+                    worst.append("refused")
+                    continue
+                ran.append(each)
+                errors = rs.pose_errors(each.solution, bench.still().solution)
+                degrees = dict(zip(errors.names, errors.rotation_deg.round(2).tolist(), strict=True))
+                worst.append(max(degrees.values()))
+                honest &= worst[-1] <= 1 or not each.said[1].startswith("trust")
+                show(f"{name}, seed {seed}", **each.facts, rotation_deg=degrees)
+            bench.row(name, ran, {"worst deg": worst}, "<= 1 deg where trusted", honest)
+
+
+ALL = (nothing_invented, suppressed, coverage, better, directions, strong)
+PARTS: dict[str, Callable[[Bench], None]] = {part.__name__.replace("_", "-"): part for part in ALL}
+
+
+def main() -> int:
+    """Measure what was asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--photos", type=Path, default=ROOT.parent / "shared" / "photos")
+    parser.add_argument("--only", nargs="+", default=list(PARTS), choices=PARTS, metavar="PART")
+    parser.add_argument("--seeds", type=int, help="of each part, instead of its own number")
+    parser.add_argument("--first-seed", type=int, default=0, help="so that seeds can be held back")
+    args = parser.parse_args()
+    warnings.simplefilter("ignore")
+    if not args.photos.is_dir():
+        show("honest", skipped="no folder of test photos beside the project")
+        return 0
+    with tempfile.TemporaryDirectory() as folder:
+        bench = Bench(args.photos, Path(folder), args.seeds, args.first_seed)
+        for part in args.only:
+            PARTS[part](bench)
+    widths = [max(map(len, column)) for column in zip(*bench.rows, strict=True)]
+    for row in bench.rows:
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    if bench.failed:
+        print("crashed: " + "; ".join(bench.failed), file=sys.stderr)
+    return 1 if bench.failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

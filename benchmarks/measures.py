@@ -1,0 +1,193 @@
+"""What `honest.py` measures: errors over the deviations that are reported, photos against twins; and truths."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rsundistort import (
+    BundleOptions,
+    Reconstruction,
+    RowMotion,
+    Solution,
+    SolvedImage,
+    init_rectify_map,
+    motion_errors,
+    psnr,
+    unproject_points,
+)
+from rsundistort.bundle import Posterior, gauge_directions
+from rsundistort.bundle.triangulate import _world_rays
+from rsundistort.critical.cost import row_phi
+from rsundistort.critical.meter import readout_axes
+from rsundistort.evaluation import align_points
+from rsundistort.io import read_photo
+from rsundistort.io.cameras import camera_from_json
+from rsundistort.pipeline.ladder import Solved
+
+Array = np.ndarray
+
+
+def normalised_errors(
+    solution: Solution, truth: Solution, sigmas: Mapping[str, Any] | None = None, log_k: float | None = None
+) -> dict[str, Array | None]:
+    """Errors of phi (m, 3), mean_phi (3,), log_k () and center (m, 3) over their deviations; None where one is missing.
+
+    Parameters
+    ----------
+    solution, truth : Solution
+        The truth has motions and poses of all photos that joined; the centres are aligned by the best similarity.
+    sigmas : mapping of quantity to array, optional
+        Standard deviations, before those that the solution has: of phi and mean_phi in radians per frame, of center in
+        the solution's frame and after that similarity, of log_k as `log_k_error` says.
+    log_k : float, optional
+        Its error.
+    """
+    joined = solution.registered
+    span = np.array([[solution.cameras[image.camera_id].frame_span] for image in joined])
+    own = [image.sigma_phi for image in joined]
+    known: dict[str, Any] = {"phi": None if any(each is None for each in own) else span * np.array(own)}
+    known |= {"log_k": (solution.critical_motion or {}).get("sigma_log_k"), **(sigmas or {})}
+    phi = motion_errors(solution, truth).phi_rad_per_frame
+    centers, true = (np.array([each.image(image.name).center_w for image in joined]) for each in (solution, truth))
+    scale, R, shift = align_points(true, centers)
+    errors = {"phi": phi, "mean_phi": phi.mean(0), "log_k": log_k, "center": centers - scale * true @ R.T - shift}
+    return {
+        key: None if error is None or known.get(key) is None else np.asarray(error / known[key])
+        for key, error in errors.items()
+    }
+
+
+def pooled(errors: Sequence[Mapping[str, Array | None]], by_component: bool = False) -> dict[str, Any]:
+    """Root mean square of the errors of several solutions, by quantity; None where one of them has none."""
+    found: dict[str, Any] = {}
+    for key in errors[0]:
+        values = [np.atleast_2d(value) for each in errors if (value := each[key]) is not None]
+        if len(values) < len(errors):
+            found[key] = None
+            continue
+        square = np.mean(np.vstack(values) ** 2, axis=0 if by_component else None)
+        found[key] = np.sqrt(square).round(2).tolist()
+    return found
+
+
+def library_sigmas(solved: Solved, options: BundleOptions) -> dict[str, Any]:
+    """Deviations that are not in solution.json, as `normalised_errors` takes them, photos in the order of their names.
+
+    `options` are those of the adjustments; of an anchor that was added to them `solved` knows.
+    """
+    result, remedy = solved.result, solved.remedy
+    rec = result.reconstruction
+    if rec.shutter_model == "global":
+        return {}
+    m, nb = result.covariances.shape[:2]
+    if remedy is not None and remedy.name == "anchor":
+        first = dict(zip(rec.image_names, row_phi(rec)[:, 0], strict=True))
+        held = {name: np.where(np.arange(3) == first[name], sigma, np.inf) for name, sigma in remedy.anchors.items()}
+        options = replace(options, known_phi={name: (np.zeros(3), sigma) for name, sigma in held.items()})
+    posterior = Posterior(result, options)
+    mean = np.zeros((3, m, nb))
+    mean[:, :, 6:9] = np.eye(3)[:, None] * rec.frame_span()[:, None] / m
+    variance = (mean * posterior.of_photos(mean)).sum((1, 2))
+    each = np.zeros((3 * m, m, nb))
+    each[:, :, 3:6] = np.eye(3 * m).reshape(3 * m, m, 3)
+    covariance = posterior.of_photos(each)[:, :, 3:6].reshape(3 * m, 3 * m)
+    # the best similarity takes off what moves, turns or scales all centres together
+    moves = np.linalg.qr(gauge_directions(result)[:, :, 3:6].reshape(7, -1).T)[0]
+    free = np.eye(3 * m) - moves @ moves.T
+    center = np.sqrt(np.diag(free @ covariance @ free)).reshape(m, 3)
+    return {"mean_phi": np.sqrt(variance), "center": center[np.argsort(rec.image_names)]}
+
+
+def _meeting_points(rec: Reconstruction) -> tuple[Array, Array]:
+    """Where the rays of each point's measurements come nearest to each other (n, 3), and where they do meet (n,)."""
+    point_idx = rec.observations.point_idx
+    centers, rays, valid = _world_rays(rec, np.arange(len(point_idx)), rec.shutter_model)
+    across = valid[:, None, None] * (np.eye(3) - rays[:, :, None] * rays[:, None])
+    A, b = np.zeros((rec.num_points, 3, 3)), np.zeros((rec.num_points, 3))
+    np.add.at(A, point_idx, across)
+    np.add.at(b, point_idx, np.einsum("kij,kj->ki", across, centers))
+    meet = np.linalg.eigvalsh(A)[:, 0] > 1e-6
+    return np.linalg.solve(A + 1e-12 * np.eye(3), b[..., None])[..., 0], meet
+
+
+def log_k_error(rec: Reconstruction, truth: Solution) -> float:
+    """Logarithm of by how much too high the scene is, along the mean axis of readout against the other two.
+
+    Of the affine map that takes true points to those found; a true point is where the rays of its own measurements meet
+    under the true poses and motions. Far points hardly count, as in `critical.shape_cost`.
+    """
+    images = [truth.image(name) for name in rec.image_names]
+    motions = [image.motion or RowMotion() for image in images]
+    cameras = [truth.cameras[image.camera_id] for image in images]
+    true = replace(
+        rec, cameras=cameras, camera_idx=np.arange(len(images)), R_cw=np.array([image.R_cw for image in images]),
+        center_w=np.array([image.center_w for image in images]), phi=np.array([motion.phi for motion in motions]),
+        velocity=np.array([motion.velocity for motion in motions]), shutter_model=truth.shutter_model,
+    )  # fmt: skip
+    points, meet = _meeting_points(true)
+    x, y = points[meet], rec.points_w[meet]
+    weight = np.ones(len(x))
+    for each in (x, y):
+        distance = np.linalg.norm(each - np.median(each, axis=0), axis=1)
+        weight = np.minimum(weight, (np.median(distance) / np.maximum(distance, 1e-300)) ** 4)
+    x, y = (each - np.average(each, axis=0, weights=weight) for each in (x, y))
+    B = np.linalg.solve((weight[:, None] * x).T @ x, (weight[:, None] * x).T @ y).T
+    axes = readout_axes(true.R_cw, [camera.readout for camera in cameras])
+    along = np.linalg.norm(B @ np.linalg.eigh(axes.T @ axes)[1][:, -1])
+    return float(1.5 * np.log(along) - 0.5 * np.log(np.abs(np.linalg.det(B))))
+
+
+def against_twins(out: Path, solution: Solution, truth: Solution, twins: Path) -> dict[str, float]:
+    """Rectified photos against twins that are turned as the solution's pose has them, for a lens that was solved for.
+
+    A principal point that is off is a pose that is turned, and no error of the photo: so each twin is seen by the
+    solution's camera, turned by what fits the true directions of its pixels best. `psnr_db` is the median over the
+    photos, `left_px` that of the root mean square by which pixels are out of place. The true camera has no lens.
+    """
+    decibels, left = [], []
+    for image in solution.registered:
+        camera, true = solution.cameras[image.camera_id], truth.image(image.name)
+        taken_by, K = truth.cameras[true.camera_id], solution.rectified_cameras[image.camera_id].K
+        assert image.motion is not None
+        motion = image.motion if image.R_cw is None else image.motion.in_camera(image.R_cw)
+        maps = np.dstack(init_rectify_map(camera, motion, solution.shutter_model, new_K=K))
+        some = np.s_[10:-10:20, 10:-10:20]
+        xy = np.stack(np.meshgrid(*map(np.arange, maps.shape[1::-1])), axis=2)[some].reshape(-1, 2).astype(float)
+        raw = maps[some].reshape(-1, 2).astype(float)
+        ideal, valid = unproject_points(raw, taken_by, true.motion, truth.shutter_model)
+        rays, true_rays = np.insert(xy, 2, 1, 1) @ np.linalg.inv(K).T, np.insert(ideal, 2, 1, 1)
+        unit = [(each / np.linalg.norm(each, axis=1, keepdims=True))[valid] for each in (true_rays, rays)]
+        turn = taken_by.K @ Rotation.align_vectors(*unit)[0].as_matrix() @ np.linalg.inv(K)
+        apart = cv2.perspectiveTransform(xy[None], turn)[0] - (true_rays @ taken_by.K.T)[:, :2]
+        left.append(float(np.sqrt((apart[valid] ** 2).sum(1).mean())))
+        mask = read_photo(out / "masks" / f"{Path(image.name).stem}.png").pixels
+        pair = read_photo(twins / image.name).pixels, np.full(mask.shape, 255, np.uint8)
+        how = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+        twin, seen = (cv2.warpPerspective(each, turn, mask.shape[::-1], flags=how) for each in pair)
+        decibels.append(psnr(read_photo(out / "images" / image.name).pixels, twin, np.minimum(mask, seen) // 255 * 255))
+    return {"psnr_db": round(float(np.median(decibels)), 2), "left_px": round(float(np.median(left)), 3)}
+
+
+def fountain_truth(folder: Path) -> Solution:
+    """The truth of fountain-small."""
+    camera = camera_from_json(json.loads((folder / "camera.json").read_text()), "camera.json")
+    images = [
+        SolvedImage(name, "1", each["R_cw"], each["center_w"], RowMotion(each["phi"], each["velocity"]))
+        for name, each in json.loads((folder / "truth.json").read_text()).items()
+    ]
+    return Solution("constant-motion", {"1": camera}, {"1": camera.pinhole()}, images)
+
+
+def with_poses(truth: Solution, poses: Solution) -> Solution:
+    """The truth of warped photos, with poses of the photos as they were."""
+    of = {image.name: image for image in poses.images}
+    images = [replace(i, R_cw=of[i.name].R_cw, center_w=of[i.name].center_w) for i in truth.images]
+    return replace(truth, images=images)

@@ -1,0 +1,317 @@
+"""One verdict on a solution, from everything that speaks for it and against it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.special import stdtr
+
+from ..bundle import BundleResult, ModelChoice
+from ..bundle.choice import clipped_errors, corners, improves, standard_errors
+from ..critical import Remedy
+from ..model import Reconstruction
+from ..sfm import LEAST_MEASUREMENTS
+from .photos import PhotoMotions, photo_motions
+from .residuals import left_along_readout, left_over_frame
+
+__all__ = ["Verdict", "judge"]
+
+# Displacements below this are lost in the interpolation of a photo.
+_UNSEEN_PX = 1.0
+# A motion that is known no better than this may do as much harm as good.
+_UNCERTAIN_PX = 2.0
+# Of the scene's height: as good as photos measure. Reported deviations of real photos are two to three times too small
+# (docs/critical-motions.md).
+_SMALL_PERCENT = 0.5
+# What may remain in the same places of all photos. A lens that makes motions wrong by half a pixel leaves 0.1 to 0.15
+# even where cameras are turned at will (k1 wrong by 0.03), and less where they are not.
+_LEFT_PX = 0.1
+# Held-out measurements may be off by this beyond their noise.
+_HELD_OUT_PX = 0.5
+# Fewer held-out measurements tell nothing.
+_LEAST_HELD_OUT = 30
+# A photo whose motion is so many times the spread of all, one with so few measurements, with all of them in such a
+# share of its frame, or with so many outliers, is to be checked.
+_FAR = 5.0
+_FEW = 2 * LEAST_MEASUREMENTS
+_CORNER = 1 / 16
+_OUTLIERS = 1 / 3
+# A hand does not repeat itself: motions whose mean is so many times what they differ by, in so many photos, and by
+# chance in one set of a thousand, are the camera's.
+_REPEATED, _LEAST_PHOTOS, _CHANCE = 2.0, 5, 0.001
+# Cosine between ways to turn that are the same.
+_SAME_WAY = 0.9
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What to believe of a solution.
+
+    Attributes
+    ----------
+    shutter : str
+        "found" (a rolling shutter that can be seen, by evidence), "not-found" (none that can be seen), or
+        "not-determined" (the photos do not tell).
+    shape : str
+        "trusted", or "doubtful" as soon as a reason speaks against it.
+    reasons : tuple of str
+        What speaks against it, in sentences.
+    doubtful : mapping of photo name to reason
+        Photos whose motion is to be checked.
+    lens_only : tuple of str
+        Photos whose motion is not to be taken out, since their measurements do not support it: all of them where the
+        evidence that chose the model does not hold.
+    """
+
+    shutter: str
+    shape: str
+    reasons: tuple[str, ...] = ()
+    doubtful: Mapping[str, str] = field(default_factory=dict)
+    lens_only: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """What `Solution.verdict` holds: of the whole; the photos have their own."""
+        return {"shutter": self.shutter, "shape": self.shape, "reasons": list(self.reasons)}
+
+
+def judge(
+    result: BundleResult,
+    global_result: BundleResult | None = None,
+    choice: ModelChoice | None = None,
+    remedy: Remedy | None = None,
+    tracks: Reconstruction | None = None,
+    known: Collection[str] = (),
+    most_phi: Mapping[str, float] | None = None,
+) -> Verdict:
+    """Weigh a solution.
+
+    Parameters
+    ----------
+    result : BundleResult
+        The solution.
+    global_result : BundleResult, optional
+        A global-shutter adjustment of the same measurements: what a model that somebody named is compared with.
+    choice : ModelChoice, optional
+        How the model was chosen; None where it was named.
+    remedy : Remedy, optional
+        What was done about a critical motion, and how well the height of the scene is known; None for a global shutter.
+    tracks : Reconstruction, optional
+        What was measured, before outliers were dropped.
+    known : collection of photo names
+        Photos whose motion is known from elsewhere, and needs no support.
+    most_phi : mapping of photo name to float, optional
+        How far each photo can have turned, radians per frame, by what else is known (its exposure).
+
+    Returns
+    -------
+    Verdict
+        "trusted" only if nothing speaks against it.
+    """
+    rec = result.reconstruction
+    reasons = _height(remedy) + _unexplained(result, choice)
+    if rec.shutter_model == "global":
+        shutter, why = _of_global(choice)
+        return _verdict(shutter, reasons + why)
+    motions = photo_motions(result)
+    outliers = _outliers(rec, tracks)
+    doubts = _doubts(result, motions, outliers, most_phi or {})
+    # the scene that is held pulls both halves to the motion that it was solved with: they differ by less than is wrong
+    torn = (motions.difference_px > np.maximum(_UNSEEN_PX, motions.shift_px / 2)) | (outliers > 0.5)
+    shutter, why = _of_motions(result, global_result, choice, motions, torn, known)
+    reasons += why
+    if not reasons:
+        reasons = _of_photos(rec, doubts, motions)
+    lost = torn | (_counts(rec) < _FEW) & (motions.sigma_px >= motions.shift_px)
+    # what cannot be seen does no harm
+    lost &= motions.shift_px >= _UNSEEN_PX
+    # a model that somebody named is obeyed
+    lost |= shutter == "not-determined" and choice is not None
+    lens_only = tuple(name for name, each in zip(rec.image_names, lost, strict=True) if each and name not in known)
+    return _verdict(shutter, reasons, {name: "; ".join(why) for name, why in doubts.items() if why}, lens_only)
+
+
+def _verdict(
+    shutter: str,
+    reasons: list[str],
+    doubtful: Mapping[str, str] | None = None,
+    lens_only: tuple[str, ...] = (),
+) -> Verdict:
+    return Verdict(shutter, "doubtful" if reasons else "trusted", tuple(reasons), doubtful or {}, lens_only)
+
+
+def _counts(rec: Reconstruction) -> NDArray[np.int64]:
+    return np.bincount(rec.observations.frame_idx, minlength=rec.num_images)
+
+
+def _outliers(rec: Reconstruction, tracks: Reconstruction | None) -> NDArray[np.float64]:
+    """(m,) share of each photo's measurements that the solution does not explain."""
+    if tracks is None:
+        return np.zeros(rec.num_images)
+    before = dict(zip(tracks.image_names, _counts(tracks).tolist(), strict=True))
+    return 1.0 - _counts(rec) / np.maximum([before.get(name, 0) for name in rec.image_names], 1)
+
+
+def _height(remedy: Remedy | None) -> list[str]:
+    if remedy is None:
+        return []
+    cost = remedy.after
+    if cost.meter.is_low and remedy.name == "none":
+        return [
+            "The cameras were not turned against each other, which leaves the height of the scene open, and the remedy "
+            "is switched off."
+        ]
+    if not 100 * cost.sigma_log_k <= _SMALL_PERCENT:
+        return [f"{cost.sentence[0].upper()}{cost.sentence[1:]}."]
+    return []
+
+
+def _unexplained(result: BundleResult, choice: ModelChoice | None) -> list[str]:
+    """What residuals say against the solution."""
+    reasons = []
+    if (left := left_over_frame(result.reconstruction)) >= _LEFT_PX:
+        reasons.append(
+            f"In the same places of all photos {left:.2f} px remain unexplained: the lens is not what it is taken for."
+        )
+    elif (left := left_along_readout(result.reconstruction)) >= _LEFT_PX:
+        reasons.append(
+            f"At the same times of the readout {left:.2f} px remain unexplained: the lens, or how the camera moves "
+            "during the readout, is not what it is taken for."
+        )
+    if choice is not None:
+        error = choice.held_out_error[choice.label]
+        beyond_px = result.sigma_px * float(np.sqrt(max(error - 1.0, 0.0)))
+        if error > 2.0 and beyond_px > _HELD_OUT_PX:
+            reasons.append(
+                f"Measurements that were held out are off by {beyond_px:.1f} px more than their noise explains."
+            )
+    return reasons
+
+
+def _of_global(choice: ModelChoice | None) -> tuple[str, list[str]]:
+    """Whether there may be a shutter that was not taken out, and why."""
+    if choice is None:
+        return "not-determined", ["The shutter was not looked at, as you asked (--model global)."]
+    if choice.num_held_out < _LEAST_HELD_OUT:
+        return "not-determined", [
+            f"There are too few measurements to tell a rolling shutter: only {choice.num_held_out} could be held out."
+        ]
+    if choice.shutter == "not-determined":
+        return choice.shutter, [
+            "A rolling shutter would explain a part of what bends the photos, and was not taken out: "
+            f"{'; '.join(choice.against)}."
+        ]
+    return choice.shutter, []
+
+
+def _of_motions(
+    result: BundleResult,
+    global_result: BundleResult | None,
+    choice: ModelChoice | None,
+    motions: PhotoMotions,
+    torn: NDArray[np.bool_],
+    known: Collection[str],
+) -> tuple[str, list[str]]:
+    """Whether a shutter was found, and why not."""
+    rec = result.reconstruction
+    if not (motions.shift_px >= _UNSEEN_PX).any():
+        return "not-found", []
+    reasons = []
+    if choice is None and not (global_result is not None and _explains(result, global_result)):
+        reasons.append(
+            f"The {rec.shutter_model} model, which you named, explains no more than remains unexplained even so: its "
+            "motions may be the lens."
+        )
+    if (axis := _repeated(rec)) is not None and not {*known}.issuperset(rec.image_names):
+        turn = np.degrees(np.mean(rec.phi[:, axis] * rec.frame_span()))
+        reasons.append(
+            f"All photos are said to have turned alike, by {abs(turn):.2f} degrees about {'xyz'[axis]}: an error of "
+            "the lens looks like that, and no hand does it."
+        )
+    if 2 * torn.sum() > rec.num_images:
+        reasons.append("In most photos halves of the measurements do not agree that there was the motion found.")
+    return ("not-determined" if reasons else "found"), reasons
+
+
+def _explains(result: BundleResult, global_result: BundleResult) -> bool:
+    """Whether a model explains its measurements better than a global shutter does, as a chosen one must."""
+    rec, plain = result.reconstruction, global_result.reconstruction
+    if len(plain.observations) != len(rec.observations):
+        return False
+    # of fitted measurements, which noise alone leaves below 1 by half of each unknown: so that they compare with 1
+    num, free = len(rec.observations), {"global": 6, "constant-motion": 12}
+    before, after = (
+        clipped_errors(each, each.observations, result.sigma_px)[0]
+        + (free.get(each.shutter_model, 9) * each.num_images + 3 * each.num_points) / (2 * num)
+        for each in (plain, rec)
+    )
+    return improves(before, after, standard_errors(before - after, corners(rec, rec.observations)))
+
+
+def _repeated(rec: Reconstruction) -> int | None:
+    """The axis of the camera about which all photos turned alike; None if they did not, or not so that it is seen.
+
+    Nor if the camera turned so from photo to photo, too: then it panned.
+    """
+    m = rec.num_images
+    if m < _LEAST_PHOTOS:
+        return None
+    phi = rec.phi * rec.frame_span()[:, None]
+    mean, spread = phi.mean(0), phi.std(0, ddof=1)
+    chance = 2.0 * stdtr(m - 1, -np.abs(mean) / np.maximum(spread, 1e-12) * np.sqrt(m))
+    half_px = float(np.median([rec.camera(i).K[0, 0] for i in range(m)])) / 2
+    between = Rotation.from_matrix(rec.R_cw[1:] @ rec.R_cw[:-1].transpose(0, 2, 1)).as_rotvec().mean(0)
+    if between @ mean > _SAME_WAY * np.linalg.norm(between) * np.linalg.norm(mean):
+        return None
+    alike = (np.abs(mean) > _REPEATED * spread) & (3 * chance < _CHANCE) & (np.abs(mean) * half_px > _UNSEEN_PX)
+    return int(np.argmax(np.where(alike, np.abs(mean), 0.0))) if alike.any() else None
+
+
+def _doubts(
+    result: BundleResult, motions: PhotoMotions, outliers: NDArray[np.float64], most_phi: Mapping[str, float]
+) -> dict[str, list[str]]:
+    """What is to be said against each photo."""
+    rec = result.reconstruction
+    turn = rec.phi * rec.frame_span()[:, None]
+    sigma = np.linalg.norm(result.sigma_phi, axis=1) * rec.frame_span()
+    times = np.abs(turn).max(1) / result.phi_sigma
+    counts = _counts(rec)
+    doubts: dict[str, list[str]] = {}
+    for i, name in enumerate(rec.image_names):
+        said = doubts[name] = []
+        if counts[i] < _FEW:
+            said.append(f"only {counts[i]} measurements")
+        if motions.covered[i] < _CORNER:
+            said.append(f"its measurements lie in {100 * motions.covered[i]:.0f} % of its frame")
+        if outliers[i] > _OUTLIERS:
+            said.append(f"{100 * outliers[i]:.0f} % of its measurements contradict the others")
+        if motions.difference_px[i] > _UNSEEN_PX:
+            said.append(f"its halves contradict each other by {motions.difference_px[i]:.1f} px")
+        if motions.sigma_px[i] > _UNCERTAIN_PX:
+            said.append(f"its motion is only known to +-{motions.sigma_px[i]:.1f} px")
+        if times[i] > _FAR and motions.shift_px[i] > _UNSEEN_PX:
+            said.append(f"it moved {times[i]:.0f} times as much as photos of this set do")
+        if np.linalg.norm(turn[i]) - 2 * sigma[i] > most_phi.get(name, np.inf):
+            said.append(
+                f"it is said to have turned by {np.degrees(np.linalg.norm(turn[i])):.2f} degrees, but would be blurred "
+                f"by more than {np.degrees(most_phi[name]):.2f}"
+            )
+    return doubts
+
+
+def _of_photos(rec: Reconstruction, doubts: Mapping[str, list[str]], motions: PhotoMotions) -> list[str]:
+    """What doubtful photos say against a whole that nothing else speaks against."""
+    # a motion that is wrong by this stretches what a photo shows by its share of half the frame, and the scene as much
+    half_px = np.array([min(each.width, each.height) / 2 for each in rec.cameras])[rec.camera_idx]
+    percent = 100 * float(np.sqrt(np.mean((motions.difference_px / half_px) ** 2)))
+    if percent > _SMALL_PERCENT:
+        return [
+            "Halves of the photos' measurements contradict each other about the motions, by "
+            f"{percent:.1f} % of the frame in the mean."
+        ]
+    doubtful = sum(bool(each) for each in doubts.values())
+    return [f"{doubtful} of {rec.num_images} photos are doubtful."] if 2 * doubtful > rec.num_images else []

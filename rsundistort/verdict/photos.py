@@ -1,0 +1,196 @@
+"""What the measurements of each photo alone say of its motion, the scene being held."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import fdtrc
+
+from ..bundle import BundleResult
+from ..model import READOUTS, Reconstruction
+from ..model.projection import clock_of, project_points_with_jacobians, unproject_points
+
+__all__ = ["PhotoMotions", "photo_motions"]
+
+Array = NDArray[np.float64]
+
+# Cells of the chequerboard, across and down; places across and down at which the frame is looked at.
+_BOARD, _LOOKED_AT = 8, 5
+# Probability that noise alone lets a photo of a set contradict itself.
+_CHANCE = 0.01
+
+
+@dataclass(frozen=True)
+class PhotoMotions:
+    """What each photo says of its motion; pixels are the largest displacement anywhere in its frame, of first order.
+
+    Attributes
+    ----------
+    shift_px : (m,) array
+        By the motion.
+    sigma_px : (m,) array
+        Standard deviation of that, with the noise that the photo's own residuals show.
+    difference_px : (m,) array
+        Between the motions that two halves of the photo's measurements call for; 0 where that may be noise.
+    covered : (m,) array
+        Share of the frame in which nine tenths of the measurements lie, across and down.
+    """
+
+    shift_px: Array
+    sigma_px: Array
+    difference_px: Array
+    covered: Array
+
+
+def photo_motions(result: BundleResult) -> PhotoMotions:
+    """Look at each photo of a solution alone.
+
+    Its pose and motion are solved for again from each half of its measurements (left and right, read first and read
+    last, the two colours of a chequerboard), the points being held, under the prior on its motion: one step of
+    Gauss-Newton from the solution, near which they stay.
+
+    Parameters
+    ----------
+    result : BundleResult
+        Of a model with a shutter.
+    """
+    rec = result.reconstruction
+    nb = 12 if rec.shutter_model == "constant-motion" else 9
+    spread = np.repeat([result.phi_sigma, result.velocity_sigma * rec.baseline], 3)[: nb - 6]
+    found = np.zeros((4, rec.num_images))
+    splits = 3 * rec.num_images
+    for i, mine in enumerate(rec.observations.by_photo(rec.num_images)):
+        if len(mine):
+            prior = np.concatenate([np.zeros(6), (rec.frame_span()[i] / np.maximum(spread, 1e-12)) ** 2])
+            photo = _Photo.of(rec, i, mine, result.sigma_px)
+            found[:, i] = (
+                photo.shift_px(photo.motion[None])[0],
+                photo.spread_px(result.covariances[i, 6:, 6:]),
+                photo.difference_px(prior, _CHANCE / splits),
+                photo.covered,
+            )
+    return PhotoMotions(*found)
+
+
+@dataclass(frozen=True)
+class _Photo:
+    """A photo's measurements, linearised at the solution: whitened residuals (n, 2) and Jacobians (n, 2, nb).
+
+    Unknowns: rotation and translation of the camera, phi, velocity, all in the camera frame. `frame` (k, 2, nb - 6) are
+    the derivatives of places all over the frame, in pixels, by the motion.
+    """
+
+    residuals: Array
+    J: Array
+    xy: Array
+    clock: Array
+    motion: Array
+    frame: Array
+    size: Array
+    along: int
+    turn: Array
+
+    @classmethod
+    def of(cls, rec: Reconstruction, i: int, mine: NDArray[np.int64], sigma_px: float) -> _Photo:
+        obs, camera, R = rec.observations, rec.camera(i), rec.R_cw[i]
+        points_c = (rec.points_w[obs.point_idx[mine]] - rec.center_w[i]) @ R.T
+        motion = rec.motion(i).in_camera(R)
+        moving = rec.shutter_model == "constant-motion"
+        xy, valid, J = project_points_with_jacobians(points_c, camera, motion, rec.shutter_model)
+        mine, points_c = mine[valid], points_c[valid]
+        blocks = [-J.point[valid] @ _cross(points_c), -J.point[valid], J.phi[valid]]
+        if moving:
+            blocks[0] = blocks[0] - J.velocity[valid] @ _cross(motion.velocity[None])
+            blocks.append(J.velocity[valid])
+        precision = 1.0 / (sigma_px * obs.sigma[mine])
+        depth = float(np.median(points_c[:, 2])) if len(points_c) else 1.0
+        across, down = (np.linspace(0, side - 1, _LOOKED_AT) for side in (camera.width, camera.height))
+        places = np.stack(np.meshgrid(across, down), axis=2).reshape(-1, 2)
+        rays, seen = unproject_points(places, camera, motion, rec.shutter_model)
+        rays = depth * np.column_stack([rays, np.ones(len(rays))])[seen]
+        _, seen, there = project_points_with_jacobians(rays, camera, motion, rec.shutter_model)
+        by_motion = [there.phi[seen], there.velocity[seen]] if moving else [there.phi[seen]]
+        return cls(
+            (xy[valid] - obs.xy_raw[mine]) * precision[:, None],
+            np.concatenate(blocks, axis=2) * precision[:, None, None],
+            obs.xy_raw[mine],
+            clock_of(camera, obs.xy_raw[mine]),
+            np.concatenate([motion.phi, motion.velocity])[: 6 if moving else 3],
+            np.concatenate(by_motion, axis=2),
+            np.array([camera.width, camera.height], float),
+            READOUTS[camera.readout][0],
+            R,
+        )
+
+    @property
+    def covered(self) -> float:
+        """Share of the frame."""
+        if not len(self.xy):
+            return 0.0
+        return float(np.prod(np.ptp(np.quantile(self.xy, [0.05, 0.95], axis=0), axis=0) / self.size) / 0.9**2)
+
+    def shift_px(self, motions: Array) -> Array:
+        """(k,) largest displacement by motions (k, nb - 6)."""
+        shift = np.linalg.norm(np.einsum("fia,ka->kfi", self.frame, motions), axis=2)
+        return np.asarray(shift.max(axis=1, initial=0.0))
+
+    def spread_px(self, covariance: Array) -> float:
+        """Largest standard deviation of a displacement by the motion of this covariance, velocities in the world."""
+        turn = np.eye(len(self.motion))
+        turn[3:, 3:] = self.turn[: len(turn) - 3, : len(turn) - 3]
+        covariance = turn @ covariance @ turn.T
+        variance = np.einsum("fia,ab,fib->f", self.frame, covariance, self.frame).max(initial=0.0)
+        return float(np.sqrt(variance * self._noise(self.residuals, self.J.shape[2])))
+
+    @staticmethod
+    def _noise(residuals: Array, unknowns: int) -> float:
+        """Variance of residuals in units of that which weighed them; at least that one."""
+        return max(1.0, float((residuals**2).sum()) / max(residuals.size - unknowns, 1))
+
+    def _halves(self) -> Iterator[NDArray[np.bool_]]:
+        """Measurements (n,) of one half."""
+        for values in (self.xy[:, 1 - self.along], self.clock):
+            yield values > np.median(values)
+        yield np.floor(_BOARD * self.xy / self.size).sum(1) % 2 == 1
+
+    def difference_px(self, prior: Array, chance: float) -> float:
+        """Largest displacement between the motions of two halves; 0 where noise alone is as unlike by this chance."""
+        if len(self.xy) < 2 * self.J.shape[2]:
+            return 0.0
+        return max(self._difference_px(half, prior, chance) for half in self._halves())
+
+    def _difference_px(self, half: NDArray[np.bool_], prior: Array, chance: float) -> float:
+        nb = self.J.shape[2]
+        steps, covariances, noise = [], [], []
+        for mine in (half, ~half):
+            if mine.sum() < nb:
+                return 0.0
+            J, residuals = self.J[mine].reshape(-1, nb), self.residuals[mine].ravel()
+            try:
+                covariance = np.linalg.inv(J.T @ J + np.diag(prior))
+            except np.linalg.LinAlgError:  # all measurements in one place
+                return 0.0
+            step = -covariance @ (J.T @ residuals + prior * np.concatenate([np.zeros(6), self.motion]))
+            steps.append(step[6:])
+            covariances.append(covariance)
+            noise.append(self._noise(residuals + J @ step, nb))
+        difference = steps[0] - steps[1]
+        # both are drawn to zero by the same prior: what it does to both is no difference
+        first, second = covariances
+        shared = (first * prior) @ second
+        variance = (first + second - shared - shared.T)[6:, 6:] * max(noise)
+        unlike = float(difference @ np.linalg.solve(variance, difference)) / len(difference)
+        # Hotelling's: the noise is read off the same residuals
+        if fdtrc(len(difference), max(self.residuals.size - 2 * nb, 1), unlike) > chance:
+            return 0.0
+        return float(self.shift_px(difference[None])[0])
+
+
+def _cross(vectors: Array) -> Array:
+    """(n, 3, 3) matrices that take x to vector cross x."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)

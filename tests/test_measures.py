@@ -1,0 +1,48 @@
+"""Normalised errors of `benchmarks/measures.py`: about one where the noise is the one that is reported."""
+
+from __future__ import annotations
+
+import numpy as np
+from measures import library_sigmas, log_k_error, normalised_errors, pooled
+from solved_scene import SCENES
+
+from rsundistort import BundleOptions, Observations, Reconstruction, Solution, SolvedImage, bundle_adjust, read_solution
+from rsundistort.critical import heal
+from rsundistort.pipeline.ladder import Solved
+
+
+def test_errors_of_measurements_with_known_noise_are_one_deviation(rng):
+    scene = SCENES / "courtyard"
+    truth = read_solution(scene / "ground_truth.json")
+    camera = truth.cameras["1"]
+    with np.load(scene / "tracks.npz") as tracks:
+        names = [str(name) for name in tracks["image_names"]]
+        frame, point, xy = tracks["frame_idx"], tracks["point_idx"], tracks["xy_raw"]
+        poses = tracks["R_cw"], tracks["center_w"], tracks["points_w"]
+    phi = np.array([truth.image(name).motion.phi for name in names])
+    errors = []
+    for _ in range(8):
+        seen = Observations(frame, point, xy + rng.normal(0, 0.3, xy.shape))
+        start = Reconstruction(
+            [camera], names, np.zeros(len(names), int), *poses, seen, phi, shutter_model="rotation"
+        )  # fmt: skip
+        options = BundleOptions()
+        result, remedy = heal(bundle_adjust(start, "rotation", options), options)
+        rec = result.reconstruction
+        images = [
+            SolvedImage(name, "1", rec.R_cw[i], rec.center_w[i], rec.motion(i), result.sigma_phi[i])
+            for i, name in enumerate(names)
+        ]
+        critical = {"sigma_log_k": remedy.after.sigma_log_k}
+        solution = Solution("rotation", truth.cameras, truth.rectified_cameras, images, critical)
+        sigmas = library_sigmas(Solved(result, result, remedy=remedy), options)
+        errors.append(normalised_errors(solution, truth, sigmas, log_k_error(rec, truth)))
+    # eight draws of a few modes: their mean square is right to about a third
+    rms = pooled(errors)
+    assert all(0.6 < value < 1.5 for value in rms.values()), rms
+
+
+def test_what_has_no_deviation_is_missing():
+    truth = read_solution(SCENES / "courtyard" / "ground_truth.json")
+    found = normalised_errors(truth, truth, {"mean_phi": np.ones(3)}, log_k=0.0)
+    assert pooled([found]) == {"phi": None, "mean_phi": 0.0, "log_k": None, "center": None}

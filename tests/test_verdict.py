@@ -1,0 +1,469 @@
+"""The verdict on solutions whose truth is known, from measurements by the NumPy projection."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from rsundistort_cli.closing import closing_table, summary
+from scipy.spatial.transform import Rotation
+from solved_scene import SCENES, solve_scene
+
+from rsundistort import (
+    BundleOptions,
+    Camera,
+    FormatError,
+    Reconstruction,
+    RowMotion,
+    RsUndistortWarning,
+    Solution,
+    SolvedImage,
+    bundle_adjust,
+    read_solution,
+    rectify_folder,
+)
+from rsundistort.bundle import ModelChoice, choose_model
+from rsundistort.critical import heal
+from rsundistort.io import write_solution
+from rsundistort.pipeline import ladder
+from rsundistort.rectify import largest_shift_px
+from rsundistort.report import verdict_of
+from rsundistort.report.displacement import displacement_field
+from rsundistort.synthetic.measurements import measure
+from rsundistort.verdict import Verdict, judge, left_along_readout, left_over_frame, photo_motions
+from rsundistort.verdict.judge import _repeated
+
+LENS = (-0.1, 0.03, 0.0, 0.0)
+CAMERA = Camera(800, 600, [[700, 0, 402], [0, 700, 297], [0, 0, 1]], LENS)
+NOISE_PX = 0.3
+ROLL = np.array([0, 0, 0.012])
+
+# problems this small wait for threads longer than they compute
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def measured(rng, phi, *, num_points=250, noise_px=NOISE_PX, velocity=None):
+    """Photos around a cloud, rolled at will, that turned by phi (m, 3) radians a frame; at the true poses."""
+    m = len(phi)
+    center_w = rng.normal(size=(m, 3))
+    center_w *= 3.5 / np.linalg.norm(center_w, axis=1, keepdims=True)
+    ahead = -center_w / np.linalg.norm(center_w, axis=1, keepdims=True)
+    right = np.cross(ahead, rng.normal(size=(m, 3)))
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    R_cw = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    # fills the frame
+    points_w = rng.uniform(-1.3, 1.3, (num_points, 3))
+    phi = np.asarray(phi) / CAMERA.frame_span
+    motions = [RowMotion(*each) for each in zip(phi, np.zeros((m, 3)) if velocity is None else velocity, strict=True)]
+    point_idx, frame_idx = (each.ravel() for each in np.mgrid[:num_points, :m])
+    seen = measure(
+        points_w, R_cw, center_w, motions, [CAMERA] * m, frame_idx, point_idx,
+        noise_px=noise_px, seed=int(rng.integers(1 << 30)),
+    ).observations  # fmt: skip
+    inside = ((seen.xy_raw >= 0) & (seen.xy_raw <= [799, 599])).all(1)
+    rec = Reconstruction(
+        [CAMERA], [f"{i}.jpg" for i in range(m)], np.zeros(m, int), R_cw, center_w, points_w, seen.select(inside)
+    )
+    return rec.with_points(np.ones(len(rec.observations), bool), min_track=3)
+
+
+def swung(rng, sigma=0.04, m=8):
+    """Motions of a hand, radians a frame."""
+    return sigma * rng.normal(size=(m, 3))
+
+
+def named(rec, model="rotation", options=None):
+    """The verdict where a model is named."""
+    options = options or BundleOptions()
+    result, remedy = heal(bundle_adjust(rec, model, options), options)
+    plain = bundle_adjust(result.reconstruction, "global", replace(options, outlier_rounds=0, sigma_px=result.sigma_px))
+    return result, judge(result, plain, None, remedy)
+
+
+def chosen(rec, options=None):
+    """The verdict where evidence chooses the model, as a run does it."""
+    options = options or BundleOptions()
+    tried = bundle_adjust(rec, "rotation", options)
+    choice = choose_model(tried.reconstruction, ("global", "two-step", "rotation"), options, sigma_px=tried.sigma_px)
+    result, remedy = tried, None
+    if choice.shutter_model != "rotation":
+        result = bundle_adjust(tried.reconstruction, choice.shutter_model, options)
+    if choice.shutter_model != "global":
+        result, remedy = heal(result, options)
+    return judge(result, None, choice, remedy)
+
+
+def moved(rec, shift_px, some=None):
+    """The same with measurements that are shifted by (o, 2) pixels, or some of them."""
+    obs = rec.observations
+    some = np.ones(len(obs), bool) if some is None else some
+    return replace(rec, observations=replace(obs, xy_raw=obs.xy_raw + some[:, None] * shift_px))
+
+
+def thinned(rec, photo, keep):
+    """Without measurements of a photo but those of a mask (o,)."""
+    keep = keep | (rec.observations.frame_idx != photo)
+    return replace(rec, observations=rec.observations.select(keep))
+
+
+def choice_of(model="global", error=1.0, gain=0.0, num_held_out=500, against=()):
+    errors = {"global": error, "rotation": error}
+    shutter = "not-determined" if against else "not-found" if model == "global" else "found"
+    return ModelChoice(
+        model, model, False, shutter, errors, errors, {"rotation": gain}, {}, (model,), None, against, num_held_out
+    )
+
+
+# ---------------------------------------------------------------- shutter and shape
+
+
+def test_motions_of_a_hand_are_found_and_trusted(rng):
+    verdict = chosen(measured(rng, swung(rng), num_points=400))
+    assert verdict == Verdict("found", "trusted")
+    assert named(measured(rng, swung(rng)))[1] == Verdict("found", "trusted")
+
+
+def test_noise_alone_is_no_shutter(rng):
+    rec = measured(rng, np.zeros((8, 3)))
+    assert chosen(rec) == named(rec)[1] == Verdict("not-found", "trusted")
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.04])
+def test_a_wrong_lens_is_no_trusted_shape(sigma, rng):
+    rec = measured(rng, swung(rng, sigma), num_points=400)
+    wrong = replace(rec, cameras=[replace(CAMERA, dist=(LENS[0] + 0.06, *LENS[1:]))])
+    for verdict in (chosen(wrong), named(wrong)[1]):
+        assert verdict.shape == "doubtful"
+        assert "the lens is not what it is taken for" in verdict.reasons[0]
+    # and one that is solved for is right again
+    assert named(wrong, options=BundleOptions(refine=("k1",)))[1].shape == "trusted"
+
+
+def test_motions_that_repeat_themselves_are_no_hands(rng):
+    alike = named(measured(rng, swung(rng, 0.002) + ROLL))[1]
+    assert alike.shutter == "not-determined"
+    assert alike.shape == "doubtful"
+    assert "turned alike, by 0." in alike.reasons[0]
+    assert "about z" in alike.reasons[0]
+    # a camera that pans turns on between its photos
+    rec = measured(rng, swung(rng, 0.002) + ROLL)
+    pan = np.array([Rotation.from_rotvec([0, 0, 0.3 * i]).as_matrix() for i in range(8)])
+    order = replace(
+        rec, R_cw=pan @ rec.R_cw[0], phi=np.tile(ROLL, (8, 1)) / CAMERA.frame_span, shutter_model="rotation"
+    )
+    assert _repeated(order) is None
+    assert _repeated(replace(order, R_cw=order.R_cw[::-1])) == 2
+    # a gyroscope may say so, too
+    result = bundle_adjust(rec, "rotation")
+    assert judge(result, None, choice_of("rotation", gain=9.0)).lens_only == tuple(rec.image_names)
+    by_gyro = judge(result, None, choice_of("rotation", gain=9.0), known=rec.image_names)
+    assert (by_gyro.shutter, by_gyro.shape, by_gyro.lens_only) == ("found", "trusted", ())
+    # of a few photos chance may do the same
+    assert "alike" not in " ".join(named(measured(rng, swung(rng, 0.002, 4) + ROLL))[1].reasons)
+
+
+def test_a_model_that_was_named_must_explain_something(rng):
+    result, verdict = named(measured(rng, swung(rng)))
+    assert verdict.shutter == "found"
+    assert verdict.lens_only == ()
+    nothing_gained = judge(result, replace(result))
+    assert nothing_gained.shutter == judge(result).shutter == "not-determined"
+    assert "rotation model, which you named, explains no more" in nothing_gained.reasons[0]
+
+
+def test_a_global_model_that_was_named_was_not_looked_at(rng):
+    rec = measured(rng, swung(rng))
+    verdict = judge(bundle_adjust(rec, "global"))
+    assert verdict.shutter == "not-determined"
+    assert verdict.shape == "doubtful"
+    assert "--model global" in verdict.reasons[-1]
+
+
+def test_a_shutter_that_gained_but_was_not_kept_is_not_determined(rng):
+    still = bundle_adjust(measured(rng, np.zeros((8, 3))), "global")
+    for choice, shutter, said in (
+        (
+            choice_of(gain=5.0, against=("two halves differ",)),
+            "not-determined",
+            "was not taken out: two halves differ.",
+        ),
+        (choice_of(gain=1.0), "not-found", ""),
+        (choice_of(num_held_out=12), "not-determined", "only 12 could be held out"),
+    ):
+        verdict = judge(still, None, choice)
+        assert verdict.shutter == shutter
+        assert verdict.shape == ("doubtful" if said else "trusted")
+        assert said in " ".join(verdict.reasons)
+
+
+def test_held_out_measurements_that_are_far_off_speak_against_a_solution(rng):
+    result = bundle_adjust(measured(rng, swung(rng)), "rotation")
+    assert judge(result, None, choice_of("rotation", 3.0, 9.0)).shape == "trusted"  # 0.4 px
+    far_off = judge(result, None, choice_of("rotation", 10.0, 9.0))
+    assert far_off.shutter == "found"
+    assert far_off.reasons == ("Measurements that were held out are off by 0.9 px more than their noise explains.",)
+
+
+def test_an_unknown_height_is_not_trusted(rng):
+    options = BundleOptions()
+    result, remedy = heal(bundle_adjust(measured(rng, swung(rng)), "rotation", options), options)
+    for sigma, shape in ((0.004, "trusted"), (0.006, "doubtful"), (np.nan, "doubtful")):
+        unsure = replace(remedy, after=replace(remedy.after, sigma_log_k=sigma))
+        verdict = judge(result, None, choice_of("rotation", gain=9.0), unsure)
+        assert verdict.shape == shape
+        assert shape == "trusted" or verdict.reasons[0].startswith("The height of the scene is ")
+
+
+# ---------------------------------------------------------------- photos
+
+
+def test_a_photo_whose_halves_disagree_is_doubtful(rng):
+    rec = measured(rng, swung(rng, 0.02))
+    obs = rec.observations
+    # what was read last was bent further, which outliers are not: each measurement moved little from its neighbours
+    late = (obs.frame_idx == 3) & (obs.xy_raw[:, 1] > 300)
+    bent = moved(rec, np.stack([(obs.xy_raw[:, 1] - 300) / 40, np.zeros(len(obs))], axis=1), late)
+    result, verdict = named(bent)
+    assert verdict.doubtful["3.jpg"].startswith("its halves contradict each other by ")
+    assert np.argmax(photo_motions(result).difference_px) == 3
+    assert not photo_motions(named(rec)[0]).difference_px.any()
+
+
+def test_a_photo_of_few_measurements_is_doubtful(rng):
+    rec = measured(rng, swung(rng))
+    mine = rec.observations.frame_idx == 2
+    few = thinned(rec, 2, mine & (np.cumsum(mine) <= 25))
+    assert named(few)[1].doubtful["2.jpg"].startswith("only 25 measurements")
+    corner = thinned(rec, 2, (rec.observations.xy_raw < [250, 220]).all(1))
+    assert "of its frame" in named(corner)[1].doubtful["2.jpg"]
+
+
+def test_a_photo_that_moved_far_more_is_doubtful(rng):
+    phi = swung(rng, 0.005, 12)
+    phi[4] = [0.05, 0.0, 0.05]
+    verdict = named(measured(rng, phi))[1]
+    assert verdict.doubtful.keys() == {"4.jpg"}
+    assert "times as much as photos of this set do" in verdict.doubtful["4.jpg"]
+
+
+def test_a_photo_that_its_exposure_contradicts_is_doubtful(rng):
+    result, _ = named(measured(rng, swung(rng)))
+    turned = np.linalg.norm(result.reconstruction.phi[1]) * CAMERA.frame_span
+    for bound, doubtful in ((1.1 * turned, False), (0.5 * turned, True)):
+        verdict = judge(result, most_phi={"1.jpg": bound})
+        assert ("1.jpg" in verdict.doubtful) == doubtful
+    assert f"{np.degrees(turned):.2f} degrees, but would be blurred" in verdict.doubtful["1.jpg"]
+
+
+def test_a_motion_that_nothing_supports_is_not_taken_out(rng):
+    rec = measured(rng, swung(rng))
+    mine = rec.observations.frame_idx == 2
+    result = bundle_adjust(thinned(rec, 2, mine & (np.cumsum(mine) <= 25)), "rotation")
+    assert judge(result).lens_only == ()
+    # the same measurements with a hundred times the noise
+    covariances = np.array(result.covariances)
+    covariances[2] *= 1e4
+    weak = judge(replace(result, covariances=covariances))
+    assert weak.lens_only == ("2.jpg",)
+    assert "only known to" in weak.doubtful["2.jpg"]
+
+
+def test_motions_that_most_photos_contradict_are_not_taken_out_if_evidence_chose_them(rng):
+    rec = measured(rng, 0 * swung(rng))
+    obs = rec.observations
+    # all left halves were sheared one way, all right halves the other
+    way = np.where(obs.xy_raw[:, :1] > 400, 1, -0.5) * (obs.xy_raw[:, 1:] - 297) / 297 * [8.0, 0.0]
+    result = bundle_adjust(moved(rec, way), "rotation", BundleOptions(outlier_rounds=0, sigma_px=NOISE_PX))
+    torn = judge(result, None, choice_of("rotation", gain=9.0))
+    assert torn.shutter == "not-determined"
+    assert "halves of the measurements do not agree" in " ".join(torn.reasons)
+    assert torn.lens_only == tuple(rec.image_names)
+    # who knows a motion from elsewhere knows better
+    assert "2.jpg" not in judge(result, None, choice_of("rotation", gain=9.0), known=["2.jpg"]).lens_only
+
+
+def test_a_photo_that_moved_two_ways_is_left_alone(rng):
+    phi = swung(rng)
+    phi[5] = 0
+    rec = measured(rng, phi)
+    obs = rec.observations
+    # its left half was sheared one way, its right half the other
+    way = np.where(obs.xy_raw[:, :1] > 400, 1.5, -0.5) * (obs.xy_raw[:, 1:] - 297) / 297 * [8.0, 0.0]
+    torn = moved(rec, way, obs.frame_idx == 5)
+    verdict = judge(bundle_adjust(torn, "rotation", BundleOptions(outlier_rounds=0, sigma_px=NOISE_PX)))
+    assert "its halves contradict each other" in verdict.doubtful["5.jpg"]
+    assert verdict.lens_only == ("5.jpg",)
+    # where outliers are dropped, they say the same
+    way = rng.normal(size=(len(obs), 2)) * 30
+    clean = bundle_adjust(moved(rec, way, (obs.frame_idx == 4) & (rng.random(len(obs)) < 0.7)), "rotation")
+    verdict = judge(clean, tracks=torn)
+    assert re.match("(6|7).* % of its measurements contradict the others", verdict.doubtful["4.jpg"])
+    assert verdict.lens_only == ("4.jpg",)
+    assert judge(clean).lens_only == ()
+
+
+# ---------------------------------------------------------------- residuals
+
+
+def test_what_remains_is_told_from_noise(rng):
+    rec = measured(rng, np.zeros((10, 3)))
+    assert left_over_frame(rec) == left_along_readout(rec) == 0
+    xy = rec.observations.xy_raw
+    ring = np.linalg.norm((xy - [402, 297]) / 400, axis=1, keepdims=True)
+    bent = 0.3 * np.cos(4 * ring) * (xy - [402, 297]) / 400 / ring
+    expected = np.sqrt((bent**2).sum(1).mean())
+    np.testing.assert_allclose(left_over_frame(moved(rec, bent)), expected, rtol=0.25)
+    late = np.stack([np.zeros(len(xy)), 0.3 * np.cos(np.pi * xy[:, 1] / 150)], axis=1)
+    np.testing.assert_allclose(left_along_readout(moved(rec, late)), 0.3 / np.sqrt(2), rtol=0.25)
+    # what is in one photo is not in all
+    assert left_over_frame(moved(rec, 4 * bent, rec.observations.frame_idx == 3)) == 0
+    # rows are no columns
+    across = replace(rec, cameras=[replace(CAMERA, readout="left-to-right")])
+    assert left_along_readout(moved(across, late)) == 0
+
+
+@pytest.mark.parametrize("model", ["rotation", "constant-motion"])
+def test_displacements_of_photos_are_those_of_their_motions(model, rng):
+    velocity = np.zeros((8, 3)) if model == "rotation" else 0.05 * rng.normal(size=(8, 3))
+    rec = measured(rng, swung(rng), velocity=velocity)
+    result = bundle_adjust(rec, model)
+    found = photo_motions(result)
+    exact = [largest_shift_px(CAMERA, result.reconstruction.motion(i), "rotation") for i in range(8)]
+    if model == "rotation":
+        np.testing.assert_allclose(found.shift_px, exact, rtol=0.2)  # of first order
+    else:
+        assert (np.abs(found.shift_px - exact) > 1).any()
+    assert ((found.covered > 0.5) & (found.covered < 1.2)).all()
+    # deviations are those of the errors
+    assert ((found.sigma_px > 0.05) & (found.sigma_px < 2)).all()
+
+
+# ---------------------------------------------------------------- what is written
+
+
+def test_a_verdict_is_kept_and_old_files_have_none(tmp_path):
+    camera = replace(CAMERA, dist=())
+    images = (
+        SolvedImage("a.jpg", "1", motion=RowMotion([0.01, 0, 0]), doubtful="only 21 measurements", lens_only=True),
+        SolvedImage("b.jpg", "1", motion=RowMotion([0.01, 0, 0])),
+    )
+    said = Verdict("found", "doubtful", ("The height is not known.",)).to_json()
+    path = tmp_path / "solution.json"
+    write_solution(path, Solution("rotation", {"1": camera}, {"1": camera.pinhole()}, images, verdict=said))
+    value = json.loads(path.read_text())
+    assert value["verdict"] == {"shutter": "found", "shape": "doubtful", "reasons": ["The height is not known."]}
+    assert [(each["doubtful"], each["lens_only"]) for each in value["images"]] == [
+        ("only 21 measurements", True), (None, False),
+    ]  # fmt: skip
+    again = read_solution(path)
+    assert again.verdict == said
+    assert [(each.doubtful, each.lens_only) for each in again.images] == [("only 21 measurements", True), (None, False)]
+    # what was found stays, and is not taken out
+    for one, other in zip(again.images, images, strict=True):
+        np.testing.assert_array_equal(one.motion.phi, other.motion.phi)
+    assert not again.images[0].taken_out.phi.any()
+    assert again.images[1].taken_out is again.images[1].motion
+    for each in value["images"]:
+        del each["doubtful"], each["lens_only"]
+    path.write_text(json.dumps({key: each for key, each in value.items() if key != "verdict"}))
+    old = read_solution(path)
+    assert old.verdict is None
+    assert [(each.doubtful, each.lens_only) for each in old.images] == [(None, False)] * 2
+    for wrong in ({"shutter": 1, "shape": "trusted", "reasons": []}, {"shape": "trusted"}, "found"):
+        path.write_text(json.dumps(value | {"verdict": wrong}))
+        with pytest.raises(FormatError, match=r"solution\.json"):
+            read_solution(path)
+
+
+@pytest.mark.parametrize(
+    ("shutter", "model", "reasons", "level", "headline"),
+    [
+        ("found", "rotation", [], "trust", "The shape can be trusted"),
+        ("not-found", "global", [], "still", "No correction needed"),
+        ("not-found", "rotation", [], "still", "No correction needed"),
+        ("found", "rotation", ["The lens is wrong."], "doubt", "The shape is doubtful"),
+        ("not-found", "global", ["The lens is wrong."], "doubt", "The shape is doubtful"),
+        ("not-determined", "global", ["It may be the lens."], "care", "The shutter is not determined"),
+        ("not-determined", "rotation", ["It may be the lens."], "doubt", "The shutter is not determined"),
+    ],
+)
+def test_report_and_closing_table_say_what_the_solution_says(shutter, model, reasons, level, headline):
+    said = Verdict(shutter, "doubtful" if reasons else "trusted", tuple(reasons)).to_json()
+    images = (SolvedImage("a.jpg", "1", motion=RowMotion([0.01, 0, 0]), rms_px=0.2, rs_shift_px=9.0),)
+    quality = {"rms_px": 0.2, "global_rms_px": 1.0, "held_out_error": {}, "sigma_intrinsics": {}}
+    solution = Solution(
+        model, {"1": CAMERA}, {"1": CAMERA.pinhole()}, images, verdict=said, quality=quality,
+        options={"camera": "camera.json", "readout": "top-to-bottom"},
+    )  # fmt: skip
+    verdict = verdict_of(solution)
+    assert (verdict.level, verdict.headline) == (level, headline)
+    assert all(reason in verdict.sentences[2] for reason in reasons)
+    table = " ".join(closing_table(solution, Path("out")).split())
+    assert f"verdict {headline}" in table
+    assert verdict.sentences[2].strip() in table
+
+
+@pytest.fixture(scope="module")
+def doubted(tmp_path_factory):
+    """Outputs of the courtyard whose fourth photo has a motion that is not to be taken out."""
+    out = tmp_path_factory.mktemp("doubted") / "out"
+    judged = Verdict("found", "trusted", (), {"0003.jpg": "halves differ"}, ("0003.jpg",))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ladder, "judge", lambda *_: judged)
+        with pytest.warns(RsUndistortWarning, match=r"lens taken out only.* 0003"):
+            solution = solve_scene("courtyard", out, shutter_model="rotation", maps="npz")
+    return out, solution
+
+
+def test_of_such_a_photo_the_lens_alone_is_taken_out(doubted):
+    out, solution = doubted
+    image = solution.image("0003.jpg")
+    assert (image.lens_only, image.doubtful, image.rs_shift_px) == (True, "halves differ", 0.0)
+    assert largest_shift_px(solution.cameras["1"], image.motion) > 20
+    # what OpenCV makes of it, which knows of no shutter
+    camera, target = solution.cameras["1"], solution.rectified_cameras["1"]
+    undistorted = cv2.initUndistortRectifyMap(
+        camera.K, camera.dist, np.eye(3), target.K, (target.width, target.height), cv2.CV_32FC1
+    )  # fmt: skip
+    with np.load(out / "maps" / "0003.forward.npz") as maps:
+        for name, expected in zip(("map_x", "map_y"), undistorted, strict=True):
+            np.testing.assert_allclose(maps[name], expected, atol=2e-3)
+    # keypoints of the model are where the rectified photo has them: its points are off by the shutter there alone
+    model = pycolmap.Reconstruction(out / "sparse")
+    errors = {}
+    for each in model.images.values():
+        seen = [(p.xy, each.project_point(model.points3D[p.point3D_id].xyz)) for p in each.points2D if p.has_point3D()]
+        errors[each.name] = np.median([np.linalg.norm(xy - there) for xy, there in seen])
+    assert errors.pop("0003.jpg") > 3
+    assert max(errors.values()) < 1
+
+
+def test_rectifying_by_the_solution_gives_the_same(doubted, tmp_path):
+    out, solution = doubted
+    again, _ = rectify_folder(SCENES / "courtyard" / "photos", out / "solution.json", tmp_path / "again", jobs=2)
+    for name in ("0003", "0004"):
+        for file in (f"images/{name}.jpg", f"masks/{name}.png"):
+            assert (tmp_path / "again" / file).read_bytes() == (out / file).read_bytes()
+    assert [image.lens_only for image in again.images] == [image.lens_only for image in solution.images]
+
+
+def test_such_a_photo_is_named(doubted):
+    out, solution = doubted
+    table = closing_table(solution, out)
+    assert "  0003.jpg: halves differ" in table
+    assert "lens only" in table
+    assert summary(solution, out, [])["lens_only"] == ["0003.jpg"]
+    assert summary(solution, out, [])["doubtful"] == {"0003.jpg": "halves differ"}
+    page = (out / "report.html").read_text()
+    assert "<small>lens only</small>" in page
+    assert "<small>doubtful: halves differ</small>" in page
+    raw, still = displacement_field(solution, solution.image("0003.jpg"))
+    np.testing.assert_allclose(raw, still, atol=1e-6)
+    raw, still = displacement_field(solution, solution.image("0002.jpg"))
+    assert np.linalg.norm(raw - still, axis=1).max() > 10
