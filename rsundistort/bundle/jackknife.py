@@ -21,6 +21,7 @@ What the priors contribute is theirs, and stays.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -30,7 +31,7 @@ from numpy.typing import NDArray
 from .elimination import Marginals
 from .normal_equations import Function, NormalEquations
 
-__all__ = ["Inflation", "Partition", "by_corner", "by_place", "inflated", "inflated_function", "inflation"]
+__all__ = ["Inflation", "Partition", "by_corner", "by_place", "inflated", "inflation", "inflation_of"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -138,12 +139,28 @@ class _Residuals(NamedTuple):
         return float((self.seen**2).sum() / (self.left**2).sum())
 
 
-def _ratio(variances: tuple[Array, Array, Array], noise: Array) -> Array:
-    """Variances seen over those of independent noise, by those of `_Residuals` and that of all of that noise."""
-    seen, drawn, left = variances
-    shown = np.divide(left, drawn, out=np.ones_like(left), where=drawn > 0)
-    ratio = np.divide(seen, noise * np.maximum(shown, _LEAST_SEEN), out=np.zeros_like(seen), where=noise > 0)
-    return ratio
+def _ratios(variances: Sequence[Array], noise: Array) -> Array:
+    """Variances (kinds,) seen over those of independent noise, from those of each of `_Residuals`.
+
+    What the fit hides is taken to be the same of all kinds.
+    """
+    seen, drawn, left = (np.divide(each, noise, out=np.zeros_like(noise), where=noise > 0) for each in variances)
+    shown = float(left.sum() / drawn.sum()) if drawn.sum() > 0 else 1.0
+    value: Array = seen / max(shown, _LEAST_SEEN)
+    return value
+
+
+def _deviations(excess: Array, square: float, partitions: Sequence[Partition], noise_factor: float) -> Array:
+    """Factors of deviations by the excess of variances over what the mean square of the residuals says.
+
+    An excess counts as far as it stands out of what independent noise makes of so few families (the positive part of
+    James and Stein's estimate).
+    """
+    # twice the squares of F sums of normal variables of variance 1 / F, less those of their four parts
+    doubt = square**2 * sum((8 + 0.5 - 2) / min(each.num_families, _FAMILIES) for each in partitions)
+    shrunk = excess - np.divide(doubt, excess, out=np.full_like(excess, np.inf), where=excess > 0)
+    value: Array = np.sqrt(np.maximum(noise_factor**2 * (square + np.maximum(shrunk, 0.0)), 1.0))
+    return value
 
 
 class Inflation(NamedTuple):
@@ -187,14 +204,14 @@ def inflation(
     weights = [np.divide(1.0, total, out=np.zeros_like(total), where=total > 0) for total in totals]
     noise = [(weight * (total - prior)).sum(0) for weight, total, prior in zip(weights, totals, priors, strict=True)]
     square = residuals.square
-    ratios = [np.full_like(each, square) for each in noise]
+    excess = [np.zeros_like(each) for each in noise]
     for partition in partitions:
         group, sign, count = partition.sketch(_FAMILIES)
         pulls = [equations.group_pulls(sign[:, None] * each, group, count) for each in residuals]
         for k, weight in enumerate(weights):
             variances = [(weight * (_squares(each[k]) + of_lengths[k]).reshape(weight.shape)).sum(0) for each in pulls]
-            ratios[k] = ratios[k] + np.maximum(_ratio((variances[0], variances[1], variances[2]), noise[k]) - square, 0)
-    return Inflation(*(np.sqrt(np.maximum(noise_factor**2 * each, 1.0)) for each in ratios))
+            excess[k] += _ratios(variances, noise[k]) - square
+    return Inflation(*(_deviations(each, square, partitions, noise_factor) for each in excess))
 
 
 def inflated(marginals: Marginals, photos: Array, cameras: Array) -> tuple[Array, Array]:
@@ -208,22 +225,17 @@ def inflated(marginals: Marginals, photos: Array, cameras: Array) -> tuple[Array
     return of_photos, of_all_cameras
 
 
-def inflated_function(
-    found: Function, equations: NormalEquations, partitions: tuple[Partition, ...], photos: Array, noise_factor: float
-) -> tuple[float, Array]:
-    """Variance of a function and its covariance with the photos (m, nb), whose factors are (nb,).
-
-    These are of the noise that weighs the measurements, which is `noise_factor` times the independent one.
-    """
-    noise, residuals = found.variance - found.of_priors, _Residuals.of(equations)
-    ratio = square = residuals.square
+def inflation_of(
+    found: Function, equations: NormalEquations, partitions: tuple[Partition, ...], noise_factor: float = 1.0
+) -> float:
+    """The factor of a function of the points: what a photo's unknowns suffer need not be what it does."""
+    residuals = _Residuals.of(equations)
+    noise, excess, square = np.array([found.variance - found.of_priors]), np.zeros(1), residuals.square
     for partition in partitions:
         variances = []
         for each in residuals:
             sums = np.zeros(_FAMILY * partition.num_families)
             np.add.at(sums, partition.group, (found.pulls * each).sum(1))
-            variances.append(_squares(sums) + found.of_lengths)
-        ratio += max(float(_ratio((variances[0], variances[1], variances[2]), np.array(noise))) - square, 0.0)
-    own = np.sqrt(max(ratio, noise_factor**-2))
-    rest = found.with_photos - found.with_photos_of_priors
-    return found.of_priors + own**2 * noise, found.with_photos_of_priors + own * photos * rest
+            variances.append(_squares(sums[:, None]) + found.of_lengths)
+        excess += _ratios(variances, noise) - square
+    return float(_deviations(excess, square, partitions, noise_factor)[0])

@@ -73,6 +73,14 @@ class Function:
     with_photos_of_priors: Array
     pulls: Array
 
+    def inflated(self, own: float, photos: Array) -> tuple[float, Array]:
+        """Variance, and covariance with the photos, where the noise's share of the deviations is enlarged.
+
+        Of the function by a factor, of the photos by one for each kind of unknown (nb,).
+        """
+        variance = self.of_priors + own**2 * (self.variance - self.of_priors)
+        return variance, self.with_photos_of_priors + own * photos * (self.with_photos - self.with_photos_of_priors)
+
 
 class NormalEquations:
     """Block normal equations at one state; `solve` eliminates the points and solves for the photos.

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .jackknife import inflated_function
+from .jackknife import inflation_of
 from .options import BundleOptions, BundleResult
 from .problem import BundleProblem, Spreads
 
@@ -38,9 +38,9 @@ class Posterior:
         state = self._problem.initial_state()
         self._equations = self._problem.linearize(state)
         self._factor = result.noise_factor
-        self._partitions, self._inflation = self._problem.partitions(state), result.inflation / self._factor
-        if plain.deviations == "model":
-            self._partitions, self._inflation = (), np.full_like(result.inflation, 1.0 / self._factor)
+        self._partitions = self._problem.partitions(state) if plain.deviations == "jackknife" else None
+        inflation = np.ones_like(result.inflation) if self._partitions is None else result.inflation
+        self._inflation = inflation / self._factor
         self._covariance = self._equations.covariance(self._inflation)
         self._own = 3 * plain.varying
         self._shape = rec.num_images, len(self._inflation) - self._own
@@ -57,9 +57,10 @@ class Posterior:
         found = self._equations.function_of_points(self._problem.in_order(weights))
         if found is None:
             return np.nan, np.full(self._shape, np.nan)
-        variance, with_photos = inflated_function(
-            found, self._equations, self._partitions, self._inflation, self._factor
-        )
+        own = 1.0
+        if self._partitions is not None:
+            own = inflation_of(found, self._equations, self._partitions, self._factor)
+        variance, with_photos = found.inflated(own / self._factor, self._inflation)
         return variance, with_photos[:, : self._shape[1]]
 
 
