@@ -25,7 +25,7 @@ from rsundistort import (
 )
 from rsundistort.bundle import Posterior, gauge_directions
 from rsundistort.bundle.triangulate import _world_rays
-from rsundistort.critical.cost import row_phi
+from rsundistort.critical.common import row_phi
 from rsundistort.critical.meter import readout_axes
 from rsundistort.evaluation import align_points
 from rsundistort.io import read_photo

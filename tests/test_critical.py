@@ -477,3 +477,32 @@ def test_what_is_said_of_a_critical_motion_is_json(rng):
     _, result, options = adjusted(named_scene("parallel"), rng, still=5, model="two-step")
     _, remedy = heal(result, options)
     json.dumps({"sentence": remedy.sentence, "anchors": dict(remedy.anchors)})
+
+
+def test_a_photo_that_stands_twice_in_the_folder_does_not_ruin_the_uncertainty(rng):
+    scene, result, options = adjusted(named_scene("20 degrees", num_points=120), rng)
+    obs = scene.observations
+    mine = np.flatnonzero(obs.frame_idx == 0)
+    # the copy is measured as its original; points that only these two show have no depth
+    lone = rng.permutation(mine)[: len(mine) // 4]
+    others = (obs.frame_idx != 0) & np.isin(obs.point_idx, obs.point_idx[lone])
+    twice = replace(
+        scene,
+        image_names=[*scene.image_names, "copy.jpg"],
+        camera_idx=np.append(scene.camera_idx, scene.camera_idx[0]),
+        R_cw=np.concatenate([scene.R_cw, scene.R_cw[:1]]),
+        center_w=np.concatenate([scene.center_w, scene.center_w[:1] + 1e-4]),
+        phi=np.zeros(0), velocity=np.zeros(0), variation=np.zeros(0), shutter_model="global",
+        observations=Observations(
+            np.append(obs.frame_idx, np.full(len(mine), scene.num_images)),
+            np.append(obs.point_idx, obs.point_idx[mine]),
+            np.concatenate([obs.xy_raw, obs.xy_raw[mine]]),
+        ).select(np.append(~others, np.ones(len(mine), bool))),
+    )  # fmt: skip
+    # few steps: depths that nothing holds have not run away yet, where they would not count
+    options = replace(options, deviations="model")
+    few = replace(options, max_iterations=1, spread_rounds=0)
+    alone = replace(result.reconstruction, observations=scene.observations)
+    found = [bundle_adjust(each, "rotation", few) for each in (alone, twice)]
+    sigma, with_copy = (shape_cost(each, options).sigma_log_k for each in found)
+    assert with_copy < 2.0 * sigma

@@ -464,7 +464,7 @@ def test_trouble_with_the_report_loses_no_run(monkeypatch, tmp_path):
 
     monkeypatch.setattr(outputs, "write_report", fails)
     with pytest.warns(RsUndistortWarning, match="^no report was written: no space$"):
-        solution = solve_scene("colonnade", tmp_path / "out", remedy="none", shutter_model="two-step")
+        solution = solve_scene("colonnade", tmp_path / "out", remedy="none", shutter_model="rotation")
     assert len(list((tmp_path / "out" / "images").iterdir())) == 10
     assert read_solution(tmp_path / "out" / "solution.json").shutter_model == solution.shutter_model
 

@@ -92,6 +92,11 @@ class BundleOptions:
     known_phi : mapping of photo name to (phi, sigma)
         Motions that are known from elsewhere, each with its standard deviation, (3,) radians per frame; components of
         infinite sigma are unknown. A soft anchor is a known phi of zero.
+    still : mapping of photo name to float
+        Photos that did not move but for so many radians per frame (one standard deviation; 0: not at all). Models
+        without a velocity hold their phi1 near zero (the paper's remedy; the measurements tell the rest),
+        constant-motion the whole motion: the velocity to the way that displaces what the photo shows, at its median
+        depth, as the angle does.
     lengths : sequence of KnownLength
         Known lengths in the scene, two or more: their ratios are residuals.
     refine : tuple of str
@@ -139,6 +144,7 @@ class BundleOptions:
     min_outlier_px: float = 0.25
     held_phi: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     known_phi: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
+    still: Mapping[str, float] = field(default_factory=dict)
     lengths: Sequence[KnownLength] = ()
     refine: tuple[str, ...] = ()
     guessed: GuessedCameras | None = None
@@ -156,6 +162,11 @@ class BundleOptions:
                 raise InputError(f"anchor {name!r}: components {components}, expected some of 0, 1, 2")
             if name in known and np.isfinite(known[name][1][list(components)]).any():
                 raise InputError(f"anchor {name!r} is held at zero and known from elsewhere; give one of them")
+        for name, still in self.still.items():
+            if not 0 <= still < np.inf:
+                raise InputError(f"still photo {name!r}: sigma {still!r}, expected 0 or a positive number")
+            if name in known or name in self.held_phi:
+                raise InputError(f"photo {name!r} is said to be still and its motion to be known; give one of them")
         if self.loss not in LOSSES:
             raise InputError(f"loss={self.loss!r}, expected one of {', '.join(LOSSES)}")
         if self.deviations not in DEVIATIONS:

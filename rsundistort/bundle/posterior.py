@@ -35,10 +35,10 @@ class Posterior:
         )  # fmt: skip
         plain = replace(options or BundleOptions(), loss="squared")
         self._problem = BundleProblem(rec, rec.shutter_model, plain, result.sigma_px * result.noise_factor, spreads)
-        state = self._problem.initial_state()
-        self._equations = self._problem.linearize(state)
+        self._state = self._problem.initial_state()
+        self._equations = self._problem.linearize(self._state)
         self._factor = result.noise_factor
-        self._partitions = self._problem.partitions(state) if plain.deviations == "jackknife" else None
+        self._partitions = self._problem.partitions(self._state) if plain.deviations == "jackknife" else None
         inflation = np.ones_like(result.inflation) if self._partitions is None else result.inflation
         self._inflation = inflation / self._factor
         self._covariance = self._equations.covariance(self._inflation)
@@ -47,7 +47,7 @@ class Posterior:
 
     def of_photos(self, vectors: Array) -> Array:
         """Covariance of the photos' unknowns times vectors (k, m, nb), as in `BundleResult.covariances`."""
-        return self._covariance(np.pad(vectors, [(0, 0), (0, 0), (0, self._own)]))[:, :, : vectors.shape[2]]
+        return self._covariance(self._whole(vectors))[:, :, : vectors.shape[2]]
 
     def of_points(self, weights: Array) -> tuple[float, Array]:
         """Variance of a linear function of the points, `sum(weights * points_w)` with weights (n, 3).
@@ -62,6 +62,35 @@ class Posterior:
             own = inflation_of(found, self._equations, self._partitions, self._factor)
         variance, with_photos = found.inflated(own / self._factor, self._inflation)
         return variance, with_photos[:, : self._shape[1]]
+
+    def motions(self) -> tuple[Array, Array]:
+        """Motions (m, k) of the photos and their covariances (m, k, k), as far as the model has them.
+
+        One Gauss-Newton step from the result, which matters where the options free what was held in it.
+        """
+        covariances = self._equations.marginal_covariances()[0]
+        solved = self._equations.solve(0.0)
+        step = np.full(covariances.shape[:2], np.nan) if solved is None else solved[0][0]
+        last = covariances.shape[1] - self._own
+        motion = np.hstack([self._state.phi, self._state.velocity])[:, : last - 6] + step[:, 6:last]
+        return motion, covariances[:, 6:last, 6:last]
+
+    def squared_shifts(self) -> Array:
+        """(m, k, k) mean over a photo's measurements of the squared displacement that a change of its motion causes.
+
+        As a quadratic form, pixels squared. Where pose and points make up for the change in the photo as it was taken,
+        it is the rectified photo that is displaced.
+        """
+        frame, _, noise_px = self._problem.measurements
+        J = self._equations.blocks[1]
+        J = J[:, :, 6 : J.shape[2] - self._own] * noise_px[:, None, None]
+        total = np.zeros((len(self._state.phi), J.shape[2], J.shape[2]))
+        np.add.at(total, frame, np.einsum("oki,okj->oij", J, J))
+        return total / np.maximum(np.bincount(frame, minlength=len(total)), 1)[:, None, None]
+
+    def _whole(self, vectors: Array) -> Array:
+        """With zeros for what the photos have of their own beside pose and motion."""
+        return np.pad(vectors, [(0, 0), (0, 0), (0, self._own)])
 
 
 def gauge_directions(result: BundleResult) -> Array:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from .._kernels import projection
 from ..errors import InputError
-from ..model import Camera, Reconstruction, check_shutter_model
+from ..model import READOUTS, Camera, Reconstruction, check_shutter_model
 from .elimination import Elimination, Marginals
 from .intrinsics import INTRINSICS, check_lenses, deviation, moved_camera, prior_weight
 from .jackknife import Partition, by_corner, by_place
@@ -177,7 +177,21 @@ class BundleProblem:
             i = self._photo(name)
             if self._block > 6:
                 known[i, :3], weight[i, :3] = phi / span[i], (span[i] / sigma) ** 2
+        for name, still in self._options.still.items():
+            i = self._photo(name)
+            if still > 0:
+                way = np.repeat([1.0, self._start.median_depth(i)], 3)[: weight.shape[1]]
+                parts = self._still_parts(i)
+                weight[i, parts] = ((span[i] / (still * way)) ** 2)[parts]
         return known, weight
+
+    def _still_parts(self, image: int) -> list[int]:
+        """Components of a photo's motion that are zero if it was still."""
+        if self._block > 9:
+            return [0, 1, 2, 3, 4, 5]
+        # the rotation that stretches the photo along its readout
+        phi1 = 0 if READOUTS[self._start.camera(image).readout][0] == 1 else 1
+        return [phi1][: self._block - 6]
 
     def _photo(self, name: str) -> int:
         """Index of an anchor's photo."""
@@ -199,6 +213,10 @@ class BundleProblem:
                 free[self._photo(name), [6 + c for c in components]] = False
             else:
                 self._photo(name)
+        for name, still in self._options.still.items():
+            if still == 0:
+                i = self._photo(name)
+                free[i, [6 + part for part in self._still_parts(i)]] = False
         return free
 
     def initial_state(self) -> State:
@@ -318,6 +336,11 @@ class BundleProblem:
         border = Border(self._camera_jacobians(state), self._start.camera_idx, prior[1] ** 2, prior[1] * prior[0])
         lengths = self._lengths.residuals(state.points_w), self._lengths.jacobian(state.points_w)
         return NormalEquations(self._elimination, total, res, J_frame, prior_diag, prior_gradient, border, lengths)
+
+    @property
+    def measurements(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Photos (o,), points (o,) as in a state, and noise (o,) in pixels of the equations' measurements."""
+        return self._structure.frame_idx, self._structure.point_idx, self._sigma_px
 
     def _camera_jacobians(self, state: State) -> NDArray[np.float64]:
         """Weighted Jacobians (o, 2, nc) of the intrinsics that are refined."""

@@ -1,6 +1,7 @@
 """Critical motions: the meter, what they cost in a solution, and their remedies."""
 
 from .advice import Advice, advise, advise_poses
+from .common import CommonMotion, clock_contrast, common_motion
 from .cost import ShapeCost, shape_cost
 from .meter import CriticalMotion, critical_motion
 from .remedy import REMEDIES, Remedy, heal, still_probability, with_remedy
@@ -8,11 +9,14 @@ from .remedy import REMEDIES, Remedy, heal, still_probability, with_remedy
 __all__ = [
     "REMEDIES",
     "Advice",
+    "CommonMotion",
     "CriticalMotion",
     "Remedy",
     "ShapeCost",
     "advise",
     "advise_poses",
+    "clock_contrast",
+    "common_motion",
     "critical_motion",
     "heal",
     "shape_cost",

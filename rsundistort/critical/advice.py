@@ -34,18 +34,23 @@ class Advice:
         Smallest singular value of the meter with them.
     sigma_log_k : float or None
         Standard deviation of the height of the scene with them; None where only poses are known.
+    shift_px : float or None
+        Displacement of the rectified photos, as of `CommonMotion`, that is left with them; None where the model has no
+        velocity.
     """
 
     what: str
     meter: float
     sigma_log_k: float | None = None
+    shift_px: float | None = None
 
     @property
     def sentence(self) -> str:
         """For people."""
         if self.sigma_log_k is None:
             return f"{self.what}: the meter would read {self.meter:.2f}"
-        return f"{self.what}: the height would be uncertain by +-{100 * self.sigma_log_k:.2g} %"
+        said = f"{self.what}: the height would be uncertain by +-{100 * self.sigma_log_k:.2g} %"
+        return said if self.shift_px is None else f"{said}, the rectified photos by {self.shift_px:.2g} px"
 
 
 def _candidates(
@@ -113,7 +118,8 @@ def advise(result: BundleResult, options: BundleOptions | None = None) -> list[A
             m, nb = result.covariances.shape[:2]
             imagined = replace(result, reconstruction=more, covariances=np.zeros((m + len(photos), nb, nb)))
             cost: ShapeCost = shape_cost(imagined, plain)
-            found.append(Advice(what, cost.meter.value, worse * cost.sigma_log_k))
+            shift = cost.common.shift_px if cost.common.of_travel else None
+            found.append(Advice(what, cost.meter.value, worse * cost.sigma_log_k, shift))
     return found
 
 

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from ..bundle import BundleOptions, BundleResult, Posterior, gauge_directions
 from ..errors import InputError
-from ..model import READOUTS, Reconstruction
+from ..model import Reconstruction
+from .common import CommonMotion, common_motion
 from .meter import CriticalMotion, critical_motion, readout_axes
 
-__all__ = ["ShapeCost", "row_phi", "shape_cost"]
+__all__ = ["ShapeCost", "shape_cost"]
 
 # Below this standard deviation of log k there is nothing to mend: half a pixel over a thousand rows.
 _SMALL = 0.0005
@@ -36,12 +37,15 @@ class ShapeCost:
         How much of that mode is the vertical scale: square of the correlation of the two, 0 to 1.
     meter : CriticalMotion
         Of the solution's poses.
+    common : CommonMotion
+        How well the part of the motions is known that the photos share.
     """
 
     sigma_log_k: float
     weakest_sigma: float
     weakest_share: float
     meter: CriticalMotion
+    common: CommonMotion
 
     @property
     def is_flagged(self) -> bool:
@@ -51,6 +55,10 @@ class ShapeCost:
     @property
     def sentence(self) -> str:
         """For people."""
+        return f"{self._of_height}; {self.common.sentence}" if self.common.is_weak else self._of_height
+
+    @property
+    def _of_height(self) -> str:
         if not np.isfinite(self.sigma_log_k):
             return "the height of the scene is not determined: the measurements leave it entirely open"
         percent = 100 * self.sigma_log_k
@@ -67,17 +75,26 @@ class ShapeCost:
         return f"{said}, because the cameras were not turned against each other"
 
 
-def row_phi(reconstruction: Reconstruction) -> NDArray[np.int64]:
-    """Components (m, 3) of phi that are each photo's phi1, phi2, phi3 of the paper, which reads rows."""
-    by_row = np.array([READOUTS[reconstruction.camera(i).readout][0] == 1 for i in range(reconstruction.num_images)])
-    return np.where(by_row[:, None], [0, 1, 2], [1, 0, 2]).astype(np.int64)
+def _uncertainty(reconstruction: Reconstruction) -> NDArray[np.float64]:
+    """(n,) how badly each point is known along its worst direction, in units of a ray's angle times its length.
+
+    Large where all who see a point stand in one place, as two copies of a photo do.
+    """
+    rec, obs = reconstruction, reconstruction.observations
+    ray = rec.points_w[obs.point_idx] - rec.center_w[obs.frame_idx]
+    square = np.maximum((ray**2).sum(1), 1e-300)[:, None, None]
+    across = (np.eye(3) - ray[:, :, None] * ray[:, None, :] / square) / square
+    information = np.zeros((rec.num_points, 3, 3))
+    np.add.at(information, obs.point_idx, across)
+    least = np.linalg.eigvalsh(information)[:, 0]
+    return np.asarray(1.0 / np.sqrt(np.maximum(least, 1e-24 * np.maximum(np.median(least), 1e-300))))
 
 
 def _log_scale(reconstruction: Reconstruction) -> NDArray[np.float64]:
     """(n, 3) the logarithm of the scene's scale along the axis of readout, as a linear function of small changes.
 
     Of the affine map B that takes the points to the changed ones best: log |B y| - log sqrt(det B / |B y|). Far points
-    hardly count: their own noise is larger than the scene.
+    hardly count, their own noise is larger than the scene, nor do points that were seen from one place only.
     """
     rec = reconstruction
     axes = readout_axes(rec.R_cw, [rec.camera(i).readout for i in range(rec.num_images)])
@@ -85,6 +102,8 @@ def _log_scale(reconstruction: Reconstruction) -> NDArray[np.float64]:
     x = rec.points_w - np.median(rec.points_w, axis=0)
     distance = np.linalg.norm(x, axis=1)
     weight = np.minimum(1.0, (np.median(distance) / np.maximum(distance, 1e-300)) ** 4)
+    uncertainty = _uncertainty(rec)
+    weight *= np.minimum(1.0, (np.median(uncertainty) / uncertainty) ** 2)
     x = rec.points_w - np.average(rec.points_w, axis=0, weights=weight)
     g = weight[:, None] * x @ np.linalg.pinv((weight[:, None] * x).T @ x)
     value: NDArray[np.float64] = 1.5 * (g @ vertical)[:, None] * vertical - 0.5 * g
@@ -135,4 +154,5 @@ def shape_cost(result: BundleResult, options: BundleOptions | None = None) -> Sh
         weakest_sigma=float(np.sqrt(value)),
         weakest_share=float(min(share, 1.0)),
         meter=critical_motion(rec.R_cw, rec.center_w, readout),
+        common=common_motion(result, options),
     )

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ..bundle import BundleOptions, BundleResult, bundle_adjust
+from ..bundle import BundleOptions, BundleResult, Posterior, bundle_adjust
 from ..errors import InputError
-from .cost import ShapeCost, row_phi, shape_cost
+from .common import row_phi
+from .cost import ShapeCost, shape_cost
 
 __all__ = ["REMEDIES", "Remedy", "contradictions", "heal", "still_probability", "with_remedy"]
 
@@ -23,8 +24,10 @@ _STILL = 1e-3
 _SHARE = 0.1
 # Standard deviation of phi, radians per frame, that stands for no prior.
 _NONE = 10.0
-# A photo whose phi2 and phi3 make stillness less likely than this contradicts who says that it was still.
+# A photo whose stillness is less likely than this contradicts who says that it was still.
 _UNLIKELY = 0.01
+# One from the first row to the last, root mean square.
+_PIXEL = 1.0 / np.sqrt(12.0)
 
 
 @dataclass(frozen=True)
@@ -38,11 +41,11 @@ class Remedy:
         "prior" (no photo stands out, or none was asked for), "given" (anchors, motions or lengths that the user knows),
         or "none" (switched off).
     anchors : dict of photo name to float
-        Photos whose phi1 is taken to be zero, with the standard deviation, radians per frame; 0 is hard.
+        Photos taken to be still, as in `BundleOptions.still`, with the standard deviation, radians per frame.
     before, after : ShapeCost
         Of the solutions without and with it.
     warnings : tuple of str
-        Anchors that the evidence contradicts.
+        Anchors that the evidence contradicts, and what stays in doubt by a pixel.
     """
 
     name: str
@@ -58,11 +61,15 @@ class Remedy:
         if self.name == "none needed":
             return left
         was = f"+-{100 * self.before.sigma_log_k:.1f} %"
+        holds = "holds the height of the scene"
+        if self.before.common.is_weak:
+            was = f"+-{self.before.common.shift_px:.2g} px in the rectified photos"
+            holds = "holds what the motions of all photos have in common"
         names = ", ".join([*self.anchors][:3])
         if len(self.anchors) > 3:
             names = f"{names} and {len(self.anchors) - 3} more"
         return {
-            "anchor": f"{names} most likely did not move and holds the height of the scene ({was} without it); {left}",
+            "anchor": f"{names} most likely did not move and {holds} ({was} without it); {left}",
             "prior": f"no photo is taken to be still, the motions to be zero in the mean; {left}",
             "given": f"with what is known of {names or 'lengths in the scene'}, {left}",
             "none": left,
@@ -76,48 +83,79 @@ def with_remedy(options: BundleOptions, remedy: str) -> BundleOptions:
     return replace(options, phi_sigma=_NONE) if remedy == "none" else options
 
 
-def _log_normal(x: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(m,) log densities, up to a constant, of x (m, 2) with zero mean and covariances (m, 2, 2)."""
-    _, logdet = np.linalg.slogdet(covariance)
-    mahalanobis = np.einsum("mi,mi->m", x, np.linalg.solve(covariance, x[..., None])[..., 0])
-    value: NDArray[np.float64] = -0.5 * (mahalanobis + logdet)
-    return value
+def _freed(
+    result: BundleResult, options: BundleOptions | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+    """Motions (m, k) and their covariances if no photo were taken to be still."""
+    free = replace(options or BundleOptions(), still={}, held_phi={})
+    return Posterior(result, free).motions()
 
 
-def still_probability(result: BundleResult) -> NDArray[np.float64]:
-    """(m,) probability that each photo did not move, from its phi2 and phi3.
+def still_probability(result: BundleResult, options: BundleOptions | None = None) -> NDArray[np.float64]:
+    """(m,) probability that each photo did not move, from what all others leave open of its motion.
 
-    Those two are determined where phi1 is not. Either the photo was still (they are zero but for 1 mrad per frame), as
-    one in ten is, or it moved like the rest (zero mean, their robust spread).
+    Either the photo was still (its motion is zero but for 1 mrad per frame, and for the way that displaces what it
+    shows as much), as one in ten is, or it moved like the rest (zero mean; the robust spread of phi2 and phi3, and that
+    of the prior on the velocity). Each is a prior on its motion in the place of the one that it was adjusted with; that
+    under which the measurements are likelier is the likelier. No other photo is taken to be still, whatever the options
+    say.
+
+    Parameters
+    ----------
+    result : BundleResult
+        Of a model with a shutter.
+    options : BundleOptions, optional
+        Of the adjustment.
     """
     rec = result.reconstruction
-    span = rec.frame_span()
-    components = row_phi(rec)
-    rows = np.arange(rec.num_images)[:, None]
-    pair = components[:, 1:]
-    found = rec.phi[rows, pair] * span[:, None]
-    covariance = result.covariances[rows[:, :, None], 6 + pair[:, :, None], 6 + pair[:, None, :]]
-    covariance = covariance * span[:, None, None] ** 2
+    m = rec.num_images
+    motion, covariance = _freed(result, options)
+    if not np.isfinite(covariance).all():
+        return np.zeros(m)
+    span, depth = rec.frame_span(), np.array([rec.median_depth(i) for i in range(m)])
+    pair = np.abs(motion[np.arange(m)[:, None], row_phi(rec)[:, 1:]] * span[:, None])
     # not the prior's: that was estimated with phi1, which a critical motion leaves at zero
-    spread = max(float(np.median(np.abs(found))) / 0.6745, 2 * _STILL)
-    still = _log_normal(found, covariance + _STILL**2 * np.eye(2))
-    moved = _log_normal(found, covariance + spread**2 * np.eye(2))
-    odds = _SHARE / (1 - _SHARE) * np.exp(np.clip(still - moved, -500, 500))
-    probability: NDArray[np.float64] = odds / (1 + odds)
+    phi = max(float(np.median(pair)) / 0.6745, 2 * _STILL)
+    velocity = np.maximum(result.velocity_sigma * rec.baseline, 2 * _STILL * depth)
+
+    def precision(of_phi: ArrayLike, of_velocity: ArrayLike) -> NDArray[np.float64]:
+        """(m, k, k) of a prior, per unit of the clock."""
+        sigma = np.repeat(np.stack(np.broadcast_arrays(of_phi, of_velocity, span)[:2], axis=1), 3, axis=1)
+        value: NDArray[np.float64] = (span[:, None] / sigma[:, : motion.shape[1]])[:, :, None] ** 2
+        return value * np.eye(motion.shape[1])
+
+    # of the motion, all that the prior of its own photo did not say: exp(pull x - x' (inside) x / 2)
+    inside = np.linalg.inv(covariance)
+    pull = np.einsum("mij,mj->mi", inside, motion)
+    inside = inside - precision(result.phi_sigma, max(result.velocity_sigma * rec.baseline, 1e-300))
+
+    def evidence(prior: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(m,) log likelihoods of a prior, up to a constant."""
+        total = inside + prior
+        gain = np.einsum("mi,mi->m", pull, np.linalg.solve(total, pull[..., None])[..., 0])
+        value: NDArray[np.float64] = 0.5 * (np.linalg.slogdet(prior)[1] - np.linalg.slogdet(total)[1] + gain)
+        return value
+
+    odds = np.log(_SHARE / (1 - _SHARE)) + evidence(precision(_STILL, _STILL * depth))
+    odds -= evidence(precision(phi, velocity))
+    probability: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-np.clip(odds, -500, 500)))
     return probability
 
 
-def contradictions(result: BundleResult, names: Mapping[str, float]) -> tuple[str, ...]:
-    """Warnings on photos said to be still whose phi2 and phi3 say that they moved."""
+def contradictions(result: BundleResult, options: BundleOptions, names: Collection[str]) -> tuple[str, ...]:
+    """Warnings on photos said to be still of which the measurements say that they moved."""
+    if not names:
+        return ()
     rec = result.reconstruction
-    probability = still_probability(result)
+    probability = still_probability(result, options)
+    motion = _freed(result, options)[0]
     span = rec.frame_span()
     components = row_phi(rec)
     found = []
     for name in names:
         i = rec.image_names.index(name)
         if probability[i] < _UNLIKELY:
-            turn = np.degrees(np.linalg.norm(rec.phi[i, components[i, 1:]]) * span[i])
+            turn = np.degrees(np.linalg.norm(motion[i, components[i, 1:]]) * span[i])
             found.append(
                 f"{name} is said to have been still, but it turned by {turn:.2f} degrees about its other axes "
                 "during the readout; the scene's height is only as right as that"
@@ -135,9 +173,10 @@ def heal(result: BundleResult, options: BundleOptions, remedy: str = "auto") -> 
     options : BundleOptions
         Its anchors and known motions are the user's: nothing is added to them.
     remedy : {"auto", "prior", "none"}
-        "auto": nothing where the poses are not critical, or the height of the scene is known to 0.05 % all the same;
-        else the photo that most likely did not move becomes a soft anchor, with the standard deviation that the
-        evidence supports, beside the prior. "prior" leaves it at the prior, "none" at what the solution was.
+        "auto": nothing where the poses are not critical, or the height of the scene is known to 0.05 % all the same,
+        and turning is told from travelling to half a pixel; else the photo that most likely did not move becomes a
+        soft anchor, with the standard deviation that the evidence supports, beside the prior. "prior" leaves it at the
+        prior, "none" at what the solution was.
 
     Returns
     -------
@@ -147,35 +186,56 @@ def heal(result: BundleResult, options: BundleOptions, remedy: str = "auto") -> 
     if remedy not in REMEDIES:
         raise InputError(f"remedy {remedy!r}, expected one of {', '.join(REMEDIES)}")
     before = shape_cost(result, options)
-    given = {name: 0.0 for name, held in options.held_phi.items() if held}
-    given |= {name: float(np.min(sigma)) for name, (_, sigma) in options.known_phi.items()}
+    still = {name: 0.0 for name, held in options.held_phi.items() if held} | dict(options.still)
+    given = still | {name: float(np.min(sigma)) for name, (_, sigma) in options.known_phi.items()}
     if given or options.lengths:
-        still = {
-            name: sigma
-            for name, sigma in given.items()
-            if name not in options.known_phi or not np.any(options.known_phi[name][0])
-        }
-        return result, Remedy("given", given, before, before, contradictions(result, still))
+        said = contradictions(result, options, still)
+        return result, Remedy("given", given, before, before, said + _warnings(before))
     if remedy == "none":
-        return result, Remedy("none", {}, before, before)
-    if not before.is_flagged or not np.isfinite(before.sigma_log_k):
+        return result, Remedy("none", {}, before, before, _warnings(before))
+    if not (before.is_flagged or before.common.is_weak) or not np.isfinite(before.sigma_log_k):
         return result, Remedy("none needed", {}, before, before)
-    probability = still_probability(result)
+    probability = still_probability(result, options)
     best = int(np.argmax(probability))
     if remedy == "prior" or probability[best] < 0.5:
-        return result, Remedy("prior", {}, before, before)
+        return result, Remedy("prior", {}, before, before, _warnings(before))
+    sigma = _anchor_sigma(result, best, float(probability[best]))
+    name = result.reconstruction.image_names[best]
+    anchored = replace(options, still={name: sigma})
+    healed = _again(result, anchored)
+    after = shape_cost(healed, anchored)
+    return healed, Remedy("anchor", {name: sigma}, before, after, _warnings(after))
+
+
+def _anchor_sigma(result: BundleResult, image: int, probability: float) -> float:
+    """Standard deviation, radians per frame, of an anchor that counts for what a photo's probable stillness does.
+
+    The estimate is to be the mean of both cases, p times that of a still photo and 1 - p times the one at hand. An
+    anchor of variance s on a value known to a variance C draws it by C / (C + s), and by p C / (C + still) if s is
+    still / p + C (1 - p) / p.
+    """
     rec = result.reconstruction
-    p = float(probability[best])
-    # moments of the mixture: still, or moved like the rest
-    sigma = float(np.sqrt(p * _STILL**2 + (1 - p) * result.phi_sigma**2))
-    components = row_phi(rec)
-    sigmas = np.full(3, np.inf)
-    sigmas[components[best, 0]] = sigma
-    name = rec.image_names[best]
-    anchored = replace(options, known_phi={name: (np.zeros(3), sigmas)})
+    variance = np.diagonal(result.covariances[image])[6:] * rec.frame_span()[image] ** 2
+    if len(variance) > 3:
+        variance = np.concatenate([variance[:3], variance[3:] / rec.median_depth(image) ** 2])
+    else:
+        variance = variance[row_phi(rec)[image, :1]]
+    open_, p = float(variance.mean()), probability
+    return float(np.sqrt((_STILL**2 + (1 - p) * open_) / p))
+
+
+def _again(result: BundleResult, options: BundleOptions) -> BundleResult:
+    """The adjustment once more from its result, with the same measurements."""
+    rec = result.reconstruction
     again = replace(
-        anchored, outlier_rounds=0, loss="squared", sigma_px=result.sigma_px, phi_sigma_start=result.phi_sigma
+        options, outlier_rounds=0, loss="squared", sigma_px=result.sigma_px,
+        phi_sigma_start=result.phi_sigma, velocity_sigma_start=result.velocity_sigma or options.velocity_sigma_start,
     )  # fmt: skip
-    healed = bundle_adjust(rec, rec.shutter_model, again)
-    healed = replace(healed, num_outliers=result.num_outliers)
-    return healed, Remedy("anchor", {name: sigma}, before, shape_cost(healed, anchored))
+    return replace(bundle_adjust(rec, rec.shutter_model, again), num_outliers=result.num_outliers)
+
+
+def _warnings(cost: ShapeCost) -> tuple[str, ...]:
+    """What is to be said of a common motion that displaces the rectified photos by a pixel over the frame."""
+    if not (cost.common.is_weak and cost.common.shift_px > _PIXEL):
+        return ()
+    return (f"{cost.common.sentence}; a photo that is known not to have moved (--still) would tell",)

@@ -170,6 +170,12 @@ class Reconstruction:
         """Median distance of the points from the middle of the cameras, world units; there must be points."""
         return float(np.median(np.linalg.norm(self.points_w - self.center_w.mean(0), axis=1)))
 
+    def median_depth(self, image: int) -> float:
+        """Median distance, along the optical axis, of the points that a photo measured; of all where it saw none."""
+        mine = self.observations.point_idx[self.observations.frame_idx == image]
+        points = self.points_w[mine] if len(mine) else self.points_w
+        return float(np.median(np.abs((points - self.center_w[image]) @ self.R_cw[image, 2])))
+
     def normalized(self) -> Reconstruction:
         """The same in a frame of its own: the first photo at the origin, consecutive centres 1 apart in the mean.
 

@@ -259,7 +259,7 @@ def _solve(
     guessed = {k: label for k, label in guessed.items() if k in used}
 
     def options_of(each: Reconstruction) -> BundleOptions:
-        return replace(options.options_for(each, cameras), outlier_sigma=_OUTLIER_SIGMA)
+        return replace(options.options_for(cameras), outlier_sigma=_OUTLIER_SIGMA)
 
     with tempfile.TemporaryDirectory() as work:
         matched = None

@@ -148,13 +148,14 @@ def _change_px(before: Reconstruction, after: Reconstruction, image: int) -> flo
 
 def _of_joined(options: BundleOptions, mapped: Reconstruction) -> BundleOptions:
     """Options without the anchors of photos that could not be joined."""
-    lost = sorted({*options.held_phi, *options.known_phi} - set(mapped.image_names))
+    lost = sorted({*options.held_phi, *options.known_phi, *options.still} - set(mapped.image_names))
     if lost:
         warnings.warn(f"not joined, so no anchor: {', '.join(lost)}", RsUndistortWarning, stacklevel=3)
     return replace(
         options,
         held_phi={name: held for name, held in options.held_phi.items() if name not in lost},
         known_phi={name: known for name, known in options.known_phi.items() if name not in lost},
+        still={name: still for name, still in options.still.items() if name not in lost},
     )
 
 
@@ -287,13 +288,17 @@ def solve_tracks(
             "choice of the model", chosen=choice.shutter_model, varying_lens=choice.varying, shutter=choice.shutter,
             agreement=choice.agreement, gain=choice.gain, num_held_out=choice.num_held_out,
         )  # fmt: skip
+        aligns = feedback is not None and feedback.workers is not None
+        if feedback is not None and aligns and choice.shutter_model == "constant-motion":
+            # the windows were aligned, and their outliers told, as a model saw them that is given up
+            result, tracks, options = _fed_back(feedback, result, options, log, ["alignment again"])
     mended, advice = None, []
     if result.reconstruction.shutter_model != "global":
         log.begin("critical motion")
         result, mended = heal(result, options, remedy)
         for text in mended.warnings:
             warnings.warn(text, RsUndistortWarning, stacklevel=3)
-        if mended.after.is_flagged:
+        if mended.after.is_flagged or mended.after.common.is_weak:
             advice = advise(result, options)
         log.end("critical motion", remedy=mended.name, sigma_log_k=mended.after.sigma_log_k)
     log.begin("comparison with a global shutter")
@@ -320,32 +325,34 @@ def solve_tracks(
 
 def _lens_only(verdict: Verdict) -> str:
     """The photos whose motion is not taken out, for people."""
-    names = ", ".join(verdict.lens_only[:3]) + (", ..." if len(verdict.lens_only) > 3 else "")
+    count = len(verdict.lens_only)
+    names = ", ".join(verdict.lens_only[:3]) + (", ..." if count > 3 else "")
     return (
-        f"{len(verdict.lens_only)} photos have the lens taken out only, since the measurements do not support the "
-        f"motions found in them: {names}"
+        f"the lens alone is taken out of {count} photo{'s' * (count > 1)}, since the measurements do not support the "
+        f"motion found: {names}"
     )
 
 
 def _fed_back(
-    feedback: Feedback, result: BundleResult, options: BundleOptions, log: StageLog
+    feedback: Feedback, result: BundleResult, options: BundleOptions, log: StageLog, stages: Sequence[str] = ()
 ) -> tuple[BundleResult, Reconstruction, BundleOptions]:
     """Free keypoints of the shutter, rebuild the tracks and adjust, until the photos settle.
 
     The last adjustment, its tracks, and the options without anchors of photos that nothing holds any more.
     """
     shutter_model = result.reconstruction.shutter_model
-    stages = [f"feedback {number}" for number in range(1, _MAX_ROUNDS + 1)]
-    if feedback.workers is not None:
-        stages.append("alignment")
+    if not stages:
+        stages = [f"feedback {number}" for number in range(1, _MAX_ROUNDS + 1)]
+        stages += ["alignment"] * (feedback.workers is not None)
     settled = False
     for stage in stages:
-        if settled and stage != "alignment":
+        aligns = stage.startswith("alignment")
+        if settled and not aligns:
             continue
         log.begin(stage)
         before = result.reconstruction
-        tracks = retriangulate(feedback.matched, before, of_two=stage == "alignment")
-        if stage == "alignment":
+        tracks = retriangulate(feedback.matched, before, of_two=aligns)
+        if aligns:
             tracks = feedback.aligned(tracks, log)
         tracks = tracks.without_photos(LEAST_MEASUREMENTS)
         options = _of_joined(options, tracks)

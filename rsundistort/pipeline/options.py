@@ -12,7 +12,7 @@ from ..bundle import BundleOptions, KnownLength
 from ..critical import with_remedy
 from ..errors import InputError
 from ..io.cameras import check_sigma
-from ..model import READOUTS, Reconstruction, check_shutter_model
+from ..model import check_shutter_model
 from ..sfm import DETECTION_MEGAPIXELS
 from .cameras import PhotoCameras, check_readouts
 from .depth import check_depth
@@ -48,8 +48,8 @@ class SolveOptions(RectifyOptions):
         Standard deviations of the cameras, in pixels or of the coefficients; else those of the file, else what
         calibrations, or EXIF, usually are off by.
     still : mapping of photo name to float
-        Photos known not to have moved: phi1 is held at zero in them (the paper's remedy), or, where the number is
-        positive, near zero with that standard deviation, radians per frame.
+        Photos known not to have moved, or by no more than so many radians per frame (one standard deviation), as in
+        `BundleOptions.still`.
     known : mapping of photo name to (phi, sigma)
         Motions known from elsewhere, as in `BundleOptions.known_phi`.
     lengths : sequence of KnownLength
@@ -106,28 +106,13 @@ class SolveOptions(RectifyOptions):
         """Those of the last stage, alone."""
         return RectifyOptions(**{each.name: getattr(self, each.name) for each in fields(RectifyOptions)})
 
-    def bundle_options(self, readout: Mapping[str, str] | None = None) -> BundleOptions:
-        """Options of the adjustments of photos with these readout directions, top-to-bottom where none is named."""
-        soft, hard = {}, {}
-        for name, sigma in self.still.items():
-            # the rotation that stretches the photo along its readout
-            phi1 = 0 if READOUTS[(readout or {}).get(name, "top-to-bottom")][0] == 1 else 1
-            if not 0 <= sigma < np.inf:
-                raise InputError(f"still photo {name!r}: sigma {sigma!r}, expected 0 or a positive number")
-            if sigma > 0 and name in self.known:
-                raise InputError(f"photo {name!r} is said to be still and its motion to be known; give one of them")
-            if sigma > 0:
-                soft[name] = (np.zeros(3), np.where(np.arange(3) == phi1, sigma, np.inf))
-            else:
-                hard[name] = (phi1,)
-        return BundleOptions(
-            held_phi=hard, known_phi={**self.known, **soft}, lengths=self.lengths, refine=self.refine or ()
-        )  # fmt: skip
+    def bundle_options(self) -> BundleOptions:
+        """Options of the adjustments, as far as they do not depend on the cameras."""
+        return BundleOptions(known_phi=self.known, still=self.still, lengths=self.lengths, refine=self.refine or ())
 
-    def options_for(self, reconstruction: Reconstruction, cameras: PhotoCameras) -> BundleOptions:
-        """Options of the adjustments of a reconstruction, by its readout directions and by what is to be refined."""
-        rec = reconstruction
-        options = self.bundle_options({name: rec.camera(i).readout for i, name in enumerate(rec.image_names)})
+    def options_for(self, cameras: PhotoCameras) -> BundleOptions:
+        """Options of the adjustments of photos of these cameras."""
+        options = self.bundle_options()
         if self.refine == ():
             return options
         # a calibration that is to be refined is not trusted: no better than a guess, but no worse

@@ -115,6 +115,7 @@ def _critical(solved: Solved) -> dict[str, Any]:
         "weakest_sigma": after.weakest_sigma,
         "weakest_share": after.weakest_share,
         "flagged": after.is_flagged,
+        "common_motion": after.common.as_json(),
         "remedy": remedy.name,
         "anchors": dict(remedy.anchors),
         "sentence": remedy.sentence,

@@ -88,7 +88,7 @@ def run(
         known_s = {k: seconds for k, (seconds, _) in readouts.items()}
 
         def options_of(rec: Reconstruction) -> BundleOptions:
-            return bounded_by_exposure(options.options_for(rec, cameras), rec, loaded, known_s)
+            return bounded_by_exposure(options.options_for(cameras), rec, loaded, known_s)
 
         with tempfile.TemporaryDirectory() as work:
             solved = solve_photos(

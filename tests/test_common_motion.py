@@ -1,0 +1,372 @@
+"""Motions that all photos share: what hides them, what a solution knows of them, and photos that did not move."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from critical_scenes import named_scene
+from numpy_twin import project
+from scipy.spatial.transform import Rotation
+
+from rsundistort import BundleOptions, InputError, bundle_adjust
+from rsundistort.bundle import Posterior
+from rsundistort.bundle.problem import BundleProblem, Spreads
+from rsundistort.critical import advise, clock_contrast, common_motion, heal, shape_cost, still_probability
+
+MODEL = "constant-motion"
+NOISE_PX = 0.5
+PHI, WAY = 0.02, 0.15  # spreads: radians a frame, baselines a frame, about as much in the photos
+KNOWN = BundleOptions(loss="squared", outlier_rounds=0, sigma_px=NOISE_PX, phi_sigma=PHI, velocity_sigma=WAY)
+
+# thousands of calls on problems this small wait for threads longer than they compute
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def pixels(scene):
+    """Where the photos show the points, by the twin."""
+    obs = scene.observations
+    xy = np.zeros((len(obs), 2))
+    for i in range(scene.num_images):
+        mine = obs.frame_idx == i
+        camera = scene.camera(i)
+        xy[mine] = project(
+            scene.points_w[obs.point_idx[mine]], scene.R_cw[i], scene.center_w[i], scene.phi[i], MODEL, camera.readout,
+            camera.K, [], scene.velocity[i],
+        )  # fmt: skip
+    return xy
+
+
+def measured(scene, rng=None, noise_px=NOISE_PX):
+    """The scene with its measurements, and their noise."""
+    xy = pixels(scene)
+    xy += 0.0 if rng is None else rng.normal(0, noise_px, xy.shape)
+    observations = replace(scene.observations, xy_raw=xy)
+    return replace(scene, observations=observations, shutter_model=MODEL)
+
+
+def moving(scene, rng, still=None, phi=PHI, way=WAY):
+    """Random turning and travelling, as the priors have it."""
+    span = scene.frame_span()[:, None]
+    turn = rng.normal(0, phi, (scene.num_images, 3)) / span
+    travel = rng.normal(0, way * scene.baseline, (scene.num_images, 3)) / span
+    if still is not None:
+        turn[still] = travel[still] = 0.0
+    return replace(scene, phi=turn, velocity=travel)
+
+
+def row_motion(rec):
+    """(m, 6) turning, radians a frame, and travelling in the camera's frame, baselines a frame; photos of rows."""
+    span = rec.frame_span()[:, None]
+    travel = np.einsum("mij,mj->mi", rec.R_cw, rec.velocity) / rec.baseline
+    return np.hstack([rec.phi, travel]) * span
+
+
+# ---------------------------------------------------------------- what hides them
+
+
+def arranged(how, rng, m=6, num_points=60):
+    """Level cameras that look ahead, side by side, one above the other, or one behind the other."""
+    points = np.column_stack([rng.uniform(-2, 2, num_points), rng.uniform(-1.5, 1.5, num_points), np.zeros(num_points)])
+    if how == "sideways, any relief":
+        points[:, 2] = rng.uniform(-2, 2, num_points)
+    centers = np.zeros((m, 3))
+    centers[:, 2] = -7.0
+    axis = {"sideways, any relief": 0, "upwards, a wall": 1, "ahead, a wall": 2}[how]
+    centers[:, axis] += np.linspace(-1, 1, m)
+    scene = named_scene("pure translation", m, num_points)
+    return replace(scene, R_cw=np.stack([np.eye(3)] * m), center_w=centers, points_w=points)
+
+
+HIDING = ["sideways, any relief", "upwards, a wall", "ahead, a wall"]
+
+
+@pytest.mark.parametrize("how", HIDING)
+def test_photos_that_time_points_alike_have_no_contrast(how, rng):
+    scene = measured(arranged(how, rng))
+    assert clock_contrast(scene) < 1e-6
+    # a wall that the cameras also turn to, or things at other depths, are told
+    relief = replace(scene, points_w=scene.points_w + rng.uniform(-1, 1, scene.points_w.shape) * [0, 0, 2])
+    if how != "sideways, any relief":
+        assert clock_contrast(measured(relief)) > 0.01
+
+
+@pytest.mark.parametrize("how", HIDING)
+@pytest.mark.parametrize("kind", range(7))
+def test_a_motion_of_the_world_by_the_clock_leaves_no_trace_without_contrast(how, kind, rng):
+    """Turns, ways and a growth of the world, the same a unit of the clock in all photos, are changes of its shape."""
+    scene = measured(arranged(how, rng))
+    turn, way, growth = np.zeros(3), np.zeros(3), 0.0
+    if kind < 3:
+        turn[kind] = 1.0
+    elif kind < 6:
+        way[kind - 3] = 1.0
+    else:
+        growth = 1.0
+    x, obs = scene.points_w, scene.observations
+    # the clock at which a photo shows a point, r = a rho + b: `rho` that of the first
+    r = (obs.xy_raw[:, 1] - 360.0) / 900.0
+    rho = np.zeros(len(x))
+    rho[obs.point_idx[obs.frame_idx == 0]] = r[obs.frame_idx == 0]
+    h = 1e-5
+    change = np.cross(turn, x) + way + growth * x
+    phi, velocity = np.zeros((2, scene.num_images, 3))
+    R_cw, centers = scene.R_cw.copy(), scene.center_w.copy()
+    for i in range(scene.num_images):
+        mine = obs.frame_idx == i
+        a, b = np.linalg.lstsq(
+            np.column_stack([rho[obs.point_idx[mine]], np.ones(mine.sum())]), r[mine], rcond=None
+        )[0]  # fmt: skip
+        # the world moves by h r / a: what it does to a camera, and what it has done at the middle row
+        phi[i] = h / a * turn
+        velocity[i] = -h / a * (np.cross(turn, scene.center_w[i]) + way + growth * scene.center_w[i])
+        R_cw[i] = Rotation.from_rotvec(-h * b / a * turn).as_matrix() @ R_cw[i]
+        centers[i] -= b * velocity[i]
+    moved = replace(
+        scene, phi=phi, velocity=velocity, R_cw=R_cw, center_w=centers, points_w=x - h * rho[:, None] * change
+    )
+    trace = np.abs(pixels(moved) - scene.observations.xy_raw).max()
+    own = np.abs(pixels(replace(moved, points_w=x, R_cw=scene.R_cw, center_w=scene.center_w)) - obs.xy_raw).max()
+    assert trace < 1e-3 * max(own, 900 * h)
+
+
+@pytest.mark.parametrize(
+    ("name", "low"), [("parallel", True), ("10 degrees", False), ("20 degrees", False), ("one portrait", False)]
+)  # fmt: skip
+def test_contrast_grows_as_cameras_are_turned(name, low):
+    found = clock_contrast(measured(named_scene(name, num_points=300)))
+    assert 0.05 < found < 1
+    assert (found < 0.15) == low
+
+
+def test_contrast_does_not_change_with_the_world_nor_with_the_direction_of_the_readout(rng):
+    scene = measured(named_scene("10 degrees"))
+    turn = Rotation.random(random_state=2).as_matrix()
+    moved = replace(
+        scene,
+        R_cw=scene.R_cw @ turn.T,
+        center_w=2 * scene.center_w @ turn.T + 1,
+        points_w=2 * scene.points_w @ turn.T + 1,
+    )
+    reversed_ = replace(scene, cameras=[replace(camera, readout="bottom-to-top") for camera in scene.cameras])
+    for other in (moved, reversed_):
+        assert clock_contrast(other) == pytest.approx(clock_contrast(scene), rel=1e-9)
+
+
+# ---------------------------------------------------------------- what a solution knows of them
+
+
+def test_sigmas_of_the_common_motion_cover_its_errors(rng):
+    """Motions and noise drawn anew: errors of the mean motion in the metric of its covariance."""
+    squares, alone = [], []
+    for _ in range(24):
+        truth = measured(moving(named_scene("parallel", num_points=120), rng), rng)
+        result = bundle_adjust(truth, MODEL, KNOWN)
+        error = (row_motion(result.reconstruction) - row_motion(truth)).mean(0)
+        common = common_motion(result, KNOWN)
+        squares.append(error @ np.linalg.solve(common.covariance, error) / 6)
+        alone.append(error / common.sigma)
+    # 144 squares of normal variables: within 12 % (one sigma)
+    assert 0.7 < np.mean(squares) < 1.4
+    assert (np.sqrt(np.mean(np.square(alone), axis=0)) > 0.5).all()
+    assert (np.sqrt(np.mean(np.square(alone), axis=0)) < 1.6).all()
+
+
+def test_the_weakest_change_displaces_the_photos_by_what_is_said(rng):
+    truth = measured(moving(named_scene("parallel", num_points=120), rng), rng)
+    result = bundle_adjust(truth, MODEL, KNOWN)
+    common = common_motion(result, KNOWN)
+    rec = result.reconstruction
+    span = rec.frame_span()[:, None]
+    small = 1e-3
+    travel = np.einsum("mji,mj->mi", rec.R_cw, common.weakest[:, 3:]) * rec.baseline
+    moved = replace(
+        rec, phi=rec.phi + small * common.weakest[:, :3] / span, velocity=rec.velocity + small * travel / span
+    )
+    shift = (pixels(moved) - pixels(rec)) / small
+    counts = np.bincount(rec.observations.frame_idx)
+    by_photo = np.bincount(rec.observations.frame_idx, (shift**2).sum(1)) / counts
+    assert np.sqrt(by_photo.mean()) == pytest.approx(common.shift_px, rel=1e-3)
+    # and nothing that the photos know as badly displaces them more
+    A = Posterior(result, KNOWN).squared_shifts()
+    whole = np.einsum("mij,mij->", A, result.covariances[:, 6:, 6:]) / rec.num_images
+    assert common.shift_px < np.sqrt(whole) < 3 * common.shift_px
+
+
+def test_common_motion_of_cameras_that_read_columns_is_that_of_rows_turned(rng):
+    rows = measured(moving(named_scene("parallel", num_points=80), rng), rng)
+    quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    cameras = [
+        replace(camera, width=camera.height, height=camera.width, K=[[900.0, 0, 360], [0, 900.0, 480], [0, 0, 1]],
+                readout="right-to-left") for camera in rows.cameras
+    ]  # fmt: skip
+    xy = rows.observations.xy_raw
+    turned = np.column_stack([719 - xy[:, 1] + 1, xy[:, 0]])
+    columns = replace(
+        rows, cameras=cameras, R_cw=quarter @ rows.R_cw, phi=rows.phi @ quarter.T,
+        observations=replace(rows.observations, xy_raw=turned),
+    )  # fmt: skip
+    found = [
+        common_motion(bundle_adjust(scene, MODEL, KNOWN), KNOWN) for scene in (rows, columns)
+    ]  # fmt: skip
+    np.testing.assert_allclose(found[1].sigma, found[0].sigma, rtol=1e-3)
+    assert found[1].shift_px == pytest.approx(found[0].shift_px, rel=1e-3)
+    assert found[1].by_column
+    assert "nodding" in found[0].sentence or "panning" in found[0].sentence
+
+
+def of_neighbours(rng, each=20):
+    """Heaps of points, 8 across and 4 up; truth, and measurements off by little each and much by heap and photo."""
+    scene = named_scene("5 degrees", num_points=32 * each)
+    heap = np.repeat(np.arange(32), each)
+    middle = np.column_stack([(heap % 8 - 3.5) * 0.6, (heap // 8 - 1.5) * 0.7, rng.uniform(-2, 2, 32)[heap]])
+    scene = moving(replace(scene, points_w=middle + rng.uniform(-0.1, 0.1, middle.shape)), rng)
+    truth = measured(scene, rng, 0.2)
+    obs = truth.observations
+    off = rng.normal(0, 0.5, (scene.num_images, 32, 2))[obs.frame_idx, heap[obs.point_idx]]
+    return truth, replace(truth, observations=replace(obs, xy_raw=obs.xy_raw + off))
+
+
+def test_noise_that_neighbours_share_is_noticed(rng):
+    """Errors of the mean motion in the metric of its covariance, where all points of a heap are off together."""
+    plain, honest, factors = [], [], []
+    for _ in range(8):
+        truth, spoiled = of_neighbours(rng)
+        for options, into in ((replace(KNOWN, deviations="model"), plain), (KNOWN, honest)):
+            found = bundle_adjust(spoiled, MODEL, options)
+            error = (row_motion(found.reconstruction) - row_motion(truth)).mean(0)
+            common = common_motion(found, options)
+            into.append(error @ np.linalg.solve(common.covariance, error) / 6)
+        factors.append(found.noise_factor)
+    # 48 squares of normal variables if nothing was off: within 20 % (one sigma)
+    assert np.mean(plain) > 5
+    assert 0.5 < np.mean(honest) < 2.5
+    assert 2 < np.mean(factors) < 5
+    assert bundle_adjust(measured(truth, rng), MODEL, KNOWN).noise_factor < 1.5
+
+
+def test_what_is_said_is_json_and_only_where_it_costs_something(rng):
+    level, turned = (
+        shape_cost(bundle_adjust(measured(moving(named_scene(name, num_points=120), rng), rng), MODEL, KNOWN), KNOWN)
+        for name in ("parallel", "one portrait")
+    )
+    assert level.common.is_weak
+    assert "can hardly be told apart" in level.sentence
+    assert "in all photos together phi" in level.sentence
+    assert not turned.common.is_weak
+    assert "told apart" not in turned.sentence
+    said = json.loads(json.dumps(level.common.as_json()))
+    assert len(said["sigma_phi_rad_per_frame"]) == len(said["sigma_velocity_baselines_per_frame"]) == 3
+    assert np.shape(said["correlation"]) == (6, 6)
+    # a model without travel has nothing to take a nod for
+    rotation = bundle_adjust(measured(named_scene("parallel"), rng), "rotation", KNOWN)
+    cost = shape_cost(rotation, KNOWN)
+    assert not cost.common.is_weak
+    assert cost.common.as_json()["sigma_velocity_baselines_per_frame"] == []
+
+
+# ---------------------------------------------------------------- photos that did not move
+
+
+def test_a_still_photo_holds_its_whole_motion_or_phi1_of_a_model_without_travel(rng):
+    truth = measured(moving(named_scene("parallel"), rng, still=3), rng)
+    hard = replace(KNOWN, still={"03.jpg": 0.0})
+    found = bundle_adjust(truth, MODEL, hard).reconstruction
+    assert not found.phi[3].any()
+    assert not found.velocity[3].any()
+    assert np.abs(np.delete(found.velocity, 3, axis=0)).min() > 0
+    turned = bundle_adjust(truth, "rotation", hard).reconstruction
+    np.testing.assert_array_equal(turned.phi[3] == 0, [True, False, False])
+    columns = replace(truth, cameras=[replace(camera, readout="left-to-right") for camera in truth.cameras])
+    by_column = bundle_adjust(columns, "rotation", hard).reconstruction
+    np.testing.assert_array_equal(by_column.phi[3] == 0, [False, True, False])
+    bundle_adjust(truth, "global", hard)
+
+
+def test_the_velocity_of_a_softly_still_photo_counts_as_the_angle_that_displaces_as_much():
+    scene = measured(named_scene("parallel"))
+    still = 0.5e-3
+    options = replace(KNOWN, still={"03.jpg": still}, phi_sigma=1e6, velocity_sigma=1e6)
+    depth = np.median((scene.points_w - scene.center_w[3]) @ scene.R_cw[3, 2])
+    span = scene.frame_span()[3]
+
+    def cost(phi, velocity):
+        turn, travel = np.zeros((2, scene.num_images, 3))
+        turn[3], travel[3] = phi, velocity
+        moved = measured(replace(scene, phi=turn, velocity=travel))
+        problem = BundleProblem(moved, MODEL, options, NOISE_PX, Spreads(1e6, 1e6))
+        return problem.cost(problem.initial_state())
+
+    nothing = np.zeros(3)
+    for axis in np.eye(3):
+        assert cost(still / span * axis, nothing) == pytest.approx(0.5, rel=1e-6)
+        assert cost(nothing, still * depth / span * axis) == pytest.approx(0.5, rel=1e-6)
+
+
+@pytest.mark.parametrize("still", [-1.0, np.inf, np.nan])
+def test_still_photos_that_make_no_sense_are_refused(still, rng):
+    with pytest.raises(InputError, match="expected 0 or a positive number"):
+        BundleOptions(still={"a": still})
+
+
+def test_still_photos_that_are_known_to_have_moved_are_refused():
+    with pytest.raises(InputError, match="give one of them"):
+        BundleOptions(still={"a": 0.0}, known_phi={"a": (np.zeros(3), 1.0)})
+    with pytest.raises(InputError, match="give one of them"):
+        BundleOptions(still={"a": 0.0}, held_phi={"a": (0,)})
+    with pytest.raises(InputError, match="'nobody' is not a photo"):
+        bundle_adjust(measured(named_scene("parallel")), MODEL, BundleOptions(still={"nobody": 0.0}))
+
+
+ESTIMATED = BundleOptions(loss="squared", outlier_rounds=0, sigma_px=NOISE_PX)
+
+
+def test_auto_finds_the_photo_that_neither_turned_nor_travelled(rng):
+    better = 0
+    for _ in range(4):
+        truth = measured(moving(named_scene("parallel", num_points=150), rng, still=5), rng)
+        result = bundle_adjust(truth, MODEL, ESTIMATED)
+        probability = still_probability(result, ESTIMATED)
+        assert np.argmax(probability) == 5
+        assert np.delete(probability, 5).max() < 0.5
+        healed, remedy = heal(result, ESTIMATED)
+        assert remedy.name == "anchor"
+        assert list(remedy.anchors) == ["05.jpg"]
+        assert 0.0005 < remedy.anchors["05.jpg"] < 0.01
+        assert "holds what the motions of all photos have in common" in remedy.sentence
+        assert remedy.after.common.shift_px < remedy.before.common.shift_px
+        errors = [np.linalg.norm((row_motion(r.reconstruction) - row_motion(truth)).mean(0)) for r in (result, healed)]
+        better += errors[1] < errors[0]
+    assert better >= 3
+
+
+def test_a_photo_that_only_turned_not_is_no_still_one(rng):
+    scene = moving(named_scene("parallel", num_points=150), rng)
+    phi = scene.phi.copy()
+    phi[5] = 0.0
+    truth = measured(replace(scene, phi=phi), rng)
+    assert still_probability(bundle_adjust(truth, MODEL, ESTIMATED), ESTIMATED).max() < 0.5
+
+
+def test_a_photo_wrongly_said_to_be_still_is_noticed(rng):
+    scene = moving(named_scene("parallel", num_points=150), rng, still=5)
+    velocity = scene.velocity.copy()
+    velocity[2] = 2 * WAY * scene.baseline / scene.frame_span()[2]
+    truth = measured(replace(scene, velocity=velocity), rng)
+    for name, warned in (("02.jpg", True), ("05.jpg", False)):
+        options = replace(ESTIMATED, still={name: 0.0})
+        healed, remedy = heal(bundle_adjust(truth, MODEL, options), options)
+        assert remedy.name == "given"
+        assert not healed.reconstruction.velocity[int(name[:2])].any()
+        assert any("is said to have been still" in text for text in remedy.warnings) == warned
+
+
+def test_a_photo_turned_by_90_degrees_is_advised_for_what_it_tells_of_the_common_motion(rng):
+    result = bundle_adjust(measured(moving(named_scene("parallel", num_points=150), rng), rng), MODEL, KNOWN)
+    before = shape_cost(result, KNOWN).common.shift_px
+    advice = advise(result, KNOWN)
+    assert advice
+    assert min(each.shift_px for each in advice) < 0.9 * before
+    assert "px" in advice[0].sentence
