@@ -82,24 +82,24 @@ def by_place(points_w: Array, point_idx: Index, num_frames: int) -> Partition:
     # photos times families, over the photos that share each
     wanted = _FAMILIES * num_frames * n / max(len(point_idx), 1)
     depth = int(np.clip(np.ceil(np.log2(max(wanted, 1.0))), 0, np.log2(max(n // _FAMILY, 1)))) + 2
-    cells = [np.arange(n)]
-    for _ in range(depth):
-        cells = [half for cell in cells for half in _halves(points_w, cell)]
-    group = np.empty(n, np.int64)
-    for number, cell in enumerate(cells):
-        group[cell] = number
-    return Partition(group[point_idx])
-
-
-def _halves(points_w: Array, cell: Index) -> list[Index]:
-    """A cell of points cut across its longest side, far points aside."""
-    if not len(cell):
-        return [cell, cell]
-    x = points_w[cell]
-    order = np.argsort(x, axis=0, kind="stable")
-    tail = len(cell) // 10
-    sides = [x[order[-1 - tail, axis], axis] - x[order[tail, axis], axis] for axis in range(3)]
-    return np.array_split(cell[order[:, int(np.argmax(sides))]], 2)
+    x = points_w - np.median(points_w, axis=0) if n else points_w
+    # far points lie at the walls of a box: the scene is not cut for their sake
+    x = np.clip(x, *(sign * 4 * np.median(np.abs(x), axis=0) for sign in (-1, 1))) if n else x
+    cell = np.zeros(n, np.int64)
+    for level in range(depth):
+        count = np.bincount(cell, minlength=2**level)
+        mean, square = (
+            np.stack([np.bincount(cell, each[:, a], 2**level) for a in range(3)], axis=1)
+            / np.maximum(count, 1)[:, None]
+            for each in (x, x**2)
+        )
+        side = np.argmax(square - mean**2, axis=1)
+        order = np.lexsort((x[np.arange(n), side[cell]], cell))
+        place = np.empty(n, np.int64)
+        place[order] = np.arange(n)
+        behind = place - (np.cumsum(count) - count)[cell] >= ((count + 1) // 2)[cell]
+        cell = 2 * cell + behind
+    return Partition(cell[point_idx])
 
 
 def by_corner(xy_raw: Array, size: Array, camera: Index) -> Partition:
@@ -163,6 +163,12 @@ def _deviations(excess: Array, square: float, partitions: Sequence[Partition], n
     return value
 
 
+def _pulls(equations: NormalEquations, residuals: Array, partition: Partition, most: int) -> tuple[Array, Array]:
+    """How far groups of residuals (o, 2) pull photos (groups, m, nb) and cameras (groups, k)."""
+    group, sign, count = partition.sketch(most)
+    return equations.group_pulls(sign[:, None] * residuals, group, count)
+
+
 class Inflation(NamedTuple):
     """How many times larger than with independent noise its share of the deviations is; 1 or more.
 
@@ -205,9 +211,10 @@ def inflation(
     noise = [(weight * (total - prior)).sum(0) for weight, total, prior in zip(weights, totals, priors, strict=True)]
     square = residuals.square
     excess = [np.zeros_like(each) for each in noise]
+    # what a fit hides is the mean over all photos: of many it takes few families to find
+    families = _FAMILIES, *[int(np.clip(8 * _FAMILIES // len(totals[0]), _FAMILY, _FAMILIES))] * 2
     for partition in partitions:
-        group, sign, count = partition.sketch(_FAMILIES)
-        pulls = [equations.group_pulls(sign[:, None] * each, group, count) for each in residuals]
+        pulls = [_pulls(equations, each, partition, most) for each, most in zip(residuals, families, strict=True)]
         for k, weight in enumerate(weights):
             variances = [(weight * (_squares(each[k]) + of_lengths[k]).reshape(weight.shape)).sum(0) for each in pulls]
             excess[k] += _ratios(variances, noise[k]) - square
