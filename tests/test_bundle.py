@@ -266,7 +266,7 @@ def test_covariances_are_those_of_the_whole_inverse(factor_limit, refine, rng):
     reference = (whole[: m * nb, : m * nb] @ vector.ravel()).reshape(m, nb)
     np.testing.assert_allclose(found, reference, rtol=0, atol=1e-8 * np.abs(reference).max())
     weights = rng.normal(size=(problem._start.num_points, 3))
-    found = problem.function_of_points(state, weights)
+    found = problem.linearize(state).function_of_points(problem.in_order(weights))
     variance, with_photos = found.variance, found.with_photos
     start, stop = m * nb, m * nb + weights.size
     b = weights[problem._points].ravel()
@@ -350,7 +350,7 @@ def test_known_lengths_join_the_system(damping, refine, rng):
         block = whole[len(whole) - len(cameras) :, len(whole) - len(cameras) :]
         np.testing.assert_allclose(cameras, block, rtol=0, atol=1e-7 * np.abs(block).max(initial=0))
         weights = rng.normal(size=(given.num_points, 3))
-        variance = joined.function_of_points(state, weights).variance
+        variance = joined.linearize(state).function_of_points(joined.in_order(weights)).variance
         b = weights[joined._points].ravel()
         assert variance == pytest.approx(b @ whole[points, points] @ b, rel=1e-6)
 

@@ -62,8 +62,8 @@ class Function:
         Its variance, and the shares of that that are the priors' and the known lengths' doing.
     with_photos, with_photos_of_priors : (m, nb) array
         Its covariance with the photos' unknowns, and the priors' share of that.
-    pulls : (o,) array
-        How far each measurement pulls it, up to the sign.
+    pulls : (o, 2) array
+        How far each residual pulls it.
     """
 
     variance: float
@@ -72,6 +72,14 @@ class Function:
     with_photos: Array
     with_photos_of_priors: Array
     pulls: Array
+
+    def inflated(self, own: float, photos: Array) -> tuple[float, Array]:
+        """Variance, and covariance with the photos, where the noise's share of the deviations is enlarged.
+
+        Of the function by a factor, of the photos by one for each kind of unknown (nb,).
+        """
+        variance = self.of_priors + own**2 * (self.variance - self.of_priors)
+        return variance, self.with_photos_of_priors + own * photos * (self.with_photos - self.with_photos_of_priors)
 
 
 class NormalEquations:
@@ -182,6 +190,16 @@ class NormalEquations:
         """Number of cameras."""
         return self._border.num_cameras
 
+    @property
+    def num_photos(self) -> int:
+        """Number of photos."""
+        return len(self._g_frame)
+
+    @property
+    def num_shared(self) -> int:
+        """Number of unknowns of all cameras."""
+        return len(self._g_camera)
+
     @cached_property
     def inverse(self) -> Factored | None:
         """The inverse of the whole system, for photos and cameras; None where it cannot be factored."""
@@ -230,34 +248,42 @@ class NormalEquations:
             return None
         frame, point, camera = solved[:3]
         weighed = self._prior_diag * frame, self._border.prior_diag.ravel() * camera
-        by_lengths = np.einsum("qna,na->q", self._lengths, point)
-        s, res = self._s, self.blocks[0]
-        moved = np.einsum("oia,oa->oi", self._J, frame[s.frame_idx])
-        moved -= np.einsum("oia,oa->oi", self._J[:, :, 3:6], point[s.point_idx])
-        own = camera.reshape(self._border.num_cameras, -1)[self._border.camera_of_frame[s.frame_idx]]
-        moved += np.einsum("oia,oa->oi", self._border.J, own)
         return Function(
             variance=float((weights * point).sum()),
             of_priors=float((weighed[0] * frame).sum() + (weighed[1] * camera).sum()),
-            of_lengths=float((by_lengths**2).sum()),
+            of_lengths=float((np.einsum("qna,na->q", self._lengths, point) ** 2).sum()),
             with_photos=frame,
             with_photos_of_priors=self.inverse.times(weighed[0][None], weighed[1][None])[0][0],
-            pulls=(moved * res).sum(1),
+            pulls=self._moved(frame, point, camera),
         )
 
-    def group_pulls(self, group: Index, sign: Array, num_groups: int) -> tuple[Array, Array]:
-        """How far groups of measurements pull photos (num_groups, m, nb) and cameras (num_groups, k).
+    def _moved(self, frame: Array, point: Array, camera: Array) -> Array:
+        """Changes (o, 2) of the residuals with a step of photos (m, nb), points (n, 3) and all cameras (k,)."""
+        f, border = self._s.frame_idx, self._border
+        own = camera.reshape(border.num_cameras, -1)[border.camera_of_frame[f]]
+        moved: Array = np.einsum("oia,oa->oi", self._J, frame[f]) + np.einsum("oia,oa->oi", border.J, own)
+        return moved - np.einsum("oia,oa->oi", self._J[:, :, 3:6], point[self._s.point_idx])
 
-        H^-1 of each group's share of the gradient, points eliminated.
+    def residuals_of(self, noise: Array, of_photos: Array, of_cameras: Array) -> Array:
+        """Residuals (o, 2) that a fit would leave of noise (o, 2), the priors' means being off, too.
 
-        Parameters
-        ----------
-        group : (o,) int array
-            Group of each measurement.
-        sign : (o,) array
-            Factor of each.
-        num_groups : int
-            Number of groups.
+        These by so many of their standard deviations, of_photos (m, nb) and of_cameras (k,). Known lengths are right.
+        """
+        assert self.inverse is not None
+        g_point, V = np.empty_like(self._g_point), np.empty_like(self._V)
+        schur.point_blocks(self._s.track_start, self._s.point_of, noise, self._J, V, g_point)
+        g_frame = self._gradients(noise, self._J)[1] + np.sqrt(self._prior_diag) * of_photos
+        g_camera = self._border.sum_photos(self._gradients(noise, self._border.J)[1])
+        g_camera = g_camera + np.sqrt(self._border.prior_diag.ravel()) * of_cameras
+        reduced, V_inv = self.reduce(0.0, g_frame, g_point, g_camera)
+        frame, camera = self.inverse.solve(reduced.b, reduced.c)
+        point = self._point_steps(V_inv, g_point, frame, camera)
+        return noise + self._moved(frame, point, camera)
+
+    def group_pulls(self, residuals: Array, group: Index, num_groups: int) -> tuple[Array, Array]:
+        """How far groups of residuals (o, 2) pull photos (num_groups, m, nb) and cameras (num_groups, k).
+
+        That is H^-1 of each group's share of the gradient, points eliminated; group (o,) is the group of each.
         """
         assert self.inverse is not None
         s, border = self._s, self._border
@@ -266,8 +292,8 @@ class NormalEquations:
         schur.invert_points(self._V, 0.0, V_inv)
         g_frame, g_camera = np.empty((m, num_groups, nb)), np.empty((m, num_groups, nc))
         schur.group_gradients(
-            s.frame_start, s.frame_order, s.track_idx, s.track_start, s.point_of, self.blocks[0] * sign[:, None],
-            self._J, border.J, V_inv, group, g_frame, g_camera,
+            s.frame_start, s.frame_order, s.track_idx, s.track_start, s.point_of, residuals, self._J, border.J, V_inv,
+            group, g_frame, g_camera,
         )  # fmt: skip
         of_cameras = border.sum_photos(g_camera.transpose(0, 2, 1)).T
         return self.inverse.times(g_frame.transpose(1, 0, 2), of_cameras)
@@ -336,14 +362,19 @@ class NormalEquations:
         if solved is None:
             return None
         frame, camera, residual, camera_residual = solved
+        point = self._point_steps(V_inv, g_point, frame, camera)
+        if not all(np.isfinite(part).all() for part in (frame, point, camera)):
+            return None
+        return frame, point, camera, residual, camera_residual
+
+    def _point_steps(self, V_inv: Array, g_point: Array, frame: Array, camera: Array) -> Array:
+        """Steps (n, 3) of the points that go with those of photos and cameras."""
         point = np.empty_like(g_point)
         schur.back_substitute(
             self._unknowns, self._s.track_start, self._s.point_of, self._s.frame_idx, V_inv,
             self._pulled(g_point, camera), self._J, frame, point,
         )  # fmt: skip
-        if not all(np.isfinite(part).all() for part in (frame, point, camera)):
-            return None
-        return frame, point, camera, residual, camera_residual
+        return point
 
     def _pulled(self, g_point: Array, step_camera: Array) -> Array:
         """Gradient of the points (n, 3) after a step of all cameras (k,)."""

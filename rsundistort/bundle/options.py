@@ -112,9 +112,10 @@ class BundleOptions:
         Conjugate gradients stop when the residual, in the norm of the preconditioner, falls below `cg_tolerance` times
         the solution, in the norm of the matrix: a step then lacks about the square of it of its decrease of the cost.
     deviations : {"jackknife", "model"}
-        What the covariances of the result are read off: "model" takes measurements to be independent and as noisy as
-        `sigma_px` says, "jackknife" looks how residuals that go together, in corners of the scene and of the lens, pull
-        at the unknowns (never less than the model's).
+        How noisy measurements are taken to be together: "model" as independent ones, each as `sigma_px` says;
+        "jackknife" as residuals show that pull together, in corners of the scene and of the lens. By that the
+        covariances are larger (never smaller than of "model"), and the measurements weigh less against the priors once
+        outliers are gone: the false motion that a lens or a scene leaves does not stand against a prior of mean zero.
     """
 
     max_iterations: int = 100
@@ -212,7 +213,7 @@ class BundleResult:
     num_iterations : int
         Steps tried, over all solves.
     sigma_px : float
-        Standard deviation of the noise that weighed the measurements in the last solve.
+        Standard deviation of the noise of a measurement in the last solve.
     phi_sigma : float
         Standard deviation of the prior on phi, radians per frame: as given, or as estimated.
     velocity_sigma : float
@@ -232,6 +233,8 @@ class BundleResult:
     inflation : (unknowns of a photo,) array
         How many times larger than of independent measurements the noise's share of the deviations of each kind of
         unknown is (`BundleOptions.deviations`), 1 or more. The covariances have it in them.
+    noise_factor : float
+        One such factor for all: times `sigma_px` it is the noise that weighed the measurements against the priors.
     """
 
     reconstruction: Reconstruction

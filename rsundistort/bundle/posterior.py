@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .jackknife import inflated_function
+from .jackknife import inflation_of
 from .options import BundleOptions, BundleResult
 from .problem import BundleProblem, Spreads
 
@@ -36,10 +36,11 @@ class Posterior:
         plain = replace(options or BundleOptions(), loss="squared")
         self._problem = BundleProblem(rec, rec.shutter_model, plain, result.sigma_px * result.noise_factor, spreads)
         self._state = self._problem.initial_state()
-        self._partitions = self._problem.partitions(self._state) if plain.deviations == "jackknife" else ()
-        self._factor = result.noise_factor
-        self._inflation = (result.inflation if self._partitions else np.ones_like(result.inflation)) / self._factor
         self._equations = self._problem.linearize(self._state)
+        self._factor = result.noise_factor
+        self._partitions = self._problem.partitions(self._state) if plain.deviations == "jackknife" else None
+        inflation = np.ones_like(result.inflation) if self._partitions is None else result.inflation
+        self._inflation = inflation / self._factor
         self._covariance = self._equations.covariance(self._inflation)
         self._own = 3 * plain.varying
         self._shape = rec.num_images, len(self._inflation) - self._own
@@ -53,10 +54,13 @@ class Posterior:
 
         And its covariance (m, nb) with the photos' unknowns. NaN where the system cannot be factored.
         """
-        found = self._problem.function_of_points(self._state, weights)
+        found = self._equations.function_of_points(self._problem.in_order(weights))
         if found is None:
             return np.nan, np.full(self._shape, np.nan)
-        variance, with_photos = inflated_function(found, self._partitions, self._inflation, self._factor)
+        own = 1.0
+        if self._partitions is not None:
+            own = inflation_of(found, self._equations, self._partitions, self._factor)
+        variance, with_photos = found.inflated(own / self._factor, self._inflation)
         return variance, with_photos[:, : self._shape[1]]
 
     def motions(self) -> tuple[Array, Array]:

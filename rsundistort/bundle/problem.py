@@ -18,7 +18,7 @@ from .elimination import Elimination, Marginals
 from .intrinsics import INTRINSICS, check_lenses, deviation, moved_camera, prior_weight
 from .jackknife import Partition, by_corner, by_place
 from .lengths import LengthResiduals
-from .normal_equations import Border, Function, NormalEquations, Step
+from .normal_equations import Border, NormalEquations, Step
 from .options import LOSSES, BundleOptions
 from .structure import Structure, by_first_photo
 
@@ -237,9 +237,9 @@ class BundleProblem:
         """
         return self.linearize(state).marginal_covariances()
 
-    def function_of_points(self, state: State, weights: NDArray[np.float64]) -> Function | None:
-        """What is known of sum(weights * points_w), weights (n, 3); None where the system cannot be factored."""
-        return self.linearize(state).function_of_points(weights[self._points])
+    def in_order(self, of_points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values of the reconstruction's points in the order of the state's."""
+        return of_points[self._points]
 
     def partitions(self, state: State) -> tuple[Partition, ...]:
         """Measurements that may go wrong together: of one corner of the scene, and of one corner of a lens."""

@@ -106,8 +106,9 @@ def advise(result: BundleResult, options: BundleOptions | None = None) -> list[A
             for mine in obs.by_photo(rec.num_images)
         ]
     )
-    # photos that were never taken have no residuals to tell it
-    options = replace(options or BundleOptions(), deviations="model")
+    # views that are imagined have no residuals: theirs are taken to go together as those at hand do
+    plain = replace(options or BundleOptions(), deviations="model")
+    worse = shape_cost(result, options).sigma_log_k / shape_cost(result, plain).sigma_log_k
     found = []
     for what, photos in _candidates(rec.R_cw, rec.center_w, pivots):
         more = rec
@@ -116,9 +117,9 @@ def advise(result: BundleResult, options: BundleOptions | None = None) -> list[A
         if more.num_images == rec.num_images + len(photos):
             m, nb = result.covariances.shape[:2]
             imagined = replace(result, reconstruction=more, covariances=np.zeros((m + len(photos), nb, nb)))
-            cost: ShapeCost = shape_cost(imagined, options)
+            cost: ShapeCost = shape_cost(imagined, plain)
             shift = cost.common.shift_px if cost.common.of_travel else None
-            found.append(Advice(what, cost.meter.value, cost.sigma_log_k, shift))
+            found.append(Advice(what, cost.meter.value, worse * cost.sigma_log_k, shift))
     return found
 
 
