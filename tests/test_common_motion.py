@@ -375,13 +375,17 @@ def test_a_photo_turned_by_90_degrees_is_advised_for_what_it_tells_of_the_common
     assert "px" in advice[0].sentence
 
 
-def test_measurements_weigh_less_where_neighbours_share_their_noise(rng):
+def test_measurements_weigh_less_against_anchors_where_neighbours_share_their_noise(rng):
     _, spoiled = of_neighbours(rng)
-    result = bundle_adjust(spoiled, MODEL, KNOWN)
-    healed, remedy = heal(result, KNOWN)
-    assert remedy.name == "prior"
+    options = replace(KNOWN, still={"05.jpg": 1e-4})
+    result = bundle_adjust(spoiled, MODEL, options)
+    healed, remedy = heal(result, options)
+    assert remedy.before.common.is_hidden
     assert 1.5 * NOISE_PX < healed.sigma_px < 5 * NOISE_PX
-    assert (healed.sigma_phi > result.sigma_phi).all()
+    others = np.arange(len(healed.sigma_phi)) != 5
+    assert (healed.sigma_phi[others] > result.sigma_phi[others]).all()
     assert remedy.after.common.noise_factor < 1.2
-    # who wants no priors gets the measurements as they are
-    assert heal(result, KNOWN, "none")[0] is result
+    # without anchors they are what there is
+    alone = bundle_adjust(spoiled, MODEL, KNOWN)
+    assert heal(alone, KNOWN, "none")[0] is alone
+    assert heal(alone, KNOWN, "prior")[0] is alone

@@ -182,27 +182,27 @@ def heal(result: BundleResult, options: BundleOptions, remedy: str = "auto") -> 
         "auto": nothing where the poses are not critical, or the height of the scene is known to 0.05 % all the same,
         and turning is told from travelling to half a pixel; else the photo that most likely did not move becomes a
         soft anchor, with the standard deviation that the evidence supports, beside the prior. "prior" leaves it at the
-        prior, "none" at what the solution was. Where turning and travelling cannot be told apart, the measurements are
-        weighed against the priors, and the anchor, by the noise that neighbours share (`Posterior.noise_factor`).
+        prior, "none" at what the solution was. Where turning is hardly told from travelling, the measurements are
+        weighed against anchors by the noise that neighbours share (`Posterior.noise_factor`).
 
     Returns
     -------
     BundleResult, Remedy
-        The solution, adjusted again if an anchor was added or the noise is another.
+        The solution, adjusted again if an anchor was added, or if it was not weighed as above.
     """
     if remedy not in REMEDIES:
         raise InputError(f"remedy {remedy!r}, expected one of {', '.join(REMEDIES)}")
     before = shape_cost(result, options)
-    if before.common.is_weak and before.common.noise_factor > 1 and remedy != "none":
-        # what all photos share is a matter of the priors, too: measurements must not count for more than they are worth
-        result = _again(result, options, before.common.noise_factor)
-        before = shape_cost(result, options)
-    noise = before.common.noise_factor
+    # what anchors hold against measurements must not be outvoted by errors that neighbours share
+    noise = before.common.noise_factor if before.common.is_hidden else 1.0
     still = {name: 0.0 for name, held in options.held_phi.items() if held} | dict(options.still)
     given = still | {name: float(np.min(sigma)) for name, (_, sigma) in options.known_phi.items()}
     if given or options.lengths:
         said = contradictions(result, options, still, noise)
-        return result, Remedy("given", given, before, before, said + _warnings(before))
+        if given and noise > 1:
+            result = _again(result, options, noise)
+        after = shape_cost(result, options) if noise > 1 else before
+        return result, Remedy("given", given, before, after, said + _warnings(after))
     if remedy == "none":
         return result, Remedy("none", {}, before, before, _warnings(before))
     if not (before.is_flagged or before.common.is_weak) or not np.isfinite(before.sigma_log_k):
@@ -214,7 +214,7 @@ def heal(result: BundleResult, options: BundleOptions, remedy: str = "auto") -> 
     sigma = _anchor_sigma(result, best, float(probability[best]))
     name = result.reconstruction.image_names[best]
     anchored = replace(options, still={name: sigma})
-    healed = _again(result, anchored)
+    healed = _again(result, anchored, noise)
     after = shape_cost(healed, anchored)
     return healed, Remedy("anchor", {name: sigma}, before, after, _warnings(after))
 
