@@ -90,9 +90,14 @@ class CommonMotion:
         }
 
     @property
+    def is_hidden(self) -> bool:
+        """Whether the photos' clocks hardly differ: what turns and travels with all photos is told by little else."""
+        return self.of_travel and self.contrast < _LOW
+
+    @property
     def is_weak(self) -> bool:
-        """Whether the photos' clocks hardly differ, and a common motion that is not told costs something here."""
-        return self.of_travel and self.contrast < _LOW and not self.shift_px <= _SMALL_PX
+        """Whether a common motion is hidden, and it costs something here."""
+        return self.is_hidden and not self.shift_px <= _SMALL_PX
 
     @property
     def sentence(self) -> str:
