@@ -27,6 +27,9 @@ _MIN_SPREAD = 1e-6
 # Spreads below this (radians, focal lengths) need not settle: a tenth of a pixel.
 _SETTLED_AT = 2e-5
 
+# No lens varies more than this from photo to photo (of f, and of the principal point in focal lengths). A strong
+# shutter would be taken for it.
+_MOST_VARIED = 0.02
 # Of a spread, between two solves.
 _LARGEST_CHANGE = 4.0
 
@@ -123,7 +126,10 @@ def _bounded(spreads: Spreads, options: BundleOptions, baseline: float) -> Sprea
     """The spreads within their upper limits."""
     phi = np.inf if options.phi_sigma_most is None else options.phi_sigma_most
     velocity = np.inf if options.velocity_sigma_most is None else options.velocity_sigma_most * baseline
-    return replace(spreads, phi=min(spreads.phi, phi), velocity=min(spreads.velocity, velocity))
+    return Spreads(
+        min(spreads.phi, phi), min(spreads.velocity, velocity), min(spreads.focal, _MOST_VARIED),
+        min(spreads.centre, _MOST_VARIED),
+    )  # fmt: skip
 
 
 def objective(reconstruction: Reconstruction, shutter_model: str, options: BundleOptions) -> float:

@@ -28,6 +28,8 @@ _PARTS = 4
 _MIN_GAIN = 2.0
 # And by this share.
 _MIN_FALL = 0.02
+# Share of an error that is most of it.
+_MOST_OF_IT = 0.5
 # What a photo's residuals have in common is sought among polynomials of this degree in x and y, whatever bent it.
 _DEGREE = 3
 # Measurements for each coefficient of such a polynomial, at least.
@@ -39,6 +41,8 @@ _MIN_AGREEMENT = 0.5
 _UNSEEN_PX = 0.5
 # Of the limit of a spread: one that comes so near would be larger if it could.
 _AT_LIMIT = 0.99
+# A model that bends to explain what it cannot creeps along its valley; the rest converge in fewer steps.
+_MOST_STEPS = 15
 # Exchanges the axis of the readout; reversing it negates the motion and changes nothing else.
 _OTHER_AXIS = ("top-to-bottom", "left-to-right")
 
@@ -201,6 +205,11 @@ class _Fit:
     left: float
     spreads: Spreads
 
+    @property
+    def is_explained(self) -> bool:
+        """Whether next to nothing is left that any model could explain."""
+        return self.left <= _MIN_FALL * float(self.errors.mean()) if len(self.errors) else True
+
 
 def half_across_readout(reconstruction: Reconstruction) -> NDArray[np.bool_]:
     """(n,) points on one side of the photos that show them, sides across the readout; half of all."""
@@ -245,7 +254,7 @@ class _Fits:
         # the gross outliers are gone: squares, and no closer than tells one model from the next
         self._rough = replace(
             options, outlier_rounds=0, spread_rounds=4, spread_tolerance=0.05, loss="squared", sigma_px=sigma_px,
-            cost_tolerance=1e-5, lengths=(), deviations="model",
+            cost_tolerance=1e-5, max_iterations=_MOST_STEPS, lengths=(), deviations="model",
         )  # fmt: skip
         self.given = replace(reconstruction, observations=reconstruction.observations.select(fitted))
         self.held_out = reconstruction.observations.select(held)
@@ -257,6 +266,8 @@ class _Fits:
     def fit(self, model: str, varying: bool, starts: Sequence[Reconstruction], label: str | None = None) -> _Fit:
         """Fit a model from the cheapest of some starts."""
         label = label or model + _VARYING * varying
+        if label in self.done:
+            return self.done[label]
         step = None if self._progress is None else partial(self._progress, label)
         options = replace(self._rough, varying=varying)
         # the motions given belong to the poses and the lens given: with those of another model they fit nothing. One
@@ -344,18 +355,24 @@ def choose_model(
     options = options or BundleOptions()
     fits = _Fits(reconstruction, options, sigma_px, seed, progress)
     given = fits.given
-    best = fits.fit(rungs[0], False, [given])
+    best = first = fits.fit(rungs[0], False, [given])
     kept, gain = [best.label], dict[str, float]()
-    if options.refine:
+    if options.refine and not first.is_explained:
         vary = fits.fit(rungs[0], True, [best.reconstruction])
         gain[vary.label] = fits.gain(best, vary)
         if fits.is_better(best, vary):
             best = vary
             kept.append(vary.label)
     plain = last = best
+    varying = plain.varying
+    if varying and "rotation" in rungs:
+        # where a shutter alone leaves less than half of what a varying lens does, the lens is not what bends the photos
+        alone = fits.fit("rotation", False, [first.reconstruction, given])
+        varying = not float(alone.errors.mean()) < _MOST_OF_IT * float(plain.errors.mean())
+        last = last if varying else first
     against: list[str] = []
     for model in rungs[1:]:
-        last = fits.fit(model, plain.varying, [last.reconstruction, given])
+        last = fits.fit(model, varying, [last.reconstruction, given])
         gain[last.label] = fits.gain(best, last)
         # where the two do as well, the exact model of a turn is taken, not its approximation
         exact = best.model == "two-step" and model == "rotation" and not fits.is_better(last, best)
@@ -384,12 +401,12 @@ def choose_model(
             against.append("the exposure times allow less motion than they would need")
         if against:
             best = plain
-        elif best.varying:
-            shared = fits.fit(best.model, False, [best.reconstruction, given])
-            gain[best.label] = fits.gain(shared, best)
-            if not fits.is_better(shared, best):
-                best = shared
-                kept.append(shared.label)
+        elif plain.varying:
+            # whether the lens varies beside the shutter
+            shared, vary = (fits.fit(best.model, each, [best.reconstruction, given]) for each in (False, True))
+            gain[vary.label] = fits.gain(shared, vary)
+            best = vary if fits.is_better(shared, vary) else shared
+            kept += [best.label] * (best.label not in kept)
     if not len(fits.held_out):
         against.append("no point is seen by three photos, so no measurement could be held out to judge by")
     shutter = "found" if best is not plain else "not-determined" if against else "not-found"
