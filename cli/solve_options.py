@@ -64,8 +64,8 @@ _still_option = click.option(
     "--anchor",
     multiple=True,
     metavar="NAME[=MRAD]",
-    help="A photo known not to have moved: its phi1, and where cameras travel its whole motion, is held at zero, or near "
-    "zero with so many mrad per frame of standard deviation. May be repeated.",
+    help="A photo known not to have moved: its phi1, and where cameras travel its whole motion, is held at zero, or "
+    "near zero with so many mrad per frame of standard deviation. May be repeated.",
 )
 _known_option = click.option(
     "--known",

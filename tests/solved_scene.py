@@ -33,9 +33,7 @@ def solve_scene(name: str, out: Path, *, unwarped: bool = False, **options) -> S
     )  # fmt: skip
     cameras = PhotoCameras((camera,), ("camera",), rec.camera_idx, True, (True,), "camera.json")
     log = StageLog(None)
-    solved = solve_tracks(
-        rec, {}, asked.shutter_model, 0, lambda each: asked.options_for(each, cameras), log, asked.remedy
-    )
+    solved = solve_tracks(rec, {}, asked.shutter_model, 0, lambda _: asked.options_for(cameras), log, asked.remedy)
     outputs = Outputs.of_outcome(Outcome(solved, cameras, (1,)), asked, {})
     with output_folder(out) as scratch:
         outputs.begin(scratch, log)

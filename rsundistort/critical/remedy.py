@@ -202,7 +202,7 @@ def heal(result: BundleResult, options: BundleOptions, remedy: str = "auto") -> 
     sigma = _anchor_sigma(result, best, float(probability[best]))
     name = result.reconstruction.image_names[best]
     anchored = replace(options, still={name: sigma})
-    healed = _again(result, anchored, noise)
+    healed = _again(result, anchored)
     after = shape_cost(healed, anchored)
     return healed, Remedy("anchor", {name: sigma}, before, after, _warnings(after))
 
