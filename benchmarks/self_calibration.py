@@ -72,7 +72,7 @@ def solve(photos: Path) -> tuple[BundleResult, BundleOptions]:
         loaded = load_photos(photos, None, None, options.max_features, workers, log, options)
 
         def of(rec: Reconstruction) -> BundleOptions:
-            return options.options_for(rec, loaded.cameras)
+            return options.options_for(loaded.cameras)
 
         solved = solve_photos(loaded, "rotation", 0, of, Path(folder), log)
     return solved.result, of(solved.result.reconstruction)

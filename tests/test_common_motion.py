@@ -208,9 +208,9 @@ def test_common_motion_of_cameras_that_read_columns_is_that_of_rows_turned(rng):
         rows, cameras=cameras, R_cw=quarter @ rows.R_cw, phi=rows.phi @ quarter.T,
         observations=replace(rows.observations, xy_raw=turned),
     )  # fmt: skip
-    found = [
-        common_motion(bundle_adjust(scene, MODEL, KNOWN), KNOWN) for scene in (rows, columns)
-    ]  # fmt: skip
+    # with independent noise: corners of a photo are others in one that is turned
+    model = replace(KNOWN, deviations="model")
+    found = [common_motion(bundle_adjust(scene, MODEL, model), model) for scene in (rows, columns)]
     np.testing.assert_allclose(found[1].sigma, found[0].sigma, rtol=1e-3)
     assert found[1].shift_px == pytest.approx(found[0].shift_px, rel=1e-3)
     assert found[1].by_column
@@ -243,7 +243,8 @@ def test_noise_that_neighbours_share_is_noticed(rng):
     # 48 squares of normal variables if nothing was off: within 20 % (one sigma)
     assert np.mean(plain) > 5
     assert 0.5 < np.mean(honest) < 2.5
-    assert 2 < np.mean(factors) < 5
+    # twenty points that are off together by 0.5 px and each by 0.2 are as good as one: sqrt(1 + 20 (0.5 / 0.2)^2)
+    assert 2 < np.mean(factors) < 11
     assert bundle_adjust(measured(truth, rng), MODEL, KNOWN).noise_factor < 1.5
 
 
