@@ -329,6 +329,7 @@ def test_run_of_a_video_with_a_gyroscope(walk, tmp_path, monkeypatch):
     assert solution.options["gyro"]["offset_s"] == 7
     assert len(solution.options["known"]) == 5
     assert "video              6 of 6 frames" in result.stdout
+    span = solution.cameras["1"].frame_span
     turned = np.degrees(np.linalg.norm([image.motion.phi for image in solution.images], axis=1)) * span / 0.025
     assert f"median {np.sort(turned)[3]:.1f}, largest {turned.max():.1f} deg/s, by a readout of" in result.stdout
     assert "  25 ms (given)\n" in result.stdout
