@@ -1,6 +1,6 @@
 """Critical motions on synthetic measurements: prints one JSON object a line.
 
-    python benchmarks/critical.py [still] [nobody] [spread] [nw-rsba] [--trials N]
+    python benchmarks/critical.py [still] [nobody] [spread] [fountain] [nw-rsba] [--trials N]
 
 `still`: the level cameras and points of sample_scenes/colonnade, random motions of 0.05 rad a frame, one photo (another
 in each trial) still, which the tool is not told: how often `auto` picks it, or another that moved by less than 1 mrad,
@@ -9,6 +9,8 @@ and the error of the scene's vertical scale, beside that without remedy for both
 it lies within two of the reported standard deviations.
 `spread`: the reported standard deviation of log k against the spread of k over the trials, for cameras that are level,
 tilted by 5, 10 and 20 degrees, and with one photo turned by 90.
+`fountain`: ../shared/photos/fountain-small, photos that turned and travelled but for the first: errors of phi and the
+rectified photos against the true ones, as they are, with the photo that is found still, and with that named.
 `nw-rsba`: meter and sigma(log k) of that generator's problems (../shared/nw-rsba) by class, how many are flagged, and
 the figures of benchmarks/nw_rsba.py with and without the remedy.
 
@@ -20,18 +22,31 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import sys
+import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numba
 import numpy as np
 import nw_rsba
 from scipy.spatial.transform import Rotation
 
-from rsundistort import BundleOptions, Camera, Observations, Reconstruction, RowMotion, climb
+from rsundistort import (
+    BundleOptions,
+    Camera,
+    Observations,
+    Reconstruction,
+    RowMotion,
+    RunOptions,
+    climb,
+    psnr,
+    run,
+)
 from rsundistort.critical import heal, shape_cost, with_remedy
 from rsundistort.critical.meter import readout_axes
 from rsundistort.synthetic import project_rows
@@ -264,6 +279,56 @@ def show_spread(pool: ProcessPoolExecutor, trials: int) -> None:
             )
 
 
+def show_fountain(_pool: ProcessPoolExecutor, _trials: int) -> None:
+    """Print the figures of `fountain`."""
+    folder = ROOT.parent / "shared" / "photos" / "fountain-small"
+    if not folder.is_dir():
+        print(json.dumps({"name": "fountain", "skipped": "no such photos beside the project"}))
+        return
+    truth = json.loads((folder / "truth.json").read_text())
+    first = min(truth)
+    for name, more in (
+        ("the prior alone", {"remedy": "prior"}),
+        ("auto", {}),
+        ("auto, the first photo left out", {"without": first}),
+        (f"{first} named", {"still": {first: 0.5e-3}}),
+    ):
+        with tempfile.TemporaryDirectory() as work:
+            photos = Path(work) / "photos"
+            shutil.copytree(folder / "rs", photos)
+            if "without" in more:
+                (photos / more.pop("without")).unlink()
+            options = RunOptions(camera=str(folder / "camera.json"), depth="points", report=False, **more)
+            out = Path(work) / "out"
+            found = run(photos, out, options)
+            db = [
+                psnr(
+                    cv2.imread(str(out / "images" / image.name)),
+                    cv2.imread(str(folder / "gs" / image.name)),
+                    cv2.imread(str(out / "masks" / image.name.replace(".jpg", ".png")), cv2.IMREAD_GRAYSCALE),
+                )
+                for image in found.registered
+            ]
+        off = np.array([image.motion.phi - truth[image.name]["phi"] for image in found.registered])
+        off *= 1e3 * found.cameras[found.registered[0].camera_id].frame_span
+        common = found.critical_motion["common_motion"]
+        print(
+            json.dumps(
+                {
+                    "name": f"fountain, {name}",
+                    "anchors": found.critical_motion["anchors"],
+                    "phi_off_mean_mrad": off.mean(0).round(2).tolist(),
+                    "phi_off_rms_mrad": np.sqrt((off**2).mean(0)).round(2).tolist(),
+                    "reported_mrad": [round(1e3 * s, 2) for s in common["sigma_phi_rad_per_frame"]],
+                    "median_db": round(float(np.median(db)), 2),
+                    "noise_factor": round(common["noise_factor"], 2),
+                    "target": ">= 36 dB",
+                }
+            ),
+            flush=True,
+        )
+
+
 def show_outsider(_pool: ProcessPoolExecutor, _trials: int) -> None:
     """Print the figures of `nw-rsba`."""
     folder = ROOT.parent / "shared" / "nw-rsba"
@@ -307,6 +372,7 @@ def main() -> None:
         "still": (show_still, 50),
         "nobody": (show_nobody, 100),
         "spread": (show_spread, 200),
+        "fountain": (show_fountain, 0),
         "nw-rsba": (show_outsider, 0),
     }
     parser.add_argument("parts", nargs="*", choices=[[], *parts], default=list(parts))

@@ -94,6 +94,12 @@ class Ran:
         joined = f"{len(self.solution.registered)}/{len(self.solution.images)}"
         return {"model": self.solution.shutter_model, "joined": joined, "verdict": self.verdict, "said": self.said}
 
+    @property
+    def evidence(self) -> dict[str, Any]:
+        """What the model was chosen by."""
+        quality = self.solution.quality
+        return {key: quality[key] for key in ("held_out_error", "held_out_kept", "agreement_of_halves")}
+
 
 @dataclass
 class Bench:
@@ -190,7 +196,7 @@ def nothing_invented(bench: Bench) -> None:
         with bench.case(name):
             ran = bench.run(photos, **options)
             shift = summary(image.rs_shift_px or 0.0 for image in ran.solution.registered)
-            show(name, **ran.facts, shift_px=shift, held_out_error=ran.solution.quality["held_out_error"])
+            show(name, **ran.facts, shift_px=shift, **ran.evidence)
             target = ", ".join(f"{key} <= {value:g}" for key, value in zip(shift, most, strict=False))
             met = all(value <= limit for value, limit in zip(shift.values(), most, strict=False)) if most else None
             bench.row(name, [ran], {f"{key} px": value for key, value in shift.items()}, target, met)
@@ -215,7 +221,7 @@ def suppressed(bench: Bench) -> None:
                 each = bench.run(warp / "photos", **bench.camera(which, warp / "camera.json"))
                 figures = brief(rs.evaluate(each.out, warp / "ground_truth.json", twins=twins))
                 turned = against_twins(each.out, each.solution, rs.read_solution(warp / "ground_truth.json"), twins)
-                show(f"{name}, seed {seed}", **each.facts, **figures, turned=turned)
+                show(f"{name}, seed {seed}", **each.facts, **figures, turned=turned, **each.evidence)
                 ran.append(each)
                 found.append([np.mean(figures["phi_mrad_per_frame"]), figures["psnr_db"]["median"], *turned.values()])
             medians = np.median(found, axis=0).round(2).tolist()

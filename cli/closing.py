@@ -159,16 +159,10 @@ def _model(solution: Solution) -> list[str]:
 def _intrinsics(solution: Solution) -> list[str]:
     """A line on each camera whose intrinsics were solved for, with standard deviations."""
     lines = []
-    # photos whose lens varied have cameras of their own: what they share is told once, with the medians
-    groups: dict[Any, list[str]] = {}
-    for key, camera in solution.cameras.items():
-        shared = (camera.width, camera.height, camera.lens, *camera.dist.tolist())
-        groups.setdefault(shared if _varies(solution) else key, []).append(key)
-    for keys in groups.values():
+    for keys, camera in solution.shared_cameras.items():
         sigmas = solution.quality["sigma_intrinsics"].get(keys[0], {})
-        own = [solution.cameras[key].K for key in keys]
-        fx, fy, cx, cy = (sorted(float(K[at]) for K in own)[len(own) // 2] for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        values = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **solution.cameras[keys[0]].coefficients}
+        (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+        values = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **camera.coefficients}
         found = [
             f"{name} {values[name]:.{4 if name[0] in 'kp' else 1}f} +- {sigma:.{4 if name[0] in 'kp' else 1}f}"
             for name, sigma in sigmas.items()
@@ -177,13 +171,9 @@ def _intrinsics(solution: Solution) -> list[str]:
     return lines
 
 
-def _varies(solution: Solution) -> bool:
-    return bool(solution.quality.get("focal_sigma") or solution.quality.get("centre_sigma_focal_lengths"))
-
-
 def _varying(solution: Solution) -> list[str]:
     """A line on how the lens differs from photo to photo, if it does."""
-    if not _varies(solution):
+    if not solution.lens_varied:
         return []
     focal, centre = solution.quality["focal_sigma"], solution.quality["centre_sigma_focal_lengths"]
     camera = next(iter(solution.cameras.values()))

@@ -529,6 +529,24 @@ def test_a_lens_that_varies_from_photo_to_photo_is_found_and_no_shutter_is(rng):
     assert 0.005 < result.centre_sigma < 0.02
 
 
+def test_what_the_other_axis_explains_as_well_is_no_shutter(rng):
+    # read by columns, and believed to be read by rows: bent photos, but not by such a shutter
+    scene = make_scene(rng, "rotation", num_images=10, num_points=150, noise_px=0.3, phi_size=0.03)
+    by_rows = [replace(camera, readout="top-to-bottom") for camera in scene.cameras]
+    by_columns = replace(scene, cameras=[replace(camera, readout="left-to-right") for camera in scene.cameras])
+    xy, _ = reprojection_residuals(
+        replace(by_columns, observations=replace(scene.observations, xy_raw=np.zeros_like(scene.observations.xy_raw)))
+    )
+    seen = replace(scene.observations, xy_raw=xy + 0.3 * rng.normal(size=xy.shape))
+    still = replace(scene, cameras=by_rows, phi=np.zeros_like(scene.phi), shutter_model="global", observations=seen)
+    choice = choose_model(still, sigma_px=0.3)
+    assert (choice.shutter, choice.shutter_model) == ("not-determined", "global")
+    assert "other axis" in choice.against[0]
+    assert choice.kept[-1] == choice.label == "global"
+    right = choose_model(replace(still, cameras=by_columns.cameras), sigma_px=0.3)
+    assert (right.shutter, right.shutter_model) == ("found", "rotation")
+
+
 def test_photos_that_do_not_vary_have_no_variation(rng):
     rec = make_scene(rng, "rotation", num_images=8, num_points=150, noise_px=0.3)
     result = bundle_adjust(rec, "rotation", BundleOptions(varying=True, outlier_rounds=0))

@@ -146,7 +146,11 @@ def standard_errors(fall: NDArray[np.float64], group: NDArray[np.int64] | None =
 
 
 def improves(before: NDArray[np.float64], after: NDArray[np.float64], gain: float) -> bool:
-    """Whether a model whose errors fell so (n,), by `gain` standard errors, is kept."""
+    """Whether a model that somebody named explains its measurements well enough for its motions to be believed.
+
+    Its errors (n,) must fall by two standard errors (`gain`), and by more than they stay above those of noise alone:
+    there is no other model that it was tried against, so what is left counts against it.
+    """
     return gain > _MIN_GAIN and (before - after).mean() > max(_MIN_FALL * before.mean(), after.mean() - 1.0)
 
 
@@ -407,6 +411,8 @@ def choose_model(
             gain[vary.label] = fits.gain(shared, vary)
             best = vary if fits.is_better(shared, vary) else shared
             kept += [best.label] * (best.label not in kept)
+    if best is plain:
+        kept = kept[: kept.index(plain.label) + 1]
     if not len(fits.held_out):
         against.append("no point is seen by three photos, so no measurement could be held out to judge by")
     shutter = "found" if best is not plain else "not-determined" if against else "not-found"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -139,6 +139,23 @@ class Solution:
         for image in self.images:
             if image.camera_id not in self.cameras:
                 raise InputError(f"photo {image.name} has camera {image.camera_id!r}, which the solution lacks")
+
+    @property
+    def lens_varied(self) -> bool:
+        """Whether f and the principal point differ from photo to photo, each of which then has a camera of its own."""
+        return bool(self.quality.get("focal_sigma") or self.quality.get("centre_sigma_focal_lengths"))
+
+    @property
+    def shared_cameras(self) -> dict[tuple[str, ...], Camera]:
+        """Cameras by their ids: those of photos whose lens varied together, with the median of each number of K."""
+        groups: dict[Any, list[str]] = {}
+        for key, camera in self.cameras.items():
+            shared = (camera.width, camera.height, camera.readout, camera.lens, *camera.dist.tolist())
+            groups.setdefault(shared if self.lens_varied else key, []).append(key)
+        return {
+            tuple(keys): replace(self.cameras[keys[0]], K=np.median([self.cameras[key].K for key in keys], axis=0))
+            for keys in groups.values()
+        }
 
     def image(self, name: str) -> SolvedImage:
         """The photo of a name."""

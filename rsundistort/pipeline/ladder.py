@@ -316,7 +316,8 @@ def solve_tracks(
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
     log.begin("verdict")
     measured = mapped if feedback is None else tracks
-    verdict = judge(result, global_result, choice, mended, measured, {*options.known_phi, *options.held_phi})
+    known = {*options.known_phi, *options.held_phi, *options.still}
+    verdict = judge(result, global_result, choice, mended, measured, known)
     if verdict.lens_only:
         warnings.warn(_lens_only(verdict), RsUndistortWarning, stacklevel=3)
     log.end("verdict", shutter=verdict.shutter, shape=verdict.shape)

@@ -212,22 +212,22 @@ def cameras(solution: Solution) -> list[dict[str, Any]]:
     sigmas = solution.quality.get("sigma_intrinsics") or {}
     times = solution.quality.get("readout_times") or {}
     rows = []
-    for key, camera in solution.cameras.items():
+    for keys, camera in solution.shared_cameras.items():
         K = camera.K
-        sigma = sigmas.get(key) or {}
+        sigma = sigmas.get(keys[0]) or {}
         lens = {name: value for name, value in camera.coefficients.items() if value or name in sigma}
         values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
         told = {name: sigma.get(name, sigma.get("f") if name[0] == "f" else None) for name in values}
         rows.append(
             {
-                "id": key,
+                "id": keys[0] if len(keys) == 1 else f"{keys[0]} to {keys[-1]}",
                 "size": f"{camera.width} x {camera.height}",
                 "intrinsics": [_value(name, value, told[name], 1) for name, value in values.items()],
                 "lens": [_value(name, value, sigma.get(name), 4) for name, value in lens.items()],
                 "model": camera.lens,
                 "readout": camera.readout,
-                "time": times.get(key),
-                "photos": sum(image.camera_id == key for image in solution.images),
+                "time": times.get(keys[0]),
+                "photos": sum(image.camera_id in keys for image in solution.images),
             }
         )
     return rows

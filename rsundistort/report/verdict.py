@@ -18,8 +18,8 @@ __all__ = ["Verdict", "advice_of", "meter_of", "verdict_of"]
 _UNSEEN_PX = 1.0
 # A shutter that lowers the error of held-out measurements by less than this share may as well be noise.
 _LEAST_GAIN = 0.01
-# Of the scene's height: up to the first it is as good as photos measure, beyond the second it is no measure. Reported
-# deviations of real photos are two to three times too small (docs/critical-motions.md).
+# Of the scene's height: up to the first it is as good as photos measure, beyond the second it is no measure.
+# What all photos share no deviation knows (docs/found.md).
 _SMALL_PERCENT, _LARGE_PERCENT = 0.5, 2.0
 
 _HEADLINES = {"doubt": "Do not trust the height", "care": "Take the height with care"}

@@ -25,8 +25,7 @@ __all__ = ["Verdict", "judge"]
 _UNSEEN_PX = 1.0
 # A motion that is known no better than this may do as much harm as good.
 _UNCERTAIN_PX = 2.0
-# Of the scene's height: as good as photos measure. Reported deviations of real photos are two to three times too small
-# (docs/critical-motions.md).
+# Of the scene's height: as good as photos measure. What all photos share no deviation knows (docs/found.md).
 _SMALL_PERCENT = 0.5
 # What may remain in the same places of all photos. A lens that makes motions wrong by half a pixel leaves 0.1 to 0.15
 # even where cameras are turned at will (k1 wrong by 0.03), and less where they are not.
