@@ -321,7 +321,6 @@ def show_fountain(_pool: ProcessPoolExecutor, _trials: int) -> None:
                     "phi_off_rms_mrad": np.sqrt((off**2).mean(0)).round(2).tolist(),
                     "reported_mrad": [round(1e3 * s, 2) for s in common["sigma_phi_rad_per_frame"]],
                     "median_db": round(float(np.median(db)), 2),
-                    "noise_factor": round(common["noise_factor"], 2),
                     "target": ">= 36 dB",
                 }
             ),
