@@ -6,6 +6,8 @@ import os
 from functools import partial
 
 import numba
+from numba.core import types
+from numba.extending import overload
 
 # Threads of OpenMP that spin while they wait take the processors from those that work as soon as anything else runs:
 # a launch then takes 7 ms, not 10 us. libgomp reads this when numba loads it, at the first launch.
@@ -22,3 +24,23 @@ prange = numba.prange
 
 # fastmath of sums whose order the compiler may choose, so that they use vectors; infinities and NaN keep their meaning.
 SUMS = {"reassoc", "contract", "nsz"}
+
+# Blocks of more columns are not unrolled: compiling would take minutes.
+_MOST_UNROLLED = 18
+
+
+def unknowns_of(nb: int) -> tuple[float, ...] | int:
+    """What kernels take for the number of columns of a block: a tuple whose length they are compiled for, or it."""
+    return (0.0,) * nb if nb <= _MOST_UNROLLED else nb
+
+
+def columns(unknowns: tuple[float, ...] | int) -> int:
+    """That number, in a kernel."""
+    return unknowns if isinstance(unknowns, int) else len(unknowns)
+
+
+@overload(columns)
+def _columns(unknowns):
+    if isinstance(unknowns, types.BaseTuple):
+        return lambda unknowns: len(unknowns)
+    return lambda unknowns: unknowns

@@ -1,14 +1,14 @@
 """A symmetric matrix of blocks, of which the upper triangle is kept: its products, and its projection on clusters.
 
 Block i (nb x nb) of S stands in block row rows[i] and block column cols[i] >= rows[i]; row_start (m + 1,) are the
-ranges of the block rows. `unknowns` is a tuple of nb zeros: its length is known when a kernel is compiled.
+ranges of the block rows. `unknowns` stands for nb, see `_jit.unknowns_of`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from ._jit import SUMS, parallel_kernel, prange
+from ._jit import SUMS, columns, parallel_kernel, prange
 
 
 @parallel_kernel(fastmath=SUMS)
@@ -18,7 +18,7 @@ def multiply(unknowns, row_start, cols, S, x, parts, y):
     Each block is read once, for its place above the diagonal and for that below: bytes are what a product costs. The
     number of ranges, not that of the threads, is the order of the sums.
     """
-    nb = len(unknowns)
+    nb = columns(unknowns)
     m, k = len(x), len(parts)
     for t in prange(k):
         part = parts[t]
@@ -54,7 +54,7 @@ def project_blocks(unknowns, turn, free, functions, pair_start, block, left, rig
     block[s] or, below the diagonal, its transpose; entries pair_start[p] to pair_start[p + 1] belong to pair p, those
     of one photo together.
     """
-    nb = len(unknowns)
+    nb = columns(unknowns)
     q = functions.shape[1]
     for pair in prange(len(E)):
         E[pair] = 0.0

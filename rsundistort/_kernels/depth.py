@@ -49,24 +49,30 @@ def sample_rows(field, scale, row0, out):
 
 
 @kernel()
-def mark_hidden(field, scale, nearest, slopes, epipole, axis, sign, intr, row0, map_x, map_y):
+def mark_hidden(field, scale, nearest, slopes, epipoles, axis, row0, map_x, map_y):
     """Point the map far outside at pixels that the camera could not see when it read the row that shows them.
 
-    A raw pixel is read at one moment t, from one place t * velocity. The line from a point at inverse depth w to that
-    place runs, in the rectified photo, over the pixels ((u, v, 1) + m t e) / (1 + m t e_z), m > 0, at the inverse
-    depths (w + m) / (1 + m t e_z), where e = `epipole` is the velocity in homogeneous pixels. The point is hidden if
-    the line comes out of the front of something on its way; it may pass behind a thing and come out at its edge.
-    `nearest` is the largest inverse depth of the field, `slopes` what it changes by at most per pixel around each tile.
+    A raw pixel is read at one moment, from one place. The line from a point at inverse depth w to that place runs, in
+    the rectified photo, over the pixels ((u, v, 1) + m e) / (1 + m e_z), m > 0, at the inverse depths (w + m) / (1 + m
+    e_z), where e is the place in homogeneous pixels: `epipoles` (lines, 3) has it for each line of the raw photo. The
+    point is hidden if the line comes out of the front of something on its way; it may pass behind a thing and come out
+    at its edge. `nearest` is the largest inverse depth of the field, `slopes` what it changes by at most per pixel
+    around each tile.
     """
     rows, cols = map_x.shape
+    last_line = len(epipoles) - 1.0
     for i in range(rows):
         v = float(row0 + i)
         for j in range(cols):
             if map_x[i, j] <= -1e6:
                 continue
             u = float(j)
-            t = sign * ((map_y[i, j] if axis == 1 else map_x[i, j]) - intr[2 + axis]) / intr[axis]
-            e0, e1, e2 = t * epipole[0], t * epipole[1], t * epipole[2]
+            at = min(max(map_y[i, j] if axis == 1 else map_x[i, j], 0.0), last_line)
+            a = int(at)
+            b, t = min(a + 1, len(epipoles) - 1), at - a
+            e0 = epipoles[a, 0] + t * (epipoles[b, 0] - epipoles[a, 0])
+            e1 = epipoles[a, 1] + t * (epipoles[b, 1] - epipoles[a, 1])
+            e2 = epipoles[a, 2] + t * (epipoles[b, 2] - epipoles[a, 2])
             pixels_per_m = math.sqrt((e0 - u * e2) ** 2 + (e1 - v * e2) ** 2)
             w = _sample(field, scale, u, v)
             # the inverse depth of the line rises by the same amount at every pixel; nothing that rises less hides it

@@ -4,7 +4,8 @@ One file, because numba's cache does not notice a changed callee elsewhere. Conv
 `lens` is (13,): OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 and the squared undistorted radius where the radial part
 folds; or (1, 14), where it may be a fisheye: then the last number is 1, and k1 k2 k3 k4 have the places of these names;
 `axis` is the component of the image that the clock follows (1: rows, 0: columns) and `sign` its direction;
-`model` is a code of `model.motion.SHUTTER_MODELS`; `intr` is (4,): fx fy cx cy.
+`model` is a code of `model.motion.SHUTTER_MODELS`; `intr` is (4,): fx fy cx cy; `phi` is (3,), or the table of a motion
+that is not steady, see `_path`. Of several photos there is one more dimension.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ _SAME_ROW = 1e-13
 _ROW_TOL = 1e-14
 _MAX_NEWTON = 30
 _CHUNK = 512
+_STILL = np.zeros(3)
 
 
 @kernel(forceinline=True)
@@ -198,9 +200,63 @@ def _row_phi(axis, sign, phi):
 
     An exchange of x and y is a reflection S, and S Exp(w) S = Exp(-S w): so columns take -S phi.
     """
+    f0, f1, f2 = _steady(phi, 0), _steady(phi, 1), _steady(phi, 2)
     if axis == 1:
-        return sign * phi[0], sign * phi[1], sign * phi[2]
-    return -sign * phi[1], -sign * phi[0], -sign * phi[2]
+        return sign * f0, sign * f1, sign * f2
+    return -sign * f1, -sign * f0, -sign * f2
+
+
+@kernel(forceinline=True)
+def _path(phi, vel, moving, t):
+    """Rotation vector and position of the camera when the clock shows t, and their derivatives by it, 12 numbers.
+
+    phi is (3,) of a steady motion: t phi and t moving vel. Of another it is (1 + 4 n, 6), how far that departs from it:
+    phi, where the frame begins and the length of each of n intervals of it; then for each interval four rows of the
+    coefficients of powers of the place in it, 0 to 1: of the rotation vector, and of the position, that `moving` times.
+    Before the frame and behind it both go on along their tangents.
+    """
+    if phi.ndim == 1:
+        f0, f1, f2 = phi[0], phi[1], phi[2]
+        v0, v1, v2 = moving * vel[0], moving * vel[1], moving * vel[2]
+        return t * f0, t * f1, t * f2, f0, f1, f2, t * v0, t * v1, t * v2, v0, v1, v2
+    i, u, beyond = _interval(phi.shape[0] // 4, (t - phi[0, 3]) / phi[0, 4])
+    rate = 1.0 / phi[0, 4]
+    i = 1 + 4 * i
+    w0, d0 = _cubic(phi, i, 0, u, beyond)
+    w1, d1 = _cubic(phi, i, 1, u, beyond)
+    w2, d2 = _cubic(phi, i, 2, u, beyond)
+    w0, w1, w2 = w0 + t * phi[0, 0], w1 + t * phi[0, 1], w2 + t * phi[0, 2]
+    d0, d1, d2 = d0 * rate + phi[0, 0], d1 * rate + phi[0, 1], d2 * rate + phi[0, 2]
+    if moving == 0.0:
+        return w0, w1, w2, d0, d1, d2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    p0, e0 = _cubic(phi, i, 3, u, beyond)
+    p1, e1 = _cubic(phi, i, 4, u, beyond)
+    p2, e2 = _cubic(phi, i, 5, u, beyond)
+    p0, p1, p2 = moving * (p0 + t * vel[0]), moving * (p1 + t * vel[1]), moving * (p2 + t * vel[2])
+    e0, e1, e2 = moving * (e0 * rate + vel[0]), moving * (e1 * rate + vel[1]), moving * (e2 * rate + vel[2])
+    return w0, w1, w2, d0, d1, d2, p0, p1, p2, e0, e1, e2
+
+
+@kernel(forceinline=True)
+def _interval(n, s):
+    """Of a place s in n intervals of length 1: which one, where in it, and how far beyond the first or the last."""
+    i = min(max(int(min(max(s, 0.0), float(n))), 0), n - 1)
+    u = min(max(s - i, 0.0), 1.0)
+    return i, u, s - i - u
+
+
+@kernel(forceinline=True)
+def _cubic(table, i, column, u, beyond):
+    """Value and derivative of a cubic, whose coefficients are rows i to i + 3, at u and along the tangent there."""
+    a, b, c, d = table[i, column], table[i + 1, column], table[i + 2, column], table[i + 3, column]
+    slope = b + u * (2.0 * c + u * 3.0 * d)
+    return a + u * (b + u * (c + u * d)) + beyond * slope, slope
+
+
+@kernel(forceinline=True)
+def _steady(phi, k):
+    """Phi itself, or that of a motion that is not steady."""
+    return phi[k] if phi.ndim == 1 else phi[0, k]
 
 
 @kernel(forceinline=True)
@@ -265,13 +321,15 @@ def _project(model, axis, sign, lens, x, y, z, phi, vel, start, out, jac):
 
     The exact models search the row from `start`; when that is NaN, from the row of a camera that does not move.
 
-    With jac: out[2:8] derivative with respect to the point (2, 3), out[8:14] to phi, out[14:20] to the
-    camera-frame velocity, which only the constant-motion model uses.
+    With jac: out[2:8] derivative with respect to the point (2, 3), out[8:14] to the rotation at the row and out[14:20]
+    to the position there, which only the constant-motion model uses. Times out[20], the clock, they are those with
+    respect to phi and to the velocity. The approximate models have those at once, and a one.
     """
     if not z > 0.0:
         return False
     X = x / z
     Y = y / z
+    out[20] = 1.0
     if model >= ROTATION:
         moving = 1.0 if model == CONSTANT_MOTION else 0.0
         return _project_exact(axis, sign, lens, x, y, z, phi, vel, moving, start, out, jac)
@@ -332,26 +390,33 @@ def _project(model, axis, sign, lens, x, y, z, phi, vel, start, out, jac):
 
 
 @kernel(forceinline=True)
-def _project_exact(axis, sign, lens, x, y, z, phi, vel, moving, start, out, jac):
-    """Paper Eq. 2 whole, q(t) = Exp(t phi) (x - t v), with t the distorted row (or column) that the sensor read.
+def _moves(w0, w1, w2, f0, f1, f2, phi, a, b, q0, q1, q2):
+    """Derivative by the clock of q = Exp(w) x: that of w is f."""
+    if phi.ndim == 2:
+        # of a steady motion w is along f, and L f = f
+        c = _third_factor(w0 * w0 + w1 * w1 + w2 * w2, a)
+        f0, f1, f2 = _turn(w0, w1, w2, b, c, f0, f1, f2)
+    return f1 * q2 - f2 * q1, f2 * q0 - f0 * q2, f0 * q1 - f1 * q0
 
-    v is moving * vel; with moving = 0 it is the rotation model. For `start` and `out` see `_project`.
+
+@kernel(forceinline=True)
+def _project_exact(axis, sign, lens, x, y, z, phi, vel, moving, start, out, jac):
+    """Paper Eq. 2 whole, q(t) = Exp(w(t)) (x - p(t)), with t the distorted row (or column) that the sensor read.
+
+    w and p are those of `_path`; with moving = 0 it is the rotation model. For `start` and `out` see `_project`.
     """
-    f0, f1, f2 = phi[0], phi[1], phi[2]
-    v0, v1, v2 = moving * vel[0], moving * vel[1], moving * vel[2]
-    angle2 = f0 * f0 + f1 * f1 + f2 * f2
     t = start
     if t != t:
         xd, yd, xx, xy, yx, yy, ok = _lens(lens, x / z, y / z)
         t = sign * (yd if axis == 1 else xd)
     for _ in range(_MAX_NEWTON):
-        a, b = _rodrigues(t * t * angle2)
-        w0, w1, w2 = t * f0, t * f1, t * f2
-        q0, q1, q2 = _turn(w0, w1, w2, a, b, x - t * v0, y - t * v1, z - t * v2)
+        w0, w1, w2, f0, f1, f2, p0, p1, p2, v0, v1, v2 = _path(phi, vel, moving, t)
+        angle2 = w0 * w0 + w1 * w1 + w2 * w2
+        a, b = _rodrigues(angle2)
+        q0, q1, q2 = _turn(w0, w1, w2, a, b, x - p0, y - p1, z - p2)
         if not q2 > 0.0:
             return False
-        # dq/dt = phi x q - E v
-        d0, d1, d2 = f1 * q2 - f2 * q1, f2 * q0 - f0 * q2, f0 * q1 - f1 * q0
+        d0, d1, d2 = _moves(w0, w1, w2, f0, f1, f2, phi, a, b, q0, q1, q2)
         if moving != 0.0:
             e0, e1, e2 = _turn(w0, w1, w2, a, b, v0, v1, v2)
             d0, d1, d2 = d0 - e0, d1 - e1, d2 - e2
@@ -374,7 +439,8 @@ def _project_exact(axis, sign, lens, x, y, z, phi, vel, moving, start, out, jac)
     out[1] = yd - yt * gap / slope
     if not jac:
         return ok
-    c = _third_factor(t * t * angle2, a)
+    c = _third_factor(angle2, a)
+    out[20] = t
     row0, row1 = (yx, yy) if axis == 1 else (xx, xy)
     for i in range(2):
         # derivatives of a distorted coordinate by X and Y: at a fixed t, and as the implicit row moves
@@ -382,14 +448,13 @@ def _project_exact(axis, sign, lens, x, y, z, phi, vel, moving, start, out, jac)
         s = -sign * ut / slope
         ux, uy = (ux + s * row0) * inverse, (uy + s * row1) * inverse
         uz = -(ux * X + uy * Y)
-        # point: dq = E dx; velocity: dq = -t E dv; phi: dq = -[q] t L dphi
+        # point: dq = E dx; position: dq = -E dp; rotation: dq = -[q] L dw
         p0, p1, p2 = _turn(w0, w1, w2, -a, b, ux, uy, uz)
         out[2 + 3 * i], out[3 + 3 * i], out[4 + 3 * i] = p0, p1, p2
-        m = -t * moving
-        out[14 + 3 * i], out[15 + 3 * i], out[16 + 3 * i] = m * p0, m * p1, m * p2
+        out[14 + 3 * i], out[15 + 3 * i], out[16 + 3 * i] = -moving * p0, -moving * p1, -moving * p2
         c0, c1, c2 = q1 * uz - q2 * uy, q2 * ux - q0 * uz, q0 * uy - q1 * ux
         p0, p1, p2 = _turn(w0, w1, w2, -b, c, c0, c1, c2)
-        out[8 + 3 * i], out[9 + 3 * i], out[10 + 3 * i] = t * p0, t * p1, t * p2
+        out[8 + 3 * i], out[9 + 3 * i], out[10 + 3 * i] = p0, p1, p2
     return ok
 
 
@@ -401,9 +466,9 @@ def _unproject(model, axis, sign, lens, xd, yd, phi):
         return C, R, ok
     if model >= ROTATION:
         t = sign * (yd if axis == 1 else xd)
-        w0, w1, w2 = -t * phi[0], -t * phi[1], -t * phi[2]
+        w0, w1, w2, _, _, _, _, _, _, _, _, _ = _path(phi, _STILL, 0.0, t)
         a, b = _rodrigues(w0 * w0 + w1 * w1 + w2 * w2)
-        X, Y, W = _turn(w0, w1, w2, a, b, C, R, 1.0)
+        X, Y, W = _turn(-w0, -w1, -w2, a, b, C, R, 1.0)
         return X / W, Y / W, W > 0.0
     q0, q1, q2 = _row_phi(axis, sign, phi)
     if axis == 0:
@@ -440,7 +505,7 @@ def project_points(model, axis, sign, intr, lens, points_c, phi, vel, xy, valid)
     """Camera-frame points (n, 3) into pixels xy (n, 2); one motion for all of them."""
     n = len(points_c)
     for chunk in prange((n + _CHUNK - 1) // _CHUNK):
-        out = np.empty(20)
+        out = np.empty(21)
         for k in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK)):
             p = points_c[k]
             valid[k] = _project(model, axis, sign, lens, p[0], p[1], p[2], phi, vel, math.nan, out, False)
@@ -451,7 +516,7 @@ def project_points(model, axis, sign, intr, lens, points_c, phi, vel, xy, valid)
 @kernel()
 def project_jacobians(model, axis, sign, intr, lens, points_c, phi, vel, xy, J_point, J_phi, J_vel, valid):
     """As `project_points`, with derivatives of the pixels (n, 2, 3) in the point, phi and velocity."""
-    out = np.empty(20)
+    out = np.empty(21)
     for k in range(len(points_c)):
         p = points_c[k]
         valid[k] = _project(model, axis, sign, lens, p[0], p[1], p[2], phi, vel, math.nan, out, True)
@@ -462,8 +527,8 @@ def project_jacobians(model, axis, sign, intr, lens, points_c, phi, vel, xy, J_p
             xy[k, i] = f * out[i] + intr[2 + i]
             for j in range(3):
                 J_point[k, i, j] = f * out[2 + 3 * i + j]
-                J_phi[k, i, j] = f * out[8 + 3 * i + j]
-                J_vel[k, i, j] = f * out[14 + 3 * i + j]
+                J_phi[k, i, j] = f * out[20] * out[8 + 3 * i + j]
+                J_vel[k, i, j] = f * out[20] * out[14 + 3 * i + j]
 
 
 @parallel_kernel()
@@ -491,7 +556,7 @@ def interpolate_map(
     patches that are not `smooth` (m, n), and pixels within `band` of where seeing ends, `edge` pixels beyond the
     outermost centres of the raw photo (width, height). `seen` gets 255 or 0; returned is how many are 0.
     """
-    out = np.empty(20)
+    out = np.empty(21)
     vel = np.zeros(3)
     rows, cols = map_x.shape
     num = nodes_x.shape[1]
@@ -647,7 +712,7 @@ def fill_map(model, axis, sign, intr, lens, phi, rays, row0, col0, map_x, map_y)
     `rays` (3, 3) takes a rectified pixel (u, v, 1) to a direction in the camera frame. Where no raw pixel
     answers, the map points far outside every photo (finite: a NaN is handled differently by OpenCV 4 and 5).
     """
-    out = np.empty(20)
+    out = np.empty(21)
     vel = np.zeros(3)
     rows, cols = map_x.shape
     for i in range(rows):
@@ -676,7 +741,7 @@ def fill_map_at_depth(axis, sign, intr, lens, phi, vel, rays, inverse_depth, row
 
     vel is in the camera frame; at an inverse depth of zero it moves nothing.
     """
-    out = np.empty(20)
+    out = np.empty(21)
     rows, cols = map_x.shape
     for i in range(rows):
         v = row0 + i
@@ -747,7 +812,7 @@ def residuals(
     """Reprojection residuals (o, 2) in pixels: predicted minus measured."""
     o = len(frame_idx)
     for chunk in prange((o + _CHUNK - 1) // _CHUNK):
-        out = np.empty(20)
+        out = np.empty(21)
         vel_c = np.empty(3)
         for k in range(chunk * _CHUNK, min(o, (chunk + 1) * _CHUNK)):
             f = frame_idx[k]
@@ -772,7 +837,7 @@ def residual_costs(
     scale2 = loss_scale * loss_scale
     size = (o + len(cost) - 1) // len(cost)
     for chunk in prange(len(cost)):
-        out = np.empty(20)
+        out = np.empty(21)
         vel_c = np.empty(3)
         total = 0.0
         for k in range(chunk * size, min(o, (chunk + 1) * size)):
@@ -792,24 +857,39 @@ def residual_costs(
         cost[chunk] = total
 
 
+@kernel(forceinline=True)
+def _by_bends(bends, ways, table, R, t, u, v, v0, v1, v2, out, J):
+    """The last columns J of `residual_blocks`."""
+    at, s, beyond = _interval(len(bends) // 4, (t - table[0, 3]) / table[0, 4])
+    turns = bends.shape[1]
+    first = len(J) - 3 * (turns + ways)
+    for j in range(turns):
+        by, _ = _cubic(bends, 4 * at, j, s, beyond)
+        for b in range(3):
+            J[first + 3 * j + b] = by * (u * out[8 + b] + v * out[11 + b])
+            if j < ways:
+                J[first + 3 * (turns + j) + b] = by * (v0 * R[0, b] + v1 * R[1, b] + v2 * R[2, b])
+
+
 @parallel_kernel()
 def residual_blocks(
     model, camera_of_frame, axes, signs, intrs, lenses, R_cw, center_w, phi, vel_w, points_w,
-    frame_idx, point_idx, xy_raw, sigma_px, loss_kind, loss_scale, clock, res, J_frame, cost,
+    frame_idx, point_idx, xy_raw, sigma_px, loss_kind, loss_scale, clock, nb, bends, ways, res, J_frame, cost,
 ):  # fmt: skip
     """Whitened, robustly weighted residuals (o, 2) with their Jacobians, and the cost summed over chunks: cost (c,).
 
-    J_frame is (o, 2, nb): rotation increment (left, camera frame), centre, phi from nb = 9 on, and velocity (world
-    frame) when nb = 12. The Jacobian of the point is minus that of the centre. `clock` (o,) is where the search for
-    the row starts, NaN: where it was measured; sigma_px is (o,). Observations that cannot be projected get zero
-    Jacobians and cost 100 px.
+    J_frame is (o, 2, >= nb): rotation increment (left, camera frame), centre, phi from nb = 9 on, and velocity (world
+    frame) when nb = 12. Of motions that are not steady the last columns are by the coefficients of the rotation along
+    the functions of `bends` (4 n, k), tables as in `_path`, three after three, and then by those of the position (world
+    frame) along the first `ways` of them. Columns between these are left alone. The Jacobian of the point is minus that
+    of the centre. `clock` (o,) is where the search for the row starts, NaN: where it was measured; sigma_px is (o,).
+    Observations that cannot be projected get zero Jacobians and cost 100 px.
     """
     o = len(frame_idx)
-    nb = J_frame.shape[2]
     scale2 = loss_scale * loss_scale
     size = (o + len(cost) - 1) // len(cost)
     for chunk in prange(len(cost)):
-        out = np.empty(20)
+        out = np.empty(21)
         vel_c = np.empty(3)
         total = 0.0
         for k in range(chunk * size, min(o, (chunk + 1) * size)):
@@ -838,22 +918,26 @@ def residual_blocks(
             res[k, 0] = r0 * w / keep
             res[k, 1] = r1 * w / keep
             g0, g1 = intrs[c, 0] * precision, intrs[c, 1] * precision
+            t = out[20]
+            _, _, _, _, _, _, p0, p1, p2, _, _, _ = _path(phi[f], vel_c, 1.0, t)
             for i in range(2):
                 u, v = (m00 * g0, m01 * g1) if i == 0 else (m01 * g0, m11 * g1)
                 a0, a1, a2 = u * out[2] + v * out[5], u * out[3] + v * out[6], u * out[4] + v * out[7]
                 v0, v1, v2 = u * out[14] + v * out[17], u * out[15] + v * out[18], u * out[16] + v * out[19]
-                # x_c = Exp(delta) R d and v_c = Exp(delta) R v
-                J_frame[k, i, 0] = a2 * y - a1 * z + v2 * vel_c[1] - v1 * vel_c[2]
-                J_frame[k, i, 1] = a0 * z - a2 * x + v0 * vel_c[2] - v2 * vel_c[0]
-                J_frame[k, i, 2] = a1 * x - a0 * y + v1 * vel_c[0] - v0 * vel_c[1]
+                # x_c = Exp(delta) R d and p_c = Exp(delta) R p
+                J_frame[k, i, 0] = a2 * y - a1 * z + v2 * p1 - v1 * p2
+                J_frame[k, i, 1] = a0 * z - a2 * x + v0 * p2 - v2 * p0
+                J_frame[k, i, 2] = a1 * x - a0 * y + v1 * p0 - v0 * p1
                 for b in range(3):
                     J_frame[k, i, 3 + b] = -(a0 * R[0, b] + a1 * R[1, b] + a2 * R[2, b])
                 if nb > 6:
                     for b in range(3):
-                        J_frame[k, i, 6 + b] = u * out[8 + b] + v * out[11 + b]
+                        J_frame[k, i, 6 + b] = t * (u * out[8 + b] + v * out[11 + b])
                 if nb > 9:
                     for b in range(3):
-                        J_frame[k, i, 9 + b] = v0 * R[0, b] + v1 * R[1, b] + v2 * R[2, b]
+                        J_frame[k, i, 9 + b] = t * (v0 * R[0, b] + v1 * R[1, b] + v2 * R[2, b])
+                if phi.ndim == 3:
+                    _by_bends(bends, ways, phi[f], R, t, u, v, v0, v1, v2, out, J_frame[k, i])
         cost[chunk] = total
 
 
@@ -904,15 +988,15 @@ def _lens_jacobian(model, axis, sign, lens, x, y, z, phi, vel, xd, yd, d):
         return
     moving = 1.0 if model == CONSTANT_MOTION else 0.0
     t = sign * (yd if axis == 1 else xd)
-    f0, f1, f2 = phi[0], phi[1], phi[2]
-    v0, v1, v2 = moving * vel[0], moving * vel[1], moving * vel[2]
-    a, b = _rodrigues(t * t * (f0 * f0 + f1 * f1 + f2 * f2))
-    q0, q1, q2 = _turn(t * f0, t * f1, t * f2, a, b, x - t * v0, y - t * v1, z - t * v2)
-    e0, e1, e2 = _turn(t * f0, t * f1, t * f2, a, b, v0, v1, v2)
-    w0, w1, w2 = f1 * q2 - f2 * q1 - e0, f2 * q0 - f0 * q2 - e1, f0 * q1 - f1 * q0 - e2
+    w0, w1, w2, f0, f1, f2, p0, p1, p2, v0, v1, v2 = _path(phi, vel, moving, t)
+    a, b = _rodrigues(w0 * w0 + w1 * w1 + w2 * w2)
+    q0, q1, q2 = _turn(w0, w1, w2, a, b, x - p0, y - p1, z - p2)
+    e0, e1, e2 = _turn(w0, w1, w2, a, b, v0, v1, v2)
+    d0, d1, d2 = _moves(w0, w1, w2, f0, f1, f2, phi, a, b, q0, q1, q2)
+    d0, d1, d2 = d0 - e0, d1 - e1, d2 - e2
     X, Y = q0 / q2, q1 / q2
     _, _, xx, xy, yx, yy, _ = _lens(lens, X, Y)
-    dX, dY = (w0 - X * w2) / q2, (w1 - Y * w2) / q2
+    dX, dY = (d0 - X * d2) / q2, (d1 - Y * d2) / q2
     at, bt = xx * dX + xy * dY, yx * dX + yy * dY
     slope = sign * (bt if axis == 1 else at) - 1.0
     _lens_basis(lens, X, Y, d)
@@ -934,7 +1018,7 @@ def intrinsic_blocks(
     o = len(frame_idx)
     scale2 = loss_scale * loss_scale
     for chunk in prange((o + _CHUNK - 1) // _CHUNK):
-        out = np.empty(20)
+        out = np.empty(21)
         d = np.empty((6, 2))
         vel_c = np.empty(3)
         for k in range(chunk * _CHUNK, min(o, (chunk + 1) * _CHUNK)):

@@ -3,9 +3,9 @@
 Observations are sorted by track (`track_start` (n+1,) are their ranges, `point_of` (n,) the point of each track);
 `frame_order` lists them by photo (`frame_start` (m+1,)). Of each observation only the Jacobian J (o, 2, nb) of its
 photo is kept: that of its point is minus that of the photo's centre, J_p = -J[:, :, 3:6]. So all that the elimination
-needs of a pair of photos is a 2x2 matrix between their Jacobians, and W = J'J_p is never written. `unknowns` is a
-tuple of nb zeros: its length is known when a kernel is compiled, so that the loops over a block unroll. Every loop in
-parallel owns what it writes, so sums do not depend on the number of threads.
+needs of a pair of photos is a 2x2 matrix between their Jacobians, and W = J'J_p is never written. `unknowns` stands for
+nb, see `_jit.unknowns_of`: loops over a small block unroll. Every loop in parallel owns what it writes, so sums do not
+depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from __future__ import annotations
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.extending import intrinsic
+from numba.extending import intrinsic, overload
 
-from ._jit import SUMS, kernel, parallel_kernel, prange
+from ._jit import SUMS, columns, kernel, parallel_kernel, prange
 
 # Tracks that a thread takes at a time.
 _CHUNK = 256
@@ -178,6 +178,27 @@ def _add_product(typingctx, unknowns, S, i, J, k, n, m00, m01, m10, m11):
     return types.void(unknowns, S, i, J, k, n, m00, m01, m10, m11), generate
 
 
+def add_product(unknowns, S, i, J, k, n, m00, m01, m10, m11):
+    """S[i] += J[k]' M J[n], in a kernel."""
+    raise NotImplementedError
+
+
+@overload(add_product, jit_options={"fastmath": {"contract"}})
+def _of_columns(unknowns, S, i, J, k, n, m00, m01, m10, m11):
+    if isinstance(unknowns, types.BaseTuple):
+        return lambda unknowns, S, i, J, k, n, m00, m01, m10, m11: _add_product(
+            unknowns, S, i, J, k, n, m00, m01, m10, m11
+        )
+
+    def wide(unknowns, S, i, J, k, n, m00, m01, m10, m11):
+        for a in range(unknowns):
+            l0, l1 = m00 * J[k, 0, a] + m10 * J[k, 1, a], m01 * J[k, 0, a] + m11 * J[k, 1, a]
+            for b in range(unknowns):
+                S[i, a, b] += l0 * J[n, 0, b] + l1 * J[n, 1, b]
+
+    return wide
+
+
 @kernel(fastmath=SUMS)
 def _times(x0, x1, x2, B, p):
     """Row (x0, x1, x2) times the symmetric matrix B[p]."""
@@ -197,7 +218,7 @@ def reduced_system(
 
     With W = J'J_p, W_k V^-1 W_n' = J_k' M J_n, where M = J_p,k V^-1 J_p,n' is 2x2; U = sum J'J goes with k = n.
     """
-    nb = len(unknowns)
+    nb = columns(unknowns)
     m = len(g_frame)
     for f in prange(m):
         slot = np.empty(m, np.int64)
@@ -227,7 +248,7 @@ def reduced_system(
                     if n == k:
                         m00 += 1.0
                         m11 += 1.0
-                    _add_product(unknowns, S, slot[frame_idx[n]], J, k, n, m00, m01, m10, m11)
+                    add_product(unknowns, S, slot[frame_idx[n]], J, k, n, m00, m01, m10, m11)
 
 
 @parallel_kernel()
@@ -317,7 +338,7 @@ def group_gradients(
 @parallel_kernel(fastmath=SUMS)
 def back_substitute(unknowns, track_start, point_of, frame_idx, V_inv, g_point, J, step_frame, step_point):
     """step_point (n, 3) = -V^-1 (g_point + sum Jp' J step_frame)."""
-    nb = len(unknowns)
+    nb = columns(unknowns)
     n = len(V_inv)
     for chunk in prange((n + _CHUNK - 1) // _CHUNK):
         for track in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK)):

@@ -12,6 +12,7 @@ from ..errors import InputError
 from ..model import Reconstruction
 from .intrinsics import pixels_of
 from .jackknife import Inflation, inflated, inflation
+from .layout import Layout
 from .options import BundleOptions, BundleResult
 from .problem import BundleProblem, Spreads, reprojection_residuals
 from .solver import minimize
@@ -41,7 +42,8 @@ def _noise_px(reconstruction: Reconstruction, shutter_model: str, floor: float) 
         return max(1.0, floor)
     # median of |x| of a normal variable is 0.6745 sigma; residuals of a fit are shorter than the noise
     spread = float(np.median(np.abs(res / reconstruction.observations.sigma[:, None])[valid])) / 0.6745
-    unknowns = 9 * reconstruction.num_images + 3 * reconstruction.num_points
+    bends = max(reconstruction.bend.shape[1] - 2, 0)
+    unknowns = (9 + 3 * bends) * reconstruction.num_images + 3 * reconstruction.num_points
     shrink = np.sqrt(max(1.0 - unknowns / (2.0 * len(res)), 0.1))
     return max(spread / shrink, floor)
 
@@ -77,14 +79,14 @@ def _spread(
 
 def _estimated(
     spreads: Spreads, current: Reconstruction, covariances: NDArray[np.float64], options: BundleOptions,
-    baseline: float,
+    layout: Layout, baseline: float,
 ) -> Spreads:  # fmt: skip
     """The spreads of both priors that a solution shows; those that were given stay."""
     variances = np.diagonal(covariances, axis1=1, axis2=2)
     if not np.isfinite(variances).all():
         return spreads
     span = current.frame_span()
-    motion = variances[:, 6 : variances.shape[1] - 3 * options.varying]
+    motion = variances[:, 6 : layout.motion]
     phi, velocity, focal, centre = spreads.phi, spreads.velocity, spreads.focal, spreads.centre
     if options.phi_sigma is None and motion.shape[1] > 0:
         phi = _spread(current.phi, motion[:, :3], span, spreads.phi) + _MIN_SPREAD
@@ -92,32 +94,56 @@ def _estimated(
         velocity = _spread(current.velocity, motion[:, 3:], span, spreads.velocity) + _MIN_SPREAD * current.baseline
     if options.varying:
         ones, varied = np.ones(len(span)), current.variation
-        focal = _spread(varied[:, :1], variances[:, -3:-2], ones, spreads.focal) + _MIN_SPREAD
-        centre = _spread(varied[:, 1:], variances[:, -2:], ones, spreads.centre) + _MIN_SPREAD
-    return _bounded(Spreads(phi, velocity, focal, centre), options, baseline)
+        of_varied = variances[:, layout.motion : layout.variation]
+        focal = _spread(varied[:, :1], of_varied[:, :1], ones, spreads.focal) + _MIN_SPREAD
+        centre = _spread(varied[:, 1:], of_varied[:, 1:], ones, spreads.centre) + _MIN_SPREAD
+    bends, ways = _bend_spreads(spreads, current, variances[:, layout.variation :], layout)
+    return _bounded(Spreads(phi, velocity, focal, centre, bends, ways), options, baseline)
+
+
+def _bend_spreads(
+    spreads: Spreads, current: Reconstruction, variances: NDArray[np.float64], layout: Layout
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """The spreads of the groups of bends, of rotations and of positions."""
+    ones, found = np.ones(current.num_images), layout.coefficients(current)
+    turns = 3 * len(layout.group)
+
+    def of(group: int, part: slice, spread: float, least: float) -> float:
+        mine = np.flatnonzero(np.repeat(np.array(layout.group[: (part.stop - part.start) // 3]) == group, 3))
+        return _spread(found[:, part][:, mine], variances[:, part][:, mine], ones, spread) + least
+
+    own, ways = slice(0, turns), slice(turns, turns + 3 * layout.ways)
+    return (
+        tuple(of(k, own, spread, _MIN_SPREAD) for k, spread in enumerate(spreads.bends)),
+        tuple(of(k, ways, spread, _MIN_SPREAD * current.baseline) for k, spread in enumerate(spreads.ways)),
+    )
 
 
 def _estimates_spreads(shutter_model: str, options: BundleOptions) -> bool:
     """Whether a spread is to be estimated."""
     of_turn = shutter_model != "global" and options.phi_sigma is None
-    return of_turn or (shutter_model == "constant-motion" and options.velocity_sigma is None) or options.varying
+    of_way = shutter_model == "constant-motion" and options.velocity_sigma is None
+    return of_turn or of_way or options.varying or options.bends > 0
 
 
 def _settled(before: Spreads, after: Spreads, tolerance: float) -> bool:
     """Whether no spread changed by more than a share; what is as good as nothing may go on falling."""
-    none = Spreads(_SETTLED_AT, 0.0, _SETTLED_AT, _SETTLED_AT)
+    of_bends = (_SETTLED_AT,) * len(before.bends), (0.0,) * len(before.ways)
+    none = Spreads(_SETTLED_AT, 0.0, _SETTLED_AT, _SETTLED_AT, *of_bends)
     return all(
         abs(new - old) <= tolerance * new or max(old, new) < least
-        for old, new, least in zip(astuple(before), astuple(after), astuple(none), strict=True)
+        for old, new, least in zip(*(np.hstack(astuple(each)) for each in (before, after, none)), strict=True)
     )
 
 
-def _starting_spreads(options: BundleOptions, baseline: float) -> Spreads:
+def _starting_spreads(options: BundleOptions, layout: Layout, baseline: float) -> Spreads:
     start = Spreads(
         options.phi_sigma or options.phi_sigma_start,
         (options.velocity_sigma or options.velocity_sigma_start) * baseline,
         options.focal_sigma_start,
         options.centre_sigma_start,
+        (options.bend_sigma_start,) * len(set(layout.group)),
+        (options.way_sigma_start * baseline,) * len(set(layout.group[: layout.ways])),
     )
     return _bounded(start, options, baseline)
 
@@ -128,7 +154,7 @@ def _bounded(spreads: Spreads, options: BundleOptions, baseline: float) -> Sprea
     velocity = np.inf if options.velocity_sigma_most is None else options.velocity_sigma_most * baseline
     return Spreads(
         min(spreads.phi, phi), min(spreads.velocity, velocity), min(spreads.focal, _MOST_VARIED),
-        min(spreads.centre, _MOST_VARIED),
+        min(spreads.centre, _MOST_VARIED), tuple(min(each, phi) for each in spreads.bends), spreads.ways,
     )  # fmt: skip
 
 
@@ -140,7 +166,7 @@ def objective(reconstruction: Reconstruction, shutter_model: str, options: Bundl
     """
     if options.sigma_px is None:
         raise InputError("the objective needs sigma_px: half a sum of squares means nothing without the noise")
-    spreads = _starting_spreads(options, reconstruction.baseline)
+    spreads = _starting_spreads(options, Layout.of(shutter_model, options), reconstruction.baseline)
     problem = BundleProblem(reconstruction, shutter_model, options, options.sigma_px, spreads)
     return problem.cost(problem.initial_state())
 
@@ -195,7 +221,8 @@ def bundle_adjust(
     iterations = 0
     sigma = options.sigma_px or _noise_px(base, shutter_model, options.min_sigma_px)
     baseline = reconstruction.baseline
-    spreads = _starting_spreads(options, baseline)
+    layout = Layout.of(shutter_model, options)
+    spreads = _starting_spreads(options, layout, baseline)
     jackknife, factor = options.deviations == "jackknife", 1.0
     for round_ in range(options.outlier_rounds + options.spread_rounds + 1):
         cleaning = round_ < options.outlier_rounds
@@ -224,7 +251,7 @@ def bundle_adjust(
             shared = inflation(equations, problem.partitions(result.state), marginals, factor)
             factor = shared.noise
         del equations
-        before, spreads = spreads, _estimated(spreads, current, marginals.photos, options, baseline)
+        before, spreads = spreads, _estimated(spreads, current, marginals.photos, options, layout, baseline)
         revived = revive_points(current, shutter_model)
         if cleaning:
             sigma = options.sigma_px or _noise_px(current, shutter_model, options.min_sigma_px)
@@ -245,7 +272,6 @@ def bundle_adjust(
     res, valid = reprojection_residuals(current)
     rms = float(np.sqrt(np.mean(res[valid] ** 2))) if valid.any() else float("nan")
     dropped = len(reconstruction.observations) - len(current.observations)
-    nb, own = marginals.photos.shape[1], 3 * options.varying
     covariances, intrinsic_covariance = inflated(marginals, shared.photos / weighed, shared.cameras / weighed)
     return BundleResult(
         current,
@@ -257,7 +283,9 @@ def bundle_adjust(
         spreads.velocity / baseline,
         spreads.focal if options.varying else 0.0,
         spreads.centre if options.varying else 0.0,
-        covariances[:, : nb - own, : nb - own],
+        spreads.bends,
+        tuple(each / baseline for each in spreads.ways),
+        covariances[:, : layout.motion, : layout.motion],
         _sigma_intrinsics(current, options.refine, intrinsic_covariance),
         rms,
         dropped,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from .._kernels import blocks
+from .._kernels._jit import unknowns_of
 from .envelope import Envelope
 from .reduced import Reduced
 from .structure import BlockPattern
@@ -90,7 +91,7 @@ class CoarseSpace:
         E = np.empty((len(self.envelope.pattern.cols), _FUNCTIONS * nb, _FUNCTIONS * nb))
         with numba.parallel_chunksize(1):
             blocks.project_blocks(
-                (0.0,) * nb, self.turn, self.free.astype(float), self.functions, *self.entries, reduced.S, E
+                unknowns_of(nb), self.turn, self.free.astype(float), self.functions, *self.entries, reduced.S, E
             )  # fmt: skip
         diagonal = np.einsum("caa->ca", E[self.envelope.pattern.diagonal])
         E[self.envelope.pattern.diagonal] += _RIDGE * diagonal[:, :, None] * np.eye(_FUNCTIONS * nb)

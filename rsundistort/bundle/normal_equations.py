@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._kernels import schur
+from .._kernels._jit import unknowns_of
 from .elimination import Elimination, Marginals
 from .reduced import Factored, Reduced
 
@@ -125,7 +126,7 @@ class NormalEquations:
         n = len(s.point_of)
         self._J = J_frame
         self.blocks = res, J_frame
-        self._unknowns = (0.0,) * nb
+        self._unknowns = unknowns_of(nb)
         self._prior_diag = prior_diag
         self._V = np.empty((n, 3, 3))
         self._g_point = np.empty((n, 3))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from ..model import Reconstruction
+from ..model import BEND_GROUPS, Reconstruction
 from .intrinsics import GuessedCameras, check_refined
 from .lengths import KnownLength, check_lengths
 
@@ -75,6 +75,12 @@ class BundleOptions:
     varying : bool
         Whether the intrinsics of each photo may differ from its camera's: log f, as a focusing lens changes it, and the
         principal point, as a stabiliser moves it, each with a zero-mean prior whose spread is estimated.
+    bends : int
+        How many groups of `model.BEND_GROUPS` the motions may depart from steady ones by, 0 to 5, under models that are
+        exact: in their rotation, and of constant-motion by the first two groups in their position. Each group has a
+        zero-mean prior whose spread is estimated, so that what is not there vanishes.
+    bend_sigma_start, way_sigma_start : float
+        Where these estimates start: root mean square over the frame, in radians, and in baselines.
     focal_sigma_start, centre_sigma_start : float
         Where these estimates start: of log f, and of the principal point in focal lengths.
     spread_rounds : int
@@ -135,6 +141,9 @@ class BundleOptions:
     phi_sigma_most: float | None = None
     velocity_sigma_most: float | None = None
     varying: bool = False
+    bends: int = 0
+    bend_sigma_start: float = 1e-3
+    way_sigma_start: float = 1e-3
     focal_sigma_start: float = 2e-3
     centre_sigma_start: float = 3e-3
     spread_rounds: int = 12
@@ -180,6 +189,8 @@ class BundleOptions:
             "min_sigma_px",
             "phi_sigma_start",
             "velocity_sigma_start",
+            "bend_sigma_start",
+            "way_sigma_start",
             "focal_sigma_start",
             "centre_sigma_start",
             "spread_tolerance",
@@ -194,6 +205,8 @@ class BundleOptions:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise InputError(f"{name}={value!r}, expected a positive number or None")
+        if self.bends not in range(len(BEND_GROUPS) + 1):
+            raise InputError(f"bends={self.bends!r}, expected 0 to {len(BEND_GROUPS)} groups")
         if self.max_iterations < 1 or self.outlier_rounds < 0 or self.spread_rounds < 0:
             raise InputError("max_iterations must be at least 1, outlier_rounds and spread_rounds at least 0")
 
@@ -220,6 +233,10 @@ class BundleResult:
         Standard deviation of the prior on the velocity, baselines per frame; for constant-motion only.
     focal_sigma, centre_sigma : float
         Standard deviations of the variation of log f, and of the principal point in focal lengths; 0 where none varies.
+    bend_sigmas : tuple of float
+        Standard deviations of the groups of the rotations' bends, radians (root mean square over the frame).
+    way_sigmas : tuple of float
+        Those of the positions' bends, baselines.
     covariances : (m, nb, nb) array
         Covariance of each photo's unknowns, the rest being free: rotation (left, radians, camera frame), centre, phi,
         velocity, as far as the model has them (nb = 6, 9 or 12). The gauge is that of the solve: the photo with the
@@ -246,6 +263,8 @@ class BundleResult:
     velocity_sigma: float
     focal_sigma: float
     centre_sigma: float
+    bend_sigmas: tuple[float, ...]
+    way_sigmas: tuple[float, ...]
     covariances: NDArray[np.float64]
     sigma_intrinsics: tuple[dict[str, float], ...]
     rms_px: float

@@ -31,7 +31,8 @@ class Posterior:
         rec = result.reconstruction
         spreads = Spreads(
             result.phi_sigma, max(result.velocity_sigma * rec.baseline, 1e-300),
-            max(result.focal_sigma, 1e-300), max(result.centre_sigma, 1e-300),
+            max(result.focal_sigma, 1e-300), max(result.centre_sigma, 1e-300), result.bend_sigmas,
+            tuple(each * rec.baseline for each in result.way_sigmas),
         )  # fmt: skip
         plain = replace(options or BundleOptions(), loss="squared")
         self._problem = BundleProblem(rec, rec.shutter_model, plain, result.sigma_px * result.noise_factor, spreads)
@@ -42,7 +43,7 @@ class Posterior:
         inflation = np.ones_like(result.inflation) if self._partitions is None else result.inflation
         self._inflation = inflation / self._factor
         self._covariance = self._equations.covariance(self._inflation)
-        self._own = 3 * plain.varying
+        self._own = self._problem.layout.size - self._problem.layout.motion
         self._shape = rec.num_images, len(self._inflation) - self._own
 
     def of_photos(self, vectors: Array) -> Array:

@@ -14,9 +14,11 @@ from scipy.spatial.transform import Rotation
 from .._kernels import projection
 from ..errors import InputError
 from ..model import READOUTS, Camera, Reconstruction, check_shutter_model
+from ..model.bend import bend_table
 from .elimination import Elimination, Marginals
 from .intrinsics import INTRINSICS, check_lenses, deviation, moved_camera, prior_weight
 from .jackknife import Partition, by_corner, by_place
+from .layout import Layout
 from .lengths import LengthResiduals
 from .normal_equations import Border, NormalEquations, Step
 from .options import LOSSES, BundleOptions
@@ -27,7 +29,10 @@ __all__ = ["BundleProblem", "Spreads", "State", "reprojection_residuals"]
 
 @dataclass(frozen=True)
 class State:
-    """What a step changes: cameras, poses, shutter motion, variation and points, as in `Reconstruction`."""
+    """What a step changes: cameras, poses, shutter motion, variation and points, as in `Reconstruction`.
+
+    Of the bends (m, 3 k) coefficients along `Layout.functions`, of the rotation, then of the position, three by three.
+    """
 
     cameras: tuple[Camera, ...]
     R_cw: NDArray[np.float64]
@@ -35,6 +40,7 @@ class State:
     phi: NDArray[np.float64]
     velocity: NDArray[np.float64]
     variation: NDArray[np.float64]
+    bend: NDArray[np.float64]
     points_w: NDArray[np.float64]
 
 
@@ -73,9 +79,12 @@ def reprojection_residuals(
     obs = reconstruction.observations
     res = np.empty((len(obs), 2))
     valid = np.empty(len(obs), bool)
+    phi = reconstruction.phi
+    if reconstruction.bends:
+        phi = _tables(phi, reconstruction.bend, reconstruction.bend_clock, reconstruction.R_cw)
     projection.residuals(
         model, *_camera_arrays(reconstruction.camera_idx, reconstruction.cameras, reconstruction.variation),
-        reconstruction.R_cw, reconstruction.center_w, reconstruction.phi, reconstruction.velocity,
+        reconstruction.R_cw, reconstruction.center_w, phi, reconstruction.velocity,
         reconstruction.points_w, obs.frame_idx, obs.point_idx, obs.xy_raw, res, valid,
     )  # fmt: skip
     return res, valid
@@ -95,20 +104,30 @@ class Spreads:
         Of the variation of log f.
     centre : float
         Of the variation of the principal point, focal lengths.
+    bends, ways : tuple of float
+        Of the groups of bends: of the rotation, radians, and of the position, world units.
     """
 
     phi: float
     velocity: float
     focal: float = 1.0
     centre: float = 1.0
+    bends: tuple[float, ...] = ()
+    ways: tuple[float, ...] = ()
 
 
 # Observations that a thread takes at a time, and whose costs are summed together.
 _CHUNK = 1024
 
-# Unknowns of a photo: pose, phi, velocity; behind them the variation of its intrinsics, if any.
-_BLOCK = {"global": 6, "constant-motion": 12}
 _VARIATION = np.array([INTRINSICS[name] for name in ("f", "cx", "cy")], np.int64)
+
+
+def _tables(
+    phi: NDArray[np.float64], values: NDArray[np.float64], clock: NDArray[np.float64], R_cw: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Motions of photos with bends as the kernels take them: positions in the cameras' frames."""
+    in_camera = np.concatenate([values[..., :3], np.einsum("mij,mnj->mni", R_cw, values[..., 3:])], axis=2)
+    return bend_table(phi, clock[:, 0], clock[:, 1], in_camera)
 
 
 class BundleProblem:
@@ -116,9 +135,10 @@ class BundleProblem:
 
     Unknowns of a photo: rotation increment (left, radians), centre (world units), phi (radians per unit of the clock)
     unless the shutter is global, velocity (world units per unit of the clock) if the motion is whole, and the variation
-    of its intrinsics (log f, cx / fx, cy / fy) if the options say that they vary. Unknowns of a
-    camera: the intrinsics that the options name, as in `moved_camera`. Seven unknowns are held for the gauge: the pose
-    of the photo with the most observations, and one coordinate of the centre farthest from it.
+    of its intrinsics (log f, cx / fx, cy / fy) if the options say that they vary, and the coefficients of its bends, if
+    it has any (`Layout`). Unknowns of a camera: the intrinsics that the options name, as in `moved_camera`. Seven
+    unknowns are held for the gauge: the pose of the photo with the most observations, and one coordinate of the centre
+    farthest from it.
     """
 
     def __init__(
@@ -143,8 +163,12 @@ class BundleProblem:
         self._start = replace(reconstruction, points_w=reconstruction.points_w[self._points], observations=obs)
         self._shutter_model = shutter_model
         self._options = options
-        self._block = _BLOCK.get(shutter_model, 9)
-        self._full = self._block + 3 * options.varying
+        self.layout = Layout.of(shutter_model, options)
+        self._block = self.layout.motion
+        self._bend_clock = reconstruction.bend_clock
+        if not reconstruction.bends:
+            photos = range(reconstruction.num_images)
+            self._bend_clock = np.array([reconstruction.camera(i).clock_range for i in photos])
         self._structure = Structure.from_observations(
             obs.frame_idx, obs.point_idx, reconstruction.num_images, reconstruction.num_points
         )
@@ -160,7 +184,8 @@ class BundleProblem:
         weight = np.hstack([np.repeat((span / s) ** 2, 3, axis=1) for s in (spreads.phi, spreads.velocity)])
         self._motion_weight = weight[:, : self._block - 6]
         varied = np.array([spreads.focal, spreads.centre, spreads.centre])[: 3 * options.varying] ** -2.0
-        self._variation_weight = np.tile(varied, (len(span), 1))
+        of_bends = self.layout.per_bend(spreads.bends, spreads.ways) ** -2.0
+        self._own_weight = np.tile(np.concatenate([varied, of_bends]), (len(span), 1))
         self._lengths = LengthResiduals(self._start, options.lengths)
         self._known, self._known_weight = self._known_motions(span)
         self._free = self._free_unknowns()
@@ -202,7 +227,7 @@ class BundleProblem:
     def _free_unknowns(self) -> NDArray[np.bool_]:
         """(m, nb) unknowns that are solved for."""
         rec = self._start
-        free = np.ones((rec.num_images, self._full), bool)
+        free = np.ones((rec.num_images, self.layout.size), bool)
         reference = int(np.argmax(np.bincount(self._structure.frame_idx, minlength=rec.num_images)))
         offset = np.abs(rec.center_w - rec.center_w[reference])
         far, axis = np.unravel_index(np.argmax(offset), offset.shape)
@@ -217,6 +242,7 @@ class BundleProblem:
             if still == 0:
                 i = self._photo(name)
                 free[i, [6 + part for part in self._still_parts(i)]] = False
+                free[i, self.layout.variation :] = False
         return free
 
     def initial_state(self) -> State:
@@ -226,8 +252,10 @@ class BundleProblem:
         motion[:, : self._block - 6] = np.where(self._free[:, 6 : self._block], found, 0.0)
         start = self._start
         variation = start.variation if self._options.varying else np.zeros_like(start.variation)
+        bend = np.where(self._free[:, self.layout.variation :], self.layout.coefficients(start), 0.0)
         return State(
-            tuple(start.cameras), start.R_cw, start.center_w, motion[:, :3], motion[:, 3:], variation, start.points_w
+            tuple(start.cameras), start.R_cw, start.center_w, motion[:, :3], motion[:, 3:], variation, bend,
+            start.points_w,
         )  # fmt: skip
 
     def covariances(self, state: State) -> Marginals:
@@ -264,15 +292,20 @@ class BundleProblem:
             phi=state.phi,
             velocity=state.velocity,
             variation=state.variation,
+            bend=self.layout.values(state.bend),
+            bend_clock=self._bend_clock,
             points_w=points_w,
             shutter_model=self._shutter_model,
         )
 
     def _kernel_args(self, state: State) -> tuple[Any, ...]:
         s = self._structure
+        phi = state.phi
+        if self.layout.num_bends:
+            phi = _tables(phi, self.layout.values(state.bend), self._bend_clock, state.R_cw)
         return (
             self._model, *_camera_arrays(self._start.camera_idx, state.cameras, state.variation),
-            state.R_cw, state.center_w, state.phi, state.velocity, state.points_w,
+            state.R_cw, state.center_w, phi, state.velocity, state.points_w,
             s.frame_idx, s.point_idx, self._xy, self._sigma_px, LOSSES[self._options.loss], self._options.loss_scale,
         )  # fmt: skip
 
@@ -280,11 +313,15 @@ class BundleProblem:
         """(m, nb - 6) unknowns of the shutter."""
         return np.hstack([state.phi, state.velocity])[:, : self._block - 6]
 
+    def _own(self, state: State) -> NDArray[np.float64]:
+        """(m, k) unknowns behind those: variation and bends."""
+        return np.hstack([state.variation[:, : 3 * self._options.varying], state.bend])
+
     def _prior_cost(self, state: State) -> float:
         motion = self._motion(state)
         known = self._known_weight * (motion - self._known) ** 2
         lengths = float(np.sum(self._lengths.residuals(state.points_w) ** 2))
-        varied = float(np.sum(self._variation_weight * state.variation[:, : 3 * self._options.varying] ** 2))
+        varied = float(np.sum(self._own_weight * self._own(state) ** 2))
         own = float(np.sum(self._motion_weight * motion**2 + known)) + varied
         return 0.5 * (own + lengths) + self._camera_priors(state)[2]
 
@@ -304,15 +341,24 @@ class BundleProblem:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
         """Weighted residuals (o, 2), Jacobians of the photos (o, 2, nb), and the cost without priors."""
         o = len(self._xy)
-        res, J_frame = spent.blocks if spent else (np.empty((o, 2)), np.empty((o, 2, self._full)))
+        res, J_frame = spent.blocks if spent else (np.empty((o, 2)), np.empty((o, 2, self.layout.size)))
         if state is not self._clock_of:
             self._clock.fill(np.nan)
             self._clock_of = None
         cost = np.empty(-(-o // _CHUNK))
         with numba.parallel_chunksize(1):
-            projection.residual_blocks(*self._kernel_args(state), self._clock, res, J_frame, cost)
+            projection.residual_blocks(
+                *self._kernel_args(state),
+                self._clock,
+                self._block,
+                self.layout.pieces,
+                self.layout.ways,
+                res,
+                J_frame,
+                cost,
+            )
         if self._options.varying:
-            J_frame[:, :, self._block :] = self._variation_jacobians(state)
+            J_frame[:, :, self._block : self.layout.variation] = self._variation_jacobians(state)
         return res, J_frame, float(cost.sum())
 
     def _blocks(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
@@ -323,14 +369,14 @@ class BundleProblem:
     def linearize(self, state: State, spent: NormalEquations | None = None) -> NormalEquations:
         """Normal equations and cost at a state, written over those of `spent`: fresh memory takes time to get."""
         res, J_frame, cost = self._jacobians(state, spent)
-        prior_diag = np.zeros((len(state.phi), self._full))
+        prior_diag = np.zeros((len(state.phi), self.layout.size))
         prior_gradient = np.zeros_like(prior_diag)
         motion = self._motion(state)
         moving, own = np.s_[:, 6 : self._block], np.s_[:, self._block :]
         prior_diag[moving] = self._motion_weight + self._known_weight
         prior_gradient[moving] = self._motion_weight * motion + self._known_weight * (motion - self._known)
-        prior_diag[own] = self._variation_weight
-        prior_gradient[own] = self._variation_weight * state.variation[:, : 3 * self._options.varying]
+        prior_diag[own] = self._own_weight
+        prior_gradient[own] = self._own_weight * self._own(state)
         total = cost + self._prior_cost(state)
         prior = self._camera_priors(state)
         border = Border(self._camera_jacobians(state), self._start.camera_idx, prior[1] ** 2, prior[1] * prior[0])
@@ -403,18 +449,22 @@ class BundleProblem:
             state.center_w + frame[:, 3:6],
             state.phi + frame[:, 6:9] if self._block > 6 else state.phi,
             state.velocity + frame[:, 9:12] if self._block > 9 else state.velocity,
-            state.variation + frame[:, self._block :] if self._options.varying else state.variation,
+            state.variation + frame[:, self._block : self.layout.variation]
+            if self._options.varying
+            else state.variation,
+            state.bend + frame[:, self.layout.variation :],
             state.points_w + point,
         )
 
     def step_size(self, state: State, step: Step) -> float:
         """Largest change: angles in radians, lengths in sizes of the scene, intrinsics in their own units."""
         frame, point, intrinsics = step
-        own = range(self._block, self._full)
+        ways = self.layout.size - 3 * self.layout.ways
+        own = range(self._block, ways)
         angles = np.abs(frame[:, [0, 1, 2, *range(6, min(self._block, 9)), *own]]).max()
         # a far point moves a lot along its ray without moving in any photo: its depth is its own yardstick
         far = state.points_w - state.center_w.mean(0)
         depth = np.maximum(np.sqrt(np.einsum("na,na->n", far, far)), self._size)
-        ways = np.abs(frame[:, [3, 4, 5, *range(9, self._block)]]).max() / self._size
-        lengths = max(ways, float((np.abs(point) / depth[:, None]).max(initial=0)))
+        moved = np.abs(frame[:, [3, 4, 5, *range(9, self._block), *range(ways, frame.shape[1])]]).max() / self._size
+        lengths = max(moved, float((np.abs(point) / depth[:, None]).max(initial=0)))
         return float(max(angles, lengths, np.abs(intrinsics).max(initial=0.0)))

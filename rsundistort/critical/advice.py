@@ -146,6 +146,8 @@ def _with_view(
         center_w=np.concatenate([rec.center_w, center_w[None]]),
         phi=np.concatenate([rec.phi, np.zeros((1, 3))]),
         velocity=np.concatenate([rec.velocity, np.zeros((1, 3))]),
+        bend=np.concatenate([rec.bend, np.zeros((1, *rec.bend.shape[1:]))]),
+        bend_clock=np.concatenate([rec.bend_clock, rec.bend_clock[-1:]]),
         variation=np.concatenate([rec.variation, rec.variation[like][None]]),
         observations=Observations(
             np.concatenate([obs.frame_idx, np.full(len(mine), rec.num_images)]),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import FileError, FormatError, InputError
-from ..model import READOUTS, Camera, RowMotion, Solution, SolvedImage
+from ..model import READOUTS, Bend, Camera, RowMotion, Solution, SolvedImage
 from .aside import write_aside
 from .cameras import camera_from_json, camera_to_json
 
@@ -17,6 +17,8 @@ __all__ = ["FORMAT", "VERSION", "read_solution", "solution_to_bytes", "solution_
 
 FORMAT = "rsundistort-solution"
 VERSION = 1
+#: Of solutions with motions that are not steady: who reads the older one only would take them for steady ones.
+BENT_VERSION = 2
 
 
 def _plain(value: Any) -> Any:
@@ -43,6 +45,24 @@ def _imaginary_camera(motion: RowMotion, camera: Camera) -> tuple[float, float]:
     return turned.aspect, turned.skew
 
 
+def _bend_to_json(bend: Bend) -> dict[str, Any]:
+    value = {"clock": bend.clock, "rotation": bend.rotation}
+    return value | {"position": bend.position} if bend.moves else value
+
+
+def _bend_from_json(entry: dict[str, Any]) -> Bend | None:
+    value = entry.get("bend")
+    if value is None:
+        return None
+    clock = np.asarray(value["clock"], float)
+    if clock.ndim != 1 or len(clock) < 2 or not np.allclose(np.diff(clock), np.diff(clock).mean(), rtol=1e-6):
+        raise InputError(f"the bend of photo {entry['name']} is not read at even steps of the clock")
+    rotation = np.asarray(value["rotation"], float)
+    if rotation.shape != (len(clock), 3):
+        raise InputError(f"the bend of photo {entry['name']} has {len(clock)} readings and rotations {rotation.shape}")
+    return Bend(float(clock[0]), float(clock[-1]), rotation, value.get("position"))
+
+
 def solution_to_json(solution: Solution) -> dict[str, Any]:
     """The object of `solution.json`."""
     images = []
@@ -67,6 +87,8 @@ def solution_to_json(solution: Solution) -> dict[str, Any]:
         if image.motion is not None:
             entry["phi"], entry["velocity"] = image.motion.phi, image.motion.velocity
             entry["aspect"], entry["skew"] = _imaginary_camera(image.motion, solution.cameras[image.camera_id])
+            if image.motion.bend is not None:
+                entry["bend"] = _bend_to_json(image.motion.bend)
         if image.depth is not None:
             entry["depth"], entry["translation_shift_px"] = image.depth, image.translation_shift_px
         if image.reason is not None:
@@ -78,7 +100,7 @@ def solution_to_json(solution: Solution) -> dict[str, Any]:
         images.append(entry)
     value = {
         "format": FORMAT,
-        "version": VERSION,
+        "version": BENT_VERSION if any("bend" in entry for entry in images) else VERSION,
         "generator": dict(solution.generator),
         "options": dict(solution.options),
         "cameras": {k: camera_to_json(c) for k, c in solution.cameras.items()},
@@ -131,9 +153,11 @@ def read_solution(path: Path, newer: bool = False) -> Solution:
     if not isinstance(value, dict) or value.get("format") != FORMAT:
         raise FormatError(f"{path} is no solution: its format is not {FORMAT!r}")
     version = value.get("version")
-    if version != VERSION and not (newer and isinstance(version, int) and version > VERSION):
+    known = (VERSION, BENT_VERSION)
+    if version not in known and not (newer and isinstance(version, int) and version > max(known)):
         raise FormatError(
-            f"{path} has version {version!r} of the format, this program reads {VERSION}; update rsundistort"
+            f"{path} has version {version!r} of the format, this program reads {VERSION} and {BENT_VERSION}; "
+            "update rsundistort"
         )
     try:
         return _solution_from_json(value, str(path))
@@ -181,7 +205,8 @@ def _solution_from_json(value: dict[str, Any], where: str) -> Solution:
             raise InputError(f"photo {entry['name']} has camera {entry['camera_id']!r}, which is not rectified")
         motion = None
         if entry["registered"] and entry.get("phi") is not None:
-            motion = RowMotion(np.asarray(entry["phi"], float), np.asarray(entry.get("velocity") or [0, 0, 0], float))
+            velocity = np.asarray(entry.get("velocity") or [0, 0, 0], float)
+            motion = RowMotion(np.asarray(entry["phi"], float), velocity, _bend_from_json(entry))
         images.append(
             SolvedImage(
                 name=entry["name"],

@@ -1,5 +1,6 @@
 """What data looks like between the stages: frozen dataclasses of arrays."""
 
+from .bend import BEND_GROUPS, Bend
 from .camera import READOUTS, Camera
 from .depth import AtInfinity, Depth, DepthMap, Plane
 from .motion import SHUTTER_MODELS, RowMotion, check_shutter_model
@@ -7,9 +8,11 @@ from .reconstruction import Observations, Reconstruction
 from .solution import Solution, SolvedImage
 
 __all__ = [
+    "BEND_GROUPS",
     "READOUTS",
     "SHUTTER_MODELS",
     "AtInfinity",
+    "Bend",
     "Camera",
     "Depth",
     "DepthMap",

@@ -133,6 +133,14 @@ class Camera:
             return self.height / float(self.K[1, 1])
         return self.width / float(self.K[0, 0])
 
+    @property
+    def clock_range(self) -> tuple[float, float]:
+        """The clock where the reading of a frame begins and where it ends: at the borders of the photo."""
+        axis, sign = READOUTS[self.readout]
+        size, f, c = (self.width, self.height)[axis], float(self.K[axis, axis]), float(self.K[axis, 2])
+        first, last = sign * (-0.5 - c) / f, sign * (size - 0.5 - c) / f
+        return min(first, last), max(first, last)
+
     @cached_property
     def kernel_args(self) -> tuple[Any, ...]:
         """(intrinsics (4,), lens (13,) or (1, 14), axis, sign) as the kernels take them."""

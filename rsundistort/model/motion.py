@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+from .bend import Bend, bend_table
 from .checks import check_finite, frozen
 
 __all__ = ["SHUTTER_MODELS", "RowMotion", "check_shutter_model"]
@@ -33,6 +35,9 @@ class RowMotion:
         Rotation in radians per unit of r, in the camera frame (the paper's phi).
     velocity : (3,) array
         World units per unit of r (the paper's v).
+    bend : Bend, optional
+        How the motion departs from this steady one; heeded by the rotation and constant-motion models. The pose that
+        goes with it is then that of the nearest steady motion at r = 0, not the one at that moment.
 
     Examples
     --------
@@ -42,6 +47,7 @@ class RowMotion:
 
     phi: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    bend: Bend | None = None
 
     def __post_init__(self) -> None:
         for name in ("phi", "velocity"):
@@ -49,7 +55,30 @@ class RowMotion:
 
     def in_camera(self, R_cw: NDArray[np.float64]) -> RowMotion:
         """The motion with its velocity in the camera frame at the reference row, as projection takes it."""
-        return RowMotion(self.phi, np.asarray(R_cw, np.float64) @ self.velocity)
+        R = np.asarray(R_cw, np.float64)
+        bend = None if self.bend is None else self.bend.turned(np.eye(3), R)
+        return replace(self, velocity=R @ self.velocity, bend=bend)
+
+    @property
+    def moves(self) -> bool:
+        """Whether the camera travels, and does not only turn."""
+        return bool(self.velocity.any()) or (self.bend is not None and self.bend.moves)
+
+    @cached_property
+    def kernel_phi(self) -> NDArray[np.float64]:
+        """What the kernels take for phi: that, (3,), or the table of a motion with a bend."""
+        if self.bend is None:
+            return self.phi
+        return bend_table(self.phi, self.bend.start, self.bend.end, self.bend.values)
+
+    def at(self, clock: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Rotation vector and position (..., 3) against the pose when the clock shows r (...), exact models."""
+        r = np.asarray(clock, np.float64)
+        turn, way = r[..., None] * self.phi, r[..., None] * self.velocity
+        if self.bend is not None:
+            bent, moved = self.bend.at(r)
+            turn, way = turn + bent, way + moved
+        return turn, way
 
     def pose_at(
         self, clock: float, R_cw: NDArray[np.float64], center_w: NDArray[np.float64]
@@ -61,17 +90,17 @@ class RowMotion:
         clock : float
             r, as `clock_of` gives it of a pixel.
         R_cw, center_w : (3, 3), (3,) array
-            Pose at r = 0. The velocity is in the world here.
+            Pose that the motion belongs to, without a bend that at r = 0. The velocity is in the world here.
 
         Returns
         -------
         R_cw, center_w : (3, 3), (3,) array
-            Exp(r phi) R_cw, and the centre moved by r velocity.
+            Exp(r phi) R_cw, and the centre moved by r velocity, with what the bend adds.
         """
         from scipy.spatial.transform import Rotation
 
-        turn = Rotation.from_rotvec(clock * self.phi).as_matrix()
-        return turn @ np.asarray(R_cw, np.float64), np.asarray(center_w, np.float64) + clock * self.velocity
+        turn, way = self.at(clock)
+        return Rotation.from_rotvec(turn).as_matrix() @ np.asarray(R_cw, np.float64), np.asarray(center_w) + way
 
     @property
     def aspect(self) -> float:

@@ -131,7 +131,8 @@ def turn_image(image: SolvedImage, orientation: int, camera_id: str) -> SolvedIm
     motion = image.motion
     if motion is not None:
         # phi is an axial vector: a mirror reverses it
-        motion = RowMotion(hand * matrix @ motion.phi, motion.velocity)
+        bend = None if motion.bend is None else motion.bend.turned(hand * matrix)
+        motion = RowMotion(hand * matrix @ motion.phi, motion.velocity, bend)
     return replace(
         image,
         camera_id=camera_id,
@@ -224,6 +225,7 @@ def turn_reconstruction(reconstruction: Reconstruction, orientations: Mapping[st
         camera_idx=np.array([place[pair] for pair in pairs], np.int64),
         R_cw=matrix @ rec.R_cw,
         phi=np.einsum("mij,mj->mi", matrix, rec.phi),
+        bend=np.concatenate([np.einsum("mij,mnj->mni", matrix, rec.bend[..., :3]), rec.bend[..., 3:]], axis=2),
         variation=np.concatenate(
             [rec.variation[:, :1], np.einsum("mij,mj->mi", matrix[:, :2, :2], rec.variation[:, 1:])], axis=1
         ),

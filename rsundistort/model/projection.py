@@ -69,7 +69,7 @@ def project_points(
     intr, lens, axis, sign = camera.kernel_args
     xy, valid = np.empty((len(points), 2)), np.empty(len(points), bool)
     model = check_shutter_model(shutter_model)
-    kernels.project_points(model, axis, sign, intr, lens, points, motion.phi, motion.velocity, xy, valid)
+    kernels.project_points(model, axis, sign, intr, lens, points, motion.kernel_phi, motion.velocity, xy, valid)
     return xy, valid
 
 
@@ -85,7 +85,7 @@ def project_points_with_jacobians(
     J_point, J_phi, J_velocity = (np.empty((n, 2, 3)) for _ in range(3))
     model = check_shutter_model(shutter_model)
     kernels.project_jacobians(
-        model, axis, sign, intr, lens, points, motion.phi, motion.velocity, xy, J_point, J_phi, J_velocity, valid
+        model, axis, sign, intr, lens, points, motion.kernel_phi, motion.velocity, xy, J_point, J_phi, J_velocity, valid
     )
     return xy, valid, ProjectionJacobians(J_point, J_phi, J_velocity)
 
@@ -114,8 +114,8 @@ def at_depth(
     depth : (n,) array
         z of the points at the reference row.
     """
-    # when its row was read, the camera stood at r v and saw the point r v + s (x', y', 1)
-    moved = clock_of(camera, xy_raw)[:, None] * motion.velocity / depth[:, None]
+    # when its row was read, the camera stood at p(r) and saw the point p(r) + s (x', y', 1)
+    moved = motion.at(clock_of(camera, xy_raw))[1] / depth[:, None]
     return np.asarray(ideal * (1.0 - moved[:, 2:]) + moved[:, :2])
 
 
@@ -143,5 +143,7 @@ def unproject_points(
     motion = motion or RowMotion()
     intr, lens, axis, sign = camera.kernel_args
     ideal, valid = np.empty_like(xy), np.empty(len(xy), bool)
-    kernels.unproject_points(check_shutter_model(shutter_model), axis, sign, intr, lens, xy, motion.phi, ideal, valid)
+    kernels.unproject_points(
+        check_shutter_model(shutter_model), axis, sign, intr, lens, xy, motion.kernel_phi, ideal, valid
+    )
     return ideal, valid

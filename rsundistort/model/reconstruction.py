@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from .bend import Bend
 from .camera import Camera
 from .checks import check_finite, check_index, check_rotations, frozen
 from .motion import RowMotion, check_shutter_model
@@ -85,6 +86,11 @@ class Reconstruction:
     variation : (m, 3) array
         How the intrinsics of each photo differ from its camera's, where focusing or a stabiliser moved the lens: log f,
         and the principal point in focal lengths (`Camera.varied`); zero when left out.
+    bend : (m, n, 6) array
+        How the motions depart from steady ones, n readings of each: rotation and position, as of `Bend.values`; n is 0
+        when left out.
+    bend_clock : (m, 2) array
+        The clock at the first and the last of these readings.
     """
 
     cameras: Sequence[Camera]
@@ -98,6 +104,8 @@ class Reconstruction:
     velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     shutter_model: str = "global"
     variation: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    bend: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    bend_clock: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         m = len(self.image_names)
@@ -116,6 +124,9 @@ class Reconstruction:
         for name in ("phi", "velocity", "variation"):
             value = getattr(self, name)
             fields[name] = check_finite(value if np.size(value) else np.zeros((m, 3)), (m, 3), name)
+        bent = np.size(self.bend) > 0
+        fields["bend"] = check_finite(self.bend if bent else np.zeros((m, 0, 6)), (m, None, 6), "bend")
+        fields["bend_clock"] = check_finite(self.bend_clock if bent else np.zeros((m, 2)), (m, 2), "bend_clock")
         for name, value in fields.items():
             object.__setattr__(self, name, frozen(value))
         object.__setattr__(self, "cameras", tuple(self.cameras))
@@ -153,7 +164,30 @@ class Reconstruction:
 
     def motion(self, image: int) -> RowMotion:
         """The motion of a photo during its readout."""
-        return RowMotion(self.phi[image], self.velocity[image])
+        bend = None
+        if self.bends:
+            start, end = self.bend_clock[image].tolist()
+            bend = Bend(start, end, self.bend[image, :, :3], self.bend[image, :, 3:])
+        return RowMotion(self.phi[image], self.velocity[image], bend)
+
+    def with_motions(self, motions: Sequence[RowMotion]) -> Reconstruction:
+        """The same with other motions of its photos, bends of as many readings or none."""
+        bends = [each.bend for each in motions if each.bend is not None]
+        values, clock = np.zeros((len(motions), len(bends[0].values) if bends else 0, 6)), np.zeros((len(motions), 2))
+        for i, bend in enumerate(each.bend for each in motions):
+            # where there is none, any range of the clock will do
+            clock[i] = (-1.0, 1.0) if bend is None else (bend.start, bend.end)
+            if bend is not None:
+                values[i] = bend.values
+        return replace(
+            self, phi=np.array([each.phi for each in motions]), velocity=np.array([each.velocity for each in motions]),
+            bend=values, bend_clock=clock,
+        )  # fmt: skip
+
+    @property
+    def bends(self) -> bool:
+        """Whether motions depart from steady ones."""
+        return self.bend.shape[1] > 0
 
     def frame_span(self) -> NDArray[np.float64]:
         """(m,) how far each photo's clock runs over its frame: turns phi into radians per frame."""
@@ -189,6 +223,7 @@ class Reconstruction:
             center_w=scale * (self.center_w - origin) @ R0.T,
             points_w=scale * (self.points_w - origin) @ R0.T,
             velocity=scale * self.velocity @ R0.T,
+            bend=np.concatenate([self.bend[..., :3], scale * self.bend[..., 3:] @ R0.T], axis=2),
         )
 
     def track_lengths(self, keep_obs: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -232,6 +267,8 @@ class Reconstruction:
                 phi=rec.phi[keep],
                 velocity=rec.velocity[keep],
                 variation=rec.variation[keep],
+                bend=rec.bend[keep],
+                bend_clock=rec.bend_clock[keep],
                 observations=replace(obs, frame_idx=(np.cumsum(keep) - 1)[obs.frame_idx]),
             )
             rec = rec.with_points(np.ones(len(rec.observations), bool))

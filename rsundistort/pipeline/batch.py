@@ -136,7 +136,7 @@ def _is_of(solution: Path, target: Place) -> bool:
 
 def _points_beside(solution: Path, solved: Solution, depth: str | Path) -> ScenePoints | None:
     """The points of the COLMAP model that a run wrote beside its solution, where a camera moved."""
-    moves = any(image.posed and image.motion is not None and image.motion.velocity.any() for image in solved.images)
+    moves = any(image.posed and image.motion is not None and image.motion.moves for image in solved.images)
     if solved.shutter_model != "constant-motion" or not moves or str(depth) == "infinity":
         return None
     folder = solution.parent / "sparse"

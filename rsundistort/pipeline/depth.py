@@ -249,7 +249,7 @@ class PhotoDepths:
         motion = image.taken_out or RowMotion()
         camera = self._solution.cameras[image.camera_id]
         new_camera = self._solution.rectified_cameras[image.camera_id]
-        if name not in self._moving or not motion.velocity.any():
+        if name not in self._moving or not motion.moves:
             return DepthJob(name, motion, None, None, camera, new_camera, "infinity")
         points_w = None
         if self._points is not None:

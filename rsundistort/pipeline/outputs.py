@@ -152,12 +152,7 @@ class Outputs:
         if options.apply_orientation:
             turns = {name: turn_of(orientations.get(name, 1), True)[0] for name in rec.image_names}
         ids = replace(ids or ModelIds.in_order(rec), cameras=outcome.camera_ids)
-        taken_out = [solution.image(name).taken_out or RowMotion() for name in rec.image_names]
-        rec = replace(
-            rec,
-            phi=np.array([each.phi for each in taken_out]),
-            velocity=np.array([each.velocity for each in taken_out]),
-        )
+        rec = rec.with_motions([solution.image(name).taken_out or RowMotion() for name in rec.image_names])
         return cls(solution, rec, options, ids, turns, rgb, with_photos, times or {}, outcome.solved)
 
     def begin(self, folder: Path, log: StageLog) -> Solution:

@@ -138,7 +138,7 @@ def _map_of(name: str) -> str:
 
 def _truth(recipe: Recipe, points: TruePoints) -> Solution:
     """The ground truth in the format of a solution; no times and dates, which would change its bytes."""
-    moves = any(view.motion.velocity.any() for view in recipe.views)
+    moves = any(view.motion.moves for view in recipe.views)
     counts = np.bincount(points.frame_idx, minlength=len(recipe.views))
     images = tuple(
         SolvedImage(

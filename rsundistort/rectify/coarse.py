@@ -62,7 +62,7 @@ class CoarseGrid:
         # float32 rounds besides
         band = self.error_px + 1e-3
         unseen: int = kernels.interpolate_map(
-            check_shutter_model(self.shutter_model), axis, sign, intr, lens, self.motion.phi, self.rays,
+            check_shutter_model(self.shutter_model), axis, sign, intr, lens, self.motion.kernel_phi, self.rays,
             self.nodes_x, self.nodes_y, self.smooth, self.spacing, band, EDGE_PX, camera.width, camera.height, row0,
             map_x, map_y, seen,
         )  # fmt: skip
@@ -89,7 +89,7 @@ def coarse_grid(
     def at_nodes(rows: int, cols: int, spacing: int, offset: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         step = np.array([[spacing, 0, offset], [0, spacing, offset], [0, 0, 1.0]])
         x, y = np.empty((rows, cols)), np.empty((rows, cols))
-        kernels.fill_map(model, axis, sign, intr, lens, motion.phi, rays @ step, 0, 0, x, y)
+        kernels.fill_map(model, axis, sign, intr, lens, motion.kernel_phi, rays @ step, 0, 0, x, y)
         return x, y
 
     for spacing in _SPACINGS:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .._kernels import depth as kernels
 from ..errors import InputError
-from ..model import AtInfinity, Camera, Depth, DepthMap, Plane, RowMotion
+from ..model import READOUTS, AtInfinity, Camera, Depth, DepthMap, Plane, RowMotion
 from ..model.projection import clock_of
 
 __all__ = ["DepthRows", "inverse_depth_at", "stretch"]
@@ -68,7 +68,7 @@ class DepthRows:
 
     def matters(self, shutter_model: str) -> bool:
         """Whether the photo looks otherwise than at infinity."""
-        moves = shutter_model == "constant-motion" and bool(self.motion.velocity.any())
+        moves = shutter_model == "constant-motion" and self.motion.moves
         return moves and not isinstance(self.depth, AtInfinity)
 
     def inverse(self, row0: int, shape: tuple[int, ...]) -> NDArray[np.float32]:
@@ -86,16 +86,17 @@ class DepthRows:
     def mark_hidden(self, row0: int, map_x: NDArray[np.float32], map_y: NDArray[np.float32]) -> None:
         """Point the rows of a grid far outside where something nearer hid what they should show."""
         if isinstance(self.depth, DepthMap):
-            intr, _, axis, sign = self.camera.kernel_args
             kernels.mark_hidden(
-                self.depth.inverse, stretch(self.depth), float(self.depth.inverse.max()), self._slopes, self._epipole,
-                axis, sign, intr, row0, map_x, map_y,
+                self.depth.inverse, stretch(self.depth), float(self.depth.inverse.max()), self._slopes, self._epipoles,
+                READOUTS[self.camera.readout][0], row0, map_x, map_y,
             )  # fmt: skip
 
     @cached_property
-    def _epipole(self) -> NDArray[np.float64]:
-        """(3,) the velocity in homogeneous pixels of the rectified photo."""
-        return np.asarray(np.linalg.solve(self.rays, self.motion.velocity), np.float64)
+    def _epipoles(self) -> NDArray[np.float64]:
+        """(lines, 3) where the camera was when it read each line, in homogeneous pixels of the rectified photo."""
+        lines = np.arange((self.camera.width, self.camera.height)[READOUTS[self.camera.readout][0]], dtype=np.float64)
+        way = self.motion.at(clock_of(self.camera, np.stack([lines, lines], axis=1)))[1]
+        return np.ascontiguousarray(np.linalg.solve(self.rays, way.T).T)
 
     @cached_property
     def _slopes(self) -> NDArray[np.float32]:
@@ -116,8 +117,7 @@ class DepthRows:
         ]
         tiles = np.maximum.reduceat(np.maximum.reduceat(slope, edges[0], axis=0), edges[1], axis=1)
         width, height = self.size
-        e = np.abs(self._epipole)
-        clock = np.abs(clock_of(self.camera, np.array([[0, 0], [self.camera.width, self.camera.height]]))).max()
-        reach_px = clock * field.max() * max(e[0] + e[2] * width, e[1] + e[2] * height)
+        e = np.abs(self._epipoles).max(0)
+        reach_px = field.max() * max(e[0] + e[2] * width, e[1] + e[2] * height)
         reach = min(int(np.ceil(reach_px / kernels.TILE_PX)) + 1, max(tiles.shape))
         return np.ascontiguousarray(maximum_filter(tiles, 2 * reach + 1, mode="nearest"))

@@ -43,11 +43,11 @@ def fill_rows(
     if depth is not None and depth.matters(shutter_model):
         inverse = depth.inverse(row0, map_x.shape)
         kernels.fill_map_at_depth(
-            axis, sign, intr, lens, motion.phi, motion.velocity, rays, inverse, row0, 0, map_x, map_y
+            axis, sign, intr, lens, motion.kernel_phi, motion.velocity, rays, inverse, row0, 0, map_x, map_y
         )
         depth.mark_hidden(row0, map_x, map_y)
         return
-    kernels.fill_map(model, axis, sign, intr, lens, motion.phi, rays, row0, 0, map_x, map_y)
+    kernels.fill_map(model, axis, sign, intr, lens, motion.kernel_phi, rays, row0, 0, map_x, map_y)
 
 
 def seen_by(map_x: NDArray[np.float32], map_y: NDArray[np.float32], width: int, height: int) -> NDArray[np.uint8]:

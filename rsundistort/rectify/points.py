@@ -66,11 +66,11 @@ def _rectified(
     with np.errstate(invalid="ignore"):
         q[~(q[:, 2] > 0)] = np.nan
     xy_rect = q[:, :2] / q[:, 2:]
-    if shutter_model != "constant-motion" or not motion.velocity.any() or isinstance(depth, AtInfinity):
+    if shutter_model != "constant-motion" or not motion.moves or isinstance(depth, AtInfinity):
         return xy_rect
     # Where the camera had got to when it read the row, in homogeneous pixels; what the raw pixel shows lies on the line
     # from there, which starts at infinity where the rotation alone takes the pixel.
-    moved = clock_of(camera, xy)[:, None] * np.linalg.solve(rays, motion.velocity)
+    moved = np.linalg.solve(rays, motion.at(clock_of(camera, xy))[1].T).T
 
     def on_line(inverse: NDArray[np.float64]) -> NDArray[np.float64]:
         w = inverse[:, None]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ..errors import FileError, FormatError
 from ..io import output_name, read_solution
-from ..io.solution import VERSION
+from ..io.solution import BENT_VERSION
 from ..model import Solution
 from .diagnostics import Diagnostics, read_diagnostics
 
@@ -96,7 +96,9 @@ def _solution(path: Path) -> tuple[Solution, list[str]]:
             solution = read_solution(path, newer=True)
         except FormatError:
             raise refused from None
-        text = f"solution.json is of a newer version of its format than {VERSION}, which this program reads: what is "
+        text = (
+            f"solution.json is of a newer version of its format than {BENT_VERSION}, which this program reads: what is "
+        )
         return solution, [f"{text}shown may be incomplete, or mean something else; update rsundistort."]
 
 

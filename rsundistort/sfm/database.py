@@ -232,7 +232,8 @@ def from_pycolmap(model: Any, matched: MatchedPhotos, posed: Reconstruction | No
         of = [index_of[name] for name in names]
         return Reconstruction(
             posed.cameras, names, posed.camera_idx[of], posed.R_cw[of], posed.center_w[of], points_w, observations,
-            posed.phi[of], posed.velocity[of], posed.shutter_model, posed.variation[of],
+            posed.phi[of], posed.velocity[of], posed.shutter_model, posed.variation[of], posed.bend[of],
+            posed.bend_clock[of],
         )  # fmt: skip
     poses = np.array([model.images[i].cam_from_world().matrix() for i in ids])
     R_cw = poses[:, :, :3]
