@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..model import READOUTS, Observations, Reconstruction
+from ..model import READOUTS, SHUTTER_MODELS, Observations, Reconstruction
+from ..model.bend import splines_at
 from .adjust import LADDER, bundle_adjust, objective
 from .options import BundleOptions
 from .problem import Spreads, reprojection_residuals
@@ -32,7 +33,9 @@ _MIN_FALL = 0.02
 _MOST_OF_IT = 0.5
 # What a photo's residuals have in common is sought among polynomials of this degree in x and y, whatever bent it.
 _DEGREE = 3
-# Measurements for each coefficient of such a polynomial, at least.
+# And, of what a motion that is not steady leaves, among splines of so many values along the readout.
+_WAVES = 17
+# Measurements for each coefficient of these, at least.
 _PER_COEFFICIENT = 3
 # Two halves of a scene must tell the same motions: what they have in common is more than what they differ by. (Warped
 # photos: 0.98 and more; a camera without rolling shutter: 0.1 to 0.5.)
@@ -47,6 +50,8 @@ _MOST_STEPS = 15
 _OTHER_AXIS = ("top-to-bottom", "left-to-right")
 
 _VARYING = ", varying lens"
+# Motions that are not steady, by the groups of bends that they take.
+_BENDS = {0: "", 2: ", bent", 5: ", vibrating"}
 
 
 @dataclass(frozen=True)
@@ -61,6 +66,8 @@ class ModelChoice:
         Its key in what follows.
     varying : bool
         Whether the intrinsics vary from photo to photo, as `BundleOptions.varying`.
+    bends : int
+        How the motions depart from steady ones, as `BundleOptions.bends`.
     shutter : {"found", "not-found", "not-determined"}
         Whether there is a rolling shutter: "not-determined" if something bends the photos that a model of the shutter
         explains in part, or no better than one that is read along the other axis.
@@ -88,6 +95,7 @@ class ModelChoice:
     shutter_model: str
     label: str
     varying: bool
+    bends: int
     shutter: str
     held_out_error: dict[str, float]
     held_out_rms_px: dict[str, float]
@@ -169,16 +177,29 @@ def _warps(rec: Reconstruction, measured: Observations) -> NDArray[np.float64]:
     return np.stack([x[:, i] * y[:, j] for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)], axis=1)
 
 
+def _waves(rec: Reconstruction, measured: Observations) -> NDArray[np.float64]:
+    """(n, k) splines along the readout, at the line of each measurement."""
+    camera = [rec.camera(i) for i in range(rec.num_images)]
+    axis = np.array([READOUTS[each.readout][0] for each in camera])[measured.frame_idx]
+    lines = np.array([(each.width, each.height) for each in camera])[measured.frame_idx, axis]
+    place = (measured.xy_raw[np.arange(len(measured)), axis] + 0.5) / lines
+    return splines_at(_WAVES, np.clip(place, 0.0, 1.0))
+
+
 def errors_without_warp(
-    rec: Reconstruction, fitted: Observations, measured: Observations, sigma_px: float
+    rec: Reconstruction,
+    fitted: Observations,
+    measured: Observations,
+    sigma_px: float,
+    functions: Callable[[Reconstruction, Observations], NDArray[np.float64]] = _warps,
 ) -> NDArray[np.float64]:
     """As `clipped_errors`, once a smooth warp of each photo, fitted to other measurements, is taken out.
 
     What it takes away is what the model left, whatever it is: lens, focus, motion. What stays is noise, and matches
-    that are wrong.
+    that are wrong. The warp is a sum of `functions` (n, k) of the measurements' places, in x and in y.
     """
     (res, valid), (rest, seen) = (reprojection_residuals(replace(rec, observations=obs)) for obs in (fitted, measured))
-    of_fitted, of_measured = _warps(rec, fitted), _warps(rec, measured)
+    of_fitted, of_measured = functions(rec, fitted), functions(rec, measured)
     rest = np.array(rest)
     for mine, others in zip(fitted.by_photo(rec.num_images), measured.by_photo(rec.num_images), strict=True):
         mine = mine[valid[mine]]
@@ -203,6 +224,7 @@ class _Fit:
     label: str
     model: str
     varying: bool
+    bends: int
     reconstruction: Reconstruction
     errors: NDArray[np.float64]
     rms_px: float
@@ -228,19 +250,28 @@ def half_across_readout(reconstruction: Reconstruction) -> NDArray[np.bool_]:
 
 
 def moved_px(reconstruction: Reconstruction) -> NDArray[np.float64]:
-    """(m,) about how far each photo's motion moves pixels half a frame from the principal row."""
+    """(m,) about how far each photo's motion moves pixels within half a frame from the principal row."""
     rec = reconstruction
     depth = np.linalg.norm(np.median(rec.points_w, axis=0) - rec.center_w, axis=1)
     angle = np.linalg.norm(rec.phi, axis=1) + np.linalg.norm(rec.velocity, axis=1) / depth
     focal = np.array([rec.camera(i).K[0, 0] for i in range(rec.num_images)])
-    return np.asarray(focal * angle * rec.frame_span() / 2)
+    bent = np.abs(rec.bend).max(1, initial=0.0)
+    bent = np.linalg.norm(bent[:, :3], axis=1) + np.linalg.norm(bent[:, 3:], axis=1) / depth
+    return np.asarray(focal * (angle * rec.frame_span() / 2 + bent))
 
 
 def read_along_other_axis(reconstruction: Reconstruction) -> Reconstruction:
     """The same photos as if all cameras were read along the other axis; without motion."""
     cameras = [replace(each, readout=_OTHER_AXIS[READOUTS[each.readout][0]]) for each in reconstruction.cameras]
     still = np.zeros_like(reconstruction.phi)
-    return replace(reconstruction, cameras=cameras, phi=still, velocity=still)
+    return replace(reconstruction, cameras=cameras, phi=still, velocity=still, bend=np.zeros(0))
+
+
+def _turns(rec: Reconstruction) -> NDArray[np.float64]:
+    """(m, k, 3) how each photo's camera is turned at some lines, radians."""
+    motions = [rec.motion(i) for i in range(rec.num_images)]
+    ranges = [rec.camera(i).clock_range for i in range(rec.num_images)]
+    return np.stack([each.at(np.linspace(*of, _WAVES))[0] for each, of in zip(motions, ranges, strict=True)])
 
 
 class _Fits:
@@ -267,13 +298,15 @@ class _Fits:
         self._progress = progress
         self.done: dict[str, _Fit] = {}
 
-    def fit(self, model: str, varying: bool, starts: Sequence[Reconstruction], label: str | None = None) -> _Fit:
+    def fit(
+        self, model: str, varying: bool, starts: Sequence[Reconstruction], label: str | None = None, bends: int = 0
+    ) -> _Fit:
         """Fit a model from the cheapest of some starts."""
-        label = label or model + _VARYING * varying
+        label = label or model + _BENDS[bends] + _VARYING * varying
         if label in self.done:
             return self.done[label]
         step = None if self._progress is None else partial(self._progress, label)
-        options = replace(self._rough, varying=varying)
+        options = replace(self._rough, varying=varying, bends=bends)
         # the motions given belong to the poses and the lens given: with those of another model they fit nothing. One
         # that starts at the cheaper of the two never ends above the simpler one, which it holds as a case
         cost = [objective(start, model, options) for start in starts]
@@ -282,28 +315,35 @@ class _Fits:
         errors, rms_px = clipped_errors(found, self.held_out, self._sigma_px)
         smooth = errors_without_warp(found, self.given.observations, self.held_out, self._sigma_px)
         left = max(float(errors.mean() - smooth.mean()), 0.0) if len(errors) else 0.0
-        self.done[label] = _Fit(label, model, varying, found, errors, rms_px, left, spreads)
+        self.done[label] = _Fit(label, model, varying, bends, found, errors, rms_px, left, spreads)
         return self.done[label]
 
     def agreement(self, fit: _Fit) -> float:
-        """Correlation over photos and axes of the motions (phi) that two halves of the scene tell, each fitted alone.
+        """Correlation over photos, axes and lines of the turns that two halves of the scene tell, each fitted alone.
 
         Halves across the readout, so that both see all of it. What a lens leaves bends them differently; only about
         their means, which a lens can share.
         """
         rec = fit.reconstruction
-        options = replace(self._rough, varying=fit.varying, phi_sigma=fit.spreads.phi)
+        options = replace(self._rough, varying=fit.varying, bends=fit.bends, phi_sigma=fit.spreads.phi)
         options = replace(options, velocity_sigma=fit.spreads.velocity or None)
         first = half_across_readout(rec)
         try:
             halves = [bundle_adjust(rec.take_points(half), fit.model, options) for half in (first, ~first)]
         except InputError:  # one without measurements
             return 0.0
-        span = rec.frame_span()[:, None]
-        one, other = ((each.reconstruction.phi * span) for each in halves)
+        one, other = (_turns(each.reconstruction) for each in halves)
         one, other = one - one.mean(0), other - other.mean(0)
         scale = float(np.sqrt((one**2).sum() * (other**2).sum()))
         return float((one * other).sum() / scale) if scale > 0 else 0.0
+
+    def waves(self, fit: _Fit) -> float:
+        """By how much the held-out error would fall if each photo's lines moved as they liked."""
+        if not len(self.held_out):
+            return 0.0
+        seen = self.given.observations
+        free = errors_without_warp(fit.reconstruction, seen, self.held_out, self._sigma_px, _waves)
+        return float(fit.errors.mean() - free.mean())
 
     def at_limit(self, fit: _Fit) -> bool:
         """Whether the motions would be larger than what is known from elsewhere allows."""
@@ -324,6 +364,34 @@ class _Fits:
         return self.gain(before, after) > _MIN_GAIN and fall > _MIN_FALL * float(before.errors.mean())
 
 
+def _unsteady(
+    fits: _Fits,
+    best: _Fit,
+    rungs: Sequence[str],
+    varying: bool,
+    kept: list[str],
+    gain: dict[str, float],
+    against: list[str],
+) -> _Fit:
+    """The best fit yet, or one whose motions are not steady, where the lines of the photos move as these would."""
+    exact = [model for model in rungs if SHUTTER_MODELS[model] >= SHUTTER_MODELS["rotation"]]
+    for model in exact[exact.index(best.model) :] if best.model in exact else exact:
+        last = fits.fit(model, varying, [best.reconstruction, fits.given])
+        for bends in (2, 5):
+            if not fits.waves(last) > _MIN_FALL * float(last.errors.mean()):
+                break
+            last = fits.fit(model, varying, [last.reconstruction], bends=bends)
+            gain[last.label] = fits.gain(best, last)
+            if not fits.is_better(best, last):
+                continue
+            if float((best.errors - last.errors).mean()) > last.left:
+                best = last
+                kept.append(last.label)
+            else:
+                against.append(f"{last.label} takes away less of what bends the photos than it leaves")
+    return best
+
+
 def choose_model(
     reconstruction: Reconstruction,
     rungs: Sequence[str] = LADDER,
@@ -336,10 +404,11 @@ def choose_model(
     """Fit models to nine tenths of the measurements, and keep those that foretell the rest better.
 
     First a lens that varies from photo to photo, then the models of the shutter in order, so that these explain what no
-    lens does. Better means: the mean held-out error falls by more than two standard errors, measurements in the same
-    part of the same photo counted once, and by more than two hundredths. A model of the shutter must also take away
-    more than a smooth warp of each photo would yet, be better than itself read along the other axis (what bends photos
-    for another reason can be taken for either), and two halves of the scene must tell the same motions.
+    lens does; then motions that are not steady, where the lines of the photos would yet move so. Better means: the mean
+    held-out error falls by more than two standard errors, measurements in the same part of the same photo counted once,
+    and by more than two hundredths. A model of the shutter must also take away more than a smooth warp of each photo
+    would yet, be better than itself read along the other axis (what bends photos for another reason can be taken for
+    either), and two halves of the scene must tell the same motions.
 
     Parameters
     ----------
@@ -387,6 +456,7 @@ def choose_model(
             kept.append(last.label)
         else:
             against.append(f"{model} takes away less of what bends the photos than it leaves")
+    best = _unsteady(fits, best, rungs, varying, kept, gain, against)
     agreement = None
     if best is not plain:
         against = []
@@ -395,7 +465,7 @@ def choose_model(
     if best is not plain:
         other = read_along_other_axis(plain.reconstruction)
         label = f"{best.label}, read along the other axis"
-        gain[label] = fits.gain(best, fits.fit(best.model, best.varying, [other], label))
+        gain[label] = fits.gain(best, fits.fit(best.model, best.varying, [other], label, best.bends))
         if not fits.is_better(fits.done[label], best):
             against.append("a shutter that reads along the other axis explains the photos as well")
         agreement = fits.agreement(best)
@@ -407,7 +477,9 @@ def choose_model(
             best = plain
         elif plain.varying:
             # whether the lens varies beside the shutter
-            shared, vary = (fits.fit(best.model, each, [best.reconstruction, given]) for each in (False, True))
+            shared, vary = (
+                fits.fit(best.model, each, [best.reconstruction, given], bends=best.bends) for each in (False, True)
+            )
             gain[vary.label] = fits.gain(shared, vary)
             best = vary if fits.is_better(shared, vary) else shared
             kept += [best.label] * (best.label not in kept)
@@ -420,6 +492,7 @@ def choose_model(
         best.model,
         best.label,
         best.varying,
+        best.bends,
         shutter,
         {label: float(fit.errors.mean()) if len(fit.errors) else float("nan") for label, fit in fits.done.items()},
         {label: fit.rms_px for label, fit in fits.done.items()},

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from .checks import check_finite, frozen
 
-__all__ = ["BEND_GROUPS", "Bend", "bend_functions", "bend_pieces", "bend_table"]
+__all__ = ["BEND_GROUPS", "Bend", "bend_functions", "bend_pieces", "bend_table", "splines_at"]
 
 Array = NDArray[np.float64]
 
@@ -107,6 +107,11 @@ def _values_at(values: Array, place: Array) -> Array:
     pieces = (bend_pieces(last + 1) @ values.reshape(last + 1, -1)).reshape(last, 4, -1)[at]
     powers = np.stack([np.ones_like(u), u + beyond, u * (u + 2 * beyond), u * u * (u + 3 * beyond)], axis=1)
     return np.einsum("pk,pkc->pc", powers, pieces).reshape(len(place), *values.shape[1:])
+
+
+def splines_at(num_sites: int, place: Array) -> Array:
+    """(p, n) splines through one value each of n even sites, at places (p,) in the frame, 0 to 1."""
+    return _values_at(np.eye(num_sites), np.asarray(place, np.float64) * (num_sites - 1))
 
 
 @dataclass(frozen=True)

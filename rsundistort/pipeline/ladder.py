@@ -280,16 +280,17 @@ def solve_tracks(
             result.reconstruction, LADDER, options, sigma_px=result.sigma_px, seed=seed,
             progress=lambda model, _: log.tell(f"choice: {model}", 0),
         )  # fmt: skip
-        if choice.shutter_model != shutter_model or choice.varying:
-            options = replace(options, varying=choice.varying)
+        if choice.shutter_model != shutter_model or choice.varying or choice.bends:
+            options = replace(options, varying=choice.varying, bends=choice.bends)
             start = replace(tracks, shutter_model=choice.shutter_model)
             result = bundle_adjust(start, choice.shutter_model, options, partial(_tell, log, "choice"))
         log.end(
-            "choice of the model", chosen=choice.shutter_model, varying_lens=choice.varying, shutter=choice.shutter,
+            "choice of the model", chosen=choice.shutter_model, varying_lens=choice.varying, bends=choice.bends,
+            shutter=choice.shutter,
             agreement=choice.agreement, gain=choice.gain, num_held_out=choice.num_held_out,
         )  # fmt: skip
         aligns = feedback is not None and feedback.workers is not None
-        if feedback is not None and aligns and choice.shutter_model == "constant-motion":
+        if feedback is not None and aligns and (choice.shutter_model == "constant-motion" or choice.bends):
             # the windows were aligned, and their outliers told, as a model saw them that is given up
             result, tracks, options = _fed_back(feedback, result, options, log, ["alignment again"])
     mended, advice = None, []
