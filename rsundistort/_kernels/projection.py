@@ -1009,10 +1009,11 @@ def _lens_jacobian(model, axis, sign, lens, x, y, z, phi, vel, xd, yd, d):
 @parallel_kernel()
 def intrinsic_blocks(
     model, camera_of_frame, axes, signs, intrs, lenses, R_cw, center_w, phi, vel_w, points_w,
-    frame_idx, point_idx, xy_raw, sigma_px, loss_kind, loss_scale, unknowns, J_camera,
+    frame_idx, point_idx, xy_raw, sigma_px, loss_kind, loss_scale, clock, unknowns, J_camera,
 ):  # fmt: skip
     """Jacobians (o, 2, nc) by the intrinsics of each observation's camera, weighted as in `residual_blocks`.
 
+    `clock` is as there.
     `unknowns` (nc,) are codes: 0 log f (both), 1 log fx, 2 log fy, 3 cx / fx, 4 cy / fy, 5 to 10 k1 k2 p1 p2 k3 k4.
     """
     o = len(frame_idx)
@@ -1027,7 +1028,7 @@ def intrinsic_blocks(
             axis, sign, lens = axes[c], signs[c], lenses[c]
             J_camera[k] = 0.0
             x, y, z = _camera_frame(R_cw[f], center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
-            row = _measured_row(axis, sign, intrs[c], xy_raw[k])
+            row = clock[k] if clock[k] == clock[k] else _measured_row(axis, sign, intrs[c], xy_raw[k])
             if not _project(model, axis, sign, lens, x, y, z, phi[f], vel_c, row, out, False):
                 continue
             xd, yd = out[0], out[1]

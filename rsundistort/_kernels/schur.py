@@ -263,7 +263,11 @@ def border_rows(
     """
     nb, nc = J.shape[2], J_camera.shape[2]
     for f in prange(len(B)):
-        left = np.empty((2, nb + nc))
+        left, u, e = np.empty((2, nb + nc)), np.empty((2, 3)), np.empty(2)  # u = J_p V^-1
+        # of one measurement, M J_camera summed over its track, by cameras; and which cameras that has
+        right = np.zeros((2, B.shape[2]))
+        cameras = np.empty(B.shape[2], np.int64)
+        met = np.zeros(B.shape[2], np.bool_)
         B[f] = 0.0
         rhs[f] = 0.0
         for s in range(frame_start[f], frame_start[f + 1]):
@@ -273,17 +277,22 @@ def border_rows(
             g = g_point[point_of[t]]
             left[:, :nb] = J[k]
             left[:, nb:] = J_camera[k]
-            u = np.zeros((2, 3))  # J_p V^-1
-            e = np.zeros(2)
             for i in range(2):
+                e[i] = 0.0
                 for b in range(3):
+                    u[i, b] = 0.0
                     for a in range(3):
                         u[i, b] -= J[k, i, 3 + a] * V[a, b]
                     e[i] += u[i, b] * g[b]
             for a in range(nc):
                 rhs[f, a] -= J_camera[k, 0, a] * e[0] + J_camera[k, 1, a] * e[1]
+            num = 0
             for n in range(track_start[t], track_start[t + 1]):
                 at = camera_of_frame[frame_idx[n]] * nc
+                if not met[at]:
+                    met[at] = True
+                    cameras[num] = at
+                    num += 1
                 # J_p,n is minus J's columns of the centre: the sign of M turns
                 m00 = u[0, 0] * J[n, 0, 3] + u[0, 1] * J[n, 0, 4] + u[0, 2] * J[n, 0, 5]
                 m01 = u[0, 0] * J[n, 1, 3] + u[0, 1] * J[n, 1, 4] + u[0, 2] * J[n, 1, 5]
@@ -292,11 +301,18 @@ def border_rows(
                 if n == k:
                     m00 += 1.0
                     m11 += 1.0
+                for b in range(nc):
+                    c0, c1 = J_camera[n, 0, b], J_camera[n, 1, b]
+                    right[0, at + b] += m00 * c0 + m01 * c1
+                    right[1, at + b] += m10 * c0 + m11 * c1
+            for i in range(num):
+                at = cameras[i]
+                met[at] = False
                 for a in range(nb + nc):
-                    l0 = left[0, a] * m00 + left[1, a] * m10
-                    l1 = left[0, a] * m01 + left[1, a] * m11
-                    for b in range(nc):
-                        B[f, a, at + b] += l0 * J_camera[n, 0, b] + l1 * J_camera[n, 1, b]
+                    l0, l1 = left[0, a], left[1, a]
+                    for b in range(at, at + nc):
+                        B[f, a, b] += l0 * right[0, b] + l1 * right[1, b]
+                right[:, at : at + nc] = 0.0
 
 
 @parallel_kernel(fastmath=SUMS)

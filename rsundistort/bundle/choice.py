@@ -37,6 +37,8 @@ _DEGREE = 3
 _WAVES = 17
 # Measurements for each coefficient of these, at least.
 _PER_COEFFICIENT = 3
+# Share of their squares that keeps coefficients finite that no measurement tells.
+_RIDGE = 1e-6
 # Two halves of a scene must tell the same motions: what they have in common is more than what they differ by. (Warped
 # photos: 0.98 and more; a camera without rolling shutter: 0.1 to 0.5.)
 _MIN_AGREEMENT = 0.5
@@ -211,7 +213,8 @@ def errors_without_warp(
         for _ in range(4):  # reweighted, so that wrong matches count little
             square = (((res[mine] - A @ found) / noise) ** 2).sum(1, keepdims=True)
             weight = 1.0 / noise / np.sqrt(1.0 + square / _CLIP**2)
-            found = np.linalg.lstsq(A * weight, res[mine] * weight, rcond=None)[0]
+            weighed = A * weight**2
+            found = np.linalg.solve(A.T @ weighed + _RIDGE * np.diag((A * weighed).sum(0)), weighed.T @ res[mine])
         rest[others] -= B @ found
     square = np.where(seen, (rest**2).sum(1) / (sigma_px * measured.sigma) ** 2, np.inf)
     return np.asarray(np.minimum(square, 2 * _CLIP**2) / 2)
@@ -364,32 +367,37 @@ class _Fits:
         return self.gain(before, after) > _MIN_GAIN and fall > _MIN_FALL * float(before.errors.mean())
 
 
-def _unsteady(
-    fits: _Fits,
-    best: _Fit,
-    rungs: Sequence[str],
-    varying: bool,
-    kept: list[str],
-    gain: dict[str, float],
-    against: list[str],
-) -> _Fit:
-    """The best fit yet, or one whose motions are not steady, where the lines of the photos move as these would."""
-    exact = [model for model in rungs if SHUTTER_MODELS[model] >= SHUTTER_MODELS["rotation"]]
-    for model in exact[exact.index(best.model) :] if best.model in exact else exact:
-        last = fits.fit(model, varying, [best.reconstruction, fits.given])
-        for bends in (2, 5):
-            if not fits.waves(last) > _MIN_FALL * float(last.errors.mean()):
-                break
-            last = fits.fit(model, varying, [last.reconstruction], bends=bends)
-            gain[last.label] = fits.gain(best, last)
-            if not fits.is_better(best, last):
+class _Rungs:
+    """The best fit yet: what was kept on the way to it, and what spoke against others."""
+
+    def __init__(self, fits: _Fits, best: _Fit, kept: list[str], gain: dict[str, float]) -> None:
+        self._fits = fits
+        self.best, self.kept, self.gain = best, kept, gain
+        self.against: list[str] = []
+
+    def climb(self, fit: _Fit) -> None:
+        """Take a fit that is better, if it takes away more than a smooth warp of each photo would yet."""
+        fits, best = self._fits, self.best
+        self.gain[fit.label] = fits.gain(best, fit)
+        # where the two do as well, the exact model of a turn is taken, not its approximation
+        exact = best.model == "two-step" and fit.label == "rotation" and not fits.is_better(fit, best)
+        if not exact and not fits.is_better(best, fit):
+            return
+        if exact or float((best.errors - fit.errors).mean()) > fit.left:
+            self.best = fit
+            self.kept.append(fit.label)
+        else:
+            self.against.append(f"{fit.label} takes away less of what bends the photos than it leaves")
+
+    def bend(self, fit: _Fit) -> None:
+        """Try motions that are not steady beyond a fit, while the lines of the photos would yet move so."""
+        for bends in _BENDS:
+            if bends <= fit.bends:
                 continue
-            if float((best.errors - last.errors).mean()) > last.left:
-                best = last
-                kept.append(last.label)
-            else:
-                against.append(f"{last.label} takes away less of what bends the photos than it leaves")
-    return best
+            if not self._fits.waves(fit) > _MIN_FALL * float(fit.errors.mean()):
+                return
+            fit = self._fits.fit(fit.model, fit.varying, [fit.reconstruction], bends=bends)
+            self.climb(fit)
 
 
 def choose_model(
@@ -443,20 +451,23 @@ def choose_model(
         alone = fits.fit("rotation", False, [first.reconstruction, given])
         varying = not float(alone.errors.mean()) < _MOST_OF_IT * float(plain.errors.mean())
         last = last if varying else first
-    against: list[str] = []
+    climbing = _Rungs(fits, plain, kept, gain)
     for model in rungs[1:]:
-        last = fits.fit(model, varying, [last.reconstruction, given])
-        gain[last.label] = fits.gain(best, last)
-        # where the two do as well, the exact model of a turn is taken, not its approximation
-        exact = best.model == "two-step" and model == "rotation" and not fits.is_better(last, best)
-        if not exact and not fits.is_better(best, last):
-            continue
-        if exact or float((best.errors - last.errors).mean()) > last.left:
-            best = last
-            kept.append(last.label)
-        else:
-            against.append(f"{model} takes away less of what bends the photos than it leaves")
-    best = _unsteady(fits, best, rungs, varying, kept, gain, against)
+        if climbing.best.bends and climbing.best.is_explained:
+            break
+        bends = climbing.best.bends
+        last = fits.fit(model, varying, [last.reconstruction, given], bends=bends)
+        climbing.climb(last)
+        if SHUTTER_MODELS[model] >= SHUTTER_MODELS["rotation"]:
+            climbing.bend(last)
+            last = climbing.best if climbing.best.model == model else last
+    best, against = climbing.best, climbing.against
+    if best.bends:
+        # a model that came later may explain what bends explained before it
+        steady = fits.fit(best.model, best.varying, [best.reconstruction, given])
+        if not fits.is_better(steady, best):
+            best = steady
+            kept.append(steady.label)
     agreement = None
     if best is not plain:
         against = []

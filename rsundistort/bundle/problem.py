@@ -342,14 +342,11 @@ class BundleProblem:
         """Weighted residuals (o, 2), Jacobians of the photos (o, 2, nb), and the cost without priors."""
         o = len(self._xy)
         res, J_frame = spent.blocks if spent else (np.empty((o, 2)), np.empty((o, 2, self.layout.size)))
-        if state is not self._clock_of:
-            self._clock.fill(np.nan)
-            self._clock_of = None
         cost = np.empty(-(-o // _CHUNK))
         with numba.parallel_chunksize(1):
             projection.residual_blocks(
                 *self._kernel_args(state),
-                self._clock,
+                self._rows(state),
                 self._block,
                 self.layout.pieces,
                 self.layout.ways,
@@ -360,6 +357,13 @@ class BundleProblem:
         if self._options.varying:
             J_frame[:, :, self._block : self.layout.variation] = self._variation_jacobians(state)
         return res, J_frame, float(cost.sum())
+
+    def _rows(self, state: State) -> NDArray[np.float64]:
+        """(o,) where to look for the rows: as the last cost found them, if it was that of this state; else NaN."""
+        if state is not self._clock_of:
+            self._clock.fill(np.nan)
+            self._clock_of = None
+        return self._clock
 
     def _blocks(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
         """Weighted residuals, Jacobians of photos and points, and the cost without priors."""
@@ -392,7 +396,7 @@ class BundleProblem:
         """Weighted Jacobians (o, 2, nc) of the intrinsics that are refined."""
         J = np.empty((len(self._xy), 2, len(self._refine)))
         if self._refine:
-            projection.intrinsic_blocks(*self._kernel_args(state), self._refine_codes, J)
+            projection.intrinsic_blocks(*self._kernel_args(state), self._rows(state), self._refine_codes, J)
         if self._refine and self._options.varying:
             own = state.variation[self._structure.frame_idx]
             by_shift = self._variation_jacobians(state)[:, :, 1:]
@@ -409,7 +413,7 @@ class BundleProblem:
     def _variation_jacobians(self, state: State) -> NDArray[np.float64]:
         """Weighted Jacobians (o, 2, 3) of the variation of each photo's intrinsics."""
         J = np.empty((len(self._xy), 2, 3))
-        projection.intrinsic_blocks(*self._kernel_args(state), _VARIATION, J)
+        projection.intrinsic_blocks(*self._kernel_args(state), self._rows(state), _VARIATION, J)
         # a photo's principal point moves by focal lengths of its camera, not by its own
         J[:, :, 1:] *= np.exp(-state.variation[self._structure.frame_idx, 0])[:, None, None]
         return J
