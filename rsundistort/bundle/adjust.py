@@ -167,7 +167,7 @@ def objective(reconstruction: Reconstruction, shutter_model: str, options: Bundl
     if options.sigma_px is None:
         raise InputError("the objective needs sigma_px: half a sum of squares means nothing without the noise")
     spreads = _starting_spreads(options, Layout.of(shutter_model, options), reconstruction.baseline)
-    problem = BundleProblem(reconstruction, shutter_model, options, options.sigma_px, spreads)
+    problem = BundleProblem(reconstruction, shutter_model, options, options.sigma_px, spreads, heavy_tails=False)
     return problem.cost(problem.initial_state())
 
 
@@ -224,6 +224,9 @@ def bundle_adjust(
     layout = Layout.of(shutter_model, options)
     spreads = _starting_spreads(options, layout, baseline)
     jackknife, factor = options.deviations == "jackknife", 1.0
+    # Measurements that seem more exact than they are would pull the intrinsics over the hump of a prior with heavy
+    # tails, and they would not come back: it is normal until the noise is known
+    noise_known = False
     for round_ in range(options.outlier_rounds + options.spread_rounds + 1):
         cleaning = round_ < options.outlier_rounds
         # where the first spreads are but a guess, their solution need not be exact
@@ -231,7 +234,7 @@ def bundle_adjust(
         # once the outliers are gone the noise is nearly normal: squares converge in a few steps and use it fully
         stage = options if round_ == 0 or not options.outlier_rounds else replace(options, loss="squared")
         believed = replace(base, observations=base.observations.select(keep))
-        problem = BundleProblem(believed, shutter_model, stage, sigma * factor, spreads)
+        problem = BundleProblem(believed, shutter_model, stage, sigma * factor, spreads, heavy_tails=noise_known)
         result = minimize(
             problem,
             problem.initial_state(),
@@ -246,10 +249,11 @@ def bundle_adjust(
         current = problem.reconstruction(result.state)
         equations = problem.linearize(result.state)
         marginals = equations.marginal_covariances()
-        weighed, shared = factor, Inflation(np.ones(len(marginals.photos[0])), np.ones(len(options.refine)))
+        weighed, noise_was_known = factor, noise_known
+        shared = Inflation(np.ones(len(marginals.photos[0])), np.ones(len(options.refine)))
         if jackknife and not rough:
             shared = inflation(equations, problem.partitions(result.state), marginals, factor)
-            factor = shared.noise
+            factor, noise_known = shared.noise, True
         del equations
         before, spreads = spreads, _estimated(spreads, current, marginals.photos, options, layout, baseline)
         revived = revive_points(current, shutter_model)
@@ -265,6 +269,7 @@ def bundle_adjust(
             and revived is current
             and _settled(before, spreads, options.spread_tolerance)
             and abs(factor - weighed) < 0.1 * factor
+            and (noise_was_known or not jackknife)
         ):
             break
         else:

@@ -34,7 +34,7 @@ _MOST_OF_IT = 0.5
 # What a photo's residuals have in common is sought among polynomials of this degree in x and y, whatever bent it.
 _DEGREE = 3
 # And, of what a motion that is not steady leaves, among splines of so many values along the readout.
-_WAVES = 17
+_WAVES = 25
 # Measurements for each coefficient of these, at least.
 _PER_COEFFICIENT = 3
 # Share of their squares that keeps coefficients finite that no measurement tells.

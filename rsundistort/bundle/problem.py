@@ -138,7 +138,7 @@ class BundleProblem:
     of its intrinsics (log f, cx / fx, cy / fy) if the options say that they vary, and the coefficients of its bends, if
     it has any (`Layout`). Unknowns of a camera: the intrinsics that the options name, as in `moved_camera`. Seven
     unknowns are held for the gauge: the pose of the photo with the most observations, and one coordinate of the centre
-    farthest from it.
+    farthest from it. The prior on intrinsics has heavy tails (`prior_weight`), or it is normal.
     """
 
     def __init__(
@@ -148,6 +148,7 @@ class BundleProblem:
         options: BundleOptions,
         sigma_px: float,
         spreads: Spreads,
+        heavy_tails: bool = True,
     ) -> None:
         self._model = check_shutter_model(shutter_model)
         obs = reconstruction.observations
@@ -163,6 +164,7 @@ class BundleProblem:
         self._start = replace(reconstruction, points_w=reconstruction.points_w[self._points], observations=obs)
         self._shutter_model = shutter_model
         self._options = options
+        self._heavy_tails = heavy_tails
         self.layout = Layout.of(shutter_model, options)
         self._block = self.layout.motion
         self._bend_clock = reconstruction.bend_clock
@@ -333,7 +335,7 @@ class BundleProblem:
             for k, (camera, guess, of) in enumerate(zip(state.cameras, guessed.cameras, guessed.sigmas, strict=True)):
                 sigma = np.array([of.get(name, np.inf) for name in self._refine])
                 apart[k], slope[k] = np.array(deviation(camera, guess, self._refine)) / sigma
-        cost, weight = prior_weight(apart**2)
+        cost, weight = prior_weight(apart**2) if self._heavy_tails else (0.5 * apart**2, np.ones_like(apart))
         return apart * np.sqrt(weight), slope * np.sqrt(weight), float(cost.sum())
 
     def _jacobians(
