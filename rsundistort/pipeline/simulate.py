@@ -143,7 +143,7 @@ def simulate_warp(
             phi.update({name: np.zeros(3) for name in options.still})
         motions = {name: RowMotion(phi[name]) for name in names}
         for name in names:
-            check_no_fold(name, camera, motions[name].phi)
+            check_no_fold(name, camera, motions[name].phi, bend=motions[name].bend)
         whole, crop = camera, (0, 0, camera.width, camera.height)
         if options.crop:
             crop = _common_rectangle(whole, motions, jobs, log)
@@ -154,7 +154,7 @@ def simulate_warp(
 
         def work(name: str) -> None:
             photo = read_photo(photos / name)
-            warped, mask = warp_photo(photo.pixels, whole, motions[name].phi)
+            warped, mask = warp_photo(photo.pixels, whole, motions[name])
             out_name = output_name(name)
             write_image(scratch / "photos" / out_name, _cut(warped, kept), photo.metadata, options.quality)
             write_image(scratch / "masks" / masks[name], _cut(mask, kept))
@@ -201,7 +201,7 @@ def _common_rectangle(
     smallest = ("", np.inf)
     log.begin("cropping", len(motions))
     with ThreadPoolExecutor(jobs) as pool:
-        found = pool.map(lambda motion: warp_mask(camera, motion.phi) > 0, motions.values())
+        found = pool.map(lambda motion: warp_mask(camera, motion) > 0, motions.values())
         for done, (name, mask) in enumerate(zip(motions, found, strict=True), start=1):
             valid &= mask
             smallest = min(smallest, (name, float(mask.mean())), key=lambda each: each[1])

@@ -40,7 +40,7 @@ class View:
     name : str
         File name of the photo.
     R_cw : (3, 3) array
-        World to camera at the line of the principal point.
+        World to camera at the line of the principal point; of a motion with a bend the pose of the nearest steady one.
     center_w : (3,) array
         Centre of the camera then, world units.
     motion : RowMotion
