@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from ..errors import InputError
 from ..model.bend import Bend
 from ..model.camera import READOUTS, Camera
-from ..model.checks import check_finite
 from ..model.motion import RowMotion
 from .lens import distort_rays, undistort_to_rays
 
