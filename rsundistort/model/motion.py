@@ -89,6 +89,17 @@ class RowMotion:
                 break
         return cls(rate[0], rate[1], bend), turn.as_matrix(), constant[1]
 
+    def steady(self, start: float, end: float) -> tuple[RowMotion, NDArray[np.float64], NDArray[np.float64]]:
+        """The steady motion that is nearest while the clock runs from start to end, and the pose it belongs to.
+
+        As `of` returns them, without a bend: of least mean square in rotation and in position.
+        """
+        if self.bend is None:
+            return self, np.eye(3), np.zeros(3)
+        clock = np.linspace(start, end, 1025)
+        near, turn, way = RowMotion.of(clock, *self.at(clock), sites=len(self.bend.values))
+        return replace(near, bend=None), turn, way
+
     def in_camera(self, R_cw: NDArray[np.float64]) -> RowMotion:
         """The motion with its velocity in the camera frame at the reference row, as projection takes it."""
         R = np.asarray(R_cw, np.float64)
