@@ -19,11 +19,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FileError, FormatError, InputError, RsUndistortWarning
+from ..model import Bend, Camera, RowMotion
 from ..model.checks import check_array, check_finite, frozen
 from .motions import Known
 from .tables import read_table
 
-__all__ = ["GyroLog", "gyro_offset", "motions_from_gyro", "parse_axes", "read_gyro", "read_photo_times"]
+__all__ = [
+    "GyroLog",
+    "bends_from_gyro",
+    "gyro_offset",
+    "motions_from_gyro",
+    "parse_axes",
+    "read_gyro",
+    "read_photo_times",
+]
 
 # rad/s. Zero-rate offset of a gyroscope that was calibrated once: half a degree per second.
 _BIAS = 0.01
@@ -31,6 +40,8 @@ _BIAS = 0.01
 _READOUT_SHARE = 0.03
 # Steps between samples: what is longer is a gap.
 _GAP_STEPS = 5.0
+# Steps that a readout is integrated in: four between two readings of a bend.
+_STEPS = 257
 # Gyroflow's axes are up, left and back (its IMU orientation page, and its integrator): rows are right, down, ahead.
 _CAMERA_FROM_GYROFLOW = np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])
 _GCSV = ("GYROFLOW IMU LOG", "CAMERA IMU LOG")
@@ -318,6 +329,44 @@ def motions_from_gyro(
             stacklevel=2,
         )
     return {name: (-span[i] * rate[i], span[i] * np.sqrt(variance[i])) for i, name in enumerate(names) if covered[i]}
+
+
+def bends_from_gyro(
+    log: GyroLog,
+    times_s: Mapping[str, float],
+    readout_s: float | Mapping[str, float],
+    cameras: Mapping[str, Camera],
+    *,
+    offset_s: float = 0.0,
+) -> dict[str, tuple[NDArray[np.float64], Bend]]:
+    """How photos turned while they were read: the steady motion that is nearest, and how the turn departs from it.
+
+    Parameters
+    ----------
+    log, times_s, readout_s, offset_s
+        As `motions_from_gyro` takes them.
+    cameras : mapping of photo name to Camera
+        Whose clock the bends go by, from where the reading of a frame begins to where it ends.
+
+    Returns
+    -------
+    dict of photo name to (phi, Bend)
+        phi (3,) in radians per frame: the slope of the turn, where `motions_from_gyro` has its mean rate. The bend is
+        as `BundleOptions.known_bends` takes it, orthogonal to 1 and to the clock, a spline of 65 readings: what shakes
+        faster than 30 times a frame is lost in it. The rates are integrated to rotations, so it is right for turns
+        about changing axes, too. Photos that the log does not cover are left out.
+    """
+    found = {}
+    for name, time_s in times_s.items():
+        span = readout_s[name] if isinstance(readout_s, Mapping) else readout_s
+        start, end = np.array(time_s + offset_s - span / 2), np.array(time_s + offset_s + span / 2)
+        if not log._covers(start, end):
+            continue
+        clock = np.linspace(*cameras[name].clock_range, _STEPS)
+        motion, _, _ = RowMotion.of(clock, log.turns(np.linspace(start, end, _STEPS)))
+        assert motion.bend is not None
+        found[name] = motion.phi * (clock[-1] - clock[0]), motion.bend
+    return found
 
 
 def gyro_offset(
