@@ -471,11 +471,11 @@ def test_diagnostics_of_another_solution_are_not_shown(copied):
 def test_a_newer_solution_is_shown_as_far_as_it_is_understood(copied):
     path = copied / "solution.json"
     value = json.loads(path.read_text())
-    path.write_text(json.dumps(value | {"version": 2, "more": []}))
+    path.write_text(json.dumps(value | {"version": 3, "more": []}))
     assert "newer version" in quietly(copied, SCENES / "courtyard" / "photos")[0]
     assert "update rsundistort" in page_of(copied).text
-    path.write_text(json.dumps(value | {"version": 2, "images": [1]}))
-    with pytest.raises(FormatError, match=r"version 2.*update rsundistort"):
+    path.write_text(json.dumps(value | {"version": 3, "images": [1]}))
+    with pytest.raises(FormatError, match=r"version 3.*update rsundistort"):
         write_report(copied)
 
 
