@@ -73,7 +73,7 @@ def warped_photos(photos: Path, work: Path, seeds: int) -> None:
             assert image.motion is not None
             original = read_photo(photos / image.name).pixels
             raw = read_photo(out / "photos" / image.name).pixels
-            warped, mask = warp_photo(original, camera, image.motion.phi)
+            warped, mask = warp_photo(original, camera, image.motion)
             whole.append(against_twin(raw, original, camera, image.motion))
             interpolated.append(against_twin(warped, original, camera, image.motion))
             stored.append(psnr(raw, warped, mask))

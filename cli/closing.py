@@ -94,6 +94,7 @@ def closing_table(solution: Solution, out: Path) -> str:
         *_varying(solution),
         *_readout(solution),
         *_depths(solution),
+        *_two_poses(solution),
         f"rms residual       {quality['global_rms_px']:.2f} px with a global shutter, {quality['rms_px']:.2f} px now",
         f"outputs            {out}  ({total:.0f} s)",
     ]
@@ -219,6 +220,14 @@ def _depths(solution: Solution) -> list[str]:
     kinds = {"points": "as the points", "plane": "on a plane", "map": "by maps", "infinity": "at infinity"}
     counts = [f"{text} in {used.count(kind)} photos" for kind, text in kinds.items() if kind in used]
     return [f"depth              {', '.join(counts)}"] if counts else []
+
+
+def _two_poses(solution: Solution) -> list[str]:
+    """A line on what formats with two poses a photo cannot say of motions that are not steady."""
+    left = solution.quality.get("rs_poses_px")
+    if left is None:
+        return []
+    return [f"rs-poses           motions are not steady: two poses a photo are off by up to {left:.1f} px"]
 
 
 def _held_out(quality: Mapping[str, Any]) -> list[str]:

@@ -30,7 +30,48 @@ def command() -> None:
 @click.option(
     "--motion",
     type=click.Path(path_type=Path),
-    help="JSON {name: [phi1, phi2, phi3]} in radians per unit of the clock, instead of random motion.",
+    help="JSON {name: [phi1, phi2, phi3]} in radians per unit of the clock, instead of random motion; or rotations by "
+    "row: CSV with name, row, rx, ry, rz, or JSON {name: {row: [...], rotation: [[rx, ry, rz], ...]}}.",
+)
+@click.option(
+    "--acceleration",
+    type=click.FloatRange(min=0),
+    default=0.0,
+    show_default=True,
+    help="Standard deviation of what the rate of turn changes by over half a frame, as a share of itself.",
+)
+@click.option(
+    "--vibration", type=click.FloatRange(min=0), metavar="MRAD", help="Amplitude of a vibration, on top of the motion."
+)
+@click.option(
+    "--vibration-periods",
+    type=float,
+    nargs=2,
+    default=(2.0, 5.0),
+    show_default=True,
+    help="Periods of the vibration a frame: drawn between these.",
+)
+@click.option(
+    "--vibration-axis",
+    type=click.Choice(["random", "x", "y", "z"]),
+    default="random",
+    show_default=True,
+    help="Axis of the camera that it turns about.",
+)
+@click.option(
+    "--gyro",
+    type=click.Path(path_type=Path),
+    help="Stretches of a gyroscope's log instead of random motion: CSV with time_s, wx, wy, wz, or Gyroflow's .gcsv.",
+)
+@click.option(
+    "--gyro-axes",
+    metavar="XYZ",
+    help="Axes of the gyroscope that point right, down and ahead in the stored pixels; small letters are reversed.",
+)
+@click.option(
+    "--readout-ms",
+    type=click.FloatRange(min=0, min_open=True),
+    help="How long a frame is read, in the time of --gyro. Default: what the log says.",
 )
 @click.option("--still", multiple=True, metavar="NAME", help="A photo that does not move.")
 @click.option(
@@ -50,6 +91,13 @@ def warp(
     readout: str | None,
     sigma: float,
     motion: Path | None,
+    acceleration: float,
+    vibration: float | None,
+    vibration_periods: tuple[float, float],
+    vibration_axis: str,
+    gyro: Path | None,
+    gyro_axes: str | None,
+    readout_ms: float | None,
     still: tuple[str, ...],
     crop: bool,
     quality: int,
@@ -61,10 +109,13 @@ def warp(
     """Warp real photos as if a rotating camera had taken them.
 
     OUT gets photos/, masks/ (what the originals hold), camera.json and ground_truth.json; with --crop also global/,
-    and camera and truth of the cut photos. --sigma is of the whole frame, also with --crop.
+    and camera and truth of the cut photos. --sigma is of the whole frame, also with --crop, and so is what is not
+    steady.
     """
     with errors_for_people(), progress_bars(Talk(quiet)) as progress:
+        from rsundistort.io import read_gyro
         from rsundistort.pipeline import WarpOptions, read_motion_file, simulate_warp
+        from rsundistort.synthetic import Vibration
 
         truth = simulate_warp(
             photos,
@@ -74,6 +125,10 @@ def warp(
                 readout=readout,
                 sigma_rad=sigma,
                 motion=None if motion is None else read_motion_file(motion),
+                gyro=None if gyro is None else read_gyro(gyro, gyro_axes),
+                readout_s=None if readout_ms is None else readout_ms / 1e3,
+                acceleration=acceleration,
+                vibration=None if not vibration else Vibration(vibration / 1e3, vibration_periods, vibration_axis),
                 still=still,
                 crop=crop,
                 seed=seed,

@@ -769,6 +769,25 @@ def test_simulate_warp_crop(invoke, photos, tmp_path):
     assert invoke(*args).exit_code == 0
 
 
+def test_simulate_warp_of_motions_that_are_not_steady(invoke, photos, tmp_path):
+    args = ["simulate", "warp", "photos", "-o", "out", "--camera", CAMERA, "--overwrite"]
+    shaking = ["--acceleration", 0.5, "--vibration", 1.5, "--vibration-periods", 3, 4, "--vibration-axis", "y"]
+    result = invoke(*args, *shaking, "--crop")
+    assert result.exit_code == 0, result.stderr
+    assert result.stderr == ""
+    truth = json.loads((tmp_path / "out" / "ground_truth.json").read_text())
+    assert truth["options"]["vibration"] == {"amplitude_rad": 0.0015, "periods": [3, 4], "axis": "y", "travel": 0}
+    assert len(truth["images"][0]["bend"]["clock"]) == 65
+    (tmp_path / "g.csv").write_text("time_s,wx,wy,wz\n" + "".join(f"{k / 100},0,1,0\n" for k in range(50)))
+    result = invoke(*args, "--gyro", "g.csv", "--gyro-axes", "XZy", "--readout-ms", 40)
+    assert result.exit_code == 0, result.stderr
+    truth = json.loads((tmp_path / "out" / "ground_truth.json").read_text())
+    assert truth["images"][2]["phi"] == pytest.approx([0, 0, 0.04 * 300 / 240], abs=1e-9)
+    assert "how long" in error_line(invoke(*args, "--gyro", "g.csv"))
+    (tmp_path / "rows.csv").write_text("name,row,rx,ry,rz\n" + "".join(f"b.png,{k},0,0,0\n" for k in (0, 99, 50, 239)))
+    assert "table of b.png: row 50 comes after 99" in error_line(invoke(*args, "--motion", "rows.csv"))
+
+
 def test_simulate_warp_refuses_to_crop_to_a_stamp(invoke, photos, tmp_path):
     (tmp_path / "motion.json").write_text('{"b.png": [3, 0, 0]}')
     before = tree(tmp_path)

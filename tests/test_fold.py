@@ -8,7 +8,7 @@ from numpy_twin import Fisheye, lens_of
 from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, InputError
-from rsundistort.model import READOUTS
+from rsundistort.model import READOUTS, Bend
 from rsundistort.synthetic.fold import check_no_fold
 from rsundistort.synthetic.lens import undistort_to_rays
 
@@ -180,3 +180,30 @@ def test_speed_is_taken_through_the_lens():
 def test_bad_arguments_are_refused(phi, velocity, depth, says):
     with pytest.raises(InputError, match=says):
         check_no_fold("b.png", camera_of(), phi, velocity, depth)
+
+
+def test_bends_count_by_their_own_rate():
+    """Rows fold where the turn is fastest, and not by its mean: half a period of a vibration, computed by hand."""
+    camera, (start, end) = camera_of(), (-R_MAX, 239 / 500)
+    middle = (start + end) / 2
+    # the rate of -a sin(k r) is -a k in the middle row, where 1 + r^2 is 1, and nothing at the ends
+    k = np.pi / (end - start)
+
+    def shaken(amplitude):
+        r = np.linspace(start, end, 65)
+        return Bend(start, end, np.outer(-amplitude * np.sin(k * (r - middle)), [1, 0, 0]))
+
+    assert not folds(camera, np.zeros(3), bend=shaken(0.99 / k))
+    assert folds(camera, np.zeros(3), bend=shaken(1.01 / k))
+    assert not folds(camera, [0.3, 0, 0], bend=shaken(1.2 / k))  # a turn the other way makes up for it
+
+
+def test_travel_that_is_not_steady_folds_rows_by_its_own_rate():
+    camera, (start, end) = camera_of(), (-R_MAX, 239 / 500)
+    clock = np.linspace(start, end, 9)
+    way = np.outer(2.0 * (clock - clock.mean()) ** 2, [0, -1, 0])  # at most 4 (end - start) / 2 of speed
+    fastest = 2.0 * (end - start)
+    bend = Bend(start, end, np.zeros((9, 3)), way)
+    assert folds(camera, np.zeros(3), None, fastest * 0.98, bend)
+    assert not folds(camera, np.zeros(3), None, fastest * 1.02, bend)
+    assert not folds(camera, np.zeros(3), None, None, bend)

@@ -10,7 +10,15 @@ from critical_scenes import named_scene
 from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, FileError, FormatError, GyroOptions, InputError, RowMotion, RsUndistortWarning
-from rsundistort.io import GyroLog, VideoFrames, gyro_offset, motions_from_gyro, read_gyro, read_photo_times
+from rsundistort.io import (
+    GyroLog,
+    VideoFrames,
+    bends_from_gyro,
+    gyro_offset,
+    motions_from_gyro,
+    read_gyro,
+    read_photo_times,
+)
 from rsundistort.io.gyro import parse_axes
 from rsundistort.model import READOUTS
 from rsundistort.pipeline.gyro import gyro_contradiction, gyro_motions, known_readouts
@@ -90,6 +98,37 @@ def test_sign_by_a_camera_that_is_turned_step_by_step(readout):
     assert np.abs(uv - seen)[inside].max() < 0.05
     still, _ = project_rows(points, start.inv().as_matrix(), np.zeros(3), RowMotion(), camera)
     assert np.abs(still - seen)[inside].max() > 3
+
+
+@pytest.mark.parametrize("readout", READOUTS)
+def test_bend_is_what_the_integral_of_the_rate_has_beside_its_line(readout):
+    """About one axis in closed form, at 50 Hz and 30 ms: one and a half periods a frame."""
+    camera = Camera(640, 480, [[600, 0, 300], [0, 610, 250], [0, 0, 1]], readout=readout)
+    time_s = np.arange(0, 2, 1e-4)
+    axis = np.array([0.6, -0.8, 0.0])
+    shaking = GyroLog(time_s, np.outer(1.5 + 4 * np.sin(100 * np.pi * time_s), axis))
+    phi, bend = bends_from_gyro(shaking, {"a": 0.5}, READOUT_S, {"a": camera}, offset_s=0.2)["a"]
+    start, end = camera.clock_range
+    clock = np.linspace(start, end, 5001)
+    at = 0.7 + READOUT_S * ((clock - start) / (end - start) - 0.5)
+    angle = -(1.5 * at - 4 * np.cos(100 * np.pi * at) / (100 * np.pi))  # the world turns the other way
+    slope, mean = np.polyfit(clock, angle, 1)
+    # samples 0.1 ms apart, linear between: a share of (0.1 ms x 100 pi)^2 / 12 of 4 / 100 pi, 1e-6 rad
+    assert phi == pytest.approx(slope * (end - start) * axis, abs=3e-6)
+    assert bend.at(clock)[0] == pytest.approx(np.outer(angle - slope * clock - mean, axis), abs=3e-6)
+    assert np.abs(bend.rotation).max() > 0.005
+    assert not bend.moves
+    assert (bend.start, bend.end) == (start, end)
+
+
+def test_steady_rates_have_no_bend_and_photos_without_a_log_none_either():
+    camera = Camera(640, 480, [[600, 0, 300], [0, 610, 250], [0, 0, 1]])
+    time_s = np.arange(0, 1, 0.002)
+    steady = GyroLog(time_s, np.tile(BASE, (len(time_s), 1)))
+    found = bends_from_gyro(steady, {"a": 0.5, "b": 0.999}, {"a": 0.02, "b": 0.02}, {"a": camera, "b": camera})
+    assert list(found) == ["a"]
+    assert found["a"][0] == pytest.approx(-0.02 * BASE, abs=1e-12)
+    assert np.abs(found["a"][1].rotation).max() < 1e-12
 
 
 def test_each_photo_may_have_its_own_readout():
@@ -323,18 +362,21 @@ def test_photos_find_their_times_and_readouts(tmp_path):
     time_s = np.arange(0, 4, 0.001)
     gyro = GyroOptions(write_csv(tmp_path / "gyro.csv", time_s, rates(time_s)), offset_s=0.5)
     readouts = {"a.jpg": READOUT_S, "b.jpg": READOUT_S, "c.jpg": None}
+    cameras = dict.fromkeys(readouts, Camera(640, 480, [[600, 0, 319.5], [0, 600, 239.5], [0, 0, 1]]))
     with pytest.raises(InputError, match="--photo-times"):
-        gyro_motions(tmp_path, gyro, gyro.log(), readouts)
+        gyro_motions(tmp_path, gyro, gyro.log(), readouts, cameras)
     (tmp_path / "frames.csv").write_text("name,time_s\nb.jpg,1.0\nother.jpg,2.0\n")
-    known = gyro_motions(tmp_path, gyro, gyro.log(), readouts)
-    assert list(known) == ["b.jpg"]
-    assert known["b.jpg"][0] == pytest.approx(-READOUT_S * mean_rates(1.5, READOUT_S), rel=0, abs=1e-7)
+    known, bends = gyro_motions(tmp_path, gyro, gyro.log(), readouts, cameras)
+    assert list(known) == list(bends) == ["b.jpg"]
+    # the slope of the turn, which differs from its mean by what the rate curves: a swing a second in 0.03 s
+    assert known["b.jpg"][0] == pytest.approx(-READOUT_S * mean_rates(1.5, READOUT_S), rel=1e-3)
+    assert 0 < np.abs(bends["b.jpg"].rotation).max() < 1e-3
     (tmp_path / "times.csv").write_text("name,time_s\nc.jpg,1.0\n")
     with pytest.raises(InputError, match=r"c\.jpg .*--readout-ms"):
-        gyro_motions(tmp_path, replace(gyro, times=tmp_path / "times.csv"), gyro.log(), readouts)
+        gyro_motions(tmp_path, replace(gyro, times=tmp_path / "times.csv"), gyro.log(), readouts, cameras)
     (tmp_path / "times.csv").write_text("name,time_s\nz.jpg,1.0\n")
     with pytest.raises(InputError, match=r"none of the photos, such as a\.jpg"):
-        gyro_motions(tmp_path, replace(gyro, times=tmp_path / "times.csv"), gyro.log(), readouts)
+        gyro_motions(tmp_path, replace(gyro, times=tmp_path / "times.csv"), gyro.log(), readouts, cameras)
     with pytest.raises(InputError, match="expected seconds"):
         GyroOptions(gyro.file, offset_s=float("nan"))
 

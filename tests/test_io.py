@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from make_photos import exif_block, texture
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from rsundistort import (
@@ -34,6 +35,7 @@ from rsundistort.io import (
 from rsundistort.io.cameras import camera_to_json
 from rsundistort.io.colmap import rectified_keypoints
 from rsundistort.io.record import Record
+from rsundistort.model import Bend
 
 K = [[500.0, 0, 322.5], [0, 510.0, 235.25], [0, 0, 1]]
 CAMERA = {"width": 640, "height": 480, "K": K, "dist": [-0.1, 0.02, 0.001, -0.002], "readout": "bottom-to-top"}
@@ -318,6 +320,61 @@ def garble(path, change):
     path.write_text(json.dumps(value))
 
 
+def bent_solution(moves=True):
+    solution = small_solution()
+    rng = np.random.default_rng(2)
+    bend = Bend(-0.4, 0.5, rng.normal(size=(9, 3)), rng.normal(size=(9, 3)) if moves else None)
+    first = next(image for image in solution.images if image.motion is not None)
+    bent = replace(first, motion=replace(first.motion, bend=bend))
+    return replace(solution, images=tuple(bent if each is first else each for each in solution.images)), bent
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_motion_that_is_not_steady_is_written_and_read_again(tmp_path, moves):
+    solution, bent = bent_solution(moves)
+    write_solution(tmp_path / "solution.json", solution)
+    value = json.loads((tmp_path / "solution.json").read_text())
+    assert value["version"] == 2
+    (entry,) = (each for each in value["images"] if "bend" in each)
+    assert ("position" in entry["bend"]) == moves
+    read = read_solution(tmp_path / "solution.json").image(bent.name).motion.bend
+    np.testing.assert_allclose(read.clock, bent.motion.bend.clock, atol=1e-15)
+    np.testing.assert_array_equal(read.values, bent.motion.bend.values)
+    # by any program: a spline of SciPy through what the file says
+    clock = np.linspace(-0.4, 0.5, 50)
+    spline = CubicSpline(entry["bend"]["clock"], entry["bend"]["rotation"])(clock)
+    np.testing.assert_allclose(bent.motion.bend.at(clock)[0], spline, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("key", "change"),
+    [
+        ("clock", lambda clock: [*clock[:-1], clock[-1] + 0.1]),
+        ("clock", lambda clock: clock[::-1]),
+        ("clock", lambda clock: clock[:5]),
+        ("rotation", lambda rotation: rotation[:-1]),
+        ("rotation", lambda rotation: [*rotation[:-1], [0, None, 0]]),
+        ("position", lambda position: position[1:]),
+        ("rotation", None),
+    ],
+)
+def test_garbled_bends_are_refused(tmp_path, key, change):
+    path = tmp_path / "solution.json"
+    solution, bent = bent_solution()
+    write_solution(path, solution)
+
+    def garble_bend(value):
+        bend = next(each["bend"] for each in value["images"] if each["name"] == bent.name)
+        value = bend.pop(key)
+        if change is not None:
+            bend[key] = change(value)
+
+    garble(path, garble_bend)
+    with pytest.raises(FormatError) as error:
+        read_solution(path)
+    assert "solution.json" in one_line(error)
+
+
 @pytest.mark.parametrize("key", ["cameras", "rectified_cameras", "images", "shutter_model", "format", "version"])
 def test_solution_that_lacks_a_key_is_refused(tmp_path, key):
     path = tmp_path / "solution.json"
@@ -332,7 +389,7 @@ def test_solution_that_lacks_a_key_is_refused(tmp_path, key):
     ("key", "value"),
     [
         ("format", "other"),
-        ("version", 2),
+        ("version", 3),
         ("version", "1"),
         ("cameras", []),
         ("cameras", {}),

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from rsundistort_cli import closing
 from scipy.spatial.transform import Rotation, Slerp
 
 from rsundistort import InputError, RsUndistortWarning
@@ -24,12 +25,13 @@ from rsundistort.io import (
     write_transforms,
 )
 from rsundistort.io.colmap import ModelIds
-from rsundistort.model import Camera, Observations, Reconstruction, RowMotion, Solution, SolvedImage
+from rsundistort.model import Bend, Camera, Observations, Reconstruction, RowMotion, Solution, SolvedImage
 from rsundistort.model.projection import clock_of, project_points, unproject_points
 from rsundistort.pipeline import SolveOptions
-from rsundistort.pipeline.outputs import Outputs, photo_times
+from rsundistort.pipeline.outputs import Outputs, _left_by_two_poses, photo_times
 from rsundistort.pipeline.progress import StageLog
 from rsundistort.pipeline.workers import Workers
+from rsundistort.rectify import bend_px
 
 W, H = 640, 480
 LENS = (-0.12, 0.03, 1e-3, -8e-4, 0.01)
@@ -495,3 +497,79 @@ def test_frames_without_files_are_left_out(tmp_path, rng):
     _, solution = solved(rng, [camera_of()])
     write_transforms(tmp_path / "transforms.json", solution, {})
     assert json.loads((tmp_path / "transforms.json").read_text())["frames"] == []
+
+
+def bent_solution(rng, camera, model="constant-motion", scale=1.0):
+    """Motions with a turn and a way that are not steady, and shakes that are of no steady motion."""
+    _, solution = solved(rng, [camera], model)
+    images = []
+    for image in solution.images:
+        clock = np.linspace(*camera.clock_range, 201)
+        turn = scale * (rng.normal(0, 2e-3, (1, 3)) * np.sin(9 * clock)[:, None] + rng.normal(0, 5e-3, 3))
+        way = scale * rng.normal(0, 5e-3, (1, 3)) * np.cos(11 * clock)[:, None]
+        bend = Bend(clock[0], clock[-1], turn, way)  # neither orthogonal to 1 nor to the clock
+        images.append(replace(image, motion=replace(image.motion, bend=bend)))
+    return replace(solution, images=tuple(images))
+
+
+@pytest.mark.parametrize("readout", READOUTS)
+def test_two_poses_of_a_bent_motion_are_the_best_two_and_the_rest_is_said(tmp_path, rng, readout):
+    camera = camera_of(readout, dist=())
+    solution = bent_solution(rng, camera)
+    write_shutter_poses(tmp_path, solution, {image.name: image.name for image in solution.images}, "points.ply")
+    value, read = json.loads((tmp_path / "transforms.json").read_text()), np.load(tmp_path / "gsplat.npz")
+    axis = 1 if readout in READOUTS[:2] else 0
+    for i, image in enumerate(solution.images):
+        frame = next(each for each in value["frames"] if each["file_path"] == image.name)
+        worst, turned = 0.0, []
+        for line in np.linspace(0, (W, H)[axis] - 1, 161):
+            xy = np.linspace(0, 1, 20)[:, None] * [W - 1, H - 1]
+            xy[:, axis] = line
+            r = float(clock_of(camera, xy[:1])[0])
+            R_cw, center = image.motion.pose_at(r, image.R_cw, image.center_w)
+            rays = np.column_stack([(xy - camera.K[:2, 2]) / np.diag(camera.K)[:2], np.ones(20)])
+            X_w = 4.0 * rays @ R_cw + center
+            R_wc, told = ngp_pose(frame, (xy[0] + 0.5) / [W, H])
+            off = cv_project((X_w - told) @ R_wc, camera.K, camera.dist, False) - xy
+            worst = max(worst, np.linalg.norm(off, axis=1).max())
+            turned.append((Rotation.from_matrix(R_wc.T) * Rotation.from_matrix(R_cw).inv()).as_rotvec())
+        # here at the moment of the line that the point was on, and not at that of the one it has gone to: the share of
+        # the clock at which images run, up to a sixth
+        assert bend_px(camera, image.motion.in_camera(image.R_cw), 4.0) == pytest.approx(worst, rel=0.2)
+        # of no other steady motion is the rest smaller: it has no mean and no slope
+        assert np.abs(np.polyfit(np.linspace(-1, 1, 161), turned, 1)).max() < 0.03 * np.abs(turned).max()
+        # and each line's own pose is there, too
+        lines = read["lines"][i]
+        assert sorted(lines[[0, -1]]) == [0, (W, H)[axis] - 1]
+        for k in (0, 20, 64):
+            r = float(clock_of(camera, np.array([[lines[k], lines[k]]]))[0])
+            R_cw, center = image.motion.pose_at(r, image.R_cw, image.center_w)
+            np.testing.assert_allclose(read["viewmats_lines"][i, k, :3, :3], R_cw, atol=1e-12)
+            np.testing.assert_allclose(read["viewmats_lines"][i, k, :3, 3], -R_cw @ center, atol=1e-12)
+
+
+def test_rs_poses_of_bent_rotations_do_not_travel(tmp_path, rng):
+    solution = bent_solution(rng, camera_of(), "rotation")
+    write_shutter_poses(tmp_path, solution, {image.name: image.name for image in solution.images}, "points.ply")
+    read = np.load(tmp_path / "gsplat.npz")["viewmats_lines"]
+    centers = -np.einsum("nkji,nkj->nki", read[..., :3, :3], read[..., :3, 3])
+    assert np.ptp(centers, axis=1).max() < 1e-12
+
+
+def test_steady_motions_are_written_as_ever(tmp_path, rng):
+    _, solution = solved(rng, [camera_of()])
+    write_shutter_poses(tmp_path, solution, {image.name: image.name for image in solution.images}, "points.ply")
+    assert "lines" not in np.load(tmp_path / "gsplat.npz")
+    assert bend_px(camera_of(), solution.images[0].motion) == 0.0
+
+
+def test_closing_line_says_what_two_poses_leave(rng):
+    made, solution = solved(rng, [camera_of(dist=())])
+    assert not any("two poses" in line for line in closing._two_poses(solution))
+    bent = bent_solution(rng, camera_of(dist=()))
+    rec = made.with_motions([image.motion for image in bent.images])
+    left = _left_by_two_poses(rec)
+    assert left > 1
+    said = closing._two_poses(replace(solution, quality={"rs_poses_px": left}))
+    assert said == [f"rs-poses           motions are not steady: two poses a photo are off by up to {left:.1f} px"]
+    assert _left_by_two_poses(made) == 0.0

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -14,6 +15,7 @@ from browser import CHROMIUM, Browser
 from click.testing import CliRunner
 from make_photos import exif_block, save_textures
 from rsundistort_cli.main import cli
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from solved_scene import SCENES, solve_scene
 
@@ -29,6 +31,7 @@ from rsundistort import (
     write_solution,
 )
 from rsundistort.io import Metadata, write_image
+from rsundistort.model import Bend
 from rsundistort.pipeline import outputs
 from rsundistort.report import diagnostics as diagnostics_module
 from rsundistort.report import read_diagnostics, verdict_of, write_diagnostics, write_figures, write_report
@@ -245,6 +248,37 @@ def test_displacement_of_a_travelling_camera_depends_on_the_depth():
 # ---------------------------------------------------------------- diagnostics
 
 
+def test_motions_that_are_not_steady_are_drawn_over_the_lines(tmp_path):
+    """The curve of each axis, read back from the page, is the rotation of the lines in degrees."""
+    rng = np.random.default_rng(4)
+    made = hand_made()
+    bend = Bend(*CAMERA.clock_range, rng.normal(size=(9, 3)) * 0.01)
+    images = list(made.images)
+    images[1] = replace(images[1], name="b & <b>.png", motion=replace(images[1].motion, bend=bend))
+    write_solution_to(tmp_path, replace(made, images=tuple(images)))
+    quietly(tmp_path)
+    page = page_of(tmp_path)
+    assert page.sections[page.sections.index("photos") + 1] == "motions"
+    text = (tmp_path / "report.html").read_text("utf-8")
+    section = text[text.index('<section id="motions">') : text.index('<section id="critical">')]
+    assert section.count("<svg") == 1  # the others are steady
+    assert "b &amp; &lt;b&gt;.png" in section
+    high, low = (float(each.replace("−", "-")) for each in re.findall(r">([−0-9.]+)°</text>", section))
+    curves = [np.array(re.findall(r"([0-9.]+) ([0-9.]+)", d), float) for d in re.findall(r'<path d="([^"]+)"', section)]
+    clock = np.linspace(*CAMERA.clock_range, len(curves[0]))
+    turn = np.degrees(clock[:, None] * images[1].motion.phi + CubicSpline(bend.clock, bend.rotation)(clock))
+    for k, curve in enumerate(curves):
+        np.testing.assert_allclose(curve[:, 0], np.linspace(0, 240, len(curve)), atol=0.06)
+        shown = high - (curve[:, 1] - 4) / 112 * (high - low)
+        np.testing.assert_allclose(shown, turn[:, k], atol=0.02)  # as the marks are rounded
+    assert len(curves) == 3
+    assert section.count('class="steady"') == 3
+
+
+def test_steady_motions_have_no_section(courtyard):
+    assert "motions" not in page_of(courtyard[0]).sections
+
+
 def test_residuals_of_photos_are_those_of_the_solution(courtyard):
     out, solution = courtyard
     told = read_diagnostics(out / "report.npz")
@@ -437,11 +471,11 @@ def test_diagnostics_of_another_solution_are_not_shown(copied):
 def test_a_newer_solution_is_shown_as_far_as_it_is_understood(copied):
     path = copied / "solution.json"
     value = json.loads(path.read_text())
-    path.write_text(json.dumps(value | {"version": 2, "more": []}))
+    path.write_text(json.dumps(value | {"version": 3, "more": []}))
     assert "newer version" in quietly(copied, SCENES / "courtyard" / "photos")[0]
     assert "update rsundistort" in page_of(copied).text
-    path.write_text(json.dumps(value | {"version": 2, "images": [1]}))
-    with pytest.raises(FormatError, match=r"version 2.*update rsundistort"):
+    path.write_text(json.dumps(value | {"version": 3, "images": [1]}))
+    with pytest.raises(FormatError, match=r"version 3.*update rsundistort"):
         write_report(copied)
 
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from numpy_twin import Fisheye, lens, lens_of
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from rsundistort.errors import FileError, FormatError, InputError
+from rsundistort.model.bend import Bend
 from rsundistort.model.camera import Camera
 from rsundistort.model.motion import RowMotion
 from rsundistort.pipeline import SceneOptions, simulate_scene
@@ -93,6 +96,39 @@ def test_what_a_pixel_sees_projects_back_to_it(readout, dist):
     assert len(np.unique(patch)) >= 3  # the wall and two sides of the box
     points = origins + distance[:, None] * directions
     np.testing.assert_allclose(project_forward(camera, v, points), uv, atol=1e-9)
+
+
+def bent(camera, rng):
+    """Ten readings each of a turn and of a way that are not steady."""
+    axis, sign = DIRECTIONS[camera.readout]
+    ends = sign * (np.array([0, [camera.width, camera.height][axis] - 1]) - camera.K[axis, 2]) / camera.K[axis, axis]
+    return Bend(*sorted(ends), rng.normal(size=(10, 3)) * 0.003, rng.normal(size=(10, 3)) * 0.01)
+
+
+@pytest.mark.parametrize("readout", DIRECTIONS)
+def test_lines_of_a_bent_motion_have_the_poses_of_its_splines(readout, rng):
+    camera = Camera(400, 300, K, [], readout)
+    bend, phi, velocity = bent(camera, rng), np.array([0.07, -0.05, 0.09]), np.array([0.11, -0.06, 0.08])
+    v = replace(view(), motion=RowMotion(phi, velocity, bend))
+    axis, sign = DIRECTIONS[readout]
+    tau = sign * (np.arange([400, 300][axis]) - K[axis, 2]) / K[axis, axis]
+    turn = tau[:, None] * phi + CubicSpline(bend.clock, bend.rotation)(tau)
+    R_cw, center_w = line_poses(camera, v)
+    np.testing.assert_allclose(R_cw, Rotation.from_rotvec(turn).as_matrix() @ v.R_cw, atol=1e-13)
+    way = tau[:, None] * velocity + CubicSpline(bend.clock, bend.position)(tau)
+    np.testing.assert_allclose(center_w, v.center_w + way, atol=1e-13)
+
+
+@pytest.mark.parametrize("readout", DIRECTIONS)
+def test_what_a_pixel_sees_in_a_bent_motion_projects_back_to_it(readout, rng):
+    camera = Camera(400, 300, K, LENS, readout)
+    v = replace(view(), motion=RowMotion([0.07, -0.05, 0.09], [0.11, -0.06, 0.08], bent(camera, rng)))
+    uv, scene = grid_uv(camera, 17), small_scene()
+    origins, directions = pixel_rays(camera, v, uv)
+    points = origins + scene.cast(origins, directions)[1][:, None] * directions
+    np.testing.assert_allclose(project_forward(camera, v, points), uv, atol=1e-9)
+    steady = project_forward(camera, replace(v, motion=replace(v.motion, bend=None)), points)
+    assert np.abs(steady - uv).max() > 0.5
 
 
 def test_lines_have_the_poses_of_their_pixels():

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from ..model import BEND_GROUPS, Reconstruction
+from ..model import BEND_GROUPS, Bend, Reconstruction
 from .intrinsics import GuessedCameras, check_refined
 from .lengths import KnownLength, check_lengths
 
@@ -98,6 +98,9 @@ class BundleOptions:
     known_phi : mapping of photo name to (phi, sigma)
         Motions that are known from elsewhere, each with its standard deviation, (3,) radians per frame; components of
         infinite sigma are unknown. A soft anchor is a known phi of zero.
+    known_bends : mapping of photo name to Bend
+        How motions depart from steady ones, where that is known from elsewhere, such as a gyroscope
+        (`io.bends_from_gyro`). The start and the end of each are those of the frame.
     still : mapping of photo name to float
         Photos that did not move but for so many radians per frame (one standard deviation; 0: not at all). Models
         without a velocity hold their phi1 near zero (the paper's remedy; the measurements tell the rest),
@@ -153,6 +156,7 @@ class BundleOptions:
     min_outlier_px: float = 0.25
     held_phi: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     known_phi: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
+    known_bends: Mapping[str, Bend] = field(default_factory=dict)
     still: Mapping[str, float] = field(default_factory=dict)
     lengths: Sequence[KnownLength] = ()
     refine: tuple[str, ...] = ()

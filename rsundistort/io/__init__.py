@@ -5,7 +5,7 @@ from .colmap import read_colmap_cameras, read_colmap_poses, write_colmap_model
 from .colmap_workspace import write_colmap_workspace
 from .depth_maps import find_depth_maps, read_depth_map
 from .groups import group_of, guess_readouts
-from .gyro import GyroLog, gyro_offset, motions_from_gyro, read_gyro, read_photo_times
+from .gyro import GyroLog, bends_from_gyro, gyro_offset, motions_from_gyro, read_gyro, read_photo_times
 from .lengths import read_known_lengths
 from .masks import find_masks, read_mask
 from .motions import read_known_motions
@@ -29,6 +29,7 @@ __all__ = [
     "Metadata",
     "Photo",
     "VideoFrames",
+    "bends_from_gyro",
     "camera_from_exif",
     "check_camera_fits",
     "extract_frames",

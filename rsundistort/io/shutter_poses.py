@@ -27,13 +27,17 @@ _NGP_SHUTTER = {
     "right-to-left": (1.0, -1.0, 0.0, 0.0),
 }
 
+#: Lines whose poses are written of motions that are not steady, evenly spaced over those of a photo.
+_LINES = 65
+
 Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def write_shutter_poses(folder: Path, solution: Solution, photos: Mapping[str, str], points: str) -> str:
     """Write `gsplat.npz` and `transforms.json` (instant-ngp and 3dgs-deblur) of the photos as they were taken.
 
-    The models that turn by an approximation (two-step, linearized) are written as the rotation of the same phi.
+    The models that turn by an approximation (two-step, linearized) are written as the rotation of the same phi. Two
+    poses a photo, or one rate, are those of the steady motion that is nearest: `rectify.bend_px` says what that leaves.
 
     Parameters
     ----------
@@ -85,22 +89,43 @@ def _motion(solution: Solution, image: SolvedImage) -> RowMotion:
     assert motion is not None
     if solution.shutter_model == "global":
         return RowMotion()
-    return motion if solution.shutter_model == "constant-motion" else RowMotion(motion.phi)
+    if solution.shutter_model == "constant-motion":
+        return motion
+    bent = motion.bend is not None and solution.shutter_model == "rotation"
+    # it heeds no positions
+    return RowMotion(motion.phi, bend=motion.bend.turned(np.eye(3), np.zeros((3, 3))) if bent and motion.bend else None)
 
 
-def _clock(camera: Camera, place: float, border: float = 0.5) -> float:
-    """The clock at a place of the readout, from -0.5 where it begins to 0.5 where it ends.
+def _steady(solution: Solution, image: SolvedImage) -> tuple[RowMotion, Pose]:
+    """The steady motion that is nearest, and its pose."""
+    assert image.R_cw is not None
+    assert image.center_w is not None
+    motion, turn, way = _motion(solution, image).steady(*solution.cameras[image.camera_id].clock_range)
+    return motion, (turn @ image.R_cw, image.center_w + way)
+
+
+def _line(camera: Camera, place: float, border: float = 0.5) -> float:
+    """The line at a place of the readout, from -0.5 where it begins to 0.5 where it ends.
 
     It begins at the border of the photo, or with `border` 0 at the centre of the line that is read first.
     """
     axis, sign = READOUTS[camera.readout]
     last = (camera.width, camera.height)[axis] - 1.0
-    xy = np.zeros((1, 2))
-    xy[0, axis] = last / 2 + sign * place * (last + 2 * border)
-    return float(clock_of(camera, xy)[0])
+    return last / 2 + sign * place * (last + 2 * border)
+
+
+def _clock(camera: Camera, place: float, border: float = 0.5) -> float:
+    """The clock there."""
+    return float(clock_of(camera, np.full((1, 2), _line(camera, place, border)))[0])
 
 
 def _pose(solution: Solution, image: SolvedImage, clock: float) -> Pose:
+    motion, pose = _steady(solution, image)
+    return motion.pose_at(clock, *pose)
+
+
+def _bent(solution: Solution, image: SolvedImage, clock: float) -> Pose:
+    """The pose that a line has, and not that of the nearest steady motion."""
     assert image.R_cw is not None
     assert image.center_w is not None
     return _motion(solution, image).pose_at(clock, image.R_cw, image.center_w)
@@ -120,6 +145,18 @@ def _write_gsplat(path: Path, solution: Solution, images: Sequence[SolvedImage],
         for image, camera in zip(images, cameras, strict=True)
     ]
     viewmats = np.array(ends).reshape(-1, 2, 4, 4)
+    lines: dict[str, NDArray[np.float64]] = {}
+    if any(_motion(solution, image).bend is not None for image in images):
+        places = np.linspace(-0.5, 0.5, _LINES)
+        lines = {
+            "lines": np.array([[_line(camera, place, border=0.0) for place in places] for camera in cameras]),
+            "viewmats_lines": np.array(
+                [
+                    [_viewmat(_bent(solution, image, _clock(camera, place, border=0.0))) for place in places]
+                    for image, camera in zip(images, cameras, strict=True)
+                ]
+            ),
+        }
     Ks = np.array([camera.K for camera in cameras]).reshape(-1, 3, 3)
     Ks[:, :2, 2] += 0.5  # its pixel centres are at 0.5
 
@@ -141,6 +178,7 @@ def _write_gsplat(path: Path, solution: Solution, images: Sequence[SolvedImage],
         radial_coeffs=radial,
         tangential_coeffs=lens("p1", "p2"),
         thin_prism_coeffs=lens("s1", "s2", "s3", "s4"),
+        **lines,  # type: ignore[arg-type]  # arrays all
     )
 
 
@@ -157,7 +195,7 @@ def _readout_time(solution: Solution, images: Sequence[SolvedImage]) -> tuple[fl
 
 def _velocities(solution: Solution, image: SolvedImage, camera: Camera, time: float) -> dict[str, Any]:
     """Velocities of the camera in its own frame, OpenGL's axes: world units and radians by the unit of time."""
-    motion = _motion(solution, image)
+    motion, _ = _steady(solution, image)
     R_cw, _ = _pose(solution, image, _clock(camera, 0.0))
     # rows run downwards there; to read them upwards is to move the other way
     rate = READOUTS[camera.readout][1] * camera.frame_span / time

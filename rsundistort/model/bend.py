@@ -53,7 +53,8 @@ def _gram(num_sites: int) -> Array:
     place, weight = np.polynomial.legendre.leggauss(4)
     powers = ((place + 1) / 2)[:, None] ** np.arange(4)
     values = np.einsum("qk,ikn->iqn", powers, bend_pieces(num_sites).reshape(-1, 4, num_sites))
-    return frozen(np.einsum("iqa,q,iqb->ab", values, weight / 2, values) / (num_sites - 1))
+    values = (np.sqrt(weight / 2)[:, None] * values).reshape(-1, num_sites)
+    return frozen(values.T @ values / (num_sites - 1))
 
 
 @lru_cache(maxsize=8)

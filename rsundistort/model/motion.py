@@ -53,6 +53,53 @@ class RowMotion:
         for name in ("phi", "velocity"):
             object.__setattr__(self, name, frozen(check_finite(getattr(self, name), (3,), name)))
 
+    @classmethod
+    def of(
+        cls, clock: ArrayLike, rotation: ArrayLike, position: ArrayLike | None = None, sites: int = 65
+    ) -> tuple[RowMotion, NDArray[np.float64], NDArray[np.float64]]:
+        """The motion that passes through readings of a pose, and the pose that it belongs to.
+
+        Parameters
+        ----------
+        clock : (k,) array
+            Ascending, from the start of the frame to its end.
+        rotation, position : (k, 3) array
+            Rotation vectors and positions there against some pose: `Exp(rotation) R_cw` and `center_w + position`.
+        sites : int
+            Readings of the bend, the cubic spline that is left beside the nearest steady motion.
+
+        Returns
+        -------
+        motion : RowMotion
+            Its bend is orthogonal to 1 and to the clock.
+        turn : (3, 3) array
+            The pose that goes with it has the rotation `turn R_cw`
+        way : (3,) array
+            and the centre `center_w + way`.
+        """
+        from scipy.spatial.transform import Rotation
+
+        readings = Rotation.from_rotvec(np.array(check_finite(rotation, (None, 3), "rotation")))
+        turn = readings[len(readings) // 2]
+        # what is constant goes into the pose; turns do not commute, so that a share of it is left each time
+        for _ in range(50):
+            bend, constant, rate = Bend.of(clock, (readings * turn.inv()).as_rotvec(), position, sites)
+            turn = Rotation.from_rotvec(constant[0]) * turn
+            if np.abs(constant[0]).max() < 1e-15:
+                break
+        return cls(rate[0], rate[1], bend), turn.as_matrix(), constant[1]
+
+    def steady(self, start: float, end: float) -> tuple[RowMotion, NDArray[np.float64], NDArray[np.float64]]:
+        """The steady motion that is nearest while the clock runs from start to end, and the pose it belongs to.
+
+        As `of` returns them, without a bend: of least mean square in rotation and in position.
+        """
+        if self.bend is None:
+            return self, np.eye(3), np.zeros(3)
+        clock = np.linspace(start, end, 1025)
+        near, turn, way = RowMotion.of(clock, *self.at(clock), sites=len(self.bend.values))
+        return replace(near, bend=None), turn, way
+
     def in_camera(self, R_cw: NDArray[np.float64]) -> RowMotion:
         """The motion with its velocity in the camera frame at the reference row, as projection takes it."""
         R = np.asarray(R_cw, np.float64)

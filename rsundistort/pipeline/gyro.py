@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike
 
 from ..errors import InputError
 from ..io import read_exif
-from ..io.gyro import GyroLog, motions_from_gyro, read_gyro, read_photo_times
+from ..io.gyro import GyroLog, bends_from_gyro, motions_from_gyro, read_gyro, read_photo_times
 from ..io.motions import Known
 from ..io.readout_times import readout_time
 from ..io.video import FRAME_TABLE, VideoFrames
-from ..model import Camera, Reconstruction
+from ..model import Bend, Camera, Reconstruction
 
 __all__ = ["GyroOptions", "gyro_contradiction", "gyro_motions", "known_readouts"]
 
@@ -88,8 +88,17 @@ def known_readouts(
     return found
 
 
-def gyro_motions(folder: Path, gyro: GyroOptions, log: GyroLog, readout_s: Mapping[str, float | None]) -> Known:
-    """Motions of the photos that have a time, as `RunOptions.known` takes them; `readout_s` by photo."""
+def gyro_motions(
+    folder: Path,
+    gyro: GyroOptions,
+    log: GyroLog,
+    readout_s: Mapping[str, float | None],
+    cameras: Mapping[str, Camera],
+) -> tuple[Known, dict[str, Bend]]:
+    """Motions of the photos that have a time, as `RunOptions.known` and `known_bends` take them.
+
+    `readout_s` and `cameras` are by photo.
+    """
     table = Path(gyro.times) if gyro.times is not None else folder / FRAME_TABLE
     if gyro.times is None and not table.is_file():
         raise InputError(f"{gyro.file}: when were the photos taken? Give a table of name, time_s with --photo-times")
@@ -100,7 +109,11 @@ def gyro_motions(folder: Path, gyro: GyroOptions, log: GyroLog, readout_s: Mappi
         raise InputError(
             f"{gyro.file}: how long does the camera of {unknown[0]} take to read a frame? Give --readout-ms"
         )
-    return motions_from_gyro(log, times, {name: readout_s[name] or 0.0 for name in times}, offset_s=gyro.offset_s)
+    spans = {name: readout_s[name] or 0.0 for name in times}
+    known = motions_from_gyro(log, times, spans, offset_s=gyro.offset_s)
+    found = bends_from_gyro(log, {name: times[name] for name in known}, spans, cameras, offset_s=gyro.offset_s)
+    # phi goes with the bend: the slope of the turn, not its mean rate
+    return {name: (found[name][0], sigma) for name, (_, sigma) in known.items()}, {k: v for k, (_, v) in found.items()}
 
 
 def gyro_contradiction(rec: Reconstruction, known: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> str | None:

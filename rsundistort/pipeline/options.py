@@ -12,7 +12,7 @@ from ..bundle import BundleOptions, KnownLength
 from ..critical import with_remedy
 from ..errors import InputError
 from ..io.cameras import check_sigma
-from ..model import check_shutter_model
+from ..model import Bend, check_shutter_model
 from ..sfm import DETECTION_MEGAPIXELS
 from .cameras import PhotoCameras, check_readouts
 from .depth import check_depth
@@ -52,6 +52,8 @@ class SolveOptions(RectifyOptions):
         `BundleOptions.still`.
     known : mapping of photo name to (phi, sigma)
         Motions known from elsewhere, as in `BundleOptions.known_phi`.
+    known_bends : mapping of photo name to Bend
+        What is known not to be steady in them, as in `BundleOptions.known_bends`.
     lengths : sequence of KnownLength
         Lengths measured in the scene, as in `BundleOptions.lengths`.
     remedy : str
@@ -78,6 +80,7 @@ class SolveOptions(RectifyOptions):
     camera_sigma: Mapping[str, float] = field(default_factory=dict)
     still: Mapping[str, float] = field(default_factory=dict)
     known: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
+    known_bends: Mapping[str, Bend] = field(default_factory=dict)
     lengths: Sequence[KnownLength] = ()
     remedy: str = "auto"
     readout_s: float | None = None
@@ -108,7 +111,10 @@ class SolveOptions(RectifyOptions):
 
     def bundle_options(self) -> BundleOptions:
         """Options of the adjustments, as far as they do not depend on the cameras."""
-        return BundleOptions(known_phi=self.known, still=self.still, lengths=self.lengths, refine=self.refine or ())
+        return BundleOptions(
+            known_phi=self.known, known_bends=self.known_bends, still=self.still, lengths=self.lengths,
+            refine=self.refine or (),
+        )  # fmt: skip
 
     def options_for(self, cameras: PhotoCameras) -> BundleOptions:
         """Options of the adjustments of photos of these cameras."""

@@ -33,6 +33,7 @@ from ..io.places import local_place
 from ..io.video import FRAME_TABLE
 from ..model import Reconstruction, RowMotion, Solution
 from ..model.orientation import turn_reconstruction, turn_solution
+from ..rectify import bend_px
 from ..report import Diagnostics, relative_folder, write_diagnostics, write_report
 from .depth import DEPTHS, PhotoDepths, ScenePoints, with_depths
 from .ladder import Solved
@@ -153,6 +154,8 @@ class Outputs:
             turns = {name: turn_of(orientations.get(name, 1), True)[0] for name in rec.image_names}
         ids = replace(ids or ModelIds.in_order(rec), cameras=outcome.camera_ids)
         rec = rec.with_motions([solution.image(name).taken_out or RowMotion() for name in rec.image_names])
+        if options.rs_poses and rec.bends:
+            solution = replace(solution, quality={**solution.quality, "rs_poses_px": _left_by_two_poses(rec)})
         return cls(solution, rec, options, ids, turns, rgb, with_photos, times or {}, outcome.solved)
 
     def begin(self, folder: Path, log: StageLog) -> Solution:
@@ -288,6 +291,19 @@ class Outputs:
             times = list(posed)
         poses = [(image.R_cw, image.center_w) for image in posed.values()]
         write_trajectory(path, np.array(times), np.array([R for R, _ in poses]), np.array([c for _, c in poses]))
+
+
+def _left_by_two_poses(rec: Reconstruction) -> float:
+    """Largest displacement in pixels, over the photos, that two poses a photo cannot say; at each one's near points."""
+    left = 0.0
+    obs = rec.observations
+    for i in range(rec.num_images):
+        seen = rec.points_w[obs.point_idx[obs.frame_idx == i]]
+        depth = (seen - rec.center_w[i]) @ rec.R_cw[i, 2]
+        moves = rec.shutter_model == "constant-motion" and (depth > 0).any()
+        near = float(np.percentile(depth[depth > 0], 5)) if moves else np.inf
+        left = max(left, bend_px(rec.camera(i), rec.motion(i).in_camera(rec.R_cw[i]), near))
+    return left
 
 
 def relative_to(folder: Path, start: Path) -> PurePath:

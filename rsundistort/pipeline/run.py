@@ -82,9 +82,14 @@ def run(
         from_gyro: Known = {}
         if options.gyro is not None and gyro_log is not None:
             times = [readouts[k][0] if k in readouts else None for k in cameras.camera_idx.tolist()]
-            motions = gyro_motions(folder, options.gyro, gyro_log, dict(zip(loaded.names, times, strict=True)))
+            by_photo = dict(zip(loaded.names, times, strict=True))
+            of_photo = {name: cameras.of(i) for i, name in enumerate(loaded.names)}
+            motions, bends = gyro_motions(folder, options.gyro, gyro_log, by_photo, of_photo)
             from_gyro = {k: v for k, v in motions.items() if k not in options.known and k not in options.still}
-            options = replace(options, known={**options.known, **from_gyro})
+            bends = {name: bends[name] for name in from_gyro}
+            options = replace(
+                options, known={**options.known, **from_gyro}, known_bends={**bends, **options.known_bends}
+            )
         known_s = {k: seconds for k, (seconds, _) in readouts.items()}
 
         def options_of(rec: Reconstruction) -> BundleOptions:

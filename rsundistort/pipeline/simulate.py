@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,23 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import FileError, FormatError, InputError
 from ..io import facts_of_exif, list_photos, output_folder, output_name, read_photo, write_image, write_solution
 from ..io.cameras import camera_to_json
+from ..io.gyro import GyroLog
 from ..io.record import Record
 from ..model import Camera, RowMotion, Solution, SolvedImage
 from ..model.checks import check_finite
 from ..rectify import largest_shift_px
 from ..synthetic.fold import check_no_fold
+from ..synthetic.unsteady import (
+    Poses,
+    RowTable,
+    Vibration,
+    accelerations,
+    read_row_tables,
+    row_table,
+    tracks,
+    unsteady,
+    vibrations,
+)
 from ..synthetic.warp import crop_camera, largest_rectangle, random_phi, warp_mask, warp_photo
 from .cameras import camera_file_of, find_cameras
 from .outcome import versions
@@ -43,8 +55,18 @@ class WarpOptions:
         As in `RunOptions`; EXIF's focal length serves if there is no camera.
     sigma_rad : float
         Standard deviation of the rotation over the frame, in radians.
-    motion : mapping of name to (3,) phi, optional
-        Given motions, radians per unit of the clock; photos not named do not move. Instead of random ones.
+    motion : mapping of name to (3,) phi or RowTable, optional
+        Given motions, radians per unit of the clock, or rotations by row; photos not named do not move. Instead of
+        random ones. A rotation that is constant stays out, so that the photo remains the twin.
+    gyro : GyroLog, optional
+        Motions are stretches of this log, drawn at random, instead of steady ones.
+    readout_s : float, optional
+        How long a frame is read in the time of the log; by default what the log says.
+    acceleration : float
+        Standard deviation of what the components of phi change by over half a frame, as a share of themselves; drawn
+        for each photo and component.
+    vibration : Vibration, optional
+        On top of all of these.
     still : sequence of str
         Photos that do not move.
     crop : bool
@@ -58,7 +80,11 @@ class WarpOptions:
     camera: str | None = None
     readout: str | None = None
     sigma_rad: float = 0.05
-    motion: Mapping[str, ArrayLike] | None = None
+    motion: Mapping[str, ArrayLike | RowTable] | None = None
+    gyro: GyroLog | None = None
+    readout_s: float | None = None
+    acceleration: float = 0.0
+    vibration: Vibration | None = None
     still: Sequence[str] = ()
     crop: bool = False
     seed: int = 0
@@ -67,8 +93,18 @@ class WarpOptions:
     overwrite: bool = False
 
 
-def read_motion_file(path: Path) -> dict[str, list[float]]:
-    """Motions of a JSON file `{name: [phi1, phi2, phi3]}`, radians per unit of the clock."""
+def read_motion_file(path: Path) -> dict[str, list[float] | RowTable]:
+    """Motions of photos.
+
+    Parameters
+    ----------
+    path : path
+        JSON `{name: [phi1, phi2, phi3]}`, radians per unit of the clock, or `{name: {"row": [...], "rotation": [[rx,
+        ry, rz], ...]}}`, `clock` instead of `row` if it is that, as of `RowTable`; or CSV, as `read_row_tables` takes
+        it.
+    """
+    if Path(path).suffix.lower() == ".csv":
+        return dict(read_row_tables(path))
     try:
         value = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
@@ -77,7 +113,12 @@ def read_motion_file(path: Path) -> dict[str, list[float]]:
         raise FormatError(f"{path} is no valid JSON: {error}") from error
     if not isinstance(value, dict):
         raise FormatError(f"{path}: expected an object of name: [phi1, phi2, phi3]")
-    return {name: check_finite(phi, (3,), f"{path}: motion of {name}").tolist() for name, phi in value.items()}
+    return {
+        name: row_table(each, f"{path}: table of {name}")
+        if isinstance(each, dict)
+        else check_finite(each, (3,), f"{path}: motion of {name}").tolist()
+        for name, each in value.items()
+    }
 
 
 def simulate_warp(
@@ -133,17 +174,9 @@ def simulate_warp(
         facts = [facts_of_exif(first.metadata.exif)]
         found = find_cameras(photos, names[:1], [(width, height)], facts, options.camera, options.readout)
         camera, source = found.of(0), found.source
-        if options.motion is None:
-            phi = random_phi(names, [camera.frame_span] * len(names), options.sigma_rad, options.seed, options.still)
-        else:
-            unknown = sorted({*options.motion, *options.still} - set(names))
-            if unknown:
-                raise InputError(f"motion or still photo {unknown[0]!r} is not among the photos of {photos}")
-            phi = {name: np.asarray(options.motion.get(name, np.zeros(3)), np.float64) for name in names}
-            phi.update({name: np.zeros(3) for name in options.still})
-        motions = {name: RowMotion(phi[name]) for name in names}
+        motions = _motions(photos, names, camera, options)
         for name in names:
-            check_no_fold(name, camera, motions[name].phi)
+            check_no_fold(name, camera, motions[name].phi, bend=motions[name].bend)
         whole, crop = camera, (0, 0, camera.width, camera.height)
         if options.crop:
             crop = _common_rectangle(whole, motions, jobs, log)
@@ -154,7 +187,7 @@ def simulate_warp(
 
         def work(name: str) -> None:
             photo = read_photo(photos / name)
-            warped, mask = warp_photo(photo.pixels, whole, motions[name].phi)
+            warped, mask = warp_photo(photo.pixels, whole, motions[name])
             out_name = output_name(name)
             write_image(scratch / "photos" / out_name, _cut(warped, kept), photo.metadata, options.quality)
             write_image(scratch / "masks" / masks[name], _cut(mask, kept))
@@ -181,16 +214,60 @@ def simulate_warp(
             options={
                 "simulation": "warp",
                 "camera": source,
-                "sigma_rad_per_frame": None if options.motion is not None else options.sigma_rad,
+                "sigma_rad_per_frame": options.sigma_rad if options.motion is None and options.gyro is None else None,
                 "seed": options.seed,
                 "still": list(options.still),
                 "crop_xywh": list(crop) if options.crop else None,
+                **({"acceleration": options.acceleration} if options.acceleration else {}),
+                **({} if options.vibration is None else {"vibration": asdict(options.vibration)}),
             },
             generator=versions(),
         )
         (scratch / "camera.json").write_text(json.dumps(camera_to_json(camera)) + "\n", encoding="utf-8")
         write_solution(scratch / "ground_truth.json", truth)
     return truth
+
+
+def _motions(photos: Path, names: Sequence[str], camera: Camera, options: WarpOptions) -> dict[str, RowMotion]:
+    """The motion of each photo."""
+    unknown = sorted({*(options.motion or ()), *options.still} - set(names))
+    if unknown:
+        raise InputError(f"motion or still photo {unknown[0]!r} is not among the photos of {photos}")
+    given = options.motion or {}
+    tables = [name for name, each in given.items() if isinstance(each, RowTable)]
+    if options.gyro is not None and options.motion is not None:
+        raise InputError("motions are given, and a gyroscope's log; expected one of them")
+    if options.acceleration and (tables or options.gyro is not None):
+        raise InputError("an acceleration goes with steady motions, not with tables or a gyroscope's log")
+    start: Mapping[str, RowMotion | RowTable | Poses]
+    cameras = [camera] * len(names)
+    if options.gyro is not None:
+        start = dict(zip(names, tracks(options.gyro, cameras, options.readout_s, options.seed), strict=True))
+    elif options.motion is None:
+        phi = random_phi(names, [camera.frame_span] * len(names), options.sigma_rad, options.seed, options.still)
+        start = {name: RowMotion(phi[name]) for name in names}
+    else:
+        start = {name: _given(given.get(name, np.zeros(3))) for name in names}
+    shares = accelerations(len(names), options.acceleration, options.seed)
+    shakes: Sequence[Poses | None] = [None] * len(names)
+    if options.vibration is not None:
+        shakes = vibrations(cameras, options.vibration, options.seed)
+    motions = {}
+    for name, share, shake in zip(names, shares, shakes, strict=True):
+        each = start[name]
+        if name in options.still:
+            motions[name] = RowMotion()
+        elif isinstance(each, RowMotion) and shake is None and not options.acceleration:
+            motions[name] = each
+        else:
+            motions[name] = unsteady(name, camera, each, share, shake)[0]
+            if motions[name].moves:
+                raise InputError(f"table of {name}: it has positions, but a photo can be warped by rotations only")
+    return motions
+
+
+def _given(value: ArrayLike | RowTable) -> RowMotion | RowTable:
+    return value if isinstance(value, RowTable) else RowMotion(np.asarray(value, np.float64))
 
 
 def _common_rectangle(
@@ -201,7 +278,7 @@ def _common_rectangle(
     smallest = ("", np.inf)
     log.begin("cropping", len(motions))
     with ThreadPoolExecutor(jobs) as pool:
-        found = pool.map(lambda motion: warp_mask(camera, motion.phi) > 0, motions.values())
+        found = pool.map(lambda motion: warp_mask(camera, motion) > 0, motions.values())
         for done, (name, mask) in enumerate(zip(motions, found, strict=True), start=1):
             valid &= mask
             smallest = min(smallest, (name, float(mask.mean())), key=lambda each: each[1])

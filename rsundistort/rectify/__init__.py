@@ -5,7 +5,7 @@ from .grid import MAP_KINDS, RemapGrid, remap_grid
 from .maps import init_rectify_map
 from .new_camera import ViewOptions, optimal_new_camera, rectified_roi, rectified_view
 from .photo import INTERPOLATIONS, rectify
-from .points import distort_points, largest_shift_px, translation_shift_px, undistort_points
+from .points import bend_px, distort_points, largest_shift_px, translation_shift_px, undistort_points
 from .sparse import depth_from_points, fit_plane, plane_in_camera, prefers_plane
 
 __all__ = [
@@ -15,6 +15,7 @@ __all__ = [
     "CoarseGrid",
     "RemapGrid",
     "ViewOptions",
+    "bend_px",
     "coarse_grid",
     "depth_from_points",
     "distort_points",

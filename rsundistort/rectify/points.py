@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._kernels.depth import EDGE
 from ..errors import InputError
-from ..model import AtInfinity, Camera, Depth, DepthMap, Plane, RowMotion
+from ..model import READOUTS, AtInfinity, Camera, Depth, DepthMap, Plane, RowMotion
 from ..model.checks import check_array, check_finite
 from ..model.projection import clock_of, project_points, unproject_points
 from .depth import inverse_depth_at
 from .maps import rectified_rays
 
-__all__ = ["distort_points", "largest_shift_px", "undistort_points"]
+__all__ = ["bend_px", "distort_points", "largest_shift_px", "undistort_points"]
 
 # A line through a depth map is followed in steps of half a pixel; bisection ends at rounding.
 _STEPS_PER_PX = 2
@@ -215,6 +215,35 @@ def largest_shift_px(
     xy, K = _rectified_grid(camera, new_camera)
     raw = distort_points(xy, camera, motion, shutter_model, P=K, depth=depth)
     return _largest(camera, raw, distort_points(xy, camera, P=K))
+
+
+def bend_px(camera: Camera, motion: RowMotion, depth: float = np.inf) -> float:
+    """Largest displacement in pixels by which a photo departs from one that the nearest steady motion would have taken.
+
+    What is left where a motion is told by two poses, or by one rate; 0 where it is steady.
+
+    Parameters
+    ----------
+    camera, motion
+        As in `init_rectify_map`, the motion in the camera frame.
+    depth : float
+        Of what is shown, in the units of the velocity; at infinity travel moves nothing.
+    """
+    if motion.bend is None:
+        return 0.0
+    near, turn, way = motion.steady(*camera.clock_range)
+    # along the readout four for each reading of the bend
+    num = [33, 33]
+    num[READOUTS[camera.readout][0]] = max(33, 4 * len(motion.bend.values))
+    u, v = np.meshgrid(np.linspace(0, camera.width - 1, num[0]), np.linspace(0, camera.height - 1, num[1]))
+    raw = np.column_stack([u.ravel(), v.ravel()])
+    ideal, valid = unproject_points(raw, camera, motion)
+    points = _homogeneous(ideal)[valid]
+    model = "constant-motion" if np.isfinite(depth) else "rotation"
+    if np.isfinite(depth):
+        points = depth * points + motion.at(clock_of(camera, raw[valid]))[1] - way
+    moved, seen = project_points(points @ turn.T, camera, near.in_camera(turn), model)
+    return float(np.linalg.norm(moved - raw[valid], axis=1)[seen].max(initial=0.0))
 
 
 def translation_shift_px(camera: Camera, motion: RowMotion, depth: Depth, new_camera: Camera | None = None) -> float:

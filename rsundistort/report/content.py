@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..critical.meter import readout_axes
 from ..io import output_name
-from ..model import SHUTTER_MODELS, Camera, Solution, SolvedImage
+from ..model import READOUTS, SHUTTER_MODELS, Camera, Solution, SolvedImage
 from ..model.orientation import MATRICES, in_stored_frame, split_mirror, turn_points
 from .diagnostics import Diagnostics
 from .displacement import displacement_field
@@ -24,6 +24,7 @@ __all__ = [
     "cameras",
     "ladder",
     "longer",
+    "motions",
     "photos",
     "residuals",
     "scene",
@@ -32,6 +33,8 @@ __all__ = [
     "view_of",
 ]
 
+# Size of the picture of a motion, and the places along the readout that it is drawn at.
+_CURVE, _CURVE_PLACES = (240, 120), 97
 # Factors by which arrows may be drawn longer than they are, and the part of a cell that a long one should fill.
 _LONGER = (1, 2, 3, 4, 6, 8, 10, 15, 20, 30, 50)
 _ACROSS = 14
@@ -70,6 +73,43 @@ def photos(source: Source) -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def motions(solution: Solution) -> list[dict[str, Any]]:
+    """How photos turned while they were read, of those that did not turn steadily: SVG paths for the three axes.
+
+    From the first line on the left to the last on the right; the steady motions that are nearest go with them.
+    """
+    width, height = _CURVE
+    found = []
+    for number, image in enumerate(solution.images):
+        if image.motion is None or image.motion.bend is None:
+            continue
+        camera = solution.cameras[image.camera_id]
+        clock = np.linspace(*camera.clock_range, _CURVE_PLACES)
+        turn = np.degrees(image.motion.at(clock)[0])
+        steady = np.degrees(clock[[0, -1], None] * image.motion.phi)
+        low, high = min(turn.min(), steady.min()), max(turn.max(), steady.max())
+        room = max(float(high - low), 1e-9)
+
+        def paths(values: NDArray[np.float64], high: float = high, room: float = room) -> list[str]:
+            x, y = np.linspace(0, width, len(values)), 4 + (height - 8) * (high - values) / room
+            return ["M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, each, strict=True)) for each in y.T]
+
+        found.append(
+            {
+                "number": number,
+                "name": image.name,
+                "curves": paths(turn),
+                "steady": paths(steady),
+                "low": float(low),
+                "high": float(high),
+                "zero": round(4 + (height - 8) * float(high) / room, 1) if low < 0 < high else None,
+                "most": float(np.linalg.norm(turn - np.degrees(clock[:, None] * image.motion.phi), axis=1).max()),
+                "lines": ("columns", "rows")[READOUTS[camera.readout][0]],
+            }
+        )
+    return found
 
 
 def view_of(source: Source, pictures: Mapping[str, Picture]) -> list[dict[str, Any]]:

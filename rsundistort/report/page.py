@@ -104,6 +104,7 @@ def _page(source: Source, pictures: dict[str, Picture]) -> str:
         advice=advice_of(solution),
         notes=source.notes,
         photos=content.photos(source),
+        motions=content.motions(solution),
         views=views,
         data=data,
         ladder=content.ladder(solution),

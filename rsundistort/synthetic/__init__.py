@@ -9,6 +9,7 @@ from .render import add_noise, line_poses, pixel_rays, render_depth, render_view
 from .scene import Light, Opening, Patch, Scene, box, wall
 from .surfaces import height_field, mesh
 from .textures import Texture
+from .unsteady import RowTable, Vibration, read_row_tables
 from .warp import random_phi, warp_photo
 
 __all__ = [
@@ -18,9 +19,11 @@ __all__ = [
     "Opening",
     "Patch",
     "Recipe",
+    "RowTable",
     "Scene",
     "Texture",
     "TruePoints",
+    "Vibration",
     "View",
     "add_noise",
     "box",
@@ -34,6 +37,7 @@ __all__ = [
     "pixel_rays",
     "project_rows",
     "random_phi",
+    "read_row_tables",
     "render_depth",
     "render_view",
     "rs_shift_px",

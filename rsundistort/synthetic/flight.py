@@ -2,18 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FormatError, InputError
+from ..io.gyro import read_gyro
+from ..model.camera import Camera
 from ..model.checks import check_finite
 from ..model.motion import RowMotion
 from .entries import count, kind_of, number, take
+from .unsteady import (
+    Poses,
+    RowTable,
+    Vibration,
+    accelerations,
+    read_row_tables,
+    row_table,
+    tracks,
+    unsteady,
+    vibrations,
+)
 
-__all__ = ["Pose", "look_at", "motions_of", "poses_of"]
+__all__ = ["Pose", "look_at", "motions_of", "poses_of", "unsteady_motions"]
 
 _UP = (0.0, 0.0, 1.0)
 
@@ -143,6 +158,18 @@ def poses_of(entry: Any, default_camera: str) -> list[Pose]:
     return _orbit(entry, default_camera) if kind == "orbit" else _lines(entry, default_camera, kind == "flyover")
 
 
+KINDS = ("none", "rotation", "random", "given", "gyro")
+#: Keys of a recipe's motion that say what is not steady, with the kinds that each goes with.
+UNSTEADY = {
+    "acceleration": ("rotation", "random", "given"),
+    "vibration": KINDS,
+    "tables": ("given",),
+    "log": ("gyro",),
+    "axes": ("gyro",),
+    "readout_ms": ("gyro",),
+}
+
+
 def _directions(rng: np.random.Generator, num: int) -> NDArray[np.float64]:
     axes = rng.normal(size=(num, 3))
     return np.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True))
@@ -154,9 +181,10 @@ def motions_of(entry: Any, poses: list[Pose], frame_spans: list[float], seed: in
     Random motion turns about an axis uniform on the sphere by an angle over the frame drawn from N(0, sigma^2), and
     moves alike; `drift_m_per_frame` carries the camera along its path besides.
     """
-    kind = kind_of(entry, "motion", ("none", "rotation", "random", "given"))
+    kind = kind_of(entry, "motion", KINDS)
+    entry = {key: value for key, value in entry.items() if key not in UNSTEADY}
     num, spans = len(poses), np.array(frame_spans)[:, None]
-    if kind == "none":
+    if kind in ("none", "gyro"):
         take(entry, "motion", ("kind",))
         return [RowMotion()] * num
     if kind == "given":
@@ -184,3 +212,62 @@ def motions_of(entry: Any, poses: list[Pose], frame_spans: list[float], seed: in
         velocity = velocity + drift / frame_spans[k] * pose.heading_w
         motions.append(RowMotion() if k in still else RowMotion(phi, velocity))
     return motions
+
+
+def unsteady_motions(
+    entry: Mapping[str, Any],
+    names: Sequence[str],
+    cameras: Sequence[Camera],
+    poses: Sequence[Pose],
+    motions: Sequence[RowMotion],
+    seed: int,
+    readout_ms: float | None,
+    folder: Path,
+) -> tuple[list[Pose], list[RowMotion]]:
+    """Poses and motions with what is not steady in a recipe's motion; the poses become those of the nearest steady one.
+
+    `entry` is the recipe's, `motions` what `motions_of` makes of it; tables and logs are looked for in `folder`.
+    """
+    kind = entry["kind"]
+    if wrong := [key for key, kinds in UNSTEADY.items() if key in entry and kind not in kinds]:
+        raise FormatError(f"motion: unknown key {wrong[0]!r} of the kind {kind}")
+    if not set(UNSTEADY) & set(entry) and kind != "gyro":
+        return list(poses), list(motions)
+    start: dict[str, RowMotion | RowTable | Poses] = dict(zip(names, motions, strict=True))
+    if kind == "gyro":
+        if "log" not in entry:
+            raise FormatError("motion: missing key 'log'")
+        log = read_gyro(folder / entry["log"], entry.get("axes"))
+        given_ms = entry.get("readout_ms", readout_ms)
+        seconds = None if given_ms is None else number(given_ms, "motion: readout_ms") / 1e3
+        start = dict(zip(names, tracks(log, list(cameras), seconds, seed), strict=True))
+    if "tables" in entry:
+        said = entry["tables"]
+        if isinstance(said, str):
+            tables = read_row_tables(folder / said)
+        else:
+            tables = {name: row_table(each, f"motion: table of {name}") for name, each in dict(said).items()}
+        if unknown := sorted(set(tables) - set(names)):
+            raise FormatError(f"motion: there is no photo {unknown[0]!r} for its table")
+        start |= tables
+    share = number(entry.get("acceleration", 0.0), "motion: acceleration")
+    shares = accelerations(len(names), share, seed)
+    shakes: Sequence[Poses | None] = [None] * len(names)
+    if "vibration" in entry:
+        keys = ("amplitude_rad", "travel_m", "periods", "axis")
+        options = dict(take(entry["vibration"], "motion: vibration", (), keys))
+        vibration = Vibration(travel=options.pop("travel_m", 0.0), **options)
+        shakes = vibrations(list(cameras), vibration, seed)
+    still = {names[k] for k in entry.get("still", [])}
+    found_poses, found = [], []
+    for name, camera, pose, acceleration, shake in zip(names, cameras, poses, shares, shakes, strict=True):
+        each = start[name]
+        steady = isinstance(each, RowMotion) and shake is None and not share
+        if isinstance(each, RowMotion) and (name in still or steady):
+            found.append(each)
+        else:
+            motion, turn, way = unsteady(name, camera, each, acceleration, shake)
+            pose = replace(pose, R_cw=turn @ pose.R_cw, center_w=pose.center_w + way)
+            found.append(motion)
+        found_poses.append(pose)
+    return found_poses, found

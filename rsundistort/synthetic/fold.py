@@ -11,13 +11,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
+from ..model.bend import Bend
 from ..model.camera import READOUTS, Camera
-from ..model.checks import check_finite
+from ..model.motion import RowMotion
 from .lens import distort_rays, undistort_to_rays
 
 __all__ = ["check_no_fold"]
 
-#: Pixels of the grid along each side; the speed is smooth, and largest at the border, which the grid holds.
+#: Pixels of the grid along each side; the speed is smooth, and largest at the border, which the grid holds. Along the
+#: readout there are four for each interval of a bend, whose speed is a parabola.
 _GRID = 33
 
 #: Step of the difference, in units of the clock: its error is 1e-9, rounding makes 1e-11 of it.
@@ -33,6 +35,7 @@ def check_no_fold(
     phi: ArrayLike,
     velocity: ArrayLike | None = None,
     depth: ArrayLike | None = None,
+    bend: Bend | None = None,
 ) -> None:
     """Refuse a motion that lets two rows of a photo see the same thing.
 
@@ -43,7 +46,7 @@ def check_no_fold(
         top-to-bottom:  -phi1 (1 + r^2) + phi2 r c + phi3 c    (rows a row)
         left-to-right:   phi2 (1 + c^2) - phi1 r c - phi3 r    (columns a column)
 
-    and at minus that where the readout is reversed. It must stay below 1.
+    and at minus that where the readout is reversed. It must stay below 1. A bend adds its own rate to phi and velocity.
 
     Parameters
     ----------
@@ -60,21 +63,25 @@ def check_no_fold(
         z in the camera of the nearest thing, world units: of the whole photo or of each pixel, at the moment its row is
         read; inf where nothing is. Only infinity when left out. The speed is linear in 1/depth, so what holds at this
         depth and at infinity holds between them.
+    bend : Bend, optional
+        What is not steady in the motion; its positions in the camera frame too.
 
     Raises
     ------
     InputError
         Names the photo, and the pixel where the image runs fastest.
     """
-    phi = check_finite(phi, (3,), "phi")
-    velocity = np.zeros(3) if velocity is None else check_finite(velocity, (3,), "velocity")
-    uv = np.stack(np.meshgrid(_stations(camera.width), _stations(camera.height)), -1).reshape(-1, 2)
-    speeds = [_line_speed(camera, uv, phi, np.zeros((len(uv), 3)))]
-    if depth is not None and velocity.any():
+    motion = RowMotion(np.asarray(phi, float), np.asarray(np.zeros(3) if velocity is None else velocity, float), bend)
+    num = [_GRID, _GRID]
+    if bend is not None:
+        num[READOUTS[camera.readout][0]] = max(_GRID, 4 * len(bend.values) - 3)
+    uv = np.stack(np.meshgrid(_stations(camera.width, num[0]), _stations(camera.height, num[1])), -1).reshape(-1, 2)
+    speeds = [_line_speed(camera, uv, motion, np.zeros(len(uv)))]
+    if depth is not None and motion.moves:
         near = _nearest(camera, uv, np.asarray(depth, np.float64))
         if not (near > 0).all():  # also NaN
             raise InputError(f"{name}: a depth of {np.min(near):g}; expected positive ones, in front of the camera")
-        speeds.append(_line_speed(camera, uv, phi, velocity / near[:, None]))
+        speeds.append(_line_speed(camera, uv, motion, 1 / near))
     speed = np.max(speeds, axis=0)
     if not np.isfinite(speed).any():
         raise InputError(f"{name}: the lens model shows nothing at any pixel of the photo")
@@ -88,9 +95,9 @@ def check_no_fold(
         )
 
 
-def _stations(length: int) -> NDArray[np.float64]:
+def _stations(length: int, num: int) -> NDArray[np.float64]:
     """Pixels along a side, whole numbers, with both ends."""
-    return np.unique(np.round(np.linspace(0, length - 1, _GRID)))
+    return np.unique(np.round(np.linspace(0, length - 1, num)))
 
 
 def _nearest(camera: Camera, uv: NDArray[np.float64], depth: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -107,7 +114,7 @@ def _nearest(camera: Camera, uv: NDArray[np.float64], depth: NDArray[np.float64]
 
 
 def _line_speed(
-    camera: Camera, uv: NDArray[np.float64], phi: NDArray[np.float64], velocity_per_depth: NDArray[np.float64]
+    camera: Camera, uv: NDArray[np.float64], motion: RowMotion, inverse_depth: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Lines (n,) by which the image of what pixels (n, 2) see runs on while one line is read; NaN beyond the lens."""
     K = camera.K
@@ -116,15 +123,17 @@ def _line_speed(
     norm = undistort_to_rays(uv, camera)
     known = np.asarray(np.isfinite(norm).all(axis=1))
     rays = np.column_stack([np.where(known[:, None], norm, 0.0), np.ones(len(uv))])
+    turned, gone = motion.at(clock)
+    level = Rotation.from_rotvec(-turned).apply(rays)
     # small against the distance of what comes towards the camera
-    step = _STEP / max(1.0, float(np.abs(velocity_per_depth).max()))
+    fastest = float(np.abs((motion.at(clock + _STEP)[1] - gone) * inverse_depth[:, None]).max()) / _STEP
+    step = _STEP / max(1.0, fastest)
 
     def position(late: float) -> NDArray[np.float64]:
         """Pixels (n, 2) of what the rays see, `late` after its own moment."""
-        moved = Rotation.from_rotvec(late * phi).apply(rays)
-        # X(t) = Exp(t phi) (X(0) - t velocity), so the camera's way is turned by all of the time gone
-        moved -= late * Rotation.from_rotvec((clock + late)[:, None] * phi).apply(velocity_per_depth)
-        return distort_rays(moved, camera)
+        # X(t) = Exp(theta(t)) (X(0) - way(t)), so the camera's way is turned by all of the time gone
+        turn, way = motion.at(clock + late)
+        return distort_rays(Rotation.from_rotvec(turn).apply(level - (way - gone) * inverse_depth[:, None]), camera)
 
     known &= np.linalg.norm(position(0.0) - uv, axis=1) < _LENS_PX
     moved_px = (position(step) - position(-step))[:, axis]

@@ -18,7 +18,8 @@ from .lens import distort_rays
 
 __all__ = ["Measured", "clock_of", "measure", "project_rows"]
 
-# |phi| contracts the fixed point: 0.2 rad per frame needs some 20 steps to rounding
+# the speed of the turn, |phi| and what a bend adds, contracts the fixed point: 0.2 rad per frame needs some 20 steps to
+# rounding
 _MAX_STEPS = 200
 _STILL = 1e-14
 
@@ -43,9 +44,9 @@ def project_rows(
     points_w : (n, 3) array
         World points.
     R_cw, center_w : (3, 3), (3,) array
-        Pose at the line of the principal point.
+        Pose that the motion belongs to.
     motion : RowMotion
-        Motion during the readout.
+        Motion during the readout, with its bend.
     camera : Camera
         Intrinsics, lens and readout direction.
 
@@ -65,8 +66,8 @@ def project_rows(
     reached = np.zeros(len(points), bool)
     for _ in range(_MAX_STEPS):
         tau = clock_of(camera.readout, seen)
-        moved = points - (center + tau[:, None] * motion.velocity)
-        q = Rotation.from_rotvec(tau[:, None] * motion.phi).apply(moved @ R.T)
+        turn, way = motion.at(tau)
+        q = Rotation.from_rotvec(turn).apply((points - (center + way)) @ R.T)
         ahead &= q[:, 2] > 1e-9
         q[~ahead] = (0.0, 0.0, 1.0)
         before, seen = seen, distort_rays(q, camera, np.eye(3))

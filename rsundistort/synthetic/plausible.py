@@ -28,7 +28,8 @@ def check_recipe(recipe: Recipe) -> None:
         depth = render_depth(recipe.scene, camera, view)
         if not np.isfinite(depth).any():
             raise InputError(f"photo {view.name} shows nothing but sky; look_at_w is away from every surface")
-        check_no_fold(view.name, camera, view.motion.phi, view.R_cw @ view.motion.velocity, depth)
+        motion = view.motion.in_camera(view.R_cw)
+        check_no_fold(view.name, camera, motion.phi, motion.velocity, depth, motion.bend)
     _check_in_front(recipe)
 
 
@@ -44,11 +45,13 @@ def _check_outside(recipe: Recipe, view: View) -> None:
     back = (patch >= 0) & ((normals[patch] * looks).sum(1) > 0)
     if back.mean() > 0.9:
         raise InputError(f"photo {view.name} is taken from inside a surface: all around it are the backs of things")
-    way = centers[-1] - centers[0]
-    if np.linalg.norm(way) > 0:
-        share = recipe.scene.cast(centers[:1], way[None])[1]
-        if share[0] < 1:
-            raise InputError(f"photo {view.name}: the camera moves through a surface while it is read")
+    # a steady camera moves along one line, others along as many as their bends can need
+    bend = view.motion.bend
+    stops = centers[np.unique(np.linspace(0, len(centers) - 1, 2 if bend is None else 257).round().astype(int))]
+    way = np.diff(stops, axis=0)
+    moves = np.linalg.norm(way, axis=1) > 0
+    if moves.any() and (recipe.scene.cast(stops[:-1][moves], way[moves])[1] < 1).any():
+        raise InputError(f"photo {view.name}: the camera moves through a surface while it is read")
 
 
 def _check_in_front(recipe: Recipe) -> None:

@@ -19,7 +19,7 @@ from ..model.camera import Camera
 from ..model.checks import check_finite, check_rotations, frozen
 from ..model.motion import RowMotion
 from .entries import number, take
-from .flight import Pose, motions_of, poses_of
+from .flight import Pose, motions_of, poses_of, unsteady_motions
 from .lens import undistort_to_rays
 from .scene import Light, Patch, Scene
 from .surfaces import surface_patches
@@ -40,7 +40,7 @@ class View:
     name : str
         File name of the photo.
     R_cw : (3, 3) array
-        World to camera at the line of the principal point.
+        World to camera at the line of the principal point; of a motion with a bend the pose of the nearest steady one.
     center_w : (3,) array
         Centre of the camera then, world units.
     motion : RowMotion
@@ -114,7 +114,7 @@ class Recipe:
     owners : tuple of str
         Which entry of the recipe each patch of the scene comes from.
     files : tuple of str
-        Meshes and pictures that the recipe names, relative to it.
+        Meshes, pictures, tables and logs that the recipe names, relative to it.
     """
 
     name: str
@@ -146,6 +146,7 @@ def _texture(entry: Any, where: str, folder: Path) -> Texture:
 def _files(data: dict[str, Any]) -> tuple[str, ...]:
     """Files beside the recipe that it names; none may lie outside its folder, since they are copied with it."""
     named = [each["path"] for each in (*data["surfaces"], *data["textures"].values()) if "path" in each]
+    named += [each for key in ("tables", "log") if isinstance(each := data["motion"].get(key), str)]
     for name in named:
         if Path(name).is_absolute() or ".." in Path(name).parts:
             raise FormatError(f"file {name!r}: expected a path below the recipe's own folder")
@@ -184,16 +185,23 @@ def _shutter(entry: Any) -> tuple[float | None, float]:
     return readout, exposure / readout
 
 
-def _views(data: dict[str, Any], cameras: dict[str, Camera], exposed: float) -> tuple[View, ...]:
+def _views(
+    data: dict[str, Any], cameras: dict[str, Camera], readout_ms: float | None, exposed: float, folder: Path
+) -> tuple[View, ...]:
     poses: list[Pose] = poses_of(data["path"], next(iter(cameras)))
     for k, pose in enumerate(poses):
         if pose.camera_id not in cameras:
             raise FormatError(f"path[{k}]: camera {pose.camera_id!r}, expected one of {', '.join(cameras)}")
     spans = [cameras[pose.camera_id].frame_span for pose in poses]
+    names = [f"{k:04d}.jpg" for k in range(len(poses))]
     motions = motions_of(data["motion"], poses, spans, data["seed"])
+    poses, motions = unsteady_motions(
+        data["motion"], names, [cameras[pose.camera_id] for pose in poses], poses, motions, data["seed"], readout_ms,
+        folder,
+    )  # fmt: skip
     return tuple(
-        View(f"{k:04d}.jpg", pose.R_cw, pose.center_w, motion, pose.camera_id, exposed * span)
-        for k, (pose, motion, span) in enumerate(zip(poses, motions, spans, strict=True))
+        View(name, pose.R_cw, pose.center_w, motion, pose.camera_id, exposed * span)
+        for name, pose, motion, span in zip(names, poses, motions, spans, strict=True)
     )
 
 
@@ -226,7 +234,7 @@ def _parse(data: Any, folder: Path) -> Recipe:
         name=data["name"],
         scene=Scene(tuple(patches), textures, light, seed),
         cameras=cameras,
-        views=_views(data, cameras, exposed),
+        views=_views(data, cameras, readout_ms, exposed, folder),
         render_options=options,
         jpeg_quality=options.pop("jpeg_quality"),
         noise=noise,
@@ -243,7 +251,7 @@ def load_recipe(path: str | Path) -> Recipe:
     Parameters
     ----------
     path : path
-        File of format rsundistort-recipe. Meshes and pictures are looked for beside it.
+        File of format rsundistort-recipe. Meshes, pictures, tables and logs are looked for beside it.
 
     Returns
     -------

@@ -34,22 +34,23 @@ def line_poses(camera: Camera, view: View, delay: float = 0.0) -> tuple[NDArray[
     camera : Camera
         Its readout says whether lines are rows or columns and which is read first.
     view : View
-        Pose at the line of the principal point, and the motion.
+        Pose and motion.
     delay : float
         Time after the middle of the line's exposure, in units of the clock.
 
     Returns
     -------
     R_cw : (lines, 3, 3) array
-        World to camera: Exp(tau*phi) @ view.R_cw, tau the clock of the line plus the delay.
+        World to camera: Exp(theta(tau)) @ view.R_cw, tau the clock of the line plus the delay; theta is tau*phi and
+        what the motion's bend adds.
     center_w : (lines, 3) array
-        view.center_w + tau*velocity.
+        view.center_w + tau*velocity, and what the bend adds.
     """
     axis, sign = READOUTS[camera.readout]
     lines = np.arange(camera.height if axis == 1 else camera.width)
     tau = sign * (lines - camera.K[axis, 2]) / camera.K[axis, axis] + delay
-    turn = Rotation.from_rotvec(tau[:, None] * view.motion.phi).as_matrix()
-    return turn @ view.R_cw, view.center_w + tau[:, None] * view.motion.velocity
+    turn, way = view.motion.at(tau)
+    return Rotation.from_rotvec(turn).as_matrix() @ view.R_cw, view.center_w + way
 
 
 def pixel_rays(camera: Camera, view: View, uv_raw: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -73,8 +74,8 @@ def pixel_rays(camera: Camera, view: View, uv_raw: ArrayLike) -> tuple[NDArray[n
     axis, sign = READOUTS[camera.readout]
     tau = sign * (uv[:, axis] - camera.K[axis, 2]) / camera.K[axis, axis]
     rays_c = np.column_stack([undistort_to_rays(uv, camera), np.ones(len(uv))])
-    turn = Rotation.from_rotvec(tau[:, None] * view.motion.phi)
-    return view.center_w + tau[:, None] * view.motion.velocity, turn.inv().apply(rays_c) @ view.R_cw
+    turn, way = view.motion.at(tau)
+    return view.center_w + way, Rotation.from_rotvec(-turn).apply(rays_c) @ view.R_cw
 
 
 def _develop(radiance: NDArray[np.float64], exposure: float) -> NDArray[np.uint8]:
@@ -154,7 +155,7 @@ def rs_shift_px(scene: Scene, camera: Camera, view: View) -> float:
     v, u = np.mgrid[: camera.height, : camera.width].astype(float)
     uv = np.stack([u.ravel(), v.ravel()], 1)
     origins, directions = pixel_rays(camera, view, uv)
-    if view.motion.velocity.any():
+    if view.motion.moves:
         distance = scene.cast(origins, directions)[1]
         met = np.isfinite(distance)
         directions[met] = origins[met] + distance[met, None] * directions[met] - view.center_w

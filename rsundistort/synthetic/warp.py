@@ -11,11 +11,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
-from ..model import READOUTS, Camera
+from ..model import READOUTS, Camera, RowMotion
 from .lens import distort_rays, undistort_to_rays
 
 __all__ = ["crop_camera", "largest_rectangle", "random_phi", "warp_mask", "warp_photo"]
@@ -57,11 +57,13 @@ def random_phi(
     return result
 
 
-def warp_photo(photo: NDArray[Any], camera: Camera, phi: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[np.uint8]]:
-    """The photo that a camera rotating by phi would have taken in place of this global-shutter one.
+def warp_photo(
+    photo: NDArray[Any], camera: Camera, motion: RowMotion | ArrayLike
+) -> tuple[NDArray[Any], NDArray[np.uint8]]:
+    """The photo that a rotating camera would have taken in place of this global-shutter one.
 
     A pixel of the result was read when the clock stood at its own (distorted) row, so the direction it saw is known:
-    `Exp(-t phi)` of its ray. That direction is looked up, bicubically, in the photo.
+    `Exp(-theta(t))` of its ray. That direction is looked up, bicubically, in the photo.
 
     Parameters
     ----------
@@ -69,8 +71,8 @@ def warp_photo(photo: NDArray[Any], camera: Camera, phi: NDArray[np.float64]) ->
         Taken without motion.
     camera : Camera
         Of the photo; its readout direction is the one simulated.
-    phi : (3,) array
-        Radians per unit of the clock.
+    motion : RowMotion or (3,) array
+        The rotation theta of `RowMotion.at`, with its bend; or phi alone, radians per unit of the clock.
 
     Returns
     -------
@@ -82,18 +84,19 @@ def warp_photo(photo: NDArray[Any], camera: Camera, phi: NDArray[np.float64]) ->
     h, w = photo.shape[:2]
     if (w, h) != (camera.width, camera.height):
         raise InputError(f"photo has {w}x{h} pixels, its camera {camera.width}x{camera.height}")
-    source, inside = _lookup(camera, phi)
+    source, inside = _lookup(camera, motion)
     warped = cv2.remap(photo, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return warped.reshape(photo.shape), np.where(inside, 255, 0).astype(np.uint8)
 
 
-def warp_mask(camera: Camera, phi: NDArray[np.float64]) -> NDArray[np.uint8]:
+def warp_mask(camera: Camera, motion: RowMotion | ArrayLike) -> NDArray[np.uint8]:
     """The mask that `warp_photo` gives with the photo: (h, w) uint8, 255 where the photo has the direction."""
-    return np.where(_lookup(camera, phi)[1], 255, 0).astype(np.uint8)
+    return np.where(_lookup(camera, motion)[1], 255, 0).astype(np.uint8)
 
 
-def _lookup(camera: Camera, phi: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _lookup(camera: Camera, motion: RowMotion | ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Pixel (h, w, 2) of the photo without motion whose direction each warped pixel saw, and whether it has it."""
+    motion = motion if isinstance(motion, RowMotion) else RowMotion(np.asarray(motion, np.float64))
     w, h = camera.width, camera.height
     K = camera.K
     axis, sign = READOUTS[camera.readout]
@@ -105,7 +108,7 @@ def _lookup(camera: Camera, phi: NDArray[np.float64]) -> tuple[NDArray[np.float3
     ideal = undistort_to_rays(np.dstack(np.meshgrid(u, v)), camera)
     # one rotation a row (or column): turn its rays by it
     steps = clock[:, 0] if axis == 1 else clock[0]
-    R = Rotation.from_rotvec(-steps[:, None] * phi).as_matrix()
+    R = Rotation.from_rotvec(-motion.at(steps)[0]).as_matrix()
     rays = np.dstack([ideal, np.ones((h, w))])
     turned = np.einsum("vij,vuj->vui" if axis == 1 else "uij,vuj->vui", R, rays)
     source = distort_rays(turned, camera).reshape(h, w, 2)
