@@ -142,7 +142,7 @@ def _starting_spreads(options: BundleOptions, layout: Layout, baseline: float) -
         (options.velocity_sigma or options.velocity_sigma_start) * baseline,
         options.focal_sigma_start,
         options.centre_sigma_start,
-        (options.bend_sigma_start,) * len(set(layout.group)),
+        tuple(np.broadcast_to(options.bend_sigma_start, len(set(layout.group))).tolist()),
         (options.way_sigma_start * baseline,) * len(set(layout.group[: layout.ways])),
     )
     return _bounded(start, options, baseline)
@@ -231,10 +231,8 @@ def bundle_adjust(
         cleaning = round_ < options.outlier_rounds
         # where the first spreads are but a guess, their solution need not be exact
         rough = cleaning or (round_ == 0 and options.spread_rounds > 0 and _estimates_spreads(shutter_model, options))
-        # once the outliers are gone the noise is nearly normal: squares converge in a few steps and use it fully
-        stage = options if round_ == 0 or not options.outlier_rounds else replace(options, loss="squared")
         believed = replace(base, observations=base.observations.select(keep))
-        problem = BundleProblem(believed, shutter_model, stage, sigma * factor, spreads, heavy_tails=noise_known)
+        problem = BundleProblem(believed, shutter_model, options, sigma * factor, spreads, heavy_tails=noise_known)
         result = minimize(
             problem,
             problem.initial_state(),

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model import SHUTTER_MODELS, Reconstruction
-from ..model.bend import bend_functions, bend_pieces
+from ..model import BEND_GROUPS, SHUTTER_MODELS, Bend, Reconstruction
+from ..model.bend import bend_functions, bend_pieces, splines_at
 from .options import BundleOptions
 
 __all__ = ["Layout"]
 
+# Sites where bends are known from elsewhere: twice as dense as those of the finest group.
+_KNOWN_SITES = 2 * list(BEND_GROUPS.values())[-1][0] + 1
 # Groups of bends that positions have, too: what vibrates faster than that turns, but hardly travels.
 _WAYS = 2
 
@@ -35,6 +37,8 @@ class Layout:
         Group of each.
     ways : int
         How many of them bend the positions.
+    known : mapping of photo name to (n, 6) array
+        Bends that are known from elsewhere, at the same sites; what is estimated comes on top of them.
     """
 
     motion: int
@@ -42,15 +46,25 @@ class Layout:
     functions: NDArray[np.float64]
     group: tuple[int, ...]
     ways: int
+    known: Mapping[str, NDArray[np.float64]]
 
     @classmethod
     def of(cls, shutter_model: str, options: BundleOptions) -> Layout:
         """That of a model."""
         motion = {"global": 6, "constant-motion": 12}.get(shutter_model, 9)
-        groups = options.bends if SHUTTER_MODELS[shutter_model] >= SHUTTER_MODELS["rotation"] else 0
-        functions, group = bend_functions(groups) if groups else (np.zeros((0, 0)), ())
+        exact = SHUTTER_MODELS[shutter_model] >= SHUTTER_MODELS["rotation"]
+        functions, group = bend_functions(options.bends) if exact and options.bends else (np.zeros((0, 0)), ())
+        known = {name: _at_sites(bend, _KNOWN_SITES) for name, bend in options.known_bends.items() if exact}
+        if known:
+            place = np.linspace(0, 1, _KNOWN_SITES)
+            functions = splines_at(len(functions), place) @ functions if group else np.zeros((_KNOWN_SITES, 0))
         ways = sum(each < _WAYS for each in group) if motion > 9 else 0
-        return cls(motion, motion + 3 * options.varying, functions, group, ways)
+        return cls(motion, motion + 3 * options.varying, functions, group, ways, known)
+
+    @property
+    def bent(self) -> bool:
+        """Whether motions are not steady."""
+        return len(self.functions) > 0
 
     @property
     def num_bends(self) -> int:
@@ -72,13 +86,20 @@ class Layout:
         values = [of_groups[each] for each in self.group] + [of_ways[each] for each in self.group[: self.ways]]
         return np.repeat(np.array(values, np.float64), 3)
 
-    def values(self, bend: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(m, n, 6) values at the sites of coefficients (m, 3 k)."""
+    def values(self, bend: NDArray[np.float64], names: Sequence[str]) -> NDArray[np.float64]:
+        """(m, n, 6) values at the sites of coefficients (m, 3 k) of photos."""
         turns = len(self.group)
-        value = np.zeros((len(bend), len(self.functions), 6))
+        value = self._known_values(names)
         coefficients = bend.reshape(len(bend), -1, 3)
-        value[..., :3] = self.functions @ coefficients[:, :turns]
-        value[..., 3:] = self.functions[:, : self.ways] @ coefficients[:, turns:]
+        value[..., :3] += self.functions @ coefficients[:, :turns]
+        value[..., 3:] += self.functions[:, : self.ways] @ coefficients[:, turns:]
+        return value
+
+    def _known_values(self, names: Sequence[str]) -> NDArray[np.float64]:
+        value = np.zeros((len(names), len(self.functions), 6))
+        for i, name in enumerate(names):
+            if name in self.known:
+                value[i] = self.known[name]
         return value
 
     def coefficients(self, reconstruction: Reconstruction) -> NDArray[np.float64]:
@@ -87,10 +108,14 @@ class Layout:
         found = np.zeros((m, self.num_bends, 3))
         if reconstruction.bends and turns:
             bends = [reconstruction.motion(i).bend for i in range(m)]
-            at = [np.linspace(each.start, each.end, len(self.functions)) for each in bends if each is not None]
-            readings = [np.hstack(bend.at(clock)) for bend, clock in zip(bends, at, strict=True) if bend is not None]
-            values = np.stack(readings)
+            values = np.stack([_at_sites(bend, len(self.functions)) for bend in bends if bend is not None])
+            values -= self._known_values(reconstruction.image_names)
             inverse = np.linalg.pinv(self.functions)
             found[:, :turns] = inverse @ values[..., :3]
             found[:, turns:] = (inverse @ values[..., 3:])[:, : self.ways]
         return found.reshape(m, -1)
+
+
+def _at_sites(bend: Bend, num_sites: int) -> NDArray[np.float64]:
+    """(n, 6) values of a bend at as many sites as others have."""
+    return np.hstack(bend.at(np.linspace(bend.start, bend.end, num_sites)))

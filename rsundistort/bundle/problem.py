@@ -294,7 +294,7 @@ class BundleProblem:
             phi=state.phi,
             velocity=state.velocity,
             variation=state.variation,
-            bend=self.layout.values(state.bend),
+            bend=self.layout.values(state.bend, self._start.image_names),
             bend_clock=self._bend_clock,
             points_w=points_w,
             shutter_model=self._shutter_model,
@@ -303,8 +303,9 @@ class BundleProblem:
     def _kernel_args(self, state: State) -> tuple[Any, ...]:
         s = self._structure
         phi = state.phi
-        if self.layout.num_bends:
-            phi = _tables(phi, self.layout.values(state.bend), self._bend_clock, state.R_cw)
+        if self.layout.bent:
+            values = self.layout.values(state.bend, self._start.image_names)
+            phi = _tables(phi, values, self._bend_clock, state.R_cw)
         return (
             self._model, *_camera_arrays(self._start.camera_idx, state.cameras, state.variation),
             state.R_cw, state.center_w, phi, state.velocity, state.points_w,

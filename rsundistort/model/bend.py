@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 
 #: Groups of functions, by what they add to those before: a rate that changes steadily, its change changing, and then
 #: splines of ever more intervals. Each with its number of intervals and how many functions there are up to it. The last
-#: follow five periods in a frame to 1.5 % of their amplitude, sixteen intervals to 9 %; and what they do not follow bends
-#: the lens and the height of the scene.
+#: follow five periods in a frame to 1.5 % of their amplitude, sixteen intervals to 9 %; and what they do not follow
+#: bends the lens and the height of the scene.
 BEND_GROUPS: dict[str, tuple[int, int]] = {
     "quadratic": (3, 1),
     "cubic": (3, 2),
