@@ -26,6 +26,10 @@ LADDER = ("global", "two-step", "rotation", "constant-motion")
 _MIN_SPREAD = 1e-6
 # Spreads below this (radians, focal lengths) need not settle: a tenth of a pixel.
 _SETTLED_AT = 2e-5
+# The same of the fields, which are in pixels.
+_MIN_SPREAD_PX, _SETTLED_PX = 1e-4, 1e-3
+# A lens that its model says so badly needs another model.
+_MOST_PX = 1.0
 
 # No lens varies more than this from photo to photo (of f, and of the principal point in focal lengths). A strong
 # shutter would be taken for it.
@@ -94,18 +98,23 @@ def _estimated(
         ones, varied = np.ones(len(span)), current.variation
         focal = _spread(varied[:, :1], variances[:, -3:-2], ones, spreads.focal) + _MIN_SPREAD
         centre = _spread(varied[:, 1:], variances[:, -2:], ones, spreads.centre) + _MIN_SPREAD
-    return _bounded(Spreads(phi, velocity, focal, centre), options, baseline)
+    return _bounded(Spreads(phi, velocity, focal, centre, spreads.field), options, baseline)
 
 
 def _estimates_spreads(shutter_model: str, options: BundleOptions) -> bool:
     """Whether a spread is to be estimated."""
     of_turn = shutter_model != "global" and options.phi_sigma is None
-    return of_turn or (shutter_model == "constant-motion" and options.velocity_sigma is None) or options.varying
+    return (
+        of_turn
+        or (shutter_model == "constant-motion" and options.velocity_sigma is None)
+        or options.varying
+        or options.residual_field
+    )
 
 
 def _settled(before: Spreads, after: Spreads, tolerance: float) -> bool:
     """Whether no spread changed by more than a share; what is as good as nothing may go on falling."""
-    none = Spreads(_SETTLED_AT, 0.0, _SETTLED_AT, _SETTLED_AT)
+    none = Spreads(_SETTLED_AT, 0.0, _SETTLED_AT, _SETTLED_AT, _SETTLED_PX)
     return all(
         abs(new - old) <= tolerance * new or max(old, new) < least
         for old, new, least in zip(astuple(before), astuple(after), astuple(none), strict=True)
@@ -118,6 +127,7 @@ def _starting_spreads(options: BundleOptions, baseline: float) -> Spreads:
         (options.velocity_sigma or options.velocity_sigma_start) * baseline,
         options.focal_sigma_start,
         options.centre_sigma_start,
+        options.field_sigma_start,
     )
     return _bounded(start, options, baseline)
 
@@ -128,7 +138,7 @@ def _bounded(spreads: Spreads, options: BundleOptions, baseline: float) -> Sprea
     velocity = np.inf if options.velocity_sigma_most is None else options.velocity_sigma_most * baseline
     return Spreads(
         min(spreads.phi, phi), min(spreads.velocity, velocity), min(spreads.focal, _MOST_VARIED),
-        min(spreads.centre, _MOST_VARIED),
+        min(spreads.centre, _MOST_VARIED), min(spreads.field, _MOST_PX),
     )  # fmt: skip
 
 
@@ -219,12 +229,19 @@ def bundle_adjust(
         current = problem.reconstruction(result.state)
         equations = problem.linearize(result.state)
         marginals = equations.marginal_covariances()
-        weighed, shared = factor, Inflation(np.ones(len(marginals.photos[0])), np.ones(len(options.refine)))
+        weighed, shared = (
+            factor,
+            Inflation(np.ones(len(marginals.photos[0])), np.ones(equations.num_shared // equations.num_cameras)),
+        )
         if jackknife and not rough:
             shared = inflation(equations, problem.partitions(result.state), marginals, factor)
             factor = shared.noise
         del equations
         before, spreads = spreads, _estimated(spreads, current, marginals.photos, options, baseline)
+        if options.residual_field:
+            values, variances = problem.fields(result.state, marginals.cameras)
+            found = _spread(values, variances, np.ones(len(values)), before.field)
+            spreads = replace(spreads, field=min(found + _MIN_SPREAD_PX, _MOST_PX))
         revived = revive_points(current, shutter_model)
         if cleaning:
             sigma = options.sigma_px or _noise_px(current, shutter_model, options.min_sigma_px)
@@ -263,6 +280,8 @@ def bundle_adjust(
         dropped,
         shared.photos,
         weighed,
+        before.field if options.residual_field else 0.0,
+        tuple(np.sqrt(problem.fields(result.state, intrinsic_covariance)[1].sum(1)).tolist()),
     )
 
 
@@ -270,9 +289,9 @@ def _sigma_intrinsics(
     current: Reconstruction, names: Sequence[str], covariance: NDArray[np.float64]
 ) -> tuple[dict[str, float], ...]:
     """Standard deviations of each camera's refined intrinsics, in pixels or as coefficients."""
-    sigmas = np.sqrt(np.diagonal(covariance)).reshape(len(current.cameras), len(names))
+    sigmas = np.sqrt(np.diagonal(covariance)).reshape(len(current.cameras), -1)
     return tuple(
-        dict(zip(names, (sigma * pixels_of(camera, names)).tolist(), strict=True))
+        dict(zip(names, (sigma[: len(names)] * pixels_of(camera, names)).tolist(), strict=True))
         for camera, sigma in zip(current.cameras, sigmas, strict=True)
     )
 
@@ -295,7 +314,7 @@ def climb(
     # a shutter that is not modelled yet would be blamed on the lens, and bend known lengths
     rough = replace(
         options, outlier_rounds=0, spread_rounds=0, cost_tolerance=options.round_tolerance, refine=(), lengths=(),
-        deviations="model",
+        deviations="model", residual_field=False,
     )  # fmt: skip
     results: dict[str, BundleResult] = {}
     current = replace(reconstruction, phi=np.zeros((reconstruction.num_images, 3)))

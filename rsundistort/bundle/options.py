@@ -77,6 +77,11 @@ class BundleOptions:
         principal point, as a stabiliser moves it, each with a zero-mean prior whose spread is estimated.
     focal_sigma_start, centre_sigma_start : float
         Where these estimates start: of log f, and of the principal point in focal lengths.
+    residual_field : bool
+        Whether what the lens models leave is solved for, too: a smooth field of each camera (`Camera.field`) without
+        mean, orthogonal to what the intrinsics express, with a zero-mean prior whose spread is estimated.
+    field_sigma_start : float
+        Where that estimate starts, pixels: of each of some twenty orthogonal fields, root mean square over the frame.
     spread_rounds : int
         At most this many more solves settle the spreads, until neither changes by more than `spread_tolerance`.
     spread_tolerance : float
@@ -137,6 +142,8 @@ class BundleOptions:
     varying: bool = False
     focal_sigma_start: float = 2e-3
     centre_sigma_start: float = 3e-3
+    residual_field: bool = False
+    field_sigma_start: float = 0.03
     spread_rounds: int = 12
     spread_tolerance: float = 0.01
     outlier_rounds: int = 3
@@ -182,6 +189,7 @@ class BundleOptions:
             "velocity_sigma_start",
             "focal_sigma_start",
             "centre_sigma_start",
+            "field_sigma_start",
             "spread_tolerance",
             "cg_tolerance",
         )
@@ -235,6 +243,10 @@ class BundleResult:
         unknown is (`BundleOptions.deviations`), 1 or more. The covariances have it in them.
     noise_factor : float
         One such factor for all: times `sigma_px` it is the noise that weighed the measurements against the priors.
+    field_sigma_px : float
+        Standard deviation of the prior on the unknowns of the cameras' residual fields; 0 where none was solved for.
+    sigma_fields_px : tuple of float
+        Standard deviation of each camera's field, root mean square over its frame; 0 where none was solved for.
     """
 
     reconstruction: Reconstruction
@@ -252,6 +264,8 @@ class BundleResult:
     num_outliers: int
     inflation: NDArray[np.float64]
     noise_factor: float
+    field_sigma_px: float = 0.0
+    sigma_fields_px: tuple[float, ...] = ()
 
     @property
     def sigma_phi(self) -> NDArray[np.float64]:
