@@ -230,6 +230,14 @@ def reduced_system(
                     _add_product(unknowns, S, slot[frame_idx[n]], J, k, n, m00, m01, m10, m11)
 
 
+@kernel(forceinline=True)
+def _add_products(left, right, B, at):
+    """Add left' right, (2, rows) and (2, nc), to the columns of B from `at` on."""
+    for a in range(left.shape[1]):
+        for b in range(right.shape[1]):
+            B[a, at + b] += left[0, a] * right[0, b] + left[1, a] * right[1, b]
+
+
 @parallel_kernel()
 def border_rows(
     frame_start, frame_order, frame_idx, track_idx, track_start, point_of, camera_of_frame,
@@ -242,7 +250,7 @@ def border_rows(
     """
     nb, nc = J.shape[2], J_camera.shape[2]
     for f in prange(len(B)):
-        left = np.empty((2, nb + nc))
+        left, right = np.empty((2, nb + nc)), np.empty((2, nc))
         B[f] = 0.0
         rhs[f] = 0.0
         for s in range(frame_start[f], frame_start[f + 1]):
@@ -261,8 +269,14 @@ def border_rows(
                     e[i] += u[i, b] * g[b]
             for a in range(nc):
                 rhs[f, a] -= J_camera[k, 0, a] * e[0] + J_camera[k, 1, a] * e[1]
+            right[:] = 0.0
+            at = camera_of_frame[frame_idx[track_start[t]]] * nc
             for n in range(track_start[t], track_start[t + 1]):
-                at = camera_of_frame[frame_idx[n]] * nc
+                # what photos of one camera have in a track is summed before it meets the photo's own
+                if camera_of_frame[frame_idx[n]] * nc != at:
+                    _add_products(left, right, B[f], at)
+                    right[:] = 0.0
+                    at = camera_of_frame[frame_idx[n]] * nc
                 # J_p,n is minus J's columns of the centre: the sign of M turns
                 m00 = u[0, 0] * J[n, 0, 3] + u[0, 1] * J[n, 0, 4] + u[0, 2] * J[n, 0, 5]
                 m01 = u[0, 0] * J[n, 1, 3] + u[0, 1] * J[n, 1, 4] + u[0, 2] * J[n, 1, 5]
@@ -271,11 +285,10 @@ def border_rows(
                 if n == k:
                     m00 += 1.0
                     m11 += 1.0
-                for a in range(nb + nc):
-                    l0 = left[0, a] * m00 + left[1, a] * m10
-                    l1 = left[0, a] * m01 + left[1, a] * m11
-                    for b in range(nc):
-                        B[f, a, at + b] += l0 * J_camera[n, 0, b] + l1 * J_camera[n, 1, b]
+                for b in range(nc):
+                    right[0, b] += m00 * J_camera[n, 0, b] + m01 * J_camera[n, 1, b]
+                    right[1, b] += m10 * J_camera[n, 0, b] + m11 * J_camera[n, 1, b]
+            _add_products(left, right, B[f], at)
 
 
 @parallel_kernel(fastmath=SUMS)
