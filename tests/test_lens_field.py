@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from test_bundle import make_scene, perturbed
 
 from rsundistort import BundleOptions, Camera, FormatError, InputError, RowMotion, bundle_adjust, init_rectify_map
+from rsundistort.bundle import choose_model
 from rsundistort.bundle.intrinsics import GuessedCameras, moved_camera
 from rsundistort.bundle.lens_field import LensFields
 from rsundistort.bundle.problem import BundleProblem, Spreads, reprojection_residuals
@@ -21,6 +22,7 @@ from rsundistort.model.orientation import MATRICES, turn_camera, turn_points
 from rsundistort.model.projection import project_points, project_points_with_jacobians, unproject_points
 from rsundistort.rectify import rectify
 from rsundistort.synthetic.lens import distort_rays
+from rsundistort.verdict import judge
 
 INTRINSICS = ("f", "cx", "cy", "k1", "k2", "k3", "p1", "p2")
 MOTION = RowMotion([0.03, -0.02, 0.04], [0.1, 0.05, -0.02])
@@ -303,3 +305,24 @@ def test_adjustments_that_do_not_ask_keep_a_given_field(rng):
     assert result.rms_px < 0.13
     assert result.field_sigma_px == 0.0
     assert result.sigma_fields_px == (0.0,)
+
+
+@pytest.mark.parametrize(("pattern", "kept"), [(waves, True), (nothing, False)])
+def test_a_field_is_kept_where_it_foretells_measurements(pattern, kept, rng):
+    rec = scene_with_field(rng, pattern, "global")
+    options = replace(options_of(rec), residual_field=False)
+    choice = choose_model(rec, ["global"], options, sigma_px=0.1)
+    assert choice.residual_field is kept
+    assert choice.label == "global" + kept * ", residual field"
+    assert kept or choice.held_out_error.keys() == {"global"}
+
+
+def test_a_lens_that_its_model_says_badly_is_told(rng):
+    camera = camera_with_field(rng, size_px=0.02)
+    rec = replace(scene_with_field(rng, nothing, "global", num_images=5, num_points=60))
+    result = bundle_adjust(rec, "global", BundleOptions())
+    reasons = [
+        judge(replace(result, reconstruction=replace(rec, cameras=[replace(rec.cameras[0], field=field)]))).reasons
+        for field in (camera.field, camera.field + 2.0)
+    ]
+    assert ["not the model of this lens" in " ".join(each) for each in reasons] == [False, True]

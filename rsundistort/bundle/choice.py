@@ -46,7 +46,7 @@ _MOST_STEPS = 15
 # Exchanges the axis of the readout; reversing it negates the motion and changes nothing else.
 _OTHER_AXIS = ("top-to-bottom", "left-to-right")
 
-_VARYING = ", varying lens"
+_VARYING, _FIELD = ", varying lens", ", residual field"
 
 
 @dataclass(frozen=True)
@@ -83,6 +83,8 @@ class ModelChoice:
         What speaks against a shutter that explained something and was not kept, for people.
     num_held_out : int
         Measurements held out.
+    residual_field : bool
+        Whether cameras have fields beside their lens models, as `BundleOptions.residual_field`.
     """
 
     shutter_model: str
@@ -97,6 +99,7 @@ class ModelChoice:
     agreement: float | None
     against: tuple[str, ...]
     num_held_out: int
+    residual_field: bool = False
 
 
 def hold_out(
@@ -203,6 +206,7 @@ class _Fit:
     label: str
     model: str
     varying: bool
+    residual_field: bool
     reconstruction: Reconstruction
     errors: NDArray[np.float64]
     rms_px: float
@@ -267,13 +271,16 @@ class _Fits:
         self._progress = progress
         self.done: dict[str, _Fit] = {}
 
-    def fit(self, model: str, varying: bool, starts: Sequence[Reconstruction], label: str | None = None) -> _Fit:
+    def fit(
+        self, model: str, varying: bool, starts: Sequence[Reconstruction], label: str | None = None,
+        residual_field: bool = False,
+    ) -> _Fit:  # fmt: skip
         """Fit a model from the cheapest of some starts."""
         label = label or model + _VARYING * varying
         if label in self.done:
             return self.done[label]
         step = None if self._progress is None else partial(self._progress, label)
-        options = replace(self._rough, varying=varying)
+        options = replace(self._rough, varying=varying, residual_field=residual_field)
         # the motions given belong to the poses and the lens given: with those of another model they fit nothing. One
         # that starts at the cheaper of the two never ends above the simpler one, which it holds as a case
         cost = [objective(start, model, options) for start in starts]
@@ -282,7 +289,7 @@ class _Fits:
         errors, rms_px = clipped_errors(found, self.held_out, self._sigma_px)
         smooth = errors_without_warp(found, self.given.observations, self.held_out, self._sigma_px)
         left = max(float(errors.mean() - smooth.mean()), 0.0) if len(errors) else 0.0
-        self.done[label] = _Fit(label, model, varying, found, errors, rms_px, left, spreads)
+        self.done[label] = _Fit(label, model, varying, residual_field, found, errors, rms_px, left, spreads)
         return self.done[label]
 
     def agreement(self, fit: _Fit) -> float:
@@ -339,7 +346,8 @@ def choose_model(
     lens does. Better means: the mean held-out error falls by more than two standard errors, measurements in the same
     part of the same photo counted once, and by more than two hundredths. A model of the shutter must also take away
     more than a smooth warp of each photo would yet, be better than itself read along the other axis (what bends photos
-    for another reason can be taken for either), and two halves of the scene must tell the same motions.
+    for another reason can be taken for either), and two halves of the scene must tell the same motions. Last, where
+    something smooth is left, a field of each camera is kept if it is better.
 
     Parameters
     ----------
@@ -416,6 +424,14 @@ def choose_model(
     if not len(fits.held_out):
         against.append("no point is seen by three photos, so no measurement could be held out to judge by")
     shutter = "found" if best is not plain else "not-determined" if against else "not-found"
+    # a warp of each photo alone is fitted to few measurements, and takes less away than one that all share
+    if options.refine and len(fits.held_out) and best.left > _MOST_OF_IT * _MIN_FALL * float(best.errors.mean()):
+        label = f"{best.label}{_FIELD}"
+        field = fits.fit(best.model, best.varying, [best.reconstruction], label, residual_field=True)
+        gain[label] = fits.gain(best, field)
+        if fits.is_better(best, field):
+            best = field
+            kept.append(label)
     return ModelChoice(
         best.model,
         best.label,
@@ -429,4 +445,5 @@ def choose_model(
         agreement,
         tuple(against),
         len(fits.held_out),
+        best.residual_field,
     )

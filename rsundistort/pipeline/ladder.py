@@ -280,13 +280,14 @@ def solve_tracks(
             result.reconstruction, LADDER, options, sigma_px=result.sigma_px, seed=seed,
             progress=lambda model, _: log.tell(f"choice: {model}", 0),
         )  # fmt: skip
-        if choice.shutter_model != shutter_model or choice.varying:
-            options = replace(options, varying=choice.varying)
+        if choice.shutter_model != shutter_model or choice.varying or choice.residual_field:
+            options = replace(options, varying=choice.varying, residual_field=choice.residual_field)
             start = replace(tracks, shutter_model=choice.shutter_model)
             result = bundle_adjust(start, choice.shutter_model, options, partial(_tell, log, "choice"))
         log.end(
-            "choice of the model", chosen=choice.shutter_model, varying_lens=choice.varying, shutter=choice.shutter,
-            agreement=choice.agreement, gain=choice.gain, num_held_out=choice.num_held_out,
+            "choice of the model", chosen=choice.shutter_model, varying_lens=choice.varying,
+            residual_field=choice.residual_field, shutter=choice.shutter, agreement=choice.agreement, gain=choice.gain,
+            num_held_out=choice.num_held_out,
         )  # fmt: skip
         aligns = feedback is not None and feedback.workers is not None
         if feedback is not None and aligns and choice.shutter_model == "constant-motion":
