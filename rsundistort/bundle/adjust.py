@@ -89,6 +89,8 @@ def _estimated(
         return spreads
     span = current.frame_span()
     motion = variances[:, 6 : variances.shape[1] - 3 * options.varying]
+    limited = [options.phi_limits.get(name, np.inf) < spreads.phi for name in current.image_names]
+    motion = np.where(np.array(limited)[:, None], 0.0, motion)
     phi, velocity, focal, centre = spreads.phi, spreads.velocity, spreads.focal, spreads.centre
     if options.phi_sigma is None and motion.shape[1] > 0:
         phi = _spread(current.phi, motion[:, :3], span, spreads.phi) + _MIN_SPREAD

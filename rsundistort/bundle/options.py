@@ -72,6 +72,10 @@ class BundleOptions:
         the mean distance of consecutive centres).
     phi_sigma_most, velocity_sigma_most : float or None
         Upper limits of the two spreads, where something else than the measurements says how far cameras can have moved.
+    phi_limits : mapping of photo name to float
+        The same of single photos: their prior is no wider than this (radians per frame), and that on their velocity no
+        wider than what displaces their scene, at its median depth, as such a turn does. They tell nothing of the spread
+        of the others.
     varying : bool
         Whether the intrinsics of each photo may differ from its camera's: log f, as a focusing lens changes it, and the
         principal point, as a stabiliser moves it, each with a zero-mean prior whose spread is estimated.
@@ -139,6 +143,7 @@ class BundleOptions:
     velocity_sigma_start: float = 0.03
     phi_sigma_most: float | None = None
     velocity_sigma_most: float | None = None
+    phi_limits: Mapping[str, float] = field(default_factory=dict)
     varying: bool = False
     focal_sigma_start: float = 2e-3
     centre_sigma_start: float = 3e-3
@@ -174,6 +179,9 @@ class BundleOptions:
                 raise InputError(f"still photo {name!r}: sigma {still!r}, expected 0 or a positive number")
             if name in known or name in self.held_phi:
                 raise InputError(f"photo {name!r} is said to be still and its motion to be known; give one of them")
+        for name, limit in self.phi_limits.items():
+            if not 0 < limit < np.inf:
+                raise InputError(f"limit of the motion of {name!r}: {limit!r}, expected a positive number")
         if self.loss not in LOSSES:
             raise InputError(f"loss={self.loss!r}, expected one of {', '.join(LOSSES)}")
         if self.deviations not in DEVIATIONS:

@@ -32,7 +32,7 @@ class Posterior:
         spreads = Spreads(
             result.phi_sigma, max(result.velocity_sigma * rec.baseline, 1e-300),
             max(result.focal_sigma, 1e-300), max(result.centre_sigma, 1e-300),
-            max(result.field_sigma_px, 1e-300),
+            result.field_sigma_px,
         )  # fmt: skip
         plain = replace(options or BundleOptions(), loss="squared")
         self._problem = BundleProblem(rec, rec.shutter_model, plain, result.sigma_px * result.noise_factor, spreads)

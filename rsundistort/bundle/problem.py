@@ -178,11 +178,11 @@ class BundleProblem:
         self._fields = (
             LensFields(reconstruction.cameras, options.refine, shutter_model) if options.residual_field else None
         )
-        self._field_weight = spreads.field**-2.0
+        self._field_weight = spreads.field**-2.0 if options.residual_field else 0.0
         self._refine_codes = np.array([INTRINSICS[name] for name in options.refine], np.int64)
         span = reconstruction.frame_span()[:, None]
-        weight = np.hstack([np.repeat((span / s) ** 2, 3, axis=1) for s in (spreads.phi, spreads.velocity)])
-        self._motion_weight = weight[:, : self._block - 6]
+        weight = [np.repeat((span[:, 0] / s)[:, None] ** 2, 3, axis=1) for s in self._motion_spreads(spreads)]
+        self._motion_weight = np.hstack(weight)[:, : self._block - 6]
         varied = np.array([spreads.focal, spreads.centre, spreads.centre])[: 3 * options.varying] ** -2.0
         self._variation_weight = np.tile(varied, (len(span), 1))
         self._lengths = LengthResiduals(self._start, options.lengths)
@@ -193,6 +193,13 @@ class BundleProblem:
             self._structure, self._free, poses, options.factor_limit, options.cg_tolerance
         )  # fmt: skip
         self._size = reconstruction.size
+
+    def _motion_spreads(self, spreads: Spreads) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Standard deviations (m,) of the priors on phi and velocity, per frame, no wider than a photo's own limit."""
+        limits = self._options.phi_limits
+        most = np.array([limits.get(name, np.inf) for name in self._start.image_names])
+        depths = [self._start.median_depth(i) if np.isfinite(each) else 1.0 for i, each in enumerate(most)]
+        return np.minimum(most, spreads.phi), np.minimum(most * depths, spreads.velocity)
 
     def _known_motions(self, span: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Motions (m, nb - 6) known from elsewhere, per unit of the clock, and their weights."""

@@ -318,7 +318,9 @@ def solve_tracks(
     log.begin("verdict")
     measured = mapped if feedback is None else tracks
     known = {*options.known_phi, *options.held_phi, *options.still}
-    verdict = judge(result, global_result, choice, mended, measured, known)
+    # two standard deviations of the priors that exposures make
+    most_phi = {name: 2.0 * limit for name, limit in options.phi_limits.items()}
+    verdict = judge(result, global_result, choice, mended, measured, known, most_phi)
     if verdict.lens_only:
         warnings.warn(_lens_only(verdict), RsUndistortWarning, stacklevel=3)
     log.end("verdict", shutter=verdict.shutter, shape=verdict.shape)
