@@ -7,20 +7,37 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rsundistort_cli.closing import _fields
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 from test_bundle import make_scene, perturbed
 
-from rsundistort import BundleOptions, Camera, FormatError, InputError, RowMotion, bundle_adjust, init_rectify_map
+from rsundistort import (
+    BundleOptions,
+    Camera,
+    FormatError,
+    InputError,
+    RowMotion,
+    Solution,
+    SolveOptions,
+    bundle_adjust,
+    init_rectify_map,
+)
 from rsundistort.bundle import choose_model
 from rsundistort.bundle.intrinsics import GuessedCameras, moved_camera
 from rsundistort.bundle.lens_field import LensFields
 from rsundistort.bundle.problem import BundleProblem, Spreads, reprojection_residuals
+from rsundistort.io import read_solution, write_solution
 from rsundistort.io.cameras import camera_from_json, camera_to_json
 from rsundistort.model.field import field_basis, field_over_frame, field_slope, lens_pixels, raw_pixels
 from rsundistort.model.orientation import MATRICES, turn_camera, turn_points
 from rsundistort.model.projection import project_points, project_points_with_jacobians, unproject_points
+from rsundistort.pipeline.cameras import PhotoCameras
+from rsundistort.pipeline.ladder import solve_tracks
+from rsundistort.pipeline.outcome import Outcome, solution_of
+from rsundistort.pipeline.progress import StageLog
 from rsundistort.rectify import rectify
+from rsundistort.report import content
 from rsundistort.synthetic.lens import distort_rays
 from rsundistort.verdict import judge
 
@@ -326,3 +343,35 @@ def test_a_lens_that_its_model_says_badly_is_told(rng):
         for field in (camera.field, camera.field + 2.0)
     ]
     assert ["not the model of this lens" in " ".join(each) for each in reasons] == [False, True]
+
+
+def test_what_was_found_is_told_and_read_back(rng, tmp_path):
+    rec = scene_with_field(rng, waves, "global")
+    cameras = PhotoCameras(rec.cameras, ("camera",), rec.camera_idx, True, (True,), "camera.json")
+    solved = solve_tracks(rec, {}, "auto", 0, lambda _: replace(options_of(rec), residual_field=False), StageLog(None))
+    solution = solution_of(Outcome(solved, cameras, (1,)), SolveOptions())
+    field = solution.cameras["1"].field
+    assert field.shape == (4, 5, 2)
+    told = solution.quality["lens_fields"]["1"]
+    lengths = np.linalg.norm(field_over_frame(solution.cameras["1"])[1], axis=2)
+    assert told["largest_px"] == lengths.max()
+    assert told["rms_px"] > 5 * told["sigma_px"] > 0
+    write_solution(tmp_path / "solution.json", solution)
+    again = read_solution(tmp_path / "solution.json")
+    assert again.cameras == solution.cameras
+    assert not again.rectified_cameras["1"].field.size
+    (row,) = content.cameras(again)
+    assert row["field"]["rms"] == told["rms_px"]
+    # arrows are at most as long as their cells
+    assert 0.5 < row["field"]["times"] * lengths.max() * 13 / 800 < 1
+    assert len(row["field"]["dots"]) == 13 * 9
+    (line,) = _fields(again)
+    assert f"{told['rms_px']:.2f} px in the mean" in line
+
+
+def test_without_a_field_nothing_is_said(rng):
+    rec = scene_with_field(rng, nothing, "global", num_images=5, num_points=60)
+    camera = rec.cameras[0]
+    solution = Solution("global", {"1": camera}, {"1": camera.pinhole()}, ())
+    assert content.cameras(solution)[0]["field"] is None
+    assert _fields(solution) == []
