@@ -362,8 +362,8 @@ def test_what_was_found_is_told_and_read_back(rng, tmp_path):
     assert not again.rectified_cameras["1"].field.size
     (row,) = content.cameras(again)
     assert row["field"]["rms"] == told["rms_px"]
-    # arrows are at most as long as their cells
-    assert 0.5 < row["field"]["times"] * lengths.max() * 13 / 800 < 1
+    # arrows are about as long as their cells; the field is larger between them
+    assert 0.5 < row["field"]["times"] * lengths.max() * 13 / 800 < 1.2
     assert len(row["field"]["dots"]) == 13 * 9
     (line,) = _fields(again)
     assert f"{told['rms_px']:.2f} px in the mean" in line
