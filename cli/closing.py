@@ -92,6 +92,7 @@ def closing_table(solution: Solution, out: Path) -> str:
         *_video(solution),
         *_intrinsics(solution),
         *_varying(solution),
+        *_fields(solution),
         *_readout(solution),
         *_depths(solution),
         *_two_poses(solution),
@@ -181,6 +182,18 @@ def _varying(solution: Solution) -> list[str]:
     return [
         f"varying lens       f by {100 * focal:.2g} %, principal point by {centre * camera.K[0, 0]:.1f} px from photo "
         "to photo (focusing, a stabiliser)"
+    ]
+
+
+def _fields(solution: Solution) -> list[str]:
+    """A line on what lens models leave, if that was taken out, too."""
+    fields = (solution.quality.get("lens_fields") or {}).values()
+    if not fields:
+        return []
+    largest = max(fields, key=lambda each: each["rms_px"])
+    return [
+        f"more than a lens   {largest['rms_px']:.2f} px in the mean, {largest['largest_px']:.2f} at most, beside the "
+        f"lens model (+-{largest['sigma_px']:.2f})"
     ]
 
 

@@ -7,12 +7,16 @@ import numpy as np
 import pytest
 from test_bundle import make_scene
 
+from rsundistort import InputError
 from rsundistort.bundle import BundleOptions, bundle_adjust
 from rsundistort.io.photos.exif_facts import ExifFacts, _facts
+from rsundistort.pipeline import ladder
 from rsundistort.pipeline.cameras import PhotoCameras
 from rsundistort.pipeline.exposure import bounded_by_exposure
 from rsundistort.pipeline.load import LoadedPhotos
+from rsundistort.pipeline.progress import StageLog
 from rsundistort.sfm import edge_width_px
+from rsundistort.verdict import judge
 
 
 def squares(blur_px):
@@ -42,9 +46,12 @@ def test_exposures_that_cannot_be_are_missing(stored, found):
 
 
 def loaded(rec, exposure_s, edge_px):
-    facts = [ExifFacts(exposure_s=exposure_s) for _ in rec.image_names]
+    """Photos with an exposure and edges, the same of all, or a list."""
+    m = rec.num_images
+    exposures = exposure_s if isinstance(exposure_s, list) else [exposure_s] * m
+    facts = [ExifFacts(exposure_s=each) for each in exposures]
     cameras = PhotoCameras(rec.cameras, ["camera"], rec.camera_idx, True, (True,), "")
-    edges = [edge_px] * rec.num_images
+    edges = edge_px if isinstance(edge_px, list) else [edge_px] * m
     return LoadedPhotos(list(rec.image_names), [], facts, {}, cameras, {}, Path(), {}, 100.0, edges)
 
 
@@ -61,3 +68,51 @@ def test_long_sharp_exposures_bound_the_motion(rng):
 def test_short_or_unknown_exposures_bound_nothing(exposure_s, edge_px, rng):
     rec = make_scene(rng, "rotation")
     assert bounded_by_exposure(BundleOptions(), rec, loaded(rec, exposure_s, edge_px), {}) == BundleOptions()
+
+
+def test_each_photo_is_bounded_by_its_own_exposure(rng):
+    rec = make_scene(rng, "rotation", noise_px=0.3)
+    # the first was exposed for long; of the others nothing is known
+    m = rec.num_images
+    photos = loaded(rec, [0.1] + [None] * (m - 1), [3.0] + [None] * (m - 1))
+    bounded = bounded_by_exposure(BundleOptions(), rec, photos, dict.fromkeys(range(9), 0.02))
+    limit = 3.0 / rec.cameras[0].K[0, 0] * 0.2
+    assert bounded.phi_limits == {rec.image_names[0]: pytest.approx(limit)}
+    assert bounded.phi_sigma_most is None
+
+
+@pytest.mark.parametrize("model", ["rotation", "constant-motion"])
+def test_a_limit_holds_one_photo_and_leaves_the_others(model, rng):
+    rec = make_scene(rng, model, noise_px=0.3)
+    limit = 1e-6
+    free = bundle_adjust(rec, model)
+    held = bundle_adjust(rec, model, BundleOptions(phi_limits={"1.jpg": limit}))
+    # measurements pull with thousands of such deviations
+    assert np.linalg.norm(held.reconstruction.phi[1]) < 0.1 * np.linalg.norm(free.reconstruction.phi[1])
+    way = limit * rec.median_depth(1)
+    assert (held.sigma_velocity[1] * rec.frame_span()[1] <= 1.01 * way).all()
+    # what is held tells nothing of how far hands move
+    assert held.phi_sigma == pytest.approx(free.phi_sigma, rel=0.5)
+    same = bundle_adjust(rec, model, BundleOptions(phi_limits={"1.jpg": 10.0, "not there.jpg": 1.0}))
+    np.testing.assert_allclose(same.reconstruction.phi, free.reconstruction.phi, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("limit", [0.0, -1.0, np.nan, np.inf])
+def test_limits_that_are_none_are_refused(limit):
+    with pytest.raises(InputError, match=r"limit of the motion of 'a\.jpg'"):
+        BundleOptions(phi_limits={"a.jpg": limit})
+
+
+def test_motions_against_the_exposure_are_looked_for(rng, monkeypatch):
+    rec = make_scene(rng, "rotation", noise_px=0.3)
+    told = []
+
+    def judged(*args):
+        told.append(args[-1])
+        return judge(*args)
+
+    monkeypatch.setattr(ladder, "judge", judged)
+    options = BundleOptions(phi_limits={"1.jpg": 1e-5})
+    solved = ladder.solve_tracks(rec, {}, "rotation", 0, lambda _: options, StageLog(None), "none")
+    assert told == [{"1.jpg": 2e-5}]
+    assert solved.verdict is not None

@@ -251,6 +251,14 @@ def reduced_system(
                     add_product(unknowns, S, slot[frame_idx[n]], J, k, n, m00, m01, m10, m11)
 
 
+@kernel(forceinline=True)
+def _add_products(left, right, B, at):
+    """Add left' right, (2, rows) and (2, nc), to the columns of B from `at` on."""
+    for a in range(left.shape[1]):
+        for b in range(right.shape[1]):
+            B[a, at + b] += left[0, a] * right[0, b] + left[1, a] * right[1, b]
+
+
 @parallel_kernel()
 def border_rows(
     frame_start, frame_order, frame_idx, track_idx, track_start, point_of, camera_of_frame,
@@ -263,11 +271,8 @@ def border_rows(
     """
     nb, nc = J.shape[2], J_camera.shape[2]
     for f in prange(len(B)):
-        left, u, e = np.empty((2, nb + nc)), np.empty((2, 3)), np.empty(2)  # u = J_p V^-1
-        # of one measurement, M J_camera summed over its track, by cameras; and which cameras that has
-        right = np.zeros((2, B.shape[2]))
-        cameras = np.empty(B.shape[2], np.int64)
-        met = np.zeros(B.shape[2], np.bool_)
+        left, right = np.empty((2, nb + nc)), np.empty((2, nc))
+        u, e = np.empty((2, 3)), np.empty(2)  # u = J_p V^-1
         B[f] = 0.0
         rhs[f] = 0.0
         for s in range(frame_start[f], frame_start[f + 1]):
@@ -286,13 +291,14 @@ def border_rows(
                     e[i] += u[i, b] * g[b]
             for a in range(nc):
                 rhs[f, a] -= J_camera[k, 0, a] * e[0] + J_camera[k, 1, a] * e[1]
-            num = 0
+            right[:] = 0.0
+            at = camera_of_frame[frame_idx[track_start[t]]] * nc
             for n in range(track_start[t], track_start[t + 1]):
-                at = camera_of_frame[frame_idx[n]] * nc
-                if not met[at]:
-                    met[at] = True
-                    cameras[num] = at
-                    num += 1
+                # what photos of one camera have in a track is summed before it meets the photo's own
+                if camera_of_frame[frame_idx[n]] * nc != at:
+                    _add_products(left, right, B[f], at)
+                    right[:] = 0.0
+                    at = camera_of_frame[frame_idx[n]] * nc
                 # J_p,n is minus J's columns of the centre: the sign of M turns
                 m00 = u[0, 0] * J[n, 0, 3] + u[0, 1] * J[n, 0, 4] + u[0, 2] * J[n, 0, 5]
                 m01 = u[0, 0] * J[n, 1, 3] + u[0, 1] * J[n, 1, 4] + u[0, 2] * J[n, 1, 5]
@@ -302,17 +308,9 @@ def border_rows(
                     m00 += 1.0
                     m11 += 1.0
                 for b in range(nc):
-                    c0, c1 = J_camera[n, 0, b], J_camera[n, 1, b]
-                    right[0, at + b] += m00 * c0 + m01 * c1
-                    right[1, at + b] += m10 * c0 + m11 * c1
-            for i in range(num):
-                at = cameras[i]
-                met[at] = False
-                for a in range(nb + nc):
-                    l0, l1 = left[0, a], left[1, a]
-                    for b in range(at, at + nc):
-                        B[f, a, b] += l0 * right[0, b] + l1 * right[1, b]
-                right[:, at : at + nc] = 0.0
+                    right[0, b] += m00 * J_camera[n, 0, b] + m01 * J_camera[n, 1, b]
+                    right[1, b] += m10 * J_camera[n, 0, b] + m11 * J_camera[n, 1, b]
+            _add_products(left, right, B[f], at)
 
 
 @parallel_kernel(fastmath=SUMS)

@@ -27,6 +27,10 @@ LADDER = ("global", "two-step", "rotation", "constant-motion")
 _MIN_SPREAD = 1e-6
 # Spreads below this (radians, focal lengths) need not settle: a tenth of a pixel.
 _SETTLED_AT = 2e-5
+# The same of the fields, which are in pixels.
+_MIN_SPREAD_PX, _SETTLED_PX = 1e-4, 1e-3
+# A lens that its model says so badly needs another model.
+_MOST_PX = 1.0
 
 # No lens varies more than this from photo to photo (of f, and of the principal point in focal lengths). A strong
 # shutter would be taken for it.
@@ -87,6 +91,8 @@ def _estimated(
         return spreads
     span = current.frame_span()
     motion = variances[:, 6 : layout.motion]
+    limited = [options.phi_limits.get(name, np.inf) < spreads.phi for name in current.image_names]
+    motion = np.where(np.array(limited)[:, None], 0.0, motion)
     phi, velocity, focal, centre = spreads.phi, spreads.velocity, spreads.focal, spreads.centre
     if options.phi_sigma is None and motion.shape[1] > 0:
         phi = _spread(current.phi, motion[:, :3], span, spreads.phi) + _MIN_SPREAD
@@ -98,7 +104,7 @@ def _estimated(
         focal = _spread(varied[:, :1], of_varied[:, :1], ones, spreads.focal) + _MIN_SPREAD
         centre = _spread(varied[:, 1:], of_varied[:, 1:], ones, spreads.centre) + _MIN_SPREAD
     bends, ways = _bend_spreads(spreads, current, variances[:, layout.variation :], layout)
-    return _bounded(Spreads(phi, velocity, focal, centre, bends, ways), options, baseline)
+    return _bounded(Spreads(phi, velocity, focal, centre, bends, ways, spreads.field), options, baseline)
 
 
 def _bend_spreads(
@@ -123,13 +129,13 @@ def _estimates_spreads(shutter_model: str, options: BundleOptions) -> bool:
     """Whether a spread is to be estimated."""
     of_turn = shutter_model != "global" and options.phi_sigma is None
     of_way = shutter_model == "constant-motion" and options.velocity_sigma is None
-    return of_turn or of_way or options.varying or options.bends > 0
+    return of_turn or of_way or options.varying or options.bends > 0 or options.residual_field
 
 
 def _settled(before: Spreads, after: Spreads, tolerance: float) -> bool:
     """Whether no spread changed by more than a share; what is as good as nothing may go on falling."""
     of_bends = (_SETTLED_AT,) * len(before.bends), (0.0,) * len(before.ways)
-    none = Spreads(_SETTLED_AT, 0.0, _SETTLED_AT, _SETTLED_AT, *of_bends)
+    none = Spreads(_SETTLED_AT, 0.0, _SETTLED_AT, _SETTLED_AT, *of_bends, _SETTLED_PX)
     return all(
         abs(new - old) <= tolerance * new or max(old, new) < least
         for old, new, least in zip(*(np.hstack(astuple(each)) for each in (before, after, none)), strict=True)
@@ -144,6 +150,7 @@ def _starting_spreads(options: BundleOptions, layout: Layout, baseline: float) -
         options.centre_sigma_start,
         tuple(np.broadcast_to(options.bend_sigma_start, len(set(layout.group))).tolist()),
         (options.way_sigma_start * baseline,) * len(set(layout.group[: layout.ways])),
+        options.field_sigma_start,
     )
     return _bounded(start, options, baseline)
 
@@ -155,6 +162,7 @@ def _bounded(spreads: Spreads, options: BundleOptions, baseline: float) -> Sprea
     return Spreads(
         min(spreads.phi, phi), min(spreads.velocity, velocity), min(spreads.focal, _MOST_VARIED),
         min(spreads.centre, _MOST_VARIED), tuple(min(each, phi) for each in spreads.bends), spreads.ways,
+        min(spreads.field, _MOST_PX),
     )  # fmt: skip
 
 
@@ -248,12 +256,17 @@ def bundle_adjust(
         equations = problem.linearize(result.state)
         marginals = equations.marginal_covariances()
         weighed, noise_was_known = factor, noise_known
-        shared = Inflation(np.ones(len(marginals.photos[0])), np.ones(len(options.refine)))
+        per_camera = equations.num_shared // equations.num_cameras
+        shared = Inflation(np.ones(len(marginals.photos[0])), np.ones(per_camera))
         if jackknife and not rough:
             shared = inflation(equations, problem.partitions(result.state), marginals, factor)
             factor, noise_known = shared.noise, True
         del equations
         before, spreads = spreads, _estimated(spreads, current, marginals.photos, options, layout, baseline)
+        if options.residual_field:
+            values, variances = problem.fields(result.state, marginals.cameras)
+            found = _spread(values, variances, np.ones(len(values)), before.field)
+            spreads = replace(spreads, field=min(found + _MIN_SPREAD_PX, _MOST_PX))
         revived = revive_points(current, shutter_model)
         if cleaning:
             sigma = options.sigma_px or _noise_px(current, shutter_model, options.min_sigma_px)
@@ -294,6 +307,8 @@ def bundle_adjust(
         dropped,
         shared.photos,
         weighed,
+        before.field if options.residual_field else 0.0,
+        tuple(np.sqrt(problem.fields(result.state, intrinsic_covariance)[1].sum(1)).tolist()),
     )
 
 
@@ -301,9 +316,9 @@ def _sigma_intrinsics(
     current: Reconstruction, names: Sequence[str], covariance: NDArray[np.float64]
 ) -> tuple[dict[str, float], ...]:
     """Standard deviations of each camera's refined intrinsics, in pixels or as coefficients."""
-    sigmas = np.sqrt(np.diagonal(covariance)).reshape(len(current.cameras), len(names))
+    sigmas = np.sqrt(np.diagonal(covariance)).reshape(len(current.cameras), -1)
     return tuple(
-        dict(zip(names, (sigma * pixels_of(camera, names)).tolist(), strict=True))
+        dict(zip(names, (sigma[: len(names)] * pixels_of(camera, names)).tolist(), strict=True))
         for camera, sigma in zip(current.cameras, sigmas, strict=True)
     )
 
@@ -326,7 +341,7 @@ def climb(
     # a shutter that is not modelled yet would be blamed on the lens, and bend known lengths
     rough = replace(
         options, outlier_rounds=0, spread_rounds=0, cost_tolerance=options.round_tolerance, refine=(), lengths=(),
-        deviations="model",
+        deviations="model", residual_field=False,
     )  # fmt: skip
     results: dict[str, BundleResult] = {}
     current = replace(reconstruction, phi=np.zeros((reconstruction.num_images, 3)))

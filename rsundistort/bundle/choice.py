@@ -51,7 +51,7 @@ _MOST_STEPS = 15
 # Exchanges the axis of the readout; reversing it negates the motion and changes nothing else.
 _OTHER_AXIS = ("top-to-bottom", "left-to-right")
 
-_VARYING = ", varying lens"
+_VARYING, _FIELD = ", varying lens", ", residual field"
 # Motions that are not steady, by the groups of bends that they take.
 _BENDS = {0: "", 2: ", bent", 5: ", vibrating"}
 
@@ -92,6 +92,8 @@ class ModelChoice:
         What speaks against a shutter that explained something and was not kept, for people.
     num_held_out : int
         Measurements held out.
+    residual_field : bool
+        Whether cameras have fields beside their lens models, as `BundleOptions.residual_field`.
     """
 
     shutter_model: str
@@ -107,6 +109,7 @@ class ModelChoice:
     agreement: float | None
     against: tuple[str, ...]
     num_held_out: int
+    residual_field: bool = False
 
 
 def hold_out(
@@ -228,6 +231,7 @@ class _Fit:
     model: str
     varying: bool
     bends: int
+    residual_field: bool
     reconstruction: Reconstruction
     errors: NDArray[np.float64]
     rms_px: float
@@ -302,14 +306,15 @@ class _Fits:
         self.done: dict[str, _Fit] = {}
 
     def fit(
-        self, model: str, varying: bool, starts: Sequence[Reconstruction], label: str | None = None, bends: int = 0
-    ) -> _Fit:
+        self, model: str, varying: bool, starts: Sequence[Reconstruction], label: str | None = None, bends: int = 0,
+        residual_field: bool = False,
+    ) -> _Fit:  # fmt: skip
         """Fit a model from the cheapest of some starts."""
         label = label or model + _BENDS[bends] + _VARYING * varying
         if label in self.done:
             return self.done[label]
         step = None if self._progress is None else partial(self._progress, label)
-        options = replace(self._rough, varying=varying, bends=bends)
+        options = replace(self._rough, varying=varying, bends=bends, residual_field=residual_field)
         # the motions given belong to the poses and the lens given: with those of another model they fit nothing. One
         # that starts at the cheaper of the two never ends above the simpler one, which it holds as a case
         cost = [objective(start, model, options) for start in starts]
@@ -318,7 +323,7 @@ class _Fits:
         errors, rms_px = clipped_errors(found, self.held_out, self._sigma_px)
         smooth = errors_without_warp(found, self.given.observations, self.held_out, self._sigma_px)
         left = max(float(errors.mean() - smooth.mean()), 0.0) if len(errors) else 0.0
-        self.done[label] = _Fit(label, model, varying, bends, found, errors, rms_px, left, spreads)
+        self.done[label] = _Fit(label, model, varying, bends, residual_field, found, errors, rms_px, left, spreads)
         return self.done[label]
 
     def agreement(self, fit: _Fit) -> float:
@@ -416,7 +421,8 @@ def choose_model(
     held-out error falls by more than two standard errors, measurements in the same part of the same photo counted once,
     and by more than two hundredths. A model of the shutter must also take away more than a smooth warp of each photo
     would yet, be better than itself read along the other axis (what bends photos for another reason can be taken for
-    either), and two halves of the scene must tell the same motions.
+    either), and two halves of the scene must tell the same motions. Last, where something smooth is left, a field of
+    each camera is kept if it is better.
 
     Parameters
     ----------
@@ -499,6 +505,14 @@ def choose_model(
     if not len(fits.held_out):
         against.append("no point is seen by three photos, so no measurement could be held out to judge by")
     shutter = "found" if best is not plain else "not-determined" if against else "not-found"
+    # a warp of each photo alone is fitted to few measurements, and takes less away than one that all share
+    if options.refine and len(fits.held_out) and best.left > _MOST_OF_IT * _MIN_FALL * float(best.errors.mean()):
+        label = f"{best.label}{_FIELD}"
+        field = fits.fit(best.model, best.varying, [best.reconstruction], label, best.bends, residual_field=True)
+        gain[label] = fits.gain(best, field)
+        if fits.is_better(best, field):
+            best = field
+            kept.append(label)
     return ModelChoice(
         best.model,
         best.label,
@@ -513,4 +527,5 @@ def choose_model(
         agreement,
         tuple(against),
         len(fits.held_out),
+        best.residual_field,
     )

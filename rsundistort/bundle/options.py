@@ -73,6 +73,10 @@ class BundleOptions:
         the mean distance of consecutive centres).
     phi_sigma_most, velocity_sigma_most : float or None
         Upper limits of the two spreads, where something else than the measurements says how far cameras can have moved.
+    phi_limits : mapping of photo name to float
+        The same of single photos: their prior is no wider than this (radians per frame), and that on their velocity no
+        wider than what displaces their scene, at its median depth, as such a turn does. They tell nothing of the spread
+        of the others.
     varying : bool
         Whether the intrinsics of each photo may differ from its camera's: log f, as a focusing lens changes it, and the
         principal point, as a stabiliser moves it, each with a zero-mean prior whose spread is estimated.
@@ -84,6 +88,11 @@ class BundleOptions:
         Where these estimates start: root mean square over the frame, in radians (or of each group), and in baselines.
     focal_sigma_start, centre_sigma_start : float
         Where these estimates start: of log f, and of the principal point in focal lengths.
+    residual_field : bool
+        Whether what the lens models leave is solved for, too: a smooth field of each camera (`Camera.field`) without
+        mean, orthogonal to what the intrinsics express, with a zero-mean prior whose spread is estimated.
+    field_sigma_start : float
+        Where that estimate starts, pixels: of each of some twenty orthogonal fields, root mean square over the frame.
     spread_rounds : int
         At most this many more solves settle the spreads, until neither changes by more than `spread_tolerance`.
     spread_tolerance : float
@@ -144,12 +153,15 @@ class BundleOptions:
     velocity_sigma_start: float = 0.03
     phi_sigma_most: float | None = None
     velocity_sigma_most: float | None = None
+    phi_limits: Mapping[str, float] = field(default_factory=dict)
     varying: bool = False
     bends: int = 0
     bend_sigma_start: float | tuple[float, ...] = 1e-3
     way_sigma_start: float = 1e-3
     focal_sigma_start: float = 2e-3
     centre_sigma_start: float = 3e-3
+    residual_field: bool = False
+    field_sigma_start: float = 0.03
     spread_rounds: int = 12
     spread_tolerance: float = 0.01
     outlier_rounds: int = 3
@@ -181,6 +193,9 @@ class BundleOptions:
                 raise InputError(f"still photo {name!r}: sigma {still!r}, expected 0 or a positive number")
             if name in known or name in self.held_phi:
                 raise InputError(f"photo {name!r} is said to be still and its motion to be known; give one of them")
+        for name, limit in self.phi_limits.items():
+            if not 0 < limit < np.inf:
+                raise InputError(f"limit of the motion of {name!r}: {limit!r}, expected a positive number")
         if self.loss not in LOSSES:
             raise InputError(f"loss={self.loss!r}, expected one of {', '.join(LOSSES)}")
         if self.deviations not in DEVIATIONS:
@@ -197,6 +212,7 @@ class BundleOptions:
             "way_sigma_start",
             "focal_sigma_start",
             "centre_sigma_start",
+            "field_sigma_start",
             "spread_tolerance",
             "cg_tolerance",
         )
@@ -259,6 +275,10 @@ class BundleResult:
         unknown is (`BundleOptions.deviations`), 1 or more. The covariances have it in them.
     noise_factor : float
         One such factor for all: times `sigma_px` it is the noise that weighed the measurements against the priors.
+    field_sigma_px : float
+        Standard deviation of the prior on the unknowns of the cameras' residual fields; 0 where none was solved for.
+    sigma_fields_px : tuple of float
+        Standard deviation of each camera's field, root mean square over its frame; 0 where none was solved for.
     """
 
     reconstruction: Reconstruction
@@ -278,6 +298,8 @@ class BundleResult:
     num_outliers: int
     inflation: NDArray[np.float64]
     noise_factor: float
+    field_sigma_px: float = 0.0
+    sigma_fields_px: tuple[float, ...] = ()
 
     @property
     def sigma_phi(self) -> NDArray[np.float64]:

@@ -30,7 +30,7 @@ class Posterior:
         spreads = Spreads(
             result.phi_sigma, max(result.velocity_sigma * rec.baseline, 1e-300),
             max(result.focal_sigma, 1e-300), max(result.centre_sigma, 1e-300), result.bend_sigmas,
-            tuple(each * rec.baseline for each in result.way_sigmas),
+            tuple(each * rec.baseline for each in result.way_sigmas), result.field_sigma_px,
         )  # fmt: skip
         plain = options or BundleOptions()
         self._problem = BundleProblem(rec, rec.shutter_model, plain, result.sigma_px * result.noise_factor, spreads)

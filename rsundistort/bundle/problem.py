@@ -15,11 +15,13 @@ from .._kernels import projection
 from ..errors import InputError
 from ..model import READOUTS, Camera, Reconstruction, check_shutter_model
 from ..model.bend import bend_table
+from ..model.field import lens_pixels
 from .elimination import Elimination, Marginals
 from .intrinsics import INTRINSICS, check_lenses, deviation, moved_camera, prior_weight
 from .jackknife import Partition, by_corner, by_place
 from .layout import Layout
 from .lengths import LengthResiduals
+from .lens_field import LensFields
 from .normal_equations import Border, NormalEquations, Step
 from .options import LOSSES, BundleOptions
 from .structure import Structure, by_first_photo
@@ -63,10 +65,23 @@ def _camera_arrays(
     return np.arange(len(camera_idx)), axes, signs, intrs, lenses
 
 
+def _lens_pixels(
+    cameras: Sequence[Camera], camera_of_obs: NDArray[np.int64], xy_raw: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Pixels (o, 2) of the lens models, those of the kernels, from measured ones."""
+    if not any(camera.field.size for camera in cameras):
+        return xy_raw
+    xy = np.empty_like(xy_raw)
+    for k, camera in enumerate(cameras):
+        mine = camera_of_obs == k
+        xy[mine] = lens_pixels(camera, xy_raw[mine])
+    return xy
+
+
 def reprojection_residuals(
     reconstruction: Reconstruction, shutter_model: str | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Predicted minus measured pixels (o, 2), and which observations could be projected.
+    """Predicted minus measured pixels (o, 2) of the lens models, and which observations could be projected.
 
     Parameters
     ----------
@@ -85,7 +100,8 @@ def reprojection_residuals(
     projection.residuals(
         model, *_camera_arrays(reconstruction.camera_idx, reconstruction.cameras, reconstruction.variation),
         reconstruction.R_cw, reconstruction.center_w, phi, reconstruction.velocity,
-        reconstruction.points_w, obs.frame_idx, obs.point_idx, obs.xy_raw, res, valid,
+        reconstruction.points_w, obs.frame_idx, obs.point_idx,
+        _lens_pixels(reconstruction.cameras, reconstruction.camera_idx[obs.frame_idx], obs.xy_raw), res, valid,
     )  # fmt: skip
     return res, valid
 
@@ -106,6 +122,8 @@ class Spreads:
         Of the variation of the principal point, focal lengths.
     bends, ways : tuple of float
         Of the groups of bends: of the rotation, radians, and of the position, world units.
+    field : float
+        Of the unknowns of the cameras' residual fields, pixels.
     """
 
     phi: float
@@ -114,6 +132,7 @@ class Spreads:
     centre: float = 1.0
     bends: tuple[float, ...] = ()
     ways: tuple[float, ...] = ()
+    field: float = 1.0
 
 
 # Observations that a thread takes at a time, and whose costs are summed together.
@@ -136,9 +155,10 @@ class BundleProblem:
     Unknowns of a photo: rotation increment (left, radians), centre (world units), phi (radians per unit of the clock)
     unless the shutter is global, velocity (world units per unit of the clock) if the motion is whole, and the variation
     of its intrinsics (log f, cx / fx, cy / fy) if the options say that they vary, and the coefficients of its bends, if
-    it has any (`Layout`). Unknowns of a camera: the intrinsics that the options name, as in `moved_camera`. Seven
-    unknowns are held for the gauge: the pose of the photo with the most observations, and one coordinate of the centre
-    farthest from it. The prior on intrinsics has heavy tails (`prior_weight`), or it is normal.
+    it has any (`Layout`). Unknowns of a camera: the intrinsics that the options name, as in `moved_camera`, and those
+    of `LensFields` if they ask for fields. Seven unknowns are held for the gauge: the pose of the photo with the most
+    observations, and one coordinate of the centre farthest from it. The prior on intrinsics has heavy tails
+    (`prior_weight`), or it is normal.
     """
 
     def __init__(
@@ -181,10 +201,14 @@ class BundleProblem:
         self._clock_of: State | None = None
         check_lenses(options.refine, reconstruction.cameras)
         self._refine = options.refine
+        self._fields = (
+            LensFields(reconstruction.cameras, options.refine, shutter_model) if options.residual_field else None
+        )
+        self._field_weight = spreads.field**-2.0 if options.residual_field else 0.0
         self._refine_codes = np.array([INTRINSICS[name] for name in options.refine], np.int64)
         span = reconstruction.frame_span()[:, None]
-        weight = np.hstack([np.repeat((span / s) ** 2, 3, axis=1) for s in (spreads.phi, spreads.velocity)])
-        self._motion_weight = weight[:, : self._block - 6]
+        weight = [np.repeat((span[:, 0] / s)[:, None] ** 2, 3, axis=1) for s in self._motion_spreads(spreads)]
+        self._motion_weight = np.hstack(weight)[:, : self._block - 6]
         varied = np.array([spreads.focal, spreads.centre, spreads.centre])[: 3 * options.varying] ** -2.0
         of_bends = self.layout.per_bend(spreads.bends, spreads.ways) ** -2.0
         self._own_weight = np.tile(np.concatenate([varied, of_bends]), (len(span), 1))
@@ -196,6 +220,13 @@ class BundleProblem:
             self._structure, self._free, poses, options.factor_limit, options.cg_tolerance
         )  # fmt: skip
         self._size = reconstruction.size
+
+    def _motion_spreads(self, spreads: Spreads) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Standard deviations (m,) of the priors on phi and velocity, per frame, no wider than a photo's own limit."""
+        limits = self._options.phi_limits
+        most = np.array([limits.get(name, np.inf) for name in self._start.image_names])
+        depths = [self._start.median_depth(i) if np.isfinite(each) else 1.0 for i, each in enumerate(most)]
+        return np.minimum(most, spreads.phi), np.minimum(most * depths, spreads.velocity)
 
     def _known_motions(self, span: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Motions (m, nb - 6) known from elsewhere, per unit of the clock, and their weights."""
@@ -255,9 +286,9 @@ class BundleProblem:
         start = self._start
         variation = start.variation if self._options.varying else np.zeros_like(start.variation)
         bend = np.where(self._free[:, self.layout.variation :], self.layout.coefficients(start), 0.0)
+        cameras = tuple(start.cameras) if self._fields is None else self._fields.started(start.cameras)
         return State(
-            tuple(start.cameras), start.R_cw, start.center_w, motion[:, :3], motion[:, 3:], variation, bend,
-            start.points_w,
+            cameras, start.R_cw, start.center_w, motion[:, :3], motion[:, 3:], variation, bend, start.points_w
         )  # fmt: skip
 
     def covariances(self, state: State) -> Marginals:
@@ -306,10 +337,11 @@ class BundleProblem:
         if self.layout.bent:
             values = self.layout.values(state.bend, self._start.image_names)
             phi = _tables(phi, values, self._bend_clock, state.R_cw)
+        xy = _lens_pixels(state.cameras, self._start.camera_idx[s.frame_idx], self._xy)
         return (
             self._model, *_camera_arrays(self._start.camera_idx, state.cameras, state.variation),
             state.R_cw, state.center_w, phi, state.velocity, state.points_w,
-            s.frame_idx, s.point_idx, self._xy, self._sigma_px, LOSSES[self._options.loss], self._options.loss_scale,
+            s.frame_idx, s.point_idx, xy, self._sigma_px, LOSSES[self._options.loss], self._options.loss_scale,
         )  # fmt: skip
 
     def _motion(self, state: State) -> NDArray[np.float64]:
@@ -329,7 +361,7 @@ class BundleProblem:
         return 0.5 * (own + lengths) + self._camera_priors(state)[2]
 
     def _camera_priors(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-        """(cameras, nc) weighted residuals of the prior on the intrinsics, their derivatives, and the cost."""
+        """Diagonal Hessian and gradient (cameras, nc) of the priors on the cameras, and their cost."""
         apart, slope = np.zeros((2, len(state.cameras), len(self._refine)))
         guessed = self._options.guessed
         if guessed is not None and self._refine:
@@ -337,7 +369,13 @@ class BundleProblem:
                 sigma = np.array([of.get(name, np.inf) for name in self._refine])
                 apart[k], slope[k] = np.array(deviation(camera, guess, self._refine)) / sigma
         cost, weight = prior_weight(apart**2) if self._heavy_tails else (0.5 * apart**2, np.ones_like(apart))
-        return apart * np.sqrt(weight), slope * np.sqrt(weight), float(cost.sum())
+        diagonal, gradient, total = slope**2 * weight, slope * apart * weight, float(cost.sum())
+        if self._fields is not None:
+            values = self._fields.values(state.cameras)
+            diagonal = np.hstack([diagonal, np.full(values.shape, self._field_weight)])
+            gradient = np.hstack([gradient, self._field_weight * values])
+            total += 0.5 * self._field_weight * float((values**2).sum())
+        return diagonal, gradient, total
 
     def _jacobians(
         self, state: State, spent: NormalEquations | None = None
@@ -385,10 +423,16 @@ class BundleProblem:
         prior_diag[own] = self._own_weight
         prior_gradient[own] = self._own_weight * self._own(state)
         total = cost + self._prior_cost(state)
-        prior = self._camera_priors(state)
-        border = Border(self._camera_jacobians(state), self._start.camera_idx, prior[1] ** 2, prior[1] * prior[0])
+        border = Border(self._camera_jacobians(state), self._start.camera_idx, *self._camera_priors(state)[:2])
         lengths = self._lengths.residuals(state.points_w), self._lengths.jacobian(state.points_w)
         return NormalEquations(self._elimination, total, res, J_frame, prior_diag, prior_gradient, border, lengths)
+
+    def fields(self, state: State, covariance: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Unknowns of the cameras' fields (cameras, nz), and their variances by all cameras' covariance (k, k)."""
+        num = len(state.cameras)
+        if self._fields is None:
+            return np.zeros((num, 0)), np.zeros((num, 0))
+        return self._fields.values(state.cameras), np.diagonal(covariance).reshape(num, -1)[:, len(self._refine) :]
 
     @property
     def measurements(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
@@ -396,7 +440,18 @@ class BundleProblem:
         return self._structure.frame_idx, self._structure.point_idx, self._sigma_px
 
     def _camera_jacobians(self, state: State) -> NDArray[np.float64]:
-        """Weighted Jacobians (o, 2, nc) of the intrinsics that are refined."""
+        """Weighted Jacobians (o, 2, nc) of what is solved for of the cameras."""
+        J = self._intrinsic_jacobians(state)
+        if self._fields is None:
+            return J
+        camera = self._start.camera_idx[self._structure.frame_idx]
+        # what a shift of the principal point does is what weighs a measurement
+        focal = np.array([np.diag(each.K)[:2] for each in state.cameras])[camera]
+        weight = self._variation_jacobians(state)[:, :, 1:] / focal[:, None]
+        return np.concatenate([J, weight @ self._fields.jacobian(state.cameras, camera, self._xy)], axis=2)
+
+    def _intrinsic_jacobians(self, state: State) -> NDArray[np.float64]:
+        """Weighted Jacobians (o, 2, len(refine)) of the intrinsics that are refined."""
         J = np.empty((len(self._xy), 2, len(self._refine)))
         if self._refine:
             projection.intrinsic_blocks(*self._kernel_args(state), self._rows(state), self._refine_codes, J)
@@ -447,9 +502,12 @@ class BundleProblem:
     def retract(self, state: State, step: Step) -> State:
         """The state after a step."""
         frame, point, intrinsics = step
-        cameras = state.cameras
+        cameras, own = state.cameras, len(self._refine)
         if self._refine:
-            cameras = tuple(moved_camera(c, self._refine, s) for c, s in zip(cameras, intrinsics, strict=True))
+            cameras = tuple(moved_camera(c, self._refine, s[:own]) for c, s in zip(cameras, intrinsics, strict=True))
+        if self._fields is not None:
+            moved = self._fields.moved
+            cameras = tuple(moved(k, c, s[own:]) for k, (c, s) in enumerate(zip(cameras, intrinsics, strict=True)))
         return State(
             cameras,
             Rotation.from_rotvec(frame[:, :3]).as_matrix() @ state.R_cw,
@@ -474,4 +532,6 @@ class BundleProblem:
         depth = np.maximum(np.sqrt(np.einsum("na,na->n", far, far)), self._size)
         moved = np.abs(frame[:, [3, 4, 5, *range(9, self._block), *range(ways, frame.shape[1])]]).max() / self._size
         lengths = max(moved, float((np.abs(point) / depth[:, None]).max(initial=0)))
-        return float(max(angles, lengths, np.abs(intrinsics).max(initial=0.0)))
+        of_lens = np.abs(intrinsics[:, : len(self._refine)]).max(initial=0.0)
+        of_fields = np.abs(intrinsics[:, len(self._refine) :]).max(initial=0.0) / float(self._start.cameras[0].K[0, 0])
+        return float(max(angles, lengths, of_lens, of_fields))

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model import READOUTS, Reconstruction
-from ..model.projection import unproject_points
+from ..model import Reconstruction
+from ..model.projection import clock_of, unproject_points
 from .problem import reprojection_residuals
 
 __all__ = ["revive_points"]
@@ -31,10 +31,8 @@ def _world_rays(
         mine = obs.frame_idx[some] == i
         camera, xy = reconstruction.camera(i), obs.xy_raw[some[mine]]
         ideal, valid[mine] = unproject_points(xy, camera, reconstruction.motion(i), shutter_model)
-        axis, sign = READOUTS[camera.readout]
-        clock = sign * (xy[:, axis] - camera.K[axis, 2]) / camera.K[axis, axis]
         moves = shutter_model == "constant-motion"
-        centers[mine] = reconstruction.center_w[i] + moves * clock[:, None] * reconstruction.velocity[i]
+        centers[mine] = reconstruction.center_w[i] + moves * clock_of(camera, xy)[:, None] * reconstruction.velocity[i]
         rays[mine] = np.column_stack([ideal, np.ones(len(ideal))]) @ reconstruction.R_cw[i]
     rays[~valid] = (0.0, 0.0, 1.0)
     return centers, rays / np.linalg.norm(rays, axis=1, keepdims=True), valid

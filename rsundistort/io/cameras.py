@@ -31,17 +31,17 @@ __all__ = [
 SIGMA_NAMES = ("f", "fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
 
 _REQUIRED = {"width", "height", "K"}
-_KNOWN = _REQUIRED | {"dist", "readout", "lens", "sigma"}
+_KNOWN = _REQUIRED | {"dist", "readout", "lens", "field", "sigma"}
 
 
 def camera_from_json(value: Any, where: str) -> Camera:
     """A camera of a parsed `camera.json`; `where` names it in errors."""
     if not isinstance(value, dict):
-        raise FormatError(f"{where}: expected an object with width, height, K, dist, readout, lens, sigma")
+        raise FormatError(f"{where}: expected an object with width, height, K, dist, readout, lens, field, sigma")
     missing, unknown = _REQUIRED - value.keys(), value.keys() - _KNOWN
     if missing or unknown:
         what = f"lacks {', '.join(sorted(missing))}" if missing else f"has unknown {', '.join(sorted(unknown))}"
-        raise FormatError(f"{where} {what}; expected width, height, K, dist, readout, lens, sigma")
+        raise FormatError(f"{where} {what}; expected width, height, K, dist, readout, lens, field, sigma")
     try:
         return Camera(
             value["width"],
@@ -50,6 +50,7 @@ def camera_from_json(value: Any, where: str) -> Camera:
             np.asarray(value.get("dist") or [], float),
             value.get("readout", "top-to-bottom"),
             value.get("lens", "pinhole"),
+            np.asarray(value.get("field") or [], float),
         )
     except (TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"{where}: {error}") from error
@@ -76,7 +77,7 @@ def check_sigma(sigma: Mapping[str, Any], where: str) -> dict[str, float]:
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
-    """The object of `camera.json`; the lens model is named when it is not the pinhole one."""
+    """The object of `camera.json`; lens model and field are named where they are not the pinhole's."""
     value: dict[str, Any] = {
         "width": camera.width,
         "height": camera.height,
@@ -86,6 +87,8 @@ def camera_to_json(camera: Camera) -> dict[str, Any]:
     }
     if camera.lens != "pinhole":
         value["lens"] = camera.lens
+    if camera.field.size:
+        value["field"] = camera.field.tolist()
     return value
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .checks import check_finite, frozen
+from .field import spline_coefficients, steepest
 
 __all__ = ["LENSES", "READOUTS", "Camera"]
 
@@ -27,6 +28,9 @@ LENSES: dict[str, tuple[str, ...]] = {
     "pinhole": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4"),
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
+
+# Slope of a field; from 1 on a photo may fold.
+_STEEPEST = 0.5
 
 _DIST_LENGTHS = {"pinhole": (0, 4, 5, 8, 12), "fisheye": (0, 4)}
 
@@ -69,6 +73,9 @@ class Camera:
     lens : {"pinhole", "fisheye"}
         Lens model: that of `cv2.projectPoints`, or that of `cv2.fisheye` (Kannala and Brandt 2006; COLMAP's
         OPENCV_FISHEYE), whose radius in the image is a polynomial of the angle from the optical axis.
+    field : (rows, cols, 2) array, optional
+        What the lens model leaves, in pixels: values of a smooth field at places spread evenly from corner to corner of
+        the photo, four or more each way (`model.field`); none when left out.
 
     Examples
     --------
@@ -83,6 +90,7 @@ class Camera:
     dist: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     readout: str = "top-to-bottom"
     lens: str = "pinhole"
+    field: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, 2)))
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
@@ -106,6 +114,18 @@ class Camera:
             raise InputError(f"readout={self.readout!r}, expected one of {', '.join(READOUTS)}")
         object.__setattr__(self, "K", frozen(K))
         object.__setattr__(self, "dist", frozen(dist))
+        object.__setattr__(self, "field", frozen(self._checked_field()))
+
+    def _checked_field(self) -> NDArray[np.float64]:
+        """The field, refused if it has not enough values, or folds the photo."""
+        if not np.size(self.field):
+            return np.zeros((0, 0, 2))
+        values = check_finite(self.field, (None, None, 2), "field")
+        if min(values.shape[:2]) < 4:
+            raise InputError(f"field.shape={values.shape}, expected at least 4 rows and 4 columns")
+        if steepest(values, self.width, self.height) > _STEEPEST:
+            raise InputError(f"field holds values of up to {np.abs(values).max():g} px: it would fold the photo")
+        return values
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Camera):
@@ -114,10 +134,12 @@ class Camera:
             (self.width, self.height, self.readout, self.lens) == (other.width, other.height, other.readout, other.lens)
             and np.array_equal(self.K, other.K)
             and np.array_equal(self.dist, other.dist)
+            and np.array_equal(self.field, other.field)
         )
 
     def __hash__(self) -> int:
-        return hash((self.width, self.height, self.readout, self.lens, self.K.tobytes(), self.dist.tobytes()))
+        arrays = (self.K.tobytes(), self.dist.tobytes(), self.field.tobytes())
+        return hash((self.width, self.height, self.readout, self.lens, *arrays))
 
     def varied(self, log_f: float, cx: float, cy: float) -> Camera:
         """The camera with its focal lengths times exp(log_f), its principal point shifted by cx fx and cy fy."""
@@ -163,7 +185,16 @@ class Camera:
     @property
     def is_pinhole(self) -> bool:
         """Whether the photo is a pinhole's: no lens distortion."""
-        return self.lens == "pinhole" and not self.dist.any()
+        return self.lens == "pinhole" and not self.dist.any() and not self.field.any()
+
+    @cached_property
+    def spline(self) -> NDArray[np.float64]:
+        """(rows, cols, 2) coefficients of the field's B-splines, as the kernels take them."""
+        return spline_coefficients(self.field)
+
+    def without_field(self) -> Camera:
+        """The camera of the lens model alone."""
+        return replace(self, field=np.zeros((0, 0, 2))) if self.field.size else self
 
     def pinhole(self) -> Camera:
         """The pinhole camera of the same K, without lens distortion: the default camera of rectified photos."""

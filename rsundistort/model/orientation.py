@@ -112,7 +112,17 @@ def turn_camera(camera: Camera, orientation: int) -> Camera:
         dist[[3, 2]] = matrix @ dist[[3, 2]]
         if len(dist) == 12:
             dist[[8, 10]], dist[[9, 11]] = matrix @ dist[[8, 10]], matrix @ dist[[9, 11]]
-    return replace(camera, width=width, height=height, K=K, dist=dist, readout=readout)
+    return replace(
+        camera, width=width, height=height, K=K, dist=dist, readout=readout, field=_turned_field(camera, matrix)
+    )
+
+
+def _turned_field(camera: Camera, matrix: NDArray[np.int64]) -> NDArray[np.float64]:
+    """The field (rows, cols, 2) of a camera whose axes a signed permutation turns."""
+    field = camera.field @ matrix.T
+    if matrix[0, 0] == 0:
+        field = field.transpose(1, 0, 2)
+    return field[:: int(matrix[1].sum()), :: int(matrix[0].sum())]
 
 
 def turn_image(image: SolvedImage, orientation: int, camera_id: str) -> SolvedImage:

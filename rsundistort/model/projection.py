@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from .._kernels import projection as kernels
 from .camera import Camera
 from .checks import check_array
+from .field import field_slope, lens_pixels, raw_pixels
 from .motion import RowMotion, check_shutter_model
 
 __all__ = [
@@ -70,7 +71,7 @@ def project_points(
     xy, valid = np.empty((len(points), 2)), np.empty(len(points), bool)
     model = check_shutter_model(shutter_model)
     kernels.project_points(model, axis, sign, intr, lens, points, motion.kernel_phi, motion.velocity, xy, valid)
-    return xy, valid
+    return (raw_pixels(camera, xy) if camera.field.size else xy), valid
 
 
 def project_points_with_jacobians(
@@ -87,13 +88,18 @@ def project_points_with_jacobians(
     kernels.project_jacobians(
         model, axis, sign, intr, lens, points, motion.kernel_phi, motion.velocity, xy, J_point, J_phi, J_velocity, valid
     )
+    if camera.field.size:
+        xy = raw_pixels(camera, xy)
+        by_lens = np.eye(2) - field_slope(camera, np.where(valid[:, None], xy, 0.0))
+        for J in (J_point, J_phi, J_velocity):
+            J[:] = np.linalg.solve(by_lens, J)
     return xy, valid, ProjectionJacobians(J_point, J_phi, J_velocity)
 
 
 def clock_of(camera: Camera, xy_raw: NDArray[np.float64]) -> NDArray[np.float64]:
     """(n,) clock r at which a camera read raw pixels (n, 2); 0 at the line of the principal point."""
     intr, _, axis, sign = camera.kernel_args
-    return np.asarray(sign * (xy_raw[:, axis] - intr[2 + axis]) / intr[axis])
+    return np.asarray(sign * (lens_pixels(camera, xy_raw)[:, axis] - intr[2 + axis]) / intr[axis])
 
 
 def at_depth(
@@ -139,7 +145,7 @@ def unproject_points(
         False beyond the fold of the lens model, for pixels of a fisheye 90 degrees or more from the axis, and where the
         row model has no inverse.
     """
-    xy = np.ascontiguousarray(check_array(xy_raw, (None, 2), "xy_raw"))
+    xy = lens_pixels(camera, np.ascontiguousarray(check_array(xy_raw, (None, 2), "xy_raw")))
     motion = motion or RowMotion()
     intr, lens, axis, sign = camera.kernel_args
     ideal, valid = np.empty_like(xy), np.empty(len(xy), bool)

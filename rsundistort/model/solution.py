@@ -150,7 +150,14 @@ class Solution:
         """Cameras by their ids: those of photos whose lens varied together, with the median of each number of K."""
         groups: dict[Any, list[str]] = {}
         for key, camera in self.cameras.items():
-            shared = (camera.width, camera.height, camera.readout, camera.lens, *camera.dist.tolist())
+            shared = (
+                camera.width,
+                camera.height,
+                camera.readout,
+                camera.lens,
+                *camera.dist.tolist(),
+                camera.field.tobytes(),
+            )
             groups.setdefault(shared if self.lens_varied else key, []).append(key)
         return {
             tuple(keys): replace(self.cameras[keys[0]], K=np.median([self.cameras[key].K for key in keys], axis=0))

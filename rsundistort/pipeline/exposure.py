@@ -18,7 +18,9 @@ _LONGEST_READOUT_S = 0.05
 def bounded_by_exposure(
     options: BundleOptions, reconstruction: Reconstruction, photos: LoadedPhotos, readout_s: Mapping[int, float]
 ) -> BundleOptions:
-    """Options whose spreads of the motion are bounded by the exposure, where all photos were exposed for long.
+    """Options whose priors on the motion are bounded by the exposure: of each photo that was exposed for long.
+
+    Where all were, the spreads of all are bounded, too, by the one that may have moved most.
 
     The picture of a photo whose steepest edges are b pixels wide moved by about b at most while it was exposed, so by b
     times readout / exposure during the readout: an angle of that over the focal length, or a way of that times the
@@ -37,12 +39,16 @@ def bounded_by_exposure(
     """
     rec = reconstruction
     place = {name: k for k, name in enumerate(photos.names)}
-    most = 0.0
+    limits: dict[str, float] = {}
     for i, name in enumerate(rec.image_names):
         exposure_s = photos.facts[place[name]].exposure_s
         edge_px = photos.edges_px[place[name]] if photos.edges_px else None
         if exposure_s is None or edge_px is None:
-            return options
+            continue
         readout = readout_s.get(int(rec.camera_idx[i]), _LONGEST_READOUT_S)
-        most = max(most, edge_px / float(rec.camera(i).K[0, 0]) * readout / exposure_s)
-    return replace(options, phi_sigma_most=most, velocity_sigma_most=most * rec.size / rec.baseline)
+        limits[name] = edge_px / float(rec.camera(i).K[0, 0]) * readout / exposure_s
+    if len(limits) < rec.num_images:
+        return replace(options, phi_limits=limits)
+    most = max(limits.values())
+    velocity = most * rec.size / rec.baseline
+    return replace(options, phi_limits=limits, phi_sigma_most=most, velocity_sigma_most=velocity)

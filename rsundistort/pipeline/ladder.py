@@ -280,14 +280,14 @@ def solve_tracks(
             result.reconstruction, LADDER, options, sigma_px=result.sigma_px, seed=seed,
             progress=lambda model, _: log.tell(f"choice: {model}", 0),
         )  # fmt: skip
-        if choice.shutter_model != shutter_model or choice.varying or choice.bends:
-            options = replace(options, varying=choice.varying, bends=choice.bends)
+        if choice.shutter_model != shutter_model or choice.varying or choice.bends or choice.residual_field:
+            options = replace(options, varying=choice.varying, bends=choice.bends, residual_field=choice.residual_field)
             start = replace(tracks, shutter_model=choice.shutter_model)
             result = bundle_adjust(start, choice.shutter_model, options, partial(_tell, log, "choice"))
         log.end(
             "choice of the model", chosen=choice.shutter_model, varying_lens=choice.varying, bends=choice.bends,
-            shutter=choice.shutter,
-            agreement=choice.agreement, gain=choice.gain, num_held_out=choice.num_held_out,
+            residual_field=choice.residual_field, shutter=choice.shutter, agreement=choice.agreement, gain=choice.gain,
+            num_held_out=choice.num_held_out,
         )  # fmt: skip
         aligns = feedback is not None and feedback.workers is not None
         if feedback is not None and aligns and (choice.shutter_model == "constant-motion" or choice.bends):
@@ -318,7 +318,9 @@ def solve_tracks(
     log.begin("verdict")
     measured = mapped if feedback is None else tracks
     known = {*options.known_phi, *options.held_phi, *options.still}
-    verdict = judge(result, global_result, choice, mended, measured, known)
+    # two standard deviations of the priors that exposures make
+    most_phi = {name: 2.0 * limit for name, limit in options.phi_limits.items()}
+    verdict = judge(result, global_result, choice, mended, measured, known, most_phi)
     if verdict.lens_only:
         warnings.warn(_lens_only(verdict), RsUndistortWarning, stacklevel=3)
     log.end("verdict", shutter=verdict.shutter, shape=verdict.shape)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..bundle import ModelChoice, reprojection_residuals
 from ..model import Reconstruction, Solution, SolvedImage
+from ..model.field import field_over_frame
 from ..rectify import largest_shift_px
 from .cameras import PhotoCameras
 from .ladder import Solved
@@ -124,6 +125,16 @@ def _critical(solved: Solved) -> dict[str, Any]:
     }
 
 
+def _fields(solved: Solved) -> list[dict[str, float]]:
+    """How large the residual field of each camera is: root mean square and largest over its frame, its deviation."""
+    lengths = [np.linalg.norm(field_over_frame(c)[1], axis=2) for c in solved.result.reconstruction.cameras]
+    sigmas = solved.result.sigma_fields_px
+    return [
+        {"rms_px": float(np.sqrt(np.mean(length**2))), "largest_px": float(length.max()), "sigma_px": sigma}
+        for length, sigma in zip(lengths, sigmas, strict=True)
+    ]
+
+
 def solution_of(outcome: Outcome, options: SolveOptions) -> Solution:
     """The solution of an adjusted reconstruction, with every photo in it; its views are those of the raw photos."""
     solved, rec, verdict = outcome.solved, outcome.reconstruction, outcome.solved.verdict
@@ -165,6 +176,7 @@ def solution_of(outcome: Outcome, options: SolveOptions) -> Solution:
         "sigma_intrinsics": _by_camera(keys, shared, solved.result.sigma_intrinsics),
         "focal_sigma": solved.result.focal_sigma,
         "centre_sigma_focal_lengths": solved.result.centre_sigma,
+        "lens_fields": _by_camera(keys, shared, _fields(solved)) if any(c.field.size for c in shared.cameras) else {},
         "phi_sigma_rad_per_frame": solved.result.phi_sigma,
         "stop_reason": solved.result.stop_reason,
         "readout_times": {

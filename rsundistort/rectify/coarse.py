@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from .._kernels import projection as kernels
 from ..model import Camera, RowMotion, check_shutter_model
-from .maps import EDGE_PX
+from ..model.field import add_field
+from .maps import EDGE_PX, seen_by
 
 __all__ = ["TOLERANCE_PX", "CoarseGrid", "coarse_grid"]
 
@@ -33,7 +34,7 @@ class CoarseGrid:
     Attributes
     ----------
     nodes_x, nodes_y : (3 m + 1, 3 n + 1) array
-        Raw pixels, exact.
+        Raw pixels of the lens model, exact; the camera's field is added to each pixel.
     smooth : (m, n) bool array
         Patches that are interpolated; the others are evaluated pixel by pixel.
     spacing : int
@@ -59,13 +60,18 @@ class CoarseGrid:
         """
         camera = self.camera
         intr, lens, axis, sign = camera.kernel_args
-        # float32 rounds besides
-        band = self.error_px + 1e-3
+        # float32 rounds besides, and the field moves the border
+        field = camera.field
+        band = self.error_px + 1e-3 + float(np.abs(field).max(initial=0.0))
         unseen: int = kernels.interpolate_map(
             check_shutter_model(self.shutter_model), axis, sign, intr, lens, self.motion.kernel_phi, self.rays,
             self.nodes_x, self.nodes_y, self.smooth, self.spacing, band, EDGE_PX, camera.width, camera.height, row0,
             map_x, map_y, seen,
         )  # fmt: skip
+        if field.size:
+            add_field(camera, map_x, map_y)
+            seen[:] = seen_by(map_x, map_y, camera.width, camera.height)
+            return bool(seen.all())
         return unseen == 0
 
 

@@ -10,6 +10,7 @@ from .._kernels import projection as kernels
 from ..errors import InputError
 from ..model import AtInfinity, Camera, Depth, RowMotion, check_shutter_model
 from ..model.checks import check_finite, check_rotations
+from ..model.field import add_field
 from .depth import DepthRows
 
 __all__ = ["fill_rows", "init_rectify_map", "rectified_rays", "seen_by"]
@@ -46,8 +47,9 @@ def fill_rows(
             axis, sign, intr, lens, motion.kernel_phi, motion.velocity, rays, inverse, row0, 0, map_x, map_y
         )
         depth.mark_hidden(row0, map_x, map_y)
-        return
-    kernels.fill_map(model, axis, sign, intr, lens, motion.kernel_phi, rays, row0, 0, map_x, map_y)
+    else:
+        kernels.fill_map(model, axis, sign, intr, lens, motion.kernel_phi, rays, row0, 0, map_x, map_y)
+    add_field(camera, map_x, map_y)
 
 
 def seen_by(map_x: NDArray[np.float32], map_y: NDArray[np.float32], width: int, height: int) -> NDArray[np.uint8]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..critical.meter import readout_axes
 from ..io import output_name
 from ..model import READOUTS, SHUTTER_MODELS, Camera, Solution, SolvedImage
+from ..model.field import field_over_frame
 from ..model.orientation import MATRICES, in_stored_frame, split_mirror, turn_points
 from .diagnostics import Diagnostics
 from .displacement import displacement_field
@@ -38,6 +39,8 @@ _CURVE, _CURVE_PLACES = (240, 120), 97
 # Factors by which arrows may be drawn longer than they are, and the part of a cell that a long one should fill.
 _LONGER = (1, 2, 3, 4, 6, 8, 10, 15, 20, 30, 50)
 _ACROSS = 14
+# Arrows across and down in the picture of what a lens model leaves.
+_FIELD_ARROWS = 13, 9
 
 
 def photos(source: Source) -> list[dict[str, Any]]:
@@ -268,9 +271,28 @@ def cameras(solution: Solution) -> list[dict[str, Any]]:
                 "readout": camera.readout,
                 "time": times.get(keys[0]),
                 "photos": sum(image.camera_id in keys for image in solution.images),
+                "field": _field(camera, (solution.quality.get("lens_fields") or {}).get(keys[0]) or {}),
             }
         )
     return rows
+
+
+def _field(camera: Camera, told: Mapping[str, float]) -> dict[str, Any] | None:
+    """A picture of what a camera's lens model leaves, in thousandths of its width, and its size; None if none."""
+    if not camera.field.size:
+        return None
+    xy, field = (each.reshape(-1, 2) for each in field_over_frame(camera, *_FIELD_ARROWS))
+    lengths = np.linalg.norm(field, axis=1)
+    unit = 1000 / camera.width
+    times = max(1, round(0.9 * camera.width / _FIELD_ARROWS[0] / max(float(lengths.max()), 1e-6)))
+    shafts = zip((unit * xy).round(1).tolist(), (unit * times * field).round(1).tolist(), strict=True)
+    return {
+        "height": round(unit * camera.height),
+        "path": "".join(f"M{x:g} {y:g}l{dx:g} {dy:g}" for (x, y), (dx, dy) in shafts),
+        "dots": (unit * xy).round(1).tolist(),
+        "times": times,
+        **{key: told.get(f"{key}_px") for key in ("rms", "largest", "sigma")},
+    }
 
 
 def settings(solution: Solution) -> list[tuple[str, str]]:

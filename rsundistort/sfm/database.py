@@ -130,7 +130,7 @@ def ideal_keypoints(
     ideal, valid = unproject_points(features.xy_raw, own or camera, motion, model)
     if camera.lens == "fisheye":
         rays = np.column_stack([np.where(valid[:, None], ideal, 0.0), np.ones(len(ideal))])
-        xy = project_points(rays, camera, None, "global")[0]
+        xy = project_points(rays, camera.without_field(), None, "global")[0]
     else:
         xy = ideal @ camera.K[:2, :2].T + camera.K[:2, 2]
     xy[~valid] = -1e4

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
+from ..errors import InputError
 from ..model import Camera
 
 __all__ = ["distort_rays", "undistort_to_rays"]
@@ -23,6 +24,7 @@ _ANGLES = np.linspace(0.0, np.pi / 2, 4097)
 
 def distort_rays(rays_c: ArrayLike, camera: Camera, K: ArrayLike | None = None) -> NDArray[np.float64]:
     """Pixels (n, 2) of directions or points (n, 3) of the camera frame, without shutter; K in place of the camera's."""
+    _check_lens(camera)
     rays, K = np.asarray(rays_c, np.float64).reshape(-1, 1, 3), np.array(camera.K if K is None else K, np.float64)
     dist, still = np.array(camera.dist) if len(camera.dist) else None, np.zeros(3)
     if camera.lens == "fisheye":
@@ -34,6 +36,7 @@ def distort_rays(rays_c: ArrayLike, camera: Camera, K: ArrayLike | None = None) 
 
 def undistort_to_rays(uv_raw: ArrayLike, camera: Camera) -> NDArray[np.float64]:
     """Undistorted normalised coordinates (..., 2) of pixels (..., 2); of a fisheye NaN from 90 degrees on."""
+    _check_lens(camera)
     uv, K = np.asarray(uv_raw, np.float64), np.array(camera.K)
     if camera.is_pinhole:
         return np.asarray((uv - K[:2, 2]) / np.diag(K)[:2], np.float64)
@@ -46,6 +49,11 @@ def undistort_to_rays(uv_raw: ArrayLike, camera: Camera) -> NDArray[np.float64]:
     else:
         rays = cv2.undistortPoints(flat, K, dist, criteria=_TIGHT)
     return np.asarray(rays, np.float64).reshape(uv.shape)
+
+
+def _check_lens(camera: Camera) -> None:
+    if camera.field.size:
+        raise InputError("the camera has a residual field, which is not simulated; take the key field out of its file")
 
 
 def _fisheye_rays(distorted: NDArray[np.float64], dist: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,6 +15,7 @@ from ..bundle import BundleResult, ModelChoice
 from ..bundle.choice import clipped_errors, corners, improves, standard_errors
 from ..critical import Remedy
 from ..model import Reconstruction
+from ..model.field import field_over_frame
 from ..sfm import LEAST_MEASUREMENTS
 from .photos import PhotoMotions, photo_motions
 from .residuals import left_along_readout, left_over_frame
@@ -30,6 +31,8 @@ _SMALL_PERCENT = 0.5
 # What may remain in the same places of all photos. A lens that makes motions wrong by half a pixel leaves 0.1 to 0.15
 # even where cameras are turned at will (k1 wrong by 0.03), and less where they are not.
 _LEFT_PX = 0.1
+# What a lens model may leave to a field beside it: more, and it is not the model of this lens.
+_FIELD_PX = 0.5
 # Held-out measurements may be off by this beyond their noise.
 _HELD_OUT_PX = 0.5
 # Fewer held-out measurements tell nothing.
@@ -180,6 +183,12 @@ def _unexplained(result: BundleResult, choice: ModelChoice | None) -> list[str]:
         reasons.append(
             f"At the same times of the readout {left:.2f} px remain unexplained: the lens, or how the camera moves "
             "during the readout, is not what it is taken for."
+        )
+    fields = [field_over_frame(camera)[1] for camera in result.reconstruction.cameras]
+    if (size := max(float(np.sqrt((field**2).sum(2).mean())) for field in fields)) > _FIELD_PX:
+        reasons.append(
+            f"The photos are {size:.1f} px in the mean off from what the lens model says, beyond what any lens of its "
+            "kind does: it is not the model of this lens."
         )
     if choice is not None:
         error = choice.held_out_error[choice.label]
