@@ -234,13 +234,14 @@ def bundle_adjust(
     jackknife, factor = options.deviations == "jackknife", 1.0
     # Measurements that seem more exact than they are would pull the intrinsics over the hump of a prior with heavy
     # tails, and they would not come back: it is normal until the noise is known
-    noise_known = False
+    prior_of_cameras = jackknife and options.guessed is not None and len(options.refine) > 0
+    heavy_tails = False
     for round_ in range(options.outlier_rounds + options.spread_rounds + 1):
         cleaning = round_ < options.outlier_rounds
         # where the first spreads are but a guess, their solution need not be exact
         rough = cleaning or (round_ == 0 and options.spread_rounds > 0 and _estimates_spreads(shutter_model, options))
         believed = replace(base, observations=base.observations.select(keep))
-        problem = BundleProblem(believed, shutter_model, options, sigma * factor, spreads, heavy_tails=noise_known)
+        problem = BundleProblem(believed, shutter_model, options, sigma * factor, spreads, heavy_tails=heavy_tails)
         result = minimize(
             problem,
             problem.initial_state(),
@@ -255,12 +256,12 @@ def bundle_adjust(
         current = problem.reconstruction(result.state)
         equations = problem.linearize(result.state)
         marginals = equations.marginal_covariances()
-        weighed, noise_was_known = factor, noise_known
+        weighed, had_tails = factor, heavy_tails
         per_camera = equations.num_shared // equations.num_cameras
         shared = Inflation(np.ones(len(marginals.photos[0])), np.ones(per_camera))
         if jackknife and not rough:
             shared = inflation(equations, problem.partitions(result.state), marginals, factor)
-            factor, noise_known = shared.noise, True
+            factor, heavy_tails = shared.noise, True
         del equations
         before, spreads = spreads, _estimated(spreads, current, marginals.photos, options, layout, baseline)
         if options.residual_field:
@@ -280,7 +281,7 @@ def bundle_adjust(
             and revived is current
             and _settled(before, spreads, options.spread_tolerance)
             and abs(factor - weighed) < 0.1 * factor
-            and (noise_was_known or not jackknife)
+            and (had_tails or not prior_of_cameras)
         ):
             break
         else:

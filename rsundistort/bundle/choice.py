@@ -68,8 +68,6 @@ class ModelChoice:
         Its key in what follows.
     varying : bool
         Whether the intrinsics vary from photo to photo, as `BundleOptions.varying`.
-    bends : int
-        How the motions depart from steady ones, as `BundleOptions.bends`.
     shutter : {"found", "not-found", "not-determined"}
         Whether there is a rolling shutter: "not-determined" if something bends the photos that a model of the shutter
         explains in part, or no better than one that is read along the other axis.
@@ -94,12 +92,13 @@ class ModelChoice:
         Measurements held out.
     residual_field : bool
         Whether cameras have fields beside their lens models, as `BundleOptions.residual_field`.
+    bends : int
+        How the motions depart from steady ones, as `BundleOptions.bends`.
     """
 
     shutter_model: str
     label: str
     varying: bool
-    bends: int
     shutter: str
     held_out_error: dict[str, float]
     held_out_rms_px: dict[str, float]
@@ -110,6 +109,7 @@ class ModelChoice:
     against: tuple[str, ...]
     num_held_out: int
     residual_field: bool = False
+    bends: int = 0
 
 
 def hold_out(
@@ -517,7 +517,6 @@ def choose_model(
         best.model,
         best.label,
         best.varying,
-        best.bends,
         shutter,
         {label: float(fit.errors.mean()) if len(fit.errors) else float("nan") for label, fit in fits.done.items()},
         {label: fit.rms_px for label, fit in fits.done.items()},
@@ -528,4 +527,5 @@ def choose_model(
         tuple(against),
         len(fits.held_out),
         best.residual_field,
+        best.bends,
     )
