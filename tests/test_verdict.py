@@ -207,7 +207,10 @@ def test_held_out_measurements_that_are_far_off_speak_against_a_solution(rng):
     assert judge(result, None, choice_of("rotation", 3.0, 9.0)).shape == "trusted"  # 0.4 px
     far_off = judge(result, None, choice_of("rotation", 10.0, 9.0))
     assert far_off.shutter == "found"
-    assert far_off.reasons == ("Measurements that were held out are off by 0.9 px more than their noise explains.",)
+    beyond = f"{3 * result.sigma_px:.1f}"  # sqrt(10 - 1) times the noise
+    assert far_off.reasons == (
+        f"Measurements that were held out are off by {beyond} px more than their noise explains.",
+    )
 
 
 def test_an_unknown_height_is_not_trusted(rng):

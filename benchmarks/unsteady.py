@@ -1,0 +1,205 @@
+"""Motions that are not steady: what is found of them, what the photos are worth, and whether any photo comes out worse.
+
+    python benchmarks/unsteady.py [--photos DIR] [--only PART ...] [--seeds N] [--first-seed K]
+
+Prints one JSON object a line and at the end a table with targets. Parts, with their own number of seeds:
+
+    changing (3)   herz-jesus-8 warped by 0.05 rad a frame, the rate changing by half of itself over half a frame
+    vibrating (3)  herz-jesus-8 warped by 0.02 rad, with 1.5 mrad of vibration at 2 to 5 periods a frame
+    scene (1)      a rendered scene, from a drone that travels and vibrates, against its twins
+    harm (13)      herz-jesus-8 with motions of all kinds, 0 to 0.1 rad: no photo is to come out more than 0.3 dB below
+                   what went in unless it is named as doubtful
+    steady (2)     steady motions of 0.02 and 0.05 rad, with these models among the choices and without
+    coverage (3)   errors of phi in units of the deviations that are reported, of all that ran before
+
+Poses of warped photos are held against the global-shutter reconstruction of the photos as they are. Exits 1 if one
+crashes, never because a figure misses its target.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+from measures import normalised_errors, pooled
+
+import rsundistort as rs
+from rsundistort.synthetic.unsteady import Vibration
+
+ROOT = Path(__file__).resolve().parent.parent
+HERZ = "herz-jesus-8"
+PARTS = ("changing", "vibrating", "scene", "harm", "steady")
+COLUMNS = ("part", "seed", "model", "verdict", "dB", "worst", "before", "deg", "phi/sigma", "doubtful", "s")
+# strength in rad a frame, change of the rate, amplitude of the vibration in rad: steady, bent, vibrating, mixed
+HARM = (
+    (0.0, 0.0, 0.0), (0.003, 0.0, 0.0), (0.01, 0.0, 0.0), (0.03, 0.0, 0.0), (0.1, 0.0, 0.0), (0.01, 0.5, 0.0),
+    (0.03, 0.5, 0.0), (0.1, 0.5, 0.0), (0.0, 0.0, 1.5e-3), (0.01, 0.0, 1e-3), (0.03, 0.0, 3e-3), (0.01, 0.5, 1.5e-3),
+    (0.05, 0.5, 1.5e-3),
+)  # fmt: skip
+
+
+def show(name: str, **figures: Any) -> None:
+    """Print one JSON line."""
+    print(json.dumps({"name": name, **figures}), flush=True)
+
+
+class Bench:
+    """Photos, the folder of work, and what came of it."""
+
+    def __init__(self, photos: Path, work: Path) -> None:
+        self.photos, self.work = photos, work
+        self.rows: list[tuple[str, ...]] = []
+        self.errors: list[dict[str, Any]] = []
+        self.failed: list[str] = []
+        self._still: Path | None = None
+
+    @property
+    def still(self) -> Path:
+        """Solution of the photos as they are."""
+        if self._still is None:
+            out = self.work / "still"
+            rs.run(self.photos / HERZ, out, rs.RunOptions(report=False, shutter_model="global"))
+            self._still = out / "solution.json"
+        return self._still
+
+    def warped(self, sigma: float, seed: int, change: float = 0.0, shake: float = 0.0) -> Path:
+        """Folder of herz-jesus-8 warped."""
+        out = self.work / f"warped-{sigma}-{change}-{shake}-{seed}"
+        vibration = Vibration(shake, (2.0, 5.0)) if shake else None
+        options = rs.WarpOptions(sigma_rad=sigma, seed=seed, acceleration=change, vibration=vibration)
+        if not out.is_dir():
+            rs.simulate_warp(self.photos / HERZ, out, options)
+        return out
+
+    def measure(self, part: str, seed: int, folder: Path, twins: Path, poses: Path | None, name: str = "run") -> Any:
+        """Run on a folder with its truth, and tell what came of it; None where it crashed."""
+        start = time.perf_counter()
+        out = folder / name
+        try:
+            solution = rs.run(folder / "photos", out, rs.RunOptions(report=False, overwrite=True))
+            seconds = time.perf_counter() - start
+            found = rs.evaluate(out, folder / "ground_truth.json", poses=poses, twins=twins)
+        except Exception as error:
+            show(f"{part}, seed {seed}", crash=f"{type(error).__name__}: {error}")
+            self.failed.append(part)
+            return None
+        after, before = found["psnr_db"]["photos"], found["psnr_before_db"]["photos"]
+        named = {image.name for image in solution.images if image.doubtful or image.lens_only}
+        truth = rs.read_solution(folder / "ground_truth.json")
+        phi = None
+        if solution.shutter_model != "global":
+            phi = normalised_errors(solution, truth) if all(i.posed for i in truth.images) else _phi(solution, truth)
+            self.errors.append({"phi": phi["phi"]})
+        quality = solution.quality
+        value = {
+            "model": quality["held_out_chosen"], "verdict": [solution.verdict["shutter"], solution.verdict["shape"]],
+            "joined": len(solution.registered), "dB": round(found["psnr_db"]["median"], 2),
+            "worst": round(min(after.values()), 2), "before": round(found["psnr_before_db"]["median"], 2),
+            "deg": round(found["rotation_deg"]["mean"], 4),
+            "phi_mrad": np.round(found["phi_mrad_per_frame"]["mean_per_component"], 2).tolist(),
+            "phi_over_sigma": None if phi is None else round(float(np.sqrt(np.mean(phi["phi"] ** 2))), 2),
+            "doubtful": sorted(named), "s": round(seconds, 1),
+            "worse": {k: round(after[k] - before[k], 2) for k in after if after[k] < before[k] - 0.3},
+            "held_out_error": {k: round(v, 3) for k, v in quality["held_out_error"].items()},
+            "agreement": quality["agreement_of_halves"],
+        }  # fmt: skip
+        show(f"{part}, seed {seed}", **value)
+        cells = [value[k] for k in ("model", "verdict", "dB", "worst", "before", "deg", "phi_over_sigma")]
+        self.rows.append((part, str(seed), *map(str, cells), str(len(named)), f"{seconds:.0f}"))
+        return value
+
+
+def _phi(solution: rs.Solution, truth: rs.Solution) -> dict[str, Any]:
+    """Errors of phi over their deviations."""
+    span = np.array([[solution.cameras[image.camera_id].frame_span] for image in solution.registered])
+    sigma = span * np.array([image.sigma_phi for image in solution.registered])
+    return {"phi": rs.motion_errors(solution, truth).phi_rad_per_frame / sigma}
+
+
+def scene(bench: Bench, seed: int) -> None:
+    """A rendered flight that travels and vibrates: the project's own recipe, with another motion."""
+    recipe = json.loads((ROOT / "sample_scenes" / "flyover" / "recipe.json").read_text())
+    recipe["seed"] = recipe["seed"] + seed
+    recipe["motion"] = recipe["motion"] | {"vibration": {"amplitude_rad": 1.5e-3, "periods": [2, 5], "travel_m": 0.002}}
+    folder = bench.work / f"scene-{seed}"
+    folder.mkdir()
+    (folder / "recipe.json").write_text(json.dumps(recipe))
+    rs.simulate_scene(folder / "recipe.json", folder / "scene", rs.SceneOptions())
+    bench.measure("scene", seed, folder / "scene", folder / "scene" / "global", None)
+
+
+def main() -> int:
+    """Run the parts that are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--photos", type=Path, default=ROOT.parent / "shared" / "photos")
+    parser.add_argument("--only", nargs="*", choices=PARTS, default=PARTS)
+    parser.add_argument("--seeds", type=int)
+    parser.add_argument("--first-seed", type=int, default=0)
+    args = parser.parse_args()
+    warnings.simplefilter("ignore")
+    with tempfile.TemporaryDirectory() as work:
+        bench = Bench(args.photos, Path(work))
+
+        def seeds(own: int) -> range:
+            return range(args.first_seed, args.first_seed + (args.seeds or own))
+
+        twins = bench.photos / HERZ
+        if "changing" in args.only:
+            for seed in seeds(3):
+                bench.measure("changing", seed, bench.warped(0.05, seed, change=0.5), twins, bench.still)
+        if "vibrating" in args.only:
+            for seed in seeds(3):
+                bench.measure("vibrating", seed, bench.warped(0.02, seed, shake=1.5e-3), twins, bench.still)
+        if "scene" in args.only:
+            for seed in seeds(1):
+                scene(bench, seed)
+        if "harm" in args.only:
+            harm(bench, seeds(1), twins)
+        if "steady" in args.only:
+            steady(bench, seeds(2), twins)
+        if bench.errors:
+            show("coverage", phi_over_sigma=pooled(bench.errors), runs=len(bench.errors))
+    widths = [max(len(row[k]) for row in [COLUMNS, *bench.rows]) for k in range(len(COLUMNS))]
+    for row in [COLUMNS, *bench.rows]:
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    return bool(bench.failed)
+
+
+def harm(bench: Bench, seeds: Sequence[int], twins: Path) -> None:
+    """Photos that come out worse than they went in, and are not named."""
+    photos, silent = 0, dict[str, float]()
+    for seed in seeds:
+        for k, (sigma, change, shake) in enumerate(HARM):
+            folder = bench.warped(sigma, 100 * seed + k, change, shake)
+            found = bench.measure(f"harm by {sigma}, {change}, {shake}", seed, folder, twins, bench.still)
+            if found is not None:
+                photos += found["joined"]
+                worse = {f"{folder.name}/{k}": v for k, v in found["worse"].items() if k not in found["doubtful"]}
+                silent |= worse
+    show("harm", photos=photos, worse_and_not_named=silent)
+
+
+def steady(bench: Bench, seeds: Sequence[int], twins: Path) -> None:
+    """What steady motions lose, and how much longer they take."""
+    for sigma in (0.02, 0.05):
+        for seed in seeds:
+            folder = bench.warped(sigma, seed)
+            with mock.patch("rsundistort.bundle.choice._BENDS", {0: ""}):
+                without = bench.measure(f"steady by {sigma}, without", seed, folder, twins, bench.still)
+            among = bench.measure(f"steady by {sigma}", seed, folder, twins, bench.still)
+            if without and among:
+                loss, times = without["dB"] - among["dB"], among["s"] / without["s"]
+                show(f"steady by {sigma}, seed {seed}", loss_db=round(loss, 2), times=round(times, 2))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
