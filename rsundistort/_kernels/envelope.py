@@ -115,26 +115,45 @@ def factor_envelope(first, offset, panel, data):
 
 @parallel_kernel(fastmath=SUMS)
 def solve_envelope(first, offset, data, B):
-    """B (k, n): right-hand sides become solutions, n a multiple of four."""
-    for j in prange(len(B)):
-        x = B[j]
-        begun = False
-        for i in range(len(x)):
-            if not begun and x[i] == 0.0:  # columns of the identity begin late
-                continue
-            begun = True
+    """B (k, n): right-hand sides become solutions, n a multiple of four.
+
+    Four at a time: the factor is read from memory, and that is what a solution costs.
+    """
+    for quad in prange((len(B) + 3) // 4):
+        j = 4 * quad
+        last = len(B) - 1
+        # what is beyond the last is the last once more, in a copy that nobody reads
+        x0 = B[j]
+        x1 = B[j + 1] if j + 1 <= last else B[last].copy()
+        x2 = B[j + 2] if j + 2 <= last else B[last].copy()
+        x3 = B[j + 3] if j + 3 <= last else B[last].copy()
+        n = len(x0)
+        begin = 0  # columns of the identity begin late
+        while begin < n and x0[begin] == 0.0 and x1[begin] == 0.0 and x2[begin] == 0.0 and x3[begin] == 0.0:
+            begin += 1
+        for i in range(begin, n):
             g = i // 4
             fg = first[g]
             at = offset[g] + (i - 4 * g) * (4 * g + 4 - fg)
-            t = 0.0
+            t0 = t1 = t2 = t3 = 0.0
             for k in range(i - fg):
-                t += data[at + k] * x[fg + k]
-            x[i] = (x[i] - t) / data[at + i - fg]
-        for i in range(len(x) - 1, -1, -1):
+                d = data[at + k]
+                t0 += d * x0[fg + k]
+                t1 += d * x1[fg + k]
+                t2 += d * x2[fg + k]
+                t3 += d * x3[fg + k]
+            d = 1.0 / data[at + i - fg]
+            x0[i], x1[i], x2[i], x3[i] = (x0[i] - t0) * d, (x1[i] - t1) * d, (x2[i] - t2) * d, (x3[i] - t3) * d
+        for i in range(n - 1, -1, -1):
             g = i // 4
             fg = first[g]
             at = offset[g] + (i - 4 * g) * (4 * g + 4 - fg)
-            t = x[i] / data[at + i - fg]
-            x[i] = t
+            d = 1.0 / data[at + i - fg]
+            t0, t1, t2, t3 = x0[i] * d, x1[i] * d, x2[i] * d, x3[i] * d
+            x0[i], x1[i], x2[i], x3[i] = t0, t1, t2, t3
             for k in range(i - fg):
-                x[fg + k] -= t * data[at + k]
+                d = data[at + k]
+                x0[fg + k] -= t0 * d
+                x1[fg + k] -= t1 * d
+                x2[fg + k] -= t2 * d
+                x3[fg + k] -= t3 * d

@@ -84,8 +84,7 @@ class ModelChoice:
     kept : tuple of str
         Those that were kept, in order.
     agreement : float or None
-        Correlation of the motions that two halves of the scene tell, each alone; None where no shutter explained
-        anything.
+        Correlation of the motions that two halves of the scene tell, each alone; None where it did not come to that.
     against : tuple of str
         What speaks against a shutter that explained something and was not kept, for people.
     num_held_out : int
@@ -183,12 +182,12 @@ def _warps(rec: Reconstruction, measured: Observations) -> NDArray[np.float64]:
 
 
 def _waves(rec: Reconstruction, measured: Observations) -> NDArray[np.float64]:
-    """(n, k) splines along the readout, at the line of each measurement."""
+    """(n, k) the same with splines along the readout."""
     camera = [rec.camera(i) for i in range(rec.num_images)]
     axis = np.array([READOUTS[each.readout][0] for each in camera])[measured.frame_idx]
     lines = np.array([(each.width, each.height) for each in camera])[measured.frame_idx, axis]
     place = (measured.xy_raw[np.arange(len(measured)), axis] + 0.5) / lines
-    return splines_at(_WAVES, np.clip(place, 0.0, 1.0))
+    return np.hstack([_warps(rec, measured), splines_at(_WAVES, np.clip(place, 0.0, 1.0))])
 
 
 def errors_without_warp(
@@ -217,7 +216,9 @@ def errors_without_warp(
             square = (((res[mine] - A @ found) / noise) ** 2).sum(1, keepdims=True)
             weight = 1.0 / noise / np.sqrt(1.0 + square / _CLIP**2)
             weighed = A * weight**2
-            found = np.linalg.solve(A.T @ weighed + _RIDGE * np.diag((A * weighed).sum(0)), weighed.T @ res[mine])
+            normal = A.T @ weighed
+            ridge = _RIDGE * float(np.trace(normal)) / len(normal)
+            found = np.linalg.solve(normal + ridge * np.eye(len(normal)), weighed.T @ res[mine])
         rest[others] -= B @ found
     square = np.where(seen, (rest**2).sum(1) / (sigma_px * measured.sigma) ** 2, np.inf)
     return np.asarray(np.minimum(square, 2 * _CLIP**2) / 2)
@@ -345,13 +346,16 @@ class _Fits:
         scale = float(np.sqrt((one**2).sum() * (other**2).sum()))
         return float((one * other).sum() / scale) if scale > 0 else 0.0
 
-    def waves(self, fit: _Fit) -> float:
-        """By how much the held-out error would fall if each photo's lines moved as they liked."""
+    def waves(self, fit: _Fit) -> bool:
+        """Whether each photo's lines would move beyond what a smooth warp of it says, by more than nothing."""
         if not len(self.held_out):
-            return 0.0
+            return False
         seen = self.given.observations
-        free = errors_without_warp(fit.reconstruction, seen, self.held_out, self._sigma_px, _waves)
-        return float(fit.errors.mean() - free.mean())
+        smooth, free = (
+            errors_without_warp(fit.reconstruction, seen, self.held_out, self._sigma_px, functions).mean()
+            for functions in (_warps, _waves)
+        )
+        return bool(smooth - free > _MIN_FALL * fit.errors.mean())
 
     def at_limit(self, fit: _Fit) -> bool:
         """Whether the motions would be larger than what is known from elsewhere allows."""
@@ -395,11 +399,12 @@ class _Rungs:
             self.against.append(f"{fit.label} takes away less of what bends the photos than it leaves")
 
     def bend(self, fit: _Fit) -> None:
-        """Try motions that are not steady beyond a fit, while the lines of the photos would yet move so."""
+        """Try motions that are not steady beyond a fit, where something smooth is left, or lines would yet move."""
         for bends in _BENDS:
             if bends <= fit.bends:
                 continue
-            if not self._fits.waves(fit) > _MIN_FALL * float(fit.errors.mean()):
+            fast = self._fits.waves(fit)
+            if not fast and (fit.is_explained or fit.bends):
                 return
             fit = self._fits.fit(fit.model, fit.varying, [fit.reconstruction], bends=bends)
             self.climb(fit)
@@ -480,16 +485,19 @@ def choose_model(
     if best is not plain and np.median(moved_px(best.reconstruction)) < _UNSEEN_PX:
         best = plain
     if best is not plain:
-        other = read_along_other_axis(plain.reconstruction)
-        label = f"{best.label}, read along the other axis"
-        gain[label] = fits.gain(best, fits.fit(best.model, best.varying, [other], label, best.bends))
-        if not fits.is_better(fits.done[label], best):
-            against.append("a shutter that reads along the other axis explains the photos as well")
-        agreement = fits.agreement(best)
-        if agreement < _MIN_AGREEMENT:
-            against.append(f"two halves of the scene tell different motions (they agree to {agreement:.2f} of 1)")
+        # one reason is enough, and the last ones take the longest to find
         if fits.at_limit(best):
             against.append("the exposure times allow less motion than they would need")
+        if not against:
+            other = read_along_other_axis(plain.reconstruction)
+            label = f"{best.label}, read along the other axis"
+            gain[label] = fits.gain(best, fits.fit(best.model, best.varying, [other], label, best.bends))
+            if not fits.is_better(fits.done[label], best):
+                against.append("a shutter that reads along the other axis explains the photos as well")
+        if not against:
+            agreement = fits.agreement(best)
+            if agreement < _MIN_AGREEMENT:
+                against.append(f"two halves of the scene tell different motions (they agree to {agreement:.2f} of 1)")
         if against:
             best = plain
         elif plain.varying:
