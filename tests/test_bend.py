@@ -23,7 +23,7 @@ from rsundistort import (
     undistort_points,
     unproject_points,
 )
-from rsundistort.bundle import choose_model
+from rsundistort.bundle import choose_model, reprojection_residuals
 from rsundistort.bundle.problem import BundleProblem, Spreads
 from rsundistort.model import BEND_GROUPS, Bend
 from rsundistort.model.bend import bend_functions, splines_at
@@ -31,6 +31,7 @@ from rsundistort.model.projection import at_depth, clock_of, project_points_with
 from rsundistort.rectify import largest_shift_px
 from rsundistort.rectify.coarse import TOLERANCE_PX, coarse_grid
 from rsundistort.rectify.maps import rectified_rays
+from rsundistort.verdict import judge
 
 DIRECTIONS = ("top-to-bottom", "bottom-to-top", "left-to-right", "right-to-left")
 GROUPS = len(BEND_GROUPS)
@@ -294,7 +295,30 @@ def test_the_choice_takes_bends_where_they_are(rng, groups, turn, label):
     choice = choose_model(start, sigma_px=NOISE_PX)
     assert choice.label == label
     assert choice.shutter == "found"
+    assert not choice.restless
     assert choice.bends == {"rotation": 0, "rotation, bent": 2, "rotation, vibrating": 5}[label]
+
+
+def test_lines_that_move_faster_than_any_model_are_noticed(rng):
+    truth = make_scene(rng, groups=0, num_points=1200)
+    camera, obs = truth.cameras[0], truth.observations
+    shakes = [
+        Bend.along(lambda p, k=k: 2e-3 * np.sin(18 * np.pi * p + k)[:, None] * [1, 0.7, 0.2], *camera.clock_range, 129)[
+            0
+        ]
+        for k in range(truth.num_images)
+    ]
+    shaken = truth.with_motions([RowMotion(phi, bend=bend) for phi, bend in zip(truth.phi, shakes, strict=True)])
+    off, valid = reprojection_residuals(shaken)
+    measured = replace(
+        obs, xy_raw=obs.xy_raw + np.where(valid[:, None], off, 0) + NOISE_PX * rng.normal(size=off.shape)
+    )
+    result = bundle_adjust(replace(still(truth), observations=measured.select(valid)), "rotation")
+    choice = choose_model(result.reconstruction, sigma_px=result.sigma_px)
+    assert choice.restless
+    verdict = judge(result, None, choice)
+    assert verdict.shape == "doubtful"
+    assert "move faster" in " ".join(verdict.reasons)
 
 
 def test_a_reconstruction_turned_or_thinned_keeps_its_bends(rng):

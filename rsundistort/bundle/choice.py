@@ -35,6 +35,8 @@ _MOST_OF_IT = 0.5
 _DEGREE = 3
 # And, of what a motion that is not steady leaves, among splines of so many values along the readout.
 _WAVES = 25
+# And what no model of ours would follow.
+_RESTLESS = 49
 # Measurements for each coefficient of these, at least.
 _PER_COEFFICIENT = 3
 # Share of their squares that keeps coefficients finite that no measurement tells.
@@ -93,6 +95,8 @@ class ModelChoice:
         Whether cameras have fields beside their lens models, as `BundleOptions.residual_field`.
     bends : int
         How the motions depart from steady ones, as `BundleOptions.bends`.
+    restless : bool
+        Whether the lines of the photos move faster yet than any of these models follows.
     """
 
     shutter_model: str
@@ -109,6 +113,7 @@ class ModelChoice:
     num_held_out: int
     residual_field: bool = False
     bends: int = 0
+    restless: bool = False
 
 
 def hold_out(
@@ -181,13 +186,13 @@ def _warps(rec: Reconstruction, measured: Observations) -> NDArray[np.float64]:
     return np.stack([x[:, i] * y[:, j] for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)], axis=1)
 
 
-def _waves(rec: Reconstruction, measured: Observations) -> NDArray[np.float64]:
-    """(n, k) the same with splines along the readout."""
+def _waves(rec: Reconstruction, measured: Observations, sites: int = _WAVES) -> NDArray[np.float64]:
+    """(n, k) the same with splines along the readout, through so many values."""
     camera = [rec.camera(i) for i in range(rec.num_images)]
     axis = np.array([READOUTS[each.readout][0] for each in camera])[measured.frame_idx]
     lines = np.array([(each.width, each.height) for each in camera])[measured.frame_idx, axis]
     place = (measured.xy_raw[np.arange(len(measured)), axis] + 0.5) / lines
-    return np.hstack([_warps(rec, measured), splines_at(_WAVES, np.clip(place, 0.0, 1.0))])
+    return np.hstack([_warps(rec, measured), splines_at(sites, np.clip(place, 0.0, 1.0))])
 
 
 def errors_without_warp(
@@ -346,14 +351,14 @@ class _Fits:
         scale = float(np.sqrt((one**2).sum() * (other**2).sum()))
         return float((one * other).sum() / scale) if scale > 0 else 0.0
 
-    def waves(self, fit: _Fit) -> bool:
+    def waves(self, fit: _Fit, sites: int = _WAVES) -> bool:
         """Whether each photo's lines would move beyond what a smooth warp of it says, by more than nothing."""
         if not len(self.held_out):
             return False
         seen = self.given.observations
         smooth, free = (
             errors_without_warp(fit.reconstruction, seen, self.held_out, self._sigma_px, functions).mean()
-            for functions in (_warps, _waves)
+            for functions in (_warps, partial(_waves, sites=sites))
         )
         return bool(smooth - free > _MIN_FALL * fit.errors.mean())
 
@@ -536,4 +541,5 @@ def choose_model(
         len(fits.held_out),
         best.residual_field,
         best.bends,
+        fits.waves(best, _RESTLESS),
     )

@@ -269,6 +269,7 @@ def motions_from_gyro(
     *,
     offset_s: float = 0.0,
     offset_sigma_s: float = 0.001,
+    steady: bool = True,
 ) -> Known:
     """Rotations of photos during their readout, as a gyroscope saw them.
 
@@ -284,6 +285,8 @@ def motions_from_gyro(
         What the clock of the log shows when the camera's shows zero.
     offset_sigma_s : float
         Standard deviation of `offset_s`.
+    steady : bool
+        Whether the motions are taken to be steady; not where `bends_from_gyro` says how they are not.
 
     Returns
     -------
@@ -291,7 +294,7 @@ def motions_from_gyro(
         Radians per frame, (3,) each, as `BundleOptions.known_phi` takes them: minus the mean rate over the readout,
         times its time. The standard deviation holds the noise of the samples, a zero-rate offset of 0.01 rad/s, what
         the uncertainty of the clocks and of the readout (3 %) does to the mean, and how far the rate varies within the
-        readout, which the model takes to be constant. Photos that the log does not cover are left out, with a warning.
+        readout where it is taken to be steady. Photos that the log does not cover are left out, with a warning.
 
     Raises
     ------
@@ -313,7 +316,7 @@ def motions_from_gyro(
         + _BIAS**2
         + np.mean((shifted - rate) ** 2, axis=0)
         + (_READOUT_SHARE * rate) ** 2
-        + np.var(slices, axis=0)
+        + (np.var(slices, axis=0) if steady else np.zeros(3))
     )
     covered = np.isfinite(variance).all(axis=1)
     if not covered.any():

@@ -110,7 +110,7 @@ def gyro_motions(
             f"{gyro.file}: how long does the camera of {unknown[0]} take to read a frame? Give --readout-ms"
         )
     spans = {name: readout_s[name] or 0.0 for name in times}
-    known = motions_from_gyro(log, times, spans, offset_s=gyro.offset_s)
+    known = motions_from_gyro(log, times, spans, offset_s=gyro.offset_s, steady=False)
     found = bends_from_gyro(log, {name: times[name] for name in known}, spans, cameras, offset_s=gyro.offset_s)
     # phi goes with the bend: the slope of the turn, not its mean rate
     return {name: (found[name][0], sigma) for name, (_, sigma) in known.items()}, {k: v for k, (_, v) in found.items()}

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bundle import ModelChoice, reprojection_residuals
-from ..model import Reconstruction, Solution, SolvedImage
+from ..bundle import BundleResult, ModelChoice, reprojection_residuals
+from ..model import BEND_GROUPS, Reconstruction, Solution, SolvedImage
 from ..model.field import field_over_frame
 from ..rectify import largest_shift_px
 from .cameras import PhotoCameras
@@ -178,6 +178,7 @@ def solution_of(outcome: Outcome, options: SolveOptions) -> Solution:
         "centre_sigma_focal_lengths": solved.result.centre_sigma,
         "lens_fields": _by_camera(keys, shared, _fields(solved)) if any(c.field.size for c in shared.cameras) else {},
         "phi_sigma_rad_per_frame": solved.result.phi_sigma,
+        **_bend_sigmas(solved.result),
         "stop_reason": solved.result.stop_reason,
         "readout_times": {
             key: {"ms": 1e3 * each[0], "source": each[1]}
@@ -215,6 +216,11 @@ def solution_of(outcome: Outcome, options: SolveOptions) -> Solution:
         generator=versions(),
         verdict=None if verdict is None else verdict.to_json(),
     )
+
+
+def _bend_sigmas(result: BundleResult) -> dict[str, Any]:
+    """Spreads of the bends by group, of motions that are not steady."""
+    return {"bend_sigmas_rad": dict(zip(BEND_GROUPS, result.bend_sigmas, strict=False))} if result.bend_sigmas else {}
 
 
 def _held_out(choice: ModelChoice | None) -> dict[str, Any]:

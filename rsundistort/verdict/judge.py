@@ -193,6 +193,11 @@ def _unexplained(result: BundleResult, choice: ModelChoice | None) -> list[str]:
     if choice is not None:
         error = choice.held_out_error[choice.label]
         beyond_px = result.sigma_px * float(np.sqrt(max(error - 1.0, 0.0)))
+        if choice.restless:
+            reasons.append(
+                "The lines of the photos move faster than the motions that are modelled: the camera shook at more than "
+                "five periods a frame, or the photos were stabilised line by line."
+            )
         if error > 2.0 and beyond_px > _HELD_OUT_PX:
             reasons.append(
                 f"Measurements that were held out are off by {beyond_px:.1f} px more than their noise explains."
