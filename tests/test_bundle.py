@@ -835,7 +835,7 @@ def test_the_model_that_made_the_measurements_is_chosen(model, rng):
     choice = choose_model(start, sigma_px=0.3)
     assert choice.shutter_model == model
     assert list(choice.held_out_rms_px) == list(choice.held_out_error)
-    assert list(choice.held_out_error)[:4] == list(LADDER)
+    assert [label for label in choice.held_out_error if label in LADDER] == list(LADDER)
     assert choice.kept[0] == "global"
     assert choice.kept[-1] == choice.label == model
     assert choice.shutter == ("not-found" if model == "global" else "found")

@@ -254,7 +254,7 @@ def bundle_adjust(
         )
         iterations += result.num_iterations
         current = problem.reconstruction(result.state)
-        equations = problem.linearize(result.state)
+        equations = problem.with_squares().linearize(result.state)
         marginals = equations.marginal_covariances()
         weighed, had_tails = factor, heavy_tails
         per_camera = equations.num_shared // equations.num_cameras

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,7 +34,7 @@ class Posterior:
             max(result.focal_sigma, 1e-300), max(result.centre_sigma, 1e-300), result.bend_sigmas,
             tuple(each * rec.baseline for each in result.way_sigmas), result.field_sigma_px,
         )  # fmt: skip
-        plain = options or BundleOptions()
+        plain = replace(options or BundleOptions(), loss="squared")
         self._problem = BundleProblem(rec, rec.shutter_model, plain, result.sigma_px * result.noise_factor, spreads)
         self._state = self._problem.initial_state()
         self._equations = self._problem.linearize(self._state)

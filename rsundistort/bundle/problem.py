@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -290,6 +291,16 @@ class BundleProblem:
         return State(
             cameras, start.R_cw, start.center_w, motion[:, :3], motion[:, 3:], variation, bend, start.points_w
         )  # fmt: skip
+
+    def with_squares(self) -> BundleProblem:
+        """The same without a robust loss, for covariances.
+
+        The curvature of a robust loss is not the inverse of a covariance: of normal noise it would be too small by a
+        quarter. That of squares is right for normal noise, and to the safe side for noise with heavy tails.
+        """
+        plain = copy(self)
+        plain._options = replace(self._options, loss="squared")
+        return plain
 
     def covariances(self, state: State) -> Marginals:
         """Covariances of each photo's unknowns (m, nb, nb), 0 where held (the gauge), and of all cameras' (k, k).
