@@ -303,7 +303,7 @@ def test_lines_that_move_faster_than_any_model_are_noticed(rng):
     truth = make_scene(rng, groups=0, num_points=1200)
     camera, obs = truth.cameras[0], truth.observations
     shakes = [
-        Bend.along(lambda p, k=k: 2e-3 * np.sin(18 * np.pi * p + k)[:, None] * [1, 0.7, 0.2], *camera.clock_range, 129)[
+        Bend.along(lambda p, k=k: 2e-3 * np.sin(28 * np.pi * p + k)[:, None] * [1, 0.7, 0.2], *camera.clock_range, 129)[
             0
         ]
         for k in range(truth.num_images)

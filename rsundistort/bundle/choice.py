@@ -351,8 +351,11 @@ class _Fits:
         scale = float(np.sqrt((one**2).sum() * (other**2).sum()))
         return float((one * other).sum() / scale) if scale > 0 else 0.0
 
-    def waves(self, fit: _Fit, sites: int = _WAVES) -> bool:
-        """Whether each photo's lines would move beyond what a smooth warp of it says, by more than nothing."""
+    def waves(self, fit: _Fit, sites: int = _WAVES, least_px: float = 0.0) -> bool:
+        """Whether each photo's lines would move beyond what a smooth warp of it says, by more than nothing.
+
+        And by more than `least_px`, root mean square.
+        """
         if not len(self.held_out):
             return False
         seen = self.given.observations
@@ -360,7 +363,8 @@ class _Fits:
             errors_without_warp(fit.reconstruction, seen, self.held_out, self._sigma_px, functions).mean()
             for functions in (_warps, partial(_waves, sites=sites))
         )
-        return bool(smooth - free > _MIN_FALL * fit.errors.mean())
+        fall = float(smooth - free)
+        return fall > _MIN_FALL * float(fit.errors.mean()) and fall > (least_px / self._sigma_px) ** 2 / 2
 
     def at_limit(self, fit: _Fit) -> bool:
         """Whether the motions would be larger than what is known from elsewhere allows."""
@@ -541,5 +545,5 @@ def choose_model(
         len(fits.held_out),
         best.residual_field,
         best.bends,
-        fits.waves(best, _RESTLESS),
+        fits.waves(best, _RESTLESS, _UNSEEN_PX / 2),
     )
