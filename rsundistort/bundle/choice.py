@@ -96,7 +96,8 @@ class ModelChoice:
     bends : int
         How the motions depart from steady ones, as `BundleOptions.bends`.
     restless : bool
-        Whether the lines of the photos move faster yet than any of these models follows.
+        Whether the lines of the photos move faster yet than any of these models follows; not asked where a shutter is
+        not determined.
     """
 
     shutter_model: str
@@ -545,5 +546,5 @@ def choose_model(
         len(fits.held_out),
         best.residual_field,
         best.bends,
-        fits.waves(best, _RESTLESS, _UNSEEN_PX / 2),
+        shutter != "not-determined" and fits.waves(best, _RESTLESS, _UNSEEN_PX / 2),
     )

@@ -145,7 +145,7 @@ def _write_gsplat(path: Path, solution: Solution, images: Sequence[SolvedImage],
         for image, camera in zip(images, cameras, strict=True)
     ]
     viewmats = np.array(ends).reshape(-1, 2, 4, 4)
-    lines: dict[str, NDArray[np.float64]] = {}
+    lines: dict[str, Any] = {}
     if any(_motion(solution, image).bend is not None for image in images):
         places = np.linspace(-0.5, 0.5, _LINES)
         lines = {
@@ -178,7 +178,7 @@ def _write_gsplat(path: Path, solution: Solution, images: Sequence[SolvedImage],
         radial_coeffs=radial,
         tangential_coeffs=lens("p1", "p2"),
         thin_prism_coeffs=lens("s1", "s2", "s3", "s4"),
-        **lines,  # type: ignore[arg-type]  # arrays all
+        **lines,
     )
 
 

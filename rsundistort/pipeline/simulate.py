@@ -21,17 +21,7 @@ from ..model import Camera, RowMotion, Solution, SolvedImage
 from ..model.checks import check_finite
 from ..rectify import largest_shift_px
 from ..synthetic.fold import check_no_fold
-from ..synthetic.unsteady import (
-    Poses,
-    RowTable,
-    Vibration,
-    accelerations,
-    read_row_tables,
-    row_table,
-    tracks,
-    unsteady,
-    vibrations,
-)
+from ..synthetic.unsteady import Poses, RowTable, Vibration, read_row_tables, row_table, tracks, unsteady_motions
 from ..synthetic.warp import crop_camera, largest_rectangle, random_phi, warp_mask, warp_photo
 from .cameras import camera_file_of, find_cameras
 from .outcome import versions
@@ -248,22 +238,11 @@ def _motions(photos: Path, names: Sequence[str], camera: Camera, options: WarpOp
         start = {name: RowMotion(phi[name]) for name in names}
     else:
         start = {name: _given(given.get(name, np.zeros(3))) for name in names}
-    shares = accelerations(len(names), options.acceleration, options.seed)
-    shakes: Sequence[Poses | None] = [None] * len(names)
-    if options.vibration is not None:
-        shakes = vibrations(cameras, options.vibration, options.seed)
-    motions = {}
-    for name, share, shake in zip(names, shares, shakes, strict=True):
-        each = start[name]
-        if name in options.still:
-            motions[name] = RowMotion()
-        elif isinstance(each, RowMotion) and shake is None and not options.acceleration:
-            motions[name] = each
-        else:
-            motions[name] = unsteady(name, camera, each, share, shake)[0]
-            if motions[name].moves:
-                raise InputError(f"table of {name}: it has positions, but a photo can be warped by rotations only")
-    return motions
+    found = unsteady_motions(start, cameras, options.acceleration, options.vibration, options.seed, options.still)
+    for name, (motion, _, _) in found.items():
+        if motion.moves:
+            raise InputError(f"table of {name}: it has positions, but a photo can be warped by rotations only")
+    return {name: motion for name, (motion, _, _) in found.items()}
 
 
 def _given(value: ArrayLike | RowTable) -> RowMotion | RowTable:

@@ -16,19 +16,9 @@ from ..model.camera import Camera
 from ..model.checks import check_finite
 from ..model.motion import RowMotion
 from .entries import count, kind_of, number, take
-from .unsteady import (
-    Poses,
-    RowTable,
-    Vibration,
-    accelerations,
-    read_row_tables,
-    row_table,
-    tracks,
-    unsteady,
-    vibrations,
-)
+from .unsteady import Poses, RowTable, Vibration, read_row_tables, row_table, tracks, unsteady_motions
 
-__all__ = ["Pose", "look_at", "motions_of", "poses_of", "unsteady_motions"]
+__all__ = ["Pose", "look_at", "motions_of", "poses_and_motions", "poses_of"]
 
 _UP = (0.0, 0.0, 1.0)
 
@@ -214,7 +204,7 @@ def motions_of(entry: Any, poses: list[Pose], frame_spans: list[float], seed: in
     return motions
 
 
-def unsteady_motions(
+def poses_and_motions(
     entry: Mapping[str, Any],
     names: Sequence[str],
     cameras: Sequence[Camera],
@@ -251,23 +241,15 @@ def unsteady_motions(
             raise FormatError(f"motion: there is no photo {unknown[0]!r} for its table")
         start |= tables
     share = number(entry.get("acceleration", 0.0), "motion: acceleration")
-    shares = accelerations(len(names), share, seed)
-    shakes: Sequence[Poses | None] = [None] * len(names)
+    vibration = None
     if "vibration" in entry:
         keys = ("amplitude_rad", "travel_m", "periods", "axis")
         options = dict(take(entry["vibration"], "motion: vibration", (), keys))
         vibration = Vibration(travel=options.pop("travel_m", 0.0), **options)
-        shakes = vibrations(list(cameras), vibration, seed)
     still = {names[k] for k in entry.get("still", [])}
-    found_poses, found = [], []
-    for name, camera, pose, acceleration, shake in zip(names, cameras, poses, shares, shakes, strict=True):
-        each = start[name]
-        steady = isinstance(each, RowMotion) and shake is None and not share
-        if isinstance(each, RowMotion) and (name in still or steady):
-            found.append(each)
-        else:
-            motion, turn, way = unsteady(name, camera, each, acceleration, shake)
-            pose = replace(pose, R_cw=turn @ pose.R_cw, center_w=pose.center_w + way)
-            found.append(motion)
-        found_poses.append(pose)
-    return found_poses, found
+    found = unsteady_motions({name: start[name] for name in names}, cameras, share, vibration, seed, still)
+    turned = [
+        replace(pose, R_cw=turn @ pose.R_cw, center_w=pose.center_w + way)
+        for pose, (_, turn, way) in zip(poses, found.values(), strict=True)
+    ]
+    return turned, [motion for motion, _, _ in found.values()]

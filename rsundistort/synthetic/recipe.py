@@ -19,7 +19,7 @@ from ..model.camera import Camera
 from ..model.checks import check_finite, check_rotations, frozen
 from ..model.motion import RowMotion
 from .entries import number, take
-from .flight import Pose, motions_of, poses_of, unsteady_motions
+from .flight import Pose, motions_of, poses_and_motions, poses_of
 from .lens import undistort_to_rays
 from .scene import Light, Patch, Scene
 from .surfaces import surface_patches
@@ -195,7 +195,7 @@ def _views(
     spans = [cameras[pose.camera_id].frame_span for pose in poses]
     names = [f"{k:04d}.jpg" for k in range(len(poses))]
     motions = motions_of(data["motion"], poses, spans, data["seed"])
-    poses, motions = unsteady_motions(
+    poses, motions = poses_and_motions(
         data["motion"], names, [cameras[pose.camera_id] for pose in poses], poses, motions, data["seed"], readout_ms,
         folder,
     )  # fmt: skip

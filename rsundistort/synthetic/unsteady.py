@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ __all__ = [
     "row_table",
     "tracks",
     "unsteady",
+    "unsteady_motions",
     "vibrations",
 ]
 
@@ -202,6 +203,33 @@ def unsteady(
             stacklevel=2,
         )
     return motion, turn, way
+
+
+def unsteady_motions(
+    start: Mapping[str, RowMotion | RowTable | Poses],
+    cameras: Sequence[Camera],
+    acceleration: float,
+    vibration: Vibration | None,
+    seed: int,
+    still: Collection[str] = (),
+) -> dict[str, tuple[RowMotion, Array, Array]]:
+    """Motions of photos as of `unsteady`, with accelerations and vibrations drawn by the seed; steady ones stay.
+
+    `start` is by photo, in the order of `cameras`; `acceleration` as `accelerations` takes it. A still photo does not
+    move.
+    """
+    shares = accelerations(len(start), acceleration, seed)
+    shakes: Sequence[Poses | None] = [None] * len(start)
+    if vibration is not None:
+        shakes = vibrations(list(cameras), vibration, seed)
+    found = {}
+    for (name, given), camera, share, shake in zip(start.items(), cameras, shares, shakes, strict=True):
+        each = RowMotion() if name in still else given
+        if isinstance(each, RowMotion) and (name in still or (shake is None and not acceleration)):
+            found[name] = each, np.eye(3), np.zeros(3)
+        else:
+            found[name] = unsteady(name, camera, each, share, shake)
+    return found
 
 
 def accelerations(num: int, sigma: float, seed: int) -> Array:

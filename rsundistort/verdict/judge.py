@@ -221,12 +221,6 @@ def _of_global(choice: ModelChoice | None) -> tuple[str, list[str]]:
     return choice.shutter, []
 
 
-def _bent_px(rec: Reconstruction) -> NDArray[np.float64]:
-    """(m,) about how far what is not steady in each photo's turn moves pixels."""
-    focal = np.array([rec.camera(i).K[0, 0] for i in range(rec.num_images)])
-    return np.asarray(focal * np.linalg.norm(np.abs(rec.bend[..., :3]).max(1, initial=0.0), axis=1))
-
-
 def _of_motions(
     result: BundleResult,
     global_result: BundleResult | None,
@@ -237,7 +231,7 @@ def _of_motions(
 ) -> tuple[str, list[str]]:
     """Whether a shutter was found, and why not."""
     rec = result.reconstruction
-    if not (motions.shift_px + _bent_px(rec) >= _UNSEEN_PX).any():
+    if not (motions.shift_px >= _UNSEEN_PX).any():
         return "not-found", []
     reasons = []
     if choice is None and not (global_result is not None and _explains(result, global_result)):

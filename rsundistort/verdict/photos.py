@@ -67,12 +67,17 @@ def photo_motions(result: BundleResult) -> PhotoMotions:
             prior = np.concatenate([np.zeros(6), (rec.frame_span()[i] / np.maximum(spread, 1e-12)) ** 2])
             photo = _Photo.of(rec, i, mine, result.sigma_px)
             found[:, i] = (
-                photo.shift_px(photo.motion[None])[0],
+                photo.shift_px(photo.motion[None])[0] + _bent_px(rec, i),
                 photo.spread_px(result.covariances[i, 6:, 6:]),
                 photo.difference_px(prior, _CHANCE / splits),
                 photo.covered,
             )
     return PhotoMotions(*found)
+
+
+def _bent_px(rec: Reconstruction, image: int) -> float:
+    """About how far what is not steady in a photo's turn moves pixels."""
+    return float(rec.camera(image).K[0, 0] * np.linalg.norm(np.abs(rec.bend[image, :, :3]).max(0, initial=0.0)))
 
 
 @dataclass(frozen=True)
