@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import textwrap
 from collections.abc import Mapping, Sequence
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -166,7 +167,8 @@ def _intrinsics(solution: Solution) -> list[str]:
         (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
         values = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **camera.coefficients}
         found = [
-            f"{name} {values[name]:.{4 if name[0] in 'kp' else 1}f} +- {sigma:.{4 if name[0] in 'kp' else 1}f}"
+            f"{name} {values[name]:.{4 if name[0] in 'kp' else 1}f}"
+            + (f" +- {sigma:.{4 if name[0] in 'kp' else 1}f}" if sigma is not None and isfinite(sigma) else "")
             for name, sigma in sigmas.items()
         ]
         lines += [f"{'refined' if i == 0 else '':19}{', '.join(found[i : i + 3])}" for i in range(0, len(found), 3)]

@@ -213,6 +213,15 @@ def test_held_out_measurements_that_are_far_off_speak_against_a_solution(rng):
     )
 
 
+def test_a_scene_that_nothing_holds_together_is_not_trusted(rng):
+    result = bundle_adjust(measured(rng, swung(rng)), "rotation")
+    torn = replace(result, covariances=np.full_like(result.covariances, np.nan))
+    for each in (torn, replace(torn, reconstruction=replace(torn.reconstruction, shutter_model="global"))):
+        verdict = judge(each, None, choice_of("rotation", 1.0, 9.0))
+        assert verdict.shape == "doubtful"
+        assert "scaled against each other" in " ".join(verdict.reasons)
+
+
 def test_an_unknown_height_is_not_trusted(rng):
     options = BundleOptions()
     result, remedy = heal(bundle_adjust(measured(rng, swung(rng)), "rotation", options), options)

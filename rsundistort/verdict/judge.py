@@ -115,7 +115,7 @@ def judge(
         "trusted" only if nothing speaks against it.
     """
     rec = result.reconstruction
-    reasons = _height(remedy) + _unexplained(result, choice)
+    reasons = _loose(result) + _height(remedy) + _unexplained(result, choice)
     if rec.shutter_model == "global":
         shutter, why = _of_global(choice)
         return _verdict(shutter, reasons + why)
@@ -156,6 +156,18 @@ def _outliers(rec: Reconstruction, tracks: Reconstruction | None) -> NDArray[np.
         return np.zeros(rec.num_images)
     before = dict(zip(tracks.image_names, _counts(tracks).tolist(), strict=True))
     return 1.0 - _counts(rec) / np.maximum([before.get(name, 0) for name in rec.image_names], 1)
+
+
+def _loose(result: BundleResult) -> list[str]:
+    """Parts of the scene that nothing holds against each other: the equations then have no single solution."""
+    if np.isfinite(result.covariances).all():
+        return []
+    rec = result.reconstruction
+    weakest = rec.image_names[int(np.argmin(_counts(rec)))]
+    return [
+        "The photos hang together by so few measurements that parts of the scene could be scaled against each other; "
+        f"more photos between them would hold it ({weakest} has the fewest)."
+    ]
 
 
 def _height(remedy: Remedy | None) -> list[str]:
