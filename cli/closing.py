@@ -97,7 +97,7 @@ def closing_table(solution: Solution, out: Path) -> str:
         *_readout(solution),
         *_depths(solution),
         *_two_poses(solution),
-        f"rms residual       {quality['global_rms_px']:.2f} px with a global shutter, {quality['rms_px']:.2f} px now",
+        _residual(solution),
         f"outputs            {out}  ({total:.0f} s)",
     ]
     critical, said = solution.critical_motion or {}, [verdict.sentences[2]]
@@ -157,6 +157,13 @@ def _model(solution: Solution) -> list[str]:
         f"{model['observations']} of {model['points']} in the model",
         f"pixel frame        {frames.get(model['frame'], model['frame'] + ', and turned back')}",
     ]
+
+
+def _residual(solution: Solution) -> str:
+    """The line on residuals, beside those of a global shutter if there is another."""
+    quality = solution.quality
+    before = f"{quality['global_rms_px']:.2f} px with a global shutter, " if solution.shutter_model != "global" else ""
+    return f"rms residual       {before}{quality['rms_px']:.2f} px{' now' * bool(before)}"
 
 
 def _intrinsics(solution: Solution) -> list[str]:

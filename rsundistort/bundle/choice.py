@@ -54,8 +54,11 @@ _MOST_STEPS = 15
 _OTHER_AXIS = ("top-to-bottom", "left-to-right")
 
 _VARYING, _FIELD = ", varying lens", ", residual field"
-# Motions that are not steady, by the groups of bends that they take.
-_BENDS = {0: "", 2: ", bent", 5: ", vibrating"}
+# Motions that are not steady, by the groups of bends that they take. A cubic that is free in each photo hides the
+# height of the scene, so a rate that changes steadily is tried without it.
+_BENDS = {0: "", 1: ", accelerating", 2: ", bent", 5: ", vibrating"}
+# Of these, what a smooth warp could be; the rest moves lines faster.
+_SMOOTH_BENDS = 2
 
 
 @dataclass(frozen=True)
@@ -414,7 +417,7 @@ class _Rungs:
             if bends <= fit.bends:
                 continue
             fast = self._fits.waves(fit)
-            if not fast and (fit.is_explained or fit.bends):
+            if not fast and (fit.is_explained or fit.bends >= _SMOOTH_BENDS):
                 return
             fit = self._fits.fit(fit.model, fit.varying, [fit.reconstruction], bends=bends)
             self.climb(fit)
