@@ -37,8 +37,10 @@ from .workers import Workers
 __all__ = ["Feedback", "Solved", "rungs_to", "solve_photos", "solve_tracks"]
 
 # Feedback ends when no rectified pixel of any photo moves by more than this between two rounds, in pixels of the images
-# that the features were found in.
+# that the features were found in; or when less than this share of the measurements is another one than before, so that
+# what yet moves is not held by tracks.
 _SETTLED_PX = 0.2
+_SETTLED_SHARE = 0.01
 _MAX_ROUNDS = 4
 # Places on each side of a photo where that is looked at.
 _LOOKED_AT = 5
@@ -144,6 +146,17 @@ def _change_px(before: Reconstruction, after: Reconstruction, image: int) -> flo
     )
     change = (new * camera.K[0, 0] - old * before.camera(image).K[0, 0])[seen & still_seen]
     return float(np.linalg.norm(change, axis=1).max(initial=0.0))
+
+
+def _changed(before: Reconstruction | None, after: Reconstruction) -> float:
+    """Share of a reconstruction's measurements that another does not have; 1 if that is of other photos."""
+    if before is None or after.image_names != before.image_names:
+        return 1.0
+    old, new = (
+        {(frame, *xy) for frame, xy in zip(obs.frame_idx.tolist(), obs.xy_raw.tolist(), strict=True)}
+        for obs in (before.observations, after.observations)
+    )
+    return len(new - old) / max(len(new), 1)
 
 
 def _of_joined(options: BundleOptions, mapped: Reconstruction) -> BundleOptions:
@@ -348,7 +361,7 @@ def _fed_back(
     if not stages:
         stages = [f"feedback {number}" for number in range(1, _MAX_ROUNDS + 1)]
         stages += ["alignment"] * (feedback.workers is not None)
-    settled = False
+    settled, found = False, None
     for stage in stages:
         aligns = stage.startswith("alignment")
         if settled and not aligns:
@@ -358,6 +371,11 @@ def _fed_back(
         tracks = retriangulate(feedback.matched, before, of_two=aligns)
         if aligns:
             tracks = feedback.aligned(tracks, log)
+        elif (changed := _changed(found, tracks)) < _SETTLED_SHARE:
+            log.end(stage, changed=changed)
+            settled = True
+            continue
+        found = tracks
         tracks = tracks.without_photos(LEAST_MEASUREMENTS)
         options = _of_joined(options, tracks)
         options = replace(options, phi_sigma_start=result.phi_sigma)
