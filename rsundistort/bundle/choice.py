@@ -11,17 +11,15 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import READOUTS, SHUTTER_MODELS, Observations, Reconstruction
-from ..model.bend import splines_at
 from .adjust import LADDER, bundle_adjust, objective
 from .options import BundleOptions
 from .problem import Spreads, reprojection_residuals
+from .remains import CLIP, WAVES, agreement_of_waves, errors_without, half_across_readout, warps, waves
 
 __all__ = ["ModelChoice", "choose_model", "clipped_errors", "corners", "hold_out", "improves", "standard_errors"]
 
 # A track gives one measurement away if this many are left: two fix the point, the third checks them.
 _LEFT_OVER = 3
-# Longer residuals, in standard deviations, count as this: a wrong match tells nothing about the shutter.
-_CLIP = 5.0
 # Parts of a photo, across and down, whose measurements count once.
 _PARTS = 4
 # A model is better if the held-out error falls by this many standard errors: of models that explain nothing, one in six
@@ -31,16 +29,8 @@ _MIN_GAIN = 2.0
 _MIN_FALL = 0.02
 # Share of an error that is most of it.
 _MOST_OF_IT = 0.5
-# What a photo's residuals have in common is sought among polynomials of this degree in x and y, whatever bent it.
-_DEGREE = 3
-# And, of what a motion that is not steady leaves, among splines of so many values along the readout.
-_WAVES = 25
-# And what no model of ours would follow.
+# Splines along the readout through so many values follow what no model of ours would.
 _RESTLESS = 49
-# Measurements for each coefficient of these, at least.
-_PER_COEFFICIENT = 3
-# Share of their squares that keeps coefficients finite that no measurement tells.
-_RIDGE = 1e-6
 # Two halves of a scene must tell the same motions: what they have in common is more than what they differ by. (Warped
 # photos: 0.98 and more; a camera without rolling shutter: 0.1 to 0.5.)
 _MIN_AGREEMENT = 0.5
@@ -148,7 +138,7 @@ def clipped_errors(rec: Reconstruction, measured: Observations, sigma_px: float)
     res, valid = reprojection_residuals(replace(rec, observations=measured))
     noise = sigma_px * measured.sigma
     square = np.where(valid, (res**2).sum(1) / noise**2, np.inf)
-    clipped = np.minimum(square, 2 * _CLIP**2)
+    clipped = np.minimum(square, 2 * CLIP**2)
     return clipped / 2, float(np.sqrt(np.mean(clipped * noise**2) / 2))
 
 
@@ -182,57 +172,6 @@ def corners(rec: Reconstruction, measured: Observations) -> NDArray[np.int64]:
     return np.asarray((measured.frame_idx * _PARTS + y) * _PARTS + x)
 
 
-def _warps(rec: Reconstruction, measured: Observations) -> NDArray[np.float64]:
-    """(n, k) polynomials in the place of each measurement, products of Legendre's of up to `_DEGREE` together."""
-    size = np.array([(camera.width, camera.height) for camera in rec.cameras])[rec.camera_idx][measured.frame_idx]
-    along = 2 * (measured.xy_raw + 0.5) / size - 1
-    x, y = (np.polynomial.legendre.legvander(along[:, k], _DEGREE) for k in (0, 1))
-    return np.stack([x[:, i] * y[:, j] for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)], axis=1)
-
-
-def _waves(rec: Reconstruction, measured: Observations, sites: int = _WAVES) -> NDArray[np.float64]:
-    """(n, k) the same with splines along the readout, through so many values."""
-    camera = [rec.camera(i) for i in range(rec.num_images)]
-    axis = np.array([READOUTS[each.readout][0] for each in camera])[measured.frame_idx]
-    lines = np.array([(each.width, each.height) for each in camera])[measured.frame_idx, axis]
-    place = (measured.xy_raw[np.arange(len(measured)), axis] + 0.5) / lines
-    return np.hstack([_warps(rec, measured), splines_at(sites, np.clip(place, 0.0, 1.0))])
-
-
-def errors_without_warp(
-    rec: Reconstruction,
-    fitted: Observations,
-    measured: Observations,
-    sigma_px: float,
-    functions: Callable[[Reconstruction, Observations], NDArray[np.float64]] = _warps,
-) -> NDArray[np.float64]:
-    """As `clipped_errors`, once a smooth warp of each photo, fitted to other measurements, is taken out.
-
-    What it takes away is what the model left, whatever it is: lens, focus, motion. What stays is noise, and matches
-    that are wrong. The warp is a sum of `functions` (n, k) of the measurements' places, in x and in y.
-    """
-    (res, valid), (rest, seen) = (reprojection_residuals(replace(rec, observations=obs)) for obs in (fitted, measured))
-    of_fitted, of_measured = functions(rec, fitted), functions(rec, measured)
-    rest = np.array(rest)
-    for mine, others in zip(fitted.by_photo(rec.num_images), measured.by_photo(rec.num_images), strict=True):
-        mine = mine[valid[mine]]
-        A, B = of_fitted[mine], of_measured[others]
-        if len(mine) < _PER_COEFFICIENT * A.shape[1]:
-            continue
-        noise = sigma_px * fitted.sigma[mine, None]
-        found = np.zeros((A.shape[1], 2))
-        for _ in range(4):  # reweighted, so that wrong matches count little
-            square = (((res[mine] - A @ found) / noise) ** 2).sum(1, keepdims=True)
-            weight = 1.0 / noise / np.sqrt(1.0 + square / _CLIP**2)
-            weighed = A * weight**2
-            normal = A.T @ weighed
-            ridge = _RIDGE * float(np.trace(normal)) / len(normal)
-            found = np.linalg.solve(normal + ridge * np.eye(len(normal)), weighed.T @ res[mine])
-        rest[others] -= B @ found
-    square = np.where(seen, (rest**2).sum(1) / (sigma_px * measured.sigma) ** 2, np.inf)
-    return np.asarray(np.minimum(square, 2 * _CLIP**2) / 2)
-
-
 @dataclass(frozen=True)
 class _Fit:
     """One model fitted, and what it says of the held-out measurements."""
@@ -252,18 +191,6 @@ class _Fit:
     def is_explained(self) -> bool:
         """Whether next to nothing is left that any model could explain."""
         return self.left <= _MIN_FALL * float(self.errors.mean()) if len(self.errors) else True
-
-
-def half_across_readout(reconstruction: Reconstruction) -> NDArray[np.bool_]:
-    """(n,) points on one side of the photos that show them, sides across the readout; half of all."""
-    obs = reconstruction.observations
-    of_photo = [reconstruction.camera(i) for i in range(reconstruction.num_images)]
-    axis = np.array([1 - READOUTS[camera.readout][0] for camera in of_photo])[obs.frame_idx]
-    size = np.array([(camera.width, camera.height) for camera in of_photo], float)[obs.frame_idx]
-    rows = np.arange(len(obs))
-    total = np.bincount(obs.point_idx, (obs.xy_raw / size)[rows, axis], reconstruction.num_points)
-    place = total / np.maximum(np.bincount(obs.point_idx, minlength=reconstruction.num_points), 1)
-    return np.asarray(place < np.median(place))
 
 
 def moved_px(reconstruction: Reconstruction) -> NDArray[np.float64]:
@@ -288,7 +215,7 @@ def _turns(rec: Reconstruction) -> NDArray[np.float64]:
     """(m, k, 3) how each photo's camera is turned at some lines, radians."""
     motions = [rec.motion(i) for i in range(rec.num_images)]
     ranges = [rec.camera(i).clock_range for i in range(rec.num_images)]
-    return np.stack([each.at(np.linspace(*of, _WAVES))[0] for each, of in zip(motions, ranges, strict=True)])
+    return np.stack([each.at(np.linspace(*of, WAVES))[0] for each, of in zip(motions, ranges, strict=True)])
 
 
 class _Fits:
@@ -331,7 +258,7 @@ class _Fits:
         result = bundle_adjust(starts[int(np.argmin(cost))], model, options, step)
         found, spreads = result.reconstruction, Spreads(result.phi_sigma, result.velocity_sigma)
         errors, rms_px = clipped_errors(found, self.held_out, self._sigma_px)
-        smooth = errors_without_warp(found, self.given.observations, self.held_out, self._sigma_px)
+        smooth = errors_without(warps, found, self.given.observations, self.held_out, self._sigma_px)
         left = max(float(errors.mean() - smooth.mean()), 0.0) if len(errors) else 0.0
         self.done[label] = _Fit(label, model, varying, bends, residual_field, found, errors, rms_px, left, spreads)
         return self.done[label]
@@ -355,7 +282,7 @@ class _Fits:
         scale = float(np.sqrt((one**2).sum() * (other**2).sum()))
         return float((one * other).sum() / scale) if scale > 0 else 0.0
 
-    def waves(self, fit: _Fit, sites: int = _WAVES, least_px: float = 0.0) -> bool:
+    def waves(self, fit: _Fit, sites: int = WAVES, least_px: float = 0.0) -> bool:
         """Whether each photo's lines would move beyond what a smooth warp of it says, by more than nothing.
 
         And by more than `least_px`, root mean square.
@@ -364,11 +291,15 @@ class _Fits:
             return False
         seen = self.given.observations
         smooth, free = (
-            errors_without_warp(fit.reconstruction, seen, self.held_out, self._sigma_px, functions).mean()
-            for functions in (_warps, partial(_waves, sites=sites))
+            errors_without(functions, fit.reconstruction, seen, self.held_out, self._sigma_px).mean()
+            for functions in (warps, partial(waves, sites=sites))
         )
         fall = float(smooth - free)
         return fall > _MIN_FALL * float(fit.errors.mean()) and fall > (least_px / self._sigma_px) ** 2 / 2
+
+    def waves_agree(self, fit: _Fit) -> bool:
+        """Whether two halves of the scene show the same motions of the lines."""
+        return agreement_of_waves(fit.reconstruction, self._sigma_px) >= _MIN_AGREEMENT
 
     def at_limit(self, fit: _Fit) -> bool:
         """Whether the motions would be larger than what is known from elsewhere allows."""
@@ -416,7 +347,8 @@ class _Rungs:
         for bends in _BENDS:
             if bends <= fit.bends:
                 continue
-            fast = self._fits.waves(fit)
+            # a vibration turns the whole line: what one half of the scene shows of it, the other shows as well
+            fast = self._fits.waves(fit) and self._fits.waves_agree(fit)
             if not fast and (fit.is_explained or fit.bends >= _SMOOTH_BENDS):
                 return
             fit = self._fits.fit(fit.model, fit.varying, [fit.reconstruction], bends=bends)
