@@ -173,6 +173,7 @@ def sets(photos: Path, names: list[str], skip_peer: bool) -> list[str]:
     rows = [list(COLUMNS)]
     failed = []
     for name in names:
+        ours(photos / name)  # kernels of whatever models a set needs
         results = {"peer": {} if skip_peer else peer(photos / name), "ours": ours(photos / name)}
         for who, result in results.items():
             if result:

@@ -252,14 +252,13 @@ def reduced_system(
 
 
 @kernel(forceinline=True)
-def _add_products(left, right, B, at):
-    """Add left' right, (2, rows) and (2, nc), to the columns of B from `at` on."""
-    for a in range(left.shape[1]):
-        for b in range(right.shape[1]):
-            B[a, at + b] += left[0, a] * right[0, b] + left[1, a] * right[1, b]
+def _add_product_to(row, l0, l1, r0, r1):
+    """Add two products with a number to a row."""
+    for b in range(len(row)):
+        row[b] += l0 * r0[b] + l1 * r1[b]
 
 
-@parallel_kernel()
+@parallel_kernel(fastmath=SUMS)
 def border_rows(
     frame_start, frame_order, frame_idx, track_idx, track_start, point_of, camera_of_frame,
     J, J_camera, V_inv, g_point, B, rhs,
@@ -271,46 +270,41 @@ def border_rows(
     """
     nb, nc = J.shape[2], J_camera.shape[2]
     for f in prange(len(B)):
-        left, right = np.empty((2, nb + nc)), np.empty((2, nc))
-        u, e = np.empty((2, 3)), np.empty(2)  # u = J_p V^-1
+        r0, r1 = np.empty(nc), np.empty(nc)
         B[f] = 0.0
         rhs[f] = 0.0
         for s in range(frame_start[f], frame_start[f + 1]):
             k = frame_order[s]
             t = track_idx[k]
-            V = V_inv[point_of[t]]
-            g = g_point[point_of[t]]
-            left[:, :nb] = J[k]
-            left[:, nb:] = J_camera[k]
-            for i in range(2):
-                e[i] = 0.0
-                for b in range(3):
-                    u[i, b] = 0.0
-                    for a in range(3):
-                        u[i, b] -= J[k, i, 3 + a] * V[a, b]
-                    e[i] += u[i, b] * g[b]
-            for a in range(nc):
-                rhs[f, a] -= J_camera[k, 0, a] * e[0] + J_camera[k, 1, a] * e[1]
-            right[:] = 0.0
-            at = camera_of_frame[frame_idx[track_start[t]]] * nc
-            for n in range(track_start[t], track_start[t + 1]):
+            p = point_of[t]
+            u0, u1, u2 = _times(-J[k, 0, 3], -J[k, 0, 4], -J[k, 0, 5], V_inv, p)
+            w0, w1, w2 = _times(-J[k, 1, 3], -J[k, 1, 4], -J[k, 1, 5], V_inv, p)
+            e0 = u0 * g_point[p, 0] + u1 * g_point[p, 1] + u2 * g_point[p, 2]
+            e1 = w0 * g_point[p, 0] + w1 * g_point[p, 1] + w2 * g_point[p, 2]
+            _add_product_to(rhs[f], -e0, -e1, J_camera[k, 0], J_camera[k, 1])
+            n, end = track_start[t], track_start[t + 1]
+            while n < end:
                 # what photos of one camera have in a track is summed before it meets the photo's own
-                if camera_of_frame[frame_idx[n]] * nc != at:
-                    _add_products(left, right, B[f], at)
-                    right[:] = 0.0
-                    at = camera_of_frame[frame_idx[n]] * nc
-                # J_p,n is minus J's columns of the centre: the sign of M turns
-                m00 = u[0, 0] * J[n, 0, 3] + u[0, 1] * J[n, 0, 4] + u[0, 2] * J[n, 0, 5]
-                m01 = u[0, 0] * J[n, 1, 3] + u[0, 1] * J[n, 1, 4] + u[0, 2] * J[n, 1, 5]
-                m10 = u[1, 0] * J[n, 0, 3] + u[1, 1] * J[n, 0, 4] + u[1, 2] * J[n, 0, 5]
-                m11 = u[1, 0] * J[n, 1, 3] + u[1, 1] * J[n, 1, 4] + u[1, 2] * J[n, 1, 5]
-                if n == k:
-                    m00 += 1.0
-                    m11 += 1.0
-                for b in range(nc):
-                    right[0, b] += m00 * J_camera[n, 0, b] + m01 * J_camera[n, 1, b]
-                    right[1, b] += m10 * J_camera[n, 0, b] + m11 * J_camera[n, 1, b]
-            _add_products(left, right, B[f], at)
+                camera = camera_of_frame[frame_idx[n]]
+                r0[:] = 0.0
+                r1[:] = 0.0
+                while n < end and camera_of_frame[frame_idx[n]] == camera:
+                    # J_p,n is minus J's columns of the centre: the sign of M turns
+                    c0, c1, c2 = J[n, 0, 3], J[n, 0, 4], J[n, 0, 5]
+                    d0, d1, d2 = J[n, 1, 3], J[n, 1, 4], J[n, 1, 5]
+                    m00, m01 = u0 * c0 + u1 * c1 + u2 * c2, u0 * d0 + u1 * d1 + u2 * d2
+                    m10, m11 = w0 * c0 + w1 * c1 + w2 * c2, w0 * d0 + w1 * d1 + w2 * d2
+                    if n == k:
+                        m00 += 1.0
+                        m11 += 1.0
+                    _add_product_to(r0, m00, m01, J_camera[n, 0], J_camera[n, 1])
+                    _add_product_to(r1, m10, m11, J_camera[n, 0], J_camera[n, 1])
+                    n += 1
+                mine = slice(camera * nc, camera * nc + nc)
+                for a in range(nb):
+                    _add_product_to(B[f, a, mine], J[k, 0, a], J[k, 1, a], r0, r1)
+                for a in range(nc):
+                    _add_product_to(B[f, nb + a, mine], J_camera[k, 0, a], J_camera[k, 1, a], r0, r1)
 
 
 @parallel_kernel(fastmath=SUMS)

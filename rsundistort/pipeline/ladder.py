@@ -284,7 +284,7 @@ def solve_tracks(
     )
     tracks = result.reconstruction
     if feedback is not None:
-        result, tracks, options = _fed_back(feedback, result, options, log)
+        result, tracks, options = _fed_back(feedback, result, options, log, ends=not auto)
     options = replace(options, phi_sigma_start=result.phi_sigma)
     choice = None
     if auto:
@@ -293,10 +293,9 @@ def solve_tracks(
             result.reconstruction, LADDER, options, sigma_px=result.sigma_px, seed=seed,
             progress=lambda model, _: log.tell(f"choice: {model}", 0),
         )  # fmt: skip
-        if choice.shutter_model != shutter_model or choice.varying or choice.bends or choice.residual_field:
-            options = replace(options, varying=choice.varying, bends=choice.bends, residual_field=choice.residual_field)
-            start = replace(tracks, shutter_model=choice.shutter_model)
-            result = bundle_adjust(start, choice.shutter_model, options, partial(_tell, log, "choice"))
+        options = replace(options, varying=choice.varying, bends=choice.bends, residual_field=choice.residual_field)
+        start = replace(tracks, shutter_model=choice.shutter_model)
+        result = bundle_adjust(start, choice.shutter_model, options, partial(_tell, log, "choice"))
         log.end(
             "choice of the model", chosen=choice.shutter_model, varying_lens=choice.varying, bends=choice.bends,
             residual_field=choice.residual_field, shutter=choice.shutter, agreement=choice.agreement, gain=choice.gain,
@@ -351,17 +350,19 @@ def _lens_only(verdict: Verdict) -> str:
 
 
 def _fed_back(
-    feedback: Feedback, result: BundleResult, options: BundleOptions, log: StageLog, stages: Sequence[str] = ()
-) -> tuple[BundleResult, Reconstruction, BundleOptions]:
+    feedback: Feedback, result: BundleResult, options: BundleOptions, log: StageLog, stages: Sequence[str] = (),
+    ends: bool = True,
+) -> tuple[BundleResult, Reconstruction, BundleOptions]:  # fmt: skip
     """Free keypoints of the shutter, rebuild the tracks and adjust, until the photos settle.
 
-    The last adjustment, its tracks, and the options without anchors of photos that nothing holds any more.
+    The last adjustment, its tracks, and the options without anchors of photos that nothing holds any more. Only the
+    last adjustment is exact, and only where it `ends` the solution: tracks are told apart by pixels.
     """
     shutter_model = result.reconstruction.shutter_model
     if not stages:
         stages = [f"feedback {number}" for number in range(1, _MAX_ROUNDS + 1)]
         stages += ["alignment"] * (feedback.workers is not None)
-    settled, found = False, None
+    settled, aligns, found = False, False, None
     for stage in stages:
         aligns = stage.startswith("alignment")
         if settled and not aligns:
@@ -379,7 +380,10 @@ def _fed_back(
         tracks = tracks.without_photos(LEAST_MEASUREMENTS)
         options = _of_joined(options, tracks)
         options = replace(options, phi_sigma_start=result.phi_sigma)
-        result = bundle_adjust(tracks, shutter_model, options, partial(_tell, log, stage))
+        # another adjustment follows that one
+        rough = replace(options, cost_tolerance=1e-5, spread_rounds=3, spread_tolerance=0.05)
+        how = options if ends and aligns else rough
+        result = bundle_adjust(tracks, shutter_model, how, partial(_tell, log, stage))
         after = result.reconstruction
         moved = _moved_px(before, after)
         log.end(
@@ -387,4 +391,6 @@ def _fed_back(
             iterations=result.num_iterations, stop_reason=result.stop_reason, moved_px=moved,
         )  # fmt: skip
         settled = moved < _SETTLED_PX * feedback.step_px
+    if ends and not aligns:
+        result = bundle_adjust(tracks, shutter_model, options, partial(_tell, log, "feedback"))
     return result, tracks, options
