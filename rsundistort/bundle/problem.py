@@ -79,6 +79,11 @@ def _lens_pixels(
     return xy
 
 
+def _plain(*arrays: NDArray[Any]) -> tuple[NDArray[Any], ...]:
+    """The arrays in one block of memory each that may be written: kernels are compiled for each kind that they meet."""
+    return tuple(np.require(each, requirements=("C", "W")) for each in arrays)
+
+
 def reprojection_residuals(
     reconstruction: Reconstruction, shutter_model: str | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -98,12 +103,13 @@ def reprojection_residuals(
     phi = reconstruction.phi
     if reconstruction.bends:
         phi = _tables(phi, reconstruction.bend, reconstruction.bend_clock, reconstruction.R_cw)
-    projection.residuals(
-        model, *_camera_arrays(reconstruction.camera_idx, reconstruction.cameras, reconstruction.variation),
+    arrays = _plain(
+        *_camera_arrays(reconstruction.camera_idx, reconstruction.cameras, reconstruction.variation),
         reconstruction.R_cw, reconstruction.center_w, phi, reconstruction.velocity,
         reconstruction.points_w, obs.frame_idx, obs.point_idx,
-        _lens_pixels(reconstruction.cameras, reconstruction.camera_idx[obs.frame_idx], obs.xy_raw), res, valid,
+        _lens_pixels(reconstruction.cameras, reconstruction.camera_idx[obs.frame_idx], obs.xy_raw),
     )  # fmt: skip
+    projection.residuals(model, *arrays, res, valid)
     return res, valid
 
 
@@ -200,11 +206,19 @@ class BundleProblem:
         # the rows that the last cost predicted, where the next Jacobians look for them
         self._clock = np.full(len(obs), np.nan)
         self._clock_of: State | None = None
+        # what the kernels were last given: several ask for the same
+        self._args_of: State | None = None
+        self._args: tuple[Any, ...] = ()
+        self._lens_of: State | None = None
+        self._lens = np.empty((0, 2, 0)), np.empty((0, 2, 3))
         check_lenses(options.refine, reconstruction.cameras)
         self._refine = options.refine
         self._fields = (
             LensFields(reconstruction.cameras, options.refine, shutter_model) if options.residual_field else None
         )
+        if self._fields is not None:
+            camera = reconstruction.camera_idx[self._structure.frame_idx]
+            self._field_jacobian = self._fields.jacobian(reconstruction.cameras, camera, self._xy)
         self._field_weight = spreads.field**-2.0 if options.residual_field else 0.0
         self._refine_codes = np.array([INTRINSICS[name] for name in options.refine], np.int64)
         span = reconstruction.frame_span()[:, None]
@@ -300,6 +314,7 @@ class BundleProblem:
         """
         plain = copy(self)
         plain._options = replace(self._options, loss="squared")
+        plain._lens_of = None
         return plain
 
     def covariances(self, state: State) -> Marginals:
@@ -343,6 +358,12 @@ class BundleProblem:
         )
 
     def _kernel_args(self, state: State) -> tuple[Any, ...]:
+        if state is not self._args_of:
+            self._args_of, self._args = state, _plain(*self._arrays(state))
+        return self._model, *self._args, LOSSES[self._options.loss], self._options.loss_scale
+
+    def _arrays(self, state: State) -> tuple[NDArray[Any], ...]:
+        """What the kernels take of cameras, photos, points and measurements."""
         s = self._structure
         phi = state.phi
         if self.layout.bent:
@@ -350,9 +371,9 @@ class BundleProblem:
             phi = _tables(phi, values, self._bend_clock, state.R_cw)
         xy = _lens_pixels(state.cameras, self._start.camera_idx[s.frame_idx], self._xy)
         return (
-            self._model, *_camera_arrays(self._start.camera_idx, state.cameras, state.variation),
+            *_camera_arrays(self._start.camera_idx, state.cameras, state.variation),
             state.R_cw, state.center_w, phi, state.velocity, state.points_w,
-            s.frame_idx, s.point_idx, xy, self._sigma_px, LOSSES[self._options.loss], self._options.loss_scale,
+            s.frame_idx, s.point_idx, xy, self._sigma_px,
         )  # fmt: skip
 
     def _motion(self, state: State) -> NDArray[np.float64]:
@@ -407,7 +428,7 @@ class BundleProblem:
                 cost,
             )
         if self._options.varying:
-            J_frame[:, :, self._block : self.layout.variation] = self._variation_jacobians(state)
+            J_frame[:, :, self._block : self.layout.variation] = self._by_lens(state)[1]
         return res, J_frame, float(cost.sum())
 
     def _rows(self, state: State) -> NDArray[np.float64]:
@@ -452,40 +473,42 @@ class BundleProblem:
 
     def _camera_jacobians(self, state: State) -> NDArray[np.float64]:
         """Weighted Jacobians (o, 2, nc) of what is solved for of the cameras."""
-        J = self._intrinsic_jacobians(state)
+        J, of_photo = self._by_lens(state)
         if self._fields is None:
             return J
-        camera = self._start.camera_idx[self._structure.frame_idx]
         # what a shift of the principal point does is what weighs a measurement
-        focal = np.array([np.diag(each.K)[:2] for each in state.cameras])[camera]
-        weight = self._variation_jacobians(state)[:, :, 1:] / focal[:, None]
-        return np.concatenate([J, weight @ self._fields.jacobian(state.cameras, camera, self._xy)], axis=2)
+        camera = self._start.camera_idx[self._structure.frame_idx]
+        weight = of_photo[:, :, 1:] / np.array([np.diag(each.K)[:2] for each in state.cameras])[camera, None]
+        return np.concatenate([J, weight @ self._field_jacobian], axis=2)
 
-    def _intrinsic_jacobians(self, state: State) -> NDArray[np.float64]:
-        """Weighted Jacobians (o, 2, len(refine)) of the intrinsics that are refined."""
-        J = np.empty((len(self._xy), 2, len(self._refine)))
-        if self._refine:
-            projection.intrinsic_blocks(*self._kernel_args(state), self._rows(state), self._refine_codes, J)
-        if self._refine and self._options.varying:
-            own = state.variation[self._structure.frame_idx]
-            by_shift = self._variation_jacobians(state)[:, :, 1:]
+    def _by_lens(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Weighted Jacobians of the intrinsics that are refined (o, 2, nr), and of a photo's variation (o, 2, 3).
+
+        The last is left empty where nobody needs it.
+        """
+        if state is self._lens_of:
+            return self._lens
+        num = len(self._refine)
+        varies = self._options.varying or self._fields is not None
+        codes = np.concatenate([self._refine_codes, _VARIATION[: 3 * varies]])
+        both = np.empty((len(self._xy), 2, len(codes)))
+        if len(codes):
+            projection.intrinsic_blocks(*self._kernel_args(state), self._rows(state), codes, both)
+        J, of_photo = both[:, :, :num], both[:, :, num:]
+        own = state.variation[self._structure.frame_idx]
+        # a photo's principal point moves by focal lengths of its camera, not by its own
+        of_photo[:, :, 1:] *= np.exp(-own[:, 0])[:, None, None]
+        if self._options.varying:
             for k, name in enumerate(self._refine):
                 if name in ("cx", "cy"):
-                    J[:, :, k] = by_shift[:, :, int(name == "cy")]
+                    J[:, :, k] = of_photo[:, :, 1 + (name == "cy")]
                 # shifts are in focal lengths
                 if name in ("f", "fx"):
-                    J[:, :, k] += by_shift[:, :, 0] * own[:, 1, None]
+                    J[:, :, k] += of_photo[:, :, 1] * own[:, 1, None]
                 if name in ("f", "fy"):
-                    J[:, :, k] += by_shift[:, :, 1] * own[:, 2, None]
-        return J
-
-    def _variation_jacobians(self, state: State) -> NDArray[np.float64]:
-        """Weighted Jacobians (o, 2, 3) of the variation of each photo's intrinsics."""
-        J = np.empty((len(self._xy), 2, 3))
-        projection.intrinsic_blocks(*self._kernel_args(state), self._rows(state), _VARIATION, J)
-        # a photo's principal point moves by focal lengths of its camera, not by its own
-        J[:, :, 1:] *= np.exp(-state.variation[self._structure.frame_idx, 0])[:, None, None]
-        return J
+                    J[:, :, k] += of_photo[:, :, 2] * own[:, 2, None]
+        self._lens_of, self._lens = state, (np.ascontiguousarray(J), of_photo)
+        return self._lens
 
     def cost(self, state: State) -> float:
         """Half the robust sum of squares in units of the noise, with the priors."""
