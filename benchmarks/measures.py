@@ -176,6 +176,20 @@ def against_twins(out: Path, solution: Solution, truth: Solution, twins: Path) -
     return {"psnr_db": round(float(np.median(decibels)), 2), "left_px": round(float(np.median(left)), 3)}
 
 
+def with_lens_of(out: Path, truth: Path) -> Path:
+    """A truth file, written beside another, with the cameras that a run found: twins then have that lens taken out.
+
+    What photos lose against such twins is not the doing of a lens that was calibrated otherwise.
+    """
+    told, found = (json.loads(path.read_text()) for path in (truth, out / "solution.json"))
+    own = {each["name"]: each["camera_id"] for each in found["images"]}
+    told["cameras"] = found["cameras"]
+    told["images"] = [each | {"camera_id": own[each["name"]]} for each in told["images"]]
+    path = truth.with_name(f"{truth.stem}-lens-of-{out.name}.json")
+    path.write_text(json.dumps(told))
+    return path
+
+
 def fountain_truth(folder: Path) -> Solution:
     """The truth of fountain-small."""
     camera = camera_from_json(json.loads((folder / "camera.json").read_text()), "camera.json")

@@ -263,6 +263,16 @@ class _Fits:
         self.done[label] = _Fit(label, model, varying, bends, residual_field, found, errors, rms_px, left, spreads)
         return self.done[label]
 
+    def along_other_axis(self, fit: _Fit, plain: _Fit) -> _Fit:
+        """The model of a fit read along the other axis, from a fit without a shutter; vibrations on the same terms."""
+        label = f"{fit.label}, read along the other axis"
+        start, smooth = read_along_other_axis(plain.reconstruction), min(fit.bends, _SMOOTH_BENDS)
+        other = self.fit(fit.model, fit.varying, [start], label, smooth)
+        if fit.bends > smooth and self.waves_agree(other):
+            del self.done[label]
+            other = self.fit(fit.model, fit.varying, [other.reconstruction], label, fit.bends)
+        return other
+
     def agreement(self, fit: _Fit) -> float:
         """Correlation over photos, axes and lines of the turns that two halves of the scene tell, each fitted alone.
 
@@ -434,10 +444,9 @@ def choose_model(
         if fits.at_limit(best):
             against.append("the exposure times allow less motion than they would need")
         if not against:
-            other = read_along_other_axis(plain.reconstruction)
-            label = f"{best.label}, read along the other axis"
-            gain[label] = fits.gain(best, fits.fit(best.model, best.varying, [other], label, best.bends))
-            if not fits.is_better(fits.done[label], best):
+            other = fits.along_other_axis(best, plain)
+            gain[other.label] = fits.gain(best, other)
+            if not fits.is_better(other, best):
                 against.append("a shutter that reads along the other axis explains the photos as well")
         if not against:
             agreement = fits.agreement(best)
