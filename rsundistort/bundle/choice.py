@@ -343,7 +343,8 @@ class _Rungs:
         fits, best = self._fits, self.best
         self.gain[fit.label] = fits.gain(best, fit)
         # where the two do as well, the exact model of a turn is taken, not its approximation
-        exact = best.model == "two-step" and fit.label == "rotation" and not fits.is_better(fit, best)
+        steady = fit.model == "rotation" and not fit.bends
+        exact = best.model == "two-step" and steady and not fits.is_better(fit, best)
         if not exact and not fits.is_better(best, fit):
             return
         if exact or float((best.errors - fit.errors).mean()) > fit.left:
