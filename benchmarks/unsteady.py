@@ -6,6 +6,8 @@ Prints one JSON object a line and at the end a table with targets. Parts, with t
 
     changing (3)   herz-jesus-8 warped by 0.05 rad a frame, the rate changing by half of itself over half a frame
     vibrating (3)  herz-jesus-8 warped by 0.02 rad, with 1.5 mrad of vibration at 2 to 5 periods a frame
+    anchored (3)   the same two with one photo that stood still, and `--still` says so: what the height of the scene, which
+                   level cameras that move so do not tell, is worth
     scene (1)      a rendered scene, from a drone that travels and vibrates, against its twins
     harm (13)      herz-jesus-8 with motions of all kinds, 0 to 0.1 rad: no photo is to come out more than 0.3 dB below
                    what went in unless it is named as doubtful
@@ -36,8 +38,8 @@ import rsundistort as rs
 from rsundistort.synthetic.unsteady import Vibration
 
 ROOT = Path(__file__).resolve().parent.parent
-HERZ = "herz-jesus-8"
-PARTS = ("changing", "vibrating", "scene", "harm", "steady")
+HERZ, STOOD = "herz-jesus-8", "0003.jpg"
+PARTS = ("changing", "vibrating", "anchored", "scene", "harm", "steady")
 COLUMNS = ("part", "seed", "model", "verdict", "dB", "worst", "before", "deg", "phi/sigma", "doubtful", "s")
 # strength in rad a frame, change of the rate, amplitude of the vibration in rad: steady, bent, vibrating, mixed
 HARM = (
@@ -71,11 +73,13 @@ class Bench:
             self._still = out / "solution.json"
         return self._still
 
-    def warped(self, sigma: float, seed: int, change: float = 0.0, shake: float = 0.0) -> Path:
+    def warped(
+        self, sigma: float, seed: int, change: float = 0.0, shake: float = 0.0, still: tuple[str, ...] = ()
+    ) -> Path:
         """Folder of herz-jesus-8 warped."""
-        out = self.work / f"warped-{sigma}-{change}-{shake}-{seed}"
+        out = self.work / f"warped-{sigma}-{change}-{shake}-{seed}{'-still' * len(still)}"
         vibration = Vibration(shake, (2.0, 5.0)) if shake else None
-        options = rs.WarpOptions(sigma_rad=sigma, seed=seed, acceleration=change, vibration=vibration)
+        options = rs.WarpOptions(sigma_rad=sigma, seed=seed, acceleration=change, vibration=vibration, still=still)
         if not out.is_dir():
             rs.simulate_warp(self.photos / HERZ, out, options)
         return out
@@ -167,6 +171,12 @@ def main() -> int:
         if "vibrating" in args.only:
             for seed in seeds(3):
                 bench.measure("vibrating", seed, bench.warped(0.02, seed, shake=1.5e-3), twins, bench.still)
+        if "anchored" in args.only:
+            for seed in seeds(3):
+                for sigma, change, shake in ((0.05, 0.5, 0.0), (0.02, 0.0, 1.5e-3)):
+                    name = "anchored, vibrating" if shake else "anchored, changing"
+                    folder = bench.warped(sigma, seed, change, shake, (STOOD,))
+                    bench.measure(name, seed, folder, twins, bench.still, still={STOOD: 1e-4})
         if "scene" in args.only:
             for seed in seeds(1):
                 scene(bench, seed)

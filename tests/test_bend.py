@@ -25,6 +25,7 @@ from rsundistort import (
 )
 from rsundistort.bundle import choose_model, reprojection_residuals
 from rsundistort.bundle.problem import BundleProblem, Spreads
+from rsundistort.bundle.remains import agreement_of_waves
 from rsundistort.model import BEND_GROUPS, Bend
 from rsundistort.model.bend import bend_functions, splines_at
 from rsundistort.model.projection import at_depth, clock_of, project_points_with_jacobians
@@ -297,6 +298,28 @@ def test_the_choice_takes_bends_where_they_are(rng, groups, turn, label):
     assert choice.shutter == "found"
     assert not choice.restless
     assert choice.bends == {"rotation": 0, "rotation, bent": 2, "rotation, vibrating": 5}[label]
+
+
+def sheared_by_line(truth, rng, same):
+    """The scene with lines that moved along themselves as they liked: both halves alike, or each its own way."""
+    obs, camera = truth.observations, truth.cameras[0]
+    place, side = (obs.xy_raw[:, 1] + 0.5) / camera.height, obs.xy_raw[:, 0] > camera.K[0, 2]
+    phase = rng.uniform(0, 2 * np.pi, (truth.num_images, 2))[obs.frame_idx, 0 if same else side.astype(int)]
+    shift = 1.0 * np.sin(8 * np.pi * place + phase)
+    return replace(truth, observations=replace(obs, xy_raw=obs.xy_raw + shift[:, None] * [1.0, 0.0]))
+
+
+@pytest.mark.parametrize(("same", "least", "most"), [(True, 0.8, 1.0), (False, -0.3, 0.3)])
+def test_only_turns_of_whole_lines_agree_between_halves(rng, same, least, most):
+    truth = make_scene(rng, groups=0, num_points=900)
+    assert least < agreement_of_waves(sheared_by_line(truth, rng, same), NOISE_PX) <= most
+
+
+def test_no_vibration_is_tried_where_halves_tell_different_ones(rng):
+    truth = make_scene(rng, groups=0, num_points=900)
+    start = bundle_adjust(still(sheared_by_line(truth, rng, same=False)), "rotation")
+    choice = choose_model(start.reconstruction, sigma_px=NOISE_PX)
+    assert not any("vibrating" in label for label in choice.held_out_error)
 
 
 def test_lines_that_move_faster_than_any_model_are_noticed(rng):

@@ -22,6 +22,7 @@ from rsundistort import (
     bundle_adjust,
     climb,
 )
+from rsundistort._kernels import projection
 from rsundistort.bundle import (
     LADDER,
     GuessedCameras,
@@ -725,6 +726,33 @@ def test_estimate_from_gross_outliers_does_not_depend_on_the_loss(rng):
     # the last rounds are squares; which good ones went with the outliers differs, and moves phi by less than its noise
     for result in results[1:]:
         assert (np.abs(result.reconstruction.phi - results[0].reconstruction.phi) < results[0].sigma_phi).all()
+
+
+def test_rays_that_miss_each_other_do_not_hold_up_the_rest(rng):
+    truth = make_scene(rng, "rotation", num_images=8, num_points=300, noise_px=0.5)
+    obs = truth.observations
+    # many points that two photos alone show, some of them wrongly: along no direction does such a point fit
+    first = np.argsort(np.argsort(obs.frame_idx + 100 * obs.point_idx)) - np.searchsorted(obs.point_idx, obs.point_idx)
+    obs = obs.select((first < 2) | (obs.point_idx % 2 == 0))
+    gross = (rng.random(len(obs)) < 0.1)[:, None]
+    spoiled = replace(obs, xy_raw=obs.xy_raw + gross * rng.uniform(5, 60, (len(obs), 2)))
+    start = replace(perturbed(truth, rng), observations=spoiled)
+    options = BundleOptions(outlier_rounds=0, spread_rounds=0, sigma_px=0.5, phi_sigma=0.03, deviations="model")
+    result = bundle_adjust(start, "rotation", options)
+    assert result.converged
+    # two of three steps lower the cost, and by more than their damping
+    assert len(result.cost_history) - 1 > 0.67 * result.num_iterations
+    assert result.num_iterations < 30
+
+
+def test_kernels_meet_one_kind_of_array(rng):
+    rec = make_scene(rng, "rotation")
+    reprojection_residuals(rec)
+    kinds = len(projection.residuals.signatures)
+    bases = np.asfortranarray(rec.R_cw.transpose(0, 2, 1)).transpose(0, 2, 1)
+    bases.flags.writeable = False
+    reprojection_residuals(replace(rec, R_cw=bases, points_w=np.hstack([rec.points_w] * 2)[:, :3]))
+    assert len(projection.residuals.signatures) == kinds
 
 
 def test_anchored_components_stay_exactly_zero(rng):
