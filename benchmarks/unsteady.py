@@ -6,8 +6,8 @@ Prints one JSON object a line and at the end a table with targets. Parts, with t
 
     changing (3)   herz-jesus-8 warped by 0.05 rad a frame, the rate changing by half of itself over half a frame
     vibrating (3)  herz-jesus-8 warped by 0.02 rad, with 1.5 mrad of vibration at 2 to 5 periods a frame
-    anchored (3)   the same two with one photo that stood still, and `--still` says so: what the height of the scene, which
-                   level cameras that move so do not tell, is worth
+    anchored (3)   the same two with one photo that stood still, and `--still` says so: what the height of the scene is
+                   worth, which level cameras that move so do not tell
     scene (1)      a rendered scene, from a drone that travels and vibrates, against its twins
     harm (13)      herz-jesus-8 with motions of all kinds, 0 to 0.1 rad: no photo is to come out more than 0.3 dB below
                    what went in unless it is named as doubtful
