@@ -46,12 +46,28 @@ def parse_yaml(text: str) -> Any:
     try:
         # in Python, not in C, which overflows the stack where this raises; the first document only, since
         # `ros2 topic echo` ends each message with ---
-        return next(iter(yaml.load_all(text, yaml.BaseLoader)), None)
+        found = next(iter(yaml.load_all(text, yaml.BaseLoader)), None)
     except yaml.MarkedYAMLError as error:
         line = f" in line {error.problem_mark.line + 1}" if error.problem_mark else ""
         raise ValueError(f"{error.problem}{line}") from error
     except (yaml.YAMLError, RecursionError) as error:
         raise ValueError(" ".join(str(error).split())) from error
+    _check_size(found, len(text))
+    return found
+
+
+def _check_size(tree: Any, length: int) -> None:
+    """Refuse aliases of aliases, which say more than the text is long."""
+    count, open_ = 0, [tree]
+    while open_:
+        each = open_.pop()
+        count += 1
+        if count > length + 1:
+            raise ValueError("its aliases repeat each other; write out what they stand for")
+        if isinstance(each, dict):
+            open_ += each.values()
+        elif isinstance(each, list):
+            open_ += each
 
 
 def parse_xml(text: str) -> Any:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from ..errors import FileError, FormatError, InputError
 from .colmap_model import ColmapModel, read_colmap_model
+from .json_text import read_json
 from .openmvg import openmvg_model
 from .opensfm import opensfm_model
 
@@ -26,10 +26,8 @@ def read_model(path: Path) -> ColmapModel:
         return read_colmap_model(path)
     mend = "give the folder of a COLMAP model, OpenMVG's sfm_data.json or OpenSfM's reconstruction.json"
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise FileError(f"{path} cannot be read: {error.strerror}") from error
-    except ValueError as error:  # no JSON, or no text
+        value = read_json(path)
+    except FormatError as error:
         raise FormatError(f"{path} is no model; {mend}") from error
     try:
         if isinstance(value, dict) and "sfm_data_version" in value:

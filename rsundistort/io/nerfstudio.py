@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, FormatError, InputError
+from ..errors import FormatError, InputError
 from ..model import Camera, Solution
+from .json_text import read_json
 
 __all__ = ["read_transforms", "write_transforms"]
 
@@ -56,11 +57,9 @@ def camera_to_world(R_cw: NDArray[np.float64], center_w: NDArray[np.float64]) ->
 
 def read_transforms(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Poses R_cw (m, 3, 3) and center_w (m, 3) of a `transforms.json`."""
+    value = read_json(path)
     try:
-        frames = json.loads(path.read_text(encoding="utf-8"))["frames"]
-        matrices = np.array([frame["transform_matrix"] for frame in frames], np.float64).reshape(-1, 4, 4)
-    except OSError as error:
-        raise FileError(f"{path} cannot be read: {error.strerror}") from error
+        matrices = np.array([frame["transform_matrix"] for frame in value["frames"]], np.float64).reshape(-1, 4, 4)
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(f"{path} is no transforms.json: expected frames with a transform_matrix each") from error
     # back from OpenGL's axes; a matrix may hold a scale

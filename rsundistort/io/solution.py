@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import FileError, FormatError, InputError
+from ..errors import FormatError, InputError
 from ..model import READOUTS, Bend, Camera, RowMotion, Solution, SolvedImage
 from .aside import write_aside
 from .cameras import camera_from_json, camera_to_json
+from .json_text import read_json
 
 __all__ = ["FORMAT", "VERSION", "read_solution", "solution_to_bytes", "solution_to_json", "write_solution"]
 
@@ -144,12 +145,7 @@ def read_solution(path: Path, newer: bool = False) -> Solution:
         When the file is missing, no solution, of another version, or inconsistent.
     """
     path = Path(path)
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise FileError(f"{path} cannot be read: {error.strerror}") from error
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise FormatError(f"{path} is no valid JSON: {error}") from error
+    value = read_json(path)
     if not isinstance(value, dict) or value.get("format") != FORMAT:
         raise FormatError(f"{path} is no solution: its format is not {FORMAT!r}")
     version = value.get("version")

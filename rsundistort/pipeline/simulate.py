@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import FileError, FormatError, InputError
+from ..errors import FormatError, InputError
 from ..io import facts_of_exif, list_photos, output_folder, output_name, read_photo, write_image, write_solution
 from ..io.cameras import camera_to_json
 from ..io.gyro import GyroLog
+from ..io.json_text import read_json
 from ..io.record import Record
 from ..model import Camera, RowMotion, Solution, SolvedImage
 from ..model.checks import check_finite
@@ -95,12 +96,7 @@ def read_motion_file(path: Path) -> dict[str, list[float] | RowTable]:
     """
     if Path(path).suffix.lower() == ".csv":
         return dict(read_row_tables(path))
-    try:
-        value = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise FileError(f"{path} cannot be read: {error.strerror}") from error
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise FormatError(f"{path} is no valid JSON: {error}") from error
+    value = read_json(path)
     if not isinstance(value, dict):
         raise FormatError(f"{path}: expected an object of name: [phi1, phi2, phi3]")
     return {

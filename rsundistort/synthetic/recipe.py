@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, fields
 from itertools import product
 from pathlib import Path
@@ -14,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, FormatError, InputError
+from ..errors import FormatError, InputError
+from ..io.json_text import read_json
 from ..model.camera import Camera
 from ..model.checks import check_finite, check_rotations, frozen
 from ..model.motion import RowMotion
@@ -259,12 +259,7 @@ def load_recipe(path: str | Path) -> Recipe:
         Ready to render. A FormatError names the entry that is wrong.
     """
     path = Path(path)
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise FileError(f"cannot read {path}: {error.strerror}") from error
-    except ValueError as error:
-        raise FormatError(f"{path} is not JSON: {error}") from error
+    data = read_json(path)
     try:
         return _parse(data, path.parent)
     except InputError as error:

@@ -36,9 +36,14 @@ _CORRECTED = {
 }
 
 
+# More declarations than any program writes; each is a name to look for in the whole packet.
+_MOST_PREFIXES = 1000
+
+
 def _is_well_formed(packet: bytes) -> bool:
+    """Whether a packet may be searched: tags that are never closed take the square of its length."""
     # nobody's packet declares entities, other than to do harm
-    if b"<!DOCTYPE" in packet or b"<!ENTITY" in packet:
+    if b"<!DOCTYPE" in packet or b"<!ENTITY" in packet or packet.count(b"xmlns:") > _MOST_PREFIXES:
         return False
     try:
         # what stands before or behind the packet is padding
@@ -122,7 +127,7 @@ def corrected_xmp(
 
 def rectified_by(packet: bytes) -> str | None:
     """The version of rsundistort that rectified a photo, by its packet; None when none did."""
-    return _get(packet, _OURS, "RectifiedBy") if _OURS.encode() in packet else None
+    return _get(packet, _OURS, "RectifiedBy") if _OURS.encode() in packet and _is_well_formed(packet) else None
 
 
 def marked_xmp(packet: bytes, version: str) -> bytes:
@@ -130,6 +135,8 @@ def marked_xmp(packet: bytes, version: str) -> bytes:
 
     A damaged packet gives way to a new one.
     """
+    if not _is_well_formed(packet):
+        packet = b""
     for namespace, names in _CORRECTED.items():
         packet = _drop(packet, namespace, names)
     if rectified_by(packet) is not None:
