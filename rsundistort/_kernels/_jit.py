@@ -3,22 +3,74 @@
 from __future__ import annotations
 
 import os
-from functools import partial
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from functools import lru_cache, partial
+from typing import Any
 
 import numba
 from numba.core import types
+from numba.core.caching import FunctionCache
 from numba.extending import overload
+
+from ..errors import RsUndistortWarning
 
 # Threads of OpenMP that spin while they wait take the processors from those that work as soon as anything else runs:
 # a launch then takes 7 ms, not 10 us. libgomp reads this when numba loads it, at the first launch.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
 
 # fastmath: products are fused into sums, nothing else; infinities and NaN keep their meaning.
 # error_model: a division by zero gives inf, which the validity flags catch, and loops can vectorise.
 # cache: compiled once per installation, not per run. Numba's cache does not notice a changed callee in another
 # file, so a kernel and all its callees stay in one file.
 # forceinline, for callees in inner loops: else each call counts the references of its arrays, twice the whole time.
-kernel = partial(numba.njit, cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+class _Kept(FunctionCache):
+    """Compiled kernels in files, where these can be had: what is damaged, or cannot be written, is compiled again."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # whatever pickle makes of a file that was cut short
+            with suppress(OSError):
+                self.flush()
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            _tell(f"compiled kernels cannot be kept ({error.strerror})")
+
+
+@lru_cache(maxsize=1)
+def _tell(what: str) -> None:
+    warnings.warn(
+        f"{what}, so that each run takes a minute to compile them; set NUMBA_CACHE_DIR to a folder that can be written",
+        RsUndistortWarning,
+        stacklevel=2,
+    )
+
+
+def kernel(
+    fastmath: Any = frozenset({"contract"}), forceinline: bool = False, parallel: bool = False
+) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator of a function that is compiled when it is first called with arrays of a kind."""
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        dispatcher = numba.njit(
+            nogil=True, error_model="numpy", fastmath=set(fastmath), forceinline=forceinline, parallel=parallel
+        )(function)
+        try:
+            dispatcher._cache = _Kept(function)
+        except RuntimeError:  # nowhere to keep it
+            _tell("compiled kernels cannot be kept (no folder for them can be written)")
+        return dispatcher
+
+    return compiled
+
+
 parallel_kernel = partial(kernel, parallel=True)
 prange = numba.prange
 
