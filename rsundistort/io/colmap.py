@@ -16,6 +16,7 @@ from ..errors import FileError, FormatError, InputError
 from ..model import Camera, Reconstruction
 from ..model.checks import check_photo_name
 from ..model.projection import at_depth, project_points, unproject_points
+from .colmap_files import check_colmap_cameras, check_colmap_files
 
 __all__ = [
     "ModelIds",
@@ -170,22 +171,24 @@ def _read_model(path: Path) -> Any:
     rest = [f"images{suffix}", f"points3D{suffix}"]
     try:
         if path.name == f"cameras{suffix}" and all(path.with_name(name).is_file() for name in rest):
+            check_colmap_files(path.parent)
             read(path.parent)
         else:  # pycolmap reads whole models only
             with TemporaryDirectory() as alone:
                 shutil.copyfile(path, Path(alone, f"cameras{suffix}"))
                 for name in rest:
                     Path(alone, name).write_bytes(bytes(8) if suffix == ".bin" else b"")
+                if suffix == ".bin":
+                    check_colmap_cameras(path)
                 read(alone)
+    except (FileError, FormatError):
+        raise
     except OSError as error:
         raise FileError(f"{path} cannot be read: {error.strerror}") from error
     except Exception as error:  # pycolmap raises what its C++ raised
         raise FormatError(f"{path} is no whole COLMAP camera file: {' '.join(str(error).split())}") from error
     if not model.cameras:
         raise FormatError(f"{path} holds no camera")
-    # pycolmap takes what was cut off for zeros; a file is the count, then id, model, size and parameters of each camera
-    if suffix == ".bin" and path.stat().st_size < 8 + sum(24 + 8 * len(c.params) for c in model.cameras.values()):
-        raise FormatError(f"{path} is cut short; copy it again")
     return model
 
 
@@ -206,6 +209,7 @@ def read_colmap_poses(folder: Path, any_lens: bool = False) -> tuple[Any, ...]:
     """
     import pycolmap
 
+    check_colmap_files(folder)
     try:
         model = pycolmap.Reconstruction(folder)
     except Exception as error:  # pycolmap raises what its C++ raised

@@ -15,6 +15,7 @@ from ..errors import FileError, FormatError, InputError
 from ..model import Observations, Reconstruction
 from ..model.checks import check_photo_name
 from .colmap import ModelIds, camera_from_colmap
+from .colmap_files import check_colmap_files
 
 __all__ = ["ColmapModel", "checked_name", "colmap_model_of", "read_colmap_model", "surviving_points"]
 
@@ -139,6 +140,7 @@ def read_colmap_model(folder: Path) -> ColmapModel:
         raise FileError(f"{folder} is no folder; give the folder with cameras, images and points3D of a COLMAP model")
     if not any(all((folder / f"{part}.{kind}").is_file() for part in _PARTS) for kind in ("bin", "txt")):
         raise FileError(f"{folder} is no COLMAP model; give the folder with its cameras, images and points3D")
+    check_colmap_files(folder)
     try:
         model = pycolmap.Reconstruction(folder)
     except Exception as error:  # pycolmap raises what its C++ raised
