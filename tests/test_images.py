@@ -388,6 +388,34 @@ def test_a_decompression_bomb_is_refused_unopened(tmp_path, suffix, monkeypatch)
     assert "--max-pixels" in str(error.value)
 
 
+@pytest.mark.parametrize("stray", [b"\0\1", b"\xff", b"\xff\xd0", b"\xff\0", b"\x5a" * 70_000])
+def test_a_bomb_behind_stray_bytes_is_found_as_the_decoder_finds_it(tmp_path, stray, monkeypatch):
+    data = claimed(".jpg", 16000, 16000)
+    end = 4 + int.from_bytes(data[4:6], "big")  # of the first segment
+    (tmp_path / "a.jpg").write_bytes(data[:end] + stray + data[end:])
+    monkeypatch.setattr(cv2, "imdecode", None)
+    with pytest.raises(FileError, match="16000x16000"):
+        read_photo(tmp_path / "a.jpg")
+
+
+def test_a_photo_with_stray_bytes_is_read_as_ever(tmp_path):
+    write_image(tmp_path / "a.jpg", texture(64, 48))
+    data = (tmp_path / "a.jpg").read_bytes()
+    end = 4 + int.from_bytes(data[4:6], "big")
+    (tmp_path / "b.jpg").write_bytes(data[:end] + b"\0\1" + data[end:])
+    np.testing.assert_array_equal(read_photo(tmp_path / "b.jpg").pixels, read_photo(tmp_path / "a.jpg").pixels)
+
+
+def test_a_header_that_does_not_say_how_large_is_refused_unopened(tmp_path, monkeypatch):
+    monkeypatch.setattr(cv2, "imdecode", None)
+    write_image(tmp_path / "a.png", texture(64, 48))
+    data = bytearray((tmp_path / "a.png").read_bytes())
+    data[8:12] = struct.pack(">I", 0xFFFFFFF0)  # a chunk of four gigabytes
+    (tmp_path / "a.png").write_bytes(data)
+    with pytest.raises(FileError, match="does not say how large"):
+        read_photo(tmp_path / "a.png")
+
+
 @pytest.mark.parametrize("quality", [80, 101])
 @pytest.mark.parametrize("alpha", [False, True])
 def test_sizes_in_webp_headers(tmp_path, quality, alpha):

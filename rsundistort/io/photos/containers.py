@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Callable, Iterator
 
 from .exif import MAKER_NOTE, Damaged, exif_of_tiff
-from .kinds import picture_size
+from .kinds import jpeg_segments, picture_size
 from .metadata import Metadata
 
 __all__ = ["Parts", "metadata_of", "with_metadata"]
@@ -51,14 +51,8 @@ def _bare(exif: bytes) -> bytes:
 
 def _segments(data: bytes) -> Iterator[tuple[int, bytes]]:
     """Marker and content of the segments before the pixels."""
-    at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
-        if data[at + 1] == 0xFF:  # padding
-            at += 1
-            continue
-        length = int.from_bytes(data[at + 2 : at + 4], "big")
-        yield data[at + 1], data[at + 4 : at + 2 + length]
-        at += 2 + length
+    for marker, begin, end in jpeg_segments(data):
+        yield marker, data[begin:end]
 
 
 def _of_jpeg(data: bytes) -> Metadata:

@@ -175,6 +175,8 @@ def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> Photo:
     size = picture_size(data, kind)
     if size is not None:
         check_size(*size)
+    elif kind in ("JPEG", "PNG", "WebP"):
+        raise FileError(f"{path.name} cannot be decoded: its header does not say how large it is; copy it again")
     if kind == "RAW":
         pixels, metadata = read_raw(data, path.name, check_size)
     elif kind == "HEIC":

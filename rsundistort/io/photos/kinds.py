@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from .boxes import primary_properties
@@ -12,6 +13,7 @@ __all__ = [
     "PHOTO_SUFFIXES",
     "RAW_SUFFIXES",
     "is_whole",
+    "jpeg_segments",
     "kind_of_content",
     "kind_of_name",
     "picture_size",
@@ -25,6 +27,8 @@ _KINDS = {".jpg": "JPEG", ".jpeg": "JPEG", ".png": "PNG", ".tif": "TIFF", ".tiff
 _HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 
 _COLOUR_FILTER = 32803
+# Markers of a JPEG that nothing follows: a stuffed byte, TEM, RST0 to RST7, SOI, EOI.
+_ALONE = frozenset((0x00, 0x01, *range(0xD0, 0xDA)))
 _DNG_VERSION, _SUB_IFDS, _PHOTOMETRIC = 0xC612, 0x014A, 0x0106
 
 
@@ -73,10 +77,28 @@ def is_whole(data: bytes) -> bool:
         return data.rfind(b"IEND") > 0
     if data[:2] != b"\xff\xd8":
         return True
+    before = max((end for _, _, end in jpeg_segments(data)), default=2)
+    return data.rfind(b"\xff\xd9", before) > 0  # from behind, where it mostly is
+
+
+def jpeg_segments(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Marker, begin and end of the content of the segments before the pixels.
+
+    What stands between them is passed over, as libjpeg does: it decodes such files, so nothing may hide there.
+    """
     at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:  # segments before the pixels
-        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    return data.rfind(b"\xff\xd9", at) > 0  # from behind, where it mostly is
+    while (at := data.find(b"\xff", at)) >= 0 and at + 4 <= len(data):
+        marker = data[at + 1]
+        if marker == 0xDA:
+            return
+        if marker == 0xFF:  # padding
+            at += 1
+        elif marker in _ALONE:
+            at += 2
+        else:
+            end = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+            yield marker, at + 4, end
+            at = max(end, at + 4)
 
 
 def picture_size(data: bytes, kind: str) -> tuple[int, int] | None:
@@ -86,20 +108,14 @@ def picture_size(data: bytes, kind: str) -> tuple[int, int] | None:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    at = 2
-    while at + 9 <= len(data) and data[at] == 0xFF:
-        marker = data[at + 1]
-        if marker == 0xFF:  # padding
-            at += 1
-        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame
-            return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
-        else:
-            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    for marker, at, _ in jpeg_segments(data):
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC) and at + 5 <= len(data):  # start of frame
+            return int.from_bytes(data[at + 3 : at + 5], "big"), int.from_bytes(data[at + 1 : at + 3], "big")
     return None
 
 
 def _png_size(data: bytes) -> tuple[int, int] | None:
-    if len(data) < 24:
+    if len(data) < 24 or data[8:16] != b"\0\0\0\rIHDR":
         return None
     return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
 
