@@ -295,15 +295,17 @@ def solve_tracks(
         )  # fmt: skip
         options = replace(options, varying=choice.varying, bends=choice.bends, residual_field=choice.residual_field)
         start = replace(tracks, shutter_model=choice.shutter_model)
-        result = bundle_adjust(start, choice.shutter_model, options, partial(_tell, log, "choice"))
+        # the windows were aligned, and their outliers told, as a model saw them that is given up
+        again = feedback is not None and feedback.workers is not None
+        again = again and (choice.shutter_model == "constant-motion" or choice.bends > 0)
+        how = _rough(options) if again else options
+        result = bundle_adjust(start, choice.shutter_model, how, partial(_tell, log, "choice"))
         log.end(
             "choice of the model", chosen=choice.shutter_model, varying_lens=choice.varying, bends=choice.bends,
             residual_field=choice.residual_field, shutter=choice.shutter, agreement=choice.agreement, gain=choice.gain,
             num_held_out=choice.num_held_out,
         )  # fmt: skip
-        aligns = feedback is not None and feedback.workers is not None
-        if feedback is not None and aligns and (choice.shutter_model == "constant-motion" or choice.bends):
-            # the windows were aligned, and their outliers told, as a model saw them that is given up
+        if feedback is not None and again:
             result, tracks, options = _fed_back(feedback, result, options, log, ["alignment again"])
     mended, advice = None, []
     if result.reconstruction.shutter_model != "global":
@@ -349,6 +351,11 @@ def _lens_only(verdict: Verdict) -> str:
     )
 
 
+def _rough(options: BundleOptions) -> BundleOptions:
+    """Options of an adjustment that another one follows."""
+    return replace(options, cost_tolerance=1e-5, spread_rounds=3, spread_tolerance=0.05)
+
+
 def _fed_back(
     feedback: Feedback, result: BundleResult, options: BundleOptions, log: StageLog, stages: Sequence[str] = (),
     ends: bool = True,
@@ -380,9 +387,7 @@ def _fed_back(
         tracks = tracks.without_photos(LEAST_MEASUREMENTS)
         options = _of_joined(options, tracks)
         options = replace(options, phi_sigma_start=result.phi_sigma)
-        # another adjustment follows that one
-        rough = replace(options, cost_tolerance=1e-5, spread_rounds=3, spread_tolerance=0.05)
-        how = options if ends and aligns else rough
+        how = options if ends and aligns else _rough(options)
         result = bundle_adjust(tracks, shutter_model, how, partial(_tell, log, stage))
         after = result.reconstruction
         moved = _moved_px(before, after)
