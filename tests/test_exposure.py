@@ -5,11 +5,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from make_photos import camera_exif, texture
 from test_bundle import make_scene
 
-from rsundistort import InputError
+from rsundistort import InputError, WarpOptions, simulate_warp
 from rsundistort.bundle import BundleOptions, bundle_adjust
-from rsundistort.io.photos.exif_facts import ExifFacts, _facts
+from rsundistort.io import Metadata, write_image
+from rsundistort.io.photos.exif_facts import ExifFacts, _facts, read_exif
 from rsundistort.pipeline import ladder
 from rsundistort.pipeline.cameras import PhotoCameras
 from rsundistort.pipeline.exposure import bounded_by_exposure
@@ -45,11 +47,16 @@ def test_exposures_that_cannot_be_are_missing(stored, found):
     assert _facts({0x829A: stored}).exposure_s == found
 
 
-def loaded(rec, exposure_s, edge_px):
+@pytest.mark.parametrize(("stored", "found"), [(0.0, False), (1.0, True), (16.0, False), (25.0, True), (None, None)])
+def test_a_flash_that_fired_is_told(stored, found):
+    assert _facts({0x9209: stored}).flash is found
+
+
+def loaded(rec, exposure_s, edge_px, flash=None):
     """Photos with an exposure and edges, the same of all, or a list."""
     m = rec.num_images
     exposures = exposure_s if isinstance(exposure_s, list) else [exposure_s] * m
-    facts = [ExifFacts(exposure_s=each) for each in exposures]
+    facts = [ExifFacts(exposure_s=each, flash=flash) for each in exposures]
     cameras = PhotoCameras(rec.cameras, ["camera"], rec.camera_idx, True, (True,), "")
     edges = edge_px if isinstance(edge_px, list) else [edge_px] * m
     return LoadedPhotos(list(rec.image_names), [], facts, {}, cameras, {}, Path(), {}, 100.0, edges)
@@ -68,6 +75,23 @@ def test_long_sharp_exposures_bound_the_motion(rng):
 def test_short_or_unknown_exposures_bound_nothing(exposure_s, edge_px, rng):
     rec = make_scene(rng, "rotation")
     assert bounded_by_exposure(BundleOptions(), rec, loaded(rec, exposure_s, edge_px), {}) == BundleOptions()
+
+
+def test_a_flash_bounds_nothing(rng):
+    rec = make_scene(rng, "rotation", noise_px=0.3)
+    bounded = bounded_by_exposure(BundleOptions(), rec, loaded(rec, 0.1, 3.0, flash=True), {})
+    assert bounded.phi_limits == {}
+    assert bounded.phi_sigma_most is None
+
+
+def test_a_simulated_photo_does_not_say_that_it_was_exposed_for_long(tmp_path):
+    (tmp_path / "photos").mkdir()
+    write_image(tmp_path / "photos" / "a.jpg", texture(64, 48), Metadata(exif=camera_exif("<")))
+    assert read_exif(tmp_path / "photos" / "a.jpg").exposure_s == pytest.approx(1 / 250)
+    simulate_warp(tmp_path / "photos", tmp_path / "out", WarpOptions(camera="60,60,31.5,23.5"))
+    facts = read_exif(tmp_path / "out" / "photos" / "a.jpg")
+    assert facts.exposure_s is None
+    assert facts.make == read_exif(tmp_path / "photos" / "a.jpg").make
 
 
 def test_each_photo_is_bounded_by_its_own_exposure(rng):

@@ -41,9 +41,10 @@ def bounded_by_exposure(
     place = {name: k for k, name in enumerate(photos.names)}
     limits: dict[str, float] = {}
     for i, name in enumerate(rec.image_names):
-        exposure_s = photos.facts[place[name]].exposure_s
-        edge_px = photos.edges_px[place[name]] if photos.edges_px else None
-        if exposure_s is None or edge_px is None:
+        facts = photos.facts[place[name]]
+        exposure_s, edge_px = facts.exposure_s, photos.edges_px[place[name]] if photos.edges_px else None
+        # a flash lights for a thousandth of a second, however long the shutter is open
+        if exposure_s is None or edge_px is None or facts.flash:
             continue
         readout = readout_s.get(int(rec.camera_idx[i]), _LONGEST_READOUT_S)
         limits[name] = edge_px / float(rec.camera(i).K[0, 0]) * readout / exposure_s

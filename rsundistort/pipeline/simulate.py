@@ -175,7 +175,9 @@ def simulate_warp(
             photo = read_photo(photos / name)
             warped, mask = warp_photo(photo.pixels, whole, motions[name])
             out_name = output_name(name)
-            write_image(scratch / "photos" / out_name, _cut(warped, kept), photo.metadata, options.quality)
+            # a photo that is sharp and was exposed for long tells that its camera did not move
+            told = photo.metadata.without_exposure()
+            write_image(scratch / "photos" / out_name, _cut(warped, kept), told, options.quality)
             write_image(scratch / "masks" / masks[name], _cut(mask, kept))
             if options.crop:
                 # above 100, WebP is stored without loss

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 __all__ = [
     "COLOR_SPACE",
     "EXIF_IFD",
+    "EXPOSURE_TAGS",
     "GPS_IFD",
     "MAKER_NOTE",
     "ORIENTATION",
@@ -310,6 +311,10 @@ def _cut_thumbnail(data: bytearray, structure: TiffStructure, link: int, thumbna
         # some cameras pad the block behind it
         if at and length and at >= others and data[at : at + 2] == b"\xff\xd8" and not any(data[at + length :]):
             del data[at:]
+
+
+#: How long the shutter was open, twice.
+EXPOSURE_TAGS = frozenset((0x829A, 0x9201))
 
 
 def exif_of_tiff(data: bytes, without: frozenset[int] = frozenset()) -> bytes:

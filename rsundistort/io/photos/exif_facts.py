@@ -21,7 +21,7 @@ __all__ = ["ExifFacts", "camera_from_exif", "facts_of_exif", "focal_from_exif", 
 # diagonal of the 36 x 24 mm frame that 35-mm equivalents refer to (CIPA DCG-001)
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
 _MAKE, _MODEL, _FOCAL_LENGTH, _DIGITAL_ZOOM_RATIO = 0x010F, 0x0110, 0x920A, 0xA404
-_EXPOSURE_TIME = 0x829A
+_EXPOSURE_TIME, _FLASH = 0x829A, 0x9209
 _FOCAL_LENGTH_IN35MM_FILM, _BODY_SERIAL_NUMBER, _LENS_MODEL = 0xA405, 0xA431, 0xA434
 _EXIF_IMAGE_WIDTH, _EXIF_IMAGE_HEIGHT = 0xA002, 0xA003
 _FOCAL_PLANE_X_RESOLUTION, _FOCAL_PLANE_RESOLUTION_UNIT = 0xA20E, 0xA210
@@ -56,6 +56,8 @@ class ExifFacts:
         When it was taken, by the camera's clock: seconds since the beginning of 1970 there.
     exposure_s : float or None
         How long the shutter was open, seconds.
+    flash : bool or None
+        Whether a flash fired.
     place_deg : (float, float) or None
         Latitude and longitude by GPS, north and east positive.
     """
@@ -73,6 +75,7 @@ class ExifFacts:
     height: int | None = None
     taken_s: float | None = None
     exposure_s: float | None = None
+    flash: bool | None = None
     place_deg: tuple[float, float] | None = None
 
 
@@ -121,7 +124,7 @@ def _facts(tags: dict[int, bytes | float | None]) -> ExifFacts:
         value = number(tag, low, high)
         return int(value) if value is not None and value == int(value) else None
 
-    focal_mm = number(_FOCAL_LENGTH, 0.5, 3000)
+    focal_mm, flash = number(_FOCAL_LENGTH, 0.5, 3000), whole(_FLASH, 0, 255)
     focal_35mm = number(_FOCAL_LENGTH_IN35MM_FILM, 4, 5000)
     width, height = whole(_EXIF_IMAGE_WIDTH, 1, 10**6), whole(_EXIF_IMAGE_HEIGHT, 1, 10**6)
     sensor = None
@@ -146,6 +149,7 @@ def _facts(tags: dict[int, bytes | float | None]) -> ExifFacts:
         width=width,
         height=height,
         exposure_s=number(_EXPOSURE_TIME, 1e-7, 3600),
+        flash=None if flash is None else bool(flash & 1),
         taken_s=_taken(text(_DATE_TIME_ORIGINAL), text(_SUB_SEC_TIME_ORIGINAL)),
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from .exif import corrected_exif, read_orientation
+from .exif import EXPOSURE_TAGS, Damaged, corrected_exif, exif_of_tiff, read_orientation
 from .xmp import corrected_xmp, marked_xmp, rectified_by
 
 __all__ = ["Metadata"]
@@ -44,6 +44,13 @@ class Metadata:
         exif, _ = corrected_exif(self.exif, orientation=orientation)
         xmp, _ = corrected_xmp(self.xmp, orientation=orientation)
         return replace(self, exif=exif, xmp=xmp)
+
+    def without_exposure(self) -> Metadata:
+        """The same without the time of the exposure: the lines of a simulated photo are exposed for none."""
+        try:
+            return replace(self, exif=exif_of_tiff(self.exif, without=EXPOSURE_TAGS))
+        except Damaged:
+            return self
 
     def marked(self, version: str) -> Metadata:
         """That of the photo after that version of rsundistort rectified it."""
