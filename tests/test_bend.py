@@ -25,7 +25,7 @@ from rsundistort import (
 )
 from rsundistort.bundle import choose_model, reprojection_residuals
 from rsundistort.bundle.problem import BundleProblem, Spreads
-from rsundistort.bundle.remains import agreement_of_waves
+from rsundistort.bundle.remains import agreement_of_waves, half_across_readout
 from rsundistort.model import BEND_GROUPS, Bend
 from rsundistort.model.bend import bend_functions, splines_at
 from rsundistort.model.projection import at_depth, clock_of, project_points_with_jacobians
@@ -303,9 +303,10 @@ def test_the_choice_takes_bends_where_they_are(rng, groups, turn, label):
 def sheared_by_line(truth, rng, same):
     """The scene with lines that moved along themselves as they liked: both halves alike, or each its own way."""
     obs, camera = truth.observations, truth.cameras[0]
-    place, side = (obs.xy_raw[:, 1] + 0.5) / camera.height, obs.xy_raw[:, 0] > camera.K[0, 2]
-    phase = rng.uniform(0, 2 * np.pi, (truth.num_images, 2))[obs.frame_idx, 0 if same else side.astype(int)]
-    shift = 1.0 * np.sin(8 * np.pi * place + phase)
+    place, side = (obs.xy_raw[:, 1] + 0.5) / camera.height, half_across_readout(truth)[obs.point_idx]
+    phase = rng.uniform(0, 2 * np.pi, truth.num_images)[obs.frame_idx]
+    # a quarter of a period apart, which has nothing in common
+    shift = np.sin(8 * np.pi * place + phase + (0.0 if same else np.pi / 2 * side))
     return replace(truth, observations=replace(obs, xy_raw=obs.xy_raw + shift[:, None] * [1.0, 0.0]))
 
 

@@ -416,7 +416,7 @@ def test_recipes_with_mistakes_are_refused_by_name(tmp_path, path, value, messag
 
 
 def test_missing_recipe_is_a_file_error(tmp_path):
-    with pytest.raises(FileError, match="cannot read"):
+    with pytest.raises(FileError, match="cannot be read"):
         load_recipe(tmp_path / "none.json")
 
 
