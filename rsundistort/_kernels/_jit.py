@@ -21,11 +21,6 @@ from ..errors import RsUndistortWarning
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
-# fastmath: products are fused into sums, nothing else; infinities and NaN keep their meaning.
-# error_model: a division by zero gives inf, which the validity flags catch, and loops can vectorise.
-# cache: compiled once per installation, not per run. Numba's cache does not notice a changed callee in another
-# file, so a kernel and all its callees stay in one file.
-# forceinline, for callees in inner loops: else each call counts the references of its arrays, twice the whole time.
 class _Kept(FunctionCache):
     """Compiled kernels in files, where these can be had: what is damaged, or cannot be written, is compiled again."""
 
@@ -44,7 +39,7 @@ class _Kept(FunctionCache):
             _tell(f"compiled kernels cannot be kept ({error.strerror})")
 
 
-@lru_cache(maxsize=1)
+@lru_cache
 def _tell(what: str) -> None:
     warnings.warn(
         f"{what}, so that each run takes a minute to compile them; set NUMBA_CACHE_DIR to a folder that can be written",
@@ -53,6 +48,11 @@ def _tell(what: str) -> None:
     )
 
 
+# fastmath: products are fused into sums, nothing else; infinities and NaN keep their meaning.
+# error_model: a division by zero gives inf, which the validity flags catch, and loops can vectorise.
+# _Kept: compiled once per installation, not per run. Numba's cache does not notice a changed callee in another
+# file, so a kernel and all its callees stay in one file.
+# forceinline, for callees in inner loops: else each call counts the references of its arrays, twice the whole time.
 def kernel(
     fastmath: Any = frozenset({"contract"}), forceinline: bool = False, parallel: bool = False
 ) -> Callable[[Callable[..., Any]], Any]:

@@ -265,12 +265,15 @@ class _Fits:
 
     def along_other_axis(self, fit: _Fit, plain: _Fit) -> _Fit:
         """The model of a fit read along the other axis, from a fit without a shutter; vibrations on the same terms."""
-        label = f"{fit.label}, read along the other axis"
-        start, smooth = read_along_other_axis(plain.reconstruction), min(fit.bends, _SMOOTH_BENDS)
-        other = self.fit(fit.model, fit.varying, [start], label, smooth)
+
+        def read(start: Reconstruction, bends: int) -> _Fit:
+            label = f"{fit.model}{_BENDS[bends]}{_VARYING * fit.varying}, read along the other axis"
+            return self.fit(fit.model, fit.varying, [start], label, bends)
+
+        smooth = min(fit.bends, _SMOOTH_BENDS)
+        other = read(read_along_other_axis(plain.reconstruction), smooth)
         if fit.bends > smooth and self.waves_agree(other):
-            del self.done[label]
-            other = self.fit(fit.model, fit.varying, [other.reconstruction], label, fit.bends)
+            other = read(other.reconstruction, fit.bends)
         return other
 
     def agreement(self, fit: _Fit) -> float:
@@ -359,8 +362,9 @@ class _Rungs:
             if bends <= fit.bends:
                 continue
             # a vibration turns the whole line: what one half of the scene shows of it, the other shows as well
-            fast = self._fits.waves(fit) and self._fits.waves_agree(fit)
-            if not fast and (fit.is_explained or fit.bends >= _SMOOTH_BENDS):
+            if (fit.is_explained or fit.bends >= _SMOOTH_BENDS) and not (
+                self._fits.waves(fit) and self._fits.waves_agree(fit)
+            ):
                 return
             fit = self._fits.fit(fit.model, fit.varying, [fit.reconstruction], bends=bends)
             self.climb(fit)

@@ -144,7 +144,7 @@ def marked_xmp(packet: bytes, version: str) -> bytes:
     rdf = (_prefixes(packet, _RDF) or [b"rdf"])[0]
     about = re.search(rb"\s" + rdf + rb":about\s*=\s*\"([^\"<]*)\"", packet)
     end = packet.rfind(b"</" + rdf + b":RDF")
-    if end >= 0 and _is_well_formed(packet):
+    if end >= 0:
         marked = packet[:end] + _mark(rdf, about[1] if about else b"", version) + packet[end:]
         if _is_well_formed(marked):
             return marked
