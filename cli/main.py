@@ -6,6 +6,8 @@ import importlib
 
 import click
 
+from .terminal import warnings_for_people
+
 # name: one line for the list of commands; the command itself is in the module of that name
 _COMMANDS = {
     "run": "Photos in, rectified photos and camera poses out.",
@@ -40,8 +42,10 @@ class _LazyGroup(click.Group):
 
 @click.command(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="rsundistort")
-def cli() -> None:
+@click.pass_context
+def cli(context: click.Context) -> None:
     """Take the rolling shutter out of photos, and find where they were taken from.
 
     Start with: rsundistort run PHOTOS -o OUT
     """
+    context.with_resource(warnings_for_people())

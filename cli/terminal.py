@@ -54,15 +54,8 @@ def say(text: str, **style: Any) -> None:
 
 
 @contextmanager
-def errors_for_people(kept: str = "nothing was written") -> Iterator[list[str]]:
-    """Known errors become one line and exit code 1; warnings become one line each, and are listed."""
-    import cv2
-
-    from rsundistort.errors import RsUndistortError
-
-    # OpenCV's and libtiff's own lines about broken files: ours say it once, with the name. 0 is silent; the function's
-    # place is OpenCV 4's, or 5's
-    (cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel)(0)
+def warnings_for_people() -> Iterator[list[str]]:
+    """Warnings become one line each, and are listed."""
     said: list[str] = []
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
@@ -72,6 +65,20 @@ def errors_for_people(kept: str = "nothing was written") -> Iterator[list[str]]:
     with warnings.catch_warnings():
         warnings.simplefilter("default")
         warnings.showwarning = show
+        yield said
+
+
+@contextmanager
+def errors_for_people(kept: str = "nothing was written") -> Iterator[list[str]]:
+    """Known errors become one line and exit code 1; warnings become one line each, and are listed."""
+    import cv2
+
+    from rsundistort.errors import RsUndistortError
+
+    # OpenCV's and libtiff's own lines about broken files: ours say it once, with the name. 0 is silent; the function's
+    # place is OpenCV 4's, or 5's
+    (cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel)(0)
+    with warnings_for_people() as said:
         try:
             yield said
         except RsUndistortError as error:

@@ -54,3 +54,13 @@ def test_without_a_folder_it_is_compiled_in_memory_and_told_once(small):
     assert found == 0
     assert said.count("RsUndistortWarning") == 1
     assert "set NUMBA_CACHE_DIR" in said
+
+
+def test_the_command_says_so_in_one_line(tmp_path):
+    nowhere = {"NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator", "NUMBA_CACHE_DIR": os.devnull + "/x"}
+    program = "from rsundistort_cli.main import cli; cli()"
+    command = [sys.executable, "-c", program, "analyze", str(tmp_path / "none")]
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | nowhere)
+    kept, error = done.stderr.strip().splitlines()
+    assert kept.startswith("warning: compiled kernels cannot be kept")
+    assert error.startswith("error: ")
