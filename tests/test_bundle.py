@@ -22,7 +22,6 @@ from rsundistort import (
     bundle_adjust,
     climb,
 )
-from rsundistort._kernels import projection
 from rsundistort.bundle import (
     LADDER,
     GuessedCameras,
@@ -745,13 +744,15 @@ def test_rays_that_miss_each_other_do_not_hold_up_the_rest(rng):
 
 
 def test_kernels_meet_one_kind_of_array(rng):
-    rec = make_scene(rng, "rotation")
-    reprojection_residuals(rec)
-    kinds = len(projection.residuals.signatures)
-    bases = np.asfortranarray(rec.R_cw.transpose(0, 2, 1)).transpose(0, 2, 1)
-    bases.flags.writeable = False
-    reprojection_residuals(replace(rec, R_cw=bases, points_w=np.hstack([rec.points_w] * 2)[:, :3]))
-    assert len(projection.residuals.signatures) == kinds
+    """They are compiled for each kind that they meet: what is read only, and views, as well."""
+    problem, state = noisy_problem(rng, "rotation")
+    step, _ = problem.linearize(state).solve(1e-4)
+    views = np.asfortranarray(state.points_w), np.hstack([state.center_w] * 2)[:, :3]
+    seen = replace(state, points_w=views[0], center_w=views[1])
+    for each in (state, problem.retract(state, step), seen):
+        arrays = [value for value in problem._kernel_args(each) if isinstance(value, np.ndarray)]
+        assert len(arrays) > 10
+        assert all(array.flags.c_contiguous and array.flags.writeable for array in arrays)
 
 
 def test_anchored_components_stay_exactly_zero(rng):

@@ -169,20 +169,20 @@ def _read_model(path: Path) -> Any:
     model = pycolmap.Reconstruction()
     read = model.read_binary if suffix == ".bin" else model.read_text
     rest = [f"images{suffix}", f"points3D{suffix}"]
+    whole = path.name == f"cameras{suffix}" and all(path.with_name(name).is_file() for name in rest)
+    if whole:
+        check_colmap_files(path.parent)
+    elif suffix == ".bin":
+        check_colmap_cameras(path)
     try:
-        if path.name == f"cameras{suffix}" and all(path.with_name(name).is_file() for name in rest):
-            check_colmap_files(path.parent)
+        if whole:
             read(path.parent)
         else:  # pycolmap reads whole models only
             with TemporaryDirectory() as alone:
                 shutil.copyfile(path, Path(alone, f"cameras{suffix}"))
                 for name in rest:
                     Path(alone, name).write_bytes(bytes(8) if suffix == ".bin" else b"")
-                if suffix == ".bin":
-                    check_colmap_cameras(path)
                 read(alone)
-    except (FileError, FormatError):
-        raise
     except OSError as error:
         raise FileError(f"{path} cannot be read: {error.strerror}") from error
     except Exception as error:  # pycolmap raises what its C++ raised

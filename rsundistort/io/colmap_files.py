@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import mmap
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from struct import Struct
 
@@ -10,9 +12,10 @@ from ..errors import FileError, FormatError
 
 __all__ = ["check_colmap_cameras", "check_colmap_files"]
 
-_COUNT, _SHORT = Struct("<Q"), Struct("<I")
-# Numbers of parameters of COLMAP's camera models, by their ids; of a newer one COLMAP itself says what is wrong.
-_PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12}
+# models of large scenes have gigabytes of points
+Bytes = mmap.mmap
+
+_COUNT, _SHORT, _MODEL = Struct("<Q"), Struct("<I"), Struct("<i")
 _POSE = 7 * 8  # a quaternion and a translation
 
 
@@ -20,36 +23,41 @@ class _Cut(Exception):
     """The bytes end before what they claim."""
 
 
-class _Unknown(Exception):
-    """A camera of a model whose parameters nobody here can count."""
-
-
-def _take(data: bytes, at: int, kind: Struct) -> int:
+def _take(data: Bytes, at: int, kind: Struct) -> int:
     if at + kind.size > len(data):
         raise _Cut
     return int(kind.unpack_from(data, at)[0])
 
 
-def _after_camera(data: bytes, at: int) -> int:
+@lru_cache
+def _num_parameters(model: int) -> int:
+    """Of a camera of COLMAP's model of this number; 0 of one that it does not know, and then says so itself."""
+    import pycolmap
+
+    try:
+        camera = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1)
+    except Exception:  # pycolmap raises what its C++ raised
+        return 0
+    return len(camera.params)
+
+
+def _after_camera(data: Bytes, at: int) -> int:
     """Where the entry after this one begins."""
-    model = _take(data, at + 4, _SHORT)
-    if model not in _PARAMETERS:
-        raise _Unknown
-    return at + 24 + 8 * _PARAMETERS[model]
+    return at + 24 + 8 * _num_parameters(_take(data, at + 4, _MODEL))
 
 
-def _after_image(data: bytes, at: int) -> int:
+def _after_image(data: Bytes, at: int) -> int:
     end_of_name = data.find(b"\0", at + 8 + _POSE)
     if end_of_name < 0:
         raise _Cut
     return end_of_name + 9 + 24 * _take(data, end_of_name + 1, _COUNT)
 
 
-def _after_point(data: bytes, at: int) -> int:
+def _after_point(data: Bytes, at: int) -> int:
     return at + 51 + 8 * _take(data, at + 43, _COUNT)
 
 
-def _after_rig(data: bytes, at: int) -> int:
+def _after_rig(data: Bytes, at: int) -> int:
     sensors, at = _take(data, at + 4, _SHORT), at + 8
     for sensor in range(sensors):
         at += 8  # the first has no pose: the others' are by it
@@ -60,11 +68,11 @@ def _after_rig(data: bytes, at: int) -> int:
     return at
 
 
-def _after_frame(data: bytes, at: int) -> int:
+def _after_frame(data: Bytes, at: int) -> int:
     return at + 12 + _POSE + 16 * _take(data, at + 8 + _POSE, _SHORT)
 
 
-_AFTER: dict[str, Callable[[bytes, int], int]] = {
+_AFTER: dict[str, Callable[[Bytes, int], int]] = {
     "cameras.bin": _after_camera,
     "images.bin": _after_image,
     "points3D.bin": _after_point,
@@ -95,20 +103,25 @@ def check_colmap_cameras(path: Path) -> None:
     _check(path, _after_camera)
 
 
-def _check(path: Path, after: Callable[[bytes, int], int]) -> None:
+def _check(path: Path, after: Callable[[Bytes, int], int]) -> None:
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            if not path.stat().st_size:  # which cannot be mapped
+                raise _Cut
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+                _walk(data, after)
     except OSError as error:
         raise FileError(f"{path} cannot be read: {error.strerror}") from error
-    try:
-        count, at = _take(data, 0, _COUNT), _COUNT.size
-        for _ in range(count):
-            if at >= len(data):
-                raise _Cut
-            at = after(data, at)
-        if at > len(data):
-            raise _Cut
-    except _Unknown:
-        return
     except _Cut:
         raise FormatError(f"{path} is cut short: it claims more than it holds; copy it again") from None
+
+
+def _walk(data: Bytes, after: Callable[[Bytes, int], int]) -> None:
+    """From entry to entry, as many as the file counts."""
+    count, at = _take(data, 0, _COUNT), _COUNT.size
+    for _ in range(count):
+        if at >= len(data):
+            raise _Cut
+        at = after(data, at)
+    if at > len(data):
+        raise _Cut
