@@ -209,6 +209,23 @@ def _times(x0, x1, x2, B, p):
     )
 
 
+@kernel(forceinline=True, fastmath=SUMS)
+def _between(u0, u1, u2, w0, w1, w2, J, k, n):
+    """M of two measurements of a track, 2x2: 1 if k = n, less J_p,k V^-1 J_p,n'; u and w are rows of -J_p,k V^-1.
+
+    J_p,n is minus J's columns of the centre: the sign turns, so that products with M are added.
+    """
+    c0, c1, c2 = J[n, 0, 3], J[n, 0, 4], J[n, 0, 5]
+    d0, d1, d2 = J[n, 1, 3], J[n, 1, 4], J[n, 1, 5]
+    own = 1.0 if n == k else 0.0
+    return (
+        u0 * c0 + u1 * c1 + u2 * c2 + own,
+        u0 * d0 + u1 * d1 + u2 * d2,
+        w0 * c0 + w1 * c1 + w2 * c2,
+        w0 * d0 + w1 * d1 + w2 * d2 + own,
+    )
+
+
 @parallel_kernel(fastmath=SUMS)
 def reduced_system(
     unknowns, frame_start, frame_order, frame_idx, track_idx, track_start, point_of, row_start, cols,
@@ -240,14 +257,7 @@ def reduced_system(
                 rhs[f, a] -= J[k, 0, a] * e0 + J[k, 1, a] * e1
             for n in range(track_start[t], track_start[t + 1]):
                 if frame_idx[n] >= f:
-                    # J_p,n is minus these: the sign of M turns, so the update is added
-                    c0, c1, c2 = J[n, 0, 3], J[n, 0, 4], J[n, 0, 5]
-                    d0, d1, d2 = J[n, 1, 3], J[n, 1, 4], J[n, 1, 5]
-                    m00, m01 = u0 * c0 + u1 * c1 + u2 * c2, u0 * d0 + u1 * d1 + u2 * d2
-                    m10, m11 = w0 * c0 + w1 * c1 + w2 * c2, w0 * d0 + w1 * d1 + w2 * d2
-                    if n == k:
-                        m00 += 1.0
-                        m11 += 1.0
+                    m00, m01, m10, m11 = _between(u0, u1, u2, w0, w1, w2, J, k, n)
                     add_product(unknowns, S, slot[frame_idx[n]], J, k, n, m00, m01, m10, m11)
 
 
@@ -289,14 +299,7 @@ def border_rows(
                 r0[:] = 0.0
                 r1[:] = 0.0
                 while n < end and camera_of_frame[frame_idx[n]] == camera:
-                    # J_p,n is minus J's columns of the centre: the sign of M turns
-                    c0, c1, c2 = J[n, 0, 3], J[n, 0, 4], J[n, 0, 5]
-                    d0, d1, d2 = J[n, 1, 3], J[n, 1, 4], J[n, 1, 5]
-                    m00, m01 = u0 * c0 + u1 * c1 + u2 * c2, u0 * d0 + u1 * d1 + u2 * d2
-                    m10, m11 = w0 * c0 + w1 * c1 + w2 * c2, w0 * d0 + w1 * d1 + w2 * d2
-                    if n == k:
-                        m00 += 1.0
-                        m11 += 1.0
+                    m00, m01, m10, m11 = _between(u0, u1, u2, w0, w1, w2, J, k, n)
                     _add_product_to(r0, m00, m01, J_camera[n, 0], J_camera[n, 1])
                     _add_product_to(r1, m10, m11, J_camera[n, 0], J_camera[n, 1])
                     n += 1

@@ -495,10 +495,10 @@ class BundleProblem:
         if len(codes):
             projection.intrinsic_blocks(*self._kernel_args(state), self._rows(state), codes, both)
         J, of_photo = both[:, :, :num], both[:, :, num:]
-        own = state.variation[self._structure.frame_idx]
-        # a photo's principal point moves by focal lengths of its camera, not by its own
-        of_photo[:, :, 1:] *= np.exp(-own[:, 0])[:, None, None]
         if self._options.varying:
+            own = state.variation[self._structure.frame_idx]
+            # a photo's principal point moves by focal lengths of its camera, not by its own
+            of_photo[:, :, 1:] *= np.exp(-own[:, 0])[:, None, None]
             for k, name in enumerate(self._refine):
                 if name in ("cx", "cy"):
                     J[:, :, k] = of_photo[:, :, 1 + (name == "cy")]

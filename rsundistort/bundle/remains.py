@@ -113,12 +113,14 @@ def _curves(
 ) -> NDArray[np.float64]:
     """Coefficients of the columns of A (n, 2, k) behind the first `smooth`, which are free; the rest has a prior."""
     A, rest = A.reshape(-1, A.shape[2]), pixels.ravel()
-    prior = np.diag(np.r_[np.full(smooth, _RIDGE), np.full(A.shape[1] - smooth, _TURNED**-2.0)])
+    prior = np.diag(np.r_[np.zeros(smooth), np.full(A.shape[1] - smooth, _TURNED**-2.0)])
     found = np.zeros(A.shape[1])
     for _ in range(_REWEIGHTED):
         square = (((rest - A @ found).reshape(-1, 2) / noise[:, None]) ** 2).sum(1)
         weight = np.repeat(1.0 / noise**2 / np.sqrt(1.0 + square / CLIP**2), 2)
-        found = np.linalg.solve((A.T * weight) @ A + prior, A.T @ (weight * rest))
+        normal = (A.T * weight) @ A
+        ridge = _RIDGE * float(np.trace(normal[:smooth, :smooth])) / smooth
+        found = np.linalg.solve(normal + prior + ridge * np.eye(len(normal)), A.T @ (weight * rest))
     return np.asarray(found[smooth:])
 
 
