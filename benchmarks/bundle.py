@@ -141,8 +141,9 @@ def ours(folder: Path, model: str, repeat: int) -> dict[str, Any]:
     """Time per iteration of our solver, in this process."""
     from rsundistort import BundleOptions, Camera, Observations, Reconstruction
     from rsundistort.bundle import elimination
-    from rsundistort.bundle.problem import BundleProblem, Spreads
+    from rsundistort.bundle.problem import BundleProblem
     from rsundistort.bundle.solver import minimize
+    from rsundistort.bundle.spreads import Spreads
 
     def problem(rec: Any, **options: Any) -> Any:
         return BundleProblem(rec, model, BundleOptions(loss="squared", **options), 0.5, Spreads(0.03, 0.3))

@@ -24,8 +24,9 @@ from rsundistort import (
     unproject_points,
 )
 from rsundistort.bundle import choose_model, reprojection_residuals
-from rsundistort.bundle.problem import BundleProblem, Spreads
+from rsundistort.bundle.problem import BundleProblem
 from rsundistort.bundle.remains import agreement_of_waves, half_across_readout
+from rsundistort.bundle.spreads import Spreads
 from rsundistort.model import BEND_GROUPS, Bend
 from rsundistort.model.bend import bend_functions, splines_at
 from rsundistort.model.projection import at_depth, clock_of, project_points_with_jacobians

@@ -33,7 +33,8 @@ from rsundistort.bundle import (
 )
 from rsundistort.bundle.choice import hold_out
 from rsundistort.bundle.intrinsics import moved_camera
-from rsundistort.bundle.problem import BundleProblem, Spreads
+from rsundistort.bundle.problem import BundleProblem
+from rsundistort.bundle.spreads import Spreads
 from rsundistort.model import READOUTS
 from rsundistort.model.projection import unproject_points
 from rsundistort.synthetic import project_rows

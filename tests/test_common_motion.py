@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, InputError, bundle_adjust
 from rsundistort.bundle import Posterior
-from rsundistort.bundle.problem import BundleProblem, Spreads
+from rsundistort.bundle.problem import BundleProblem
+from rsundistort.bundle.spreads import Spreads
 from rsundistort.critical import advise, clock_contrast, common_motion, heal, shape_cost, still_probability
 
 MODEL = "constant-motion"

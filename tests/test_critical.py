@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, InputError, Observations, RsUndistortError, bundle_adjust, climb, critical_motion
 from rsundistort.bundle import KnownLength
-from rsundistort.bundle.problem import BundleProblem, Spreads
+from rsundistort.bundle.problem import BundleProblem
+from rsundistort.bundle.spreads import Spreads
 from rsundistort.critical import advise, heal, shape_cost, still_probability, with_remedy
 from rsundistort.io import read_known_lengths, read_known_motions
 

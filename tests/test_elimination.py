@@ -17,9 +17,10 @@ from rsundistort.bundle.coarse import CoarseSpace
 from rsundistort.bundle.conjugate_gradients import solve_iteratively
 from rsundistort.bundle.elimination import Elimination
 from rsundistort.bundle.envelope import Envelope
-from rsundistort.bundle.problem import BundleProblem, Spreads
+from rsundistort.bundle.problem import BundleProblem
 from rsundistort.bundle.reduced import Reduced
 from rsundistort.bundle.solver import minimize
+from rsundistort.bundle.spreads import Spreads
 from rsundistort.bundle.structure import Structure
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -219,11 +220,33 @@ def test_panels_of_the_factor_give_what_one_panel_gives(rng, monkeypatch):
     shape = Envelope.smallest(grid.pattern, grid.free)
     B = shape.gather(rng.normal(size=(2, *grid.free.shape)))
     one, many = B.copy(), B.copy()
-    shape.factor(grid.reduced.S)(one)
+    shape.factor(grid.reduced.S).solve(one)
     monkeypatch.setattr(envelope, "_WORTH_THREADS", 0.0)
     monkeypatch.setattr(envelope, "_PANEL", 20)
-    shape.factor(grid.reduced.S)(many)
+    shape.factor(grid.reduced.S).solve(many)
     np.testing.assert_array_equal(many, one)
+
+
+@pytest.mark.parametrize("parts", [1, 3])
+@pytest.mark.parametrize("order", ["rising", "falling", "drawn"])
+def test_inverse_inside_the_envelope_is_that_of_dense_algebra(rng, monkeypatch, parts, order):
+    grid = Grid(rng, long=7)
+    m = len(grid.free)
+    shape = Envelope.of(
+        grid.pattern,
+        grid.free,
+        {"rising": np.arange(m), "falling": np.arange(m)[::-1], "drawn": rng.permutation(m)}[order],
+    )
+    monkeypatch.setattr(envelope, "_WORTH_THREADS", 0.0)
+    monkeypatch.setattr(envelope, "_PARTS", parts)
+    blocks = shape.factor(grid.reduced.S).inverse_blocks()
+    everything = shape.gather(np.eye(grid.free.size).reshape(-1, *grid.free.shape))
+    shape.factor(grid.reduced.S).solve(everything)
+    expected = shape.scatter(everything).reshape(*grid.free.shape, *grid.free.shape)
+    held = ~(grid.free[:, :, None] & grid.free[:, None])
+    for i in range(m):
+        own = np.where(held[i], 0.0, expected[i, :, i])
+        np.testing.assert_allclose(blocks[i], own, rtol=1e-9, atol=1e-12 * np.abs(own).max())
 
 
 def block(photos, monkeypatch):

@@ -26,7 +26,8 @@ from rsundistort import (
 from rsundistort.bundle import choose_model
 from rsundistort.bundle.intrinsics import GuessedCameras, moved_camera
 from rsundistort.bundle.lens_field import LensFields
-from rsundistort.bundle.problem import BundleProblem, Spreads, reprojection_residuals
+from rsundistort.bundle.problem import BundleProblem, reprojection_residuals
+from rsundistort.bundle.spreads import Spreads
 from rsundistort.io import read_solution, write_solution
 from rsundistort.io.cameras import camera_from_json, camera_to_json
 from rsundistort.model.field import field_basis, field_over_frame, field_slope, lens_pixels, raw_pixels

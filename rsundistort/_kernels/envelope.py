@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from ._jit import SUMS, kernel, parallel_kernel, prange
 
 # Bands that take a column of the factor together: with their own rows they fit in the cache of a processor.
@@ -157,3 +159,85 @@ def solve_envelope(first, offset, data, B):
                 x1[fg + k] -= t1 * d
                 x2[fg + k] -= t2 * d
                 x3[fg + k] -= t3 * d
+
+
+@kernel(fastmath=SUMS)
+def _times_band(data, first, offset, g, h, V, out):
+    """Add to out (4, n) what band h of the inverse makes of V (4, n), in the columns after band g; both triangles."""
+    low, width = 4 * g + 4, 4 * h + 4 - first[h]
+    at = offset[h] + low - first[h]
+    z0, z1, z2, z3 = data[at:], data[at + width :], data[at + 2 * width :], data[at + 3 * width :]
+    n = 4 * h - low
+    for c in range(4):
+        v, o = V[c, low:], out[c, low:]
+        v0, v1, v2, v3 = v[n], v[n + 1], v[n + 2], v[n + 3]
+        s0 = s1 = s2 = s3 = 0.0
+        for k in range(n):
+            s0 += z0[k] * v[k]
+            s1 += z1[k] * v[k]
+            s2 += z2[k] * v[k]
+            s3 += z3[k] * v[k]
+        for k in range(n):
+            o[k] += z0[k] * v0 + z1[k] * v1 + z2[k] * v2 + z3[k] * v3
+        o[n] += s0 + z0[n] * v0 + z1[n] * v1 + z2[n] * v2 + z3[n] * v3
+        o[n + 1] += s1 + z1[n] * v0 + z1[n + 1] * v1 + z2[n + 1] * v2 + z3[n + 1] * v3
+        o[n + 2] += s2 + z2[n] * v0 + z2[n + 1] * v1 + z2[n + 2] * v2 + z3[n + 2] * v3
+        o[n + 3] += s3 + z3[n] * v0 + z3[n + 1] * v1 + z3[n + 2] * v2 + z3[n + 3] * v3
+
+
+@parallel_kernel()
+def invert_envelope(first, offset, parts, data):
+    """A factor becomes, in place, the inverse of its matrix, inside the envelope only.
+
+    From the last band to the first (Takahashi, Fagan and Chin, "Formation of a sparse bus impedance matrix", 1973):
+    with D the diagonal block of a band of L and W what is below it, V = W D^-1, the inverse is -Z V below and
+    D^-T D^-1 + V' Z V on the diagonal, Z being the inverse of the bands after it. `parts` of these are summed side by
+    side; their number decides the rounding, not that of the threads.
+    """
+    bands = len(first)
+    V, D_inv = np.zeros((4, 4 * bands)), np.zeros((4, 4))
+    out = np.zeros((parts, 4, 4 * bands))
+    for g in range(bands - 1, -1, -1):
+        width = 4 * g + 4 - first[g]
+        dia = offset[g] + 4 * g - first[g]
+        for j in range(4):
+            for i in range(j, 4):
+                v = 1.0 if i == j else 0.0
+                for k in range(j, i):
+                    v -= data[dia + i * width + k] * D_inv[k, j]
+                D_inv[i, j] = v / data[dia + i * width + i]
+        last = g
+        for h in range(g + 1, bands):
+            if first[h] <= 4 * g:
+                last = h
+        stop = 4 * last + 4
+        for h in range(g + 1, last + 1):
+            for r in range(4):
+                at = offset[h] + r * (4 * h + 4 - first[h]) + 4 * g - first[h]
+                for c in range(4):
+                    v = 0.0
+                    if first[h] <= 4 * g:
+                        for k in range(c, 4):
+                            v += data[at + k] * D_inv[k, c]
+                    V[c, 4 * h + r] = v
+        for part in prange(parts):
+            out[part, :, 4 * g + 4 : stop] = 0.0
+            for h in range(g + 1 + part, last + 1, parts):
+                if first[h] <= 4 * g:
+                    _times_band(data, first, offset, g, h, V, out[part])
+        for part in range(1, parts):
+            out[0, :, 4 * g + 4 : stop] += out[part, :, 4 * g + 4 : stop]
+        for h in range(g + 1, last + 1):
+            if first[h] <= 4 * g:
+                for r in range(4):
+                    at = offset[h] + r * (4 * h + 4 - first[h]) + 4 * g - first[h]
+                    for c in range(4):
+                        data[at + c] = -out[0, c, 4 * h + r]
+        for i in range(4):
+            for j in range(i + 1):
+                v = 0.0
+                for k in range(i, 4):
+                    v += D_inv[k, i] * D_inv[k, j]
+                for k in range(4 * g + 4, stop):
+                    v += V[i, k] * out[0, j, k]
+                data[dia + i * width + j] = v

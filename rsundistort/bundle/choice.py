@@ -13,8 +13,9 @@ from ..errors import InputError
 from ..model import READOUTS, SHUTTER_MODELS, Observations, Reconstruction
 from .adjust import LADDER, bundle_adjust, objective
 from .options import BundleOptions
-from .problem import Spreads, reprojection_residuals
+from .problem import reprojection_residuals
 from .remains import CLIP, WAVES, agreement_of_waves, errors_without, half_across_readout, warps, waves
+from .spreads import Spreads
 
 __all__ = ["ModelChoice", "choose_model", "clipped_errors", "corners", "hold_out", "improves", "standard_errors"]
 

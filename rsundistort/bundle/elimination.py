@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +10,11 @@ from numpy.typing import NDArray
 from .coarse import CoarseSpace
 from .conjugate_gradients import solve_iteratively
 from .envelope import Envelope
-from .reduced import Factored, Reduced, factor, products
+from .reduced import Factored, Reduced, factor
 from .structure import Structure
 
-__all__ = ["Elimination", "Marginals"]
+__all__ = ["Elimination"]
 
-# Right-hand sides of the inverse that are held at once: 192 in a system of 10,000 photos are 180 MB.
-_COLUMNS = 192
 # Iterations that conjugate gradients are expected to take (measured: 5 to 30 a step on blocks of 50 to 2500 photos).
 _EXPECTED_CG = 20
 _MAX_CG = 500
@@ -28,24 +25,6 @@ _WAIT = 6.0
 _CLUSTER = 32
 
 Array = NDArray[np.float64]
-
-
-class Marginals(NamedTuple):
-    """Covariances of unknowns, all others being free; 0 where held.
-
-    Attributes
-    ----------
-    photos, cameras : (m, nb, nb), (k, k) array
-        Of each photo's unknowns, and of the cameras'.
-    photos_of_priors, cameras_of_priors : (m, nb, nb), (k, k) array
-        The shares of these that are the priors' doing, H^-1 P H^-1: how far the priors' means are from the truth. The
-        rest is noise.
-    """
-
-    photos: Array
-    cameras: Array
-    photos_of_priors: Array
-    cameras_of_priors: Array
 
 
 @dataclass(frozen=True)
@@ -127,42 +106,11 @@ class Elimination:
         """The system factored; None if it is not positive."""
         return factor(reduced, self.envelope)
 
-    def marginals(self, factored: Factored | None, prior: Array, camera_prior: Array) -> Marginals:
-        """Covariances where the priors have diagonal Hessians (m, nb) and (k,): `factored` is the inverse.
+    def covariances(self, factored: Factored | None) -> tuple[Array, Array]:
+        """Of the unknowns of each photo (m, nb, nb) and of all cameras (k, k): `factored` is the inverse.
 
-        The diagonal blocks of the inverse, a few columns at a time: never the whole inverse. NaN without one.
+        Its diagonal blocks alone, never the whole inverse. NaN without one, 0 where held.
         """
-        m, nb = self.free.shape
-        k = len(camera_prior)
         if factored is None:
-            unknown = np.where(self.free[:, :, None] & self.free[:, None, :], np.nan, 0.0)
-            return Marginals(unknown, np.full((k, k), np.nan), unknown, np.full((k, k), np.nan))
-        frames, of_cameras = factored.frames, factored.cameras
-        shares = of_cameras.T @ factored.weights
-        cameras = shares @ of_cameras
-        with_photos = np.tensordot(shares, frames, 1)
-        cameras_of_priors = products(with_photos * prior, with_photos) + (cameras * camera_prior) @ cameras
-        photos, of_priors = np.zeros((2, m, nb, nb))
-        place, padded = self.envelope.place, self.envelope.gather(frames)
-        weight = self.envelope.gather(prior[None])[0]
-        step = max(_COLUMNS // nb, 1)
-        for begin in range(0, m, step):
-            chunk = np.arange(begin, min(begin + step, m))
-            solved = self.free[chunk]
-            rows = np.zeros((int(solved.sum()), 4 * len(self.envelope.first)))
-            rows[np.arange(len(rows)), place[chunk][solved]] = 1.0
-            factored.solve_rows(rows)
-            # what the cameras leave open moves the photos with them
-            shares = frames[:, chunk][:, solved].T @ factored.weights
-            rows += shares @ padded
-            with_cameras = shares @ of_cameras
-            done = 0
-            for i in chunk:
-                free = np.flatnonzero(self.free[i])
-                mine = slice(done, done + len(free))
-                block, own = rows[mine][:, place[i, free]], np.ix_(free, free)
-                photos[i][own] = (block + block.T) / 2
-                of_priors[i][own] = (rows[mine] * weight) @ rows[mine].T
-                of_priors[i][own] += (with_cameras[mine] * camera_prior) @ with_cameras[mine].T
-                done += len(free)
-        return Marginals(photos, (cameras + cameras.T) / 2, of_priors, cameras_of_priors)
+            return np.where(self.free[:, :, None] & self.free[:, None, :], np.nan, 0.0), np.array(np.nan)
+        return factored.diagonal_blocks()

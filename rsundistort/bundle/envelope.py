@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,12 +11,14 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from .._kernels import envelope as kernels
 from .structure import BlockPattern
 
-__all__ = ["Envelope"]
+__all__ = ["CholeskyFactor", "Envelope"]
 
 # Bands (of four unknowns) of the envelope that threads share: wide enough to be worth meeting for.
 _PANEL = 48
 # Below these multiply-adds (30 ms of one thread) the factor is one panel: on a busy machine meetings cost more.
 _WORTH_THREADS = 3e8
+# Parts of the inverse's sums that threads share: a number of its own, since it decides the rounding.
+_PARTS = 8
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -78,11 +79,8 @@ class Envelope:
         adds = float((2.0 * width.astype(float) ** 2).sum())
         return cls(pattern, place, size, first, offset[:-1], int(offset[-1]), adds)
 
-    def factor(self, S: Array) -> Callable[[Array], None] | None:
-        """Solver, in place, of right-hand sides (k, padded rows) for a matrix of blocks (blocks, nb, nb).
-
-        None if the matrix is not positive.
-        """
+    def factor(self, S: Array) -> CholeskyFactor | None:
+        """Factor of a matrix of blocks (blocks, nb, nb); None if it is not positive."""
         scale = np.ones(4 * len(self.first))
         diagonal = np.diagonal(S[self.pattern.diagonal], axis1=1, axis2=2)
         free = self.place >= 0
@@ -96,12 +94,7 @@ class Envelope:
         if not kernels.factor_envelope(self.first, self.offset, panel, data):
             return None
 
-        def solve(B: Array) -> None:
-            B *= scale
-            kernels.solve_envelope(self.first, self.offset, data, B)
-            B *= scale
-
-        return solve
+        return CholeskyFactor(self, data, scale)
 
     def gather(self, x: Array) -> Array:
         """Values of the block rows (k, m, nb) as right-hand sides (k, padded rows)."""
@@ -113,3 +106,42 @@ class Envelope:
     def scatter(self, B: Array) -> Array:
         """Right-hand sides (k, padded rows) as values of the block rows (k, m, nb); 0 where held."""
         return np.where(self.place >= 0, B[:, self.place], 0.0)
+
+
+@dataclass(frozen=True)
+class CholeskyFactor:
+    """Factor of a symmetric matrix inside its envelope.
+
+    Attributes
+    ----------
+    envelope : Envelope
+        Where it has entries.
+    data : (num_values,) array
+        These.
+    scale : (padded rows,) array
+        What rows and columns of the matrix were multiplied by.
+    """
+
+    envelope: Envelope
+    data: Array
+    scale: Array
+
+    def solve(self, B: Array) -> None:
+        """Right-hand sides (k, padded rows) become solutions."""
+        B *= self.scale
+        kernels.solve_envelope(self.envelope.first, self.envelope.offset, self.data, B)
+        B *= self.scale
+
+    def inverse_blocks(self) -> Array:
+        """Diagonal blocks (m, nb, nb) of the inverse; 0 where held."""
+        envelope = self.envelope
+        first, offset, place = envelope.first, envelope.offset, envelope.place
+        inverse = self.data.copy()
+        parts = _PARTS if envelope.multiply_adds > _WORTH_THREADS else 1
+        kernels.invert_envelope(first, offset, parts, inverse)
+        row, column = np.maximum(place[:, :, None], place[:, None]), np.minimum(place[:, :, None], place[:, None])
+        band = row // 4
+        at = offset[band] + (row - 4 * band) * (4 * band + 4 - first[band]) + column - first[band]
+        free = column >= 0
+        found = inverse[np.where(free, at, 0)] * self.scale[row] * self.scale[column]
+        return np.where(free, found, 0.0)

@@ -28,8 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .elimination import Marginals
-from .normal_equations import Function, NormalEquations
+from .normal_equations import Function, Marginals, NormalEquations
 
 __all__ = ["Inflation", "Partition", "by_corner", "by_place", "inflated", "inflation", "inflation_of"]
 

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from .jackknife import inflation_of
 from .options import BundleOptions, BundleResult
-from .problem import BundleProblem, Spreads
+from .problem import BundleProblem
+from .spreads import Spreads
 
 __all__ = ["Posterior", "gauge_directions"]
 
@@ -69,7 +70,7 @@ class Posterior:
 
         One Gauss-Newton step from the result, which matters where the options free what was held in it.
         """
-        covariances = self._equations.marginal_covariances()[0]
+        covariances = self._equations.marginal_covariances(of_priors=False).photos
         solved = self._equations.solve(0.0)
         step = np.full(covariances.shape[:2], np.nan) if solved is None else solved[0][0]
         last = covariances.shape[1] - self._own

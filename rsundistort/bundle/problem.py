@@ -17,17 +17,18 @@ from ..errors import InputError
 from ..model import READOUTS, Camera, Reconstruction, check_shutter_model
 from ..model.bend import bend_table
 from ..model.field import lens_pixels
-from .elimination import Elimination, Marginals
+from .elimination import Elimination
 from .intrinsics import INTRINSICS, check_lenses, deviation, moved_camera, prior_weight
 from .jackknife import Partition, by_corner, by_place
 from .layout import Layout
 from .lengths import LengthResiduals
 from .lens_field import LensFields
-from .normal_equations import Border, NormalEquations, Step
+from .normal_equations import Border, Marginals, NormalEquations, Step
 from .options import LOSSES, BundleOptions
+from .spreads import Spreads
 from .structure import Structure, by_first_photo
 
-__all__ = ["BundleProblem", "Spreads", "State", "reprojection_residuals"]
+__all__ = ["BundleProblem", "State", "reprojection_residuals"]
 
 
 @dataclass(frozen=True)
@@ -111,35 +112,6 @@ def reprojection_residuals(
     )  # fmt: skip
     projection.residuals(model, *arrays, res, valid)
     return res, valid
-
-
-@dataclass(frozen=True)
-class Spreads:
-    """Standard deviations of the zero-mean priors on what each photo has of its own.
-
-    Attributes
-    ----------
-    phi : float
-        Radians per frame.
-    velocity : float
-        World units per frame.
-    focal : float
-        Of the variation of log f.
-    centre : float
-        Of the variation of the principal point, focal lengths.
-    bends, ways : tuple of float
-        Of the groups of bends: of the rotation, radians, and of the position, world units.
-    field : float
-        Of the unknowns of the cameras' residual fields, pixels.
-    """
-
-    phi: float
-    velocity: float
-    focal: float = 1.0
-    centre: float = 1.0
-    bends: tuple[float, ...] = ()
-    ways: tuple[float, ...] = ()
-    field: float = 1.0
 
 
 # Observations that a thread takes at a time, and whose costs are summed together.

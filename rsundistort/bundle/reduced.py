@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .envelope import Envelope
+from .envelope import CholeskyFactor, Envelope
 
 __all__ = ["Factored", "Reduced", "factor", "products"]
 
@@ -63,18 +62,15 @@ class Factored:
 
     Attributes
     ----------
-    envelope : Envelope
-        Where the factor of the photos' part has entries.
-    solve_rows : callable
-        Solves the photos' part for right-hand sides (n, padded rows) in place.
+    photos : CholeskyFactor
+        Of the photos' part.
     frames, cameras : (r, m, nb), (r, k) array
         The changes. Of each of the cameras' unknowns: -S^-1 B' of the photos, and 1 of itself.
     weights : (r, r) array
         Their covariance.
     """
 
-    envelope: Envelope
-    solve_rows: Callable[[Array], None]
+    photos: CholeskyFactor
     frames: Array
     cameras: Array
     weights: Array
@@ -87,9 +83,16 @@ class Factored:
     def times(self, b: Array, c: Array) -> tuple[Array, Array]:
         """The inverse times stacks of photos' values (n, m, nb) and of cameras' (n, k)."""
         shares = (products(b, self.frames) + c @ self.cameras.T) @ self.weights
-        rows = self.envelope.gather(b)
-        self.solve_rows(rows)
-        return self.envelope.scatter(rows) + np.tensordot(shares, self.frames, 1), shares @ self.cameras
+        envelope = self.photos.envelope
+        rows = envelope.gather(b)
+        self.photos.solve(rows)
+        return envelope.scatter(rows) + np.tensordot(shares, self.frames, 1), shares @ self.cameras
+
+    def diagonal_blocks(self) -> tuple[Array, Array]:
+        """Of the inverse: those of each photo (m, nb, nb), 0 where held, and that of all cameras (k, k)."""
+        shared = np.einsum("rma,rs->sma", self.frames, self.weights)
+        cameras = self.cameras.T @ self.weights @ self.cameras
+        return self.photos.inverse_blocks() + np.einsum("sma,smb->mab", shared, self.frames), (cameras + cameras.T) / 2
 
     def joined(self, frames: Array, cameras: Array, weights: Array) -> Factored:
         """The inverse with more changes added."""
@@ -106,11 +109,11 @@ class Factored:
 
 def factor(reduced: Reduced, envelope: Envelope) -> Factored | None:
     """The system factored; None if it is not positive."""
-    solve = envelope.factor(reduced.S)
-    if solve is None:
+    photos = envelope.factor(reduced.S)
+    if photos is None:
         return None
     rows = envelope.gather(reduced.border)
-    solve(rows)
+    photos.solve(rows)
     X = envelope.scatter(rows)
     cameras = _positive_inverse(reduced.corner - products(reduced.border, X))
-    return None if cameras is None else Factored(envelope, solve, -X, np.eye(len(X)), cameras)
+    return None if cameras is None else Factored(photos, -X, np.eye(len(X)), cameras)

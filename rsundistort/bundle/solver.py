@@ -45,12 +45,13 @@ class Problem(Protocol):
 
 @dataclass(frozen=True)
 class MinimizeResult:
-    """Last state, why the loop stopped, and the costs of the accepted states."""
+    """Last state, why the loop stopped, the costs of the accepted states, and the damping of the next step."""
 
     state: Any
     stop_reason: str
     cost_history: NDArray[np.float64]
     num_iterations: int
+    damping: float
 
 
 def minimize(
@@ -111,4 +112,4 @@ def minimize(
             if damping > max_damping:
                 reason = "damping"
                 break
-    return MinimizeResult(state, reason, np.array(history), iteration)
+    return MinimizeResult(state, reason, np.array(history), iteration, damping)

@@ -1,0 +1,172 @@
+"""Spreads of the priors on what each photo has of its own, as the photos themselves show them."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model import Reconstruction
+from .layout import Layout
+from .options import BundleOptions
+
+__all__ = ["Spreads", "estimated", "estimates_spreads", "field_spread", "settled", "starting_spreads"]
+
+# Radians per frame: a hundredth of a pixel at any focal length in use. Keeps the prior's weight finite.
+_MIN_SPREAD = 1e-6
+# Spreads below this (radians, focal lengths) need not settle: a tenth of a pixel.
+_SETTLED_AT = 2e-5
+# The same of the fields, which are in pixels.
+_MIN_SPREAD_PX, _SETTLED_PX = 1e-4, 1e-3
+# A lens that its model says so badly needs another model.
+_MOST_PX = 1.0
+
+# No lens varies more than this from photo to photo (of f, and of the principal point in focal lengths). A strong
+# shutter would be taken for it.
+_MOST_VARIED = 0.02
+# Of a spread, between two solves.
+_LARGEST_CHANGE = 4.0
+
+
+@dataclass(frozen=True)
+class Spreads:
+    """Standard deviations of the zero-mean priors on what each photo has of its own.
+
+    Attributes
+    ----------
+    phi : float
+        Radians per frame.
+    velocity : float
+        World units per frame.
+    focal : float
+        Of the variation of log f.
+    centre : float
+        Of the variation of the principal point, focal lengths.
+    bends, ways : tuple of float
+        Of the groups of bends: of the rotation, radians, and of the position, world units.
+    field : float
+        Of the unknowns of the cameras' residual fields, pixels.
+    """
+
+    phi: float
+    velocity: float
+    focal: float = 1.0
+    centre: float = 1.0
+    bends: tuple[float, ...] = ()
+    ways: tuple[float, ...] = ()
+    field: float = 1.0
+
+
+def _spread(
+    values: NDArray[np.float64], variance: NDArray[np.float64], span: NDArray[np.float64], spread: float
+) -> float:
+    """Spread over photos and axes, per frame, of unknowns (m, 3) per unit of the clock with posterior variances (m, 3).
+
+    `spread` is that of the prior under which they were found. Values beyond three robust spreads count as three: a few
+    photos that moved far more, or that hang on by few measurements, must not loosen the prior of the rest. Held values
+    tell nothing.
+    """
+    free = variance > 0
+    if not free.any():
+        return 0.0
+    scale = np.broadcast_to(span[:, None] ** 2, values.shape)[free]
+    square, unknown = values[free] ** 2 * scale, float((variance[free] * scale).mean())
+    robust = float(np.median(square + variance[free] * scale)) / 0.455  # median of the square of a normal variable
+    seen = float(np.minimum(square, 9.0 * robust).mean())
+    # MacKay's fixed point of sigma^2 = mean(phi^2 + variance): a few rounds where that takes dozens. `told` is the
+    # share of the unknowns that the measurements, not the prior, decide
+    told = max(1.0 - unknown / spread**2, 1e-3)
+    return float(np.clip(np.sqrt(seen / told), spread / _LARGEST_CHANGE, spread * _LARGEST_CHANGE))
+
+
+def estimated(
+    spreads: Spreads, current: Reconstruction, covariances: NDArray[np.float64], options: BundleOptions,
+    layout: Layout, baseline: float,
+) -> Spreads:  # fmt: skip
+    """The spreads of both priors that a solution shows; those that were given stay."""
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
+    if not np.isfinite(variances).all():
+        return spreads
+    span = current.frame_span()
+    motion = variances[:, 6 : layout.motion]
+    limited = [options.phi_limits.get(name, np.inf) < spreads.phi for name in current.image_names]
+    motion = np.where(np.array(limited)[:, None], 0.0, motion)
+    phi, velocity, focal, centre = spreads.phi, spreads.velocity, spreads.focal, spreads.centre
+    if options.phi_sigma is None and motion.shape[1] > 0:
+        phi = _spread(current.phi, motion[:, :3], span, spreads.phi) + _MIN_SPREAD
+    if options.velocity_sigma is None and motion.shape[1] > 3:
+        velocity = _spread(current.velocity, motion[:, 3:], span, spreads.velocity) + _MIN_SPREAD * current.baseline
+    if options.varying:
+        ones, varied = np.ones(len(span)), current.variation
+        of_varied = variances[:, layout.motion : layout.variation]
+        focal = _spread(varied[:, :1], of_varied[:, :1], ones, spreads.focal) + _MIN_SPREAD
+        centre = _spread(varied[:, 1:], of_varied[:, 1:], ones, spreads.centre) + _MIN_SPREAD
+    bends, ways = _bend_spreads(spreads, current, variances[:, layout.variation :], layout)
+    return _bounded(Spreads(phi, velocity, focal, centre, bends, ways, spreads.field), options, baseline)
+
+
+def _bend_spreads(
+    spreads: Spreads, current: Reconstruction, variances: NDArray[np.float64], layout: Layout
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """The spreads of the groups of bends, of rotations and of positions."""
+    ones, found = np.ones(current.num_images), layout.coefficients(current)
+    turns = 3 * len(layout.group)
+
+    def of(group: int, part: slice, spread: float, least: float) -> float:
+        mine = np.flatnonzero(np.repeat(np.array(layout.group[: (part.stop - part.start) // 3]) == group, 3))
+        return _spread(found[:, part][:, mine], variances[:, part][:, mine], ones, spread) + least
+
+    own, ways = slice(0, turns), slice(turns, turns + 3 * layout.ways)
+    return (
+        tuple(of(k, own, spread, _MIN_SPREAD) for k, spread in enumerate(spreads.bends)),
+        tuple(of(k, ways, spread, _MIN_SPREAD * current.baseline) for k, spread in enumerate(spreads.ways)),
+    )
+
+
+def estimates_spreads(shutter_model: str, options: BundleOptions) -> bool:
+    """Whether a spread is to be estimated."""
+    of_turn = shutter_model != "global" and options.phi_sigma is None
+    of_way = shutter_model == "constant-motion" and options.velocity_sigma is None
+    return of_turn or of_way or options.varying or options.bends > 0 or options.residual_field
+
+
+def settled(before: Spreads, after: Spreads, tolerance: float) -> bool:
+    """Whether no spread changed by more than a share; what is as good as nothing may go on falling."""
+    of_bends = (_SETTLED_AT,) * len(before.bends), (0.0,) * len(before.ways)
+    none = Spreads(_SETTLED_AT, 0.0, _SETTLED_AT, _SETTLED_AT, *of_bends, _SETTLED_PX)
+    return all(
+        abs(new - old) <= tolerance * new or max(old, new) < least
+        for old, new, least in zip(*(np.hstack(astuple(each)) for each in (before, after, none)), strict=True)
+    )
+
+
+def starting_spreads(options: BundleOptions, layout: Layout, baseline: float) -> Spreads:
+    """Those that are given, or at which the estimation begins."""
+    start = Spreads(
+        options.phi_sigma or options.phi_sigma_start,
+        (options.velocity_sigma or options.velocity_sigma_start) * baseline,
+        options.focal_sigma_start,
+        options.centre_sigma_start,
+        tuple(np.broadcast_to(options.bend_sigma_start, len(set(layout.group))).tolist()),
+        (options.way_sigma_start * baseline,) * len(set(layout.group[: layout.ways])),
+        options.field_sigma_start,
+    )
+    return _bounded(start, options, baseline)
+
+
+def _bounded(spreads: Spreads, options: BundleOptions, baseline: float) -> Spreads:
+    """The spreads within their upper limits."""
+    phi = np.inf if options.phi_sigma_most is None else options.phi_sigma_most
+    velocity = np.inf if options.velocity_sigma_most is None else options.velocity_sigma_most * baseline
+    return Spreads(
+        min(spreads.phi, phi), min(spreads.velocity, velocity), min(spreads.focal, _MOST_VARIED),
+        min(spreads.centre, _MOST_VARIED), tuple(min(each, phi) for each in spreads.bends), spreads.ways,
+        min(spreads.field, _MOST_PX),
+    )  # fmt: skip
+
+
+def field_spread(values: NDArray[np.float64], variances: NDArray[np.float64], spread: float) -> float:
+    """Spread in pixels of the unknowns (k, n) of residual fields, as `_spread`."""
+    found = _spread(values, variances, np.ones(len(values)), spread)
+    return min(found + _MIN_SPREAD_PX, _MOST_PX)
