@@ -34,7 +34,10 @@ def command(
         from rsundistort.pipeline import evaluate
 
         result = evaluate(out, truth, poses=poses, twins=twins, raw=raw, progress=progress)
-    click.echo(json.dumps(result) if as_json else _text(result))
+    if as_json:
+        click.echo(json.dumps(result))
+    elif not quiet:
+        click.echo(_text(result))
 
 
 def _text(result: dict[str, Any]) -> str:

@@ -20,14 +20,11 @@ _OURS = ("dev", "docs")
 def command(as_json: bool) -> None:
     """Versions, threads and optional parts."""
     with errors_for_people():
-        import cv2
-
         from rsundistort.pipeline import use_threads, versions
 
         found: dict[str, object] = {
             "versions": versions(),
             "threads": use_threads(0),
-            "keeps_metadata": hasattr(cv2, "imdecodeWithMetadata"),
             "extras": _extras(),
         }
     click.echo(json.dumps(found) if as_json else _text(found))
@@ -55,7 +52,6 @@ def _text(found: dict[str, object]) -> str:
     assert isinstance(versions, dict)
     assert isinstance(extras, dict)
     rows = [*versions.items(), ("threads", str(found["threads"]))]
-    rows.append(("EXIF, XMP, ICC of JPEG, PNG, WebP", "kept" if found["keeps_metadata"] else "lost (needs OpenCV 5)"))
     optional = [("optional part", "")]
     for extra, packages in sorted(extras.items()):
         lost = [name for name, number in packages.items() if number is None]

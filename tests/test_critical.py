@@ -11,12 +11,23 @@ from critical_scenes import HIDDEN, named_scene
 from numpy_twin import project
 from scipy.spatial.transform import Rotation
 
-from rsundistort import BundleOptions, InputError, Observations, RsUndistortError, bundle_adjust, climb, critical_motion
+from rsundistort import (
+    BundleOptions,
+    InputError,
+    Observations,
+    RsUndistortError,
+    RsUndistortWarning,
+    bundle_adjust,
+    climb,
+    critical_motion,
+)
 from rsundistort.bundle import KnownLength
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.bundle.spreads import Spreads
 from rsundistort.critical import advise, heal, shape_cost, still_probability, with_remedy
 from rsundistort.io import read_known_lengths, read_known_motions
+from rsundistort.pipeline.ladder import solve_tracks
+from rsundistort.pipeline.progress import StageLog
 
 SIGMA_RAD = 0.05
 NOISE_PX = 0.5
@@ -367,6 +378,19 @@ def test_bad_lengths_are_refused(end, length, sigma, says, rng):
         solve(seen_at(truth, 2), seen_at(truth, 2), 1.0, 0.1)
     with pytest.raises(InputError, match="scale of the world"):
         BundleOptions(lengths=[good])
+
+
+def test_lengths_of_photos_that_are_not_joined_are_left_out_and_named(rng):
+    truth = with_measurements(named_scene("random"), np.zeros((10, 3)), "rotation")
+    good = [KnownLength(seen_at(truth, k), seen_at(truth, k + 1), 1.0, 0.1) for k in range(2)]
+    lost = KnownLength(seen_at(truth, 4), ("lost.jpg", 3.0, 4.0), 1.0, 0.1)
+    for lengths, says in (
+        ([*good, lost], "not joined, so no known length: lost.jpg; those of the others are used"),
+        ([good[0], lost], "not joined, so no known length: lost.jpg; none is used, since ratios need two"),
+    ):
+        options = BundleOptions(lengths=lengths)
+        with pytest.warns(RsUndistortWarning, match=says):
+            solve_tracks(truth, {}, "global", 0, lambda _, options=options: options, StageLog(None))
 
 
 def test_known_lengths_are_read(tmp_path):

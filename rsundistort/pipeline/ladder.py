@@ -160,12 +160,21 @@ def _changed(before: Reconstruction | None, after: Reconstruction) -> float:
 
 
 def _of_joined(options: BundleOptions, mapped: Reconstruction) -> BundleOptions:
-    """Options without the anchors of photos that could not be joined."""
-    lost = sorted({*options.held_phi, *options.known_phi, *options.still} - set(mapped.image_names))
+    """Options without the anchors and lengths of photos that could not be joined."""
+    joined = set(mapped.image_names)
+    lengths = [each for each in options.lengths if joined >= {each.start[0], each.end[0]}]
+    # one alone tells the scale of the world, which changes no photo
+    lengths = lengths if len(lengths) > 1 else []
+    if len(lengths) < len(options.lengths):
+        apart = sorted({end[0] for each in options.lengths for end in (each.start, each.end)} - joined)
+        rest = "those of the others are used" if lengths else "none is used, since ratios need two"
+        warnings.warn(f"not joined, so no known length: {', '.join(apart)}; {rest}", RsUndistortWarning, stacklevel=3)
+    lost = sorted({*options.held_phi, *options.known_phi, *options.still} - joined)
     if lost:
         warnings.warn(f"not joined, so no anchor: {', '.join(lost)}", RsUndistortWarning, stacklevel=3)
     return replace(
         options,
+        lengths=lengths,
         held_phi={name: held for name, held in options.held_phi.items() if name not in lost},
         known_phi={name: known for name, known in options.known_phi.items() if name not in lost},
         still={name: still for name, still in options.still.items() if name not in lost},

@@ -326,7 +326,7 @@ def _write_extras(job: PhotoJob, out: Path, seen: PhotoDepth, turn: int) -> Iter
         try:
             image = read_photo(each.source, job.options.max_megapixels)
             pixels, _ = rectify(image.pixels, *grid_of, each.interpolation, depth=seen.depth)
-            write_image(out / each.target, turn_pixels(pixels, turn), image.metadata, 98)
+            write_image(out / each.target, turn_pixels(pixels, turn), image.metadata, job.options.quality)
         except (FileError, InputError) as error:
             if getattr(error.__cause__, "errno", None) in CANNOT_WRITE:
                 raise
