@@ -1,7 +1,8 @@
 # Needs Python 3.10 or newer and make; everything else goes into .venv.
 PYTHON ?= python3
 VENV ?= .venv
-BIN := $(VENV)/bin
+# Windows has no bin
+BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 OUT ?= demo-out
 
 .PHONY: demo test test-all check format docs bench figures clean

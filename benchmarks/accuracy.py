@@ -32,10 +32,10 @@ from rsundistort import (
     run,
     simulate_warp,
 )
-from rsundistort.pipeline.ladder import solve_photos
-from rsundistort.pipeline.load import load_photos
-from rsundistort.pipeline.progress import StageLog
-from rsundistort.pipeline.workers import Workers
+from rsundistort.batch.progress import StageLog
+from rsundistort.batch.workers import Workers
+from rsundistort.input.load import load_photos
+from rsundistort.solve.model_sequence import solve_photos
 
 ROOT = Path(__file__).resolve().parent.parent
 

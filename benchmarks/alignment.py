@@ -18,13 +18,13 @@ from pathlib import Path
 import numpy as np
 
 from rsundistort import BundleOptions, RunOptions, Solution, WarpOptions, bundle_adjust, read_solution, simulate_warp
+from rsundistort.batch.progress import StageLog
+from rsundistort.batch.workers import Workers, use_threads
 from rsundistort.bundle import climb
 from rsundistort.bundle.options import BundleResult
-from rsundistort.pipeline.ladder import Feedback
-from rsundistort.pipeline.load import load_photos
-from rsundistort.pipeline.progress import StageLog
-from rsundistort.pipeline.workers import Workers, use_threads
+from rsundistort.input.load import load_photos
 from rsundistort.sfm import map_photos, match_photos, retriangulate
+from rsundistort.solve.model_sequence import Feedback
 
 ROOT = Path(__file__).resolve().parent.parent
 

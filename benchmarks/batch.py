@@ -38,7 +38,7 @@ QUALITY = 98
 OURS = """
 import sys, time, json
 from pathlib import Path
-from rsundistort.pipeline import rectify_folder
+from rsundistort.batch import rectify_folder
 photos, solution, out, warm, interpolation, quality, jobs = sys.argv[1:]
 options = {"interpolation": interpolation, "quality": int(quality), "jobs": int(jobs)}
 rectify_folder(warm, solution, out + "-warm", **options)

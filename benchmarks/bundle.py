@@ -132,7 +132,7 @@ def save(folder: Path, rec: Any, peer: bool) -> None:
         point_idx=obs.point_idx, xy=obs.xy_raw,
     )  # fmt: skip
     if peer:
-        from rsundistort.io.colmap import write_colmap_model
+        from rsundistort.colmap import write_colmap_model
 
         write_colmap_model(folder / "model", rec, rec.cameras, rec.image_names)
 

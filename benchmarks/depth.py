@@ -36,9 +36,9 @@ from rsundistort import (
     run,
     simulate_scene,
 )
+from rsundistort.batch import use_threads
+from rsundistort.batch.geometry import PhotoDepths, ScenePoints
 from rsundistort.io import read_photo
-from rsundistort.pipeline import use_threads
-from rsundistort.pipeline.depth import PhotoDepths, ScenePoints
 from rsundistort.synthetic import load_recipe, render_depth
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -46,8 +46,8 @@ from measures import (
 
 import rsundistort as rs
 from rsundistort.model import READOUTS
-from rsundistort.pipeline.ladder import Solved, solve_photos
 from rsundistort.report.verdict import verdict_of
+from rsundistort.solve.model_sequence import Solved, solve_photos
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENES = ROOT / "sample_scenes"
@@ -154,7 +154,7 @@ class Bench:
 
         if key not in self.ran:
             out = self.work / f"out-{len(self.ran)}"
-            with mock.patch("rsundistort.pipeline.run.solve_photos", solving):
+            with mock.patch("rsundistort.solve.run.solve_photos", solving):
                 solution = rs.run(photos, out, rs.RunOptions(report=False, overwrite=True, **options))
             self.ran[key] = Ran(out, solution, **kept)
         return self.ran[key]

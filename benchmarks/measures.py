@@ -30,7 +30,7 @@ from rsundistort.critical.meter import readout_axes
 from rsundistort.evaluation import align_points
 from rsundistort.io import read_photo
 from rsundistort.io.cameras import camera_from_json
-from rsundistort.pipeline.ladder import Solved
+from rsundistort.solve.model_sequence import Solved
 
 Array = np.ndarray
 

@@ -20,7 +20,7 @@ import bundle
 from batch import make_photos
 
 import rsundistort as rs
-from rsundistort.io.colmap import write_colmap_model
+from rsundistort.colmap import write_colmap_model
 
 REPORT = """
 import json, sys, time

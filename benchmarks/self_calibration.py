@@ -22,14 +22,14 @@ from pathlib import Path
 import numpy as np
 
 from rsundistort import BundleOptions, BundleResult, Reconstruction, RsUndistortWarning, RunOptions
+from rsundistort.batch import use_threads
+from rsundistort.batch.progress import StageLog
+from rsundistort.batch.workers import Workers
 from rsundistort.bundle import Posterior, bundle_adjust
 from rsundistort.bundle.choice import clipped_errors, standard_errors
 from rsundistort.critical.cost import row_phi
-from rsundistort.pipeline import use_threads
-from rsundistort.pipeline.ladder import solve_photos
-from rsundistort.pipeline.load import load_photos
-from rsundistort.pipeline.progress import StageLog
-from rsundistort.pipeline.workers import Workers
+from rsundistort.input.load import load_photos
+from rsundistort.solve.model_sequence import solve_photos
 
 import pycolmap  # isort: skip  # after rsundistort: see rsundistort/io/photos/images.py
 

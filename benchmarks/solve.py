@@ -27,7 +27,7 @@ from typing import Any
 import bundle
 
 import rsundistort as rs
-from rsundistort.io.colmap import write_colmap_model
+from rsundistort.colmap import write_colmap_model
 
 ROOT = Path(__file__).resolve().parent.parent
 

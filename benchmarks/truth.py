@@ -35,9 +35,9 @@ from rsundistort import (
     simulate_scene,
     simulate_warp,
 )
+from rsundistort.batch import use_threads
 from rsundistort.io import read_photo
-from rsundistort.pipeline import use_threads
-from rsundistort.pipeline.scene import _encode_jpeg
+from rsundistort.simulate.render_folder import _encode_jpeg
 from rsundistort.synthetic import add_noise, load_recipe, render_view, warp_photo
 
 ROOT = Path(__file__).resolve().parent.parent

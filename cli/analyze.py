@@ -23,7 +23,7 @@ def command(path: Path, readout: str | None, as_json: bool) -> None:
     PATH is a solution (solution.json, or the output of a run), a COLMAP model, or a transforms.json.
     """
     with errors_for_people():
-        from rsundistort.pipeline import analyze
+        from rsundistort.analysis import analyze
 
         result = analyze(path, readout)
     click.echo(json.dumps(result) if as_json else _text(result))

@@ -31,7 +31,7 @@ def command(
 ) -> None:
     """Compare the outputs of a run, in the folder OUT, with the truth."""
     with errors_for_people(), progress_bars(Talk(quiet, as_json=as_json)) as progress:
-        from rsundistort.pipeline import evaluate
+        from rsundistort.analysis import evaluate
 
         result = evaluate(out, truth, poses=poses, twins=twins, raw=raw, progress=progress)
     if as_json:

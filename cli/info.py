@@ -20,7 +20,8 @@ _OURS = ("dev", "docs")
 def command(as_json: bool) -> None:
     """Versions, threads and optional parts."""
     with errors_for_people():
-        from rsundistort.pipeline import use_threads, versions
+        from rsundistort.batch import use_threads
+        from rsundistort.versions import versions
 
         found: dict[str, object] = {
             "versions": versions(),

@@ -75,8 +75,8 @@ def command(
         raise click.UsageError("--overwrite begins anew and --resume goes on; give one of them")
     kept = "what is done is whole, the same command with --resume goes on"
     with errors_for_people(kept) as warned, progress_bars(talk) as progress:
+        from rsundistort.batch import RectifyOptions, rectify_folder
         from rsundistort.io.places import place_of, sizes_under
-        from rsundistort.pipeline import RectifyOptions, rectify_folder
 
         options = RectifyOptions(masks=masks, maps=maps, also=also, **opt.photo_fields(photo))
         solved, left_out = rectify_folder(

@@ -93,7 +93,8 @@ def command(
     Exit code 3 says that photos with a motion could not be rectified; they are listed, and the others are done.
     """
     with errors_for_people() as warned, progress_bars(talk) as progress:
-        from rsundistort.pipeline import GyroOptions, RunOptions, run
+        from rsundistort.input import GyroOptions
+        from rsundistort.solve import RunOptions, run
 
         options = RunOptions(
             camera=camera,

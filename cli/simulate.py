@@ -114,7 +114,7 @@ def warp(
     """
     with errors_for_people(), progress_bars(Talk(quiet)) as progress:
         from rsundistort.io import read_gyro
-        from rsundistort.pipeline import WarpOptions, read_motion_file, simulate_warp
+        from rsundistort.simulate import WarpOptions, read_motion_file, simulate_warp
         from rsundistort.synthetic import Vibration
 
         truth = simulate_warp(
@@ -158,7 +158,7 @@ def scene(recipe: Path, out: Path, depth: bool, jobs: int, overwrite: bool, quie
     several), ground_truth.json and the recipe.
     """
     with errors_for_people(), progress_bars(Talk(quiet)) as progress:
-        from rsundistort.pipeline import SceneOptions, simulate_scene
+        from rsundistort.simulate import SceneOptions, simulate_scene
 
         truth = simulate_scene(recipe, out, SceneOptions(depth=depth, jobs=jobs, overwrite=overwrite), progress)
     if not quiet:

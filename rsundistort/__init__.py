@@ -10,7 +10,9 @@ from Motion", CVPR 2017. Functions are used in the manner of `cv2`:
 array([[320., 240.]])
 """
 
-from .bundle import BundleOptions, BundleResult, bundle_adjust, climb
+from .analysis import analyze, evaluate
+from .batch import RectifyOptions, rectify_folder
+from .bundle import BundleOptions, BundleResult, GuessedCameras, bundle_adjust, climb
 from .critical import CriticalMotion, critical_motion
 from .errors import (
     FileError,
@@ -24,27 +26,24 @@ from .errors import (
     SkippedPhotoWarning,
 )
 from .evaluation import motion_errors, pose_errors, psnr
+from .input import GyroOptions
 from .io import read_solution, write_solution
-from .model import AtInfinity, Camera, DepthMap, Observations, Plane, Reconstruction, RowMotion, Solution, SolvedImage
-from .model.projection import project_points, unproject_points
-from .pipeline import (
-    GyroOptions,
-    RectifyOptions,
-    RunOptions,
-    SceneOptions,
-    SolveOptions,
-    WarpOptions,
-    analyze,
-    evaluate,
-    rectify_folder,
-    run,
-    simulate_scene,
-    simulate_warp,
-    solve,
-    solve_model,
+from .model import (
+    AtInfinity,
+    Camera,
+    DepthMap,
+    KnownLength,
+    Observations,
+    Plane,
+    Reconstruction,
+    RowMotion,
+    Solution,
+    SolvedImage,
 )
+from .model.projection import project_points, unproject_points
 from .rectify import (
     RemapGrid,
+    ViewOptions,
     distort_points,
     init_rectify_map,
     largest_shift_px,
@@ -53,6 +52,8 @@ from .rectify import (
     remap_grid,
     undistort_points,
 )
+from .simulate import SceneOptions, WarpOptions, simulate_scene, simulate_warp
+from .solve import RunOptions, SolveOptions, run, solve, solve_model
 
 __version__ = "0.1.0"
 
@@ -66,8 +67,10 @@ __all__ = [
     "FileError",
     "FileKindWarning",
     "FormatError",
+    "GuessedCameras",
     "GyroOptions",
     "InputError",
+    "KnownLength",
     "MetadataWarning",
     "Observations",
     "Plane",
@@ -84,6 +87,7 @@ __all__ = [
     "Solution",
     "SolveOptions",
     "SolvedImage",
+    "ViewOptions",
     "WarpOptions",
     "analyze",
     "bundle_adjust",

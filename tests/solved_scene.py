@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from rsundistort import Observations, Reconstruction, Solution, SolveOptions, read_solution
+from rsundistort.batch.progress import StageLog
+from rsundistort.batch.workers import Workers
+from rsundistort.input.photo_cameras import PhotoCameras
 from rsundistort.io import output_folder
-from rsundistort.pipeline.cameras import PhotoCameras
-from rsundistort.pipeline.ladder import solve_tracks
-from rsundistort.pipeline.outcome import Outcome
-from rsundistort.pipeline.outputs import Outputs
-from rsundistort.pipeline.progress import StageLog
-from rsundistort.pipeline.workers import Workers
+from rsundistort.solve.model_sequence import solve_tracks
+from rsundistort.solve.outcome import Outcome
+from rsundistort.solve.run_outputs import Outputs
 
 SCENES = Path(__file__).parent.parent / "sample_scenes"
 

@@ -37,9 +37,9 @@ from rsundistort import (
     run,
     write_solution,
 )
+from rsundistort.batch.workers import Workers
 from rsundistort.io import read_colmap_poses, read_photo
 from rsundistort.io.journal import Journal, JournalEntry
-from rsundistort.pipeline.workers import Workers
 
 COMMAND = Path(sys.executable).with_name("rsundistort")
 FOUR = ["a.png", "b.png", "c.png", "d.jpg"]
@@ -315,7 +315,7 @@ def test_photos_that_could_not_be_joined_are_no_failure(four):
 
 
 def test_a_photo_that_does_not_fit_the_memory_is_left_out(four, monkeypatch):
-    from rsundistort.pipeline import photo
+    from rsundistort.batch import one_photo as photo
 
     def scarce(pixels, *args, **kwargs):
         if pixels.shape == (240, 320, 3) and pixels[0, 0, 0] == scarce.mark:
@@ -610,12 +610,11 @@ def test_a_photo_that_vanishes_from_a_run_is_in_no_model(courtyard, tmp_path):
 
 
 def test_a_run_says_3_when_its_last_stage_lost_photos(monkeypatch, tmp_path):
-    from rsundistort import pipeline
-
     camera = Camera(64, 48, np.diag([60.0, 60, 1]))
     image = SolvedImage("a.png", "1", motion=RowMotion(), reason="a.png cannot be read", rms_px=0.1, rs_shift_px=0.0)
     solution = Solution("global", {"1": camera}, {"1": camera}, (image,))
-    monkeypatch.setattr(pipeline, "run", lambda *_: solution)
+    # the package, which the function of its name hides
+    monkeypatch.setattr(sys.modules["rsundistort.solve"], "run", lambda *_: solution)
     result = invoke("run", tmp_path, "-o", tmp_path / "out", "--quiet")
     assert result.exit_code == 3
     assert result.stdout == ""
@@ -677,7 +676,7 @@ def test_opencv_has_one_thread_in_the_pool_and_its_own_again_afterwards():
 
 def test_a_scheduler_that_is_not_there_is_refused_in_one_line(four, monkeypatch):
     pytest.importorskip("distributed")
-    from rsundistort.pipeline import workers
+    from rsundistort.batch import workers
 
     monkeypatch.setattr(workers, "_TIMEOUT_S", 0.2)
     result = invoke(*arguments(four, "--scheduler", "tcp://127.0.0.1:9"))

@@ -23,13 +23,14 @@ from rsundistort import (
     undistort_points,
     unproject_points,
 )
-from rsundistort.bundle import choose_model, reprojection_residuals
+from rsundistort.bundle import choose_model
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.bundle.remains import agreement_of_waves, half_across_readout
 from rsundistort.bundle.spreads import Spreads
 from rsundistort.model import BEND_GROUPS, Bend
 from rsundistort.model.bend import bend_functions, splines_at
 from rsundistort.model.projection import at_depth, clock_of, project_points_with_jacobians
+from rsundistort.model.reprojection import reprojection_residuals
 from rsundistort.rectify import largest_shift_px
 from rsundistort.rectify.coarse import TOLERANCE_PX, coarse_grid
 from rsundistort.rectify.maps import rectified_rays

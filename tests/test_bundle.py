@@ -25,18 +25,17 @@ from rsundistort import (
 from rsundistort.bundle import (
     LADDER,
     GuessedCameras,
-    KnownLength,
     choose_model,
     choose_readouts,
     objective,
-    reprojection_residuals,
 )
 from rsundistort.bundle.choice import hold_out
 from rsundistort.bundle.intrinsics import moved_camera
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.bundle.spreads import Spreads
-from rsundistort.model import READOUTS
+from rsundistort.model import READOUTS, KnownLength
 from rsundistort.model.projection import unproject_points
+from rsundistort.model.reprojection import reprojection_residuals
 from rsundistort.synthetic import project_rows
 
 LENS = [-0.12, 0.03, 0.001, -0.002]

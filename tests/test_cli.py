@@ -147,8 +147,8 @@ def test_wrong_use_is_exit_code_2(invoke, tmp_path, args):
 def test_choices_are_those_of_the_library():
     from rsundistort_cli.options import INTERPOLATION_NAMES, MAP_KIND_NAMES, MATCHING_NAMES, READOUT_NAMES
 
+    from rsundistort.input.pairing import MATCHINGS
     from rsundistort.model import READOUTS
-    from rsundistort.pipeline.pairing import MATCHINGS
     from rsundistort.rectify import INTERPOLATIONS, MAP_KINDS
 
     assert set(READOUT_NAMES) == set(READOUTS)

@@ -9,9 +9,9 @@ import pycolmap
 import pytest
 
 from rsundistort import FormatError
-from rsundistort.io.colmap import read_colmap_cameras, read_colmap_poses
-from rsundistort.io.colmap_files import check_colmap_files
-from rsundistort.io.colmap_model import read_colmap_model
+from rsundistort.colmap import read_colmap_cameras, read_colmap_poses
+from rsundistort.colmap.file_checks import check_colmap_files
+from rsundistort.colmap.measured_model import read_colmap_model
 
 PARTS = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
 

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from rsundistort import (
     BundleOptions,
     InputError,
+    KnownLength,
     Observations,
     RsUndistortError,
     RsUndistortWarning,
@@ -21,13 +22,12 @@ from rsundistort import (
     climb,
     critical_motion,
 )
-from rsundistort.bundle import KnownLength
+from rsundistort.batch.progress import StageLog
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.bundle.spreads import Spreads
 from rsundistort.critical import advise, heal, shape_cost, still_probability, with_remedy
 from rsundistort.io import read_known_lengths, read_known_motions
-from rsundistort.pipeline.ladder import solve_tracks
-from rsundistort.pipeline.progress import StageLog
+from rsundistort.solve.model_sequence import solve_tracks
 
 SIGMA_RAD = 0.05
 NOISE_PX = 0.5

@@ -37,9 +37,9 @@ from rsundistort import (
     undistort_points,
     write_solution,
 )
+from rsundistort.batch.geometry import PhotoDepths, ScenePoints
 from rsundistort.io import find_depth_maps, read_depth_map, write_colmap_model
 from rsundistort.model import Observations, Reconstruction
-from rsundistort.pipeline.depth import PhotoDepths, ScenePoints
 from rsundistort.rectify import depth_from_points, fit_plane, plane_in_camera, prefers_plane, translation_shift_px
 from rsundistort.synthetic import measure, project_rows
 

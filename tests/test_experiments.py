@@ -24,7 +24,6 @@ from rsundistort import (
     Solution,
     SolvedImage,
 )
-from rsundistort.bundle import reprojection_residuals
 from rsundistort.evaluation import rotation_angles_deg
 from rsundistort.experiments import (
     METHODS,
@@ -39,6 +38,7 @@ from rsundistort.experiments import (
 from rsundistort.experiments.figures import camera_paths, plan_axes
 from rsundistort.experiments.one import draw_motions, draw_trial, errors_of, run_trial
 from rsundistort.io import write_colmap_model
+from rsundistort.model.reprojection import reprojection_residuals
 from rsundistort.synthetic import look_at
 
 K = np.array([[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]])

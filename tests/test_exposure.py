@@ -9,15 +9,15 @@ from make_photos import camera_exif, texture
 from test_bundle import make_scene
 
 from rsundistort import InputError, WarpOptions, simulate_warp
+from rsundistort.batch.progress import StageLog
 from rsundistort.bundle import BundleOptions, bundle_adjust
+from rsundistort.input.exposure import bounded_by_exposure
+from rsundistort.input.load import LoadedPhotos
+from rsundistort.input.photo_cameras import PhotoCameras
 from rsundistort.io import Metadata, write_image
 from rsundistort.io.photos.exif_facts import ExifFacts, _facts, read_exif
-from rsundistort.pipeline import ladder
-from rsundistort.pipeline.cameras import PhotoCameras
-from rsundistort.pipeline.exposure import bounded_by_exposure
-from rsundistort.pipeline.load import LoadedPhotos
-from rsundistort.pipeline.progress import StageLog
 from rsundistort.sfm import edge_width_px
+from rsundistort.solve import model_sequence as ladder
 from rsundistort.verdict import judge
 
 

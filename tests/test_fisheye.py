@@ -10,12 +10,12 @@ import pytest
 from make_photos import COURTYARD
 
 from rsundistort import Camera, RowMotion, RunOptions, evaluate, optimal_new_camera, rectify, run, unproject_points
+from rsundistort.colmap.lenses import camera_to_colmap, refined_camera
 from rsundistort.errors import InputError
 from rsundistort.model.projection import project_points
-from rsundistort.pipeline import SceneOptions, simulate_scene
 from rsundistort.sfm import Features
-from rsundistort.sfm.database import database_camera, ideal_keypoints
-from rsundistort.sfm.mapping import _refined_camera
+from rsundistort.sfm.database import ideal_keypoints
+from rsundistort.simulate import SceneOptions, simulate_scene
 from rsundistort.synthetic.lens import distort_rays, undistort_to_rays
 
 K = np.array([[260.0, 0, 402], [0, 262, 297], [0, 0, 1]])
@@ -54,7 +54,7 @@ def test_colmap_sees_the_rays_of_the_keypoints(camera, rng):
     xy = rng.uniform([100, 50], [700, 550], (50, 2))
     features = Features(np.vstack([xy, [[-2000.0, 300.0]]]), np.ones(51), np.zeros((51, 128), np.uint8))
     keypoints = ideal_keypoints(features, camera, motion, "rotation")
-    theirs = database_camera(camera, True, 1).cam_from_img(keypoints.astype(float)[:50])
+    theirs = camera_to_colmap(camera, True, 1).cam_from_img(keypoints.astype(float)[:50])
     ideal, valid = unproject_points(xy, camera, motion)
     assert valid.all()
     # float32 of some hundred pixels, over the focal length, and the tangent's slope of up to 30 at 80 degrees
@@ -68,8 +68,8 @@ def test_colmap_sees_the_rays_of_the_keypoints(camera, rng):
 def test_colmap_refines_the_lens_that_a_camera_has(lens, rng):
     K_round = [[260.0, 0, 402], [0, 260, 297], [0, 0, 1]]
     camera = Camera(800, 600, K_round, [0.04, 0, 0, 0], "left-to-right", lens)
-    guessed = database_camera(camera, False, 1)
-    assert _refined_camera(guessed, camera) == camera
+    guessed = camera_to_colmap(camera, False, 1)
+    assert refined_camera(guessed, camera) == camera
     points = rng.uniform([-1, -1, 1], [1, 1, 2], (20, 3))
     theirs = [guessed.img_from_cam(point) - 0.5 for point in points]
     np.testing.assert_allclose(project_points(points, camera)[0], theirs, atol=1e-9)

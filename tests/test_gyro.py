@@ -10,6 +10,7 @@ from critical_scenes import named_scene
 from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, FileError, FormatError, GyroOptions, InputError, RowMotion, RsUndistortWarning
+from rsundistort.input.gyroscope import gyro_contradiction, gyro_motions, known_readouts
 from rsundistort.io import (
     GyroLog,
     VideoFrames,
@@ -21,7 +22,6 @@ from rsundistort.io import (
 )
 from rsundistort.io.gyro import parse_axes
 from rsundistort.model import READOUTS
-from rsundistort.pipeline.gyro import gyro_contradiction, gyro_motions, known_readouts
 from rsundistort.synthetic import project_rows
 
 READOUT_S = 0.03

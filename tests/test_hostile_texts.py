@@ -11,7 +11,7 @@ from rsundistort.io.cameras import read_camera_file
 from rsundistort.io.models import read_model
 from rsundistort.io.nerfstudio import read_transforms
 from rsundistort.io.photos.xmp import corrected_xmp, marked_xmp, rectified_by
-from rsundistort.pipeline.simulate import read_motion_file
+from rsundistort.simulate.warp_folder import read_motion_file
 from rsundistort.synthetic.recipe import load_recipe
 
 READERS = {

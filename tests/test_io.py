@@ -23,6 +23,7 @@ from rsundistort import (
     read_solution,
     write_solution,
 )
+from rsundistort.colmap.rectified_model import rectified_keypoints
 from rsundistort.io import (
     Metadata,
     camera_from_exif,
@@ -33,7 +34,6 @@ from rsundistort.io import (
     write_transforms,
 )
 from rsundistort.io.cameras import camera_to_json
-from rsundistort.io.colmap import rectified_keypoints
 from rsundistort.io.record import Record
 from rsundistort.model import Bend
 

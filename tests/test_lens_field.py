@@ -23,22 +23,23 @@ from rsundistort import (
     bundle_adjust,
     init_rectify_map,
 )
+from rsundistort.batch.progress import StageLog
 from rsundistort.bundle import choose_model
 from rsundistort.bundle.intrinsics import GuessedCameras, moved_camera
 from rsundistort.bundle.lens_field import LensFields
-from rsundistort.bundle.problem import BundleProblem, reprojection_residuals
+from rsundistort.bundle.problem import BundleProblem
 from rsundistort.bundle.spreads import Spreads
+from rsundistort.input.photo_cameras import PhotoCameras
 from rsundistort.io import read_solution, write_solution
 from rsundistort.io.cameras import camera_from_json, camera_to_json
 from rsundistort.model.field import field_basis, field_over_frame, field_slope, lens_pixels, raw_pixels
 from rsundistort.model.orientation import MATRICES, turn_camera, turn_points
 from rsundistort.model.projection import project_points, project_points_with_jacobians, unproject_points
-from rsundistort.pipeline.cameras import PhotoCameras
-from rsundistort.pipeline.ladder import solve_tracks
-from rsundistort.pipeline.outcome import Outcome, solution_of
-from rsundistort.pipeline.progress import StageLog
+from rsundistort.model.reprojection import reprojection_residuals
 from rsundistort.rectify import rectify
 from rsundistort.report import content
+from rsundistort.solve.model_sequence import solve_tracks
+from rsundistort.solve.outcome import Outcome, solution_of
 from rsundistort.synthetic.lens import distort_rays
 from rsundistort.verdict import judge
 

@@ -8,7 +8,7 @@ from solved_scene import SCENES
 
 from rsundistort import BundleOptions, Observations, Reconstruction, Solution, SolvedImage, bundle_adjust, read_solution
 from rsundistort.critical import heal
-from rsundistort.pipeline.ladder import Solved
+from rsundistort.solve.model_sequence import Solved
 
 
 def test_errors_of_measurements_with_known_noise_are_one_deviation(rng):

@@ -22,13 +22,13 @@ from rsundistort import (
     rectify_folder,
     write_solution,
 )
+from rsundistort.batch import workers as workers_module
+from rsundistort.batch.memory import free_memory
+from rsundistort.batch.progress import StageLog
+from rsundistort.batch.workers import Workers
+from rsundistort.input.load import load_photos
 from rsundistort.io import read_photo
 from rsundistort.io.photos.images import stored_size
-from rsundistort.pipeline import workers as workers_module
-from rsundistort.pipeline.load import load_photos
-from rsundistort.pipeline.memory import free_memory
-from rsundistort.pipeline.progress import StageLog
-from rsundistort.pipeline.workers import Workers
 from rsundistort.sfm import detect_features, detection_bytes
 
 

@@ -12,9 +12,9 @@ from rsundistort_cli.main import cli
 from scipy.spatial.transform import Rotation
 
 from rsundistort import FileError, FormatError, InputError
-from rsundistort.bundle import reprojection_residuals
 from rsundistort.io.models import read_model
-from rsundistort.pipeline import SolveOptions, solve_model
+from rsundistort.model.reprojection import reprojection_residuals
+from rsundistort.solve import SolveOptions, solve_model
 
 W, H = 640, 480
 F, CX, CY = 500.0, 322.0, 236.5  # integer pixel centres

@@ -15,6 +15,9 @@ from rsundistort_cli import closing
 from scipy.spatial.transform import Rotation, Slerp
 
 from rsundistort import InputError, RsUndistortWarning
+from rsundistort.batch.progress import StageLog
+from rsundistort.batch.workers import Workers
+from rsundistort.colmap.rectified_model import ModelIds
 from rsundistort.io import (
     output_folder,
     read_transforms,
@@ -24,14 +27,11 @@ from rsundistort.io import (
     write_trajectory,
     write_transforms,
 )
-from rsundistort.io.colmap import ModelIds
 from rsundistort.model import Bend, Camera, Observations, Reconstruction, RowMotion, Solution, SolvedImage
 from rsundistort.model.projection import clock_of, project_points, unproject_points
-from rsundistort.pipeline import SolveOptions
-from rsundistort.pipeline.outputs import Outputs, _left_by_two_poses, photo_times
-from rsundistort.pipeline.progress import StageLog
-from rsundistort.pipeline.workers import Workers
 from rsundistort.rectify import bend_px
+from rsundistort.solve import SolveOptions
+from rsundistort.solve.run_outputs import Outputs, _left_by_two_poses, photo_times
 
 W, H = 640, 480
 LENS = (-0.12, 0.03, 1e-3, -8e-4, 0.01)
@@ -88,7 +88,7 @@ def test_workspace_is_what_colmap_writes(tmp_path, rng):
         (photos / name).parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(photos / name), np.zeros((H, W, 3), np.uint8))
     model.mkdir()
-    from rsundistort.io.colmap import colmap_model
+    from rsundistort.colmap.rectified_model import colmap_model
 
     ids = ModelIds([7], [4, 9, 2, 3], range(1, 61))
     colmap_model(rec, list(rec.cameras), names, None, ids).write(model)

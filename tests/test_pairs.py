@@ -13,10 +13,10 @@ import pytest
 from large_sets import COMMON, make_street
 
 from rsundistort import Camera, InputError, RunOptions
+from rsundistort.input.load import LoadedPhotos
+from rsundistort.input.pairing import capture_sequences, pairs_to_match, places_of
+from rsundistort.input.photo_cameras import PhotoCameras
 from rsundistort.io import ExifFacts
-from rsundistort.pipeline.cameras import PhotoCameras
-from rsundistort.pipeline.load import LoadedPhotos
-from rsundistort.pipeline.pairing import capture_sequences, pairs_to_match, places_of
 from rsundistort.sfm import Features, choose_pairs, global_descriptors, match_photos
 
 

@@ -13,9 +13,9 @@ import pytest
 from make_photos import COURTYARD_NAMES, exif_block, half_courtyard, save_png, texture
 
 from rsundistort import Camera, FileError, FormatError, InputError, RowMotion, RunOptions, rectify, rectify_folder, run
+from rsundistort.input import photo_cameras
 from rsundistort.io import Metadata, find_masks, read_exif, read_mask, write_image
 from rsundistort.io.cameras import camera_to_json
-from rsundistort.pipeline import cameras as photo_cameras
 from rsundistort.sfm import detect_features
 
 HANDHELD = Path(__file__).parent.parent / "sample_scenes" / "handheld"

@@ -33,7 +33,7 @@ from rsundistort import (
 from rsundistort.io import read_photo
 from rsundistort.io.record import Record
 from rsundistort.model import READOUTS
-from rsundistort.pipeline.outputs import files_of_run
+from rsundistort.solve.run_outputs import files_of_run
 from rsundistort.synthetic.warp import largest_rectangle
 
 CAMERA = "300,300,160,120"

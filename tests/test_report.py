@@ -32,11 +32,11 @@ from rsundistort import (
 )
 from rsundistort.io import Metadata, write_image
 from rsundistort.model import Bend
-from rsundistort.pipeline import outputs
 from rsundistort.report import diagnostics as diagnostics_module
 from rsundistort.report import read_diagnostics, verdict_of, write_diagnostics, write_figures, write_report
 from rsundistort.report.displacement import displacement_field
 from rsundistort.report.pictures import PictureJob, _bytes_of_each, _small, make_pictures
+from rsundistort.solve import run_outputs as outputs
 
 SECTIONS = ["verdict", "pictures", "scene", "photos", "critical", "ladder", "residuals", "cameras", "settings"]
 CAMERA = Camera(320, 240, np.array([[300.0, 0, 160], [0, 300.0, 120], [0, 0, 1]]))

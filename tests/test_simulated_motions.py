@@ -12,9 +12,10 @@ from make_photos import save_png, save_textures, texture
 from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, FormatError, InputError, RowMotion, RsUndistortWarning
+from rsundistort.batch import rectify_folder
 from rsundistort.io import GyroLog, read_photo, read_solution
 from rsundistort.model import READOUTS
-from rsundistort.pipeline import WarpOptions, read_motion_file, rectify_folder, simulate_warp
+from rsundistort.simulate import WarpOptions, read_motion_file, simulate_warp
 from rsundistort.synthetic import RowTable, Vibration, load_recipe, read_row_tables
 from rsundistort.synthetic.unsteady import accelerations, tracks, unsteady, vibrations
 

@@ -14,8 +14,8 @@ from make_photos import exif_block, save_png, texture
 from scipy.spatial.transform import Rotation
 
 import rsundistort as rs
+from rsundistort.colmap.measured_model import colmap_model_of, read_colmap_model, surviving_points
 from rsundistort.errors import RsUndistortError
-from rsundistort.io.colmap_model import colmap_model_of, read_colmap_model, surviving_points
 from rsundistort.synthetic import project_rows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -318,7 +318,7 @@ def test_a_database_that_is_not_the_models_is_refused(tmp_path, rng, what):
 def turned_model(scene, orientation_of):
     """The same model of photos that were turned by their EXIF orientation before COLMAP looked at them."""
     given = colmap_model_of(scene.model)
-    from rsundistort.io.colmap import ModelIds
+    from rsundistort.colmap.rectified_model import ModelIds
     from rsundistort.model.orientation import turn_reconstruction
 
     rec = turn_reconstruction(given.reconstruction, orientation_of)

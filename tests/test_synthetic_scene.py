@@ -17,7 +17,7 @@ from rsundistort.errors import FileError, FormatError, InputError
 from rsundistort.model.bend import Bend
 from rsundistort.model.camera import Camera
 from rsundistort.model.motion import RowMotion
-from rsundistort.pipeline import SceneOptions, simulate_scene
+from rsundistort.simulate import SceneOptions, simulate_scene
 from rsundistort.synthetic import load_recipe, look_at, project_rows
 from rsundistort.synthetic.recipe import View
 from rsundistort.synthetic.render import line_poses, pixel_rays, render_depth, render_view, rs_shift_px

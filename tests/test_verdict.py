@@ -31,10 +31,10 @@ from rsundistort import (
 from rsundistort.bundle import ModelChoice, choose_model
 from rsundistort.critical import heal
 from rsundistort.io import write_solution
-from rsundistort.pipeline import ladder
 from rsundistort.rectify import largest_shift_px
 from rsundistort.report import verdict_of
 from rsundistort.report.displacement import displacement_field
+from rsundistort.solve import model_sequence as ladder
 from rsundistort.synthetic.measurements import measure
 from rsundistort.verdict import Verdict, judge, left_along_readout, left_over_frame, photo_motions
 from rsundistort.verdict.judge import _repeated

@@ -19,8 +19,8 @@ from rsundistort import (
     rectify,
 )
 from rsundistort import undistort_points as undistort
+from rsundistort.batch.views import with_view
 from rsundistort.model.orientation import in_stored_frame, turn_pixels, turn_solution
-from rsundistort.pipeline.views import with_view
 from rsundistort.rectify import ViewOptions, init_rectify_map, rectified_roi, rectified_view
 from rsundistort.rectify.maps import EDGE_PX
 

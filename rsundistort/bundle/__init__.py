@@ -4,17 +4,14 @@ from .adjust import LADDER, bundle_adjust, climb, objective
 from .choice import ModelChoice, choose_model
 from .direction import ReadoutChoice, choose_readouts
 from .intrinsics import GuessedCameras, deviation, pixels_of
-from .lengths import KnownLength
 from .options import BundleOptions, BundleResult
 from .posterior import Posterior, gauge_directions
-from .problem import reprojection_residuals
 
 __all__ = [
     "LADDER",
     "BundleOptions",
     "BundleResult",
     "GuessedCameras",
-    "KnownLength",
     "ModelChoice",
     "Posterior",
     "ReadoutChoice",
@@ -26,5 +23,4 @@ __all__ = [
     "gauge_directions",
     "objective",
     "pixels_of",
-    "reprojection_residuals",
 ]

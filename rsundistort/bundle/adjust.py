@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import Reconstruction
+from ..model.reprojection import reprojection_residuals
 from .intrinsics import pixels_of
 from .jackknife import Inflation, inflated, inflation
 from .layout import Layout
 from .options import BundleOptions, BundleResult
-from .problem import BundleProblem, reprojection_residuals
+from .problem import BundleProblem
 from .solver import minimize
 from .spreads import estimated, estimates_spreads, field_spread, settled, starting_spreads
 from .triangulate import revive_points

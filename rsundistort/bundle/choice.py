@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import READOUTS, SHUTTER_MODELS, Observations, Reconstruction
+from ..model.reprojection import reprojection_residuals
 from .adjust import LADDER, bundle_adjust, objective
 from .options import BundleOptions
-from .problem import reprojection_residuals
 from .remains import CLIP, WAVES, agreement_of_waves, errors_without, half_across_readout, warps, waves
 from .spreads import Spreads
 

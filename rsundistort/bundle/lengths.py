@@ -3,48 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..model import Reconstruction
+from ..model import KnownLength, Reconstruction
+from ..model.known_length import End
 
-__all__ = ["KnownLength", "LengthResiduals", "check_lengths"]
+__all__ = ["LengthResiduals", "check_lengths"]
 
 # A point whose measurement lies so near to where the user pointed is the one meant, pixels.
 _REACH_PX = 5.0
-
-End = tuple[str, float, float]
-
-
-@dataclass(frozen=True)
-class KnownLength:
-    """A length between two points of the scene, in any unit: all lengths share it.
-
-    Parameters
-    ----------
-    start, end : (photo name, x, y)
-        Where the points are seen, in pixels of stored photos with integer centres; each is taken to be the point that
-        was measured nearest, within 5 px.
-    length : float
-        What was measured.
-    sigma : float
-        Its standard deviation, in the same unit.
-    """
-
-    start: End
-    end: End
-    length: float
-    sigma: float
-
-    def __post_init__(self) -> None:
-        for name, value in (("length", self.length), ("sigma", self.sigma)):
-            if not 0 < value < np.inf:
-                raise InputError(f"known length from {self.start} to {self.end}: {name}={value!r}, expected above 0")
-        if not np.isfinite([*self.start[1:], *self.end[1:]]).all():
-            raise InputError(f"known length from {self.start} to {self.end}: pixels must be finite numbers")
 
 
 def check_lengths(lengths: Sequence[KnownLength]) -> tuple[KnownLength, ...]:

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from ..model import BEND_GROUPS, Bend, Reconstruction
+from ..model import BEND_GROUPS, Bend, KnownLength, Reconstruction
 from .intrinsics import GuessedCameras, check_refined
-from .lengths import KnownLength, check_lengths
+from .lengths import check_lengths
 
 __all__ = ["DEVIATIONS", "LOSSES", "BundleOptions", "BundleResult"]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,8 +14,7 @@ from scipy.spatial.transform import Rotation
 from .._kernels import projection
 from ..errors import InputError
 from ..model import READOUTS, Camera, Reconstruction, check_shutter_model
-from ..model.bend import bend_table
-from ..model.field import lens_pixels
+from ..model.reprojection import camera_arrays, motion_tables, observed_lens_pixels, plain_arrays
 from .elimination import Elimination
 from .intrinsics import INTRINSICS, check_lenses, deviation, moved_camera, prior_weight
 from .jackknife import Partition, by_corner, by_place
@@ -28,7 +26,7 @@ from .options import LOSSES, BundleOptions
 from .spreads import Spreads
 from .structure import Structure, by_first_photo
 
-__all__ = ["BundleProblem", "State", "reprojection_residuals"]
+__all__ = ["BundleProblem", "State"]
 
 
 @dataclass(frozen=True)
@@ -48,84 +46,10 @@ class State:
     points_w: NDArray[np.float64]
 
 
-def _camera_arrays(
-    camera_idx: NDArray[np.int64], cameras: Sequence[Camera], variation: NDArray[np.float64]
-) -> tuple[NDArray[Any], ...]:
-    """Photo-to-camera indices, clock axes, signs, intrinsics and lenses as the kernels take them.
-
-    Of cameras that vary from photo to photo (m, 3) each photo has its own.
-    """
-    intr, lens, axis, sign = zip(*(camera.kernel_args for camera in cameras), strict=True)
-    if any(each.ndim == 2 for each in lens):  # among fisheyes a pinhole lens is one that is none
-        lens = tuple(each if each.ndim == 2 else np.append(each, 0.0)[None] for each in lens)
-    arrays = np.array(axis), np.array(sign), np.array(intr), np.array(lens)
-    if not variation.any():
-        return camera_idx, *arrays
-    axes, signs, intrs, lenses = (each[camera_idx] for each in arrays)
-    intrs[:, 2:] += intrs[:, :2] * variation[:, 1:]
-    intrs[:, :2] *= np.exp(variation[:, :1])
-    return np.arange(len(camera_idx)), axes, signs, intrs, lenses
-
-
-def _lens_pixels(
-    cameras: Sequence[Camera], camera_of_obs: NDArray[np.int64], xy_raw: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Pixels (o, 2) of the lens models, those of the kernels, from measured ones."""
-    if not any(camera.field.size for camera in cameras):
-        return xy_raw
-    xy = np.empty_like(xy_raw)
-    for k, camera in enumerate(cameras):
-        mine = camera_of_obs == k
-        xy[mine] = lens_pixels(camera, xy_raw[mine])
-    return xy
-
-
-def _plain(*arrays: NDArray[Any]) -> tuple[NDArray[Any], ...]:
-    """The arrays in one block of memory each that may be written: kernels are compiled for each kind that they meet."""
-    return tuple(np.require(each, requirements=("C", "W")) for each in arrays)
-
-
-def reprojection_residuals(
-    reconstruction: Reconstruction, shutter_model: str | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Predicted minus measured pixels (o, 2) of the lens models, and which observations could be projected.
-
-    Parameters
-    ----------
-    reconstruction : Reconstruction
-        Poses, motions, points and measurements.
-    shutter_model : str, optional
-        Model to predict with; that of the reconstruction when left out.
-    """
-    model = check_shutter_model(shutter_model or reconstruction.shutter_model)
-    obs = reconstruction.observations
-    res = np.empty((len(obs), 2))
-    valid = np.empty(len(obs), bool)
-    phi = reconstruction.phi
-    if reconstruction.bends:
-        phi = _tables(phi, reconstruction.bend, reconstruction.bend_clock, reconstruction.R_cw)
-    arrays = _plain(
-        *_camera_arrays(reconstruction.camera_idx, reconstruction.cameras, reconstruction.variation),
-        reconstruction.R_cw, reconstruction.center_w, phi, reconstruction.velocity,
-        reconstruction.points_w, obs.frame_idx, obs.point_idx,
-        _lens_pixels(reconstruction.cameras, reconstruction.camera_idx[obs.frame_idx], obs.xy_raw),
-    )  # fmt: skip
-    projection.residuals(model, *arrays, res, valid)
-    return res, valid
-
-
 # Observations that a thread takes at a time, and whose costs are summed together.
 _CHUNK = 1024
 
 _VARIATION = np.array([INTRINSICS[name] for name in ("f", "cx", "cy")], np.int64)
-
-
-def _tables(
-    phi: NDArray[np.float64], values: NDArray[np.float64], clock: NDArray[np.float64], R_cw: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Motions of photos with bends as the kernels take them: positions in the cameras' frames."""
-    in_camera = np.concatenate([values[..., :3], np.einsum("mij,mnj->mni", R_cw, values[..., 3:])], axis=2)
-    return bend_table(phi, clock[:, 0], clock[:, 1], in_camera)
 
 
 class BundleProblem:
@@ -331,7 +255,7 @@ class BundleProblem:
 
     def _kernel_args(self, state: State) -> tuple[Any, ...]:
         if state is not self._args_of:
-            self._args_of, self._args = state, _plain(*self._arrays(state))
+            self._args_of, self._args = state, plain_arrays(*self._arrays(state))
         return self._model, *self._args, LOSSES[self._options.loss], self._options.loss_scale
 
     def _arrays(self, state: State) -> tuple[NDArray[Any], ...]:
@@ -340,10 +264,10 @@ class BundleProblem:
         phi = state.phi
         if self.layout.bent:
             values = self.layout.values(state.bend, self._start.image_names)
-            phi = _tables(phi, values, self._bend_clock, state.R_cw)
-        xy = _lens_pixels(state.cameras, self._start.camera_idx[s.frame_idx], self._xy)
+            phi = motion_tables(phi, values, self._bend_clock, state.R_cw)
+        xy = observed_lens_pixels(state.cameras, self._start.camera_idx[s.frame_idx], self._xy)
         return (
-            *_camera_arrays(self._start.camera_idx, state.cameras, state.variation),
+            *camera_arrays(self._start.camera_idx, state.cameras, state.variation),
             state.R_cw, state.center_w, phi, state.velocity, state.points_w,
             s.frame_idx, s.point_idx, xy, self._sigma_px,
         )  # fmt: skip

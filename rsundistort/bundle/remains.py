@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..model import READOUTS, Observations, Reconstruction
 from ..model.bend import splines_at
-from .problem import reprojection_residuals
+from ..model.reprojection import reprojection_residuals
 
 __all__ = ["CLIP", "WAVES", "agreement_of_waves", "errors_without", "half_across_readout", "warps", "waves"]
 

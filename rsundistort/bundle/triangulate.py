@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..model import Reconstruction
 from ..model.projection import clock_of, unproject_points
-from .problem import reprojection_residuals
+from ..model.reprojection import reprojection_residuals
 
 __all__ = ["revive_points"]
 

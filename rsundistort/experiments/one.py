@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..batch.progress import ProgressCallback
 from ..bundle import BundleOptions, bundle_adjust, objective
 from ..errors import FileError, FormatError, InputError
 from ..evaluation import align_points, rotation_angles_deg
 from ..io.record import Record
 from ..model import Observations, Reconstruction, RowMotion
-from ..pipeline.progress import ProgressCallback
 from ..synthetic import project_rows
 from .figures import cumulative_histograms, need_matplotlib
 from .scenes import KnownScene, load_scene

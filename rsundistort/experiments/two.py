@@ -12,15 +12,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..batch.progress import ProgressCallback
 from ..errors import InputError, ReconstructionError
 from ..evaluation import align_points, pose_errors
+from ..input.photo_cameras import camera_file_of
 from ..io import list_photos, output_folder
 from ..io.record import Record
 from ..model import Solution, check_shutter_model
-from ..pipeline import RunOptions, run, versions
-from ..pipeline.cameras import camera_file_of
-from ..pipeline.outputs import files_of_run
-from ..pipeline.progress import ProgressCallback
+from ..solve import RunOptions, run
+from ..solve.run_outputs import files_of_run
+from ..versions import versions
 from .figures import camera_paths, need_matplotlib
 
 __all__ = ["PathComparison", "TwoOptions", "compare_paths", "experiment_two"]

@@ -1,8 +1,7 @@
 """Files: photos, cameras, solutions, COLMAP models, nerfstudio."""
 
+from ..colmap import read_colmap_cameras, read_colmap_poses, write_colmap_model, write_colmap_workspace
 from .cameras import CameraFile, check_camera_fits, parse_camera, read_camera_file
-from .colmap import read_colmap_cameras, read_colmap_poses, write_colmap_model
-from .colmap_workspace import write_colmap_workspace
 from .depth_maps import find_depth_maps, read_depth_map
 from .groups import group_of, guess_readouts
 from .gyro import GyroLog, bends_from_gyro, gyro_offset, motions_from_gyro, read_gyro, read_photo_times

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from ..colmap import read_colmap_cameras
 from ..errors import FileError, FormatError, InputError
 from ..model import READOUTS, Camera
 from .calibrations import camera_from_calibration, is_calibration, parse_xml, parse_yaml
-from .colmap import read_colmap_cameras
 
 __all__ = [
     "SIGMA_NAMES",

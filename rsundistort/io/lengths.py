@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..bundle import KnownLength
 from ..errors import FormatError, InputError
+from ..model import KnownLength
 from .tables import read_table
 
 __all__ = ["read_known_lengths"]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..colmap.measured_model import ColmapModel, read_colmap_model
 from ..errors import FileError, FormatError, InputError
-from .colmap_model import ColmapModel, read_colmap_model
 from .json_text import read_json
 from .openmvg import openmvg_model
 from .opensfm import opensfm_model

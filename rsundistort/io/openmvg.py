@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from ..colmap.cameras_and_poses import checked_name
+from ..colmap.measured_model import ColmapModel
 from ..errors import FormatError
 from ..model import Camera, Observations, Reconstruction
-from .colmap_model import ColmapModel, checked_name
 
 __all__ = ["openmvg_model"]
 

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..colmap.cameras_and_poses import checked_name
+from ..colmap.measured_model import ColmapModel
 from ..errors import FileError, FormatError
 from ..model import Camera, Observations, Reconstruction
-from .colmap_model import ColmapModel, checked_name
 
 __all__ = ["opensfm_model"]
 

@@ -3,6 +3,7 @@
 from .bend import BEND_GROUPS, Bend
 from .camera import READOUTS, Camera
 from .depth import AtInfinity, Depth, DepthMap, Plane
+from .known_length import KnownLength
 from .motion import SHUTTER_MODELS, RowMotion, check_shutter_model
 from .reconstruction import Observations, Reconstruction
 from .solution import Solution, SolvedImage
@@ -16,6 +17,7 @@ __all__ = [
     "Camera",
     "Depth",
     "DepthMap",
+    "KnownLength",
     "Observations",
     "Plane",
     "Reconstruction",

@@ -1,34 +1,25 @@
-"""Whole jobs: the order of the stages, nothing else."""
+"""Deprecated: what was here is in `input`, `solve`, `batch`, `simulate` and `analysis`. Gone in the next version."""
 
-from .analyze import analyze
-from .batch import rectify_folder
-from .evaluate import evaluate
-from .from_model import solve, solve_model
-from .gyro import GyroOptions
-from .options import RunOptions, SolveOptions
-from .outcome import versions
-from .photo import RectifyOptions
-from .run import run
-from .scene import SceneOptions, simulate_scene
-from .simulate import WarpOptions, read_motion_file, simulate_warp
-from .workers import use_threads
+import warnings
+from importlib import import_module
+from typing import Any
 
-__all__ = [
-    "GyroOptions",
-    "RectifyOptions",
-    "RunOptions",
-    "SceneOptions",
-    "SolveOptions",
-    "WarpOptions",
-    "analyze",
-    "evaluate",
-    "read_motion_file",
-    "rectify_folder",
-    "run",
-    "simulate_scene",
-    "simulate_warp",
-    "solve",
-    "solve_model",
-    "use_threads",
-    "versions",
-]
+_MOVED = {
+    "analyze": "analysis", "evaluate": "analysis",
+    "RectifyOptions": "batch", "rectify_folder": "batch", "use_threads": "batch",
+    "GyroOptions": "input",
+    "SceneOptions": "simulate", "WarpOptions": "simulate", "read_motion_file": "simulate",
+    "simulate_scene": "simulate", "simulate_warp": "simulate",
+    "RunOptions": "solve", "SolveOptions": "solve", "run": "solve", "solve": "solve", "solve_model": "solve",
+    "versions": "versions",
+}  # fmt: skip
+
+__all__ = list(_MOVED)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MOVED:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = f"rsundistort.{_MOVED[name]}"
+    warnings.warn(f"rsundistort.pipeline.{name} is now in {module}", DeprecationWarning, stacklevel=2)
+    return getattr(import_module(module), name)

@@ -11,7 +11,7 @@ from ..errors import InputError
 from ..model import AtInfinity, Camera, Depth, RowMotion, check_shutter_model
 from ..model.checks import check_finite, check_rotations
 from ..model.field import add_field
-from .depth import DepthRows
+from .pixel_depths import DepthRows
 
 __all__ = ["fill_rows", "init_rectify_map", "rectified_rays", "seen_by"]
 

@@ -16,8 +16,8 @@ from .._kernels import projection as kernels
 from ..errors import InputError
 from ..model import AtInfinity, Camera, Depth, DepthMap, RowMotion
 from .coarse import coarse_grid
-from .depth import DepthRows
 from .maps import fill_rows, rectified_rays, seen_by
+from .pixel_depths import DepthRows
 
 __all__ = ["INTERPOLATIONS", "rectify"]
 

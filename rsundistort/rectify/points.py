@@ -13,8 +13,8 @@ from ..errors import InputError
 from ..model import READOUTS, AtInfinity, Camera, Depth, DepthMap, Plane, RowMotion
 from ..model.checks import check_array, check_finite
 from ..model.projection import clock_of, project_points, unproject_points
-from .depth import inverse_depth_at
 from .maps import rectified_rays
+from .pixel_depths import inverse_depth_at
 
 __all__ = ["bend_px", "distort_points", "largest_shift_px", "undistort_points"]
 

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..bundle import BundleResult, reprojection_residuals
+from ..bundle import BundleResult
 from ..errors import FileError, FormatError
 from ..evaluation import align_points
 from ..io.aside import write_aside
 from ..model import READOUTS, Reconstruction
+from ..model.reprojection import reprojection_residuals
 
 __all__ = ["Diagnostics", "read_diagnostics", "write_diagnostics"]
 

@@ -1,7 +1,7 @@
 """Structure from motion around pycolmap: features, pairs, matching, mapping, re-triangulation."""
 
 from .alignment import PatchPlaces, PatchSource, align_tracks, allowed_patches, cut_patches
-from .database import MatchedPhotos, kept_log_level
+from .database import MatchedPhotos
 from .features import DETECTION_MEGAPIXELS, Features, detect_features, detection_bytes, grey_8_bit
 from .imported import matched_of_database
 from .mapping import LEAST_MEASUREMENTS, map_photos
@@ -26,7 +26,6 @@ __all__ = [
     "edge_width_px",
     "global_descriptors",
     "grey_8_bit",
-    "kept_log_level",
     "map_photos",
     "match_photos",
     "matched_of_database",

@@ -8,9 +8,7 @@ measurements of the adjustment remain the raw pixels.
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,27 +16,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..colmap.conventions import HALF, poses_of, quiet_pycolmap
+from ..colmap.lenses import camera_to_colmap
 from ..errors import ReconstructionError
 from ..model import Camera, Observations, Reconstruction, RowMotion
 from ..model.projection import project_points, unproject_points
 from .features import Features
 
 __all__ = [
-    "HALF",
     "LOOSE",
     "MatchedPhotos",
-    "database_camera",
     "from_pycolmap",
     "ideal_keypoints",
-    "kept_log_level",
     "pipeline_options",
-    "quiet_pycolmap",
     "verification_options",
     "write_photos",
 ]
 
-#: COLMAP's pixel centres are at 0.5.
-HALF = 0.5
 #: A shutter that turns by 0.05 rad over the frame moves pixels by tens; epipolar geometry absorbs most of it. With
 #: thresholds four times COLMAP's own, all photos register and tracks stay whole; with its own, a third is cut off.
 LOOSE = 4.0
@@ -71,55 +65,6 @@ class MatchedPhotos:
     seed: int
 
 
-_level_lock = threading.Lock()
-_level: dict[str, int] = {"users": 0, "before": 0}
-
-
-@contextmanager
-def kept_log_level() -> Iterator[None]:
-    """What pycolmap logs is, after the last of these blocks in any thread, what it was before the first."""
-    import pycolmap
-
-    with _level_lock:
-        if not _level["users"]:
-            _level["before"] = pycolmap.logging.minloglevel
-        _level["users"] += 1
-    try:
-        yield
-    finally:
-        with _level_lock:
-            _level["users"] -= 1
-            if not _level["users"]:
-                pycolmap.logging.minloglevel = _level["before"]
-
-
-def quiet_pycolmap() -> Any:
-    """Pycolmap, quiet, and imported late: it takes half a second, and cv2 must come first (see `io.photos.images`)."""
-    import pycolmap
-
-    pycolmap.logging.minloglevel = 3
-    return pycolmap
-
-
-def database_camera(camera: Camera, calibrated: bool, camera_id: int) -> Any:
-    """The camera of the corrected keypoints; one that mapping can refine, if it is a guess."""
-    K = camera.K
-    cx, cy = K[0, 2] + HALF, K[1, 2] + HALF
-    fisheye = camera.lens == "fisheye"
-    if not calibrated:
-        model = "SIMPLE_RADIAL_FISHEYE" if fisheye else "SIMPLE_RADIAL"
-        params = [K[0, 0], cx, cy, camera.coefficients["k1"]]
-    elif fisheye:
-        model, params = "OPENCV_FISHEYE", [K[0, 0], K[1, 1], cx, cy, *camera.coefficients.values()]
-    else:
-        model, params = "PINHOLE", [K[0, 0], K[1, 1], cx, cy]
-    result = quiet_pycolmap().Camera(
-        model=model, width=camera.width, height=camera.height, params=params, camera_id=camera_id
-    )
-    result.has_prior_focal_length = True
-    return result
-
-
 def ideal_keypoints(
     features: Features, camera: Camera, motion: RowMotion, model: str, own: Camera | None = None
 ) -> NDArray[np.float32]:
@@ -142,7 +87,7 @@ def write_photos(db: Any, matched: MatchedPhotos, limit: int | None = None) -> N
     pycolmap = quiet_pycolmap()
     rig_ids = []
     for index, camera in enumerate(matched.cameras):
-        colmap_camera = database_camera(camera, matched.calibrated, index + 1)
+        colmap_camera = camera_to_colmap(camera, matched.calibrated, index + 1)
         db.write_camera(colmap_camera, use_camera_id=True)
         rig = pycolmap.Rig()
         rig.add_ref_sensor(colmap_camera.sensor_id)
@@ -237,8 +182,6 @@ def from_pycolmap(model: Any, matched: MatchedPhotos, posed: Reconstruction | No
             posed.phi[of], posed.velocity[of], posed.shutter_model, posed.variation[of], posed.bend[of],
             posed.bend_clock[of],
         )  # fmt: skip
-    poses = np.array([model.images[i].cam_from_world().matrix() for i in ids])
-    R_cw = poses[:, :, :3]
-    center_w = -np.einsum("mji,mj->mi", R_cw, poses[:, :, 3])
+    R_cw, center_w = poses_of([model.images[i] for i in ids])
     camera_idx = np.array([matched.camera_idx[i - 1] for i in ids])
     return Reconstruction(matched.cameras, names, camera_idx, R_cw, center_w, points_w, observations)

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..colmap.conventions import HALF, quiet_pycolmap
 from ..errors import FileError, InputError
 from ..model import Reconstruction
-from .database import HALF, MatchedPhotos, quiet_pycolmap, write_photos
+from .database import MatchedPhotos, write_photos
 from .features import Features, size_sigma
 
 __all__ = ["matched_of_database"]

@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from ..colmap.conventions import quiet_pycolmap
+from ..colmap.lenses import refined_camera
 from ..errors import ReconstructionError
-from ..model import Camera, Reconstruction
-from .database import HALF, LOOSE, MatchedPhotos, from_pycolmap, pipeline_options, quiet_pycolmap, write_photos
+from ..model import Reconstruction
+from .database import LOOSE, MatchedPhotos, from_pycolmap, pipeline_options, write_photos
 
 __all__ = ["LEAST_MEASUREMENTS", "map_photos"]
 
@@ -137,7 +139,7 @@ def _firmly_joined(model: Any, matched: MatchedPhotos) -> Reconstruction | None:
 def _refined(matched: MatchedPhotos, model: Any) -> MatchedPhotos:
     """The photos with the cameras that mapping refined; one that took none of the joined photos stays a guess."""
     cameras = [
-        _refined_camera(model.cameras[k + 1], camera) if k + 1 in model.cameras else camera
+        refined_camera(model.cameras[k + 1], camera) if k + 1 in model.cameras else camera
         for k, camera in enumerate(matched.cameras)
     ]
     return replace(matched, cameras=tuple(cameras), calibrated=True)
@@ -205,10 +207,3 @@ def _mapping_options(loose: float, matched: MatchedPhotos) -> Any:
         options.ba_global_function_tolerance = 1e-4
         options.ba_global_max_refinements = 2
     return options
-
-
-def _refined_camera(refined: Any, camera: Camera) -> Camera:
-    """Our camera of a SIMPLE_RADIAL or SIMPLE_RADIAL_FISHEYE camera that mapping refined."""
-    f, cx, cy, k1 = refined.params
-    K = [[f, 0, cx - HALF], [0, f, cy - HALF], [0, 0, 1]]
-    return replace(camera, K=np.array(K), dist=np.array([k1, 0, 0, 0]))

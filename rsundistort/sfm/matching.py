@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..colmap.conventions import quiet_pycolmap
 from ..model import Camera
-from .database import LOOSE, MatchedPhotos, quiet_pycolmap, verification_options, write_photos
+from .database import LOOSE, MatchedPhotos, verification_options, write_photos
 from .features import Features
 
 __all__ = ["match_photos"]

@@ -8,16 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..colmap.conventions import quiet_pycolmap
+from ..colmap.lenses import camera_to_colmap
 from ..model import Camera, Reconstruction, RowMotion
 from ..model.projection import unproject_points
-from .database import (
-    MatchedPhotos,
-    database_camera,
-    from_pycolmap,
-    ideal_keypoints,
-    pipeline_options,
-    quiet_pycolmap,
-)
+from .database import MatchedPhotos, from_pycolmap, ideal_keypoints, pipeline_options
 
 __all__ = ["retriangulate"]
 
@@ -55,7 +50,7 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction, *, of_
     tight_px = _TIGHT_PX * float(np.median([each.step_px for each in matched.features]))
     with pycolmap.Database.open(matched.database) as db:
         for index, camera in enumerate(cameras):
-            db.update_camera(database_camera(camera, True, index + 1))
+            db.update_camera(camera_to_colmap(camera, True, index + 1))
         for index, found in enumerate(matched.features):
             camera = cameras[matched.camera_idx[index]]
             model, motion, own = "global", RowMotion(), camera

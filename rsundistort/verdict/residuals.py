@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from ..bundle import reprojection_residuals
 from ..model import Reconstruction
 from ..model.projection import clock_of
+from ..model.reprojection import reprojection_residuals
 
 __all__ = ["left_along_readout", "left_over_frame"]
 

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ..batch.progress import StageLog
+from ..batch.workers import Workers
 from ..bundle import (
     LADDER,
     BundleOptions,
@@ -24,15 +26,13 @@ from ..bundle import (
 )
 from ..critical import Advice, Remedy, advise, heal, with_remedy
 from ..errors import ReconstructionError, RsUndistortWarning
+from ..input.load import LoadedPhotos
+from ..input.pairing import pairs_to_match
+from ..input.patches import patch_source
 from ..model import Reconstruction
 from ..model.projection import unproject_points
 from ..sfm import LEAST_MEASUREMENTS, MatchedPhotos, align_tracks, map_photos, match_photos, retriangulate
 from ..verdict import Verdict, judge
-from .load import LoadedPhotos
-from .pairing import pairs_to_match
-from .patches import patch_source
-from .progress import StageLog
-from .workers import Workers
 
 __all__ = ["Feedback", "Solved", "rungs_to", "solve_photos", "solve_tracks"]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from .._kernels import depth as kernels
 from ..errors import InputError
 from ..model import DepthMap, Plane
-from .depth import inverse_depth_at
+from .pixel_depths import inverse_depth_at
 
 __all__ = ["depth_from_points", "fit_plane", "plane_in_camera", "prefers_plane"]
 

@@ -8,17 +8,17 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..bundle import BundleOptions, KnownLength
+from ..batch.geometry import check_depth
+from ..batch.rectify_options import RectifyOptions
+from ..bundle import BundleOptions
 from ..critical import with_remedy
 from ..errors import InputError
+from ..input.gyroscope import GyroOptions
+from ..input.pairing import MATCHINGS
+from ..input.photo_cameras import PhotoCameras, check_readouts
 from ..io.cameras import check_sigma
-from ..model import Bend, check_shutter_model
+from ..model import Bend, KnownLength, check_shutter_model
 from ..sfm import DETECTION_MEGAPIXELS
-from .cameras import PhotoCameras, check_readouts
-from .depth import check_depth
-from .gyro import GyroOptions
-from .pairing import MATCHINGS
-from .photo import RectifyOptions
 
 __all__ = ["RunOptions", "SolveOptions"]
 

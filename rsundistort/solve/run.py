@@ -7,24 +7,24 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
+from ..batch.progress import ProgressCallback, StageLog
+from ..batch.workers import Workers, use_threads
 from ..bundle import BundleOptions
 from ..errors import InputError, RsUndistortWarning
+from ..input.exposure import bounded_by_exposure
+from ..input.frames import find_photos
+from ..input.gyroscope import gyro_contradiction, gyro_motions, known_readouts
+from ..input.load import load_photos
+from ..input.photo_cameras import camera_file_of
 from ..io import is_video, list_photos, output_folder
 from ..io.motions import Known
 from ..io.places import local_place
 from ..io.record import Record
 from ..model import Reconstruction, Solution
-from .cameras import camera_file_of
-from .exposure import bounded_by_exposure
-from .frames import find_photos
-from .gyro import gyro_contradiction, gyro_motions, known_readouts
-from .ladder import solve_photos
-from .load import load_photos
-from .options import RunOptions
+from .model_sequence import solve_photos
 from .outcome import Outcome
-from .outputs import REPLACED, Outputs, files_of_run, inputs_of, photo_times
-from .progress import ProgressCallback, StageLog
-from .workers import Workers, use_threads
+from .run_options import RunOptions
+from .run_outputs import REPLACED, Outputs, files_of_run, inputs_of, photo_times
 
 __all__ = ["run"]
 

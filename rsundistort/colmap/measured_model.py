@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bundle import reprojection_residuals
-from ..errors import FileError, FormatError, InputError
+from ..errors import FileError, FormatError
 from ..model import Observations, Reconstruction
-from ..model.checks import check_photo_name
-from .colmap import ModelIds, camera_from_colmap
-from .colmap_files import check_colmap_files
+from ..model.reprojection import reprojection_residuals
+from .cameras_and_poses import checked_name
+from .conventions import HALF, poses_of, quiet_pycolmap
+from .file_checks import check_colmap_files
+from .lenses import camera_from_colmap
+from .rectified_model import ModelIds
 
-__all__ = ["ColmapModel", "checked_name", "colmap_model_of", "read_colmap_model", "surviving_points"]
+__all__ = ["ColmapModel", "colmap_model_of", "read_colmap_model", "surviving_points"]
 
-# COLMAP's pixel centres are at 0.5, ours at 0
-_HALF = 0.5
 
 # files of every model, text or binary; newer ones have rigs and frames, too
 _PARTS = ("cameras", "images", "points3D")
@@ -132,9 +132,6 @@ def read_colmap_model(folder: Path) -> ColmapModel:
     FileError, FormatError
         When there is none, or one that cannot be taken (see `colmap_model_of`).
     """
-    import pycolmap
-
-    pycolmap.logging.minloglevel = 3
     folder = Path(folder)
     if not folder.is_dir():
         raise FileError(f"{folder} is no folder; give the folder with cameras, images and points3D of a COLMAP model")
@@ -142,7 +139,7 @@ def read_colmap_model(folder: Path) -> ColmapModel:
         raise FileError(f"{folder} is no COLMAP model; give the folder with its cameras, images and points3D")
     check_colmap_files(folder)
     try:
-        model = pycolmap.Reconstruction(folder)
+        model = quiet_pycolmap().Reconstruction(folder)
     except Exception as error:  # pycolmap raises what its C++ raised
         raise FileError(f"{folder} is no COLMAP model: {' '.join(str(error).split())}") from error
     return colmap_model_of(model, str(folder))
@@ -171,11 +168,11 @@ def colmap_model_of(model: Any, where: str = "the model") -> ColmapModel:
         raise FormatError(
             f"{where} holds {len(images)} registered photos and {model.num_points3D()} points, expected more"
         )
-    poses = np.array([image.cam_from_world().matrix() for image in images])
+    R_cw, center_w = poses_of(images)
     point_ids = np.array(sorted(model.point3D_ids()), np.int64)
     points_w = np.array([model.points3D[k].xyz for k in point_ids.tolist()])
     colors = np.array([model.points3D[k].color for k in point_ids.tolist()], np.uint8)
-    for name, values in (("pose", poses), ("point", points_w)):
+    for name, values in (("pose", R_cw), ("pose", center_w), ("point", points_w)):
         if not np.isfinite(values).all():
             raise FormatError(f"{where} holds a {name} that is no number")
     frame_idx, point_of, keypoint, xy = [], [], [], []
@@ -185,16 +182,15 @@ def colmap_model_of(model: Any, where: str = "the model") -> ColmapModel:
         table = np.array(seen, np.float64).reshape(-1, 4)
         keypoint.append(table[:, 0].astype(np.int64))
         point_of.append(np.searchsorted(point_ids, table[:, 1].astype(np.int64)))
-        xy.append(table[:, 2:] - _HALF)
+        xy.append(table[:, 2:] - HALF)
     frame, point = np.concatenate(frame_idx), np.concatenate(point_of)
     place = {key: k for k, key in enumerate(camera_ids)}
-    R_cw = poses[:, :, :3]
     rec = Reconstruction(
         cameras,
         [checked_name(image.name, where) for image in images],
         np.array([place[image.camera_id] for image in images], np.int64),
         R_cw,
-        -np.einsum("mji,mj->mi", R_cw, poses[:, :, 3]),
+        center_w,
         points_w,
         Observations(frame, point, np.concatenate(xy)),
     )
@@ -209,14 +205,6 @@ def colmap_model_of(model: Any, where: str = "the model") -> ColmapModel:
         tuple(unregistered),
         any(model.cameras[k].model_name != "PINHOLE" for k in camera_ids),
     ).once_a_photo()
-
-
-def checked_name(name: str, where: str) -> str:
-    """The name of a photo of the model that `where` names."""
-    try:
-        return check_photo_name(name)
-    except InputError as error:
-        raise FormatError(f"{where}: {error}") from error
 
 
 def _once_a_photo(rec: Reconstruction) -> NDArray[np.bool_]:

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..batch.many_photos import mask_names
+from ..batch.progress import ProgressCallback, StageLog
 from ..errors import FileError, InputError
 from ..evaluation import motion_errors, pose_errors, psnr
 from ..io import output_name, read_photo, read_solution
 from ..model import RowMotion, Solution, SolvedImage
 from ..model.orientation import INVERSE, in_stored_frame, turn_pixels
 from ..rectify import rectify
-from .progress import ProgressCallback, StageLog
-from .write import mask_names
 
 __all__ = ["evaluate"]
 

@@ -12,7 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..batch.many_photos import mask_names
+from ..batch.progress import ProgressCallback, StageLog
+from ..batch.workers import use_threads
 from ..errors import FormatError, InputError
+from ..input.photo_cameras import camera_file_of, find_cameras
 from ..io import facts_of_exif, list_photos, output_folder, output_name, read_photo, write_image, write_solution
 from ..io.cameras import camera_to_json
 from ..io.gyro import GyroLog
@@ -24,11 +28,7 @@ from ..rectify import largest_shift_px
 from ..synthetic.fold import check_no_fold
 from ..synthetic.unsteady import Poses, RowTable, Vibration, read_row_tables, row_table, tracks, unsteady_motions
 from ..synthetic.warp import crop_camera, largest_rectangle, random_phi, warp_mask, warp_photo
-from .cameras import camera_file_of, find_cameras
-from .outcome import versions
-from .progress import ProgressCallback, StageLog
-from .workers import use_threads
-from .write import mask_names
+from ..versions import versions
 
 __all__ = ["WarpOptions", "read_motion_file", "simulate_warp"]
 

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..batch.workers import Workers
 from ..errors import FileError
 from ..io import read_mask, read_photo
 from ..sfm import PatchPlaces, PatchSource, allowed_patches, cut_patches, grey_8_bit
 from .load import LoadedPhotos
-from .workers import Workers
 
 __all__ = ["patch_source"]
 

@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..batch.progress import ProgressCallback, StageLog
+from ..batch.workers import use_threads
 from ..errors import InputError
 from ..io import output_folder, write_solution
 from ..io.cameras import camera_to_json
@@ -20,8 +22,6 @@ from ..io.record import Record
 from ..model import Solution, SolvedImage
 from ..synthetic import Recipe, TruePoints, add_noise, check_recipe, load_recipe, render_depth, render_view, true_points
 from ..synthetic import rs_shift_px as shift_in_scene
-from .progress import ProgressCallback, StageLog
-from .workers import use_threads
 
 __all__ = ["SceneOptions", "simulate_scene"]
 

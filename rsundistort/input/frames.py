@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..batch.progress import StageLog
 from ..errors import InputError
 from ..io.video import VideoFrames, extract_frames, is_video
-from .progress import StageLog
 
 __all__ = ["PhotoSource", "find_photos"]
 

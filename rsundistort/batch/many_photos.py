@@ -19,10 +19,11 @@ from ..io.photos.kinds import kind_of_name
 from ..io.places import Place, RemoteFolder, absolute, files_of, place_of, sizes_under
 from ..io.record import Record
 from ..model import Reconstruction, Solution
-from .depth import DEPTHS, PhotoDepths
 from .extras import find_extras
-from .photo import PhotoDone, PhotoJob, RectifyOptions, rectify_photo
+from .geometry import DEPTHS, PhotoDepths
+from .one_photo import PhotoDone, PhotoJob, rectify_photo
 from .progress import StageLog
+from .rectify_options import RectifyOptions
 from .workers import Workers
 
 __all__ = ["PointColors", "mask_names", "rectify_photos"]

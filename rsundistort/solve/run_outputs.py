@@ -13,6 +13,13 @@ from pathlib import Path, PurePath
 import numpy as np
 from numpy.typing import NDArray
 
+from ..batch.geometry import DEPTHS, PhotoDepths, ScenePoints, with_depths
+from ..batch.many_photos import PointColors, mask_names, rectify_photos
+from ..batch.one_photo import turn_of
+from ..batch.progress import StageLog
+from ..batch.views import with_view
+from ..batch.workers import Workers
+from ..colmap.rectified_model import ModelIds
 from ..errors import FileError, InputError, RsUndistortWarning
 from ..io import (
     output_folder,
@@ -26,7 +33,6 @@ from ..io import (
     write_trajectory,
     write_transforms,
 )
-from ..io.colmap import ModelIds
 from ..io.journal import Journal
 from ..io.outputs import batch_folder
 from ..io.places import local_place
@@ -35,15 +41,9 @@ from ..model import Reconstruction, RowMotion, Solution
 from ..model.orientation import turn_reconstruction, turn_solution
 from ..rectify import bend_px
 from ..report import Diagnostics, relative_folder, write_diagnostics, write_report
-from .depth import DEPTHS, PhotoDepths, ScenePoints, with_depths
-from .ladder import Solved
-from .options import SolveOptions
+from .model_sequence import Solved
 from .outcome import Outcome, solution_of
-from .photo import turn_of
-from .progress import StageLog
-from .views import with_view
-from .workers import Workers
-from .write import PointColors, mask_names, rectify_photos
+from .run_options import SolveOptions
 
 __all__ = ["REPLACED", "Outputs", "files_of_run", "inputs_of", "photo_times"]
 

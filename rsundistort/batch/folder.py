@@ -16,12 +16,12 @@ from ..io.record import Record
 from ..io.solution import solution_to_bytes
 from ..model import Solution
 from ..model.orientation import in_stored_frame, split_mirror, turn_solution
-from .depth import DEPTHS, PhotoDepths, ScenePoints, check_depth, with_depths
-from .photo import RectifyOptions
+from .geometry import DEPTHS, PhotoDepths, ScenePoints, check_depth, with_depths
+from .many_photos import rectify_photos
 from .progress import ProgressCallback, StageLog
+from .rectify_options import RectifyOptions
 from .views import with_view
 from .workers import Workers, use_threads
-from .write import rectify_photos
 
 __all__ = ["rectify_folder"]
 

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bundle import BundleResult, ModelChoice, reprojection_residuals
+from ..bundle import BundleResult, ModelChoice
+from ..input.photo_cameras import PhotoCameras
 from ..model import BEND_GROUPS, Reconstruction, Solution, SolvedImage
 from ..model.field import field_over_frame
+from ..model.reprojection import reprojection_residuals
 from ..rectify import largest_shift_px
-from .cameras import PhotoCameras
-from .ladder import Solved
-from .options import SolveOptions
+from ..versions import versions
+from .model_sequence import Solved
+from .run_options import SolveOptions
 
-__all__ = ["Outcome", "solution_of", "versions"]
+__all__ = ["Outcome", "solution_of"]
 
 
 @dataclass(frozen=True)
@@ -59,12 +59,6 @@ class Outcome:
         """Of the reconstruction's cameras, in all outputs."""
         rec = self.solved.result.reconstruction
         return list(range(1, 1 + rec.num_images)) if rec.varies else list(self.shared_ids)
-
-
-def versions() -> dict[str, str]:
-    """Versions of what a result depends on."""
-    names = ("rsundistort", "opencv-contrib-python-headless", "numpy", "scipy", "numba", "pycolmap")
-    return {"python": platform.python_version(), **{name: version(name) for name in names}}
 
 
 def _by_camera(keys: Sequence[str], shared: Reconstruction, values: Sequence[Any]) -> dict[str, Any]:

@@ -11,26 +11,27 @@ from typing import Any
 
 import numpy as np
 
+from ..batch.progress import ProgressCallback, StageLog
+from ..batch.workers import Workers, use_threads
 from ..bundle import BundleOptions
+from ..colmap.conventions import kept_log_level
+from ..colmap.measured_model import ColmapModel, colmap_model_of, surviving_points
+from ..colmap.rectified_model import ModelIds, colmap_model
 from ..errors import FileError, InputError, ReconstructionError, RsUndistortWarning
+from ..input.gyroscope import known_readouts
+from ..input.photo_cameras import PhotoCameras, check_readouts
 from ..io import ExifFacts, guess_readouts, list_photos, output_folder, output_name, read_exif
-from ..io.colmap import ModelIds, colmap_model
-from ..io.colmap_model import ColmapModel, colmap_model_of, surviving_points
 from ..io.models import read_model
 from ..io.photos.images import stored_size
 from ..io.places import local_place
 from ..io.record import Record
 from ..model import Reconstruction, Solution
 from ..model.orientation import INVERSE, turn_reconstruction
-from ..sfm import kept_log_level, matched_of_database
-from .cameras import PhotoCameras, check_readouts
-from .gyro import known_readouts
-from .ladder import Feedback, solve_tracks
-from .options import SolveOptions
+from ..sfm import matched_of_database
+from .model_sequence import Feedback, solve_tracks
 from .outcome import Outcome
-from .outputs import REPLACED, Outputs, PointRgb, files_of_run, inputs_of, photo_times
-from .progress import ProgressCallback, StageLog
-from .workers import Workers, use_threads
+from .run_options import SolveOptions
+from .run_outputs import REPLACED, Outputs, PointRgb, files_of_run, inputs_of, photo_times
 
 __all__ = ["solve", "solve_model"]
 

@@ -8,15 +8,16 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ..batch.one_photo import check_not_rectified
+from ..batch.progress import StageLog
+from ..batch.rectify_options import RectifyOptions
+from ..batch.workers import Workers
 from ..errors import FileError, InputError, SkippedPhotoWarning
 from ..io import ExifFacts, facts_of_exif, find_masks, list_photos, read_mask, read_photo
 from ..io.photos.images import stored_size
 from ..io.places import local_place
 from ..sfm import DETECTION_MEGAPIXELS, Features, detect_features, detection_bytes, edge_width_px, grey_8_bit
-from .cameras import PhotoCameras, find_cameras
-from .photo import RectifyOptions, check_not_rectified
-from .progress import StageLog
-from .workers import Workers
+from .photo_cameras import PhotoCameras, find_cameras
 
 __all__ = ["LONG_EXPOSURE_S", "LoadedPhotos", "load_photos"]
 

@@ -1,0 +1,6 @@
+"""What files are worth: poses by the measure of critical motions, outputs against the truth."""
+
+from .against_truth import evaluate
+from .critical_poses import analyze
+
+__all__ = ["analyze", "evaluate"]

@@ -1,0 +1,57 @@
+"""How pycolmap counts pixels, holds poses and logs, against how we do: each once, here."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["HALF", "kept_log_level", "poses_of", "quiet_pycolmap", "rigid_of"]
+
+#: COLMAP's pixel centres are at 0.5, ours at 0.
+HALF = 0.5
+
+_level_lock = threading.Lock()
+_level: dict[str, int] = {"users": 0, "before": 0}
+
+
+@contextmanager
+def kept_log_level() -> Iterator[None]:
+    """What pycolmap logs is, after the last of these blocks in any thread, what it was before the first."""
+    import pycolmap
+
+    with _level_lock:
+        if not _level["users"]:
+            _level["before"] = pycolmap.logging.minloglevel
+        _level["users"] += 1
+    try:
+        yield
+    finally:
+        with _level_lock:
+            _level["users"] -= 1
+            if not _level["users"]:
+                pycolmap.logging.minloglevel = _level["before"]
+
+
+def quiet_pycolmap() -> Any:
+    """Pycolmap, quiet, and imported late: it takes half a second, and cv2 must come first (see `io.photos.images`)."""
+    import pycolmap
+
+    pycolmap.logging.minloglevel = 3
+    return pycolmap
+
+
+def poses_of(images: Sequence[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotations R_cw (m, 3, 3) and centres (m, 3) of pycolmap's images."""
+    poses = np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4)
+    R_cw = poses[:, :, :3]
+    return R_cw, -np.einsum("mji,mj->mi", R_cw, poses[:, :, 3])
+
+
+def rigid_of(R_cw: NDArray[np.float64], center_w: NDArray[np.float64]) -> Any:
+    """Pycolmap's pose of a rotation (3, 3) and a centre (3,)."""
+    return quiet_pycolmap().Rigid3d(np.column_stack([R_cw, -R_cw @ center_w]))
