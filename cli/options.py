@@ -11,7 +11,7 @@ import click
 
 from .terminal import Talk, errors_for_people
 
-# as in `model`, `rectify` and `pipeline`: not to be imported for --help
+# as in `model`, `rectify` and `input`: not to be imported for --help
 READOUT_NAMES = ("top-to-bottom", "bottom-to-top", "left-to-right", "right-to-left")
 INTERPOLATION_NAMES = ("cubic", "linear", "lanczos", "nearest")
 MAP_KIND_NAMES = ("npz", "exr", "stmap")
@@ -140,6 +140,20 @@ depth_option: Decorator = click.option(
     help="How far away what the photos show is, which matters where the camera travelled during the readout: on a "
     "plane, as the known points, or as maps of your own (a.npy, .npz or float .tif for a.jpg: docs/depth.md).",
 )
+maps_option: Decorator = click.option(
+    "--maps",
+    type=click.Choice(MAP_KIND_NAMES),
+    help="Write each photo's map and its inverse into OUT/maps: NumPy (npz), OpenEXR in pixels, or the ST map of "
+    "compositing programs (extra exr).",
+)
+also_option: Decorator = click.option(
+    "--also",
+    multiple=True,
+    metavar="FOLDER[=INTERPOLATION]",
+    callback=also_folders,
+    help="Rectify other images of the same frames alike (a.png for a.jpg): labels, depth, near infrared; by nearest, "
+    "which makes up no values, or as told. May be repeated.",
+)
 interpolation_option: Decorator = click.option(
     "--interpolation", type=click.Choice(INTERPOLATION_NAMES), default="cubic", show_default=True
 )
@@ -214,6 +228,8 @@ PHOTO_OPTIONS: tuple[Decorator, ...] = (
     apply_orientation_option,
     again_option,
     max_pixels_option,
+    maps_option,
+    also_option,
 )
 
 

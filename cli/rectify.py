@@ -29,20 +29,6 @@ from .terminal import Talk, errors_for_people, list_failed, progress_bars
     help="Folder of masks, a.png for a.jpg: what is black in them is black in OUT/masks.",
 )
 @opt.gathered("photo", *opt.PHOTO_OPTIONS)
-@click.option(
-    "--maps",
-    type=click.Choice(opt.MAP_KIND_NAMES),
-    help="Write each photo's map and its inverse into OUT/maps: NumPy (npz), OpenEXR in pixels, or the ST map of "
-    "compositing programs (extra exr).",
-)
-@click.option(
-    "--also",
-    multiple=True,
-    metavar="FOLDER[=INTERPOLATION]",
-    callback=opt.also_folders,
-    help="Rectify other images of the same frames alike (a.png for a.jpg): labels, depth, near infrared; by nearest, "
-    "which makes up no values, or as told. May be repeated.",
-)
 @opt.jobs_option
 @opt.scheduler_option
 @opt.overwrite_option
@@ -58,8 +44,6 @@ def command(
     out: Path | str,
     masks: Path | str | None,
     photo: dict[str, Any],
-    maps: str | None,
-    also: tuple[tuple[Path, str], ...],
     jobs: int,
     scheduler: str | None,
     overwrite: bool,
@@ -78,7 +62,7 @@ def command(
         from rsundistort.batch import RectifyOptions, rectify_folder
         from rsundistort.io.places import place_of, sizes_under
 
-        options = RectifyOptions(masks=masks, maps=maps, also=also, **opt.photo_fields(photo))
+        options = RectifyOptions(masks=masks, **opt.photo_fields(photo))
         solved, left_out = rectify_folder(
             photos, solution, out, options,
             jobs=jobs, overwrite=overwrite, resume=resume, scheduler=scheduler, progress=progress,

@@ -381,7 +381,7 @@ def test_photos_find_their_times_and_readouts(tmp_path):
         GyroOptions(gyro.file, offset_s=float("nan"))
 
 
-def test_who_says_how_long_the_readout_takes(tmp_path):
+def test_who_says_how_long_the_readout_takes():
     """The user before the log, the log before the table."""
     camera = Camera(1280, 720, [[1000, 0, 640], [0, 1000, 360], [0, 0, 1]])
     other = Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]])
@@ -389,7 +389,7 @@ def test_who_says_how_long_the_readout_takes(tmp_path):
     told = log(readout_s=0.02)
 
     def known(given_s, log_):
-        return known_readouts(tmp_path, ["a.png", "b.png"], [camera, other], [0, 1], frames, given_s, log_)
+        return known_readouts([frames] * 2, [camera, other], [0, 1], given_s, log_)
 
     assert known(0.03, told) == {0: (0.03, "given"), 1: (0.03, "given")}
     assert known(None, told) == dict.fromkeys((0, 1), (0.02, "the gyroscope's log"))

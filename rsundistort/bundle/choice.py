@@ -335,11 +335,12 @@ class _Fits:
 
 
 class _Rungs:
-    """The best fit yet: what was kept on the way to it, and what spoke against others."""
+    """The best fit yet, from the one without a shutter: what was kept on the way, and what spoke against others."""
 
     def __init__(self, fits: _Fits, best: _Fit, kept: list[str], gain: dict[str, float]) -> None:
         self._fits = fits
-        self.best, self.kept, self.gain = best, kept, gain
+        self.plain = self.best = best
+        self.kept, self.gain = kept, gain
         self.against: list[str] = []
 
     def climb(self, fit: _Fit) -> None:
@@ -407,67 +408,20 @@ def choose_model(
     """
     options = options or BundleOptions()
     fits = _Fits(reconstruction, options, sigma_px, seed, progress)
-    given = fits.given
-    best = first = fits.fit(rungs[0], False, [given])
-    kept, gain = [best.label], dict[str, float]()
-    if options.refine and not first.is_explained:
-        vary = fits.fit(rungs[0], True, [best.reconstruction])
-        gain[vary.label] = fits.gain(best, vary)
-        if fits.is_better(best, vary):
-            best = vary
-            kept.append(vary.label)
-    plain = last = best
-    varying = plain.varying
-    if varying and "rotation" in rungs:
-        # where a shutter alone leaves less than half of what a varying lens does, the lens is not what bends the photos
-        alone = fits.fit("rotation", False, [first.reconstruction, given])
-        varying = not float(alone.errors.mean()) < _MOST_OF_IT * float(plain.errors.mean())
-        last = last if varying else first
-    climbing = _Rungs(fits, plain, kept, gain)
-    for model in rungs[1:]:
-        if climbing.best.bends and climbing.best.is_explained:
-            break
-        bends = climbing.best.bends
-        last = fits.fit(model, varying, [last.reconstruction, given], bends=bends)
-        climbing.climb(last)
-        if SHUTTER_MODELS[model] >= SHUTTER_MODELS["rotation"]:
-            climbing.bend(last)
-            last = climbing.best if climbing.best.model == model else last
-    best, against = climbing.best, climbing.against
-    if best.bends:
-        # a model that came later may explain what bends explained before it
-        steady = fits.fit(best.model, best.varying, [best.reconstruction, given])
-        if not fits.is_better(steady, best):
-            best = steady
-            kept.append(steady.label)
-    agreement = None
+    rungs_kept = _climbed(fits, rungs, bool(options.refine))
+    plain, best, kept, gain = rungs_kept.plain, rungs_kept.best, rungs_kept.kept, rungs_kept.gain
+    against, agreement = rungs_kept.against, None
     if best is not plain:
         against = []
-    if best is not plain and np.median(moved_px(best.reconstruction)) < _UNSEEN_PX:
-        best = plain
-    if best is not plain:
-        # one reason is enough, and the last ones take the longest to find
-        if fits.at_limit(best):
-            against.append("the exposure times allow less motion than they would need")
-        if not against:
-            other = fits.along_other_axis(best, plain)
-            gain[other.label] = fits.gain(best, other)
-            if not fits.is_better(other, best):
-                against.append("a shutter that reads along the other axis explains the photos as well")
-        if not against:
-            agreement = fits.agreement(best)
-            if agreement < _MIN_AGREEMENT:
-                against.append(f"two halves of the scene tell different motions (they agree to {agreement:.2f} of 1)")
-        if against:
+        if np.median(moved_px(best.reconstruction)) < _UNSEEN_PX:
             best = plain
-        elif plain.varying:
-            # whether the lens varies beside the shutter
-            shared, vary = (
-                fits.fit(best.model, each, [best.reconstruction, given], bends=best.bends) for each in (False, True)
-            )
-            gain[vary.label] = fits.gain(shared, vary)
-            best = vary if fits.is_better(shared, vary) else shared
-            kept += [best.label] * (best.label not in kept)
+        else:
+            against, agreement = _doubts(fits, best, plain, gain)
+            if against:
+                best = plain
+            elif plain.varying:
+                best = _with_shared_lens(fits, best, gain)
+                kept += [best.label] * (best.label not in kept)
     if best is plain:
         kept = kept[: kept.index(plain.label) + 1]
     if not len(fits.held_out):
@@ -498,3 +452,65 @@ def choose_model(
         best.bends,
         shutter != "not-determined" and fits.waves(best, _RESTLESS, _UNSEEN_PX / 2),
     )
+
+
+def _climbed(fits: _Fits, rungs: Sequence[str], refines: bool) -> _Rungs:
+    """The models in order: a lens that varies, then those of the shutter, then motions that are not steady."""
+    given = fits.given
+    first = plain = fits.fit(rungs[0], False, [given])
+    kept, gain = [first.label], dict[str, float]()
+    if refines and not first.is_explained:
+        vary = fits.fit(rungs[0], True, [first.reconstruction])
+        gain[vary.label] = fits.gain(first, vary)
+        if fits.is_better(first, vary):
+            plain = vary
+            kept.append(vary.label)
+    last, varying = plain, plain.varying
+    if varying and "rotation" in rungs:
+        # where a shutter alone leaves less than half of what a varying lens does, the lens is not what bends the photos
+        alone = fits.fit("rotation", False, [first.reconstruction, given])
+        varying = not float(alone.errors.mean()) < _MOST_OF_IT * float(plain.errors.mean())
+        last = last if varying else first
+    climbing = _Rungs(fits, plain, kept, gain)
+    for model in rungs[1:]:
+        if climbing.best.bends and climbing.best.is_explained:
+            break
+        last = fits.fit(model, varying, [last.reconstruction, given], bends=climbing.best.bends)
+        climbing.climb(last)
+        if SHUTTER_MODELS[model] >= SHUTTER_MODELS["rotation"]:
+            climbing.bend(last)
+            last = climbing.best if climbing.best.model == model else last
+    best = climbing.best
+    if best.bends:
+        # a model that came later may explain what bends explained before it
+        steady = fits.fit(best.model, best.varying, [best.reconstruction, given])
+        if not fits.is_better(steady, best):
+            climbing.best = steady
+            kept.append(steady.label)
+    return climbing
+
+
+def _doubts(fits: _Fits, best: _Fit, plain: _Fit, gain: dict[str, float]) -> tuple[list[str], float | None]:
+    """What speaks against a shutter, for people, and how far two halves of the scene agree on its motions.
+
+    One reason is enough, and the last ones take the longest to find.
+    """
+    if fits.at_limit(best):
+        return ["the exposure times allow less motion than they would need"], None
+    other = fits.along_other_axis(best, plain)
+    gain[other.label] = fits.gain(best, other)
+    if not fits.is_better(other, best):
+        return ["a shutter that reads along the other axis explains the photos as well"], None
+    agreement = fits.agreement(best)
+    if agreement < _MIN_AGREEMENT:
+        return [f"two halves of the scene tell different motions (they agree to {agreement:.2f} of 1)"], agreement
+    return [], agreement
+
+
+def _with_shared_lens(fits: _Fits, best: _Fit, gain: dict[str, float]) -> _Fit:
+    """A model of the shutter with one lens for all photos, or with one that varies, if that is better."""
+    shared, vary = (
+        fits.fit(best.model, each, [best.reconstruction, fits.given], bends=best.bends) for each in (False, True)
+    )
+    gain[vary.label] = fits.gain(shared, vary)
+    return vary if fits.is_better(shared, vary) else shared

@@ -11,14 +11,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import InputError
-from ..io import read_exif
+from ..io import ExifFacts
 from ..io.gyro import GyroLog, bends_from_gyro, motions_from_gyro, read_gyro, read_photo_times
 from ..io.motions import Known
 from ..io.readout_times import readout_time
 from ..io.video import FRAME_TABLE, VideoFrames
 from ..model import Bend, Camera, Reconstruction
 
-__all__ = ["GyroOptions", "gyro_contradiction", "gyro_motions", "known_readouts"]
+__all__ = ["GyroOptions", "Readouts", "gyro_contradiction", "gyro_motions", "known_readouts"]
+
+#: By camera: seconds that the readout of a frame takes, and who says so.
+Readouts = dict[int, tuple[float, str]]
 
 # Known motions that a solution misses by this many of their standard deviations are not those of its photos.
 _FAR = 3.0
@@ -59,18 +62,16 @@ class GyroOptions:
 
 
 def known_readouts(
-    folder: Path | None,
-    names: Sequence[str],
+    bodies: Sequence[ExifFacts | VideoFrames],
     cameras: Sequence[Camera],
     camera_idx: ArrayLike,
-    frames: VideoFrames | None,
     given_s: float | None,
     log: GyroLog | None,
-) -> dict[int, tuple[float, str]]:
+) -> Readouts:
     """Seconds that the readout of a frame takes, and who says so: the user, the gyroscope's log, or the table.
 
-    By camera; those of which nothing is known are missing, as all are without a folder or a video. A camera's make and
-    model are those of its first photo, or the video's.
+    By camera; those of which nothing is known are missing. A camera's make and model are those of its first photo, as
+    the EXIF of each or the video says them; nothing is known of them where `bodies` is empty.
     """
     if given_s is not None:
         return dict.fromkeys(range(len(cameras)), (given_s, "given"))
@@ -79,9 +80,9 @@ def known_readouts(
     index = np.asarray(camera_idx).tolist()
     found = {}
     for k, camera in enumerate(cameras):
-        if k not in index or (folder is None and frames is None):
+        if k not in index or not bodies:
             continue
-        body = read_exif((folder or Path()) / names[index.index(k)]) if frames is None else frames
+        body = bodies[index.index(k)]
         readout = readout_time(body.make or "", body.model or "", camera.width, camera.height) if body.model else None
         if readout is not None:
             found[k] = readout

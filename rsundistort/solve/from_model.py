@@ -283,7 +283,7 @@ def _solve(
         warnings.warn(text, RsUndistortWarning, stacklevel=3)
     lost = dict.fromkeys(given.unregistered, "it is not registered in the model")
     lost |= dict.fromkeys(set(rec.image_names) - set(after.image_names), "no measurement of it survived")
-    readouts = known_readouts(None, after.image_names, after.cameras, after.camera_idx, None, options.readout_s, None)
+    readouts = known_readouts((), after.cameras, after.camera_idx, options.readout_s, None)
     old = surviving_points(given.reconstruction, after)
     ids = given.ids_of(old, after.image_names)
     known = (old >= 0) & given.has_colors

@@ -13,10 +13,11 @@ from ..bundle import BundleOptions
 from ..errors import InputError, RsUndistortWarning
 from ..input.exposure import bounded_by_exposure
 from ..input.frames import find_photos
-from ..input.gyroscope import gyro_contradiction, gyro_motions, known_readouts
-from ..input.load import load_photos
+from ..input.gyroscope import GyroOptions, Readouts, gyro_contradiction, gyro_motions, known_readouts
+from ..input.load import LoadedPhotos, load_photos
 from ..input.photo_cameras import camera_file_of
 from ..io import is_video, list_photos, output_folder
+from ..io.gyro import GyroLog
 from ..io.motions import Known
 from ..io.places import local_place
 from ..io.record import Record
@@ -72,24 +73,15 @@ def run(
             options.feature_megapixels,
         )  # fmt: skip
         cameras = loaded.cameras
-        readouts = known_readouts(
-            folder, loaded.names, cameras.cameras, cameras.camera_idx, source.frames, options.readout_s, gyro_log
-        )  # fmt: skip
+        bodies = loaded.facts if source.frames is None else [source.frames] * len(loaded.names)
+        readouts = known_readouts(bodies, cameras.cameras, cameras.camera_idx, options.readout_s, gyro_log)
         ends = (end[0] for each in options.lengths for end in (each.start, each.end))
         for name in (*options.still, *options.known, *ends):
             if name not in loaded.names:
                 raise InputError(f"anchor {name!r} is not among the photos of {photos}")
         from_gyro: Known = {}
         if options.gyro is not None and gyro_log is not None:
-            times = [readouts[k][0] if k in readouts else None for k in cameras.camera_idx.tolist()]
-            by_photo = dict(zip(loaded.names, times, strict=True))
-            of_photo = {name: cameras.of(i) for i, name in enumerate(loaded.names)}
-            motions, bends = gyro_motions(folder, options.gyro, gyro_log, by_photo, of_photo)
-            from_gyro = {k: v for k, v in motions.items() if k not in options.known and k not in options.still}
-            bends = {name: bends[name] for name in from_gyro}
-            options = replace(
-                options, known={**options.known, **from_gyro}, known_bends={**bends, **options.known_bends}
-            )
+            from_gyro, options = _with_gyroscope(options, options.gyro, gyro_log, loaded, readouts)
         known_s = {k: seconds for k, (seconds, _) in readouts.items()}
 
         def options_of(rec: Reconstruction) -> BundleOptions:
@@ -122,3 +114,17 @@ def run(
         outputs = Outputs.of_outcome(outcome, options, loaded.orientations, times=photo_times(folder))
         outputs.begin(scratch, log)
     return outputs.rectify(folder if source.frames is None else out / "frames", out, workers, log)
+
+
+def _with_gyroscope(
+    options: RunOptions, gyro: GyroOptions, log: GyroLog, loaded: LoadedPhotos, readouts: Readouts
+) -> tuple[Known, RunOptions]:
+    """The motions that a gyroscope's log tells, of photos whose motion nobody told, and the options with them."""
+    cameras = loaded.cameras
+    times = [readouts[k][0] if k in readouts else None for k in cameras.camera_idx.tolist()]
+    by_photo = dict(zip(loaded.names, times, strict=True))
+    of_photo = {name: cameras.of(i) for i, name in enumerate(loaded.names)}
+    motions, bends = gyro_motions(loaded.folder, gyro, log, by_photo, of_photo)
+    found = {k: v for k, v in motions.items() if k not in options.known and k not in options.still}
+    known_bends = {name: bends[name] for name in found} | dict(options.known_bends)
+    return found, replace(options, known={**options.known, **found}, known_bends=known_bends)

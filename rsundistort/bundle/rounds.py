@@ -1,0 +1,205 @@
+"""The solves of an adjustment that follow each other: outliers drop out, spreads and noise settle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..model import Reconstruction
+from ..model.reprojection import reprojection_residuals
+from .intrinsics import pixels_of
+from .jackknife import Inflation, inflated, inflation
+from .layout import Layout
+from .options import BundleOptions, BundleResult
+from .problem import BundleProblem
+from .solver import minimize
+from .spreads import estimated, field_spread, settled, starting_spreads
+from .triangulate import revive_points
+
+__all__ = ["Rounds"]
+
+# The factor of the noise is settled if it changes by less than this share.
+_SETTLED_NOISE = 0.1
+
+
+def _noise_px(reconstruction: Reconstruction, shutter_model: str, floor: float) -> float:
+    """Robust standard deviation of the residuals' parts in pixels, of measurements whose relative sigma is 1."""
+    res, valid = reprojection_residuals(reconstruction, shutter_model)
+    if not valid.any():
+        return max(1.0, floor)
+    # median of |x| of a normal variable is 0.6745 sigma; residuals of a fit are shorter than the noise
+    spread = float(np.median(np.abs(res / reconstruction.observations.sigma[:, None])[valid])) / 0.6745
+    bends = max(reconstruction.bend.shape[1] - 2, 0)
+    unknowns = (9 + 3 * bends) * reconstruction.num_images + 3 * reconstruction.num_points
+    shrink = np.sqrt(max(1.0 - unknowns / (2.0 * len(res)), 0.1))
+    return max(spread / shrink, floor)
+
+
+def _believed(reconstruction: Reconstruction, options: BundleOptions, sigma: float) -> NDArray[np.bool_]:
+    """(o,) measurements that lie as near to their prediction as their noise allows."""
+    res, valid = reprojection_residuals(reconstruction)
+    limit = np.maximum(options.outlier_sigma * sigma * reconstruction.observations.sigma, options.min_outlier_px)
+    return valid & (np.linalg.norm(res, axis=1) <= limit)
+
+
+def _check_solvable(reconstruction: Reconstruction, shutter_model: str) -> None:
+    """Refuse what has no answer: too few photos for a shutter, and photos without parallax."""
+    m = reconstruction.num_images
+    if shutter_model != "global" and m < 3:
+        raise InputError(f"{m} photos cannot tell the shutter from the scene; at least three are needed")
+    if m > 1 and not np.linalg.norm(np.ptp(reconstruction.center_w, axis=0)) > 1e-9 * reconstruction.size:
+        raise InputError("all photos are taken from one place: without parallax there is no scene to solve for")
+
+
+def _sigma_intrinsics(
+    current: Reconstruction, names: Sequence[str], covariance: NDArray[np.float64]
+) -> tuple[dict[str, float], ...]:
+    """Standard deviations of each camera's refined intrinsics, in pixels or as coefficients."""
+    sigmas = np.sqrt(np.diagonal(covariance)).reshape(len(current.cameras), -1)
+    return tuple(
+        dict(zip(names, (sigma[: len(names)] * pixels_of(camera, names)).tolist(), strict=True))
+        for camera, sigma in zip(current.cameras, sigmas, strict=True)
+    )
+
+
+class Rounds:
+    """Solves of one adjustment, each with what the one before says of outliers, spreads and noise.
+
+    Parameters
+    ----------
+    reconstruction, shutter_model, options, progress
+        As in `bundle_adjust`.
+    """
+
+    def __init__(
+        self,
+        reconstruction: Reconstruction,
+        shutter_model: str,
+        options: BundleOptions,
+        progress: Callable[[float], None] | None,
+    ) -> None:
+        self._given, self._model, self._options, self._progress = reconstruction, shutter_model, options, progress
+        # `base` holds all measurements of the points still in use, `keep` says which of them are believed: one that was
+        # doubted while an outlier bent its point is heard again in the next round
+        base = reconstruction.with_points(np.ones(len(reconstruction.observations), bool))
+        if base.num_points:
+            _check_solvable(base, shutter_model)
+        self._base = revive_points(base, shutter_model, from_afar=True)
+        self._keep = np.ones(len(self._base.observations), bool)
+        self._sigma_px = options.sigma_px or _noise_px(self._base, shutter_model, options.min_sigma_px)
+        self._baseline = reconstruction.baseline
+        self._layout = Layout.of(shutter_model, options)
+        self._spreads = self._weighed_spreads = starting_spreads(options, self._layout, self._baseline)
+        self._noise = self._weighed_noise = 1.0
+        # Measurements that seem more exact than they are would pull the intrinsics over the hump of a prior with heavy
+        # tails, and they would not come back: it is normal until the noise is known
+        self._heavy_tails = self._had_heavy_tails = False
+        self._damping = options.initial_damping
+        self._iterations = 0
+
+    def solve(self, cost_tolerance: float, is_judged: bool = False) -> None:
+        """Solve once. One that is judged says how uncertain it is by its residuals, if the options ask for that."""
+        options = self._options
+        believed = replace(self._base, observations=self._base.observations.select(self._keep))
+        problem = self._problem = BundleProblem(
+            believed, self._model, options, self._sigma_px * self._noise, self._spreads, heavy_tails=self._heavy_tails
+        )
+        self._solved = minimize(
+            problem,
+            problem.initial_state(),
+            max_iterations=options.max_iterations,
+            cost_tolerance=cost_tolerance,
+            step_tolerance=options.step_tolerance,
+            initial_damping=self._damping,
+            max_damping=options.max_damping,
+            progress=self._progress,
+        )
+        state = self._solved.state
+        self._iterations += self._solved.num_iterations
+        # the next round's valley is this one's
+        self._damping = min(self._solved.damping, options.initial_damping)
+        self._current = problem.reconstruction(state)
+        asks_residuals = is_judged and options.deviations == "jackknife"
+        equations = problem.with_squares().linearize(state)
+        self._marginals = equations.marginal_covariances(of_priors=asks_residuals)
+        self._weighed_noise, self._had_heavy_tails = self._noise, self._heavy_tails
+        per_camera = equations.num_shared // equations.num_cameras
+        self._inflation = Inflation(np.ones(len(self._marginals.photos[0])), np.ones(per_camera))
+        if asks_residuals:
+            self._inflation = inflation(equations, problem.partitions(state), self._marginals, self._noise)
+            self._noise, self._heavy_tails = self._inflation.noise, True
+        self._weighed_spreads = self._spreads
+        self._spreads = estimated(
+            self._spreads, self._current, self._marginals.photos, options, self._layout, self._baseline
+        )
+        if options.residual_field:
+            values, variances = problem.fields(state, self._marginals.cameras)
+            field = field_spread(values, variances, self._weighed_spreads.field)
+            self._spreads = replace(self._spreads, field=field)
+        self._revived = revive_points(self._current, self._model)
+
+    def drop_outliers(self) -> None:
+        """Believe, from the next solve on, what lies as near to the last as its noise allows."""
+        options = self._options
+        self._sigma_px = options.sigma_px or _noise_px(self._current, self._model, options.min_sigma_px)
+        self.begin_next()
+        base = self._base
+        keep = _believed(base, options, self._sigma_px)
+        alive = base.track_lengths(keep) >= 2
+        self._keep = keep[alive[base.observations.point_idx]]
+        self._base = base.take_points(alive)
+
+    @property
+    def are_settled(self) -> bool:
+        """Whether the last solve says of spreads and noise what it was weighed with."""
+        options = self._options
+        awaits_tails = (
+            options.deviations == "jackknife" and options.guessed is not None and len(options.refine) > 0
+        ) and not self._had_heavy_tails
+        return (
+            self._revived is self._current
+            and settled(self._weighed_spreads, self._spreads, options.spread_tolerance)
+            and abs(self._noise - self._weighed_noise) < _SETTLED_NOISE * self._noise
+            and not awaits_tails
+        )
+
+    def begin_next(self, with_same_weights: bool = False) -> None:
+        """Start the next solve from the last, with what that says of spreads and noise, or as it was weighed."""
+        if with_same_weights:
+            self._spreads, self._noise = self._weighed_spreads, self._weighed_noise
+            self._heavy_tails = self._had_heavy_tails
+        self._base = replace(self._revived, observations=self._base.observations)
+
+    def result(self) -> BundleResult:
+        """What the last solve found."""
+        current, options, layout, state = self._current, self._options, self._layout, self._solved.state
+        res, valid = reprojection_residuals(current)
+        weighed, spreads = self._weighed_noise, self._spreads
+        covariances, of_intrinsics = inflated(
+            self._marginals, self._inflation.photos / weighed, self._inflation.cameras / weighed
+        )
+        return BundleResult(
+            current,
+            self._solved.stop_reason,
+            self._solved.cost_history,
+            self._iterations,
+            self._sigma_px,
+            spreads.phi,
+            spreads.velocity / self._baseline,
+            spreads.focal if options.varying else 0.0,
+            spreads.centre if options.varying else 0.0,
+            spreads.bends,
+            tuple(each / self._baseline for each in spreads.ways),
+            covariances[:, : layout.motion, : layout.motion],
+            _sigma_intrinsics(current, options.refine, of_intrinsics),
+            float(np.sqrt(np.mean(res[valid] ** 2))) if valid.any() else float("nan"),
+            len(self._given.observations) - len(current.observations),
+            self._inflation.photos,
+            weighed,
+            self._weighed_spreads.field if options.residual_field else 0.0,
+            tuple(np.sqrt(self._problem.fields(state, of_intrinsics)[1].sum(1)).tolist()),
+        )
