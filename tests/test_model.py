@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import FrozenInstanceError
+from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
@@ -17,6 +17,7 @@ from rsundistort import (
     RsUndistortError,
     Solution,
     SolvedImage,
+    project_points,
 )
 
 K = [[500.0, 0, 320], [0, 400, 240], [0, 0, 1]]
@@ -167,9 +168,11 @@ def test_frame_span_is_how_far_the_clock_runs(readout, span):
 
 def test_motion_has_the_aspect_and_skew_of_the_papers_camera():
     motion = RowMotion([0.1, 0.02, 0.3])
-    assert motion.aspect == 0.9
-    assert motion.skew == 0.02
-    assert RowMotion().aspect == 1
+    assert motion.imaginary_camera() == (0.9, 0.02)
+    assert motion.imaginary_camera("bottom-to-top") == (1.1, -0.02)
+    # x grows by 1 + phi2 where columns are read, y leans by -phi1
+    assert motion.imaginary_camera("left-to-right") == (1.02, -0.1)
+    assert RowMotion().imaginary_camera() == (1, 0)
     assert not RowMotion().velocity.any()
 
 
@@ -229,3 +232,32 @@ def test_solution_knows_registered_and_posed_photos():
     assert solution.image("none.jpg").reason == "too few matches"
     with pytest.raises(InputError, match=r"the solution has no photo 'x\.jpg'"):
         solution.image("x.jpg")
+
+
+# ---------------------------------------------------------------- frames of motions
+
+
+def test_a_motion_in_the_other_frame_is_refused_where_it_matters():
+    camera = Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]])
+    R_cw = Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix()
+    image = SolvedImage("a.jpg", "1", R_cw, np.zeros(3), RowMotion([0.01, 0, 0], [0.1, 0.2, 0]))
+    point = [[0.1, 0.2, 5.0]]
+    assert image.motion.frame == "world"
+    with pytest.raises(InputError, match=r"told in the world frame, expected the camera frame; call motion.in_camera"):
+        project_points(point, camera, image.motion, "constant-motion")
+    ours = image.motion.in_camera(R_cw)
+    unsaid = RowMotion(image.motion.phi, R_cw @ image.motion.velocity)
+    for model in ("rotation", "constant-motion"):
+        found, expected = (project_points(point, camera, each, model)[0] for each in (ours, unsaid))
+        np.testing.assert_array_equal(found, expected)
+    with pytest.raises(InputError, match="told in the camera frame, expected the world frame"):
+        ours.in_camera(R_cw)
+    with pytest.raises(InputError, match="told in the camera frame"):
+        ours.pose_at(0.1, R_cw, np.zeros(3))
+    with pytest.raises(InputError, match="told in the camera frame"):
+        replace(image, motion=ours)
+    # which frame a motion without velocity is told in makes no difference
+    turning = replace(image, motion=RowMotion([0.01, 0, 0])).motion
+    project_points(point, camera, turning, "constant-motion")
+    with pytest.raises(InputError, match="frame='body', expected one of world, camera"):
+        RowMotion(frame="body")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import FormatError, InputError
-from ..model import READOUTS, Bend, Camera, RowMotion, Solution, SolvedImage
+from ..model import Bend, Camera, RowMotion, Solution, SolvedImage
 from .aside import write_aside
 from .cameras import camera_from_json, camera_to_json
 from .json_text import read_json
@@ -35,15 +35,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not np.isfinite(value):
         return None
     return value
-
-
-def _imaginary_camera(motion: RowMotion, camera: Camera) -> tuple[float, float]:
-    """Aspect ratio and skew of the paper's imaginary camera in the direction of the readout."""
-    axis, sign = READOUTS[camera.readout]
-    phi = sign * motion.phi
-    # for columns x and y are exchanged, which takes phi to -(phi2, phi1, phi3)
-    turned = RowMotion(phi if axis == 1 else -phi[[1, 0, 2]])
-    return turned.aspect, turned.skew
 
 
 def _bend_to_json(bend: Bend) -> dict[str, Any]:
@@ -87,7 +78,7 @@ def solution_to_json(solution: Solution) -> dict[str, Any]:
         }
         if image.motion is not None:
             entry["phi"], entry["velocity"] = image.motion.phi, image.motion.velocity
-            entry["aspect"], entry["skew"] = _imaginary_camera(image.motion, solution.cameras[image.camera_id])
+            entry["aspect"], entry["skew"] = image.motion.imaginary_camera(solution.cameras[image.camera_id].readout)
             if image.motion.bend is not None:
                 entry["bend"] = _bend_to_json(image.motion.bend)
         if image.depth is not None:

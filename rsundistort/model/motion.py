@@ -10,12 +10,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from .bend import Bend, bend_table
+from .camera import READOUTS
 from .checks import check_finite, frozen
 
 __all__ = ["SHUTTER_MODELS", "RowMotion", "check_shutter_model"]
 
 #: Names of the shutter models and their codes in the kernels, in the order of the ladder.
 SHUTTER_MODELS: dict[str, int] = {"global": 0, "two-step": 1, "linearized": 2, "rotation": 3, "constant-motion": 4}
+
+
+_FRAMES = ("world", "camera")
 
 
 def check_shutter_model(name: str) -> int:
@@ -38,18 +42,24 @@ class RowMotion:
     bend : Bend, optional
         How the motion departs from this steady one; heeded by the rotation and constant-motion models. The pose that
         goes with it is then that of the nearest steady motion at r = 0, not the one at that moment.
+    frame : {"world", "camera"}, optional
+        What velocity and bend's positions are told in. A `SolvedImage` has its motion in the world, projection and
+        rectification take it in the camera (`in_camera`), and refuse one that is told to be in the other frame.
 
     Examples
     --------
-    >>> RowMotion([0.1, 0.02, 0.0]).aspect
-    0.9
+    >>> RowMotion([0.1, 0.02, 0.0]).imaginary_camera()
+    (0.9, 0.02)
     """
 
     phi: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     bend: Bend | None = None
+    frame: str | None = None
 
     def __post_init__(self) -> None:
+        if self.frame not in (None, *_FRAMES):
+            raise InputError(f"frame={self.frame!r}, expected one of {', '.join(_FRAMES)}")
         for name in ("phi", "velocity"):
             object.__setattr__(self, name, frozen(check_finite(getattr(self, name), (3,), name)))
 
@@ -98,13 +108,31 @@ class RowMotion:
             return self, np.eye(3), np.zeros(3)
         clock = np.linspace(start, end, 1025)
         near, turn, way = RowMotion.of(clock, *self.at(clock), sites=len(self.bend.values))
-        return replace(near, bend=None), turn, way
+        return replace(near, bend=None, frame=self.frame), turn, way
 
     def in_camera(self, R_cw: NDArray[np.float64]) -> RowMotion:
         """The motion with its velocity in the camera frame at the reference row, as projection takes it."""
+        self._check_frame("world")
         R = np.asarray(R_cw, np.float64)
         bend = None if self.bend is None else self.bend.turned(np.eye(3), R)
-        return replace(self, velocity=R @ self.velocity, bend=bend)
+        return replace(self, velocity=R @ self.velocity, bend=bend, frame="camera")
+
+    def as_in(self, frame: str) -> RowMotion:
+        """The motion, told to be in a frame; refused if it is told to be in the other, and matters."""
+        self._check_frame(frame)
+        return replace(self, frame=frame)
+
+    def _check_frame(self, frame: str) -> None:
+        """Refuse a motion that is told to be in the other frame, if the camera travels."""
+        if self.frame is not None and self.frame != frame and self.moves:
+            mend = "" if frame == "world" else "; call motion.in_camera(R_cw)"
+            raise InputError(f"the motion is told in the {self.frame} frame, expected the {frame} frame{mend}")
+
+    @property
+    def velocity_in_camera(self) -> NDArray[np.float64]:
+        """The velocity, of a motion that is not told to be in the world."""
+        self._check_frame("camera")
+        return self.velocity
 
     @property
     def moves(self) -> bool:
@@ -146,15 +174,13 @@ class RowMotion:
         """
         from scipy.spatial.transform import Rotation
 
+        self._check_frame("world")
         turn, way = self.at(clock)
         return Rotation.from_rotvec(turn).as_matrix() @ np.asarray(R_cw, np.float64), np.asarray(center_w) + way
 
-    @property
-    def aspect(self) -> float:
-        """Aspect ratio of the paper's imaginary camera, 1 - phi1 (row readout)."""
-        return 1.0 - float(self.phi[0])
-
-    @property
-    def skew(self) -> float:
-        """Skew of the paper's imaginary camera, phi2 (row readout)."""
-        return float(self.phi[1])
+    def imaginary_camera(self, readout: str = "top-to-bottom") -> tuple[float, float]:
+        """Aspect ratio and skew, in the direction of the readout, of the camera that the paper puts behind the lens."""
+        axis, sign = READOUTS[readout]
+        # for columns x and y are exchanged, which takes phi to -(phi2, phi1, phi3)
+        phi = sign * (self.phi if axis == 1 else -self.phi[[1, 0, 2]])
+        return 1.0 - float(phi[0]), float(phi[1])

@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from .camera import READOUTS, Camera
 from .checks import check_finite
-from .motion import RowMotion
 from .reconstruction import Reconstruction
 from .solution import Solution, SolvedImage
 
@@ -142,7 +141,7 @@ def turn_image(image: SolvedImage, orientation: int, camera_id: str) -> SolvedIm
     if motion is not None:
         # phi is an axial vector: a mirror reverses it
         bend = None if motion.bend is None else motion.bend.turned(hand * matrix)
-        motion = RowMotion(hand * matrix @ motion.phi, motion.velocity, bend)
+        motion = replace(motion, phi=hand * matrix @ motion.phi, bend=bend)
     return replace(
         image,
         camera_id=camera_id,

@@ -70,7 +70,8 @@ def project_points(
     intr, lens, axis, sign = camera.kernel_args
     xy, valid = np.empty((len(points), 2)), np.empty(len(points), bool)
     model = check_shutter_model(shutter_model)
-    kernels.project_points(model, axis, sign, intr, lens, points, motion.kernel_phi, motion.velocity, xy, valid)
+    velocity = _velocity(motion, shutter_model)
+    kernels.project_points(model, axis, sign, intr, lens, points, motion.kernel_phi, velocity, xy, valid)
     return (raw_pixels(camera, xy) if camera.field.size else xy), valid
 
 
@@ -85,8 +86,9 @@ def project_points_with_jacobians(
     xy, valid = np.empty((n, 2)), np.empty(n, bool)
     J_point, J_phi, J_velocity = (np.empty((n, 2, 3)) for _ in range(3))
     model = check_shutter_model(shutter_model)
+    velocity = _velocity(motion, shutter_model)
     kernels.project_jacobians(
-        model, axis, sign, intr, lens, points, motion.kernel_phi, motion.velocity, xy, J_point, J_phi, J_velocity, valid
+        model, axis, sign, intr, lens, points, motion.kernel_phi, velocity, xy, J_point, J_phi, J_velocity, valid
     )
     if camera.field.size:
         xy = raw_pixels(camera, xy)
@@ -94,6 +96,11 @@ def project_points_with_jacobians(
         for J in (J_point, J_phi, J_velocity):
             J[:] = np.linalg.solve(by_lens, J)
     return xy, valid, ProjectionJacobians(J_point, J_phi, J_velocity)
+
+
+def _velocity(motion: RowMotion, shutter_model: str) -> NDArray[np.float64]:
+    """In the camera's frame; models that know no velocity take any."""
+    return motion.velocity_in_camera if shutter_model == "constant-motion" else motion.velocity
 
 
 def clock_of(camera: Camera, xy_raw: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -121,7 +128,7 @@ def at_depth(
         z of the points at the reference row.
     """
     # when its row was read, the camera stood at p(r) and saw the point p(r) + s (x', y', 1)
-    moved = motion.at(clock_of(camera, xy_raw))[1] / depth[:, None]
+    moved = motion.as_in("camera").at(clock_of(camera, xy_raw))[1] / depth[:, None]
     return np.asarray(ideal * (1.0 - moved[:, 2:]) + moved[:, :2])
 
 

@@ -163,12 +163,12 @@ class Reconstruction:
         return replace(self, cameras=own, camera_idx=np.arange(self.num_images), variation=np.zeros(0))
 
     def motion(self, image: int) -> RowMotion:
-        """The motion of a photo during its readout."""
+        """The motion of a photo during its readout, in the world."""
         bend = None
         if self.bends:
             start, end = self.bend_clock[image].tolist()
             bend = Bend(start, end, self.bend[image, :, :3], self.bend[image, :, 3:])
-        return RowMotion(self.phi[image], self.velocity[image], bend)
+        return RowMotion(self.phi[image], self.velocity[image], bend, "world")
 
     def with_motions(self, motions: Sequence[RowMotion]) -> Reconstruction:
         """The same with other motions of its photos, bends of as many readings or none."""

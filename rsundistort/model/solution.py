@@ -78,6 +78,8 @@ class SolvedImage:
         if self.R_cw is not None:
             R = check_rotations(np.asarray(self.R_cw, np.float64)[None], 1, f"R_cw of {self.name}")[0]
             object.__setattr__(self, "R_cw", frozen(R))
+        if self.motion is not None:
+            object.__setattr__(self, "motion", self.motion.as_in("world"))
         if self.center_w is not None:
             center = check_finite(self.center_w, (3,), f"center_w of {self.name}")
             object.__setattr__(self, "center_w", frozen(center))
