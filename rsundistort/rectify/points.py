@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -242,7 +243,9 @@ def bend_px(camera: Camera, motion: RowMotion, depth: float = np.inf) -> float:
     model = "constant-motion" if np.isfinite(depth) else "rotation"
     if np.isfinite(depth):
         points = depth * points + motion.at(clock_of(camera, raw[valid]))[1] - way
-    moved, seen = project_points(points @ turn.T, camera, near.in_camera(turn), model)
+    # the camera of the bent motion is the world here
+    near = replace(near, frame="world").in_camera(turn)
+    moved, seen = project_points(points @ turn.T, camera, near, model)
     return float(np.linalg.norm(moved - raw[valid], axis=1)[seen].max(initial=0.0))
 
 
