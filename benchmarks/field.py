@@ -27,6 +27,7 @@ import sys
 import tempfile
 import time
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -297,10 +298,11 @@ def large(num: int = 500, few: int = 125) -> list[str]:
 def warped(photos: Path) -> None:
     """Rotation errors of warped photos, whose lens is found from EXIF, as that of the photos as they are was.
 
-    They are warped by the camera that was found there, or the warp would not be that of a turning camera. Photos that
-    went through the same remap and encoder without any motion say how far two reconstructions differ anyhow.
+    They are warped by the camera that was found there, or the warp would not be that of a turning camera. What remains
+    where the true motions are given, and between photos that went through the same remap and encoder without any
+    motion, is not the shutter's.
     """
-    from rsundistort import RunOptions, WarpOptions, pose_errors, run, simulate_warp
+    from rsundistort import RunOptions, WarpOptions, pose_errors, read_solution, run, simulate_warp
     from rsundistort.io.cameras import camera_to_json
 
     with tempfile.TemporaryDirectory() as folder:
@@ -308,23 +310,30 @@ def warped(photos: Path) -> None:
         reference = run(photos, work / "still", RunOptions(shutter_model="global"))
         camera = work / "found.json"
         camera.write_text(json.dumps(camera_to_json(reference.cameras["1"]), default=np.ndarray.tolist))
-        for sigma, model in ((0.02, "auto"), (0.02, "global"), (0.0, "global")):
+        for sigma, how in ((0.02, "auto"), (0.02, "true motions"), (0.02, "global"), (0.0, "global")):
             made = work / f"warped-{sigma}"
             if not made.is_dir():
                 simulate_warp(photos, made, WarpOptions(camera=str(camera), sigma_rad=sigma))
                 (made / "camera.json").unlink()
-            solution = run(made / "photos", work / f"{model}-{sigma}", RunOptions(shutter_model=model))
+            options = RunOptions(shutter_model=how if how in ("auto", "global") else "rotation")
+            if how == "true motions":
+                truth = read_solution(made / "ground_truth.json")
+                span = next(iter(truth.cameras.values())).frame_span
+                known = {each.name: (each.motion.phi * span, np.full(3, 1e-6)) for each in truth.images if each.motion}
+                options = replace(options, known=known)
+            solution = run(made / "photos", work / f"{how}-{sigma}", options)
             error = pose_errors(solution, reference).rotation_deg
+            cameras = [each.cameras[each.registered[0].camera_id] for each in (solution, reference)]
             show(
-                f"{photos.name} warped by {sigma:g}, {model}",
+                f"{photos.name} warped by {sigma:g}, {how}",
                 shutter_model=solution.shutter_model,
                 joined=f"{len(solution.registered)}/{len(solution.images)}",
                 reference_joined=len(reference.registered),
                 rotation_deg={"median": round(float(np.median(error)), 4), "worst": round(float(error.max()), 4)},
                 rotation_deg_but_for_a_common_turn=common_turn_off(solution, reference),
-                focal_px=[round(float(each.cameras["1"].K[0, 0]), 1) for each in (solution, reference)],
-                centre_px=[np.round(each.cameras["1"].K[:2, 2], 1).tolist() for each in (solution, reference)],
-                target="all, <= 0.05 deg" if model == "auto" else None,
+                focal_px=[round(float(each.K[0, 0]), 1) for each in cameras],
+                centre_px=[np.round(each.K[:2, 2], 1).tolist() for each in cameras],
+                target="all, <= 0.05 deg" if how == "auto" else None,
             )
 
 
