@@ -297,25 +297,7 @@ def solve_tracks(
     options = replace(options, phi_sigma_start=result.phi_sigma)
     choice = None
     if auto:
-        log.begin("choice of the model")
-        choice = choose_model(
-            result.reconstruction, LADDER, options, sigma_px=result.sigma_px, seed=seed,
-            progress=lambda model, _: log.tell(f"choice: {model}", 0),
-        )  # fmt: skip
-        options = replace(options, varying=choice.varying, bends=choice.bends, residual_field=choice.residual_field)
-        start = replace(tracks, shutter_model=choice.shutter_model)
-        # the windows were aligned, and their outliers told, as a model saw them that is given up
-        again = feedback is not None and feedback.workers is not None
-        again = again and (choice.shutter_model == "constant-motion" or choice.bends > 0)
-        how = _rough(options) if again else options
-        result = bundle_adjust(start, choice.shutter_model, how, partial(_tell, log, "choice"))
-        log.end(
-            "choice of the model", chosen=choice.shutter_model, varying_lens=choice.varying, bends=choice.bends,
-            residual_field=choice.residual_field, shutter=choice.shutter, agreement=choice.agreement, gain=choice.gain,
-            num_held_out=choice.num_held_out,
-        )  # fmt: skip
-        if feedback is not None and again:
-            result, tracks, options = _fed_back(feedback, result, options, log, ["alignment again"])
+        choice, result, tracks, options = _chosen(feedback, result, tracks, options, seed, log)
     mended, advice = None, []
     if result.reconstruction.shutter_model != "global":
         log.begin("critical motion")
@@ -326,17 +308,7 @@ def solve_tracks(
             advice = advise(result, options)
         log.end("critical motion", remedy=mended.name, sigma_log_k=mended.after.sigma_log_k)
     log.begin("comparison with a global shutter")
-    plain = BundleOptions(
-        outlier_rounds=0,
-        loss="squared",
-        cost_tolerance=1e-4,
-        sigma_px=result.sigma_px,
-        refine=options.refine,
-        guessed=options.guessed,
-        varying=options.varying,
-        deviations="model",
-    )
-    global_result = bundle_adjust(result.reconstruction, "global", plain)
+    global_result = _without_shutter(result, options)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
     log.begin("verdict")
     measured = mapped if feedback is None else tracks
@@ -348,6 +320,48 @@ def solve_tracks(
         warnings.warn(_lens_only(verdict), RsUndistortWarning, stacklevel=3)
     log.end("verdict", shutter=verdict.shutter, shape=verdict.shape)
     return Solved(result, global_result, choice, mended, advice, readouts, verdict)
+
+
+def _chosen(
+    feedback: Feedback | None, result: BundleResult, tracks: Reconstruction, options: BundleOptions, seed: int,
+    log: StageLog,
+) -> tuple[ModelChoice, BundleResult, Reconstruction, BundleOptions]:  # fmt: skip
+    """The model that the measurements support, adjusted with all of them: its tracks and options."""
+    log.begin("choice of the model")
+    choice = choose_model(
+        result.reconstruction, LADDER, options, sigma_px=result.sigma_px, seed=seed,
+        progress=lambda model, _: log.tell(f"choice: {model}", 0),
+    )  # fmt: skip
+    options = replace(options, varying=choice.varying, bends=choice.bends, residual_field=choice.residual_field)
+    start = replace(tracks, shutter_model=choice.shutter_model)
+    # the windows were aligned, and their outliers told, as a model saw them that is given up
+    again = feedback is not None and feedback.workers is not None
+    again = again and (choice.shutter_model == "constant-motion" or choice.bends > 0)
+    how = _rough(options) if again else options
+    result = bundle_adjust(start, choice.shutter_model, how, partial(_tell, log, "choice"))
+    log.end(
+        "choice of the model", chosen=choice.shutter_model, varying_lens=choice.varying, bends=choice.bends,
+        residual_field=choice.residual_field, shutter=choice.shutter, agreement=choice.agreement, gain=choice.gain,
+        num_held_out=choice.num_held_out,
+    )  # fmt: skip
+    if feedback is not None and again:
+        result, tracks, options = _fed_back(feedback, result, options, log, ["alignment again"])
+    return choice, result, tracks, options
+
+
+def _without_shutter(result: BundleResult, options: BundleOptions) -> BundleResult:
+    """The same measurements explained by a global shutter, for comparison."""
+    plain = BundleOptions(
+        outlier_rounds=0,
+        loss="squared",
+        cost_tolerance=1e-4,
+        sigma_px=result.sigma_px,
+        refine=options.refine,
+        guessed=options.guessed,
+        varying=options.varying,
+        deviations="model",
+    )
+    return bundle_adjust(result.reconstruction, "global", plain)
 
 
 def _lens_only(verdict: Verdict) -> str:
