@@ -1,6 +1,7 @@
 """Bundle adjustment against pycolmap's, and its growth with the problem: prints one JSON object a line.
 
     python benchmarks/bundle.py [--layout street block] [--sizes 40000 1000000] [--models ...] [--repeat N] [--scale]
+    python benchmarks/bundle.py --covariances
 
 Synthetic problems of a given number of observations, 2000 a photo, tracks of six on average: a street (cameras along a
 line, facades on both sides) and a block (a grid of aerial photos). Measured by `project_rows`, plain NumPy that shares
@@ -296,6 +297,36 @@ def floor(rec: Any, nb: int) -> tuple[float, float]:
     return o * (80.0 + 3 * 8 * (2 * nb + 2)), o * (nb * (nb + 1) + 12.0) + pairs * (2 * nb * nb + 4 * nb)
 
 
+def covariances() -> None:
+    """Time of the covariances of blocks of photos, over that of the solution of the same system for every unknown."""
+    from rsundistort import BundleOptions
+    from rsundistort.bundle.problem import BundleProblem
+    from rsundistort.bundle.spreads import Spreads
+
+    for photos in (30, 125, 500):
+        rec = make_problem("block", PER_PHOTO * photos)
+        problem = BundleProblem(rec, "rotation", BundleOptions(loss="squared"), 0.5, Spreads(0.03, 0.3))
+        state = problem.initial_state()
+
+        def timed(of_priors: bool, problem: Any = problem, state: Any = state) -> float:
+            equations = problem.linearize(state)
+            began = time.perf_counter()
+            equations.marginal_covariances(of_priors=of_priors)
+            return time.perf_counter() - began
+
+        equations = problem.linearize(state)
+        m, nb = rec.num_images, equations.blocks[1].shape[2]
+        began = time.perf_counter()
+        inverse = equations.inverse
+        for part in np.array_split(np.eye(m * nb).reshape(-1, m, nb), max(m * nb // 192, 1)):
+            inverse.times(part, np.zeros((len(part), inverse.cameras.shape[1])))
+        whole = time.perf_counter() - began
+        alone, with_priors = (min(timed(of_priors) for _ in range(3)) for of_priors in (False, True))
+        figures = {"photos": rec.num_images, "covariances_s": round(alone, 4), "with_priors_s": round(with_priors, 4)}
+        ratios = {"ratio": round(alone / whole, 3), "ratio_with_priors": round(with_priors / whole, 3)}
+        print(json.dumps({"name": "covariances", **figures, "whole_inverse_s": round(whole, 3), **ratios}), flush=True)
+
+
 def main() -> None:
     """Measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -305,6 +336,7 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--scale", action="store_true", help="ours alone, from 1e5 to 5e6 observations")
     parser.add_argument("--no-peer", action="store_true")
+    parser.add_argument("--covariances", action="store_true", help="their time instead, against the whole inverse")
     parser.add_argument("--worker", nargs="+", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.worker:
@@ -312,6 +344,9 @@ def main() -> None:
         figures = ours(Path(folder), rest[0], int(rest[1])) if kind == "ours" else peer(Path(folder), int(rest[0]))
         figures["peak_mb"] = peak_mb()
         print(json.dumps(figures))
+        return
+    if args.covariances:
+        covariances()
         return
     with_peer = not (args.scale or args.no_peer)
     for model in args.models:
