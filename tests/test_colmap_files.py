@@ -7,9 +7,10 @@ import struct
 
 import pycolmap
 import pytest
+from test_bundle import make_scene
 
 from rsundistort import FormatError
-from rsundistort.colmap import read_colmap_cameras, read_colmap_poses
+from rsundistort.colmap import read_colmap_cameras, read_colmap_poses, write_colmap_model
 from rsundistort.colmap.file_checks import check_colmap_files
 from rsundistort.colmap.measured_model import read_colmap_model
 
@@ -72,3 +73,15 @@ def test_cameras_alone_are_checked_under_any_name(model, tmp_path):
     (tmp_path / "mine.bin").write_bytes(data[:-1])
     with pytest.raises(FormatError, match=r"mine\.bin is cut short"):
         read_colmap_cameras(tmp_path / "mine.bin")
+
+
+def test_writing_a_model_leaves_what_pycolmap_logs_to_its_user(tmp_path, rng):
+    rec = make_scene(rng, "rotation")
+    before = pycolmap.logging.minloglevel
+    try:
+        pycolmap.logging.minloglevel = 1
+        cameras = [camera.pinhole() for camera in rec.cameras]
+        write_colmap_model(tmp_path / "sparse", rec, cameras, [f"{i}.jpg" for i in range(rec.num_images)])
+        assert pycolmap.logging.minloglevel == 1
+    finally:
+        pycolmap.logging.minloglevel = before

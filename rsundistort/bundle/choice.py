@@ -408,9 +408,9 @@ def choose_model(
     """
     options = options or BundleOptions()
     fits = _Fits(reconstruction, options, sigma_px, seed, progress)
-    rungs_kept = _climbed(fits, rungs, bool(options.refine))
-    plain, best, kept, gain = rungs_kept.plain, rungs_kept.best, rungs_kept.kept, rungs_kept.gain
-    against, agreement = rungs_kept.against, None
+    climbed = _climbed(fits, rungs, bool(options.refine))
+    plain, best, kept, gain = climbed.plain, climbed.best, climbed.kept, climbed.gain
+    against, agreement = climbed.against, None
     if best is not plain:
         against = []
         if np.median(moved_px(best.reconstruction)) < _UNSEEN_PX:

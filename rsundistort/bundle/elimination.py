@@ -105,12 +105,3 @@ class Elimination:
     def factored(self, reduced: Reduced) -> Factored | None:
         """The system factored; None if it is not positive."""
         return factor(reduced, self.envelope)
-
-    def covariances(self, factored: Factored | None) -> tuple[Array, Array]:
-        """Of the unknowns of each photo (m, nb, nb) and of all cameras (k, k): `factored` is the inverse.
-
-        Its diagonal blocks alone, never the whole inverse. NaN without one, 0 where held.
-        """
-        if factored is None:
-            return np.where(self.free[:, :, None] & self.free[:, None, :], np.nan, 0.0), np.array(np.nan)
-        return factored.diagonal_blocks()

@@ -253,8 +253,10 @@ class NormalEquations:
 
     def _covariances(self) -> tuple[Array, Array]:
         """Those of photos (m, nb, nb) and of all cameras (k, k)."""
-        photos, cameras = self._elimination.covariances(self.inverse)
-        return photos, np.broadcast_to(cameras, (self.num_shared,) * 2)
+        if self.inverse is None:
+            free = self._elimination.free
+            return np.where(free[:, :, None] & free[:, None], np.nan, 0.0), np.full((self.num_shared,) * 2, np.nan)
+        return self.inverse.diagonal_blocks()
 
     def _with_priors(self, scale: float) -> NormalEquations:
         """The same with the priors' precision multiplied; for its inverse only, since gradients are not."""

@@ -38,7 +38,10 @@ def kept_log_level() -> Iterator[None]:
 
 
 def quiet_pycolmap() -> Any:
-    """Pycolmap, quiet, and imported late: it takes half a second, and cv2 must come first (see `io.photos.images`)."""
+    """Pycolmap, quiet, and imported late: it takes half a second, and cv2 must come first (see `io.photos.images`).
+
+    For what logs; what only makes its objects imports it as it is, and leaves to users what it logs for them.
+    """
     import pycolmap
 
     pycolmap.logging.minloglevel = 3
@@ -54,4 +57,6 @@ def poses_of(images: Sequence[Any]) -> tuple[NDArray[np.float64], NDArray[np.flo
 
 def rigid_of(R_cw: NDArray[np.float64], center_w: NDArray[np.float64]) -> Any:
     """Pycolmap's pose of a rotation (3, 3) and a centre (3,)."""
-    return quiet_pycolmap().Rigid3d(np.column_stack([R_cw, -R_cw @ center_w]))
+    import pycolmap
+
+    return pycolmap.Rigid3d(np.column_stack([R_cw, -R_cw @ center_w]))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..errors import FormatError
 from ..model import Camera
 from ..model.projection import project_points
-from .conventions import HALF, quiet_pycolmap
+from .conventions import HALF
 
 __all__ = ["camera_from_colmap", "camera_to_colmap", "pinhole_to_colmap", "refined_camera"]
 
@@ -113,12 +113,12 @@ def camera_to_colmap(camera: Camera, calibrated: bool, camera_id: int) -> Any:
 
 def _colmap_camera(camera: Camera, model: str, coefficients: list[float], camera_id: int) -> Any:
     """One of a model whose lens takes these coefficients."""
+    import pycolmap
+
     K = camera.K
     focal = [K[0, 0]] if model.startswith("SIMPLE_") else [K[0, 0], K[1, 1]]
     params = [*focal, K[0, 2] + HALF, K[1, 2] + HALF, *coefficients]
-    return quiet_pycolmap().Camera(
-        model=model, width=camera.width, height=camera.height, params=params, camera_id=camera_id
-    )
+    return pycolmap.Camera(model=model, width=camera.width, height=camera.height, params=params, camera_id=camera_id)
 
 
 def refined_camera(refined: Any, camera: Camera) -> Camera:
