@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,12 +135,24 @@ class CholeskyFactor:
 
     def inverse_blocks(self) -> Array:
         """Diagonal blocks (m, nb, nb) of the inverse; 0 where held."""
+        every = np.arange(len(self.envelope.place))
+        return self.inverse_blocks_of(every, every)
+
+    @cached_property
+    def _inverse(self) -> Array:
+        """Entries of the inverse inside the envelope, of the scaled matrix."""
         envelope = self.envelope
-        first, offset, place = envelope.first, envelope.offset, envelope.place
         inverse = self.data.copy()
         parts = _PARTS if envelope.multiply_adds > _WORTH_THREADS else 1
-        kernels.invert_envelope(first, offset, parts, inverse)
-        row, column = np.maximum(place[:, :, None], place[:, None]), np.minimum(place[:, :, None], place[:, None])
+        kernels.invert_envelope(envelope.first, envelope.offset, parts, inverse)
+        return inverse
+
+    def inverse_blocks_of(self, first_row: Index, second_row: Index) -> Array:
+        """Blocks (q, nb, nb) of the inverse, of pairs of block rows that the pattern joins; 0 where held."""
+        envelope = self.envelope
+        first, offset, inverse = envelope.first, envelope.offset, self._inverse
+        of_rows, of_columns = envelope.place[first_row][:, :, None], envelope.place[second_row][:, None]
+        row, column = np.maximum(of_rows, of_columns), np.minimum(of_rows, of_columns)
         band = row // 4
         at = offset[band] + (row - 4 * band) * (4 * band + 4 - first[band]) + column - first[band]
         free = column >= 0

@@ -16,8 +16,9 @@ from .._kernels import schur
 from .._kernels._jit import unknowns_of
 from .elimination import Elimination
 from .reduced import Factored, Reduced
+from .structure import BlockPattern
 
-__all__ = ["Border", "Function", "Marginals", "NormalEquations", "Step"]
+__all__ = ["Border", "Coupling", "Function", "Marginals", "NormalEquations", "Step"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -77,6 +78,61 @@ class Border:
 
 
 @dataclass(frozen=True)
+class Coupling:
+    """Residuals of a prior that joins pairs of photos, q pairs of r residuals.
+
+    Attributes
+    ----------
+    first, second : (q,) int array
+        The photos.
+    res : (q, r) array
+        Residuals in their standard deviations.
+    J_first, J_second : (q, r, nb) array
+        Their Jacobians.
+    """
+
+    first: Index
+    second: Index
+    res: Array
+    J_first: Array
+    J_second: Array
+
+    def pull(self, residuals: Array, num_photos: int) -> Array:
+        """J' times residuals (q, r): (m, nb)."""
+        total = np.zeros((num_photos, self.J_first.shape[2]))
+        for photo, J in ((self.first, self.J_first), (self.second, self.J_second)):
+            np.add.at(total, photo, np.einsum("qra,qr->qa", J, residuals))
+        return total
+
+    def times(self, frame: Array) -> Array:
+        """J'J times photos' values (..., m, nb)."""
+        total = np.zeros_like(frame)
+        moved = np.einsum("qra,...qa->...qr", self.J_first, frame[..., self.first, :])
+        moved += np.einsum("qra,...qa->...qr", self.J_second, frame[..., self.second, :])
+        for photo, J in ((self.first, self.J_first), (self.second, self.J_second)):
+            pulled = np.einsum("qra,...qr->...qa", J, moved)
+            np.add.at(np.moveaxis(total, -2, 0), photo, np.moveaxis(pulled, -2, 0))
+        return total
+
+    def diagonal(self, num_photos: int) -> Array:
+        """Diagonal (m, nb) of J'J."""
+        total = np.zeros((num_photos, self.J_first.shape[2]))
+        for photo, J in ((self.first, self.J_first), (self.second, self.J_second)):
+            np.add.at(total, photo, (J**2).sum(1))
+        return total
+
+    def add_to(self, S: Array, pattern: BlockPattern, scale: float = 1.0) -> None:
+        """Add J'J to the blocks (blocks, nb, nb) of the photos' system, in place."""
+        turned = self.first > self.second  # only blocks above the diagonal are kept
+        across = scale * np.einsum("qra,qrb->qab", self.J_first, self.J_second)
+        np.add.at(
+            S, pattern.find(self.first, self.second), np.where(turned[:, None, None], across.transpose(0, 2, 1), across)
+        )
+        for photo, J in ((self.first, self.J_first), (self.second, self.J_second)):
+            np.add.at(S, pattern.diagonal[photo], scale * np.einsum("qra,qrb->qab", J, J))
+
+
+@dataclass(frozen=True)
 class Function:
     """What is known of a linear function of the points.
 
@@ -124,6 +180,8 @@ class NormalEquations:
     lengths : tuple of (q,) and (q, n, 3) arrays
         Residuals on few points and their Jacobian: they join points, which the elimination takes one by one, so their
         share of the Hessian is added to its inverse (Woodbury).
+    coupling : Coupling, optional
+        Prior that joins pairs of photos; the structure's pattern has their blocks.
 
     Attributes
     ----------
@@ -141,6 +199,7 @@ class NormalEquations:
         prior_gradient: Array,
         border: Border,
         lengths: tuple[Array, Array],
+        coupling: Coupling | None = None,
     ) -> None:
         self.cost = cost
         self._elimination = elimination
@@ -157,6 +216,11 @@ class NormalEquations:
         self._diagonal, self._g_frame = self._gradients(res, J_frame)
         self._diagonal += prior_diag
         self._g_frame += prior_gradient
+        self._coupling = coupling
+        if coupling is not None:
+            m = len(prior_diag)
+            self._diagonal += coupling.diagonal(m)
+            self._g_frame += coupling.pull(coupling.res, m)
         self._border = border
         diagonal, g_camera = self._gradients(res, border.J)
         self._camera_diagonal = border.sum_photos(diagonal)
@@ -192,6 +256,8 @@ class NormalEquations:
                 s.pattern.row_start, s.pattern.cols, self._J, V_inv, g_point, g_frame,
                 self._prior_diag + damping * self._diagonal, S, rhs,
             )  # fmt: skip
+        if self._coupling is not None:
+            self._coupling.add_to(S, s.pattern)
         nc = self._border.J.shape[2]
         k = len(g_camera)
         rows, rhs_camera = np.zeros((m, nb + nc, k)), np.zeros((m, nc))
@@ -258,6 +324,28 @@ class NormalEquations:
             return np.where(free[:, :, None] & free[:, None], np.nan, 0.0), np.full((self.num_shared,) * 2, np.nan)
         return self.inverse.diagonal_blocks()
 
+    def photos_by_shared(self, unknown: int) -> Array:
+        """(m, nb) covariances of photos' unknowns with one that each shares with those of its camera."""
+        border = self._border
+        if self.inverse is None:
+            return np.full(self._g_frame.shape, np.nan)
+        column = border.camera_of_frame * border.J.shape[2] + unknown
+        found: Array = self.inverse.photos_by_cameras()[np.arange(self.num_photos), :, column]
+        return found
+
+    def coupling_variances(self) -> tuple[Array, Array]:
+        """Residuals (q, r) of the coupling, and their variances, all unknowns being free."""
+        c = self._coupling
+        assert c is not None
+        if self.inverse is None:
+            return c.res, np.full_like(c.res, np.nan)
+        ends = (c.first, c.J_first), (c.second, c.J_second)
+        variances = np.zeros_like(c.res)
+        for photo, J in ends:
+            for other, J_other in ends:
+                variances += np.einsum("qra,qab,qrb->qr", J, self.inverse.pair_blocks(photo, other), J_other)
+        return c.res, variances
+
     def _with_priors(self, scale: float) -> NormalEquations:
         """The same with the priors' precision multiplied; for its inverse only, since gradients are not."""
         other = copy(self)
@@ -266,6 +354,8 @@ class NormalEquations:
         other._border = replace(self._border, prior_diag=scale * self._border.prior_diag)
         S, (diagonal, own) = self._reduced.S.copy(), (self._s.pattern.diagonal, np.arange(self._prior_diag.shape[1]))
         S[diagonal[:, None], own, own] += (scale - 1.0) * self._prior_diag
+        if self._coupling is not None:
+            self._coupling.add_to(S, self._s.pattern, scale - 1.0)
         corner = self._reduced.corner + np.diag((scale - 1.0) * self._border.prior_diag.ravel())
         other._reduced = replace(self._reduced, S=S, corner=corner)
         return other
@@ -292,7 +382,12 @@ class NormalEquations:
         """H^-1 P H^-1 of the photos' unknowns times vectors (k, m, nb), P the priors' precision."""
         assert self.inverse is not None
         frame, camera = self.inverse.times(vectors, np.zeros((len(vectors), len(self._g_camera))))
-        return self.inverse.times(self._prior_diag * frame, self._border.prior_diag.ravel() * camera)[0]
+        return self.inverse.times(self._of_priors(frame), self._border.prior_diag.ravel() * camera)[0]
+
+    def _of_priors(self, frame: Array) -> Array:
+        """The priors' precision times photos' values (..., m, nb)."""
+        own = self._prior_diag * frame
+        return own if self._coupling is None else own + self._coupling.times(frame)
 
     def function_of_points(self, weights: Array) -> Function | None:
         """What is known of sum(weights * points), weights (n, 3); None where the system cannot be factored."""
@@ -301,7 +396,7 @@ class NormalEquations:
         if solved is None or self.inverse is None:
             return None
         frame, point, camera = solved[:3]
-        weighed = self._prior_diag * frame, self._border.prior_diag.ravel() * camera
+        weighed = self._of_priors(frame), self._border.prior_diag.ravel() * camera
         return Function(
             variance=float((weights * point).sum()),
             of_priors=float((weighed[0] * frame).sum() + (weighed[1] * camera).sum()),
@@ -327,6 +422,9 @@ class NormalEquations:
         g_point, V = np.empty_like(self._g_point), np.empty_like(self._V)
         schur.point_blocks(self._s.track_start, self._s.point_of, noise, self._J, V, g_point)
         g_frame = self._gradients(noise, self._J)[1] + np.sqrt(self._prior_diag) * of_photos
+        if self._coupling is not None:
+            drawn = np.random.default_rng(1).normal(size=self._coupling.res.shape)
+            g_frame += self._coupling.pull(drawn, len(g_frame))
         g_camera = self._border.sum_photos(self._gradients(noise, self._border.J)[1])
         g_camera = g_camera + np.sqrt(self._border.prior_diag.ravel()) * of_cameras
         reduced, V_inv = self.reduce(0.0, g_frame, g_point, g_camera)

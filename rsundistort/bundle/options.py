@@ -12,6 +12,7 @@ from ..errors import InputError
 from ..model import BEND_GROUPS, Bend, KnownLength, Reconstruction
 from .intrinsics import GuessedCameras, check_refined
 from .lengths import check_lengths
+from .path import FramePath, PathSolution
 
 __all__ = ["DEVIATIONS", "LOSSES", "BundleOptions", "BundleResult"]
 
@@ -135,6 +136,10 @@ class BundleOptions:
         "jackknife" as residuals show that pull together, in corners of the scene and of the lens. By that the
         covariances are larger (never smaller than of "model"), and the measurements weigh less against the priors once
         outliers are gone: the false motion that a lens or a scene leaves does not stand against a prior of mean zero.
+    path : FramePath, optional
+        Frames of a video share one trajectory: neighbours are joined by a prior of white noise on acceleration, phi and
+        velocity are the trajectory's rates times the time that the readout takes, which is solved for. Only
+        constant-motion; takes the place of the priors on phi and velocity.
     """
 
     max_iterations: int = 100
@@ -177,6 +182,7 @@ class BundleOptions:
     factor_limit: float | None = None
     cg_tolerance: float = 0.01
     deviations: str = "jackknife"
+    path: FramePath | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "refine", check_refined(self.refine))
@@ -279,6 +285,10 @@ class BundleResult:
         Standard deviation of the prior on the unknowns of the cameras' residual fields; 0 where none was solved for.
     sigma_fields_px : tuple of float
         Standard deviation of each camera's field, root mean square over its frame; 0 where none was solved for.
+    path : PathSolution or None
+        The path, of frames that have one.
+    path_sigmas : tuple of float
+        The spreads of its prior, of turn and of travel, as `PathPrior` takes them.
     """
 
     reconstruction: Reconstruction
@@ -300,6 +310,8 @@ class BundleResult:
     noise_factor: float
     field_sigma_px: float = 0.0
     sigma_fields_px: tuple[float, ...] = ()
+    path: PathSolution | None = None
+    path_sigmas: tuple[float, ...] = ()
 
     @property
     def sigma_phi(self) -> NDArray[np.float64]:

@@ -21,8 +21,9 @@ from .jackknife import Partition, by_corner, by_place
 from .layout import Layout
 from .lengths import LengthResiduals
 from .lens_field import LensFields
-from .normal_equations import Border, Marginals, NormalEquations, Step
+from .normal_equations import Border, Coupling, Marginals, NormalEquations, Step
 from .options import LOSSES, BundleOptions
+from .path import PathPrior, PathState
 from .spreads import Spreads
 from .structure import Structure, by_first_photo
 
@@ -34,6 +35,7 @@ class State:
     """What a step changes: cameras, poses, shutter motion, variation and points, as in `Reconstruction`.
 
     Of the bends (m, 3 k) coefficients along `Layout.functions`, of the rotation, then of the position, three by three.
+    Of frames on a path, phi and velocity are those of its rates.
     """
 
     cameras: tuple[Camera, ...]
@@ -44,6 +46,7 @@ class State:
     variation: NDArray[np.float64]
     bend: NDArray[np.float64]
     points_w: NDArray[np.float64]
+    path: PathState | None = None
 
 
 # Observations that a thread takes at a time, and whose costs are summed together.
@@ -72,6 +75,7 @@ class BundleProblem:
         sigma_px: float,
         spreads: Spreads,
         heavy_tails: bool = True,
+        path: PathState | None = None,
     ) -> None:
         self._model = check_shutter_model(shutter_model)
         obs = reconstruction.observations
@@ -94,9 +98,15 @@ class BundleProblem:
         if not reconstruction.bends:
             photos = range(reconstruction.num_images)
             self._bend_clock = np.array([reconstruction.camera(i).clock_range for i in photos])
+        self._path, self._path_start = None, path
+        if options.path is not None:
+            if shutter_model != "constant-motion":
+                raise InputError(f"frames on a path move by constant-motion, not by {shutter_model}")
+            self._path = PathPrior(options.path, reconstruction, (spreads.path[0], spreads.path[1]))
         self._structure = Structure.from_observations(
-            obs.frame_idx, obs.point_idx, reconstruction.num_images, reconstruction.num_points
-        )
+            obs.frame_idx, obs.point_idx, reconstruction.num_images, reconstruction.num_points,
+            None if self._path is None else (self._path.first, self._path.second),
+        )  # fmt: skip
         self._xy = obs.xy_raw[self._structure.order]
         self._sigma_px = sigma_px * obs.sigma[self._structure.order]
         # the rows that the last cost predicted, where the next Jacobians look for them
@@ -120,6 +130,8 @@ class BundleProblem:
         span = reconstruction.frame_span()[:, None]
         weight = [np.repeat((span[:, 0] / s)[:, None] ** 2, 3, axis=1) for s in self._motion_spreads(spreads)]
         self._motion_weight = np.hstack(weight)[:, : self._block - 6]
+        if self._path is not None:  # which says it all
+            self._motion_weight = np.zeros_like(self._motion_weight)
         varied = np.array([spreads.focal, spreads.centre, spreads.centre])[: 3 * options.varying] ** -2.0
         of_bends = self.layout.per_bend(spreads.bends, spreads.ways) ** -2.0
         self._own_weight = np.tile(np.concatenate([varied, of_bends]), (len(span), 1))
@@ -198,8 +210,12 @@ class BundleProblem:
         variation = start.variation if self._options.varying else np.zeros_like(start.variation)
         bend = np.where(self._free[:, self.layout.variation :], self.layout.coefficients(start), 0.0)
         cameras = tuple(start.cameras) if self._fields is None else self._fields.started(start.cameras)
+        path = self._path_start
+        if self._path is not None:
+            path = path or self._path.start(start)
+            motion = path.motions(start.camera_idx)
         return State(
-            cameras, start.R_cw, start.center_w, motion[:, :3], motion[:, 3:], variation, bend, start.points_w
+            cameras, start.R_cw, start.center_w, motion[:, :3], motion[:, 3:], variation, bend, start.points_w, path
         )  # fmt: skip
 
     def with_squares(self) -> BundleProblem:
@@ -286,6 +302,8 @@ class BundleProblem:
         lengths = float(np.sum(self._lengths.residuals(state.points_w) ** 2))
         varied = float(np.sum(self._own_weight * self._own(state) ** 2))
         own = float(np.sum(self._motion_weight * motion**2 + known)) + varied
+        if self._path is not None and state.path is not None:
+            own += 2.0 * self._path.cost(state.R_cw, state.center_w, state.path)
         return 0.5 * (own + lengths) + self._camera_priors(state)[2]
 
     def _camera_priors(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
@@ -303,6 +321,10 @@ class BundleProblem:
             diagonal = np.hstack([diagonal, np.full(values.shape, self._field_weight)])
             gradient = np.hstack([gradient, self._field_weight * values])
             total += 0.5 * self._field_weight * float((values**2).sum())
+        if self._path is not None and state.path is not None:
+            weight_of_pace = self._path.pace_sigma[:, None] ** -2.0
+            diagonal = np.hstack([diagonal, weight_of_pace])
+            gradient = np.hstack([gradient, weight_of_pace * (state.path.pace - self._path.pace_prior)[:, None]])
         return diagonal, gradient, total
 
     def _jacobians(
@@ -352,15 +374,36 @@ class BundleProblem:
         prior_gradient[own] = self._own_weight * self._own(state)
         total = cost + self._prior_cost(state)
         border = Border(self._camera_jacobians(state), self._start.camera_idx, *self._camera_priors(state)[:2])
+        coupling = None
+        if self._path is not None and state.path is not None:
+            moves = self._start.camera_idx[self._structure.frame_idx]
+            own_rates = state.path.rates[self._structure.frame_idx]
+            by_pace = np.einsum("oia,oa->oi", J_frame[:, :, 6:12], own_rates)
+            border = replace(border, J=np.concatenate([border.J, by_pace[:, :, None]], axis=2))
+            J_frame[:, :, 6:12] *= state.path.pace[moves, None, None]
+            joins, by_first, by_second = self._path.jacobians(state.R_cw, state.center_w, state.path.rates)
+            wide = ((0, 0), (0, 0), (0, self.layout.size - 12))
+            coupling = Coupling(
+                self._path.first, self._path.second, joins, np.pad(by_first, wide), np.pad(by_second, wide)
+            )
         lengths = self._lengths.residuals(state.points_w), self._lengths.jacobian(state.points_w)
-        return NormalEquations(self._elimination, total, res, J_frame, prior_diag, prior_gradient, border, lengths)
+        return NormalEquations(
+            self._elimination, total, res, J_frame, prior_diag, prior_gradient, border, lengths, coupling
+        )
+
+    @property
+    def path(self) -> PathPrior:
+        """The prior of the frames' path."""
+        assert self._path is not None
+        return self._path
 
     def fields(self, state: State, covariance: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Unknowns of the cameras' fields (cameras, nz), and their variances by all cameras' covariance (k, k)."""
         num = len(state.cameras)
         if self._fields is None:
             return np.zeros((num, 0)), np.zeros((num, 0))
-        return self._fields.values(state.cameras), np.diagonal(covariance).reshape(num, -1)[:, len(self._refine) :]
+        values, own = self._fields.values(state.cameras), len(self._refine)
+        return values, np.diagonal(covariance).reshape(num, -1)[:, own : own + values.shape[1]]
 
     @property
     def measurements(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
@@ -437,18 +480,26 @@ class BundleProblem:
             cameras = tuple(moved_camera(c, self._refine, s[:own]) for c, s in zip(cameras, intrinsics, strict=True))
         if self._fields is not None:
             moved = self._fields.moved
-            cameras = tuple(moved(k, c, s[own:]) for k, (c, s) in enumerate(zip(cameras, intrinsics, strict=True)))
+            last = intrinsics.shape[1] - (self._path is not None)
+            cameras = tuple(moved(k, c, s[own:last]) for k, (c, s) in enumerate(zip(cameras, intrinsics, strict=True)))
+        phi = state.phi + frame[:, 6:9] if self._block > 6 else state.phi
+        velocity = state.velocity + frame[:, 9:12] if self._block > 9 else state.velocity
+        path = state.path
+        if path is not None:
+            path = PathState(path.rates + frame[:, 6:12], path.pace + intrinsics[:, -1])
+            phi, velocity = np.split(path.motions(self._start.camera_idx), 2, axis=1)
         return State(
             cameras,
             Rotation.from_rotvec(frame[:, :3]).as_matrix() @ state.R_cw,
             state.center_w + frame[:, 3:6],
-            state.phi + frame[:, 6:9] if self._block > 6 else state.phi,
-            state.velocity + frame[:, 9:12] if self._block > 9 else state.velocity,
+            phi,
+            velocity,
             state.variation + frame[:, self._block : self.layout.variation]
             if self._options.varying
             else state.variation,
             state.bend + frame[:, self.layout.variation :],
             state.points_w + point,
+            path,
         )
 
     def step_size(self, state: State, step: Step) -> float:

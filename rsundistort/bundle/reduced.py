@@ -12,6 +12,7 @@ from .envelope import CholeskyFactor, Envelope
 __all__ = ["Factored", "Reduced", "factor", "products"]
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,15 @@ class Factored:
         shared = np.einsum("rma,rs->sma", self.frames, self.weights)
         cameras = self.cameras.T @ self.weights @ self.cameras
         return self.photos.inverse_blocks() + np.einsum("sma,smb->mab", shared, self.frames), (cameras + cameras.T) / 2
+
+    def pair_blocks(self, first: Index, second: Index) -> Array:
+        """Of the inverse: those of pairs of photos that the pattern joins, (q, nb, nb), 0 where held."""
+        shared = np.einsum("rqa,rs->sqa", self.frames[:, first], self.weights)
+        return self.photos.inverse_blocks_of(first, second) + np.einsum("sqa,sqb->qab", shared, self.frames[:, second])
+
+    def photos_by_cameras(self) -> Array:
+        """Of the inverse: between photos and cameras, (m, nb, k)."""
+        return np.einsum("rma,rs,sk->mak", self.frames, self.weights, self.cameras)
 
     def joined(self, frames: Array, cameras: Array, weights: Array) -> Factored:
         """The inverse with more changes added."""

@@ -14,16 +14,28 @@ from ..model.reprojection import reprojection_residuals
 from .intrinsics import pixels_of
 from .jackknife import Inflation, inflated, inflation
 from .layout import Layout
+from .normal_equations import NormalEquations
 from .options import BundleOptions, BundleResult
+from .path import (
+    FramePath,
+    PathState,
+    of_motions,
+    orthogonal,
+    path_bends,
+    path_solution,
+    with_path_motions,
+)  # fmt: skip
 from .problem import BundleProblem
 from .solver import minimize
-from .spreads import estimated, field_spread, settled, starting_spreads
+from .spreads import estimated, field_spread, path_spreads, settled, starting_spreads
 from .triangulate import revive_points
 
 __all__ = ["Rounds"]
 
 # The factor of the noise is settled if it changes by less than this share.
 _SETTLED_NOISE = 0.1
+# The bends of a path are settled if they change by less, radians: a twentieth of a pixel at any focal length in use.
+_SETTLED_BEND = 2e-5
 
 
 def _noise_px(reconstruction: Reconstruction, shutter_model: str, floor: float) -> float:
@@ -46,10 +58,10 @@ def _believed(reconstruction: Reconstruction, options: BundleOptions, sigma: flo
     return valid & (np.linalg.norm(res, axis=1) <= limit)
 
 
-def _check_solvable(reconstruction: Reconstruction, shutter_model: str) -> None:
+def _check_solvable(reconstruction: Reconstruction, shutter_model: str, path: FramePath | None) -> None:
     """Refuse what has no answer: too few photos for a shutter, and photos without parallax."""
     m = reconstruction.num_images
-    if shutter_model != "global" and m < 3:
+    if shutter_model != "global" and m < 3 and path is None:
         raise InputError(f"{m} photos cannot tell the shutter from the scene; at least three are needed")
     if m > 1 and not np.linalg.norm(np.ptp(reconstruction.center_w, axis=0)) > 1e-9 * reconstruction.size:
         raise InputError("all photos are taken from one place: without parallax there is no scene to solve for")
@@ -87,7 +99,7 @@ class Rounds:
         # doubted while an outlier bent its point is heard again in the next round
         base = reconstruction.with_points(np.ones(len(reconstruction.observations), bool))
         if base.num_points:
-            _check_solvable(base, shutter_model)
+            _check_solvable(base, shutter_model, options.path)
         self._base = revive_points(base, shutter_model, from_afar=True)
         self._keep = np.ones(len(self._base.observations), bool)
         self._sigma_px = options.sigma_px or _noise_px(self._base, shutter_model, options.min_sigma_px)
@@ -100,14 +112,17 @@ class Rounds:
         self._heavy_tails = self._had_heavy_tails = False
         self._damping = options.initial_damping
         self._iterations = 0
+        self._path: PathState | None = None
+        self._path_moved = np.inf
 
     def solve(self, cost_tolerance: float, is_judged: bool = False) -> None:
         """Solve once. One that is judged says how uncertain it is by its residuals, if the options ask for that."""
         options = self._options
         believed = replace(self._base, observations=self._base.observations.select(self._keep))
         problem = self._problem = BundleProblem(
-            believed, self._model, options, self._sigma_px * self._noise, self._spreads, heavy_tails=self._heavy_tails
-        )
+            believed, self._model, options, self._sigma_px * self._noise, self._spreads,
+            heavy_tails=self._heavy_tails, path=self._path,
+        )  # fmt: skip
         self._solved = minimize(
             problem,
             problem.initial_state(),
@@ -126,6 +141,8 @@ class Rounds:
         asks_residuals = is_judged and options.deviations == "jackknife"
         equations = problem.with_squares().linearize(state)
         self._marginals = equations.marginal_covariances(of_priors=asks_residuals)
+        if state.path is not None:
+            self._with_pace = equations.photos_by_shared(equations.num_shared // equations.num_cameras - 1)
         self._weighed_noise, self._had_heavy_tails = self._noise, self._heavy_tails
         per_camera = equations.num_shared // equations.num_cameras
         self._inflation = Inflation(np.ones(len(self._marginals.photos[0])), np.ones(per_camera))
@@ -140,7 +157,28 @@ class Rounds:
             values, variances = problem.fields(state, self._marginals.cameras)
             field = field_spread(values, variances, self._weighed_spreads.field)
             self._spreads = replace(self._spreads, field=field)
+        if state.path is not None:
+            self._follow_path(problem, equations)
         self._revived = revive_points(self._current, self._model)
+
+    def _follow_path(self, problem: BundleProblem, equations: NormalEquations) -> None:
+        """Bend the motions of the next solve as the path of this one bends, and settle its spreads."""
+        state, options = self._solved.state, self._options
+        assert options.path is not None
+        residuals, variances = equations.coupling_variances()
+        if np.isfinite(variances).all():
+            self._spreads = replace(self._spreads, path=path_spreads(problem.path, residuals, variances))
+        self._path = state.path
+        bends = path_bends(self._current, options.path, state.path)
+        before, after = (
+            Layout.of(self._model, replace(options, known_bends=each)).values(
+                np.zeros((self._current.num_images, 0)), self._current.image_names
+            )
+            for each in (options.known_bends or bends, bends)
+        )
+        self._path_moved = float(np.abs(after - before)[..., :3].max()) if options.known_bends else np.inf
+        self._options = replace(options, known_bends=bends)
+        self._layout = Layout.of(self._model, self._options)
 
     def drop_outliers(self) -> None:
         """Believe, from the next solve on, what lies as near to the last as its noise allows."""
@@ -165,6 +203,7 @@ class Rounds:
             and settled(self._weighed_spreads, self._spreads, options.spread_tolerance)
             and abs(self._noise - self._weighed_noise) < _SETTLED_NOISE * self._noise
             and not awaits_tails
+            and (options.path is None or self._path_moved < _SETTLED_BEND)
         )
 
     def begin_next(self, with_same_weights: bool = False) -> None:
@@ -179,9 +218,15 @@ class Rounds:
         current, options, layout, state = self._current, self._options, self._layout, self._solved.state
         res, valid = reprojection_residuals(current)
         weighed, spreads = self._weighed_noise, self._spreads
-        covariances, of_intrinsics = inflated(
-            self._marginals, self._inflation.photos / weighed, self._inflation.cameras / weighed
-        )
+        by = self._inflation.photos / weighed, self._inflation.cameras / weighed
+        covariances, of_intrinsics = inflated(self._marginals, *by)
+        path = None
+        if self._path is not None and options.path is not None:
+            pace_sigma = np.sqrt(np.diagonal(of_intrinsics).reshape(len(current.cameras), -1)[:, -1])
+            path = path_solution(current, options.path, self._path, pace_sigma)
+            with_pace = self._with_pace * by[0] * by[1][-1]
+            covariances = of_motions(covariances, with_pace, pace_sigma, self._path, current.camera_idx)
+            current = orthogonal(with_path_motions(current, options.path, self._path))
         return BundleResult(
             current,
             self._solved.stop_reason,
@@ -202,4 +247,6 @@ class Rounds:
             weighed,
             self._weighed_spreads.field if options.residual_field else 0.0,
             tuple(np.sqrt(self._problem.fields(state, of_intrinsics)[1].sum(1)).tolist()),
+            path,
+            spreads.path,
         )

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from ..model import Reconstruction
 from .layout import Layout
 from .options import BundleOptions
+from .path import PathPrior
 
-__all__ = ["Spreads", "estimated", "estimates_spreads", "field_spread", "settled", "starting_spreads"]
+__all__ = ["Spreads", "estimated", "estimates_spreads", "field_spread", "path_spreads", "settled", "starting_spreads"]
 
 # Radians per frame: a hundredth of a pixel at any focal length in use. Keeps the prior's weight finite.
 _MIN_SPREAD = 1e-6
@@ -25,6 +26,8 @@ _MOST_PX = 1.0
 # No lens varies more than this from photo to photo (of f, and of the principal point in focal lengths). A strong
 # shutter would be taken for it.
 _MOST_VARIED = 0.02
+# Of a path's rates from frame to frame: radians, and shares of the mean way between consecutive photos.
+_TURN_START, _TRAVEL_START = 5e-3, 0.2
 # Of a spread, between two solves.
 _LARGEST_CHANGE = 4.0
 
@@ -47,6 +50,8 @@ class Spreads:
         Of the groups of bends: of the rotation, radians, and of the position, world units.
     field : float
         Of the unknowns of the cameras' residual fields, pixels.
+    path : tuple of float
+        Of a path, if there is one: turn and travel, as `PathPrior` takes them.
     """
 
     phi: float
@@ -56,6 +61,7 @@ class Spreads:
     bends: tuple[float, ...] = ()
     ways: tuple[float, ...] = ()
     field: float = 1.0
+    path: tuple[float, ...] = ()
 
 
 def _spread(
@@ -103,7 +109,7 @@ def estimated(
         focal = _spread(varied[:, :1], of_varied[:, :1], ones, spreads.focal) + _MIN_SPREAD
         centre = _spread(varied[:, 1:], of_varied[:, 1:], ones, spreads.centre) + _MIN_SPREAD
     bends, ways = _bend_spreads(spreads, current, variances[:, layout.variation :], layout)
-    return _bounded(Spreads(phi, velocity, focal, centre, bends, ways, spreads.field), options, baseline)
+    return _bounded(Spreads(phi, velocity, focal, centre, bends, ways, spreads.field, spreads.path), options, baseline)
 
 
 def _bend_spreads(
@@ -128,13 +134,15 @@ def estimates_spreads(shutter_model: str, options: BundleOptions) -> bool:
     """Whether a spread is to be estimated."""
     of_turn = shutter_model != "global" and options.phi_sigma is None
     of_way = shutter_model == "constant-motion" and options.velocity_sigma is None
-    return of_turn or of_way or options.varying or options.bends > 0 or options.residual_field
+    return (
+        of_turn or of_way or options.path is not None or options.varying or options.bends > 0 or options.residual_field
+    )
 
 
 def settled(before: Spreads, after: Spreads, tolerance: float) -> bool:
     """Whether no spread changed by more than a share; what is as good as nothing may go on falling."""
     of_bends = (_SETTLED_AT,) * len(before.bends), (0.0,) * len(before.ways)
-    none = Spreads(_SETTLED_AT, 0.0, _SETTLED_AT, _SETTLED_AT, *of_bends, _SETTLED_PX)
+    none = Spreads(_SETTLED_AT, 0.0, _SETTLED_AT, _SETTLED_AT, *of_bends, _SETTLED_PX, (0.0,) * len(before.path))
     return all(
         abs(new - old) <= tolerance * new or max(old, new) < least
         for old, new, least in zip(*(np.hstack(astuple(each)) for each in (before, after, none)), strict=True)
@@ -151,6 +159,7 @@ def starting_spreads(options: BundleOptions, layout: Layout, baseline: float) ->
         tuple(np.broadcast_to(options.bend_sigma_start, len(set(layout.group))).tolist()),
         (options.way_sigma_start * baseline,) * len(set(layout.group[: layout.ways])),
         options.field_sigma_start,
+        () if options.path is None else (_TURN_START, _TRAVEL_START * baseline),
     )
     return _bounded(start, options, baseline)
 
@@ -162,7 +171,7 @@ def _bounded(spreads: Spreads, options: BundleOptions, baseline: float) -> Sprea
     return Spreads(
         min(spreads.phi, phi), min(spreads.velocity, velocity), min(spreads.focal, _MOST_VARIED),
         min(spreads.centre, _MOST_VARIED), tuple(min(each, phi) for each in spreads.bends), spreads.ways,
-        min(spreads.field, _MOST_PX),
+        min(spreads.field, _MOST_PX), spreads.path,
     )  # fmt: skip
 
 
@@ -170,3 +179,13 @@ def field_spread(values: NDArray[np.float64], variances: NDArray[np.float64], sp
     """Spread in pixels of the unknowns (k, n) of residual fields, as `_spread`."""
     found = _spread(values, variances, np.ones(len(values)), spread)
     return min(found + _MIN_SPREAD_PX, _MOST_PX)
+
+
+def path_spreads(prior: PathPrior, residuals: NDArray[np.float64], variances: NDArray[np.float64]) -> tuple[float, ...]:
+    """Spreads of a path by its residuals (q, 12) and their posterior variances, as `_spread`."""
+    squares, unknown = (prior.unit_squares(each) for each in (residuals**2, variances))
+    ones = np.ones(len(residuals))
+    return tuple(
+        _spread(np.sqrt(square), variance, ones, spread) + _MIN_SPREAD * spread
+        for square, variance, spread in zip(squares, unknown, prior.spreads, strict=True)
+    )

@@ -50,6 +50,17 @@ class BlockPattern:
         """(m,) the diagonal blocks."""
         return self.row_start[:-1]
 
+    def with_blocks(self, first: Index, second: Index) -> BlockPattern:
+        """The pattern with the blocks of some pairs, too."""
+        keys = np.minimum(first, second) * self.size + np.maximum(first, second)
+        rows, cols = np.divmod(np.union1d(self.rows * self.size + self.cols, keys), self.size)
+        return BlockPattern(np.searchsorted(rows, np.arange(self.size + 1)), cols)
+
+    def find(self, first: Index, second: Index) -> Index:
+        """(q,) places of the blocks of pairs of rows and columns, in either order."""
+        keys = np.minimum(first, second) * self.size + np.maximum(first, second)
+        return np.searchsorted(self.rows * self.size + self.cols, keys)
+
     def graph(self) -> scipy.sparse.csr_array:
         """The whole pattern, below the diagonal too, as (m, m) ones."""
         upper = scipy.sparse.csr_array((np.ones(len(self.cols)), self.cols, self.row_start), shape=(self.size,) * 2)
@@ -86,8 +97,11 @@ class Structure:
     pattern: BlockPattern
 
     @classmethod
-    def from_observations(cls, frame_idx: Index, point_idx: Index, num_frames: int, num_points: int) -> Structure:
-        """Structure of observations in any order."""
+    def from_observations(
+        cls, frame_idx: Index, point_idx: Index, num_frames: int, num_points: int,
+        joined: tuple[Index, Index] | None = None,
+    ) -> Structure:  # fmt: skip
+        """Structure of observations in any order; priors join the pairs of photos `joined`, too."""
         point_of = by_first_photo(frame_idx, point_idx, num_frames, num_points)
         track = np.empty(num_points, np.int64)
         track[point_of] = np.arange(num_points)
@@ -104,4 +118,6 @@ class Structure:
         cols = np.empty(row_start[-1], np.int64)
         schur.covisible_columns(*lists, row_start, cols)
         pattern = BlockPattern(row_start, cols)
+        if joined is not None:
+            pattern = pattern.with_blocks(*joined)
         return cls(order, frame_idx, point_idx, track_idx, track_start, point_of, frame_start, frame_order, pattern)

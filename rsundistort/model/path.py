@@ -1,0 +1,158 @@
+"""The path of a camera: poses and rates at moments, and the pose at any time between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from ..errors import InputError
+from .checks import check_finite, check_index, check_rotations, frozen
+from .motion import RowMotion
+
+__all__ = ["CameraPath", "cross_matrices", "inverse_left_jacobians"]
+
+Array = NDArray[np.float64]
+
+# Sites of the bend that a frame gets from the path: cubics on both sides of the principal row.
+_SITES = 17
+
+
+def cross_matrices(x: Array) -> Array:
+    """(..., 3, 3) matrices [x] of vectors (..., 3): [x] y = x x y."""
+    zero = np.zeros(x.shape[:-1])
+    rows = [[zero, -x[..., 2], x[..., 1]], [x[..., 2], zero, -x[..., 0]], [-x[..., 1], x[..., 0], zero]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def inverse_left_jacobians(xi: Array) -> Array:
+    """(..., 3, 3) inverse left Jacobians of SO(3): log(Exp(d) Exp(xi)) = xi + J d (Barfoot 2017, Eq. 7.76)."""
+    angle2 = np.einsum("...a,...a->...", xi, xi)
+    small = angle2 < 1e-4
+    angle = np.sqrt(np.where(small, 1.0, angle2))
+    exact = 1.0 / angle**2 - (1.0 + np.cos(angle)) / (2.0 * angle * np.sin(angle))
+    factor = np.where(small, 1.0 / 12.0 + angle2 / 720.0, exact)
+    X = cross_matrices(xi)
+    return np.eye(3) - 0.5 * X + factor[..., None, None] * (X @ X)
+
+
+def _hermite(u: Array) -> Array:
+    """(4, n) cubic functions of u for values and slopes at 0 and 1, in the order value, slope, value, slope."""
+    return np.stack([(1 + 2 * u) * (1 - u) ** 2, u * (1 - u) ** 2, u**2 * (3 - 2 * u), u**2 * (u - 1)])
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Poses and rates of a camera at m moments.
+
+    Between two moments the path is the cubic in the rotation vector and in the position that both poses and rates
+    fix, which is the mean of white noise on acceleration between them (Barfoot 2017, section 11.1).
+
+    Parameters
+    ----------
+    time_s : (m,) array
+        Ascending.
+    R_cw, center_w : (m, 3, 3), (m, 3) array
+        `x_c = R_cw (X_w - center_w)`.
+    rate : (m, 3) array
+        Radians per second, in the camera frame: `dR_cw / dt = [rate] R_cw`.
+    velocity : (m, 3) array
+        World units per second, in the world.
+    part : (m,) int array, optional
+        Moments of different parts are not joined: between them the video was cut.
+    """
+
+    time_s: Array
+    R_cw: Array
+    center_w: Array
+    rate: Array
+    velocity: Array
+    part: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    def __post_init__(self) -> None:
+        m = len(self.time_s)
+        if not m or (np.diff(self.time_s) <= 0).any():
+            raise InputError("the times of a path must ascend, and there must be one")
+        part = self.part if np.size(self.part) else np.zeros(m, np.int64)
+        fields = {
+            "time_s": check_finite(self.time_s, (m,), "time_s"),
+            "R_cw": check_rotations(self.R_cw, m, "R_cw"),
+            **{name: check_finite(getattr(self, name), (m, 3), name) for name in ("center_w", "rate", "velocity")},
+            "part": check_index(part, m, m, "part"),
+        }
+        for name, value in fields.items():
+            object.__setattr__(self, name, frozen(value))
+
+    def near(self, moment: int, offset_s: ArrayLike) -> tuple[Array, Array]:
+        """Rotation vectors and positions (n, 3) against a moment's pose, so many seconds (n,) after it.
+
+        `Exp(rotation) R_cw` and `center_w + position`. Up to the neighbouring moments these lie on the path; beyond
+        them, and where there is none, they go on as the path does there.
+        """
+        offset = np.atleast_1d(np.asarray(offset_s, np.float64))
+        turn, way = offset[:, None] * self.rate[moment], offset[:, None] * self.velocity[moment]
+        for other, on_this_side in ((moment - 1, offset < 0), (moment + 1, offset > 0)):
+            joined = 0 <= other < len(self.time_s) and self.part[other] == self.part[moment]
+            if joined and on_this_side.any():
+                turn[on_this_side], way[on_this_side] = self._towards(moment, other, offset[on_this_side])
+        return turn, way
+
+    def _towards(self, moment: int, other: int, offset: Array) -> tuple[Array, Array]:
+        """As `near`, on the side of one neighbour."""
+        dt = self.time_s[other] - self.time_s[moment]
+        xi = Rotation.from_matrix(self.R_cw[other] @ self.R_cw[moment].T).as_rotvec()
+        end_rate = inverse_left_jacobians(xi) @ self.rate[other]
+        step = self.center_w[other] - self.center_w[moment]
+        u = np.minimum(offset / dt, 1.0)
+        _, slope0, value1, slope1 = (each[:, None] for each in _hermite(u))
+        beyond = (offset - dt * u)[:, None]
+        turn = slope0 * dt * self.rate[moment] + value1 * xi + slope1 * dt * end_rate + beyond * end_rate
+        way = slope0 * dt * self.velocity[moment] + value1 * step + slope1 * dt * self.velocity[other]
+        return turn, way + beyond * self.velocity[other]
+
+    def poses_at(self, time_s: ArrayLike) -> tuple[Array, Array]:
+        """Poses R_cw (n, 3, 3) and center_w (n, 3) at any times (n,)."""
+        time = np.atleast_1d(np.asarray(time_s, np.float64))
+        nearest = self.nearest(time)
+        R_cw, center_w = np.empty((len(time), 3, 3)), np.empty((len(time), 3))
+        for moment in np.unique(nearest).tolist():
+            mine = nearest == moment
+            turn, way = self.near(moment, time[mine] - self.time_s[moment])
+            R_cw[mine] = Rotation.from_rotvec(turn).as_matrix() @ self.R_cw[moment]
+            center_w[mine] = self.center_w[moment] + way
+        return R_cw, center_w
+
+    def nearest(self, time: Array) -> NDArray[np.int64]:
+        """(n,) the moment nearest to each time (n,)."""
+        after = np.clip(np.searchsorted(self.time_s, time), 1, max(len(self.time_s) - 1, 1))
+        after = np.minimum(after, len(self.time_s) - 1)
+        before = np.maximum(after - 1, 0)
+        return np.where(time - self.time_s[before] <= self.time_s[after] - time, before, after)
+
+    def row_motion(self, moment: int, clock_range: tuple[float, float], clock_s: float) -> RowMotion:
+        """The motion of a frame of the path whose principal row is read at that moment.
+
+        Parameters
+        ----------
+        moment : int
+            Index of the frame.
+        clock_range : (start, end)
+            Of its camera (`Camera.clock_range`).
+        clock_s : float
+            Seconds to a unit of the clock.
+
+        Returns
+        -------
+        RowMotion
+            In the world, against the pose at that moment. Its bend is what the path departs by from its tangent there,
+            so it need not be orthogonal to 1 and to the clock.
+        """
+        from .bend import Bend
+
+        clock = np.linspace(*clock_range, _SITES)
+        turn, way = self.near(moment, clock * clock_s)
+        phi, velocity = clock_s * self.rate[moment], clock_s * self.velocity[moment]
+        bend = Bend(*clock_range, turn - clock[:, None] * phi, way - clock[:, None] * velocity)
+        return RowMotion(phi, velocity, bend, "world")
