@@ -1,0 +1,180 @@
+"""The path of a video's camera, as a prior of the adjustment: derivatives, interpolation, readout time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from clips import HandHeld, filmed, rotation_errors_deg
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation
+
+from rsundistort import BundleOptions, InputError, Reconstruction, bundle_adjust
+from rsundistort.bundle.path import FramePath, PathPrior, orthogonal, with_path_motions
+from rsundistort.bundle.path import PathState as State
+from rsundistort.model.path import CameraPath, inverse_left_jacobians
+
+FRAME_S = 1 / 30
+
+
+def adjusted(truth: Reconstruction, times: dict[str, float], **options):  # type: ignore[no-untyped-def]
+    """From the global-shutter solution, as a video is solved."""
+    plain = bundle_adjust(truth, "global", BundleOptions(outlier_rounds=0, deviations="model")).reconstruction
+    how = BundleOptions(path=FramePath(times, FRAME_S, **options))
+    return bundle_adjust(plain, "constant-motion", how)
+
+
+def test_the_inverse_left_jacobian_is_that_of_the_logarithm() -> None:
+    xi = np.array([[0.3, -0.2, 0.1], [1e-3, 2e-3, -1e-3], [0.0, 0.0, 0.0]])
+    step = 1e-6
+    for axis in range(3):
+        d = np.eye(3)[axis] * step
+        ahead, behind = (
+            (Rotation.from_rotvec(sign * d) * Rotation.from_rotvec(xi)).as_rotvec() for sign in (1.0, -1.0)
+        )
+        expected = (ahead - behind) / (2 * step)
+        np.testing.assert_allclose(inverse_left_jacobians(xi)[:, :, axis], expected, atol=1e-8)
+
+
+def test_the_jacobians_of_the_path_are_those_of_differences() -> None:
+    truth, times = filmed(HandHeld(3, swing=2.0), 8)
+    prior = PathPrior(FramePath(times, FRAME_S), truth, (0.02, 0.3))
+    rates = prior.start(truth).rates + np.random.default_rng(0).normal(0, 0.02, (8, 6))
+    res, by_first, by_second = prior.jacobians(truth.R_cw, truth.center_w, rates)
+    np.testing.assert_allclose(res.reshape(-1, 2, 6), prior.residuals(truth.R_cw, truth.center_w, rates))
+    step = 1e-6
+    for of, J in ((prior.first, by_first), (prior.second, by_second)):
+        for unknown in range(12):
+            moved = []
+            for sign in (1.0, -1.0):
+                R_cw, center_w, own = truth.R_cw.copy(), truth.center_w.copy(), rates.copy()
+                d = np.zeros(12)
+                d[unknown] = sign * step
+                pair = 3  # only this pair's end is moved, so that no other residual of it changes
+                R_cw[of[pair]] = Rotation.from_rotvec(d[:3]).as_matrix() @ R_cw[of[pair]]
+                center_w[of[pair]] += d[3:6]
+                own[of[pair]] += d[6:]
+                moved.append(prior.residuals(R_cw, center_w, own)[pair].ravel())
+            np.testing.assert_allclose(J[3, :, unknown], (moved[0] - moved[1]) / (2 * step), rtol=2e-5, atol=2e-5)
+
+
+def test_a_path_passes_through_its_moments_with_their_rates() -> None:
+    hand = HandHeld(1)
+    time = np.arange(10) * FRAME_S
+    h = 1e-5
+    between = Rotation.from_matrix(hand.rotations(time + h)) * Rotation.from_matrix(hand.rotations(time - h)).inv()
+    velocity = (hand.centers(time + h) - hand.centers(time - h)) / (2 * h)
+    path = CameraPath(time, hand.rotations(time), hand.centers(time), between.as_rotvec() / (2 * h), velocity)
+    R_cw, center_w = path.poses_at(time)
+    np.testing.assert_allclose(R_cw, hand.rotations(time), atol=1e-12)
+    fine = np.linspace(time[0], time[-1], 200)
+    R_cw, center_w = path.poses_at(fine)
+    expected = CubicHermiteSpline(time, hand.centers(time), velocity)(fine)
+    np.testing.assert_allclose(center_w, expected, atol=1e-12)
+    # a tremor of 11 Hz at 30 frames a second, between which a cubic cannot know all
+    apart = Rotation.from_matrix(R_cw @ hand.rotations(fine).transpose(0, 2, 1)).magnitude()
+    assert apart.max() < 2e-3
+
+
+def test_the_motion_of_a_frame_is_that_of_the_path_around_it() -> None:
+    truth, times = filmed(HandHeld(2, tremor=0.01), 6)
+    path = FramePath(times, FRAME_S, readout=(0.02, 1e-6))
+    prior = PathPrior(path, truth, (0.01, 0.1))
+    state = replace(prior.start(truth), pace=prior.pace_prior)
+    bent = with_path_motions(truth, path, state)
+    told = orthogonal(bent)
+    from rsundistort.bundle.path import path_solution
+
+    found = path_solution(truth, path, state, np.zeros(1)).path
+    clock_s = 0.02 / truth.cameras[0].frame_span
+    for image in (0, 2, 5):
+        clock = np.linspace(*truth.cameras[0].clock_range, 9)
+        R_cw, center_w = found.poses_at(found.time_s[image] + clock * clock_s)
+        for rec in (bent, told):
+            poses = [rec.motion(image).pose_at(r, rec.R_cw[image], rec.center_w[image]) for r in clock]
+            np.testing.assert_allclose([each[0] for each in poses], R_cw, atol=2e-6)
+            np.testing.assert_allclose([each[1] for each in poses], center_w, atol=2e-6)
+
+
+@pytest.mark.parametrize(("seed", "readout"), [(0, 0.6), (1, 0.25), (2, -0.4), (3, 0.0)])
+def test_the_readout_time_is_measured(seed: int, readout: float) -> None:
+    truth, times = filmed(HandHeld(seed), 24, readout)
+    result = adjusted(truth, times)
+    assert result.path is not None
+    share, sigma = result.path.readout_s / FRAME_S, result.path.sigma_readout_s / FRAME_S
+    assert abs(share - readout) < 3 * sigma
+    assert sigma < 0.02
+    assert np.max(rotation_errors_deg(result.path.path.R_cw, truth.R_cw)) < 0.05
+
+
+def test_a_camera_that_is_held_level_is_no_longer_critical() -> None:
+    truth, times = filmed(HandHeld(4, level=True), 24)
+    result = adjusted(truth, times)
+    moved = result.reconstruction.points_w - result.reconstruction.points_w.mean(0)
+    was = truth.points_w - truth.points_w.mean(0)
+    # the height of the scene against its width, axis by axis
+    stretch = np.linalg.norm(moved, axis=0) / np.linalg.norm(was, axis=0)
+    assert len(moved) == len(was)
+    assert abs(stretch[1] / stretch[0] - 1) < 0.003
+
+
+def test_the_normalised_error_of_the_readout_is_of_unit_variance() -> None:
+    errors = []
+    for seed in range(8):
+        truth, times = filmed(HandHeld(20 + seed), 12, num_points=120)
+        path = adjusted(truth, times).path
+        assert path is not None
+        errors.append(((path.readout_s - 0.6 * FRAME_S) / path.sigma_readout_s)[0])
+    assert 0.4 < np.sqrt(np.mean(np.square(errors))) < 1.7
+
+
+def test_two_frames_suffice() -> None:
+    truth, times = filmed(HandHeld(5, swing=3.0), 2, num_points=400, noise_px=0.1)
+    result = adjusted(truth, times)
+    assert result.path is not None
+    assert abs(result.path.readout_s[0] / FRAME_S - 0.6) < 3 * result.path.sigma_readout_s[0] / FRAME_S
+
+
+def test_a_path_is_not_joined_over_a_cut() -> None:
+    truth, times = filmed(HandHeld(6), 12)
+    part = {name: int(k >= 6) for k, name in enumerate(truth.image_names)}
+    late = {name: time + 100 * part[name] for name, time in times.items()}
+    result = adjusted(truth, late, part=part)
+    assert result.path is not None
+    assert abs(result.path.readout_s[0] / FRAME_S - 0.6) < 3 * result.path.sigma_readout_s[0] / FRAME_S
+    np.testing.assert_array_equal(result.path.path.part, [0] * 6 + [1] * 6)
+
+
+def test_a_known_readout_time_is_believed() -> None:
+    truth, times = filmed(HandHeld(7), 10)
+    result = adjusted(truth, times, readout=(0.6 * FRAME_S, 1e-7))
+    assert result.path is not None
+    assert result.path.readout_s[0] == pytest.approx(0.6 * FRAME_S, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"frame_s": 0.0}, "frame_s"),
+        ({"readout": (0.02, 0.0)}, "readout"),
+        ({"time_s": {"000000.png": 0.0}}, "no time of"),
+        ({"time_s": {f"{k:06d}.png": 1.0 for k in range(6)}}, "same time"),
+    ],
+)
+def test_a_path_that_cannot_be_is_refused(change: dict[str, object], says: str) -> None:
+    truth, times = filmed(HandHeld(8), 6)
+    with pytest.raises(InputError, match=says):
+        path = FramePath(**{"time_s": times, "frame_s": FRAME_S, **change})  # type: ignore[arg-type]
+        bundle_adjust(truth, "constant-motion", BundleOptions(path=path))
+
+
+def test_frames_on_a_path_move_by_constant_motion() -> None:
+    truth, times = filmed(HandHeld(8), 6)
+    with pytest.raises(InputError, match="constant-motion"):
+        bundle_adjust(truth, "rotation", BundleOptions(path=FramePath(times, FRAME_S)))
+
+
+def test_the_state_of_a_path_gives_the_motions() -> None:
+    state = State(np.arange(12.0).reshape(2, 6), np.array([0.5, 2.0]))
+    np.testing.assert_array_equal(state.motions(np.array([1, 0])), [np.arange(6) * 2.0, np.arange(6, 12) * 0.5])
