@@ -6,6 +6,7 @@ import csv
 import struct
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,17 @@ from .photos.exif import ORIENTATION, pack_ifd
 from .photos.images import write_image
 from .photos.metadata import Metadata
 
-__all__ = ["FRAME_TABLE", "VIDEO_SUFFIXES", "VideoFrames", "extract_frames", "is_video"]
+__all__ = [
+    "FRAME_TABLE",
+    "VIDEO_SUFFIXES",
+    "FrameWriter",
+    "VideoFrames",
+    "VideoReader",
+    "extract_frames",
+    "frame_name",
+    "is_video",
+    "sharpness_of",
+]
 
 VIDEO_SUFFIXES = (
     ".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".3gp", ".wmv", ".h264",
@@ -131,74 +142,146 @@ def extract_frames(
     group = every or sharpest or 0
     if group < 1:
         raise InputError(f"every {group} frames: expected 1 or more")
-    try:
-        import av
-    except ImportError:
-        raise InputError(f'{video.name} is a video, which needs PyAV: pip install "rsundistort[video]"') from None
-    with output_folder(Path(folder)) as scratch:
+    with output_folder(Path(folder)) as scratch, VideoReader(video) as reader:
+        return _extract(reader, scratch, group, measure=sharpest is not None, progress=progress)
+
+
+def _extract(
+    reader: VideoReader, folder: Path, group: int, *, measure: bool, progress: Callable[[int, int], None] | None
+) -> VideoFrames:
+    writer = FrameWriter(reader, folder)
+    best: _Frame | None = None
+    for number, time_s, picture in reader:
+        if progress is not None:
+            progress(number + 1, reader.num_frames)
+        if best is not None and number // group > best.number // group:
+            writer.add(best.number, best.time_s, best.picture, best.sharpness)
+            best = None
+        if measure or best is None:
+            frame = _Frame(number, time_s, sharpness_of(picture), picture)
+            best = frame if best is None or frame.sharpness > best.sharpness else best
+    if best is not None:
+        writer.add(best.number, best.time_s, best.picture, best.sharpness)
+    reader.warn()
+    return writer.finish()
+
+
+class VideoReader:
+    """Whole frames of a video in the order of presentation, each as (number, time_s, picture of PyAV).
+
+    Used in a `with` statement. Times are those since the first frame; NaN where the video holds none. A frame that
+    cannot be decoded is passed over, and so are those that build on it; behind a change of size the video ends.
+
+    Raises
+    ------
+    InputError
+        PyAV is missing.
+    FileError
+        No video, or it cannot be read.
+    """
+
+    def __init__(self, video: Path | str) -> None:
+        self.video = Path(video)
+
+    def __enter__(self) -> VideoReader:
         try:
+            import av
+        except ImportError:
+            raise InputError(
+                f'{self.video.name} is a video, which needs PyAV: pip install "rsundistort[video]"'
+            ) from None
+        with self._explained():
             # a name with a colon is no protocol, and a file that refers to others must not fetch them
-            with av.open(f"file:{video}", options={"protocol_whitelist": "file"}) as container:
-                return _extract(container, video, scratch, group, measure=sharpest is not None, progress=progress)
+            self._container = av.open(f"file:{self.video}", options={"protocol_whitelist": "file"})
+        # a cover picture is a video stream, too
+        streams = self._container.streams.video
+        stream = next((s for s in streams if not int(s.disposition) & _ATTACHED_PICTURE), None)
+        if stream is None:
+            self._container.close()
+            raise FileError(f"{self.video} holds no pictures")
+        self._stream = stream
+        tags = {key.lower(): value for key, value in (*self._container.metadata.items(), *stream.metadata.items())}
+        self.make, self.model = (
+            next((tags[key].strip() for key in keys if tags.get(key)), "") for keys in (_MAKE, _MODEL)
+        )
+        self.decoded = _Decoded(stream)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._container.close()
+
+    def __iter__(self) -> Iterator[tuple[int, float, Any]]:
+        with self._explained():
+            yield from self.decoded
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        """Errors of FFmpeg as those of the file."""
+        import av
+
+        try:
+            yield
         except (OSError, av.error.FFmpegError) as error:
             if isinstance(error, RsUndistortError):
                 raise
             raise FileError(
-                f"{video} cannot be read as a video ({error.strerror}); if it was cut short while being recorded, "
+                f"{self.video} cannot be read as a video ({error.strerror}); if it was cut short while being recorded, "
                 "repair it or copy it again"
             ) from error
 
+    @property
+    def num_frames(self) -> int:
+        """Frames by the container; 0 where it does not say."""
+        return int(self._stream.frames)
 
-def _extract(
-    container: Any,
-    video: Path,
-    folder: Path,
-    group: int,
-    *,
-    measure: bool,
-    progress: Callable[[int, int], None] | None,
-) -> VideoFrames:
-    # a cover picture is a video stream, too
-    stream = next((s for s in container.streams.video if not int(s.disposition) & _ATTACHED_PICTURE), None)
-    if stream is None:
-        raise FileError(f"{video} holds no pictures")
-    tags = {key.lower(): value for key, value in (*container.metadata.items(), *stream.metadata.items())}
-    make, model = (next((tags[key].strip() for key in keys if tags.get(key)), "") for keys in (_MAKE, _MODEL))
-    decoded = _Decoded(stream)
-    rows: list[_Frame] = []
-    names: list[str] = []
-    orientation = 1
-    best: _Frame | None = None
+    @property
+    def stream(self) -> Any:
+        """PyAV's stream of pictures."""
+        return self._stream
 
-    def keep(frame: _Frame) -> None:
-        nonlocal orientation
-        orientation = _ORIENTATIONS.get(frame.picture.rotation, 1)
-        names.append(f"{video.stem}_{frame.number:06d}.png")
-        write_image(folder / names[-1], _pixels(frame.picture), _metadata(orientation, make, model))
-        rows.append(_Frame(frame.number, frame.time_s, frame.sharpness, None))
+    def warn(self) -> None:
+        """Say what was wrong with the video."""
+        self.decoded.warn(self.video.name)
 
-    for number, time_s, picture in decoded:
-        if progress is not None:
-            progress(number + 1, stream.frames)
-        if best is not None and number // group > best.number // group:
-            keep(best)
-            best = None
-        if measure or best is None:
-            frame = _Frame(number, time_s, _sharpness(picture), picture)
-            best = frame if best is None or frame.sharpness > best.sharpness else best
-    if best is not None:
-        keep(best)
-    if not rows:
-        raise FileError(f"{video} holds no whole frame; copy it again from the camera")
-    decoded.warn(video.name)
-    with (folder / FRAME_TABLE).open("w", encoding="utf-8", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(["name", "frame", "time_s", "sharpness"])
-        for name, row in zip(names, rows, strict=True):
-            time = f"{row.time_s:.6f}" if np.isfinite(row.time_s) else ""
-            table.writerow([name, row.number, time, f"{row.sharpness:.2f}"])
-    times = np.array([row.time_s for row in rows])
-    return VideoFrames(tuple(names), times, decoded.num_whole, decoded.num_damaged, orientation, make, model)
+
+class FrameWriter:
+    """Writes frames of a video as PNG files, and the table of their times."""
+
+    def __init__(self, reader: VideoReader, folder: Path) -> None:
+        self._reader, self._folder = reader, folder
+        self._rows: list[tuple[str, int, float, float]] = []
+        self._orientation = 1
+
+    def add(self, number: int, time_s: float, picture: Any, sharpness: float) -> None:
+        """Write one frame."""
+        self._orientation = _ORIENTATIONS.get(picture.rotation, 1)
+        name = frame_name(self._reader.video, number)
+        write_image(
+            self._folder / name, _pixels(picture), _metadata(self._orientation, self._reader.make, self._reader.model)
+        )
+        self._rows.append((name, number, time_s, sharpness))
+
+    def finish(self) -> VideoFrames:
+        """Write the table."""
+        if not self._rows:
+            raise FileError(f"{self._reader.video} holds no whole frame; copy it again from the camera")
+        with (self._folder / FRAME_TABLE).open("w", encoding="utf-8", newline="") as file:
+            table = csv.writer(file)
+            table.writerow(["name", "frame", "time_s", "sharpness"])
+            for name, number, time_s, sharpness in self._rows:
+                time = f"{time_s:.6f}" if np.isfinite(time_s) else ""
+                table.writerow([name, number, time, f"{sharpness:.2f}"])
+        names, _, times, _ = zip(*self._rows, strict=True)
+        decoded = self._reader.decoded
+        return VideoFrames(
+            names, np.array(times), decoded.num_whole, decoded.num_damaged, self._orientation, self._reader.make,
+            self._reader.model,
+        )  # fmt: skip
+
+
+def frame_name(video: Path, number: int) -> str:
+    """Name of a frame as a photo."""
+    return f"{video.stem}_{number:06d}.png"
 
 
 class _Decoded:
@@ -216,6 +299,8 @@ class _Decoded:
         self._timeless = 0
         self._broken = ""
         self._end_s = 0.0
+        self._size: tuple[int, int] | None = None
+        self._changes_at_s: float | None = None
 
     def __iter__(self) -> Iterator[tuple[int, float, Any]]:
         first: float | None = None
@@ -234,6 +319,11 @@ class _Decoded:
             if damaged:
                 self.num_damaged += 1
                 continue
+            size = picture.width, picture.height
+            if size != (self._size or size):
+                self._changes_at_s = time_s
+                return
+            self._size = size
             self.num_whole += 1
             self._interlaced |= picture.interlaced_frame
             self._timeless += picture.time is None
@@ -268,8 +358,10 @@ class _Decoded:
         length = self._stream.duration and float(self._stream.duration * self._stream.time_base)
         if length is None and self._stream.container.duration is not None:
             length = self._stream.container.duration / 1e6
+        if self._changes_at_s is not None:
+            said.append(f"its frames change size at {self._changes_at_s:.1f} s; what follows was left out")
         # containers round, and count the sound that goes on after the last frame
-        if self._broken or (length and self._end_s and self._end_s < length - max(0.5, 0.02 * length)):
+        elif self._broken or (length and self._end_s and self._end_s < length - max(0.5, 0.02 * length)):
             said.append(f"it ends at {self._end_s:.1f} s{f' of {length:.1f} s' if length else ''}")
         if self._interlaced:
             said.append("it is interlaced: each frame holds two moments, which no shutter model describes")
@@ -288,7 +380,7 @@ def _pixels(picture: Any) -> NDArray[Any]:
     return pixels
 
 
-def _sharpness(picture: Any) -> float:
+def sharpness_of(picture: Any) -> float:
     """Variance of the Laplacian of the reduced grey frame."""
     scale = min(1.0, _MEASURED_PX / max(picture.width, picture.height))
     width, height = (max(2, round(scale * side)) for side in (picture.width, picture.height))

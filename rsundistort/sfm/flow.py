@@ -78,9 +78,10 @@ class KeyFrameChooser:
         self._since: list[tuple[Grey, float, float]] = []  # frames from the last key on: grey, sharpness, moved
         self._number = -1
 
-    def feed(self, grey: Grey, sharpness: float) -> None:
+    def feed(self, grey: Grey) -> None:
         """The next frame."""
         self._number += 1
+        sharpness = float(cv2.Laplacian(grey, cv2.CV_32F).var())
         if not self.keys:
             self._begin(self._number, grey, sharpness)
             return

@@ -1,0 +1,163 @@
+"""A video as one clip: its key frames as photos, and when every frame was taken."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError, RsUndistortWarning
+from ..io.video import FrameWriter, VideoFrames, VideoReader, frame_name, sharpness_of
+from ..sfm.flow import KeyFrameChooser, flow_size
+
+__all__ = ["Clip", "greys_of", "read_clip"]
+
+# A clip has this many key frames at least, if it has as many frames: what moved little is still seen from its ends.
+_LEAST_KEYS = 8
+# Grey levels of a frame that shows nothing.
+_DARK = 2.0
+# Longer than this many of the usual steps between frames, and the recording paused.
+_PAUSE = 20.0
+
+
+@dataclass(frozen=True)
+class Clip:
+    """The frames of a video, in their order.
+
+    Attributes
+    ----------
+    video : Path
+        The file.
+    folder : Path
+        Where its key frames lie, as PNG files.
+    names : tuple of str, length n
+        Of all frames, also of those that were not written.
+    time_s : (n,) array
+        When each was taken, by the container's time stamps; seconds since the first.
+    frame_s : float
+        The usual time from one frame to the next.
+    part : (n,) int array
+        Which frames go on from each other: a cut, or a pause of the recording, begins a new part.
+    keys : (k,) int array
+        The key frames.
+    moved_px : (n - 1,) array
+        How far the picture moved to the next frame, the median; NaN over a cut.
+    frames : VideoFrames
+        What else is known of them, and of the camera.
+    """
+
+    video: Path
+    folder: Path
+    names: tuple[str, ...]
+    time_s: NDArray[np.float64]
+    frame_s: float
+    part: NDArray[np.int64]
+    keys: NDArray[np.int64]
+    moved_px: NDArray[np.float64]
+    frames: VideoFrames
+
+    @property
+    def key_names(self) -> tuple[str, ...]:
+        """Names of the key frames."""
+        return tuple(self.names[k] for k in self.keys.tolist())
+
+
+def _grey(picture: Any) -> NDArray[np.uint8]:
+    """A frame as it is followed: grey, and shrunk if it is large."""
+    width, height = flow_size(picture.width, picture.height)
+    if (width, height) == (picture.width, picture.height):
+        return np.ascontiguousarray(picture.to_ndarray(format="gray"))
+    return np.ascontiguousarray(picture.to_ndarray(format="gray", width=width, height=height))
+
+
+def greys_of(video: Path, wanted: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Frames of a video, by their numbers (ascending), as they are followed; one in memory at a time."""
+    numbers = set(wanted)
+    with VideoReader(video) as reader:
+        for number, _, picture in reader:
+            if number in numbers:
+                yield number, _grey(picture)
+                if number == wanted[-1]:
+                    return
+
+
+def read_clip(video: Path, folder: Path, progress: Callable[[int, int], None] | None = None) -> Clip:
+    """Choose the key frames of a video by how far the picture moved and how sharp they are, and write these.
+
+    Parameters
+    ----------
+    video : path
+        Any file that FFmpeg decodes.
+    folder : path
+        Where the key frames go, as PNG files, with `frames.csv`; must not exist.
+    progress : callable, optional
+        Called with the number of frames read, and of all, 0 where that is not known.
+
+    Raises
+    ------
+    InputError
+        Fewer than two frames that show anything, or no times.
+    FileError
+        No video, or damaged at its beginning.
+    """
+    chooser, numbers, times, sharpness, num_late = KeyFrameChooser(), list[int](), list[float](), list[float](), 0
+    with VideoReader(video) as reader:
+        for number, time_s, picture in reader:
+            if progress is not None:
+                progress(number + 1, reader.num_frames)
+            if not np.isfinite(time_s):
+                raise InputError(f"{video.name} holds no times of its frames; write it anew, or say --every N")
+            if times and time_s <= times[-1]:
+                num_late += 1
+                continue
+            grey = _grey(picture)
+            if grey.std() < _DARK:
+                continue
+            numbers.append(number)
+            times.append(time_s)
+            sharpness.append(sharpness_of(picture))
+            chooser.feed(grey)
+        chooser.finish()
+        reader.warn()
+    if num_late:
+        warnings.warn(
+            f"{video.name}: {num_late} frames whose time runs back were left out", RsUndistortWarning, stacklevel=2
+        )
+    if len(numbers) < 2:
+        raise InputError(f"{video.name} has {len(numbers)} frames that show anything; a path needs two")
+    time = np.array(times)
+    frame_s = float(np.median(np.diff(time)))
+    breaks = {*chooser.cuts, *(np.flatnonzero(np.diff(time) > _PAUSE * frame_s) + 1).tolist()}
+    keys = np.array(sorted({*chooser.keys, *_between(len(numbers), len(chooser.keys)), *_ends(breaks)}))
+    frames = _write(video, folder, {numbers[k]: sharpness[k] for k in keys.tolist()})
+    part = np.cumsum([k in breaks for k in range(len(numbers))])
+    names = tuple(frame_name(video, number) for number in numbers)
+    return Clip(video, folder, names, time, frame_s, part, keys, np.array(chooser.steps), frames)
+
+
+def _write(video: Path, folder: Path, sharpness: Mapping[int, float]) -> VideoFrames:
+    """Frames of a video, by their numbers, as PNG files."""
+    folder.mkdir(parents=True)
+    with VideoReader(video) as reader:
+        writer = FrameWriter(reader, folder)
+        for number, time_s, picture in reader:
+            if number in sharpness:
+                writer.add(number, time_s, picture, sharpness[number])
+        return writer.finish()
+
+
+def _between(num_frames: int, num_keys: int) -> Iterable[int]:
+    """More key frames, spread evenly, where the picture hardly moved."""
+    if num_keys >= _LEAST_KEYS:
+        return ()
+    return np.linspace(0, num_frames - 1, min(_LEAST_KEYS, num_frames)).round().astype(int).tolist()
+
+
+def _ends(breaks: set[int]) -> Iterable[int]:
+    """The frames on both sides of a break: no path leads beyond them."""
+    return (k - side for k in breaks for side in (0, 1))
