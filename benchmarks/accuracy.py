@@ -18,23 +18,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rsundistort import (
-    BundleOptions,
-    RowMotion,
-    RunOptions,
-    WarpOptions,
-    bundle_adjust,
-    evaluate,
-    pose_errors,
-    psnr,
-    read_solution,
-    rectify,
-    run,
-    simulate_warp,
-)
+from rsundistort import BundleOptions, RowMotion, RunOptions, bundle_adjust, evaluate, read_solution, rectify, run
+from rsundistort.analysis import Evaluation
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
+from rsundistort.evaluation import pose_errors, psnr
 from rsundistort.input.load import load_photos
+from rsundistort.simulate import WarpOptions, simulate_warp
 from rsundistort.solve.model_sequence import solve_photos
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -45,15 +35,15 @@ def show(name: str, **figures: Any) -> None:
     print(json.dumps({"name": name, **figures}), flush=True)
 
 
-def brief(result: dict[str, Any]) -> dict[str, Any]:
+def brief(result: Evaluation) -> dict[str, Any]:
     """The figures that the README shows."""
     return {
-        "registered": f"{result['registered']}/{result['photos']}",
-        "rotation_deg": round(result["rotation_deg"]["mean"], 4),
-        "phi_mrad_per_frame": [round(v, 3) for v in result["phi_mrad_per_frame"]["mean_per_component"]],
-        "psnr_before_db": round(result["psnr_before_db"]["median"], 2),
-        "psnr_db": round(result["psnr_db"]["median"], 2),
-        "psnr_worst_db": round(result["psnr_db"]["min"], 2),
+        "registered": f"{result.registered}/{result.photos}",
+        "rotation_deg": round(result.rotation_deg.mean, 4),
+        "phi_mrad_per_frame": [round(v, 3) for v in result.phi_mrad_per_frame.mean_per_component],
+        "psnr_before_db": round(result.psnr_before_db.median, 2),
+        "psnr_db": round(result.psnr_db.median, 2),
+        "psnr_worst_db": round(result.psnr_db.min, 2),
     }
 
 
@@ -88,7 +78,7 @@ def herz_jesus(photos: Path, work: Path, seeds: int) -> None:
             run(warped / "photos", out)
             truth = warped / "ground_truth.json"
             result = evaluate(out, truth, poses=plain / "solution.json", twins=photos)
-            pooled += result["psnr_db"]["photos"].values()
+            pooled += result.psnr_db.photos.values()
             show(f"herz-jesus-8 warped by {sigma}, seed {seed}", **brief(result), target=target)
             if seed == 0:
                 blind = work / f"blind-{sigma}"
@@ -96,7 +86,7 @@ def herz_jesus(photos: Path, work: Path, seeds: int) -> None:
                 blind_result = evaluate(blind, truth, poses=plain / "solution.json")
                 show(
                     "the same without a shutter model",
-                    rotation_deg=round(blind_result["rotation_deg"]["mean"], 3),
+                    rotation_deg=round(blind_result.rotation_deg.mean, 3),
                 )
         show(
             f"herz-jesus-8 warped by {sigma}, all seeds",

@@ -17,13 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
-from rsundistort import BundleOptions, RunOptions, Solution, WarpOptions, bundle_adjust, read_solution, simulate_warp
+from rsundistort import BundleOptions, RunOptions, Solution, bundle_adjust, read_solution
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers, use_threads
-from rsundistort.bundle import climb
 from rsundistort.bundle.options import BundleResult
 from rsundistort.input.load import load_photos
 from rsundistort.sfm import map_photos, match_photos, retriangulate
+from rsundistort.simulate import WarpOptions, simulate_warp
 from rsundistort.solve.model_sequence import Feedback
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -63,7 +63,7 @@ def main() -> None:
             matched = match_photos(
                 work / "database.db", loaded.names, loaded.features, cameras.cameras, cameras.camera_idx
             )
-            result = climb(map_photos(matched), ("global", "two-step", "rotation"))["rotation"]
+            result = bundle_adjust(map_photos(matched), "rotation", simpler_first=True)
             result = bundle_adjust(retriangulate(matched, result.reconstruction), "rotation")
             again = BundleOptions(phi_sigma_start=result.phi_sigma)
             feedback = Feedback(matched, loaded, workers)

@@ -30,10 +30,10 @@ from rsundistort import (
     RowMotion,
     bundle_adjust,
     init_rectify_map,
-    psnr,
     read_solution,
     undistort_points,
 )
+from rsundistort.evaluation import psnr
 
 SCENE = Path(__file__).resolve().parent.parent / "sample_scenes" / "handheld"
 

@@ -36,19 +36,10 @@ import numpy as np
 import nw_rsba
 from scipy.spatial.transform import Rotation
 
-from rsundistort import (
-    BundleOptions,
-    Camera,
-    Observations,
-    Reconstruction,
-    RowMotion,
-    RunOptions,
-    climb,
-    psnr,
-    run,
-)
+from rsundistort import BundleOptions, Camera, Observations, Reconstruction, RowMotion, RunOptions, bundle_adjust, run
 from rsundistort.critical import heal, shape_cost, with_remedy
 from rsundistort.critical.meter import readout_axes
+from rsundistort.evaluation import psnr
 from rsundistort.synthetic import project_rows
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -146,8 +137,7 @@ def options_of(remedy: str) -> BundleOptions:
 def solved(truth: Reconstruction, rng: np.random.Generator, model: str, remedy: str) -> tuple[Any, Any]:
     """The healed solution and what was done."""
     options = options_of(remedy)
-    rungs = ("global", "two-step", model) if model != "two-step" else ("global", "two-step")
-    result = climb(start_of(truth, rng), rungs, options)[model]
+    result = bundle_adjust(start_of(truth, rng), model, options, simpler_first=True)
     return heal(result, options, remedy)
 
 
@@ -197,7 +187,7 @@ def trial_spread(arguments: tuple[str, str, int]) -> tuple[float, float]:
     rng = np.random.default_rng([9, trial])
     truth = with_motion(scene, rng, None, model)
     options = replace(options_of("prior"), phi_sigma=SIGMA_RAD / np.sqrt(3))
-    result = climb(start_of(truth, rng), ("global", "two-step", model)[: 2 + (model != "two-step")], options)[model]
+    result = bundle_adjust(start_of(truth, rng), model, options, simpler_first=True)
     return log_vertical_scale(result.reconstruction, truth), shape_cost(result, options).sigma_log_k
 
 
@@ -339,7 +329,7 @@ def show_outsider(_pool: ProcessPoolExecutor, _trials: int) -> None:
             arrays = {key: file[key] for key in file.files}
         costs, before, after = [], [], []
         for k in range(len(arrays["K"])):
-            result = climb(nw_rsba.problem(arrays, k))["constant-motion"]
+            result = bundle_adjust(nw_rsba.problem(arrays, k), "constant-motion", simpler_first=True)
             healed, done = heal(result, BundleOptions())
             costs.append(done.before)
             before.append(nw_rsba.errors(result.reconstruction, arrays, k))

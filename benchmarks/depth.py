@@ -29,16 +29,16 @@ from rsundistort import (
     RowMotion,
     RunOptions,
     init_rectify_map,
-    psnr,
     read_solution,
     rectify,
     rectify_folder,
     run,
-    simulate_scene,
 )
 from rsundistort.batch import use_threads
 from rsundistort.batch.geometry import PhotoDepths, ScenePoints
+from rsundistort.evaluation import psnr
 from rsundistort.io import read_photo
+from rsundistort.simulate import simulate_scene
 from rsundistort.synthetic import load_recipe, render_depth
 
 ROOT = Path(__file__).resolve().parent.parent

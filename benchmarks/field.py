@@ -302,8 +302,10 @@ def warped(photos: Path) -> None:
     where the true motions are given, and between photos that went through the same remap and encoder without any
     motion, is not the shutter's.
     """
-    from rsundistort import RunOptions, WarpOptions, pose_errors, read_solution, run, simulate_warp
+    from rsundistort import RunOptions, read_solution, run
+    from rsundistort.evaluation import pose_errors
     from rsundistort.io.cameras import camera_to_json
+    from rsundistort.simulate import WarpOptions, simulate_warp
 
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)

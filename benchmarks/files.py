@@ -22,16 +22,9 @@ import exifread
 import numpy as np
 from PIL import Image
 
-from rsundistort import (
-    Camera,
-    FileError,
-    RowMotion,
-    Solution,
-    SolvedImage,
-    psnr,
-    rectify_folder,
-    write_solution,
-)
+from rsundistort import Camera, RowMotion, Solution, SolvedImage, rectify_folder, write_solution
+from rsundistort.errors import FileError
+from rsundistort.evaluation import psnr
 from rsundistort.io import list_photos, output_name, read_photo, write_image
 from rsundistort.model.orientation import MATRICES, turn_pixels
 

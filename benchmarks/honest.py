@@ -27,7 +27,7 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -45,8 +45,12 @@ from measures import (
 )
 
 import rsundistort as rs
+from rsundistort.analysis import Evaluation
+from rsundistort.errors import ReconstructionError
+from rsundistort.evaluation import pose_errors
 from rsundistort.model import READOUTS
 from rsundistort.report.verdict import verdict_of
+from rsundistort.simulate import WarpOptions, simulate_warp
 from rsundistort.solve.model_sequence import Solved, solve_photos
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -163,7 +167,7 @@ class Bench:
         """Folder of herz-jesus-8 warped."""
         out = self.work / f"warped-{sigma}-{seed}"
         if not out.is_dir():
-            rs.simulate_warp(self.photos / HERZ, out, rs.WarpOptions(sigma_rad=sigma, seed=seed))
+            simulate_warp(self.photos / HERZ, out, WarpOptions(sigma_rad=sigma, seed=seed))
         return out
 
     def still(self) -> Ran:
@@ -211,12 +215,13 @@ def nothing_invented(bench: Bench) -> None:
             bench.row(name, [ran], {f"{key} px": value for key, value in shift.items()}, target, met)
 
 
-def brief(found: dict[str, Any]) -> dict[str, Any]:
+def brief(found: Evaluation) -> dict[str, Any]:
     """What `evaluate` said, shorter."""
-    figures = {"phi_mrad_per_frame": np.round(found["phi_mrad_per_frame"]["mean_per_component"], 3).tolist()}
-    if "rotation_deg" in found:
-        figures["rotation_deg"] = {key: round(value, 4) for key, value in found["rotation_deg"].items()}
-    return figures | {key: summary(found[key]["photos"].values(), min) for key in ("psnr_before_db", "psnr_db")}
+    figures = {"phi_mrad_per_frame": np.round(found.phi_mrad_per_frame.mean_per_component, 3).tolist()}
+    if found.rotation_deg is not None:
+        figures["rotation_deg"] = {key: round(value, 4) for key, value in asdict(found.rotation_deg).items()}
+    both = {"psnr_before_db": found.psnr_before_db, "psnr_db": found.psnr_db}
+    return figures | {key: summary(value.photos.values(), min) for key, value in both.items()}
 
 
 def suppressed(bench: Bench) -> None:
@@ -277,10 +282,10 @@ def better(bench: Bench) -> None:
             ran.append(bench.run(warp / "photos"))
             truth, still = warp / "ground_truth.json", bench.still().out / "solution.json"
             found = rs.evaluate(ran[-1].out, truth, poses=still, twins=bench.photos / HERZ)
-            psnr_db += found["psnr_db"]["photos"].values()
+            psnr_db += found.psnr_db.photos.values()
             # the same against twins without the lens that was found: the calibration is no truth to a tenth of a pixel
             own = rs.evaluate(ran[-1].out, with_lens_of(ran[-1].out, truth), twins=bench.photos / HERZ)
-            own_lens_db += own["psnr_db"]["photos"].values()
+            own_lens_db += own.psnr_db.photos.values()
             show(f"{name}, seed {seed}", **ran[-1].facts, **brief(found), own_lens_db=brief(own)["psnr_db"])
         dB = summary(psnr_db, min)
         figures = {"dB": list(dB.values()), "by the lens found": list(summary(own_lens_db, min).values())}
@@ -328,12 +333,12 @@ def strong(bench: Bench) -> None:
             for seed in bench.numbers(3):
                 try:
                     each = bench.run(bench.warped(sigma, seed) / "photos")
-                except rs.ReconstructionError as error:
+                except ReconstructionError as error:
                     show(f"{name}, seed {seed}", refused=str(error))
                     worst.append("refused")
                     continue
                 ran.append(each)
-                errors = rs.pose_errors(each.solution, bench.still().solution)
+                errors = pose_errors(each.solution, bench.still().solution)
                 degrees = dict(zip(errors.names, errors.rotation_deg.round(2).tolist(), strict=True))
                 worst.append(max(degrees.values()))
                 honest &= worst[-1] <= 1 or not each.said[1].startswith("trust")

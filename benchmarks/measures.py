@@ -19,15 +19,13 @@ from rsundistort import (
     Solution,
     SolvedImage,
     init_rectify_map,
-    motion_errors,
-    psnr,
     unproject_points,
 )
 from rsundistort.bundle import Posterior, gauge_directions
 from rsundistort.bundle.triangulate import _world_rays
 from rsundistort.critical.common import row_phi
 from rsundistort.critical.meter import readout_axes
-from rsundistort.evaluation import align_points
+from rsundistort.evaluation import align_points, motion_errors, psnr
 from rsundistort.io import read_photo
 from rsundistort.io.cameras import camera_from_json
 from rsundistort.solve.model_sequence import Solved

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from rsundistort import BundleOptions, Camera, Observations, Reconstruction, climb
+from rsundistort import BundleOptions, Camera, Observations, Reconstruction, bundle_adjust
 from rsundistort.evaluation import align_points, rotation_angles_deg
 
 CLASSES = ("general", "near-parallel", "parallel")
@@ -68,7 +68,7 @@ def main() -> None:
         found = []
         for k in range(len(arrays["K"])):
             start = problem(arrays, k)
-            result = climb(start, options=options)["constant-motion"].reconstruction
+            result = bundle_adjust(start, "constant-motion", options, simpler_first=True).reconstruction
             if result.num_points < start.num_points:
                 raise SystemExit(f"{name} {k}: {start.num_points - result.num_points} points were lost")
             found.append(errors(result, arrays, k))

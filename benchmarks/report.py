@@ -48,7 +48,7 @@ def main() -> None:
         write_colmap_model(folder / "model", rec, list(rec.cameras), list(rec.image_names))
         options = rs.SolveOptions(readout="top-to-bottom", shutter_model="rotation", report=False)
         began = time.perf_counter()
-        rs.solve_model(folder / "model", folder / "out", options, images=folder / "photos")
+        rs.solve(folder / "model", folder / "out", options, images=folder / "photos")
         beside = time.perf_counter() - began
         command = [sys.executable, "-c", REPORT, str(folder / "out"), str(Path(__file__).parent)]
         done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)

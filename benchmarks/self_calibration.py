@@ -21,11 +21,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rsundistort import BundleOptions, BundleResult, Reconstruction, RsUndistortWarning, RunOptions
+from rsundistort import BundleOptions, Reconstruction, RsUndistortWarning, RunOptions
 from rsundistort.batch import use_threads
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
-from rsundistort.bundle import Posterior, bundle_adjust
+from rsundistort.bundle import BundleResult, Posterior, bundle_adjust
 from rsundistort.bundle.choice import clipped_errors, standard_errors
 from rsundistort.critical.cost import row_phi
 from rsundistort.input.load import load_photos

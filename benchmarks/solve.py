@@ -28,6 +28,8 @@ import bundle
 
 import rsundistort as rs
 from rsundistort.colmap import write_colmap_model
+from rsundistort.evaluation import pose_errors
+from rsundistort.simulate import WarpOptions, simulate_warp
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -104,9 +106,9 @@ print(json.dumps({"s": time.perf_counter() - began,
 
 OURS = """
 import json, resource, sys, time
-from rsundistort import SolveOptions, solve_model
+from rsundistort import SolveOptions, solve
 began = time.perf_counter()
-solution = solve_model(sys.argv[1], sys.argv[2], SolveOptions(readout="top-to-bottom"))
+solution = solve(sys.argv[1], sys.argv[2], SolveOptions(readout="top-to-bottom"))
 print(json.dumps({"s": time.perf_counter() - began, "model": solution.shutter_model,
                   "stages": {stage["name"]: stage["seconds"] for stage in solution.stages},
                   "mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}))
@@ -129,9 +131,9 @@ def real_photos(photos: Path, work: Path) -> None:
     """Models of warped photos."""
     K = json.dumps(json.loads((photos / "camera.json").read_text())["K"])
     truth = told(MODEL, photos, work / "unwarped", K, 1)
-    rs.solve_model(work / "unwarped" / "model", work / "truth", rs.SolveOptions(shutter_model="global"))
+    rs.solve(work / "unwarped" / "model", work / "truth", rs.SolveOptions(shutter_model="global"))
     reference = rs.read_solution(work / "truth" / "solution.json")
-    rs.simulate_warp(photos, work / "warp", rs.WarpOptions(sigma_rad=0.05, seed=0))
+    simulate_warp(photos, work / "warp", WarpOptions(sigma_rad=0.05, seed=0))
     warped = work / "warp" / "photos"
     for kind, loose in (("default", 1), ("loosened", 4)):
         given = told(MODEL, warped, work / kind, K, loose)
@@ -139,8 +141,8 @@ def real_photos(photos: Path, work: Path) -> None:
         for database in (None, work / kind / "database.db"):
             out = work / f"{kind}-{'alone' if database is None else 'database'}"
             options = rs.SolveOptions(readout="top-to-bottom")
-            solution = rs.solve_model(work / kind / "model", out, options, images=warped, database=database)
-            errors, errors_before = (rs.pose_errors(each, reference).rotation_deg for each in (solution, before))
+            solution = rs.solve(work / kind / "model", out, options, images=warped, database=database)
+            errors, errors_before = (pose_errors(each, reference).rotation_deg for each in (solution, before))
             share = solution.quality["num_observations"] / truth["observations"]
             show(
                 f"solve, warped herz-jesus-8, {kind} thresholds, {out.name.split('-')[1]}",
@@ -171,7 +173,7 @@ def real_photos(photos: Path, work: Path) -> None:
 
 def rs_of(model: Path, out: Path) -> Path:
     """The solution of a model without a shutter."""
-    rs.solve_model(model, out, rs.SolveOptions(shutter_model="global"))
+    rs.solve(model, out, rs.SolveOptions(shutter_model="global"))
     return out / "solution.json"
 
 

@@ -23,20 +23,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rsundistort import (
-    Camera,
-    RowMotion,
-    SceneOptions,
-    Solution,
-    WarpOptions,
-    psnr,
-    read_solution,
-    rectify,
-    simulate_scene,
-    simulate_warp,
-)
+from rsundistort import Camera, RowMotion, Solution, read_solution, rectify
 from rsundistort.batch import use_threads
+from rsundistort.evaluation import psnr
 from rsundistort.io import read_photo
+from rsundistort.simulate import SceneOptions, WarpOptions, simulate_scene, simulate_warp
 from rsundistort.simulate.render_folder import _encode_jpeg
 from rsundistort.synthetic import add_noise, load_recipe, render_view, warp_photo
 

@@ -35,6 +35,8 @@ import numpy as np
 from measures import normalised_errors, pooled, with_lens_of
 
 import rsundistort as rs
+from rsundistort.evaluation import motion_errors
+from rsundistort.simulate import SceneOptions, WarpOptions, simulate_scene, simulate_warp
 from rsundistort.synthetic.unsteady import Vibration
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -79,9 +81,9 @@ class Bench:
         """Folder of herz-jesus-8 warped."""
         out = self.work / f"warped-{sigma}-{change}-{shake}-{seed}{'-still' * len(still)}"
         vibration = Vibration(shake, (2.0, 5.0)) if shake else None
-        options = rs.WarpOptions(sigma_rad=sigma, seed=seed, acceleration=change, vibration=vibration, still=still)
+        options = WarpOptions(sigma_rad=sigma, seed=seed, acceleration=change, vibration=vibration, still=still)
         if not out.is_dir():
-            rs.simulate_warp(self.photos / HERZ, out, options)
+            simulate_warp(self.photos / HERZ, out, options)
         return out
 
     def measure(
@@ -104,7 +106,7 @@ class Bench:
             show(f"{part}, seed {seed}", crash=f"{type(error).__name__}: {error}")
             self.failed.append(part)
             return None
-        after, before = found["psnr_db"]["photos"], found["psnr_before_db"]["photos"]
+        after, before = found.psnr_db.photos, found.psnr_before_db.photos
         named = {image.name for image in solution.images if image.doubtful or image.lens_only}
         truth = rs.read_solution(folder / "ground_truth.json")
         phi = None
@@ -114,10 +116,10 @@ class Bench:
         quality = solution.quality
         value = {
             "model": quality["held_out_chosen"], "verdict": [solution.verdict["shutter"], solution.verdict["shape"]],
-            "joined": len(solution.registered), "dB": round(found["psnr_db"]["median"], 2),
-            "worst": round(min(after.values()), 2), "before": round(found["psnr_before_db"]["median"], 2),
-            "deg": round(found["rotation_deg"]["mean"], 4),
-            "phi_mrad": np.round(found["phi_mrad_per_frame"]["mean_per_component"], 2).tolist(),
+            "joined": len(solution.registered), "dB": round(found.psnr_db.median, 2),
+            "worst": round(min(after.values()), 2), "before": round(found.psnr_before_db.median, 2),
+            "deg": round(found.rotation_deg.mean, 4),
+            "phi_mrad": np.round(found.phi_mrad_per_frame.mean_per_component, 2).tolist(),
             "phi_over_sigma": None if phi is None else round(float(np.sqrt(np.mean(phi["phi"] ** 2))), 2),
             "doubtful": sorted(named), "s": round(seconds, 1),
             "worse": {k: round(after[k] - before[k], 2) for k in after if after[k] < before[k] - 0.3},
@@ -134,7 +136,7 @@ def _phi(solution: rs.Solution, truth: rs.Solution) -> dict[str, Any]:
     """Errors of phi over their deviations."""
     span = np.array([[solution.cameras[image.camera_id].frame_span] for image in solution.registered])
     sigma = span * np.array([image.sigma_phi for image in solution.registered])
-    return {"phi": rs.motion_errors(solution, truth).phi_rad_per_frame / sigma}
+    return {"phi": motion_errors(solution, truth).phi_rad_per_frame / sigma}
 
 
 def scene(bench: Bench, seed: int) -> None:
@@ -145,7 +147,7 @@ def scene(bench: Bench, seed: int) -> None:
     folder = bench.work / f"scene-{seed}"
     folder.mkdir()
     (folder / "recipe.json").write_text(json.dumps(recipe))
-    rs.simulate_scene(folder / "recipe.json", folder / "scene", rs.SceneOptions())
+    simulate_scene(folder / "recipe.json", folder / "scene", SceneOptions())
     bench.measure("scene", seed, folder / "scene", folder / "scene" / "global", None)
 
 

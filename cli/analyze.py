@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import textwrap
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
 from . import options as opt
 from .terminal import errors_for_people
+
+if TYPE_CHECKING:
+    from rsundistort.analysis import PoseAnalysis
 
 
 @click.command()
@@ -26,23 +29,24 @@ def command(path: Path, readout: str | None, as_json: bool) -> None:
         from rsundistort.analysis import analyze
 
         result = analyze(path, readout)
-    click.echo(json.dumps(result) if as_json else _text(result))
+    click.echo(json.dumps(result.to_json()) if as_json else _text(result))
 
 
-def _text(result: dict[str, Any]) -> str:
-    values = ", ".join(f"{value:.3f}" for value in result["singular_values"])
-    ds, da, *p = result["null_vector"]
+def _text(result: PoseAnalysis) -> str:
+    meter = result.meter
+    values = ", ".join(f"{value:.3f}" for value in meter.singular_values)
+    ds, da, *p = meter.null_vector
     lines = [
-        f"photos             {result['photos']}, readout {', '.join(result['readout'])}",
-        f"meter              {result['singular_values'][-1]:.3f} of {values}",
-        f"y axes             {result['y_axis_spread_deg']:.1f} degrees apart (root mean square)",
+        f"photos             {result.photos}, readout {', '.join(result.readout)}",
+        f"meter              {meter.value:.3f} of {values}",
+        f"y axes             {meter.y_axis_spread_deg:.1f} degrees apart (root mean square)",
         f"hidden best        skew {ds:.2f}, aspect {da:.2f}, plane at infinity {', '.join(f'{x:.2f}' for x in p)}",
-        f"confounded         {result['meaning']}",
+        f"confounded         {meter.meaning}",
     ]
-    if result["sentence"]:
-        lines += ["", *textwrap.wrap(result["sentence"], 80)]
-    if result["advice"]:
+    if result.sentence:
+        lines += ["", *textwrap.wrap(result.sentence, 80)]
+    if result.advice:
         lines += ["", "at the next shoot:"]
-        for each in result["advice"]:
+        for each in result.advice:
             lines += textwrap.wrap(each, 80, initial_indent="  ", subsequent_indent="    ")
     return "\n".join(lines)

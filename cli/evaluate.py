@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
 from . import options as opt
 from .terminal import Talk, errors_for_people, progress_bars, table
+
+if TYPE_CHECKING:
+    from rsundistort.analysis import Evaluation
 
 
 @click.command()
@@ -35,23 +38,24 @@ def command(
 
         result = evaluate(out, truth, poses=poses, twins=twins, raw=raw, progress=progress)
     if as_json:
-        click.echo(json.dumps(result))
+        click.echo(json.dumps(result.to_json()))
     elif not quiet:
         click.echo(_text(result))
 
 
-def _text(result: dict[str, Any]) -> str:
+def _text(result: Evaluation) -> str:
     rows = [("", "mean", "median", "worst")]
-    for key, label in (
-        ("rotation_deg", "rotation error, deg"),
-        ("center", "position error, baselines"),
-        ("phi_mrad_per_frame", "phi error, mrad per frame"),
+    for errors, label in (
+        (result.rotation_deg, "rotation error, deg"),
+        (result.center, "position error, baselines"),
+        (result.phi_mrad_per_frame, "phi error, mrad per frame"),
     ):
-        if key in result:
-            v = result[key]
-            rows.append((label, f"{v['mean']:.4f}", f"{v['median']:.4f}", f"{v['max']:.4f}"))
-    for key, label in (("psnr_before_db", "raw against twin, dB"), ("psnr_db", "rectified against twin, dB")):
-        if key in result:
-            v = result[key]
-            rows.append((label, "", f"{v['median']:.2f}", f"{v['min']:.2f}"))
-    return f"{table(rows)}\n\nphotos registered  {result['registered']} of {result['photos']}"
+        if errors is not None:
+            rows.append((label, f"{errors.mean:.4f}", f"{errors.median:.4f}", f"{errors.max:.4f}"))
+    for likeness, label in (
+        (result.psnr_before_db, "raw against twin, dB"),
+        (result.psnr_db, "rectified against twin, dB"),
+    ):
+        if likeness is not None:
+            rows.append((label, "", f"{likeness.median:.2f}", f"{likeness.min:.2f}"))
+    return f"{table(rows)}\n\nphotos registered  {result.registered} of {result.photos}"

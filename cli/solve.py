@@ -46,8 +46,8 @@ def command(
     1=left-to-right".
     """
     with errors_for_people() as warned, progress_bars(talk) as progress:
-        from rsundistort.solve import SolveOptions, solve_model
+        from rsundistort.solve import SolveOptions, solve
 
         options = SolveOptions(**solve_fields(solving))
-        solution = solve_model(model, out, options, images=images, database=database, progress=progress)
+        solution = solve(model, out, options, images=images, database=database, progress=progress)
     close(solution, out, warned, talk)

@@ -10,22 +10,15 @@ from Motion", CVPR 2017. Functions are used in the manner of `cv2`:
 array([[320., 240.]])
 """
 
+from typing import TYPE_CHECKING as _TYPE_CHECKING
+from typing import Any as _Any
+
+from ._former import by_former_name as _by_former_name
 from .analysis import analyze, evaluate
 from .batch import RectifyOptions, rectify_folder
-from .bundle import BundleOptions, BundleResult, GuessedCameras, bundle_adjust, climb
-from .critical import CriticalMotion, critical_motion
-from .errors import (
-    FileError,
-    FileKindWarning,
-    FormatError,
-    InputError,
-    MetadataWarning,
-    ReconstructionError,
-    RsUndistortError,
-    RsUndistortWarning,
-    SkippedPhotoWarning,
-)
-from .evaluation import motion_errors, pose_errors, psnr
+from .bundle import BundleOptions, bundle_adjust
+from .critical import critical_motion
+from .errors import RsUndistortError, RsUndistortWarning
 from .input import GyroOptions
 from .io import read_solution, write_solution
 from .model import (
@@ -49,69 +42,52 @@ from .rectify import (
     largest_shift_px,
     optimal_new_camera,
     rectify,
-    remap_grid,
     undistort_points,
 )
-from .simulate import SceneOptions, WarpOptions, simulate_scene, simulate_warp
-from .solve import RunOptions, SolveOptions, run, solve, solve_model
+from .solve import RunOptions, SolveOptions, run, solve
 
 __version__ = "0.1.0"
 
 __all__ = [
     "AtInfinity",
     "BundleOptions",
-    "BundleResult",
     "Camera",
-    "CriticalMotion",
     "DepthMap",
-    "FileError",
-    "FileKindWarning",
-    "FormatError",
-    "GuessedCameras",
     "GyroOptions",
-    "InputError",
     "KnownLength",
-    "MetadataWarning",
     "Observations",
     "Plane",
     "Reconstruction",
-    "ReconstructionError",
     "RectifyOptions",
     "RemapGrid",
     "RowMotion",
     "RsUndistortError",
     "RsUndistortWarning",
     "RunOptions",
-    "SceneOptions",
-    "SkippedPhotoWarning",
     "Solution",
     "SolveOptions",
     "SolvedImage",
     "ViewOptions",
-    "WarpOptions",
     "analyze",
     "bundle_adjust",
-    "climb",
     "critical_motion",
     "distort_points",
     "evaluate",
     "init_rectify_map",
     "largest_shift_px",
-    "motion_errors",
     "optimal_new_camera",
-    "pose_errors",
     "project_points",
-    "psnr",
     "read_solution",
     "rectify",
     "rectify_folder",
-    "remap_grid",
     "run",
-    "simulate_scene",
-    "simulate_warp",
     "solve",
-    "solve_model",
     "undistort_points",
     "unproject_points",
     "write_solution",
 ]
+
+if not _TYPE_CHECKING:  # type checkers know the present names only
+
+    def __getattr__(name: str) -> _Any:
+        return _by_former_name(__name__, name)

@@ -44,13 +44,3 @@ def test_a_photo_passes_each_room_once():
     way = PAGE.split("## The way of a photo")[1].split("##")[0]
     rooms = re.findall(r"^\d+\. `([\w.]+)\.\w+`", way, re.MULTILINE)
     assert len(rooms) == len(set(rooms)) <= 9
-
-
-def test_names_of_the_former_package_still_work_with_a_warning():
-    former = import_module("rsundistort.pipeline")
-    for name in former.__all__:
-        with pytest.warns(DeprecationWarning, match=f"rsundistort.pipeline.{name} is now in rsundistort."):
-            found = getattr(former, name)
-        assert found.__name__ == name
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        former.nothing  # noqa: B018

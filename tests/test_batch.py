@@ -24,12 +24,9 @@ from rsundistort_cli.main import cli
 
 from rsundistort import (
     Camera,
-    FileError,
-    InputError,
     RectifyOptions,
     RowMotion,
     RunOptions,
-    SkippedPhotoWarning,
     Solution,
     SolvedImage,
     read_solution,
@@ -38,6 +35,7 @@ from rsundistort import (
     write_solution,
 )
 from rsundistort.batch.workers import Workers
+from rsundistort.errors import FileError, InputError, SkippedPhotoWarning
 from rsundistort.io import read_colmap_poses, read_photo
 from rsundistort.io.journal import Journal, JournalEntry
 

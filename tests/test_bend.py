@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from rsundistort import (
     BundleOptions,
     Camera,
-    InputError,
     Observations,
     Reconstruction,
     RowMotion,
@@ -27,6 +26,7 @@ from rsundistort.bundle import choose_model
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.bundle.remains import agreement_of_waves, half_across_readout
 from rsundistort.bundle.spreads import Spreads
+from rsundistort.errors import InputError
 from rsundistort.model import BEND_GROUPS, Bend
 from rsundistort.model.bend import bend_functions, splines_at
 from rsundistort.model.projection import at_depth, clock_of, project_points_with_jacobians

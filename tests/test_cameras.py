@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsundistort import Camera, FileError, FormatError, InputError, RsUndistortError
+from rsundistort import Camera, RsUndistortError
+from rsundistort.errors import FileError, FormatError, InputError
 from rsundistort.io import check_camera_fits, parse_camera, read_camera_file
 from rsundistort.io.cameras import camera_to_json
 from rsundistort.model.projection import project_points

@@ -9,10 +9,10 @@ import pycolmap
 import pytest
 from test_bundle import make_scene
 
-from rsundistort import FormatError
 from rsundistort.colmap import read_colmap_cameras, read_colmap_poses, write_colmap_model
 from rsundistort.colmap.file_checks import check_colmap_files
 from rsundistort.colmap.measured_model import read_colmap_model
+from rsundistort.errors import FormatError
 
 PARTS = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
 

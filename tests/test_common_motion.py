@@ -11,11 +11,12 @@ from critical_scenes import named_scene
 from numpy_twin import project
 from scipy.spatial.transform import Rotation
 
-from rsundistort import BundleOptions, InputError, bundle_adjust
+from rsundistort import BundleOptions, bundle_adjust
 from rsundistort.bundle import Posterior
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.bundle.spreads import Spreads
 from rsundistort.critical import advise, clock_contrast, common_motion, heal, shape_cost, still_probability
+from rsundistort.errors import InputError
 
 MODEL = "constant-motion"
 NOISE_PX = 0.5

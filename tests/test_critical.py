@@ -13,19 +13,18 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import (
     BundleOptions,
-    InputError,
     KnownLength,
     Observations,
     RsUndistortError,
     RsUndistortWarning,
     bundle_adjust,
-    climb,
     critical_motion,
 )
 from rsundistort.batch.progress import StageLog
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.bundle.spreads import Spreads
 from rsundistort.critical import advise, heal, shape_cost, still_probability, with_remedy
+from rsundistort.errors import InputError
 from rsundistort.io import read_known_lengths, read_known_motions
 from rsundistort.solve.model_sequence import solve_tracks
 
@@ -75,8 +74,7 @@ def adjusted(scene, rng, still=None, model="rotation", options=None):
     truth = with_measurements(scene, moving(scene, rng, still), model, rng)
     options = options or BundleOptions(loss="squared", outlier_rounds=0, sigma_px=NOISE_PX)
     start = replace(truth, phi=np.zeros_like(truth.phi), shutter_model="global")
-    rungs = ("global", "two-step") if model == "two-step" else ("global", "two-step", model)
-    return truth, climb(start, rungs, options)[model], options
+    return truth, bundle_adjust(start, model, options, simpler_first=True), options
 
 
 # ---------------------------------------------------------------- the meter
@@ -277,7 +275,8 @@ def test_auto_leaves_photos_that_all_moved_to_the_prior(rng):
     phi = rng.choice([-1, 1], (10, 3)) * rng.uniform(0.02, 0.05, (10, 3)) / scene.frame_span()[:, None]
     truth = with_measurements(scene, phi, "two-step", rng)
     options = BundleOptions(loss="squared", outlier_rounds=0, sigma_px=NOISE_PX)
-    result = climb(replace(truth, phi=0 * phi, shutter_model="global"), ("global", "two-step"), options)["two-step"]
+    start = replace(truth, phi=0 * phi, shutter_model="global")
+    result = bundle_adjust(start, "two-step", options, simpler_first=True)
     healed, remedy = heal(result, options)
     assert remedy.name == "prior"
     assert healed is result
@@ -298,13 +297,13 @@ def test_wrong_anchor_is_obeyed_and_noticed(rng):
     phi[2] = [0.02, 0.05, -0.04]
     truth = with_measurements(scene, phi, "two-step", rng)
     start = replace(truth, phi=0 * phi, shutter_model="global")
-    result = climb(start, ("global", "two-step"), options)["two-step"]
+    result = bundle_adjust(start, "two-step", options, simpler_first=True)
     healed, remedy = heal(result, options)
     assert healed.reconstruction.phi[2, 0] == 0.0
     assert remedy.name == "given"
     assert "02.jpg is said to have been still" in remedy.warnings[0]
     right = replace(options, held_phi={"05.jpg": (0,)})
-    result = climb(start, ("global", "two-step"), right)["two-step"]
+    result = bundle_adjust(start, "two-step", right, simpler_first=True)
     assert heal(result, right)[1].warnings == ()
 
 

@@ -8,16 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rsundistort import (
-    Camera,
-    InputError,
-    RowMotion,
-    Solution,
-    SolvedImage,
-    motion_errors,
-    pose_errors,
-    psnr,
-)
+from rsundistort import Camera, RowMotion, Solution, SolvedImage
+from rsundistort.errors import InputError
+from rsundistort.evaluation import motion_errors, pose_errors, psnr
 
 CAMERA = Camera(640, 480, [[500, 0, 320], [0, 400, 240], [0, 0, 1]])
 

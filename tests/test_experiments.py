@@ -13,17 +13,8 @@ from make_photos import COURTYARD, COURTYARD_NAMES, half_courtyard, save_png, sa
 from rsundistort_cli.main import cli
 from scipy.spatial.transform import Rotation
 
-from rsundistort import (
-    Camera,
-    FileError,
-    FormatError,
-    InputError,
-    Reconstruction,
-    ReconstructionError,
-    RowMotion,
-    Solution,
-    SolvedImage,
-)
+from rsundistort import Camera, Reconstruction, RowMotion, Solution, SolvedImage
+from rsundistort.errors import FileError, FormatError, InputError, ReconstructionError
 from rsundistort.evaluation import rotation_angles_deg
 from rsundistort.experiments import (
     METHODS,

@@ -8,15 +8,16 @@ import pytest
 from make_photos import camera_exif, texture
 from test_bundle import make_scene
 
-from rsundistort import InputError, WarpOptions, simulate_warp
 from rsundistort.batch.progress import StageLog
 from rsundistort.bundle import BundleOptions, bundle_adjust
+from rsundistort.errors import InputError
 from rsundistort.input.exposure import bounded_by_exposure
 from rsundistort.input.load import LoadedPhotos
 from rsundistort.input.photo_cameras import PhotoCameras
 from rsundistort.io import Metadata, write_image
 from rsundistort.io.photos.exif_facts import ExifFacts, _facts, read_exif
 from rsundistort.sfm import edge_width_px
+from rsundistort.simulate import WarpOptions, simulate_warp
 from rsundistort.solve import model_sequence as ladder
 from rsundistort.verdict import judge
 

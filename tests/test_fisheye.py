@@ -111,10 +111,10 @@ def test_run_on_photos_of_a_fisheye(tmp_path):
     options = RunOptions(camera=str(tmp_path / "guess.json"), refine=("f", "k1", "k2"))
     solution = run(tmp_path / "scene" / "photos", tmp_path / "out", options)
     result = evaluate(tmp_path / "out", tmp_path / "scene" / "ground_truth.json")
-    assert result["registered"] == 10
-    assert result["rotation_deg"]["max"] < 0.1  # a third of a pixel
-    assert result["phi_mrad_per_frame"]["mean"] < 1.5
-    assert result["psnr_db"]["min"] > result["psnr_before_db"]["median"] + 8
+    assert result.registered == 10
+    assert result.rotation_deg.max < 0.1  # a third of a pixel
+    assert result.phi_mrad_per_frame.mean < 1.5
+    assert result.psnr_db.min > result.psnr_before_db.median + 8
     (found,) = solution.cameras.values()
     assert found.lens == "fisheye"
     assert found.K[0, 0] == pytest.approx(200, rel=5e-3)

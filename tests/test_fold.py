@@ -7,7 +7,8 @@ import pytest
 from numpy_twin import Fisheye, lens_of
 from scipy.spatial.transform import Rotation
 
-from rsundistort import Camera, InputError
+from rsundistort import Camera
+from rsundistort.errors import InputError
 from rsundistort.model import READOUTS, Bend
 from rsundistort.synthetic.fold import check_no_fold
 from rsundistort.synthetic.lens import undistort_to_rays

@@ -8,19 +8,8 @@ import pytest
 from numpy_twin import DIRECTIONS, MODELS, Fisheye, lens_of
 from scipy.ndimage import map_coordinates
 
-from rsundistort import (
-    Camera,
-    FileError,
-    FormatError,
-    InputError,
-    Plane,
-    RemapGrid,
-    RowMotion,
-    init_rectify_map,
-    rectify,
-    remap_grid,
-    undistort_points,
-)
+from rsundistort import Camera, Plane, RemapGrid, RowMotion, init_rectify_map, rectify, undistort_points
+from rsundistort.errors import FileError, FormatError, InputError
 from rsundistort.rectify import TOLERANCE_PX, coarse_grid
 from rsundistort.rectify.maps import EDGE_PX, fill_rows, rectified_rays
 
@@ -148,7 +137,7 @@ def test_rectified_photo_is_that_of_the_exact_map(dtype, rng):
 @pytest.mark.parametrize("dist", [[], LENS, RATIONAL, FISHEYE], ids=["pinhole", "lens", "rational", "fisheye"])
 @all_directions
 def test_forward_and_inverse_compose_to_identity(readout, dist):
-    grid = remap_grid(make_camera(dist, readout), FAST)
+    grid = RemapGrid.from_camera(make_camera(dist, readout), FAST)
     inverse = grid.inverse()
     assert inverse.size == (W, H)
     assert (inverse.source_width, inverse.source_height) == grid.size
@@ -169,7 +158,7 @@ def test_forward_and_inverse_compose_to_identity(readout, dist):
 @all_models
 def test_inverse_is_where_undistort_points_sends_the_pixels(model, readout, dist):
     camera = make_camera(dist, readout)
-    inverse = remap_grid(camera, MOTION, model).inverse()
+    inverse = RemapGrid.from_camera(camera, MOTION, model).inverse()
     known = inverse.seen > 0
     v, u = np.nonzero(np.ones((H, W)))
     expected = undistort_points(np.column_stack([u, v]).astype(float), camera, MOTION, model, P=K)
@@ -185,7 +174,7 @@ def test_inverse_is_where_undistort_points_sends_the_pixels(model, readout, dist
 def test_inverse_knows_the_depth_of_its_grid():
     camera, motion = make_camera(LENS), RowMotion([0.05, 0.02, -0.03], [0.4, 0.1, 0.2])
     ground = Plane([0.1, 0.9, 0.5], 3.0)
-    inverse = remap_grid(camera, motion, "constant-motion", depth=ground).inverse()
+    inverse = RemapGrid.from_camera(camera, motion, "constant-motion", depth=ground).inverse()
     known = inverse.seen > 0
     raw = np.argwhere(known)[:, ::-1].astype(float)
     expected = undistort_points(raw, camera, motion, "constant-motion", P=K, depth=ground)
@@ -204,7 +193,7 @@ def test_inverse_of_a_fold_takes_one_of_the_two():
 def test_grid_is_applied_as_rectify_does(rng):
     camera, photo = make_camera(LENS), np.rint(255 * smooth_photo(rng)).astype(np.uint8)
     new = Camera(500, 300, [[500, 0, 250], [0, 510, 140], [0, 0, 1]])
-    grid = remap_grid(camera, MOTION, new_camera=new)
+    grid = RemapGrid.from_camera(camera, MOTION, new_camera=new)
     expected, mask = rectify(photo, camera, MOTION, new_camera=new, interpolation="linear")
     for jobs in (1, 3):
         found, seen = grid.apply(photo, "linear", jobs)
@@ -239,7 +228,7 @@ def test_impossible_grids_are_refused(x, y, says):
 def grid():
     """A grid with pixels that nothing answers, of another size than its source."""
     camera = Camera(W, H, K, [-0.6, 0, 0, 0])
-    return remap_grid(camera, MOTION, new_camera=Camera(300, 200, [[120, 0, 150], [0, 120, 100], [0, 0, 1]]))
+    return RemapGrid.from_camera(camera, MOTION, new_camera=Camera(300, 200, [[120, 0, 150], [0, 120, 100], [0, 0, 1]]))
 
 
 @pytest.mark.parametrize("kind", ["npz", "exr", "stmap"])

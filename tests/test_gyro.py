@@ -9,7 +9,8 @@ import pytest
 from critical_scenes import named_scene
 from scipy.spatial.transform import Rotation
 
-from rsundistort import Camera, FileError, FormatError, GyroOptions, InputError, RowMotion, RsUndistortWarning
+from rsundistort import Camera, GyroOptions, RowMotion, RsUndistortWarning
+from rsundistort.errors import FileError, FormatError, InputError
 from rsundistort.input.gyroscope import gyro_contradiction, gyro_motions, known_readouts
 from rsundistort.io import (
     GyroLog,

@@ -6,7 +6,8 @@ import time
 
 import pytest
 
-from rsundistort import FormatError, read_solution
+from rsundistort import read_solution
+from rsundistort.errors import FormatError
 from rsundistort.io.cameras import read_camera_file
 from rsundistort.io.models import read_model
 from rsundistort.io.nerfstudio import read_transforms

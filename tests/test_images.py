@@ -13,7 +13,8 @@ import pytest
 from make_photos import camera_exif, small_dng, tagged_jpeg, texture
 from PIL import Image
 
-from rsundistort import Camera, FileError, FileKindWarning, InputError, MetadataWarning, rectify
+from rsundistort import Camera, rectify
+from rsundistort.errors import FileError, FileKindWarning, InputError, MetadataWarning
 from rsundistort.io import Metadata, list_photos, output_name, read_photo, write_image
 from rsundistort.model.orientation import turn_pixels
 

@@ -11,9 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import (
     Camera,
-    FileError,
-    FormatError,
-    InputError,
     Observations,
     Reconstruction,
     RowMotion,
@@ -24,6 +21,7 @@ from rsundistort import (
     write_solution,
 )
 from rsundistort.colmap.rectified_model import rectified_keypoints
+from rsundistort.errors import FileError, FormatError, InputError
 from rsundistort.io import (
     Metadata,
     camera_from_exif,

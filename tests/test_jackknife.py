@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from test_bundle import dense_system, make_scene, noisy_problem
 
-from rsundistort import BundleOptions, InputError, KnownLength, bundle_adjust
+from rsundistort import BundleOptions, KnownLength, bundle_adjust
 from rsundistort.bundle import Posterior
 from rsundistort.bundle.jackknife import Partition, by_corner, by_place, inflated, inflation
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.bundle.spreads import Spreads
 from rsundistort.critical.cost import _log_scale
+from rsundistort.errors import InputError
 
 
 def whole_jacobian(problem, state):

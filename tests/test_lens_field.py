@@ -12,23 +12,14 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 from test_bundle import make_scene, perturbed
 
-from rsundistort import (
-    BundleOptions,
-    Camera,
-    FormatError,
-    InputError,
-    RowMotion,
-    Solution,
-    SolveOptions,
-    bundle_adjust,
-    init_rectify_map,
-)
+from rsundistort import BundleOptions, Camera, RowMotion, Solution, SolveOptions, bundle_adjust, init_rectify_map
 from rsundistort.batch.progress import StageLog
 from rsundistort.bundle import choose_model
 from rsundistort.bundle.intrinsics import GuessedCameras, moved_camera
 from rsundistort.bundle.lens_field import LensFields
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.bundle.spreads import Spreads
+from rsundistort.errors import FormatError, InputError
 from rsundistort.input.photo_cameras import PhotoCameras
 from rsundistort.io import read_solution, write_solution
 from rsundistort.io.cameras import camera_from_json, camera_to_json

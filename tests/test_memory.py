@@ -16,7 +16,6 @@ from rsundistort import (
     RectifyOptions,
     RowMotion,
     RsUndistortWarning,
-    SkippedPhotoWarning,
     Solution,
     SolvedImage,
     rectify_folder,
@@ -26,6 +25,7 @@ from rsundistort.batch import workers as workers_module
 from rsundistort.batch.memory import free_memory
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
+from rsundistort.errors import SkippedPhotoWarning
 from rsundistort.input.load import load_photos
 from rsundistort.io import read_photo
 from rsundistort.io.photos.images import stored_size

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from make_photos import MAKER_NOTE, THUMBNAIL, camera_exif, small_dng, tagged_jpeg, texture
 from PIL import Image, ImageCms
 
-from rsundistort import MetadataWarning
+from rsundistort.errors import MetadataWarning
 from rsundistort.io import Metadata, read_photo, write_image
 from rsundistort.io.photos.exif import corrected_exif, exif_of_tiff
 from rsundistort.model.orientation import turn_pixels
@@ -165,7 +165,7 @@ def test_xmp_is_corrected_in_its_text(tmp_path):
 
 @pytest.mark.parametrize("xmp", [b"", XMP, b"garbage", b"<x>", b"<rdf:RDF/>", b"\xff\xfe<\0x\0"], ids=range(6))
 @pytest.mark.parametrize("suffix", SUFFIXES)
-@pytest.mark.filterwarnings("ignore::rsundistort.MetadataWarning")
+@pytest.mark.filterwarnings("ignore::rsundistort.errors.MetadataWarning")
 def test_a_rectified_photo_carries_its_mark(tmp_path, suffix, xmp):
     assert Metadata(xmp=xmp).rectified_by is None
     marked = Metadata(camera_exif("<"), xmp, ICC).marked("1.2.3")
@@ -415,7 +415,7 @@ def test_no_damage_of_xmp_raises(content, at, gone):
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_damaged_files_are_refused_or_read_but_never_raise_anything_else(tmp_path, suffix, rng):
-    from rsundistort import FileError
+    from rsundistort.errors import FileError
 
     write_image(tmp_path / f"a{suffix}", texture(48, 32), Metadata(camera_exif("<"), XMP, ICC))
     data = np.frombuffer((tmp_path / f"a{suffix}").read_bytes(), np.uint8)

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import (
     Camera,
-    InputError,
     Observations,
     Reconstruction,
     RowMotion,
@@ -19,6 +18,7 @@ from rsundistort import (
     SolvedImage,
     project_points,
 )
+from rsundistort.errors import InputError
 
 K = [[500.0, 0, 320], [0, 400, 240], [0, 0, 1]]
 NAN = float("nan")

@@ -11,10 +11,10 @@ from click.testing import CliRunner
 from rsundistort_cli.main import cli
 from scipy.spatial.transform import Rotation
 
-from rsundistort import FileError, FormatError, InputError
+from rsundistort.errors import FileError, FormatError, InputError
 from rsundistort.io.models import read_model
 from rsundistort.model.reprojection import reprojection_residuals
-from rsundistort.solve import SolveOptions, solve_model
+from rsundistort.solve import SolveOptions, solve
 
 W, H = 640, 480
 F, CX, CY = 500.0, 322.0, 236.5  # integer pixel centres
@@ -211,7 +211,7 @@ def test_solve_finds_the_shutter_from_openmvg(tmp_path):
     truth = Truth((-0.1, 0, 0, 0), num=6, points=150, turning=0.05)
     (tmp_path / "sfm_data.json").write_text(json.dumps(openmvg(truth, {"disto_k1": [-0.1]})))
     options = SolveOptions(shutter_model="rotation", refine=(), readout="top-to-bottom", remedy="none")
-    solution = solve_model(tmp_path / "sfm_data.json", tmp_path / "out", options)
+    solution = solve(tmp_path / "sfm_data.json", tmp_path / "out", options)
     for k, name in enumerate(truth.names):
         np.testing.assert_allclose(solution.image(name).motion.phi, truth.phi[k], atol=2e-3)
     assert solution.image("lost.jpg").reason == "it is not registered in the model"
@@ -294,7 +294,7 @@ def test_other_files_are_no_model(tmp_path, content):
 def test_a_database_goes_with_colmap_alone(tmp_path):
     (tmp_path / "sfm_data.json").write_text("{}")
     with pytest.raises(InputError, match="--database is COLMAP's"):
-        solve_model(tmp_path / "sfm_data.json", tmp_path / "out", database=tmp_path / "database.db")
+        solve(tmp_path / "sfm_data.json", tmp_path / "out", database=tmp_path / "database.db")
 
 
 def test_command_leaves_nothing_of_a_model_that_is_none(tmp_path):

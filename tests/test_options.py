@@ -72,7 +72,7 @@ RUN = [
 ]
 COMMANDS = {
     "run": (run_command, "rsundistort.solve", "run", RunOptions(), RUN, ["photos", "-o", "out"]),
-    "solve": (solve_command, "rsundistort.solve", "solve_model", SolveOptions(), SOLVE, ["model", "-o", "out"]),
+    "solve": (solve_command, "rsundistort.solve", "solve", SolveOptions(), SOLVE, ["model", "-o", "out"]),
     "rectify": (
         rectify_command, "rsundistort.batch", "rectify_folder", RectifyOptions(), PHOTO,
         ["photos", "--solution", "s.json", "-o", "out"],

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import (
     Camera,
-    InputError,
     Observations,
     Reconstruction,
     RowMotion,
@@ -22,6 +21,7 @@ from rsundistort import (
     rectify,
     write_solution,
 )
+from rsundistort.errors import InputError
 from rsundistort.model import READOUTS
 from rsundistort.model.orientation import (
     INVERSE,

@@ -14,10 +14,11 @@ import trimesh
 from rsundistort_cli import closing
 from scipy.spatial.transform import Rotation, Slerp
 
-from rsundistort import InputError, RsUndistortWarning
+from rsundistort import RsUndistortWarning
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
 from rsundistort.colmap.rectified_model import ModelIds
+from rsundistort.errors import InputError
 from rsundistort.io import (
     output_folder,
     read_transforms,

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from large_sets import COMMON, make_street
 
-from rsundistort import Camera, InputError, RunOptions
+from rsundistort import Camera, RunOptions
+from rsundistort.errors import InputError
 from rsundistort.input.load import LoadedPhotos
 from rsundistort.input.pairing import capture_sequences, pairs_to_match, places_of
 from rsundistort.input.photo_cameras import PhotoCameras

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from make_photos import COURTYARD_NAMES, exif_block, half_courtyard, save_png, texture
 
-from rsundistort import Camera, FileError, FormatError, InputError, RowMotion, RunOptions, rectify, rectify_folder, run
+from rsundistort import Camera, RowMotion, RunOptions, rectify, rectify_folder, run
+from rsundistort.errors import FileError, FormatError, InputError
 from rsundistort.input import photo_cameras
 from rsundistort.io import Metadata, find_masks, read_exif, read_mask, write_image
 from rsundistort.io.cameras import camera_to_json

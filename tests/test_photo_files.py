@@ -16,12 +16,8 @@ from rsundistort_cli.main import cli
 
 from rsundistort import (
     Camera,
-    FileKindWarning,
-    InputError,
-    MetadataWarning,
     RowMotion,
     RunOptions,
-    SkippedPhotoWarning,
     Solution,
     SolvedImage,
     evaluate,
@@ -30,6 +26,7 @@ from rsundistort import (
     run,
     write_solution,
 )
+from rsundistort.errors import FileKindWarning, InputError, MetadataWarning, SkippedPhotoWarning
 from rsundistort.io import Metadata, read_photo, write_image
 from rsundistort.model.orientation import INVERSE, turn_pixels
 
@@ -167,11 +164,11 @@ def test_a_turned_run_is_evaluated_like_any_other(turned_run):
     plain, turned = (
         evaluate(folder / out, folder / "ground_truth.json", twins=folder / "photos") for out in ("plain", "out")
     )
-    assert turned["rotation_deg"]["max"] < 0.2
+    assert turned.rotation_deg.max < 0.2
     for key in ("rotation_deg", "phi_mrad_per_frame", "psnr_db"):
-        for figure, value in plain[key].items():
+        for figure, value in plain.to_json()[key].items():
             if figure != "photos":
-                assert turned[key][figure] == pytest.approx(value, rel=1e-6)
+                assert turned.to_json()[key][figure] == pytest.approx(value, rel=1e-6)
 
 
 # ---------------------------------------------------------------- once, and not twice

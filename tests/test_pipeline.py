@@ -11,28 +11,24 @@ from make_photos import COURTYARD_NAMES, half_courtyard, save_png, save_textures
 
 from rsundistort import (
     Camera,
-    FileError,
-    InputError,
-    ReconstructionError,
     RowMotion,
     RsUndistortWarning,
     RunOptions,
-    SkippedPhotoWarning,
     Solution,
     SolvedImage,
-    WarpOptions,
     evaluate,
-    psnr,
     read_solution,
     rectify,
     rectify_folder,
     run,
-    simulate_warp,
     write_solution,
 )
+from rsundistort.errors import FileError, InputError, ReconstructionError, SkippedPhotoWarning
+from rsundistort.evaluation import psnr
 from rsundistort.io import read_photo
 from rsundistort.io.record import Record
 from rsundistort.model import READOUTS
+from rsundistort.simulate import WarpOptions, simulate_warp
 from rsundistort.solve.run_outputs import files_of_run
 from rsundistort.synthetic.warp import largest_rectangle
 
@@ -99,14 +95,14 @@ def test_unreadable_photo_is_in_the_solution_with_its_reason(solved):
 
 def test_poses_and_motions_are_near_the_truth(courtyard, solved):
     result = evaluate(solved[1], courtyard / "ground_truth.json")
-    assert result["photos"] == 7
-    assert result["registered"] == 6
-    assert result["rotation_deg"]["max"] <= 0.15
-    assert result["center"]["max"] <= 0.02
-    assert result["phi_mrad_per_frame"]["mean"] <= 4.0
+    assert result.photos == 7
+    assert result.registered == 6
+    assert result.rotation_deg.max <= 0.15
+    assert result.center.max <= 0.02
+    assert result.phi_mrad_per_frame.mean <= 4.0
     truth = read_solution(courtyard / "ground_truth.json")
     still = np.mean([np.abs(image.motion.phi).mean() for image in truth.images]) * 320 / 400 * 1e3
-    assert result["phi_mrad_per_frame"]["mean"] < 0.25 * still  # the photos do move
+    assert result.phi_mrad_per_frame.mean < 0.25 * still  # the photos do move
 
 
 def test_twins_are_nearer_to_the_rectified_photos(courtyard, solved, tmp_path):
@@ -116,8 +112,8 @@ def test_twins_are_nearer_to_the_rectified_photos(courtyard, solved, tmp_path):
         raw = read_photo(courtyard / "photos" / name).pixels
         save_png(tmp_path / name, rectify(raw, camera, truth.image(name).motion)[0])
     result = evaluate(solved[1], courtyard / "ground_truth.json", twins=tmp_path)
-    assert set(result["psnr_db"]["photos"]) == set(COURTYARD_NAMES)
-    assert result["psnr_db"]["median"] > result["psnr_before_db"]["median"] + 3
+    assert set(result.psnr_db.photos) == set(COURTYARD_NAMES)
+    assert result.psnr_db.median > result.psnr_before_db.median + 3
 
 
 def test_outputs_of_a_run(solved):
@@ -195,7 +191,7 @@ def test_progress_is_told(solved):
     assert all(0 <= done <= total or total == 0 for _, done, total in told)
 
 
-@pytest.mark.filterwarnings("ignore::rsundistort.SkippedPhotoWarning")
+@pytest.mark.filterwarnings("ignore::rsundistort.errors.SkippedPhotoWarning")
 @pytest.mark.slow
 def test_same_seed_same_poses(courtyard, solved, tmp_path):
     first = solved[0]
@@ -220,7 +216,7 @@ def test_guessed_focal_length_is_refined(courtyard, solved, tmp_path):
     assert abs(found.K[0, 0] - true.K[0, 0]) < 5 * sigma["f"] < 5.0  # px; the guess was 16 off
     assert np.abs(found.dist[:2]).max() < 0.01
     before, after = (evaluate(out, courtyard / "ground_truth.json") for out in (solved[1], tmp_path / "out"))
-    assert after["phi_mrad_per_frame"]["mean"] < 1.5 * before["phi_mrad_per_frame"]["mean"] + 0.5
+    assert after.phi_mrad_per_frame.mean < 1.5 * before.phi_mrad_per_frame.mean + 0.5
 
 
 @pytest.mark.slow

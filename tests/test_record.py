@@ -19,7 +19,8 @@ from test_batch import save_solution
 from test_cli import solution_of
 from test_synthetic_scene import TINY
 
-from rsundistort import FileError, rectify_folder
+from rsundistort import rectify_folder
+from rsundistort.errors import FileError
 from rsundistort.io import output_folder
 from rsundistort.io.journal import Journal
 from rsundistort.io.outputs import _SCRATCH, batch_folder

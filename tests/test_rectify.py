@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import (
     Camera,
-    InputError,
     RowMotion,
     distort_points,
     init_rectify_map,
@@ -20,6 +19,7 @@ from rsundistort import (
     rectify,
     undistort_points,
 )
+from rsundistort.errors import InputError
 from rsundistort.model import READOUTS, Bend
 from rsundistort.rectify import INTERPOLATIONS, coarse_grid
 from rsundistort.rectify.maps import rectified_rays

@@ -19,17 +19,8 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from solved_scene import SCENES, solve_scene
 
-from rsundistort import (
-    Camera,
-    FileError,
-    FormatError,
-    RowMotion,
-    RsUndistortWarning,
-    Solution,
-    SolvedImage,
-    read_solution,
-    write_solution,
-)
+from rsundistort import Camera, RowMotion, RsUndistortWarning, Solution, SolvedImage, read_solution, write_solution
+from rsundistort.errors import FileError, FormatError
 from rsundistort.io import Metadata, write_image
 from rsundistort.model import Bend
 from rsundistort.report import diagnostics as diagnostics_module

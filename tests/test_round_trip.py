@@ -22,10 +22,10 @@ from rsundistort import (
     largest_shift_px,
     optimal_new_camera,
     project_points,
-    psnr,
     rectify,
     undistort_points,
 )
+from rsundistort.evaluation import psnr
 from rsundistort.model import READOUTS
 from rsundistort.model.motion import SHUTTER_MODELS
 from rsundistort.rectify import INTERPOLATIONS

@@ -8,7 +8,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy_twin import DIRECTIONS, MODELS, Fisheye, lens, lens_of, project_normalised, undistort_with_opencv
 
-from rsundistort import Camera, InputError, RowMotion, project_points, unproject_points
+from rsundistort import Camera, RowMotion, project_points, unproject_points
+from rsundistort.errors import InputError
 from rsundistort.model.projection import project_points_with_jacobians
 
 K = np.array([[410.0, 0, 201.0], [0, 400.0, 148.5], [0, 0, 1]])

@@ -11,8 +11,9 @@ import pytest
 from make_photos import save_png, save_textures, texture
 from scipy.spatial.transform import Rotation
 
-from rsundistort import Camera, FormatError, InputError, RowMotion, RsUndistortWarning
+from rsundistort import Camera, RowMotion, RsUndistortWarning
 from rsundistort.batch import rectify_folder
+from rsundistort.errors import FormatError, InputError
 from rsundistort.io import GyroLog, read_photo, read_solution
 from rsundistort.model import READOUTS
 from rsundistort.simulate import WarpOptions, read_motion_file, simulate_warp

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 import rsundistort as rs
 from rsundistort.colmap.measured_model import colmap_model_of, read_colmap_model, surviving_points
-from rsundistort.errors import RsUndistortError
+from rsundistort.errors import FileError, FormatError, InputError, RsUndistortError
+from rsundistort.evaluation import pose_errors
 from rsundistort.synthetic import project_rows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -127,7 +128,7 @@ def tracks_of(model):
 )
 def test_models_round_trip(tmp_path, rng, form, lenses):
     scene = make_scene(rng, lenses)
-    solution = rs.solve_model(save(scene.model, tmp_path / "model", form), tmp_path / "out", OPTIONS)
+    solution = rs.solve(save(scene.model, tmp_path / "model", form), tmp_path / "out", OPTIONS)
     assert np.abs(phi_errors(solution, scene)).max() < 2.5e-3
     assert {image.name for image in solution.registered} == set(NAMES)
     assert set(solution.cameras) == {str(4 + 3 * k) for k in range(len(lenses))}
@@ -146,7 +147,7 @@ def test_models_round_trip(tmp_path, rng, form, lenses):
 
 def test_what_comes_out_is_a_model_without_shutter(rng):
     scene = make_scene(rng, noise_px=0.05)
-    out, solution = rs.solve(scene.model, OPTIONS)
+    out, solution = rs.solve(scene.model, options=OPTIONS)
     errors = [
         np.linalg.norm(image.project_point(out.points3D[p.point3D_id].xyz) - p.xy)
         for image in out.images.values()
@@ -158,7 +159,7 @@ def test_what_comes_out_is_a_model_without_shutter(rng):
         rs.SolvedImage(n, "4", R, c, rs.RowMotion()) for n, R, c in zip(NAMES, scene.R_cw, scene.center_w, strict=True)
     ]
     true = replace(solution, images=tuple(truth))
-    assert rs.pose_errors(solution, true).rotation_deg.max() < 0.1
+    assert pose_errors(solution, true).rotation_deg.max() < 0.1
     # the given frame is kept, not replaced by one of ours
     assert np.abs(np.array([solution.image(n).center_w for n in NAMES]) - scene.center_w).max() < 0.05
 
@@ -166,7 +167,7 @@ def test_what_comes_out_is_a_model_without_shutter(rng):
 def test_photos_are_rectified_into_their_sub_folders(tmp_path, rng):
     scene = make_scene(rng)
     photos = save_photos(tmp_path / "photos")
-    solution = rs.solve_model(save(scene.model, tmp_path / "model"), tmp_path / "out", OPTIONS, images=photos)
+    solution = rs.solve(save(scene.model, tmp_path / "model"), tmp_path / "out", OPTIONS, images=photos)
     for image in solution.registered:
         written = cv2.imread(str(tmp_path / "out" / "images" / image.name))
         again, _ = rs.rectify(cv2.imread(str(photos / image.name)), solution.cameras["4"], image.motion)
@@ -199,11 +200,11 @@ def test_unregistered_photos_are_said_to_be(tmp_path, rng):
         if point.has_point3D():
             scene.model.delete_observation(image.image_id, k)
     scene.model.deregister_frame(image.frame_id)
-    assert "not registered" in rs.solve(scene.model, OPTIONS)[1].image(lost).reason
+    assert "not registered" in rs.solve(scene.model, options=OPTIONS)[1].image(lost).reason
     # the files of a model do not name them, the folder of photos does
     photos = save_photos(tmp_path / "photos")
     (photos / "notes.txt").write_text("no photo")
-    solution = rs.solve_model(save(scene.model, tmp_path / "model"), tmp_path / "out", OPTIONS, images=photos)
+    solution = rs.solve(save(scene.model, tmp_path / "model"), tmp_path / "out", OPTIONS, images=photos)
     assert [image.name for image in solution.images if not image.registered] == [lost]
     assert "not registered" in solution.image(lost).reason
 
@@ -278,7 +279,7 @@ def test_measurements_that_colmap_threw_away_come_back(tmp_path, rng):
     cut = scene.model.compute_num_observations()
     assert cut < 0.75 * whole
     level = pycolmap.logging.minloglevel
-    out, solution = rs.solve(scene.model, OPTIONS, database=database)
+    out, solution = rs.solve(scene.model, options=OPTIONS, database=database)
     assert pycolmap.logging.minloglevel == level
     assert out.compute_num_observations() >= 0.95 * whole
     assert np.abs(phi_errors(solution, scene)).max() < 2.5e-3
@@ -305,7 +306,7 @@ def test_a_database_that_is_not_the_models_is_refused(tmp_path, rng, what):
             else:
                 db.clear_matches()
     with pytest.raises(RsUndistortError) as error:
-        rs.solve_model(save(scene.model, tmp_path / "model"), tmp_path / "out", OPTIONS, database=path)
+        rs.solve(save(scene.model, tmp_path / "model"), tmp_path / "out", OPTIONS, database=path)
     assert "\n" not in str(error.value)
     assert "database.db" in str(error.value)
     assert path.exists() == (what != "missing")
@@ -359,7 +360,7 @@ def test_a_model_of_turned_photos_is_turned_back(tmp_path, rng):
         assert done
         (photos / name).write_bytes(bytes(data))
     model = save(turned_model(scene, dict.fromkeys(NAMES[:3], 6)), tmp_path / "model")
-    solution = rs.solve_model(model, tmp_path / "out", OPTIONS, images=photos)
+    solution = rs.solve(model, tmp_path / "out", OPTIONS, images=photos)
     # the shutter runs over the rows of the sensor, whichever way people hold the camera
     assert np.abs(phi_errors(solution, scene)).max() < 2.5e-3
     assert "turned" in solution.options["model"]["frame"]
@@ -369,8 +370,8 @@ def test_a_model_of_turned_photos_is_turned_back(tmp_path, rng):
 def test_photos_of_another_size_are_refused(tmp_path, rng):
     photos = save_photos(tmp_path / "photos", width=600, height=480)
     model = save(make_scene(rng).model, tmp_path / "model")
-    with pytest.raises(rs.InputError, match="600x480 pixels, its camera in the model 640x480"):
-        rs.solve_model(model, tmp_path / "out", OPTIONS, images=photos)
+    with pytest.raises(InputError, match="600x480 pixels, its camera in the model 640x480"):
+        rs.solve(model, tmp_path / "out", OPTIONS, images=photos)
     assert not (tmp_path / "out").exists()
 
 
@@ -379,12 +380,12 @@ def test_photos_of_another_size_are_refused(tmp_path, rng):
 
 def test_threads_solve_side_by_side_and_nothing_global_changes(rng):
     scenes = [make_scene(rng), make_scene(rng, ("SIMPLE_RADIAL",))]
-    alone = [rs.solve(scene.model, OPTIONS)[1] for scene in scenes]
+    alone = [rs.solve(scene.model, options=OPTIONS)[1] for scene in scenes]
     before = cv2.getNumThreads(), numba.get_num_threads(), np.geterr(), pycolmap.logging.minloglevel
     found = {}
 
     def work(k):
-        found[k] = rs.solve(scenes[k].model, OPTIONS)[1]
+        found[k] = rs.solve(scenes[k].model, options=OPTIONS)[1]
 
     threads = [threading.Thread(target=work, args=(k,)) for k in range(2)]
     for thread in threads:
@@ -408,10 +409,10 @@ def test_what_progress_raises_stops_the_work(tmp_path, rng):
     scene = make_scene(rng)
     tracks = tracks_of(scene.model)
     with pytest.raises(Enough):
-        rs.solve(scene.model, OPTIONS, progress=progress)
+        rs.solve(scene.model, options=OPTIONS, progress=progress)
     assert tracks_of(scene.model) == tracks
     with pytest.raises(Enough):
-        rs.solve_model(save(scene.model, tmp_path / "model"), tmp_path / "out", OPTIONS, progress=progress)
+        rs.solve(save(scene.model, tmp_path / "model"), tmp_path / "out", OPTIONS, progress=progress)
     assert not (tmp_path / "out").exists()
 
 
@@ -457,7 +458,7 @@ def test_bad_models_are_refused_in_one_line(tmp_path, rng, spoil, says):
     spoil(scene)
     model = save(scene.model, tmp_path / "model")
     with pytest.raises(RsUndistortError) as error:
-        rs.solve_model(model, tmp_path / "out", OPTIONS)
+        rs.solve(model, tmp_path / "out", OPTIONS)
     assert says in str(error.value)
     assert "\n" not in str(error.value)
     assert not (tmp_path / "out").exists()
@@ -470,20 +471,20 @@ def test_rigs_of_several_sensors_are_refused(rng):
     rig.add_ref_sensor(ids[0])
     rig.add_sensor(ids[1], pycolmap.Rigid3d())
     scene.model.add_rig(rig)
-    with pytest.raises(rs.FormatError, match="rig 77 holds 2 sensors"):
-        rs.solve(scene.model, OPTIONS)
+    with pytest.raises(FormatError, match="rig 77 holds 2 sensors"):
+        rs.solve(scene.model, options=OPTIONS)
 
 
 def test_what_is_no_model_is_refused(tmp_path):
     (tmp_path / "model").mkdir()
     for path in (tmp_path / "model", tmp_path / "missing"):
-        with pytest.raises(rs.FileError) as error:
+        with pytest.raises(FileError) as error:
             read_colmap_model(path)
         assert "\n" not in str(error.value)
 
 
 def test_photos_missing_on_disk_are_named(tmp_path, rng):
     photos = save_photos(tmp_path / "photos", NAMES[1:])
-    with pytest.raises(rs.InputError, match=NAMES[0]):
-        rs.solve_model(save(make_scene(rng).model, tmp_path / "model"), tmp_path / "out", OPTIONS, images=photos)
+    with pytest.raises(InputError, match=NAMES[0]):
+        rs.solve(save(make_scene(rng).model, tmp_path / "model"), tmp_path / "out", OPTIONS, images=photos)
     assert not (tmp_path / "out").exists()

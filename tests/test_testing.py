@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rsundistort import FileError, InputError
+from rsundistort.errors import FileError, InputError
 from rsundistort.testing import Golden, assert_images_close
 
 pytest_plugins = ["pytester"]

@@ -15,7 +15,8 @@ import pytest
 from make_photos import save_png, save_textures, texture
 from test_batch import FOUR, invoke, save_solution, tree
 
-from rsundistort import FileError, InputError, RunOptions, SkippedPhotoWarning, rectify_folder, run, solve_model
+from rsundistort import RunOptions, rectify_folder, run, solve
+from rsundistort.errors import FileError, InputError, SkippedPhotoWarning
 from rsundistort.io.journal import Journal, RemoteJournal
 from rsundistort.io.photos.images import list_photos
 from rsundistort.io.places import RemoteFolder, place_of
@@ -459,7 +460,7 @@ def test_run_and_solve_take_paths(tmp_path):
     with pytest.raises(InputError, match="URLs are taken by rectify"):
         run(tmp_path, "s3://bucket/out", RunOptions())
     with pytest.raises(InputError, match="URLs are taken by rectify"):
-        solve_model(tmp_path, "s3://bucket/out")
+        solve(tmp_path, "s3://bucket/out")
 
 
 # ---------------------------------------------------------------- file systems

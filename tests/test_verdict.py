@@ -18,7 +18,6 @@ from solved_scene import SCENES, solve_scene
 from rsundistort import (
     BundleOptions,
     Camera,
-    FormatError,
     Reconstruction,
     RowMotion,
     RsUndistortWarning,
@@ -30,6 +29,7 @@ from rsundistort import (
 )
 from rsundistort.bundle import ModelChoice, choose_model
 from rsundistort.critical import heal
+from rsundistort.errors import FormatError
 from rsundistort.io import write_solution
 from rsundistort.rectify import largest_shift_px
 from rsundistort.report import verdict_of

@@ -14,7 +14,8 @@ from click.testing import CliRunner
 from make_photos import COURTYARD_NAMES, half_courtyard, texture
 from rsundistort_cli.main import cli
 
-from rsundistort import FileError, InputError, RsUndistortWarning, RunOptions, read_solution, run
+from rsundistort import RsUndistortWarning, RunOptions, read_solution, run
+from rsundistort.errors import FileError, InputError
 from rsundistort.io import extract_frames, is_video, read_photo
 
 av = pytest.importorskip("av")

@@ -7,19 +7,10 @@ import numpy as np
 import pytest
 from numpy_twin import DIRECTIONS
 
-from rsundistort import (
-    Camera,
-    DepthMap,
-    InputError,
-    Plane,
-    RowMotion,
-    Solution,
-    SolvedImage,
-    optimal_new_camera,
-    rectify,
-)
+from rsundistort import Camera, DepthMap, Plane, RowMotion, Solution, SolvedImage, optimal_new_camera, rectify
 from rsundistort import undistort_points as undistort
 from rsundistort.batch.views import with_view
+from rsundistort.errors import InputError
 from rsundistort.model.orientation import in_stored_frame, turn_pixels, turn_solution
 from rsundistort.rectify import ViewOptions, init_rectify_map, rectified_roi, rectified_view
 from rsundistort.rectify.maps import EDGE_PX

@@ -2,5 +2,6 @@
 
 from .against_truth import evaluate
 from .critical_poses import analyze
+from .results import ErrorSummary, Evaluation, PhiErrorSummary, PoseAnalysis, PsnrSummary
 
-__all__ = ["analyze", "evaluate"]
+__all__ = ["ErrorSummary", "Evaluation", "PhiErrorSummary", "PoseAnalysis", "PsnrSummary", "analyze", "evaluate"]

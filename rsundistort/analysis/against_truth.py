@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,20 @@ from ..io import output_name, read_photo, read_solution
 from ..model import RowMotion, Solution, SolvedImage
 from ..model.orientation import INVERSE, in_stored_frame, turn_pixels
 from ..rectify import rectify
+from .results import ErrorSummary, Evaluation, PhiErrorSummary, PsnrSummary
 
 __all__ = ["evaluate"]
 
 
-def _summary(values: list[float] | np.ndarray[Any, Any]) -> dict[str, float]:
-    return {"mean": float(np.mean(values)), "median": float(np.median(values)), "max": float(np.max(values))}
+def _summary(values: NDArray[np.float64]) -> ErrorSummary:
+    return ErrorSummary(float(np.mean(values)), float(np.median(values)), float(np.max(values)))
+
+
+def _psnr_summary(photos: Mapping[str, float]) -> PsnrSummary | None:
+    if not photos:
+        return None
+    values = list(photos.values())
+    return PsnrSummary(float(np.median(values)), float(np.min(values)), photos)
 
 
 def evaluate(
@@ -33,7 +42,7 @@ def evaluate(
     twins: Path | str | None = None,
     raw: Path | str | None = None,
     progress: ProgressCallback | None = None,
-) -> dict[str, Any]:
+) -> Evaluation:
     """Compare the outputs of a run with the truth.
 
     Parameters
@@ -54,30 +63,36 @@ def evaluate(
 
     Returns
     -------
-    dict
-        `photos` and `registered` (counts); `rotation_deg` and `center` (in mean distances of consecutive centres)
-        with mean, median, max; `phi_mrad_per_frame` (mean per component, and mean, median, max); `psnr_db` and
-        `psnr_before_db` with median, min and each photo's. What cannot be compared is left out.
+    Evaluation
+        Errors of poses, motions and images; None where there is nothing to compare with.
     """
     out, truth = Path(out), Path(truth)
     written, true_solution = read_solution(out / "solution.json"), read_solution(truth)
     solution = in_stored_frame(written)
     turns = {image.name: image.turned for image in written.images}
-    result: dict[str, Any] = {"photos": len(solution.images), "registered": len(solution.registered)}
+    rotation = center = after = before = None
     pose_truth = read_solution(Path(poses)) if poses is not None else true_solution
     if any(image.posed for image in pose_truth.images):
         errors = pose_errors(solution, pose_truth)
-        result["rotation_deg"], result["center"] = _summary(errors.rotation_deg), _summary(errors.center)
+        rotation, center = _summary(errors.rotation_deg), _summary(errors.center)
     phi = np.abs(motion_errors(solution, true_solution).phi_rad_per_frame) * 1e3
-    result["phi_mrad_per_frame"] = {**_summary(phi), "mean_per_component": phi.mean(0).tolist()}
+    x, y, z = phi.mean(0).tolist()
     folders = {"twins": (twins, truth.parent / "global"), "raw": (raw, truth.parent / "photos")}
     chosen = {k: Path(given) if given is not None else default for k, (given, default) in folders.items()}
     for key, (given, _) in folders.items():
         if given is not None and not chosen[key].is_dir():
             raise FileError(f"{chosen[key]} is no folder; give the folder of the {key} photos")
     if chosen["twins"].is_dir():
-        result.update(_image_errors(out, solution, turns, true_solution, chosen, StageLog(progress)))
-    return result
+        after, before = _image_errors(out, solution, turns, true_solution, chosen, StageLog(progress))
+    return Evaluation(
+        photos=len(solution.images),
+        registered=len(solution.registered),
+        rotation_deg=rotation,
+        center=center,
+        phi_mrad_per_frame=PhiErrorSummary(**asdict(_summary(phi)), mean_per_component=(x, y, z)),
+        psnr_db=after,
+        psnr_before_db=before,
+    )
 
 
 def _without_lens(
@@ -100,7 +115,8 @@ def _image_errors(
     truth: Solution,
     folders: Mapping[str, Path],
     log: StageLog,
-) -> dict[str, Any]:
+) -> tuple[PsnrSummary | None, PsnrSummary | None]:
+    """Of the rectified photos against their twins, and of the photos before."""
     twins, raw = folders["twins"], folders["raw"]
     masks = mask_names([image.name for image in solution.images])
     raw_as = solution.options.get("raw_as", "tif")
@@ -122,13 +138,4 @@ def _image_errors(
         except InputError as error:
             raise InputError(f"{image.name}: {error}") from error
         log.tell("comparing", done, len(registered))
-    result: dict[str, Any] = {}
-    for key, values in (("psnr_db", after), ("psnr_before_db", before)):
-        if values:
-            numbers = list(values.values())
-            result[key] = {
-                "median": float(np.median(numbers)),
-                "min": float(np.min(numbers)),
-                "photos": values,
-            }
-    return result
+    return _psnr_summary(after), _psnr_summary(before)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -12,11 +11,12 @@ from ..errors import FileError, InputError
 from ..io import read_colmap_poses, read_solution, read_transforms
 from ..model import READOUTS
 from ..model.orientation import in_stored_frame
+from .results import PoseAnalysis
 
 __all__ = ["analyze"]
 
 
-def analyze(path: Path | str, readout: str | None = None) -> dict[str, Any]:
+def analyze(path: Path | str, readout: str | None = None) -> PoseAnalysis:
     """Whether poses let the shutter be told from the shape of the scene.
 
     Parameters
@@ -28,9 +28,8 @@ def analyze(path: Path | str, readout: str | None = None) -> dict[str, Any]:
 
     Returns
     -------
-    dict
-        photos, readout, singular_values, null_vector, y_axis_spread_deg, meaning, critical (whether the meter is low);
-        sentence (what the shape of a solution is worth, None of bare poses); advice for the next shoot, if critical.
+    PoseAnalysis
+        The meter of the poses; what the shape of a solution is worth; advice for the next shoot, if they are critical.
     """
     path = Path(path)
     if readout is not None and readout not in READOUTS:
@@ -60,14 +59,4 @@ def analyze(path: Path | str, readout: str | None = None) -> dict[str, Any]:
     meter = critical_motion(R_cw, center_w, directions)
     if advice is None and meter.is_low:
         advice = [each.sentence for each in advise_poses(R_cw, center_w, directions)]
-    return {
-        "photos": len(R_cw),
-        "readout": sorted(set(directions)),
-        "singular_values": meter.singular_values.tolist(),
-        "null_vector": meter.null_vector.tolist(),
-        "y_axis_spread_deg": meter.y_axis_spread_deg,
-        "meaning": meter.meaning,
-        "critical": meter.is_low,
-        "sentence": sentence,
-        "advice": advice or [],
-    }
+    return PoseAnalysis(len(R_cw), tuple(sorted(set(directions))), meter, sentence, tuple(advice or ()))

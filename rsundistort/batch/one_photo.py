@@ -22,7 +22,7 @@ from ..io.outputs import CANNOT_WRITE
 from ..io.photos.exif import read_orientation
 from ..io.places import File, Place, RemoteFile, fetched
 from ..model.orientation import split_mirror, turn_pixels
-from ..rectify import MAP_KINDS, RemapGrid, ViewOptions, rectify, remap_grid
+from ..rectify import MAP_KINDS, RemapGrid, ViewOptions, rectify
 from .extras import AlsoImage
 from .geometry import DepthJob, PhotoDepth
 from .rectify_options import RectifyOptions
@@ -275,7 +275,7 @@ def _write_extras(job: PhotoJob, out: Path, seen: PhotoDepth, turn: int) -> Iter
             raise InputError(f"{each.source.parent.name}/{each.source.name}: {error}") from error
         yield each.target
     if job.maps is not None and job.options.maps is not None:
-        grid = remap_grid(*grid_of, seen.depth)
+        grid = RemapGrid.from_camera(*grid_of, seen.depth)
         if turn != 1:
             map_x, map_y = (turn_pixels(m, turn) for m in (grid.map_x, grid.map_y))
             grid = RemapGrid(map_x, map_y, grid.source_width, grid.source_height)

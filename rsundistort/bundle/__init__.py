@@ -1,6 +1,6 @@
 """Rolling-shutter bundle adjustment: problem, solver, priors and gauge."""
 
-from .adjust import LADDER, bundle_adjust, climb, objective
+from .adjust import LADDER, adjust_sequence, bundle_adjust, objective, sequence_to
 from .choice import ModelChoice, choose_model
 from .direction import ReadoutChoice, choose_readouts
 from .intrinsics import GuessedCameras, deviation, pixels_of
@@ -15,12 +15,13 @@ __all__ = [
     "ModelChoice",
     "Posterior",
     "ReadoutChoice",
+    "adjust_sequence",
     "bundle_adjust",
     "choose_model",
     "choose_readouts",
-    "climb",
     "deviation",
     "gauge_directions",
     "objective",
     "pixels_of",
+    "sequence_to",
 ]

@@ -15,7 +15,7 @@ from .problem import BundleProblem
 from .rounds import Rounds
 from .spreads import estimates_spreads, starting_spreads
 
-__all__ = ["LADDER", "bundle_adjust", "climb", "objective"]
+__all__ = ["LADDER", "adjust_sequence", "bundle_adjust", "objective", "sequence_to"]
 
 #: Shutter models in the order in which they are solved, each from the one before.
 LADDER = ("global", "two-step", "rotation", "constant-motion")
@@ -42,6 +42,8 @@ def bundle_adjust(
     shutter_model: str = "rotation",
     options: BundleOptions | None = None,
     progress: Callable[[float], None] | None = None,
+    *,
+    simpler_first: bool = False,
 ) -> BundleResult:
     """Poses, shutter motions and points that explain the measurements best.
 
@@ -55,6 +57,9 @@ def bundle_adjust(
         Tolerances, loss, priors, anchors.
     progress : callable, optional
         Called with the cost after each accepted step.
+    simpler_first : bool
+        Adjust with the simpler models first, each from the one before, phi from zero: for starts without motions, such
+        as those of global-shutter programs.
 
     Returns
     -------
@@ -68,6 +73,9 @@ def bundle_adjust(
         Fewer than two photos (three for a shutter), no common points, or all photos taken from one place.
     """
     options = options or BundleOptions()
+    if simpler_first:
+        tell = None if progress is None else (lambda _, cost: progress(cost))
+        return adjust_sequence(reconstruction, sequence_to(shutter_model), options, tell)[shutter_model]
     rounds = Rounds(reconstruction, shutter_model, options, progress)
     for _ in range(options.outlier_rounds):
         rounds.solve(options.round_tolerance)
@@ -89,13 +97,35 @@ def bundle_adjust(
     return rounds.result()
 
 
-def climb(
+def sequence_to(shutter_model: str) -> tuple[str, ...]:
+    """Shutter models that end at one, each the start of the next."""
+    if shutter_model == "global":
+        return ("global",)
+    if shutter_model == "two-step":
+        return ("global", "two-step")
+    if shutter_model == "constant-motion":
+        return LADDER
+    return ("global", "two-step", shutter_model)
+
+
+def adjust_sequence(
     reconstruction: Reconstruction,
-    rungs: Sequence[str] = LADDER,
+    models: Sequence[str] = LADDER,
     options: BundleOptions | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> dict[str, BundleResult]:
-    """Solve the shutter models one after the other, each started from the one before, phi from zero.
+    """Adjust with one shutter model after the other, each started from the one before, phi from zero.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Start of the first.
+    models : sequence of str
+        Shutter models, the simplest first.
+    options : BundleOptions, optional
+        Of the last; of the others as far as they concern a start.
+    progress : callable, optional
+        Called as (model, cost) after each accepted step.
 
     Returns
     -------
@@ -103,7 +133,7 @@ def climb(
         By model, in the order solved. All but the last are rough: no outliers are dropped from them.
     """
     options = options or BundleOptions()
-    # every rung but the last is only a start: what its model cannot explain is no outlier, and it need not converge
+    # every model but the last is only a start: what it cannot explain is no outlier, and it need not converge
     # a shutter that is not modelled yet would be blamed on the lens, and bend known lengths
     rough = replace(
         options, outlier_rounds=0, spread_rounds=0, cost_tolerance=options.round_tolerance, refine=(), lengths=(),
@@ -111,8 +141,8 @@ def climb(
     )  # fmt: skip
     results: dict[str, BundleResult] = {}
     current = replace(reconstruction, phi=np.zeros((reconstruction.num_images, 3)))
-    for model in rungs:
+    for model in models:
         step = None if progress is None else (lambda cost, model=model: progress(model, cost))
-        results[model] = bundle_adjust(current, model, options if model == rungs[-1] else rough, step)
+        results[model] = bundle_adjust(current, model, options if model == models[-1] else rough, step)
         current = results[model].reconstruction
     return results

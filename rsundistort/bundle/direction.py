@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model import READOUTS, Reconstruction
-from .adjust import climb
+from .adjust import adjust_sequence
 from .choice import clipped_errors, standard_errors
 from .options import BundleOptions, BundleResult
 
@@ -73,7 +73,7 @@ def choose_readouts(
     )  # fmt: skip
 
     def fit(rec: Reconstruction) -> BundleResult:
-        return climb(rec, ("two-step", "rotation"), rough, progress)["rotation"]
+        return adjust_sequence(rec, ("two-step", "rotation"), rough, progress)["rotation"]
 
     def errors_of(result: BundleResult) -> NDArray[Any]:
         errors = clipped_errors(result.reconstruction, reconstruction.observations, sigma_px)[0]

@@ -1,25 +1,12 @@
 """Deprecated: what was here is in `input`, `solve`, `batch`, `simulate` and `analysis`. Gone in the next version."""
 
-import warnings
-from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-_MOVED = {
-    "analyze": "analysis", "evaluate": "analysis",
-    "RectifyOptions": "batch", "rectify_folder": "batch", "use_threads": "batch",
-    "GyroOptions": "input",
-    "SceneOptions": "simulate", "WarpOptions": "simulate", "read_motion_file": "simulate",
-    "simulate_scene": "simulate", "simulate_warp": "simulate",
-    "RunOptions": "solve", "SolveOptions": "solve", "run": "solve", "solve": "solve", "solve_model": "solve",
-    "versions": "versions",
-}  # fmt: skip
+from .._former import FORMER_NAMES, by_former_name
 
-__all__ = list(_MOVED)
+__all__ = [name.removeprefix("pipeline.") for name in FORMER_NAMES if name.startswith("pipeline.")]
 
+if not TYPE_CHECKING:
 
-def __getattr__(name: str) -> Any:
-    if name not in _MOVED:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = f"rsundistort.{_MOVED[name]}"
-    warnings.warn(f"rsundistort.pipeline.{name} is now in {module}", DeprecationWarning, stacklevel=2)
-    return getattr(import_module(module), name)
+    def __getattr__(name: str) -> Any:
+        return by_former_name(__name__, name)

@@ -1,7 +1,7 @@
 """Rectification: grids, photos and points, both ways."""
 
 from .coarse import TOLERANCE_PX, CoarseGrid, coarse_grid
-from .grid import MAP_KINDS, RemapGrid, remap_grid
+from .grid import MAP_KINDS, RemapGrid
 from .maps import init_rectify_map
 from .new_camera import ViewOptions, optimal_new_camera, rectified_roi, rectified_view
 from .photo import INTERPOLATIONS, rectify
@@ -28,7 +28,6 @@ __all__ = [
     "rectified_roi",
     "rectified_view",
     "rectify",
-    "remap_grid",
     "translation_shift_px",
     "undistort_points",
 ]

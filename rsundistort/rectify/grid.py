@@ -18,7 +18,7 @@ from ..model.checks import check_array, frozen
 from .maps import init_rectify_map, seen_by
 from .photo import check_interpolation, check_photo, remap_strips
 
-__all__ = ["MAP_KINDS", "RemapGrid", "remap_grid"]
+__all__ = ["MAP_KINDS", "RemapGrid"]
 
 #: Kinds of files of grids, and their endings.
 MAP_KINDS: dict[str, str] = {"npz": ".npz", "exr": ".exr", "stmap": ".exr"}
@@ -43,7 +43,7 @@ class RemapGrid:
     Examples
     --------
     >>> camera = Camera(64, 48, [[50, 0, 32], [0, 50, 24], [0, 0, 1]], [-0.1, 0, 0, 0])
-    >>> grid = remap_grid(camera, RowMotion([0.05, 0.0, 0.02]))
+    >>> grid = RemapGrid.from_camera(camera, RowMotion([0.05, 0.0, 0.02]))
     >>> there, seen = grid.apply(np.full((48, 64), 7, np.uint8))
     >>> back, known = grid.inverse().apply(there)
     >>> there.shape, bool((there[seen > 0] == 7).all())
@@ -65,6 +65,28 @@ class RemapGrid:
             raise InputError(f"map_x.shape={self.map_x.shape}, map_y.shape={self.map_y.shape}, expected the same")
         if self.source_width < 1 or self.source_height < 1:
             raise InputError(f"the source has {self.source_width}x{self.source_height} pixels, expected positive ones")
+
+    @classmethod
+    def from_camera(
+        cls,
+        camera: Camera,
+        motion: RowMotion | None = None,
+        shutter_model: str = "rotation",
+        new_camera: Camera | None = None,
+        depth: Depth | None = None,
+    ) -> RemapGrid:
+        """The grid that `rectify` uses, of full size and exact.
+
+        Parameters
+        ----------
+        camera, motion, shutter_model, new_camera, depth
+            As in `rectify`.
+        """
+        target = new_camera or camera.pinhole()
+        size = (target.width, target.height)
+        map_x, map_y = init_rectify_map(camera, motion, shutter_model, new_K=target.K, size=size, depth=depth)
+        assert map_y is not None
+        return cls(map_x, map_y, camera.width, camera.height)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -208,27 +230,6 @@ class RemapGrid:
         nowhere = ~(np.isfinite(x) & np.isfinite(y))
         x[nowhere] = y[nowhere] = _NOWHERE
         return cls(x.astype(np.float32), y.astype(np.float32), width, height)
-
-
-def remap_grid(
-    camera: Camera,
-    motion: RowMotion | None = None,
-    shutter_model: str = "rotation",
-    new_camera: Camera | None = None,
-    depth: Depth | None = None,
-) -> RemapGrid:
-    """The grid that `rectify` uses, of full size and exact.
-
-    Parameters
-    ----------
-    camera, motion, shutter_model, new_camera, depth
-        As in `rectify`.
-    """
-    target = new_camera or camera.pinhole()
-    size = (target.width, target.height)
-    map_x, map_y = init_rectify_map(camera, motion, shutter_model, new_K=target.K, size=size, depth=depth)
-    assert map_y is not None
-    return RemapGrid(map_x, map_y, camera.width, camera.height)
 
 
 def _openexr() -> Any:

@@ -1,7 +1,7 @@
 """From photos, or a model of another program, to poses, motions and points, and all that is written of them."""
 
-from .from_model import solve, solve_model
+from .from_model import solve
 from .run import run
 from .run_options import RunOptions, SolveOptions
 
-__all__ = ["RunOptions", "SolveOptions", "run", "solve", "solve_model"]
+__all__ = ["RunOptions", "SolveOptions", "run", "solve"]

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
@@ -33,14 +33,15 @@ from .outcome import Outcome
 from .run_options import SolveOptions
 from .run_outputs import REPLACED, Outputs, PointRgb, files_of_run, inputs_of, photo_times
 
-__all__ = ["solve", "solve_model"]
+__all__ = ["solve"]
 
 # Others' keypoints have longer tails than ours, whose large ones weigh less: at 4.5 deviations 5 % of the measurements
 # of the warped herz-jesus-8 are lost and the poses are off by 0.017 deg, at this by 0.013, with 2 % more.
 _OUTLIER_SIGMA = 6.0
 
 
-def solve_model(
+@overload
+def solve(
     model: Path | str,
     out: Path | str,
     options: SolveOptions | None = None,
@@ -48,20 +49,47 @@ def solve_model(
     images: Path | str | None = None,
     database: Path | str | None = None,
     progress: ProgressCallback | None = None,
-) -> Solution:
-    """Recover how the camera moved during each photo's readout from a COLMAP model; write what `run` writes.
+) -> Solution: ...
+
+
+@overload
+def solve(
+    model: Any,
+    out: None = None,
+    options: SolveOptions | None = None,
+    *,
+    images: None = None,
+    database: Path | str | None = None,
+    progress: ProgressCallback | None = None,
+) -> tuple[Any, Solution]: ...
+
+
+def solve(
+    model: Any,
+    out: Path | str | None = None,
+    options: SolveOptions | None = None,
+    *,
+    images: Path | str | None = None,
+    database: Path | str | None = None,
+    progress: ProgressCallback | None = None,
+) -> Solution | tuple[Any, Solution]:
+    """Recover how the camera moved during each photo's readout from a model of another program.
+
+    From files it writes what `run` writes. From a `pycolmap.Reconstruction` it writes nothing, changes nothing global,
+    and several threads may each solve one.
 
     Parameters
     ----------
-    model : path
+    model : path or pycolmap.Reconstruction
         Folder of a COLMAP model, text or binary; or `sfm_data.json` of OpenMVG, or `reconstruction.json` of OpenSfM
-        with `tracks.csv` beside it.
+        with `tracks.csv` beside it. A `pycolmap.Reconstruction` stays as it is; its keypoints must be pixels of the
+        photos as the sensor stored them.
     out : path
-        Folder for the outputs, as of `run`.
+        Folder for the outputs, as of `run`; for a model in files.
     options : SolveOptions, optional
-        See there. Groups are cameras of the model: "camera 1".
+        See there. Groups are cameras of the model: "camera 1". What concerns files is not looked at without `out`.
     images : path, optional
-        Folder of the photos that the model names. Without it none are rectified.
+        Folder of the photos that the model names; for a model in files. Without it none are rectified.
     database : path, optional
         COLMAP's database behind the model: the matches in it are verified again with the motions found, and the tracks
         rebuilt.
@@ -70,10 +98,39 @@ def solve_model(
 
     Returns
     -------
-    Solution
-        As written to `out/solution.json`.
+    rectified : pycolmap.Reconstruction
+        Of a `pycolmap.Reconstruction` only: poses, points and tracks without shutter, in PINHOLE cameras; the model of
+        the rectified photos.
+    solution : Solution
+        The motions; of a model in files as written to `out/solution.json`.
+
+    Raises
+    ------
+    InputError
+        When `out` is missing for a model in files, or given for a `pycolmap.Reconstruction`.
     """
+    if isinstance(out, SolveOptions):  # until the next version: they were the second argument
+        warnings.warn("solve takes options by name: solve(model, options=...)", DeprecationWarning, stacklevel=2)
+        out, options = None, out
     options = options or SolveOptions()
+    if isinstance(model, str | Path):
+        if out is None:
+            raise InputError(f"solve: out is missing; say which folder gets the outputs of {model}")
+        return _solve_files(model, out, options, images, database, progress)
+    if out is not None or images is not None:
+        raise InputError("solve: out and images are for a model in files; write what is returned, or give the folder")
+    return _solve_in_memory(model, options, database, progress)
+
+
+def _solve_files(
+    model: Path | str,
+    out: Path | str,
+    options: SolveOptions,
+    images: Path | str | None,
+    database: Path | str | None,
+    progress: ProgressCallback | None,
+) -> Solution:
+    """From files to files."""
     model, out = local_place(model), local_place(out)
     folder = None if images is None else local_place(images)
     if database is not None and model.is_file():
@@ -108,36 +165,10 @@ def solve_model(
     return solution
 
 
-def solve(
-    reconstruction: Any,
-    options: SolveOptions | None = None,
-    *,
-    database: Path | str | None = None,
-    progress: ProgressCallback | None = None,
+def _solve_in_memory(
+    reconstruction: Any, options: SolveOptions, database: Path | str | None, progress: ProgressCallback | None
 ) -> tuple[Any, Solution]:
-    """Recover how the camera moved during each photo's readout from a `pycolmap.Reconstruction`.
-
-    Nothing global is changed, and several threads may each solve one.
-
-    Parameters
-    ----------
-    reconstruction : pycolmap.Reconstruction
-        It stays as it is. Its keypoints must be pixels of the photos as the sensor stored them.
-    options : SolveOptions, optional
-        See there; what concerns files is not looked at.
-    database : path, optional
-        As in `solve_model`.
-    progress : callable, optional
-        Called as (stage, done, total). What it raises stops the work.
-
-    Returns
-    -------
-    rectified : pycolmap.Reconstruction
-        Poses, points and tracks without shutter, in PINHOLE cameras: the model of the rectified photos.
-    solution : Solution
-        The motions.
-    """
-    options = options or SolveOptions()
+    """From a `pycolmap.Reconstruction` to another one."""
     log = StageLog(progress)
     given = colmap_model_of(reconstruction)
     with kept_log_level():
@@ -198,7 +229,7 @@ def _in_stored_frame(
     if unsure:
         warnings.warn(
             f"{len(unsure)} photos, such as {unsure[0]}, have an EXIF orientation that keeps their size: the model is "
-            "taken to show them as they are stored", RsUndistortWarning, stacklevel=3,
+            "taken to show them as they are stored", RsUndistortWarning, stacklevel=4,
         )  # fmt: skip
     if not turns:
         return given, "stored" if photos else "not looked at"
@@ -280,7 +311,7 @@ def _solve(
         )
     after = solved.result.reconstruction
     for text in cameras.contradicted(after.cameras, options_of(after)):
-        warnings.warn(text, RsUndistortWarning, stacklevel=3)
+        warnings.warn(text, RsUndistortWarning, stacklevel=4)
     lost = dict.fromkeys(given.unregistered, "it is not registered in the model")
     lost |= dict.fromkeys(set(rec.image_names) - set(after.image_names), "no measurement of it survived")
     readouts = known_readouts((), after.cameras, after.camera_idx, options.readout_s, None)

@@ -19,10 +19,11 @@ from ..bundle import (
     BundleResult,
     ModelChoice,
     ReadoutChoice,
+    adjust_sequence,
     bundle_adjust,
     choose_model,
     choose_readouts,
-    climb,
+    sequence_to,
 )
 from ..critical import Advice, Remedy, advise, heal, with_remedy
 from ..errors import ReconstructionError, RsUndistortWarning
@@ -34,7 +35,7 @@ from ..model.projection import unproject_points
 from ..sfm import LEAST_MEASUREMENTS, MatchedPhotos, align_tracks, map_photos, match_photos, retriangulate
 from ..verdict import Verdict, judge
 
-__all__ = ["Feedback", "Solved", "rungs_to", "solve_photos", "solve_tracks"]
+__all__ = ["Feedback", "Solved", "solve_photos", "solve_tracks"]
 
 # Feedback ends when no rectified pixel of any photo moves by more than this between two rounds, in pixels of the images
 # that the features were found in; or when less than this share of the measurements is another one than before, so that
@@ -108,17 +109,6 @@ class Feedback:
         found = dict(zip(self.matched.names, self.matched.features, strict=True))
         source = patch_source(self.photos, names, self.workers, lambda done: log.tell("alignment", done, len(names)))
         return align_tracks(reconstruction, [found[name].step_px for name in names], source)
-
-
-def rungs_to(shutter_model: str) -> tuple[str, ...]:
-    """Ladder that ends at a shutter model."""
-    if shutter_model == "global":
-        return ("global",)
-    if shutter_model == "two-step":
-        return ("global", "two-step")
-    if shutter_model == "constant-motion":
-        return LADDER
-    return ("global", "two-step", shutter_model)
 
 
 def _tell_model(log: StageLog, model: str, _cost: float) -> None:
@@ -285,7 +275,8 @@ def solve_tracks(
     auto = shutter_model == "auto"
     shutter_model = "rotation" if auto else shutter_model
     log.begin("ladder")
-    results = climb(mapped, rungs_to(shutter_model), options, lambda model, _: log.tell(f"ladder: {model}", 0))
+    models = sequence_to(shutter_model)
+    results = adjust_sequence(mapped, models, options, lambda model, _: log.tell(f"ladder: {model}", 0))
     result = results[shutter_model]
     log.end(
         "ladder",

@@ -25,7 +25,7 @@ __all__ = ["RunOptions", "SolveOptions"]
 
 @dataclass(frozen=True, kw_only=True)
 class SolveOptions(RectifyOptions):
-    """Options of `solve_model`: those of `RectifyOptions` for its last stage, and the following.
+    """Options of `solve`: those of `RectifyOptions` for its last stage, and the following.
 
     With `apply_orientation` photos that it mirrors are turned only, and keep the mirror as their orientation: no camera
     takes a mirror image.
