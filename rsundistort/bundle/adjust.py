@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..errors import InputError
-from ..model import Reconstruction
+from ..model import Reconstruction, check_shutter_model
 from .layout import Layout
 from .options import BundleOptions, BundleResult
 from .problem import BundleProblem
@@ -99,6 +99,7 @@ def bundle_adjust(
 
 def sequence_to(shutter_model: str) -> tuple[str, ...]:
     """Shutter models that end at one, each the start of the next."""
+    check_shutter_model(shutter_model)
     if shutter_model == "global":
         return ("global",)
     if shutter_model == "two-step":
