@@ -176,7 +176,7 @@ def _sigmas(text: str | None) -> dict[str, float]:
 
 def _anchors(still: tuple[str, ...]) -> dict[str, float]:
     """Photos and their standard deviations, radians per frame, of NAME or NAME=MRAD."""
-    from rsundistort import InputError
+    from rsundistort.errors import InputError
 
     anchors: dict[str, float] = {}
     for text in still:

@@ -1,5 +1,17 @@
 """Errors and warnings: one root, each leaf also of the builtin class that a caller expects."""
 
+__all__ = [
+    "FileError",
+    "FileKindWarning",
+    "FormatError",
+    "InputError",
+    "MetadataWarning",
+    "ReconstructionError",
+    "RsUndistortError",
+    "RsUndistortWarning",
+    "SkippedPhotoWarning",
+]
+
 
 class RsUndistortError(Exception):
     """Root of every error that rsundistort raises on purpose; its text is one line for a person."""

@@ -416,7 +416,30 @@ def test_what_progress_raises_stops_the_work(tmp_path, rng):
     assert not (tmp_path / "out").exists()
 
 
+def test_options_in_the_second_place_still_work(rng):
+    """Where `solve` of a reconstruction had them."""
+    scene = make_scene(rng)
+    with pytest.warns(DeprecationWarning, match=r"solve\(model, options=...\)"):
+        _, former = rs.solve(scene.model, OPTIONS)
+    assert former.shutter_model == OPTIONS.shutter_model
+    _, present = rs.solve(scene.model, options=OPTIONS)
+    assert np.allclose(former.image(NAMES[0]).motion.phi, present.image(NAMES[0]).motion.phi, rtol=0, atol=1e-12)
+
+
 # ---------------------------------------------------------------- bad input
+
+
+def test_what_does_not_go_together_is_refused(tmp_path, rng):
+    model = make_scene(rng).model
+    folder = save(model, tmp_path / "model")
+    with pytest.raises(InputError, match=f"out is missing; say which folder gets the outputs of {folder}"):
+        rs.solve(folder)
+    for options in ({"out": tmp_path / "out"}, {"images": tmp_path}):
+        with pytest.raises(InputError, match="out and images are for a model in files"):
+            rs.solve(model, **options)
+    with pytest.raises(InputError, match=r"model is a builtins\.int, expected a folder, a file or a pycolmap"):
+        rs.solve(20)
+    assert not (tmp_path / "out").exists()
 
 
 def spoil_points(scene):

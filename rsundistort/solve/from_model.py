@@ -117,6 +117,9 @@ def solve(
         if out is None:
             raise InputError(f"solve: out is missing; say which folder gets the outputs of {model}")
         return _solve_files(model, out, options, images, database, progress)
+    if not hasattr(model, "reg_image_ids"):
+        kind = f"{type(model).__module__}.{type(model).__name__}"
+        raise InputError(f"solve: model is a {kind}, expected a folder, a file or a pycolmap.Reconstruction")
     if out is not None or images is not None:
         raise InputError("solve: out and images are for a model in files; write what is returned, or give the folder")
     return _solve_in_memory(model, options, database, progress)
