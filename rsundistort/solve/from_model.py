@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any, overload
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 
@@ -33,6 +33,9 @@ from .outcome import Outcome
 from .run_options import SolveOptions
 from .run_outputs import REPLACED, Outputs, PointRgb, files_of_run, inputs_of, photo_times
 
+if TYPE_CHECKING:
+    import pycolmap
+
 __all__ = ["solve"]
 
 # Others' keypoints have longer tails than ours, whose large ones weigh less: at 4.5 deviations 5 % of the measurements
@@ -54,25 +57,25 @@ def solve(
 
 @overload
 def solve(
-    model: Any,
+    model: pycolmap.Reconstruction,
     out: None = None,
     options: SolveOptions | None = None,
     *,
     images: None = None,
     database: Path | str | None = None,
     progress: ProgressCallback | None = None,
-) -> tuple[Any, Solution]: ...
+) -> tuple[pycolmap.Reconstruction, Solution]: ...
 
 
 def solve(
-    model: Any,
+    model: Path | str | pycolmap.Reconstruction,
     out: Path | str | None = None,
     options: SolveOptions | None = None,
     *,
     images: Path | str | None = None,
     database: Path | str | None = None,
     progress: ProgressCallback | None = None,
-) -> Solution | tuple[Any, Solution]:
+) -> Solution | tuple[pycolmap.Reconstruction, Solution]:
     """Recover how the camera moved during each photo's readout from a model of another program.
 
     From files it writes what `run` writes. From a `pycolmap.Reconstruction` it writes nothing, changes nothing global,
@@ -169,8 +172,11 @@ def _solve_files(
 
 
 def _solve_in_memory(
-    reconstruction: Any, options: SolveOptions, database: Path | str | None, progress: ProgressCallback | None
-) -> tuple[Any, Solution]:
+    reconstruction: pycolmap.Reconstruction,
+    options: SolveOptions,
+    database: Path | str | None,
+    progress: ProgressCallback | None,
+) -> tuple[pycolmap.Reconstruction, Solution]:
     """From a `pycolmap.Reconstruction` to another one."""
     log = StageLog(progress)
     given = colmap_model_of(reconstruction)
