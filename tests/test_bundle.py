@@ -589,7 +589,7 @@ def test_a_pinhole_lens_among_fisheyes_stays_what_it_is(rng):
     assert np.abs(res[fisheye]).max() > 1
 
 
-def test_a_sequence_of_models_ends_at_the_truth(rng):
+def test_ladder_ends_at_the_truth_and_climbs_in_order(rng):
     truth = make_scene(rng, "constant-motion")
     seen = []
     results = adjust_sequence(perturbed(truth, rng), progress=lambda model, cost: seen.append(model))
