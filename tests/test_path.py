@@ -10,9 +10,10 @@ from clips import HandHeld, filmed, rotation_errors_deg
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
-from rsundistort import BundleOptions, InputError, Reconstruction, bundle_adjust
+from rsundistort import BundleOptions, Reconstruction, bundle_adjust
 from rsundistort.bundle.path import FramePath, PathPrior, orthogonal, with_path_motions
 from rsundistort.bundle.path import PathState as State
+from rsundistort.errors import InputError
 from rsundistort.model.path import CameraPath, inverse_left_jacobians
 
 FRAME_S = 1 / 30
