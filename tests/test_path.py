@@ -165,9 +165,9 @@ def test_a_known_readout_time_is_believed() -> None:
 )
 def test_a_path_that_cannot_be_is_refused(change: dict[str, object], says: str) -> None:
     truth, times = filmed(HandHeld(8), 6)
+    told = {"time_s": times, "frame_s": FRAME_S, **change}
     with pytest.raises(InputError, match=says):
-        path = FramePath(**{"time_s": times, "frame_s": FRAME_S, **change})  # type: ignore[arg-type]
-        bundle_adjust(truth, "constant-motion", BundleOptions(path=path))
+        bundle_adjust(truth, "constant-motion", BundleOptions(path=FramePath(**told)))  # type: ignore[arg-type]
 
 
 def test_frames_on_a_path_move_by_constant_motion() -> None:
