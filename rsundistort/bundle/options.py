@@ -236,6 +236,8 @@ class BundleOptions:
             raise InputError(f"bend_sigma_start={self.bend_sigma_start!r}, expected a positive number, or one a group")
         if self.bends not in range(len(BEND_GROUPS) + 1):
             raise InputError(f"bends={self.bends!r}, expected 0 to {len(BEND_GROUPS)} groups")
+        if self.path is not None and (self.known_phi or self.still or self.held_phi):
+            raise InputError("the path of a video says how its frames move; it takes no anchors, but known rates")
         if self.max_iterations < 1 or self.outlier_rounds < 0 or self.spread_rounds < 0:
             raise InputError("max_iterations must be at least 1, outlier_rounds and spread_rounds at least 0")
 

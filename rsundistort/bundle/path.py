@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
@@ -48,12 +48,15 @@ class FramePath:
         much.
     part : mapping of photo name to int, optional
         Parts that a cut separates; all in one when left out.
+    rates : mapping of photo name to (rate, sigma), optional
+        What a gyroscope says of the turn, (3,) radians per second in the camera frame, and its standard deviation.
     """
 
     time_s: Mapping[str, float]
     frame_s: float
     readout: tuple[float, float] | None = None
     part: Mapping[str, int] = field(default_factory=dict)
+    rates: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not 0 < self.frame_s < np.inf:
@@ -67,6 +70,16 @@ class FramePath:
         if self.readout is None:
             return _READOUT_SHARE, _READOUT_SIGMA
         return self.readout[0] / self.frame_s, self.readout[1] / self.frame_s
+
+    def known_rates(self, names: Sequence[str]) -> tuple[Array, Array]:
+        """Rates (m, 6) that are known, and their weights, from one frame to the next; weight 0 where none is."""
+        known, weight = np.zeros((2, len(names), 6))
+        for i, name in enumerate(names):
+            if name in self.rates:
+                rate, sigma = self.rates[name]
+                known[i, :3] = np.asarray(rate) * self.frame_s
+                weight[i, :3] = (np.asarray(sigma, np.float64) * self.frame_s) ** -2.0
+        return known, weight
 
     def order(self, names: Sequence[str]) -> tuple[Index, Array, Index]:
         """Photos in the order of their times, these (m,) in times between frames, and their parts (m,)."""
@@ -236,6 +249,8 @@ class PathSolution:
     ----------
     path : CameraPath
         Poses at the moments of the frames' principal rows, less the time that the row takes to come.
+    state : PathState
+        The same rates as the adjustment has them, and the pace of the readout.
     frames : (m,) int array
         The photo of each moment.
     readout_s, sigma_readout_s : (cameras,) array
@@ -244,6 +259,7 @@ class PathSolution:
     """
 
     path: CameraPath
+    state: PathState
     frames: Index
     readout_s: Array
     sigma_readout_s: Array
@@ -253,7 +269,7 @@ def path_solution(reconstruction: Reconstruction, path: FramePath, state: PathSt
     """The path through a reconstruction's poses, and the readout time by pace and standard deviation (cameras,)."""
     found, frames = camera_path(reconstruction, path, state)
     span_s = np.array([camera.frame_span for camera in reconstruction.cameras]) * path.frame_s
-    return PathSolution(found, frames, state.pace * span_s, pace_sigma * span_s)
+    return PathSolution(found, state, frames, state.pace * span_s, pace_sigma * span_s)
 
 
 def of_motions(covariances: Array, with_pace: Array, pace_sigma: Array, state: PathState, camera_idx: Index) -> Array:

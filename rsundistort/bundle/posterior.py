@@ -33,10 +33,13 @@ class Posterior:
         spreads = Spreads(
             result.phi_sigma, max(result.velocity_sigma * rec.baseline, 1e-300),
             max(result.focal_sigma, 1e-300), max(result.centre_sigma, 1e-300), result.bend_sigmas,
-            tuple(each * rec.baseline for each in result.way_sigmas), result.field_sigma_px,
+            tuple(each * rec.baseline for each in result.way_sigmas), result.field_sigma_px, result.path_sigmas,
         )  # fmt: skip
         plain = replace(options or BundleOptions(), loss="squared")
-        self._problem = BundleProblem(rec, rec.shutter_model, plain, result.sigma_px * result.noise_factor, spreads)
+        self._path = None if result.path is None else result.path.state
+        self._problem = BundleProblem(
+            rec, rec.shutter_model, plain, result.sigma_px * result.noise_factor, spreads, path=self._path
+        )
         self._state = self._problem.initial_state()
         self._equations = self._problem.linearize(self._state)
         self._factor = result.noise_factor
@@ -44,12 +47,26 @@ class Posterior:
         inflation = np.ones_like(result.inflation) if self._partitions is None else result.inflation
         self._inflation = inflation / self._factor
         self._covariance = self._equations.covariance(self._inflation)
+        self._camera_idx = rec.camera_idx
         self._own = self._problem.layout.size - self._problem.layout.motion
         self._shape = rec.num_images, len(self._inflation) - self._own
 
     def of_photos(self, vectors: Array) -> Array:
         """Covariance of the photos' unknowns times vectors (k, m, nb), as in `BundleResult.covariances`."""
-        return self._covariance(self._whole(vectors))[:, :, : vectors.shape[2]]
+        whole = self._whole(vectors)
+        if self._path is None:
+            return self._covariance(whole)[:, :, : vectors.shape[2]]
+        # phi and velocity are pace times rates
+        pace, rates = self._path.pace[self._camera_idx][:, None], self._path.rates
+        of_pace = np.zeros((len(vectors), self._equations.num_shared))
+        columns = (self._camera_idx + 1) * (self._equations.num_shared // self._equations.num_cameras) - 1
+        np.add.at(of_pace.T, columns, np.einsum("kma,ma->mk", vectors[:, :, 6:12], rates))
+        whole[:, :, 6:12] *= pace
+        if self._equations.inverse is None:
+            return np.full_like(vectors, np.nan)
+        moved, shared = self._equations.inverse.times(whole, of_pace)
+        moved[:, :, 6:12] = pace * moved[:, :, 6:12] + shared[:, columns, None] * rates
+        return moved[:, :, : vectors.shape[2]]
 
     def of_points(self, weights: Array) -> tuple[float, Array]:
         """Variance of a linear function of the points, `sum(weights * points_w)` with weights (n, 3).
@@ -86,6 +103,8 @@ class Posterior:
         frame, _, noise_px = self._problem.measurements
         J = self._equations.blocks[1]
         J = J[:, :, 6 : J.shape[2] - self._own] * noise_px[:, None, None]
+        if self._path is not None:  # the Jacobians are by rates
+            J = J / self._path.pace[self._camera_idx[frame], None, None]
         total = np.zeros((len(self._state.phi), J.shape[2], J.shape[2]))
         np.add.at(total, frame, np.einsum("oki,okj->oij", J, J))
         return total / np.maximum(np.bincount(frame, minlength=len(total)), 1)[:, None, None]

@@ -153,6 +153,8 @@ class BundleProblem:
 
     def _known_motions(self, span: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Motions (m, nb - 6) known from elsewhere, per unit of the clock, and their weights."""
+        if self._options.path is not None:
+            return self._options.path.known_rates(self._start.image_names)
         known, weight = np.zeros((2, *self._motion_weight.shape))
         for name, (phi, sigma) in self._options.known_phi.items():
             i = self._photo(name)
@@ -290,6 +292,8 @@ class BundleProblem:
 
     def _motion(self, state: State) -> NDArray[np.float64]:
         """(m, nb - 6) unknowns of the shutter."""
+        if state.path is not None:
+            return state.path.rates
         return np.hstack([state.phi, state.velocity])[:, : self._block - 6]
 
     def _own(self, state: State) -> NDArray[np.float64]:

@@ -39,7 +39,7 @@ class Remedy:
     name : str
         "none needed" (or none possible: the covariance cannot be computed), "anchor" (a photo taken to be still),
         "prior" (no photo stands out, or none was asked for), "given" (anchors, motions or lengths that the user knows),
-        or "none" (switched off).
+        "path" (frames of a video, whose path says how they move), or "none" (switched off).
     anchors : dict of photo name to float
         Photos taken to be still, as in `BundleOptions.still`, with the standard deviation, radians per frame.
     before, after : ShapeCost
@@ -72,6 +72,7 @@ class Remedy:
             "anchor": f"{names} most likely did not move and {holds} ({was} without it); {left}",
             "prior": f"no photo is taken to be still, the motions to be zero in the mean; {left}",
             "given": f"with what is known of {names or 'lengths in the scene'}, {left}",
+            "path": f"the path of the video tells how its frames moved; {left}",
             "none": left,
         }[self.name]
 
@@ -186,6 +187,8 @@ def heal(result: BundleResult, options: BundleOptions, remedy: str = "auto") -> 
     if remedy not in REMEDIES:
         raise InputError(f"remedy {remedy!r}, expected one of {', '.join(REMEDIES)}")
     before = shape_cost(result, options)
+    if options.path is not None:
+        return result, Remedy("path", {}, before, before)
     still = {name: 0.0 for name, held in options.held_phi.items() if held} | dict(options.still)
     given = still | {name: float(np.min(sigma)) for name, (_, sigma) in options.known_phi.items()}
     if given or options.lengths:
