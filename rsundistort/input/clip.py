@@ -35,6 +35,8 @@ class Clip:
         The file.
     folder : Path
         Where its key frames lie, as PNG files.
+    numbers : tuple of int, length n
+        Of the frames among those that could be decoded; what shows nothing is left out.
     names : tuple of str, length n
         Of all frames, also of those that were not written.
     time_s : (n,) array
@@ -53,6 +55,7 @@ class Clip:
 
     video: Path
     folder: Path
+    numbers: tuple[int, ...]
     names: tuple[str, ...]
     time_s: NDArray[np.float64]
     frame_s: float
@@ -75,14 +78,14 @@ def _grey(picture: Any) -> NDArray[np.uint8]:
     return np.ascontiguousarray(picture.to_ndarray(format="gray", width=width, height=height))
 
 
-def greys_of(video: Path, wanted: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Frames of a video, by their numbers (ascending), as they are followed; one in memory at a time."""
-    numbers = set(wanted)
-    with VideoReader(video) as reader:
+def greys_of(clip: Clip, wanted: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Frames of a clip, by their places in it (ascending), as they are followed; one in memory at a time."""
+    number_of = {clip.numbers[k]: k for k in wanted}
+    with VideoReader(clip.video) as reader:
         for number, _, picture in reader:
-            if number in numbers:
-                yield number, _grey(picture)
-                if number == wanted[-1]:
+            if number in number_of:
+                yield number_of[number], _grey(picture)
+                if number_of[number] == wanted[-1]:
                     return
 
 
@@ -137,7 +140,7 @@ def read_clip(video: Path, folder: Path, progress: Callable[[int, int], None] | 
     frames = _write(video, folder, {numbers[k]: sharpness[k] for k in keys.tolist()})
     part = np.cumsum([k in breaks for k in range(len(numbers))])
     names = tuple(frame_name(video, number) for number in numbers)
-    return Clip(video, folder, names, time, frame_s, part, keys, np.array(chooser.steps), frames)
+    return Clip(video, folder, tuple(numbers), names, time, frame_s, part, keys, np.array(chooser.steps), frames)
 
 
 def _write(video: Path, folder: Path, sharpness: Mapping[int, float]) -> VideoFrames:

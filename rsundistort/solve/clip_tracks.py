@@ -1,0 +1,138 @@
+"""All frames of a clip, placed by the points of its key frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..input.clip import Clip, greys_of
+from ..model import Observations, Reconstruction, RowMotion
+from ..model.projection import unproject_points
+from ..sfm.flow import flow_between
+from ..sfm.resection import resect
+
+__all__ = ["Followed", "follow_points", "with_all_frames"]
+
+# Points of a key frame that are followed: those of the most key frames first, spread over its cells.
+_POINTS = 120
+_CELLS = 6
+# Room for the shutter where a frame is placed without it, in pixels.
+_ROOM_PX = 12.0
+
+
+class Followed:
+    """Points of key frames in the frames around them: by key, which of its measurements, and where frames show them.
+
+    Attributes
+    ----------
+    chosen : mapping of frame number to (n,) int array
+        Of each key: indices of the measurements that are followed.
+    frame, key, place : (o,) int array
+        Of what was found: frame, key frame, and place among those of the key.
+    xy_raw : (o, 2) array
+        Pixels.
+    """
+
+    def __init__(self, chosen: Mapping[int, NDArray[np.int64]]) -> None:
+        self.chosen = chosen
+        self.frame = self.key = self.place = np.zeros(0, np.int64)
+        self.xy_raw = np.zeros((0, 2))
+
+    def add(self, key: int, frame: NDArray[np.int64], place: NDArray[np.int64], xy_raw: NDArray[np.float64]) -> None:
+        """What was found of a key's points."""
+        self.frame = np.concatenate([self.frame, frame])
+        self.key = np.concatenate([self.key, np.full(len(frame), key)])
+        self.place = np.concatenate([self.place, place])
+        self.xy_raw = np.concatenate([self.xy_raw, xy_raw])
+
+
+def _spread(xy: NDArray[np.float64], worth: NDArray[np.int64], size: tuple[int, int]) -> NDArray[np.int64]:
+    """Indices of the points (n, 2) that are followed: the best of each cell of the frame, then the next best."""
+    cell = np.clip(_CELLS * (xy + 0.5) / size, 0, _CELLS - 1).astype(int) @ [1, _CELLS]
+    order = np.lexsort((-worth, cell))
+    rank = np.empty(len(xy), np.int64)
+    start = np.searchsorted(cell[order], np.arange(_CELLS**2))
+    rank[order] = np.arange(len(xy)) - start[cell[order]]
+    return np.sort(np.lexsort((-worth, rank))[:_POINTS])
+
+
+def _between_keys(clip: Clip, keys: list[int]) -> Iterator[tuple[int, int, list[NDArray[np.uint8]]]]:
+    """Neighbouring key frames of one part, with the frames from one to the other."""
+    wanted = [k for a, b in zip(keys[:-1], keys[1:], strict=True) if clip.part[a] == clip.part[b] for k in range(a, b)]
+    wanted = sorted({*wanted, *keys})
+    held: dict[int, NDArray[np.uint8]] = {}
+    place = 0
+    for number, grey in greys_of(clip, wanted):
+        held[number] = grey
+        while place + 1 < len(keys) and keys[place + 1] <= number:
+            a, b = keys[place], keys[place + 1]
+            if clip.part[a] == clip.part[b]:
+                yield a, b, [held[k] for k in range(a, b + 1)]
+            held = {k: each for k, each in held.items() if k >= b}
+            place += 1
+
+
+def follow_points(clip: Clip, reconstruction: Reconstruction) -> Followed:
+    """Follow what the key frames of a reconstruction show of its points to the key frames before and after."""
+    rec = reconstruction
+    number = {name: k for k, name in enumerate(clip.names)}
+    image_of = {number[name]: i for i, name in enumerate(rec.image_names)}
+    keys = sorted(image_of)
+    obs, by_photo = rec.observations, rec.observations.by_photo(rec.num_images)
+    worth = np.bincount(obs.point_idx, minlength=rec.num_points)
+    chosen = {}
+    for key, image in image_of.items():
+        mine, camera = by_photo[image], rec.camera(image)
+        best = _spread(obs.xy_raw[mine], worth[obs.point_idx[mine]], (camera.width, camera.height))
+        chosen[key] = mine[best]
+    followed = Followed(chosen)
+    camera = rec.cameras[0]
+    for a, b, greys in _between_keys(clip, keys):
+        step = np.array([camera.width, camera.height]) / greys[0].shape[::-1]
+        starts = [(obs.xy_raw[chosen[key]] + 0.5) / step - 0.5 for key in (a, b)]
+        for key, tracks in zip((a, b), flow_between(greys, *starts), strict=True):
+            followed.add(key, tracks.frame + a, tracks.point, (tracks.xy + 0.5) * step - 0.5)
+    return followed
+
+
+def with_all_frames(clip: Clip, reconstruction: Reconstruction, followed: Followed) -> Reconstruction:
+    """A reconstruction of all frames that could be placed, by that of the key frames.
+
+    Each point that is followed is one of its own, at the place of that which its key frame shows: where flow starts
+    from counts as where the key frame shows it, so that what is off there is off in all frames alike, and moves the
+    point. Points of the key frames tie these together, as before.
+    """
+    rec, obs = reconstruction, reconstruction.observations
+    number = {name: k for k, name in enumerate(clip.names)}
+    image_of = {number[name]: i for i, name in enumerate(rec.image_names)}
+    keys = sorted(followed.chosen)
+    start = dict(zip(keys, np.cumsum([0, *(len(followed.chosen[k]) for k in keys)])[:-1].tolist(), strict=True))
+    own = np.concatenate([followed.chosen[k] for k in keys])
+    points_w = np.concatenate([rec.points_w, rec.points_w[obs.point_idx[own]]])
+    point = rec.num_points + np.array([start[k] for k in followed.key.tolist()], np.int64) + followed.place
+    at_key = np.concatenate([np.full(len(followed.chosen[k]), k) for k in keys])
+    frames = np.array([number[name] for name in rec.image_names])
+    poses = {k: (rec.R_cw[i], rec.center_w[i]) for k, i in image_of.items()}
+    camera = rec.cameras[0]
+    rays, valid = unproject_points(followed.xy_raw, camera, RowMotion(), "global")
+    within = _ROOM_PX / float(camera.K[0, 0])
+    for k in sorted({*followed.frame.tolist()} - {*keys}):
+        mine = np.flatnonzero((followed.frame == k) & valid)
+        if (found := resect(rays[mine], points_w[point[mine]], within)) is not None:
+            poses[k] = found
+    placed = np.array(sorted(poses))
+    index = np.full(len(clip.names), -1)
+    index[placed] = np.arange(len(placed))
+    frame = index[np.concatenate([frames[obs.frame_idx], at_key, followed.frame])]
+    of_point = np.concatenate([obs.point_idx, rec.num_points + np.arange(len(own)), point])
+    xy_raw = np.concatenate([obs.xy_raw, obs.xy_raw[own], followed.xy_raw])
+    sigma = np.concatenate([obs.sigma, np.ones(len(own) + len(followed.frame))])
+    seen = frame >= 0
+    whole = Reconstruction(
+        rec.cameras, [clip.names[k] for k in placed.tolist()], np.zeros(len(placed), np.int64),
+        np.array([poses[k][0] for k in placed.tolist()]), np.array([poses[k][1] for k in placed.tolist()]), points_w,
+        Observations(frame[seen], of_point[seen], xy_raw[seen], sigma[seen]),
+    )  # fmt: skip
+    return whole.with_points(np.ones(int(seen.sum()), bool))
