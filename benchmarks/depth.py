@@ -28,6 +28,7 @@ from rsundistort import (
     Plane,
     RowMotion,
     RunOptions,
+    SolveOptions,
     init_rectify_map,
     read_solution,
     rectify,
@@ -128,7 +129,7 @@ def estimated(scene: Path, work: Path) -> None:
 def forced(scene: Path, work: Path) -> None:
     """Constant-motion forced on a scene whose camera only turned."""
     folders = {depth: work / f"{scene.name}-forced-{depth}" for depth in ("auto", "infinity")}
-    options = RunOptions(shutter_model="constant-motion")
+    options = RunOptions(solve=SolveOptions(shutter_model="constant-motion"))
     solution = run(scene / "photos", folders["auto"], options)
     rectify_folder(scene / "photos", folders["auto"] / "solution.json", folders["infinity"], depth="infinity")
     figures = against_twins(scene, folders)

@@ -40,6 +40,7 @@ from measures import (
     log_k_error,
     normalised_errors,
     pooled,
+    run_options,
     with_lens_of,
     with_poses,
 )
@@ -159,7 +160,7 @@ class Bench:
         if key not in self.ran:
             out = self.work / f"out-{len(self.ran)}"
             with mock.patch("rsundistort.solve.run.solve_photos", solving):
-                solution = rs.run(photos, out, rs.RunOptions(report=False, overwrite=True, **options))
+                solution = rs.run(photos, out, run_options(**options), overwrite=True)
             self.ran[key] = Ran(out, solution, **kept)
         return self.ran[key]
 

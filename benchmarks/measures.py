@@ -15,9 +15,12 @@ from scipy.spatial.transform import Rotation
 from rsundistort import (
     BundleOptions,
     Reconstruction,
+    RectifyOptions,
     RowMotion,
+    RunOptions,
     Solution,
     SolvedImage,
+    SolveOptions,
     init_rectify_map,
     unproject_points,
 )
@@ -28,6 +31,7 @@ from rsundistort.critical.meter import readout_axes
 from rsundistort.evaluation import align_points, motion_errors, psnr
 from rsundistort.io import read_photo
 from rsundistort.io.cameras import camera_from_json
+from rsundistort.solve import OutputOptions
 from rsundistort.solve.model_sequence import Solved
 
 Array = np.ndarray
@@ -74,6 +78,15 @@ def pooled(errors: Sequence[Mapping[str, Array | None]], by_component: bool = Fa
         square = np.mean(np.vstack(values) ** 2, axis=0 if by_component else None)
         found[key] = np.sqrt(square).round(2).tolist()
     return found
+
+
+def run_options(**given: Any) -> RunOptions:
+    """Options of a run without a report, of the fields of all its parts."""
+    parts = {
+        part: kind(**{key: given.pop(key) for key in [*given] if key in kind.__dataclass_fields__})
+        for part, kind in (("solve", SolveOptions), ("rectify", RectifyOptions))
+    }
+    return RunOptions(**parts, outputs=OutputOptions(report=False), **given)
 
 
 def library_sigmas(solved: Solved, options: BundleOptions) -> dict[str, Any]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from .terminal import Talk, errors_for_people
 
@@ -175,7 +176,7 @@ def talk_options(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def gathered(name: str, *options: Decorator) -> Decorator:
-    """Options whose values the command gets as one mapping."""
+    """Options whose values the command gets as one mapping of those that were given: defaults are the library's."""
 
     def with_options(function: Callable[..., Any]) -> Callable[..., Any]:
         return functools.reduce(lambda inner, option: option(inner), reversed(options), function)
@@ -185,7 +186,9 @@ def gathered(name: str, *options: Decorator) -> Decorator:
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(function)
         def with_mapping(*args: Any, **named: Any) -> Any:
-            given = {key: named.pop(key) for key in keys}
+            source = click.get_current_context().get_parameter_source
+            values = {key: named.pop(key) for key in keys}
+            given = {key: value for key, value in values.items() if source(key) is not ParameterSource.DEFAULT}
             return function(*args, **named, **{name: given})
 
         return with_options(with_mapping)
@@ -218,7 +221,7 @@ def view_options(function: Callable[..., Any]) -> Callable[..., Any]:
     return function
 
 
-#: What is done to each photo; for `photo_fields`.
+#: What is done to each photo; for `rectify_options`.
 PHOTO_OPTIONS: tuple[Decorator, ...] = (
     depth_option,
     view_options,
@@ -233,10 +236,15 @@ PHOTO_OPTIONS: tuple[Decorator, ...] = (
 )
 
 
-def photo_fields(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of `RectifyOptions` of what was given, and the rest as it is."""
+def taken(given: dict[str, Any], kind: type) -> Any:
+    """Options of a kind, of its fields among what was given; these are taken out."""
+    return kind(**{key: given.pop(key) for key in [*given] if key in kind.__dataclass_fields__})  # type: ignore[attr-defined]
+
+
+def rectify_options(given: dict[str, Any]) -> Any:
+    """`RectifyOptions` of what was given; it is taken out."""
+    from rsundistort.batch import RectifyOptions
     from rsundistort.rectify import ViewOptions
 
-    fields = dict(given)
-    view = ViewOptions(*(fields.pop(key) for key in ("alpha", "scale", "max_size")))
-    return {**fields, "view": view}
+    given["view"] = taken(given, ViewOptions)
+    return taken(given, RectifyOptions)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -110,9 +109,9 @@ _report_option = click.option(
     "--report/--no-report", default=True, help="Write OUT/report.html; rsundistort report makes it later, too."
 )
 
-#: How the motions are found and what is done to each photo; the command gets them as `solving`, for `solve_fields`.
+#: How the motions are found, what is done to each photo and how; the command gets them as `given`, for `parts_of`.
 solve_options = opt.gathered(
-    "solving",
+    "given",
     _readout_groups_option,
     _masks_option,
     _model_option,
@@ -134,36 +133,35 @@ solve_options = opt.gathered(
 )
 
 
-def solve_fields(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of `SolveOptions` of what was given."""
+def parts_of(given: dict[str, Any]) -> tuple[Any, Any, Any]:
+    """`SolveOptions`, `RectifyOptions` and `OutputOptions` of what was given; the rest is left in it."""
     from rsundistort.io import read_known_lengths, read_known_motions
+    from rsundistort.solve import OutputOptions, SolveOptions
 
-    fields = opt.photo_fields(given)
-    readout_ms, known, lengths = fields.pop("readout_ms"), fields["known"], fields["lengths"]
-    readout_s = readout_ms and readout_ms / 1e3
-    return {
-        **fields,
-        "refine": _names_between_commas(fields["refine"]),
-        "camera_sigma": _sigmas(fields["camera_sigma"]),
-        "still": _anchors(fields["still"]),
-        "known": {} if known is None else read_known_motions(known, readout_s),
-        "lengths": () if lengths is None else read_known_lengths(lengths),
-        "readout_s": readout_s,
-    }
+    if "readout_ms" in given:
+        given["readout_s"] = given.pop("readout_ms") / 1e3
+    for key, read in (
+        ("refine", _names_between_commas),
+        ("camera_sigma", _sigmas),
+        ("still", _anchors),
+        ("known", lambda path: read_known_motions(path, given.get("readout_s"))),
+        ("lengths", read_known_lengths),
+    ):
+        if key in given:
+            given[key] = read(given[key])
+    return opt.taken(given, SolveOptions), opt.rectify_options(given), opt.taken(given, OutputOptions)
 
 
-def _names_between_commas(refine: str | None) -> tuple[str, ...] | None:
-    """Names between commas; () for none, None where nothing was said."""
-    if refine is None:
-        return None
+def _names_between_commas(refine: str) -> tuple[str, ...]:
+    """Names between commas; () for none."""
     names = tuple(name.strip() for name in refine.split(",") if name.strip())
     return () if names == ("none",) else names
 
 
-def _sigmas(text: str | None) -> dict[str, float]:
+def _sigmas(text: str) -> dict[str, float]:
     """Standard deviations by name, of NAME=SIGMA with commas between."""
     found: dict[str, float] = {}
-    for each in (text or "").split(",") if text else []:
+    for each in text.split(",") if text else []:
         name, _, number = each.partition("=")
         try:
             found[name.strip()] = float(number)

@@ -18,9 +18,9 @@ from rsundistort import (
     Camera,
     DepthMap,
     Plane,
+    RectifyOptions,
     RowMotion,
     RsUndistortWarning,
-    RunOptions,
     Solution,
     SolvedImage,
     distort_points,
@@ -550,7 +550,7 @@ def test_rectify_says_that_the_points_are_missing(tmp_path, rng):
     with pytest.raises(FileError, match="'somewhere' is no folder, nor one of auto, infinity, plane, points"):
         rectify_folder(tmp_path / "photos", tmp_path / "solution.json", tmp_path / "two", depth="somewhere")
     with pytest.raises(FileError, match="is no folder"):
-        RunOptions(depth="somewhere")
+        RectifyOptions(depth="somewhere")
 
 
 def test_auto_leaves_photos_alone_that_hardly_travelled(rng):

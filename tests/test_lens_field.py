@@ -12,7 +12,16 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 from test_bundle import make_scene, perturbed
 
-from rsundistort import BundleOptions, Camera, RowMotion, Solution, SolveOptions, bundle_adjust, init_rectify_map
+from rsundistort import (
+    BundleOptions,
+    Camera,
+    RectifyOptions,
+    RowMotion,
+    Solution,
+    SolveOptions,
+    bundle_adjust,
+    init_rectify_map,
+)
 from rsundistort.batch.progress import StageLog
 from rsundistort.bundle import choose_model
 from rsundistort.bundle.intrinsics import GuessedCameras, moved_camera
@@ -342,7 +351,7 @@ def test_what_was_found_is_told_and_read_back(rng, tmp_path):
     rec = scene_with_field(rng, waves, "global")
     cameras = PhotoCameras(rec.cameras, ("camera",), rec.camera_idx, True, (True,), "camera.json")
     solved = solve_tracks(rec, {}, "auto", 0, lambda _: replace(options_of(rec), residual_field=False), StageLog(None))
-    solution = solution_of(Outcome(solved, cameras, (1,)), SolveOptions())
+    solution = solution_of(Outcome(solved, cameras, (1,)), SolveOptions(), RectifyOptions())
     field = solution.cameras["1"].field
     assert field.shape == (4, 5, 2)
     told = solution.quality["lens_fields"]["1"]

@@ -16,7 +16,7 @@ from ..io.record import Record
 from ..io.solution import solution_to_bytes
 from ..model import Solution
 from ..model.orientation import in_stored_frame, split_mirror, turn_solution
-from .geometry import DEPTHS, PhotoDepths, ScenePoints, check_depth, with_depths
+from .geometry import DEPTHS, PhotoDepths, ScenePoints, with_depths
 from .many_photos import rectify_photos
 from .progress import ProgressCallback, StageLog
 from .rectify_options import RectifyOptions
@@ -76,7 +76,6 @@ def rectify_folder(
         Photos of the folder that were not rectified; a warning says so, too.
     """
     options = replace(options or RectifyOptions(), **named)
-    check_depth(options.depth)
     solution = local_place(solution)
     also = [local_place(each) for each, _ in options.also]
     depth = [] if str(options.depth) in DEPTHS else [local_place(options.depth)]

@@ -103,7 +103,8 @@ class PhotoJob:
         # where things lie, and which photos are let in, does not change what comes of them; nor does a pose, but for
         # how the photo is turned
         options = replace(
-            self.options, masks=None, again=False, max_megapixels=MAX_MEGAPIXELS, depth="", view=ViewOptions(), also=()
+            self.options, masks=None, again=False, max_megapixels=MAX_MEGAPIXELS, depth="auto", view=ViewOptions(),
+            also=(),
         )  # fmt: skip
         posed = self.posed and options.apply_orientation
         try:

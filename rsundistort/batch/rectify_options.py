@@ -9,6 +9,7 @@ from pathlib import Path
 from ..errors import InputError
 from ..io import MAX_MEGAPIXELS, RAW_AS
 from ..rectify import INTERPOLATIONS, MAP_KINDS, ViewOptions
+from .geometry import check_depth
 
 __all__ = ["RectifyOptions"]
 
@@ -61,6 +62,7 @@ class RectifyOptions:
     also: Sequence[tuple[Path, str]] = ()
 
     def __post_init__(self) -> None:
+        check_depth(self.depth)
         for interpolation in (self.interpolation, *(each for _, each in self.also)):
             if interpolation not in INTERPOLATIONS:
                 raise InputError(f"interpolation={interpolation!r}, expected one of {', '.join(INTERPOLATIONS)}")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..batch.rectify_options import RectifyOptions
 from ..bundle import BundleResult, ModelChoice
 from ..input.photo_cameras import PhotoCameras
 from ..model import BEND_GROUPS, Reconstruction, Solution, SolvedImage
@@ -129,7 +130,7 @@ def _fields(solved: Solved) -> list[dict[str, float]]:
     ]
 
 
-def solution_of(outcome: Outcome, options: SolveOptions) -> Solution:
+def solution_of(outcome: Outcome, options: SolveOptions, rectify: RectifyOptions) -> Solution:
     """The solution of an adjusted reconstruction, with every photo in it; its views are those of the raw photos."""
     solved, rec, verdict = outcome.solved, outcome.reconstruction, outcome.solved.verdict
     doubtful, lens_only = ({}, ()) if verdict is None else (verdict.doubtful, verdict.lens_only)
@@ -196,15 +197,15 @@ def solution_of(outcome: Outcome, options: SolveOptions) -> Solution:
             "readout": _readouts(shared, outcome.cameras),
             "guesses": _guesses(solved, outcome.cameras),
             "seed": options.seed,
-            "interpolation": options.interpolation,
-            "quality": options.quality,
-            "raw_as": options.raw_as,
+            "interpolation": rectify.interpolation,
+            "quality": rectify.quality,
+            "raw_as": rectify.raw_as,
             "refine": list(solved.result.sigma_intrinsics[0]),
             "still": dict(options.still),
             "known": sorted(options.known),
             "lengths": len(options.lengths),
             "remedy": options.remedy,
-            "depth": str(options.depth),
+            "depth": str(rectify.depth),
             **outcome.options,
         },
         generator=versions(),
