@@ -16,7 +16,7 @@ from ..io.record import Record
 from ..io.solution import solution_to_bytes
 from ..model import Solution
 from ..model.orientation import in_stored_frame, split_mirror, turn_solution
-from .geometry import DEPTHS, PhotoDepths, ScenePoints, with_depths
+from .geometry import DEPTHS, SceneGeometry, ScenePoints, with_depths
 from .many_photos import rectify_photos
 from .progress import ProgressCallback, StageLog
 from .rectify_options import RectifyOptions
@@ -94,9 +94,7 @@ def rectify_folder(
     for name in left_out:
         warnings.warn(f"skipped: {name} has no motion in {solution}", SkippedPhotoWarning, stacklevel=2)
     solved = with_view(solved, options.view)
-    depths = PhotoDepths(solved, options.depth, _points_beside(solution, solved, options.depth))
-    # a photo without a pose may be mirrored
-    unposed = replace(solved, images=[replace(image, R_cw=None, center_w=None) for image in solved.images])
+    scene = SceneGeometry(solved, options.depth, _points_beside(solution, solved, options.depth))
     workers = Workers(use_threads(jobs), scheduler)
     inputs = [folder, *masks, *also, *depth]
     with batch_folder(target, overwrite=overwrite, resume=resume, apart_from=inputs) as journal:
@@ -104,8 +102,8 @@ def rectify_folder(
         # a solution of ours is brought up to date in its place
         record.check(["solution.json"], [] if _is_of(solution, target) else [solution], again=resume)
         done = rectify_photos(
-            folder, unposed, names, target, options, depths, workers, StageLog(progress), journal,
-            resume=resume, go_on="whole; the same command with --resume goes on",
+            folder, scene, names, target, options, workers, StageLog(progress), journal,
+            posed=False, resume=resume, go_on="whole; the same command with --resume goes on",
         )  # fmt: skip
         turns = {name: each.turn for name, each in done.items() if not each.problem}
         left_out |= {name: each.problem for name, each in done.items() if each.problem}

@@ -20,7 +20,7 @@ from ..io.places import Place, RemoteFolder, absolute, files_of, place_of, sizes
 from ..io.record import Record
 from ..model import Reconstruction, Solution
 from .extras import find_extras
-from .geometry import DEPTHS, PhotoDepths
+from .geometry import DEPTHS, SceneGeometry
 from .one_photo import PhotoDone, PhotoJob, rectify_photo
 from .progress import StageLog
 from .rectify_options import RectifyOptions
@@ -43,15 +43,15 @@ def mask_names(names: Sequence[str]) -> dict[str, str]:
 
 def rectify_photos(
     folder: Place,
-    solution: Solution,
+    scene: SceneGeometry,
     names: Sequence[str],
     out: Place,
     options: RectifyOptions,
-    depths: PhotoDepths,
     workers: Workers,
     log: StageLog,
     journal: Journal,
     *,
+    posed: bool = True,
     resume: bool = False,
     colors: PointColors | None = None,
     go_on: str = "",
@@ -64,14 +64,16 @@ def rectify_photos(
 
     Parameters
     ----------
-    folder, solution, names
-        Of the raw photos, their motions, and which of them.
+    folder, scene, names
+        Of the raw photos, their geometry, and which of them.
     out : Path or RemoteFolder
         `batch_folder` made it ready, and gave `journal`.
-    options, depths, workers, log
-        What is done to each, how far away what it shows is, where, and who is told.
+    options, workers, log
+        What is done to each, where, and who is told.
     journal : Journal
         Takes what is done.
+    posed : bool
+        Whether they keep poses, which no mirror image has.
     resume : bool
         Pass over what is whole and current by the journal.
     colors : PointColors, optional
@@ -86,7 +88,7 @@ def rectify_photos(
     """
     before = journal.read()
     done: dict[str, PhotoDone] = {}
-    jobs = _Jobs(folder, solution, names, out, options, depths, colors)
+    jobs = _Jobs(folder, scene, names, out, options, colors, posed)
     if resume:
         sizes = sizes_under(out, BATCH_FOLDERS)
         for name in names:
@@ -120,7 +122,7 @@ def rectify_photos(
             journal.add(JournalEntry(name, "", before[name].files))
     journal.settle()
     log.begin("rectifying", len(names), len(done))
-    fitting = workers.fitting("rectifying", _most_bytes(solution, todo, options))
+    fitting = workers.fitting("rectifying", _most_bytes(scene.solution, todo, options))
     results = fitting.map(rectify_photo, begun(), lambda job, why: PhotoDone(job.name, why))
     try:
         with record.writing(), closing(results):
@@ -154,24 +156,22 @@ class _Jobs:
     def __init__(
         self,
         folder: Place,
-        solution: Solution,
+        scene: SceneGeometry,
         names: Sequence[str],
         out: Place,
         options: RectifyOptions,
-        depths: PhotoDepths,
         colors: PointColors | None,
+        posed: bool,
     ) -> None:
         # absolute: workers elsewhere have another working directory
         self._folder, self._out = absolute(folder), absolute(out)
         self._files = files_of(self._folder, names)
-        self._solution, self._options, self._depths, self._colors = solution, options, depths, colors
+        self._scene, self._options, self._colors, self._posed = scene, options, colors, posed
         self.extras = find_extras(options.maps, options.also, names)
-        self._mask_name = mask_names([image.name for image in solution.images])
+        self._mask_name = mask_names([image.name for image in scene.solution.images])
         self._own = {} if options.masks is None else find_masks(absolute(place_of(options.masks)), names)
 
     def __getitem__(self, name: str) -> PhotoJob:
-        solution = self._solution
-        image = solution.image(name)
         stem = PurePosixPath(self._mask_name[name]).with_suffix("").as_posix()
         return PhotoJob(
             name=name,
@@ -179,9 +179,8 @@ class _Jobs:
             out=self._out,
             image=f"images/{output_name(name, self._options.raw_as)}",
             mask=f"masks/{self._mask_name[name]}",
-            depth=self._depths.job(name),
-            shutter_model=solution.shutter_model,
-            posed=image.posed,
+            geometry=self._scene.of(name),
+            posed=self._posed,
             options=self._options,
             own_mask=self._own.get(name),
             also=self.extras.of(name),

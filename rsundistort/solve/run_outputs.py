@@ -13,7 +13,7 @@ from pathlib import Path, PurePath
 import numpy as np
 from numpy.typing import NDArray
 
-from ..batch.geometry import DEPTHS, PhotoDepths, ScenePoints, with_depths
+from ..batch.geometry import DEPTHS, SceneGeometry, ScenePoints, with_depths
 from ..batch.many_photos import PointColors, mask_names, rectify_photos
 from ..batch.one_photo import turn_of
 from ..batch.progress import StageLog
@@ -190,11 +190,11 @@ class Outputs:
         """Rectify the photos of a folder into `out`, which `begin` has filled, and write the rest again."""
         solution, rec, options = self.solution, self.reconstruction, self.rectifying
         colors = None if self.rgb is not None and self.rgb.known.all() else PointColors(rec)
-        depths = PhotoDepths(solution, options.depth, ScenePoints.of_reconstruction(rec))
+        scene = SceneGeometry(solution, options.depth, ScenePoints.of_reconstruction(rec))
         go_on = f"whole; go on with: rsundistort rectify {photos} --solution {out / 'solution.json'} -o {out} --resume"
         with batch_folder(out, overwrite=True) as journal:
             done = rectify_photos(
-                photos, solution, list(rec.image_names), out, options, depths, workers, log, journal,
+                photos, scene, list(rec.image_names), out, options, workers, log, journal,
                 colors=colors, go_on=go_on,
             )  # fmt: skip
         log.begin("writing")
