@@ -115,7 +115,7 @@ def spread_of_halves(photos: Path, draws: int = 16) -> np.ndarray:
     with tempfile.TemporaryDirectory() as folder:
         loaded = load_photos(photos, None, None, RunOptions().max_features, Workers(2), log)
         solved = solve_photos(loaded, "rotation", 0, lambda _: BundleOptions(), Path(folder), log)
-    rec, rng = solved.result.reconstruction, np.random.default_rng(0)
+    rec, rng = solved.shared, np.random.default_rng(0)
     options = BundleOptions(phi_sigma_start=solved.result.phi_sigma)
     means = []
     for _ in range(draws):

@@ -24,15 +24,15 @@ from rsundistort import (
     init_rectify_map,
     unproject_points,
 )
-from rsundistort.bundle import Posterior, gauge_directions
+from rsundistort.bundle import BundleResult, Posterior, gauge_directions
 from rsundistort.bundle.triangulate import _world_rays
+from rsundistort.critical import Remedy
 from rsundistort.critical.common import row_phi
 from rsundistort.critical.meter import readout_axes
 from rsundistort.evaluation import align_points, motion_errors, psnr
 from rsundistort.io import read_photo
 from rsundistort.io.cameras import camera_from_json
 from rsundistort.solve import OutputOptions
-from rsundistort.solve.model_sequence import Solved
 
 Array = np.ndarray
 
@@ -89,12 +89,11 @@ def run_options(**given: Any) -> RunOptions:
     return RunOptions(**parts, outputs=OutputOptions(report=False), **given)
 
 
-def library_sigmas(solved: Solved, options: BundleOptions) -> dict[str, Any]:
+def library_sigmas(result: BundleResult, remedy: Remedy | None, options: BundleOptions) -> dict[str, Any]:
     """Deviations that are not in solution.json, as `normalised_errors` takes them, photos in the order of their names.
 
-    `options` are those of the adjustments; of an anchor that was added to them `solved` knows.
+    `options` are those of the adjustments; of an anchor that was added to them `remedy` knows.
     """
-    result, remedy = solved.result, solved.remedy
     rec = result.reconstruction
     if rec.shutter_model == "global":
         return {}

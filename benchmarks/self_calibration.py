@@ -75,7 +75,7 @@ def solve(photos: Path) -> tuple[BundleResult, BundleOptions]:
             return options.solve.options_for(loaded.cameras)
 
         solved = solve_photos(loaded, "rotation", 0, of, Path(folder), log)
-    return solved.result, of(solved.result.reconstruction)
+    return solved.result, of(solved.shared)
 
 
 def alternatives(result: BundleResult, options: BundleOptions, focal: dict[str, float]) -> dict[str, float]:

@@ -13,10 +13,16 @@ from rsundistort.input.photo_cameras import PhotoCameras
 from rsundistort.io import output_folder
 from rsundistort.solve import OutputOptions
 from rsundistort.solve.model_sequence import solve_tracks
-from rsundistort.solve.outcome import Outcome
 from rsundistort.solve.run_outputs import Outputs
 
 SCENES = Path(__file__).parent.parent / "sample_scenes"
+
+
+def cameras_of(rec: Reconstruction) -> PhotoCameras:
+    """The cameras of a reconstruction, as if a file had told them."""
+    count = len(rec.cameras)
+    labels = tuple(f"camera {k}" for k in range(count))
+    return PhotoCameras(tuple(rec.cameras), labels, rec.camera_idx, True, (True,) * count, "camera.json")
 
 
 def solve_scene(
@@ -34,12 +40,9 @@ def solve_scene(
         tracks["center_w"], tracks["points_w"],
         Observations(tracks["frame_idx"][seen], tracks["point_idx"][seen], xy[seen]),
     )  # fmt: skip
-    cameras = PhotoCameras((camera,), ("camera",), rec.camera_idx, True, (True,), "camera.json")
-    log = StageLog(None)
-    solved = solve_tracks(rec, {}, asked.shutter_model, 0, lambda _: asked.options_for(cameras), log, asked.remedy)
-    outputs = Outputs.of_outcome(
-        Outcome(solved, cameras, (1,)), asked, RectifyOptions(maps=maps), OutputOptions(report=report), {}
-    )
+    cameras, log = cameras_of(rec), StageLog(None)
+    solved = solve_tracks(rec, cameras, asked.shutter_model, 0, lambda _: asked.options_for(cameras), log, asked.remedy)
+    outputs = Outputs.of_solved(solved, asked, RectifyOptions(maps=maps), OutputOptions(report=report), {})
     with output_folder(out) as scratch:
         outputs.begin(scratch, log)
     return outputs.rectify(SCENES / name / ("global" if unwarped else "photos"), out, Workers(2), log)

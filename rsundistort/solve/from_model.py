@@ -30,7 +30,7 @@ from ..model import Reconstruction, Solution
 from ..model.orientation import INVERSE, turn_reconstruction
 from ..sfm import matched_of_database
 from .model_sequence import Feedback, solve_tracks
-from .outcome import Outcome
+from .outcome import Solved
 from .run_options import OutputOptions, SolveOptions
 from .run_outputs import REPLACED, Outputs, PointRgb, files_of_run, inputs_of, photo_times
 
@@ -174,17 +174,17 @@ def _solve_files(
             given = replace(given, unregistered=_others_in(folder, given, rectify.raw_as))
         log.end("model", photos=given.reconstruction.num_images, points=given.reconstruction.num_points)
         facts = {name: fact for name, (_, fact) in photos.items()}
-        outcome, ids, rgb = _solve(given, str(model), facts, options, None if database is None else Path(database), log)
+        solved, ids, rgb = _solve(given, str(model), facts, options, None if database is None else Path(database), log)
         facts_of_model = {
             "frame": said,
             "points": given.reconstruction.num_points,
             "observations": len(given.reconstruction.observations),
         }
-        outcome = replace(outcome, options={"model": facts_of_model})
+        solved = replace(solved, told={"model": facts_of_model})
         orientations = {name: fact.orientation or 1 for name, fact in facts.items()}
         times = {} if folder is None else photo_times(folder)
-        written = Outputs.of_outcome(
-            outcome, options, rectify, outputs, orientations, ids, rgb, folder is not None, times
+        written = Outputs.of_solved(
+            solved, options, rectify, outputs, orientations, ids, rgb, folder is not None, times
         )
         solution = written.begin(scratch, log)
     if folder is not None:
@@ -204,8 +204,8 @@ def _solve_in_memory(
     log = StageLog(progress)
     given = colmap_model_of(reconstruction)
     with kept_log_level():
-        outcome, ids, rgb = _solve(given, "the model", {}, options, None if database is None else Path(database), log)
-    outputs = Outputs.of_outcome(outcome, options, rectify, OutputOptions(), {}, ids, rgb)
+        solved, ids, rgb = _solve(given, "the model", {}, options, None if database is None else Path(database), log)
+    outputs = Outputs.of_solved(solved, options, rectify, OutputOptions(), {}, ids, rgb)
     rec, solution = outputs.reconstruction, outputs.solution
     names = [output_name(name, rectify.raw_as) for name in rec.image_names]
     cameras = [solution.rectified_cameras[str(key)] for key in ids.cameras]
@@ -308,7 +308,7 @@ def _solve(
     options: SolveOptions,
     database: Path | None,
     log: StageLog,
-) -> tuple[Outcome, ModelIds, PointRgb]:
+) -> tuple[Solved, ModelIds, PointRgb]:
     if given.reconstruction.num_images < 3:
         raise ReconstructionError(
             f"the model holds {given.reconstruction.num_images} registered photos, the shutter needs three"
@@ -318,9 +318,6 @@ def _solve(
     for name in (*options.still, *options.known):
         if name not in rec.image_names:
             raise InputError(f"anchor {name!r} is not among the photos of the model")
-    guessed = {k: label for k, label in enumerate(cameras.labels) if not cameras.readout_told[k]}
-    used = set(rec.camera_idx.tolist())
-    guessed = {k: label for k, label in guessed.items() if k in used}
 
     def options_of(each: Reconstruction) -> BundleOptions:
         return replace(options.options_for(cameras), outlier_sigma=_OUTLIER_SIGMA)
@@ -333,7 +330,7 @@ def _solve(
             log.end("database", keypoints=sum(len(found.xy_raw) for found in matched.features))
         solved = solve_tracks(
             rec,
-            guessed,
+            cameras,
             options.shutter_model,
             options.seed,
             options_of,
@@ -341,7 +338,7 @@ def _solve(
             options.remedy,
             None if matched is None else Feedback(matched),
         )
-    after = solved.result.reconstruction
+    after = solved.shared
     for text in cameras.contradicted(after.cameras, options_of(after)):
         warnings.warn(text, RsUndistortWarning, stacklevel=4)
     lost = dict.fromkeys(given.unregistered, "it is not registered in the model")
@@ -351,4 +348,4 @@ def _solve(
     ids = given.ids_of(old, after.image_names)
     known = (old >= 0) & given.has_colors
     rgb = PointRgb(np.where(known[:, None], given.colors[old], 0).astype(np.uint8), known)
-    return Outcome(solved, cameras, ids.cameras, lost, readouts), ids, rgb
+    return replace(solved, shared_ids=ids.cameras, unregistered=lost, readouts=readouts), ids, rgb

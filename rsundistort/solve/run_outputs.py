@@ -42,8 +42,7 @@ from ..model import Reconstruction, RowMotion, Solution
 from ..model.orientation import turn_reconstruction, turn_solution
 from ..rectify import bend_px
 from ..report import Diagnostics, relative_folder, write_diagnostics, write_report
-from .model_sequence import Solved
-from .outcome import Outcome, solution_of
+from .outcome import Solved, solution_of
 from .run_options import OutputOptions, SolveOptions
 
 __all__ = ["REPLACED", "Outputs", "files_of_run", "inputs_of", "photo_times"]
@@ -140,9 +139,9 @@ class Outputs:
     solved: Solved | None = None
 
     @classmethod
-    def of_outcome(
+    def of_solved(
         cls,
-        outcome: Outcome,
+        solved: Solved,
         solving: SolveOptions,
         rectifying: RectifyOptions,
         options: OutputOptions,
@@ -152,17 +151,17 @@ class Outputs:
         with_photos: bool = True,
         times: Mapping[str, float] | None = None,
     ) -> Outputs:
-        """Outputs of an outcome, whose photos have these EXIF orientations."""
-        rec = outcome.reconstruction
-        solution = with_view(solution_of(outcome, solving, rectifying), rectifying.view)
+        """Outputs of what was solved, whose photos have these EXIF orientations."""
+        rec = solved.reconstruction
+        solution = with_view(solution_of(solved, solving, rectifying), rectifying.view)
         turns: dict[str, int] = {}
         if rectifying.apply_orientation:
             turns = {name: turn_of(orientations.get(name, 1), True)[0] for name in rec.image_names}
-        ids = replace(ids or ModelIds.in_order(rec), cameras=outcome.camera_ids)
+        ids = replace(ids or ModelIds.in_order(rec), cameras=solved.camera_ids)
         rec = rec.with_motions([solution.image(name).taken_out or RowMotion() for name in rec.image_names])
         if options.rs_poses and rec.bends:
             solution = replace(solution, quality={**solution.quality, "rs_poses_px": _left_by_two_poses(rec)})
-        return cls(solution, rec, rectifying, options, ids, turns, rgb, with_photos, times or {}, outcome.solved)
+        return cls(solution, rec, rectifying, options, ids, turns, rgb, with_photos, times or {}, solved)
 
     def begin(self, folder: Path, log: StageLog) -> Solution:
         """Write all but the photos and the colours that they tell, so that what comes after can be gone on with."""
@@ -225,7 +224,7 @@ class Outputs:
     def _diagnostics(self) -> Diagnostics | None:
         if self.solved is None:
             return None
-        shared = self.solved.result.reconstruction
+        shared = self.solved.shared
         # photos that vary have cameras of their own: what they share goes by that of the first
         first = [int(np.argmax(shared.camera_idx == k)) for k in range(len(shared.cameras))]
         ids = [self.ids.cameras[k] for k in (first if shared.varies else range(len(shared.cameras)))]
