@@ -688,7 +688,7 @@ def test_experiment_two_keeps_outputs_unless_told(folders, made_up, tmp_path):
 
 
 def test_experiment_two_leaves_nothing_where_too_few_are_joined(folders, made_up, monkeypatch, poses, tmp_path):
-    monkeypatch.setattr(two, "run", lambda *_: solution_of(*poses, lost=NAMES[:4]))
+    monkeypatch.setattr(two, "run", lambda *_, **__: solution_of(*poses, lost=NAMES[:4]))
     with pytest.raises(InputError, match="2 photos were joined in all three"):
         experiment_two(*folders, tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -750,7 +750,7 @@ def test_command_two(folders, made_up, tmp_path):
     assert "still 6, swung 6, swung-global 5 of 6; 5 compared" in result.stdout
     assert "swung-global: 5.png not joined" in result.stdout
     assert all(len(line) <= 100 for line in result.stdout.splitlines()[:5])
-    assert made_up[1][2].shutter_model == "two-step"
+    assert made_up[1][2].solve.shutter_model == "two-step"
     again = CliRunner().invoke(cli, args)
     assert again.exit_code == 1
     assert "not empty" in again.stderr

@@ -82,10 +82,6 @@ class Feedback:
         return align_tracks(reconstruction, [found[name].step_px for name in names], source)
 
 
-def _tell_model(log: StageLog, model: str, _cost: float) -> None:
-    log.tell(f"readout: {model}", 0)
-
-
 def _tell(log: StageLog, stage: str, _cost: float) -> None:
     log.tell(stage, 0)
 
@@ -150,7 +146,7 @@ def _read_out(
     if not guessed:
         return None
     log.begin("readout")
-    choice = choose_readouts(mapped, list(guessed), options, progress=partial(_tell_model, log))
+    choice = choose_readouts(mapped, list(guessed), options, progress=lambda model, _: log.tell(f"readout: {model}", 0))
     log.end(
         "readout",
         directions={label: choice.reconstruction.cameras[k].readout for k, label in guessed.items()},

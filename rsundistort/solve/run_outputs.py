@@ -13,7 +13,7 @@ from pathlib import Path, PurePath
 import numpy as np
 from numpy.typing import NDArray
 
-from ..batch.geometry import DEPTHS, SceneGeometry, ScenePoints, with_depths
+from ..batch.geometry import SceneGeometry, ScenePoints, with_depths
 from ..batch.many_photos import PointColors, mask_names, rectify_photos
 from ..batch.one_photo import turn_of
 from ..batch.progress import StageLog
@@ -69,10 +69,7 @@ def files_of_run(names: Sequence[str], raw_as: str, options: OutputOptions) -> l
 
 def inputs_of(options: RectifyOptions, *given: Path | str | None) -> list[Path]:
     """Files and folders that are read: those given, and those that the options name."""
-    found = [*given, options.masks, *(folder for folder, _ in options.also)]
-    if str(options.depth) not in DEPTHS:
-        found.append(options.depth)
-    return [local_place(path) for path in found if path is not None]
+    return [local_place(path) for path in (*given, *options.inputs) if path is not None]
 
 
 def photo_times(folder: Path) -> dict[str, float]:
