@@ -196,35 +196,26 @@ def gathered(name: str, *options: Decorator) -> Decorator:
     return decorate
 
 
-def view_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """What rectified photos show, and how large they are."""
-    for option in (
-        click.option(
-            "--max-size", type=click.IntRange(min=2), metavar="PIXELS", help="Longest side of the rectified photos."
-        ),
-        click.option(
-            "--scale",
-            type=click.FloatRange(min=0, min_open=True),
-            default=1.0,
-            show_default=True,
-            help="Size of the rectified photos in that of the raw ones; what shrinks is averaged.",
-        ),
-        click.option(
-            "--alpha",
-            metavar="keep|0..1",
-            callback=view_alpha,
-            help="keep: K and size of the raw photos; 0: no empty pixel in any photo of a camera; 1: every pixel of "
-            "all of them is kept; between: between. Default: keep, or as the solution has it.",
-        ),
-    ):
-        function = option(function)
-    return function
-
-
 #: What is done to each photo; for `rectify_options`.
 PHOTO_OPTIONS: tuple[Decorator, ...] = (
     depth_option,
-    view_options,
+    click.option(
+        "--alpha",
+        metavar="keep|0..1",
+        callback=view_alpha,
+        help="keep: K and size of the raw photos; 0: no empty pixel in any photo of a camera; 1: every pixel of "
+        "all of them is kept; between: between. Default: keep, or as the solution has it.",
+    ),
+    click.option(
+        "--scale",
+        type=click.FloatRange(min=0, min_open=True),
+        default=1.0,
+        show_default=True,
+        help="Size of the rectified photos in that of the raw ones; what shrinks is averaged.",
+    ),
+    click.option(
+        "--max-size", type=click.IntRange(min=2), metavar="PIXELS", help="Longest side of the rectified photos."
+    ),
     interpolation_option,
     quality_option,
     raw_as_option,

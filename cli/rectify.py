@@ -41,13 +41,7 @@ from .terminal import Talk, errors_for_people, list_failed, progress_bars
     ),
 )
 @opt.talk_options
-def command(
-    photos: Path | str,
-    solution: Path,
-    out: Path | str,
-    given: dict[str, Any],
-    talk: Talk,
-) -> None:
+def command(photos: Path | str, solution: Path, out: Path | str, given: dict[str, Any], talk: Talk) -> None:
     """Rectify the photos of a folder with the motions of a solution.
 
     PHOTOS, OUT and the masks are folders, by path or by a URL that fsspec knows (s3://bucket/folder, gs://...).

@@ -78,13 +78,7 @@ _measure_options = opt.gathered(
 @_measure_options
 @solve_options
 @opt.talk_options
-def command(
-    photos: Path,
-    out: Path,
-    measuring: dict[str, Any],
-    given: dict[str, Any],
-    talk: Talk,
-) -> None:
+def command(photos: Path, out: Path, measuring: dict[str, Any], given: dict[str, Any], talk: Talk) -> None:
     """Find how the camera moved during each photo's readout, and take it out.
 
     PHOTOS is a folder of photos that one camera took of one scene, in any order, or a video. OUT gets images/, masks/,

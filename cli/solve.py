@@ -31,12 +31,7 @@ from .terminal import Talk, errors_for_people, progress_bars
 @solve_options
 @opt.talk_options
 def command(
-    model: Path,
-    out: Path,
-    images: Path | None,
-    database: Path | None,
-    given: dict[str, Any],
-    talk: Talk,
+    model: Path, out: Path, images: Path | None, database: Path | None, given: dict[str, Any], talk: Talk
 ) -> None:
     """Find how the camera moved during each photo's readout, from a model of COLMAP, OpenMVG or OpenSfM.
 

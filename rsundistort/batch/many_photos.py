@@ -91,9 +91,8 @@ def rectify_photos(
     earlier = record.ours(BATCH_FOLDERS)
     if resume:
         earlier &= {path for entry in before.values() for path in entry.files}
-    inputs = [each for name in names for each in jobs[name].inputs]
     # what was cut short, or changed, since it was made is made again by `resume`
-    record.check(earlier.union(*todo.values()), inputs, again=resume)
+    record.check(earlier.union(*todo.values()), [file for name in names for file in jobs[name].inputs], again=resume)
     _make_room(jobs, todo, out, record)
     for name in todo:
         if name in before:  # from here on its outputs may be of either making
