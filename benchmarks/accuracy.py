@@ -18,7 +18,17 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rsundistort import BundleOptions, RowMotion, RunOptions, bundle_adjust, evaluate, read_solution, rectify, run
+from rsundistort import (
+    BundleOptions,
+    RowMotion,
+    RunOptions,
+    SolveOptions,
+    bundle_adjust,
+    evaluate,
+    read_solution,
+    rectify,
+    run,
+)
 from rsundistort.analysis import Evaluation
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
@@ -59,7 +69,7 @@ def herz_jesus(photos: Path, work: Path, seeds: int) -> None:
     """Real photos without a shutter: unharmed as they are, recovered when warped."""
     plain, still = work / "plain", work / "global"
     solution = run(photos, plain)
-    reference = run(photos, still, RunOptions(shutter_model="global"))
+    reference = run(photos, still, RunOptions(solve=SolveOptions(shutter_model="global")))
     shifts = [image.rs_shift_px or 0.0 for image in solution.registered]
     show(
         "herz-jesus-8 as it is",
@@ -82,7 +92,7 @@ def herz_jesus(photos: Path, work: Path, seeds: int) -> None:
             show(f"herz-jesus-8 warped by {sigma}, seed {seed}", **brief(result), target=target)
             if seed == 0:
                 blind = work / f"blind-{sigma}"
-                run(warped / "photos", blind, RunOptions(shutter_model="global"))
+                run(warped / "photos", blind, RunOptions(solve=SolveOptions(shutter_model="global")))
                 blind_result = evaluate(blind, truth, poses=plain / "solution.json")
                 show(
                     "the same without a shutter model",
@@ -103,9 +113,9 @@ def spread_of_halves(photos: Path, draws: int = 16) -> np.ndarray:
     """
     log = StageLog(None)
     with tempfile.TemporaryDirectory() as folder:
-        loaded = load_photos(photos, None, None, RunOptions().max_features, Workers(2), log, RunOptions())
+        loaded = load_photos(photos, None, None, RunOptions().max_features, Workers(2), log)
         solved = solve_photos(loaded, "rotation", 0, lambda _: BundleOptions(), Path(folder), log)
-    rec, rng = solved.result.reconstruction, np.random.default_rng(0)
+    rec, rng = solved.shared, np.random.default_rng(0)
     options = BundleOptions(phi_sigma_start=solved.result.phi_sigma)
     means = []
     for _ in range(draws):

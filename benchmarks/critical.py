@@ -36,10 +36,22 @@ import numpy as np
 import nw_rsba
 from scipy.spatial.transform import Rotation
 
-from rsundistort import BundleOptions, Camera, Observations, Reconstruction, RowMotion, RunOptions, bundle_adjust, run
+from rsundistort import (
+    BundleOptions,
+    Camera,
+    Observations,
+    Reconstruction,
+    RectifyOptions,
+    RowMotion,
+    RunOptions,
+    SolveOptions,
+    bundle_adjust,
+    run,
+)
 from rsundistort.critical import heal, shape_cost, with_remedy
 from rsundistort.critical.meter import readout_axes
 from rsundistort.evaluation import psnr
+from rsundistort.solve import OutputOptions
 from rsundistort.synthetic import project_rows
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -288,7 +300,10 @@ def show_fountain(_pool: ProcessPoolExecutor, _trials: int) -> None:
             shutil.copytree(folder / "rs", photos)
             if "without" in more:
                 (photos / more.pop("without")).unlink()
-            options = RunOptions(camera=str(folder / "camera.json"), depth="points", report=False, **more)
+            options = RunOptions(
+                camera=str(folder / "camera.json"), rectify=RectifyOptions(depth="points"),
+                outputs=OutputOptions(report=False), solve=SolveOptions(**more),
+            )  # fmt: skip
             out = Path(work) / "out"
             found = run(photos, out, options)
             db = [

@@ -28,6 +28,7 @@ from rsundistort import (
     Plane,
     RowMotion,
     RunOptions,
+    SolveOptions,
     init_rectify_map,
     read_solution,
     rectify,
@@ -35,7 +36,7 @@ from rsundistort import (
     run,
 )
 from rsundistort.batch import use_threads
-from rsundistort.batch.geometry import PhotoDepths, ScenePoints
+from rsundistort.batch.geometry import SceneGeometry, ScenePoints
 from rsundistort.evaluation import psnr
 from rsundistort.io import read_photo
 from rsundistort.simulate import simulate_scene
@@ -128,7 +129,7 @@ def estimated(scene: Path, work: Path) -> None:
 def forced(scene: Path, work: Path) -> None:
     """Constant-motion forced on a scene whose camera only turned."""
     folders = {depth: work / f"{scene.name}-forced-{depth}" for depth in ("auto", "infinity")}
-    options = RunOptions(shutter_model="constant-motion")
+    options = RunOptions(solve=SolveOptions(shutter_model="constant-motion"))
     solution = run(scene / "photos", folders["auto"], options)
     rectify_folder(scene / "photos", folders["auto"] / "solution.json", folders["infinity"], depth="infinity")
     figures = against_twins(scene, folders)
@@ -157,8 +158,8 @@ def cost(out: Path) -> None:
     """What depths of a photo cost, and grids of 12 megapixels, on one thread."""
     solution = read_solution(out / "solution.json")
     names = [image.name for image in solution.registered]
-    depths = PhotoDepths(solution, "auto", ScenePoints.of_colmap_model(out / "sparse", names, "tif"))
-    show("depth of a photo from its points", ms=median_ms(lambda: depths.of(names[1])), target="<= 100 ms")
+    scene = SceneGeometry(solution, "auto", ScenePoints.of_colmap_model(out / "sparse", names, "tif"))
+    show("depth of a photo from its points", ms=median_ms(lambda: scene.of(names[1]).find_depth()), target="<= 100 ms")
     camera = Camera(4000, 3000, np.array([[3200.0, 0, 1999.5], [0, 3200.0, 1499.5], [0, 0, 1]]), [-0.1, 0.02, 0, 0])
     motion = RowMotion([0.02, 0.01, 0.01], [0.3, 0.1, 0.0])
     rng = np.random.default_rng(0)

@@ -302,14 +302,14 @@ def warped(photos: Path) -> None:
     where the true motions are given, and between photos that went through the same remap and encoder without any
     motion, is not the shutter's.
     """
-    from rsundistort import RunOptions, read_solution, run
+    from rsundistort import RunOptions, SolveOptions, read_solution, run
     from rsundistort.evaluation import pose_errors
     from rsundistort.io.cameras import camera_to_json
     from rsundistort.simulate import WarpOptions, simulate_warp
 
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
-        reference = run(photos, work / "still", RunOptions(shutter_model="global"))
+        reference = run(photos, work / "still", RunOptions(solve=SolveOptions(shutter_model="global")))
         camera = work / "found.json"
         camera.write_text(json.dumps(camera_to_json(reference.cameras["1"]), default=np.ndarray.tolist))
         for sigma, how in ((0.02, "auto"), (0.02, "true motions"), (0.02, "global"), (0.0, "global")):
@@ -317,13 +317,13 @@ def warped(photos: Path) -> None:
             if not made.is_dir():
                 simulate_warp(photos, made, WarpOptions(camera=str(camera), sigma_rad=sigma))
                 (made / "camera.json").unlink()
-            options = RunOptions(shutter_model=how if how in ("auto", "global") else "rotation")
+            options = SolveOptions(shutter_model=how if how in ("auto", "global") else "rotation")
             if how == "true motions":
                 truth = read_solution(made / "ground_truth.json")
                 span = next(iter(truth.cameras.values())).frame_span
                 known = {each.name: (each.motion.phi * span, np.full(3, 1e-6)) for each in truth.images if each.motion}
                 options = replace(options, known=known)
-            solution = run(made / "photos", work / f"{how}-{sigma}", options)
+            solution = run(made / "photos", work / f"{how}-{sigma}", RunOptions(solve=options))
             error = pose_errors(solution, reference).rotation_deg
             cameras = [each.cameras[each.registered[0].camera_id] for each in (solution, reference)]
             show(

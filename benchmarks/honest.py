@@ -40,6 +40,7 @@ from measures import (
     log_k_error,
     normalised_errors,
     pooled,
+    run_options,
     with_lens_of,
     with_poses,
 )
@@ -51,7 +52,8 @@ from rsundistort.evaluation import pose_errors
 from rsundistort.model import READOUTS
 from rsundistort.report.verdict import verdict_of
 from rsundistort.simulate import WarpOptions, simulate_warp
-from rsundistort.solve.model_sequence import Solved, solve_photos
+from rsundistort.solve.model_sequence import solve_photos
+from rsundistort.solve.outcome import Solved
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENES = ROOT / "sample_scenes"
@@ -153,13 +155,13 @@ class Bench:
 
         def solving(loaded: Any, model: str, seed: int, options_of: Any, *rest: Any, **more: Any) -> Solved:
             solved = solve_photos(loaded, model, seed, options_of, *rest, **more)
-            kept.update(solved=solved, options=options_of(solved.result.reconstruction))
+            kept.update(solved=solved, options=options_of(solved.shared))
             return solved
 
         if key not in self.ran:
             out = self.work / f"out-{len(self.ran)}"
             with mock.patch("rsundistort.solve.run.solve_photos", solving):
-                solution = rs.run(photos, out, rs.RunOptions(report=False, overwrite=True, **options))
+                solution = rs.run(photos, out, run_options(**options), overwrite=True)
             self.ran[key] = Ran(out, solution, **kept)
         return self.ran[key]
 
@@ -265,7 +267,7 @@ def coverage(bench: Bench) -> None:
             for photos, options, truth in (case[1:] for case in cases if case[0] == label):
                 ran.append(bench.run(photos, **options))
                 each = ran[-1]
-                sigmas, rec = library_sigmas(each.solved, each.options), each.solved.result.reconstruction
+                sigmas, rec = library_sigmas(each.solved.result, each.solved.remedy, each.options), each.solved.shared
                 errors.append(normalised_errors(each.solution, truth, sigmas, log_k_error(rec, truth)))
             rms, by_component = pooled(errors), pooled(errors, by_component=True)
             show(name, **ran[0].facts, runs=len(ran), rms=rms, by_component=by_component)

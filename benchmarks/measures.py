@@ -15,20 +15,24 @@ from scipy.spatial.transform import Rotation
 from rsundistort import (
     BundleOptions,
     Reconstruction,
+    RectifyOptions,
     RowMotion,
+    RunOptions,
     Solution,
     SolvedImage,
+    SolveOptions,
     init_rectify_map,
     unproject_points,
 )
-from rsundistort.bundle import Posterior, gauge_directions
+from rsundistort.bundle import BundleResult, Posterior, gauge_directions
 from rsundistort.bundle.triangulate import _world_rays
+from rsundistort.critical import Remedy
 from rsundistort.critical.common import row_phi
 from rsundistort.critical.meter import readout_axes
 from rsundistort.evaluation import align_points, motion_errors, psnr
 from rsundistort.io import read_photo
 from rsundistort.io.cameras import camera_from_json
-from rsundistort.solve.model_sequence import Solved
+from rsundistort.solve import OutputOptions
 
 Array = np.ndarray
 
@@ -76,12 +80,20 @@ def pooled(errors: Sequence[Mapping[str, Array | None]], by_component: bool = Fa
     return found
 
 
-def library_sigmas(solved: Solved, options: BundleOptions) -> dict[str, Any]:
+def run_options(**given: Any) -> RunOptions:
+    """Options of a run without a report, of the fields of all its parts."""
+    parts = {
+        part: kind(**{key: given.pop(key) for key in [*given] if key in kind.__dataclass_fields__})
+        for part, kind in (("solve", SolveOptions), ("rectify", RectifyOptions))
+    }
+    return RunOptions(**parts, outputs=OutputOptions(report=False), **given)
+
+
+def library_sigmas(result: BundleResult, remedy: Remedy | None, options: BundleOptions) -> dict[str, Any]:
     """Deviations that are not in solution.json, as `normalised_errors` takes them, photos in the order of their names.
 
-    `options` are those of the adjustments; of an anchor that was added to them `solved` knows.
+    `options` are those of the adjustments; of an anchor that was added to them `remedy` knows.
     """
-    result, remedy = solved.result, solved.remedy
     rec = result.reconstruction
     if rec.shutter_model == "global":
         return {}

@@ -45,7 +45,9 @@ def main() -> None:
     truth = rs.read_solution(SCENE / "ground_truth.json")
     with tempfile.TemporaryDirectory() as work:
         found = rs.run(SCENE / "photos", Path(work) / "out")
-        plain = rs.run(SCENE / "photos", Path(work) / "plain", rs.RunOptions(shutter_model="global"))
+        plain = rs.run(
+            SCENE / "photos", Path(work) / "plain", rs.RunOptions(solve=rs.SolveOptions(shutter_model="global"))
+        )
         after = cv2.imread(str(Path(work) / "out" / "images" / args.photo))
         model = pycolmap.Reconstruction(Path(work) / "out" / "sparse")
     before = cv2.imread(str(SCENE / "photos" / args.photo))

@@ -21,6 +21,7 @@ from batch import make_photos
 
 import rsundistort as rs
 from rsundistort.colmap import write_colmap_model
+from rsundistort.solve import OutputOptions
 
 REPORT = """
 import json, sys, time
@@ -46,9 +47,11 @@ def main() -> None:
         for made, name in zip(make_photos(folder / "photos", count), rec.image_names, strict=True):
             (folder / "photos" / made).rename(folder / "photos" / name)
         write_colmap_model(folder / "model", rec, list(rec.cameras), list(rec.image_names))
-        options = rs.SolveOptions(readout="top-to-bottom", shutter_model="rotation", report=False)
+        options = rs.SolveOptions(readout="top-to-bottom", shutter_model="rotation")
         began = time.perf_counter()
-        rs.solve(folder / "model", folder / "out", options, images=folder / "photos")
+        rs.solve(
+            folder / "model", folder / "out", options, outputs=OutputOptions(report=False), images=folder / "photos"
+        )
         beside = time.perf_counter() - began
         command = [sys.executable, "-c", REPORT, str(folder / "out"), str(Path(__file__).parent)]
         done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)

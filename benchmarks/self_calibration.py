@@ -69,13 +69,13 @@ def solve(photos: Path) -> tuple[BundleResult, BundleOptions]:
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore", RsUndistortWarning)
         workers = Workers(use_threads(0))
-        loaded = load_photos(photos, None, None, options.max_features, workers, log, options)
+        loaded = load_photos(photos, None, None, options.max_features, workers, log)
 
         def of(rec: Reconstruction) -> BundleOptions:
-            return options.options_for(loaded.cameras)
+            return options.solve.options_for(loaded.cameras)
 
         solved = solve_photos(loaded, "rotation", 0, of, Path(folder), log)
-    return solved.result, of(solved.result.reconstruction)
+    return solved.result, of(solved.shared)
 
 
 def alternatives(result: BundleResult, options: BundleOptions, focal: dict[str, float]) -> dict[str, float]:

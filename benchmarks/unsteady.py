@@ -32,7 +32,7 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-from measures import normalised_errors, pooled, with_lens_of
+from measures import normalised_errors, pooled, run_options, with_lens_of
 
 import rsundistort as rs
 from rsundistort.evaluation import motion_errors
@@ -71,7 +71,7 @@ class Bench:
         """Solution of the photos as they are."""
         if self._still is None:
             out = self.work / "still"
-            rs.run(self.photos / HERZ, out, rs.RunOptions(report=False, shutter_model="global"))
+            rs.run(self.photos / HERZ, out, run_options(shutter_model="global"))
             self._still = out / "solution.json"
         return self._still
 
@@ -97,7 +97,7 @@ class Bench:
         start = time.perf_counter()
         out = folder / name
         try:
-            solution = rs.run(folder / "photos", out, rs.RunOptions(report=False, overwrite=True, **options))
+            solution = rs.run(folder / "photos", out, run_options(**options), overwrite=True)
             seconds = time.perf_counter() - start
             told = folder / "ground_truth.json"
             told = with_lens_of(out, told) if own_lens else told

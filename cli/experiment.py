@@ -19,28 +19,22 @@ def command() -> None:
 @command.command()
 @click.argument("scenes", nargs=-1, required=True, type=click.Path(path_type=Path))
 @opt.out_option
-@click.option("--trials", type=click.IntRange(min=1), default=100, show_default=True, help="Trials a scene.")
-@click.option(
-    "--motion",
-    type=click.Choice(("both", "rotation")),
-    default="both",
-    show_default=True,
-    help="Rotation and translation as in the paper, or rotation only.",
+@opt.gathered(
+    "given",
+    click.option("--trials", type=click.IntRange(min=1), default=100, show_default=True, help="Trials a scene."),
+    click.option(
+        "--motion",
+        type=click.Choice(("both", "rotation")),
+        default="both",
+        show_default=True,
+        help="Rotation and translation as in the paper, or rotation only.",
+    ),
+    click.option("--method", "methods", multiple=True, metavar="NAME", help="Only this method; may be repeated."),
+    opt.seed_option,
+    opt.jobs_option,
 )
-@click.option("--method", "methods", multiple=True, metavar="NAME", help="Only this method; may be repeated.")
-@opt.seed_option
-@opt.jobs_option
 @opt.quiet_option
-def one(
-    scenes: tuple[Path, ...],
-    out: Path,
-    trials: int,
-    motion: str,
-    methods: tuple[str, ...],
-    seed: int,
-    jobs: int,
-    quiet: bool,
-) -> None:
+def one(scenes: tuple[Path, ...], out: Path, given: dict[str, Any], quiet: bool) -> None:
     """Bundle adjustment of synthetic measurements of SCENES (.npz, COLMAP models, outputs of runs).
 
     OUT gets trials.jsonl, summary.json, summary.csv and histograms.png; trials that it already holds are not repeated.
@@ -48,10 +42,9 @@ def one(
     with errors_for_people("the same command goes on where it was"), progress_bars(Talk(quiet)) as progress:
         from rsundistort.experiments import OneOptions, experiment_one
 
-        kinds: dict[str, Any] = {"methods": methods} if methods else {}
-        if motion == "rotation":
-            kinds["translation"] = 0.0
-        summary = experiment_one(scenes, out, OneOptions(trials=trials, seed=seed, jobs=jobs, **kinds), progress)
+        if given.pop("motion", None) == "rotation":
+            given["translation"] = 0.0
+        summary = experiment_one(scenes, out, OneOptions(**given), progress)
     if not quiet:
         rows = [("scene", "method", "rotation deg", "translation", "structure", "iterations")]
         for scene, found in summary.items():
@@ -65,32 +58,24 @@ def one(
 @click.argument("still", type=click.Path(path_type=Path))
 @click.argument("swung", type=click.Path(path_type=Path))
 @opt.out_option
-@opt.camera_option
-@opt.readout_option
-@click.option(
-    "--model",
-    "shutter_model",
-    type=click.Choice(("auto", "constant-motion", "rotation", "linearized", "two-step")),
-    default="auto",
-    show_default=True,
-    help="How the shutter of SWUNG is modelled, as in run.",
+@opt.gathered(
+    "given",
+    opt.camera_option,
+    opt.readout_option,
+    click.option(
+        "--model",
+        "shutter_model",
+        type=click.Choice(("auto", "constant-motion", "rotation", "linearized", "two-step")),
+        default="auto",
+        show_default=True,
+        help="How the shutter of SWUNG is modelled, as in run.",
+    ),
+    opt.seed_option,
+    opt.jobs_option,
+    opt.overwrite_option,
 )
-@opt.seed_option
-@opt.jobs_option
-@opt.overwrite_option
 @opt.quiet_option
-def two(
-    still: Path,
-    swung: Path,
-    out: Path,
-    camera: str | None,
-    readout: str | None,
-    shutter_model: str,
-    seed: int,
-    jobs: int,
-    overwrite: bool,
-    quiet: bool,
-) -> None:
+def two(still: Path, swung: Path, out: Path, given: dict[str, Any], quiet: bool) -> None:
     """Camera positions of real photos taken in motion, against those of photos taken still.
 
     STILL and SWUNG are folders of photos with the same names, each pair taken from one place by one camera. OUT gets
@@ -100,8 +85,7 @@ def two(
     with errors_for_people(), progress_bars(Talk(quiet)) as progress:
         from rsundistort.experiments import TwoOptions, experiment_two
 
-        options = TwoOptions(camera, readout, shutter_model, seed, jobs, overwrite)
-        summary = experiment_two(still, swung, out, options, progress)
+        summary = experiment_two(still, swung, out, TwoOptions(**given), progress)
     if not quiet:
         click.echo(_comparison(summary, out))
 

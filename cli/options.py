@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from .terminal import Talk, errors_for_people
 
@@ -175,7 +176,7 @@ def talk_options(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def gathered(name: str, *options: Decorator) -> Decorator:
-    """Options whose values the command gets as one mapping."""
+    """Options whose values the command gets as one mapping of those that were given: defaults are the library's."""
 
     def with_options(function: Callable[..., Any]) -> Callable[..., Any]:
         return functools.reduce(lambda inner, option: option(inner), reversed(options), function)
@@ -185,7 +186,9 @@ def gathered(name: str, *options: Decorator) -> Decorator:
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(function)
         def with_mapping(*args: Any, **named: Any) -> Any:
-            given = {key: named.pop(key) for key in keys}
+            source = click.get_current_context().get_parameter_source
+            values = {key: named.pop(key) for key in keys}
+            given = {key: value for key, value in values.items() if source(key) is not ParameterSource.DEFAULT}
             return function(*args, **named, **{name: given})
 
         return with_options(with_mapping)
@@ -193,35 +196,26 @@ def gathered(name: str, *options: Decorator) -> Decorator:
     return decorate
 
 
-def view_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """What rectified photos show, and how large they are."""
-    for option in (
-        click.option(
-            "--max-size", type=click.IntRange(min=2), metavar="PIXELS", help="Longest side of the rectified photos."
-        ),
-        click.option(
-            "--scale",
-            type=click.FloatRange(min=0, min_open=True),
-            default=1.0,
-            show_default=True,
-            help="Size of the rectified photos in that of the raw ones; what shrinks is averaged.",
-        ),
-        click.option(
-            "--alpha",
-            metavar="keep|0..1",
-            callback=view_alpha,
-            help="keep: K and size of the raw photos; 0: no empty pixel in any photo of a camera; 1: every pixel of "
-            "all of them is kept; between: between. Default: keep, or as the solution has it.",
-        ),
-    ):
-        function = option(function)
-    return function
-
-
-#: What is done to each photo; for `photo_fields`.
+#: What is done to each photo; for `rectify_options`.
 PHOTO_OPTIONS: tuple[Decorator, ...] = (
     depth_option,
-    view_options,
+    click.option(
+        "--alpha",
+        metavar="keep|0..1",
+        callback=view_alpha,
+        help="keep: K and size of the raw photos; 0: no empty pixel in any photo of a camera; 1: every pixel of "
+        "all of them is kept; between: between. Default: keep, or as the solution has it.",
+    ),
+    click.option(
+        "--scale",
+        type=click.FloatRange(min=0, min_open=True),
+        default=1.0,
+        show_default=True,
+        help="Size of the rectified photos in that of the raw ones; what shrinks is averaged.",
+    ),
+    click.option(
+        "--max-size", type=click.IntRange(min=2), metavar="PIXELS", help="Longest side of the rectified photos."
+    ),
     interpolation_option,
     quality_option,
     raw_as_option,
@@ -233,10 +227,15 @@ PHOTO_OPTIONS: tuple[Decorator, ...] = (
 )
 
 
-def photo_fields(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of `RectifyOptions` of what was given, and the rest as it is."""
+def taken(given: dict[str, Any], kind: type) -> Any:
+    """Options of a kind, of its fields among what was given; these are taken out."""
+    return kind(**{key: given.pop(key) for key in [*given] if key in kind.__dataclass_fields__})  # type: ignore[attr-defined]
+
+
+def rectify_options(given: dict[str, Any]) -> Any:
+    """`RectifyOptions` of what was given; it is taken out."""
+    from rsundistort.batch import RectifyOptions
     from rsundistort.rectify import ViewOptions
 
-    fields = dict(given)
-    view = ViewOptions(*(fields.pop(key) for key in ("alpha", "scale", "max_size")))
-    return {**fields, "view": view}
+    given["view"] = taken(given, ViewOptions)
+    return taken(given, RectifyOptions)

@@ -23,50 +23,39 @@ from .terminal import Talk, errors_for_people, list_failed, progress_bars
 @click.option(
     "-o", "--out", type=opt.PathOrUrl(path_type=Path), required=True, help="Folder for the outputs, or its URL."
 )
-@click.option(
-    "--masks",
-    type=opt.PathOrUrl(exists=True, file_okay=False, path_type=Path),
-    help="Folder of masks, a.png for a.jpg: what is black in them is black in OUT/masks.",
-)
-@opt.gathered("photo", *opt.PHOTO_OPTIONS)
-@opt.jobs_option
-@opt.scheduler_option
-@opt.overwrite_option
-@click.option(
-    "--resume",
-    is_flag=True,
-    help="Go on with the batch in OUT: pass over what is whole and current, make the rest.",
+@opt.gathered(
+    "given",
+    click.option(
+        "--masks",
+        type=opt.PathOrUrl(exists=True, file_okay=False, path_type=Path),
+        help="Folder of masks, a.png for a.jpg: what is black in them is black in OUT/masks.",
+    ),
+    *opt.PHOTO_OPTIONS,
+    opt.jobs_option,
+    opt.scheduler_option,
+    opt.overwrite_option,
+    click.option(
+        "--resume",
+        is_flag=True,
+        help="Go on with the batch in OUT: pass over what is whole and current, make the rest.",
+    ),
 )
 @opt.talk_options
-def command(
-    photos: Path | str,
-    solution: Path,
-    out: Path | str,
-    masks: Path | str | None,
-    photo: dict[str, Any],
-    jobs: int,
-    scheduler: str | None,
-    overwrite: bool,
-    resume: bool,
-    talk: Talk,
-) -> None:
+def command(photos: Path | str, solution: Path, out: Path | str, given: dict[str, Any], talk: Talk) -> None:
     """Rectify the photos of a folder with the motions of a solution.
 
     PHOTOS, OUT and the masks are folders, by path or by a URL that fsspec knows (s3://bucket/folder, gs://...).
     Exit code 3 says that some photos failed; they are listed, and the others are done.
     """
-    if overwrite and resume:
+    if given.get("overwrite") and given.get("resume"):
         raise click.UsageError("--overwrite begins anew and --resume goes on; give one of them")
     kept = "what is done is whole, the same command with --resume goes on"
     with errors_for_people(kept) as warned, progress_bars(talk) as progress:
-        from rsundistort.batch import RectifyOptions, rectify_folder
+        from rsundistort.batch import rectify_folder
         from rsundistort.io.places import place_of, sizes_under
 
-        options = RectifyOptions(masks=masks, **opt.photo_fields(photo))
-        solved, left_out = rectify_folder(
-            photos, solution, out, options,
-            jobs=jobs, overwrite=overwrite, resume=resume, scheduler=scheduler, progress=progress,
-        )  # fmt: skip
+        options = opt.rectify_options(given)
+        solved, left_out = rectify_folder(photos, solution, out, options, progress=progress, **given)
         count = len(sizes_under(place_of(out), ["images"]))
     # of photos that the solution could not join it says so itself
     known = {image.name for image in solved.images if not image.registered}

@@ -9,81 +9,76 @@ import click
 
 from . import options as opt
 from .closing import close
-from .solve_options import solve_fields, solve_options
+from .solve_options import parts_of, solve_options
 from .terminal import Talk, errors_for_people, progress_bars
+
+_GYRO_FIELDS = {"gyro": "file", "gyro_offset": "offset_s", "gyro_axes": "axes", "photo_times": "times"}
+
+# How photos are measured, as `RunOptions` takes it.
+_measure_options = opt.gathered(
+    "measuring",
+    opt.camera_option,
+    click.option(
+        "--every", type=click.IntRange(min=1), metavar="N", help="Of a video: the photos are each N-th frame,"
+    ),
+    click.option("--sharpest", type=click.IntRange(min=1), metavar="N", help="or the sharpest of each N frames."),
+    click.option(
+        "--gyro",
+        type=click.Path(exists=True, dir_okay=False, path_type=Path),
+        metavar="FILE",
+        help="A gyroscope's log: CSV with time_s, wx, wy, wz in rad/s, or Gyroflow's .gcsv.",
+    ),
+    click.option(
+        "--gyro-offset",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="Seconds that the gyroscope's clock shows when the camera's shows zero.",
+    ),
+    click.option(
+        "--gyro-axes",
+        metavar="XYZ",
+        help="Axes of the gyroscope that point right, down and ahead in the stored pixels; small letters are reversed.",
+    ),
+    click.option(
+        "--photo-times",
+        type=click.Path(exists=True, dir_okay=False, path_type=Path),
+        metavar="CSV",
+        help="When photos were taken, for --gyro: name, time_s. Default: frames.csv among them.",
+    ),
+    click.option(
+        "--max-features",
+        type=click.IntRange(min=100),
+        default=8192,
+        show_default=True,
+        help="Features of a photo, the largest.",
+    ),
+    click.option(
+        "--feature-megapixels",
+        type=click.FloatRange(min=0.05),
+        default=1.0,
+        show_default=True,
+        metavar="MP",
+        help="Larger photos are shrunk to this to find their features.",
+    ),
+    click.option(
+        "--matching",
+        type=click.Choice(opt.MATCHING_NAMES),
+        default="auto",
+        show_default=True,
+        help="Photos matched with each other: all; neighbours in order of capture, by GPS or in looks; auto: these "
+        "beyond more than 60.",
+    ),
+)
 
 
 @click.command()
 @opt.photos_argument
 @opt.out_option
-@opt.camera_option
-@click.option("--every", type=click.IntRange(min=1), metavar="N", help="Of a video: the photos are each N-th frame,")
-@click.option("--sharpest", type=click.IntRange(min=1), metavar="N", help="or the sharpest of each N frames.")
-@click.option(
-    "--gyro",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    metavar="FILE",
-    help="A gyroscope's log: CSV with time_s, wx, wy, wz in rad/s, or Gyroflow's .gcsv.",
-)
-@click.option(
-    "--gyro-offset",
-    type=float,
-    default=0.0,
-    metavar="S",
-    help="Seconds that the gyroscope's clock shows when the camera's shows zero.",
-)
-@click.option(
-    "--gyro-axes",
-    metavar="XYZ",
-    help="Axes of the gyroscope that point right, down and ahead in the stored pixels; small letters are reversed.",
-)
-@click.option(
-    "--photo-times",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    metavar="CSV",
-    help="When photos were taken, for --gyro: name, time_s. Default: frames.csv among them.",
-)
-@click.option(
-    "--max-features",
-    type=click.IntRange(min=100),
-    default=8192,
-    show_default=True,
-    help="Features of a photo, the largest.",
-)
-@click.option(
-    "--feature-megapixels",
-    type=click.FloatRange(min=0.05),
-    default=1.0,
-    show_default=True,
-    metavar="MP",
-    help="Larger photos are shrunk to this to find their features.",
-)
-@click.option(
-    "--matching",
-    type=click.Choice(opt.MATCHING_NAMES),
-    default="auto",
-    show_default=True,
-    help="Photos matched with each other: all; neighbours in order of capture, by GPS or in looks; auto: these beyond "
-    "more than 60.",
-)
+@_measure_options
 @solve_options
 @opt.talk_options
-def command(
-    photos: Path,
-    out: Path,
-    camera: str | None,
-    every: int | None,
-    sharpest: int | None,
-    gyro: Path | None,
-    gyro_offset: float,
-    gyro_axes: str | None,
-    photo_times: Path | None,
-    max_features: int,
-    feature_megapixels: float,
-    matching: str,
-    solving: dict[str, Any],
-    talk: Talk,
-) -> None:
+def command(photos: Path, out: Path, measuring: dict[str, Any], given: dict[str, Any], talk: Talk) -> None:
     """Find how the camera moved during each photo's readout, and take it out.
 
     PHOTOS is a folder of photos that one camera took of one scene, in any order, or a video. OUT gets images/, masks/,
@@ -96,15 +91,9 @@ def command(
         from rsundistort.input import GyroOptions
         from rsundistort.solve import RunOptions, run
 
-        options = RunOptions(
-            camera=camera,
-            every=every,
-            sharpest=sharpest,
-            gyro=None if gyro is None else GyroOptions(gyro, gyro_offset, gyro_axes, photo_times),
-            max_features=max_features,
-            feature_megapixels=feature_megapixels,
-            matching=matching,
-            **solve_fields(solving),
-        )
-        solution = run(photos, out, options, progress)
+        log = {field: measuring.pop(key) for key, field in _GYRO_FIELDS.items() if key in measuring}
+        gyro = GyroOptions(**log) if "file" in log else None
+        solve, rectify, outputs = parts_of(given)
+        options = RunOptions(solve=solve, rectify=rectify, outputs=outputs, gyro=gyro, **measuring)
+        solution = run(photos, out, options, progress, **given)
     close(solution, out, warned, talk)

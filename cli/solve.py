@@ -9,7 +9,7 @@ import click
 
 from . import options as opt
 from .closing import close
-from .solve_options import solve_fields, solve_options
+from .solve_options import parts_of, solve_options
 from .terminal import Talk, errors_for_people, progress_bars
 
 
@@ -31,12 +31,7 @@ from .terminal import Talk, errors_for_people, progress_bars
 @solve_options
 @opt.talk_options
 def command(
-    model: Path,
-    out: Path,
-    images: Path | None,
-    database: Path | None,
-    solving: dict[str, Any],
-    talk: Talk,
+    model: Path, out: Path, images: Path | None, database: Path | None, given: dict[str, Any], talk: Talk
 ) -> None:
     """Find how the camera moved during each photo's readout, from a model of COLMAP, OpenMVG or OpenSfM.
 
@@ -46,8 +41,11 @@ def command(
     1=left-to-right".
     """
     with errors_for_people() as warned, progress_bars(talk) as progress:
-        from rsundistort.solve import SolveOptions, solve
+        from rsundistort.solve import solve
 
-        options = SolveOptions(**solve_fields(solving))
-        solution = solve(model, out, options, images=images, database=database, progress=progress)
+        solving, rectify, outputs = parts_of(given)
+        solution = solve(
+            model, out, solving, rectify=rectify, outputs=outputs, images=images, database=database, progress=progress,
+            **given,
+        )  # fmt: skip
     close(solution, out, warned, talk)

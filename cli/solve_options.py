@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,145 +24,130 @@ def _readout_by_group(
     return directions or None
 
 
-_readout_groups_option = click.option(
-    "--readout",
-    multiple=True,
-    metavar="[GROUP=]DIRECTION",
-    callback=_readout_by_group,
-    help=f"Direction of the readout in the stored pixels: {', '.join(opt.READOUT_NAMES)}; of all photos, or of a "
-    "group (as the closing table names it). By default the camera file's, else guessed and settled by the photos.",
-)
-_masks_option = click.option(
-    "--masks",
-    type=opt.LocalPath(exists=True, file_okay=False, path_type=Path),
-    help="Folder of masks, a.png for a.jpg: what is black in them is not looked at, nor kept in OUT/masks.",
-)
-_model_option = click.option(
-    "--model",
-    "shutter_model",
-    type=click.Choice(("auto", "constant-motion", "rotation", "linearized", "two-step", "global")),
-    default="auto",
-    show_default=True,
-    help="How the shutter is modelled; auto is the model that foretells measurements held out from its fit.",
-)
-_refine_option = click.option(
-    "--refine",
-    metavar="NAMES",
-    help="Intrinsics to solve for with the rest: some of f (or fx, fy), cx, cy, k1, k2, p1, p2, k3 (of a "
-    "fisheye k1 to k4) with commas between, or none. By default all, as far from a camera that was given, or from "
-    "EXIF's guess, as these usually are off.",
-)
-_camera_sigma_option = click.option(
-    "--camera-sigma",
-    metavar="NAME=SIGMA,...",
-    help="How well the camera is known: standard deviations of some of f (or fx, fy), cx, cy in pixels, and of k1, k2, "
-    "k3, p1, p2. Default: the key sigma of camera.json, else what calibrations usually are off by.",
-)
-_still_option = click.option(
-    "--still",
-    "--anchor",
-    multiple=True,
-    metavar="NAME[=MRAD]",
-    help="A photo known not to have moved: its phi1, and where cameras travel its whole motion, is held at zero, or "
-    "near zero with so many mrad per frame of standard deviation. May be repeated.",
-)
-_known_option = click.option(
-    "--known",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    metavar="CSV",
-    help="Motions known from elsewhere: name, phi1, phi2, phi3 (rad per frame; or omega1.. in rad/s) and sigma.",
-)
-_lengths_option = click.option(
-    "--lengths",
-    "--length",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    metavar="CSV",
-    help="Lengths measured in the scene, two or more: photo1, x1, y1, photo2, x2, y2, length, sigma.",
-)
-_readout_ms_option = click.option(
-    "--readout-ms",
-    type=click.FloatRange(min=0, min_open=True),
-    help="Time of the readout of a frame. Default: the gyroscope's log, or a table of cameras.",
-)
-_remedy_option = click.option(
-    "--remedy",
-    type=click.Choice(("auto", "prior", "none")),
-    default="auto",
-    show_default=True,
-    help="Where all cameras are level: auto looks for a photo that did not move, prior takes the motions to be zero "
-    "in the mean, none does neither.",
-)
-_sparse_format_option = click.option(
-    "--sparse-format",
-    type=click.Choice(("bin", "txt")),
-    default="bin",
-    show_default=True,
-    help="How the COLMAP model is written.",
-)
-_rs_poses_option = click.option(
-    "--rs-poses",
-    is_flag=True,
-    help="OUT/rs-poses: the original photos' cameras and poses with the shutter, for gsplat, instant-ngp and "
-    "3dgs-deblur (docs/outputs.md).",
-)
-_report_option = click.option(
-    "--report/--no-report", default=True, help="Write OUT/report.html; rsundistort report makes it later, too."
-)
-
-#: How the motions are found and what is done to each photo; the command gets them as `solving`, for `solve_fields`.
+#: How the motions are found, what is done to each photo and how; the command gets them as `given`, for `parts_of`.
 solve_options = opt.gathered(
-    "solving",
-    _readout_groups_option,
-    _masks_option,
-    _model_option,
-    _refine_option,
-    _camera_sigma_option,
-    _still_option,
-    _known_option,
-    _lengths_option,
-    _readout_ms_option,
-    _remedy_option,
+    "given",
+    click.option(
+        "--readout",
+        multiple=True,
+        metavar="[GROUP=]DIRECTION",
+        callback=_readout_by_group,
+        help=f"Direction of the readout in the stored pixels: {', '.join(opt.READOUT_NAMES)}; of all photos, or of a "
+        "group (as the closing table names it). By default the camera file's, else guessed and settled by the photos.",
+    ),
+    click.option(
+        "--masks",
+        type=opt.LocalPath(exists=True, file_okay=False, path_type=Path),
+        help="Folder of masks, a.png for a.jpg: what is black in them is not looked at, nor kept in OUT/masks.",
+    ),
+    click.option(
+        "--model",
+        "shutter_model",
+        type=click.Choice(("auto", "constant-motion", "rotation", "linearized", "two-step", "global")),
+        default="auto",
+        show_default=True,
+        help="How the shutter is modelled; auto is the model that foretells measurements held out from its fit.",
+    ),
+    click.option(
+        "--refine",
+        metavar="NAMES",
+        help="Intrinsics to solve for with the rest: some of f (or fx, fy), cx, cy, k1, k2, p1, p2, k3 (of a "
+        "fisheye k1 to k4) with commas between, or none. By default all, as far from a camera that was given, or from "
+        "EXIF's guess, as these usually are off.",
+    ),
+    click.option(
+        "--camera-sigma",
+        metavar="NAME=SIGMA,...",
+        help="How well the camera is known: standard deviations of some of f (or fx, fy), cx, cy in pixels, and of k1, "
+        "k2, k3, p1, p2. Default: the key sigma of camera.json, else what calibrations usually are off by.",
+    ),
+    click.option(
+        "--still",
+        "--anchor",
+        multiple=True,
+        metavar="NAME[=MRAD]",
+        help="A photo known not to have moved: its phi1, and where cameras travel its whole motion, is held at zero, "
+        "or near zero with so many mrad per frame of standard deviation. May be repeated.",
+    ),
+    click.option(
+        "--known",
+        type=click.Path(exists=True, dir_okay=False, path_type=Path),
+        metavar="CSV",
+        help="Motions known from elsewhere: name, phi1, phi2, phi3 (rad per frame; or omega1.. in rad/s) and sigma.",
+    ),
+    click.option(
+        "--lengths",
+        "--length",
+        type=click.Path(exists=True, dir_okay=False, path_type=Path),
+        metavar="CSV",
+        help="Lengths measured in the scene, two or more: photo1, x1, y1, photo2, x2, y2, length, sigma.",
+    ),
+    click.option(
+        "--readout-ms",
+        type=click.FloatRange(min=0, min_open=True),
+        help="Time of the readout of a frame. Default: the gyroscope's log, or a table of cameras.",
+    ),
+    click.option(
+        "--remedy",
+        type=click.Choice(("auto", "prior", "none")),
+        default="auto",
+        show_default=True,
+        help="Where all cameras are level: auto looks for a photo that did not move, prior takes the motions to be "
+        "zero in the mean, none does neither.",
+    ),
     *opt.PHOTO_OPTIONS,
-    _sparse_format_option,
-    _rs_poses_option,
+    click.option(
+        "--sparse-format",
+        type=click.Choice(("bin", "txt")),
+        default="bin",
+        show_default=True,
+        help="How the COLMAP model is written.",
+    ),
+    click.option(
+        "--rs-poses",
+        is_flag=True,
+        help="OUT/rs-poses: the original photos' cameras and poses with the shutter, for gsplat, instant-ngp and "
+        "3dgs-deblur (docs/outputs.md).",
+    ),
     opt.seed_option,
     opt.jobs_option,
     opt.scheduler_option,
     opt.overwrite_option,
-    _report_option,
+    click.option(
+        "--report/--no-report", default=True, help="Write OUT/report.html; rsundistort report makes it later, too."
+    ),
 )
 
 
-def solve_fields(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of `SolveOptions` of what was given."""
+def parts_of(given: dict[str, Any]) -> tuple[Any, Any, Any]:
+    """`SolveOptions`, `RectifyOptions` and `OutputOptions` of what was given; the rest is left in it."""
     from rsundistort.io import read_known_lengths, read_known_motions
+    from rsundistort.solve import OutputOptions, SolveOptions
 
-    fields = opt.photo_fields(given)
-    readout_ms, known, lengths = fields.pop("readout_ms"), fields["known"], fields["lengths"]
-    readout_s = readout_ms and readout_ms / 1e3
-    return {
-        **fields,
-        "refine": _names_between_commas(fields["refine"]),
-        "camera_sigma": _sigmas(fields["camera_sigma"]),
-        "still": _anchors(fields["still"]),
-        "known": {} if known is None else read_known_motions(known, readout_s),
-        "lengths": () if lengths is None else read_known_lengths(lengths),
-        "readout_s": readout_s,
-    }
+    if "readout_ms" in given:
+        given["readout_s"] = given.pop("readout_ms") / 1e3
+    for key, read in (
+        ("refine", _names_between_commas),
+        ("camera_sigma", _sigmas),
+        ("still", _anchors),
+        ("known", lambda path: read_known_motions(path, given.get("readout_s"))),
+        ("lengths", read_known_lengths),
+    ):
+        if key in given:
+            given[key] = read(given[key])
+    return opt.taken(given, SolveOptions), opt.rectify_options(given), opt.taken(given, OutputOptions)
 
 
-def _names_between_commas(refine: str | None) -> tuple[str, ...] | None:
-    """Names between commas; () for none, None where nothing was said."""
-    if refine is None:
-        return None
+def _names_between_commas(refine: str) -> tuple[str, ...]:
+    """Names between commas; () for none."""
     names = tuple(name.strip() for name in refine.split(",") if name.strip())
     return () if names == ("none",) else names
 
 
-def _sigmas(text: str | None) -> dict[str, float]:
+def _sigmas(text: str) -> dict[str, float]:
     """Standard deviations by name, of NAME=SIGMA with commas between."""
     found: dict[str, float] = {}
-    for each in (text or "").split(",") if text else []:
+    for each in text.split(",") if text else []:
         name, _, number = each.partition("=")
         try:
             found[name.strip()] = float(number)

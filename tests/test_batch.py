@@ -29,6 +29,7 @@ from rsundistort import (
     RunOptions,
     Solution,
     SolvedImage,
+    SolveOptions,
     read_solution,
     rectify_folder,
     run,
@@ -469,7 +470,7 @@ def test_photos_among_the_outputs_are_not_replaced(four, inside):
         with pytest.raises(FileError, match="would be replaced by the outputs"):
             rectify_folder(four / "out" / inside, four / "s.json", out, overwrite=True)
     with pytest.raises(FileError, match="would be replaced by the outputs"):
-        run(four / "out" / inside, four / "out", RunOptions(camera="300,300,160,120", overwrite=True))
+        run(four / "out" / inside, four / "out", RunOptions(camera="300,300,160,120"), overwrite=True)
     assert tree(four) == before
 
 
@@ -553,7 +554,7 @@ def test_sub_folders_that_the_solution_names(tmp_path):
 def courtyard(tmp_path_factory):
     folder = tmp_path_factory.mktemp("courtyard")
     half_courtyard(folder)
-    options = RunOptions(max_features=2000, shutter_model="rotation")
+    options = RunOptions(max_features=2000, solve=SolveOptions(shutter_model="rotation"))
     run(folder / "photos", folder / "out", options)
     return folder, options
 
@@ -595,7 +596,9 @@ def test_a_photo_that_vanishes_from_a_run_is_in_no_model(courtyard, tmp_path):
     shutil.copytree(folder / "photos", tmp_path / "photos")
     gone = COURTYARD_NAMES[-1]
     act = Stop(1, lambda: (tmp_path / "photos" / gone).unlink(missing_ok=True))
-    options = RunOptions(camera=str(folder / "camera.json"), max_features=2000, shutter_model="rotation", jobs=1)
+    options = RunOptions(
+        camera=str(folder / "camera.json"), max_features=2000, solve=SolveOptions(shutter_model="rotation")
+    )
     with pytest.warns(SkippedPhotoWarning, match=f"{gone} cannot be read"):
         solution = run(tmp_path / "photos", tmp_path / "out", options, act)
     assert solution.image(gone).registered
@@ -612,7 +615,7 @@ def test_a_run_says_3_when_its_last_stage_lost_photos(monkeypatch, tmp_path):
     image = SolvedImage("a.png", "1", motion=RowMotion(), reason="a.png cannot be read", rms_px=0.1, rs_shift_px=0.0)
     solution = Solution("global", {"1": camera}, {"1": camera}, (image,))
     # the package, which the function of its name hides
-    monkeypatch.setattr(sys.modules["rsundistort.solve"], "run", lambda *_: solution)
+    monkeypatch.setattr(sys.modules["rsundistort.solve"], "run", lambda *_, **__: solution)
     result = invoke("run", tmp_path, "-o", tmp_path / "out", "--quiet")
     assert result.exit_code == 3
     assert result.stdout == ""

@@ -10,6 +10,7 @@ import pytest
 from critical_scenes import HIDDEN, named_scene
 from numpy_twin import project
 from scipy.spatial.transform import Rotation
+from solved_scene import cameras_of
 
 from rsundistort import (
     BundleOptions,
@@ -389,7 +390,7 @@ def test_lengths_of_photos_that_are_not_joined_are_left_out_and_named(rng):
     ):
         options = BundleOptions(lengths=lengths)
         with pytest.warns(RsUndistortWarning, match=says):
-            solve_tracks(truth, {}, "global", 0, lambda _, options=options: options, StageLog(None))
+            solve_tracks(truth, cameras_of(truth), "global", 0, lambda _, options=options: options, StageLog(None))
 
 
 def test_known_lengths_are_read(tmp_path):

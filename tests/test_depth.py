@@ -18,9 +18,9 @@ from rsundistort import (
     Camera,
     DepthMap,
     Plane,
+    RectifyOptions,
     RowMotion,
     RsUndistortWarning,
-    RunOptions,
     Solution,
     SolvedImage,
     distort_points,
@@ -34,7 +34,7 @@ from rsundistort import (
     undistort_points,
     write_solution,
 )
-from rsundistort.batch.geometry import PhotoDepths, ScenePoints
+from rsundistort.batch.geometry import SceneGeometry, ScenePoints
 from rsundistort.errors import FileError, InputError
 from rsundistort.evaluation import psnr
 from rsundistort.io import find_depth_maps, read_depth_map, write_colmap_model
@@ -550,13 +550,13 @@ def test_rectify_says_that_the_points_are_missing(tmp_path, rng):
     with pytest.raises(FileError, match="'somewhere' is no folder, nor one of auto, infinity, plane, points"):
         rectify_folder(tmp_path / "photos", tmp_path / "solution.json", tmp_path / "two", depth="somewhere")
     with pytest.raises(FileError, match="is no folder"):
-        RunOptions(depth="somewhere")
+        RectifyOptions(depth="somewhere")
 
 
 def test_auto_leaves_photos_alone_that_hardly_travelled(rng):
     for velocity, kind in (((0.004, 0.0, 0.0), "infinity"), ((0.1, 0.0, 0.0), "points")):
         rec, solution = small_scene(rng, velocity)
-        found = PhotoDepths(solution, "auto", ScenePoints.of_reconstruction(rec)).of("1.png")
+        found = SceneGeometry(solution, "auto", ScenePoints.of_reconstruction(rec)).of("1.png").find_depth()
         assert found.kind == kind
         assert (found.shift_px > 0.5) == (kind == "points")
 
@@ -566,17 +566,19 @@ def test_auto_takes_the_plane_of_a_flat_scene(rng):
     flat = np.array(rec.points_w)
     flat[:, 2] = 7.0 + 0.1 * flat[:, 0] + rng.normal(0, 0.02, len(flat))
     points = ScenePoints.of_reconstruction(replace(rec, points_w=flat))
-    found = PhotoDepths(solution, "auto", points).of("2.png")
+    found = SceneGeometry(solution, "auto", points).of("2.png").find_depth()
     assert found.kind == "plane"
     assert isinstance(found.depth, Plane)
-    assert PhotoDepths(solution, "points", points).of("2.png").kind == "points"
-    assert PhotoDepths(solution, "plane", ScenePoints.of_reconstruction(rec)).of("2.png").kind == "plane"
+    assert SceneGeometry(solution, "points", points).of("2.png").find_depth().kind == "points"
+    assert SceneGeometry(solution, "plane", ScenePoints.of_reconstruction(rec)).of("2.png").find_depth().kind == "plane"
 
 
 def test_rotation_models_know_no_depth(rng):
     rec, solution = small_scene(rng)
-    found = PhotoDepths(replace(solution, shutter_model="rotation"), "auto", ScenePoints.of_reconstruction(rec)).of(
-        "1.png"
+    found = (
+        SceneGeometry(replace(solution, shutter_model="rotation"), "auto", ScenePoints.of_reconstruction(rec))
+        .of("1.png")
+        .find_depth()
     )
     assert (found.kind, found.shift_px) == ("infinity", 0.0)
 
@@ -606,7 +608,7 @@ def test_maps_of_another_scale_are_noticed(tmp_path, rng):
     rec, solution = small_scene(rng)
     np.save(tmp_path / "1.npy", np.full((H, W), 700.0))
     with pytest.warns(RsUndistortWarning, match=r"depths are [\d.]+ times those of the solution's points"):
-        PhotoDepths(solution, tmp_path, ScenePoints.of_reconstruction(rec)).of("1.png")
+        SceneGeometry(solution, tmp_path, ScenePoints.of_reconstruction(rec)).of("1.png").find_depth()
 
 
 def test_maps_that_cannot_be_used_are_refused(tmp_path, rng):
@@ -635,7 +637,7 @@ def test_maps_that_cannot_be_used_are_refused(tmp_path, rng):
     ):
         np.save(tmp_path / "1.npy", values)
         with pytest.raises(InputError, match=says):
-            PhotoDepths(solution, tmp_path, None).of("1.png")
+            SceneGeometry(solution, tmp_path, None).of("1.png").find_depth()
 
 
 def test_depth_in_the_solution_survives_the_file(tmp_path, rng):

@@ -143,7 +143,7 @@ def prepared(tmp_path_factory):
     K = [[400.0, 0.0, 243.0], [0.0, 400.0, 156.375], [0.0, 0.0, 1.0]]
     (place / "camera.json").write_text(json.dumps({"width": 480, "height": 320, "K": K, "dist": []}))
     np.savetxt(place / "K.txt", K)
-    rs.run(place / "PHOTOS", place / "OUT", rs.RunOptions(shutter_model="rotation", jobs=2))
+    rs.run(place / "PHOTOS", place / "OUT", rs.RunOptions(solve=rs.SolveOptions(shutter_model="rotation")), jobs=2)
     shutil.copytree(place / "OUT" / "sparse", place / "MODEL")
     shutil.copytree(place / "PHOTOS", place / "STILL")
     shutil.copytree(place / "PHOTOS", place / "SWUNG")

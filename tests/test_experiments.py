@@ -615,15 +615,15 @@ def made_up(monkeypatch, poses, rng):
     bent = center + rng.normal(0, 0.2, center.shape)
     calls = []
 
-    def fake(photos, out, options, progress=None):
-        calls.append((photos.name, out.name, options))
+    def fake(photos, out, options, progress=None, jobs=0):
+        calls.append((photos.name, out.name, options, jobs))
         if progress is not None:
             progress("matching", 0, 0)
         out.mkdir()
         (out / "solution.json").write_text("{}")
         if photos.name == "still":
             return solution_of(R, center, model="global")
-        if options.shutter_model == "global":
+        if options.solve.shutter_model == "global":
             return solution_of(*moved(R, bent, rng), model="global", lost=["5.png"])
         return solution_of(*moved(R, center, rng), model="rotation")
 
@@ -635,13 +635,13 @@ def test_experiment_two_writes_what_it_promises(folders, made_up, tmp_path):
     out, told = tmp_path / "out", []
     options = TwoOptions(camera="500,500,320,240", readout="bottom-to-top", seed=3, jobs=1)
     summary = experiment_two(*folders, out, options, lambda *args: told.append(args))
-    assert [(photos, name, o.shutter_model) for photos, name, o in made_up] == [
+    assert [(photos, name, o.solve.shutter_model) for photos, name, o, _ in made_up] == [
         ("still", "still", "global"),
         ("swung", "swung", "auto"),
         ("swung", "swung-global", "global"),
     ]
-    for _, _, passed in made_up:
-        assert (passed.camera, passed.readout, passed.seed, passed.jobs) == (
+    for _, _, passed, jobs in made_up:
+        assert (passed.camera, passed.solve.readout, passed.solve.seed, jobs) == (
             "500,500,320,240", "bottom-to-top", 3, 1,
         )  # fmt: skip
     assert [stage for stage, _, _ in told] == ["still: matching", "swung: matching", "swung-global: matching"]
@@ -688,7 +688,7 @@ def test_experiment_two_keeps_outputs_unless_told(folders, made_up, tmp_path):
 
 
 def test_experiment_two_leaves_nothing_where_too_few_are_joined(folders, made_up, monkeypatch, poses, tmp_path):
-    monkeypatch.setattr(two, "run", lambda *_: solution_of(*poses, lost=NAMES[:4]))
+    monkeypatch.setattr(two, "run", lambda *_, **__: solution_of(*poses, lost=NAMES[:4]))
     with pytest.raises(InputError, match="2 photos were joined in all three"):
         experiment_two(*folders, tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -697,7 +697,7 @@ def test_experiment_two_leaves_nothing_where_too_few_are_joined(folders, made_up
 def test_experiment_two_says_which_photos_cannot_be_joined(folders, made_up, monkeypatch, tmp_path):
     good = two.run
 
-    def fake(photos, out, options, progress=None):
+    def fake(photos, out, options, progress=None, jobs=0):
         if photos.name == "swung":
             raise ReconstructionError("only 2 of 6 photos could be joined")
         return good(photos, out, options, progress)
@@ -750,7 +750,7 @@ def test_command_two(folders, made_up, tmp_path):
     assert "still 6, swung 6, swung-global 5 of 6; 5 compared" in result.stdout
     assert "swung-global: 5.png not joined" in result.stdout
     assert all(len(line) <= 100 for line in result.stdout.splitlines()[:5])
-    assert made_up[1][2].shutter_model == "two-step"
+    assert made_up[1][2].solve.shutter_model == "two-step"
     again = CliRunner().invoke(cli, args)
     assert again.exit_code == 1
     assert "not empty" in again.stderr

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from make_photos import camera_exif, texture
+from solved_scene import cameras_of
 from test_bundle import make_scene
 
 from rsundistort.batch.progress import StageLog
@@ -138,6 +139,6 @@ def test_motions_against_the_exposure_are_looked_for(rng, monkeypatch):
 
     monkeypatch.setattr(ladder, "judge", judged)
     options = BundleOptions(phi_limits={"1.jpg": 1e-5})
-    solved = ladder.solve_tracks(rec, {}, "rotation", 0, lambda _: options, StageLog(None), "none")
+    solved = ladder.solve_tracks(rec, cameras_of(rec), "rotation", 0, lambda _: options, StageLog(None), "none")
     assert told == [{"1.jpg": 2e-5}]
     assert solved.verdict is not None

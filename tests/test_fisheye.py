@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 from make_photos import COURTYARD
 
-from rsundistort import Camera, RowMotion, RunOptions, evaluate, optimal_new_camera, rectify, run, unproject_points
+from rsundistort import (
+    Camera,
+    RowMotion,
+    RunOptions,
+    SolveOptions,
+    evaluate,
+    optimal_new_camera,
+    rectify,
+    run,
+    unproject_points,
+)
 from rsundistort.colmap.lenses import camera_to_colmap, refined_camera
 from rsundistort.errors import InputError
 from rsundistort.model.projection import project_points
@@ -108,7 +118,7 @@ def test_run_on_photos_of_a_fisheye(tmp_path):
     simulate_scene(tmp_path / "recipe.json", tmp_path / "scene", SceneOptions(depth=False))
     guess = {**recipe["camera"], "K": [[206.0, 0, 243], [0, 206, 156.5], [0, 0, 1]], "dist": []}
     (tmp_path / "guess.json").write_text(json.dumps(guess))
-    options = RunOptions(camera=str(tmp_path / "guess.json"), refine=("f", "k1", "k2"))
+    options = RunOptions(camera=str(tmp_path / "guess.json"), solve=SolveOptions(refine=("f", "k1", "k2")))
     solution = run(tmp_path / "scene" / "photos", tmp_path / "out", options)
     result = evaluate(tmp_path / "out", tmp_path / "scene" / "ground_truth.json")
     assert result.registered == 10

@@ -10,9 +10,19 @@ import pytest
 from rsundistort_cli.closing import _fields
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
+from solved_scene import cameras_of
 from test_bundle import make_scene, perturbed
 
-from rsundistort import BundleOptions, Camera, RowMotion, Solution, SolveOptions, bundle_adjust, init_rectify_map
+from rsundistort import (
+    BundleOptions,
+    Camera,
+    RectifyOptions,
+    RowMotion,
+    Solution,
+    SolveOptions,
+    bundle_adjust,
+    init_rectify_map,
+)
 from rsundistort.batch.progress import StageLog
 from rsundistort.bundle import choose_model
 from rsundistort.bundle.intrinsics import GuessedCameras, moved_camera
@@ -20,7 +30,6 @@ from rsundistort.bundle.lens_field import LensFields
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.bundle.spreads import Spreads
 from rsundistort.errors import FormatError, InputError
-from rsundistort.input.photo_cameras import PhotoCameras
 from rsundistort.io import read_solution, write_solution
 from rsundistort.io.cameras import camera_from_json, camera_to_json
 from rsundistort.model.field import field_basis, field_over_frame, field_slope, lens_pixels, raw_pixels
@@ -30,7 +39,7 @@ from rsundistort.model.reprojection import reprojection_residuals
 from rsundistort.rectify import rectify
 from rsundistort.report import content
 from rsundistort.solve.model_sequence import solve_tracks
-from rsundistort.solve.outcome import Outcome, solution_of
+from rsundistort.solve.outcome import solution_of
 from rsundistort.synthetic.lens import distort_rays
 from rsundistort.verdict import judge
 
@@ -340,9 +349,9 @@ def test_a_lens_that_its_model_says_badly_is_told(rng):
 
 def test_what_was_found_is_told_and_read_back(rng, tmp_path):
     rec = scene_with_field(rng, waves, "global")
-    cameras = PhotoCameras(rec.cameras, ("camera",), rec.camera_idx, True, (True,), "camera.json")
-    solved = solve_tracks(rec, {}, "auto", 0, lambda _: replace(options_of(rec), residual_field=False), StageLog(None))
-    solution = solution_of(Outcome(solved, cameras, (1,)), SolveOptions())
+    options = replace(options_of(rec), residual_field=False)
+    solved = solve_tracks(rec, cameras_of(rec), "auto", 0, lambda _: options, StageLog(None))
+    solution = solution_of(solved, SolveOptions(), RectifyOptions())
     field = solution.cameras["1"].field
     assert field.shape == (4, 5, 2)
     told = solution.quality["lens_fields"]["1"]

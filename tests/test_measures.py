@@ -8,7 +8,6 @@ from solved_scene import SCENES
 
 from rsundistort import BundleOptions, Observations, Reconstruction, Solution, SolvedImage, bundle_adjust, read_solution
 from rsundistort.critical import heal
-from rsundistort.solve.model_sequence import Solved
 
 
 def test_errors_of_measurements_with_known_noise_are_one_deviation(rng):
@@ -35,7 +34,7 @@ def test_errors_of_measurements_with_known_noise_are_one_deviation(rng):
         ]
         critical = {"sigma_log_k": remedy.after.sigma_log_k}
         solution = Solution("rotation", truth.cameras, truth.rectified_cameras, images, critical)
-        sigmas = library_sigmas(Solved(result, result, remedy=remedy), options)
+        sigmas = library_sigmas(result, remedy, options)
         errors.append(normalised_errors(solution, truth, sigmas, log_k_error(rec, truth)))
     # eight draws of a few modes: their mean square is right to about a third
     rms = pooled(errors)

@@ -13,7 +13,6 @@ from make_photos import texture
 
 from rsundistort import (
     Camera,
-    RectifyOptions,
     RowMotion,
     RsUndistortWarning,
     Solution,
@@ -125,9 +124,7 @@ def test_photos_that_are_refused_do_not_count(tmp_path, monkeypatch):
         cv2.imwrite(str(tmp_path / f"{k}.png"), texture(90, 60))
     cv2.imwrite(str(tmp_path / "large.png"), texture(400, 300))
     with pytest.warns(SkippedPhotoWarning, match=r"large\.png has 400x300 pixels"):
-        load_photos(
-            tmp_path, "80,80,44.5,29.5", None, 500, Workers(1), StageLog(None), RectifyOptions(max_megapixels=0.1)
-        )
+        load_photos(tmp_path, "80,80,44.5,29.5", None, 500, Workers(1), StageLog(None), max_megapixels=0.1)
     assert asked == [90 * 60 * (245 + 16)]
 
 

@@ -19,6 +19,8 @@ from rsundistort import (
     project_points,
 )
 from rsundistort.errors import InputError
+from rsundistort.model import other_axis
+from rsundistort.model.projection import clock_of
 
 K = [[500.0, 0, 320], [0, 400, 240], [0, 0, 1]]
 NAN = float("nan")
@@ -164,6 +166,25 @@ def test_camera_is_a_value():
 )
 def test_frame_span_is_how_far_the_clock_runs(readout, span):
     assert make_camera(readout=readout).frame_span == pytest.approx(span, rel=1e-15)  # one division
+
+
+@pytest.mark.parametrize(
+    ("readout", "axis", "sign", "lines", "other"),
+    [
+        ("top-to-bottom", 1, 1.0, 480, "left-to-right"),
+        ("bottom-to-top", 1, -1.0, 480, "left-to-right"),
+        ("left-to-right", 0, 1.0, 640, "top-to-bottom"),
+        ("right-to-left", 0, -1.0, 640, "top-to-bottom"),
+    ],
+)
+def test_a_camera_says_which_way_its_clock_runs(readout, axis, sign, lines, other):
+    camera = make_camera(readout=readout)
+    assert (camera.clock_axis, camera.clock_sign, camera.num_lines) == (axis, sign, lines)
+    assert other_axis(readout) == other
+    step = sign * np.eye(2)[axis]
+    # the kernels' clock: it is zero at the principal point, and shows 1/f more a line later
+    clock = clock_of(camera, np.stack([camera.K[:2, 2], camera.K[:2, 2] + step]))
+    np.testing.assert_allclose(clock, [0.0, 1.0 / camera.K[axis, axis]], rtol=1e-12)
 
 
 def test_motion_has_the_aspect_and_skew_of_the_papers_camera():

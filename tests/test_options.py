@@ -2,27 +2,46 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import sys
 from dataclasses import fields, replace
 from pathlib import Path
 
 import click
-import numpy as np
 import pytest
 from click.testing import CliRunner
 from rsundistort_cli.rectify import command as rectify_command
 from rsundistort_cli.run import command as run_command
 from rsundistort_cli.solve import command as solve_command
 
-from rsundistort import GyroOptions, KnownLength, RectifyOptions, RunOptions, SolveOptions, ViewOptions
+from rsundistort import (
+    GyroOptions,
+    KnownLength,
+    RectifyOptions,
+    RunOptions,
+    SolveOptions,
+    ViewOptions,
+    rectify_folder,
+    run,
+    solve,
+)
+from rsundistort.errors import InputError
+from rsundistort.solve import OutputOptions
 
-# of the command itself, or arguments of the function beside the options
+# of the command itself, or no options
 NOT_OPTIONS = {
-    "photos", "model", "out", "solution", "resume", "images", "database",
-    "progress_form", "as_json", "quiet", "verbose", "help",
-}  # fmt: skip
-ARGUMENTS_OF_RECTIFY = {"jobs", "scheduler", "overwrite"}
+    "photos",
+    "model",
+    "out",
+    "solution",
+    "images",
+    "database",
+    "progress_form",
+    "as_json",
+    "quiet",
+    "verbose",
+}
 
 PHOTO = [
     (["--masks", "."], {"masks": Path()}),
@@ -40,7 +59,6 @@ PHOTO = [
     (["--also", "."], {"also": ((Path(), "nearest"),)}),
 ]
 SOLVE = [
-    *PHOTO,
     (["--readout", "left-to-right"], {"readout": {"": "left-to-right"}}),
     (["--model", "rotation"], {"shutter_model": "rotation"}),
     (["--refine", "f,k1"], {"refine": ("f", "k1")}),
@@ -49,16 +67,19 @@ SOLVE = [
     (["--lengths", "lengths.csv"], {"lengths": [KnownLength(("a", 1.0, 2.0), ("a", 3.0, 4.0), 5.0, 0.1)] * 2}),
     (["--readout-ms", "20"], {"readout_s": 0.02}),
     (["--remedy", "none"], {"remedy": "none"}),
+    (["--seed", "3"], {"seed": 3}),
+]
+OUTPUTS = [
     (["--sparse-format", "txt"], {"sparse_format": "txt"}),
     (["--rs-poses"], {"rs_poses": True}),
-    (["--seed", "3"], {"seed": 3}),
+    (["--no-report"], {"report": False}),
+]
+WORK = [
     (["--jobs", "1"], {"jobs": 1}),
     (["--scheduler", "tcp://host:8786"], {"scheduler": "tcp://host:8786"}),
     (["--overwrite"], {"overwrite": True}),
-    (["--no-report"], {"report": False}),
 ]
-RUN = [
-    *SOLVE,
+MEASURE = [
     (["--camera", "camera.json"], {"camera": "camera.json"}),
     (["--every", "4"], {"every": 4}),
     (["--sharpest", "4"], {"sharpest": 4}),
@@ -70,82 +91,141 @@ RUN = [
     (["--feature-megapixels", "2"], {"feature_megapixels": 2.0}),
     (["--matching", "neighbours"], {"matching": "neighbours"}),
 ]
+# command, package and name of its function, required arguments
 COMMANDS = {
-    "run": (run_command, "rsundistort.solve", "run", RunOptions(), RUN, ["photos", "-o", "out"]),
-    "solve": (solve_command, "rsundistort.solve", "solve", SolveOptions(), SOLVE, ["model", "-o", "out"]),
+    "run": (run_command, "rsundistort.solve", run, ["photos", "-o", "out"]),
+    "solve": (solve_command, "rsundistort.solve", solve, ["model", "-o", "out"]),
     "rectify": (
-        rectify_command, "rsundistort.batch", "rectify_folder", RectifyOptions(), PHOTO,
-        ["photos", "--solution", "s.json", "-o", "out"],
+        rectify_command, "rsundistort.batch", rectify_folder, ["photos", "--solution", "s.json", "-o", "out"],
     ),
 }  # fmt: skip
+# which options set fields of which part, under the name that the function has for it; "" are its own arguments
+PARTS = {
+    "run": {"options": MEASURE, "solve": SOLVE, "rectify": PHOTO, "outputs": OUTPUTS, "": WORK},
+    "solve": {"options": SOLVE, "rectify": PHOTO, "outputs": OUTPUTS, "": WORK},
+    "rectify": {"options": PHOTO, "": [*WORK, (["--resume"], {"resume": True})]},
+}
+DEFAULTS = {
+    "run": {"options": RunOptions(), "solve": SolveOptions(), "rectify": RectifyOptions(), "outputs": OutputOptions()},
+    "solve": {"options": SolveOptions(), "rectify": RectifyOptions(), "outputs": OutputOptions()},
+    "rectify": {"options": RectifyOptions()},
+}
+TRIED = [(name, part, *each) for name, parts in PARTS.items() for part, tried in parts.items() for each in tried]
+# no file holds what a gyroscope knows; the parts of `RunOptions` are seen by themselves
+WITHOUT_OPTION = {"known", "known_bends", "solve", "rectify", "outputs"}
 
 
 class Seen(Exception):
-    """Carries the options that a command made."""
+    """Carries what a command calls its function with."""
 
 
 @pytest.fixture
-def options_of(monkeypatch, tmp_path):
-    """What options a command makes of its arguments."""
+def call_of(monkeypatch, tmp_path):
+    """What a command calls its function with: options by part, and arguments as ""."""
     monkeypatch.chdir(tmp_path)
     for name in ("lengths.csv", "log.csv", "t.csv"):
         Path(name).write_text("photo1,x1,y1,photo2,x2,y2,length,sigma\n" + "a,1,2,,3,4,5,0.1\n" * 2)
     Path("s.json").write_text("{}")
 
-    def options(name, *arguments):
-        command, package, function, default, _, required = COMMANDS[name]
+    def call(name, *arguments):
+        command, package, function, required = COMMANDS[name]
 
-        def stop(*given, **_):
-            raise Seen(next(each for each in given if isinstance(each, type(default))))
+        def stop(*given, **named):
+            raise Seen(inspect.signature(function).bind(*given, **named))
 
-        monkeypatch.setattr(sys.modules[package], function, stop)
+        monkeypatch.setattr(sys.modules[package], function.__name__, stop)
         result = CliRunner().invoke(command, [*required, *arguments])
         assert isinstance(result.exception, Seen), result.output
-        return result.exception.args[0]
+        found = result.exception.args[0]
+        found.apply_defaults()
+        found = {**found.arguments}
+        if name == "run":
+            found |= {part: getattr(found["options"], part) for part in ("solve", "rectify", "outputs")}
+        parts = {part: as_plain(found[part]) for part in DEFAULTS[name]}
+        return {**parts, "": {key: found[key] for key in arguments_of(name)}}
 
-    return options
+    return call
+
+
+def arguments_of(name):
+    """Arguments of the function that options set."""
+    return [field for _, changed in PARTS[name][""] for field in changed]
 
 
 def as_plain(options):
     """Fields in a form that compares."""
-    return {each.name: json.dumps(getattr(options, each.name), default=repr) for each in fields(options)}
+    plain = {each.name: json.dumps(getattr(options, each.name), default=repr) for each in fields(options)}
+    return {key: value for key, value in plain.items() if key not in ("solve", "rectify", "outputs")}
+
+
+def untouched(name):
+    """What a command calls its function with where no option is given."""
+    signature = inspect.signature(COMMANDS[name][2]).parameters
+    parts = {part: as_plain(each) for part, each in DEFAULTS[name].items()}
+    return {**parts, "": {key: signature[key].default for key in arguments_of(name)}}
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_defaults_are_those_of_the_fields(name, options_of):
-    assert as_plain(options_of(name)) == as_plain(COMMANDS[name][3])
+def test_defaults_are_those_of_the_fields(name, call_of):
+    assert call_of(name) == untouched(name)
 
 
-@pytest.mark.parametrize(
-    ("name", "arguments", "changed"), [(name, *each) for name, of in COMMANDS.items() for each in of[4]]
-)
-def test_an_option_sets_its_field_and_no_other(name, arguments, changed, options_of):
-    expected = replace(COMMANDS[name][3], **changed)
-    assert as_plain(options_of(name, *arguments)) == as_plain(expected)
+@pytest.mark.parametrize(("name", "part", "arguments", "changed"), TRIED)
+def test_an_option_sets_its_field_and_no_other(name, part, arguments, changed, call_of):
+    expected = untouched(name)
+    expected[part] = as_plain(replace(DEFAULTS[name][part], **changed)) if part else expected[part] | changed
+    assert call_of(name, *arguments) == expected
 
 
-def test_known_motions_set_their_field(options_of, tmp_path):
+@pytest.mark.parametrize(("name", "part", "arguments", "changed"), TRIED)
+def test_the_default_that_help_shows_is_that_of_the_field(name, part, arguments, changed):
+    (field,) = changed
+    option = next(each for each in COMMANDS[name][0].params if arguments[-2:][0] in [*each.opts, *each.secondary_opts])
+    shown = option.to_info_dict()["default"]
+    if not option.show_default:
+        return
+    of_view = {"scale": "scale", "alpha": "alpha", "max_size": "max_size"}.get(option.name)
+    kept = getattr(DEFAULTS[name][part], field)
+    assert shown == (getattr(kept, of_view) if of_view else kept)
+
+
+def test_known_motions_set_their_field(call_of, tmp_path):
     (tmp_path / "known.csv").write_text("name,phi1,phi2,phi3,sigma\na.jpg,0.01,0,0,0.001\n")
-    for name in ("run", "solve"):
-        known = options_of(name, "--known", "known.csv").known
-        assert list(known) == ["a.jpg"]
-        np.testing.assert_array_equal(known["a.jpg"][0], [0.01, 0, 0])
+    for name, part in (("run", "solve"), ("solve", "options")):
+        (known,) = json.loads(call_of(name, "--known", "known.csv")[part]["known"]).items()
+        assert known[0] == "a.jpg"
+        assert "0.01" in str(known[1])
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_option_is_tried(name):
-    command, *_, tried, _ = COMMANDS[name]
-    flags = {flag for arguments, _ in tried for flag in arguments if flag.startswith("--")} | {"--known"}
-    beside = NOT_OPTIONS | (ARGUMENTS_OF_RECTIFY if name == "rectify" else set())
-    options = [each for each in command.params if isinstance(each, click.Option) and each.name not in beside]
-    assert [each.name for each in options if not flags & {*each.opts, *each.secondary_opts}] == []
+    flags = {flag for of, _, arguments, _ in TRIED if of == name for flag in arguments if flag.startswith("--")}
+    options = [each for each in COMMANDS[name][0].params if isinstance(each, click.Option)]
+    untried = [each.name for each in options if not (flags | {"--known"}) & {*each.opts, *each.secondary_opts}]
+    assert not {*untried} - NOT_OPTIONS
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_field_has_an_option(name):
-    _, _, _, default, tried, _ = COMMANDS[name]
-    # a gyroscope's, which no file holds
-    without = {"known", "known_bends"}
-    assert {each.name for each in fields(default)} - without == {
-        field for _, changed in tried for field in changed
-    } - without
+@pytest.mark.parametrize(("name", "part"), [(name, part) for name, parts in DEFAULTS.items() for part in parts])
+def test_every_field_has_an_option(name, part):
+    tried = {field for _, changed in PARTS[name][part] for field in changed}
+    assert {each.name for each in fields(DEFAULTS[name][part])} - WITHOUT_OPTION == tried - WITHOUT_OPTION
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "says"),
+    [
+        (
+            RunOptions,
+            {"shutter_model": "rotation"},
+            "RunOptions has no 'shutter_model', which is a field of SolveOptions",
+        ),
+        (RunOptions, {"quality": 90}, "RunOptions has no 'quality', which is a field of RectifyOptions"),
+        (SolveOptions, {"report": False}, "SolveOptions has no 'report', which is a field of OutputOptions"),
+        (SolveOptions, {"jobs": 2}, "SolveOptions has no 'jobs', which is an argument of run and solve"),
+    ],
+)
+def test_an_option_that_moved_is_refused_with_its_place(kind, given, says):
+    with pytest.raises(InputError, match=f"^{says}$"):
+        kind(**given)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'no_such'"):
+        kind(no_such=1)

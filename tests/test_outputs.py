@@ -14,7 +14,7 @@ import trimesh
 from rsundistort_cli import closing
 from scipy.spatial.transform import Rotation, Slerp
 
-from rsundistort import RsUndistortWarning
+from rsundistort import RectifyOptions, RsUndistortWarning
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
 from rsundistort.colmap.rectified_model import ModelIds
@@ -31,7 +31,7 @@ from rsundistort.io import (
 from rsundistort.model import Bend, Camera, Observations, Reconstruction, RowMotion, Solution, SolvedImage
 from rsundistort.model.projection import clock_of, project_points, unproject_points
 from rsundistort.rectify import bend_px
-from rsundistort.solve import SolveOptions
+from rsundistort.solve import OutputOptions
 from rsundistort.solve.run_outputs import Outputs, _left_by_two_poses, photo_times
 
 W, H = 640, 480
@@ -113,9 +113,9 @@ def test_scripts_are_shell_and_name_no_machine(tmp_path):
 
 def outputs_of(rng, tmp_path, options=None, turns=None, cameras=None, with_photos=True, times=None, names=None):
     rec, solution = solved(rng, cameras or [camera_of()], names=names)
-    options = options or SolveOptions()
+    options = options or OutputOptions()
     ids = ModelIds.in_order(rec)
-    made = Outputs(solution, rec, options, ids, turns or {}, None, with_photos, times or {})
+    made = Outputs(solution, rec, RectifyOptions(), options, ids, turns or {}, None, with_photos, times or {})
     tmp_path.mkdir(exist_ok=True)
     return made, made.begin(tmp_path, StageLog(None))
 
@@ -127,7 +127,7 @@ def test_sparse_opens_as_text_and_binary(tmp_path, rng, form, num_cameras):
 
     cameras = [camera_of(), camera_of(dist=()), camera_of(lens="fisheye")][:num_cameras]
     names = [f"sub{k % 2}/{k}.jpg" for k in range(4)]
-    made, _ = outputs_of(rng, tmp_path, SolveOptions(sparse_format=form), cameras=cameras, names=names)
+    made, _ = outputs_of(rng, tmp_path, OutputOptions(sparse_format=form), cameras=cameras, names=names)
     parts = {path.name for path in (tmp_path / "sparse").iterdir()}
     assert parts == {f"{part}.{form}" for part in ("cameras", "images", "points3D", "rigs", "frames")}
     model = pycolmap.Reconstruction(tmp_path / "sparse")
@@ -141,7 +141,7 @@ def test_sparse_opens_as_text_and_binary(tmp_path, rng, form, num_cameras):
 
 def test_text_that_cuts_names_is_said(tmp_path, rng):
     with pytest.warns(RsUndistortWarning, match="names end at a space in text, such as sub 0/0.jpg"):
-        outputs_of(rng, tmp_path, SolveOptions(sparse_format="txt"), with_photos=False)
+        outputs_of(rng, tmp_path, OutputOptions(sparse_format="txt"), with_photos=False)
 
 
 def write_colmap_array(path, array):
@@ -157,7 +157,9 @@ def test_dense_fusion_of_colmap_runs_in_the_workspace(tmp_path, rng):
     K = np.array([[75.0, 0, 47.2], [0, 76.0, 35.1], [0, 0, 1]])
     small = Camera(96, 72, K)
     solution = replace(solution, rectified_cameras={"1": small})
-    Outputs(solution, rec, SolveOptions(), ModelIds.in_order(rec), {}).begin(tmp_path, StageLog(None))
+    Outputs(solution, rec, RectifyOptions(), OutputOptions(), ModelIds.in_order(rec), {}).begin(
+        tmp_path, StageLog(None)
+    )
     v, u = np.mgrid[:72, :96]
     rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T
     for image in solution.images:  # stereo itself needs a graphics card; its maps of the plane z = 8 do not
@@ -179,7 +181,7 @@ def test_dense_fusion_of_colmap_runs_in_the_workspace(tmp_path, rng):
 
 def test_depth_maps_of_an_earlier_result_stay_and_are_told_of(tmp_path, rng):
     """COLMAP made them, and would take them for those of the new photos."""
-    made, _ = outputs_of(rng, tmp_path / "first", SolveOptions(report=False), names=[f"{k}.png" for k in range(4)])
+    made, _ = outputs_of(rng, tmp_path / "first", OutputOptions(report=False), names=[f"{k}.png" for k in range(4)])
     for name in made.reconstruction.image_names:
         (tmp_path / "photos").mkdir(exist_ok=True)
         cv2.imwrite(str(tmp_path / "photos" / name), np.full((H, W, 3), 90, np.uint8))
@@ -220,7 +222,7 @@ def test_turned_photos_have_their_cameras_in_the_model(tmp_path, rng, orientatio
 
 def test_sparse_format_is_checked():
     with pytest.raises(InputError, match="expected bin or txt"):
-        SolveOptions(sparse_format="ply")
+        OutputOptions(sparse_format="ply")
 
 
 # ---------------------------------------------------------------- poses and points
@@ -485,7 +487,7 @@ def test_rs_poses_go_beside_the_model_and_name_the_originals(tmp_path, rng):
     outputs_of(rng, tmp_path / "without")
     assert not (tmp_path / "without" / "rs-poses").exists()
     turns = {f"sub {k % 2}/{k}.jpg": 6 for k in range(4)}
-    made, _ = outputs_of(rng, tmp_path / "with", SolveOptions(rs_poses=True), turns)
+    made, _ = outputs_of(rng, tmp_path / "with", OutputOptions(rs_poses=True), turns)
     value = json.loads((tmp_path / "with" / "rs-poses" / "transforms.json").read_text())
     assert (value["w"], value["h"]) == (W, H)  # as stored, not as turned
     assert [frame["file_path"] for frame in value["frames"]] == list(made.reconstruction.image_names)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from make_photos import COURTYARD_NAMES, exif_block, half_courtyard, save_png, texture
 
-from rsundistort import Camera, RowMotion, RunOptions, rectify, rectify_folder, run
+from rsundistort import Camera, RectifyOptions, RowMotion, RunOptions, SolveOptions, rectify, rectify_folder, run
 from rsundistort.errors import FileError, FormatError, InputError
 from rsundistort.input import photo_cameras
 from rsundistort.io import Metadata, find_masks, read_exif, read_mask, write_image
@@ -131,7 +131,7 @@ def test_what_the_user_says_of_the_readout_overrides_the_file_and_the_guess(fold
     with pytest.raises(InputError, match="no such group of photos, there are x, z"):
         find_cameras(folder, NAMES, SIZES, readout={"q": "right-to-left"})
     with pytest.raises(InputError, match="upwards"):
-        RunOptions(readout={"z": "upwards"})
+        SolveOptions(readout={"z": "upwards"})
 
 
 def test_directions_that_nobody_told_are_guesses(folder, tmp_path):
@@ -216,7 +216,9 @@ def test_run_and_rectify_keep_masks_out_of_features_and_outputs(tmp_path):
     mask[:, 300:] = 0
     for name in COURTYARD_NAMES[:3]:  # the last photo has none
         save_png(masks / name, mask)
-    options = RunOptions(max_features=2500, jobs=2, shutter_model="rotation", masks=masks)
+    options = RunOptions(
+        max_features=2500, solve=SolveOptions(shutter_model="rotation"), rectify=RectifyOptions(masks=masks)
+    )
     solution = run(photos, tmp_path / "out", options)
     shown = [cv2.imread(str(tmp_path / "out" / "masks" / name), cv2.IMREAD_GRAYSCALE) for name in COURTYARD_NAMES[:4]]
     for valid in shown[:3]:

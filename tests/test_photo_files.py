@@ -16,10 +16,12 @@ from rsundistort_cli.main import cli
 
 from rsundistort import (
     Camera,
+    RectifyOptions,
     RowMotion,
     RunOptions,
     Solution,
     SolvedImage,
+    SolveOptions,
     evaluate,
     read_solution,
     rectify_folder,
@@ -119,7 +121,11 @@ def turned_run(tmp_path_factory):
         write_image(photos / name, read_photo(photos / name).pixels, Metadata(camera_exif("<", o)))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        options = RunOptions(max_features=2500, shutter_model="rotation", apply_orientation=True)
+        options = RunOptions(
+            max_features=2500,
+            solve=SolveOptions(shutter_model="rotation"),
+            rectify=RectifyOptions(apply_orientation=True),
+        )
         solution = run(photos, folder / "out", options)
     plain, _ = rectify_folder(photos, folder / "out" / "solution.json", folder / "plain")
     return folder, orientations, solution, plain, [str(w.message) for w in caught]
@@ -246,7 +252,7 @@ def test_the_others_go_on(tmp_path):
 
 def test_options_are_checked():
     with pytest.raises(InputError, match="raw_as"):
-        RunOptions(raw_as="bmp")
+        RectifyOptions(raw_as="bmp")
 
 
 def test_a_png_under_the_name_of_a_jpeg_is_written_as_its_name_says(tmp_path):

@@ -11,11 +11,13 @@ from make_photos import COURTYARD_NAMES, half_courtyard, save_png, save_textures
 
 from rsundistort import (
     Camera,
+    RectifyOptions,
     RowMotion,
     RsUndistortWarning,
     RunOptions,
     Solution,
     SolvedImage,
+    SolveOptions,
     evaluate,
     read_solution,
     rectify,
@@ -29,11 +31,12 @@ from rsundistort.io import read_photo
 from rsundistort.io.record import Record
 from rsundistort.model import READOUTS
 from rsundistort.simulate import WarpOptions, simulate_warp
+from rsundistort.solve import OutputOptions
 from rsundistort.solve.run_outputs import files_of_run
 from rsundistort.synthetic.warp import largest_rectangle
 
 CAMERA = "300,300,160,120"
-OPTIONS = RunOptions(max_features=2500, jobs=2)
+OPTIONS = RunOptions(max_features=2500)
 BROKEN = "0009.png"
 
 
@@ -126,7 +129,7 @@ def test_outputs_of_a_run(solved):
     assert sorted(p.name for p in (out / "masks").iterdir()) == COURTYARD_NAMES
     # what is in their way is refused before the work
     written = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file() and not p.name.startswith(".")}
-    assert written == {*files_of_run(COURTYARD_NAMES, RunOptions())}
+    assert written == {*files_of_run(COURTYARD_NAMES, "tif", OutputOptions())}
     for name in COURTYARD_NAMES:
         image = read_photo(out / "images" / name).pixels
         mask = read_photo(out / "masks" / name).pixels
@@ -208,7 +211,7 @@ def test_same_seed_same_poses(courtyard, solved, tmp_path):
 def test_guessed_focal_length_is_refined(courtyard, solved, tmp_path):
     true = read_solution(courtyard / "ground_truth.json").cameras["1"]
     fx, fy, cx, cy = 1.04 * true.K[0, 0], 1.04 * true.K[1, 1], true.K[0, 2], true.K[1, 2]
-    options = replace(OPTIONS, camera=f"{fx},{fy},{cx},{cy}", refine=("f", "k1", "k2"))
+    options = replace(OPTIONS, camera=f"{fx},{fy},{cx},{cy}", solve=SolveOptions(refine=("f", "k1", "k2")))
     solution = run(courtyard / "photos", tmp_path / "out", options)
     found = solution.cameras["1"]
     sigma = solution.quality["sigma_intrinsics"]["1"]
@@ -228,7 +231,7 @@ def test_a_wrong_anchor_is_obeyed_and_warned_of(courtyard, tmp_path):
     shutil.copy(courtyard / "camera.json", photos)
     truth = read_solution(courtyard / "ground_truth.json")
     moved = max(truth.images, key=lambda image: np.linalg.norm(image.motion.phi[1:])).name
-    options = replace(OPTIONS, still={moved: 0.0}, shutter_model="rotation")
+    options = replace(OPTIONS, solve=SolveOptions(still={moved: 0.0}, shutter_model="rotation"))
     with pytest.warns(RsUndistortWarning, match=f"{moved} is said to have been still"):
         solution = run(photos, tmp_path / "out", options)
     assert solution.image(moved).motion.phi[0] == 0.0
@@ -263,7 +266,7 @@ def test_grey_16_bit_and_global_model(courtyard, tmp_path):
         done = cv2.imwrite(str(photos / name.replace(".png", ".tif")), grey.astype(np.uint16) * 257)
         assert done
     shutil.copy(courtyard / "camera.json", photos)
-    solution = run(photos, tmp_path / "out", RunOptions(max_features=2500, shutter_model="global"))
+    solution = run(photos, tmp_path / "out", RunOptions(max_features=2500, solve=SolveOptions(shutter_model="global")))
     assert len(solution.registered) >= 5
     assert all((image.motion.phi == 0).all() for image in solution.registered)
     image = read_photo(tmp_path / "out" / "images" / "0001.tif").pixels
@@ -281,7 +284,7 @@ def test_failing_run_leaves_out_as_it_was(tmp_path):
     (out / "mine.txt").write_text("mine")
     before = tree(tmp_path)
     with pytest.raises(ReconstructionError):
-        run(photos, out, RunOptions(camera=CAMERA, overwrite=True, max_features=500))
+        run(photos, out, RunOptions(camera=CAMERA, max_features=500), overwrite=True)
     assert tree(tmp_path) == before
     with pytest.raises(FileError, match="not empty"):
         run(photos, out, RunOptions(camera=CAMERA))
@@ -289,19 +292,24 @@ def test_failing_run_leaves_out_as_it_was(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("kind", "options", "says"),
     [
-        {"shutter_model": "spiral"},
-        {"interpolation": "magic"},
-        {"jobs": -1},
-        {"max_features": 5},
-        {"quality": 0},
-        {"refine": ("k9",)},
+        (SolveOptions, {"shutter_model": "spiral"}, "shutter model 'spiral'"),
+        (RectifyOptions, {"interpolation": "magic"}, "interpolation='magic'"),
+        (RunOptions, {"max_features": 5}, "max_features=5"),
+        (RectifyOptions, {"quality": 0}, "quality=0"),
+        (SolveOptions, {"refine": ("k9",)}, "cannot refine 'k9'"),
     ],
 )
-def test_run_options_are_checked(options):
-    with pytest.raises(InputError):
-        RunOptions(**options)
+def test_options_are_checked(kind, options, says):
+    with pytest.raises(InputError, match=says):
+        kind(**options)
+
+
+def test_number_of_jobs_is_checked(tmp_path):
+    with pytest.raises(InputError, match="jobs=-1, expected 0 or more"):
+        run(tmp_path, tmp_path / "out", jobs=-1)
+    assert not (tmp_path / "out").exists()
 
 
 # ---------------------------------------------------------------- rectify_folder

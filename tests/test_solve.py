@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 WIDTH, HEIGHT, F = 640, 480, 500.0
 NAMES = ["walk/0007.png", "walk/0001.png", "b.png", "a.png", "c/d/e.png", "f.png"]
-OPTIONS = rs.SolveOptions(shutter_model="rotation", readout="top-to-bottom", jobs=1, refine=())
+OPTIONS = rs.SolveOptions(shutter_model="rotation", readout="top-to-bottom", refine=())
 LENSES = {
     "PINHOLE": ([F, F, 320.5, 240.5], [], "pinhole"),
     "SIMPLE_RADIAL": ([F, 320.5, 240.5, -0.08], [-0.08, 0, 0, 0], "pinhole"),

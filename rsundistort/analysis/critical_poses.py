@@ -9,7 +9,7 @@ import numpy as np
 from ..critical import advise_poses, critical_motion
 from ..errors import FileError, InputError
 from ..io import read_colmap_poses, read_solution, read_transforms
-from ..model import READOUTS
+from ..model import check_readout
 from ..model.orientation import in_stored_frame
 from .results import PoseAnalysis
 
@@ -32,8 +32,8 @@ def analyze(path: Path | str, readout: str | None = None) -> PoseAnalysis:
         The meter of the poses; what the shape of a solution is worth; advice for the next shoot, if they are critical.
     """
     path = Path(path)
-    if readout is not None and readout not in READOUTS:
-        raise InputError(f"readout={readout!r}, expected one of {', '.join(READOUTS)}")
+    if readout is not None:
+        check_readout(readout)
     if not path.exists():
         raise FileError(f"{path} does not exist")
     sentence, advice = None, None

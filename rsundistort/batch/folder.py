@@ -16,8 +16,9 @@ from ..io.record import Record
 from ..io.solution import solution_to_bytes
 from ..model import Solution
 from ..model.orientation import in_stored_frame, split_mirror, turn_solution
-from .geometry import DEPTHS, PhotoDepths, ScenePoints, check_depth, with_depths
+from .geometry import SceneGeometry, ScenePoints, with_depths
 from .many_photos import rectify_photos
+from .one_photo import PhotoDone
 from .progress import ProgressCallback, StageLog
 from .rectify_options import RectifyOptions
 from .views import with_view
@@ -76,53 +77,58 @@ def rectify_folder(
         Photos of the folder that were not rectified; a warning says so, too.
     """
     options = replace(options or RectifyOptions(), **named)
-    check_depth(options.depth)
     solution = local_place(solution)
-    also = [local_place(each) for each, _ in options.also]
-    depth = [] if str(options.depth) in DEPTHS else [local_place(options.depth)]
     folder, target = place_of(photos), place_of(out)
-    masks = [] if options.masks is None else [place_of(options.masks)]
-    for place in (folder, target, *masks):
+    inputs = [folder, *map(place_of, options.inputs)]
+    for place in (target, *inputs):
         if scheduler is not None and isinstance(place, RemoteFolder) and place.protocol == "memory":
             raise InputError(f"{place} is in the memory of this process, which the workers of a scheduler do not see")
     solved = in_stored_frame(read_solution(solution))
-    motions = {image.name for image in solved.registered}
-    listed = list_photos(folder, options.raw_as, {PurePosixPath(name).parent.as_posix() for name in motions} - {"."})
-    names = [name for name in listed if name in motions]
-    if not names:
-        raise InputError(f"{solution} has no motion for any photo of {photos}, such as {listed[0]}; is it theirs?")
-    left_out = {name: f"it has no motion in {solution}" for name in listed if name not in motions}
-    for name in left_out:
-        warnings.warn(f"skipped: {name} has no motion in {solution}", SkippedPhotoWarning, stacklevel=2)
+    names, left_out = _with_motion(folder, solved, solution, options.raw_as)
     solved = with_view(solved, options.view)
-    depths = PhotoDepths(solved, options.depth, _points_beside(solution, solved, options.depth))
-    # a photo without a pose may be mirrored
-    unposed = replace(solved, images=[replace(image, R_cw=None, center_w=None) for image in solved.images])
+    scene = SceneGeometry(solved, options.depth, _points_beside(solution, solved, options.depth))
     workers = Workers(use_threads(jobs), scheduler)
-    inputs = [folder, *masks, *also, *depth]
     with batch_folder(target, overwrite=overwrite, resume=resume, apart_from=inputs) as journal:
         record = Record(target)
         # a solution of ours is brought up to date in its place
         record.check(["solution.json"], [] if _is_of(solution, target) else [solution], again=resume)
         done = rectify_photos(
-            folder, unposed, names, target, options, depths, workers, StageLog(progress), journal,
-            resume=resume, go_on="whole; the same command with --resume goes on",
+            folder, scene, names, target, options, workers, StageLog(progress), journal,
+            posed=False, resume=resume, go_on="whole; the same command with --resume goes on",
         )  # fmt: skip
-        turns = {name: each.turn for name, each in done.items() if not each.problem}
         left_out |= {name: each.problem for name, each in done.items() if each.problem}
-        if not turns:
+        if all(each.problem for each in done.values()):
             raise InputError(f"none of the {len(names)} photos of {photos} could be rectified; see the warnings")
-        solved = with_depths(solved, {name: each.depth for name, each in done.items() if each.depth is not None})
-        told = [
-            replace(image, reason=left_out.get(image.name)) if image.name in done else image for image in solved.images
-        ]
-        solved = replace(solved, images=tuple(told))
-        if options.apply_orientation:
-            solved = turn_solution(_without_mirrored_poses(solved, turns), turns)
-        solved = replace(solved, options={**solved.options, "raw_as": options.raw_as})
+        solved = _as_rectified(solved, done, options)
         with record.writing(["solution.json"]):
             write_in(target, "solution.json", solution_to_bytes(solved))
     return solved, dict(sorted(left_out.items()))
+
+
+def _with_motion(folder: Place, solved: Solution, solution: Path, raw_as: str) -> tuple[list[str], dict[str, str]]:
+    """Photos of a folder that have a motion; and the others, with the reason why they are left out."""
+    motions = {image.name for image in solved.registered}
+    listed = list_photos(folder, raw_as, {PurePosixPath(name).parent.as_posix() for name in motions} - {"."})
+    if motions.isdisjoint(listed):
+        raise InputError(f"{solution} has no motion for any photo of {folder}, such as {listed[0]}; is it theirs?")
+    left_out = {name: f"it has no motion in {solution}" for name in listed if name not in motions}
+    for name in left_out:
+        warnings.warn(f"skipped: {name} has no motion in {solution}", SkippedPhotoWarning, stacklevel=3)
+    return [name for name in listed if name in motions], left_out
+
+
+def _as_rectified(solved: Solution, done: Mapping[str, PhotoDone], options: RectifyOptions) -> Solution:
+    """The solution with what became of each photo."""
+    solved = with_depths(solved, {name: each.depth for name, each in done.items() if each.depth is not None})
+    images = [
+        replace(image, reason=done[image.name].problem or None) if image.name in done else image
+        for image in solved.images
+    ]
+    solved = replace(solved, images=tuple(images), options={**solved.options, "raw_as": options.raw_as})
+    if options.apply_orientation:
+        turns = {name: each.turn for name, each in done.items() if not each.problem}
+        solved = turn_solution(_without_mirrored_poses(solved, turns), turns)
+    return solved
 
 
 def _is_of(solution: Path, target: Place) -> bool:

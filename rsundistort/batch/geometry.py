@@ -1,4 +1,4 @@
-"""How far away what each photo shows is, for the photos of a camera that moved."""
+"""What the remap grid of each photo takes: cameras, motion, and how far away what it shows is."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..errors import FileError, InputError, RsUndistortWarning
 from ..io import find_depth_maps, output_name, read_colmap_poses, read_depth_map
 from ..io.places import local_place
-from ..model import AtInfinity, Camera, Depth, DepthMap, Reconstruction, RowMotion, Solution
+from ..model import AtInfinity, Camera, Depth, DepthMap, Plane, Reconstruction, RowMotion, Solution
 from ..rectify import (
     depth_from_points,
     fit_plane,
@@ -25,7 +25,7 @@ from ..rectify import (
     translation_shift_px,
 )
 
-__all__ = ["DEPTHS", "DepthJob", "PhotoDepth", "PhotoDepths", "ScenePoints", "check_depth", "with_depths"]
+__all__ = ["DEPTHS", "PhotoDepth", "PhotoGeometry", "SceneGeometry", "ScenePoints", "check_depth", "with_depths"]
 
 #: What `--depth` may say besides a folder.
 DEPTHS = ("auto", "infinity", "plane", "points")
@@ -90,14 +90,12 @@ class _Seen(NamedTuple):
 
 @dataclass(frozen=True)
 class PhotoDepth:
-    """What one photo is rectified with.
+    """How far away what one photo shows is, as it is rectified.
 
     Attributes
     ----------
     depth : Depth
         For `rectify`.
-    motion : RowMotion
-        With its velocity in the camera frame.
     kind : str
         "infinity", "plane", "points" or "map".
     shift_px : float
@@ -107,7 +105,6 @@ class PhotoDepth:
     """
 
     depth: Depth
-    motion: RowMotion
     kind: str
     shift_px: float = 0.0
     whole_shift_px: float | None = None
@@ -118,59 +115,63 @@ _ONE_AT_A_TIME = Lock()
 
 
 @dataclass(frozen=True)
-class DepthJob:
-    """All that the depth of one photo takes; small, and sent to where the photo is rectified.
+class PhotoGeometry:
+    """All that the remap grid of one photo takes, in its camera's frame; small, and sent to where it is rectified.
 
     Attributes
     ----------
     name : str
         Of the photo, for people.
-    motion : RowMotion
-        Its velocity in the world frame.
-    R_cw, center_w : (3, 3), (3,) array or None
-        Pose; None for a photo whose camera did not travel, which is rectified at infinity.
     camera, new_camera : Camera
         Of the raw photo, and the pinhole of the rectified one.
-    how : str
-        One of `DEPTHS`, or "map".
-    points_w : (n, 3) array or None
+    motion : RowMotion
+        What is taken out.
+    shutter_model : str
+        By which.
+    how : str or None
+        How the depth is found: one of `DEPTHS`, or "map"; None of a photo whose camera did not travel, which is
+        rectified at infinity.
+    points_c : (n, 3) array or None
         Points that the photo measured.
-    plane : (normal (3,), offset) or None
-        The plane nearest to most points of the scene, as of `fit_plane`.
+    plane : Plane or None
+        The plane nearest to most points of the scene.
     own_map : Path or None
         The user's depth map of it.
     """
 
     name: str
-    motion: RowMotion
-    R_cw: NDArray[np.float64] | None
-    center_w: NDArray[np.float64] | None
     camera: Camera
     new_camera: Camera
-    how: str
-    points_w: NDArray[np.float64] | None = None
-    plane: tuple[NDArray[np.float64], float] | None = None
+    motion: RowMotion
+    shutter_model: str
+    how: str | None = None
+    points_c: NDArray[np.float64] | None = None
+    plane: Plane | None = None
     own_map: Path | None = None
 
-    def find(self) -> PhotoDepth:
-        """What the photo is rectified with."""
-        if self.R_cw is None or self.center_w is None:
-            return PhotoDepth(AtInfinity(), self.motion, "infinity")
-        motion = self.motion.in_camera(self.R_cw)
-        depth, kind = self._choose(self.R_cw, self.center_w)
+    @property
+    def grid(self) -> tuple[Camera, RowMotion, str, Camera]:
+        """What `rectify` and `RemapGrid.from_camera` take, but for the depth."""
+        return self.camera, self.motion, self.shutter_model, self.new_camera
+
+    def find_depth(self) -> PhotoDepth:
+        """How far away what the photo shows is."""
+        if self.how is None:
+            return PhotoDepth(AtInfinity(), "infinity")
+        depth, kind = self._choose()
         with _ONE_AT_A_TIME:
-            shift = translation_shift_px(self.camera, motion, depth, self.new_camera)
+            shift = translation_shift_px(self.camera, self.motion, depth, self.new_camera)
             if self.how == "auto" and not shift > _LEAST_SHIFT_PX:
                 depth, kind = AtInfinity(), "infinity"
-            whole = largest_shift_px(self.camera, motion, "constant-motion", depth, self.new_camera)
-        return PhotoDepth(depth, motion, kind, shift, whole)
+            whole = largest_shift_px(self.camera, self.motion, self.shutter_model, depth, self.new_camera)
+        return PhotoDepth(depth, kind, shift, whole)
 
-    def _choose(self, R_cw: NDArray[np.float64], center_w: NDArray[np.float64]) -> tuple[Depth, str]:
+    def _choose(self) -> tuple[Depth, str]:
         size = (self.new_camera.width, self.new_camera.height)
-        seen = self._seen(R_cw, center_w)
+        seen = self._seen()
         if self.how == "map":
             return self._own_map(size, seen)
-        plane = None if self.plane is None else plane_in_camera(*self.plane, R_cw, center_w)
+        plane = self.plane
         if plane is not None and self.how == "auto" and seen is not None:
             plane = plane if prefers_plane(plane, *seen, size) else None
         if plane is not None:
@@ -179,12 +180,11 @@ class DepthJob:
             return depth_from_points(seen.xy, seen.depth, size), "points"
         return AtInfinity(), "infinity"
 
-    def _seen(self, R_cw: NDArray[np.float64], center_w: NDArray[np.float64]) -> _Seen | None:
-        if self.points_w is None:
+    def _seen(self) -> _Seen | None:
+        if self.points_c is None:
             return None
         K = self.new_camera.K
-        X_c = (self.points_w - center_w) @ R_cw.T
-        X_c = X_c[X_c[:, 2] > 0]
+        X_c = self.points_c[self.points_c[:, 2] > 0]
         rays = X_c / X_c[:, 2:]
         return _Seen(rays[:, :2] @ K[:2, :2].T + K[:2, 2], rays, X_c[:, 2]) if len(X_c) else None
 
@@ -215,8 +215,8 @@ class DepthJob:
         return depth, "map"
 
 
-class PhotoDepths:
-    """Depths of the photos of a solution.
+class SceneGeometry:
+    """Geometry of the photos of a solution.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ class PhotoDepths:
 
     def __init__(self, solution: Solution, depth: str | Path, points: ScenePoints | None) -> None:
         check_depth(depth)
-        self._solution = solution
+        self.solution = solution
         self._how = str(depth) if str(depth) in DEPTHS else "map"
         self._points = points
         moving = solution.shutter_model == "constant-motion"
@@ -243,25 +243,25 @@ class PhotoDepths:
         if self._moving and points is not None and len(points.points_w) >= 3 and self._how in ("auto", "plane"):
             self._plane = fit_plane(points.points_w)
 
-    def job(self, name: str) -> DepthJob:
-        """How to find what a photo is rectified with."""
-        image = self._solution.image(name)
+    def of(self, name: str) -> PhotoGeometry:
+        """Geometry of a photo."""
+        solution, image = self.solution, self.solution.image(name)
         motion = image.taken_out or RowMotion()
-        camera = self._solution.cameras[image.camera_id]
-        new_camera = self._solution.rectified_cameras[image.camera_id]
+        cameras = solution.cameras[image.camera_id], solution.rectified_cameras[image.camera_id]
         if name not in self._moving or not motion.moves:
-            return DepthJob(name, motion, None, None, camera, new_camera, "infinity")
-        points_w = None
+            return PhotoGeometry(name, *cameras, motion, solution.shutter_model)
+        R_cw, center_w = image.R_cw, image.center_w
+        assert R_cw is not None
+        assert center_w is not None
+        points_c = None
         if self._points is not None:
-            points_w = self._points.points_w[self._points.seen.get(name, np.zeros(0, np.int64))]
-        return DepthJob(
-            name, motion, image.R_cw, image.center_w, camera, new_camera, self._how, points_w, self._plane,
+            seen = self._points.seen.get(name, np.zeros(0, np.int64))
+            points_c = (self._points.points_w[seen] - center_w) @ R_cw.T
+        plane = None if self._plane is None else plane_in_camera(*self._plane, R_cw, center_w)
+        return PhotoGeometry(
+            name, *cameras, motion.in_camera(R_cw), solution.shutter_model, self._how, points_c, plane,
             self._maps.get(name),
         )  # fmt: skip
-
-    def of(self, name: str) -> PhotoDepth:
-        """What a photo is rectified with."""
-        return self.job(name).find()
 
 
 def with_depths(solution: Solution, found: Mapping[str, tuple[str, float, float]]) -> Solution:

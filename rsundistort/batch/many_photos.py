@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import PurePosixPath
 
@@ -20,7 +20,7 @@ from ..io.places import Place, RemoteFolder, absolute, files_of, place_of, sizes
 from ..io.record import Record
 from ..model import Reconstruction, Solution
 from .extras import find_extras
-from .geometry import DEPTHS, PhotoDepths
+from .geometry import DEPTHS, SceneGeometry
 from .one_photo import PhotoDone, PhotoJob, rectify_photo
 from .progress import StageLog
 from .rectify_options import RectifyOptions
@@ -43,15 +43,15 @@ def mask_names(names: Sequence[str]) -> dict[str, str]:
 
 def rectify_photos(
     folder: Place,
-    solution: Solution,
+    scene: SceneGeometry,
     names: Sequence[str],
     out: Place,
     options: RectifyOptions,
-    depths: PhotoDepths,
     workers: Workers,
     log: StageLog,
     journal: Journal,
     *,
+    posed: bool = True,
     resume: bool = False,
     colors: PointColors | None = None,
     go_on: str = "",
@@ -64,14 +64,14 @@ def rectify_photos(
 
     Parameters
     ----------
-    folder, solution, names
-        Of the raw photos, their motions, and which of them.
+    folder, scene, names
+        Of the raw photos, their geometry, and which of them.
     out : Path or RemoteFolder
         `batch_folder` made it ready, and gave `journal`.
-    options, depths, workers, log
-        What is done to each, how far away what it shows is, where, and who is told.
-    journal : Journal
-        Takes what is done.
+    options, workers, log, journal
+        What is done to each, where, who is told, and what takes what is done.
+    posed : bool
+        Whether they keep poses, which no mirror image has.
     resume : bool
         Pass over what is whole and current by the journal.
     colors : PointColors, optional
@@ -84,51 +84,26 @@ def rectify_photos(
     dict of name to PhotoDone
         Of every photo; those that were left out have a `problem`.
     """
-    before = journal.read()
-    done: dict[str, PhotoDone] = {}
-    jobs = _Jobs(folder, solution, names, out, options, depths, colors)
+    before, record = journal.read(), Record(out)
+    jobs = _Jobs(folder, scene, names, out, options, colors, posed)
+    done = _still_whole(jobs, names, before, out) if resume else {}
+    todo = {name: jobs[name].targets for name in names if name not in done}
+    earlier = record.ours(BATCH_FOLDERS)
     if resume:
-        sizes = sizes_under(out, BATCH_FOLDERS)
-        for name in names:
-            entry = before.get(name)
-            if entry and entry.fingerprint and entry.fingerprint == jobs[name].fingerprint() and entry.is_whole(sizes):
-                done[name] = PhotoDone(name, "", entry.fingerprint, entry.files, entry.turn, entry.depth)
-    todo = [name for name in names if name not in done]
-    record = Record(out)
-    earlier = {path for entry in before.values() for path in entry.files}
-    if not resume:
-        earlier |= record.ours(BATCH_FOLDERS)
-    earlier &= record.ours(BATCH_FOLDERS)
-    targets = {name: jobs[name].targets for name in todo}
-    inputs = [each for name in names for each in jobs[name].inputs]
+        earlier &= {path for entry in before.values() for path in entry.files}
     # what was cut short, or changed, since it was made is made again by `resume`
-    record.check(earlier.union(*targets.values()), inputs, again=resume)
-    if isinstance(out, RemoteFolder):  # its record is put as a whole: once for all photos
-        record.claim(path for name in todo for path in targets[name])
-    else:  # remote folders are made with what is in them
-        for within in jobs.folders(todo):
-            make_inside(out, within)
-
-    def begun() -> Iterator[PhotoJob]:
-        for name in todo:
-            record.claim(targets[name])
-            yield jobs[name]
-
+    record.check(earlier.union(*todo.values()), [file for name in names for file in jobs[name].inputs], again=resume)
+    _make_room(jobs, todo, out, record)
     for name in todo:
-        if name in before:
-            # from here on its outputs may be of either making
+        if name in before:  # from here on its outputs may be of either making
             journal.add(JournalEntry(name, "", before[name].files))
     journal.settle()
     log.begin("rectifying", len(names), len(done))
-    fitting = workers.fitting("rectifying", _most_bytes(solution, todo, options))
-    results = fitting.map(rectify_photo, begun(), lambda job, why: PhotoDone(job.name, why))
+    fitting = workers.fitting("rectifying", _most_bytes(scene.solution, todo, options))
     try:
-        with record.writing(), closing(results):
+        with closing(_rectified(jobs, todo, record, fitting)) as results:
             for result in results:
-                record.add(targets[result.name])
-                if result.problem:
-                    warnings.warn(f"skipped: {result.name}: {result.problem}", SkippedPhotoWarning, stacklevel=2)
-                else:
+                if not result.problem:
                     journal.add(_entry(result))
                     if colors is not None and result.colors is not None:
                         colors.add(result.name, result.colors)
@@ -138,14 +113,55 @@ def rectify_photos(
         raise FileError(f"{error}; {len(done)} of {len(names)} photos are done, {go_on}") from error
     except KeyboardInterrupt as stop:
         raise KeyboardInterrupt(f"{len(done)} of {len(names)} photos are done, {go_on}") from stop
-    if any(not each.problem for each in done.values()):
-        kept = {name: before[name] for name in before.keys() - done.keys()} if resume else {}
-        kept |= {name: _entry(each) for name, each in done.items() if not each.problem}
+    made = {name: _entry(each) for name, each in done.items() if not each.problem}
+    if made:
+        kept = ({name: before[name] for name in before.keys() - done.keys()} if resume else {}) | made
         record.remove(earlier - {path for entry in kept.values() for path in entry.files})
         record.settle()
         journal.write(kept[name] for name in sorted(kept))
-    log.end("rectifying", photos=sum(not each.problem for each in done.values()))
+    log.end("rectifying", photos=len(made))
     return {name: done[name] for name in names}
+
+
+def _still_whole(
+    jobs: _Jobs, names: Sequence[str], before: Mapping[str, JournalEntry], out: Place
+) -> dict[str, PhotoDone]:
+    """The photos of an earlier batch whose outputs are whole and current."""
+    sizes = sizes_under(out, BATCH_FOLDERS)
+    found = {}
+    for name in names:
+        entry = before.get(name)
+        if entry and entry.fingerprint and entry.fingerprint == jobs[name].fingerprint() and entry.is_whole(sizes):
+            found[name] = PhotoDone(name, "", entry.fingerprint, entry.files, entry.turn, entry.depth)
+    return found
+
+
+def _make_room(jobs: _Jobs, targets: Mapping[str, Sequence[str]], out: Place, record: Record) -> None:
+    """Make the folders of the outputs of photos."""
+    if isinstance(out, RemoteFolder):  # they are made with what is in them, and its record is put as a whole: once
+        record.claim(path for paths in targets.values() for path in paths)
+    else:
+        for within in jobs.folders(targets):
+            make_inside(out, within)
+
+
+def _rectified(
+    jobs: _Jobs, targets: Mapping[str, Sequence[str]], record: Record, workers: Workers
+) -> Generator[PhotoDone, None, None]:
+    """The photos as they are done, those that were left out with a warning; the record has what is written of them."""
+
+    def begun() -> Iterator[PhotoJob]:
+        for name, paths in targets.items():
+            record.claim(paths)
+            yield jobs[name]
+
+    results = workers.map(rectify_photo, begun(), lambda job, why: PhotoDone(job.name, why))
+    with record.writing(), closing(results):
+        for result in results:
+            record.add(targets[result.name])
+            if result.problem:
+                warnings.warn(f"skipped: {result.name}: {result.problem}", SkippedPhotoWarning, stacklevel=3)
+            yield result
 
 
 class _Jobs:
@@ -154,24 +170,22 @@ class _Jobs:
     def __init__(
         self,
         folder: Place,
-        solution: Solution,
+        scene: SceneGeometry,
         names: Sequence[str],
         out: Place,
         options: RectifyOptions,
-        depths: PhotoDepths,
         colors: PointColors | None,
+        posed: bool,
     ) -> None:
         # absolute: workers elsewhere have another working directory
         self._folder, self._out = absolute(folder), absolute(out)
         self._files = files_of(self._folder, names)
-        self._solution, self._options, self._depths, self._colors = solution, options, depths, colors
-        self.extras = find_extras(options.maps, options.also, names)
-        self._mask_name = mask_names([image.name for image in solution.images])
+        self._scene, self._options, self._colors, self._posed = scene, options, colors, posed
+        self._extras = find_extras(options.also, names)
+        self._mask_name = mask_names([image.name for image in scene.solution.images])
         self._own = {} if options.masks is None else find_masks(absolute(place_of(options.masks)), names)
 
     def __getitem__(self, name: str) -> PhotoJob:
-        solution = self._solution
-        image = solution.image(name)
         stem = PurePosixPath(self._mask_name[name]).with_suffix("").as_posix()
         return PhotoJob(
             name=name,
@@ -179,25 +193,24 @@ class _Jobs:
             out=self._out,
             image=f"images/{output_name(name, self._options.raw_as)}",
             mask=f"masks/{self._mask_name[name]}",
-            depth=self._depths.job(name),
-            shutter_model=solution.shutter_model,
-            posed=image.posed,
+            geometry=self._scene.of(name),
+            posed=self._posed,
             options=self._options,
             own_mask=self._own.get(name),
-            also=self.extras.of(name),
+            also=tuple(self._extras[name]),
             maps=None if self._options.maps is None else f"maps/{stem}",
             sample_xy=None if self._colors is None else self._colors.pixels(name),
         )
 
-    def folders(self, names: Sequence[str]) -> list[str]:
+    def folders(self, names: Iterable[str]) -> list[str]:
         """Folders of the outputs of photos."""
         kinds = ("images", "masks", *(["maps"] if self._options.maps is not None else []))
         found = [kind / within for within in {PurePosixPath(name).parent for name in names} for kind in kinds]
-        found += {PurePosixPath(each.target).parent for name in names for each in self.extras.of(name)}
+        found += {PurePosixPath(each.target).parent for name in names for each in self._extras[name]}
         return sorted(path.as_posix() for path in found)
 
 
-def _most_bytes(solution: Solution, names: Sequence[str], options: RectifyOptions) -> float:
+def _most_bytes(solution: Solution, names: Iterable[str], options: RectifyOptions) -> float:
     """What the largest of the photos takes, about."""
     own_depth = str(options.depth) not in DEPTHS
     besides = _BYTES_OF_GRIDS * bool(options.maps) + _BYTES_OF_DEPTH * own_depth

@@ -21,10 +21,11 @@ from ..io import MAX_MEGAPIXELS, Photo, read_mask, read_photo, write_image
 from ..io.outputs import CANNOT_WRITE
 from ..io.photos.exif import read_orientation
 from ..io.places import File, Place, RemoteFile, fetched
+from ..model import Depth
 from ..model.orientation import split_mirror, turn_pixels
 from ..rectify import MAP_KINDS, RemapGrid, ViewOptions, rectify
 from .extras import AlsoImage
-from .geometry import DepthJob, PhotoDepth
+from .geometry import PhotoGeometry
 from .rectify_options import RectifyOptions
 
 __all__ = ["PhotoDone", "PhotoJob", "check_not_rectified", "rectify_photo", "turn_of"]
@@ -48,10 +49,8 @@ class PhotoJob:
         Folder of the outputs.
     image, mask : str
         Rectified photo and its mask, in `out`.
-    depth : DepthJob
-        Its cameras and motion, and how far away what it shows is.
-    shutter_model : str
-        Of the remap grid.
+    geometry : PhotoGeometry
+        All that its remap grid takes.
     posed : bool
         Whether the photo has a pose, which no mirror image has.
     options : RectifyOptions
@@ -71,8 +70,7 @@ class PhotoJob:
     out: Place
     image: str
     mask: str
-    depth: DepthJob
-    shutter_model: str
+    geometry: PhotoGeometry
     posed: bool
     options: RectifyOptions
     own_mask: File | None = None
@@ -83,7 +81,7 @@ class PhotoJob:
     @property
     def inputs(self) -> list[File]:
         """The files that are read."""
-        given = (self.source, self.own_mask, self.depth.own_map, *(each.source for each in self.also))
+        given = (self.source, self.own_mask, self.geometry.own_map, *(each.source for each in self.also))
         return [each for each in given if each is not None]
 
     @property
@@ -103,7 +101,8 @@ class PhotoJob:
         # where things lie, and which photos are let in, does not change what comes of them; nor does a pose, but for
         # how the photo is turned
         options = replace(
-            self.options, masks=None, again=False, max_megapixels=MAX_MEGAPIXELS, depth="", view=ViewOptions(), also=()
+            self.options, masks=None, again=False, max_megapixels=MAX_MEGAPIXELS, depth="auto", view=ViewOptions(),
+            also=(),
         )  # fmt: skip
         posed = self.posed and options.apply_orientation
         try:
@@ -225,17 +224,16 @@ def _rectify_in(work: Path, job: PhotoJob) -> PhotoDone:
 
 def _rectify(job: PhotoJob, source: Path, own_mask: Path | None, out: Path) -> PhotoDone:
     """The same with local files; without the fingerprint."""
-    options, camera = job.options, job.depth.camera
+    options, geometry = job.options, job.geometry
     files: dict[str, int] = {}
     writing = False
     try:
         photo = read_photo(source, options.max_megapixels)
         if not options.again:
             check_not_rectified(photo)
-        own = None if own_mask is None else read_mask(own_mask, camera.width, camera.height)
-        seen = job.depth.find()
-        grid_of = (camera, seen.motion, job.shutter_model, job.depth.new_camera)
-        pixels, mask = rectify(photo.pixels, *grid_of, options.interpolation, mask=own, depth=seen.depth)
+        own = None if own_mask is None else read_mask(own_mask, geometry.camera.width, geometry.camera.height)
+        found = geometry.find_depth()
+        pixels, mask = rectify(photo.pixels, *geometry.grid, options.interpolation, mask=own, depth=found.depth)
         colors = None if job.sample_xy is None else _colors(photo, job.sample_xy)
         metadata, turn = photo.metadata.marked(_VERSION), 1
         if options.apply_orientation:
@@ -249,7 +247,7 @@ def _rectify(job: PhotoJob, source: Path, own_mask: Path | None, out: Path) -> P
         files[job.image] = (out / job.image).stat().st_size
         write_image(out / job.mask, mask, flat=True)
         files[job.mask] = (out / job.mask).stat().st_size
-        for name in _write_extras(job, out, seen, turn):
+        for name in _write_extras(job, out, found.depth, turn):
             files[name] = (out / name).stat().st_size
     except (FileError, InputError, MemoryError, cv2.error) as error:
         if writing and getattr(error.__cause__, "errno", None) in CANNOT_WRITE:
@@ -257,17 +255,16 @@ def _rectify(job: PhotoJob, source: Path, own_mask: Path | None, out: Path) -> P
         for name in files:  # no photo without its mask
             (out / name).unlink(missing_ok=True)
         return PhotoDone(job.name, " ".join(str(error).split()) or "it does not fit into the memory")
-    note = None if seen.whole_shift_px is None else (seen.kind, seen.shift_px, seen.whole_shift_px)
+    note = None if found.whole_shift_px is None else (found.kind, found.shift_px, found.whole_shift_px)
     return PhotoDone(job.name, "", "", files, turn, note, colors)
 
 
-def _write_extras(job: PhotoJob, out: Path, seen: PhotoDepth, turn: int) -> Iterator[str]:
+def _write_extras(job: PhotoJob, out: Path, depth: Depth, turn: int) -> Iterator[str]:
     """Write the other images of a photo's frame and its grids; their names, each when it is there."""
-    grid_of = (job.depth.camera, seen.motion, job.shutter_model, job.depth.new_camera)
     for each in job.also:
         try:
             image = read_photo(each.source, job.options.max_megapixels)
-            pixels, _ = rectify(image.pixels, *grid_of, each.interpolation, depth=seen.depth)
+            pixels, _ = rectify(image.pixels, *job.geometry.grid, each.interpolation, depth=depth)
             write_image(out / each.target, turn_pixels(pixels, turn), image.metadata, job.options.quality)
         except (FileError, InputError) as error:
             if getattr(error.__cause__, "errno", None) in CANNOT_WRITE:
@@ -275,7 +272,7 @@ def _write_extras(job: PhotoJob, out: Path, seen: PhotoDepth, turn: int) -> Iter
             raise InputError(f"{each.source.parent.name}/{each.source.name}: {error}") from error
         yield each.target
     if job.maps is not None and job.options.maps is not None:
-        grid = RemapGrid.from_camera(*grid_of, seen.depth)
+        grid = RemapGrid.from_camera(*job.geometry.grid, depth)
         if turn != 1:
             map_x, map_y = (turn_pixels(m, turn) for m in (grid.map_x, grid.map_y))
             grid = RemapGrid(map_x, map_y, grid.source_width, grid.source_height)

@@ -8,7 +8,9 @@ from pathlib import Path
 
 from ..errors import InputError
 from ..io import MAX_MEGAPIXELS, RAW_AS
+from ..io.places import local_place
 from ..rectify import INTERPOLATIONS, MAP_KINDS, ViewOptions
+from .geometry import DEPTHS, check_depth
 
 __all__ = ["RectifyOptions"]
 
@@ -60,7 +62,16 @@ class RectifyOptions:
     maps: str | None = None
     also: Sequence[tuple[Path, str]] = ()
 
+    @property
+    def inputs(self) -> list[Path | str]:
+        """Folders that are read: of masks, other images and depth maps."""
+        found = [self.masks, *(folder for folder, _ in self.also), None if str(self.depth) in DEPTHS else self.depth]
+        return [each for each in found if each is not None]
+
     def __post_init__(self) -> None:
+        check_depth(self.depth)
+        for folder, _ in self.also:
+            local_place(folder)
         for interpolation in (self.interpolation, *(each for _, each in self.also)):
             if interpolation not in INTERPOLATIONS:
                 raise InputError(f"interpolation={interpolation!r}, expected one of {', '.join(INTERPOLATIONS)}")

@@ -33,6 +33,8 @@ _RETRIES = 2
 
 def use_threads(jobs: int) -> int:
     """Hold OpenCV and the kernels to a number of threads; 0 for all cores. Returns the number."""
+    if jobs < 0:
+        raise InputError(f"jobs={jobs!r}, expected 0 or more")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     jobs = jobs or cores
     cv2.setNumThreads(jobs)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..model import READOUTS, SHUTTER_MODELS, Observations, Reconstruction
+from ..model import SHUTTER_MODELS, Observations, Reconstruction, other_axis
 from ..model.reprojection import reprojection_residuals
 from .adjust import LADDER, bundle_adjust, objective
 from .options import BundleOptions
@@ -41,8 +41,6 @@ _UNSEEN_PX = 0.5
 _AT_LIMIT = 0.99
 # A model that bends to explain what it cannot creeps along its valley; the rest converge in fewer steps.
 _MOST_STEPS = 15
-# Exchanges the axis of the readout; reversing it negates the motion and changes nothing else.
-_OTHER_AXIS = ("top-to-bottom", "left-to-right")
 
 _VARYING, _FIELD = ", varying lens", ", residual field"
 # Motions that are not steady, by the groups of bends that they take. A cubic that is free in each photo hides the
@@ -207,7 +205,7 @@ def moved_px(reconstruction: Reconstruction) -> NDArray[np.float64]:
 
 def read_along_other_axis(reconstruction: Reconstruction) -> Reconstruction:
     """The same photos as if all cameras were read along the other axis; without motion."""
-    cameras = [replace(each, readout=_OTHER_AXIS[READOUTS[each.readout][0]]) for each in reconstruction.cameras]
+    cameras = [replace(each, readout=other_axis(each.readout)) for each in reconstruction.cameras]
     still = np.zeros_like(reconstruction.phi)
     return replace(reconstruction, cameras=cameras, phi=still, velocity=still, bend=np.zeros(0))
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model import READOUTS, Reconstruction
+from ..model import Reconstruction, other_axis
 from .adjust import adjust_sequence
 from .choice import clipped_errors, standard_errors
 from .options import BundleOptions, BundleResult
@@ -18,8 +18,6 @@ __all__ = ["ReadoutChoice", "choose_readouts"]
 
 # The first guess is right far more often than not: it is given up for a gain of this many standard errors.
 _MIN_GAIN = 5.0
-# Reversing the readout negates the motion and changes nothing else, so one direction of each axis is tried.
-_OTHER_AXIS = ("top-to-bottom", "left-to-right")
 
 
 @dataclass(frozen=True)
@@ -103,5 +101,5 @@ def choose_readouts(
 def _turned(reconstruction: Reconstruction, camera: int) -> Reconstruction:
     """The reconstruction with one camera read out along the other axis."""
     cameras = list(reconstruction.cameras)
-    cameras[camera] = replace(cameras[camera], readout=_OTHER_AXIS[READOUTS[cameras[camera].readout][0]])
+    cameras[camera] = replace(cameras[camera], readout=other_axis(cameras[camera].readout))
     return replace(reconstruction, cameras=tuple(cameras))

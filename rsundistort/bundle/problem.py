@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from .._kernels import projection
 from ..errors import InputError
-from ..model import READOUTS, Camera, Reconstruction, check_shutter_model
+from ..model import Camera, Reconstruction, check_shutter_model
 from ..model.reprojection import camera_arrays, motion_tables, observed_lens_pixels, plain_arrays
 from .elimination import Elimination
 from .intrinsics import INTRINSICS, check_lenses, deviation, moved_camera, prior_weight
@@ -173,7 +173,7 @@ class BundleProblem:
         if self._block > 9:
             return [0, 1, 2, 3, 4, 5]
         # the rotation that stretches the photo along its readout
-        phi1 = 0 if READOUTS[self._start.camera(image).readout][0] == 1 else 1
+        phi1 = 1 - self._start.camera(image).clock_axis
         return [phi1][: self._block - 6]
 
     def _photo(self, name: str) -> int:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model import READOUTS, Observations, Reconstruction
+from ..model import Observations, Reconstruction
 from ..model.bend import splines_at
 from ..model.reprojection import reprojection_residuals
 
@@ -36,7 +36,7 @@ def half_across_readout(reconstruction: Reconstruction) -> NDArray[np.bool_]:
     """(n,) points on one side of the photos that show them, sides across the readout; half of all."""
     obs = reconstruction.observations
     of_photo = [reconstruction.camera(i) for i in range(reconstruction.num_images)]
-    axis = np.array([1 - READOUTS[camera.readout][0] for camera in of_photo])[obs.frame_idx]
+    axis = np.array([1 - camera.clock_axis for camera in of_photo])[obs.frame_idx]
     size = np.array([(camera.width, camera.height) for camera in of_photo], float)[obs.frame_idx]
     rows = np.arange(len(obs))
     total = np.bincount(obs.point_idx, (obs.xy_raw / size)[rows, axis], reconstruction.num_points)
@@ -55,8 +55,8 @@ def warps(rec: Reconstruction, measured: Observations) -> NDArray[np.float64]:
 def _splines_along(rec: Reconstruction, measured: Observations, sites: int) -> NDArray[np.float64]:
     """(n, sites) splines along the readout at the place of each measurement."""
     camera = [rec.camera(i) for i in range(rec.num_images)]
-    axis = np.array([READOUTS[each.readout][0] for each in camera])[measured.frame_idx]
-    lines = np.array([(each.width, each.height) for each in camera])[measured.frame_idx, axis]
+    axis = np.array([each.clock_axis for each in camera])[measured.frame_idx]
+    lines = np.array([each.num_lines for each in camera])[measured.frame_idx]
     place = (measured.xy_raw[np.arange(len(measured)), axis] + 0.5) / lines
     return splines_at(sites, np.clip(place, 0.0, 1.0))
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bundle import BundleOptions, BundleResult, Posterior
-from ..model import READOUTS, Reconstruction
+from ..model import Reconstruction
 from ..model.projection import clock_of
 
 __all__ = ["CommonMotion", "clock_contrast", "common_motion", "row_phi"]
@@ -120,7 +120,7 @@ class CommonMotion:
 
 def row_phi(reconstruction: Reconstruction) -> NDArray[np.int64]:
     """Components (m, 3) of phi that are each photo's phi1, phi2, phi3 of the paper, which reads rows."""
-    by_row = np.array([READOUTS[reconstruction.camera(i).readout][0] == 1 for i in range(reconstruction.num_images)])
+    by_row = np.array([reconstruction.camera(i).clock_axis == 1 for i in range(reconstruction.num_images)])
     return np.where(by_row[:, None], [0, 1, 2], [1, 0, 2]).astype(np.int64)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from ..model import READOUTS
+from ..model import check_readout
 from ..model.checks import check_finite, check_rotations, frozen
 
 __all__ = ["CriticalMotion", "critical_motion", "readout_axes"]
@@ -84,7 +84,7 @@ class CriticalMotion:
 
 def readout_axes(R_cw: NDArray[np.float64], readout: Sequence[str]) -> NDArray[np.float64]:
     """(m, 3) world directions along which the photos were read out: y axes of rows, x axes of columns, no sign."""
-    return np.array([R[READOUTS[direction][0]] for R, direction in zip(R_cw, readout, strict=True)])
+    return np.array([R[check_readout(direction)[0]] for R, direction in zip(R_cw, readout, strict=True)])
 
 
 def _equations(
@@ -142,10 +142,7 @@ def critical_motion(
     directions = [readout] * m if isinstance(readout, str) else list(readout)
     if len(directions) != m:
         raise InputError(f"readout names {len(directions)} directions for {m} photos")
-    for direction in directions:
-        if direction not in READOUTS:
-            raise InputError(f"readout={direction!r}, expected one of {', '.join(READOUTS)}")
-    by_column = np.array([READOUTS[direction][0] == 0 for direction in directions])
+    by_column = np.array([check_readout(direction)[0] == 0 for direction in directions])
     spread = float(np.sqrt(2 * np.mean(np.sum((centers - centers.mean(0)) ** 2, axis=1)))) or 1.0
     values = np.zeros((m, 5))
     vectors = np.zeros((m, 5))

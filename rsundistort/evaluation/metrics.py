@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..model import READOUTS, Solution
+from ..model import Solution
 
 __all__ = ["MotionErrors", "PoseErrors", "align_points", "motion_errors", "pose_errors", "psnr", "rotation_angles_deg"]
 
@@ -119,7 +119,7 @@ def motion_errors(solution: Solution, truth: Solution) -> MotionErrors:
         true_image = true_of[image.name]
         assert true_image.motion is not None
         camera, true_camera = solution.cameras[image.camera_id], truth.cameras[true_image.camera_id]
-        reverse = READOUTS[camera.readout][1] * READOUTS[true_camera.readout][1]
+        reverse = camera.clock_sign * true_camera.clock_sign
         names.append(image.name)
         errors.append((image.motion.phi - reverse * true_image.motion.phi) * camera.frame_span)
     if not names:

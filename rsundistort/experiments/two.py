@@ -19,7 +19,7 @@ from ..input.photo_cameras import camera_file_of
 from ..io import list_photos, output_folder
 from ..io.record import Record
 from ..model import Solution, check_shutter_model
-from ..solve import RunOptions, run
+from ..solve import RunOptions, SolveOptions, run
 from ..solve.run_outputs import files_of_run
 from ..versions import versions
 from .figures import camera_paths, need_matplotlib
@@ -194,12 +194,13 @@ def experiment_two(
     # before the minutes of work, not after them
     need_matplotlib()
     names = check_same_names(still, swung)
-    common = RunOptions(camera=options.camera, readout=options.readout, seed=options.seed, jobs=options.jobs)
+    solving = SolveOptions(readout=options.readout, seed=options.seed)
+    common = RunOptions(solve=solving, camera=options.camera)
     solutions: dict[str, Solution] = {}
     camera_files = [file for each in (still, swung) if (file := camera_file_of(each, options.camera)) is not None]
     inputs, folders = [still, swung, *camera_files], (_STILL, _WITH, _WITHOUT)
     with output_folder(out, overwrite=options.overwrite, apart_from=inputs, replaced=folders) as scratch:
-        files = files_of_run(names, common)
+        files = files_of_run(names, common.rectify.raw_as, common.outputs)
         made = ["summary.json", "photos.csv", "paths.png", *(f"{key}/{file}" for key in folders for file in files)]
         Record(out).check(made, inputs)
         for key, photos, model in (
@@ -207,9 +208,10 @@ def experiment_two(
             (_WITH, swung, options.shutter_model),
             (_WITHOUT, swung, "global"),
         ):
+            each = replace(common, solve=replace(solving, shutter_model=model))
             told = None if progress is None else _within(progress, key)
             try:
-                solutions[key] = run(photos, scratch / key, replace(common, shutter_model=model), told)
+                solutions[key] = run(photos, scratch / key, each, told, jobs=options.jobs)
             except ReconstructionError as error:
                 raise ReconstructionError(f"{photos}: {error}") from error
         found = compare_paths(solutions[_STILL], solutions[_WITH], solutions[_WITHOUT])

@@ -10,10 +10,9 @@ from pathlib import Path
 
 from ..batch.one_photo import check_not_rectified
 from ..batch.progress import StageLog
-from ..batch.rectify_options import RectifyOptions
 from ..batch.workers import Workers
 from ..errors import FileError, InputError, SkippedPhotoWarning
-from ..io import ExifFacts, facts_of_exif, find_masks, list_photos, read_mask, read_photo
+from ..io import MAX_MEGAPIXELS, ExifFacts, facts_of_exif, find_masks, list_photos, read_mask, read_photo
 from ..io.photos.images import stored_size
 from ..io.places import local_place
 from ..sfm import DETECTION_MEGAPIXELS, Features, detect_features, detection_bytes, edge_width_px, grey_8_bit
@@ -78,7 +77,8 @@ class _LoadJob:
     own_mask: Path | None
     max_features: int
     megapixels: float
-    options: RectifyOptions
+    max_megapixels: float
+    again: bool
 
 
 @dataclass(frozen=True)
@@ -96,8 +96,8 @@ class _Loaded:
 
 def _load(job: _LoadJob) -> _Loaded:
     try:
-        photo = read_photo(job.source, job.options.max_megapixels)
-        if not job.options.again:
+        photo = read_photo(job.source, job.max_megapixels)
+        if not job.again:
             check_not_rectified(photo)
     except FileError as error:
         return _Loaded(problem=str(error))
@@ -114,7 +114,7 @@ def _load(job: _LoadJob) -> _Loaded:
     return _Loaded(features, width, height, photo.metadata.orientation, facts, edge_px)
 
 
-def _most_bytes(folder: Path, names: Sequence[str], megapixels: float, options: RectifyOptions) -> float:
+def _most_bytes(folder: Path, names: Sequence[str], megapixels: float, max_megapixels: float) -> float:
     """What the largest of the photos takes, about; of those that will be taken."""
 
     def bytes_of(name: str) -> float:
@@ -122,7 +122,7 @@ def _most_bytes(folder: Path, names: Sequence[str], megapixels: float, options: 
             width, height = stored_size(folder / name) or _SIZE_OF_OTHERS
         except FileError:  # it is told when its turn comes
             return 0.0
-        if width * height > options.max_megapixels * 1e6:
+        if width * height > max_megapixels * 1e6:
             return 0.0
         return detection_bytes(width, height, megapixels) + _BYTES_PER_PIXEL * width * height
 
@@ -136,8 +136,12 @@ def load_photos(
     max_features: int,
     workers: Workers,
     log: StageLog,
-    options: RectifyOptions,
+    *,
     megapixels: float = DETECTION_MEGAPIXELS,
+    masks: Path | str | None = None,
+    raw_as: str = "tif",
+    again: bool = False,
+    max_megapixels: float = MAX_MEGAPIXELS,
 ) -> LoadedPhotos:
     """Read every photo of a folder once, for its size and features; unusable ones are skipped with a warning.
 
@@ -153,19 +157,19 @@ def load_photos(
         Where it is done.
     log : StageLog
         Told the progress.
-    options : RectifyOptions
-        Of which masks, raw_as, again and max_megapixels matter.
     megapixels : float
         As in `detect_features`.
+    masks, raw_as, again, max_megapixels
+        As in `RectifyOptions`.
     """
-    listed = list_photos(folder, options.raw_as)
+    listed = list_photos(folder, raw_as)
     if len(listed) < 3:
         raise InputError(
             f"{folder} holds {len(listed)} photo{'s' * (len(listed) > 1)}; the shutter needs at least three"
         )
-    mask_of = {} if options.masks is None else find_masks(local_place(options.masks).absolute(), listed)
+    mask_of = {} if masks is None else find_masks(local_place(masks).absolute(), listed)
     jobs = (
-        _LoadJob(name, folder.absolute() / name, mask_of.get(name), max_features, megapixels, options)
+        _LoadJob(name, folder.absolute() / name, mask_of.get(name), max_features, megapixels, max_megapixels, again)
         for name in listed
     )
     log.begin("features", len(listed))
@@ -175,7 +179,9 @@ def load_photos(
     skipped: dict[str, str] = {}
     # the headers are not looked at for workers elsewhere, which mind their own memory
     fitting = (
-        workers if workers.scheduler else workers.fitting("features", _most_bytes(folder, listed, megapixels, options))
+        workers
+        if workers.scheduler
+        else workers.fitting("features", _most_bytes(folder, listed, megapixels, max_megapixels))
     )
     results = fitting.map(_load, jobs, lambda job, why: _Loaded(problem=f"{job.name}: {why}"))
     with closing(results):
@@ -198,6 +204,6 @@ def load_photos(
     log.end("features", photos=len(names), keypoints=sum(len(f.xy_raw) for f in features))
     orientations = {name: each.orientation for name, each in zip(names, found, strict=True)}
     return LoadedPhotos(
-        names, features, facts, skipped, cameras, orientations, folder.absolute(), mask_of, options.max_megapixels,
+        names, features, facts, skipped, cameras, orientations, folder.absolute(), mask_of, max_megapixels,
         [each.edge_px for each in found],
     )  # fmt: skip

@@ -21,7 +21,7 @@ from ..io import (
     guess_readouts,
     read_camera_file,
 )
-from ..model import READOUTS, Camera
+from ..model import Camera, check_readout
 
 __all__ = ["GIVEN_SIGMA", "GUESS_SIGMA", "PhotoCameras", "camera_file_of", "check_readouts", "find_cameras"]
 
@@ -124,9 +124,7 @@ def check_readouts(readout: str | Mapping[str, str] | None) -> dict[str, str]:
     """Directions by group, the empty name for all others; refused where one is no direction."""
     told = {"": readout} if isinstance(readout, str) else dict(readout or {})
     for group, direction in told.items():
-        if direction not in READOUTS:
-            where = f" of {group}" if group else ""
-            raise InputError(f"readout{where} {direction!r}, expected one of {', '.join(READOUTS)}")
+        check_readout(direction, f"readout of {group}" if group else "readout")
     return told
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..colmap import read_colmap_cameras
 from ..errors import FileError, FormatError, InputError
-from ..model import READOUTS, Camera
+from ..model import Camera, other_axis
 from .calibrations import camera_from_calibration, is_calibration, parse_xml, parse_yaml
 
 __all__ = [
@@ -190,10 +190,9 @@ def _how_to_fit(camera: Camera, width: int, height: int) -> str:
     """What to do about a camera of another size."""
     if (camera.width, camera.height) == (height, width):
         stored = "portrait" if height > width else "landscape"
-        across = "left-to-right" if READOUTS[camera.readout][0] == 1 else "top-to-bottom"
         return (
             f"they are stored in {stored}, turned since they were read out: give a camera with width and height, fx "
-            f"and fy, cx and cy exchanged and the readout {across}"
+            f"and fy, cx and cy exchanged and the readout {other_axis(camera.readout)}"
         )
     factor = Fraction(width, camera.width)
     if factor == Fraction(height, camera.height):

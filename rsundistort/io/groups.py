@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ..model import READOUTS
+from ..model import other_axis
 from .photos.exif_facts import ExifFacts
 
 __all__ = ["group_of", "guess_readouts"]
@@ -68,7 +68,7 @@ def guess_readouts(
     notes : list of str
         What was guessed, for people; empty if nothing was.
     """
-    across = "left-to-right" if READOUTS[readout][0] == 1 else "top-to-bottom"
+    across = other_axis(readout)
     frames = {(_body(fact), *size) for fact, size in zip(facts, sizes, strict=True)}
     # a tag that turns the photo for people says that nobody has turned its pixels
     tagged = {group for fact, group in zip(facts, groups, strict=True) if fact.orientation not in (None, 1)}

@@ -10,14 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..model import READOUTS, Camera, RowMotion, Solution, SolvedImage
+from ..model import Camera, RowMotion, Solution, SolvedImage
 from ..model.projection import clock_of
 from .nerfstudio import camera_to_world, write_frames
 
 __all__ = ["write_shutter_poses"]
-
-#: gsplat's `RollingShutterType` of each direction: its names, since Python and C++ number them apart.
-_GSPLAT_SHUTTER = {direction: f"ROLLING_{direction.upper().replace('-', '_')}" for direction in READOUTS}
 
 #: instant-ngp's time of a pixel: A + B u + C v + D (blur), with u and v from 0 to 1 between the borders of the photo.
 _NGP_SHUTTER = {
@@ -109,9 +106,8 @@ def _line(camera: Camera, place: float, border: float = 0.5) -> float:
 
     It begins at the border of the photo, or with `border` 0 at the centre of the line that is read first.
     """
-    axis, sign = READOUTS[camera.readout]
-    last = (camera.width, camera.height)[axis] - 1.0
-    return last / 2 + sign * place * (last + 2 * border)
+    last = camera.num_lines - 1.0
+    return last / 2 + camera.clock_sign * place * (last + 2 * border)
 
 
 def _clock(camera: Camera, place: float, border: float = 0.5) -> float:
@@ -170,7 +166,8 @@ def _write_gsplat(path: Path, solution: Solution, images: Sequence[SolvedImage],
         names=np.array([image.name for image in images], np.str_),
         viewmats=viewmats[:, 0],
         viewmats_rs=viewmats[:, 1],
-        rolling_shutter=np.array([_GSPLAT_SHUTTER[camera.readout] for camera in cameras], np.str_),
+        # names of gsplat's `RollingShutterType`, which Python and C++ number apart
+        rolling_shutter=np.array([f"ROLLING_{c.readout.upper().replace('-', '_')}" for c in cameras], np.str_),
         Ks=Ks,
         width=np.array([camera.width for camera in cameras], np.int64),
         height=np.array([camera.height for camera in cameras], np.int64),
@@ -185,7 +182,7 @@ def _write_gsplat(path: Path, solution: Solution, images: Sequence[SolvedImage],
 def _readout_time(solution: Solution, images: Sequence[SolvedImage]) -> tuple[float, str] | None:
     """The time that 3dgs-deblur is told of all photos, and its unit; None where it cannot follow."""
     used = {image.camera_id for image in images}
-    if any(READOUTS[solution.cameras[key].readout][0] == 0 for key in used):
+    if any(solution.cameras[key].clock_axis == 0 for key in used):
         return None  # it knows of rows only
     known = solution.quality.get("readout_times") or {}
     seconds = {known[key]["ms"] / 1e3 if key in known else None for key in used}
@@ -198,7 +195,7 @@ def _velocities(solution: Solution, image: SolvedImage, camera: Camera, time: fl
     motion, _ = _steady(solution, image)
     R_cw, _ = _pose(solution, image, _clock(camera, 0.0))
     # rows run downwards there; to read them upwards is to move the other way
-    rate = READOUTS[camera.readout][1] * camera.frame_span / time
+    rate = camera.clock_sign * camera.frame_span / time
     axes = np.array([1.0, -1.0, -1.0])
     return {
         "camera_linear_velocity": (rate * axes * (R_cw @ motion.velocity)).tolist(),

@@ -1,7 +1,7 @@
 """What data looks like between the stages: frozen dataclasses of arrays."""
 
 from .bend import BEND_GROUPS, Bend
-from .camera import READOUTS, Camera
+from .camera import READOUTS, Camera, check_readout, other_axis
 from .depth import AtInfinity, Depth, DepthMap, Plane
 from .known_length import KnownLength
 from .motion import SHUTTER_MODELS, RowMotion, check_shutter_model
@@ -24,5 +24,7 @@ __all__ = [
     "RowMotion",
     "Solution",
     "SolvedImage",
+    "check_readout",
     "check_shutter_model",
+    "other_axis",
 ]

@@ -13,7 +13,7 @@ from ..errors import InputError
 from .checks import check_finite, frozen
 from .field import spline_coefficients, steepest
 
-__all__ = ["LENSES", "READOUTS", "Camera"]
+__all__ = ["LENSES", "READOUTS", "Camera", "check_readout", "other_axis"]
 
 #: Readout directions, in the stored pixel frame: (axis of the clock, its sign).
 READOUTS: dict[str, tuple[int, float]] = {
@@ -22,6 +22,19 @@ READOUTS: dict[str, tuple[int, float]] = {
     "left-to-right": (0, 1.0),
     "right-to-left": (0, -1.0),
 }
+
+
+def check_readout(readout: str, name: str = "readout") -> tuple[int, float]:
+    """Axis of the clock of a readout direction (0 of columns, 1 of rows) and its sign; refused if it is none."""
+    if readout not in READOUTS:
+        raise InputError(f"{name}={readout!r}, expected one of {', '.join(READOUTS)}")
+    return READOUTS[readout]
+
+
+def other_axis(readout: str) -> str:
+    """A readout direction along the other axis; to reverse one is to negate the motion, and changes nothing else."""
+    return ("top-to-bottom", "left-to-right")[READOUTS[readout][0]]
+
 
 #: Lens models, and the names of their coefficients in the order of `Camera.dist`.
 LENSES: dict[str, tuple[str, ...]] = {
@@ -110,8 +123,7 @@ class Camera:
         lengths = _DIST_LENGTHS[self.lens]
         if len(dist) not in lengths:
             raise InputError(f"dist has {len(dist)} numbers, a {self.lens} lens has one of {lengths} in OpenCV's order")
-        if self.readout not in READOUTS:
-            raise InputError(f"readout={self.readout!r}, expected one of {', '.join(READOUTS)}")
+        check_readout(self.readout)
         object.__setattr__(self, "K", frozen(K))
         object.__setattr__(self, "dist", frozen(dist))
         object.__setattr__(self, "field", frozen(self._checked_field()))
@@ -149,18 +161,31 @@ class Camera:
         return replace(self, K=K)
 
     @property
+    def clock_axis(self) -> int:
+        """Pixel axis along which the photo is read out: 0, x, of columns; 1, y, of rows."""
+        return READOUTS[self.readout][0]
+
+    @property
+    def clock_sign(self) -> float:
+        """1 where the photo is read out along that axis, -1 against it."""
+        return READOUTS[self.readout][1]
+
+    @property
+    def num_lines(self) -> int:
+        """Rows of the photo, or columns, that are read out one after the other."""
+        return (self.width, self.height)[self.clock_axis]
+
+    @property
     def frame_span(self) -> float:
         """How far the clock runs over the whole frame: height/fy, or width/fx for column readout."""
-        if READOUTS[self.readout][0] == 1:
-            return self.height / float(self.K[1, 1])
-        return self.width / float(self.K[0, 0])
+        return self.num_lines / float(self.K[self.clock_axis, self.clock_axis])
 
     @property
     def clock_range(self) -> tuple[float, float]:
         """The clock where the reading of a frame begins and where it ends: at the borders of the photo."""
-        axis, sign = READOUTS[self.readout]
-        size, f, c = (self.width, self.height)[axis], float(self.K[axis, axis]), float(self.K[axis, 2])
-        first, last = sign * (-0.5 - c) / f, sign * (size - 0.5 - c) / f
+        axis, sign = self.clock_axis, self.clock_sign
+        f, c = float(self.K[axis, axis]), float(self.K[axis, 2])
+        first, last = sign * (-0.5 - c) / f, sign * (self.num_lines - 0.5 - c) / f
         return min(first, last), max(first, last)
 
     @cached_property
@@ -172,9 +197,8 @@ class Camera:
         lens[12] = _fold_radius_squared(self.lens, lens)
         if self.lens == "fisheye":
             lens = np.append(lens, 1.0)[None]
-        axis, sign = READOUTS[self.readout]
         K = self.K
-        return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]), lens, axis, sign
+        return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]), lens, self.clock_axis, self.clock_sign
 
     @property
     def coefficients(self) -> dict[str, float]:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from .bend import Bend, bend_table
-from .camera import READOUTS
+from .camera import check_readout
 from .checks import check_finite, frozen
 
 __all__ = ["SHUTTER_MODELS", "RowMotion", "check_shutter_model"]
@@ -180,7 +180,7 @@ class RowMotion:
 
     def imaginary_camera(self, readout: str = "top-to-bottom") -> tuple[float, float]:
         """Aspect ratio and skew, in the direction of the readout, of the camera that the paper puts behind the lens."""
-        axis, sign = READOUTS[readout]
+        axis, sign = check_readout(readout)
         # for columns x and y are exchanged, which takes phi to -(phi2, phi1, phi3)
         phi = sign * (self.phi if axis == 1 else -self.phi[[1, 0, 2]])
         return 1.0 - float(phi[0]), float(phi[1])

@@ -101,8 +101,7 @@ def turn_camera(camera: Camera, orientation: int) -> Camera:
     K = np.eye(3)
     K[[0, 1], [0, 1]] = np.abs(matrix) @ np.diag(camera.K)[:2]
     K[:2, 2] = turn_points(camera.K[None, :2, 2], camera.width, camera.height, orientation)[0]
-    axis, sign = READOUTS[camera.readout]
-    clock = sign * matrix[:, axis]
+    clock = camera.clock_sign * matrix[:, camera.clock_axis]
     along = int(np.flatnonzero(clock)[0])
     readout = next(name for name, way in READOUTS.items() if way == (along, float(clock[along])))
     dist = np.array(camera.dist)

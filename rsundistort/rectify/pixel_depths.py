@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .._kernels import depth as kernels
 from ..errors import InputError
-from ..model import READOUTS, AtInfinity, Camera, Depth, DepthMap, Plane, RowMotion
+from ..model import AtInfinity, Camera, Depth, DepthMap, Plane, RowMotion
 from ..model.projection import clock_of
 
 __all__ = ["DepthRows", "inverse_depth_at", "stretch"]
@@ -88,13 +88,13 @@ class DepthRows:
         if isinstance(self.depth, DepthMap):
             kernels.mark_hidden(
                 self.depth.inverse, stretch(self.depth), float(self.depth.inverse.max()), self._slopes, self._epipoles,
-                READOUTS[self.camera.readout][0], row0, map_x, map_y,
+                self.camera.clock_axis, row0, map_x, map_y,
             )  # fmt: skip
 
     @cached_property
     def _epipoles(self) -> NDArray[np.float64]:
         """(lines, 3) where the camera was when it read each line, in homogeneous pixels of the rectified photo."""
-        lines = np.arange((self.camera.width, self.camera.height)[READOUTS[self.camera.readout][0]], dtype=np.float64)
+        lines = np.arange(self.camera.num_lines, dtype=np.float64)
         way = self.motion.at(clock_of(self.camera, np.stack([lines, lines], axis=1)))[1]
         return np.ascontiguousarray(np.linalg.solve(self.rays, way.T).T)
 

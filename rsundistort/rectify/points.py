@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._kernels.depth import EDGE
 from ..errors import InputError
-from ..model import READOUTS, AtInfinity, Camera, Depth, DepthMap, Plane, RowMotion
+from ..model import AtInfinity, Camera, Depth, DepthMap, Plane, RowMotion
 from ..model.checks import check_array, check_finite
 from ..model.projection import clock_of, project_points, unproject_points
 from .maps import rectified_rays
@@ -235,7 +235,7 @@ def bend_px(camera: Camera, motion: RowMotion, depth: float = np.inf) -> float:
     near, turn, way = motion.steady(*camera.clock_range)
     # along the readout four for each reading of the bend
     num = [33, 33]
-    num[READOUTS[camera.readout][0]] = max(33, 4 * len(motion.bend.values))
+    num[camera.clock_axis] = max(33, 4 * len(motion.bend.values))
     u, v = np.meshgrid(np.linspace(0, camera.width - 1, num[0]), np.linspace(0, camera.height - 1, num[1]))
     raw = np.column_stack([u.ravel(), v.ravel()])
     ideal, valid = unproject_points(raw, camera, motion)

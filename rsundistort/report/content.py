@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..critical.meter import readout_axes
 from ..io import output_name
-from ..model import READOUTS, SHUTTER_MODELS, Camera, Solution, SolvedImage
+from ..model import SHUTTER_MODELS, Camera, Solution, SolvedImage
 from ..model.field import field_over_frame
 from ..model.orientation import MATRICES, in_stored_frame, split_mirror, turn_points
 from .diagnostics import Diagnostics
@@ -109,7 +109,7 @@ def motions(solution: Solution) -> list[dict[str, Any]]:
                 "high": float(high),
                 "zero": round(4 + (height - 8) * float(high) / room, 1) if low < 0 < high else None,
                 "most": float(np.linalg.norm(turn - np.degrees(clock[:, None] * image.motion.phi), axis=1).max()),
-                "lines": ("columns", "rows")[READOUTS[camera.readout][0]],
+                "lines": ("columns", "rows")[camera.clock_axis],
             }
         )
     return found

@@ -17,7 +17,7 @@ from ..bundle import BundleResult
 from ..errors import FileError, FormatError
 from ..evaluation import align_points
 from ..io.aside import write_aside
-from ..model import READOUTS, Reconstruction
+from ..model import Reconstruction
 from ..model.reprojection import reprojection_residuals
 
 __all__ = ["Diagnostics", "read_diagnostics", "write_diagnostics"]
@@ -240,8 +240,8 @@ class _Residuals:
         camera = rec.camera_idx[frame]
         sizes = np.array([(each.width, each.height) for each in rec.cameras], float)
         place = np.clip((obs.xy_raw[valid] + 0.5) / sizes[camera], 0, 1)
-        axis = np.array([READOUTS[each.readout][0] for each in rec.cameras])[camera]
-        sign = np.array([READOUTS[each.readout][1] for each in rec.cameras])[camera]
+        axis = np.array([each.clock_axis for each in rec.cameras])[camera]
+        sign = np.array([each.clock_sign for each in rec.cameras])[camera]
         along = place[np.arange(len(place)), axis]
         return cls(rec, residuals[valid], frame, np.where(sign > 0, along, 1 - along), place)
 

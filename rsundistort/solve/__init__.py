@@ -2,6 +2,6 @@
 
 from .from_model import solve
 from .run import run
-from .run_options import RunOptions, SolveOptions
+from .run_options import OutputOptions, RunOptions, SolveOptions
 
-__all__ = ["RunOptions", "SolveOptions", "run", "solve"]
+__all__ = ["OutputOptions", "RunOptions", "SolveOptions", "run", "solve"]

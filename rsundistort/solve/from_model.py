@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, overload
 import numpy as np
 
 from ..batch.progress import ProgressCallback, StageLog
+from ..batch.rectify_options import RectifyOptions
 from ..batch.workers import Workers, use_threads
 from ..bundle import BundleOptions
 from ..colmap.conventions import kept_log_level
@@ -29,8 +30,8 @@ from ..model import Reconstruction, Solution
 from ..model.orientation import INVERSE, turn_reconstruction
 from ..sfm import matched_of_database
 from .model_sequence import Feedback, solve_tracks
-from .outcome import Outcome
-from .run_options import SolveOptions
+from .outcome import Solved
+from .run_options import OutputOptions, SolveOptions
 from .run_outputs import REPLACED, Outputs, PointRgb, files_of_run, inputs_of, photo_times
 
 if TYPE_CHECKING:
@@ -49,8 +50,13 @@ def solve(
     out: Path | str,
     options: SolveOptions | None = None,
     *,
+    rectify: RectifyOptions | None = None,
+    outputs: OutputOptions | None = None,
     images: Path | str | None = None,
     database: Path | str | None = None,
+    jobs: int = 0,
+    overwrite: bool = False,
+    scheduler: str | None = None,
     progress: ProgressCallback | None = None,
 ) -> Solution: ...
 
@@ -61,7 +67,7 @@ def solve(
     out: None = None,
     options: SolveOptions | None = None,
     *,
-    images: None = None,
+    rectify: RectifyOptions | None = None,
     database: Path | str | None = None,
     progress: ProgressCallback | None = None,
 ) -> tuple[pycolmap.Reconstruction, Solution]: ...
@@ -72,8 +78,13 @@ def solve(
     out: Path | str | None = None,
     options: SolveOptions | None = None,
     *,
+    rectify: RectifyOptions | None = None,
+    outputs: OutputOptions | None = None,
     images: Path | str | None = None,
     database: Path | str | None = None,
+    jobs: int = 0,
+    overwrite: bool = False,
+    scheduler: str | None = None,
     progress: ProgressCallback | None = None,
 ) -> Solution | tuple[pycolmap.Reconstruction, Solution]:
     """Recover how the camera moved during each photo's readout from a model of another program.
@@ -90,12 +101,16 @@ def solve(
     out : path
         Folder for the outputs, as of `run`; for a model in files.
     options : SolveOptions, optional
-        See there. Groups are cameras of the model: "camera 1". What concerns files is not looked at without `out`.
+        See there. Groups are cameras of the model: "camera 1".
+    rectify, outputs : RectifyOptions, OutputOptions, optional
+        As in `RunOptions`; of a `pycolmap.Reconstruction` `rectify.view` and `rectify.raw_as` alone count.
     images : path, optional
         Folder of the photos that the model names; for a model in files. Without it none are rectified.
     database : path, optional
         COLMAP's database behind the model: the matches in it are verified again with the motions found, and the tracks
         rebuilt.
+    jobs, overwrite, scheduler
+        As in `rectify_folder`, for a model in files.
     progress : callable, optional
         Called as (stage, done, total). What it raises stops the work.
 
@@ -115,25 +130,30 @@ def solve(
     if isinstance(out, SolveOptions):  # until the next version: they were the second argument
         warnings.warn("solve takes options by name: solve(model, options=...)", DeprecationWarning, stacklevel=2)
         out, options = None, out
-    options = options or SolveOptions()
+    options, rectify = options or SolveOptions(), rectify or RectifyOptions()
     if isinstance(model, str | Path):
         if out is None:
             raise InputError(f"solve: out is missing; say which folder gets the outputs of {model}")
-        return _solve_files(model, out, options, images, database, progress)
+        workers, outputs = Workers(use_threads(jobs), scheduler), outputs or OutputOptions()
+        return _solve_files(model, out, options, rectify, outputs, images, database, workers, overwrite, progress)
     if not hasattr(model, "reg_image_ids"):
         kind = f"{type(model).__module__}.{type(model).__name__}"
         raise InputError(f"solve: model is a {kind}, expected a folder, a file or a pycolmap.Reconstruction")
-    if out is not None or images is not None:
+    if not (out is images is outputs is None):
         raise InputError("solve: out and images are for a model in files; write what is returned, or give the folder")
-    return _solve_in_memory(model, options, database, progress)
+    return _solve_in_memory(model, options, rectify, database, progress)
 
 
 def _solve_files(
     model: Path | str,
     out: Path | str,
     options: SolveOptions,
+    rectify: RectifyOptions,
+    outputs: OutputOptions,
     images: Path | str | None,
     database: Path | str | None,
+    workers: Workers,
+    overwrite: bool,
     progress: ProgressCallback | None,
 ) -> Solution:
     """From files to files."""
@@ -142,38 +162,41 @@ def _solve_files(
     if database is not None and model.is_file():
         raise InputError(f"{model} is no COLMAP model, and --database is COLMAP's; leave it out")
     log = StageLog(progress)
-    workers = Workers(use_threads(options.jobs), options.scheduler)
-    inputs = inputs_of(options, model, folder, database)
-    with output_folder(out, overwrite=options.overwrite, apart_from=inputs, replaced=REPLACED) as scratch:
+    inputs = inputs_of(rectify, model, folder, database)
+    with output_folder(out, overwrite=overwrite, apart_from=inputs, replaced=REPLACED) as scratch:
         log.begin("model")
         given = read_model(model)
-        Record(out).check(files_of_run([] if folder is None else given.reconstruction.image_names, options), inputs)
+        names = [] if folder is None else given.reconstruction.image_names
+        Record(out).check(files_of_run(names, rectify.raw_as, outputs), inputs)
         photos = {} if folder is None else _look_at(folder, given.reconstruction)
         given, said = _in_stored_frame(given, photos)
         if folder is not None:
-            given = replace(given, unregistered=_others_in(folder, given, options.raw_as))
+            given = replace(given, unregistered=_others_in(folder, given, rectify.raw_as))
         log.end("model", photos=given.reconstruction.num_images, points=given.reconstruction.num_points)
         facts = {name: fact for name, (_, fact) in photos.items()}
-        outcome, ids, rgb = _solve(given, str(model), facts, options, None if database is None else Path(database), log)
+        solved, ids, rgb = _solve(given, str(model), facts, options, None if database is None else Path(database), log)
         facts_of_model = {
             "frame": said,
             "points": given.reconstruction.num_points,
             "observations": len(given.reconstruction.observations),
         }
-        outcome = replace(outcome, options={"model": facts_of_model})
+        solved = replace(solved, told={"model": facts_of_model})
         orientations = {name: fact.orientation or 1 for name, fact in facts.items()}
         times = {} if folder is None else photo_times(folder)
-        outputs = Outputs.of_outcome(outcome, options, orientations, ids, rgb, folder is not None, times)
-        solution = outputs.begin(scratch, log)
+        written = Outputs.of_solved(
+            solved, options, rectify, outputs, orientations, ids, rgb, folder is not None, times
+        )
+        solution = written.begin(scratch, log)
     if folder is not None:
-        return outputs.rectify(folder, out, workers, log)
-    outputs.report(out, log)
+        return written.rectify(folder, out, workers, log)
+    written.report(out, workers.jobs, log)
     return solution
 
 
 def _solve_in_memory(
     reconstruction: pycolmap.Reconstruction,
     options: SolveOptions,
+    rectify: RectifyOptions,
     database: Path | str | None,
     progress: ProgressCallback | None,
 ) -> tuple[pycolmap.Reconstruction, Solution]:
@@ -181,10 +204,10 @@ def _solve_in_memory(
     log = StageLog(progress)
     given = colmap_model_of(reconstruction)
     with kept_log_level():
-        outcome, ids, rgb = _solve(given, "the model", {}, options, None if database is None else Path(database), log)
-    outputs = Outputs.of_outcome(outcome, options, {}, ids, rgb)
+        solved, ids, rgb = _solve(given, "the model", {}, options, None if database is None else Path(database), log)
+    outputs = Outputs.of_solved(solved, options, rectify, OutputOptions(), {}, ids, rgb)
     rec, solution = outputs.reconstruction, outputs.solution
-    names = [output_name(name, options.raw_as) for name in rec.image_names]
+    names = [output_name(name, rectify.raw_as) for name in rec.image_names]
     cameras = [solution.rectified_cameras[str(key)] for key in ids.cameras]
     return colmap_model(rec, cameras, names, rgb.values, ids), replace(solution, stages=tuple(log.stages))
 
@@ -285,7 +308,7 @@ def _solve(
     options: SolveOptions,
     database: Path | None,
     log: StageLog,
-) -> tuple[Outcome, ModelIds, PointRgb]:
+) -> tuple[Solved, ModelIds, PointRgb]:
     if given.reconstruction.num_images < 3:
         raise ReconstructionError(
             f"the model holds {given.reconstruction.num_images} registered photos, the shutter needs three"
@@ -295,9 +318,6 @@ def _solve(
     for name in (*options.still, *options.known):
         if name not in rec.image_names:
             raise InputError(f"anchor {name!r} is not among the photos of the model")
-    guessed = {k: label for k, label in enumerate(cameras.labels) if not cameras.readout_told[k]}
-    used = set(rec.camera_idx.tolist())
-    guessed = {k: label for k, label in guessed.items() if k in used}
 
     def options_of(each: Reconstruction) -> BundleOptions:
         return replace(options.options_for(cameras), outlier_sigma=_OUTLIER_SIGMA)
@@ -310,7 +330,7 @@ def _solve(
             log.end("database", keypoints=sum(len(found.xy_raw) for found in matched.features))
         solved = solve_tracks(
             rec,
-            guessed,
+            cameras,
             options.shutter_model,
             options.seed,
             options_of,
@@ -318,7 +338,7 @@ def _solve(
             options.remedy,
             None if matched is None else Feedback(matched),
         )
-    after = solved.result.reconstruction
+    after = solved.shared
     for text in cameras.contradicted(after.cameras, options_of(after)):
         warnings.warn(text, RsUndistortWarning, stacklevel=4)
     lost = dict.fromkeys(given.unregistered, "it is not registered in the model")
@@ -328,4 +348,4 @@ def _solve(
     ids = given.ids_of(old, after.image_names)
     known = (old >= 0) & given.has_colors
     rgb = PointRgb(np.where(known[:, None], given.colors[old], 0).astype(np.uint8), known)
-    return Outcome(solved, cameras, ids.cameras, lost, readouts), ids, rgb
+    return replace(solved, shared_ids=ids.cameras, unregistered=lost, readouts=readouts), ids, rgb

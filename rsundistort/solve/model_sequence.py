@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,17 +25,19 @@ from ..bundle import (
     choose_readouts,
     sequence_to,
 )
-from ..critical import Advice, Remedy, advise, heal, with_remedy
+from ..critical import advise, heal, with_remedy
 from ..errors import ReconstructionError, RsUndistortWarning
 from ..input.load import LoadedPhotos
 from ..input.pairing import pairs_to_match
 from ..input.patches import patch_source
+from ..input.photo_cameras import PhotoCameras
 from ..model import Reconstruction
 from ..model.projection import unproject_points
 from ..sfm import LEAST_MEASUREMENTS, MatchedPhotos, align_tracks, map_photos, match_photos, retriangulate
 from ..verdict import Verdict, judge
+from .outcome import Solved
 
-__all__ = ["Feedback", "Solved", "solve_photos", "solve_tracks"]
+__all__ = ["Feedback", "solve_photos", "solve_tracks"]
 
 # Feedback ends when no rectified pixel of any photo moves by more than this between two rounds, in pixels of the images
 # that the features were found in; or when less than this share of the measurements is another one than before, so that
@@ -45,37 +47,6 @@ _SETTLED_SHARE = 0.01
 _MAX_ROUNDS = 4
 # Places on each side of a photo where that is looked at.
 _LOOKED_AT = 5
-
-
-@dataclass(frozen=True)
-class Solved:
-    """Outcome of the reconstruction.
-
-    Attributes
-    ----------
-    result : BundleResult
-        Last adjustment.
-    global_result : BundleResult
-        A global-shutter adjustment of the same measurements: what not modelling the shutter costs.
-    choice : ModelChoice or None
-        How the model was chosen; None where it was given.
-    remedy : Remedy or None
-        What was done about a critical motion; None for a global shutter.
-    advice : sequence of Advice
-        For the next shoot, where the poses are critical.
-    readouts : ReadoutChoice or None
-        What the photos say of directions of the readout that nobody told.
-    verdict : Verdict or None
-        What to believe of all this.
-    """
-
-    result: BundleResult
-    global_result: BundleResult
-    choice: ModelChoice | None = None
-    remedy: Remedy | None = None
-    advice: Sequence[Advice] = ()
-    readouts: ReadoutChoice | None = None
-    verdict: Verdict | None = None
 
 
 @dataclass(frozen=True)
@@ -109,10 +80,6 @@ class Feedback:
         found = dict(zip(self.matched.names, self.matched.features, strict=True))
         source = patch_source(self.photos, names, self.workers, lambda done: log.tell("alignment", done, len(names)))
         return align_tracks(reconstruction, [found[name].step_px for name in names], source)
-
-
-def _tell_model(log: StageLog, model: str, _cost: float) -> None:
-    log.tell(f"readout: {model}", 0)
 
 
 def _tell(log: StageLog, stage: str, _cost: float) -> None:
@@ -172,13 +139,14 @@ def _of_joined(options: BundleOptions, mapped: Reconstruction) -> BundleOptions:
 
 
 def _read_out(
-    mapped: Reconstruction, guessed: Mapping[int, str], options: BundleOptions, log: StageLog
+    mapped: Reconstruction, cameras: PhotoCameras, options: BundleOptions, log: StageLog
 ) -> ReadoutChoice | None:
     """The directions of readout that nobody told, as the measurements have them; None if all were told."""
+    guessed = {k: cameras.labels[k] for k in np.unique(cameras.camera_idx).tolist() if not cameras.readout_told[k]}
     if not guessed:
         return None
     log.begin("readout")
-    choice = choose_readouts(mapped, list(guessed), options, progress=partial(_tell_model, log))
+    choice = choose_readouts(mapped, list(guessed), options, progress=lambda model, _: log.tell(f"readout: {model}", 0))
     log.end(
         "readout",
         directions={label: choice.reconstruction.cameras[k].readout for k, label in guessed.items()},
@@ -237,17 +205,16 @@ def solve_photos(
             f"only {mapped.num_images} of {len(photos.names)} photos could be joined, the shutter needs three; "
             "use photos that share more of the scene"
         )
-    guessed = {k: cameras.labels[k] for k, told in enumerate(cameras.readout_told) if not told}
     solved = solve_tracks(
-        mapped, guessed, shutter_model, seed, options_of, log, remedy, Feedback(matched, photos, workers)
+        mapped, cameras, shutter_model, seed, options_of, log, remedy, Feedback(matched, photos, workers)
     )
     # which frame a mapping ends in is chance
-    return replace(solved, result=replace(solved.result, reconstruction=solved.result.reconstruction.normalized()))
+    return replace(solved, result=replace(solved.result, reconstruction=solved.shared.normalized()))
 
 
 def solve_tracks(
     mapped: Reconstruction,
-    guessed: Mapping[int, str],
+    cameras: PhotoCameras,
     shutter_model: str,
     seed: int,
     options_of: Callable[[Reconstruction], BundleOptions],
@@ -261,16 +228,16 @@ def solve_tracks(
     ----------
     mapped : Reconstruction
         Poses, points and measurements.
-    guessed : mapping of int to str
-        Cameras whose direction of readout nobody told, and their names for people.
+    cameras : PhotoCameras
+        Where its cameras come from.
     shutter_model, seed, options_of, log, remedy
         As in `solve_photos`.
     feedback : Feedback, optional
         The matches behind it: its tracks are then rebuilt with the motions found, until these settle.
     """
-    readouts = _read_out(mapped, guessed, options_of(mapped), log)
-    if readouts is not None:
-        mapped = readouts.reconstruction
+    directions = _read_out(mapped, cameras, options_of(mapped), log)
+    if directions is not None:
+        mapped = directions.reconstruction
     options = _of_joined(with_remedy(options_of(mapped), remedy), mapped)
     auto = shutter_model == "auto"
     shutter_model = "rotation" if auto else shutter_model
@@ -310,7 +277,7 @@ def solve_tracks(
     if verdict.lens_only:
         warnings.warn(_lens_only(verdict), RsUndistortWarning, stacklevel=3)
     log.end("verdict", shutter=verdict.shutter, shape=verdict.shape)
-    return Solved(result, global_result, choice, mended, advice, readouts, verdict)
+    return Solved(result, global_result, cameras, choice, mended, advice, directions, verdict)
 
 
 def _chosen(

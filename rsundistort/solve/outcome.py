@@ -2,69 +2,94 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bundle import BundleResult, ModelChoice
+from ..batch.rectify_options import RectifyOptions
+from ..bundle import BundleResult, ModelChoice, ReadoutChoice
+from ..critical import Advice, Remedy
 from ..input.photo_cameras import PhotoCameras
 from ..model import BEND_GROUPS, Reconstruction, Solution, SolvedImage
 from ..model.field import field_over_frame
 from ..model.reprojection import reprojection_residuals
 from ..rectify import largest_shift_px
+from ..verdict import Verdict
 from ..versions import versions
-from .model_sequence import Solved
 from .run_options import SolveOptions
 
-__all__ = ["Outcome", "solution_of"]
+__all__ = ["Solved", "solution_of"]
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Solved:
     """What a reconstruction came to, and what is to be said beside it.
 
     Attributes
     ----------
-    solved : Solved
-        The reconstruction.
+    result : BundleResult
+        Last adjustment.
+    global_result : BundleResult
+        A global-shutter adjustment of the same measurements: what not modelling the shutter costs.
     cameras : PhotoCameras
         The cameras that it began with, and where they come from.
+    choice : ModelChoice or None
+        How the model was chosen; None where it was given.
+    remedy : Remedy or None
+        What was done about a critical motion; None for a global shutter.
+    advice : sequence of Advice
+        For the next shoot, where the poses are critical.
+    directions : ReadoutChoice or None
+        What the photos say of directions of the readout that nobody told.
+    verdict : Verdict or None
+        What to believe of all this.
     shared_ids : sequence of int
-        Of the cameras that photos share, in all outputs; where they vary, the photos' own are numbered.
+        Of the cameras that photos share, in all outputs, if they are not 1, 2, ...; where they vary, the photos' own
+        are numbered.
     unregistered : mapping of name to reason
         Photos that are not in it.
     readouts : mapping of camera index to (seconds, source)
         Times of the readout, as far as they are known.
-    options : mapping
+    told : mapping
         What else `solution.json` says of how it was made.
     """
 
-    solved: Solved
+    result: BundleResult
+    global_result: BundleResult
     cameras: PhotoCameras
-    shared_ids: Sequence[int]
+    choice: ModelChoice | None = None
+    remedy: Remedy | None = None
+    advice: Sequence[Advice] = ()
+    directions: ReadoutChoice | None = None
+    verdict: Verdict | None = None
+    shared_ids: Sequence[int] = ()
     unregistered: Mapping[str, str] = field(default_factory=dict)
     readouts: Mapping[int, tuple[float, str]] = field(default_factory=dict)
-    options: Mapping[str, Any] = field(default_factory=dict)
+    told: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def shared(self) -> Reconstruction:
+        """With poses, motions and points, and the cameras that photos share."""
+        return self.result.reconstruction
 
     @property
     def reconstruction(self) -> Reconstruction:
-        """With poses, motions and points, and a camera for each photo if they vary."""
-        return self.solved.result.reconstruction.with_own_cameras()
+        """The same with a camera for each photo if they vary."""
+        return self.shared.with_own_cameras()
 
     @property
     def camera_ids(self) -> list[int]:
-        """Of the reconstruction's cameras, in all outputs."""
-        rec = self.solved.result.reconstruction
-        return list(range(1, 1 + rec.num_images)) if rec.varies else list(self.shared_ids)
+        """Of the cameras of `reconstruction`, in all outputs."""
+        own = self.shared.varies
+        return list((not own and self.shared_ids) or range(1, 1 + len(self.reconstruction.cameras)))
 
-
-def _by_camera(keys: Sequence[str], shared: Reconstruction, values: Sequence[Any]) -> dict[str, Any]:
-    """What shared cameras have, by the ids of the outputs: those of the photos, if they vary."""
-    of_photos = [values[k] for k in shared.camera_idx.tolist()]
-    return dict(zip(keys, of_photos if shared.varies else values, strict=True))
+    def by_camera(self, values: Sequence[Any]) -> dict[str, Any]:
+        """What shared cameras have, by the ids of the outputs: those of the photos, if they vary."""
+        of_photos = [values[k] for k in self.shared.camera_idx.tolist()]
+        return dict(zip(map(str, self.camera_ids), of_photos if self.shared.varies else values, strict=True))
 
 
 def _readouts(rec: Reconstruction, cameras: PhotoCameras) -> str | dict[str, str]:
@@ -73,18 +98,16 @@ def _readouts(rec: Reconstruction, cameras: PhotoCameras) -> str | dict[str, str
     return rec.cameras[0].readout if len(set(directions.values())) == 1 else directions
 
 
-def _guesses(solved: Solved, cameras: PhotoCameras) -> list[str]:
+def _guesses(solved: Solved) -> list[str]:
     """What was guessed of the cameras, and what the photos said of it, for people."""
-    choice = solved.readouts
-    found = [] if choice is None else choice.turned
-    said = [] if found else list(cameras.notes)
-    for k in found:
-        assert choice is not None
-        said.append(
-            f"{cameras.labels[k]} fits better as read out {choice.reconstruction.cameras[k].readout} "
-            f"(by {choice.gain[k]:.0f} standard errors); --readout settles it"
-        )
-    return said
+    choice, cameras = solved.directions, solved.cameras
+    if choice is None or not choice.turned:
+        return list(cameras.notes)
+    return [
+        f"{cameras.labels[k]} fits better as read out {choice.reconstruction.cameras[k].readout} "
+        f"(by {choice.gain[k]:.0f} standard errors); --readout settles it"
+        for k in choice.turned
+    ]
 
 
 def _image_rms(rec: Reconstruction) -> NDArray[np.float64]:
@@ -121,7 +144,7 @@ def _critical(solved: Solved) -> dict[str, Any]:
 
 def _fields(solved: Solved) -> list[dict[str, float]]:
     """How large the residual field of each camera is: root mean square and largest over its frame, its deviation."""
-    lengths = [np.linalg.norm(field_over_frame(c)[1], axis=2) for c in solved.result.reconstruction.cameras]
+    lengths = [np.linalg.norm(field_over_frame(c)[1], axis=2) for c in solved.shared.cameras]
     sigmas = solved.result.sigma_fields_px
     return [
         {"rms_px": float(np.sqrt(np.mean(length**2))), "largest_px": float(length.max()), "sigma_px": sigma}
@@ -129,87 +152,86 @@ def _fields(solved: Solved) -> list[dict[str, float]]:
     ]
 
 
-def solution_of(outcome: Outcome, options: SolveOptions) -> Solution:
+def solution_of(solved: Solved, options: SolveOptions, rectify: RectifyOptions) -> Solution:
     """The solution of an adjusted reconstruction, with every photo in it; its views are those of the raw photos."""
-    solved, rec, verdict = outcome.solved, outcome.reconstruction, outcome.solved.verdict
-    doubtful, lens_only = ({}, ()) if verdict is None else (verdict.doubtful, verdict.lens_only)
-    rms = _image_rms(rec)
-    counts = np.bincount(rec.observations.frame_idx, minlength=rec.num_images)
-    keys = [str(key) for key in outcome.camera_ids]
-    cameras = dict(zip(keys, rec.cameras, strict=True))
-    shared = solved.result.reconstruction
-    places = {name: i for i, name in enumerate(rec.image_names)}
-    images = []
-    for name in sorted([*rec.image_names, *outcome.unregistered]):
-        if name in outcome.unregistered:
-            images.append(SolvedImage(name, keys[0], reason=outcome.unregistered[name]))
-            continue
-        i = places[name]
-        shift_px = largest_shift_px(rec.camera(i), rec.motion(i), rec.shutter_model) if name not in lens_only else 0.0
-        images.append(
-            SolvedImage(
-                name=name,
-                camera_id=keys[int(rec.camera_idx[i])],
-                R_cw=rec.R_cw[i],
-                center_w=rec.center_w[i],
-                motion=rec.motion(i),
-                sigma_phi=None if rec.shutter_model == "global" else solved.result.sigma_phi[i],
-                num_observations=int(counts[i]),
-                rms_px=float(rms[i]),
-                rs_shift_px=shift_px,
-                doubtful=doubtful.get(name),
-                lens_only=name in lens_only,
-            )
-        )
-    quality = {
-        "num_points": rec.num_points,
-        "num_observations": len(rec.observations),
-        "rms_px": solved.result.rms_px,
-        "global_rms_px": solved.global_result.rms_px,
-        **_held_out(solved.choice),
-        "sigma_intrinsics": _by_camera(keys, shared, solved.result.sigma_intrinsics),
-        "focal_sigma": solved.result.focal_sigma,
-        "centre_sigma_focal_lengths": solved.result.centre_sigma,
-        "lens_fields": _by_camera(keys, shared, _fields(solved)) if any(c.field.size for c in shared.cameras) else {},
-        "phi_sigma_rad_per_frame": solved.result.phi_sigma,
-        **_bend_sigmas(solved.result),
-        "stop_reason": solved.result.stop_reason,
-        "readout_times": {
-            key: {"ms": 1e3 * each[0], "source": each[1]}
-            for key, each in _by_camera(
-                keys, shared, [outcome.readouts.get(k) for k in range(len(shared.cameras))]
-            ).items()
-            if each is not None
-        },
-    }
+    rec, shared = solved.reconstruction, solved.shared
     return Solution(
         shutter_model=rec.shutter_model,
-        cameras=cameras,
+        cameras=dict(zip(map(str, solved.camera_ids), rec.cameras, strict=True)),
         # same size and K, so that raw and rectified compare pixel by pixel
-        rectified_cameras=_by_camera(keys, shared, [camera.pinhole() for camera in shared.cameras]),
-        images=tuple(images),
-        quality=quality,
+        rectified_cameras=solved.by_camera([camera.pinhole() for camera in shared.cameras]),
+        images=tuple(_images(solved)),
+        quality=_quality(solved),
         critical_motion=None if solved.remedy is None else _critical(solved),
         options={
-            "camera": outcome.cameras.source,
+            "camera": solved.cameras.source,
             "shutter_model": options.shutter_model,
-            "readout": _readouts(shared, outcome.cameras),
-            "guesses": _guesses(solved, outcome.cameras),
+            "readout": _readouts(shared, solved.cameras),
+            "guesses": _guesses(solved),
             "seed": options.seed,
-            "interpolation": options.interpolation,
-            "quality": options.quality,
-            "raw_as": options.raw_as,
+            "interpolation": rectify.interpolation,
+            "quality": rectify.quality,
+            "raw_as": rectify.raw_as,
             "refine": list(solved.result.sigma_intrinsics[0]),
             "still": dict(options.still),
             "known": sorted(options.known),
             "lengths": len(options.lengths),
             "remedy": options.remedy,
-            "depth": str(options.depth),
-            **outcome.options,
+            "depth": str(rectify.depth),
+            **solved.told,
         },
         generator=versions(),
-        verdict=None if verdict is None else verdict.to_json(),
+        verdict=None if solved.verdict is None else solved.verdict.to_json(),
     )
+
+
+def _images(solved: Solved) -> Iterator[SolvedImage]:
+    """Every photo, by name."""
+    rec, verdict, keys = solved.reconstruction, solved.verdict, [str(key) for key in solved.camera_ids]
+    doubtful, lens_only = ({}, ()) if verdict is None else (verdict.doubtful, verdict.lens_only)
+    rms = _image_rms(rec)
+    counts = np.bincount(rec.observations.frame_idx, minlength=rec.num_images)
+    places = {name: i for i, name in enumerate(rec.image_names)}
+    for name in sorted([*rec.image_names, *solved.unregistered]):
+        if name in solved.unregistered:
+            yield SolvedImage(name, keys[0], reason=solved.unregistered[name])
+            continue
+        i = places[name]
+        shift_px = largest_shift_px(rec.camera(i), rec.motion(i), rec.shutter_model) if name not in lens_only else 0.0
+        yield SolvedImage(
+            name=name,
+            camera_id=keys[int(rec.camera_idx[i])],
+            R_cw=rec.R_cw[i],
+            center_w=rec.center_w[i],
+            motion=rec.motion(i),
+            sigma_phi=None if rec.shutter_model == "global" else solved.result.sigma_phi[i],
+            num_observations=int(counts[i]),
+            rms_px=float(rms[i]),
+            rs_shift_px=shift_px,
+            doubtful=doubtful.get(name),
+            lens_only=name in lens_only,
+        )
+
+
+def _quality(solved: Solved) -> dict[str, Any]:
+    """What `solution.json` says of how well all is known."""
+    result, shared = solved.result, solved.shared
+    readouts = solved.by_camera([solved.readouts.get(k) for k in range(len(shared.cameras))])
+    return {
+        "num_points": shared.num_points,
+        "num_observations": len(shared.observations),
+        "rms_px": result.rms_px,
+        "global_rms_px": solved.global_result.rms_px,
+        **_held_out(solved.choice),
+        "sigma_intrinsics": solved.by_camera(result.sigma_intrinsics),
+        "focal_sigma": result.focal_sigma,
+        "centre_sigma_focal_lengths": result.centre_sigma,
+        "lens_fields": solved.by_camera(_fields(solved)) if any(c.field.size for c in shared.cameras) else {},
+        "phi_sigma_rad_per_frame": result.phi_sigma,
+        **_bend_sigmas(result),
+        "stop_reason": result.stop_reason,
+        "readout_times": {k: {"ms": 1e3 * each[0], "source": each[1]} for k, each in readouts.items() if each},
+    }
 
 
 def _bend_sigmas(result: BundleResult) -> dict[str, Any]:

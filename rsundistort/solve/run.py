@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,15 +17,16 @@ from ..input.frames import find_photos
 from ..input.gyroscope import GyroOptions, Readouts, gyro_contradiction, gyro_motions, known_readouts
 from ..input.load import LoadedPhotos, load_photos
 from ..input.photo_cameras import camera_file_of
-from ..io import is_video, list_photos, output_folder
+from ..io import ExifFacts, is_video, list_photos, output_folder
 from ..io.gyro import GyroLog
 from ..io.motions import Known
 from ..io.places import local_place
 from ..io.record import Record
+from ..io.video import VideoFrames
 from ..model import Reconstruction, Solution
 from .model_sequence import solve_photos
-from .outcome import Outcome
-from .run_options import RunOptions
+from .outcome import Solved
+from .run_options import RunOptions, SolveOptions
 from .run_outputs import REPLACED, Outputs, files_of_run, inputs_of, photo_times
 
 __all__ = ["run"]
@@ -35,6 +37,10 @@ def run(
     out: Path | str,
     options: RunOptions | None = None,
     progress: ProgressCallback | None = None,
+    *,
+    jobs: int = 0,
+    overwrite: bool = False,
+    scheduler: str | None = None,
 ) -> Solution:
     """Recover how the camera moved during each photo's readout; write rectified photos, masks and poses.
 
@@ -49,6 +55,8 @@ def run(
         See there.
     progress : callable, optional
         Called as (stage, done, total).
+    jobs, overwrite, scheduler
+        As in `rectify_folder`.
 
     Returns
     -------
@@ -56,69 +64,85 @@ def run(
         As written to `out/solution.json`; photos that did not register are in it, with the reason.
     """
     options = options or RunOptions()
+    rectify = options.rectify
     photos, out = local_place(photos), local_place(out)
     log = StageLog(progress)
-    workers = Workers(use_threads(options.jobs), options.scheduler)
+    workers = Workers(use_threads(jobs), scheduler)
     gyro_files = () if options.gyro is None else (options.gyro.file, options.gyro.times)
-    inputs = inputs_of(options, photos, *gyro_files, camera_file_of(photos, options.camera))
+    inputs = inputs_of(rectify, photos, *gyro_files, camera_file_of(photos, options.camera))
     replaced = (*REPLACED, "frames") if is_video(photos) else REPLACED
-    with output_folder(out, overwrite=options.overwrite, apart_from=inputs, replaced=replaced) as scratch:
+    with output_folder(out, overwrite=overwrite, apart_from=inputs, replaced=replaced) as scratch:
         gyro_log = None if options.gyro is None else options.gyro.log()
         source = find_photos(photos, scratch, options.camera, options.every, options.sharpest, log)
         folder = source.folder
         frames = [] if source.frames is None else [f"frames/{path.name}" for path in folder.iterdir()]
-        Record(out).check([*frames, *files_of_run(list_photos(folder, options.raw_as), options)], inputs)
+        names = list_photos(folder, rectify.raw_as)
+        Record(out).check([*frames, *files_of_run(names, rectify.raw_as, options.outputs)], inputs)
         loaded = load_photos(
-            folder, source.camera, options.readout, options.max_features, workers, log, options,
-            options.feature_megapixels,
+            folder, source.camera, options.solve.readout, options.max_features, workers, log,
+            megapixels=options.feature_megapixels, masks=rectify.masks, raw_as=rectify.raw_as, again=rectify.again,
+            max_megapixels=rectify.max_megapixels,
         )  # fmt: skip
-        cameras = loaded.cameras
+        _check_anchors(options.solve, loaded.names, photos)
         bodies = loaded.facts if source.frames is None else [source.frames] * len(loaded.names)
-        readouts = known_readouts(bodies, cameras.cameras, cameras.camera_idx, options.readout_s, gyro_log)
-        ends = (end[0] for each in options.lengths for end in (each.start, each.end))
-        for name in (*options.still, *options.known, *ends):
-            if name not in loaded.names:
-                raise InputError(f"anchor {name!r} is not among the photos of {photos}")
-        from_gyro: Known = {}
-        if options.gyro is not None and gyro_log is not None:
-            from_gyro, options = _with_gyroscope(options, options.gyro, gyro_log, loaded, readouts)
-        known_s = {k: seconds for k, (seconds, _) in readouts.items()}
-
-        def options_of(rec: Reconstruction) -> BundleOptions:
-            return bounded_by_exposure(options.options_for(cameras), rec, loaded, known_s)
-
-        with tempfile.TemporaryDirectory() as work:
-            solved = solve_photos(
-                loaded, options.shutter_model, options.seed, options_of,
-                Path(work), log, options.remedy, options.matching, workers,
-            )  # fmt: skip
-        rec = solved.result.reconstruction
-        if contradiction := gyro_contradiction(rec, from_gyro):
-            warnings.warn(contradiction, RsUndistortWarning, stacklevel=2)
-        for text in cameras.contradicted(solved.result.reconstruction.cameras, options_of(rec)):
-            warnings.warn(text, RsUndistortWarning, stacklevel=2)
-        outcome = Outcome(
-            solved,
-            cameras,
-            range(1, 1 + len(rec.cameras)),
-            loaded.unregistered(rec.image_names),
-            readouts,
-            {
-                "max_features": options.max_features,
-                "feature_megapixels": options.feature_megapixels,
-                "matching": options.matching,
-                "video": source.video,
-                "gyro": options.gyro and options.gyro.facts(),
-            },
-        )
-        outputs = Outputs.of_outcome(outcome, options, loaded.orientations, times=photo_times(folder))
+        solved, solving = _solve(options, loaded, bodies, gyro_log, workers, log)
+        told = {
+            "max_features": options.max_features,
+            "feature_megapixels": options.feature_megapixels,
+            "matching": options.matching,
+            "video": source.video,
+            "gyro": options.gyro and options.gyro.facts(),
+        }
+        outputs = Outputs.of_solved(
+            replace(solved, told=told), solving, rectify, options.outputs, loaded.orientations,
+            times=photo_times(folder),
+        )  # fmt: skip
         outputs.begin(scratch, log)
     return outputs.rectify(folder if source.frames is None else out / "frames", out, workers, log)
 
 
+def _check_anchors(options: SolveOptions, names: Sequence[str], photos: Path) -> None:
+    """Refuse what is known of photos that are not there."""
+    ends = (end[0] for each in options.lengths for end in (each.start, each.end))
+    for name in (*options.still, *options.known, *ends):
+        if name not in names:
+            raise InputError(f"anchor {name!r} is not among the photos of {photos}")
+
+
+def _solve(
+    options: RunOptions,
+    loaded: LoadedPhotos,
+    bodies: Sequence[ExifFacts | VideoFrames],
+    gyro_log: GyroLog | None,
+    workers: Workers,
+    log: StageLog,
+) -> tuple[Solved, SolveOptions]:
+    """What the photos, and a gyroscope's log, come to; and the options with the motions of that."""
+    solving, cameras = options.solve, loaded.cameras
+    readouts = known_readouts(bodies, cameras.cameras, cameras.camera_idx, solving.readout_s, gyro_log)
+    from_gyro: Known = {}
+    if options.gyro is not None and gyro_log is not None:
+        from_gyro, solving = _with_gyroscope(solving, options.gyro, gyro_log, loaded, readouts)
+    known_s = {k: seconds for k, (seconds, _) in readouts.items()}
+
+    def options_of(rec: Reconstruction) -> BundleOptions:
+        return bounded_by_exposure(solving.options_for(cameras), rec, loaded, known_s)
+
+    with tempfile.TemporaryDirectory() as work:
+        solved = solve_photos(
+            loaded, solving.shutter_model, solving.seed, options_of,
+            Path(work), log, solving.remedy, options.matching, workers,
+        )  # fmt: skip
+    rec = solved.shared
+    contradictions = [gyro_contradiction(rec, from_gyro), *cameras.contradicted(rec.cameras, options_of(rec))]
+    for text in filter(None, contradictions):
+        warnings.warn(text, RsUndistortWarning, stacklevel=3)
+    return replace(solved, unregistered=loaded.unregistered(rec.image_names), readouts=readouts), solving
+
+
 def _with_gyroscope(
-    options: RunOptions, gyro: GyroOptions, log: GyroLog, loaded: LoadedPhotos, readouts: Readouts
-) -> tuple[Known, RunOptions]:
+    options: SolveOptions, gyro: GyroOptions, log: GyroLog, loaded: LoadedPhotos, readouts: Readouts
+) -> tuple[Known, SolveOptions]:
     """The motions that a gyroscope's log tells, of photos whose motion nobody told, and the options with them."""
     cameras = loaded.cameras
     times = [readouts[k][0] if k in readouts else None for k in cameras.camera_idx.tolist()]

@@ -1,14 +1,14 @@
-"""Options of the commands that solve for motions."""
+"""Options of the functions that solve for motions, by what they concern."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..batch.geometry import check_depth
 from ..batch.rectify_options import RectifyOptions
 from ..bundle import BundleOptions
 from ..critical import with_remedy
@@ -20,15 +20,26 @@ from ..io.cameras import check_sigma
 from ..model import Bend, KnownLength, check_shutter_model
 from ..sfm import DETECTION_MEGAPIXELS
 
-__all__ = ["RunOptions", "SolveOptions"]
+__all__ = ["OutputOptions", "RunOptions", "SolveOptions"]
+
+
+class _Part:
+    """Options that say where one belongs that was theirs when all were in one class."""
+
+    def __new__(cls, *_: Any, **given: Any) -> Any:
+        for name in sorted(given.keys() - cls.__dataclass_fields__.keys()):  # type: ignore[attr-defined]
+            homes = [
+                each for each in (SolveOptions, RectifyOptions, OutputOptions) if name in each.__dataclass_fields__
+            ]
+            if homes or name in ("jobs", "overwrite", "scheduler"):
+                there = f"a field of {homes[0].__name__}" if homes else "an argument of run and solve"
+                raise InputError(f"{cls.__name__} has no {name!r}, which is {there}")
+        return super().__new__(cls)
 
 
 @dataclass(frozen=True, kw_only=True)
-class SolveOptions(RectifyOptions):
-    """Options of `solve`: those of `RectifyOptions` for its last stage, and the following.
-
-    With `apply_orientation` photos that it mirrors are turned only, and keep the mirror as their orientation: no camera
-    takes a mirror image.
+class SolveOptions(_Part):
+    """How the motions are found.
 
     Parameters
     ----------
@@ -39,8 +50,6 @@ class SolveOptions(RectifyOptions):
         measurements best.
     seed : int
         Of every random choice.
-    jobs : int
-        Threads; 0 for all cores.
     refine : tuple of str, optional
         Intrinsics that are solved for with the rest, as in `BundleOptions`, under a loose prior; () for none. By
         default all, under a prior as tight as the camera is known: a calibration, or EXIF's guess.
@@ -60,22 +69,11 @@ class SolveOptions(RectifyOptions):
         What to do about a critical motion: "auto", "prior" or "none"; see `critical.heal`.
     readout_s : float, optional
         Time of the readout of a frame; else the log's, else that of the camera in the table, if it is there.
-    sparse_format : str
-        "bin" or "txt": how the COLMAP model is written.
-    rs_poses : bool
-        Whether the poses of the original photos with their shutter are written, for renderers that model it.
-    overwrite : bool
-        Replace the outputs of an earlier run.
-    scheduler : str, optional
-        Address of a Dask scheduler whose workers rectify the photos, as in `rectify_folder`.
-    report : bool
-        Write `report.html`. What it needs is kept in any case: `report.write_report` makes it later.
     """
 
     readout: str | Mapping[str, str] | None = None
     shutter_model: str = "auto"
     seed: int = 0
-    jobs: int = 0
     refine: tuple[str, ...] | None = None
     camera_sigma: Mapping[str, float] = field(default_factory=dict)
     still: Mapping[str, float] = field(default_factory=dict)
@@ -84,30 +82,15 @@ class SolveOptions(RectifyOptions):
     lengths: Sequence[KnownLength] = ()
     remedy: str = "auto"
     readout_s: float | None = None
-    sparse_format: str = "bin"
-    rs_poses: bool = False
-    overwrite: bool = False
-    scheduler: str | None = None
-    report: bool = True
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         if self.shutter_model != "auto":
             check_shutter_model(self.shutter_model)
         check_readouts(self.readout)
-        check_depth(self.depth)
         check_sigma(self.camera_sigma, "camera_sigma")
         with_remedy(self.bundle_options(), self.remedy)
-        if self.jobs < 0:
-            raise InputError(f"jobs={self.jobs!r}, expected 0 or more")
-        if self.sparse_format not in ("bin", "txt"):
-            raise InputError(f"sparse_format={self.sparse_format!r}, expected bin or txt")
         if self.readout_s is not None and not 0 < self.readout_s < np.inf:
             raise InputError(f"readout_s={self.readout_s!r}, expected a positive number of seconds")
-
-    def rectify_options(self) -> RectifyOptions:
-        """Those of the last stage, alone."""
-        return RectifyOptions(**{each.name: getattr(self, each.name) for each in fields(RectifyOptions)})
 
     def bundle_options(self) -> BundleOptions:
         """Options of the adjustments, as far as they do not depend on the cameras."""
@@ -128,11 +111,41 @@ class SolveOptions(RectifyOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions(SolveOptions):
-    """Options of `run`: those of `SolveOptions`, and the following. There are no features where the `masks` are black.
+class OutputOptions(_Part):
+    """What is written beside the rectified photos.
 
     Parameters
     ----------
+    sparse_format : str
+        "bin" or "txt": how the COLMAP model is written.
+    rs_poses : bool
+        Whether the poses of the original photos with their shutter are written, for renderers that model it.
+    report : bool
+        Write `report.html`. What it needs is kept in any case: `report.write_report` makes it later.
+    """
+
+    sparse_format: str = "bin"
+    rs_poses: bool = False
+    report: bool = True
+
+    def __post_init__(self) -> None:
+        if self.sparse_format not in ("bin", "txt"):
+            raise InputError(f"sparse_format={self.sparse_format!r}, expected bin or txt")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(_Part):
+    """Options of `run`: how photos are measured; and by what the motions are found, and what is made of the photos.
+
+    Parameters
+    ----------
+    solve : SolveOptions
+        How the motions are found.
+    rectify : RectifyOptions
+        What is done to each photo. There are no features where its `masks` are black. With `apply_orientation` photos
+        that it mirrors are turned only, and keep the mirror as their orientation: no camera takes a mirror image.
+    outputs : OutputOptions
+        What is written besides.
     camera : str, optional
         File or folder of cameras, or numbers, as `io.read_camera_file` takes them; else `camera.json` or `cameras.json`
         in or beside the folder of photos, else EXIF.
@@ -149,6 +162,9 @@ class RunOptions(SolveOptions):
         A gyroscope's log, for the motions that are neither `known` nor those of `still` photos.
     """
 
+    solve: SolveOptions = field(default_factory=SolveOptions)
+    rectify: RectifyOptions = field(default_factory=RectifyOptions)
+    outputs: OutputOptions = field(default_factory=OutputOptions)
     camera: str | None = None
     max_features: int = 8192
     feature_megapixels: float = DETECTION_MEGAPIXELS
@@ -158,7 +174,6 @@ class RunOptions(SolveOptions):
     gyro: GyroOptions | None = None
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         if self.max_features < 100:
             raise InputError(f"max_features={self.max_features!r}, expected at least 100")
         if not 0.05 <= self.feature_megapixels < np.inf:

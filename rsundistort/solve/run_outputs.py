@@ -13,10 +13,11 @@ from pathlib import Path, PurePath
 import numpy as np
 from numpy.typing import NDArray
 
-from ..batch.geometry import DEPTHS, PhotoDepths, ScenePoints, with_depths
+from ..batch.geometry import SceneGeometry, ScenePoints, with_depths
 from ..batch.many_photos import PointColors, mask_names, rectify_photos
 from ..batch.one_photo import turn_of
 from ..batch.progress import StageLog
+from ..batch.rectify_options import RectifyOptions
 from ..batch.views import with_view
 from ..batch.workers import Workers
 from ..colmap.rectified_model import ModelIds
@@ -41,9 +42,8 @@ from ..model import Reconstruction, RowMotion, Solution
 from ..model.orientation import turn_reconstruction, turn_solution
 from ..rectify import bend_px
 from ..report import Diagnostics, relative_folder, write_diagnostics, write_report
-from .model_sequence import Solved
-from .outcome import Outcome, solution_of
-from .run_options import SolveOptions
+from .outcome import Solved, solution_of
+from .run_options import OutputOptions, SolveOptions
 
 __all__ = ["REPLACED", "Outputs", "files_of_run", "inputs_of", "photo_times"]
 
@@ -59,20 +59,17 @@ _RS_POSES = ("rs-poses/gsplat.npz", "rs-poses/transforms.json")
 _PARTS = ("cameras", "images", "points3D", "rigs", "frames")
 
 
-def files_of_run(names: Sequence[str], options: SolveOptions) -> list[str]:
+def files_of_run(names: Sequence[str], raw_as: str, options: OutputOptions) -> list[str]:
     """All files that the outputs of photos may have: what is in their way is to be told before the work, not after."""
     files = [*_FILES, *(f"sparse/{part}.{options.sparse_format}" for part in _PARTS)]
     files += [*_RS_POSES] * options.rs_poses + ["report.html"] * options.report
     masks = mask_names(names)
-    return files + [each for n in names for each in (f"images/{output_name(n, options.raw_as)}", f"masks/{masks[n]}")]
+    return files + [each for n in names for each in (f"images/{output_name(n, raw_as)}", f"masks/{masks[n]}")]
 
 
-def inputs_of(options: SolveOptions, *given: Path | str | None) -> list[Path]:
+def inputs_of(options: RectifyOptions, *given: Path | str | None) -> list[Path]:
     """Files and folders that are read: those given, and those that the options name."""
-    found = [*given, options.masks, *(folder for folder, _ in options.also)]
-    if str(options.depth) not in DEPTHS:
-        found.append(options.depth)
-    return [local_place(path) for path in found if path is not None]
+    return [local_place(path) for path in (*given, *options.inputs) if path is not None]
 
 
 def photo_times(folder: Path) -> dict[str, float]:
@@ -109,8 +106,10 @@ class Outputs:
         In the stored frame, with the rectified cameras that were asked for.
     reconstruction : Reconstruction
         Poses, points and measurements, and the motions that are taken out.
-    options : SolveOptions
-        How the outputs are to be.
+    rectifying : RectifyOptions
+        What is done to each photo.
+    options : OutputOptions
+        What is written besides.
     ids : ModelIds
         By which the COLMAP model calls its parts.
     turns : mapping of name to int
@@ -127,7 +126,8 @@ class Outputs:
 
     solution: Solution
     reconstruction: Reconstruction
-    options: SolveOptions
+    rectifying: RectifyOptions
+    options: OutputOptions
     ids: ModelIds
     turns: Mapping[str, int]
     rgb: PointRgb | None = None
@@ -136,27 +136,29 @@ class Outputs:
     solved: Solved | None = None
 
     @classmethod
-    def of_outcome(
+    def of_solved(
         cls,
-        outcome: Outcome,
-        options: SolveOptions,
+        solved: Solved,
+        solving: SolveOptions,
+        rectifying: RectifyOptions,
+        options: OutputOptions,
         orientations: Mapping[str, int],
         ids: ModelIds | None = None,
         rgb: PointRgb | None = None,
         with_photos: bool = True,
         times: Mapping[str, float] | None = None,
     ) -> Outputs:
-        """Outputs of an outcome, whose photos have these EXIF orientations."""
-        rec = outcome.reconstruction
-        solution = with_view(solution_of(outcome, options), options.view)
+        """Outputs of what was solved, whose photos have these EXIF orientations."""
+        rec = solved.reconstruction
+        solution = with_view(solution_of(solved, solving, rectifying), rectifying.view)
         turns: dict[str, int] = {}
-        if options.apply_orientation:
+        if rectifying.apply_orientation:
             turns = {name: turn_of(orientations.get(name, 1), True)[0] for name in rec.image_names}
-        ids = replace(ids or ModelIds.in_order(rec), cameras=outcome.camera_ids)
+        ids = replace(ids or ModelIds.in_order(rec), cameras=solved.camera_ids)
         rec = rec.with_motions([solution.image(name).taken_out or RowMotion() for name in rec.image_names])
         if options.rs_poses and rec.bends:
             solution = replace(solution, quality={**solution.quality, "rs_poses_px": _left_by_two_poses(rec)})
-        return cls(solution, rec, options, ids, turns, rgb, with_photos, times or {}, outcome.solved)
+        return cls(solution, rec, rectifying, options, ids, turns, rgb, with_photos, times or {}, solved)
 
     def begin(self, folder: Path, log: StageLog) -> Solution:
         """Write all but the photos and the colours that they tell, so that what comes after can be gone on with."""
@@ -170,25 +172,25 @@ class Outputs:
         self._tell_report(folder, rgb)
         return turned
 
-    def report(self, out: Path, log: StageLog, photos: Path | None = None) -> None:
+    def report(self, out: Path, jobs: int, log: StageLog, photos: Path | None = None) -> None:
         """Write the report of what is in `out`, if it is asked for; a failure is no more than warned of."""
         if not self.options.report:
             return
         try:
             with _only_warned_of():
-                write_report(out, photos, jobs=self.options.jobs, progress=log.tell)
+                write_report(out, photos, jobs=jobs, progress=log.tell)
         except KeyboardInterrupt as stop:
             raise KeyboardInterrupt(f"all but the report is written; go on with: rsundistort report {out}") from stop
 
     def rectify(self, photos: Path, out: Path, workers: Workers, log: StageLog) -> Solution:
         """Rectify the photos of a folder into `out`, which `begin` has filled, and write the rest again."""
-        solution, rec, options = self.solution, self.reconstruction, self.options
+        solution, rec, options = self.solution, self.reconstruction, self.rectifying
         colors = None if self.rgb is not None and self.rgb.known.all() else PointColors(rec)
-        depths = PhotoDepths(solution, options.depth, ScenePoints.of_reconstruction(rec))
+        scene = SceneGeometry(solution, options.depth, ScenePoints.of_reconstruction(rec))
         go_on = f"whole; go on with: rsundistort rectify {photos} --solution {out / 'solution.json'} -o {out} --resume"
         with batch_folder(out, overwrite=True) as journal:
             done = rectify_photos(
-                photos, solution, list(rec.image_names), out, options.rectify_options(), depths, workers, log, journal,
+                photos, scene, list(rec.image_names), out, options, workers, log, journal,
                 colors=colors, go_on=go_on,
             )  # fmt: skip
         log.begin("writing")
@@ -212,14 +214,14 @@ class Outputs:
             )  # fmt: skip
         if not left_out:
             journal.path.unlink()  # nothing to go on with
-        self.report(out, log, photos)
+        self.report(out, workers.jobs, log, photos)
         return turned
 
     @cached_property
     def _diagnostics(self) -> Diagnostics | None:
         if self.solved is None:
             return None
-        shared = self.solved.result.reconstruction
+        shared = self.solved.shared
         # photos that vary have cameras of their own: what they share goes by that of the first
         first = [int(np.argmax(shared.camera_idx == k)) for k in range(len(shared.cameras))]
         ids = [self.ids.cameras[k] for k in (first if shared.varies else range(len(shared.cameras)))]
@@ -251,8 +253,8 @@ class Outputs:
 
         `photos` is where the original ones are, seen from the folder of their poses.
         """
-        rec, ids, options = self.reconstruction, self.ids, self.options
-        names = [None if name in left_out else output_name(name, options.raw_as) for name in rec.image_names]
+        rec, ids, options, raw_as = self.reconstruction, self.ids, self.options, self.rectifying.raw_as
+        names = [None if name in left_out else output_name(name, raw_as) for name in rec.image_names]
         written = {name: new for name, new in zip(rec.image_names, names, strict=True) if new is not None}
         last = photos is not None or not self.with_photos
         cut = [new for new in written.values() if " " in new]

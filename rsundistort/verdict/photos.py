@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from ..bundle import BundleResult
-from ..model import READOUTS, Reconstruction
+from ..model import Reconstruction
 from ..model.projection import clock_of, project_points_with_jacobians, unproject_points
 
 __all__ = ["PhotoMotions", "photo_motions"]
@@ -126,7 +126,7 @@ class _Photo:
             np.concatenate([motion.phi, motion.velocity])[: 6 if moving else 3],
             np.concatenate(by_motion, axis=2),
             np.array([camera.width, camera.height], float),
-            READOUTS[camera.readout][0],
+            camera.clock_axis,
             R,
         )
 
