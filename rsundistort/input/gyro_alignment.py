@@ -8,7 +8,8 @@ measures `omega` about its axes, with a zero-rate offset (bias), by a clock of i
 
 R takes the gyroscope's axes to the camera's. s is 1 for the true focal length; rotations from a wrong one are too large
 or too small by what it is wrong. The offset is looked for by the correlation that the best R at each offset reaches (a
-Procrustes problem, in closed form); all unknowns are then refined together, with a loss that leaves false rotations out.
+Procrustes problem, in closed form); all unknowns are then refined together, with a loss that leaves false rotations
+out.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _FEWEST, _COVERED = 20, 0.6
 _LEAST_CORRELATION = 0.7
 # Another offset, or a mirror image, whose residuals have less than this many times the variance is as good, or better.
 _AS_GOOD, _BETTER = 1.3, 0.7
-# rad/s rms of the rates. Below, the camera stood still: what is seen is noise and wind.
+# rad/s rms of the rates about their mean. Below, what is seen is noise and wind.
 _STILL = 0.02
 # Share of a rate by which it is wrong for the focal length and the lens.
 _SHARE = 0.05
@@ -42,6 +43,8 @@ _TILT, _OBLIQUE = np.radians(5.0), np.radians(15.0)
 # Twice the log-likelihood by which one way to lie must be better than another to exclude it. Twelve is 0.002 at one in
 # twenty-four; the residuals of neighbours are not independent.
 _EXCLUDES = 20.0
+# Offsets that are looked at together.
+_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -151,7 +154,7 @@ def align_gyro(
     if joined.ndim != 2 or joined.shape[1] != 2 or not np.issubdtype(joined.dtype, np.integer):
         raise InputError(f"pairs.shape={joined.shape} of {joined.dtype}, expected (n, 2) of int")
     vectors = check_array(turns, (len(joined), 3), "turns")
-    if len(joined) and not (0 <= joined.min() and joined.max() < len(times)):
+    if len(joined) and (joined.min() < 0 or joined.max() >= len(times)):
         raise InputError(f"pairs join frames {joined.min()} to {joined.max()} of {len(times)}")
     start, end = times[joined[:, 0]], times[joined[:, 1]]
     good = np.isfinite(vectors).all(axis=1) & (end > start)
@@ -178,23 +181,25 @@ def align_gyro(
     if fit.correlation < _LEAST_CORRELATION:
         if max(spread) < _STILL:
             return NoAlignment(
-                f"the camera hardly turned ({max(spread):.3f} rad/s): its gyroscope cannot be found by it", proper
+                f"the camera stood still or turned evenly (its rate changes by {max(spread):.3f} rad/s): no gyroscope "
+                "can be found by that",
+                proper,
             )
         return NoAlignment(
             f"the gyroscope's log does not show the camera's turns (correlation {fit.correlation:.2f}): it is of "
             "another clip, or the video is stabilised",
             proper,
         )
-    if not fit.sigma[_OFFSET] < interval / 2:
-        return NoAlignment("the camera turned too evenly: no offset of the gyroscope's clock can be told", proper)
-    if 1 - rival**2 < _AS_GOOD * (1 - proper**2):
-        return NoAlignment("the camera's turns repeat: several offsets of the gyroscope's clock fit them", proper)
     if np.linalg.det(ways[0]) < 0:
         return NoAlignment(
             f"the gyroscope's axes are a mirror image of the camera's, as {_letters(ways[0])} takes them, which no "
             "sensor is: the sign of an axis is wrong, or two axes are exchanged",
             proper,
         )
+    if not fit.sigma[_OFFSET] < interval / 2:
+        return NoAlignment("the camera turned too evenly to tell the offset of the gyroscope's clock", proper)
+    if 1 - rival**2 < _AS_GOOD * (1 - proper**2):
+        return NoAlignment("the camera's turns repeat: several offsets of the gyroscope's clock fit them", proper)
     tilt = np.arccos(np.clip((np.trace(fit.rotation @ ways[0].T) - 1) / 2, -1, 1))
     return GyroAlignment(
         offset_s=fit.offset_s,
@@ -236,32 +241,39 @@ class _Coarse:
     end: _Array
     seen: _Array
 
-    def products(self, offset_s: float) -> tuple[_Array, float] | None:
-        """(3, 3) of the rates of both without their means, over the root of their squares, and their ratio.
+    def products(self, offset_s: float | _Array) -> tuple[_Array, _Array]:
+        """(..., 3, 3) of the rates of both without their means, over the root of their squares, and (...) their ratio.
 
-        None if the log covers too little.
+        NaN if the log covers too little.
         """
-        measured = self.log.mean(self.start + offset_s, self.end + offset_s)
-        there = np.isfinite(measured[:, 0])
-        if there.sum() < max(_FEWEST, _COVERED * len(there)):
-            return None
-        a, b = self.seen[there], measured[there]
-        a, b = a - a.mean(0), b - b.mean(0)
-        norms = np.linalg.norm(a), np.linalg.norm(b)
-        return (a.T @ b / (norms[0] * norms[1]), float(norms[0] / norms[1])) if min(norms) > 0 else None
+        offsets = np.asarray(offset_s)[..., None]
+        measured = self.log.mean(self.start + offsets, self.end + offsets)
+        there = np.isfinite(measured[..., :1])
+        count = there.sum(axis=-2, keepdims=True)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            a, b = (np.where(there, x, 0.0) for x in (self.seen, measured))
+            a, b = (np.where(there, x - x.sum(axis=-2, keepdims=True) / count, 0.0) for x in (a, b))
+            norms = (np.sqrt(np.sum(x * x, axis=(-2, -1))) for x in (a, b))
+            of_a, of_b = (np.where(n > 0, n, np.nan) for n in norms)
+            enough = count[..., 0, 0] >= max(_FEWEST, _COVERED * len(self.seen))
+            scale = np.where(enough, of_a * of_b, np.nan)
+            return a.swapaxes(-1, -2) @ b / scale[..., None, None], of_a / of_b
 
-    def correlations(self, offset_s: float) -> tuple[float, float]:
-        """What the best rotation, and the best mirror image, reach; -inf if the log covers too little."""
-        found = self.products(offset_s)
-        if found is None:
-            return -np.inf, -np.inf
-        U, s, Vt = np.linalg.svd(found[0])
-        last = s[2] * np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-        return float(s[0] + s[1] + last), float(s[0] + s[1] - last)
+    def correlations(self, offset_s: _Array) -> _Array:
+        """(k, 2) what the best rotation, and the best mirror image, reach; -inf where the log covers too little."""
+        found = np.full((len(offset_s), 2), -np.inf)
+        for first in range(0, len(offset_s), _AT_ONCE):
+            products, _ = self.products(offset_s[first : first + _AT_ONCE])
+            covered = np.isfinite(products).all(axis=(1, 2))
+            U, s, Vt = np.linalg.svd(products[covered])
+            last = s[:, 2] * np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+            rows = first + np.flatnonzero(covered)
+            found[rows] = np.stack([s[:, 0] + s[:, 1] + last, s[:, 0] + s[:, 1] - last], axis=1)
+        return found
 
     def ratio(self, offset_s: float) -> float:
         """Rates of the camera over those of the log."""
-        products, ratio = self.products(offset_s) or (np.eye(3), 1.0)
+        products, ratio = self.products(offset_s)
         return float(np.clip(ratio * np.linalg.svd(products)[1].sum(), 0.5, 2.0))
 
     def search(self, largest_s: float) -> tuple[float, float, float, float] | None:
@@ -272,8 +284,7 @@ class _Coarse:
         first = max(-largest_s, self.log.time_s[0] - self.end.max())
         last = min(largest_s, self.log.time_s[-1] - self.start.min())
         offsets = np.arange(np.ceil(first / step), np.floor(last / step) + 1) * step
-        found = np.array([self.correlations(offset) for offset in offsets]).reshape(-1, 2)
-        either = found.max(axis=1)
+        either = self.correlations(offsets).max(axis=1)
         if not len(either) or not np.isfinite(either.max()):
             return None
         top = int(np.argmax(either))
@@ -284,7 +295,7 @@ class _Coarse:
         beyond = [*either[: before[-1] if len(before) else 0], *either[top + after[0] if len(after) else len(either) :]]
         rival = float(max(beyond, default=0.0))
         fine = offsets[top] + step * np.arange(-8, 9) / 8
-        scores = np.array([self.correlations(offset) for offset in fine])
+        scores = self.correlations(fine)
         best = int(np.argmax(scores.max(axis=1)))
         return float(fine[best]), *map(float, scores[best]), max(rival, 0.0)
 

@@ -27,7 +27,10 @@ from .gyro import CAMERA_FROM_GYROFLOW, GyroLog, parse_axes
 
 __all__ = ["GyroPayload", "has_telemetry", "parse_payload", "read_gpmf"]
 
-_DTYPES = {"b": "i1", "B": "u1", "s": ">i2", "S": ">u2", "l": ">i4", "L": ">u4", "j": ">i8", "J": ">u8", "f": ">f4", "d": ">f8"}  # fmt: skip
+_DTYPES = {
+    "b": "i1", "B": "u1", "s": ">i2", "S": ">u2", "l": ">i4", "L": ">u4", "j": ">i8", "J": ">u8",
+    "f": ">f4", "d": ">f8",
+}  # fmt: skip
 # rad/s of a unit, as SIUN or UNIT write it
 _UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180, "\xb0/s": np.pi / 180}
 # Axes that HERO5 wrote without saying so (Z up, X left, Y back), and to which ORIO takes the samples of those after it.
@@ -43,13 +46,13 @@ _READOUTS_MS = (1.0, 100.0)
 
 @dataclass(frozen=True)
 class _Item:
-    """Key, type and samples of an item; `whole` where all bytes that it claims are there."""
+    """Key, type, size and number of the samples of an item, as it claims, and those of its bytes that are there."""
 
     key: str
     kind: str
     sample_bytes: int
+    num_samples: int
     data: memoryview
-    whole: bool
 
     def text(self) -> str:
         return bytes(self.data).split(b"\0")[0].decode("latin-1").strip()
@@ -195,9 +198,7 @@ def _track(container: Any) -> Any:
     return None
 
 
-def _payloads(
-    container: Any, stream: Any
-) -> tuple[list[tuple[float, float, GyroPayload]], tuple[float, float] | None]:
+def _payloads(container: Any, stream: Any) -> tuple[list[tuple[float, float, GyroPayload]], tuple[float, float] | None]:
     """Each payload with its time and length in seconds; where the track ends, and should, if it was cut short."""
     import av
 
@@ -330,17 +331,17 @@ def _items(data: memoryview, problems: list[str]) -> Iterator[_Item]:
         if not key.isascii() or not key.decode("ascii").isprintable():
             problems.append(f"bytes that are no key ({key!r})")
             return
-        size = data[at + 5]
-        end = at + 8 + size * int.from_bytes(data[at + 6 : at + 8], "big")
+        size, count = data[at + 5], int.from_bytes(data[at + 6 : at + 8], "big")
+        end = at + 8 + size * count
         whole = end <= len(data)
         if not whole:
             problems.append(f"{key.decode('ascii')} is cut short")
-        yield _Item(key.decode("ascii"), chr(data[at + 4]), size, data[at + 8 : end], whole)
+        yield _Item(key.decode("ascii"), chr(data[at + 4]), size, count, data[at + 8 : end])
         at = end + -end % 4 if whole else len(data)
 
 
 def _gyroscope(stream: dict[str, _Item], device: str, problems: list[str]) -> GyroPayload | None:
-    """The samples of a stream; None if there are none that can be read, for the reason that is added to the problems."""
+    """The samples of a stream; None if there are none that can be read, with the reason among the problems."""
     item = stream["GYRO"]
     counts = item.rows()
     if not len(counts):
@@ -363,7 +364,7 @@ def _gyroscope(stream: dict[str, _Item], device: str, problems: list[str]) -> Gy
         rates,
         _orientation(stream, device, problems),
         device,
-        None if total is None else int(total) - len(counts),
+        None if total is None else int(total) - item.num_samples,
         _first(stream.get("STMP"), 1e-6),
         delay_s=_first(stream.get("TIMO")) or 0.0,
     )
