@@ -197,12 +197,15 @@ def _regress(y: _Array, x: _Array, noise: _Array, *, steady: bool = False) -> Re
     if steady:
         x, y = x - np.median(x, axis=0), y - np.median(y, axis=0)
     x, y = x / noise, y / noise
-    inlier = np.ones(len(x))
-    slope = 0.0
+    # false turns are large and pull: the start is the slope of one frame that leaves the smallest median
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slopes = np.sum(x * y, 1) / np.sum(x * x, 1)
+    slopes = np.append(np.quantile(slopes[np.isfinite(slopes)], np.linspace(0, 1, 101)), 0.0)
+    slope = slopes[np.argmin([np.median(np.linalg.norm(y - each * x, axis=1)) for each in slopes])]
     for _ in range(20):
-        slope = float(inlier @ np.sum(x * y, 1) / (inlier @ np.sum(x * x, 1)))
         size = np.linalg.norm(y - slope * x, axis=1)
-        inlier = 1 / (1 + (size / (6 * max(np.median(size) / 1.538, 1e-12))) ** 2)
+        inlier = 1 / (1 + (size / (6 * max(np.median(size) / 1.538, 1e-12))) ** 2) ** 2
+        slope = float(inlier @ np.sum(x * y, 1) / (inlier @ np.sum(x * x, 1)))
     left = y - slope * x
     information = inlier @ np.sum(x * x, 1)
     sigma = np.sqrt(np.sum((inlier * np.sum(x * left, 1)) ** 2)) / information
@@ -214,7 +217,7 @@ def _regress(y: _Array, x: _Array, noise: _Array, *, steady: bool = False) -> Re
         correlation=float(inlier @ np.sum(x * y, 1) / np.sqrt(norms)) if norms > 0 else 0.0,
         signal=float(power @ np.sum(y * y, 1) - 1),
         unexplained=float(power @ np.sum(left * left, 1) - 1),
-        reach=float(1 / np.sqrt(np.sum(x * x))),
+        reach=float(1 / np.sqrt(information)),
     )
 
 
