@@ -173,7 +173,7 @@ def align_gyro(
         )
     offset, proper, mirrored, rival = found
     measured = log.mean(start + offset, end + offset)
-    spread = [float(np.sqrt(np.nanmedian(np.sum((x - np.nanmedian(x, 0)) ** 2, 1)))) for x in (seen, measured)]
+    spread = [float(np.sqrt(np.nanmean(np.nanvar(x, axis=0)))) for x in (coarse.seen, measured)]
     ways = _ways(coarse, offset, seen, mirrored=mirrored > proper and 1 - mirrored**2 < _BETTER * (1 - proper**2))
     fit = _refine(log, start, end, seen, offset, ways[0], coarse.ratio(offset))
     if fit is None:
@@ -297,7 +297,8 @@ class _Coarse:
         fine = offsets[top] + step * np.arange(-8, 9) / 8
         scores = self.correlations(fine)
         best = int(np.argmax(scores.max(axis=1)))
-        return float(fine[best]), *map(float, scores[best]), max(rival, 0.0)
+        proper, mirrored = map(float, scores[best])
+        return float(fine[best]), proper, mirrored, max(rival, 0.0)
 
 
 # ---------------------------------------------------------------- which way it lies

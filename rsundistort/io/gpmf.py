@@ -384,7 +384,7 @@ def _orientation(stream: dict[str, _Item], device: str, problems: list[str]) -> 
 
 
 def _first(item: _Item | None, scale: float = 1.0) -> float | None:
-    numbers = item.numbers() if item is not None else ()
+    numbers = item.numbers() if item is not None else np.zeros(0)
     return float(numbers[0]) * scale if len(numbers) and np.isfinite(numbers[0]) else None
 
 
