@@ -409,6 +409,14 @@ def test_a_file_cut_short_gives_what_it_has(tmp_path):
     assert log.omega_c == pytest.approx(omega(log.time_s), abs=0.51 / SCALE)
 
 
+def test_tags_in_another_encoding_are_no_obstacle(tmp_path):
+    path = mux(tmp_path / "a.mp4", telemetry([400] * 2))
+    data = path.read_bytes()
+    at = data.rindex(b"Lavf")
+    path.write_bytes(data[:at] + b"\x87\xfff" + data[at + 3 :])
+    assert len(read_gpmf(path).time_s) == 800
+
+
 def test_memory_follows_the_size_of_the_file(tmp_path):
     """65,535 samples are claimed by each of two hundred payloads, of which three are there."""
     lies = payload(

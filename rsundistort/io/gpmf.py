@@ -6,8 +6,8 @@ it a stream, whose last item is its data and whose others describe it (github.co
 
 The samples carry no times. Payloads do, about one a second, but a payload gets what the camera happened to have by
 then, so that its time is right to some ten milliseconds only. The samples are uniform in time: sample n was taken at
-a + b n, the line that fits the times of all payloads best, with n from TSMP, which counts also what was lost. Cameras
-from HERO8 on write microseconds besides (STMP), of which the video's are those of its exposures (SHUT).
+a + b n, the line that fits the times of all payloads best, with n from TSMP, which counts also what was lost. Fusion
+and newer cameras write microseconds besides (STMP), of which the video's are those of its exposures (SHUT).
 """
 
 from __future__ import annotations
@@ -185,7 +185,8 @@ def _open(path: Path) -> Any:
     except ImportError:
         raise InputError(f'{path.name} is a video, which needs PyAV: pip install "rsundistort[video]"') from None
     try:
-        return av.open(f"file:{path}", options={"protocol_whitelist": "file"})
+        # tags in another encoding are nothing to fail at
+        return av.open(f"file:{path}", options={"protocol_whitelist": "file"}, metadata_errors="replace")
     except (OSError, av.error.FFmpegError) as error:
         raise FileError(f"{path} cannot be read as a video ({error.strerror})") from error
 
