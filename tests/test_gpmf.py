@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsundistort import FileError, FormatError, RsUndistortWarning
+from rsundistort import RsUndistortWarning
+from rsundistort.errors import FileError, FormatError
 from rsundistort.io import has_telemetry, motions_from_gyro, read_gpmf, read_gyro
 from rsundistort.io.gpmf import _sample_times, parse_payload
 

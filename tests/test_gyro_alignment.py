@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from rsundistort import InputError
+from rsundistort.errors import InputError
 from rsundistort.input.gyro_alignment import GyroAlignment, NoAlignment, align_gyro
 from rsundistort.io.gyro import GyroLog, motions_from_gyro, parse_axes
 
@@ -214,6 +214,9 @@ def test_too_little():
     times, pairs, turns = frames()
     assert "too few" in align_gyro(gyroscope(), times, pairs[:10], turns[:10]).reason
     assert "too few" in align_gyro(gyroscope(), times, pairs, np.full_like(turns, np.nan)).reason
+    assert "did not move" in align_gyro(gyroscope(), times, pairs, np.zeros_like(turns)).reason
+    dead = GyroLog(np.arange(0.0, 10.0, 0.01), np.zeros((1000, 3)))
+    assert "did not move" in align_gyro(dead, times, pairs, turns).reason
     far = gyroscope(offset_s=1e6)
     assert "cover the frames" in align_gyro(far, times, pairs, turns).reason
     with pytest.raises(InputError, match="expected"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rsundistort import InputError
+from rsundistort.errors import InputError
 from rsundistort.input.stabilisation import judge_stabilisation
 from rsundistort.io.gyro import GyroLog
 

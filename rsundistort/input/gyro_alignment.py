@@ -165,6 +165,8 @@ def align_gyro(
 
     interval = float(np.median(end - start))
     coarse = _Coarse(log, start, end, _without_jumps(seen, start, log, interval))
+    if not min(np.ptp(coarse.seen), np.ptp(log.omega_c)) > 0:
+        return NoAlignment("the camera, or its gyroscope, did not move at all")
     found = coarse.search(largest_s)
     if found is None:
         return NoAlignment(
