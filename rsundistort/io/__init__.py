@@ -3,6 +3,7 @@
 from ..colmap import read_colmap_cameras, read_colmap_poses, write_colmap_model, write_colmap_workspace
 from .cameras import CameraFile, check_camera_fits, parse_camera, read_camera_file
 from .depth_maps import find_depth_maps, read_depth_map
+from .gpmf import has_telemetry, read_gpmf
 from .groups import group_of, guess_readouts
 from .gyro import GyroLog, bends_from_gyro, gyro_offset, motions_from_gyro, read_gyro, read_photo_times
 from .lengths import read_known_lengths
@@ -39,6 +40,7 @@ __all__ = [
     "group_of",
     "guess_readouts",
     "gyro_offset",
+    "has_telemetry",
     "is_video",
     "list_photos",
     "motions_from_gyro",
@@ -50,6 +52,7 @@ __all__ = [
     "read_colmap_poses",
     "read_depth_map",
     "read_exif",
+    "read_gpmf",
     "read_gyro",
     "read_known_lengths",
     "read_known_motions",

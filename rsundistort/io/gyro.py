@@ -1,4 +1,4 @@
-"""Motions of photos from a gyroscope's log: CSV, and Gyroflow's `.gcsv`.
+"""Motions of photos from a gyroscope's log: CSV, Gyroflow's `.gcsv`, and GoPro's videos.
 
 The sign. While the clock r runs, the orientation of a photo is `R_cw(r) = Exp(r phi) R_cw`. A gyroscope measures omega,
 the rate of the camera about its own axes: `R_wc(t + dt) = R_wc(t) Exp(omega dt)`. Transposed, that is
@@ -23,6 +23,7 @@ from ..model import Bend, Camera, RowMotion
 from ..model.checks import check_array, check_finite, frozen
 from .motions import Known
 from .tables import read_table
+from .video import is_video
 
 __all__ = [
     "GyroLog",
@@ -43,7 +44,7 @@ _GAP_STEPS = 5.0
 # Steps that a readout is integrated in: four between two readings of a bend.
 _STEPS = 257
 # Gyroflow's axes are up, left and back (its IMU orientation page, and its integrator): rows are right, down, ahead.
-_CAMERA_FROM_GYROFLOW = np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])
+CAMERA_FROM_GYROFLOW = np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])
 _GCSV = ("GYROFLOW IMU LOG", "CAMERA IMU LOG")
 _COLUMNS = ("time_s", "wx", "wy", "wz")
 
@@ -160,10 +161,11 @@ def read_gyro(path: Path | str, axes: str | None = None) -> GyroLog:
     Parameters
     ----------
     path : path
-        CSV with the columns `time_s, wx, wy, wz` (rad/s, right-handed), or Gyroflow's `.gcsv`.
+        CSV with the columns `time_s, wx, wy, wz` (rad/s, right-handed), Gyroflow's `.gcsv`, or a video of a GoPro
+        (`read_gpmf`).
     axes : str, optional
         Axes of the sensor that point to the right, down and ahead in the stored pixels, as `parse_axes` takes them. By
-        default XYZ for CSV, and the file's own orientation for `.gcsv`.
+        default XYZ for CSV, and the file's own orientation for `.gcsv` and videos.
 
     Raises
     ------
@@ -172,6 +174,10 @@ def read_gyro(path: Path | str, axes: str | None = None) -> GyroLog:
         off is left out.
     """
     path = Path(path)
+    if is_video(path):
+        from .gpmf import read_gpmf
+
+        return read_gpmf(path, axes)
     try:
         lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     except OSError as error:
@@ -200,7 +206,7 @@ def _from_gcsv(path: Path, lines: list[str], axes: str | None) -> GyroLog:
         raise FormatError(f"{path}: {error}") from None
     if axes is None and "orientation" not in header:
         raise FormatError(f"{path} does not say how the sensor lies (orientation); give --gyro-axes")
-    to_camera = parse_axes(axes) if axes else _CAMERA_FROM_GYROFLOW @ parse_axes(header["orientation"].strip())
+    to_camera = parse_axes(axes) if axes else CAMERA_FROM_GYROFLOW @ parse_axes(header["orientation"].strip())
     time, counts = _samples(path, lines, start + 1, [0, 1, 2, 3])
     return _log(path, tscale * time, gscale * counts @ to_camera.T, readout_s if readout_s > 0 else None)
 

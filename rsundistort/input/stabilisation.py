@@ -1,0 +1,272 @@
+"""Whether a video was stabilised in the camera, so that its shutter and its path no longer belong together.
+
+While a frame is read, in a time T, the world turns in an unstabilised video by phi = T w, where w is the rate at which
+it turns between the frames: T is between 0 and the time from frame to frame, and the same for all frames. A camera that
+stabilises turns each frame as a whole against its shaking, and may take its shutter out, too:
+
+- shutter without its rotation: the frames are smooth, but their lines still show the shaking that was taken out;
+- rotation without its shutter: the frames turn, and their lines show less of it than the fastest sensor would;
+- against a gyroscope: the frames turn by less than the camera did, or otherwise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError
+from ..io.gyro import GyroLog
+from ..model.checks import check_array, check_finite
+
+__all__ = ["Regression", "Stabilisation", "judge_stabilisation"]
+
+_Array = NDArray[np.float64]
+
+# Of the time from frame to frame: no rolling shutter is read faster (0.2 of 1/60 s; `io.readout_times`), none slower.
+_FASTEST, _SLOWEST = 0.1, 1.0
+# A readout that is known is right to this share.
+_KNOWN_SHARE = 0.3
+# Standard deviations that decide, and the share of the power of a signal that must be left unexplained.
+_SIGMAS, _UNEXPLAINED = 4.0, 0.5
+# Frames turn as the gyroscope says but for the focal length, which may be wrong by a fifth.
+_TURN_SHARE = 0.75
+_FEWEST = 10
+
+
+@dataclass(frozen=True)
+class Regression:
+    """One motion by another, through the origin: `y = slope x`.
+
+    Attributes
+    ----------
+    slope, sigma : float
+        With its standard deviation, from the spread of what is left.
+    correlation : float
+        Of both, weighted, about zero: from -1 to 1.
+    signal : float
+        Mean square of y over that of its noise, less one: 0 if y is noise alone.
+    unexplained : float
+        The same of what is left of y.
+    reach : float
+        Standard deviation that the slope would have by the noise alone.
+    """
+
+    slope: float
+    sigma: float
+    correlation: float
+    signal: float
+    unexplained: float
+    reach: float
+
+
+@dataclass(frozen=True)
+class Stabilisation:
+    """What a video says of its stabilisation.
+
+    Attributes
+    ----------
+    verdict : {"none", "stabilised", "unknown"}
+        "unknown" where the camera turned too little to tell.
+    reason : str
+        One line, with the figures that decide.
+    shutter : Regression
+        Turns during the readout by the rate between frames: the slope is the time of the readout in seconds.
+    frames_by_gyro, shutter_by_gyro : Regression or None
+        Rates between frames, and turns during the readout, by the gyroscope's rates.
+    """
+
+    verdict: Literal["none", "stabilised", "unknown"]
+    reason: str
+    shutter: Regression
+    frames_by_gyro: Regression | None = None
+    shutter_by_gyro: Regression | None = None
+
+    def __str__(self) -> str:
+        return self.reason
+
+
+def judge_stabilisation(
+    frame_time_s: ArrayLike,
+    pairs: ArrayLike,
+    turns: ArrayLike,
+    phi_frame: ArrayLike,
+    phi_sigma: ArrayLike,
+    *,
+    turn_sigma: ArrayLike = 0.0,
+    readout_s: float | None = None,
+    log: GyroLog | None = None,
+    offset_s: float = 0.0,
+) -> Stabilisation:
+    """Whether the frames of a video turn as their shutters say, and as a gyroscope says.
+
+    Parameters
+    ----------
+    frame_time_s : (m,) array
+        When the middle lines of the frames were read.
+    pairs : (n, 2) array of int
+        Neighbouring frames that each turn joins, the earlier first.
+    turns : (n, 3) array
+        Rotation vectors of the world in the camera, radians; NaN where unknown.
+    phi_frame, phi_sigma : (m, 3) array
+        Turns of the world in the camera during the readout of each frame, in radians per frame, found without any
+        knowledge of `turns`; NaN where unknown. Their standard deviations, or one for all; too small by a factor of
+        1.4, they do no harm.
+    turn_sigma : float or (n, 3) array
+        Standard deviation of `turns` in radians.
+    readout_s : float, optional
+        Time of the readout, where it is known.
+    log : GyroLog, optional
+        About the camera's axes (`GyroAlignment.in_camera`), and known to be of this clip: one of another is taken for
+        a proof.
+    offset_s : float
+        What its clock shows when the camera's shows zero.
+
+    Returns
+    -------
+    Stabilisation
+        "stabilised" only where figures say so by four standard deviations, "none" only where the shutter follows.
+
+    Raises
+    ------
+    InputError
+        Shapes that do not fit, or a readout that is not positive.
+    """
+    times = check_finite(frame_time_s, (None,), "frame_time_s")
+    joined = np.asarray(pairs)
+    if joined.ndim != 2 or joined.shape[1] != 2 or not np.issubdtype(joined.dtype, np.integer):
+        raise InputError(f"pairs.shape={joined.shape} of {joined.dtype}, expected (n, 2) of int")
+    vectors = check_array(turns, (len(joined), 3), "turns")
+    phi = check_array(phi_frame, (len(times), 3), "phi_frame")
+    phi_noise = _noise(phi_sigma, phi, "phi_sigma")
+    turn_noise = _noise(turn_sigma, vectors, "turn_sigma")
+    if readout_s is not None and not (np.isfinite(readout_s) and readout_s > 0):
+        raise InputError(f"the time of the readout is {readout_s!r} s, expected a positive number")
+    start, end = times[joined[:, 0]], times[joined[:, 1]]
+    span = np.where(end > start, end - start, np.nan)
+    interval = float(np.nanmedian(span)) if np.isfinite(span).any() else np.nan
+    rate, rate_noise = vectors / span[:, None], turn_noise / span[:, None]
+    at_frames = _rate_at_frames(rate, joined, len(times))
+    shutter = _regress(phi, at_frames, phi_noise)
+    frames_by_gyro = shutter_by_gyro = None
+    if log is not None:
+        felt = -log.mean(start + offset_s, end + offset_s)
+        # of turns without a known noise, that of the gyroscope is all there is
+        noise = np.hypot(rate_noise, log.noise * np.sqrt(np.minimum(1.0, log.step_s / interval)))
+        frames_by_gyro = _regress(rate, felt, noise, steady=True)
+        length = readout_s or 0.5 * interval
+        within = -log.mean(times + offset_s - length / 2, times + offset_s + length / 2)
+        shutter_by_gyro = _regress(phi, within, phi_noise)
+    verdict, reason = _judge(shutter, frames_by_gyro, shutter_by_gyro, interval, readout_s)
+    return Stabilisation(verdict, reason, shutter, frames_by_gyro, shutter_by_gyro)
+
+
+def _noise(sigma: ArrayLike, values: _Array, name: str) -> _Array:
+    """(n, 3) standard deviations of values, from those or one for all."""
+    given = np.asarray(sigma, np.float64)
+    return np.broadcast_to(given, values.shape) if given.ndim == 0 else check_array(given, values.shape, name)
+
+
+def _rate_at_frames(rate: _Array, pairs: NDArray[np.integer], num_frames: int) -> _Array:
+    """(m, 3) rate when each frame was read, from the mean rates between frames; NaN where a neighbour is unknown.
+
+    Means over the time between frames are smoother than the rate: with two on each side the value at the frame is that
+    of the cubic through their integral, 7/12 and -1/12 of them; with one, their mean.
+    """
+    before, after = np.full((2, num_frames, 3), np.nan)
+    earlier, later = np.full((2, num_frames), -1)
+    before[pairs[:, 1]], earlier[pairs[:, 1]] = rate, pairs[:, 0]
+    after[pairs[:, 0]], later[pairs[:, 0]] = rate, pairs[:, 1]
+    near = before + after
+    far = np.where((earlier >= 0)[:, None], before[earlier], np.nan) + np.where(
+        (later >= 0)[:, None], after[later], np.nan
+    )
+    cubic: _Array = (7 * near - far) / 12
+    return np.where(np.isfinite(cubic), cubic, near / 2)
+
+
+def _regress(y: _Array, x: _Array, noise: _Array, *, steady: bool = False) -> Regression:
+    """`y = slope x` with a robust loss; without the means of both where a steady difference (a bias) says nothing."""
+    there = np.isfinite(x).all(axis=1) & np.isfinite(y).all(axis=1) & (noise > 0).all(axis=1)
+    x, y, noise = x[there], y[there], noise[there]
+    if len(x) < _FEWEST or not np.any(x):
+        signal = float(np.mean((y / noise) ** 2) - 1) if len(y) else 0.0
+        return Regression(0.0, np.inf, 0.0, signal, signal, np.inf)
+    if steady:
+        x, y = x - np.median(x, axis=0), y - np.median(y, axis=0)
+    x, y = x / noise, y / noise
+    # false turns are large and pull: the start is the slope of one frame that leaves the smallest median
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slopes = np.sum(x * y, 1) / np.sum(x * x, 1)
+    slopes = np.append(np.quantile(slopes[np.isfinite(slopes)], np.linspace(0, 1, 101)), 0.0)
+    slope = slopes[np.argmin([np.median(np.linalg.norm(y - each * x, axis=1)) for each in slopes])]
+    for _ in range(20):
+        size = np.linalg.norm(y - slope * x, axis=1)
+        inlier = 1 / (1 + (size / (6 * max(np.median(size) / 1.538, 1e-12))) ** 2) ** 2
+        slope = float(inlier @ np.sum(x * y, 1) / (inlier @ np.sum(x * x, 1)))
+    left = y - slope * x
+    information = inlier @ np.sum(x * x, 1)
+    sigma = np.sqrt(np.sum((inlier * np.sum(x * left, 1)) ** 2)) / information
+    norms = (inlier @ np.sum(x * x, 1)) * (inlier @ np.sum(y * y, 1))
+    power = inlier / inlier.sum() / 3
+    return Regression(
+        slope=slope,
+        sigma=float(sigma),
+        correlation=float(inlier @ np.sum(x * y, 1) / np.sqrt(norms)) if norms > 0 else 0.0,
+        signal=float(power @ np.sum(y * y, 1) - 1),
+        unexplained=float(power @ np.sum(left * left, 1) - 1),
+        reach=float(1 / np.sqrt(information)),
+    )
+
+
+def _judge(
+    shutter: Regression,
+    frames_by_gyro: Regression | None,
+    shutter_by_gyro: Regression | None,
+    interval: float,
+    readout_s: float | None,
+) -> tuple[Literal["none", "stabilised", "unknown"], str]:
+    """The verdict, and the line that says why."""
+    if readout_s is None:
+        least, most, wanted = _FASTEST * interval, _SLOWEST * interval, f"{1e3 * _FASTEST * interval:.1f} ms or more"
+    else:
+        least, most = (1 - _KNOWN_SHARE) * readout_s, (1 + _KNOWN_SHARE) * readout_s
+        wanted = f"{1e3 * readout_s:.1f} ms"
+    found = f"{1e3 * shutter.slope:.1f} +- {1e3 * shutter.sigma:.1f} ms, correlation {shutter.correlation:.2f}"
+    low, high = (shutter.slope + side * _SIGMAS * shutter.sigma for side in (-1, 1))
+    shakes = shutter.signal > 1.0  # lines show more than their noise
+    unexplained = shakes and shutter.unexplained > max(_UNEXPLAINED * shutter.signal, 1.0)
+    if frames_by_gyro is not None:
+        turns = frames_by_gyro
+        if (
+            _SIGMAS * max(turns.reach, turns.sigma) < 1 - _TURN_SHARE
+            and turns.slope + _SIGMAS * turns.sigma < _TURN_SHARE
+        ):
+            line = (
+                f"stabilised in the camera: the frames turn by {turns.slope:.2f} +- {turns.sigma:.2f} of what the "
+                "gyroscope felt"
+            )
+            if shutter_by_gyro is not None and shutter_by_gyro.slope > _SIGMAS * shutter_by_gyro.sigma:
+                line += f", their lines as it says ({1e3 * shutter_by_gyro.slope:.1f} ms)"
+            return "stabilised", line
+    detectable = _SIGMAS * shutter.reach < least
+    if unexplained and (detectable or shutter.correlation < 0.5):
+        return "stabilised", (
+            f"stabilised in the camera: a shutter without its rotation, {shutter.unexplained / shutter.signal:.0%} of "
+            f"what the lines show is not in the rotation between the frames (readout {found})"
+        )
+    if detectable and high < least:
+        return "stabilised", (
+            f"stabilised in the camera: rotation between the frames without its shutter (readout {found}, expected "
+            f"{wanted})"
+        )
+    if detectable and low > most:
+        return "stabilised", (
+            f"stabilised in the camera: the lines turn by more than the frames (readout {found}, expected "
+            f"{1e3 * most:.1f} ms at most)"
+        )
+    if detectable and high > least and low < most and shutter.slope > _SIGMAS * shutter.sigma:
+        return "none", f"not stabilised: the lines turn as the frames do (readout {found})"
+    return "unknown", f"the camera turned too little to tell whether it was stabilised (readout {found})"
