@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -314,6 +314,10 @@ class BundleResult:
     sigma_fields_px: tuple[float, ...] = ()
     path: PathSolution | None = None
     path_sigmas: tuple[float, ...] = ()
+
+    def of_photos(self, keep: NDArray[np.bool_]) -> BundleResult:
+        """The same of some photos (m,) only, with the points that two of them show."""
+        return replace(self, reconstruction=self.reconstruction.take_photos(keep), covariances=self.covariances[keep])
 
     @property
     def sigma_phi(self) -> NDArray[np.float64]:

@@ -251,7 +251,7 @@ class PathSolution:
         Poses at the moments of the frames' principal rows, less the time that the row takes to come.
     state : PathState
         The same rates as the adjustment has them, and the pace of the readout.
-    frames : (m,) int array
+    names : tuple of str
         The photo of each moment.
     readout_s, sigma_readout_s : (cameras,) array
         Time of the readout of a frame, seconds, negative where it runs against its direction; and its standard
@@ -260,7 +260,7 @@ class PathSolution:
 
     path: CameraPath
     state: PathState
-    frames: Index
+    names: tuple[str, ...]
     readout_s: Array
     sigma_readout_s: Array
 
@@ -269,7 +269,8 @@ def path_solution(reconstruction: Reconstruction, path: FramePath, state: PathSt
     """The path through a reconstruction's poses, and the readout time by pace and standard deviation (cameras,)."""
     found, frames = camera_path(reconstruction, path, state)
     span_s = np.array([camera.frame_span for camera in reconstruction.cameras]) * path.frame_s
-    return PathSolution(found, state, frames, state.pace * span_s, pace_sigma * span_s)
+    names = tuple(reconstruction.image_names[k] for k in frames.tolist())
+    return PathSolution(found, state, names, state.pace * span_s, pace_sigma * span_s)
 
 
 def of_motions(covariances: Array, with_pace: Array, pace_sigma: Array, state: PathState, camera_idx: Index) -> Array:

@@ -69,6 +69,14 @@ class Clip:
         """Names of the key frames."""
         return tuple(self.names[k] for k in self.keys.tolist())
 
+    def facts(self) -> dict[str, Any]:
+        """What `solution.json` says of it."""
+        return {
+            "key_frames": len(self.keys),
+            "frame_s": self.frame_s,
+            "cuts_s": self.time_s[np.flatnonzero(np.diff(self.part)) + 1].tolist(),
+        }
+
 
 def _grey(picture: Any) -> NDArray[np.uint8]:
     """A frame as it is followed: grey, and shrunk if it is large."""

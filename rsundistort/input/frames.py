@@ -9,6 +9,7 @@ from typing import Any
 from ..batch.progress import StageLog
 from ..errors import InputError
 from ..io.video import VideoFrames, extract_frames, is_video
+from .clip import Clip, read_clip
 
 __all__ = ["PhotoSource", "find_photos"]
 
@@ -27,29 +28,42 @@ class PhotoSource:
         Of the video, if they are frames of one.
     video : dict or None
         What `solution.json` says of it.
+    clip : Clip or None
+        The video, if its frames are to share one path.
     """
 
     folder: Path
     camera: str | None
     frames: VideoFrames | None = None
     video: dict[str, Any] | None = None
+    clip: Clip | None = None
 
 
 def find_photos(
     photos: Path, scratch: Path, camera: str | None, every: int | None, sharpest: int | None, log: StageLog
 ) -> PhotoSource:
-    """A folder as it is; of a video, frames in `scratch/frames`, with the `camera.json` that lies beside the video."""
+    """A folder as it is; of a video, frames in `scratch/frames`, with the `camera.json` that lies beside the video.
+
+    Frames that neither `every` nor `sharpest` chooses are the key frames of one clip.
+    """
     if not is_video(photos):
         if every is not None or sharpest is not None:
             raise InputError(f"{photos} is no video; --every and --sharpest choose frames of one")
         return PhotoSource(photos, camera)
     log.begin("frames")
     folder = scratch / "frames"
-    frames = extract_frames(
-        photos, folder, every=every, sharpest=sharpest, progress=lambda done, total: log.tell("frames", done, total)
-    )
+
+    def tell(done: int, total: int) -> None:
+        log.tell("frames", done, total)
+
+    clip = None
+    if every is None and sharpest is None:
+        clip = read_clip(photos, folder, tell)
+        frames = clip.frames
+    else:
+        frames = extract_frames(photos, folder, every=every, sharpest=sharpest, progress=tell)
     log.end("frames", photos=len(frames.names), frames=frames.num_frames, damaged=frames.num_damaged)
-    if len(frames.names) < 3:
+    if clip is None and len(frames.names) < 3:
         raise InputError(
             f"{photos} gives {len(frames.names)} photos; the shutter needs at least three, take a smaller N"
         )
@@ -67,5 +81,7 @@ def find_photos(
             "orientation": frames.orientation,
             "make": frames.make,
             "model": frames.model,
+            **({} if clip is None else clip.facts()),
         },
+        clip,
     )

@@ -26,6 +26,8 @@ LONG_EXPOSURE_S = 1 / 250
 # What a decoded photo takes for each pixel, at most but for floats; and the size of one whose header does not say.
 _BYTES_PER_PIXEL, _SIZE_OF_OTHERS = 16, (8000, 6000)
 
+_NUMBERS = {2: "two", 3: "three"}
+
 
 @dataclass(frozen=True)
 class LoadedPhotos:
@@ -142,6 +144,7 @@ def load_photos(
     raw_as: str = "tif",
     again: bool = False,
     max_megapixels: float = MAX_MEGAPIXELS,
+    least: int = 3,
 ) -> LoadedPhotos:
     """Read every photo of a folder once, for its size and features; unusable ones are skipped with a warning.
 
@@ -161,11 +164,13 @@ def load_photos(
         As in `detect_features`.
     masks, raw_as, again, max_megapixels
         As in `RectifyOptions`.
+    least : int
+        Photos that there must be, two or three.
     """
     listed = list_photos(folder, raw_as)
-    if len(listed) < 3:
+    if len(listed) < least:
         raise InputError(
-            f"{folder} holds {len(listed)} photo{'s' * (len(listed) > 1)}; the shutter needs at least three"
+            f"{folder} holds {len(listed)} photo{'s' * (len(listed) > 1)}; the shutter needs at least {_NUMBERS[least]}"
         )
     mask_of = {} if masks is None else find_masks(local_place(masks).absolute(), listed)
     jobs = (
@@ -194,10 +199,10 @@ def load_photos(
                 features.append(each.features)
                 found.append(each)
             log.tell("features", len(names) + len(skipped), len(listed))
-    if len(names) < 3:
+    if len(names) < least:
         raise InputError(
             f"{folder} holds {len(names)} readable photo{'s' * (len(names) != 1)} of {len(listed)}; "
-            f"the shutter needs at least three ({next(iter(skipped.values()))})"
+            f"the shutter needs at least {_NUMBERS[least]} ({next(iter(skipped.values()))})"
         )
     sizes, facts = [(each.width, each.height) for each in found], [each.facts for each in found]
     cameras = find_cameras(folder, names, sizes, facts, camera, readout)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -84,6 +84,15 @@ class CameraPath:
         }
         for name, value in fields.items():
             object.__setattr__(self, name, frozen(value))
+
+    def moved(self, R: Array, origin: Array, scale: float) -> CameraPath:
+        """The same in a world where x is scale R (x - origin)."""
+        return replace(
+            self,
+            R_cw=self.R_cw @ R.T,
+            center_w=scale * (self.center_w - origin) @ R.T,
+            velocity=scale * self.velocity @ R.T,
+        )
 
     def near(self, moment: int, offset_s: ArrayLike) -> tuple[Array, Array]:
         """Rotation vectors and positions (n, 3) against a moment's pose, so many seconds (n,) after it.

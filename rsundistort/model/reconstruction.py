@@ -215,15 +215,17 @@ class Reconstruction:
 
         Which similarity a mapping ends in is chance; results of two runs must compare without aligning them.
         """
-        R0, origin = self.R_cw[0], self.center_w[0]
-        scale = 1.0 / self.baseline
+        return self.moved(self.R_cw[0], self.center_w[0], 1.0 / self.baseline)
+
+    def moved(self, R: NDArray[np.float64], origin: NDArray[np.float64], scale: float) -> Reconstruction:
+        """The same in a world where x is scale R (x - origin)."""
         return replace(
             self,
-            R_cw=self.R_cw @ R0.T,
-            center_w=scale * (self.center_w - origin) @ R0.T,
-            points_w=scale * (self.points_w - origin) @ R0.T,
-            velocity=scale * self.velocity @ R0.T,
-            bend=np.concatenate([self.bend[..., :3], scale * self.bend[..., 3:] @ R0.T], axis=2),
+            R_cw=self.R_cw @ R.T,
+            center_w=scale * (self.center_w - origin) @ R.T,
+            points_w=scale * (self.points_w - origin) @ R.T,
+            velocity=scale * self.velocity @ R.T,
+            bend=np.concatenate([self.bend[..., :3], scale * self.bend[..., 3:] @ R.T], axis=2),
         )
 
     def track_lengths(self, keep_obs: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -252,23 +254,25 @@ class Reconstruction:
         """The reconstruction without photos of fewer than `least` measurements, and what only they showed."""
         rec = self
         while True:
-            counts = np.bincount(rec.observations.frame_idx, minlength=rec.num_images)
-            keep = counts >= least
+            keep = np.bincount(rec.observations.frame_idx, minlength=rec.num_images) >= least
             if keep.all():
                 return rec
-            obs = rec.observations.select(keep[rec.observations.frame_idx])
-            place = np.flatnonzero(keep)
-            rec = replace(
-                rec,
-                image_names=[rec.image_names[i] for i in place.tolist()],
-                camera_idx=rec.camera_idx[keep],
-                R_cw=rec.R_cw[keep],
-                center_w=rec.center_w[keep],
-                phi=rec.phi[keep],
-                velocity=rec.velocity[keep],
-                variation=rec.variation[keep],
-                bend=rec.bend[keep],
-                bend_clock=rec.bend_clock[keep],
-                observations=replace(obs, frame_idx=(np.cumsum(keep) - 1)[obs.frame_idx]),
-            )
-            rec = rec.with_points(np.ones(len(rec.observations), bool))
+            rec = rec.take_photos(keep)
+
+    def take_photos(self, keep: NDArray[np.bool_]) -> Reconstruction:
+        """The reconstruction with some photos (m,) only, and the points that two of them show."""
+        obs = self.observations.select(keep[self.observations.frame_idx])
+        taken = replace(
+            self,
+            image_names=[self.image_names[i] for i in np.flatnonzero(keep).tolist()],
+            camera_idx=self.camera_idx[keep],
+            R_cw=self.R_cw[keep],
+            center_w=self.center_w[keep],
+            phi=self.phi[keep],
+            velocity=self.velocity[keep],
+            variation=self.variation[keep],
+            bend=self.bend[keep],
+            bend_clock=self.bend_clock[keep],
+            observations=replace(obs, frame_idx=(np.cumsum(keep) - 1)[obs.frame_idx]),
+        )
+        return taken.with_points(np.ones(len(obs), bool))

@@ -127,7 +127,7 @@ def pipeline_options(loose: float, seed: int, refine_intrinsics: bool, num_photo
     options.num_threads = options.mapper.num_threads = 1
     options.extract_colors = False
     # smaller models are given up and another first pair is tried
-    options.min_model_size = min(10, max(3, num_photos // 2))
+    options.min_model_size = min(10, max(min(3, num_photos), num_photos // 2))
     options.ba_refine_focal_length = refine_intrinsics
     options.ba_refine_extra_params = refine_intrinsics
     mapper, triangulation = options.mapper, options.triangulation

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +61,7 @@ def _spread(xy: NDArray[np.float64], worth: NDArray[np.int64], size: tuple[int, 
 
 def _between_keys(clip: Clip, keys: list[int]) -> Iterator[tuple[int, int, list[NDArray[np.uint8]]]]:
     """Neighbouring key frames of one part, with the frames from one to the other."""
-    wanted = [k for a, b in zip(keys[:-1], keys[1:], strict=True) if clip.part[a] == clip.part[b] for k in range(a, b)]
+    wanted = [k for a, b in pairwise(keys) if clip.part[a] == clip.part[b] for k in range(a, b)]
     wanted = sorted({*wanted, *keys})
     held: dict[int, NDArray[np.uint8]] = {}
     place = 0
@@ -97,12 +98,14 @@ def follow_points(clip: Clip, reconstruction: Reconstruction) -> Followed:
     return followed
 
 
-def with_all_frames(clip: Clip, reconstruction: Reconstruction, followed: Followed) -> Reconstruction:
+def with_all_frames(
+    clip: Clip, reconstruction: Reconstruction, followed: Followed, placed_before: Reconstruction | None = None
+) -> Reconstruction:
     """A reconstruction of all frames that could be placed, by that of the key frames.
 
     Each point that is followed is one of its own, at the place of that which its key frame shows: where flow starts
     from counts as where the key frame shows it, so that what is off there is off in all frames alike, and moves the
-    point. Points of the key frames tie these together, as before.
+    point. Points of the key frames tie these together, as before. Frames that have been `placed_before` stay there.
     """
     rec, obs = reconstruction, reconstruction.observations
     number = {name: k for k, name in enumerate(clip.names)}
@@ -115,10 +118,13 @@ def with_all_frames(clip: Clip, reconstruction: Reconstruction, followed: Follow
     at_key = np.concatenate([np.full(len(followed.chosen[k]), k) for k in keys])
     frames = np.array([number[name] for name in rec.image_names])
     poses = {k: (rec.R_cw[i], rec.center_w[i]) for k, i in image_of.items()}
+    if placed_before is not None:
+        at = zip(placed_before.image_names, placed_before.R_cw, placed_before.center_w, strict=True)
+        poses = {number[name]: (R, c) for name, R, c in at} | poses
     camera = rec.cameras[0]
     rays, valid = unproject_points(followed.xy_raw, camera, RowMotion(), "global")
     within = _ROOM_PX / float(camera.K[0, 0])
-    for k in sorted({*followed.frame.tolist()} - {*keys}):
+    for k in sorted({*followed.frame.tolist()} - {*poses}):
         mine = np.flatnonzero((followed.frame == k) & valid)
         if (found := resect(rays[mine], points_w[point[mine]], within)) is not None:
             poses[k] = found

@@ -37,7 +37,7 @@ from ..sfm import LEAST_MEASUREMENTS, MatchedPhotos, align_tracks, map_photos, m
 from ..verdict import Verdict, judge
 from .outcome import Solved
 
-__all__ = ["Feedback", "solve_photos", "solve_tracks"]
+__all__ = ["Feedback", "rough_options", "solve_photos", "solve_tracks", "without_shutter"]
 
 # Feedback ends when no rectified pixel of any photo moves by more than this between two rounds, in pixels of the images
 # that the features were found in; or when less than this share of the measurements is another one than before, so that
@@ -266,7 +266,7 @@ def solve_tracks(
             advice = advise(result, options)
         log.end("critical motion", remedy=mended.name, sigma_log_k=mended.after.sigma_log_k)
     log.begin("comparison with a global shutter")
-    global_result = _without_shutter(result, options)
+    global_result = without_shutter(result, options)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
     log.begin("verdict")
     measured = mapped if feedback is None else tracks
@@ -295,7 +295,7 @@ def _chosen(
     # the windows were aligned, and their outliers told, as a model saw them that is given up
     again = feedback is not None and feedback.workers is not None
     again = again and (choice.shutter_model == "constant-motion" or choice.bends > 0)
-    how = _rough(options) if again else options
+    how = rough_options(options) if again else options
     result = bundle_adjust(start, choice.shutter_model, how, partial(_tell, log, "choice"))
     log.end(
         "choice of the model", chosen=choice.shutter_model, varying_lens=choice.varying, bends=choice.bends,
@@ -307,7 +307,7 @@ def _chosen(
     return choice, result, tracks, options
 
 
-def _without_shutter(result: BundleResult, options: BundleOptions) -> BundleResult:
+def without_shutter(result: BundleResult, options: BundleOptions) -> BundleResult:
     """The same measurements explained by a global shutter, for comparison."""
     plain = BundleOptions(
         outlier_rounds=0,
@@ -332,7 +332,7 @@ def _lens_only(verdict: Verdict) -> str:
     )
 
 
-def _rough(options: BundleOptions) -> BundleOptions:
+def rough_options(options: BundleOptions) -> BundleOptions:
     """Options of an adjustment that another one follows."""
     return replace(options, cost_tolerance=1e-5, spread_rounds=3, spread_tolerance=0.05)
 
@@ -368,7 +368,7 @@ def _fed_back(
         tracks = tracks.without_photos(LEAST_MEASUREMENTS)
         options = _of_joined(options, tracks)
         options = replace(options, phi_sigma_start=result.phi_sigma)
-        how = options if ends and aligns else _rough(options)
+        how = options if ends and aligns else rough_options(options)
         result = bundle_adjust(tracks, shutter_model, how, partial(_tell, log, stage))
         after = result.reconstruction
         moved = _moved_px(before, after)

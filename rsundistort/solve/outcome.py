@@ -53,6 +53,10 @@ class Solved:
         Photos that are not in it.
     readouts : mapping of camera index to (seconds, source)
         Times of the readout, as far as they are known.
+    whole : Reconstruction or None
+        All frames of a video, whose key frames are the photos.
+    evidence : mapping
+        What `solution.json` says of the readout time of a video.
     told : mapping
         What else `solution.json` says of how it was made.
     """
@@ -68,6 +72,8 @@ class Solved:
     shared_ids: Sequence[int] = ()
     unregistered: Mapping[str, str] = field(default_factory=dict)
     readouts: Mapping[int, tuple[float, str]] = field(default_factory=dict)
+    whole: Reconstruction | None = None
+    evidence: Mapping[str, Any] = field(default_factory=dict)
     told: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -230,6 +236,7 @@ def _quality(solved: Solved) -> dict[str, Any]:
         "phi_sigma_rad_per_frame": result.phi_sigma,
         **_bend_sigmas(result),
         "stop_reason": result.stop_reason,
+        **({"readout_time": dict(solved.evidence)} if solved.evidence else {}),
         "readout_times": {k: {"ms": 1e3 * each[0], "source": each[1]} for k, each in readouts.items() if each},
     }
 

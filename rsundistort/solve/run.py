@@ -12,6 +12,7 @@ from ..batch.progress import ProgressCallback, StageLog
 from ..batch.workers import Workers, use_threads
 from ..bundle import BundleOptions
 from ..errors import InputError, RsUndistortWarning
+from ..input.clip import Clip
 from ..input.exposure import bounded_by_exposure
 from ..input.frames import find_photos
 from ..input.gyroscope import GyroOptions, Readouts, gyro_contradiction, gyro_motions, known_readouts
@@ -24,6 +25,7 @@ from ..io.places import local_place
 from ..io.record import Record
 from ..io.video import VideoFrames
 from ..model import Reconstruction, Solution
+from .clip import frame_path, solve_clip
 from .model_sequence import solve_photos
 from .outcome import Solved
 from .run_options import RunOptions, SolveOptions
@@ -81,11 +83,14 @@ def run(
         loaded = load_photos(
             folder, source.camera, options.solve.readout, options.max_features, workers, log,
             megapixels=options.feature_megapixels, masks=rectify.masks, raw_as=rectify.raw_as, again=rectify.again,
-            max_megapixels=rectify.max_megapixels,
+            max_megapixels=rectify.max_megapixels, least=3 if source.clip is None else 2,
         )  # fmt: skip
         _check_anchors(options.solve, loaded.names, photos)
         bodies = loaded.facts if source.frames is None else [source.frames] * len(loaded.names)
-        solved, solving = _solve(options, loaded, bodies, gyro_log, workers, log)
+        if source.clip is None:
+            solved, solving = _solve(options, loaded, bodies, gyro_log, workers, log)
+        else:
+            solved, solving = _solve_clip(options, source.clip, loaded, bodies, gyro_log, log), options.solve
         told = {
             "max_features": options.max_features,
             "feature_megapixels": options.feature_megapixels,
@@ -138,6 +143,30 @@ def _solve(
     for text in filter(None, contradictions):
         warnings.warn(text, RsUndistortWarning, stacklevel=3)
     return replace(solved, unregistered=loaded.unregistered(rec.image_names), readouts=readouts), solving
+
+
+def _solve_clip(
+    options: RunOptions,
+    clip: Clip,
+    keys: LoadedPhotos,
+    bodies: Sequence[ExifFacts | VideoFrames],
+    gyro_log: GyroLog | None,
+    log: StageLog,
+) -> Solved:
+    """What a video, and a gyroscope's log, come to."""
+    solving, cameras = options.solve, keys.cameras
+    if solving.still or solving.known or solving.shutter_model not in ("auto", "constant-motion"):
+        raise InputError(
+            "the path of a video says how its frames move: it takes no --still, --motions or --model; "
+            "say --every N for photos that do"
+        )
+    readouts = known_readouts(bodies, cameras.cameras, cameras.camera_idx, solving.readout_s, gyro_log)
+    with tempfile.TemporaryDirectory() as work:
+        solved = solve_clip(
+            clip, keys, frame_path(clip, readouts.get(0)), lambda _: solving.options_for(cameras), Path(work), log,
+            seed=solving.seed, matching=options.matching, gyroscope=gyro_log,
+        )  # fmt: skip
+    return replace(solved, unregistered=keys.unregistered(solved.shared.image_names), readouts=readouts)
 
 
 def _with_gyroscope(

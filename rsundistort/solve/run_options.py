@@ -23,6 +23,10 @@ from ..sfm import DETECTION_MEGAPIXELS
 __all__ = ["OutputOptions", "RunOptions", "SolveOptions"]
 
 
+#: Frames of a video that are rectified.
+FRAMES = ("key", "all")
+
+
 class _Part:
     """Options that say where one belongs that was theirs when all were in one class."""
 
@@ -154,7 +158,10 @@ class RunOptions(_Part):
     feature_megapixels : float
         Larger photos are shrunk to this to find their features.
     every, sharpest : int, optional
-        Of a video: each N-th frame, or the sharpest of each N frames, as in `io.extract_frames`.
+        Of a video: each N-th frame, or the sharpest of each N frames, as in `io.extract_frames`; by default its frames
+        share one path, and its key frames are the photos.
+    frames : {"key", "all"}
+        Of a video with a path: whether only its key frames are rectified, or all of them, into `video.mp4`, too.
     matching : str
         Photos matched with each other: "exhaustive", all; "neighbours", those taken one after the other, near by GPS,
         or that look alike; "auto", neighbours in sets of more than 60.
@@ -170,6 +177,7 @@ class RunOptions(_Part):
     feature_megapixels: float = DETECTION_MEGAPIXELS
     every: int | None = None
     sharpest: int | None = None
+    frames: str = "key"
     matching: str = "auto"
     gyro: GyroOptions | None = None
 
@@ -178,5 +186,9 @@ class RunOptions(_Part):
             raise InputError(f"max_features={self.max_features!r}, expected at least 100")
         if not 0.05 <= self.feature_megapixels < np.inf:
             raise InputError(f"feature_megapixels={self.feature_megapixels!r}, expected at least 0.05")
+        if self.frames not in FRAMES:
+            raise InputError(f"frames={self.frames!r}, expected one of {', '.join(FRAMES)}")
+        if self.frames == "all" and not (self.every is None and self.sharpest is None):
+            raise InputError("all frames of a video are rectified by its path; leave --every and --sharpest out")
         if self.matching not in MATCHINGS:
             raise InputError(f"matching={self.matching!r}, expected one of {', '.join(MATCHINGS)}")

@@ -20,7 +20,7 @@ from ..sfm import LEAST_MEASUREMENTS
 from .photos import PhotoMotions, photo_motions
 from .residuals import left_along_readout, left_over_frame
 
-__all__ = ["Verdict", "judge"]
+__all__ = ["Verdict", "height_reasons", "judge", "loose_reasons", "unexplained_reasons"]
 
 # Displacements below this are lost in the interpolation of a photo.
 _UNSEEN_PX = 1.0
@@ -115,7 +115,7 @@ def judge(
         "trusted" only if nothing speaks against it.
     """
     rec = result.reconstruction
-    reasons = _loose(result) + _height(remedy) + _unexplained(result, choice)
+    reasons = loose_reasons(result) + height_reasons(remedy) + unexplained_reasons(result, choice)
     if rec.shutter_model == "global":
         shutter, why = _of_global(choice)
         return _verdict(shutter, reasons + why)
@@ -158,7 +158,7 @@ def _outliers(rec: Reconstruction, tracks: Reconstruction | None) -> NDArray[np.
     return 1.0 - _counts(rec) / np.maximum([before.get(name, 0) for name in rec.image_names], 1)
 
 
-def _loose(result: BundleResult) -> list[str]:
+def loose_reasons(result: BundleResult) -> list[str]:
     """Parts of the scene that nothing holds against each other: the equations then have no single solution."""
     if np.isfinite(result.covariances).all():
         return []
@@ -170,7 +170,8 @@ def _loose(result: BundleResult) -> list[str]:
     ]
 
 
-def _height(remedy: Remedy | None) -> list[str]:
+def height_reasons(remedy: Remedy | None) -> list[str]:
+    """How badly the height of the scene is known, if it is."""
     if remedy is None:
         return []
     cost = remedy.after
@@ -184,7 +185,7 @@ def _height(remedy: Remedy | None) -> list[str]:
     return []
 
 
-def _unexplained(result: BundleResult, choice: ModelChoice | None) -> list[str]:
+def unexplained_reasons(result: BundleResult, choice: ModelChoice | None) -> list[str]:
     """What residuals say against the solution."""
     reasons = []
     if (left := left_over_frame(result.reconstruction)) >= _LEFT_PX:

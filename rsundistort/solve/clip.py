@@ -1,0 +1,325 @@
+"""From the frames of a video to one path: poses at any time, motions of all frames, and the time of the readout."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ..batch.progress import StageLog
+from ..bundle import BundleOptions, BundleResult, bundle_adjust
+from ..bundle.path import FramePath
+from ..critical import heal
+from ..errors import RsUndistortError, RsUndistortWarning
+from ..input.clip import Clip
+from ..input.gyro_alignment import GyroAlignment, NoAlignment, align_gyro
+from ..input.load import LoadedPhotos
+from ..input.pairing import pairs_to_match
+from ..input.stabilisation import Stabilisation, judge_stabilisation
+from ..io.gpmf import has_telemetry
+from ..io.gyro import GyroLog, read_gyro
+from ..model import Reconstruction
+from ..model.path import CameraPath
+from ..sfm import MatchedPhotos, map_photos, match_photos, retriangulate
+from ..verdict.clip import ReadoutTime, judge_clip
+from .clip_tracks import follow_points, with_all_frames
+from .model_sequence import rough_options, without_shutter
+from .outcome import Solved
+
+__all__ = ["frame_path", "solve_clip"]
+
+# Frames that are placed by fewer measurements say nothing of the path.
+_LEAST_MEASUREMENTS = 15
+# A half of a clip needs so many frames to tell a readout time of its own.
+_LEAST_HALF = 4
+# Frames that are asked whether they were stabilised, at most: ten seconds tell.
+_FRAMES_ASKED = 300
+# Of a readout time that is given, or in the table: its standard deviation, as a share.
+_GIVEN_SIGMA, _TABLE_SIGMA = 0.02, 0.1
+# Known to this share of what it was known to before, it was measured.
+_MEASURED = 0.7
+
+
+def solve_clip(
+    clip: Clip,
+    keys: LoadedPhotos,
+    path: FramePath,
+    options_of: Callable[[Reconstruction], BundleOptions],
+    scratch: Path,
+    log: StageLog,
+    *,
+    seed: int = 0,
+    matching: str = "auto",
+    gyroscope: GyroLog | None = None,
+) -> Solved:
+    """Map the key frames, place all others by what these show, and adjust all as moments of one path.
+
+    Parameters
+    ----------
+    clip : Clip
+        The video.
+    keys : LoadedPhotos
+        Its key frames, with their features.
+    path : FramePath
+        Times of all frames, and what is known of the readout.
+    options_of : callable
+        Options of the adjustments for a reconstruction.
+    scratch : Path
+        Folder for the database.
+    log : StageLog
+        Told the progress.
+    seed, matching
+        As in `solve_photos`.
+    gyroscope : GyroLog, optional
+        A gyroscope's log; else that of the video's own telemetry, if it has any. Its axes and the offset of its clock
+        are found.
+
+    Returns
+    -------
+    Solved
+        Its result is that of the key frames, `whole` the reconstruction of all frames.
+    """
+    mapped, matched = _mapped(keys, scratch, log, seed, matching)
+    # a shutter that is not modelled yet would be blamed on the lens
+    rough = rough_options(replace(options_of(mapped), refine=()))
+    current, result = bundle_adjust(mapped, "global", rough).reconstruction, None
+    for stage in ("path", "path again"):
+        log.begin("flow")
+        followed = follow_points(clip, current)
+        before = None if result is None else result.reconstruction
+        whole = with_all_frames(clip, current, followed, before).without_photos(_LEAST_MEASUREMENTS)
+        log.end("flow", frames=whole.num_images, of_frames=len(clip.names), observations=len(followed.frame))
+        log.begin(stage)
+        options = replace(options_of(whole), path=path)
+        how = rough_options(options) if result is None else options
+        first = result is None
+        result = bundle_adjust(whole, "constant-motion", how, partial(_tell, log, stage))
+        log.end(
+            stage, rms_px=result.rms_px, iterations=result.num_iterations, readout_s=_readout(result).seconds,
+            stop_reason=result.stop_reason,
+        )  # fmt: skip
+        if first:
+            # key frames freed of the shutter: what it had torn from their tracks returns
+            current = retriangulate(matched, result.of_photos(_are_keys(result, clip)).reconstruction)
+    assert result is not None
+    alone = _readout(result)
+    log.begin("gyroscope")
+    felt = _felt(clip, result, gyroscope)
+    if felt is not None:
+        options = replace(options, path=replace(path, rates=felt.rates(result)))
+        result = bundle_adjust(
+            result.reconstruction, "constant-motion", replace(options, outlier_rounds=0),
+            partial(_tell, log, "gyroscope"),
+        )  # fmt: skip
+    log.end("gyroscope", offset_s=None if felt is None else felt.alignment.offset_s)
+    return _judged(clip, keys, result, options, alone, felt, log)
+
+
+def _mapped(
+    keys: LoadedPhotos, scratch: Path, log: StageLog, seed: int, matching: str
+) -> tuple[Reconstruction, MatchedPhotos]:
+    """The key frames, placed as photos of a global shutter."""
+    cameras = keys.cameras
+    log.begin("matching")
+    pairs = pairs_to_match(keys, matching, seed)
+    matched = match_photos(
+        scratch / "database.db", keys.names, keys.features, cameras.cameras, cameras.camera_idx,
+        calibrated=cameras.calibrated, seed=seed, pairs=pairs,
+    )  # fmt: skip
+    log.end("matching")
+    log.begin("mapping", len(keys.names))
+    mapped = map_photos(matched, lambda done: log.tell("mapping", done, len(keys.names)))
+    log.end("mapping", photos=mapped.num_images, points=mapped.num_points, observations=len(mapped.observations))
+    return mapped, matched
+
+
+def _judged(
+    clip: Clip, keys: LoadedPhotos, result: BundleResult, options: BundleOptions, alone: ReadoutTime,
+    felt: Felt | None, log: StageLog,
+) -> Solved:  # fmt: skip
+    """What is to be believed of a path, and what is told of its key frames."""
+    log.begin("critical motion")
+    result, remedy = heal(result, options)
+    log.end("critical motion", sigma_log_k=remedy.after.sigma_log_k)
+    log.begin("halves")
+    halves = _halves(result, options)
+    log.end("halves", readout_s=None if halves is None else [each.seconds for each in halves])
+    log.begin("stabilisation")
+    stabilisation = _stabilisation(clip, result, options, felt)
+    log.end("stabilisation", verdict=stabilisation.verdict)
+    of_keys = result.of_photos(_are_keys(result, clip))
+    log.begin("comparison with a global shutter")
+    global_result = without_shutter(of_keys, replace(options, path=None))
+    log.end("comparison with a global shutter", rms_px=global_result.rms_px)
+    against = stabilisation.reason if stabilisation.verdict == "stabilised" else ""
+    verdict = judge_clip(result, of_keys, halves, clip.frame_s, remedy, against)
+    if verdict.lens_only:
+        warnings.warn(
+            f"only the lens is taken out of the frames: {verdict.reasons[0]}", RsUndistortWarning, stacklevel=4
+        )
+    # which frame a mapping ends in is chance
+    rec, found = of_keys.reconstruction, result.path
+    assert found is not None
+    world = rec.R_cw[0], rec.center_w[0], 1.0 / rec.baseline
+    path = replace(found, path=found.path.moved(*world))
+    of_keys = replace(of_keys, reconstruction=rec.moved(*world), path=path)
+    time = _readout(result)
+    evidence: dict[str, Any] = {
+        "seconds": time.seconds,
+        "sigma": time.sigma,
+        "source": _source(options, time, felt),
+        "of_frame": time.seconds / clip.frame_s,
+        "frames": len(path.names),
+        "halves": [] if halves is None else [each._asdict() for each in halves],
+        "stabilisation": {"verdict": stabilisation.verdict, "reason": stabilisation.reason},
+    }
+    if felt is not None:
+        by_gyro = stabilisation.shutter_by_gyro
+        evidence["by_pictures"] = alone._asdict()
+        evidence["gyroscope"] = felt.facts()
+        if by_gyro is not None:
+            evidence["by_gyroscope"] = {"seconds": by_gyro.slope, "sigma": by_gyro.sigma}
+    return Solved(
+        of_keys, global_result, keys.cameras, remedy=remedy, verdict=verdict,
+        whole=result.reconstruction.moved(*world), evidence=evidence,
+    )  # fmt: skip
+
+
+def _source(options: BundleOptions, time: ReadoutTime, felt: Felt | None) -> str:
+    """What the readout time comes from."""
+    assert options.path is not None
+    measured = "the video" if felt is None else "the video and its gyroscope"
+    if options.path.readout is None or time.sigma < _MEASURED * options.path.readout[1]:
+        return measured
+    return "what was known before"
+
+
+def frame_path(clip: Clip, readout: tuple[float, str] | None) -> FramePath:
+    """The path of a clip's frames, whose readout is known to some seconds from some source, or not at all."""
+    known = None
+    if readout is not None:
+        seconds, source = readout
+        known = seconds, (_GIVEN_SIGMA if source == "given" else _TABLE_SIGMA) * seconds
+    time = dict(zip(clip.names, clip.time_s.tolist(), strict=True))
+    return FramePath(time, clip.frame_s, known, dict(zip(clip.names, clip.part.tolist(), strict=True)))
+
+
+@dataclass(frozen=True)
+class Felt:
+    """A gyroscope that is of this clip.
+
+    Attributes
+    ----------
+    alignment : GyroAlignment
+        How it lies to the camera.
+    log : GyroLog
+        About the camera's axes, by its own clock.
+    """
+
+    alignment: GyroAlignment
+    log: GyroLog
+
+    def rates(self, result: BundleResult) -> dict[str, tuple[NDArray[np.float64], float]]:
+        """Rates of the frames that it covers, as `FramePath.rates` takes them, about the time of their middle rows."""
+        assert result.path is not None
+        half = max(0.5 * abs(_readout(result).seconds), 0.5 * self.log.step_s)
+        at = result.path.path.time_s + self.alignment.offset_s
+        inside = (at - half >= self.log.time_s[0]) & (at + half <= self.log.time_s[-1])
+        names = [name for name, there in zip(result.path.names, inside, strict=True) if there]
+        if not names:
+            return {}
+        # the world turns against the camera
+        values = -self.log.mean(at[inside] - half, at[inside] + half)
+        return {name: (rate, self.alignment.rms) for name, rate in zip(names, values, strict=True)}
+
+    def facts(self) -> dict[str, Any]:
+        """What `solution.json` says of it."""
+        found = self.alignment
+        return {
+            "axes": found.axes,
+            "offset_s": found.offset_s,
+            "offset_sigma_s": found.offset_sigma_s,
+            "correlation": found.correlation,
+            "rotation_ratio": found.ratio,
+        }
+
+
+def _felt(clip: Clip, result: BundleResult, log: GyroLog | None) -> Felt | None:
+    """The gyroscope of a clip, aligned with its frames; None without one, or if it is of another clip."""
+    if log is None and has_telemetry(clip.video):
+        try:
+            log = read_gyro(clip.video)
+        except RsUndistortError as error:
+            warnings.warn(f"without the gyroscope of {clip.video.name}: {error}", RsUndistortWarning, stacklevel=5)
+    if log is None:
+        return None
+    assert result.path is not None
+    pairs, turns = _turns(result.path.path)
+    found = align_gyro(log, result.path.path.time_s, pairs, turns)
+    if isinstance(found, NoAlignment):
+        warnings.warn(f"without the gyroscope: {found.reason}", RsUndistortWarning, stacklevel=5)
+        return None
+    return Felt(found, found.in_camera(log))
+
+
+def _turns(path: CameraPath) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Neighbouring moments (n, 2) of a path, and the rotations (n, 3) from one to the other."""
+    first = np.flatnonzero(path.part[1:] == path.part[:-1])
+    turns = Rotation.from_matrix(path.R_cw[first + 1] @ path.R_cw[first].transpose(0, 2, 1)).as_rotvec()
+    return np.stack([first, first + 1], axis=1), turns
+
+
+def _readout(result: BundleResult) -> ReadoutTime:
+    assert result.path is not None
+    return ReadoutTime(float(result.path.readout_s[0]), float(result.path.sigma_readout_s[0]))
+
+
+def _are_keys(result: BundleResult, clip: Clip) -> NDArray[np.bool_]:
+    keys = {*clip.key_names}
+    return np.array([name in keys for name in result.reconstruction.image_names])
+
+
+def _halves(result: BundleResult, options: BundleOptions) -> tuple[ReadoutTime, ReadoutTime] | None:
+    """What each half of the frames says of the readout; None if there are too few."""
+    rec = result.reconstruction
+    late = np.arange(rec.num_images) >= rec.num_images // 2
+    if rec.num_images < 2 * _LEAST_HALF:
+        return None
+    how = replace(rough_options(options), outlier_rounds=0, refine=())
+    parts = [rec.take_photos(keep) for keep in (~late, late)]
+    if any(part.num_images < _LEAST_HALF or part.num_points < _LEAST_MEASUREMENTS for part in parts):
+        return None
+    first, second = (_readout(bundle_adjust(part, "constant-motion", how)) for part in parts)
+    return first, second
+
+
+def _stabilisation(clip: Clip, result: BundleResult, options: BundleOptions, felt: Felt | None) -> Stabilisation:
+    """Whether the lines of the frames move as the frames do, each frame being asked for its own motion."""
+    assert result.path is not None
+    rec = result.reconstruction
+    free = rec.take_photos(np.arange(rec.num_images) < _FRAMES_ASKED)
+    free = replace(free, bend=np.zeros(0), bend_clock=np.zeros(0))
+    how = replace(rough_options(options), path=None, outlier_rounds=0, refine=(), deviations="model")
+    found = bundle_adjust(free, "rotation", how)
+    rec = found.reconstruction
+    path = result.path.path
+    place = np.array([result.path.names.index(name) for name in rec.image_names])
+    here = CameraPath(
+        path.time_s[place], rec.R_cw, rec.center_w, path.rate[place], path.velocity[place], path.part[place]
+    )
+    span = rec.frame_span()[:, None]
+    log, offset_s = (None, 0.0) if felt is None else (felt.log, felt.alignment.offset_s)
+    return judge_stabilisation(
+        here.time_s, *_turns(here), rec.phi * span, found.sigma_phi * span, log=log, offset_s=offset_s
+    )
+
+
+def _tell(log: StageLog, stage: str, _cost: float) -> None:
+    log.tell(stage, 0)

@@ -1,0 +1,92 @@
+"""What to believe of the path of a video."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..bundle import BundleResult
+from ..critical import Remedy
+from ..rectify import largest_shift_px
+from .judge import Verdict, height_reasons, loose_reasons, unexplained_reasons
+
+__all__ = ["ReadoutTime", "judge_clip"]
+
+# Displacements below this are lost in the interpolation of a photo.
+_UNSEEN_PX = 1.0
+# Standard deviations that tell a readout time from none, and two of them from each other.
+_SIGMAS, _APART = 3.0, 4.0
+
+
+class ReadoutTime(NamedTuple):
+    """Time of the readout of a frame in seconds, and its standard deviation."""
+
+    seconds: float
+    sigma: float
+
+
+def judge_clip(
+    result: BundleResult,
+    keys: BundleResult,
+    halves: tuple[ReadoutTime, ReadoutTime] | None,
+    frame_s: float,
+    remedy: Remedy | None = None,
+    against: str = "",
+) -> Verdict:
+    """Weigh the path of a video.
+
+    Parameters
+    ----------
+    result : BundleResult
+        Of all frames.
+    keys : BundleResult
+        The same of the key frames only.
+    halves : pair of ReadoutTime, optional
+        What the first and the second half of the frames say on their own.
+    frame_s : float
+        Time from frame to frame, which no readout exceeds.
+    remedy : Remedy, optional
+        How well the height of the scene is known.
+    against : str
+        What says that the frames are no longer as they were read, such as stabilisation; empty if nothing does.
+
+    Returns
+    -------
+    Verdict
+        "found" if a readout time is told from none and lines are displaced by it, "not-found" if they are not by more
+        than can be seen, whatever the readout may be within its deviations; else "not-determined".
+    """
+    assert result.path is not None
+    time = ReadoutTime(float(result.path.readout_s[0]), float(result.path.sigma_readout_s[0]))
+    reasons = loose_reasons(keys) + height_reasons(remedy) + unexplained_reasons(keys, None)
+    rec = keys.reconstruction
+    shift = max(largest_shift_px(rec.camera(i), rec.motion(i), rec.shutter_model) for i in range(rec.num_images))
+    most = shift * (abs(time.seconds) + _SIGMAS * time.sigma) / max(abs(time.seconds), 1e-9)
+    if against:
+        return Verdict("not-determined", "doubtful", (f"{against}.", *reasons), {}, tuple(rec.image_names))
+    if not most > _UNSEEN_PX:
+        shutter = "not-found"
+    elif abs(time.seconds) > _SIGMAS * time.sigma:
+        shutter = "found"
+    else:
+        shutter = "not-determined"
+        reasons.append(
+            f"The camera moved too little to tell how long a frame takes to be read: {1e3 * time.seconds:.1f} +- "
+            f"{1e3 * time.sigma:.1f} ms."
+        )
+    if shutter == "found" and abs(time.seconds) - _SIGMAS * time.sigma > frame_s:
+        reasons.append(
+            f"The readout is said to take {1e3 * abs(time.seconds):.1f} ms, longer than the {1e3 * frame_s:.1f} ms "
+            "from frame to frame: something else bends the frames."
+        )
+    if halves is not None:
+        a, b = halves
+        apart = abs(a.seconds - b.seconds) / float(np.hypot(a.sigma, b.sigma))
+        if apart > _APART:
+            reasons.append(
+                f"The first half of the video says that a frame takes {1e3 * a.seconds:.1f} ms to be read, the second "
+                f"{1e3 * b.seconds:.1f} ms, {apart:.0f} standard deviations apart."
+            )
+    lens_only = tuple(rec.image_names) if shutter == "not-determined" else ()
+    return Verdict(shutter, "doubtful" if reasons else "trusted", tuple(reasons), {}, lens_only)
