@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -199,13 +199,14 @@ def test_a_clip_is_written_with_its_truth_and_twins(tmp_path):
     assert truth.options["readout_ms"] == pytest.approx(24)
     for image, view in zip(truth.images, recipe.views, strict=True):
         back = replace(view, R_cw=image.R_cw, center_w=image.center_w, motion=image.motion)
-        for told, rendered in zip(line_poses(recipe.cameras["1"], back), line_poses(recipe.cameras["1"], view)):
+        for told, rendered in zip(
+            line_poses(recipe.cameras["1"], back), line_poses(recipe.cameras["1"], view), strict=True
+        ):
             np.testing.assert_allclose(told, rendered, atol=1e-13)
-    # a decoded frame is the photo but for the coding, whose colours have half the resolution
+    # a decoded frame is the photo but for the coding
     photo = render_view(recipe.scene, recipe.cameras["1"], recipe.views[5], samples=4)
     frame = read_photo(tmp_path / "frames" / "clip_000005.png").pixels
-    grey = [cv2.cvtColor(each, cv2.COLOR_BGR2GRAY) for each in (photo, frame)]
-    assert psnr(grey[0], grey[1]) > 38
+    assert psnr(photo, frame) > 40
 
     # frames are judged by the twins that there are
     options = RectifyOptions(depth="infinity")
@@ -264,8 +265,8 @@ def test_clips_that_make_no_sense_are_refused_in_one_line(tmp_path, changes, say
 
 def test_a_video_of_odd_size_is_refused(tmp_path):
     pytest.importorskip("av")
-    with pytest.raises(InputError, match="7x4 pixels: H.264 needs an even width"):
-        write_video(tmp_path / "a.mp4", [np.zeros((4, 7, 3), np.uint8)], 25)
+    with pytest.raises(InputError, match=r"7x4 pixels: H\.264 needs an even width"):
+        write_video(tmp_path / "a.mp4", [np.zeros((4, 7, 3), np.uint8)], Fraction(25))
 
 
 def test_committed_walk_is_what_its_recipe_makes(tmp_path):
@@ -282,7 +283,7 @@ def test_committed_walk_is_what_its_recipe_makes(tmp_path):
     view = recipe.views[30]
     top = replace(recipe.cameras["1"], height=96)
     image = render_view(recipe.scene, top, view, **recipe.render_options)
-    assert psnr(image, read_photo(tmp_path / "frames" / view.name).pixels[:96]) > 36
+    assert psnr(image, read_photo(tmp_path / "frames" / view.name).pixels[:96]) > 40
 
 
 def test_true_motion_takes_the_shutter_out_of_the_walk(tmp_path):

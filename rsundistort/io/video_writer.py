@@ -15,8 +15,10 @@ from ..errors import InputError
 __all__ = ["write_video"]
 
 
-def write_video(path: Path | str, frames: Iterable[NDArray[np.uint8]], fps: Fraction, crf: int = 12) -> None:
-    """Write frames as H.264 in MP4, at a constant rate.
+def write_video(path: Path | str, frames: Iterable[NDArray[np.uint8]], fps: Fraction, crf: int = 8) -> None:
+    """Write frames as H.264 in MP4, at a constant rate; the same bytes for the same pixels and x264.
+
+    Colours keep their full resolution (4:4:4): halved, it alone costs 2 dB. FFmpeg reads that, few browsers do.
 
     Parameters
     ----------
@@ -27,7 +29,7 @@ def write_video(path: Path | str, frames: Iterable[NDArray[np.uint8]], fps: Frac
     fps : Fraction
         Frames a second.
     crf : int
-        Constant rate factor of x264, 0 (without loss but for the colours, which have half the resolution) to 51.
+        Constant rate factor of x264, 0 (without loss but for the rounding of colours) to 51.
 
     Raises
     ------
@@ -47,7 +49,7 @@ def write_video(path: Path | str, frames: Iterable[NDArray[np.uint8]], fps: Frac
                     raise InputError(f"a video of {width}x{height} pixels: H.264 needs an even width and height")
                 # one thread: the bytes do not depend on how many there are
                 stream = container.add_stream("libx264", rate=fps, options={"crf": str(crf), "preset": "slow"})
-                stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+                stream.width, stream.height, stream.pix_fmt = width, height, "yuv444p"
                 stream.codec_context.thread_count = 1
             container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="bgr24")))
         if stream is not None:

@@ -23,8 +23,16 @@ from ..io.record import Record
 from ..io.video_writer import write_video
 from ..model import Solution, SolvedImage
 from ..synthetic import (
-    Recipe, TruePoints, View, add_noise, check_recipe, load_recipe, render_depth, render_view, true_points,
-)  # fmt: skip
+    Recipe,
+    TruePoints,
+    View,
+    add_noise,
+    check_recipe,
+    load_recipe,
+    render_depth,
+    render_view,
+    true_points,
+)
 from ..synthetic import rs_shift_px as shift_in_scene
 
 __all__ = ["SceneOptions", "simulate_scene"]

@@ -208,11 +208,14 @@ def clip_of(entry: Any, twins: Any, seed: int) -> Clip:
     if not isinstance(level, bool):
         raise FormatError(f"path: level={level!r}, expected true or false")
     steps = take(entry.get("steps", {}), "path: steps", (), ("hz", "up_m", "side_m"))
-    place, target, roll = _way(entry, pan, level, (num - 1) / fps)
     path = CameraPath(
-        place, target, roll, _tremor(entry.get("tremor", {}), pan, seed),
-        *(number(steps.get(key, 0.0), f"path: steps: {key}") for key in ("hz", "up_m", "side_m")), level,
-    )  # fmt: skip
+        *_way(entry, pan, level, (num - 1) / fps),
+        tremor=_tremor(entry.get("tremor", {}), pan, seed),
+        steps_hz=number(steps.get("hz", 0.0), "path: steps: hz"),
+        bob=number(steps.get("up_m", 0.0), "path: steps: up_m"),
+        sway=number(steps.get("side_m", 0.0), "path: steps: side_m"),
+        level=level,
+    )
     every = count(take(twins, "twins", (), ("every",)).get("every", 10), "twins: every")
     clip = Clip(path, num, Fraction(fps).limit_denominator(1001), readout, every)
     try:
@@ -230,7 +233,9 @@ def _tremor(entry: Any, pan: bool, seed: int) -> Tremor:
     return Tremor(float(np.radians(rotation)), travel, (low, high), num, seed)
 
 
-def _way(entry: dict[str, Any], pan: bool, level: bool, end_s: float) -> tuple[Callable[[Array], Array], ...]:
+def _way(
+    entry: dict[str, Any], pan: bool, level: bool, end_s: float
+) -> tuple[Callable[[Array], Array], Callable[[Array], Array], Callable[[Array], Array]]:
     """Place, target and roll as functions of time: cubic splines through the way points, evenly spread over it."""
     if not isinstance(entry["way"], list) or not entry["way"]:
         raise FormatError("path: way has no points, expected one or more")

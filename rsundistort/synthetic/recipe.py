@@ -231,10 +231,12 @@ def _frames(clip: Clip, cameras: dict[str, Camera], exposed: float) -> tuple[Vie
 
 def _parse(data: Any, folder: Path) -> Recipe:
     keys = ("format", "version", "name", "seed", "render", "light", "textures", "surfaces", "path")
+    optional = ("camera", "cameras", "shutter", "noise", "points")
     filmed = isinstance(data, dict) and is_clip(data.get("path"))
-    # the path of a clip is its motion
-    keys, optional = (keys, ("twins",)) if filmed else ((*keys, "motion"), ())
-    take(data, "recipe", keys, ("camera", "cameras", "shutter", "noise", "points", *optional))
+    if filmed:  # along its path, which is its motion
+        take(data, "recipe", keys, (*optional, "twins"))
+    else:
+        take(data, "recipe", (*keys, "motion"), optional)
     if data["format"] != _FORMAT or data["version"] != _VERSION:
         raise FormatError(f"format {data['format']!r} version {data['version']!r}, expected {_FORMAT} {_VERSION}")
     seed = data["seed"]
