@@ -21,7 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from rsundistort import SceneOptions, read_solution, simulate_scene
+from rsundistort import read_solution
+from rsundistort.simulate import SceneOptions, simulate_scene
 
 KINDS = ("walk", "level", "pan", "two")
 WIDTH, HEIGHT, FOCAL_PX = 640, 360, 500.0

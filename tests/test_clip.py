@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rsundistort import DepthMap, FormatError, InputError, evaluate, psnr, read_solution, rectify
+from rsundistort import DepthMap, evaluate, read_solution, rectify
 from rsundistort.batch import RectifyOptions, rectify_folder
+from rsundistort.errors import FormatError, InputError
+from rsundistort.evaluation import psnr
 from rsundistort.io import read_photo
 from rsundistort.io.video import extract_frames
 from rsundistort.io.video_writer import write_video
@@ -213,8 +215,8 @@ def test_a_clip_is_written_with_its_truth_and_twins(tmp_path):
     rectify_folder(tmp_path / "frames", tmp_path / "a" / "ground_truth.json", tmp_path / "back", options)
     (tmp_path / "back" / "solution.json").write_bytes((tmp_path / "a" / "ground_truth.json").read_bytes())
     found = evaluate(tmp_path / "back", tmp_path / "a" / "ground_truth.json", raw=tmp_path / "frames")
-    assert sorted(found["psnr_db"]["photos"]) == [f"{stem}.png" for stem in twins]
-    assert found["rotation_deg"]["max"] < 1e-9
+    assert sorted(found.psnr_db.photos) == [f"{stem}.png" for stem in twins]
+    assert found.rotation_deg.max < 1e-9
 
 
 def test_two_frames_are_a_clip(tmp_path):
