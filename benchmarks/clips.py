@@ -124,7 +124,10 @@ def path(kind: str, rng: np.random.Generator, num_frames: int) -> dict[str, Any]
 
 
 def clip_recipe(kind: str, seed: int, num_frames: int = 60) -> dict[str, Any]:
-    """The recipe of a random clip; the same kind and seed give the same."""
+    """The recipe of a random clip; the same kind and seed give the same.
+
+    Of 40 to 150 frames: the way points are as many, so that shorter ones turn faster; longer ones leave the yard.
+    """
     rng = np.random.default_rng([seed, KINDS.index(kind)])
     K = [[FOCAL_PX, 0, WIDTH / 2 + 1.5], [0, FOCAL_PX, HEIGHT / 2 - 1.75], [0, 0, 1]]
     return {
