@@ -137,8 +137,8 @@ def warp(photos: Path, out: Path, given: dict[str, Any], quiet: bool) -> None:
 def scene(recipe: Path, out: Path, given: dict[str, Any], quiet: bool) -> None:
     """Render the rolling-shutter photos of a scene, with everything that is true about them.
 
-    OUT gets photos/, global/ (the twins), depth/, global-depth/, tracks.npz, camera.json (cameras.json if there are
-    several), ground_truth.json and the recipe.
+    OUT gets photos/ (or clip.mp4, if the recipe's path is that of a video), global/ (the twins), depth/, global-depth/,
+    tracks.npz, camera.json (cameras.json if there are several), ground_truth.json and the recipe.
     """
     with errors_for_people(), progress_bars(Talk(quiet)) as progress:
         from rsundistort.simulate import SceneOptions, simulate_scene

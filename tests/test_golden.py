@@ -37,6 +37,8 @@ def chosen_photos():
     """Two photos a scene: where the shutter bent most, of different cameras if the scene has several."""
     chosen = []
     for truth_path in sorted(SCENES.glob("*/ground_truth.json")):
+        if not (truth_path.parent / "photos").is_dir():  # a clip, whose frames depend on the decoder
+            continue
         truth = read_solution(truth_path)
         by_shift = []
         for image in truth.registered:

@@ -54,8 +54,9 @@ def evaluate(
     poses : path, optional
         Solution to take the true poses from, e.g. of the same photos without motion.
     twins : path, optional
-        Folder of global-shutter photos of the same names, taken by the same camera: a lens is taken out of them before
-        the comparison. `global` beside the truth file when there is one.
+        Folder of global-shutter photos of the same names (or JPEG files of the same stems), taken by the same camera: a
+        lens is taken out of them before the comparison. `global` beside the truth file when there is one. Photos
+        without a twin are not compared, if any has one.
     raw : path, optional
         Folder of the photos that were rectified, for the figure before; `photos` beside the truth file.
     progress : callable, optional
@@ -95,6 +96,13 @@ def evaluate(
     )
 
 
+def _twin(folder: Path, name: str) -> Path:
+    """Where the twin of a photo is: a frame of a video is called as a PNG file, its twin may be a JPEG."""
+    path = folder / output_name(name)
+    small = path.with_suffix(".jpg")
+    return small if small.is_file() and not path.is_file() else path
+
+
 def _without_lens(
     twin: NDArray[Any], image: SolvedImage, solution: Solution, truth: Solution
 ) -> tuple[NDArray[Any], NDArray[np.uint8]]:
@@ -122,11 +130,12 @@ def _image_errors(
     raw_as = solution.options.get("raw_as", "tif")
     after: dict[str, float] = {}
     before: dict[str, float] = {}
-    registered = solution.registered
+    twin_of = {image.name: _twin(twins, image.name) for image in solution.registered}
+    some = any(path.is_file() for path in twin_of.values())
+    registered = [image for image in solution.registered if twin_of[image.name].is_file() or not some]
     log.begin("comparing", len(registered))
     for done, image in enumerate(registered, start=1):
-        name = output_name(image.name)
-        taken = read_photo(twins / name).pixels
+        taken = read_photo(twin_of[image.name]).pixels
         files = out / "images" / output_name(image.name, raw_as), out / "masks" / masks[image.name]
         photo, mask = (turn_pixels(read_photo(path).pixels, INVERSE[turns[image.name]]) for path in files)
         try:

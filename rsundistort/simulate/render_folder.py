@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -19,8 +20,19 @@ from ..errors import InputError
 from ..io import output_folder, write_solution
 from ..io.cameras import camera_to_json
 from ..io.record import Record
+from ..io.video_writer import write_video
 from ..model import Solution, SolvedImage
-from ..synthetic import Recipe, TruePoints, add_noise, check_recipe, load_recipe, render_depth, render_view, true_points
+from ..synthetic import (
+    Recipe,
+    TruePoints,
+    View,
+    add_noise,
+    check_recipe,
+    load_recipe,
+    render_depth,
+    render_view,
+    true_points,
+)
 from ..synthetic import rs_shift_px as shift_in_scene
 
 __all__ = ["SceneOptions", "simulate_scene"]
@@ -54,9 +66,10 @@ def simulate_scene(
 ) -> Solution:
     """Render a recipe: rolling-shutter photos and what is true about them.
 
-    Writes `photos/`; `global/`, their global-shutter twins, from the pose of the principal row, without noise and blur;
-    `depth/` and `global-depth/` (float32 TIFF, z in the camera at the moment of the pixel's line, inf where nothing
-    is); `tracks.npz` (points on the surfaces with the pixels that show them; keys as in `TruePoints`, with `K`,
+    Writes `photos/`, or of a recipe whose path is that of a video `clip.mp4`; `global/`, their global-shutter twins,
+    from the pose of the principal row, without noise and blur, of a video of some frames only; `depth/` and
+    `global-depth/` of what has twins (float32 TIFF, z in the camera at the moment of the pixel's line, inf where
+    nothing is); `tracks.npz` (points on the surfaces with the pixels that show them; keys as in `TruePoints`, with `K`,
     `width`, `height`, `R_cw`, `center_w`, `image_names` of the photos); `camera.json`, or `cameras.json` where
     there are several; `ground_truth.json`; and the recipe with the files that it names. The same
     recipe gives the same bytes.
@@ -94,31 +107,37 @@ def simulate_scene(
     read = {} if source is None else {"recipe.json": source, **{name: source.parent / name for name in loaded.files}}
     # a recipe is also rendered where it was copied to
     copied = {name: file for name, file in read.items() if not ((out / name).exists() and file.samefile(out / name))}
-    folders = ("photos", "global", *(("depth", "global-depth") if options.depth else ()))
+    twins = {view.name for view in loaded.twins}
+    folders = (*(() if loaded.clip else ("photos",)), "global", *(("depth", "global-depth") if options.depth else ()))
     with output_folder(out, overwrite=options.overwrite, apart_from=list(read.values())) as scratch:
         made = [
-            f"{folder}/{_map_of(view.name) if 'depth' in folder else view.name}"
+            f"{folder}/{_file_of(loaded, folder, view.name)}"
             for folder in folders
             for view in loaded.views
+            if folder == "photos" or view.name in twins
         ]
-        Record(out).check([*made, *_FILES, _cameras_file(loaded), *copied], read.values())
+        clip = [] if loaded.clip is None else [loaded.clip.NAME]
+        Record(out).check([*made, *clip, *_FILES, _cameras_file(loaded), *copied], read.values())
         log.begin("points")
         points = true_points(loaded)
         log.end("points")
         for folder in folders:
             (scratch / folder).mkdir()
         log.begin("rendering", len(loaded.views))
-        for number, view in enumerate(loaded.views):
-            camera = loaded.camera(view)
-            for folder, each in (("photos", view), ("global", view.at_once())):
-                photo = render_view(loaded.scene, camera, each, **loaded.render_options)
-                if folder == "photos":
-                    photo = add_noise(photo, loaded.noise, loaded.scene.seed, number)
-                (scratch / folder / view.name).write_bytes(_encode_jpeg(photo, loaded.jpeg_quality))
-                if options.depth:
-                    to = scratch / ("depth" if folder == "photos" else "global-depth") / _map_of(view.name)
-                    to.write_bytes(bytes(cv2.imencode(".tif", render_depth(loaded.scene, camera, each))[1]))
-            log.tell("rendering", number + 1, len(loaded.views))
+
+        def rendered() -> Iterator[tuple[View, NDArray[np.uint8]]]:
+            """The photos, whose twins and depth maps are written meanwhile."""
+            for number, view in enumerate(loaded.views):
+                yield view, add_noise(_render(loaded, view), loaded.noise, loaded.scene.seed, number)
+                if view.name in twins:
+                    _write_twin(scratch, loaded, view, options.depth)
+                log.tell("rendering", number + 1, len(loaded.views))
+
+        if loaded.clip is not None:
+            write_video(scratch / loaded.clip.NAME, (photo for _, photo in rendered()), loaded.clip.fps)
+        else:
+            for view, photo in rendered():
+                (scratch / "photos" / view.name).write_bytes(_encode_jpeg(photo, loaded.jpeg_quality))
         log.end("rendering")
         truth = _truth(loaded, points)
         _write_cameras(scratch, loaded)
@@ -131,9 +150,25 @@ def simulate_scene(
     return truth
 
 
-def _map_of(name: str) -> str:
-    """Name of a photo's depth map."""
-    return f"{Path(name).stem}.tif"
+def _render(recipe: Recipe, view: View) -> NDArray[np.uint8]:
+    return render_view(recipe.scene, recipe.camera(view), view, **recipe.render_options)
+
+
+def _write_twin(folder: Path, recipe: Recipe, view: View, depth: bool) -> None:
+    """The global-shutter twin of a photo, and the depth maps of both."""
+    twin = view.at_once()
+    photo = _encode_jpeg(_render(recipe, twin), recipe.jpeg_quality)
+    (folder / "global" / _file_of(recipe, "global", view.name)).write_bytes(photo)
+    if depth:
+        for to, each in (("depth", view), ("global-depth", twin)):
+            values = render_depth(recipe.scene, recipe.camera(view), each)
+            (folder / to / _file_of(recipe, to, view.name)).write_bytes(bytes(cv2.imencode(".tif", values)[1]))
+
+
+def _file_of(recipe: Recipe, folder: str, name: str) -> str:
+    """Name of a photo's file in a folder: depth maps are TIFF, twins of a clip's frames JPEG, which are smaller."""
+    suffix = ".tif" if "depth" in folder else ".jpg" if recipe.clip else Path(name).suffix
+    return Path(name).with_suffix(suffix).name
 
 
 def _truth(recipe: Recipe, points: TruePoints) -> Solution:
@@ -153,14 +188,18 @@ def _truth(recipe: Recipe, points: TruePoints) -> Solution:
         for view, number in zip(recipe.views, counts, strict=True)
     )
     options: dict[str, Any] = {"simulation": "scene", "recipe": recipe.name, "seed": recipe.scene.seed}
+    quality: dict[str, Any] = {"num_points": len(points.points_w), "num_observations": len(points.frame_idx)}
     if recipe.readout_ms is not None:
         options["readout_ms"] = recipe.readout_ms
+    if (clip := recipe.clip) is not None:
+        options["video"] = {"name": clip.NAME, "fps": float(clip.fps), "time_s": clip.time_s}
+        quality["readout_time"] = {"seconds": clip.readout_s, "sigma": 0.0, "source": "recipe"}
     return Solution(
         shutter_model="constant-motion" if moves else "rotation",
         cameras=recipe.cameras,
         rectified_cameras={key: camera.pinhole() for key, camera in recipe.cameras.items()},
         images=images,
-        quality={"num_points": len(points.points_w), "num_observations": len(points.frame_idx)},
+        quality=quality,
         options=options,
         generator={"rsundistort": version("rsundistort")},
     )

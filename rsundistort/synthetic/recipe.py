@@ -18,6 +18,7 @@ from ..io.json_text import read_json
 from ..model.camera import Camera
 from ..model.checks import check_finite, check_rotations, frozen
 from ..model.motion import RowMotion
+from .clip import Clip, clip_of, is_clip
 from .entries import number, take
 from .flight import Pose, motions_of, poses_and_motions, poses_of
 from .lens import undistort_to_rays
@@ -109,6 +110,8 @@ class Recipe:
         Of the rolling-shutter photos; the twins have none.
     readout_ms : float or None
         Time over which a frame is read, where the recipe says it.
+    clip : Clip or None
+        The video whose frames the views are, where the recipe's path is that of one.
     num_points : int
         True points to give away with the photos.
     owners : tuple of str
@@ -125,6 +128,7 @@ class Recipe:
     jpeg_quality: int
     noise: Noise = Noise()
     readout_ms: float | None = None
+    clip: Clip | None = None
     num_points: int = 1000
     owners: tuple[str, ...] = ()
     files: tuple[str, ...] = ()
@@ -132,6 +136,11 @@ class Recipe:
     def camera(self, view: View) -> Camera:
         """The camera that took a view."""
         return self.cameras[view.camera_id]
+
+    @property
+    def twins(self) -> tuple[View, ...]:
+        """The views that have a global-shutter twin: all photos, and some frames of a clip."""
+        return self.views if self.clip is None else self.views[:: self.clip.twins_every]
 
 
 def _texture(entry: Any, where: str, folder: Path) -> Texture:
@@ -146,7 +155,8 @@ def _texture(entry: Any, where: str, folder: Path) -> Texture:
 def _files(data: dict[str, Any]) -> tuple[str, ...]:
     """Files beside the recipe that it names; none may lie outside its folder, since they are copied with it."""
     named = [each["path"] for each in (*data["surfaces"], *data["textures"].values()) if "path" in each]
-    named += [each for key in ("tables", "log") if isinstance(each := data["motion"].get(key), str)]
+    motion = data.get("motion", {})
+    named += [each for key in ("tables", "log") if isinstance(each := motion.get(key), str)]
     for name in named:
         if Path(name).is_absolute() or ".." in Path(name).parts:
             raise FormatError(f"file {name!r}: expected a path below the recipe's own folder")
@@ -173,12 +183,13 @@ def _cameras(data: dict[str, Any]) -> dict[str, Camera]:
     return cameras
 
 
-def _shutter(entry: Any) -> tuple[float | None, float]:
-    """Readout time in ms, and the share of it for which a line is exposed."""
+def _shutter(entry: Any, clip: Clip | None) -> tuple[float | None, float]:
+    """Readout time in ms, which the path of a clip says, and the share of it for which a line is exposed."""
+    known = None if clip is None else 1e3 * clip.readout_s
     if entry is None:
-        return None, 0.0
-    take(entry, "shutter", ("readout_ms",), ("exposure_ms",))
-    readout = number(entry["readout_ms"], "shutter.readout_ms")
+        return known, 0.0
+    take(entry, "shutter", ("readout_ms",) if clip is None else (), ("exposure_ms",))
+    readout = number(entry["readout_ms"], "shutter.readout_ms") if known is None else known
     exposure = number(entry.get("exposure_ms", 0.0), "shutter.exposure_ms")
     if readout <= 0 or exposure < 0:
         raise FormatError(f"shutter: readout_ms={readout:g}, exposure_ms={exposure:g}; expected times")
@@ -205,9 +216,27 @@ def _views(
     )
 
 
+def _frames(clip: Clip, cameras: dict[str, Camera], exposed: float) -> tuple[View, ...]:
+    """The views of a clip."""
+    if len(cameras) > 1:
+        raise FormatError(f"cameras: a clip is taken by one camera, got {len(cameras)}")
+    ((id_, camera),) = cameras.items()
+    if camera.width % 2 or camera.height % 2:
+        raise FormatError(f"camera: {camera.width}x{camera.height} pixels; a clip needs an even width and height")
+    return tuple(
+        View(name, *clip.frame(number, camera), id_, exposed * camera.frame_span)
+        for number, name in enumerate(clip.names)
+    )
+
+
 def _parse(data: Any, folder: Path) -> Recipe:
-    keys = ("format", "version", "name", "seed", "render", "light", "textures", "surfaces", "path", "motion")
-    take(data, "recipe", keys, ("camera", "cameras", "shutter", "noise", "points"))
+    keys = ("format", "version", "name", "seed", "render", "light", "textures", "surfaces", "path")
+    optional = ("camera", "cameras", "shutter", "noise", "points")
+    filmed = isinstance(data, dict) and is_clip(data.get("path"))
+    if filmed:  # along its path, which is its motion
+        take(data, "recipe", keys, (*optional, "twins"))
+    else:
+        take(data, "recipe", (*keys, "motion"), optional)
     if data["format"] != _FORMAT or data["version"] != _VERSION:
         raise FormatError(f"format {data['format']!r} version {data['version']!r}, expected {_FORMAT} {_VERSION}")
     seed = data["seed"]
@@ -225,7 +254,9 @@ def _parse(data: Any, folder: Path) -> Recipe:
         owners += [f"{where} ({entry['kind']})"] * len(added)
     light = Light(**take(data["light"], "light", (), tuple(f.name for f in fields(Light))))
     noise = Noise(**take(data.get("noise", {}), "noise", (), ("read_grey", "shot_grey")))
-    readout_ms, exposed = _shutter(data.get("shutter"))
+    clip = clip_of(data["path"], data.get("twins", {}), seed) if filmed else None
+    readout_ms, exposed = _shutter(data.get("shutter"), clip)
+    views = _views(data, cameras, readout_ms, exposed, folder) if clip is None else _frames(clip, cameras, exposed)
     options = dict(take(data["render"], "render", ("jpeg_quality",), ("samples", "spread_px", "exposure")))
     num_points = data.get("points", 1000)
     if not isinstance(num_points, int) or num_points < 0:
@@ -234,11 +265,12 @@ def _parse(data: Any, folder: Path) -> Recipe:
         name=data["name"],
         scene=Scene(tuple(patches), textures, light, seed),
         cameras=cameras,
-        views=_views(data, cameras, readout_ms, exposed, folder),
+        views=views,
         render_options=options,
         jpeg_quality=options.pop("jpeg_quality"),
         noise=noise,
         readout_ms=readout_ms,
+        clip=clip,
         num_points=num_points,
         owners=tuple(owners),
         files=files,

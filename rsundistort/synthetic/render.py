@@ -74,8 +74,9 @@ def pixel_rays(camera: Camera, view: View, uv_raw: ArrayLike) -> tuple[NDArray[n
     axis, sign = READOUTS[camera.readout]
     tau = sign * (uv[:, axis] - camera.K[axis, 2]) / camera.K[axis, axis]
     rays_c = np.column_stack([undistort_to_rays(uv, camera), np.ones(len(uv))])
+    tau, line = np.unique(tau, return_inverse=True)  # of whole photos there are few
     turn, way = view.motion.at(tau)
-    return view.center_w + way, Rotation.from_rotvec(-turn).apply(rays_c) @ view.R_cw
+    return view.center_w + way[line], Rotation.from_rotvec(-turn)[line].apply(rays_c) @ view.R_cw
 
 
 def _develop(radiance: NDArray[np.float64], exposure: float) -> NDArray[np.uint8]:
