@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from clips import HandHeld, filmed, rotation_errors_deg
-from scipy.interpolate import CubicHermiteSpline
+from scipy.interpolate import BPoly
 from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, Reconstruction, bundle_adjust
@@ -41,41 +41,87 @@ def test_the_inverse_left_jacobian_is_that_of_the_logarithm() -> None:
 def test_the_jacobians_of_the_path_are_those_of_differences() -> None:
     truth, times = filmed(HandHeld(3, swing=2.0), 8)
     prior = PathPrior(FramePath(times, FRAME_S), truth, (0.02, 0.3))
-    rates = prior.start(truth).rates + np.random.default_rng(0).normal(0, 0.02, (8, 6))
-    res, by_first, by_second = prior.jacobians(truth.R_cw, truth.center_w, rates)
-    np.testing.assert_allclose(res.reshape(-1, 2, 6), prior.residuals(truth.R_cw, truth.center_w, rates))
-    step = 1e-6
+    rng = np.random.default_rng(0)
+    start = prior.start(truth)
+    state = replace(start, rates=start.rates + rng.normal(0, 0.02, (8, 6)), changes=rng.normal(0, 0.02, (8, 6)))
+    res, by_first, by_second = prior.jacobians(truth.R_cw, truth.center_w, state)
+    np.testing.assert_allclose(res, prior.residuals(truth.R_cw, truth.center_w, state))
+    step, pair = 1e-6, 3
     for of, J in ((prior.first, by_first), (prior.second, by_second)):
-        for unknown in range(12):
+        for unknown in range(18):
             moved = []
             for sign in (1.0, -1.0):
-                R_cw, center_w, own = truth.R_cw.copy(), truth.center_w.copy(), rates.copy()
-                d = np.zeros(12)
+                R_cw, center_w, rates, changes = (
+                    each.copy() for each in (truth.R_cw, truth.center_w, state.rates, state.changes)
+                )
+                d = np.zeros(18)
                 d[unknown] = sign * step
-                pair = 3  # only this pair's end is moved, so that no other residual of it changes
-                R_cw[of[pair]] = Rotation.from_rotvec(d[:3]).as_matrix() @ R_cw[of[pair]]
-                center_w[of[pair]] += d[3:6]
-                own[of[pair]] += d[6:]
-                moved.append(prior.residuals(R_cw, center_w, own)[pair].ravel())
-            np.testing.assert_allclose(J[3, :, unknown], (moved[0] - moved[1]) / (2 * step), rtol=2e-5, atol=2e-5)
+                image = of[pair]
+                R_cw[image] = Rotation.from_rotvec(d[:3]).as_matrix() @ R_cw[image]
+                center_w[image] += d[3:6]
+                rates[image] += d[6:12]
+                changes[image] += d[12:]
+                moved.append(prior.residuals(R_cw, center_w, replace(state, rates=rates, changes=changes))[pair])
+            np.testing.assert_allclose(J[pair, :, unknown], (moved[0] - moved[1]) / (2 * step), rtol=5e-5, atol=5e-4)
+
+
+def test_residuals_of_a_path_are_white() -> None:
+    """A path that is drawn: acceleration by white noise, in small steps."""
+    rng = np.random.default_rng(2)
+    fine, frames = 200, 400
+    noise, h = rng.normal(0, np.sqrt(1 / fine) * 0.3, (frames * fine, 3)), 1 / fine
+    # each kick in the middle of its step, exactly from step to step
+    changes = np.cumsum(noise, axis=0) - noise
+    rates = np.cumsum(h * changes + h / 2 * noise, axis=0)
+    rates -= h * changes + h / 2 * noise
+    steps = h * rates + h**2 / 2 * changes + h**2 / 8 * noise
+    centers = np.cumsum(steps, axis=0) - steps
+    at = np.arange(0, frames * fine, fine)
+    truth, _ = filmed(HandHeld(0), 2)
+    names = [f"{k}.png" for k in range(frames)]
+    rec = replace(
+        truth, image_names=names, camera_idx=np.zeros(frames, int), R_cw=np.tile(np.eye(3), (frames, 1, 1)),
+        center_w=centers[at], phi=np.zeros(0), velocity=np.zeros(0), variation=np.zeros(0), bend=np.zeros(0),
+        bend_clock=np.zeros(0),
+    )  # fmt: skip
+    prior = PathPrior(FramePath({name: float(k) for k, name in enumerate(names)}, 1.0), rec, (1.0, 0.3))
+    state = State(np.hstack([0 * rates[at], rates[at]]), np.hstack([0 * changes[at], changes[at]]), np.ones(1))
+    res = prior.residuals(rec.R_cw, rec.center_w, state).reshape(-1, 3, 6)[:, :, 3:]
+    covariance = np.cov(res.transpose(1, 0, 2).reshape(3, -1))
+    np.testing.assert_allclose(covariance, np.eye(3), atol=0.15)
+
+
+def true_path(hand: HandHeld, time: np.ndarray) -> CameraPath:
+    """The path of a hand with its derivatives by differences."""
+    h = 1e-4
+
+    def rate(at: np.ndarray) -> np.ndarray:
+        return (
+            Rotation.from_matrix(hand.rotations(at + h)) * Rotation.from_matrix(hand.rotations(at - h)).inv()
+        ).as_rotvec() / (2 * h)
+
+    def velocity(at: np.ndarray) -> np.ndarray:
+        return (hand.centers(at + h) - hand.centers(at - h)) / (2 * h)
+
+    return CameraPath(
+        time, hand.rotations(time), hand.centers(time), rate(time), velocity(time),
+        (rate(time + h) - rate(time - h)) / (2 * h), (velocity(time + h) - velocity(time - h)) / (2 * h),
+    )  # fmt: skip
 
 
 def test_a_path_passes_through_its_moments_with_their_rates() -> None:
     hand = HandHeld(1)
     time = np.arange(10) * FRAME_S
-    h = 1e-5
-    between = Rotation.from_matrix(hand.rotations(time + h)) * Rotation.from_matrix(hand.rotations(time - h)).inv()
-    velocity = (hand.centers(time + h) - hand.centers(time - h)) / (2 * h)
-    path = CameraPath(time, hand.rotations(time), hand.centers(time), between.as_rotvec() / (2 * h), velocity)
-    R_cw, center_w = path.poses_at(time)
+    path = true_path(hand, time)
+    R_cw, _ = path.poses_at(time)
     np.testing.assert_allclose(R_cw, hand.rotations(time), atol=1e-12)
     fine = np.linspace(time[0], time[-1], 200)
     R_cw, center_w = path.poses_at(fine)
-    expected = CubicHermiteSpline(time, hand.centers(time), velocity)(fine)
-    np.testing.assert_allclose(center_w, expected, atol=1e-12)
-    # a tremor of 11 Hz at 30 frames a second, between which a cubic cannot know all
+    derivatives = np.stack([path.center_w, path.velocity, path.acceleration], axis=1)
+    np.testing.assert_allclose(center_w, BPoly.from_derivatives(time, derivatives)(fine), atol=1e-12)
+    # a tremor of 11 Hz at 30 frames a second
     apart = Rotation.from_matrix(R_cw @ hand.rotations(fine).transpose(0, 2, 1)).magnitude()
-    assert apart.max() < 2e-3
+    assert apart.max() < 1e-4
 
 
 def test_the_motion_of_a_frame_is_that_of_the_path_around_it() -> None:
@@ -177,5 +223,5 @@ def test_frames_on_a_path_move_by_constant_motion() -> None:
 
 
 def test_the_state_of_a_path_gives_the_motions() -> None:
-    state = State(np.arange(12.0).reshape(2, 6), np.array([0.5, 2.0]))
+    state = State(np.arange(12.0).reshape(2, 6), np.zeros((2, 6)), np.array([0.5, 2.0]))
     np.testing.assert_array_equal(state.motions(np.array([1, 0])), [np.arange(6) * 2.0, np.arange(6, 12) * 0.5])

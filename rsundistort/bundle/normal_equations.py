@@ -171,8 +171,9 @@ class NormalEquations:
         Which photo sees which point, and how the reduced system is solved.
     cost : float
         Cost at the state.
-    res, J_frame : (o, 2), (o, 2, nb) array
-        Weighted residuals and Jacobians; that of the point is minus that of the centre.
+    res, J_frame : (o, 2), (o, 2, seen) array
+        Weighted residuals and Jacobians, of the first unknowns of the photos, to which only priors may add; that of
+        the point is minus that of the centre.
     prior_diag, prior_gradient : (m, nb) array
         Diagonal Hessian and gradient of the priors of the photos.
     border : Border
@@ -208,12 +209,13 @@ class NormalEquations:
         n = len(s.point_of)
         self._J = J_frame
         self.blocks = res, J_frame
-        self._unknowns = unknowns_of(nb)
+        self._num_unseen = nb - J_frame.shape[2]
+        self._unknowns = unknowns_of(J_frame.shape[2])
         self._prior_diag = prior_diag
         self._V = np.empty((n, 3, 3))
         self._g_point = np.empty((n, 3))
         schur.point_blocks(s.track_start, s.point_of, res, J_frame, self._V, self._g_point)
-        self._diagonal, self._g_frame = self._gradients(res, J_frame)
+        self._diagonal, self._g_frame = (self._wide(each) for each in self._gradients(res, J_frame))
         self._diagonal += prior_diag
         self._g_frame += prior_gradient
         self._coupling = coupling
@@ -227,6 +229,14 @@ class NormalEquations:
         self._g_camera = border.sum_photos(g_camera) + border.prior_gradient.ravel()
         self._lengths = lengths[1]
         self._g_point += np.einsum("q,qna->na", *lengths)
+
+    def _wide(self, values: Array) -> Array:
+        """Photos' values (..., m, measured) with zeros for the unknowns that no measurement sees."""
+        return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, self._num_unseen)])
+
+    def _seen(self, values: Array) -> Array:
+        """Photos' values (..., m, nb) of the unknowns that measurements see."""
+        return values[..., : values.shape[-1] - self._num_unseen]
 
     def _gradients(self, res: Array, J: Array) -> tuple[Array, Array]:
         """Diagonal of J'J and J'res, summed over each photo (m, unknowns)."""
@@ -248,19 +258,26 @@ class NormalEquations:
         m, nb = g_frame.shape
         V_inv = np.empty_like(self._V)
         schur.invert_points(self._V, damping, V_inv)
-        S = np.empty((len(s.pattern.cols), nb, nb))
-        rhs = np.empty_like(g_frame)
+        seen = nb - self._num_unseen
+        S = np.empty((len(s.pattern.cols), seen, seen))
+        rhs = np.empty((m, seen))
+        diagonal = self._prior_diag + damping * self._diagonal
         with numba.parallel_chunksize(1):
             schur.reduced_system(
                 self._unknowns, s.frame_start, s.frame_order, s.frame_idx, s.track_idx, s.track_start, s.point_of,
-                s.pattern.row_start, s.pattern.cols, self._J, V_inv, g_point, g_frame,
-                self._prior_diag + damping * self._diagonal, S, rhs,
+                s.pattern.row_start, s.pattern.cols, self._J, V_inv, g_point,
+                np.ascontiguousarray(self._seen(g_frame)), np.ascontiguousarray(self._seen(diagonal)), S, rhs,
             )  # fmt: skip
+        if self._num_unseen:
+            S = np.pad(S, ((0, 0), (0, self._num_unseen), (0, self._num_unseen)))
+            own = np.arange(seen, nb)
+            S[s.pattern.diagonal[:, None], own, own] = diagonal[:, seen:]
+            rhs = np.hstack([rhs, g_frame[:, seen:]])
         if self._coupling is not None:
             self._coupling.add_to(S, s.pattern)
         nc = self._border.J.shape[2]
         k = len(g_camera)
-        rows, rhs_camera = np.zeros((m, nb + nc, k)), np.zeros((m, nc))
+        rows, rhs_camera = np.zeros((m, seen + nc, k)), np.zeros((m, nc))
         if nc:
             with numba.parallel_chunksize(1):
                 schur.border_rows(
@@ -270,8 +287,8 @@ class NormalEquations:
         # nothing pulls at a camera that took none of the photos, whatever holds it
         unused = np.repeat(np.bincount(self._border.camera_of_frame, minlength=self._border.num_cameras) == 0, nc)
         held = self._border.prior_diag.ravel() + damping * self._camera_diagonal + unused
-        corner = self._border.sum_photos(rows[:, nb:]) + np.diag(held)
-        border = np.where(self._elimination.free, rows[:, :nb].transpose(2, 0, 1), 0.0)
+        corner = self._border.sum_photos(rows[:, seen:]) + np.diag(held)
+        border = np.where(self._elimination.free, self._wide(rows[:, :seen].transpose(2, 0, 1)), 0.0)
         c = -g_camera - self._border.sum_photos(rhs_camera)
         return Reduced(S, -rhs, border, (corner + corner.T) / 2, c), V_inv
 
@@ -320,18 +337,19 @@ class NormalEquations:
     def _covariances(self) -> tuple[Array, Array]:
         """Those of photos (m, nb, nb) and of all cameras (k, k)."""
         if self.inverse is None:
-            free = self._elimination.free
+            free = self._elimination.free[:, : self._J.shape[2]]
             return np.where(free[:, :, None] & free[:, None], np.nan, 0.0), np.full((self.num_shared,) * 2, np.nan)
-        return self.inverse.diagonal_blocks()
+        photos, cameras = self.inverse.diagonal_blocks()
+        return self._seen(photos)[:, : photos.shape[1] - self._num_unseen], cameras
 
     def photos_by_shared(self, unknown: int) -> Array:
         """(m, nb) covariances of photos' unknowns with one that each shares with those of its camera."""
         border = self._border
         if self.inverse is None:
-            return np.full(self._g_frame.shape, np.nan)
+            return np.full(self._seen(self._g_frame).shape, np.nan)
         column = border.camera_of_frame * border.J.shape[2] + unknown
         found: Array = self.inverse.photos_by_cameras()[np.arange(self.num_photos), :, column]
-        return found
+        return self._seen(found)
 
     def coupling_variances(self) -> tuple[Array, Array]:
         """Residuals (q, r) of the coupling, and their variances, all unknowns being free."""
@@ -370,7 +388,7 @@ class NormalEquations:
             return lambda vectors: np.full_like(vectors, np.nan)
 
         def times(vectors: Array) -> Array:
-            return inverse.times(vectors, np.zeros((len(vectors), len(self._g_camera))))[0]
+            return self._seen(inverse.times(self._wide(vectors), np.zeros((len(vectors), len(self._g_camera))))[0])
 
         if np.all(inflation == 1.0):
             return times
@@ -378,11 +396,18 @@ class NormalEquations:
             self._by_priors(vectors) + inflation * (times(inflation * vectors) - self._by_priors(inflation * vectors))
         )
 
+    def times(self, frame: Array, camera: Array) -> tuple[Array, Array]:
+        """H^-1 times stacks of photos' values (k, m, seen) and of cameras' (k, unknowns); NaN without an inverse."""
+        if self.inverse is None:
+            return np.full_like(frame, np.nan), np.full_like(camera, np.nan)
+        found = self.inverse.times(self._wide(frame), camera)
+        return self._seen(found[0]), found[1]
+
     def _by_priors(self, vectors: Array) -> Array:
         """H^-1 P H^-1 of the photos' unknowns times vectors (k, m, nb), P the priors' precision."""
         assert self.inverse is not None
-        frame, camera = self.inverse.times(vectors, np.zeros((len(vectors), len(self._g_camera))))
-        return self.inverse.times(self._of_priors(frame), self._border.prior_diag.ravel() * camera)[0]
+        frame, camera = self.inverse.times(self._wide(vectors), np.zeros((len(vectors), len(self._g_camera))))
+        return self._seen(self.inverse.times(self._of_priors(frame), self._border.prior_diag.ravel() * camera)[0])
 
     def _of_priors(self, frame: Array) -> Array:
         """The priors' precision times photos' values (..., m, nb)."""
@@ -401,8 +426,8 @@ class NormalEquations:
             variance=float((weights * point).sum()),
             of_priors=float((weighed[0] * frame).sum() + (weighed[1] * camera).sum()),
             of_lengths=float((np.einsum("qna,na->q", self._lengths, point) ** 2).sum()),
-            with_photos=frame,
-            with_photos_of_priors=self.inverse.times(weighed[0][None], weighed[1][None])[0][0],
+            with_photos=self._seen(frame),
+            with_photos_of_priors=self._seen(self.inverse.times(weighed[0][None], weighed[1][None])[0][0]),
             pulls=self._moved(frame, point, camera),
         )
 
@@ -410,7 +435,7 @@ class NormalEquations:
         """Changes (o, 2) of the residuals with a step of photos (m, nb), points (n, 3) and all cameras (k,)."""
         f, border = self._s.frame_idx, self._border
         own = camera.reshape(border.num_cameras, -1)[border.camera_of_frame[f]]
-        moved: Array = np.einsum("oia,oa->oi", self._J, frame[f]) + np.einsum("oia,oa->oi", border.J, own)
+        moved: Array = np.einsum("oia,oa->oi", self._J, self._seen(frame)[f]) + np.einsum("oia,oa->oi", border.J, own)
         return moved - np.einsum("oia,oa->oi", self._J[:, :, 3:6], point[self._s.point_idx])
 
     def residuals_of(self, noise: Array, of_photos: Array, of_cameras: Array) -> Array:
@@ -421,7 +446,8 @@ class NormalEquations:
         assert self.inverse is not None
         g_point, V = np.empty_like(self._g_point), np.empty_like(self._V)
         schur.point_blocks(self._s.track_start, self._s.point_of, noise, self._J, V, g_point)
-        g_frame = self._gradients(noise, self._J)[1] + np.sqrt(self._prior_diag) * of_photos
+        g_frame = self._wide(self._gradients(noise, self._J)[1])
+        g_frame = g_frame + np.sqrt(self._prior_diag) * self._wide(of_photos)
         if self._coupling is not None:
             drawn = np.random.default_rng(1).normal(size=self._coupling.res.shape)
             g_frame += self._coupling.pull(drawn, len(g_frame))
@@ -448,7 +474,8 @@ class NormalEquations:
             group, g_frame, g_camera,
         )  # fmt: skip
         of_cameras = border.sum_photos(g_camera.transpose(0, 2, 1)).T
-        return self.inverse.times(g_frame.transpose(1, 0, 2), of_cameras)
+        frame, camera = self.inverse.times(self._wide(g_frame.transpose(1, 0, 2)), of_cameras)
+        return self._seen(frame), camera
 
     def length_pulls(self) -> tuple[Array, Array]:
         """The same of known lengths (q, m, nb) and (q, k), each wrong by its standard deviation."""
@@ -457,7 +484,7 @@ class NormalEquations:
         # H^-1 J' = (H - J'J)^-1 J' (1 + J (H - J'J)^-1 J')^-1: the last of the inverse's changes
         last = slice(len(inverse.weights) - len(self._lengths), None)
         inner = -inverse.weights[last, last]
-        return np.tensordot(inner, inverse.frames[last], 1), inner @ inverse.cameras[last]
+        return self._seen(np.tensordot(inner, inverse.frames[last], 1)), inner @ inverse.cameras[last]
 
     def solve(self, damping: float) -> tuple[Step, float] | None:
         """Step of the photos (m, nb), points (n, 3) and cameras (c, nc), and the decrease of cost that it predicts."""
@@ -524,7 +551,7 @@ class NormalEquations:
         point = np.empty_like(g_point)
         schur.back_substitute(
             self._unknowns, self._s.track_start, self._s.point_of, self._s.frame_idx, V_inv,
-            self._pulled(g_point, camera), self._J, frame, point,
+            self._pulled(g_point, camera), self._J, np.ascontiguousarray(self._seen(frame)), point,
         )  # fmt: skip
         return point
 

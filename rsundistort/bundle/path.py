@@ -1,4 +1,4 @@
-"""The path of a video's camera as a prior: white noise on acceleration joins neighbouring frames."""
+"""The path of a video's camera as a prior: white noise on the change of acceleration joins neighbouring frames."""
 
 from __future__ import annotations
 
@@ -31,6 +31,8 @@ Index = NDArray[np.int64]
 # Before anything is known of a readout: it takes about half of the time to the next frame, give or take as much, so
 # that neither a global shutter nor one that runs the other way is excluded.
 _READOUT_SHARE, _READOUT_SIGMA = 0.5, 1.0
+# Frames that a path is taken to have run at, from rest, before its first one.
+_FRAMES_BEFORE = 100.0
 
 
 @dataclass(frozen=True)
@@ -102,11 +104,14 @@ class PathState:
     ----------
     rates : (m, 6) array
         Radians (camera frame) and world units (world) from one frame to the next, at each photo.
+    changes : (m, 6) array
+        How fast these change.
     pace : (cameras,) array
         Time that a unit of each camera's clock takes: phi is `pace * rates`.
     """
 
     rates: Array
+    changes: Array
     pace: Array
 
     def motions(self, camera_idx: Index) -> Array:
@@ -117,8 +122,11 @@ class PathState:
 class PathPrior:
     """Residuals of the path between neighbouring photos, their Jacobians, and those of the readout time.
 
-    Of neighbours at times t and t + dt: xi - dt omega and J(xi)^-1 omega' - omega, xi = log(R' R^T), and likewise of
-    the positions, with the covariance Q [dt^3/3, dt^2/2; dt^2/2, dt] (Barfoot 2017, Eqs. 11.7 and 11.94).
+    Of neighbours at times t and t + dt, whose rotations differ by xi = log(R' R^T): xi - dt omega - dt^2/2 alpha,
+    J(xi)^-1 omega' - omega - dt alpha and J(xi)^-1 alpha' - alpha, and likewise of the positions, with the covariance
+    that white noise on the change of acceleration has (Barfoot 2017, section 11.1; Tang, Yoon and Barfoot 2019). White
+    noise on acceleration itself would do with fewer unknowns, but its cubics have but 0.9 of the rate of a tremor at a
+    third of the frame rate and 0.6 at 0.4 of it, and readouts come out the longer for it; these have 0.98 and 0.8.
 
     Parameters
     ----------
@@ -127,7 +135,7 @@ class PathPrior:
     reconstruction : Reconstruction
         Whose photos they are.
     spreads : (turn, travel)
-        Square roots of the spectral densities Q: radians, and world units, per (time between frames)^(3/2).
+        Square roots of the spectral densities Q: radians, and world units, per (time between frames)^(5/2).
     """
 
     def __init__(self, path: FramePath, reconstruction: Reconstruction, spreads: tuple[float, float]) -> None:
@@ -136,8 +144,14 @@ class PathPrior:
         self.first, self.second = order[:-1][joined], order[1:][joined]
         if not len(self.first):
             raise InputError("a path needs two frames that are not separated by a cut")
-        self.dt = time[self.second] - time[self.first]
+        self.dt = dt = time[self.second] - time[self.first]
+        powers = [[dt**5 / 20, dt**4 / 8, dt**3 / 6], [dt**4 / 8, dt**3 / 3, dt**2 / 2], [dt**3 / 6, dt**2 / 2, dt]]
+        # unit variance: times the inverse of the covariance's Cholesky factor
+        self._whitening = np.linalg.inv(np.linalg.cholesky(np.array(powers).transpose(2, 0, 1)))
         self.spreads = spreads
+        # nothing comes before the first frame of a part: its changes are those of a path that began at rest
+        self.begins = np.setdiff1d(self.first, self.second)
+        self.begins_sigma = np.sqrt(_FRAMES_BEFORE) * np.repeat(spreads, 3)
         share, sigma = path.readout_prior
         span = np.array([camera.frame_span for camera in reconstruction.cameras])
         self.pace_prior, self.pace_sigma = share / span, sigma / span
@@ -153,73 +167,95 @@ class PathPrior:
         for end in (i, j):
             np.add.at(total, end, rate)
             np.add.at(count, end, 1.0)
-        return PathState(total / np.maximum(count, 1.0), self.pace_prior.copy())
+        return PathState(total / np.maximum(count, 1.0), np.zeros((m, 6)), self.pace_prior.copy())
 
-    def residuals(self, R_cw: Array, center_w: Array, rates: Array) -> Array:
-        """(q, 2, 6) residuals of unit variance: of the change of rates, and of the steps given that."""
-        step, change, _ = self._differences(R_cw, center_w, rates)
-        return self._whitened(step, change)
+    def residuals(self, R_cw: Array, center_w: Array, state: PathState) -> Array:
+        """(q, 18) residuals of unit variance, 6 each of steps, rates and changes."""
+        return self._whitened(self._differences(R_cw, center_w, state)[0]).reshape(len(self.dt), 18)
 
-    def _differences(self, R_cw: Array, center_w: Array, rates: Array) -> tuple[Array, Array, Array]:
-        """(q, 6) what steps and rates differ by from those of steady rates, and xi (q, 3)."""
-        i, j = self.first, self.second
+    def _differences(self, R_cw: Array, center_w: Array, state: PathState) -> tuple[Array, Array]:
+        """(q, 3, 6) what steps, rates and changes differ by from those of steady changes, and xi (q, 3)."""
+        i, j, dt = self.first, self.second, self.dt[:, None]
         xi = Rotation.from_matrix(R_cw[j] @ R_cw[i].transpose(0, 2, 1)).as_rotvec()
-        step = np.hstack([xi, center_w[j] - center_w[i]]) - self.dt[:, None] * rates[i]
-        local = np.einsum("qab,qb->qa", inverse_left_jacobians(xi), rates[j, :3])
-        return step, np.hstack([local, rates[j, 3:]]) - rates[i], xi
+        J = inverse_left_jacobians(xi)
 
-    def _whitened(self, step: Array, change: Array) -> Array:
-        """(q, 2, 6, ...) by the Cholesky factor of the covariance, the change first."""
-        dt = self.dt.reshape(-1, *(1,) * (step.ndim - 1))
-        spread = np.repeat(self.spreads, 3).reshape(6, *(1,) * (step.ndim - 2))
-        conditional = (step - 0.5 * dt * change) / np.sqrt(dt**3 / 12.0)
-        return np.stack([change / np.sqrt(dt), conditional], axis=1) / spread
+        def local(values: Array) -> Array:
+            return np.hstack([np.einsum("qab,qb->qa", J, values[j, :3]), values[j, 3:]])
+
+        rates, changes = state.rates[i], state.changes[i]
+        step = np.hstack([xi, center_w[j] - center_w[i]]) - dt * rates - 0.5 * dt**2 * changes
+        return np.stack([step, local(state.rates) - rates - dt * changes, local(state.changes) - changes], axis=1), xi
+
+    def _whitened(self, differences: Array) -> Array:
+        """(q, 3, 6, ...) divided by their standard deviations."""
+        spread = np.repeat(self.spreads, 3).reshape(6, *(1,) * (differences.ndim - 3))
+        value: Array = np.einsum("qij,qj...->qi...", self._whitening, differences) / spread
+        return value
 
     def cost(self, R_cw: Array, center_w: Array, state: PathState) -> float:
         """Half the sum of squares, with that of the pace."""
         apart = (state.pace - self.pace_prior) / self.pace_sigma
-        return 0.5 * float((self.residuals(R_cw, center_w, state.rates) ** 2).sum() + (apart**2).sum())
+        begun = state.changes[self.begins] / self.begins_sigma
+        squares = (self.residuals(R_cw, center_w, state) ** 2).sum() + (apart**2).sum() + (begun**2).sum()
+        return 0.5 * float(squares)
 
-    def jacobians(self, R_cw: Array, center_w: Array, rates: Array) -> tuple[Array, Array, Array]:
-        """Residuals (q, 12) and their Jacobians (q, 12, 12) by pose and rates of the first and the second photo.
+    def prior_on_changes(self, state: PathState) -> tuple[Array, Array]:
+        """Diagonal Hessian and gradient (m, 6) of what is known of the changes beforehand."""
+        diagonal, gradient = np.zeros((2, *state.changes.shape))
+        diagonal[self.begins] = self.begins_sigma**-2.0
+        gradient[self.begins] = self.begins_sigma**-2.0 * state.changes[self.begins]
+        return diagonal, gradient
+
+    def jacobians(self, R_cw: Array, center_w: Array, state: PathState) -> tuple[Array, Array, Array]:
+        """Residuals (q, 18), and their Jacobians (q, 18, 18) by pose, rates and changes of the first and second photo.
 
         Poses by a left increment of the rotation and the centre.
         """
-        step, change, xi = self._differences(R_cw, center_w, rates)
+        differences, xi = self._differences(R_cw, center_w, state)
         q = len(xi)
         J = inverse_left_jacobians(xi)
-        # by xi of J(xi)^-1 omega'; the series of the factor to the second order
-        omega = rates[self.second, :3]
-        turned = np.cross(xi, omega)
-        by_xi = 0.5 * cross_matrices(omega) - (
-            cross_matrices(turned) + cross_matrices(xi) @ cross_matrices(omega)
-        ) / 12.0 + np.cross(xi, turned)[:, :, None] * xi[:, None] / 360.0  # fmt: skip
-        of_first, of_second = np.zeros((2, 2, q, 6, 12))  # of steps and of changes
-        eye = np.eye(3)
+        Jt = J.transpose(0, 2, 1)
+        dt, eye = self.dt[:, None, None], np.eye(6)
+        of_first, of_second = np.zeros((2, q, 3, 6, 18))
         # log(Exp(d') Exp(xi) Exp(-d)) = xi + J d' - J' d
-        of_first[0, :, :3, :3], of_second[0, :, :3, :3] = -J.transpose(0, 2, 1), J
-        of_first[1, :, :3, :3], of_second[1, :, :3, :3] = -by_xi @ J.transpose(0, 2, 1), by_xi @ J
-        of_first[0, :, 3:, 3:6], of_second[0, :, 3:, 3:6] = -eye, eye
-        of_first[0, :, :, 6:] = -self.dt[:, None, None] * np.eye(6)
-        of_first[1, :, :, 6:] = -np.eye(6)
-        of_second[1, :, :3, 6:9], of_second[1, :, 3:, 9:] = J, eye
-        res = self._whitened(step, change).reshape(q, 12)
-        A, B = (self._whitened(*each).reshape(q, 12, 12) for each in (of_first, of_second))
-        return res, A, B
+        of_first[:, 0, :3, :3], of_second[:, 0, :3, :3] = -Jt, J
+        of_first[:, 0, 3:, 3:6], of_second[:, 0, 3:, 3:6] = -eye[:3, :3], eye[:3, :3]
+        of_first[:, 0, :, 6:12], of_first[:, 0, :, 12:] = -dt * eye, -0.5 * dt**2 * eye
+        of_first[:, 1, :, 12:] = -dt * eye
+        for level, values in ((1, state.rates), (2, state.changes)):
+            by_xi = _by_xi(xi, values[self.second, :3])
+            of_first[:, level, :3, :3], of_second[:, level, :3, :3] = -by_xi @ Jt, by_xi @ J
+            own = slice(6 * level, 6 * level + 6)
+            of_first[:, level, :, own] = -eye
+            of_second[:, level, 3:, own] = eye[3:]
+            of_second[:, level, :3, 6 * level : 6 * level + 3] = J
+        A, B = (self._whitened(each).reshape(q, 18, 18) for each in (of_first, of_second))
+        return self._whitened(differences).reshape(q, 18), A, B
 
     def unit_squares(self, squares: Array) -> tuple[Array, Array]:
-        """Squares (q, 12) of residuals as those of spreads of 1: of turn and of travel, (q, 6) each."""
-        by_kind = squares.reshape(-1, 2, 2, 3)
-        return tuple(by_kind[:, :, k].reshape(-1, 6) * self.spreads[k] ** 2 for k in range(2))  # type: ignore[return-value]
+        """Squares (q, 18) of residuals as those of spreads of 1: of turn and of travel, (q, 9) each."""
+        by_kind = squares.reshape(-1, 3, 2, 3)
+        turn, travel = (by_kind[:, :, k].reshape(-1, 9) * self.spreads[k] ** 2 for k in range(2))
+        return turn, travel
+
+
+def _by_xi(xi: Array, x: Array) -> Array:
+    """(q, 3, 3) derivatives by xi of J(xi)^-1 x, the series of J's factor to the second order."""
+    turned = np.cross(xi, x)
+    return (
+        0.5 * cross_matrices(x)
+        - (cross_matrices(turned) + cross_matrices(xi) @ cross_matrices(x)) / 12.0
+        + np.cross(xi, turned)[:, :, None] * xi[:, None] / 360.0
+    )
 
 
 def camera_path(reconstruction: Reconstruction, path: FramePath, state: PathState) -> tuple[CameraPath, Index]:
     """The path through a reconstruction's poses, and its photos in the order of time."""
     order, time, part = path.order(reconstruction.image_names)
-    rates = state.rates[order] / path.frame_s
+    rates, changes = state.rates[order] / path.frame_s, state.changes[order] / path.frame_s**2
     return CameraPath(
         time[order] * path.frame_s, reconstruction.R_cw[order], reconstruction.center_w[order], rates[:, :3],
-        rates[:, 3:], part[order],
+        rates[:, 3:], changes[:, :3], changes[:, 3:], part[order],
     ), order  # fmt: skip
 
 

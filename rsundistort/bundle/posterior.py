@@ -62,9 +62,7 @@ class Posterior:
         columns = (self._camera_idx + 1) * (self._equations.num_shared // self._equations.num_cameras) - 1
         np.add.at(of_pace.T, columns, np.einsum("kma,ma->mk", vectors[:, :, 6:12], rates))
         whole[:, :, 6:12] *= pace
-        if self._equations.inverse is None:
-            return np.full_like(vectors, np.nan)
-        moved, shared = self._equations.inverse.times(whole, of_pace)
+        moved, shared = self._equations.times(whole, of_pace)
         moved[:, :, 6:12] = pace * moved[:, :, 6:12] + shared[:, columns, None] * rates
         return moved[:, :, : vectors.shape[2]]
 

@@ -201,7 +201,7 @@ class BundleProblem:
                 i = self._photo(name)
                 free[i, [6 + part for part in self._still_parts(i)]] = False
                 free[i, self.layout.variation :] = False
-        return free
+        return free if self._path is None else np.pad(free, ((0, 0), (0, 6)), constant_values=True)
 
     def initial_state(self) -> State:
         """The reconstruction's values; zero for held components of the motion and those that the model lacks."""
@@ -210,7 +210,7 @@ class BundleProblem:
         motion[:, : self._block - 6] = np.where(self._free[:, 6 : self._block], found, 0.0)
         start = self._start
         variation = start.variation if self._options.varying else np.zeros_like(start.variation)
-        bend = np.where(self._free[:, self.layout.variation :], self.layout.coefficients(start), 0.0)
+        bend = np.where(self._free[:, self.layout.variation : self.layout.size], self.layout.coefficients(start), 0.0)
         cameras = tuple(start.cameras) if self._fields is None else self._fields.started(start.cameras)
         path = self._path_start
         if self._path is not None:
@@ -385,10 +385,14 @@ class BundleProblem:
             by_pace = np.einsum("oia,oa->oi", J_frame[:, :, 6:12], own_rates)
             border = replace(border, J=np.concatenate([border.J, by_pace[:, :, None]], axis=2))
             J_frame[:, :, 6:12] *= state.path.pace[moves, None, None]
-            joins, by_first, by_second = self._path.jacobians(state.R_cw, state.center_w, state.path.rates)
-            wide = ((0, 0), (0, 0), (0, self.layout.size - 12))
-            coupling = Coupling(
-                self._path.first, self._path.second, joins, np.pad(by_first, wide), np.pad(by_second, wide)
+            joins, *by_ends = self._path.jacobians(state.R_cw, state.center_w, state.path)
+            # the changes of the rates stand behind all that the measurements know
+            of_own = np.zeros((*joins.shape, self.layout.size - 12))
+            by_first, by_second = (np.concatenate([J[..., :12], of_own, J[..., 12:]], axis=2) for J in by_ends)
+            coupling = Coupling(self._path.first, self._path.second, joins, by_first, by_second)
+            of_changes = self._path.prior_on_changes(state.path)
+            prior_diag, prior_gradient = (
+                np.hstack(each) for each in zip((prior_diag, prior_gradient), of_changes, strict=True)
             )
         lengths = self._lengths.residuals(state.points_w), self._lengths.jacobian(state.points_w)
         return NormalEquations(
@@ -490,7 +494,8 @@ class BundleProblem:
         velocity = state.velocity + frame[:, 9:12] if self._block > 9 else state.velocity
         path = state.path
         if path is not None:
-            path = PathState(path.rates + frame[:, 6:12], path.pace + intrinsics[:, -1])
+            changes = path.changes + frame[:, self.layout.size :]
+            path = PathState(path.rates + frame[:, 6:12], changes, path.pace + intrinsics[:, -1])
             phi, velocity = np.split(path.motions(self._start.camera_idx), 2, axis=1)
         return State(
             cameras,
@@ -501,7 +506,7 @@ class BundleProblem:
             state.variation + frame[:, self._block : self.layout.variation]
             if self._options.varying
             else state.variation,
-            state.bend + frame[:, self.layout.variation :],
+            state.bend + frame[:, self.layout.variation : self.layout.size],
             state.points_w + point,
             path,
         )
@@ -509,6 +514,7 @@ class BundleProblem:
     def step_size(self, state: State, step: Step) -> float:
         """Largest change: angles in radians, lengths in sizes of the scene, intrinsics in their own units."""
         frame, point, intrinsics = step
+        frame = frame[:, : self.layout.size]
         ways = self.layout.size - 3 * self.layout.ways
         own = range(self._block, ways)
         angles = np.abs(frame[:, [0, 1, 2, *range(6, min(self._block, 9)), *own]]).max()

@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 
 # Sites of the bend that a frame gets from the path: cubics on both sides of the principal row.
 _SITES = 17
+_VECTORS = ("center_w", "rate", "velocity", "rate_change", "acceleration")
 
 
 def cross_matrices(x: Array) -> Array:
@@ -39,16 +40,25 @@ def inverse_left_jacobians(xi: Array) -> Array:
 
 
 def _hermite(u: Array) -> Array:
-    """(4, n) cubic functions of u for values and slopes at 0 and 1, in the order value, slope, value, slope."""
-    return np.stack([(1 + 2 * u) * (1 - u) ** 2, u * (1 - u) ** 2, u**2 * (3 - 2 * u), u**2 * (u - 1)])
+    """(5, n) quintic functions of u: for value, slope and curvature at 1, and for slope and curvature at 0."""
+    v = 1 - u
+    return np.stack(
+        [
+            u**3 * (10 - 15 * u + 6 * u**2),
+            -(u**3) * v * (4 - 3 * u),
+            0.5 * u**3 * v**2,
+            u * v**3 * (1 + 3 * u),
+            0.5 * u**2 * v**3,
+        ]
+    )
 
 
 @dataclass(frozen=True)
 class CameraPath:
     """Poses and rates of a camera at m moments.
 
-    Between two moments the path is the cubic in the rotation vector and in the position that both poses and rates
-    fix, which is the mean of white noise on acceleration between them (Barfoot 2017, section 11.1).
+    Between two moments the path is the polynomial of the fifth degree, in the rotation vector and in the position, that
+    the poses, rates and accelerations of both fix: the mean of a path whose acceleration changes by white noise.
 
     Parameters
     ----------
@@ -60,6 +70,8 @@ class CameraPath:
         Radians per second, in the camera frame: `dR_cw / dt = [rate] R_cw`.
     velocity : (m, 3) array
         World units per second, in the world.
+    rate_change, acceleration : (m, 3) array
+        How fast rate and velocity change, per second.
     part : (m,) int array, optional
         Moments of different parts are not joined: between them the video was cut.
     """
@@ -69,6 +81,8 @@ class CameraPath:
     center_w: Array
     rate: Array
     velocity: Array
+    rate_change: Array
+    acceleration: Array
     part: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __post_init__(self) -> None:
@@ -79,7 +93,7 @@ class CameraPath:
         fields = {
             "time_s": check_finite(self.time_s, (m,), "time_s"),
             "R_cw": check_rotations(self.R_cw, m, "R_cw"),
-            **{name: check_finite(getattr(self, name), (m, 3), name) for name in ("center_w", "rate", "velocity")},
+            **{name: check_finite(getattr(self, name), (m, 3), name) for name in _VECTORS},
             "part": check_index(part, m, m, "part"),
         }
         for name, value in fields.items():
@@ -92,6 +106,7 @@ class CameraPath:
             R_cw=self.R_cw @ R.T,
             center_w=scale * (self.center_w - origin) @ R.T,
             velocity=scale * self.velocity @ R.T,
+            acceleration=scale * self.acceleration @ R.T,
         )
 
     def near(self, moment: int, offset_s: ArrayLike) -> tuple[Array, Array]:
@@ -101,7 +116,13 @@ class CameraPath:
         them, and where there is none, they go on as the path does there.
         """
         offset = np.atleast_1d(np.asarray(offset_s, np.float64))
-        turn, way = offset[:, None] * self.rate[moment], offset[:, None] * self.velocity[moment]
+        turn, way = (
+            offset[:, None] * slope + 0.5 * offset[:, None] ** 2 * bend
+            for slope, bend in (
+                (self.rate[moment], self.rate_change[moment]),
+                (self.velocity[moment], self.acceleration[moment]),
+            )
+        )
         for other, on_this_side in ((moment - 1, offset < 0), (moment + 1, offset > 0)):
             joined = 0 <= other < len(self.time_s) and self.part[other] == self.part[moment]
             if joined and on_this_side.any():
@@ -112,14 +133,25 @@ class CameraPath:
         """As `near`, on the side of one neighbour."""
         dt = self.time_s[other] - self.time_s[moment]
         xi = Rotation.from_matrix(self.R_cw[other] @ self.R_cw[moment].T).as_rotvec()
-        end_rate = inverse_left_jacobians(xi) @ self.rate[other]
+        J = inverse_left_jacobians(xi)
         step = self.center_w[other] - self.center_w[moment]
         u = np.minimum(offset / dt, 1.0)
-        _, slope0, value1, slope1 = (each[:, None] for each in _hermite(u))
+        weights = _hermite(u) * np.array([1.0, dt, dt**2, dt, dt**2])[:, None]
         beyond = (offset - dt * u)[:, None]
-        turn = slope0 * dt * self.rate[moment] + value1 * xi + slope1 * dt * end_rate + beyond * end_rate
-        way = slope0 * dt * self.velocity[moment] + value1 * step + slope1 * dt * self.velocity[other]
-        return turn, way + beyond * self.velocity[other]
+
+        def along(end: tuple[Array, Array, Array], start: tuple[Array, Array]) -> Array:
+            within: Array = weights.T @ np.stack([*end, *start])
+            return within + beyond * end[1] + 0.5 * beyond**2 * end[2]
+
+        return (
+            along(
+                (xi, J @ self.rate[other], J @ self.rate_change[other]), (self.rate[moment], self.rate_change[moment])
+            ),
+            along(
+                (step, self.velocity[other], self.acceleration[other]),
+                (self.velocity[moment], self.acceleration[moment]),
+            ),
+        )
 
     def poses_at(self, time_s: ArrayLike) -> tuple[Array, Array]:
         """Poses R_cw (n, 3, 3) and center_w (n, 3) at any times (n,)."""

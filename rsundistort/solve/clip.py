@@ -26,7 +26,6 @@ from ..input.stabilisation import Stabilisation, judge_stabilisation
 from ..io.gpmf import has_telemetry
 from ..io.gyro import GyroLog, read_gyro
 from ..model import Reconstruction
-from ..model.path import CameraPath
 from ..sfm import MatchedPhotos, map_photos, match_photos, retriangulate
 from ..verdict.clip import ReadoutTime, judge_clip
 from .clip_tracks import follow_points, with_all_frames
@@ -261,18 +260,18 @@ def _felt(clip: Clip, result: BundleResult, log: GyroLog | None) -> Felt | None:
     if log is None:
         return None
     assert result.path is not None
-    pairs, turns = _turns(result.path.path)
-    found = align_gyro(log, result.path.path.time_s, pairs, turns)
+    path = result.path.path
+    found = align_gyro(log, path.time_s, *_turns(path.part, path.R_cw))
     if isinstance(found, NoAlignment):
         warnings.warn(f"without the gyroscope: {found.reason}", RsUndistortWarning, stacklevel=5)
         return None
     return Felt(found, found.in_camera(log))
 
 
-def _turns(path: CameraPath) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Neighbouring moments (n, 2) of a path, and the rotations (n, 3) from one to the other."""
-    first = np.flatnonzero(path.part[1:] == path.part[:-1])
-    turns = Rotation.from_matrix(path.R_cw[first + 1] @ path.R_cw[first].transpose(0, 2, 1)).as_rotvec()
+def _turns(part: NDArray[np.int64], R_cw: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Neighbouring frames (n, 2) of a part, and the rotations (n, 3) from one to the other."""
+    first = np.flatnonzero(part[1:] == part[:-1])
+    turns = Rotation.from_matrix(R_cw[first + 1] @ R_cw[first].transpose(0, 2, 1)).as_rotvec()
     return np.stack([first, first + 1], axis=1), turns
 
 
@@ -311,13 +310,11 @@ def _stabilisation(clip: Clip, result: BundleResult, options: BundleOptions, fel
     rec = found.reconstruction
     path = result.path.path
     place = np.array([result.path.names.index(name) for name in rec.image_names])
-    here = CameraPath(
-        path.time_s[place], rec.R_cw, rec.center_w, path.rate[place], path.velocity[place], path.part[place]
-    )
+    pairs, turns = _turns(path.part[place], rec.R_cw)
     span = rec.frame_span()[:, None]
     log, offset_s = (None, 0.0) if felt is None else (felt.log, felt.alignment.offset_s)
     return judge_stabilisation(
-        here.time_s, *_turns(here), rec.phi * span, found.sigma_phi * span, log=log, offset_s=offset_s
+        path.time_s[place], pairs, turns, rec.phi * span, found.sigma_phi * span, log=log, offset_s=offset_s
     )
 
 
