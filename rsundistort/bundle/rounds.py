@@ -167,7 +167,9 @@ class Rounds:
         assert options.path is not None
         residuals, variances = equations.coupling_variances()
         if np.isfinite(variances).all():
-            self._spreads = replace(self._spreads, path=path_spreads(problem.path, residuals, variances))
+            self._spreads = replace(
+                self._spreads, path=path_spreads(problem.path, residuals, variances, self._baseline)
+            )
         self._path = state.path
         bends = path_bends(self._current, options.path, state.path)
         before, after = (

@@ -28,6 +28,8 @@ _MOST_PX = 1.0
 _MOST_VARIED = 0.02
 # Of a path's rates from frame to frame: radians, and shares of the mean way between consecutive photos.
 _TURN_START, _TRAVEL_START = 5e-3, 0.2
+# Residuals of a path that count as if these had been seen before.
+_USUAL_WEIGHT = 2.0
 # Of a spread, between two solves.
 _LARGEST_CHANGE = 4.0
 
@@ -181,11 +183,17 @@ def field_spread(values: NDArray[np.float64], variances: NDArray[np.float64], sp
     return min(found + _MIN_SPREAD_PX, _MOST_PX)
 
 
-def path_spreads(prior: PathPrior, residuals: NDArray[np.float64], variances: NDArray[np.float64]) -> tuple[float, ...]:
-    """Spreads of a path by its residuals (q, 12) and their posterior variances, as `_spread`."""
+def path_spreads(
+    prior: PathPrior, residuals: NDArray[np.float64], variances: NDArray[np.float64], baseline: float
+) -> tuple[float, ...]:
+    """Spreads of a path by its residuals (q, 18) and their posterior variances, as `_spread`.
+
+    Of few frames, which hardly tell them, they are drawn to those of a hand.
+    """
     squares, unknown = (prior.unit_squares(each) for each in (residuals**2, variances))
-    ones = np.ones(len(residuals))
-    return tuple(
-        _spread(np.sqrt(square), variance, ones, spread) + _MIN_SPREAD * spread
-        for square, variance, spread in zip(squares, unknown, prior.spreads, strict=True)
-    )
+    ones, found = np.ones(len(residuals)), []
+    usual = _TURN_START, _TRAVEL_START * baseline
+    for square, variance, spread, start in zip(squares, unknown, prior.spreads, usual, strict=True):
+        seen = _spread(np.sqrt(square), variance, ones, spread) ** 2
+        found.append(float(np.sqrt((square.size * seen + _USUAL_WEIGHT * start**2) / (square.size + _USUAL_WEIGHT))))
+    return tuple(found)
