@@ -183,6 +183,8 @@ class NormalEquations:
         share of the Hessian is added to its inverse (Woodbury).
     coupling : Coupling, optional
         Prior that joins pairs of photos; the structure's pattern has their blocks.
+    rays : (n, 3) array, optional
+        Directions along which no point moves, where all photos are taken from one place.
 
     Attributes
     ----------
@@ -201,6 +203,7 @@ class NormalEquations:
         border: Border,
         lengths: tuple[Array, Array],
         coupling: Coupling | None = None,
+        rays: Array | None = None,
     ) -> None:
         self.cost = cost
         self._elimination = elimination
@@ -215,6 +218,11 @@ class NormalEquations:
         self._V = np.empty((n, 3, 3))
         self._g_point = np.empty((n, 3))
         schur.point_blocks(s.track_start, s.point_of, res, J_frame, self._V, self._g_point)
+        if rays is not None:
+            # any weight holds what nothing pulls at
+            unit = rays / np.linalg.norm(rays, axis=1)[:, None]
+            weight = np.trace(self._V, axis1=1, axis2=2)[:, None, None]
+            self._V += weight * unit[:, :, None] * unit[:, None]
         self._diagonal, self._g_frame = (self._wide(each) for each in self._gradients(res, J_frame))
         self._diagonal += prior_diag
         self._g_frame += prior_gradient

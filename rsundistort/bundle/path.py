@@ -52,6 +52,8 @@ class FramePath:
         Parts that a cut separates; all in one when left out.
     rates : mapping of photo name to (rate, sigma), optional
         What a gyroscope says of the turn, (3,) radians per second in the camera frame, and its standard deviation.
+    turns_only : bool
+        Whether the camera stays where it is: centres are held, and points count by their directions.
     """
 
     time_s: Mapping[str, float]
@@ -59,6 +61,7 @@ class FramePath:
     readout: tuple[float, float] | None = None
     part: Mapping[str, int] = field(default_factory=dict)
     rates: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
+    turns_only: bool = False
 
     def __post_init__(self) -> None:
         if not 0 < self.frame_s < np.inf:

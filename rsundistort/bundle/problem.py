@@ -99,6 +99,7 @@ class BundleProblem:
             photos = range(reconstruction.num_images)
             self._bend_clock = np.array([reconstruction.camera(i).clock_range for i in photos])
         self._path, self._path_start = None, path
+        self._turns_only = options.path is not None and options.path.turns_only
         if options.path is not None:
             if shutter_model != "constant-motion":
                 raise InputError(f"frames on a path move by constant-motion, not by {shutter_model}")
@@ -201,7 +202,12 @@ class BundleProblem:
                 i = self._photo(name)
                 free[i, [6 + part for part in self._still_parts(i)]] = False
                 free[i, self.layout.variation :] = False
-        return free if self._path is None else np.pad(free, ((0, 0), (0, 6)), constant_values=True)
+        if self._path is None:
+            return free
+        free = np.pad(free, ((0, 0), (0, 6)), constant_values=True)
+        if self._turns_only:
+            free[:, [3, 4, 5, 9, 10, 11, *range(self.layout.size + 3, self.layout.size + 6)]] = False
+        return free
 
     def initial_state(self) -> State:
         """The reconstruction's values; zero for held components of the motion and those that the model lacks."""
@@ -396,8 +402,9 @@ class BundleProblem:
             )
         lengths = self._lengths.residuals(state.points_w), self._lengths.jacobian(state.points_w)
         return NormalEquations(
-            self._elimination, total, res, J_frame, prior_diag, prior_gradient, border, lengths, coupling
-        )
+            self._elimination, total, res, J_frame, prior_diag, prior_gradient, border, lengths, coupling,
+            state.points_w - state.center_w[0] if self._turns_only else None,
+        )  # fmt: skip
 
     @property
     def path(self) -> PathPrior:

@@ -63,6 +63,8 @@ def _check_solvable(reconstruction: Reconstruction, shutter_model: str, path: Fr
     m = reconstruction.num_images
     if shutter_model != "global" and m < 3 and path is None:
         raise InputError(f"{m} photos cannot tell the shutter from the scene; at least three are needed")
+    if path is not None and path.turns_only:
+        return
     if m > 1 and not np.linalg.norm(np.ptp(reconstruction.center_w, axis=0)) > 1e-9 * reconstruction.size:
         raise InputError("all photos are taken from one place: without parallax there is no scene to solve for")
 
@@ -100,7 +102,8 @@ class Rounds:
         base = reconstruction.with_points(np.ones(len(reconstruction.observations), bool))
         if base.num_points:
             _check_solvable(base, shutter_model, options.path)
-        self._base = revive_points(base, shutter_model, from_afar=True)
+        self._turns_only = options.path is not None and options.path.turns_only
+        self._base = base if self._turns_only else revive_points(base, shutter_model, from_afar=True)
         self._keep = np.ones(len(self._base.observations), bool)
         self._sigma_px = options.sigma_px or _noise_px(self._base, shutter_model, options.min_sigma_px)
         self._baseline = reconstruction.baseline
@@ -159,7 +162,7 @@ class Rounds:
             self._spreads = replace(self._spreads, field=field)
         if state.path is not None:
             self._follow_path(problem, equations)
-        self._revived = revive_points(self._current, self._model)
+        self._revived = self._current if self._turns_only else revive_points(self._current, self._model)
 
     def _follow_path(self, problem: BundleProblem, equations: NormalEquations) -> None:
         """Bend the motions of the next solve as the path of this one bends, and settle its spreads."""

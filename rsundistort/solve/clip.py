@@ -28,8 +28,9 @@ from ..io.gyro import GyroLog, read_gyro
 from ..model import Reconstruction
 from ..sfm import MatchedPhotos, map_photos, match_photos, retriangulate
 from ..verdict.clip import ReadoutTime, judge_clip
+from .clip_pan import turning_only
 from .clip_tracks import follow_points, with_all_frames
-from .model_sequence import rough_options, without_shutter
+from .model_sequence import rough_options
 from .outcome import Solved
 
 __all__ = ["frame_path", "solve_clip"]
@@ -40,6 +41,10 @@ _LEAST_MEASUREMENTS = 15
 _LEAST_HALF = 4
 # Frames that are asked whether they were stabilised, at most: ten seconds tell.
 _FRAMES_ASKED = 300
+# What flow may be off by, pixels, and measurements that may be far off, as a share, where rotations explain the frames.
+_FLOW_PX, _OUTLIERS = 0.5, 0.2
+# Of the time between frames: none.
+_NO_READOUT = 1e-6
 # Of a readout time that is given, or in the table: its standard deviation, as a share.
 _GIVEN_SIGMA, _TABLE_SIGMA = 0.02, 0.1
 # Known to this share of what it was known to before, it was measured.
@@ -85,6 +90,55 @@ def solve_clip(
     Solved
         Its result is that of the key frames, `whole` the reconstruction of all frames.
     """
+    result, options = _turned(clip, keys, path, options_of, log)
+    if result is None:
+        result, options = _travelled(clip, keys, path, options_of, scratch, log, seed, matching)
+    assert options.path is not None
+    path = options.path
+    alone = _readout(result)
+    log.begin("gyroscope")
+    felt = _felt(clip, result, gyroscope)
+    if felt is not None:
+        options = replace(options, path=replace(path, rates=felt.rates(result)))
+        result = bundle_adjust(
+            result.reconstruction, "constant-motion", replace(options, outlier_rounds=0),
+            partial(_tell, log, "gyroscope"),
+        )  # fmt: skip
+    log.end("gyroscope", offset_s=None if felt is None else felt.alignment.offset_s)
+    return _judged(clip, keys, result, options, alone, felt, log)
+
+
+def _turned(
+    clip: Clip, keys: LoadedPhotos, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions],
+    log: StageLog,
+) -> tuple[BundleResult | None, BundleOptions]:  # fmt: skip
+    """The path of a camera that only turns; None where that does not explain the frames."""
+    log.begin("rotations")
+    start = turning_only(clip, keys)
+    result, options = None, BundleOptions()
+    if start is not None:
+        options = replace(options_of(start), path=replace(path, turns_only=True))
+        result = bundle_adjust(start, "constant-motion", rough_options(options), partial(_tell, log, "rotations"))
+        if result.sigma_px < _FLOW_PX and result.num_outliers < _OUTLIERS * len(start.observations):
+            result = bundle_adjust(
+                result.reconstruction, "constant-motion", replace(options, outlier_rounds=1),
+                partial(_tell, log, "rotations"),
+            )  # fmt: skip
+            warnings.warn(
+                "the camera only turned: without parallax there are directions, but no places and no scene",
+                RsUndistortWarning, stacklevel=4,
+            )  # fmt: skip
+        else:
+            result = None
+    log.end("rotations", explained=result is not None)
+    return result, options
+
+
+def _travelled(
+    clip: Clip, keys: LoadedPhotos, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions],
+    scratch: Path, log: StageLog, seed: int, matching: str,
+) -> tuple[BundleResult, BundleOptions]:  # fmt: skip
+    """The path of a camera that travels, through the scene that its key frames show."""
     mapped, matched = _mapped(keys, scratch, log, seed, matching)
     # a shutter that is not modelled yet would be blamed on the lens
     rough = rough_options(replace(options_of(mapped), refine=()))
@@ -98,27 +152,17 @@ def solve_clip(
         log.begin(stage)
         options = replace(options_of(whole), path=path)
         how = rough_options(options) if result is None else options
-        first = result is None
+        is_first = result is None
         result = bundle_adjust(whole, "constant-motion", how, partial(_tell, log, stage))
         log.end(
             stage, rms_px=result.rms_px, iterations=result.num_iterations, readout_s=_readout(result).seconds,
             stop_reason=result.stop_reason,
         )  # fmt: skip
-        if first:
+        if is_first:
             # key frames freed of the shutter: what it had torn from their tracks returns
             current = retriangulate(matched, result.of_photos(_are_keys(result, clip)).reconstruction)
     assert result is not None
-    alone = _readout(result)
-    log.begin("gyroscope")
-    felt = _felt(clip, result, gyroscope)
-    if felt is not None:
-        options = replace(options, path=replace(path, rates=felt.rates(result)))
-        result = bundle_adjust(
-            result.reconstruction, "constant-motion", replace(options, outlier_rounds=0),
-            partial(_tell, log, "gyroscope"),
-        )  # fmt: skip
-    log.end("gyroscope", offset_s=None if felt is None else felt.alignment.offset_s)
-    return _judged(clip, keys, result, options, alone, felt, log)
+    return result, options
 
 
 def _mapped(
@@ -144,9 +188,12 @@ def _judged(
     felt: Felt | None, log: StageLog,
 ) -> Solved:  # fmt: skip
     """What is to be believed of a path, and what is told of its key frames."""
-    log.begin("critical motion")
-    result, remedy = heal(result, options)
-    log.end("critical motion", sigma_log_k=remedy.after.sigma_log_k)
+    assert options.path is not None
+    remedy = None
+    if not options.path.turns_only:  # else there is no shape that could be wrong
+        log.begin("critical motion")
+        result, remedy = heal(result, options)
+        log.end("critical motion", sigma_log_k=remedy.after.sigma_log_k)
     log.begin("halves")
     halves = _halves(result, options)
     log.end("halves", readout_s=None if halves is None else [each.seconds for each in halves])
@@ -155,7 +202,12 @@ def _judged(
     log.end("stabilisation", verdict=stabilisation.verdict)
     of_keys = result.of_photos(_are_keys(result, clip))
     log.begin("comparison with a global shutter")
-    global_result = without_shutter(of_keys, replace(options, path=None))
+    # a path of frames that are read at once
+    at_once = replace(options.path, readout=(0.0, _NO_READOUT * clip.frame_s))
+    global_result = bundle_adjust(
+        of_keys.reconstruction, "constant-motion",
+        replace(rough_options(options), path=at_once, outlier_rounds=0, deviations="model"),
+    )  # fmt: skip
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
     against = stabilisation.reason if stabilisation.verdict == "stabilised" else ""
     verdict = judge_clip(result, of_keys, halves, clip.frame_s, remedy, against)

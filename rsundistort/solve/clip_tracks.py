@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..input.clip import Clip, greys_of
-from ..model import Observations, Reconstruction, RowMotion
+from ..model import Camera, Observations, Reconstruction, RowMotion
 from ..model.projection import unproject_points
 from ..sfm.flow import flow_between
 from ..sfm.resection import resect
 
-__all__ = ["Followed", "follow_points", "with_all_frames"]
+__all__ = ["Followed", "follow", "follow_points", "with_all_frames"]
 
 # Points of a key frame that are followed: those of the most key frames first, spread over its cells.
 _POINTS = 120
@@ -76,23 +76,47 @@ def _between_keys(clip: Clip, keys: list[int]) -> Iterator[tuple[int, int, list[
 
 
 def follow_points(clip: Clip, reconstruction: Reconstruction) -> Followed:
-    """Follow what the key frames of a reconstruction show of its points to the key frames before and after."""
-    rec = reconstruction
+    """Follow what the key frames of a reconstruction show of its points to the key frames before and after.
+
+    What is chosen are indices of its measurements.
+    """
+    rec, obs = reconstruction, reconstruction.observations
     number = {name: k for k, name in enumerate(clip.names)}
-    image_of = {number[name]: i for i, name in enumerate(rec.image_names)}
-    keys = sorted(image_of)
-    obs, by_photo = rec.observations, rec.observations.by_photo(rec.num_images)
-    worth = np.bincount(obs.point_idx, minlength=rec.num_points)
+    mine = {number[name]: each for name, each in zip(rec.image_names, obs.by_photo(rec.num_images), strict=True)}
+    worth = np.bincount(obs.point_idx, minlength=rec.num_points)[obs.point_idx]
+    shown = {key: obs.xy_raw[each] for key, each in mine.items()}
+    followed = follow(clip, shown, rec.cameras[0], {key: worth[each] for key, each in mine.items()})
+    followed.chosen = {key: mine[key][chosen] for key, chosen in followed.chosen.items()}
+    return followed
+
+
+def follow(
+    clip: Clip, shown: Mapping[int, NDArray[np.float64]], camera: Camera,
+    worth: Mapping[int, NDArray[np.int64]] | None = None,
+) -> Followed:  # fmt: skip
+    """Follow points of key frames to the key frames before and after.
+
+    Parameters
+    ----------
+    clip : Clip
+        The video.
+    shown : mapping of frame number to (n, 2) array
+        Points of each key frame, pixels.
+    camera : Camera
+        Of the frames.
+    worth : mapping of frame number to (n,) int array, optional
+        Of points in the same part of a frame those of more worth are followed; else those that come first.
+    """
+    size = camera.width, camera.height
+    keys = sorted(shown)
     chosen = {}
-    for key, image in image_of.items():
-        mine, camera = by_photo[image], rec.camera(image)
-        best = _spread(obs.xy_raw[mine], worth[obs.point_idx[mine]], (camera.width, camera.height))
-        chosen[key] = mine[best]
+    for key, xy in shown.items():
+        value = np.arange(len(xy))[::-1] if worth is None else worth[key]
+        chosen[key] = _spread(xy, value, size)
     followed = Followed(chosen)
-    camera = rec.cameras[0]
     for a, b, greys in _between_keys(clip, keys):
-        step = np.array([camera.width, camera.height]) / greys[0].shape[::-1]
-        starts = [(obs.xy_raw[chosen[key]] + 0.5) / step - 0.5 for key in (a, b)]
+        step = np.array(size) / greys[0].shape[::-1]
+        starts = [(shown[key][chosen[key]] + 0.5) / step - 0.5 for key in (a, b)]
         for key, tracks in zip((a, b), flow_between(greys, *starts), strict=True):
             followed.add(key, tracks.frame + a, tracks.point, (tracks.xy + 0.5) * step - 0.5)
     return followed

@@ -37,7 +37,7 @@ from ..sfm import LEAST_MEASUREMENTS, MatchedPhotos, align_tracks, map_photos, m
 from ..verdict import Verdict, judge
 from .outcome import Solved
 
-__all__ = ["Feedback", "rough_options", "solve_photos", "solve_tracks", "without_shutter"]
+__all__ = ["Feedback", "rough_options", "solve_photos", "solve_tracks"]
 
 # Feedback ends when no rectified pixel of any photo moves by more than this between two rounds, in pixels of the images
 # that the features were found in; or when less than this share of the measurements is another one than before, so that
@@ -266,7 +266,7 @@ def solve_tracks(
             advice = advise(result, options)
         log.end("critical motion", remedy=mended.name, sigma_log_k=mended.after.sigma_log_k)
     log.begin("comparison with a global shutter")
-    global_result = without_shutter(result, options)
+    global_result = _without_shutter(result, options)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
     log.begin("verdict")
     measured = mapped if feedback is None else tracks
@@ -307,7 +307,7 @@ def _chosen(
     return choice, result, tracks, options
 
 
-def without_shutter(result: BundleResult, options: BundleOptions) -> BundleResult:
+def _without_shutter(result: BundleResult, options: BundleOptions) -> BundleResult:
     """The same measurements explained by a global shutter, for comparison."""
     plain = BundleOptions(
         outlier_rounds=0,

@@ -1,0 +1,130 @@
+"""A clip whose camera only turns: directions instead of points, rotations instead of poses."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ..input.clip import Clip
+from ..input.load import LoadedPhotos
+from ..model import Camera, Observations, Reconstruction, RowMotion
+from ..model.projection import unproject_points
+from .clip_tracks import Followed, follow
+
+__all__ = ["turning_only"]
+
+# Room for the shutter where frames are turned onto each other, pixels; and what may be left in the median when turns of
+# both frames' lines are taken out, too: the picture moves by fifty from key to key, and travel leaves a part of that.
+_ROOM_PX, _LEFT_PX = 40.0, 2.0
+_LEAST_AGREEING = 12
+_TRIALS = 20
+
+
+def turning_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
+    """All frames of a clip, chained by the rotations between them, with the directions that they show as points.
+
+    The centres are all at the origin, the points at a distance of 1. None where the frames do not hang together, or are
+    not turned onto each other but for what a shutter leaves.
+    """
+    camera = keys.cameras.of(0)
+    number = {name: k for k, name in enumerate(clip.names)}
+    shown = {number[name]: found.xy_raw for name, found in zip(keys.names, keys.features, strict=True)}
+    followed = follow(clip, shown, camera)
+    rays = _directions(followed.xy_raw, camera)
+    own = {key: _directions(shown[key][followed.chosen[key]], camera) for key in followed.chosen}
+    order = sorted(followed.chosen)
+    R_cw = {order[0]: np.eye(3)}
+    for a, b in pairwise(order):
+        if a not in R_cw or clip.part[a] != clip.part[b]:
+            break
+        for k in range(a + 1, b + 1):
+            mine = (followed.frame == k) & (followed.key == a)
+            turn = _turn(own[a][followed.place[mine]], rays[mine], _ROOM_PX / float(camera.K[0, 0]))
+            if turn is not None:
+                R_cw[k] = turn @ R_cw[a]
+    left = []
+    for a, b in pairwise(order):
+        if a in R_cw and b in R_cw:
+            mine = (followed.frame == b) & (followed.key == a)
+            before = own[a][followed.place[mine]] @ (R_cw[b] @ R_cw[a].T).T
+            left.append(_left_by_shutter(before, rays[mine], camera))
+    if not left or not np.median(left) * camera.K[0, 0] < _LEFT_PX:
+        return None
+    return _joined(clip, keys, followed, shown, own, R_cw)
+
+
+def _joined(
+    clip: Clip, keys: LoadedPhotos, followed: Followed, shown: dict[int, NDArray[np.float64]],
+    own: dict[int, NDArray[np.float64]], R_cw: dict[int, NDArray[np.float64]],
+) -> Reconstruction:  # fmt: skip
+    """The frames whose rotations are known, and what they show."""
+    placed = np.array(sorted(R_cw))
+    index = np.full(len(clip.names), -1)
+    index[placed] = np.arange(len(placed))
+    order = [key for key in sorted(followed.chosen) if key in R_cw]
+    start = dict(zip(order, np.cumsum([0, *(len(own[key]) for key in order)])[:-1].tolist(), strict=True))
+    there = np.isin(followed.key, order) & (index[followed.frame] >= 0)
+    point = np.array([start[key] for key in followed.key[there].tolist()], np.int64) + followed.place[there]
+    num = sum(len(own[key]) for key in order)
+    at_key = np.concatenate([np.full(len(own[key]), index[key]) for key in order])
+    rec = Reconstruction(
+        [keys.cameras.of(0)], [clip.names[k] for k in placed.tolist()], np.zeros(len(placed), np.int64),
+        np.array([R_cw[k] for k in placed.tolist()]), np.zeros((len(placed), 3)),
+        np.concatenate([own[key] @ R_cw[key] for key in order]),
+        Observations(
+            np.concatenate([at_key, index[followed.frame[there]]]), np.concatenate([np.arange(num), point]),
+            np.concatenate([*(shown[key][followed.chosen[key]] for key in order), followed.xy_raw[there]]),
+        ),
+    )  # fmt: skip
+    return rec.with_points(np.ones(len(rec.observations), bool))
+
+
+def _directions(xy_raw: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """(n, 3) unit rays of pixels; NaN where there is none."""
+    rays, valid = unproject_points(xy_raw, camera, RowMotion(), "global")
+    ahead = np.column_stack([rays, np.ones(len(rays))])
+    ahead /= np.linalg.norm(ahead, axis=1)[:, None]
+    ahead[~valid] = np.nan
+    return ahead
+
+
+def _left_by_shutter(before: NDArray[np.float64], after: NDArray[np.float64], camera: Camera) -> float:
+    """Median distance of directions (n, 3) of two frames, turned onto each other, that turns of lines do not explain."""
+    seen = np.isfinite(before).all(1) & np.isfinite(after).all(1)
+    if seen.sum() < _LEAST_AGREEING:
+        return float("inf")
+    (u, v), (x, y) = (each[seen, :2].T / each[seen, 2] for each in (before, after))
+    # dx / dt of x = X / Z where X turns, by the three axes
+    by_turn = np.stack([np.stack([x * y, -(1 + x**2), y], 1), np.stack([1 + y**2, -x * y, -x], 1)], axis=1)
+    r_before, r_after = (u, x) if camera.clock_axis == 0 else (v, y)
+    A = np.concatenate([by_turn, r_after[:, None, None] * by_turn, -r_before[:, None, None] * by_turn], axis=2)
+    apart, weight = np.stack([x - u, y - v], axis=1), np.ones(len(x))
+    size = np.linalg.norm(apart, axis=1)
+    for _ in range(10):
+        root = np.sqrt(weight)[:, None]
+        fit = np.linalg.lstsq((root[:, :, None] * A).reshape(-1, 9), (root * apart).ravel(), rcond=None)[0]
+        size = np.linalg.norm(apart - A @ fit, axis=1)
+        weight = 1.0 / np.maximum(size, 1e-5)
+    return float(np.median(size))
+
+
+def _turn(before: NDArray[np.float64], after: NDArray[np.float64], within: float) -> NDArray[np.float64] | None:
+    """The rotation that takes most directions (n, 3) to those of another frame; None if too few agree on one."""
+    seen = np.isfinite(before).all(1) & np.isfinite(after).all(1)
+    before, after = before[seen], after[seen]
+    if len(before) < _LEAST_AGREEING:
+        return None
+    rng = np.random.default_rng(0)
+    best, most = None, 0
+    for _ in range(_TRIALS):
+        pair = rng.choice(len(before), 2, replace=False)
+        turn = Rotation.align_vectors(after[pair], before[pair])[0].as_matrix()
+        agree = np.linalg.norm(before @ turn.T - after, axis=1) < within
+        if agree.sum() > most:
+            best, most = agree, int(agree.sum())
+    if best is None or most < _LEAST_AGREEING:
+        return None
+    return np.asarray(Rotation.align_vectors(after[best], before[best])[0].as_matrix())
