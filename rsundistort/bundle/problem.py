@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from .._kernels import projection
+from .._kernels import residuals
 from ..errors import InputError
 from ..model import Camera, Reconstruction, check_shutter_model
 from ..model.reprojection import camera_arrays, motion_tables, observed_lens_pixels, plain_arrays
@@ -339,7 +339,7 @@ class BundleProblem:
         res, J_frame = spent.blocks if spent else (np.empty((o, 2)), np.empty((o, 2, self.layout.size)))
         cost = np.empty(-(-o // _CHUNK))
         with numba.parallel_chunksize(1):
-            projection.residual_blocks(
+            residuals.residual_blocks(
                 *self._kernel_args(state),
                 self._rows(state),
                 self._block,
@@ -440,7 +440,7 @@ class BundleProblem:
         codes = np.concatenate([self._refine_codes, _VARIATION[: 3 * varies]])
         both = np.empty((len(self._xy), 2, len(codes)))
         if len(codes):
-            projection.intrinsic_blocks(*self._kernel_args(state), self._rows(state), codes, both)
+            residuals.intrinsic_blocks(*self._kernel_args(state), self._rows(state), codes, both)
         J, of_photo = both[:, :, :num], both[:, :, num:]
         if self._options.varying:
             own = state.variation[self._structure.frame_idx]
@@ -461,7 +461,7 @@ class BundleProblem:
         """Half the robust sum of squares in units of the noise, with the priors."""
         cost = np.empty(-(-len(self._xy) // _CHUNK))
         with numba.parallel_chunksize(1):
-            projection.residual_costs(*self._kernel_args(state), self._clock, cost)
+            residuals.residual_costs(*self._kernel_args(state), self._clock, cost)
         self._clock_of = state
         return float(cost.sum()) + self._prior_cost(state)
 
@@ -474,7 +474,7 @@ class BundleProblem:
     def _track_costs(self, state: State) -> NDArray[np.float64]:
         """(n,) cost of each point's measurements."""
         cost = np.empty(len(self._xy))
-        projection.residual_costs(*self._kernel_args(state), self._clock, cost)
+        residuals.residual_costs(*self._kernel_args(state), self._clock, cost)
         self._clock_of = state
         total = np.zeros(len(state.points_w))
         np.add.at(total, self._structure.point_idx, cost)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .._kernels import projection as kernels
+from .._kernels import maps as kernels
 from ..model import Camera, RowMotion, check_shutter_model
 from ..model.field import add_field
 from .maps import EDGE_PX, seen_by
