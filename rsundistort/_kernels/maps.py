@@ -12,38 +12,49 @@ from .projection import project, project_exact
 _5, _16, _31, _LOW_HALF, _BIAS = np.int32(5), np.int32(16), np.int32(31), np.int32(0xFFFF), np.int32(1 << 20)
 
 
-@kernel()
-def fill_map(model, axis, sign, intr, lens, phi, rays, row0, col0, map_x, map_y):
-    """Raw pixel that saw each rectified pixel, for the block of the grid that starts at (row0, col0).
+@kernel(forceinline=True)
+def _ray(rays, u, v):
+    """Direction (x, y, z) in the camera frame of a rectified pixel."""
+    return (
+        rays[0, 0] * u + rays[0, 1] * v + rays[0, 2],
+        rays[1, 0] * u + rays[1, 1] * v + rays[1, 2],
+        rays[2, 0] * u + rays[2, 1] * v + rays[2, 2],
+    )
 
-    `rays` (3, 3) takes a rectified pixel (u, v, 1) to a direction in the camera frame. Where no raw pixel
-    answers, the map points far outside every photo (finite: a NaN is handled differently by OpenCV 4 and 5).
+
+@kernel(forceinline=True)
+def _raw_pixel(ok, intr, out):
+    """The raw pixel that `project` found; if none answers, one far outside of every photo.
+
+    It is finite: a NaN is handled differently by OpenCV 4 and 5.
+    """
+    if ok:
+        return intr[0] * out[0] + intr[2], intr[1] * out[1] + intr[3]
+    return -1e6, -1e6
+
+
+@kernel()
+def fill_map(model, axis, sign, intr, lens, phi, rays, row0, map_x, map_y):
+    """Raw pixel that saw each rectified pixel of the rows `row0 ...`.
+
+    `rays` (3, 3) takes a rectified pixel (u, v, 1) to a direction in the camera frame.
     """
     out = np.empty(21)
     vel = np.zeros(3)
     rows, cols = map_x.shape
     for i in range(rows):
-        v = row0 + i
         # the clock of the last two pixels foretells that of the next
         t1 = t2 = math.nan
         for j in range(cols):
-            u = col0 + j
-            x = rays[0, 0] * u + rays[0, 1] * v + rays[0, 2]
-            y = rays[1, 0] * u + rays[1, 1] * v + rays[1, 2]
-            z = rays[2, 0] * u + rays[2, 1] * v + rays[2, 2]
+            x, y, z = _ray(rays, j, row0 + i)
             ok = project(model, axis, sign, lens, x, y, z, phi, vel, 2.0 * t1 - t2, out, False)
             t2 = t1
             t1 = sign * out[axis] if ok else math.nan
-            if ok:
-                map_x[i, j] = intr[0] * out[0] + intr[2]
-                map_y[i, j] = intr[1] * out[1] + intr[3]
-            else:
-                map_x[i, j] = -1e6
-                map_y[i, j] = -1e6
+            map_x[i, j], map_y[i, j] = _raw_pixel(ok, intr, out)
 
 
 @kernel()
-def fill_map_at_depth(axis, sign, intr, lens, phi, vel, rays, inverse_depth, row0, col0, map_x, map_y):
+def fill_map_at_depth(axis, sign, intr, lens, phi, vel, rays, inverse_depth, row0, map_x, map_y):
     """As `fill_map`, of the constant-motion model: what pixel [i, j] shows lies at its ray / inverse_depth[i, j].
 
     vel is in the camera frame; at an inverse depth of zero it moves nothing.
@@ -51,21 +62,54 @@ def fill_map_at_depth(axis, sign, intr, lens, phi, vel, rays, inverse_depth, row
     out = np.empty(21)
     rows, cols = map_x.shape
     for i in range(rows):
-        v = row0 + i
         t1 = t2 = math.nan
         for j in range(cols):
-            u = col0 + j
-            x = rays[0, 0] * u + rays[0, 1] * v + rays[0, 2]
-            y = rays[1, 0] * u + rays[1, 1] * v + rays[1, 2]
-            z = rays[2, 0] * u + rays[2, 1] * v + rays[2, 2]
+            x, y, z = _ray(rays, j, row0 + i)
             # the scale of a scene does not show: the ray, and the velocity times the inverse depth
             ok = z > 0.0 and project_exact(
                 axis, sign, lens, x, y, z, phi, vel, float(inverse_depth[i, j]), 2.0 * t1 - t2, out, False
             )
             t2 = t1
             t1 = sign * out[axis] if ok else math.nan
-            map_x[i, j] = intr[0] * out[0] + intr[2] if ok else -1e6
-            map_y[i, j] = intr[1] * out[1] + intr[3] if ok else -1e6
+            map_x[i, j], map_y[i, j] = _raw_pixel(ok, intr, out)
+
+
+@kernel(forceinline=True)
+def _powers(x0, x1, x2, x3):
+    """Coefficients of the cubic through the values at 0, 1, 2, 3, by powers of the place."""
+    x1, x2, x3 = x1 - x0, x2 - x0, x3 - x0
+    return x0, 3.0 * x1 - 1.5 * x2 + x3 / 3.0, -2.5 * x1 + 2.0 * x2 - 0.5 * x3, 0.5 * (x1 - x2) + x3 / 6.0
+
+
+@kernel(forceinline=True)
+def _nodes_of_row(nodes, p, s, column):
+    """Values (n,) at the columns of nodes, in a row of pixels at the place s, 0 to 3, of the row p of patches."""
+    w0, w1 = (1.0 - s) * (2.0 - s) * (3.0 - s) / 6.0, s * (2.0 - s) * (3.0 - s) / 2.0
+    w2, w3 = s * (1.0 - s) * (s - 3.0) / 2.0, s * (1.0 - s) * (2.0 - s) / 6.0
+    a, b, c, d = 3 * p, 3 * p + 1, 3 * p + 2, 3 * p + 3
+    for k in range(len(column)):
+        column[k] = w0 * nodes[a, k] + w1 * nodes[b, k] + w2 * nodes[c, k] + w3 * nodes[d, k]
+
+
+@kernel(forceinline=True)
+def _interpolate_row(column_x, column_y, k, at, low, right, bottom, row_x, row_y, row_seen):
+    """A row of a patch from its nodes k ... k + 3; seen is what lies between low and right, or bottom.
+
+    Returned is how many pixels do not.
+    """
+    x0, xa, xb, xc = _powers(column_x[k], column_x[k + 1], column_x[k + 2], column_x[k + 3])
+    y0, ya, yb, yc = _powers(column_y[k], column_y[k + 1], column_y[k + 2], column_y[k + 3])
+    outside = 0
+    for j in range(len(row_x)):
+        t = at[j]
+        x = x0 + t * (xa + t * (xb + t * xc))
+        y = y0 + t * (ya + t * (yb + t * yc))
+        row_x[j] = x
+        row_y[j] = y
+        inside = (x > low) & (x < right) & (y > low) & (y < bottom)
+        row_seen[j] = 255 if inside else 0
+        outside += 0 if inside else 1
+    return outside
 
 
 @kernel()
@@ -73,7 +117,7 @@ def interpolate_map(
     model, axis, sign, intr, lens, phi, rays, nodes_x, nodes_y, smooth, spacing, band, edge, width, height, row0,
     map_x, map_y, seen,
 ):  # fmt: skip
-    """As `fill_map` for the rows `row0 ...`, by cubics between nodes of the grid; and which pixels see the raw photo.
+    """As `fill_map`, by cubics between nodes of the grid; and which pixels see the raw photo.
 
     Patches of 3 x 3 cells have 4 x 4 of the nodes, (3 m + 1, 3 n + 1) in all, `spacing` pixels apart. Exact instead are
     patches that are not `smooth` (m, n), and pixels within `band` of where seeing ends, `edge` pixels beyond the
@@ -92,40 +136,18 @@ def interpolate_map(
         v = row0 + i
         line_x, line_y, line_seen = map_x[i], map_y[i], seen[i]
         p = v // side
-        s = at[v - p * side]
-        w0, w1 = (1.0 - s) * (2.0 - s) * (3.0 - s) / 6.0, s * (2.0 - s) * (3.0 - s) / 2.0
-        w2, w3 = s * (1.0 - s) * (s - 3.0) / 2.0, s * (1.0 - s) * (2.0 - s) / 6.0
-        a, b, c, d = 3 * p, 3 * p + 1, 3 * p + 2, 3 * p + 3
-        for k in range(num):
-            column_x[k] = w0 * nodes_x[a, k] + w1 * nodes_x[b, k] + w2 * nodes_x[c, k] + w3 * nodes_x[d, k]
-            column_y[k] = w0 * nodes_y[a, k] + w1 * nodes_y[b, k] + w2 * nodes_y[c, k] + w3 * nodes_y[d, k]
+        _nodes_of_row(nodes_x, p, at[v - p * side], column_x)
+        _nodes_of_row(nodes_y, p, at[v - p * side], column_y)
         for q in range(smooth.shape[1]):
             start = q * side
             n = min(side, cols - start)
             row_x, row_y, row_seen = line_x[start : start + n], line_y[start : start + n], line_seen[start : start + n]
-            near = n
             if smooth[p, q]:
-                # by powers of the place in the patch
-                x0, y0 = column_x[3 * q], column_y[3 * q]
-                x1, y1 = column_x[3 * q + 1] - x0, column_y[3 * q + 1] - y0
-                x2, y2 = column_x[3 * q + 2] - x0, column_y[3 * q + 2] - y0
-                x3, y3 = column_x[3 * q + 3] - x0, column_y[3 * q + 3] - y0
-                xa, ya = 3.0 * x1 - 1.5 * x2 + x3 / 3.0, 3.0 * y1 - 1.5 * y2 + y3 / 3.0
-                xb, yb = -2.5 * x1 + 2.0 * x2 - 0.5 * x3, -2.5 * y1 + 2.0 * y2 - 0.5 * y3
-                xc, yc = 0.5 * (x1 - x2) + x3 / 6.0, 0.5 * (y1 - y2) + y3 / 6.0
-                near = 0
-                x_in, x_out, y_in, y_out = low + band, right - band, low + band, bottom - band
-                for j in range(n):
-                    t = at[j]
-                    x = x0 + t * (xa + t * (xb + t * xc))
-                    y = y0 + t * (ya + t * (yb + t * yc))
-                    row_x[j] = x
-                    row_y[j] = y
-                    safe = (x > x_in) & (x < x_out) & (y > y_in) & (y < y_out)
-                    row_seen[j] = 255 if safe else 0
-                    near += 0 if safe else 1
-            if near == 0:
-                continue
+                near = _interpolate_row(
+                    column_x, column_y, 3 * q, at, low + band, right - band, bottom - band, row_x, row_y, row_seen
+                )
+                if near == 0:
+                    continue
             t1 = t2 = math.nan
             for j in range(n):
                 x, y = float(row_x[j]), float(row_y[j])
@@ -137,15 +159,11 @@ def interpolate_map(
                         t1 = math.nan
                         unseen += 1
                         continue
-                u = start + j
-                x = rays[0, 0] * u + rays[0, 1] * v + rays[0, 2]
-                y = rays[1, 0] * u + rays[1, 1] * v + rays[1, 2]
-                z = rays[2, 0] * u + rays[2, 1] * v + rays[2, 2]
+                x, y, z = _ray(rays, start + j, v)
                 ok = project(model, axis, sign, lens, x, y, z, phi, vel, 2.0 * t1 - t2, out, False)
                 t2 = t1
                 t1 = sign * out[axis] if ok else math.nan
-                x = intr[0] * out[0] + intr[2] if ok else -1e6
-                y = intr[1] * out[1] + intr[3] if ok else -1e6
+                x, y = _raw_pixel(ok, intr, out)
                 row_x[j] = x
                 row_y[j] = y
                 row_seen[j] = 255 if low <= x <= right and low <= y <= bottom else 0

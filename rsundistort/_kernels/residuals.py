@@ -39,6 +39,21 @@ def _loss(kind, s, scale2):
 
 
 @kernel(forceinline=True)
+def _weights(kind, r0, r1, scale2):
+    """Of a whitened residual r: rho, w, keep and the symmetric M = m00, m01, m11, for r w / keep and M J.
+
+    J <- sqrt(rho') (I - a n n') J and r <- sqrt(rho') r / (1 - a), n = r/|r|: the gradient stays rho' J'r and J'J
+    becomes the Hessian of `_loss`.
+    """
+    s = r0 * r0 + r1 * r1
+    rho, weight, share = _loss(kind, s, scale2)
+    w = math.sqrt(weight)
+    keep = math.sqrt(1.0 - share)
+    a_s = (1.0 - keep) / s if s > 0.0 else 0.0
+    return rho, w, keep, w * (1.0 - a_s * r0 * r0), -w * a_s * r0 * r1, w * (1.0 - a_s * r1 * r1)
+
+
+@kernel(forceinline=True)
 def _camera_frame(R, center, velocity, point, vel_c):
     """Point in the camera frame at the reference row (x, y, z), and the velocity there in vel_c."""
     d0, d1, d2 = point[0] - center[0], point[1] - center[1], point[2] - center[2]
@@ -159,15 +174,8 @@ def residual_blocks(
             precision = 1.0 / sigma_px[k]
             r0 = (intrs[c, 0] * out[0] + intrs[c, 2] - xy_raw[k, 0]) * precision
             r1 = (intrs[c, 1] * out[1] + intrs[c, 3] - xy_raw[k, 1]) * precision
-            s = r0 * r0 + r1 * r1
-            rho, weight, share = _loss(loss_kind, s, scale2)
+            rho, w, keep, m00, m01, m11 = _weights(loss_kind, r0, r1, scale2)
             total += 0.5 * rho
-            # J <- sqrt(rho') (I - a n n') J and r <- sqrt(rho') r / (1 - a), n = r/|r|: the gradient stays rho' J'r
-            # and J'J becomes the Hessian of `_loss`
-            w = math.sqrt(weight)
-            keep = math.sqrt(1.0 - share)
-            a_s = (1.0 - keep) / s if s > 0.0 else 0.0
-            m00, m01, m11 = w * (1.0 - a_s * r0 * r0), -w * a_s * r0 * r1, w * (1.0 - a_s * r1 * r1)
             res[k, 0] = r0 * w / keep
             res[k, 1] = r1 * w / keep
             g0, g1 = intrs[c, 0] * precision, intrs[c, 1] * precision
@@ -253,11 +261,7 @@ def intrinsic_blocks(
             xd, yd = out[0], out[1]
             r0 = (intrs[c, 0] * xd + intrs[c, 2] - xy_raw[k, 0]) / sigma_px[k]
             r1 = (intrs[c, 1] * yd + intrs[c, 3] - xy_raw[k, 1]) / sigma_px[k]
-            s = r0 * r0 + r1 * r1
-            _, weight, share = _loss(loss_kind, s, scale2)
-            w = math.sqrt(weight)
-            a_s = (1.0 - math.sqrt(1.0 - share)) / s if s > 0.0 else 0.0
-            m00, m01, m11 = w * (1.0 - a_s * r0 * r0), -w * a_s * r0 * r1, w * (1.0 - a_s * r1 * r1)
+            _, _, _, m00, m01, m11 = _weights(loss_kind, r0, r1, scale2)
             g0, g1 = intrs[c, 0] / sigma_px[k], intrs[c, 1] / sigma_px[k]
             _lens_jacobian(model, axis, sign, lens, x, y, z, phi[f], vel_c, xd, yd, d)
             for i in range(len(unknowns)):

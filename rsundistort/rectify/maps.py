@@ -44,11 +44,11 @@ def fill_rows(
     if depth is not None and depth.matters(shutter_model):
         inverse = depth.inverse(row0, map_x.shape)
         kernels.fill_map_at_depth(
-            axis, sign, intr, lens, motion.kernel_phi, motion.velocity_in_camera, rays, inverse, row0, 0, map_x, map_y
+            axis, sign, intr, lens, motion.kernel_phi, motion.velocity_in_camera, rays, inverse, row0, map_x, map_y
         )
         depth.mark_hidden(row0, map_x, map_y)
     else:
-        kernels.fill_map(model, axis, sign, intr, lens, motion.kernel_phi, rays, row0, 0, map_x, map_y)
+        kernels.fill_map(model, axis, sign, intr, lens, motion.kernel_phi, rays, row0, map_x, map_y)
     add_field(camera, map_x, map_y)
 
 
