@@ -153,8 +153,8 @@ def test_jacobian_equals_central_differences_through_the_step(model, varying, re
     problem, state = noisy_problem(rng, model, refine=refine, dist=dist, varying=varying)
     order = problem._structure.order
     obs = problem._start.observations.select(order)
-    _, J_frame, J_point, _ = problem._blocks(state)
-    jacobians = J_frame, J_point, problem._camera_jacobians(state)
+    _, J_frame, _ = problem._jacobians(state)
+    jacobians = J_frame, -J_frame[:, :, 3:6], problem._camera_jacobians(state)
     owners_of = obs.frame_idx, obs.point_idx, problem._start.camera_idx[obs.frame_idx]
     h = 1e-6
 
@@ -191,7 +191,7 @@ def test_gradient_equals_central_differences_of_the_cost(model, loss, refine, rn
 
 def dense_system(problem, state):
     """Hessian and gradient of all unknowns, photos, points, cameras, written out; with the mask of the free ones."""
-    res, J_frame, J_point, _ = problem._blocks(state)
+    res, J_frame, _ = problem._jacobians(state)
     J_camera = problem._camera_jacobians(state)
     nc = J_camera.shape[2]
     obs = problem._start.observations.select(problem._structure.order)
@@ -202,7 +202,7 @@ def dense_system(problem, state):
         f, p = nb * obs.frame_idx[k], m * nb + 3 * obs.point_idx[k]
         c = m * nb + others[0] + nc * problem._start.camera_idx[obs.frame_idx[k]]
         J[k, :, f : f + nb] = J_frame[k]
-        J[k, :, p : p + 3] = J_point[k]
+        J[k, :, p : p + 3] = -J_frame[k, :, 3:6]
         J[k, :, c : c + nc] = J_camera[k]
     J = J.reshape(-1, J.shape[2])
     H, g = J.T @ J, J.T @ res.ravel()

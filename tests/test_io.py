@@ -25,8 +25,9 @@ from rsundistort.errors import FileError, FormatError, InputError
 from rsundistort.io import (
     Metadata,
     camera_from_exif,
+    check_camera_fits,
     output_folder,
-    parse_camera,
+    read_camera_file,
     write_colmap_model,
     write_image,
     write_transforms,
@@ -57,22 +58,27 @@ def tree(folder):
 # ---------------------------------------------------------------- cameras
 
 
+def camera_of(text, width=640, height=480):
+    """The camera of a file or of numbers, for photos of a size."""
+    (camera,) = read_camera_file(text, width, height).cameras.values()
+    check_camera_fits(camera, width, height, str(text))
+    return camera
+
+
 def test_camera_json(tmp_path):
     path = tmp_path / "camera.json"
     path.write_text(json.dumps(CAMERA))
-    camera = parse_camera(str(path), 640, 480)
+    camera = camera_of(path)
     assert camera == Camera(640, 480, np.array(K), np.array(CAMERA["dist"]), "bottom-to-top")
-    assert parse_camera(str(path), 640, 480, "left-to-right").readout == "left-to-right"
     path.write_text(json.dumps({k: CAMERA[k] for k in ("width", "height", "K")}))
-    assert parse_camera(str(path), 640, 480) == Camera(640, 480, np.array(K))
+    assert camera_of(path) == Camera(640, 480, np.array(K))
 
 
 def test_the_lens_of_a_camera_json(tmp_path):
     path = tmp_path / "camera.json"
     fisheye = Camera(640, 480, np.array(K), np.array([0.1, -0.02, 0.01, 0.0]), "bottom-to-top", "fisheye")
     path.write_text(json.dumps(camera_to_json(fisheye)))
-    assert parse_camera(str(path), 640, 480) == fisheye
-    assert parse_camera(str(path), 640, 480, "left-to-right").lens == "fisheye"
+    assert camera_of(path) == fisheye
     # an older reader can read what it knows
     assert "lens" not in camera_to_json(fisheye.pinhole())
 
@@ -80,19 +86,19 @@ def test_the_lens_of_a_camera_json(tmp_path):
 @pytest.mark.parametrize("text", ["500 0 322.5\n0 510 235.25\n0 0 1\n", "500,0,322.5,0,510,235.25,0,0,1"])
 def test_camera_of_a_text_file(tmp_path, text):
     (tmp_path / "K.txt").write_text(text)
-    assert parse_camera(str(tmp_path / "K.txt"), 640, 480) == Camera(640, 480, np.array(K))
+    assert camera_of(tmp_path / "K.txt") == Camera(640, 480, np.array(K))
 
 
 def test_camera_of_a_scaled_matrix(tmp_path):
     (tmp_path / "K.txt").write_text(" ".join(str(2 * v) for v in np.ravel(K)))
-    assert parse_camera(str(tmp_path / "K.txt"), 640, 480) == Camera(640, 480, np.array(K))
+    assert camera_of(tmp_path / "K.txt") == Camera(640, 480, np.array(K))
 
 
 @pytest.mark.parametrize("lens", [[], [-0.1, 0.02, 0.001, -0.002], [-0.1, 0.02, 0.001, -0.002, 0.003]])
 def test_camera_of_numbers(lens):
     text = ",".join(str(v) for v in [500.0, 510.0, 322.5, 235.25, *lens])
-    expected = Camera(640, 480, np.array(K), np.array(lens), "right-to-left")
-    assert parse_camera(text, 640, 480, "right-to-left") == expected
+    expected = Camera(640, 480, np.array(K), np.array(lens))
+    assert camera_of(text) == expected
 
 
 @pytest.mark.parametrize(
@@ -114,13 +120,13 @@ def test_camera_of_numbers(lens):
 )
 def test_garbled_numbers_are_refused(text):
     with pytest.raises(InputError) as error:
-        parse_camera(text, 640, 480)
+        camera_of(text)
     one_line(error)
 
 
 def test_many_numbers_are_refused():
     with pytest.raises(InputError) as error:
-        parse_camera(",".join(["1"] * 300), 640, 480)
+        camera_of(",".join(["1"] * 300))
     one_line(error)
 
 
@@ -156,7 +162,7 @@ def test_camera_json_that_does_not_fit_is_refused(tmp_path, change):
     path = tmp_path / "camera.json"
     path.write_text(json.dumps({**CAMERA, **change}))
     with pytest.raises(InputError) as error:
-        parse_camera(str(path), 640, 480)
+        camera_of(path)
     assert "camera.json" in one_line(error)
 
 
@@ -164,7 +170,7 @@ def test_a_camera_of_another_size_says_both_sizes(tmp_path):
     path = tmp_path / "camera.json"
     path.write_text(json.dumps(CAMERA))
     with pytest.raises(InputError) as error:
-        parse_camera(str(path), 320, 240)
+        camera_of(path, 320, 240)
     assert "640x480" in one_line(error)
     assert "320x240" in one_line(error)
 
@@ -176,14 +182,14 @@ def test_camera_files_that_are_none_are_refused(tmp_path, content):
     path = tmp_path / "camera.json"
     path.write_bytes(content)
     with pytest.raises((FormatError, FileError)) as error:
-        parse_camera(str(path), 640, 480)
+        camera_of(path)
     assert str(path) in one_line(error)
 
 
 def test_missing_camera_files_are_refused(tmp_path):
     for path in (tmp_path / "none.json", tmp_path):
         with pytest.raises(FileError) as error:
-            parse_camera(str(path), 640, 480)
+            camera_of(path)
         assert str(path) in one_line(error)
 
 
