@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from folders import tree
 from make_photos import save_png, save_textures, texture
 from rsundistort_cli.main import cli
 from scipy.spatial.transform import Rotation
@@ -41,13 +42,6 @@ def invoke(monkeypatch, tmp_path):
         return CliRunner().invoke(cli, [str(arg) for arg in args])
 
     return run
-
-
-def tree(folder):
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes() if path.is_file() else None
-        for path in sorted(folder.rglob("*"))
-    }
 
 
 def error_line(result):
@@ -399,7 +393,7 @@ def test_analyze_a_colmap_model_with_a_lens(invoke, tmp_path):
         ("transforms.json", "{}", "no transforms.json"),
         ("transforms.json", '{"frames": [{"transform_matrix": [[1, 2], [3, 4]]}]}', "no transforms.json"),
         ("transforms.json", '{"frames": []}', "0 poses"),
-        ("solution.json", "{}", ""),
+        ("solution.json", "{}", "is no solution"),
     ],
 )
 def test_analyze_refuses_what_has_no_poses(invoke, tmp_path, name, text, says):

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
+import numpy_twin
 import pytest
 from numpy_twin import DIRECTIONS
 from scipy.interpolate import LinearNDInterpolator
@@ -15,7 +17,6 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import (
     AtInfinity,
-    Camera,
     DepthMap,
     Plane,
     RectifyOptions,
@@ -44,6 +45,7 @@ from rsundistort.synthetic import measure, project_rows
 
 W, H = 200, 160
 K = np.array([[210.0, 0, 97.3], [0, 205.0, 81.6], [0, 0, 1]])
+make_camera = partial(numpy_twin.make_camera, W, H, K)
 LENS = [-0.12, 0.03, 0.001, -0.002]
 VELOCITY = np.array([0.6, -0.3, 0.4])  # m per unit of the clock; the frame is 0.8 of it
 MOTION = RowMotion([0.04, -0.03, 0.05], VELOCITY)
@@ -51,13 +53,9 @@ R = Rotation.from_rotvec([0.02, -0.05, 0.1]).as_matrix()
 MODEL = "constant-motion"
 
 all_directions = pytest.mark.parametrize("readout", DIRECTIONS)
-FISHEYE = (0.02, -0.01, 0.003, -0.001)
+FISHEYE = numpy_twin.Fisheye((0.02, -0.01, 0.003, -0.001))
 with_and_without_lens = pytest.mark.parametrize("dist", [[], LENS, FISHEYE], ids=["pinhole", "lens", "fisheye"])
 depths = pytest.mark.parametrize("kind", ["plane", "map", "points"])
-
-
-def make_camera(dist=(), readout="top-to-bottom"):
-    return Camera(W, H, K, dist, readout, "fisheye" if dist is FISHEYE else "pinhole")
 
 
 def pixel_grid(width=W, height=H):

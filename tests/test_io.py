@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from folders import tree
 from make_photos import exif_block, texture
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
@@ -45,14 +46,6 @@ def one_line(error):
     assert text
     assert "\n" not in text
     return text
-
-
-def tree(folder):
-    """What a folder holds: content of files, None for folders."""
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes() if path.is_file() else None
-        for path in sorted(folder.rglob("*"))
-    }
 
 
 # ---------------------------------------------------------------- cameras
