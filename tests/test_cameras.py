@@ -12,6 +12,7 @@ import pycolmap
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import one_line
 
 from rsundistort import Camera, RsUndistortError
 from rsundistort.errors import FileError, FormatError, InputError
@@ -29,13 +30,6 @@ lenses = pytest.mark.parametrize(("lens", "length"), LENSES)
 
 def calibrated(lens="pinhole", length=5):
     return Camera(640, 480, K, np.array(DIST[:length]), lens=lens)
-
-
-def one_line(error):
-    text = str(error.value)
-    assert text
-    assert "\n" not in text
-    return text
 
 
 def read_one(path, width=640, height=480):

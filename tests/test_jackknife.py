@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_bundle import dense_system, make_scene, noisy_problem
+from bundle_scenes import dense_system, make_scene, noisy_problem
 
 from rsundistort import BundleOptions, KnownLength, bundle_adjust
 from rsundistort.bundle import Posterior

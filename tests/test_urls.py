@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from folders import seen_files
+from four_photos import FOUR, invoke, save_solution
 from make_photos import save_png, save_textures, texture
-from test_batch import FOUR, invoke, save_solution
 
 from rsundistort import RunOptions, rectify_folder, run, solve
 from rsundistort.errors import FileError, InputError, SkippedPhotoWarning
