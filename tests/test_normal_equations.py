@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import covariance
 import numpy as np
 import pytest
 from bundle_scenes import (
@@ -127,7 +128,7 @@ def test_covariances_are_those_of_the_whole_inverse(factor_limit, refine, rng):
     found = problem.linearize(state).function_of_points(problem.in_order(weights))
     variance, with_photos = found.variance, found.with_photos
     start, stop = m * nb, m * nb + weights.size
-    b = weights[problem._points].ravel()
+    b = weights[problem._structure.points].ravel()
     assert variance == pytest.approx(b @ whole[start:stop, start:stop] @ b, rel=1e-7)
     reference = (whole[: m * nb, start:stop] @ b).reshape(m, nb)
     np.testing.assert_allclose(with_photos, reference, rtol=0, atol=1e-7 * np.abs(reference).max())
@@ -152,6 +153,21 @@ def test_conjugate_gradients_of_several_clusters_give_the_factored_step(model, r
         steps.append(problem.linearize(problem.initial_state()).solve(1e-4)[0])
     for factored, iterated in zip(*steps, strict=True):
         np.testing.assert_allclose(iterated, factored, rtol=0, atol=1e-7 * np.abs(factored).max(initial=0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["rotation", "constant-motion"])
+def test_predicted_deviations_are_those_of_monte_carlo(model):
+    # of 200 trials each of 50 ratios has a standard error of 5 %
+    for found in covariance.ratios(model, 200).values():
+        assert found.min() > 0.85
+        assert found.max() < 1.15
+
+
+def test_predicted_deviations_are_those_of_few_trials():
+    for found in covariance.ratios("rotation", 30).values():
+        # 13 % each, and the components of a photo go together
+        assert 0.85 < np.sqrt(np.mean(found**2)) < 1.15
 
 
 @pytest.mark.parametrize("refine", [(), ("f", "k1")], ids=["calibrated", "refined"])
@@ -209,5 +225,5 @@ def test_known_lengths_join_the_system(damping, refine, rng):
         np.testing.assert_allclose(cameras, block, rtol=0, atol=1e-7 * np.abs(block).max(initial=0))
         weights = rng.normal(size=(given.num_points, 3))
         variance = joined.linearize(state).function_of_points(joined.in_order(weights)).variance
-        b = weights[joined._points].ravel()
+        b = weights[joined._structure.points].ravel()
         assert variance == pytest.approx(b @ whole[points, points] @ b, rel=1e-6)
