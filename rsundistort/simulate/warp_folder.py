@@ -17,19 +17,11 @@ from ..batch.progress import ProgressCallback, StageLog
 from ..batch.workers import use_threads
 from ..errors import FormatError, InputError
 from ..input.photo_cameras import camera_file_of, find_cameras
-from ..io import (
-    Photo,
-    facts_of_exif,
-    list_photos,
-    output_folder,
-    output_name,
-    read_photo,
-    write_image,
-    write_solution,
-)
+from ..io import facts_of_exif, list_photos, output_folder, output_name, read_photo, write_image, write_solution
 from ..io.cameras import camera_to_json
 from ..io.gyro import GyroLog
 from ..io.json_text import read_json
+from ..io.photos.images import Photo
 from ..io.record import Record
 from ..model import Camera, RowMotion, Solution, SolvedImage
 from ..model.checks import check_finite
