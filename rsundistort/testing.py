@@ -77,23 +77,11 @@ def assert_images_close(
     _check_tolerance(max_grey, "max_grey")
     if not 0.0 <= max_share <= 1.0:
         raise InputError(f"max_share={max_share}, expected 0 to 1")
-    picture = _as_picture(got, "got")
-    if isinstance(expected, (str, Path)):
-        path = Path(expected)
-        if not path.is_file():
-            raise AssertionError(_missing(path))
-        target = _as_picture(_read(path), str(path))
-    else:
-        target = _as_picture(expected, "expected")
+    picture, target = _as_picture(got, "got"), _expected_picture(expected)
     if picture.shape != target.shape or picture.dtype != target.dtype:
         shown = _write_pictures(out, expected=_show(target), got=_show(picture))
         raise AssertionError(f"{_unlike(picture, target)}\n{shown}")
-    compared = np.ones(picture.shape[:2], bool) if mask is None else np.asarray(mask) != 0
-    if compared.shape != picture.shape[:2]:
-        raise InputError(f"mask.shape={compared.shape}, expected {picture.shape[:2]}")
-    if not compared.any():
-        raise InputError("mask leaves no pixel to compare")
-
+    compared = _compared(mask, picture.shape[:2])
     steps = _STEPS_PER_GREY.get(picture.dtype.name, 1.0)
     difference = _difference(picture, target) / steps
     by_pixel = np.where(compared, difference if difference.ndim == 2 else difference.max(axis=2), 0.0)
@@ -235,6 +223,27 @@ def _as_picture(value: ArrayLike, name: str) -> NDArray[Any]:
     if not kinds or array.ndim not in (2, 3) or array.size == 0:
         raise InputError(f"{name} is {array.dtype} {array.shape}, expected uint8, uint16 or floats (h, w[, channels])")
     return array
+
+
+def _expected_picture(expected: ArrayLike | str | Path) -> NDArray[Any]:
+    """The picture that is given, or that a golden file holds."""
+    __tracebackhide__ = True
+    if not isinstance(expected, (str, Path)):
+        return _as_picture(expected, "expected")
+    path = Path(expected)
+    if not path.is_file():
+        raise AssertionError(_missing(path))
+    return _as_picture(_read(path), str(path))
+
+
+def _compared(mask: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Which pixels are compared: those where the mask is not 0."""
+    compared = np.ones(shape, bool) if mask is None else np.asarray(mask) != 0
+    if compared.shape != shape:
+        raise InputError(f"mask.shape={compared.shape}, expected {shape}")
+    if not compared.any():
+        raise InputError("mask leaves no pixel to compare")
+    return compared
 
 
 def _read(path: Path) -> NDArray[Any]:

@@ -12,6 +12,9 @@ import hypothesis
 import numba
 import numpy as np
 import pytest
+from click.testing import CliRunner
+from rsundistort_cli.main import cli
+from solved_scene import solve_scene
 
 hypothesis.settings.register_profile("rsundistort", max_examples=40, deadline=None, derandomize=True, database=None)
 hypothesis.settings.load_profile("rsundistort")
@@ -21,6 +24,24 @@ hypothesis.settings.load_profile("rsundistort")
 def rng(request):
     """A generator that depends on the test's id only: neither on the order of tests nor on other draws."""
     return np.random.default_rng(zlib.crc32(request.node.nodeid.encode()))
+
+
+@pytest.fixture
+def invoke(monkeypatch, tmp_path):
+    """Runs the command inside an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*args):
+        return CliRunner().invoke(cli, [str(arg) for arg in args])
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def solved_courtyard(tmp_path_factory):
+    """Outputs of the courtyard, and its solution; not to be changed."""
+    out = tmp_path_factory.mktemp("courtyard") / "out"
+    return out, solve_scene("courtyard", out)
 
 
 @pytest.fixture

@@ -37,6 +37,11 @@ def lens_of(dist):
     return "fisheye" if isinstance(dist, Fisheye) else "pinhole"
 
 
+def make_camera(width, height, K, dist=(), readout="top-to-bottom"):
+    """A camera of the lens model that its coefficients belong to."""
+    return Camera(width, height, K, dist, readout, lens_of(dist))
+
+
 def lens(dist, xy):
     """OpenCV's lens on normalised coordinates (n, 2)."""
     if isinstance(dist, Fisheye):

@@ -47,6 +47,13 @@ def make_camera(readout="top-to-bottom"):
     return Camera(800, 600, [[720, 0, 402], [0, 700, 297], [0, 0, 1]], [-0.1, 0.03, 0.001, -0.002], readout)
 
 
+def bend_along(rotation, camera, sites=65):
+    """The bend nearest to rotation vectors, a function of the place in the frame, 0 to 1."""
+    place = np.linspace(0, 1, 4 * (sites - 1) + 1)
+    start, end = camera.clock_range
+    return Bend.of(start + (end - start) * place, rotation(place), sites=sites)[0]
+
+
 def random_bend(rng, camera, groups=GROUPS, turn=3e-4, way=0.002):
     functions, _ = bend_functions(groups)
     k = functions.shape[1]
@@ -329,9 +336,7 @@ def test_lines_that_move_faster_than_any_model_are_noticed(rng):
     truth = make_scene(rng, groups=0, num_points=1200)
     camera, obs = truth.cameras[0], truth.observations
     shakes = [
-        Bend.along(lambda p, k=k: 2e-3 * np.sin(28 * np.pi * p + k)[:, None] * [1, 0.7, 0.2], *camera.clock_range, 129)[
-            0
-        ]
+        bend_along(lambda p, k=k: 2e-3 * np.sin(28 * np.pi * p + k)[:, None] * [1, 0.7, 0.2], camera, 129)
         for k in range(truth.num_images)
     ]
     shaken = truth.with_motions([RowMotion(phi, bend=bend) for phi, bend in zip(truth.phi, shakes, strict=True)])
@@ -360,7 +365,7 @@ def test_a_reconstruction_turned_or_thinned_keeps_its_bends(rng):
 
 def test_the_largest_shift_counts_bends(rng):
     camera = make_camera()
-    bend = Bend.along(lambda p: 0.004 * np.sin(6 * np.pi * p)[:, None] * [1, 0, 0], *camera.clock_range)[0]
+    bend = bend_along(lambda p: 0.004 * np.sin(6 * np.pi * p)[:, None] * [1, 0, 0], camera)
     assert 2.0 < largest_shift_px(camera, RowMotion(bend=bend)) < 4.0
 
 

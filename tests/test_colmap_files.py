@@ -7,7 +7,7 @@ import struct
 
 import pycolmap
 import pytest
-from test_bundle import make_scene
+from bundle_scenes import make_scene
 
 from rsundistort.colmap import read_colmap_cameras, read_colmap_poses, write_colmap_model
 from rsundistort.colmap.file_checks import check_colmap_files

@@ -168,13 +168,13 @@ def test_hessian_without_a_gauge_has_as_many_zeros_as_the_meter_says(name):
     options = BundleOptions(loss="squared", outlier_rounds=0)
     problem = BundleProblem(scene, "two-step", options, 1.0, Spreads(1e9, 1e9))
     state = problem.initial_state()
-    _, J_frame, J_point, _ = problem._blocks(state)
+    _, J_frame, _ = problem._jacobians(state)
     obs = problem._start.observations.select(problem._structure.order)
     m, n, nb = scene.num_images, scene.num_points, 9
     J = np.zeros((len(obs), 2, nb * m + 3 * n))
     for k in range(len(obs)):
         J[k, :, nb * obs.frame_idx[k] : nb * obs.frame_idx[k] + nb] = J_frame[k]
-        J[k, :, nb * m + 3 * obs.point_idx[k] : nb * m + 3 * obs.point_idx[k] + 3] = J_point[k]
+        J[k, :, nb * m + 3 * obs.point_idx[k] : nb * m + 3 * obs.point_idx[k] + 3] = -J_frame[k, :, 3:6]
     J = J.reshape(-1, J.shape[2])
     values = np.linalg.svd(J / np.linalg.norm(J, axis=0), compute_uv=False)
     # squares of these are the eigenvalues; seven are the similarity of the world

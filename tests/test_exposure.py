@@ -5,9 +5,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from bundle_scenes import make_scene
 from make_photos import camera_exif, texture
 from solved_scene import cameras_of
-from test_bundle import make_scene
 
 from rsundistort.batch.progress import StageLog
 from rsundistort.bundle import BundleOptions, bundle_adjust

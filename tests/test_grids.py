@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import cv2
 import numpy as np
+import numpy_twin
 import pytest
-from numpy_twin import DIRECTIONS, MODELS, Fisheye, lens_of
+from numpy_twin import DIRECTIONS, MODELS, Fisheye
 from scipy.ndimage import map_coordinates
 
 from rsundistort import Camera, Plane, RemapGrid, RowMotion, init_rectify_map, rectify, undistort_points
@@ -15,6 +18,7 @@ from rsundistort.rectify.maps import EDGE_PX, fill_rows, rectified_rays
 
 W, H = 640, 480
 K = np.array([[520.0, 0, 315.3], [0, 510.0, 246.6], [0, 0, 1]])
+make_camera = partial(numpy_twin.make_camera, W, H, K)
 LENS = [-0.12, 0.03, 0.001, -0.002]
 FISHEYE = Fisheye([0.03, -0.01, 0.004, -0.001])
 RATIONAL = [0.1, -0.05, 0.001, -0.002, 0.01, 0.25, 0.02, 0.005, 0.002, -0.001, 0.001, 0.0015]
@@ -27,10 +31,6 @@ lenses = pytest.mark.parametrize(
 )
 all_directions = pytest.mark.parametrize("readout", DIRECTIONS)
 all_models = pytest.mark.parametrize("model", MODELS)
-
-
-def make_camera(dist=(), readout="top-to-bottom"):
-    return Camera(W, H, K, dist, readout, lens_of(dist))
 
 
 def whole(grid, width, height):

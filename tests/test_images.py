@@ -12,18 +12,12 @@ import numpy as np
 import pytest
 from make_photos import camera_exif, small_dng, tagged_jpeg, texture
 from PIL import Image
+from refusals import one_line
 
 from rsundistort import Camera, rectify
 from rsundistort.errors import FileError, FileKindWarning, InputError, MetadataWarning
 from rsundistort.io import Metadata, list_photos, output_name, read_photo, write_image
 from rsundistort.model.orientation import turn_pixels
-
-
-def one_line(error):
-    text = str(error.value)
-    assert text
-    assert "\n" not in text
-    return text
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])

@@ -1,4 +1,4 @@
-"""pycolmap exports a zlib of its own; whoever imports it first must still be able to write PNG."""
+"""pycolmap exports a zlib of its own: PNG is written where it comes after ours, and refused where it came before."""
 
 from __future__ import annotations
 
@@ -37,18 +37,38 @@ print("done")
 """
 
 
+REFUSED = """
+import sys
+from pathlib import Path
+import numpy as np
+from rsundistort.errors import InputError
+from rsundistort.io import output_folder, write_image
+folder = Path(sys.argv[1])
+write_image(folder / "photo.jpg", np.zeros((4, 6, 3), np.uint8))
+png = lambda: write_image(folder / "mask.png", np.zeros((4, 6), np.uint8))
+for job in (png, output_folder(folder / "out").__enter__):
+    try:
+        job()
+    except InputError as error:
+        print(error)
+"""
+
+
+def in_order(imports):
+    """The names of what is imported."""
+    return imports.replace("import ", "").replace("\n", "-")
+
+
 @pytest.mark.parametrize(
     "first",
     [
-        "import pycolmap\nimport rsundistort",
-        "import pycolmap\nimport cv2\nimport rsundistort",
         "import rsundistort\nimport pycolmap",
         "import rsundistort",
         "import cv2\nimport pycolmap\nimport rsundistort",
     ],
-    ids=lambda text: text.replace("import ", "").replace("\n", "-"),
+    ids=in_order,
 )
-def test_png_is_written_whoever_comes_first(tmp_path, first):
+def test_png_is_written_where_pycolmap_comes_after_zlib(tmp_path, first):
     # compressed here, since the process may not be able to
     small = bytes(cv2.imencode(".png", np.zeros((2, 2), np.uint8))[1])
     given = f"\nSMALL = {small!r}\nPROFILE = {zlib.compress(bytes(70000))!r}\n"
@@ -61,6 +81,21 @@ def test_png_is_written_whoever_comes_first(tmp_path, first):
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "done"
+
+
+@pytest.mark.parametrize(
+    "first",
+    ["import pycolmap\nimport rsundistort", "import pycolmap\nimport cv2\nimport rsundistort"],
+    ids=in_order,
+)
+def test_png_and_folders_of_outputs_are_refused_where_pycolmap_came_first(tmp_path, first):
+    command = [sys.executable, "-c", first + REFUSED, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert len(lines) == 2
+    assert all("import rsundistort first, then pycolmap" in line for line in lines)
+    assert [path.name for path in tmp_path.iterdir()] == ["photo.jpg"]
 
 
 def test_every_package_is_installed():

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_bundle import dense_system, make_scene, noisy_problem
+from bundle_scenes import dense_system, make_scene, noisy_problem
 
 from rsundistort import BundleOptions, KnownLength, bundle_adjust
 from rsundistort.bundle import Posterior
@@ -19,7 +19,7 @@ from rsundistort.errors import InputError
 
 def whole_jacobian(problem, state):
     """Weighted residuals (o, 2), Jacobian (o, 2, all unknowns), and Hessian and its inverse with 0 where held."""
-    res, J_frame, J_point, _ = problem._blocks(state)
+    res, J_frame, _ = problem._jacobians(state)
     J_camera = problem._camera_jacobians(state)
     H, _, free = dense_system(problem, state)
     s, camera_idx = problem._structure, problem._start.camera_idx
@@ -27,8 +27,10 @@ def whole_jacobian(problem, state):
     J = np.zeros((len(res), 2, len(free)))
     for k, (f, p) in enumerate(zip(s.frame_idx, s.point_idx, strict=True)):
         for first, block in (
-            (nb * f, J_frame[k]), (m * nb + 3 * p, J_point[k]), (m * nb + 3 * n + nc * camera_idx[f], J_camera[k])
-        ):  # fmt: skip
+            (nb * f, J_frame[k]),
+            (m * nb + 3 * p, -J_frame[k, :, 3:6]),
+            (m * nb + 3 * n + nc * camera_idx[f], J_camera[k]),
+        ):
             J[k, :, first : first + block.shape[1]] = block
     scale = 1 / np.sqrt(np.diag(H)[free])
     inverse = np.zeros_like(H)

@@ -10,9 +10,17 @@ import pytest
 
 MODULE = """
 from rsundistort._kernels._jit import kernel
+from callee import FACTOR, add
 @kernel()
 def twice(x):
-    return 2 * x
+    return add(FACTOR * x)
+"""
+CALLEE = """
+from rsundistort._kernels._jit import kernel
+FACTOR = 2
+@kernel()
+def add(x):
+    return x + 0
 """
 CALL = "import numba; from small import twice; print(twice(21)); print(sum(twice.stats.cache_hits.values()))"
 
@@ -21,15 +29,16 @@ CALL = "import numba; from small import twice; print(twice(21)); print(sum(twice
 def small(tmp_path):
     """A program with one kernel: what it says, and how often it found the kernel compiled."""
     (tmp_path / "small.py").write_text(MODULE)
+    (tmp_path / "callee.py").write_text(CALLEE)
 
-    def run(**environment):
+    def run(expected=42, **environment):
         kept = {"NUMBA_CACHE_DIR": str(tmp_path / "kept"), "PYTHONPATH": str(tmp_path)}
         done = subprocess.run(
             [sys.executable, "-c", CALL], capture_output=True, text=True, env=os.environ | kept | environment
         )
         assert done.returncode == 0, done.stderr
         answer, found = map(int, done.stdout.split())
-        assert answer == 42
+        assert answer == expected
         return found, done.stderr
 
     return run
@@ -40,10 +49,22 @@ def test_a_kernel_is_compiled_once(small):
     assert small() == (1, "")
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "answer"),
+    [("x + 0", "x + 1", 43), ("FACTOR = 2", "FACTOR = 3", 63)],
+    ids=["callee", "constant"],
+)
+def test_a_change_in_the_file_of_a_callee_is_noticed(small, tmp_path, old, new, answer):
+    small()
+    (tmp_path / "callee.py").write_text(CALLEE.replace(old, new))
+    assert small(answer) == (0, "")
+    assert small(answer) == (1, "")
+
+
 @pytest.mark.parametrize(("suffix", "length"), [(".nbi", 40), (".nbc", 0)])
 def test_what_was_cut_short_is_compiled_again(small, tmp_path, suffix, length):
     small()
-    (damaged,) = (tmp_path / "kept").rglob(f"*{suffix}")
+    (damaged,) = (tmp_path / "kept").rglob(f"small.twice*{suffix}")
     damaged.write_bytes(damaged.read_bytes()[:length])
     assert [small(), small()] == [(0, ""), (1, "")]
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bundle_scenes import make_scene, perturbed
 from rsundistort_cli.closing import _fields
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 from solved_scene import cameras_of
-from test_bundle import make_scene, perturbed
 
 from rsundistort import (
     BundleOptions,

@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from folders import tree
 from make_photos import COURTYARD_NAMES, half_courtyard, save_png, save_textures, texture
 
 from rsundistort import (
@@ -38,13 +39,6 @@ from rsundistort.synthetic.warp import largest_rectangle
 CAMERA = "300,300,160,120"
 OPTIONS = RunOptions(max_features=2500)
 BROKEN = "0009.png"
-
-
-def tree(folder):
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes() if path.is_file() else None
-        for path in sorted(folder.rglob("*"))
-    }
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_bundle import make_scene, perturbed
+from bundle_scenes import make_scene, perturbed
 
 import rsundistort as rs
 from rsundistort._former import FORMER_NAMES

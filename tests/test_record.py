@@ -13,11 +13,11 @@ import time
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from commands import solution_of
+from four_photos import save_solution
 from make_photos import save_textures
 from rsundistort_cli.main import cli
-from test_batch import save_solution
-from test_cli import solution_of
-from test_synthetic_scene import TINY
+from test_recipes import TINY
 
 from rsundistort import rectify_folder
 from rsundistort.errors import FileError

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import cv2
 import numpy as np
+import numpy_twin
 import pytest
-from numpy_twin import DIRECTIONS, MODELS, Fisheye, lens, lens_of, undistort_with_opencv
+from numpy_twin import DIRECTIONS, MODELS, Fisheye, lens, undistort_with_opencv
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
@@ -27,6 +30,7 @@ from rsundistort.synthetic.warp import warp_photo
 
 W, H = 200, 160
 K = np.array([[210.0, 0, 97.3], [0, 205.0, 81.6], [0, 0, 1]])
+make_camera = partial(numpy_twin.make_camera, W, H, K)
 LENS = [-0.12, 0.03, 0.001, -0.002]
 FISHEYE = Fisheye([0.03, -0.01, 0.004, -0.001])
 RATIONAL = [0.1, -0.05, 0.001, -0.002, 0.01, 0.25, 0.02, 0.005, 0.002, -0.001, 0.001, 0.0015]
@@ -39,10 +43,6 @@ lenses = pytest.mark.parametrize(
     "dist", [[], LENS, RATIONAL, FISHEYE], ids=["pinhole", "4-parameters", "12-parameters", "fisheye"]
 )
 with_and_without_lens = pytest.mark.parametrize("dist", [[], LENS, FISHEYE], ids=["pinhole", "lens", "fisheye"])
-
-
-def make_camera(dist=(), readout="top-to-bottom"):
-    return Camera(W, H, K, dist, readout, lens_of(dist))
 
 
 def opencv_map(dist, R, new_K, size):

@@ -2,10 +2,8 @@ from __future__ import annotations
 
 import base64
 import json
-import re
 import shutil
 from dataclasses import replace
-from html.parser import HTMLParser
 from urllib.parse import unquote
 
 import cv2
@@ -14,126 +12,34 @@ import pytest
 from browser import CHROMIUM, Browser
 from click.testing import CliRunner
 from make_photos import exif_block, save_textures
+from report_pages import hand_made, page_of, quietly, write_solution_to
 from rsundistort_cli.main import cli
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation
 from solved_scene import SCENES, solve_scene
 
-from rsundistort import Camera, RowMotion, RsUndistortWarning, Solution, SolvedImage, read_solution, write_solution
-from rsundistort.errors import FileError, FormatError
+from rsundistort import RsUndistortWarning, SolvedImage, read_solution, write_solution
+from rsundistort.errors import FormatError
 from rsundistort.io import Metadata, write_image
-from rsundistort.model import Bend
-from rsundistort.report import diagnostics as diagnostics_module
-from rsundistort.report import read_diagnostics, verdict_of, write_diagnostics, write_figures, write_report
-from rsundistort.report.displacement import displacement_field
+from rsundistort.report import verdict_of, write_figures, write_report
 from rsundistort.report.pictures import PictureJob, _bytes_of_each, _small, make_pictures
 from rsundistort.solve import run_outputs as outputs
 
 SECTIONS = ["verdict", "pictures", "scene", "photos", "critical", "ladder", "residuals", "cameras", "settings"]
-CAMERA = Camera(320, 240, np.array([[300.0, 0, 160], [0, 300.0, 120], [0, 0, 1]]))
-CRITICAL = {
-    "singular_values": [1.9, 1.3, 0.6, 0.4, 0.27],
-    "null_vector": [1.0, 0, 0, 0, 0],
-    "y_axis_spread_deg": 11.0,
-    "meaning": "nothing",
-    "sigma_log_k": 0.0003,
-    "flagged": False,
-    "remedy": "none needed",
-    "anchors": {},
-    "sentence": "the height of the scene is uncertain by +-0.03 % (one standard deviation)",
-    "warnings": [],
-    "advice": [],
-}
 LEVEL = {"singular_values": [1.9, 1.3, 0.6, 0.2, 0.0], "null_vector": [0, 1.0, 0, 0, 0], "y_axis_spread_deg": 0.1}
 
 
-class Page(HTMLParser):
-    """What a report is made of: its sections, links, scripts, and the text of each element of interest."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.sections: list[str] = []
-        self.tags: list[str] = []
-        self.links: list[str] = []
-        self.fetched: list[str] = []
-        self.scripts: list[str] = []
-        self.text = ""
-        self._script = False
-        self.feed(text)
-
-    def handle_starttag(self, tag, attrs):
-        given = dict(attrs)
-        self.tags.append(tag)
-        if tag == "section":
-            self.sections.append(given["id"])
-        if tag == "a":
-            self.links.append(given.get("href", ""))
-        self.fetched += [v for k, v in attrs if k in ("src", "srcset", "data") or (k == "href" and tag != "a")]
-        self.fetched += [k for k, _ in attrs if k.startswith("on")]
-        if tag == "script":
-            self._script = True
-            self.scripts.append("")
-
-    def handle_endtag(self, tag):
-        self._script = self._script and tag != "script"
-
-    def handle_data(self, data):
-        if self._script:
-            self.scripts[-1] += data
-        else:
-            self.text += data
-
-    @property
-    def data(self):
-        return json.loads(self.scripts[0])
-
-
-def page_of(out) -> Page:
-    return Page((out / "report.html").read_text("utf-8"))
-
-
-def hand_made(
-    names=("a.png", "b.png", "c.png"), critical=None, shutter_model="rotation", shift=12.0, **more
-) -> Solution:
-    """A solution of small photos on an arc, said to be as good as the courtyard's."""
-    images = tuple(
-        SolvedImage(
-            name, "1", Rotation.from_euler("yx", [0.1 * i, 0.05 * i * i]).as_matrix(), np.array([i, 0.1 * i * i, 0.0]),
-            RowMotion([0.02, -0.01, 0.03]), np.full(3, 1e-4), 100, 0.2, shift / (1 + i),
-        )
-        for i, name in enumerate(names)
-    )  # fmt: skip
-    critical = None if critical is False else CRITICAL | (critical or {})
-    return Solution(shutter_model, {"1": CAMERA}, {"1": CAMERA.pinhole()}, images, critical, **more)
-
-
-@pytest.fixture(scope="module")
-def courtyard(tmp_path_factory):
-    """Outputs of the courtyard; not to be changed."""
-    out = tmp_path_factory.mktemp("courtyard") / "out"
-    return out, solve_scene("courtyard", out)
-
-
 @pytest.fixture
-def copied(courtyard, tmp_path):
+def copied(solved_courtyard, tmp_path):
     """Outputs of the courtyard without their report, to be changed; the photos are not found from here."""
     out = tmp_path / "moved" / "out"
-    shutil.copytree(courtyard[0], out, ignore=shutil.ignore_patterns("report.html"))
+    shutil.copytree(solved_courtyard[0], out, ignore=shutil.ignore_patterns("report.html"))
     return out
-
-
-def quietly(*args, **kwargs):
-    """A report of which nothing is missing that anybody asked for."""
-    with pytest.warns(RsUndistortWarning) as caught:
-        write_report(*args, **kwargs)
-    return [str(each.message) for each in caught]
 
 
 # ---------------------------------------------------------------- what it holds
 
 
-def test_a_run_writes_the_report_and_what_it_needs(courtyard):
-    out, _ = courtyard
+def test_a_run_writes_the_report_and_what_it_needs(solved_courtyard):
+    out, _ = solved_courtyard
     page = page_of(out)
     assert page.sections == SECTIONS
     assert page.fetched == ["data:,"]  # the icon
@@ -142,15 +48,15 @@ def test_a_run_writes_the_report_and_what_it_needs(courtyard):
     assert (out / "report.html").stat().st_size < 9_000_000
 
 
-def test_table_links_to_photos_that_are_there(courtyard):
-    out, solution = courtyard
+def test_table_links_to_photos_that_are_there(solved_courtyard):
+    out, solution = solved_courtyard
     files = [unquote(link) for link in page_of(out).links if not link.startswith("#")]
     assert len(files) == 2 * len(solution.images)
     assert all((out / link).is_file() for link in files)
 
 
-def test_pictures_of_both_sides_are_small_and_of_the_photos_shape(courtyard):
-    out, solution = courtyard
+def test_pictures_of_both_sides_are_small_and_of_the_photos_shape(solved_courtyard):
+    out, solution = solved_courtyard
     views = page_of(out).data["views"]
     assert [view["name"] for view in views] == [image.name for image in solution.images]
     for view in views[:3]:
@@ -164,15 +70,15 @@ def test_pictures_of_both_sides_are_small_and_of_the_photos_shape(courtyard):
             assert cv2.PSNR(whole, pixels) > 27
 
 
-def test_report_from_the_folder_alone_is_the_same(courtyard):
-    out, _ = courtyard
+def test_report_from_the_folder_alone_is_the_same(solved_courtyard):
+    out, _ = solved_courtyard
     before = (out / "report.html").read_bytes()
     write_report(out)
     assert (out / "report.html").read_bytes() == before
 
 
-def test_scene_has_a_camera_a_photo_and_the_global_shutters_beside(courtyard):
-    out, solution = courtyard
+def test_scene_has_a_camera_a_photo_and_the_global_shutters_beside(solved_courtyard):
+    out, solution = solved_courtyard
     scene = page_of(out).data["scene"]
 
     def count(points):
@@ -199,155 +105,6 @@ def test_rotated_photos_are_shown_upright(tmp_path):
     x, y = 0.320 * np.array(upright["arrows"])[:, 0::2], 0.320 * np.array(upright["arrows"])[:, 1::2]
     expected = np.stack([(239 - y) / 0.240, x / 0.240], axis=-1).reshape(-1, 4)
     np.testing.assert_allclose(np.array(turned["arrows"]), expected, atol=0.3)  # a tenth, rounded twice
-
-
-# ---------------------------------------------------------------- displacement
-
-
-@pytest.mark.parametrize("readout", ["top-to-bottom", "right-to-left"])
-def test_displacement_is_that_of_the_rotation(readout):
-    camera = replace(CAMERA, readout=readout)
-    motion = RowMotion([0.05, -0.03, 0.08])
-    image = SolvedImage("a", "1", motion=motion)
-    solution = Solution("rotation", {"1": camera}, {"1": camera.pinhole()}, (image,))
-    raw, still = displacement_field(solution, image)
-    # the row is known from the raw pixel: turn its ray back
-    rays = np.column_stack([(raw - [160, 120]) / 300, np.ones(len(raw))])
-    clock = rays[:, 1] if readout == "top-to-bottom" else -rays[:, 0]
-    back = Rotation.from_rotvec(-clock[:, None] * motion.phi).apply(rays)
-    np.testing.assert_allclose(300 * back[:, :2] / back[:, 2:] + [160, 120], still, atol=1e-6)
-    assert len(raw) > 60
-
-
-def test_no_motion_no_displacement():
-    image = SolvedImage("a", "1", motion=RowMotion())
-    camera = replace(CAMERA, dist=np.array([-0.1, 0.02, 0, 0]))
-    raw, still = displacement_field(Solution("rotation", {"1": camera}, {"1": camera.pinhole()}, (image,)), image)
-    np.testing.assert_allclose(raw, still, atol=1e-6)
-
-
-def test_displacement_of_a_travelling_camera_depends_on_the_depth():
-    image = SolvedImage("a", "1", np.eye(3), np.zeros(3), RowMotion([0, 0, 0], [0.5, 0, 0]))
-    solution = Solution("constant-motion", {"1": CAMERA}, {"1": CAMERA.pinhole()}, (image,))
-    far, near = (displacement_field(solution, image, depth) for depth in (None, 10.0))
-    np.testing.assert_allclose(*far, atol=1e-6)
-    # x' = X/z - r v / z with the row that shows it
-    clock = (near[0][:, 1] - 120) / 300
-    np.testing.assert_allclose(near[0][:, 0] - near[1][:, 0], -300 * clock * 0.5 / 10, atol=1e-6)
-
-
-# ---------------------------------------------------------------- diagnostics
-
-
-def test_motions_that_are_not_steady_are_drawn_over_the_lines(tmp_path):
-    """The curve of each axis, read back from the page, is the rotation of the lines in degrees."""
-    rng = np.random.default_rng(4)
-    made = hand_made()
-    bend = Bend(*CAMERA.clock_range, rng.normal(size=(9, 3)) * 0.01)
-    images = list(made.images)
-    images[1] = replace(images[1], name="b & <b>.png", motion=replace(images[1].motion, bend=bend))
-    write_solution_to(tmp_path, replace(made, images=tuple(images)))
-    quietly(tmp_path)
-    page = page_of(tmp_path)
-    assert page.sections[page.sections.index("photos") + 1] == "motions"
-    text = (tmp_path / "report.html").read_text("utf-8")
-    section = text[text.index('<section id="motions">') : text.index('<section id="critical">')]
-    assert section.count("<svg") == 1  # the others are steady
-    assert "b &amp; &lt;b&gt;.png" in section
-    high, low = (float(each.replace("−", "-")) for each in re.findall(r">([−0-9.]+)°</text>", section))
-    curves = [np.array(re.findall(r"([0-9.]+) ([0-9.]+)", d), float) for d in re.findall(r'<path d="([^"]+)"', section)]
-    clock = np.linspace(*CAMERA.clock_range, len(curves[0]))
-    turn = np.degrees(clock[:, None] * images[1].motion.phi + CubicSpline(bend.clock, bend.rotation)(clock))
-    for k, curve in enumerate(curves):
-        np.testing.assert_allclose(curve[:, 0], np.linspace(0, 240, len(curve)), atol=0.06)
-        shown = high - (curve[:, 1] - 4) / 112 * (high - low)
-        np.testing.assert_allclose(shown, turn[:, k], atol=0.02)  # as the marks are rounded
-    assert len(curves) == 3
-    assert section.count('class="steady"') == 3
-
-
-def test_steady_motions_have_no_section(courtyard):
-    assert "motions" not in page_of(courtyard[0]).sections
-
-
-def test_residuals_of_photos_are_those_of_the_solution(courtyard):
-    out, solution = courtyard
-    told = read_diagnostics(out / "report.npz")
-    assert told.names == tuple(image.name for image in solution.images)
-    np.testing.assert_allclose(told.rms_px[1], [image.rms_px for image in solution.images], rtol=1e-5)
-    counts = np.array([image.num_observations for image in solution.images])
-    for k, whole in ((0, solution.quality["global_rms_px"]), (1, solution.quality["rms_px"])):
-        assert np.sqrt(np.average(told.rms_px[k] ** 2, weights=counts)) == pytest.approx(whole, rel=0.01)
-    # 0.2 px of noise in, minus what the fit absorbs
-    assert 0.15 < np.nanmean(told.row_rms_px[1]) < 0.22
-    assert np.nanmean(told.row_rms_px[0]) > 5 * np.nanmean(told.row_rms_px[1])
-    assert told.histogram[1].sum() == pytest.approx(2 * counts.sum(), rel=0.01)
-    assert told.rgb.shape == told.points_w.shape
-
-
-def test_global_result_lies_beside_the_solution(courtyard):
-    out, solution = courtyard
-    told = read_diagnostics(out / "report.npz")
-    centers = np.array([image.center_w for image in solution.images])
-    away = np.linalg.norm(told.global_center_w - centers, axis=1)
-    assert 0 < away.max() < 0.2 * np.linalg.norm(np.ptp(centers, axis=0))
-
-
-def test_a_similarity_is_taken_out(courtyard, rng):
-    from rsundistort import Observations, Reconstruction
-
-    R = Rotation.random(5, random_state=1).as_matrix()
-    none = Observations(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
-    rec = Reconstruction(
-        [CAMERA], list("abcde"), np.zeros(5, int), R, rng.normal(size=(5, 3)), rng.normal(size=(9, 3)), none
-    )
-    S = Rotation.random(random_state=2).as_matrix()
-    other = replace(rec, R_cw=R @ S.T, center_w=3 * rec.center_w @ S.T + 1, points_w=3 * rec.points_w @ S.T + 1)
-    back = diagnostics_module._aligned(other, rec)
-    for name in ("R_cw", "center_w", "points_w"):
-        np.testing.assert_allclose(getattr(back, name), getattr(rec, name), atol=1e-9)
-
-
-def test_diagnostics_of_a_thousand_photos_are_small(courtyard, tmp_path, rng):
-    told = read_diagnostics(courtyard[0] / "report.npz")
-    many, points = 1000, 15_000
-    big = replace(
-        told, names=tuple(f"{i:05}.jpg" for i in range(many)), rms_px=rng.random((2, many)), depth=rng.random(many),
-        row_mean_px=rng.normal(size=(2, many, 12, 2)), points_w=rng.normal(size=(points, 3)),
-        global_points_w=rng.normal(size=(points, 3)), point_idx=np.arange(points),
-        rgb=rng.integers(0, 256, (points, 3), dtype=np.uint8), global_R_cw=rng.normal(size=(many, 3, 3)),
-        global_center_w=rng.normal(size=(many, 3)),
-    )  # fmt: skip
-    write_diagnostics(tmp_path / "report.npz", big)
-    assert (tmp_path / "report.npz").stat().st_size < 1_000_000
-    back = read_diagnostics(tmp_path / "report.npz")
-    np.testing.assert_allclose(back.row_mean_px, big.row_mean_px, rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"version": np.array(2)}, "version 2"),
-        ({"format": np.array("x")}, "format"),
-        ({"depth": np.zeros(3)}, "depth"),
-        ({"names": np.array([{}], dtype=object)}, "garbled"),
-    ],
-)
-def test_other_diagnostics_are_refused(courtyard, tmp_path, change, said):
-    with np.load(courtyard[0] / "report.npz") as file:
-        values = dict(file)
-    np.savez(tmp_path / "report.npz", **(values | change))
-    with pytest.raises(FormatError, match=said):
-        read_diagnostics(tmp_path / "report.npz")
-
-
-def test_garbled_diagnostics_are_refused(courtyard, tmp_path):
-    path = tmp_path / "report.npz"
-    data = (courtyard[0] / "report.npz").read_bytes()
-    for garbled in (b"", data[: len(data) // 2], b"\x93NUMPY", data.replace(b"rms_px", b"rms_py")):
-        path.write_bytes(garbled)
-        with pytest.raises((FormatError, FileError)):
-            read_diagnostics(path)
 
 
 # ---------------------------------------------------------------- pictures
@@ -408,11 +165,6 @@ def test_names_are_only_names(tmp_path):
     links = [link for link in page.links if not link.startswith("#")]
     assert all((out / unquote(link)).is_file() for link in links)
     assert len(links) == 2 * len(evil)
-
-
-def write_solution_to(out, solution) -> None:
-    out.mkdir(parents=True, exist_ok=True)
-    write_solution(out / "solution.json", solution)
 
 
 # ---------------------------------------------------------------- what is missing
@@ -533,8 +285,8 @@ def test_verdict_counts_photos_and_pixels():
     assert "from 2.00 px to 0.21 px" in verdict.sentences[1]
 
 
-def test_verdicts_of_scenes(courtyard, tmp_path):
-    assert verdict_of(courtyard[1]).level == "trust"
+def test_verdicts_of_scenes(solved_courtyard, tmp_path):
+    assert verdict_of(solved_courtyard[1]).level == "trust"
     level = solve_scene("colonnade", tmp_path / "level", remedy="none", report=False)
     assert verdict_of(level).headline == "Do not trust the height"
     unwarped = solve_scene("courtyard", tmp_path / "unwarped", unwarped=True, report=False)
@@ -551,10 +303,10 @@ def invoke():
     return lambda *args: CliRunner().invoke(cli, ["report", *(str(arg) for arg in args)])
 
 
-def test_command_says_where_the_report_is(courtyard, invoke):
-    result = invoke(courtyard[0])
+def test_command_says_where_the_report_is(solved_courtyard, invoke):
+    result = invoke(solved_courtyard[0])
     assert result.exit_code == 0, result.output
-    assert result.stdout == f"{courtyard[0] / 'report.html'}\n"
+    assert result.stdout == f"{solved_courtyard[0] / 'report.html'}\n"
     assert result.stderr == ""
 
 
@@ -576,16 +328,16 @@ def test_bad_folders_are_one_line(invoke, monkeypatch, tmp_path, args, said):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_bad_photos_folder_keeps_the_report(courtyard, invoke, tmp_path):
-    before = (courtyard[0] / "report.html").read_bytes()
-    result = invoke(courtyard[0], "--photos", tmp_path / "missing")
+def test_bad_photos_folder_keeps_the_report(solved_courtyard, invoke, tmp_path):
+    before = (solved_courtyard[0] / "report.html").read_bytes()
+    result = invoke(solved_courtyard[0], "--photos", tmp_path / "missing")
     assert result.exit_code == 1
     assert "missing is no folder" in result.stderr
-    assert (courtyard[0] / "report.html").read_bytes() == before
+    assert (solved_courtyard[0] / "report.html").read_bytes() == before
 
 
-def test_figures_for_papers(courtyard, invoke, tmp_path):
-    result = invoke(courtyard[0], "--figures", tmp_path / "figures")
+def test_figures_for_papers(solved_courtyard, invoke, tmp_path):
+    result = invoke(solved_courtyard[0], "--figures", tmp_path / "figures")
     assert result.exit_code == 0, result.output
     names = [
         f"{name}.{kind}" for name in ("ladder", "displacement", "paths", "critical-motion") for kind in ("png", "pdf")
@@ -610,8 +362,8 @@ needs_chromium = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not instal
 
 
 @needs_chromium
-def test_report_in_a_browser(courtyard, tmp_path):
-    out, solution = courtyard
+def test_report_in_a_browser(solved_courtyard, tmp_path):
+    out, solution = solved_courtyard
     with Browser(tmp_path, 1400, 1000) as page:
         page.open(out / "report.html", "document.documentElement?.dataset.drawn === 'yes'")
         # the slider moves, by the mouse

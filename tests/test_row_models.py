@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
+import numpy_twin
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from numpy_twin import DIRECTIONS, MODELS, Fisheye, lens, lens_of, project_normalised, undistort_with_opencv
+from numpy_twin import DIRECTIONS, MODELS, Fisheye, lens, project_normalised, undistort_with_opencv
 
 from rsundistort import Camera, RowMotion, project_points, unproject_points
 from rsundistort.errors import InputError
 from rsundistort.model.projection import project_points_with_jacobians
 
 K = np.array([[410.0, 0, 201.0], [0, 400.0, 148.5], [0, 0, 1]])
+make_camera = partial(numpy_twin.make_camera, 400, 300, K)
 FOCAL = np.array([410.0, 400.0])
 RATIONAL = [0.1, -0.05, 0.001, -0.002, 0.01, 0.25, 0.02, 0.005]
 LENSES = {
@@ -25,10 +29,6 @@ LENSES = {
 all_models = pytest.mark.parametrize("model", MODELS)
 all_directions = pytest.mark.parametrize("readout", DIRECTIONS)
 all_lenses = pytest.mark.parametrize("dist", LENSES.values(), ids=LENSES)
-
-
-def make_camera(dist=(), readout="top-to-bottom"):
-    return Camera(400, 300, K, dist, readout, lens_of(dist))
 
 
 def draw_points(rng, n=60, field=0.6):

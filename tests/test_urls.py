@@ -12,8 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from folders import seen_files
+from four_photos import FOUR, invoke, save_solution
 from make_photos import save_png, save_textures, texture
-from test_batch import FOUR, invoke, save_solution, tree
 
 from rsundistort import RunOptions, rectify_folder, run, solve
 from rsundistort.errors import FileError, InputError, SkippedPhotoWarning
@@ -39,7 +40,7 @@ def memory():
 
 
 def put(fs, folder, url):
-    for path, data in tree(folder).items():
+    for path, data in seen_files(folder).items():
         fs.pipe_file(f"{url}/{path}", data)
 
 
@@ -61,7 +62,7 @@ def made_locally(tmp_path_factory):
     (folder / "black").mkdir()
     save_png(folder / "black" / "b.png", np.zeros((240, 320), np.uint8))
     rectify_folder(folder / "in", folder / "s.json", folder / "truth", masks=folder / "black", maps="npz")
-    return folder, tree(folder / "truth")
+    return folder, seen_files(folder / "truth")
 
 
 @pytest.fixture
@@ -110,7 +111,7 @@ def test_one_end_by_url(remote, end):
     photos = "memory://bucket/in" if end == "in" else folder / "in"
     out = "memory://bucket/out" if end == "out" else folder / "out"
     rectify_folder(photos, folder / "s.json", out, masks=folder / "black", maps="npz")
-    assert (tree(out) if end == "in" else held(fs, out)) == truth
+    assert (seen_files(out) if end == "in" else held(fs, out)) == truth
 
 
 def test_a_file_url_is_a_path(photos):
@@ -118,7 +119,7 @@ def test_a_file_url_is_a_path(photos):
     rectify_folder(
         (folder / "in").as_uri(), folder / "s.json", (folder / "o ut").as_uri(), masks=folder / "black", maps="npz"
     )
-    assert tree(folder / "o ut") == truth
+    assert seen_files(folder / "o ut") == truth
     result = invoke("info", "--json")
     assert result.exit_code == 0
     result = invoke("rectify", (folder / "in").as_uri(), "--solution", (folder / "s.json").as_uri(), "-o",
@@ -141,11 +142,11 @@ def test_workers_of_a_cluster_read_and_write_by_url(photos, cluster):
         root = f"shared://{folder}"
         url = {"masks": f"{root}/black", "maps": "npz", "scheduler": address}
         rectify_folder(f"{root}/in", folder / "s.json", f"{root}/out", **url)
-        assert tree(folder / "out") == truth
+        assert seen_files(folder / "out") == truth
         assert not list((folder / "out").rglob("*.partial"))
         workers[0].kill()
         rectify_folder(f"{root}/in", folder / "s.json", f"{root}/out", **url, overwrite=True)
-        assert tree(folder / "out") == truth
+        assert seen_files(folder / "out") == truth
     with pytest.raises(InputError, match="workers of a scheduler do not see"):
         rectify_folder("memory://in", folder / "s.json", folder / "other", scheduler=address)
 
@@ -470,7 +471,7 @@ def test_a_file_replaces_another_where_nothing_is_renamed_onto_what_is_there(tmp
     folder = place_of(f"shared://{tmp_path}")
     folder.write("sub/a", b"one")
     folder.write("sub/a", b"two")
-    assert tree(tmp_path) == {"sub/a": b"two"}
+    assert seen_files(tmp_path) == {"sub/a": b"two"}
     assert not list(tmp_path.rglob("*.partial"))
 
 

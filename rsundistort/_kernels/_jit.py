@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from functools import lru_cache, partial
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -22,7 +24,16 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 class _Kept(FunctionCache):
-    """Compiled kernels in files, where these can be had: what is damaged, or cannot be written, is compiled again."""
+    """Compiled kernels in files, where these can be had: what is damaged, or cannot be written, is compiled again.
+
+    So is what was compiled of other sources. Numba asks only whether a kernel's own file is the same; a kernel holds
+    the code and the constants of those that it calls, too, and these may stand in any file beside it.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        sources = _stamp(Path(function.__code__.co_filename).parent)
+        self._cache_file._source_stamp = self._cache_file._source_stamp, sources
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
@@ -40,6 +51,15 @@ class _Kept(FunctionCache):
 
 
 @lru_cache
+def _stamp(folder: Path) -> bytes:
+    """Changes with any source file of a folder; of a package in a zip file, whose stamp numba takes, it is constant."""
+    digest = hashlib.sha256()
+    for path in sorted(folder.glob("*.py")):
+        digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.digest()
+
+
+@lru_cache
 def _tell(what: str) -> None:
     warnings.warn(
         f"{what}, so that each run takes a minute to compile them; set NUMBA_CACHE_DIR to a folder that can be written",
@@ -50,8 +70,7 @@ def _tell(what: str) -> None:
 
 # fastmath: products are fused into sums, nothing else; infinities and NaN keep their meaning.
 # error_model: a division by zero gives inf, which the validity flags catch, and loops can vectorise.
-# _Kept: compiled once per installation, not per run. Numba's cache does not notice a changed callee in another
-# file, so a kernel and all its callees stay in one file.
+# _Kept: compiled once per installation, not per run.
 # forceinline, for callees in inner loops: else each call counts the references of its arrays, twice the whole time.
 def kernel(
     fastmath: Any = frozenset({"contract"}), forceinline: bool = False, parallel: bool = False

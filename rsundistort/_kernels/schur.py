@@ -1,7 +1,7 @@
 """Block normal equations and the elimination of points.
 
-Observations are sorted by track (`track_start` (n+1,) are their ranges, `point_of` (n,) the point of each track);
-`frame_order` lists them by photo (`frame_start` (m+1,)). Of each observation only the Jacobian J (o, 2, nb) of its
+Observations are sorted by point (`track_start` (n+1,) are the ranges of their tracks); `frame_order` lists them by
+photo (`frame_start` (m+1,)). Of each observation only the Jacobian J (o, 2, nb) of its
 photo is kept: that of its point is minus that of the photo's centre, J_p = -J[:, :, 3:6]. So all that the elimination
 needs of a pair of photos is a 2x2 matrix between their Jacobians, and W = J'J_p is never written. `unknowns` stands for
 nb, see `_jit.unknowns_of`: loops over a small block unroll. Every loop in parallel owns what it writes, so sums do not
@@ -22,13 +22,13 @@ _CHUNK = 256
 
 
 @parallel_kernel()
-def point_blocks(track_start, point_of, res, J, V, g_point):
+def point_blocks(track_start, res, J, V, g_point):
     """V (n, 3, 3) = sum Jp'Jp and g (n, 3) = sum Jp'r."""
     n = len(V)
     for chunk in prange((n + _CHUNK - 1) // _CHUNK):
-        for track in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK)):
+        for p in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK)):
             v00 = v01 = v02 = v11 = v12 = v22 = g0 = g1 = g2 = 0.0
-            for k in range(track_start[track], track_start[track + 1]):
+            for k in range(track_start[p], track_start[p + 1]):
                 for i in range(2):
                     a, b, c, r = J[k, i, 3], J[k, i, 4], J[k, i, 5], res[k, i]
                     v00 += a * a
@@ -40,7 +40,6 @@ def point_blocks(track_start, point_of, res, J, V, g_point):
                     g0 -= a * r
                     g1 -= b * r
                     g2 -= c * r
-            p = point_of[track]
             V[p, 0, 0] = v00
             V[p, 0, 1] = V[p, 1, 0] = v01
             V[p, 0, 2] = V[p, 2, 0] = v02
@@ -97,15 +96,15 @@ def invert_points(V, damping, V_inv):
 
 
 @kernel()
-def _neighbours(f, frame_start, frame_order, frame_idx, track_idx, track_start, slot, found):
+def _neighbours(f, frame_start, frame_order, frame_idx, point_idx, track_start, slot, found):
     """Photos >= f that share a point with f, ascending in found[:count]; slot (m,) is scratch of -1."""
     count = 0
     slot[f] = 0
     found[0] = f
     count = 1
     for s in range(frame_start[f], frame_start[f + 1]):
-        t = track_idx[frame_order[s]]
-        for k in range(track_start[t], track_start[t + 1]):
+        p = point_idx[frame_order[s]]
+        for k in range(track_start[p], track_start[p + 1]):
             g = frame_idx[k]
             if g > f and slot[g] < 0:
                 slot[g] = 0
@@ -116,25 +115,25 @@ def _neighbours(f, frame_start, frame_order, frame_idx, track_idx, track_start, 
 
 
 @kernel()
-def covisible_counts(frame_start, frame_order, frame_idx, track_idx, track_start, counts):
+def covisible_counts(frame_start, frame_order, frame_idx, point_idx, track_start, counts):
     """Number of photos >= f that each photo f shares points with, itself included."""
     m = len(counts)
     slot = np.full(m, -1)
     found = np.empty(m, np.int64)
     for f in range(m):
-        counts[f] = _neighbours(f, frame_start, frame_order, frame_idx, track_idx, track_start, slot, found)
+        counts[f] = _neighbours(f, frame_start, frame_order, frame_idx, point_idx, track_start, slot, found)
         for i in range(counts[f]):
             slot[found[i]] = -1
 
 
 @kernel()
-def covisible_columns(frame_start, frame_order, frame_idx, track_idx, track_start, row_start, cols):
+def covisible_columns(frame_start, frame_order, frame_idx, point_idx, track_start, row_start, cols):
     """Block columns of the upper triangle of the reduced system, ascending in each block row."""
     m = len(row_start) - 1
     slot = np.full(m, -1)
     found = np.empty(m, np.int64)
     for f in range(m):
-        count = _neighbours(f, frame_start, frame_order, frame_idx, track_idx, track_start, slot, found)
+        count = _neighbours(f, frame_start, frame_order, frame_idx, point_idx, track_start, slot, found)
         for i in range(count):
             cols[row_start[f] + i] = found[i]
             slot[found[i]] = -1
@@ -228,7 +227,7 @@ def _between(u0, u1, u2, w0, w1, w2, J, k, n):
 
 @parallel_kernel(fastmath=SUMS)
 def reduced_system(
-    unknowns, frame_start, frame_order, frame_idx, track_idx, track_start, point_of, row_start, cols,
+    unknowns, frame_start, frame_order, frame_idx, point_idx, track_start, row_start, cols,
     J, V_inv, g_point, g_frame, diagonal, S, rhs,
 ):  # fmt: skip
     """S (blocks, nb, nb) = U + diag(diagonal) - W V^-1 W' (upper block triangle) and rhs (m, nb) = g - W V^-1 g_point.
@@ -247,15 +246,14 @@ def reduced_system(
             S[row_start[f], a, a] = diagonal[f, a]
         for s in range(frame_start[f], frame_start[f + 1]):
             k = frame_order[s]
-            t = track_idx[k]
-            p = point_of[t]
+            p = point_idx[k]
             u0, u1, u2 = _times(-J[k, 0, 3], -J[k, 0, 4], -J[k, 0, 5], V_inv, p)
             w0, w1, w2 = _times(-J[k, 1, 3], -J[k, 1, 4], -J[k, 1, 5], V_inv, p)
             e0 = u0 * g_point[p, 0] + u1 * g_point[p, 1] + u2 * g_point[p, 2]
             e1 = w0 * g_point[p, 0] + w1 * g_point[p, 1] + w2 * g_point[p, 2]
             for a in range(nb):
                 rhs[f, a] -= J[k, 0, a] * e0 + J[k, 1, a] * e1
-            for n in range(track_start[t], track_start[t + 1]):
+            for n in range(track_start[p], track_start[p + 1]):
                 if frame_idx[n] >= f:
                     m00, m01, m10, m11 = _between(u0, u1, u2, w0, w1, w2, J, k, n)
                     add_product(unknowns, S, slot[frame_idx[n]], J, k, n, m00, m01, m10, m11)
@@ -270,7 +268,7 @@ def _add_product_to(row, l0, l1, r0, r1):
 
 @parallel_kernel(fastmath=SUMS)
 def border_rows(
-    frame_start, frame_order, frame_idx, track_idx, track_start, point_of, camera_of_frame,
+    frame_start, frame_order, frame_idx, point_idx, track_start, camera_of_frame,
     J, J_camera, V_inv, g_point, B, rhs,
 ):  # fmt: skip
     """The reduced system against the k unknowns of all cameras together, nc each, as a share of every photo f.
@@ -285,14 +283,13 @@ def border_rows(
         rhs[f] = 0.0
         for s in range(frame_start[f], frame_start[f + 1]):
             k = frame_order[s]
-            t = track_idx[k]
-            p = point_of[t]
+            p = point_idx[k]
             u0, u1, u2 = _times(-J[k, 0, 3], -J[k, 0, 4], -J[k, 0, 5], V_inv, p)
             w0, w1, w2 = _times(-J[k, 1, 3], -J[k, 1, 4], -J[k, 1, 5], V_inv, p)
             e0 = u0 * g_point[p, 0] + u1 * g_point[p, 1] + u2 * g_point[p, 2]
             e1 = w0 * g_point[p, 0] + w1 * g_point[p, 1] + w2 * g_point[p, 2]
             _add_product_to(rhs[f], -e0, -e1, J_camera[k, 0], J_camera[k, 1])
-            n, end = track_start[t], track_start[t + 1]
+            n, end = track_start[p], track_start[p + 1]
             while n < end:
                 # what photos of one camera have in a track is summed before it meets the photo's own
                 camera = camera_of_frame[frame_idx[n]]
@@ -312,7 +309,7 @@ def border_rows(
 
 @parallel_kernel(fastmath=SUMS)
 def group_gradients(
-    frame_start, frame_order, track_idx, track_start, point_of, res, J, J_camera, V_inv, group, g_frame, g_camera
+    frame_start, frame_order, point_idx, track_start, res, J, J_camera, V_inv, group, g_frame, g_camera
 ):  # fmt: skip
     """What groups of measurements have in J'r - W V^-1 Jp'r: g_frame (m, groups, nb), g_camera (m, groups, nc).
 
@@ -324,12 +321,11 @@ def group_gradients(
         g_camera[f] = 0.0
         for s in range(frame_start[f], frame_start[f + 1]):
             n = frame_order[s]
-            t = track_idx[n]
-            p = point_of[t]
+            p = point_idx[n]
             # J_p is minus these: the sign of their product does not turn
             u0, u1, u2 = _times(J[n, 0, 3], J[n, 0, 4], J[n, 0, 5], V_inv, p)
             w0, w1, w2 = _times(J[n, 1, 3], J[n, 1, 4], J[n, 1, 5], V_inv, p)
-            for k in range(track_start[t], track_start[t + 1]):
+            for k in range(track_start[p], track_start[p + 1]):
                 r0, r1 = res[k, 0], res[k, 1]
                 e0 = J[k, 0, 3] * r0 + J[k, 1, 3] * r1
                 e1 = J[k, 0, 4] * r0 + J[k, 1, 4] * r1
@@ -347,15 +343,14 @@ def group_gradients(
 
 
 @parallel_kernel(fastmath=SUMS)
-def back_substitute(unknowns, track_start, point_of, frame_idx, V_inv, g_point, J, step_frame, step_point):
+def back_substitute(unknowns, track_start, frame_idx, V_inv, g_point, J, step_frame, step_point):
     """step_point (n, 3) = -V^-1 (g_point + sum Jp' J step_frame)."""
     nb = columns(unknowns)
     n = len(V_inv)
     for chunk in prange((n + _CHUNK - 1) // _CHUNK):
-        for track in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK)):
-            p = point_of[track]
+        for p in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK)):
             t0, t1, t2 = g_point[p, 0], g_point[p, 1], g_point[p, 2]
-            for k in range(track_start[track], track_start[track + 1]):
+            for k in range(track_start[p], track_start[p + 1]):
                 f = frame_idx[k]
                 x = y = 0.0
                 for a in range(nb):

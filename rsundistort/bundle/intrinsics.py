@@ -63,13 +63,13 @@ class GuessedCameras:
         """The standard deviations of each camera."""
         return [self.sigma] * len(self.cameras) if isinstance(self.sigma, Mapping) else self.sigma
 
-    def surprises(self, cameras: Sequence[Camera], least: float = 3.0) -> list[tuple[int, str, float]]:
-        """Intrinsics that lie more than `least` standard deviations off: (camera, name, how many)."""
+    def surprises(self, cameras: Sequence[Camera]) -> list[tuple[int, str, float]]:
+        """Intrinsics that lie more than three standard deviations off: (camera, name, how many)."""
         found = []
         for k, (camera, guess, sigma) in enumerate(zip(cameras, self.cameras, self.sigmas, strict=True)):
             names = [name for name in sigma if name in ("f", "fx", "fy", "cx", "cy") or name in camera.coefficients]
             for name, apart in zip(names, deviation(camera, guess, names)[0].tolist(), strict=True):
-                if abs(apart) > least * sigma[name]:
+                if abs(apart) > 3.0 * sigma[name]:
                     found.append((k, name, abs(apart) / sigma[name]))
         return found
 

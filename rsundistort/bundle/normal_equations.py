@@ -209,7 +209,7 @@ class NormalEquations:
         self._elimination = elimination
         s = self._s = elimination.structure
         nb = prior_diag.shape[1]
-        n = len(s.point_of)
+        n = len(s.points)
         self._J = J_frame
         self.blocks = res, J_frame
         self._num_unseen = nb - J_frame.shape[2]
@@ -217,7 +217,7 @@ class NormalEquations:
         self._prior_diag = prior_diag
         self._V = np.empty((n, 3, 3))
         self._g_point = np.empty((n, 3))
-        schur.point_blocks(s.track_start, s.point_of, res, J_frame, self._V, self._g_point)
+        schur.point_blocks(s.track_start, res, J_frame, self._V, self._g_point)
         if rays is not None:
             # any weight holds what nothing pulls at
             unit = rays / np.linalg.norm(rays, axis=1)[:, None]
@@ -272,7 +272,7 @@ class NormalEquations:
         diagonal = self._prior_diag + damping * self._diagonal
         with numba.parallel_chunksize(1):
             schur.reduced_system(
-                self._unknowns, s.frame_start, s.frame_order, s.frame_idx, s.track_idx, s.track_start, s.point_of,
+                self._unknowns, s.frame_start, s.frame_order, s.frame_idx, s.point_idx, s.track_start,
                 s.pattern.row_start, s.pattern.cols, self._J, V_inv, g_point,
                 np.ascontiguousarray(self._seen(g_frame)), np.ascontiguousarray(self._seen(diagonal)), S, rhs,
             )  # fmt: skip
@@ -289,7 +289,7 @@ class NormalEquations:
         if nc:
             with numba.parallel_chunksize(1):
                 schur.border_rows(
-                    s.frame_start, s.frame_order, s.frame_idx, s.track_idx, s.track_start, s.point_of,
+                    s.frame_start, s.frame_order, s.frame_idx, s.point_idx, s.track_start,
                     self._border.camera_of_frame, self._J, self._border.J, V_inv, g_point, rows, rhs_camera,
                 )  # fmt: skip
         # nothing pulls at a camera that took none of the photos, whatever holds it
@@ -453,7 +453,7 @@ class NormalEquations:
         """
         assert self.inverse is not None
         g_point, V = np.empty_like(self._g_point), np.empty_like(self._V)
-        schur.point_blocks(self._s.track_start, self._s.point_of, noise, self._J, V, g_point)
+        schur.point_blocks(self._s.track_start, noise, self._J, V, g_point)
         g_frame = self._wide(self._gradients(noise, self._J)[1])
         g_frame = g_frame + np.sqrt(self._prior_diag) * self._wide(of_photos)
         if self._coupling is not None:
@@ -478,7 +478,7 @@ class NormalEquations:
         schur.invert_points(self._V, 0.0, V_inv)
         g_frame, g_camera = np.empty((m, num_groups, nb)), np.empty((m, num_groups, nc))
         schur.group_gradients(
-            s.frame_start, s.frame_order, s.track_idx, s.track_start, s.point_of, residuals, self._J, border.J, V_inv,
+            s.frame_start, s.frame_order, s.point_idx, s.track_start, residuals, self._J, border.J, V_inv,
             group, g_frame, g_camera,
         )  # fmt: skip
         of_cameras = border.sum_photos(g_camera.transpose(0, 2, 1)).T
@@ -558,7 +558,7 @@ class NormalEquations:
         """Steps (n, 3) of the points that go with those of photos and cameras."""
         point = np.empty_like(g_point)
         schur.back_substitute(
-            self._unknowns, self._s.track_start, self._s.point_of, self._s.frame_idx, V_inv,
+            self._unknowns, self._s.track_start, self._s.frame_idx, V_inv,
             self._pulled(g_point, camera), self._J, np.ascontiguousarray(self._seen(frame)), point,
         )  # fmt: skip
         return point
@@ -571,7 +571,7 @@ class NormalEquations:
         steps = step_camera.reshape(self._border.num_cameras, -1)
         V, pull = np.empty_like(self._V), np.empty_like(g_point)
         moved = np.einsum("oij,oj->oi", self._border.J, steps[self._border.camera_of_frame[s.frame_idx]])
-        schur.point_blocks(s.track_start, s.point_of, moved, self._J, V, pull)
+        schur.point_blocks(s.track_start, moved, self._J, V, pull)
         return g_point + pull
 
     def point_steps(self) -> Array:

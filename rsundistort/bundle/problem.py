@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from .._kernels import projection
+from .._kernels import residuals
 from ..errors import InputError
 from ..model import Camera, Reconstruction, check_shutter_model
 from ..model.reprojection import camera_arrays, motion_tables, observed_lens_pixels, plain_arrays
@@ -25,7 +25,7 @@ from .normal_equations import Border, Coupling, Marginals, NormalEquations, Step
 from .options import LOSSES, BundleOptions
 from .path import PathPrior, PathState
 from .spreads import Spreads
-from .structure import Structure, by_first_photo
+from .structure import Structure
 
 __all__ = ["BundleProblem", "State"]
 
@@ -81,14 +81,6 @@ class BundleProblem:
         obs = reconstruction.observations
         if not len(obs) or reconstruction.num_images < 2:
             raise InputError("bundle adjustment needs two photos and measurements of common points")
-        # points in the order of their tracks: what a photo sees lies together in memory
-        self._points = by_first_photo(
-            obs.frame_idx, obs.point_idx, reconstruction.num_images, reconstruction.num_points
-        )
-        rank = np.argsort(self._points)
-        self._given = reconstruction
-        obs = replace(obs, point_idx=rank[obs.point_idx])
-        self._start = replace(reconstruction, points_w=reconstruction.points_w[self._points], observations=obs)
         self._shutter_model = shutter_model
         self._options = options
         self._heavy_tails = heavy_tails
@@ -104,12 +96,16 @@ class BundleProblem:
             if shutter_model != "constant-motion":
                 raise InputError(f"frames on a path move by constant-motion, not by {shutter_model}")
             self._path = PathPrior(options.path, reconstruction, (spreads.path[0], spreads.path[1]))
-        self._structure = Structure.from_observations(
+        structure = Structure.from_observations(
             obs.frame_idx, obs.point_idx, reconstruction.num_images, reconstruction.num_points,
             None if self._path is None else (self._path.first, self._path.second),
         )  # fmt: skip
-        self._xy = obs.xy_raw[self._structure.order]
-        self._sigma_px = sigma_px * obs.sigma[self._structure.order]
+        self._structure = structure
+        self._given = reconstruction
+        obs = replace(obs, point_idx=np.argsort(structure.points)[obs.point_idx])
+        self._start = replace(reconstruction, points_w=reconstruction.points_w[structure.points], observations=obs)
+        self._xy = obs.xy_raw[structure.order]
+        self._sigma_px = sigma_px * obs.sigma[structure.order]
         # the rows that the last cost predicted, where the next Jacobians look for them
         self._clock = np.full(len(obs), np.nan)
         self._clock_of: State | None = None
@@ -246,7 +242,7 @@ class BundleProblem:
 
     def in_order(self, of_points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Values of the reconstruction's points in the order of the state's."""
-        return of_points[self._points]
+        return of_points[self._structure.points]
 
     def partitions(self, state: State) -> tuple[Partition, ...]:
         """Measurements that may go wrong together: of one corner of the scene, and of one corner of a lens."""
@@ -262,7 +258,7 @@ class BundleProblem:
         """The reconstruction at a state."""
         U, _, Vt = np.linalg.svd(state.R_cw)  # rounding of many increments
         points_w = np.empty_like(state.points_w)
-        points_w[self._points] = state.points_w
+        points_w[self._structure.points] = state.points_w
         return replace(
             self._given,
             cameras=state.cameras,
@@ -345,7 +341,7 @@ class BundleProblem:
         res, J_frame = spent.blocks if spent else (np.empty((o, 2)), np.empty((o, 2, self.layout.size)))
         cost = np.empty(-(-o // _CHUNK))
         with numba.parallel_chunksize(1):
-            projection.residual_blocks(
+            residuals.residual_blocks(
                 *self._kernel_args(state),
                 self._rows(state),
                 self._block,
@@ -365,11 +361,6 @@ class BundleProblem:
             self._clock.fill(np.nan)
             self._clock_of = None
         return self._clock
-
-    def _blocks(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
-        """Weighted residuals, Jacobians of photos and points, and the cost without priors."""
-        res, J_frame, cost = self._jacobians(state)
-        return res, J_frame, -J_frame[:, :, 3:6], cost
 
     def linearize(self, state: State, spent: NormalEquations | None = None) -> NormalEquations:
         """Normal equations and cost at a state, written over those of `spent`: fresh memory takes time to get."""
@@ -447,7 +438,7 @@ class BundleProblem:
         codes = np.concatenate([self._refine_codes, _VARIATION[: 3 * varies]])
         both = np.empty((len(self._xy), 2, len(codes)))
         if len(codes):
-            projection.intrinsic_blocks(*self._kernel_args(state), self._rows(state), codes, both)
+            residuals.intrinsic_blocks(*self._kernel_args(state), self._rows(state), codes, both)
         J, of_photo = both[:, :, :num], both[:, :, num:]
         if self._options.varying:
             own = state.variation[self._structure.frame_idx]
@@ -468,7 +459,7 @@ class BundleProblem:
         """Half the robust sum of squares in units of the noise, with the priors."""
         cost = np.empty(-(-len(self._xy) // _CHUNK))
         with numba.parallel_chunksize(1):
-            projection.residual_costs(*self._kernel_args(state), self._clock, cost)
+            residuals.residual_costs(*self._kernel_args(state), self._clock, cost)
         self._clock_of = state
         return float(cost.sum()) + self._prior_cost(state)
 
@@ -481,7 +472,7 @@ class BundleProblem:
     def _track_costs(self, state: State) -> NDArray[np.float64]:
         """(n,) cost of each point's measurements."""
         cost = np.empty(len(self._xy))
-        projection.residual_costs(*self._kernel_args(state), self._clock, cost)
+        residuals.residual_costs(*self._kernel_args(state), self._clock, cost)
         self._clock_of = state
         total = np.zeros(len(state.points_w))
         np.add.at(total, self._structure.point_idx, cost)

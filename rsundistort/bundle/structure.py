@@ -10,16 +10,9 @@ from numpy.typing import NDArray
 
 from .._kernels import schur
 
-__all__ = ["BlockPattern", "Structure", "by_first_photo"]
+__all__ = ["BlockPattern", "Structure"]
 
 Index = NDArray[np.int64]
-
-
-def by_first_photo(frame_idx: Index, point_idx: Index, num_frames: int, num_points: int) -> Index:
-    """Points in the order of the first photo that sees each."""
-    first = np.full(num_points, num_frames)
-    np.minimum.at(first, point_idx, frame_idx)
-    return np.argsort(first, kind="stable")
 
 
 @dataclass(frozen=True)
@@ -73,25 +66,25 @@ class Structure:
 
     Attributes
     ----------
+    points : (n,) int array
+        The points as they were given, in the order of the first photo that sees each: what a photo sees lies together.
     order : (o,) int array
-        The observations as they were given, by track and then by photo; tracks by their first photo, so that what a
-        photo sees lies together. All else is in this order.
-    frame_idx, point_idx, track_idx : (o,) int array
-        Photo, point and track.
-    track_start, point_of : (n + 1,), (n,) int array
-        Ranges of the tracks in the observations, and their points.
+        The observations as they were given, by point in that order and then by photo. All else is in these orders.
+    frame_idx, point_idx : (o,) int array
+        Photo and point.
+    track_start : (n + 1,) int array
+        Ranges of the points in the observations.
     frame_start, frame_order : (m + 1,), (o,) int array
         The observations of each photo.
     pattern : BlockPattern
         Photos that share points: the blocks of the reduced system.
     """
 
+    points: Index
     order: Index
     frame_idx: Index
     point_idx: Index
-    track_idx: Index
     track_start: Index
-    point_of: Index
     frame_start: Index
     frame_order: Index
     pattern: BlockPattern
@@ -102,17 +95,17 @@ class Structure:
         joined: tuple[Index, Index] | None = None,
     ) -> Structure:  # fmt: skip
         """Structure of observations in any order; priors join the pairs of photos `joined`, too."""
-        point_of = by_first_photo(frame_idx, point_idx, num_frames, num_points)
-        track = np.empty(num_points, np.int64)
-        track[point_of] = np.arange(num_points)
-        order = np.argsort(track[point_idx] * num_frames + frame_idx, kind="stable")
+        first = np.full(num_points, num_frames)
+        np.minimum.at(first, point_idx, frame_idx)
+        points = np.argsort(first, kind="stable")
+        point_idx = np.argsort(points)[point_idx]
+        order = np.argsort(point_idx * num_frames + frame_idx, kind="stable")
         frame_idx, point_idx = frame_idx[order], point_idx[order]
-        track_idx = track[point_idx]
-        track_start = np.searchsorted(track_idx, np.arange(num_points + 1))
+        track_start = np.searchsorted(point_idx, np.arange(num_points + 1))
         frame_order = np.argsort(frame_idx, kind="stable")
         frame_start = np.concatenate([[0], np.cumsum(np.bincount(frame_idx, minlength=num_frames))])
         counts = np.empty(num_frames, np.int64)
-        lists = (frame_start, frame_order, frame_idx, track_idx, track_start)
+        lists = (frame_start, frame_order, frame_idx, point_idx, track_start)
         schur.covisible_counts(*lists, counts)
         row_start = np.concatenate([[0], np.cumsum(counts)])
         cols = np.empty(row_start[-1], np.int64)
@@ -120,4 +113,4 @@ class Structure:
         pattern = BlockPattern(row_start, cols)
         if joined is not None:
             pattern = pattern.with_blocks(*joined)
-        return cls(order, frame_idx, point_idx, track_idx, track_start, point_of, frame_start, frame_order, pattern)
+        return cls(points, order, frame_idx, point_idx, track_start, frame_start, frame_order, pattern)

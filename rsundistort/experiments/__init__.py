@@ -1,8 +1,9 @@
 """The paper's experiments, on any scene."""
 
 from .one import METHODS, OneOptions, experiment_one
+from .paths import PathComparison, compare_paths
 from .scenes import KnownScene, load_scene
-from .two import PathComparison, TwoOptions, compare_paths, experiment_two
+from .two import TwoOptions, experiment_two
 
 __all__ = [
     "METHODS",

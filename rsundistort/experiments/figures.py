@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-
-if TYPE_CHECKING:
-    from .two import PathComparison
+from .paths import PathComparison
 
 __all__ = ["camera_paths", "cumulative_histograms", "need_matplotlib", "plan_axes"]
 

@@ -1,7 +1,7 @@
 """Files: photos, cameras, solutions, COLMAP models, nerfstudio."""
 
 from ..colmap import read_colmap_cameras, read_colmap_poses, write_colmap_model, write_colmap_workspace
-from .cameras import CameraFile, check_camera_fits, parse_camera, read_camera_file
+from .cameras import CameraFile, check_camera_fits, read_camera_file
 from .depth_maps import find_depth_maps, read_depth_map
 from .gpmf import has_telemetry, read_gpmf
 from .groups import group_of, guess_readouts
@@ -46,7 +46,6 @@ __all__ = [
     "motions_from_gyro",
     "output_folder",
     "output_name",
-    "parse_camera",
     "read_camera_file",
     "read_colmap_cameras",
     "read_colmap_poses",

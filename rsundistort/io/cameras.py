@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,6 @@ __all__ = [
     "camera_to_json",
     "check_camera_fits",
     "check_sigma",
-    "parse_camera",
     "read_camera_file",
 ]
 
@@ -150,26 +149,6 @@ def read_camera_file(text: str | Path, width: int, height: int) -> CameraFile:
     if (path / "cameras.bin").is_file() or (path / "cameras.txt").is_file():
         return CameraFile(*read_colmap_cameras(path), source=f"{path} (COLMAP)")
     return _read_folder(path, width, height)
-
-
-def parse_camera(text: str, width: int, height: int, readout: str | None = None) -> Camera:
-    """The one camera of a file or of numbers, checked to fit the photos.
-
-    Parameters
-    ----------
-    text : str
-        As `read_camera_file` takes it.
-    width, height : int
-        Size of the photos; a file of another size is refused, with what both are.
-    readout : str, optional
-        Readout direction; overrides a file's.
-    """
-    found = read_camera_file(text, width, height)
-    if len(found.cameras) != 1:
-        raise InputError(f"{text} holds {len(found.cameras)} cameras, expected one")
-    (camera,) = found.cameras.values()
-    check_camera_fits(camera, width, height, text)
-    return camera if readout is None else replace(camera, readout=readout)
 
 
 def check_camera_fits(camera: Camera, width: int, height: int, where: str) -> None:

@@ -17,6 +17,7 @@ import psutil
 from ..errors import FileError
 from .aside import is_partial, remove_partial
 from .journal import Journal, RemoteJournal
+from .photos.images import check_compression
 from .places import Place, RemoteFolder
 from .record import Record, is_inside
 
@@ -225,6 +226,7 @@ def make_inside(folder: Path, name: str) -> Path:
 
 def _prepare(folder: Path, apart_from: Sequence[Path], replaced: Sequence[str]) -> Path | None:
     """Refuse a folder that is in the way of the inputs; the topmost folder that has to be made for it to exist."""
+    check_compression()  # outputs hold PNG: rather now than after hours
     place = folder.resolve()
     for other in apart_from:
         inside = other.resolve()

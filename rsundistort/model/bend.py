@@ -7,7 +7,6 @@ at n - 1 intervals hold all that fewer of them, halved as often, can say.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -189,13 +188,6 @@ class Bend:
         rate = slope * 2 / (r[-1] - r[0])
         constant = mean - rate * (r[0] + r[-1]) / 2
         return cls(float(r[0]), float(r[-1]), rest[:, :3], rest[:, 3:]), constant.reshape(2, 3), rate.reshape(2, 3)
-
-    @classmethod
-    def along(cls, function: Callable[[Array], Array], start: float, end: float, sites: int = 65) -> tuple[Bend, Array]:
-        """As `of`, of a rotation vector as a function of the place in the frame, 0 to 1; the bend and the rate (3,)."""
-        place = np.linspace(0, 1, 4 * (sites - 1) + 1)
-        bend, _, rate = cls.of(start + (end - start) * place, function(place), sites=sites)
-        return bend, rate[0]
 
     @property
     def clock(self) -> Array:

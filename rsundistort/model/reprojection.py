@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .._kernels import projection
+from .._kernels import residuals
 from .bend import bend_table
 from .camera import Camera
 from .field import lens_pixels
@@ -88,5 +88,5 @@ def reprojection_residuals(
         reconstruction.points_w, obs.frame_idx, obs.point_idx,
         observed_lens_pixels(reconstruction.cameras, reconstruction.camera_idx[obs.frame_idx], obs.xy_raw),
     )  # fmt: skip
-    projection.residuals(model, *arrays, res, valid)
+    residuals.residuals(model, *arrays, res, valid)
     return res, valid

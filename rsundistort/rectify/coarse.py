@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .._kernels import projection as kernels
+from .._kernels import maps as kernels
 from ..model import Camera, RowMotion, check_shutter_model
 from ..model.field import add_field
 from .maps import EDGE_PX, seen_by
@@ -95,7 +95,7 @@ def coarse_grid(
     def at_nodes(rows: int, cols: int, spacing: int, offset: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         step = np.array([[spacing, 0, offset], [0, spacing, offset], [0, 0, 1.0]])
         x, y = np.empty((rows, cols)), np.empty((rows, cols))
-        kernels.fill_map(model, axis, sign, intr, lens, motion.kernel_phi, rays @ step, 0, 0, x, y)
+        kernels.fill_map(model, axis, sign, intr, lens, motion.kernel_phi, rays @ step, 0, x, y)
         return x, y
 
     for spacing in _SPACINGS:

@@ -11,7 +11,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from .._kernels import projection as kernels
+from .._kernels import maps as kernels
 from ..errors import FileError, FormatError, InputError
 from ..model import Camera, Depth, RowMotion
 from ..model.checks import check_array, frozen

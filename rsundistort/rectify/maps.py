@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._kernels import projection as kernels
+from .._kernels import maps as kernels
 from ..errors import InputError
 from ..model import AtInfinity, Camera, Depth, RowMotion, check_shutter_model
 from ..model.checks import check_finite, check_rotations
@@ -44,11 +44,11 @@ def fill_rows(
     if depth is not None and depth.matters(shutter_model):
         inverse = depth.inverse(row0, map_x.shape)
         kernels.fill_map_at_depth(
-            axis, sign, intr, lens, motion.kernel_phi, motion.velocity_in_camera, rays, inverse, row0, 0, map_x, map_y
+            axis, sign, intr, lens, motion.kernel_phi, motion.velocity_in_camera, rays, inverse, row0, map_x, map_y
         )
         depth.mark_hidden(row0, map_x, map_y)
     else:
-        kernels.fill_map(model, axis, sign, intr, lens, motion.kernel_phi, rays, row0, 0, map_x, map_y)
+        kernels.fill_map(model, axis, sign, intr, lens, motion.kernel_phi, rays, row0, map_x, map_y)
     add_field(camera, map_x, map_y)
 
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .._kernels import projection as kernels
+from .._kernels import maps as kernels
 from ..errors import InputError
 from ..model import AtInfinity, Camera, Depth, DepthMap, RowMotion
 from .coarse import coarse_grid

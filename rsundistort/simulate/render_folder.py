@@ -124,20 +124,7 @@ def simulate_scene(
         for folder in folders:
             (scratch / folder).mkdir()
         log.begin("rendering", len(loaded.views))
-
-        def rendered() -> Iterator[tuple[View, NDArray[np.uint8]]]:
-            """The photos, whose twins and depth maps are written meanwhile."""
-            for number, view in enumerate(loaded.views):
-                yield view, add_noise(_render(loaded, view), loaded.noise, loaded.scene.seed, number)
-                if view.name in twins:
-                    _write_twin(scratch, loaded, view, options.depth)
-                log.tell("rendering", number + 1, len(loaded.views))
-
-        if loaded.clip is not None:
-            write_video(scratch / loaded.clip.NAME, (photo for _, photo in rendered()), loaded.clip.fps)
-        else:
-            for view, photo in rendered():
-                (scratch / "photos" / view.name).write_bytes(_encode_jpeg(photo, loaded.jpeg_quality))
+        _write_photos(scratch, loaded, twins, options.depth, log)
         log.end("rendering")
         truth = _truth(loaded, points)
         _write_cameras(scratch, loaded)
@@ -148,6 +135,24 @@ def simulate_scene(
             (scratch / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, scratch / name)
     return truth
+
+
+def _write_photos(folder: Path, recipe: Recipe, twins: set[str], depth: bool, log: StageLog) -> None:
+    """The photos, or the video, with the twins and depth maps of those that have them."""
+
+    def rendered() -> Iterator[tuple[View, NDArray[np.uint8]]]:
+        """The photos, whose twins and depth maps are written meanwhile."""
+        for number, view in enumerate(recipe.views):
+            yield view, add_noise(_render(recipe, view), recipe.noise, recipe.scene.seed, number)
+            if view.name in twins:
+                _write_twin(folder, recipe, view, depth)
+            log.tell("rendering", number + 1, len(recipe.views))
+
+    if recipe.clip is not None:
+        write_video(folder / recipe.clip.NAME, (photo for _, photo in rendered()), recipe.clip.fps)
+    else:
+        for view, photo in rendered():
+            (folder / "photos" / view.name).write_bytes(_encode_jpeg(photo, recipe.jpeg_quality))
 
 
 def _render(recipe: Recipe, view: View) -> NDArray[np.uint8]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from ..io import facts_of_exif, list_photos, output_folder, output_name, read_ph
 from ..io.cameras import camera_to_json
 from ..io.gyro import GyroLog
 from ..io.json_text import read_json
+from ..io.photos.images import Photo
 from ..io.record import Record
 from ..model import Camera, RowMotion, Solution, SolvedImage
 from ..model.checks import check_finite
@@ -31,6 +32,9 @@ from ..synthetic.warp import crop_camera, largest_rectangle, random_phi, warp_ma
 from ..versions import versions
 
 __all__ = ["WarpOptions", "read_motion_file", "simulate_warp"]
+
+# x, y, width, height in pixels
+Rectangle = tuple[int, int, int, int]
 
 #: Share of the frame that a crop must keep; less is no photo of the scene any more.
 _LEAST_CROP = 0.25
@@ -155,65 +159,79 @@ def simulate_warp(
         twins = [f"{folder}/{output_name(name)}" for folder in folders if folder != "masks" for name in names]
         made = ["camera.json", "ground_truth.json", *twins, *(f"masks/{name}" for name in masks.values())]
         Record(out).check(made, inputs)
-        first = read_photo(photos / names[0])
-        height, width = first.pixels.shape[:2]
-        facts = [facts_of_exif(first.metadata.exif)]
-        found = find_cameras(photos, names[:1], [(width, height)], facts, options.camera, options.readout)
-        camera, source = found.of(0), found.source
-        motions = _motions(photos, names, camera, options)
+        whole, source = _camera(photos, names[0], options)
+        motions = _motions(photos, names, whole, options)
         for name in names:
-            check_no_fold(name, camera, motions[name].phi, bend=motions[name].bend)
-        whole, crop = camera, (0, 0, camera.width, camera.height)
-        if options.crop:
-            crop = _common_rectangle(whole, motions, jobs, log)
-            camera = crop_camera(whole, crop)
-        kept = np.s_[crop[1] : crop[1] + crop[3], crop[0] : crop[0] + crop[2]]
+            check_no_fold(name, whole, motions[name].phi, bend=motions[name].bend)
+        crop = _common_rectangle(whole, motions, jobs, log) if options.crop else None
         for folder in folders:
             (scratch / folder).mkdir()
 
         def work(name: str) -> None:
             photo = read_photo(photos / name)
             warped, mask = warp_photo(photo.pixels, whole, motions[name])
-            out_name = output_name(name)
-            # a photo that is sharp and was exposed for long tells that its camera did not move
-            told = photo.metadata.without_exposure()
-            write_image(scratch / "photos" / out_name, _cut(warped, kept), told, options.quality)
-            write_image(scratch / "masks" / masks[name], _cut(mask, kept))
-            if options.crop:
-                # above 100, WebP is stored without loss
-                best = 101 if out_name.lower().endswith(".webp") else 100
-                write_image(scratch / "global" / out_name, _cut(photo.pixels, kept), photo.metadata, best)
+            write_image(scratch / "masks" / masks[name], _cut(mask, crop))
+            _write_photos(scratch, output_name(name), photo, warped, crop, options.quality)
 
         log.begin("warping", len(names))
         with ThreadPoolExecutor(jobs) as pool:
             for done, _ in enumerate(pool.map(work, names), start=1):
                 log.tell("warping", done, len(names))
         log.end("warping", photos=len(names))
-        images = tuple(
-            SolvedImage(output_name(n), "1", motion=motions[n], rs_shift_px=largest_shift_px(camera, motions[n]))
-            for n in names
-        )
-        truth = Solution(
-            shutter_model="rotation",
-            cameras={"1": camera},
-            rectified_cameras={"1": camera.pinhole()},
-            images=images,
-            stages=tuple(log.stages),
-            options={
-                "simulation": "warp",
-                "camera": source,
-                "sigma_rad_per_frame": options.sigma_rad if options.motion is None and options.gyro is None else None,
-                "seed": options.seed,
-                "still": list(options.still),
-                "crop_xywh": list(crop) if options.crop else None,
-                **({"acceleration": options.acceleration} if options.acceleration else {}),
-                **({} if options.vibration is None else {"vibration": asdict(options.vibration)}),
-            },
-            generator=versions(),
-        )
+        camera = whole if crop is None else crop_camera(whole, crop)
+        truth = replace(_truth(camera, source, motions, crop, options), stages=tuple(log.stages))
         (scratch / "camera.json").write_text(json.dumps(camera_to_json(camera)) + "\n", encoding="utf-8")
         write_solution(scratch / "ground_truth.json", truth)
     return truth
+
+
+def _camera(photos: Path, name: str, options: WarpOptions) -> tuple[Camera, str]:
+    """The camera of the photos, as the first of them has it, and where it is from."""
+    first = read_photo(photos / name)
+    height, width = first.pixels.shape[:2]
+    facts = [facts_of_exif(first.metadata.exif)]
+    found = find_cameras(photos, [name], [(width, height)], facts, options.camera, options.readout)
+    return found.of(0), found.source
+
+
+def _write_photos(
+    folder: Path, name: str, photo: Photo, warped: NDArray[Any], crop: Rectangle | None, quality: int
+) -> None:
+    """Write what a photo was warped to, and its twin if they are cut."""
+    # a photo that is sharp and was exposed for long tells that its camera did not move
+    told = photo.metadata.without_exposure()
+    write_image(folder / "photos" / name, _cut(warped, crop), told, quality)
+    if crop is not None:
+        # above 100, WebP is stored without loss
+        best = 101 if name.lower().endswith(".webp") else 100
+        write_image(folder / "global" / name, _cut(photo.pixels, crop), photo.metadata, best)
+
+
+def _truth(
+    camera: Camera, source: str, motions: Mapping[str, RowMotion], crop: Rectangle | None, options: WarpOptions
+) -> Solution:
+    """The motions of the photos, as the camera that took them, or to which they are cut, shows them."""
+    images = tuple(
+        SolvedImage(output_name(name), "1", motion=motion, rs_shift_px=largest_shift_px(camera, motion))
+        for name, motion in motions.items()
+    )
+    return Solution(
+        shutter_model="rotation",
+        cameras={"1": camera},
+        rectified_cameras={"1": camera.pinhole()},
+        images=images,
+        options={
+            "simulation": "warp",
+            "camera": source,
+            "sigma_rad_per_frame": options.sigma_rad if options.motion is None and options.gyro is None else None,
+            "seed": options.seed,
+            "still": list(options.still),
+            "crop_xywh": None if crop is None else list(crop),
+            **({"acceleration": options.acceleration} if options.acceleration else {}),
+            **({} if options.vibration is None else {"vibration": asdict(options.vibration)}),
+        },
+        generator=versions(),
+    )
 
 
 def _motions(photos: Path, names: Sequence[str], camera: Camera, options: WarpOptions) -> dict[str, RowMotion]:
@@ -247,9 +265,7 @@ def _given(value: ArrayLike | RowTable) -> RowMotion | RowTable:
     return value if isinstance(value, RowTable) else RowMotion(np.asarray(value, np.float64))
 
 
-def _common_rectangle(
-    camera: Camera, motions: Mapping[str, RowMotion], jobs: int, log: StageLog
-) -> tuple[int, int, int, int]:
+def _common_rectangle(camera: Camera, motions: Mapping[str, RowMotion], jobs: int, log: StageLog) -> Rectangle:
     """The largest rectangle (x, y, width, height) of pixels that all warped photos fill."""
     valid = np.ones((camera.height, camera.width), bool)
     smallest = ("", np.inf)
@@ -272,5 +288,6 @@ def _common_rectangle(
     return rectangle
 
 
-def _cut(pixels: NDArray[Any], kept: tuple[slice, slice]) -> NDArray[Any]:
-    return np.ascontiguousarray(pixels[kept])
+def _cut(pixels: NDArray[Any], crop: Rectangle | None) -> NDArray[Any]:
+    x, y, width, height = crop or (0, 0, pixels.shape[1], pixels.shape[0])
+    return np.ascontiguousarray(pixels[y : y + height, x : x + width])

@@ -92,7 +92,7 @@ def _directions(xy_raw: NDArray[np.float64], camera: Camera) -> NDArray[np.float
 
 
 def _left_by_shutter(before: NDArray[np.float64], after: NDArray[np.float64], camera: Camera) -> float:
-    """Median distance of directions (n, 3) of two frames, turned onto each other, that turns of lines do not explain."""
+    """Median distance of directions (n, 3) of two frames, beyond what turns of their lines explain."""
     seen = np.isfinite(before).all(1) & np.isfinite(after).all(1)
     if seen.sum() < _LEAST_AGREEING:
         return float("inf")

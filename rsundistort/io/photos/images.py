@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import mmap
-import subprocess
 import sys
 import warnings
 
@@ -41,6 +40,7 @@ __all__ = [
     "MAX_MEGAPIXELS",
     "RAW_AS",
     "Photo",
+    "check_compression",
     "list_photos",
     "output_name",
     "read_photo",
@@ -268,7 +268,7 @@ def write_image(
     Raises
     ------
     InputError
-        When a file of that kind cannot hold such pixels.
+        When a file of that kind cannot hold such pixels; for PNG, when pycolmap was imported before rsundistort.
     FileError
         When it cannot be written.
     """
@@ -297,14 +297,12 @@ def _encode(path: Path, pixels: NDArray[Any], metadata: Metadata, quality: int, 
             data, lost = encode_tiff(pixels, metadata)
             parts: Parts = [data]
         else:
-            if kind == "PNG" and _compression_is_broken():
-                encoded = memoryview(_encode_elsewhere(suffix, pixels, _encode_params(suffix, quality, flat)))
-            else:
-                done, array = cv2.imencode(suffix, pixels, _encode_params(suffix, quality, flat))
-                if not done:
-                    raise InputError(f"an image {pixels.shape} {pixels.dtype} cannot be stored as {suffix}")
-                encoded = array.data
-            parts, lost = with_metadata(encoded, kind, metadata)
+            if kind == "PNG":
+                check_compression()
+            done, array = cv2.imencode(suffix, pixels, _encode_params(suffix, quality, flat))
+            if not done:
+                raise InputError(f"an image {pixels.shape} {pixels.dtype} cannot be stored as {suffix}")
+            parts, lost = with_metadata(array.data, kind, metadata)
     except cv2.error as error:
         raise InputError(f"an image {pixels.shape} {pixels.dtype} cannot be stored as {suffix}: {error.err}") from error
     if lost:
@@ -314,33 +312,14 @@ def _encode(path: Path, pixels: NDArray[Any], metadata: Metadata, quality: int, 
     return parts
 
 
-def _compression_is_broken() -> bool:
-    """Whether pycolmap was imported before zlib (see the top of this file): then compressing aborts this process."""
+def check_compression() -> None:
+    """Refuse to work where pycolmap came before zlib (see the top of this file): PNG would abort the process."""
     order = list(sys.modules)
     if "pycolmap" not in order:
-        return False
+        return
     loaded = [order.index(name) for name in ("zlib", "cv2") if name in order]
-    return order.index("pycolmap") < min(loaded, default=len(order))
-
-
-def _encode_elsewhere(suffix: str, pixels: NDArray[Any], params: list[int]) -> bytes:
-    """Encode in a clean process; slower, but this one would abort."""
-    code = (
-        "import sys, cv2, numpy as np;"
-        "shape, dtype, suffix, params = eval(sys.argv[1]);"
-        "pixels = np.frombuffer(sys.stdin.buffer.read(), dtype).reshape(shape);"
-        "sys.stdout.buffer.write(bytes(cv2.imencode(suffix, pixels, params)[1]))"
-    )
-    job = repr((pixels.shape, pixels.dtype.str, suffix, params))
-    done = subprocess.run(
-        [sys.executable, "-c", code, job],
-        input=np.ascontiguousarray(pixels).tobytes(),
-        capture_output=True,
-        check=False,
-    )
-    if done.returncode or not done.stdout:
+    if order.index("pycolmap") < min(loaded, default=len(order)):
         raise InputError(
-            "PNG cannot be written because pycolmap was imported before rsundistort in this program; "
-            "import rsundistort first"
+            "PNG cannot be written: pycolmap was imported before rsundistort, and its zlib is not that of Python; "
+            "import rsundistort first, then pycolmap"
         )
-    return done.stdout

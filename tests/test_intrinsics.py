@@ -1,0 +1,191 @@
+"""Intrinsics as unknowns of the adjustment: recovered, varying, guessed, and refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bundle_scenes import FISHEYE, LENS, RATIONAL, gradients, make_scene, perturbed, scaled, unit_steps
+from numpy_twin import Fisheye
+
+from rsundistort import BundleOptions, bundle_adjust
+from rsundistort.bundle import (
+    GuessedCameras,
+    choose_model,
+)
+from rsundistort.bundle.intrinsics import moved_camera
+from rsundistort.bundle.problem import BundleProblem
+from rsundistort.bundle.spreads import Spreads
+from rsundistort.errors import InputError
+from rsundistort.model.reprojection import reprojection_residuals
+
+# thousands of calls on problems this small wait for threads longer than they compute
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def spoilt_cameras(rec, refine):
+    """Cameras of which some intrinsics are only guessed: 3 % off in f, 1 % in the centre, no lens."""
+    off = {"f": 0.03, "fx": 0.03, "fy": -0.02, "cx": 0.01, "cy": -0.01}
+    step = np.array([off.get(name, 0.0) for name in refine])
+    lens = any(name.startswith(("k", "p")) for name in refine)
+    moved = [moved_camera(camera, refine, step) for camera in rec.cameras]
+    return replace(rec, cameras=[replace(c, dist=np.zeros(0)) if lens else c for c in moved])
+
+
+@pytest.mark.parametrize(
+    ("refine", "dist"),
+    [
+        (("f", "k1", "k2", "p1", "p2"), LENS), (("fx", "fy", "cx", "cy"), LENS),
+        (("f", "k1", "k2"), Fisheye([0.05, -0.02, 0.0, 0.0])),
+    ],
+    ids=["f-k1-k2-p1-p2", "fx-fy-cx-cy", "fisheye"],
+)  # fmt: skip
+@pytest.mark.parametrize("model", ["global", "two-step", "rotation", "constant-motion"])
+def test_intrinsics_are_recovered_without_noise(model, refine, dist, rng):
+    truth = make_scene(rng, model, num_images=12, num_points=120, dist=dist)
+    options = BundleOptions(
+        loss="squared", sigma_px=0.5, phi_sigma=10.0, velocity_sigma=10.0, outlier_rounds=0, cost_tolerance=1e-12,
+        refine=refine,
+    )  # fmt: skip
+    start = spoilt_cameras(replace(perturbed(truth, rng, 0.01, 0.02), phi=truth.phi, velocity=truth.velocity), refine)
+    result = bundle_adjust(start, model, options)
+    for found, true in zip(result.reconstruction.cameras, truth.cameras, strict=True):
+        np.testing.assert_allclose(found.K, true.K, atol=1e-2)
+        np.testing.assert_allclose(found.dist, true.dist, atol=1e-4)
+    assert result.rms_px < 1e-4
+
+
+def test_normalised_errors_of_refined_intrinsics_are_one(rng):
+    refine = ("f", "k1", "k2")
+    errors = []
+    for _ in range(6):
+        truth = make_scene(rng, "rotation", num_images=12, num_points=80, noise_px=0.5, dist=[-0.12, 0.03, 0, 0])
+        start = replace(perturbed(truth, rng, 0.01, 0.02), phi=truth.phi)
+        result = bundle_adjust(spoilt_cameras(start, refine), "rotation", BundleOptions(refine=refine))
+        for found, true, sigma in zip(
+            result.reconstruction.cameras, truth.cameras, result.sigma_intrinsics, strict=True
+        ):  # fmt: skip
+            errors.append((found.K[0, 0] - true.K[0, 0]) / sigma["f"])
+            errors.extend((found.dist[:2] - true.dist[:2]) / [sigma["k1"], sigma["k2"]])
+    assert 0.75 < np.sqrt(np.mean(np.square(errors))) < 1.3  # 72 values, a third of them independent
+
+
+@pytest.mark.parametrize(
+    ("refine", "message"),
+    [(("f", "fx"), "either f"), (("k9",), "'k9'"), (("k1", "k1"), "twice")],
+    ids=["f and fx", "unknown", "twice"],
+)
+def test_intrinsics_that_contradict_each_other_are_refused(refine, message):
+    with pytest.raises(InputError, match=message):
+        BundleOptions(refine=refine)
+
+
+GUESS_SIGMA = {"f": 0.01, "cx": 0.002, "k1": 0.03, "p1": 1e-3}
+
+
+def guessing_problem(rng, used=4):
+    """A problem whose intrinsics are pulled at guesses elsewhere; the last of `used` + 0 cameras may have no photo."""
+    rec = make_scene(rng, "rotation", num_images=6, num_points=30, noise_px=1.0, dist=LENS)
+    rec = replace(rec, camera_idx=np.arange(6) % used)
+    refine = tuple(GUESS_SIGMA)
+    guesses = [moved_camera(camera, refine, rng.normal(size=4) * [0.01, 0.002, 0.03, 1e-3]) for camera in rec.cameras]
+    options = BundleOptions(
+        loss="squared", sigma_px=1.0, refine=refine, guessed=GuessedCameras(guesses, GUESS_SIGMA), outlier_rounds=0
+    )
+    return rec, options
+
+
+def test_gradient_of_the_prior_on_intrinsics_equals_central_differences(rng):
+    rec, options = guessing_problem(rng)
+    problem = BundleProblem(rec, "rotation", options, 1.0, Spreads(0.03, 0.1))
+    state = problem.initial_state()
+    equations = problem.linearize(state)
+    expected = gradients(equations)[2]
+    h = 3e-6
+    for kind, index, step in unit_steps(problem, state):
+        if kind == 2:
+            ahead, behind = (problem.cost(problem.retract(state, scaled(step, s))) for s in (h, -h))
+            assert abs((ahead - behind) / (2 * h) - expected[index]) <= 1e-6 * np.abs(expected).max()
+
+
+def test_weak_photos_leave_intrinsics_at_their_guess_and_strong_ones_do_not(rng):
+    rec, options = guessing_problem(rng)
+    tight = replace(options, guessed=GuessedCameras(options.guessed.cameras, dict.fromkeys(GUESS_SIGMA, 1e-9)))
+    # from the guess: far from it a prior lets go
+    held = bundle_adjust(replace(rec, cameras=tight.guessed.cameras), "rotation", tight)
+    for camera, guess in zip(held.reconstruction.cameras, tight.guessed.cameras, strict=True):
+        np.testing.assert_allclose(camera.K, guess.K, rtol=1e-6)
+        assert camera.dist == pytest.approx(guess.dist, abs=1e-6)
+    assert all(sigma["k1"] == pytest.approx(1e-9, rel=0.01) for sigma in held.sigma_intrinsics)
+    loose = replace(options, guessed=GuessedCameras(options.guessed.cameras, dict.fromkeys(GUESS_SIGMA, 1e6)))
+    free, without = (bundle_adjust(rec, "rotation", each) for each in (loose, replace(options, guessed=None)))
+    K, K_without = (each.reconstruction.cameras[0].K for each in (free, without))
+    np.testing.assert_allclose(K, K_without, rtol=1e-5)
+
+
+def test_what_the_other_axis_explains_as_well_is_no_shutter(rng):
+    # read by columns, and believed to be read by rows: bent photos, but not by such a shutter
+    scene = make_scene(rng, "rotation", num_images=10, num_points=150, noise_px=0.3, phi_size=0.03)
+    by_rows = [replace(camera, readout="top-to-bottom") for camera in scene.cameras]
+    by_columns = replace(scene, cameras=[replace(camera, readout="left-to-right") for camera in scene.cameras])
+    xy, _ = reprojection_residuals(
+        replace(by_columns, observations=replace(scene.observations, xy_raw=np.zeros_like(scene.observations.xy_raw)))
+    )
+    seen = replace(scene.observations, xy_raw=xy + 0.3 * rng.normal(size=xy.shape))
+    still = replace(scene, cameras=by_rows, phi=np.zeros_like(scene.phi), shutter_model="global", observations=seen)
+    choice = choose_model(still, sigma_px=0.3)
+    assert (choice.shutter, choice.shutter_model) == ("not-determined", "global")
+    assert "other axis" in choice.against[0]
+    assert choice.kept[-1] == choice.label == "global"
+    right = choose_model(replace(still, cameras=by_columns.cameras), sigma_px=0.3)
+    assert (right.shutter, right.shutter_model) == ("found", "rotation")
+
+
+def test_photos_that_do_not_vary_have_no_variation(rng):
+    rec = make_scene(rng, "rotation", num_images=8, num_points=150, noise_px=0.3)
+    result = bundle_adjust(rec, "rotation", BundleOptions(varying=True, outlier_rounds=0))
+    assert result.focal_sigma < 1e-3
+    assert result.centre_sigma < 2e-3
+    assert result.covariances.shape == (8, 9, 9)
+
+
+@pytest.mark.parametrize("guess", [False, True])
+def test_a_camera_that_took_no_photo_stays_as_it_was(guess, rng):
+    rec, options = guessing_problem(rng, used=3)
+    options = options if guess else replace(options, guessed=None)
+    before = rec.cameras[3] if not guess else options.guessed.cameras[3]
+    result = bundle_adjust(rec, "rotation", options)
+    assert result.converged
+    np.testing.assert_allclose(result.reconstruction.cameras[3].K, before.K, rtol=1e-6)
+    np.testing.assert_allclose(result.reconstruction.cameras[3].dist, before.dist, atol=1e-6)
+
+
+@pytest.mark.parametrize(("sigma", "named"), [({"f": -1.0}, "f"), ({"zoom": 1.0}, "zoom")])
+def test_impossible_priors_on_intrinsics_are_refused(sigma, named):
+    with pytest.raises(InputError, match=named):
+        GuessedCameras((), sigma)
+
+
+@pytest.mark.parametrize(
+    ("name", "dist", "message"),
+    [
+        ("p1", FISHEYE, "p1 of a fisheye lens, expected some of k1, k2, k3, k4"),
+        ("k4", RATIONAL, "k4 of a pinhole lens"),
+    ],
+    ids=["fisheye", "pinhole"],
+)
+def test_intrinsics_that_a_lens_lacks_are_refused(name, dist, message, rng):
+    with pytest.raises(InputError, match=message):
+        bundle_adjust(make_scene(rng, "global", dist=dist), "global", BundleOptions(refine=(name,)))
+
+
+def test_a_pinhole_lens_among_fisheyes_stays_what_it_is(rng):
+    rec = make_scene(rng, "rotation", dist=FISHEYE)
+    both = make_scene(rng, "rotation", dist=LENS)
+    mixed = replace(both, cameras=[*both.cameras[:3], rec.cameras[3]])
+    res, valid = reprojection_residuals(mixed)
+    assert valid.all()
+    fisheye = both.camera_idx[both.observations.frame_idx] == 3
+    assert np.abs(res[~fisheye]).max() < 1e-9  # px, as above
+    assert np.abs(res[fisheye]).max() > 1
