@@ -26,8 +26,8 @@ _CORNERS = 300
 # A key frame follows the last one when the picture has moved by this share of its diagonal, or when so few of the
 # corners are still seen; the sharpest of the frames that moved by `_CANDIDATE` of that is taken.
 _MOVED, _SEEN, _CANDIDATE = 0.06, 0.5, 0.6
-# But no later than after so many frames.
-_MOST_GAP = 30
+# But no later than after so many frames: what is followed from one key frame to the next joins all frames between.
+_MOST_GAP = 12
 # Corners that vanish from one frame to the next: another scene.
 _CUT, _LEAST_CORNERS = 0.75, 20
 

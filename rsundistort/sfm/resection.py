@@ -10,13 +10,18 @@ __all__ = ["LEAST_POINTS", "resect"]
 
 # Fewer points that agree tell no pose.
 LEAST_POINTS = 12
-_TRIALS = 200
+# Points that agree are sought around the guess, then around what these say, ever nearer.
+_NARROWER = (4.0, 2.0, 1.0)
 
 
 def resect(
-    rays: NDArray[np.float64], points_w: NDArray[np.float64], within: float
+    rays: NDArray[np.float64],
+    points_w: NDArray[np.float64],
+    R_cw: NDArray[np.float64],
+    center_w: NDArray[np.float64],
+    within: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Pose of a photo by points of the scene and where it shows them, as far as these agree.
+    """Pose of a photo by points of the scene and where it shows them, as far as these agree, from a pose nearby.
 
     Parameters
     ----------
@@ -24,26 +29,28 @@ def resect(
         Ideal image coordinates x / z, y / z of the points in the camera.
     points_w : (n, 3) array
         The points.
+    R_cw, center_w : (3, 3), (3,) array
+        Where it is looked for.
     within : float
-        How far apart, in the same coordinates, a point and its prediction may be: room for the shutter.
+        How far apart, in the coordinates of the rays, a point and its prediction may be in the end: room for the
+        shutter. Four times that at first.
 
     Returns
     -------
     R_cw, center_w : (3, 3), (3,) array
         Or None if fewer than `LEAST_POINTS` agree on one.
     """
-    if len(rays) < LEAST_POINTS:
-        return None
-    # a world of its own, for the sake of the scale of what is solved
-    middle, size = points_w.mean(0), float(np.linalg.norm(points_w.std(0))) or 1.0
-    local = (points_w - middle) / size
-    found, rotation, translation, agreeing = cv2.solvePnPRansac(
-        local, rays, np.eye(3), None, iterationsCount=_TRIALS, reprojectionError=within, confidence=0.9999,
-        flags=cv2.SOLVEPNP_SQPNP,
-    )  # fmt: skip
-    if not found or agreeing is None or len(agreeing) < LEAST_POINTS:
-        return None
-    chosen = agreeing.ravel()
-    rotation, translation = cv2.solvePnPRefineLM(local[chosen], rays[chosen], np.eye(3), None, rotation, translation)
-    R_cw = cv2.Rodrigues(rotation)[0]
-    return R_cw, middle - size * (R_cw.T @ translation.ravel())
+    for times in _NARROWER:
+        x_c = (points_w - center_w) @ R_cw.T
+        ahead = x_c[:, 2] > 0
+        apart = np.linalg.norm(x_c[:, :2] / np.where(ahead, x_c[:, 2], 1.0)[:, None] - rays, axis=1)
+        agree = ahead & (apart < times * within)
+        if agree.sum() < LEAST_POINTS:
+            return None
+        # a world of its own, for the sake of the scale of what is solved
+        size = float(np.median(x_c[agree, 2]))
+        local = (points_w[agree] - center_w) / size
+        turn, way = cv2.solvePnPRefineLM(local, rays[agree], np.eye(3), None, cv2.Rodrigues(R_cw)[0], np.zeros((3, 1)))
+        R_cw = cv2.Rodrigues(turn)[0]
+        center_w = center_w - size * (R_cw.T @ way.ravel())
+    return R_cw, center_w

@@ -43,6 +43,8 @@ _LEAST_HALF = 4
 _FRAMES_ASKED = 300
 # What flow may be off by, pixels, and measurements that may be far off, as a share, where rotations explain the frames.
 _FLOW_PX, _OUTLIERS = 0.5, 0.2
+# Solves that settle the spreads of a path: of hundreds of frames few do.
+_SPREADS = 4
 # Of the time between frames: none.
 _NO_READOUT = 1e-6
 # Of a readout time that is given, or in the table: its standard deviation, as a share.
@@ -101,7 +103,8 @@ def solve_clip(
     if felt is not None:
         options = replace(options, path=replace(path, rates=felt.rates(result)))
         result = bundle_adjust(
-            result.reconstruction, "constant-motion", replace(options, outlier_rounds=0),
+            result.reconstruction, "constant-motion",
+            replace(options, outlier_rounds=0, spread_rounds=_SPREADS),
             partial(_tell, log, "gyroscope"),
         )  # fmt: skip
     log.end("gyroscope", offset_s=None if felt is None else felt.alignment.offset_s)
@@ -118,10 +121,10 @@ def _turned(
     result, options = None, BundleOptions()
     if start is not None:
         options = replace(options_of(start), path=replace(path, turns_only=True))
-        result = bundle_adjust(start, "constant-motion", rough_options(options), partial(_tell, log, "rotations"))
+        result = bundle_adjust(start, "constant-motion", _at_first(options), partial(_tell, log, "rotations"))
         if result.sigma_px < _FLOW_PX and result.num_outliers < _OUTLIERS * len(start.observations):
             result = bundle_adjust(
-                result.reconstruction, "constant-motion", replace(options, outlier_rounds=1),
+                result.reconstruction, "constant-motion", replace(options, outlier_rounds=1, spread_rounds=_SPREADS),
                 partial(_tell, log, "rotations"),
             )  # fmt: skip
             warnings.warn(
@@ -151,7 +154,7 @@ def _travelled(
         log.end("flow", frames=whole.num_images, of_frames=len(clip.names), observations=len(followed.frame))
         log.begin(stage)
         options = replace(options_of(whole), path=path)
-        how = rough_options(options) if result is None else options
+        how = _at_first(options) if result is None else replace(options, outlier_rounds=1, spread_rounds=_SPREADS)
         is_first = result is None
         result = bundle_adjust(whole, "constant-motion", how, partial(_tell, log, stage))
         log.end(
@@ -163,6 +166,11 @@ def _travelled(
             current = retriangulate(matched, result.of_photos(_are_keys(result, clip)).reconstruction)
     assert result is not None
     return result, options
+
+
+def _at_first(options: BundleOptions) -> BundleOptions:
+    """Options of an adjustment of a path that another one follows."""
+    return replace(rough_options(options), outlier_rounds=2, spread_rounds=1, deviations="model")
 
 
 def _mapped(
@@ -343,7 +351,7 @@ def _halves(result: BundleResult, options: BundleOptions) -> tuple[ReadoutTime, 
     late = np.arange(rec.num_images) >= rec.num_images // 2
     if rec.num_images < 2 * _LEAST_HALF:
         return None
-    how = replace(rough_options(options), outlier_rounds=0, refine=())
+    how = replace(_at_first(options), outlier_rounds=0, refine=())
     parts = [rec.take_photos(keep) for keep in (~late, late)]
     if any(part.num_images < _LEAST_HALF or part.num_points < _LEAST_MEASUREMENTS for part in parts):
         return None

@@ -6,7 +6,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ..input.clip import Clip
 from ..input.load import LoadedPhotos
@@ -121,10 +120,16 @@ def _turn(before: NDArray[np.float64], after: NDArray[np.float64], within: float
     best, most = None, 0
     for _ in range(_TRIALS):
         pair = rng.choice(len(before), 2, replace=False)
-        turn = Rotation.align_vectors(after[pair], before[pair])[0].as_matrix()
+        turn = _aligned(before[pair], after[pair])
         agree = np.linalg.norm(before @ turn.T - after, axis=1) < within
         if agree.sum() > most:
             best, most = agree, int(agree.sum())
     if best is None or most < _LEAST_AGREEING:
         return None
-    return np.asarray(Rotation.align_vectors(after[best], before[best])[0].as_matrix())
+    return _aligned(before[best], after[best])
+
+
+def _aligned(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rotation (3, 3) that takes directions (n, 3) nearest to others (Kabsch 1976)."""
+    U, _, Vt = np.linalg.svd(after.T @ before)
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ..input.clip import Clip, greys_of
 from ..model import Camera, Observations, Reconstruction, RowMotion
@@ -122,6 +123,28 @@ def follow(
     return followed
 
 
+class CameraPoses:
+    """Poses between those of some frames of a clip."""
+
+    def __init__(self, clip: Clip, poses: Mapping[int, tuple[NDArray[np.float64], NDArray[np.float64]]]) -> None:
+        self._clip, self._poses = clip, dict(poses)
+        self._frames = np.array(sorted(poses))
+
+    def near(self, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """A steady motion's pose between the two frames around one, or that of the only neighbour in its part."""
+        part = self._clip.part
+        after = int(np.searchsorted(self._frames, frame))
+        around = [int(k) for k in self._frames[max(after - 1, 0) : after + 1] if part[k] == part[frame]]
+        a, b = around[0], around[-1]
+        (R_a, c_a), (R_b, c_b) = self._poses[a], self._poses[b]
+        if a == b:
+            return R_a, c_a
+        time = self._clip.time_s
+        share = (time[frame] - time[a]) / (time[b] - time[a])
+        turn = Rotation.from_rotvec(share * Rotation.from_matrix(R_b @ R_a.T).as_rotvec())
+        return turn.as_matrix() @ R_a, c_a + share * (c_b - c_a)
+
+
 def with_all_frames(
     clip: Clip, reconstruction: Reconstruction, followed: Followed, placed_before: Reconstruction | None = None
 ) -> Reconstruction:
@@ -148,10 +171,11 @@ def with_all_frames(
     camera = rec.cameras[0]
     rays, valid = unproject_points(followed.xy_raw, camera, RowMotion(), "global")
     within = _ROOM_PX / float(camera.K[0, 0])
+    known = CameraPoses(clip, poses)
     for k in sorted({*followed.frame.tolist()} - {*poses}):
         mine = np.flatnonzero((followed.frame == k) & valid)
-        if (found := resect(rays[mine], points_w[point[mine]], within)) is not None:
-            poses[k] = found
+        guess = known.near(k)
+        poses[k] = resect(rays[mine], points_w[point[mine]], *guess, within) or guess
     placed = np.array(sorted(poses))
     index = np.full(len(clip.names), -1)
     index[placed] = np.arange(len(placed))
