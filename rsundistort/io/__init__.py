@@ -17,7 +17,7 @@ from .photos.metadata import Metadata
 from .readout_times import readout_time
 from .shutter_poses import write_shutter_poses
 from .solution import read_solution, write_solution
-from .trajectory import write_point_cloud, write_trajectory
+from .trajectory import write_path, write_point_cloud, write_trajectory
 from .video import VideoFrames, extract_frames, is_video
 
 __all__ = [
@@ -64,6 +64,7 @@ __all__ = [
     "write_colmap_model",
     "write_colmap_workspace",
     "write_image",
+    "write_path",
     "write_point_cloud",
     "write_shutter_poses",
     "write_solution",

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import csv
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["write_point_cloud", "write_trajectory"]
+from ..model.path import CameraPath
+
+__all__ = ["write_path", "write_point_cloud", "write_trajectory"]
+
+_PATH_COLUMNS = "frame time_s tx ty tz qx qy qz qw vx vy vz wx wy wz".split()
 
 
 def write_trajectory(
@@ -24,13 +30,42 @@ def write_trajectory(
     R_cw, center_w : (m, 3, 3), (m, 3) array
         Poses; written are those of the camera in the world, x right, y down, z ahead.
     """
-    from scipy.spatial.transform import Rotation
-
-    quaternions = Rotation.from_matrix(np.reshape(R_cw, (-1, 3, 3)).transpose(0, 2, 1)).as_quat(canonical=True)
-    table = np.column_stack([times, np.reshape(center_w, (-1, 3)), quaternions])
+    table = np.column_stack([times, np.reshape(center_w, (-1, 3)), _quaternions(R_cw)])
     order = np.argsort(times, kind="stable")
     with path.open("wb") as file:
         np.savetxt(file, table[order], fmt=["%.9f"] + 7 * ["%.12g"], header="timestamp tx ty tz qx qy qz qw")
+
+
+def _quaternions(R_cw: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(m, 4) rotations x, y, z, w of cameras in the world."""
+    from scipy.spatial.transform import Rotation
+
+    turned = np.reshape(R_cw, (-1, 3, 3)).transpose(0, 2, 1)
+    return np.asarray(Rotation.from_matrix(turned).as_quat(canonical=True))
+
+
+def write_path(path: Path, names: Sequence[str], camera_path: CameraPath) -> None:
+    """Write the path of a camera as CSV, a line for each frame: pose as in `write_trajectory`, velocity, turn.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    names : sequence of str, length m
+        The frame of each moment.
+    camera_path : CameraPath
+        Written are its times in seconds, the camera in the world, its velocity in world units per second, and its
+        angular velocity about its own axes (x right, y down, z ahead) in radians per second, which is minus
+        `CameraPath.rate`: as the camera turns, the world turns the other way in it.
+    """
+    moved = np.column_stack(
+        [camera_path.center_w, _quaternions(camera_path.R_cw), camera_path.velocity, -camera_path.rate]
+    )
+    with path.open("w", encoding="utf-8", newline="") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(_PATH_COLUMNS)
+        for name, time_s, values in zip(names, camera_path.time_s.tolist(), (moved + 0.0).tolist(), strict=True):
+            table.writerow([name, f"{time_s:.9f}", *(f"{each:.12g}" for each in values)])
 
 
 def write_point_cloud(path: Path, points_w: NDArray[np.float64], rgb: NDArray[np.uint8] | None = None) -> None:

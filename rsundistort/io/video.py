@@ -192,7 +192,8 @@ class VideoReader:
             ) from None
         with self._explained():
             # a name with a colon is no protocol, and a file that refers to others must not fetch them
-            self._container = av.open(f"file:{self.video}", options={"protocol_whitelist": "file"})
+            options = {"protocol_whitelist": "file"}
+            self._container = av.open(f"file:{self.video}", options=options, metadata_errors="replace")
         # a cover picture is a video stream, too
         streams = self._container.streams.video
         stream = next((s for s in streams if not int(s.disposition) & _ATTACHED_PICTURE), None)
@@ -200,6 +201,7 @@ class VideoReader:
             self._container.close()
             raise FileError(f"{self.video} holds no pictures")
         self._stream = stream
+        self.tags = dict(self._container.metadata)
         tags = {key.lower(): value for key, value in (*self._container.metadata.items(), *stream.metadata.items())}
         self.make, self.model = (
             next((tags[key].strip() for key in keys if tags.get(key)), "") for keys in (_MAKE, _MODEL)

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from .camera import READOUTS, Camera
 from .checks import check_finite
+from .path import CameraPath
 from .reconstruction import Reconstruction
 from .solution import Solution, SolvedImage
 
@@ -28,6 +29,7 @@ __all__ = [
     "split_mirror",
     "turn_camera",
     "turn_image",
+    "turn_path",
     "turn_pixels",
     "turn_points",
     "turn_reconstruction",
@@ -148,6 +150,15 @@ def turn_image(image: SolvedImage, orientation: int, camera_id: str) -> SolvedIm
         motion=motion,
         sigma_phi=None if image.sigma_phi is None else np.abs(matrix) @ image.sigma_phi,
         turned=compose_orientations(image.turned, orientation),
+    )
+
+
+def turn_path(path: CameraPath, orientation: int) -> CameraPath:
+    """The path of the camera whose frames the orientation shows; one that mirrors is refused, no camera takes these."""
+    matrix = np.eye(3)
+    matrix[:2, :2] = MATRICES[orientation]
+    return replace(
+        path, R_cw=matrix @ path.R_cw, rate=path.rate @ matrix.T, rate_change=path.rate_change @ matrix.T
     )
 
 

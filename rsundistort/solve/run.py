@@ -29,9 +29,9 @@ from .clip import frame_path, solve_clip
 from .model_sequence import solve_photos
 from .outcome import Solved
 from .run_options import RunOptions, SolveOptions
-from .run_outputs import REPLACED, Outputs, files_of_run, inputs_of, photo_times
+from .run_outputs import OF_VIDEOS, REPLACED, VIDEO, Outputs, files_of_run, inputs_of, photo_times
 
-__all__ = ["run"]
+__all__ = ["run", "solve_frames"]
 
 
 def run(
@@ -49,7 +49,8 @@ def run(
     Parameters
     ----------
     photos : path
-        Folder of photos of one camera, or a video, whose frames go to `out/frames`.
+        Folder of photos of one camera, or a video: its frames share one path, and its key frames, which go to
+        `out/frames`, are the photos.
     out : path
         Folder for the outputs. It stays as it was until the motions are solved; then it gets the solution, and the
         rectified photos one by one. Should that be interrupted, `rectify_folder(..., resume=True)` goes on.
@@ -77,9 +78,12 @@ def run(
         gyro_log = None if options.gyro is None else options.gyro.log()
         source = find_photos(photos, scratch, options.camera, options.every, options.sharpest, log)
         folder = source.folder
+        if options.frames == "all" and source.clip is None:
+            raise InputError(f"{photos} is no video; --frames all is for one")
         frames = [] if source.frames is None else [f"frames/{path.name}" for path in folder.iterdir()]
+        of_video = [] if source.clip is None else [name for name in OF_VIDEOS if _writes(name, options)]
         names = list_photos(folder, rectify.raw_as)
-        Record(out).check([*frames, *files_of_run(names, rectify.raw_as, options.outputs)], inputs)
+        Record(out).check([*frames, *of_video, *files_of_run(names, rectify.raw_as, options.outputs)], inputs)
         loaded = load_photos(
             folder, source.camera, options.solve.readout, options.max_features, workers, log,
             megapixels=options.feature_megapixels, masks=rectify.masks, raw_as=rectify.raw_as, again=rectify.again,
@@ -90,7 +94,7 @@ def run(
         if source.clip is None:
             solved, solving = _solve(options, loaded, bodies, gyro_log, workers, log)
         else:
-            solved, solving = _solve_clip(options, source.clip, loaded, bodies, gyro_log, log), options.solve
+            solved, solving = solve_frames(options, source.clip, loaded, bodies, gyro_log, log), options.solve
         told = {
             "max_features": options.max_features,
             "feature_megapixels": options.feature_megapixels,
@@ -103,7 +107,16 @@ def run(
             times=photo_times(folder),
         )  # fmt: skip
         outputs.begin(scratch, log)
+    # what an earlier run left there is of another path
+    Record(out).remove([name for name in OF_VIDEOS if name not in of_video])
+    if options.frames == "all":
+        outputs.rectify_clip(photos, out, workers, log)
     return outputs.rectify(folder if source.frames is None else out / "frames", out, workers, log)
+
+
+def _writes(name: str, options: RunOptions) -> bool:
+    """Whether a file of videos is written."""
+    return name != VIDEO or options.frames == "all"
 
 
 def _check_anchors(options: SolveOptions, names: Sequence[str], photos: Path) -> None:
@@ -145,7 +158,7 @@ def _solve(
     return replace(solved, unregistered=loaded.unregistered(rec.image_names), readouts=readouts), solving
 
 
-def _solve_clip(
+def solve_frames(
     options: RunOptions,
     clip: Clip,
     keys: LoadedPhotos,

@@ -13,7 +13,8 @@ from pathlib import Path, PurePath
 import numpy as np
 from numpy.typing import NDArray
 
-from ..batch.geometry import SceneGeometry, ScenePoints, with_depths
+from ..batch.clip import rectify_clip
+from ..batch.geometry import DEPTHS, PhotoGeometry, SceneGeometry, ScenePoints, with_depths
 from ..batch.many_photos import PointColors, mask_names, rectify_photos
 from ..batch.one_photo import turn_of
 from ..batch.progress import StageLog
@@ -28,6 +29,7 @@ from ..io import (
     read_photo_times,
     write_colmap_model,
     write_colmap_workspace,
+    write_path,
     write_point_cloud,
     write_shutter_poses,
     write_solution,
@@ -37,18 +39,24 @@ from ..io import (
 from ..io.journal import Journal
 from ..io.outputs import batch_folder
 from ..io.places import local_place
+from ..io.record import Record
 from ..io.video import FRAME_TABLE
-from ..model import Reconstruction, RowMotion, Solution
-from ..model.orientation import turn_reconstruction, turn_solution
+from ..model import Reconstruction, RowMotion, Solution, SolvedImage
+from ..model.orientation import turn_path, turn_reconstruction, turn_solution
 from ..rectify import bend_px
 from ..report import Diagnostics, relative_folder, write_diagnostics, write_report
 from .outcome import Solved, solution_of
 from .run_options import OutputOptions, SolveOptions
 
-__all__ = ["REPLACED", "Outputs", "files_of_run", "inputs_of", "photo_times"]
+__all__ = ["OF_VIDEOS", "REPLACED", "VIDEO", "Outputs", "files_of_run", "inputs_of", "photo_times"]
 
 #: Folders that a run replaces.
 REPLACED = ("images", "masks", "sparse", "stereo", "rs-poses")
+
+#: All frames of a video, rectified.
+VIDEO = "video.mp4"
+#: Files that are there of videos only.
+OF_VIDEOS = ("path.csv", "path.txt", VIDEO)
 
 # What it writes besides the photos.
 _FILES = (
@@ -280,10 +288,48 @@ class Outputs:
             write_colmap_workspace(folder, [name for _, name in by_id])
         write_point_cloud(folder / "points.ply", rec.points_w, rgb)
         self._trajectory(folder / "poses.txt", solution)
+        self._path(folder)
         masks = mask_names([image.name for image in solution.images])
         files = {name: (f"images/{new}", f"masks/{masks[name]}") for name, new in written.items()}
         write_transforms(folder / "transforms.json", solution, files, "points.ply")
         return solution
+
+    def _path(self, folder: Path) -> None:
+        """Write where the camera of a video was, and how it moved, at each frame; turned as the key frames are."""
+        found = None if self.solved is None else self.solved.result.path
+        if found is None:
+            return
+        path = turn_path(found.path, next(iter(self.turns.values()), 1))
+        write_path(folder / "path.csv", found.names, path)
+        write_trajectory(folder / "path.txt", path.time_s, path.R_cw, path.center_w)
+
+    def rectify_clip(self, video: Path, out: Path, workers: Workers, log: StageLog) -> None:
+        """Rectify all frames of a video into `out`, which `begin` has filled."""
+        assert self.solved is not None
+        assert self.solved.whole is not None
+        whole, solution = self.solved.whole.with_own_cameras(), self.solution
+        # one view for all: the lens that focusing moved is that of each frame
+        new_camera = next(iter(solution.rectified_cameras.values()))
+        lens_only = any(image.lens_only for image in solution.registered)
+        images = tuple(
+            SolvedImage(name, str(whole.camera_idx[i]), whole.R_cw[i], whole.center_w[i], whole.motion(i))
+            for i, name in enumerate(whole.image_names)
+        )
+        cameras = {str(k): camera for k, camera in enumerate(whole.cameras)}
+        every = Solution(whole.shutter_model, cameras, dict.fromkeys(cameras, new_camera), images)
+        # maps are those of the key frames: with them, and without them in between, things would jump
+        depth = self.rectifying.depth if str(self.rectifying.depth) in DEPTHS else "auto"
+        scene = SceneGeometry(every, depth, ScenePoints.of_reconstruction(whole))
+        placed = {*whole.image_names}
+        still = PhotoGeometry(video.name, self.solved.shared.cameras[0], new_camera, RowMotion(), "global")
+
+        def geometry_of(name: str) -> PhotoGeometry | None:
+            if lens_only:
+                return still
+            return scene.of(name) if name in placed else None
+
+        with Record(out).writing([VIDEO]):
+            rectify_clip(video, out / VIDEO, geometry_of, still, self.rectifying.interpolation, workers, log)
 
     def _trajectory(self, path: Path, solution: Solution) -> None:
         """Write the poses by time if that of all photos is known, else by their place among all photos."""

@@ -1,0 +1,145 @@
+"""All frames of a video, rectified one after the other into a video."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ..errors import FileError, RsUndistortWarning
+from ..io.aside import written_aside
+from ..io.video import VideoReader, frame_name
+from ..io.video_like import Pixels, VideoWriter, black_out, pixels_of
+from ..model import Camera
+from ..rectify import rectify
+from .geometry import PhotoGeometry
+from .progress import StageLog
+from .workers import Workers
+
+__all__ = ["ClipDone", "rectify_clip"]
+
+# What a frame takes for each pixel from decoding to encoding, 16 bits a colour: three planes, before and after, twice.
+_BYTES_PER_PIXEL = 40
+
+
+@dataclass(frozen=True)
+class ClipDone:
+    """What came of the frames of a video.
+
+    Attributes
+    ----------
+    num_frames : int
+        Written.
+    num_lens_only : int
+        Of these, those whose motion nobody knows: the lens was taken out of them, and no motion.
+    encoder, pixel_format : str
+        FFmpeg's names of how they are encoded.
+    """
+
+    num_frames: int
+    num_lens_only: int
+    encoder: str
+    pixel_format: str
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A decoded frame, and what its grid takes."""
+
+    pts: int
+    picture: Any
+    geometry: PhotoGeometry
+
+
+def _even(camera: Camera) -> Camera:
+    """A camera of even sides, a pixel less where they are odd: encoders take colours for two pixels each way."""
+    return replace(camera, width=camera.width - camera.width % 2, height=camera.height - camera.height % 2)
+
+
+def rectify_clip(
+    video: Path,
+    out: Path,
+    geometry_of: Callable[[str], PhotoGeometry | None],
+    otherwise: PhotoGeometry,
+    interpolation: str,
+    workers: Workers,
+    log: StageLog,
+) -> ClipDone:
+    """Rectify every frame of a video, each by its own motion; the result is whole or not there.
+
+    Size, rate, time stamps, colours and sound are those of the video; a view of odd sides loses a pixel. A few frames
+    are in memory at a time.
+
+    Parameters
+    ----------
+    video : Path
+        The raw frames.
+    out : Path
+        MP4 file to write.
+    geometry_of : callable
+        Geometry of a frame by its name; None of one whose motion is not known.
+    otherwise : PhotoGeometry
+        Of such frames.
+    interpolation : str
+        As in `rectify`.
+    workers : Workers
+        Its threads are used, and no cluster: the frames come one after the other.
+    log : StageLog
+        Told the progress.
+
+    Raises
+    ------
+    FileError
+        The video cannot be read, or the result not be written.
+    """
+    target = _even(otherwise.new_camera)
+    num_lens_only = num_frames = 0
+
+    def work(frame: _Frame) -> tuple[_Frame, Pixels]:
+        raw = pixels_of(frame.picture)
+        depth = frame.geometry.find_depth().depth
+        values, valid = rectify(raw.values, *frame.geometry.grid, interpolation, depth=depth)
+        values, valid = values[: target.height, : target.width], valid[: target.height, : target.width]
+        return frame, black_out(raw, values, valid)
+
+    def frames(reader: VideoReader) -> Iterator[_Frame]:
+        nonlocal num_lens_only
+        for number, _, picture in reader:
+            if picture.pts is None:
+                continue
+            found = geometry_of(frame_name(video, number))
+            num_lens_only += found is None
+            yield _Frame(picture.pts, picture, found or otherwise)
+
+    camera = otherwise.camera
+    alone = replace(workers, scheduler=None)
+    alone = alone.fitting("the video", _BYTES_PER_PIXEL * camera.width * camera.height)
+    log.begin("video")
+    try:
+        with written_aside(out) as aside, VideoReader(video) as reader:
+            log.tell("video", 0, reader.num_frames)
+            with VideoWriter(aside, reader, target.width, target.height, workers.jobs) as writer:
+                with closing(alone.map(work, frames(reader), _lost)) as results:
+                    for frame, pixels in results:
+                        writer.add(frame.pts, frame.picture, pixels)
+                        num_frames += 1
+                        log.tell("video", num_frames, max(num_frames, reader.num_frames))
+    except FileError as error:
+        raise FileError(f"{out}: {error}") from error
+    except KeyboardInterrupt as stop:
+        raise KeyboardInterrupt(f"{out.name} was not written; start anew for it") from stop
+    num_frames -= writer.num_late
+    if num_lens_only:
+        warnings.warn(
+            f"{out.name}: {num_lens_only} of {num_frames} frames could not be placed; only the lens was taken out of "
+            "them", RsUndistortWarning, stacklevel=3,
+        )  # fmt: skip
+    log.end("video", frames=num_frames, lens_only=num_lens_only, encoder=writer.encoder)
+    return ClipDone(num_frames, num_lens_only, writer.encoder, writer.pixel_format)
+
+
+def _lost(_frame: _Frame, why: str) -> Any:
+    raise FileError(why)
