@@ -16,7 +16,7 @@ from .terminal import Talk, list_failed, table
 if TYPE_CHECKING:
     from rsundistort.model import Solution
 
-__all__ = ["close", "closing_table", "summary"]
+__all__ = ["close", "closing_table", "fitted", "summary"]
 
 
 _COLUMNS = 80
@@ -48,6 +48,7 @@ def summary(solution: Solution, out: Path, warned: Sequence[str]) -> dict[str, A
         "critical_motion": None
         if critical is None
         else {key: critical[key] for key in ("flagged", "sigma_log_k", "remedy", "sentence")},
+        "readout_time": solution.quality.get("readout_time"),
         "verdict": solution.verdict,
         "doubtful": {image.name: image.doubtful for image in solution.registered if image.doubtful},
         "lens_only": [image.name for image in solution.registered if image.lens_only],
@@ -94,6 +95,7 @@ def closing_table(solution: Solution, out: Path) -> str:
         *_intrinsics(solution),
         *_varying(solution),
         *_fields(solution),
+        *_readout_time(solution),
         *_readout(solution),
         *_depths(solution),
         *_two_poses(solution),
@@ -117,10 +119,10 @@ def closing_table(solution: Solution, out: Path) -> str:
     lost = [image for image in solution.images if not image.registered]
     if lost:
         lines += ["", "not joined:", *(f"  {image.name}: {image.reason}" for image in lost)]
-    return "\n".join(part for line in lines for part in _fitted(line))
+    return "\n".join(part for line in lines for part in fitted(line))
 
 
-def _fitted(text: str) -> list[str]:
+def fitted(text: str) -> list[str]:
     """Lines of 80 columns; what belongs to a label is indented as its first line is."""
     lines = []
     for line in text.splitlines() or [""]:
@@ -213,7 +215,21 @@ def _video(solution: Solution) -> list[str]:
         return []
     turned = {3: 180, 6: 90, 8: 270}.get(video["orientation"])
     said = f", players turn them by {turned} degrees clockwise, the files do not" if turned else ""
-    return [f"video              {len(solution.images)} of {video['frames']} frames{said}"]
+    what = "key frames of" if "key_frames" in video else "of"
+    return [f"video              {len(solution.images)} {what} {video['frames']} frames{said}"]
+
+
+def _readout_time(solution: Solution) -> list[str]:
+    """Lines on the readout time that a video told, and on what tells against or for it."""
+    from rsundistort.report.readout import readout_facts
+
+    told = solution.quality.get("readout_time")
+    if not told:
+        return []
+    shown = ["readout time", "gyroscope"]
+    if told["stabilisation"]["verdict"] == "stabilised":
+        shown.append("stabilisation")
+    return [f"{label:<{_LABEL}}{text}" for label, text in readout_facts(told) if label in shown]
 
 
 def _readout(solution: Solution) -> list[str]:

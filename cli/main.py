@@ -12,6 +12,7 @@ from .terminal import warnings_for_people
 _COMMANDS = {
     "run": "Photos in, rectified photos and camera poses out.",
     "solve": "A COLMAP model in, the same without the shutter out.",
+    "readout": "How long a camera takes to read a frame, from a video.",
     "rectify": "Rectify a folder of photos with a solution.",
     "analyze": "Whether poses let the shutter be told from the scene's shape.",
     "simulate": "Photos with a known shutter motion.",

@@ -16,6 +16,7 @@ from .terminal import Talk, errors_for_people
 READOUT_NAMES = ("top-to-bottom", "bottom-to-top", "left-to-right", "right-to-left")
 INTERPOLATION_NAMES = ("cubic", "linear", "lanczos", "nearest")
 MAP_KIND_NAMES = ("npz", "exr", "stmap")
+FRAMES_NAMES = ("key", "all")
 MATCHING_NAMES = ("auto", "exhaustive", "neighbours")
 
 

@@ -19,7 +19,17 @@ _measure_options = opt.gathered(
     "measuring",
     opt.camera_option,
     click.option(
-        "--every", type=click.IntRange(min=1), metavar="N", help="Of a video: the photos are each N-th frame,"
+        "--frames",
+        type=click.Choice(opt.FRAMES_NAMES),
+        default="key",
+        show_default=True,
+        help="Of a video: rectify its key frames, into images/; or all frames as well, into video.mp4.",
+    ),
+    click.option(
+        "--every",
+        type=click.IntRange(min=1),
+        metavar="N",
+        help="Of a video: take each N-th frame as a photo by itself; the frames then share no path,",
     ),
     click.option("--sharpest", type=click.IntRange(min=1), metavar="N", help="or the sharpest of each N frames."),
     click.option(
@@ -82,7 +92,10 @@ def command(photos: Path, out: Path, measuring: dict[str, Any], given: dict[str,
     """Find how the camera moved during each photo's readout, and take it out.
 
     PHOTOS is a folder of photos that one camera took of one scene, in any order, or a video. OUT gets images/, masks/,
-    sparse/ (COLMAP), transforms.json (nerfstudio), solution.json and report.html; of a video frames/, too.
+    sparse/ (COLMAP), transforms.json (nerfstudio), solution.json and report.html.
+
+    The frames of a video share one path of the camera. Its key frames are the photos. OUT gets frames/ (these, as they
+    were) and path.csv (pose, velocity and turn at every frame), too.
 
     OUT stays as it was until the motions are solved. If the rest is interrupted, `rectify --resume` goes on with it.
     Exit code 3 says that photos with a motion could not be rectified; they are listed, and the others are done.

@@ -81,6 +81,7 @@ WORK = [
 ]
 MEASURE = [
     (["--camera", "camera.json"], {"camera": "camera.json"}),
+    (["--frames", "all"], {"frames": "all"}),
     (["--every", "4"], {"every": 4}),
     (["--sharpest", "4"], {"sharpest": 4}),
     (["--gyro", "log.csv"], {"gyro": GyroOptions(Path("log.csv"))}),

@@ -15,6 +15,7 @@ from ..io.aside import write_aside
 from ..io.record import Record
 from . import content
 from .pictures import Picture, PictureJob, make_pictures
+from .readout import readout_facts
 from .source import Source, read_source
 from .verdict import advice_of, meter_of, verdict_of
 
@@ -109,6 +110,7 @@ def _page(source: Source, pictures: dict[str, Picture]) -> str:
         data=data,
         ladder=content.ladder(solution),
         cameras=content.cameras(solution),
+        readout=readout_facts(solution.quality["readout_time"]) if solution.quality.get("readout_time") else [],
         settings=content.settings(solution),
         seconds=sum(float(stage.get("seconds") or 0) for stage in solution.stages),
         json=_json(data),

@@ -11,12 +11,12 @@ from ..critical import Remedy
 from ..rectify import largest_shift_px
 from .judge import Verdict, height_reasons, loose_reasons, unexplained_reasons
 
-__all__ = ["ReadoutTime", "judge_clip"]
+__all__ = ["APART", "SIGMAS", "ReadoutTime", "judge_clip"]
 
 # Displacements below this are lost in the interpolation of a photo.
 _UNSEEN_PX = 1.0
-# Standard deviations that tell a readout time from none, and two of them from each other.
-_SIGMAS, _APART = 3.0, 4.0
+#: Standard deviations that tell a readout time from none, and two of them from each other.
+SIGMAS, APART = 3.0, 4.0
 
 
 class ReadoutTime(NamedTuple):
@@ -62,12 +62,12 @@ def judge_clip(
     reasons = loose_reasons(keys) + height_reasons(remedy) + unexplained_reasons(keys, None)
     rec = keys.reconstruction
     shift = max(largest_shift_px(rec.camera(i), rec.motion(i), rec.shutter_model) for i in range(rec.num_images))
-    most = shift * (abs(time.seconds) + _SIGMAS * time.sigma) / max(abs(time.seconds), 1e-9)
+    most = shift * (abs(time.seconds) + SIGMAS * time.sigma) / max(abs(time.seconds), 1e-9)
     if against:
         return Verdict("not-determined", "doubtful", (f"{against}.", *reasons), {}, tuple(rec.image_names))
     if not most > _UNSEEN_PX:
         shutter = "not-found"
-    elif abs(time.seconds) > _SIGMAS * time.sigma:
+    elif abs(time.seconds) > SIGMAS * time.sigma:
         shutter = "found"
     else:
         shutter = "not-determined"
@@ -75,7 +75,7 @@ def judge_clip(
             f"The camera moved too little to tell how long a frame takes to be read: {1e3 * time.seconds:.1f} +- "
             f"{1e3 * time.sigma:.1f} ms."
         )
-    if shutter == "found" and abs(time.seconds) - _SIGMAS * time.sigma > frame_s:
+    if shutter == "found" and abs(time.seconds) - SIGMAS * time.sigma > frame_s:
         reasons.append(
             f"The readout is said to take {1e3 * abs(time.seconds):.1f} ms, longer than the {1e3 * frame_s:.1f} ms "
             "from frame to frame: something else bends the frames."
@@ -83,7 +83,7 @@ def judge_clip(
     if halves is not None:
         a, b = halves
         apart = abs(a.seconds - b.seconds) / float(np.hypot(a.sigma, b.sigma))
-        if apart > _APART:
+        if apart > APART:
             reasons.append(
                 f"The first half of the video says that a frame takes {1e3 * a.seconds:.1f} ms to be read, the second "
                 f"{1e3 * b.seconds:.1f} ms, {apart:.0f} standard deviations apart."

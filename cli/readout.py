@@ -1,0 +1,80 @@
+"""`rsundistort readout`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from . import options as opt
+from .closing import fitted
+from .terminal import SOME_FAILED, Talk, errors_for_people, progress_bars
+
+if TYPE_CHECKING:
+    from rsundistort.solve import MeasuredReadout
+
+_measure_options = opt.gathered(
+    "given",
+    opt.camera_option,
+    click.option(
+        "--readout",
+        type=click.Choice(opt.READOUT_NAMES),
+        metavar="DIRECTION",
+        help=f"Direction of the readout in the stored pixels: {', '.join(opt.READOUT_NAMES)}.",
+    ),
+    click.option(
+        "--readout-ms",
+        type=click.FloatRange(min=0, min_open=True),
+        help="A readout time that is known to 2 %, to start from. It is measured only if the video tells it better.",
+    ),
+    click.option(
+        "--gyro",
+        type=click.Path(exists=True, dir_okay=False, path_type=Path),
+        metavar="FILE",
+        help="A gyroscope's log, as `run` takes it. Its axes and its clock are found. Default: the log in the video.",
+    ),
+    opt.seed_option,
+    opt.jobs_option,
+)
+
+
+@click.command()
+@click.argument("video", type=opt.LocalPath(exists=True, dir_okay=False, path_type=Path))
+@_measure_options
+@opt.talk_options
+def command(video: Path, given: dict[str, Any], talk: Talk) -> None:
+    """Measure how long the camera takes to read a frame, from a video that it took. Nothing is written.
+
+    VIDEO is any clip of a scene at rest. The camera should have shaken, turned or walked. It must not have stabilised
+    the video.
+
+    Exit code 3 says that the video does not tell the readout time, and why.
+    """
+    with errors_for_people() as warned, progress_bars(talk) as progress:
+        from rsundistort.input import GyroOptions
+        from rsundistort.solve import RunOptions, SolveOptions, measure_readout
+
+        gyro = GyroOptions(given.pop("gyro")) if "gyro" in given else None
+        jobs, camera = given.pop("jobs", 0), given.pop("camera", None)
+        if "readout_ms" in given:
+            given["readout_s"] = given.pop("readout_ms") / 1e3
+        options = RunOptions(solve=SolveOptions(**given), gyro=gyro, camera=camera)
+        found = measure_readout(video, options, progress, jobs=jobs)
+    if talk.as_json:
+        click.echo(json.dumps({**found.to_json(), "warnings": list(warned)}))
+    elif talk.to_people:
+        click.echo("\n".join(_lines(found)))
+    if not found.measured:
+        sys.exit(SOME_FAILED)
+
+
+def _lines(found: MeasuredReadout) -> list[str]:
+    from rsundistort.report.readout import readout_facts
+
+    facts = [*readout_facts(found.evidence), ("frames", str(found.evidence["frames"]))]
+    if found.problem:
+        facts[0] = ("readout time", f"not told: {found.problem}")
+    return [part for label, text in facts for part in fitted(f"{label:<19}{text}")]

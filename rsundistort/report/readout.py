@@ -1,0 +1,42 @@
+"""What is said of the readout time of a video, and of what it rests on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+__all__ = ["readout_facts"]
+
+
+def _time(told: Mapping[str, Any]) -> str:
+    return f"{1e3 * told['seconds']:.1f} +- {1e3 * told['sigma']:.1f} ms"
+
+
+def readout_facts(told: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Label and text of all that is known of a readout time, for people.
+
+    Parameters
+    ----------
+    told : mapping
+        `quality.readout_time` of a solution.
+    """
+    source = told["source"]
+    origin = source if source.startswith("what") else f"measured from {source}"
+    facts = [("readout time", f"{_time(told)} ({told['of_frame']:.2f} of the frame), {origin}")]
+    halves = told.get("halves") or ()
+    if halves:
+        facts.append(("its halves say", " and ".join(_time(half) for half in halves)))
+    for key, label in (("by_pictures", "pictures alone"), ("by_gyroscope", "by the gyroscope")):
+        if told.get(key):
+            facts.append((label, _time(told[key])))
+    gyro = told.get("gyroscope")
+    if gyro:
+        offset, sigma = 1e3 * gyro["offset_s"], 1e3 * gyro["offset_sigma_s"]
+        facts.append(
+            (
+                "gyroscope",
+                f"axes {gyro['axes']}, offset {offset:.1f} +- {sigma:.1f} ms, correlation {gyro['correlation']:.3f}",
+            )
+        )
+    facts.append(("stabilisation", (told.get("stabilisation") or {}).get("reason") or "not looked at"))
+    return facts

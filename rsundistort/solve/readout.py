@@ -1,0 +1,128 @@
+"""How long a camera takes to read a frame, by a video of it."""
+
+from __future__ import annotations
+
+import tempfile
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..batch.progress import ProgressCallback, StageLog
+from ..batch.workers import Workers, use_threads
+from ..errors import InputError, RsUndistortWarning
+from ..input.frames import find_photos
+from ..input.load import load_photos
+from ..io import is_video
+from ..io.places import local_place
+from ..verdict.clip import APART, SIGMAS
+from .run import solve_frames
+from .run_options import RunOptions
+
+__all__ = ["MeasuredReadout", "measure_readout"]
+
+
+@dataclass(frozen=True)
+class MeasuredReadout:
+    """What a video says of the time in which its camera reads a frame.
+
+    Attributes
+    ----------
+    seconds, sigma : float
+        From the first line to the last, negative where it runs against its direction; and its standard deviation.
+    of_frame : float
+        Share of the time from frame to frame.
+    problem : str
+        Why the video did not tell it; empty if it did.
+    evidence : mapping
+        `quality.readout_time` of a solution: the same by halves, by pictures and gyroscope alone, whether the video was
+        stabilised, and how many frames it rests on.
+    """
+
+    seconds: float
+    sigma: float
+    of_frame: float
+    problem: str
+    evidence: Mapping[str, Any]
+
+    @property
+    def measured(self) -> bool:
+        """Whether the video told it."""
+        return not self.problem
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain values."""
+        return {"measured": self.measured, "problem": self.problem, **self.evidence}
+
+
+def measure_readout(
+    video: Path | str,
+    options: RunOptions | None = None,
+    progress: ProgressCallback | None = None,
+    *,
+    jobs: int = 0,
+) -> MeasuredReadout:
+    """Measure the readout time of a camera from a video that it took; nothing is written.
+
+    The camera must have shaken or turned, and not have stabilised the video. What it filmed does not matter, if it
+    stood still.
+
+    Parameters
+    ----------
+    video : path
+        Any file that FFmpeg decodes.
+    options : RunOptions, optional
+        `solve.readout_s` is a first guess, known to 2 %: what the video does not tell better is not measured.
+    progress : callable, optional
+        Called as (stage, done, total).
+    jobs : int
+        Threads; 0 for all cores.
+
+    Returns
+    -------
+    MeasuredReadout
+        With a `problem` where the video does not tell.
+    """
+    options = options or RunOptions()
+    video = local_place(video)
+    if not is_video(video):
+        raise InputError(f"{video} is no video; a readout time is measured from one")
+    log, workers = StageLog(progress), Workers(use_threads(jobs))
+    with tempfile.TemporaryDirectory(prefix="rsundistort-") as work, warnings.catch_warnings():
+        # no frame is rectified
+        warnings.filterwarnings("ignore", "only the lens is taken out", RsUndistortWarning)
+        gyro_log = None if options.gyro is None else options.gyro.log()
+        source = find_photos(video, Path(work), options.camera, None, None, log)
+        assert source.clip is not None
+        assert source.frames is not None
+        loaded = load_photos(
+            source.folder, source.camera, options.solve.readout, options.max_features, workers, log,
+            megapixels=options.feature_megapixels, again=True, least=2,
+        )  # fmt: skip
+        bodies = [source.frames] * len(loaded.names)
+        solved = solve_frames(options, source.clip, loaded, bodies, gyro_log, log)
+    told = dict(solved.evidence)
+    return MeasuredReadout(told["seconds"], told["sigma"], told["of_frame"], _problem(told), told)
+
+
+def _problem(told: Mapping[str, Any]) -> str:
+    """Why a video does not tell its readout time; empty if it does."""
+    stabilised = told["stabilisation"]
+    if stabilised["verdict"] == "stabilised":
+        return str(stabilised["reason"])
+    if told["source"] == "what was known before":
+        return "the video does not tell it better than it was known before"
+    seconds, sigma = told["seconds"], told["sigma"]
+    if not abs(seconds) > SIGMAS * sigma:
+        return f"the camera moved too little: {1e3 * seconds:.1f} +- {1e3 * sigma:.1f} ms"
+    if told["halves"]:
+        first, second = told["halves"]
+        apart = abs(first["seconds"] - second["seconds"]) / np.hypot(first["sigma"], second["sigma"])
+        if apart > APART:
+            return f"the halves of the video contradict each other, {apart:.0f} standard deviations apart"
+    if abs(told["of_frame"]) - SIGMAS * sigma * abs(told["of_frame"] / seconds) > 1:
+        return "it would be longer than from frame to frame: something else bends the frames"
+    return ""
