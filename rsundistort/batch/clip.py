@@ -121,12 +121,14 @@ def rectify_clip(
     try:
         with written_aside(out) as aside, VideoReader(video) as reader:
             log.tell("video", 0, reader.num_frames)
-            with VideoWriter(aside, reader, target.width, target.height, workers.jobs) as writer:
-                with closing(alone.map(work, frames(reader), _lost)) as results:
-                    for frame, pixels in results:
-                        writer.add(frame.pts, frame.picture, pixels)
-                        num_frames += 1
-                        log.tell("video", num_frames, max(num_frames, reader.num_frames))
+            with (
+                VideoWriter(aside, reader, target.width, target.height, workers.jobs) as writer,
+                closing(alone.map(work, frames(reader), _lost)) as results,
+            ):
+                for frame, pixels in results:
+                    writer.add(frame.pts, frame.picture, pixels)
+                    num_frames += 1
+                    log.tell("video", num_frames, max(num_frames, reader.num_frames))
     except FileError as error:
         raise FileError(f"{out}: {error}") from error
     except KeyboardInterrupt as stop:

@@ -140,7 +140,8 @@ def read_clip(video: Path, folder: Path, progress: Callable[[int, int], None] | 
             f"{video.name}: {num_late} frames whose time runs back were left out", RsUndistortWarning, stacklevel=2
         )
     if len(numbers) < 2:
-        raise InputError(f"{video.name} has {len(numbers)} frames that show anything; a path needs two")
+        some = "1 frame that shows" if numbers else "no frame that shows"
+        raise InputError(f"{video.name} has {some} anything; a path needs two")
     time = np.array(times)
     frame_s = float(np.median(np.diff(time)))
     breaks = {*chooser.cuts, *(np.flatnonzero(np.diff(time) > _PAUSE * frame_s) + 1).tolist()}

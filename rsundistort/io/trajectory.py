@@ -13,7 +13,7 @@ from ..model.path import CameraPath
 
 __all__ = ["write_path", "write_point_cloud", "write_trajectory"]
 
-_PATH_COLUMNS = "frame time_s tx ty tz qx qy qz qw vx vy vz wx wy wz".split()
+_PATH_COLUMNS = ["frame", "time_s", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "vx", "vy", "vz", "wx", "wy", "wz"]
 
 
 def write_trajectory(

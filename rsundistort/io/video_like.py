@@ -122,7 +122,9 @@ def _picture_of(pixels: Pixels, form: str) -> Any:
         plane = np.ascontiguousarray(values if values.ndim == 2 else values[..., k])
         if k and size != (width, height):
             plane = cv2.resize(plane, size, interpolation=cv2.INTER_AREA)
-        rows = np.zeros((picture.planes[k].buffer_size // picture.planes[k].line_size, picture.planes[k].line_size), "u1")
+        rows = np.zeros(
+            (picture.planes[k].buffer_size // picture.planes[k].line_size, picture.planes[k].line_size), "u1"
+        )
         coded = np.ascontiguousarray(plane).view("u1").reshape(plane.shape[0], -1)
         rows[: coded.shape[0], : coded.shape[1]] = coded
         picture.planes[k].update(rows)
@@ -335,7 +337,9 @@ class _Sound:
         """Say what sound was left out."""
         if self._lost:
             said = ", ".join(sorted({*self._lost}))
-            warnings.warn(f"{name}: sound that MP4 does not hold was left out ({said})", RsUndistortWarning, stacklevel=5)
+            warnings.warn(
+                f"{name}: sound that MP4 does not hold was left out ({said})", RsUndistortWarning, stacklevel=5
+            )
         if self._num_spoiled:
             warnings.warn(
                 f"{name}: {self._num_spoiled} damaged packets of sound were left out", RsUndistortWarning, stacklevel=5

@@ -157,9 +157,7 @@ def turn_path(path: CameraPath, orientation: int) -> CameraPath:
     """The path of the camera whose frames the orientation shows; one that mirrors is refused, no camera takes these."""
     matrix = np.eye(3)
     matrix[:2, :2] = MATRICES[orientation]
-    return replace(
-        path, R_cw=matrix @ path.R_cw, rate=path.rate @ matrix.T, rate_change=path.rate_change @ matrix.T
-    )
+    return replace(path, R_cw=matrix @ path.R_cw, rate=path.rate @ matrix.T, rate_change=path.rate_change @ matrix.T)
 
 
 def _new_places(pairs: set[tuple[int, int]], count: int) -> dict[tuple[int, int], int]:

@@ -22,7 +22,7 @@ from ..verdict.clip import APART, SIGMAS
 from .run import solve_frames
 from .run_options import RunOptions
 
-__all__ = ["MeasuredReadout", "measure_readout"]
+__all__ = ["MeasuredReadout", "measure_readout", "problem_of"]
 
 
 @dataclass(frozen=True)
@@ -105,10 +105,10 @@ def measure_readout(
         bodies = [source.frames] * len(loaded.names)
         solved = solve_frames(options, source.clip, loaded, bodies, gyro_log, log)
     told = dict(solved.evidence)
-    return MeasuredReadout(told["seconds"], told["sigma"], told["of_frame"], _problem(told), told)
+    return MeasuredReadout(told["seconds"], told["sigma"], told["of_frame"], problem_of(told), told)
 
 
-def _problem(told: Mapping[str, Any]) -> str:
+def problem_of(told: Mapping[str, Any]) -> str:
     """Why a video does not tell its readout time; empty if it does."""
     stabilised = told["stabilisation"]
     if stabilised["verdict"] == "stabilised":

@@ -1,0 +1,155 @@
+"""Videos with something wrong: one line that says what, or a warning and a result without it."""
+
+from __future__ import annotations
+
+import warnings
+from fractions import Fraction
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from make_photos import texture
+from rsundistort_cli.main import cli
+
+from rsundistort.errors import RsUndistortWarning
+from rsundistort.input.clip import read_clip
+from rsundistort.io.video import VideoReader
+
+av = pytest.importorskip("av")
+
+WIDTH, HEIGHT = 320, 240
+SCENE = texture(WIDTH + 200, HEIGHT, seed=5)
+
+
+def view(number):
+    return np.ascontiguousarray(SCENE[:, 3 * number : 3 * number + WIDTH])
+
+
+def encode(path, frames, codec="libx264", pix_fmt="yuv420p", options=None, rotation=0):
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=30, options=options or {})
+        stream.height, stream.width = frames[0].shape[:2]
+        stream.pix_fmt = pix_fmt
+        if rotation:
+            stream.set_display_rotation(rotation)
+        for pixels in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="bgr24")))
+        container.mux(stream.encode(None))
+    return path
+
+
+def only_sound(path):
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("aac", rate=16000)
+        sound = av.AudioFrame.from_ndarray(np.zeros((1, 16000), np.float32), format="fltp", layout="mono")
+        sound.sample_rate = 16000
+        container.mux(stream.encode(sound))
+        container.mux(stream.encode(None))
+    return path
+
+
+def only_a_cover(path):
+    """Sound with a picture of its cover, which is a video stream of one frame."""
+    with av.open(str(path), "w") as container:
+        sound = container.add_stream("aac", rate=16000)
+        cover = container.add_stream("mjpeg", rate=1)
+        cover.width, cover.height, cover.pix_fmt = WIDTH, HEIGHT, "yuvj420p"
+        cover.disposition = av.stream.Disposition.attached_pic
+        container.mux(cover.encode(av.VideoFrame.from_ndarray(view(0), format="bgr24")))
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 16000), np.float32), format="fltp", layout="mono")
+        frame.sample_rate = 16000
+        container.mux(sound.encode(frame))
+        for stream in (cover, sound):
+            container.mux(stream.encode(None))
+    return path
+
+
+BLACK = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (only_sound, "holds no pictures"),
+        (only_a_cover, "holds no pictures"),
+        (lambda path: encode(path, [view(0)]), "1 frame that shows anything; a path needs two"),
+        (lambda path: encode(path, [BLACK] * 6), "no frame that shows anything; a path needs two"),
+        (lambda path: path.write_bytes(b"no video\n" * 99), "cannot be read as a video"),
+        (lambda path: path.write_bytes(b""), "cannot be read as a video"),
+    ],
+)
+@pytest.mark.parametrize("command", ["run", "readout"])
+def test_a_video_that_tells_nothing_ends_in_one_line(tmp_path, command, make, says):
+    make(tmp_path / "clip.mp4")
+    out = ["-o", str(tmp_path / "out")] if command == "run" else []
+    camera = ["--camera", "300,300,160,120"]
+    result = CliRunner().invoke(cli, [command, str(tmp_path / "clip.mp4"), *out, *camera])
+    assert result.exit_code == 1, result.exception
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("error: ")
+    assert says in line
+    assert [path.name for path in tmp_path.iterdir()] == ["clip.mp4"]
+
+
+def test_a_size_that_changes_midway_ends_the_video_there(tmp_path):
+    """Two recordings in one transport stream."""
+    small = np.ascontiguousarray(view(9)[:120, :160])
+    a = encode(tmp_path / "a.ts", [view(k) for k in range(12)]).read_bytes()
+    b = encode(tmp_path / "b.ts", [small] * 12).read_bytes()
+    (tmp_path / "clip.ts").write_bytes(a + b)
+    with pytest.warns(RsUndistortWarning, match=r"clip\.ts: its frames change size at 0\.\d s; what follows was left"):
+        clip = read_clip(tmp_path / "clip.ts", tmp_path / "frames")
+    assert 8 <= len(clip.names) <= 12
+
+
+def test_frames_whose_time_runs_back_are_left_out(tmp_path):
+    """A recording that begins again in the same stream: its times do, too."""
+    one = encode(tmp_path / "a.ts", [view(k) for k in range(20)], options={"bf": "0"}).read_bytes()
+    (tmp_path / "clip.ts").write_bytes(one + one)
+    with pytest.warns(RsUndistortWarning, match=r"clip\.ts: \d+ frames whose time runs back were left out"):
+        clip = read_clip(tmp_path / "clip.ts", tmp_path / "frames")
+    assert (np.diff(clip.time_s) > 0).all()
+    assert len(clip.names) >= 20
+
+
+def test_dark_frames_are_left_out(tmp_path):
+    frames = [view(k) for k in range(10)]
+    frames[4] = frames[5] = BLACK
+    clip = read_clip(encode(tmp_path / "clip.mp4", frames), tmp_path / "frames")
+    assert clip.numbers == (0, 1, 2, 3, 6, 7, 8, 9)
+
+
+def test_an_interlaced_video_is_said_to_be_one(tmp_path):
+    options = {"x264-params": "interlaced=1:tff=1", "flags": "+ildct+ilme"}
+    video = encode(tmp_path / "clip.mp4", [view(k) for k in range(10)], options=options)
+    with VideoReader(video) as reader:
+        if not any(picture.interlaced_frame for _, _, picture in reader):
+            pytest.skip("this FFmpeg does not encode interlaced frames")
+    with pytest.warns(RsUndistortWarning, match="interlaced: each frame holds two moments"):
+        read_clip(video, tmp_path / "frames")
+
+
+def test_ten_bits_and_a_rotation_are_no_trouble(tmp_path):
+    frames = [view(k) for k in range(8)]
+    video = encode(tmp_path / "clip.mp4", frames, pix_fmt="yuv420p10le", rotation=-90)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        clip = read_clip(video, tmp_path / "frames")
+    assert clip.frames.orientation == 6
+    stored = cv2.imread(str(tmp_path / "frames" / clip.key_names[0]), cv2.IMREAD_UNCHANGED)
+    assert stored.dtype == np.uint16
+    assert stored.shape == (HEIGHT, WIDTH, 3)
+
+
+def test_tags_in_another_encoding_are_no_trouble(tmp_path):
+    with av.open(str(tmp_path / "clip.mp4"), "w") as container:
+        container.metadata["comment"] = "AAAAAAAA"
+        stream = container.add_stream("libx264", rate=Fraction(30))
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        for k in range(4):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(view(k), format="bgr24")))
+        container.mux(stream.encode(None))
+    data = (tmp_path / "clip.mp4").read_bytes()
+    (tmp_path / "clip.mp4").write_bytes(data.replace(b"AAAAAAAA", b"\xff\xfe\xe4\xf6\xfc\xc3\xc3\xc3"))
+    assert len(read_clip(tmp_path / "clip.mp4", tmp_path / "frames").names) == 4

@@ -1,0 +1,447 @@
+"""What is written of a video: all its frames, its path, and how long a frame took to be read."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from fractions import Fraction
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from clips import HandHeld
+from make_photos import texture
+from rsundistort_cli.main import cli
+from scipy.spatial.transform import Rotation
+
+from rsundistort import (
+    Camera,
+    GyroOptions,
+    RowMotion,
+    RsUndistortWarning,
+    RunOptions,
+    SolveOptions,
+    read_solution,
+    rectify,
+    run,
+)
+from rsundistort.batch.clip import rectify_clip
+from rsundistort.batch.geometry import PhotoGeometry
+from rsundistort.batch.progress import StageLog
+from rsundistort.batch.workers import Workers
+from rsundistort.errors import FileError, InputError
+from rsundistort.io import write_path
+from rsundistort.io.video import VideoReader, frame_name
+from rsundistort.io.video_like import pixels_of
+from rsundistort.io.video_writer import write_video
+from rsundistort.model.orientation import turn_path
+from rsundistort.model.path import CameraPath
+from rsundistort.report.readout import readout_facts
+from rsundistort.solve import MeasuredReadout, measure_readout
+from rsundistort.solve.readout import problem_of
+
+av = pytest.importorskip("av")
+
+WALK = Path(__file__).parents[1] / "sample_scenes" / "walk"
+WIDTH, HEIGHT = 320, 240
+SCENE = cv2.GaussianBlur(texture(WIDTH + 200, HEIGHT, seed=3), (0, 0), 1.5)
+CAMERA = Camera(WIDTH, HEIGHT, [[300, 0, 160], [0, 300, 120], [0, 0, 1]])
+STILL = PhotoGeometry("clip", CAMERA, CAMERA, RowMotion(), "global")
+FULL_RANGE, LIMITED_RANGE, BT709 = 2, 1, 1
+
+
+def view(number):
+    return np.ascontiguousarray(SCENE[:, 2 * number : 2 * number + WIDTH])
+
+
+def encode(path, frames, pix_fmt="yuv420p", times_ms=None, rotation=0, full_range=False, sound=None, codec="libx264"):
+    """A video as a camera writes it, with little loss."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=30, options={"crf": "4"} if codec == "libx264" else {})
+        stream.height, stream.width = frames[0].shape[:2]
+        stream.pix_fmt = pix_fmt
+        context = stream.codec_context
+        if codec == "libx264":
+            context.color_range = FULL_RANGE if full_range else LIMITED_RANGE
+            context.colorspace = context.color_primaries = context.color_trc = BT709
+        if times_ms is not None:
+            context.time_base = Fraction(1, 1000)
+        if rotation:
+            stream.set_display_rotation(rotation)
+        voice = None if sound is None else container.add_stream(sound, rate=16000)
+        for k, pixels in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(pixels, format="bgr24")
+            if times_ms is not None:
+                frame.pts, frame.time_base = times_ms[k], Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+        if voice is not None:
+            noise = np.random.default_rng(0).normal(0, 0.1, (1, 16000)).astype(np.float32)
+            frame = av.AudioFrame.from_ndarray(noise, format="fltp", layout="mono")
+            frame.sample_rate = 16000
+            container.mux(voice.encode(frame))
+            container.mux(voice.encode(None))
+    return path
+
+
+def frames_of(path):
+    with av.open(str(path)) as container:
+        return list(container.decode(container.streams.video[0]))
+
+
+def rectified(video, out, geometry_of=lambda _: STILL, jobs=1):
+    return rectify_clip(video, out, geometry_of, STILL, "cubic", Workers(jobs), StageLog(None))
+
+
+def psnr(a, b):
+    return 10 * np.log10(255**2 / np.mean((np.asarray(a, float) - b) ** 2))
+
+
+# ---------------------------------------------------------------- all frames
+
+
+def test_frames_without_a_motion_stay_as_they_are(tmp_path):
+    pictures = [view(k) for k in range(20)]
+    video = encode(tmp_path / "clip.mp4", pictures, times_ms=None)
+    done = rectified(video, tmp_path / "out.mp4", jobs=2)
+    assert (done.num_frames, done.num_lens_only, done.pixel_format) == (20, 0, "yuv420p")
+    before, after = frames_of(video), frames_of(tmp_path / "out.mp4")
+    assert [frame.time for frame in after] == [frame.time for frame in before]
+    # the quality of the encoder; a shift by a tenth of a pixel, or another range, would leave 35 dB
+    for a, b in zip(before, after, strict=True):
+        assert psnr(a.to_ndarray(format="bgr24"), b.to_ndarray(format="bgr24")) > 41
+        assert (b.color_range, b.colorspace) == (LIMITED_RANGE, BT709)
+    with av.open(str(video)) as a, av.open(str(tmp_path / "out.mp4")) as b:
+        assert a.streams.video[0].average_rate == b.streams.video[0].average_rate
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["clip.mp4", "out.mp4"]
+
+
+def test_each_frame_is_rectified_by_its_own_motion(tmp_path):
+    """Against the photo's way: the frame as BGR, through `rectify`."""
+    pictures = [view(k) for k in range(6)]
+    video = encode(tmp_path / "clip.mp4", pictures)
+    turns = {frame_name(video, k): RowMotion([0.01 * (k - 2), 0.02 * k, -0.03 * k]) for k in range(6)}
+
+    def geometry_of(name):
+        return PhotoGeometry(name, CAMERA, CAMERA, turns[name], "rotation")
+
+    rectified(video, tmp_path / "out.mp4", geometry_of, jobs=2)
+    for name, before, after in zip(turns, frames_of(video), frames_of(tmp_path / "out.mp4"), strict=True):
+        expected, valid = rectify(before.to_ndarray(format="bgr24"), CAMERA, turns[name], "rotation")
+        found = after.to_ndarray(format="bgr24")
+        inner = cv2.erode(valid, np.ones((9, 9), np.uint8), borderValue=0) > 0
+        grey = [cv2.cvtColor(each, cv2.COLOR_BGR2GRAY) for each in (found, expected)]
+        assert psnr(*(each[inner] for each in grey)) > 38
+        # colours have half of the size in the file, so only those that change slowly compare
+        smooth = [cv2.GaussianBlur(each, (0, 0), 3) for each in (found, expected)]
+        assert psnr(*(each[inner] for each in smooth)) > 38
+        outer = cv2.dilate(valid, np.ones((17, 17), np.uint8)) == 0
+        if outer.any():
+            assert found[outer].max() < 12  # black, and not the green of zeros
+
+
+def test_variable_rate_rotation_and_full_range_are_kept(tmp_path):
+    times_ms = np.cumsum([500, 33, 33, 90, 20, 33, 41, 200, 33]).tolist()
+    video = encode(tmp_path / "clip.mp4", [view(k) for k in range(9)], "yuvj420p", times_ms, -90, full_range=True)
+    rectified(video, tmp_path / "out.mp4")
+    before, after = frames_of(video), frames_of(tmp_path / "out.mp4")
+    np.testing.assert_allclose(np.diff([f.time for f in after]), np.diff(times_ms) / 1e3, rtol=0, atol=1e-3)
+    for a, b in zip(before, after, strict=True):
+        assert b.rotation == a.rotation == -90
+        assert b.color_range == FULL_RANGE
+        assert psnr(a.to_ndarray(format="gray"), b.to_ndarray(format="gray")) > 41
+
+
+def test_ten_bits_stay_ten_bits(tmp_path):
+    video = encode(tmp_path / "clip.mp4", [view(k) for k in range(5)], "yuv420p10le")
+    assert rectified(video, tmp_path / "out.mp4").pixel_format == "yuv420p10le"
+    for a, b in zip(frames_of(video), frames_of(tmp_path / "out.mp4"), strict=True):
+        deep, found = pixels_of(a), pixels_of(b)
+        assert deep.bits == found.bits == 10
+        assert psnr(deep.values / 4.0, found.values / 4.0) > 41
+
+
+def test_ten_bits_become_eight_where_nothing_else_is_built_in(tmp_path, monkeypatch):
+    monkeypatch.setattr("rsundistort.io.video_like._ENCODERS", {"mpeg4": {"qmin": "1", "qmax": "3"}})
+    video = encode(tmp_path / "clip.mp4", [view(k) for k in range(5)], "yuv420p10le")
+    with pytest.warns(RsUndistortWarning, match="10 bits a colour, and mpeg4 writes 8"):
+        done = rectified(video, tmp_path / "out.mp4")
+    assert (done.encoder, done.pixel_format) == ("mpeg4", "yuv420p")
+    for a, b in zip(frames_of(video), frames_of(tmp_path / "out.mp4"), strict=True):
+        assert psnr(a.to_ndarray(format="gray"), b.to_ndarray(format="gray")) > 38
+
+
+@pytest.mark.parametrize(("codec", "pix_fmt", "suffix"), [("ffv1", "bgr0", ".mkv"), ("mjpeg", "yuvj422p", ".avi")])
+def test_other_formats_of_pixels_mean_the_same_colours(tmp_path, codec, pix_fmt, suffix):
+    video = encode(tmp_path / f"clip{suffix}", [view(k) for k in range(4)], pix_fmt, codec=codec)
+    rectified(video, tmp_path / "out.mp4")
+    with VideoReader(tmp_path / "out.mp4") as reader:
+        for (_, _, picture), before in zip(reader, frames_of(video), strict=True):
+            a, b = before.to_ndarray(format="gray"), picture.to_ndarray(format="gray")
+            if codec == "ffv1":  # grey of BGR is BT.601's, with all 256 levels
+                assert picture.colorspace == BT709
+                b = cv2.cvtColor(picture.to_ndarray(format="bgr24", src_colorspace="ITU709"), cv2.COLOR_BGR2GRAY)
+                a = cv2.cvtColor(before.to_ndarray(format="bgr24"), cv2.COLOR_BGR2GRAY)
+            assert psnr(a, b) > 37
+
+
+def test_sound_is_copied_packet_by_packet(tmp_path):
+    video = encode(tmp_path / "clip.mp4", [view(k) for k in range(30)], sound="aac")
+    rectified(video, tmp_path / "out.mp4")
+
+    def packets(path):
+        with av.open(str(path)) as container:
+            stream = container.streams.audio[0]
+            return [(p.pts * p.time_base, bytes(p)) for p in container.demux(stream) if p.size]
+
+    assert packets(tmp_path / "out.mp4") == packets(video)
+
+
+def test_a_transport_stream_begins_at_zero_with_its_sound(tmp_path):
+    video = encode(tmp_path / "clip.ts", [view(k) for k in range(30)], sound="aac")
+    rectified(video, tmp_path / "out.mp4")
+    apart = []
+    for path in (video, tmp_path / "out.mp4"):
+        with av.open(str(path)) as container:
+            starts = {s.type: float(s.start_time * s.time_base) for s in container.streams}
+        apart.append(starts["video"] - starts["audio"])
+    assert min(starts.values()) == pytest.approx(0, abs=0.08)
+    assert apart[1] == pytest.approx(apart[0], abs=0.08)  # the beginning that an encoder of sound puts before it
+
+
+def test_sound_that_does_not_fit_is_left_out_and_said(tmp_path):
+    video = encode(tmp_path / "clip.mkv", [view(k) for k in range(5)], sound="wmav2")
+    with pytest.warns(RsUndistortWarning, match=r"clip\.mkv: sound that MP4 does not hold was left out"):
+        rectified(video, tmp_path / "out.mp4")
+    assert len(frames_of(tmp_path / "out.mp4")) == 5
+
+
+def test_frames_that_were_not_placed_lose_their_lens_only(tmp_path):
+    lens = Camera(WIDTH, HEIGHT, CAMERA.K, [-0.2, 0, 0, 0, 0])
+    geometry = PhotoGeometry("clip", lens, CAMERA, RowMotion(), "global")
+    video = encode(tmp_path / "clip.mp4", [view(k) for k in range(5)])
+    with pytest.warns(RsUndistortWarning, match=r"out\.mp4: 5 of 5 frames could not be placed; only the lens was"):
+        rectify_clip(video, tmp_path / "out.mp4", lambda _: None, geometry, "cubic", Workers(1), StageLog(None))
+    for before, after in zip(frames_of(video), frames_of(tmp_path / "out.mp4"), strict=True):
+        expected = cv2.undistort(before.to_ndarray(format="gray"), lens.K, lens.dist)
+        assert psnr(after.to_ndarray(format="gray")[9:-9, 9:-9], expected[9:-9, 9:-9]) > 38
+
+
+def test_a_view_of_odd_sides_loses_a_pixel(tmp_path):
+    odd = PhotoGeometry("clip", CAMERA, Camera(301, 201, CAMERA.K), RowMotion(), "global")
+    video = encode(tmp_path / "clip.mp4", [view(k) for k in range(3)])
+    rectify_clip(video, tmp_path / "out.mp4", lambda _: odd, odd, "cubic", Workers(1), StageLog(None))
+    (first, *_) = frames_of(tmp_path / "out.mp4")
+    assert (first.width, first.height) == (300, 200)
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, FileError, MemoryError])
+def test_what_is_interrupted_leaves_nothing_under_the_name(tmp_path, stop):
+    video = encode(tmp_path / "clip.mp4", [view(k) for k in range(20)])
+
+    def geometry_of(name):
+        if name.endswith("7.png"):
+            raise stop("now")
+        return STILL
+
+    with pytest.raises(stop):
+        rectified(video, tmp_path / "out.mp4", geometry_of)
+    assert [path.name for path in tmp_path.iterdir()] == ["clip.mp4"]
+
+
+# ---------------------------------------------------------------- the path
+
+
+def path_of(hand, time_s, h=1e-4):
+    """The path of a hand, its rates by central differences of poses."""
+    R, after, before = (hand.rotations(time_s + d) for d in (0, h, -h))
+    rate = Rotation.from_matrix(after @ before.transpose(0, 2, 1)).as_rotvec() / (2 * h)
+    velocity = (hand.centers(time_s + h) - hand.centers(time_s - h)) / (2 * h)
+    zero = np.zeros((len(time_s), 3))
+    return CameraPath(time_s, R, hand.centers(time_s), rate, velocity, zero, zero)
+
+
+def rows_of(path):
+    return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+
+
+def test_path_csv_has_pose_velocity_and_turn_of_the_camera(tmp_path):
+    hand, time = HandHeld(3), np.arange(12) / 30
+    names = [f"clip, one_{k:06d}.png" for k in range(12)]
+    write_path(tmp_path / "path.csv", names, path_of(hand, time))
+    rows = rows_of(tmp_path / "path.csv")
+    assert [row["frame"] for row in rows] == names
+    numbers = {key: np.array([float(row[key]) for row in rows]) for key in rows[0] if key != "frame"}
+    columns = {key: np.stack([numbers[name] for name in key.split()], axis=1) for key in COLUMNS}
+    np.testing.assert_allclose(numbers["time_s"], time, atol=1e-9)
+    np.testing.assert_allclose(columns["tx ty tz"], hand.centers(time), atol=1e-9)
+    to_world = Rotation.from_quat(columns["qx qy qz qw"])
+    np.testing.assert_allclose(to_world.as_matrix(), hand.rotations(time).transpose(0, 2, 1), atol=1e-9)
+    h = 1e-3
+    moved = (hand.centers(time + h) - hand.centers(time - h)) / (2 * h)
+    np.testing.assert_allclose(columns["vx vy vz"], moved, atol=1e-3)
+    # a gyroscope fixed to the camera: a turn about its own axes takes its axes in the world to those a moment later
+    later = to_world * Rotation.from_rotvec(h * columns["wx wy wz"])
+    true = Rotation.from_matrix(hand.rotations(time + h).transpose(0, 2, 1))
+    assert (true.inv() * later).magnitude().max() < 2e-5
+
+
+COLUMNS = ["tx ty tz", "qx qy qz qw", "vx vy vz", "wx wy wz"]
+
+
+def test_the_path_of_turned_frames_is_that_of_a_turned_camera(tmp_path):
+    path = path_of(HandHeld(4), np.arange(8) / 30)
+    turned = turn_path(path, 6)
+    # shown clockwise, what points right is what pointed up
+    np.testing.assert_allclose(turned.R_cw[:, 0], -path.R_cw[:, 1])
+    np.testing.assert_allclose(turned.R_cw[:, 1], path.R_cw[:, 0])
+    between = np.linspace(0.01, 0.2, 9)
+    R, _ = path.poses_at(between)
+    turned_R, centers = turned.poses_at(between)
+    np.testing.assert_allclose(turned_R, [[[0, -1, 0], [1, 0, 0], [0, 0, 1]]] @ R, atol=1e-12)
+    np.testing.assert_allclose(centers, path.poses_at(between)[1])
+
+
+# ---------------------------------------------------------------- the readout time
+
+
+TOLD = {
+    "seconds": 0.0205, "sigma": 0.0003, "source": "the video", "of_frame": 0.615, "frames": 90,
+    "halves": [{"seconds": 0.0206, "sigma": 0.0005}, {"seconds": 0.0204, "sigma": 0.0005}],
+    "stabilisation": {"verdict": "none", "reason": "not stabilised"},
+}  # fmt: skip
+
+
+def test_the_readout_time_is_told_with_its_evidence():
+    facts = dict(readout_facts(TOLD))
+    assert facts["readout time"] == "20.5 +- 0.3 ms (0.61 of the frame), measured from the video"
+    assert facts["its halves say"] == "20.6 +- 0.5 ms and 20.4 +- 0.5 ms"
+    gyro = {"axes": "yxz", "offset_s": -0.0177, "offset_sigma_s": 0.0002, "correlation": 0.9991, "rotation_ratio": 1.0}
+    facts = dict(readout_facts({**TOLD, "source": "what was known before", "gyroscope": gyro, "halves": []}))
+    assert facts["readout time"].endswith("(0.61 of the frame), what was known before")
+    assert facts["gyroscope"] == "axes yxz, offset -17.7 +- 0.2 ms, correlation 0.999"
+    assert "its halves say" not in facts
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({}, ""),
+        ({"stabilisation": {"verdict": "stabilised", "reason": "stabilised: why"}}, "stabilised: why"),
+        ({"source": "what was known before"}, "does not tell it better than it was known before"),
+        ({"sigma": 0.007}, "the camera moved too little: 20.5 +- 7.0 ms"),
+        (
+            {"halves": [{"seconds": 0.030, "sigma": 0.0005}, {"seconds": 0.0204, "sigma": 0.0005}]},
+            "contradict each other, 14 standard deviations apart",
+        ),
+        ({"seconds": 0.04, "of_frame": 1.2}, "longer than from frame to frame"),
+        ({"seconds": -0.0205, "of_frame": -0.615}, ""),
+    ],
+)
+def test_readout_says_whether_the_video_tells(tmp_path, monkeypatch, changed, says):
+    told = {**TOLD, **changed}
+    found = MeasuredReadout(told["seconds"], told["sigma"], told["of_frame"], problem_of(told), told)
+    assert found.measured is (not says)
+    monkeypatch.setattr(sys.modules["rsundistort.solve"], "measure_readout", lambda *_, **__: found)
+    (tmp_path / "clip.mp4").write_bytes(b"")
+    result = CliRunner().invoke(cli, ["readout", str(tmp_path / "clip.mp4")])
+    as_json = CliRunner().invoke(cli, ["readout", str(tmp_path / "clip.mp4"), "--json"])
+    assert result.exit_code == as_json.exit_code == (3 if says else 0)
+    assert says in " ".join(result.stdout.split())
+    assert max(map(len, result.stdout.splitlines())) <= 80
+    assert json.loads(as_json.stdout) == {"measured": not says, "problem": found.problem, **told, "warnings": []}
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ([], RunOptions()),
+        (["--camera", "c.json"], RunOptions(camera="c.json")),
+        (["--readout", "left-to-right"], RunOptions(solve=SolveOptions(readout="left-to-right"))),
+        (["--readout-ms", "20"], RunOptions(solve=SolveOptions(readout_s=0.02))),
+        (["--seed", "3"], RunOptions(solve=SolveOptions(seed=3))),
+        (["--gyro", "clip.mp4"], RunOptions(gyro=GyroOptions(Path("clip.mp4")))),
+    ],
+)
+def test_options_of_readout_set_those_of_a_run(tmp_path, monkeypatch, given, expected):
+    seen = []
+
+    def stop(video, options, progress, jobs):
+        seen.append((video, options, jobs))
+        raise InputError("seen")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys.modules["rsundistort.solve"], "measure_readout", stop)
+    Path("clip.mp4").write_bytes(b"")
+    CliRunner().invoke(cli, ["readout", "clip.mp4", "--jobs", "2", *given])
+    assert seen == [(Path("clip.mp4"), expected, 2)]
+
+
+@pytest.fixture(scope="module")
+def cut(tmp_path_factory):
+    """Half a second of the walk, from its 20th frame on."""
+    folder = tmp_path_factory.mktemp("cut")
+    pictures = [frame.to_ndarray(format="bgr24") for frame in frames_of(WALK / "clip.mp4")[20:36]]
+    write_video(folder / "cut.mp4", pictures, Fraction(30))
+    (folder / "camera.json").write_bytes((WALK / "camera.json").read_bytes())
+    return folder / "cut.mp4"
+
+
+def test_the_readout_time_of_the_walk_is_measured_and_nothing_written(cut, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    before = sorted(cut.parent.iterdir())
+    found = measure_readout(cut, RunOptions(max_features=1000))
+    truth = json.loads((WALK / "recipe.json").read_text())["path"]["readout"] / 30
+    assert found.measured
+    assert abs(found.seconds - truth) < 4 * found.sigma
+    assert found.sigma < 0.1 * truth
+    assert (found.evidence["frames"], found.evidence["source"]) == (16, "the video")
+    assert sorted(cut.parent.iterdir()) == before
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_readout_of_photos_is_refused(tmp_path):
+    (tmp_path / "photo.jpg").write_bytes(b"")
+    result = CliRunner().invoke(cli, ["readout", str(tmp_path / "photo.jpg")])
+    assert result.exit_code == 1
+    assert "photo.jpg is no video; a readout time is measured from one" in result.stderr
+    with pytest.raises(InputError, match="is no video; --frames all is for one"):
+        run(half_empty(tmp_path), tmp_path / "out", RunOptions(frames="all"))
+
+
+def half_empty(tmp_path):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    cv2.imwrite(str(folder / "a.png"), view(0))
+    return folder
+
+
+def test_run_of_a_video_writes_all_its_frames_and_its_path(cut, tmp_path):
+    out = tmp_path / "out"
+    result = CliRunner().invoke(
+        cli, ["run", str(cut), "-o", str(out), "--frames", "all", "--max-features", "1000", "--apply-orientation"]
+    )
+    assert result.exit_code == 0, (result.stderr, result.exception)
+    solution, rows = read_solution(out / "solution.json"), rows_of(out / "path.csv")
+    assert [row["frame"] for row in rows] == [f"cut_{k:06d}.png" for k in range(16)]
+    poses = {row["frame"]: [float(row[key]) for key in ("tx", "ty", "tz")] for row in rows}
+    for image in solution.registered:  # key frames lie on the path, but for what is not steady within a frame
+        np.testing.assert_allclose(poses[image.name], image.center_w, atol=0.01)
+    assert len((out / "path.txt").read_text().splitlines()) == 17
+    after, before = frames_of(out / "video.mp4"), frames_of(cut)
+    assert len(after) == 16
+    inner = np.s_[20:-20, 20:-20]
+    twin = cv2.imread(str(WALK / "global" / "clip_000027.jpg"))[inner]
+    found, raw = (each[7].to_ndarray(format="bgr24")[inner] for each in (after, before))
+    assert psnr(found, twin) > max(34, psnr(raw, twin) + 6)
+    assert "readout time       " in result.stdout
+    assert "of the frame), measured from the video" in " ".join(result.stdout.split())
+    assert "measured from the video" in (out / "report.html").read_text(encoding="utf-8")
+    assert {"path.csv", "path.txt", "video.mp4"} <= written(out)
+
+
+def written(out):
+    return {json.loads(line)[0] for line in (out / ".rsundistort-written").read_text().splitlines()}
