@@ -42,6 +42,8 @@ NOT_RUN = {
     "solve --database": "needs COLMAP's database; tests of solve run it",
     "run --every": "frames of the video show no scene; tests/test_video.py runs it",
     "run --sharpest": "as --every",
+    "run --frames": "tests/test_clip_outputs.py runs it",
+    "readout": "tests/test_clip_outputs.py runs it",
     "run --gyro": "tests/test_gyro.py runs it",
 }
 
