@@ -249,7 +249,7 @@ def invoke(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ([], "--every N or --sharpest N"),
+        ([], "give --camera"),
         (["--every", "4", "--sharpest", "4"], "--every N or --sharpest N"),
         (["--every", "4"], "2 photos; the shutter needs at least three"),
         (["--every", "1"], "give --camera"),

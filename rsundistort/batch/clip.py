@@ -134,6 +134,10 @@ def rectify_clip(
     except KeyboardInterrupt as stop:
         raise KeyboardInterrupt(f"{out.name} was not written; start anew for it") from stop
     num_frames -= writer.num_late
+    if writer.num_late:
+        warnings.warn(
+            f"{out.name}: {writer.num_late} frames whose time runs back were left out", RsUndistortWarning, stacklevel=3
+        )
     if num_lens_only:
         warnings.warn(
             f"{out.name}: {num_lens_only} of {num_frames} frames could not be placed; only the lens was taken out of "
