@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from ..batch.progress import StageLog
 from ..bundle import BundleOptions, BundleResult, bundle_adjust
+from ..bundle.own_motions import phi_of_frames
 from ..bundle.path import FramePath
 from ..critical import heal
 from ..errors import RsUndistortError, RsUndistortWarning
@@ -39,8 +40,6 @@ __all__ = ["frame_path", "solve_clip"]
 _LEAST_MEASUREMENTS = 15
 # A half of a clip needs so many frames to tell a readout time of its own.
 _LEAST_HALF = 4
-# Frames that are asked whether they were stabilised, at most: ten seconds tell.
-_FRAMES_ASKED = 300
 # What flow may be off by, pixels, and measurements that may be far off, as a share, where rotations explain the frames.
 _FLOW_PX, _OUTLIERS = 0.5, 0.2
 # Solves that settle the spreads of a path: of hundreds of frames few do.
@@ -206,7 +205,7 @@ def _judged(
     halves = _halves(result, options)
     log.end("halves", readout_s=None if halves is None else [each.seconds for each in halves])
     log.begin("stabilisation")
-    stabilisation = _stabilisation(clip, result, options, felt)
+    stabilisation = _stabilisation(result, felt)
     log.end("stabilisation", verdict=stabilisation.verdict)
     of_keys = result.of_photos(_are_keys(result, clip))
     log.begin("comparison with a global shutter")
@@ -351,7 +350,9 @@ def _halves(result: BundleResult, options: BundleOptions) -> tuple[ReadoutTime, 
     late = np.arange(rec.num_images) >= rec.num_images // 2
     if rec.num_images < 2 * _LEAST_HALF:
         return None
-    how = replace(_at_first(options), outlier_rounds=0, refine=())
+    assert options.path is not None
+    pictures = replace(options.path, rates={})
+    how = replace(rough_options(options), path=pictures, outlier_rounds=0, refine=())
     parts = [rec.take_photos(keep) for keep in (~late, late)]
     if any(part.num_images < _LEAST_HALF or part.num_points < _LEAST_MEASUREMENTS for part in parts):
         return None
@@ -359,23 +360,16 @@ def _halves(result: BundleResult, options: BundleOptions) -> tuple[ReadoutTime, 
     return first, second
 
 
-def _stabilisation(clip: Clip, result: BundleResult, options: BundleOptions, felt: Felt | None) -> Stabilisation:
+def _stabilisation(result: BundleResult, felt: Felt | None) -> Stabilisation:
     """Whether the lines of the frames move as the frames do, each frame being asked for its own motion."""
     assert result.path is not None
-    rec = result.reconstruction
-    free = rec.take_photos(np.arange(rec.num_images) < _FRAMES_ASKED)
-    free = replace(free, bend=np.zeros(0), bend_clock=np.zeros(0))
-    how = replace(rough_options(options), path=None, outlier_rounds=0, refine=(), deviations="model")
-    found = bundle_adjust(free, "rotation", how)
-    rec = found.reconstruction
-    path = result.path.path
+    rec, path = result.reconstruction, result.path.path
+    phi, sigma = phi_of_frames(result)
     place = np.array([result.path.names.index(name) for name in rec.image_names])
     pairs, turns = _turns(path.part[place], rec.R_cw)
     span = rec.frame_span()[:, None]
     log, offset_s = (None, 0.0) if felt is None else (felt.log, felt.alignment.offset_s)
-    return judge_stabilisation(
-        path.time_s[place], pairs, turns, rec.phi * span, found.sigma_phi * span, log=log, offset_s=offset_s
-    )
+    return judge_stabilisation(path.time_s[place], pairs, turns, phi * span, sigma * span, log=log, offset_s=offset_s)
 
 
 def _tell(log: StageLog, stage: str, _cost: float) -> None:
