@@ -29,6 +29,7 @@ from ..io.gyro import GyroLog, read_gyro
 from ..model import Reconstruction
 from ..sfm import MatchedPhotos, map_photos, match_photos, retriangulate
 from ..verdict.clip import ReadoutTime, judge_clip
+from .clip_pair import two_frames
 from .clip_pan import turning_only
 from .clip_tracks import follow_points, with_all_frames
 from .model_sequence import rough_options
@@ -41,7 +42,7 @@ _LEAST_MEASUREMENTS = 15
 # A half of a clip needs so many frames to tell a readout time of its own.
 _LEAST_HALF = 4
 # What flow may be off by, pixels, and measurements that may be far off, as a share, where rotations explain the frames.
-_FLOW_PX, _OUTLIERS = 0.5, 0.2
+_FLOW_PX, _OUTLIERS = 0.25, 0.2
 # Solves that settle the spreads of a path: of hundreds of frames few do.
 _SPREADS = 4
 # Of the time between frames: none.
@@ -92,7 +93,10 @@ def solve_clip(
         Its result is that of the key frames, `whole` the reconstruction of all frames.
     """
     result, options = _turned(clip, keys, path, options_of, log)
-    if result is None:
+    if result is None and len(clip.names) == 2:
+        options = replace(options_of(start := two_frames(clip, keys)), path=path)
+        result = bundle_adjust(start, "constant-motion", options, partial(_tell, log, "path"))
+    elif result is None:
         result, options = _travelled(clip, keys, path, options_of, scratch, log, seed, matching)
     assert options.path is not None
     path = options.path

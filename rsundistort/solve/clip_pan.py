@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ..input.clip import Clip
 from ..input.load import LoadedPhotos
@@ -13,11 +14,11 @@ from ..model import Camera, Observations, Reconstruction, RowMotion
 from ..model.projection import unproject_points
 from .clip_tracks import Followed, follow
 
-__all__ = ["turning_only"]
+__all__ = ["turn_between", "turning_only"]
 
 # Room for the shutter where frames are turned onto each other, pixels; and what may be left in the median when turns of
 # both frames' lines are taken out, too: the picture moves by fifty from key to key, and travel leaves a part of that.
-_ROOM_PX, _LEFT_PX = 40.0, 2.0
+_ROOM_PX, _LEFT_PX = 40.0, 0.5
 _LEAST_AGREEING = 12
 _TRIALS = 20
 
@@ -108,6 +109,15 @@ def _left_by_shutter(before: NDArray[np.float64], after: NDArray[np.float64], ca
         size = np.linalg.norm(apart - A @ fit, axis=1)
         weight = 1.0 / np.maximum(size, 1e-5)
     return float(np.median(size))
+
+
+def turn_between(
+    xy_before: NDArray[np.float64], xy_after: NDArray[np.float64], camera: Camera
+) -> NDArray[np.float64] | None:
+    """The rotation vector that takes what pixels (n, 2) show to what those of another frame show; None if none does."""
+    before, after = _directions(xy_before, camera), _directions(xy_after, camera)
+    turn = _turn(before, after, _ROOM_PX / float(camera.K[0, 0]))
+    return None if turn is None else np.asarray(Rotation.from_matrix(turn).as_rotvec())
 
 
 def _turn(before: NDArray[np.float64], after: NDArray[np.float64], within: float) -> NDArray[np.float64] | None:

@@ -1,0 +1,279 @@
+"""Videos as one path: readout times, rotations and rectified frames against the truth, and a GoPro's gyroscope.
+
+    python benchmarks/video.py [--only PART ...] [--clips FOLDER] [--num 20] [--first-seed 100] [--shared ../shared]
+
+Prints one JSON object a line. Clips are rendered into FOLDER once (`clips.py`: 80 s of one core each).
+
+    walk     sample_scenes/walk: readout time, rotations of all frames, frames against their twins; and the same key
+             frames as photos that know nothing of each other
+    level    random clips that are held level: the height of the scene, too
+    pan      random clips from a tripod
+    two      two frames whose readout time is known: how far off the corrected positions are
+    readout  random walks, gentle to wild: errors of the readout time, and these over their standard deviations
+    gopro    ../shared/video: clock, axes and rotation of its gyroscope, readout by pictures and by the gyroscope
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from clips import clip_folder
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rsundistort import Reconstruction, Solution, evaluate, read_solution, rectify, run
+from rsundistort.batch.geometry import SceneGeometry, ScenePoints
+from rsundistort.batch.progress import StageLog
+from rsundistort.batch.workers import Workers
+from rsundistort.evaluation import psnr
+from rsundistort.input.clip import read_clip
+from rsundistort.input.load import load_photos
+from rsundistort.io.video import VideoReader, frame_name
+from rsundistort.model import RowMotion, SolvedImage
+from rsundistort.model.projection import unproject_points
+from rsundistort.solve import RunOptions, SolveOptions
+from rsundistort.solve.clip import frame_path, solve_clip
+from rsundistort.solve.outcome import Solved
+
+WALK = Path(__file__).parents[1] / "sample_scenes" / "walk"
+PARTS = ("walk", "level", "pan", "two", "readout", "gopro")
+
+
+def solved_clip(video: Path, camera: str, readout_s: float | None = None) -> tuple[Solved, float]:
+    """A clip solved, and the processor's seconds that it took."""
+    began = time.process_time()
+    with tempfile.TemporaryDirectory() as scratch:
+        clip = read_clip(video, Path(scratch) / "frames")
+        keys = load_photos(Path(scratch) / "frames", camera, None, 8192, Workers(0), StageLog(None), least=2)
+        known = None if readout_s is None else (readout_s, "given")
+        options = SolveOptions()
+        solved = solve_clip(
+            clip, keys, frame_path(clip, known), lambda _: options.options_for(keys.cameras), Path(scratch),
+            StageLog(None),
+        )  # fmt: skip
+    return solved, time.process_time() - began
+
+
+def in_true_world(rec: Reconstruction, truth: Solution) -> tuple[NDArray[np.float64], list[str]]:
+    """Rotation errors in degrees after the worlds are turned onto each other, of the frames of both."""
+    true = {image.name: image.R_cw for image in truth.images if image.R_cw is not None}
+    names = [name for name in rec.image_names if name in true]
+    found = np.array([rec.R_cw[rec.image_names.index(name)] for name in names])
+    wanted = np.array([true[name] for name in names])
+    U, _, Vt = np.linalg.svd(np.einsum("nab,nac->bc", wanted, found))
+    world = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+    return np.degrees(Rotation.from_matrix(found @ world.T @ wanted.transpose(0, 2, 1)).magnitude()), names
+
+
+def against_twins(video: Path, solved: Solved) -> dict[str, Any]:
+    """PSNR of frames, as they were read and rectified, against their twins."""
+    rec = solved.whole
+    assert rec is not None
+    images = tuple(
+        SolvedImage(name, "1", R_cw=rec.R_cw[i], center_w=rec.center_w[i], motion=rec.motion(i))
+        for i, name in enumerate(rec.image_names)
+    )
+    solution = Solution(rec.shutter_model, {"1": rec.cameras[0]}, {"1": rec.cameras[0].pinhole()}, images)
+    scene = SceneGeometry(solution, "auto", ScenePoints.of_reconstruction(rec))
+    raw, better = [], []
+    with VideoReader(video) as reader:
+        for number, _, picture in reader:
+            name = frame_name(video, number)
+            twin = next(iter((video.parent / "global").glob(f"{Path(name).stem}.*")), None)
+            if twin is None or name not in rec.image_names:
+                continue
+            pixels, wanted = picture.to_ndarray(format="bgr24"), cv2.imread(str(twin))
+            geometry = scene.of(name)
+            camera, motion, model, new_camera = geometry.grid
+            rectified, valid = rectify(pixels, camera, motion, model, new_camera, depth=geometry.find_depth().depth)
+            mask = cv2.erode(valid, np.ones((9, 9), np.uint8))
+            raw.append(psnr(pixels, wanted, mask))
+            better.append(psnr(rectified, wanted, mask))
+    return {
+        "twins": len(raw), "raw_db": round(float(np.median(raw)), 2), "rectified_db": round(float(np.median(better)), 2),
+        "worst_db": round(float(np.min(better)), 2),
+    }  # fmt: skip
+
+
+def judged(folder: Path, solved: Solved, cpu_s: float) -> dict[str, Any]:
+    """Figures of a clip whose truth lies beside it."""
+    truth = read_solution(folder / "ground_truth.json")
+    true_s, found = truth.options["readout_ms"] / 1e3, solved.evidence
+    assert solved.whole is not None
+    errors, names = in_true_world(solved.whole, truth)
+    return {
+        "clip": folder.name, "frames": len(names), "of_frames": len(truth.images),
+        "readout_ms": round(1e3 * found["seconds"], 3), "sigma_ms": round(1e3 * found["sigma"], 3),
+        "true_ms": round(1e3 * true_s, 3), "error_percent": round(100 * (found["seconds"] / true_s - 1), 2),
+        "error_over_sigma": round((found["seconds"] - true_s) / found["sigma"], 2),
+        "rotation_deg": round(float(np.median(errors)), 4), "worst_rotation_deg": round(float(errors.max()), 4),
+        "verdict": None if solved.verdict is None else [solved.verdict.shutter, solved.verdict.shape],
+        "stabilisation": found["stabilisation"]["verdict"], "cpu_s": round(cpu_s, 1),
+    }  # fmt: skip
+
+
+def positions(folder: Path, solved: Solved) -> dict[str, float]:
+    """How far pixels of frames are off, as they were read and as they are corrected: the largest over a lattice."""
+    truth = read_solution(folder / "ground_truth.json")
+    rec = solved.whole
+    assert rec is not None
+    before, after = [], []
+    for image in truth.images:
+        if image.name not in rec.image_names or image.motion is None:
+            continue
+        i, camera = rec.image_names.index(image.name), truth.cameras[image.camera_id]
+        x, y = np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 7))
+        xy = np.column_stack([x.ravel(), y.ravel()])
+        wanted, plain, found = (
+            unproject_points(xy, camera, motion, "rotation")[0]
+            for motion in (
+                replace(image.motion, velocity=np.zeros(3), bend=None, frame=None), RowMotion(),
+                RowMotion(rec.phi[i]),
+            )
+        )  # fmt: skip
+        focal_px = float(camera.K[0, 0])
+        before.append(focal_px * np.linalg.norm(plain - wanted, axis=1).max())
+        after.append(focal_px * np.linalg.norm(found - wanted, axis=1).max())
+    return {"as_read_px": round(float(np.max(before)), 2), "corrected_px": round(float(np.max(after)), 2)}
+
+
+def height_error_percent(folder: Path, solved: Solved) -> float:
+    """How far the height of the cameras' path is off against its width: of the affine map to the true one."""
+    truth = read_solution(folder / "ground_truth.json")
+    rec = solved.whole
+    assert rec is not None
+    # points by the true cameras' rays would need depths: the scene's own points, seen by the found ones, tell the shape
+    true = {image.name: (image.R_cw, image.center_w) for image in truth.images}
+    R_true = np.array([true[name][0] for name in rec.image_names])
+    c_true = np.array([true[name][1] for name in rec.image_names])
+    U, _, Vt = np.linalg.svd(np.einsum("nab,nac->bc", R_true, rec.R_cw))
+    world = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+    points = rec.points_w @ world.T
+    obs = rec.observations
+    # each point once more, by the true poses and motions
+    again = np.full_like(points, np.nan)
+    by_point = np.argsort(obs.point_idx, kind="stable")
+    starts = np.searchsorted(obs.point_idx[by_point], np.arange(rec.num_points + 1))
+    rays = np.empty((len(obs), 3))
+    where = np.empty((len(obs), 3))
+    for i, name in enumerate(rec.image_names):
+        mine = obs.frame_idx == i
+        image = truth.image(name)
+        assert image.motion is not None
+        camera = truth.cameras[image.camera_id]
+        clock = camera.clock_sign * (obs.xy_raw[mine, camera.clock_axis] - camera.K[camera.clock_axis, 2])
+        clock /= camera.K[camera.clock_axis, camera.clock_axis]
+        turn, way = image.motion.at(clock)
+        ideal = unproject_points(obs.xy_raw[mine], camera, RowMotion(), "global")[0]
+        R = Rotation.from_rotvec(turn).as_matrix() @ R_true[i]
+        rays[mine] = np.einsum("nab,na->nb", R, np.column_stack([ideal, np.ones(len(ideal))]))
+        where[mine] = c_true[i] + way
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    for k in range(rec.num_points):
+        mine = by_point[starts[k] : starts[k + 1]]
+        if len(mine) >= 3:
+            across = np.eye(3) - rays[mine, :, None] * rays[mine, None]
+            total = across.sum(0)
+            if np.linalg.cond(total) < 1e3:
+                again[k] = np.linalg.solve(total, np.einsum("nab,nb->a", across, where[mine]))
+    good = np.isfinite(again).all(1)
+    x, y = points[good] - np.median(points[good], axis=0), again[good] - np.median(again[good], axis=0)
+    near = np.linalg.norm(y, axis=1) < 3 * np.median(np.linalg.norm(y, axis=1))
+    B = np.linalg.lstsq(x[near], y[near], rcond=None)[0]
+    for _ in range(5):  # a few points are far off
+        left = np.linalg.norm(y - x @ B, axis=1)
+        weight = np.sqrt(near / np.maximum(left, np.median(left)))[:, None]
+        B = np.linalg.lstsq(weight * x, weight * y, rcond=None)[0]
+    up = R_true[:, 1].mean(0) / np.linalg.norm(R_true[:, 1].mean(0))
+    along = np.linalg.norm(up @ B)
+    return float(100 * (1.5 * np.log(along) - 0.5 * np.log(abs(np.linalg.det(B)))))
+
+
+def walk(args: argparse.Namespace) -> None:
+    """The sample, as a clip and as photos."""
+    solved, cpu_s = solved_clip(WALK / "clip.mp4", str(WALK / "camera.json"))
+    print(json.dumps(judged(WALK, solved, cpu_s) | against_twins(WALK / "clip.mp4", solved)), flush=True)
+    with tempfile.TemporaryDirectory() as out:
+        began = time.process_time()
+        options = RunOptions(camera=str(WALK / "camera.json"), every=9)
+        run(WALK / "clip.mp4", Path(out) / "photos", options)
+        value = evaluate(Path(out) / "photos", WALK / "ground_truth.json")
+        said = {"photos_of_walk": value.to_json(), "cpu_s": round(time.process_time() - began, 1)}
+        print(json.dumps(said, default=float), flush=True)
+
+
+def of_kind(kind: str, args: argparse.Namespace) -> list[dict[str, Any]]:
+    """Random clips of a kind."""
+    values = []
+    for seed in range(args.first_seed, args.first_seed + args.num):
+        folder = clip_folder(args.clips, kind, seed)
+        known = read_solution(folder / "ground_truth.json").options["readout_ms"] / 1e3 if kind == "two" else None
+        try:
+            solved, cpu_s = solved_clip(folder / "clip.mp4", str(folder / "camera.json"), known)
+        except Exception as error:  # counted, as what a user would see
+            print(json.dumps({"clip": folder.name, "error": str(error)}), flush=True)
+            values.append({"error": str(error)})
+            continue
+        value = judged(folder, solved, cpu_s)
+        if kind in ("pan", "walk"):
+            value |= against_twins(folder / "clip.mp4", solved)
+        if kind == "two":
+            value |= positions(folder, solved)
+        if kind == "level":
+            value["height_error_percent"] = round(height_error_percent(folder, solved), 3)
+        print(json.dumps(value), flush=True)
+        values.append(value)
+    return values
+
+
+def readout(args: argparse.Namespace) -> None:
+    """Errors of the readout time over random walks."""
+    values = [each for each in of_kind("walk", args) if "error" not in each]
+    percent = np.abs([each["error_percent"] for each in values])
+    normalised = np.array([each["error_over_sigma"] for each in values])
+    print(
+        json.dumps({
+            "clips": len(values), "of": args.num, "median_error_percent": round(float(np.median(percent)), 3),
+            "worst_error_percent": round(float(percent.max()), 3),
+            "normalised_rms": round(float(np.sqrt(np.mean(normalised**2))), 2),
+            "rectified_db": round(float(np.median([each["rectified_db"] for each in values])), 2),
+        }),
+        flush=True,
+    )  # fmt: skip
+
+
+def gopro(args: argparse.Namespace) -> None:
+    """A GoPro with its gyroscope."""
+    video = args.shared / "video" / "gopro-hero5-gentle.mp4"
+    solved, cpu_s = solved_clip(video, "592,592,426.5,239.5")
+    print(json.dumps(dict(solved.evidence) | {"cpu_s": round(cpu_s, 1)}), flush=True)
+
+
+def main() -> None:
+    """Run the parts that are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", choices=PARTS, nargs="+", default=PARTS)
+    parser.add_argument("--clips", type=Path, default=Path(tempfile.gettempdir()) / "rsundistort-clips")
+    parser.add_argument("--num", type=int, default=20)
+    parser.add_argument("--first-seed", type=int, default=100)
+    parser.add_argument("--shared", type=Path, default=Path(__file__).parents[2] / "shared")
+    args = parser.parse_args()
+    warnings.simplefilter("ignore")
+    for part in args.only:
+        if part in ("level", "pan", "two"):
+            of_kind(part, args)
+        else:
+            {"walk": walk, "readout": readout, "gopro": gopro}[part](args)
+
+
+if __name__ == "__main__":
+    main()
