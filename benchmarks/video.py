@@ -99,7 +99,8 @@ def against_twins(video: Path, solved: Solved) -> dict[str, Any]:
             raw.append(psnr(pixels, wanted, mask))
             better.append(psnr(rectified, wanted, mask))
     return {
-        "twins": len(raw), "raw_db": round(float(np.median(raw)), 2), "rectified_db": round(float(np.median(better)), 2),
+        "twins": len(raw), "raw_db": round(float(np.median(raw)), 2),
+        "rectified_db": round(float(np.median(better)), 2),
         "worst_db": round(float(np.min(better)), 2),
     }  # fmt: skip
 
