@@ -11,6 +11,7 @@ from scipy.interpolate import BPoly
 from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, Reconstruction, bundle_adjust
+from rsundistort.bundle.own_motions import phi_of_frames
 from rsundistort.bundle.path import FramePath, PathPrior, orthogonal, with_path_motions
 from rsundistort.bundle.path import PathState as State
 from rsundistort.errors import InputError
@@ -220,6 +221,41 @@ def test_frames_on_a_path_move_by_constant_motion() -> None:
     truth, times = filmed(HandHeld(8), 6)
     with pytest.raises(InputError, match="constant-motion"):
         bundle_adjust(truth, "rotation", BundleOptions(path=FramePath(times, FRAME_S)))
+
+
+def test_a_camera_that_only_turns_tells_the_readout_time() -> None:
+    truth, times = filmed(HandHeld(9, walks=False), 24)
+    directions = truth.points_w / np.linalg.norm(truth.points_w, axis=1)[:, None]
+    start = replace(truth, points_w=directions)
+    result = bundle_adjust(start, "constant-motion", BundleOptions(path=FramePath(times, FRAME_S, turns_only=True)))
+    assert result.path is not None
+    assert abs(result.path.readout_s[0] / FRAME_S - 0.6) < 3 * result.path.sigma_readout_s[0] / FRAME_S
+    assert result.path.sigma_readout_s[0] / FRAME_S < 0.02
+    assert np.max(rotation_errors_deg(result.path.path.R_cw, truth.R_cw)) < 0.05
+    assert not result.reconstruction.center_w.any()
+    assert not result.reconstruction.velocity.any()
+
+
+def test_a_gyroscope_says_what_the_rates_are() -> None:
+    hand = HandHeld(10)
+    truth, times = filmed(hand, 10, num_points=60)
+    rate = true_path(hand, np.array([*times.values()])).rate
+    known = {name: (rate[k], 1e-4) for k, name in enumerate(times)}
+    alone, together = adjusted(truth, times).path, adjusted(truth, times, rates=known).path
+    assert alone is not None
+    assert together is not None
+    np.testing.assert_allclose(together.path.rate, rate, atol=1e-3)
+    assert together.sigma_readout_s[0] < alone.sigma_readout_s[0]
+    assert abs(together.readout_s[0] / FRAME_S - 0.6) < 3 * together.sigma_readout_s[0] / FRAME_S
+
+
+def test_each_frame_says_its_own_turn() -> None:
+    truth, times = filmed(HandHeld(11), 16, noise_px=0.2)
+    result = adjusted(truth, times)
+    phi, sigma = phi_of_frames(result)
+    error = (phi - result.reconstruction.phi) / sigma
+    # the path knows them far better than a frame alone
+    assert 0.7 < np.sqrt(np.mean(error**2)) < 1.4
 
 
 def test_the_state_of_a_path_gives_the_motions() -> None:

@@ -1,0 +1,104 @@
+"""Optical flow between frames: what is followed, which frames become key frames, and where a video was cut."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from make_photos import texture
+from scipy.spatial.transform import Rotation
+
+from rsundistort.sfm.flow import KeyFrameChooser, flow_between, flow_size
+from rsundistort.sfm.resection import resect
+
+WIDTH, HEIGHT = 320, 240
+
+
+def frames(shifts_px: np.ndarray, seed: int = 0) -> list[np.ndarray]:
+    """Windows (grey) of one picture, shifted to the right by so much."""
+    grey = cv2.GaussianBlur(texture(900, 400, seed, channels=1), (0, 0), 1.5)
+    found = []
+    for shift in shifts_px:
+        M = np.array([[1, 0, shift], [0, 1, 0]], np.float64)
+        found.append(cv2.warpAffine(grey, M, (WIDTH, HEIGHT), flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP))
+    return found
+
+
+def test_points_are_followed_to_a_twentieth_of_a_pixel() -> None:
+    shifts = np.array([0.0, 3.3, 7.1, 9.9])
+    xy = np.random.default_rng(1).uniform([40, 30], [280, 210], (80, 2))
+    forward, backward = flow_between(frames(shifts), xy, xy - [shifts[-1], 0])
+    assert len(forward.frame) > 200
+    expected = xy[forward.point] - np.column_stack([shifts[forward.frame], np.zeros(len(forward.frame))])
+    assert np.median(np.abs(forward.xy - expected)) < 0.05
+    expected = xy[backward.point] - np.column_stack([shifts[backward.frame], np.zeros(len(backward.frame))])
+    assert np.median(np.abs(backward.xy - expected)) < 0.05
+    assert set(forward.frame) == {1, 2, 3}
+    assert set(backward.frame) == {0, 1, 2}
+
+
+def test_what_leaves_the_frame_is_not_followed() -> None:
+    forward, _ = flow_between(
+        frames(np.array([0.0, 25.0])), np.array([[20.0, 120.0], [200.0, 120.0]]), np.zeros((0, 2))
+    )
+    assert forward.point.tolist() == [1]
+
+
+def test_key_frames_follow_the_motion_of_the_picture() -> None:
+    chooser = KeyFrameChooser()
+    for grey in frames(8.0 * np.arange(20)):
+        chooser.feed(grey)
+    chooser.finish()
+    # 0.06 of a diagonal of 400 pixels
+    steps = 8.0 * np.diff(chooser.keys)
+    assert chooser.keys[0] == 0
+    assert chooser.keys[-1] == 19
+    assert (steps <= 32).all()
+    assert np.median(steps) >= 16
+    assert chooser.cuts == []
+    np.testing.assert_allclose(chooser.steps, 8.0, atol=0.1)
+
+
+def test_the_sharpest_of_the_candidates_is_taken() -> None:
+    greys = frames(7.0 * np.arange(8))
+    blurred = [grey if k == 3 else cv2.GaussianBlur(grey, (0, 0), 0.8) for k, grey in enumerate(greys)]
+    chooser = KeyFrameChooser()
+    for grey in blurred:
+        chooser.feed(grey)
+    assert chooser.keys[1] == 3
+
+
+def test_a_cut_begins_anew() -> None:
+    chooser = KeyFrameChooser()
+    for grey in frames(1.0 * np.arange(5)) + frames(1.0 * np.arange(5), seed=9):
+        chooser.feed(grey)
+    chooser.finish()
+    assert chooser.cuts == [5]
+    assert {4, 5} <= {*chooser.keys}
+
+
+@pytest.mark.parametrize("size", [(640, 360), (1920, 1080), (3840, 2160)])
+def test_large_frames_are_shrunk(size: tuple[int, int]) -> None:
+    width, height = flow_size(*size)
+    assert width * height <= 2.2e6
+    assert width / height == pytest.approx(size[0] / size[1], rel=1e-2)
+    assert (width, height) == size or width * height > 1.9e6
+
+
+def test_a_photo_is_placed_from_a_pose_nearby() -> None:
+    rng = np.random.default_rng(3)
+    points_w = rng.uniform([-3, -2, 4], [3, 2, 9], (200, 3)) + np.array([100.0, 0, 0])
+    R_cw, center_w = Rotation.from_rotvec([0.1, -0.2, 0.05]).as_matrix(), np.array([100.3, -0.1, 0.2])
+    x_c = (points_w - center_w) @ R_cw.T
+    rays = x_c[:, :2] / x_c[:, 2:] + rng.normal(0, 2e-4, (200, 2))
+    rays[:40] += rng.uniform(-0.5, 0.5, (40, 2))  # false ones
+    guess = Rotation.from_rotvec([0.12, -0.17, 0.05]).as_matrix(), center_w + np.array([0.05, 0.05, -0.05])
+    found = resect(rays, points_w, *guess, within=0.01)
+    assert found is not None
+    assert Rotation.from_matrix(found[0] @ R_cw.T).magnitude() < 1e-3
+    np.testing.assert_allclose(found[1], center_w, atol=5e-3)
+
+
+def test_too_few_points_place_nothing() -> None:
+    points_w = np.random.default_rng(4).uniform([-3, -2, 4], [3, 2, 9], (11, 3))
+    assert resect(points_w[:, :2] / points_w[:, 2:], points_w, np.eye(3), np.zeros(3), within=0.01) is None
