@@ -134,17 +134,20 @@ def rectify_clip(
     except KeyboardInterrupt as stop:
         raise KeyboardInterrupt(f"{out.name} was not written; start anew for it") from stop
     num_frames -= writer.num_late
-    if writer.num_late:
-        warnings.warn(
-            f"{out.name}: {writer.num_late} frames whose time runs back were left out", RsUndistortWarning, stacklevel=3
-        )
-    if num_lens_only:
-        warnings.warn(
-            f"{out.name}: {num_lens_only} of {num_frames} frames could not be placed; only the lens was taken out of "
-            "them", RsUndistortWarning, stacklevel=3,
-        )  # fmt: skip
+    _warn(out.name, num_frames, writer.num_late, num_lens_only)
     log.end("video", frames=num_frames, lens_only=num_lens_only, encoder=writer.encoder)
     return ClipDone(num_frames, num_lens_only, writer.encoder, writer.pixel_format)
+
+
+def _warn(name: str, num_frames: int, num_late: int, num_lens_only: int) -> None:
+    """Say which frames are missing, or keep their motion."""
+    if num_late:
+        warnings.warn(f"{name}: {num_late} frames whose time runs back were left out", RsUndistortWarning, stacklevel=4)
+    if num_lens_only:
+        warnings.warn(
+            f"{name}: {num_lens_only} of {num_frames} frames could not be placed; only the lens was taken out of them",
+            RsUndistortWarning, stacklevel=4,
+        )  # fmt: skip
 
 
 def _lost(_frame: _Frame, why: str) -> Any:

@@ -180,28 +180,11 @@ def align_gyro(
     fit = _refine(log, start, end, seen, offset, ways[0], coarse.ratio(offset))
     if fit is None:
         return NoAlignment("the gyroscope's log does not cover the frames", proper)
-    if fit.correlation < _LEAST_CORRELATION:
-        if max(spread) < _STILL:
-            return NoAlignment(
-                f"the camera stood still or turned evenly (its rate changes by {max(spread):.3f} rad/s): no gyroscope "
-                "can be found by that",
-                proper,
-            )
-        return NoAlignment(
-            f"the gyroscope's log does not show the camera's turns (correlation {fit.correlation:.2f}): it is of "
-            "another clip, or the video is stabilised",
-            proper,
-        )
-    if np.linalg.det(ways[0]) < 0:
-        return NoAlignment(
-            f"the gyroscope's axes are a mirror image of the camera's, as {_letters(ways[0])} takes them, which no "
-            "sensor is: the sign of an axis is wrong, or two axes are exchanged",
-            proper,
-        )
-    if not fit.sigma[_OFFSET] < interval / 2:
-        return NoAlignment("the camera turned too evenly to tell the offset of the gyroscope's clock", proper)
-    if 1 - rival**2 < _AS_GOOD * (1 - proper**2):
-        return NoAlignment("the camera's turns repeat: several offsets of the gyroscope's clock fit them", proper)
+    against = _why_not(fit, ways[0], max(spread), interval)
+    if against is None and 1 - rival**2 < _AS_GOOD * (1 - proper**2):
+        against = "the camera's turns repeat: several offsets of the gyroscope's clock fit them"
+    if against is not None:
+        return NoAlignment(against, proper)
     tilt = np.arccos(np.clip((np.trace(fit.rotation @ ways[0].T) - 1) / 2, -1, 1))
     return GyroAlignment(
         offset_s=fit.offset_s,
@@ -219,6 +202,28 @@ def align_gyro(
         num_inliers=fit.num_inliers,
         num_turns=fit.num_turns,
     )
+
+
+def _why_not(fit: _Fit, way: _Array, spread: float, interval_s: float) -> str | None:
+    """What speaks against an alignment by the nearest signed permutation, where rates change by `spread`."""
+    if fit.correlation < _LEAST_CORRELATION and spread < _STILL:
+        return (
+            f"the camera stood still or turned evenly (its rate changes by {spread:.3f} rad/s): no gyroscope can be "
+            "found by that"
+        )
+    if fit.correlation < _LEAST_CORRELATION:
+        return (
+            f"the gyroscope's log does not show the camera's turns (correlation {fit.correlation:.2f}): it is of "
+            "another clip, or the video is stabilised"
+        )
+    if np.linalg.det(way) < 0:
+        return (
+            f"the gyroscope's axes are a mirror image of the camera's, as {_letters(way)} takes them, which no sensor "
+            "is: the sign of an axis is wrong, or two axes are exchanged"
+        )
+    if not fit.sigma[_OFFSET] < interval_s / 2:
+        return "the camera turned too evenly to tell the offset of the gyroscope's clock"
+    return None
 
 
 def _without_jumps(seen: _Array, at_s: _Array, log: GyroLog, interval_s: float) -> _Array:

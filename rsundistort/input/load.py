@@ -183,12 +183,9 @@ def load_photos(
     found: list[_Loaded] = []
     skipped: dict[str, str] = {}
     # the headers are not looked at for workers elsewhere, which mind their own memory
-    fitting = (
-        workers
-        if workers.scheduler
-        else workers.fitting("features", _most_bytes(folder, listed, megapixels, max_megapixels))
-    )
-    results = fitting.map(_load, jobs, lambda job, why: _Loaded(problem=f"{job.name}: {why}"))
+    if not workers.scheduler:
+        workers = workers.fitting("features", _most_bytes(folder, listed, megapixels, max_megapixels))
+    results = workers.map(_load, jobs, lambda job, why: _Loaded(problem=f"{job.name}: {why}"))
     with closing(results):
         for name, each in zip(listed, results, strict=True):
             if each.features is None:
