@@ -109,6 +109,11 @@ solve_options = opt.gathered(
         help="OUT/rs-poses: the original photos' cameras and poses with the shutter, for gsplat, instant-ngp and "
         "3dgs-deblur (docs/outputs.md).",
     ),
+    click.option(
+        "--usd",
+        is_flag=True,
+        help="Of a video: OUT/camera.usda, the camera at every frame and the points of the scene, for Blender.",
+    ),
     opt.seed_option,
     opt.jobs_option,
     opt.scheduler_option,

@@ -72,6 +72,7 @@ SOLVE = [
 OUTPUTS = [
     (["--sparse-format", "txt"], {"sparse_format": "txt"}),
     (["--rs-poses"], {"rs_poses": True}),
+    (["--usd"], {"usd": True}),
     (["--no-report"], {"report": False}),
 ]
 WORK = [

@@ -32,7 +32,7 @@ from ..sfm import matched_of_database
 from .model_sequence import Feedback, solve_tracks
 from .outcome import Solved
 from .run_options import OutputOptions, SolveOptions
-from .run_outputs import REPLACED, Outputs, PointRgb, files_of_run, inputs_of, photo_times
+from .run_outputs import REPLACED, Outputs, PointRgb, check_usd, files_of_run, inputs_of, photo_times
 
 if TYPE_CHECKING:
     import pycolmap
@@ -135,6 +135,7 @@ def solve(
         if out is None:
             raise InputError(f"solve: out is missing; say which folder gets the outputs of {model}")
         workers, outputs = Workers(use_threads(jobs), scheduler), outputs or OutputOptions()
+        check_usd(outputs, is_clip=False)
         return _solve_files(model, out, options, rectify, outputs, images, database, workers, overwrite, progress)
     if not hasattr(model, "reg_image_ids"):
         kind = f"{type(model).__module__}.{type(model).__name__}"

@@ -29,7 +29,7 @@ from .clip import frame_path, solve_clip
 from .model_sequence import solve_photos
 from .outcome import Solved
 from .run_options import RunOptions, SolveOptions
-from .run_outputs import OF_VIDEOS, REPLACED, VIDEO, Outputs, files_of_run, inputs_of, photo_times
+from .run_outputs import OF_VIDEOS, REPLACED, VIDEO, Outputs, check_usd, files_of_run, inputs_of, photo_times
 
 __all__ = ["run", "solve_frames"]
 
@@ -73,6 +73,7 @@ def run(
     workers = Workers(use_threads(jobs), scheduler)
     gyro_files = () if options.gyro is None else (options.gyro.file, options.gyro.times)
     inputs = inputs_of(rectify, photos, *gyro_files, camera_file_of(photos, options.camera))
+    check_usd(options.outputs, is_video(photos) and options.every is None and options.sharpest is None)
     replaced = (*REPLACED, "frames") if is_video(photos) else REPLACED
     with output_folder(out, overwrite=overwrite, apart_from=inputs, replaced=replaced) as scratch:
         gyro_log = None if options.gyro is None else options.gyro.log()

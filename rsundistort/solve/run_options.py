@@ -124,12 +124,15 @@ class OutputOptions(_Part):
         "bin" or "txt": how the COLMAP model is written.
     rs_poses : bool
         Whether the poses of the original photos with their shutter are written, for renderers that model it.
+    usd : bool
+        Of a video with a path: write `camera.usda`, its camera at every frame and the points, for match-moving.
     report : bool
         Write `report.html`. What it needs is kept in any case: `report.write_report` makes it later.
     """
 
     sparse_format: str = "bin"
     rs_poses: bool = False
+    usd: bool = False
     report: bool = True
 
     def __post_init__(self) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path, PurePath
 
 import numpy as np
@@ -40,23 +41,26 @@ from ..io.journal import Journal
 from ..io.outputs import batch_folder
 from ..io.places import local_place
 from ..io.record import Record
+from ..io.usd import write_usd_camera
 from ..io.video import FRAME_TABLE
-from ..model import Reconstruction, RowMotion, Solution, SolvedImage
+from ..model import Camera, Reconstruction, RowMotion, Solution, SolvedImage
 from ..model.orientation import turn_path, turn_reconstruction, turn_solution
 from ..rectify import bend_px
 from ..report import Diagnostics, relative_folder, write_diagnostics, write_report
 from .outcome import Solved, solution_of
 from .run_options import OutputOptions, SolveOptions
 
-__all__ = ["OF_VIDEOS", "REPLACED", "VIDEO", "Outputs", "files_of_run", "inputs_of", "photo_times"]
+__all__ = ["OF_VIDEOS", "REPLACED", "VIDEO", "Outputs", "check_usd", "files_of_run", "inputs_of", "photo_times"]
 
 #: Folders that a run replaces.
 REPLACED = ("images", "masks", "sparse", "stereo", "rs-poses")
 
 #: All frames of a video, rectified.
 VIDEO = "video.mp4"
+#: The camera of a video for match-moving.
+USD = "camera.usda"
 #: Files that are there of videos only.
-OF_VIDEOS = ("path.csv", "path.txt", VIDEO)
+OF_VIDEOS = ("path.csv", "path.txt", VIDEO, USD)
 
 # What it writes besides the photos.
 _FILES = (
@@ -73,6 +77,14 @@ def files_of_run(names: Sequence[str], raw_as: str, options: OutputOptions) -> l
     files += [*_RS_POSES] * options.rs_poses + ["report.html"] * options.report
     masks = mask_names(names)
     return files + [each for n in names for each in (f"images/{output_name(n, raw_as)}", f"masks/{masks[n]}")]
+
+
+def check_usd(options: OutputOptions, is_clip: bool) -> None:
+    """Refuse, before any work, a USD camera of what has no path, or without USD's library."""
+    if options.usd and not is_clip:
+        raise InputError("--usd is for a video whose frames share a path, without --every and --sharpest")
+    if options.usd and find_spec("pxr") is None:
+        raise InputError('--usd needs USD\'s library: pip install "rsundistort[usd]"')
 
 
 def inputs_of(options: RectifyOptions, *given: Path | str | None) -> list[Path]:
@@ -288,13 +300,13 @@ class Outputs:
             write_colmap_workspace(folder, [name for _, name in by_id])
         write_point_cloud(folder / "points.ply", rec.points_w, rgb)
         self._trajectory(folder / "poses.txt", solution)
-        self._path(folder)
+        self._path(folder, next(iter(solution.rectified_cameras.values())))
         masks = mask_names([image.name for image in solution.images])
         files = {name: (f"images/{new}", f"masks/{masks[name]}") for name, new in written.items()}
         write_transforms(folder / "transforms.json", solution, files, "points.ply")
         return solution
 
-    def _path(self, folder: Path) -> None:
+    def _path(self, folder: Path, new_camera: Camera) -> None:
         """Write where the camera of a video was, and how it moved, at each frame; turned as the key frames are."""
         found = None if self.solved is None else self.solved.result.path
         if found is None:
@@ -302,6 +314,9 @@ class Outputs:
         path = turn_path(found.path, next(iter(self.turns.values()), 1))
         write_path(folder / "path.csv", found.names, path)
         write_trajectory(folder / "path.txt", path.time_s, path.R_cw, path.center_w)
+        if self.options.usd:
+            frame_s = float(np.median(np.diff(path.time_s)))
+            write_usd_camera(folder / USD, new_camera, path, frame_s, self.reconstruction.points_w)
 
     def rectify_clip(self, video: Path, out: Path, workers: Workers, log: StageLog) -> None:
         """Rectify all frames of a video into `out`, which `begin` has filled."""
