@@ -107,7 +107,7 @@ def solve_clip(
         options = replace(options, path=replace(path, rates=felt.rates(result)))
         result = bundle_adjust(
             result.reconstruction, "constant-motion",
-            replace(options, outlier_rounds=0, spread_rounds=_SPREADS),
+            replace(options, outlier_rounds=0, spread_rounds=1),
             partial(_tell, log, "gyroscope"),
         )  # fmt: skip
     log.end("gyroscope", offset_s=None if felt is None else felt.alignment.offset_s)
@@ -356,7 +356,7 @@ def _halves(result: BundleResult, options: BundleOptions) -> tuple[ReadoutTime, 
         return None
     assert options.path is not None
     pictures = replace(options.path, rates={})
-    how = replace(rough_options(options), path=pictures, outlier_rounds=0, refine=())
+    how = replace(rough_options(options), path=pictures, outlier_rounds=0, spread_rounds=1, refine=())
     parts = [rec.take_photos(keep) for keep in (~late, late)]
     if any(part.num_images < _LEAST_HALF or part.num_points < _LEAST_MEASUREMENTS for part in parts):
         return None
