@@ -107,7 +107,7 @@ def solve_clip(
         options = replace(options, path=replace(path, rates=felt.rates(result)))
         result = bundle_adjust(
             result.reconstruction, "constant-motion",
-            replace(options, outlier_rounds=0, spread_rounds=1),
+            replace(options, outlier_rounds=0, spread_rounds=_SPREADS),
             partial(_tell, log, "gyroscope"),
         )  # fmt: skip
     log.end("gyroscope", offset_s=None if felt is None else felt.alignment.offset_s)
