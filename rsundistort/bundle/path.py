@@ -287,7 +287,8 @@ class PathSolution:
     Attributes
     ----------
     path : CameraPath
-        Poses at the moments of the frames' principal rows, less the time that the row takes to come.
+        Poses when the principal rows are read, at the frames' times: these are all early by the same, the time that the
+        row takes to come.
     state : PathState
         The same rates as the adjustment has them, and the pace of the readout.
     names : tuple of str

@@ -4,31 +4,29 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ..batch.progress import StageLog
 from ..bundle import BundleOptions, BundleResult, bundle_adjust
 from ..bundle.own_motions import phi_of_frames
 from ..bundle.path import FramePath
 from ..critical import heal
-from ..errors import RsUndistortError, RsUndistortWarning
+from ..errors import RsUndistortWarning
 from ..input.clip import Clip
-from ..input.gyro_alignment import GyroAlignment, NoAlignment, align_gyro
 from ..input.load import LoadedPhotos
 from ..input.pairing import pairs_to_match
 from ..input.stabilisation import Stabilisation, judge_stabilisation
-from ..io.gpmf import has_telemetry
-from ..io.gyro import GyroLog, read_gyro
+from ..io.gyro import GyroLog
 from ..model import Reconstruction
 from ..sfm import MatchedPhotos, map_photos, match_photos, retriangulate
 from ..verdict.clip import ReadoutTime, judge_clip
+from .clip_gyroscope import Felt, felt_gyroscope, readout_of, turns_between
 from .clip_pair import two_frames
 from .clip_pan import turning_only
 from .clip_tracks import follow_points, with_all_frames
@@ -100,9 +98,9 @@ def solve_clip(
         result, options = _travelled(clip, keys, path, options_of, scratch, log, seed, matching)
     assert options.path is not None
     path = options.path
-    alone = _readout(result)
+    alone = readout_of(result)
     log.begin("gyroscope")
-    felt = _felt(clip, result, gyroscope)
+    felt = felt_gyroscope(clip, result, gyroscope)
     if felt is not None:
         options = replace(options, path=replace(path, rates=felt.rates(result)))
         result = bundle_adjust(
@@ -161,7 +159,7 @@ def _travelled(
         is_first = result is None
         result = bundle_adjust(whole, "constant-motion", how, partial(_tell, log, stage))
         log.end(
-            stage, rms_px=result.rms_px, iterations=result.num_iterations, readout_s=_readout(result).seconds,
+            stage, rms_px=result.rms_px, iterations=result.num_iterations, readout_s=readout_of(result).seconds,
             stop_reason=result.stop_reason,
         )  # fmt: skip
         if is_first:
@@ -232,7 +230,7 @@ def _judged(
     world = rec.R_cw[0], rec.center_w[0], 1.0 / rec.baseline
     path = replace(found, path=found.path.moved(*world))
     of_keys = replace(of_keys, reconstruction=rec.moved(*world), path=path)
-    time = _readout(result)
+    time = readout_of(result)
     evidence: dict[str, Any] = {
         "seconds": time.seconds,
         "sigma": time.sigma,
@@ -273,76 +271,6 @@ def frame_path(clip: Clip, readout: tuple[float, str] | None) -> FramePath:
     return FramePath(time, clip.frame_s, known, dict(zip(clip.names, clip.part.tolist(), strict=True)))
 
 
-@dataclass(frozen=True)
-class Felt:
-    """A gyroscope that is of this clip.
-
-    Attributes
-    ----------
-    alignment : GyroAlignment
-        How it lies to the camera.
-    log : GyroLog
-        About the camera's axes, by its own clock.
-    """
-
-    alignment: GyroAlignment
-    log: GyroLog
-
-    def rates(self, result: BundleResult) -> dict[str, tuple[NDArray[np.float64], float]]:
-        """Rates of the frames that it covers, as `FramePath.rates` takes them, about the time of their middle rows."""
-        assert result.path is not None
-        half = max(0.5 * abs(_readout(result).seconds), 0.5 * self.log.step_s)
-        at = result.path.path.time_s + self.alignment.offset_s
-        inside = (at - half >= self.log.time_s[0]) & (at + half <= self.log.time_s[-1])
-        names = [name for name, there in zip(result.path.names, inside, strict=True) if there]
-        if not names:
-            return {}
-        # the world turns against the camera
-        values = -self.log.mean(at[inside] - half, at[inside] + half)
-        return {name: (rate, self.alignment.rms) for name, rate in zip(names, values, strict=True)}
-
-    def facts(self) -> dict[str, Any]:
-        """What `solution.json` says of it."""
-        found = self.alignment
-        return {
-            "axes": found.axes,
-            "offset_s": found.offset_s,
-            "offset_sigma_s": found.offset_sigma_s,
-            "correlation": found.correlation,
-            "rotation_ratio": found.ratio,
-        }
-
-
-def _felt(clip: Clip, result: BundleResult, log: GyroLog | None) -> Felt | None:
-    """The gyroscope of a clip, aligned with its frames; None without one, or if it is of another clip."""
-    if log is None and has_telemetry(clip.video):
-        try:
-            log = read_gyro(clip.video)
-        except RsUndistortError as error:
-            warnings.warn(f"without the gyroscope of {clip.video.name}: {error}", RsUndistortWarning, stacklevel=5)
-    if log is None:
-        return None
-    assert result.path is not None
-    path = result.path.path
-    found = align_gyro(log, path.time_s, *_turns(path.part, path.R_cw))
-    if isinstance(found, NoAlignment):
-        warnings.warn(f"without the gyroscope: {found.reason}", RsUndistortWarning, stacklevel=5)
-        return None
-    return Felt(found, found.in_camera(log))
-
-
-def _turns(part: NDArray[np.int64], R_cw: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Neighbouring frames (n, 2) of a part, and the rotations (n, 3) from one to the other."""
-    first = np.flatnonzero(part[1:] == part[:-1])
-    turns = Rotation.from_matrix(R_cw[first + 1] @ R_cw[first].transpose(0, 2, 1)).as_rotvec()
-    return np.stack([first, first + 1], axis=1), turns
-
-
-def _readout(result: BundleResult) -> ReadoutTime:
-    assert result.path is not None
-    return ReadoutTime(float(result.path.readout_s[0]), float(result.path.sigma_readout_s[0]))
-
-
 def _are_keys(result: BundleResult, clip: Clip) -> NDArray[np.bool_]:
     keys = {*clip.key_names}
     return np.array([name in keys for name in result.reconstruction.image_names])
@@ -360,7 +288,7 @@ def _halves(result: BundleResult, options: BundleOptions) -> tuple[ReadoutTime, 
     parts = [rec.take_photos(keep) for keep in (~late, late)]
     if any(part.num_images < _LEAST_HALF or part.num_points < _LEAST_MEASUREMENTS for part in parts):
         return None
-    first, second = (_readout(bundle_adjust(part, "constant-motion", how)) for part in parts)
+    first, second = (readout_of(bundle_adjust(part, "constant-motion", how)) for part in parts)
     return first, second
 
 
@@ -369,8 +297,9 @@ def _stabilisation(result: BundleResult, felt: Felt | None) -> Stabilisation:
     assert result.path is not None
     rec, path = result.reconstruction, result.path.path
     phi, sigma = phi_of_frames(result)
-    place = np.array([result.path.names.index(name) for name in rec.image_names])
-    pairs, turns = _turns(path.part[place], rec.R_cw)
+    moment = {name: k for k, name in enumerate(result.path.names)}
+    place = np.array([moment[name] for name in rec.image_names])
+    pairs, turns = turns_between(path.part[place], rec.R_cw)
     span = rec.frame_span()[:, None]
     log, offset_s = (None, 0.0) if felt is None else (felt.log, felt.alignment.offset_s)
     return judge_stabilisation(path.time_s[place], pairs, turns, phi * span, sigma * span, log=log, offset_s=offset_s)

@@ -26,8 +26,8 @@ _TRIALS = 20
 def turning_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
     """All frames of a clip, chained by the rotations between them, with the directions that they show as points.
 
-    The centres are all at the origin, the points at a distance of 1. None where the frames do not hang together, or are
-    not turned onto each other but for what a shutter leaves.
+    The centres are all at the origin, the points at a distance of 1. None where most frames do not hang together, or
+    are not turned onto each other but for what a shutter leaves.
     """
     camera = keys.cameras.of(0)
     number = {name: k for k, name in enumerate(clip.names)}
@@ -45,6 +45,8 @@ def turning_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
             turn = _turn(own[a][followed.place[mine]], rays[mine], _ROOM_PX / float(camera.K[0, 0]))
             if turn is not None:
                 R_cw[k] = turn @ R_cw[a]
+    if 2 * len(R_cw) < len(clip.names):
+        return None
     left = []
     for a, b in pairwise(order):
         if a in R_cw and b in R_cw:

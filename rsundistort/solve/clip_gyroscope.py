@@ -1,0 +1,92 @@
+"""The gyroscope of a clip: found, aligned with the frames, and what it says of their rates."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ..bundle import BundleResult
+from ..errors import RsUndistortError, RsUndistortWarning
+from ..input.clip import Clip
+from ..input.gyro_alignment import GyroAlignment, NoAlignment, align_gyro
+from ..io.gpmf import has_telemetry
+from ..io.gyro import GyroLog, read_gyro
+from ..verdict.clip import ReadoutTime
+
+__all__ = ["Felt", "felt_gyroscope", "readout_of", "turns_between"]
+
+
+@dataclass(frozen=True)
+class Felt:
+    """A gyroscope that is of this clip.
+
+    Attributes
+    ----------
+    alignment : GyroAlignment
+        How it lies to the camera.
+    log : GyroLog
+        About the camera's axes, by its own clock.
+    """
+
+    alignment: GyroAlignment
+    log: GyroLog
+
+    def rates(self, result: BundleResult) -> dict[str, tuple[NDArray[np.float64], float]]:
+        """Rates of the frames that it covers, as `FramePath.rates` takes them, about the time of their middle rows."""
+        assert result.path is not None
+        half = max(0.5 * abs(readout_of(result).seconds), 0.5 * self.log.step_s)
+        at = result.path.path.time_s + self.alignment.offset_s
+        inside = (at - half >= self.log.time_s[0]) & (at + half <= self.log.time_s[-1])
+        names = [name for name, there in zip(result.path.names, inside, strict=True) if there]
+        if not names:
+            return {}
+        # the world turns against the camera
+        values = -self.log.mean(at[inside] - half, at[inside] + half)
+        return {name: (rate, self.alignment.rms) for name, rate in zip(names, values, strict=True)}
+
+    def facts(self) -> dict[str, Any]:
+        """What `solution.json` says of it."""
+        found = self.alignment
+        return {
+            "axes": found.axes,
+            "offset_s": found.offset_s,
+            "offset_sigma_s": found.offset_sigma_s,
+            "correlation": found.correlation,
+            "rotation_ratio": found.ratio,
+        }
+
+
+def felt_gyroscope(clip: Clip, result: BundleResult, log: GyroLog | None) -> Felt | None:
+    """The gyroscope of a clip, aligned with its frames; None without one, or if it is of another clip."""
+    if log is None and has_telemetry(clip.video):
+        try:
+            log = read_gyro(clip.video)
+        except RsUndistortError as error:
+            warnings.warn(f"without the gyroscope of {clip.video.name}: {error}", RsUndistortWarning, stacklevel=5)
+    if log is None:
+        return None
+    assert result.path is not None
+    path = result.path.path
+    found = align_gyro(log, path.time_s, *turns_between(path.part, path.R_cw))
+    if isinstance(found, NoAlignment):
+        warnings.warn(f"without the gyroscope: {found.reason}", RsUndistortWarning, stacklevel=5)
+        return None
+    return Felt(found, found.in_camera(log))
+
+
+def turns_between(part: NDArray[np.int64], R_cw: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Neighbouring frames (n, 2) of a part, and the rotations (n, 3) from one to the other."""
+    first = np.flatnonzero(part[1:] == part[:-1])
+    turns = Rotation.from_matrix(R_cw[first + 1] @ R_cw[first].transpose(0, 2, 1)).as_rotvec()
+    return np.stack([first, first + 1], axis=1), turns
+
+
+def readout_of(result: BundleResult) -> ReadoutTime:
+    """The readout time that an adjustment of a path found."""
+    assert result.path is not None
+    return ReadoutTime(float(result.path.readout_s[0]), float(result.path.sigma_readout_s[0]))
