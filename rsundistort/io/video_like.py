@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, RsUndistortError, RsUndistortWarning
 from .video import VideoReader
+from .video_writer import X264_PARAMS
 
 __all__ = ["Pixels", "VideoWriter", "black_out", "pixels_of"]
 
 # The first of these that FFmpeg was built with; its options keep what a rectified photo would.
-_ENCODERS = {"libx264": {"crf": "16"}, "mpeg4": {"qmin": "1", "qmax": "3"}}
+_ENCODERS = {"libx264": {"crf": "16", "x264-params": X264_PARAMS}, "mpeg4": {"qmin": "1", "qmax": "3"}}
 # MPEG-4 counts in 16 bits.
 _FINEST = {"mpeg4": 60000}
 _MPEG4_BITS_PER_PIXEL = 4

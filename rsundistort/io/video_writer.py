@@ -12,7 +12,11 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 
-__all__ = ["write_video"]
+__all__ = ["X264_PARAMS", "write_video"]
+
+#: Without its macroblock tree, which decides by memory that x264 (build 165) never wrote: its bytes then depend on what
+#: ran before.
+X264_PARAMS = "mbtree=0"
 
 
 def write_video(path: Path | str, frames: Iterable[NDArray[np.uint8]], fps: Fraction, crf: int = 8) -> None:
@@ -48,7 +52,8 @@ def write_video(path: Path | str, frames: Iterable[NDArray[np.uint8]], fps: Frac
                 if height % 2 or width % 2:
                     raise InputError(f"a video of {width}x{height} pixels: H.264 needs an even width and height")
                 # one thread: the bytes do not depend on how many there are
-                stream = container.add_stream("libx264", rate=fps, options={"crf": str(crf), "preset": "slow"})
+                stream = container.add_stream("libx264", rate=fps)
+                stream.options = {"crf": str(crf), "preset": "slow", "x264-params": X264_PARAMS}
                 stream.width, stream.height, stream.pix_fmt = width, height, "yuv444p"
                 stream.codec_context.thread_count = 1
             container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="bgr24")))
