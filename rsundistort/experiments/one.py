@@ -20,6 +20,8 @@ from ..batch.progress import ProgressCallback
 from ..bundle import BundleOptions, bundle_adjust, objective
 from ..errors import FileError, FormatError, InputError
 from ..evaluation import align_points, rotation_angles_deg
+from ..io.aside import write_aside
+from ..io.outputs import only_writer
 from ..io.record import Record
 from ..model import Observations, Reconstruction, RowMotion
 from ..synthetic import project_rows
@@ -299,20 +301,17 @@ def experiment_one(
     # before the hours of work, not after them
     need_matplotlib()
     out = Path(out)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"{out} cannot be made: {error.strerror}; give another folder") from error
-    settings = _settings(options)
-    digests = {scene.name: scene.digest for scene in loaded}
-    known = _check_settings(out / "settings.json", settings, digests)
-    record = Record(out)
-    if not known:  # settings of this experiment: the rest is of it, too
-        record.check(_FILES, map(Path, scenes))
-    with record.writing(_FILES):
-        text = json.dumps({**settings, "scenes": {**known, **digests}}, indent=1)
-        (out / "settings.json").write_text(text + "\n", encoding="utf-8")
-        return _experiment_one(loaded, out, options, progress)
+    with only_writer(out):
+        settings = _settings(options)
+        digests = {scene.name: scene.digest for scene in loaded}
+        known = _check_settings(out / "settings.json", settings, digests)
+        record = Record(out)
+        if not known:  # settings of this experiment: the rest is of it, too
+            record.check(_FILES, map(Path, scenes))
+        with record.writing(_FILES):
+            text = json.dumps({**settings, "scenes": {**known, **digests}}, indent=1)
+            write_aside(out / "settings.json", f"{text}\n".encode())
+            return _experiment_one(loaded, out, options, progress)
 
 
 def _experiment_one(

@@ -13,6 +13,7 @@ from ..batch.progress import StageLog
 from ..batch.workers import Workers
 from ..errors import FileError, InputError, SkippedPhotoWarning
 from ..io import MAX_MEGAPIXELS, ExifFacts, facts_of_exif, find_masks, list_photos, read_mask, read_photo
+from ..io.kept import Kept
 from ..io.photos.images import stored_size
 from ..io.places import local_place
 from ..sfm import DETECTION_MEGAPIXELS, Features, detect_features, detection_bytes, edge_width_px, grey_8_bit
@@ -145,6 +146,7 @@ def load_photos(
     again: bool = False,
     max_megapixels: float = MAX_MEGAPIXELS,
     least: int = 3,
+    kept: Kept | None = None,
 ) -> LoadedPhotos:
     """Read every photo of a folder once, for its size and features; unusable ones are skipped with a warning.
 
@@ -166,18 +168,23 @@ def load_photos(
         As in `RectifyOptions`.
     least : int
         Photos that there must be, two or three.
+    kept : Kept, optional
+        What was found before, and takes what is found.
     """
+    kept = kept or Kept()
     listed = list_photos(folder, raw_as)
     if len(listed) < least:
         raise InputError(
             f"{folder} holds {len(listed)} photo{'s' * (len(listed) > 1)}; the shutter needs at least {_NUMBERS[least]}"
         )
     mask_of = {} if masks is None else find_masks(local_place(masks).absolute(), listed)
+    before = {name: each for name in listed if (each := kept.get(f"features of {name}")) is not None}
     jobs = (
         _LoadJob(name, folder.absolute() / name, mask_of.get(name), max_features, megapixels, max_megapixels, again)
         for name in listed
+        if name not in before
     )
-    log.begin("features", len(listed))
+    log.begin("features", len(listed), len(before))
     names: list[str] = []
     features: list[Features] = []
     found: list[_Loaded] = []
@@ -187,7 +194,10 @@ def load_photos(
         workers = workers.fitting("features", _most_bytes(folder, listed, megapixels, max_megapixels))
     results = workers.map(_load, jobs, lambda job, why: _Loaded(problem=f"{job.name}: {why}"))
     with closing(results):
-        for name, each in zip(listed, results, strict=True):
+        for name in listed:
+            each: _Loaded = before[name] if name in before else next(results)
+            if name not in before and each.features is not None:
+                kept.put(f"features of {name}", each)
             if each.features is None:
                 skipped[name] = each.problem
                 warnings.warn(f"skipped: {each.problem}", SkippedPhotoWarning, stacklevel=2)

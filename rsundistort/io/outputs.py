@@ -9,7 +9,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import psutil
@@ -17,19 +17,24 @@ import psutil
 from ..errors import FileError
 from .aside import is_partial, remove_partial
 from .journal import Journal, RemoteJournal
+from .lock import check_still_there, locked
 from .photos.images import check_compression
 from .places import Place, RemoteFolder
 from .record import Record, is_inside
 
-__all__ = ["BATCH_FOLDERS", "CANNOT_WRITE", "batch_folder", "make_inside", "output_folder"]
+__all__ = ["BATCH_FOLDERS", "CANNOT_WRITE", "batch_folder", "make_inside", "output_folder", "only_writer"]
 
 #: What a batch fills.
 BATCH_FOLDERS = ("images", "masks", "maps", "also")
 
-#: What a full disk, a read-only one, a limit say: anything else is not OUT's fault.
-CANNOT_WRITE = (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EPERM, errno.EDQUOT, errno.EIO)
+#: What a full disk, a read-only one, a limit, a folder that is gone say: anything else is not OUT's fault.
+CANNOT_WRITE = (
+    errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EPERM, errno.EDQUOT, errno.EIO, errno.EFBIG, errno.ENOENT,
+    errno.ENOTDIR, errno.ESTALE, errno.EMFILE, errno.ENFILE,
+)  # fmt: skip
 
-# Hidden names in OUT that are no outputs: scratch folders, with machine and process, and the record.
+# Hidden names in OUT that are no outputs: scratch folders, with machine and process, the lock, what a run keeps, and
+# the record.
 _HIDDEN = ".rsundistort-"
 _SCRATCH = f"{_HIDDEN}{re.sub(r'[^0-9A-Za-z]', '_', platform.node())}-"
 
@@ -60,24 +65,54 @@ def output_folder(
         ours is in the way. `Record.check` tells that earlier, of names that are known.
     """
     folder = Path(folder)
-    made = _prepare(folder, apart_from, replaced)
+    _prepare(folder, apart_from, replaced)
     scratch = None
+    with only_writer(folder):
+        try:
+            with _errors_of(folder, "; give another folder"):
+                if _has_content(folder) and not overwrite:
+                    raise FileError(
+                        f"{folder} is not empty; give another folder, or --overwrite to replace its outputs"
+                    )
+                scratch = Path(tempfile.mkdtemp(prefix=f"{_SCRATCH}{os.getpid()}-", dir=folder))
+            with _errors_of(folder):
+                yield scratch
+                check_still_there(folder)
+                _move(scratch, folder, apart_from)
+        finally:
+            if scratch is not None:
+                shutil.rmtree(scratch, ignore_errors=True)
+
+
+@contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """A folder that nobody else writes for a block, cleared of what killed processes left half-done.
+
+    It is made if missing; folders that were made are removed again if nothing came into them.
+
+    Raises
+    ------
+    FileError
+        When another process is writing there, or the folder cannot be written.
+    """
+    made = None
     try:
-        with _errors_of(folder, "; give another folder"):
-            folder.mkdir(parents=True, exist_ok=True)
-            if _has_content(folder) and not overwrite:
-                raise FileError(f"{folder} is not empty; give another folder, or --overwrite to replace its outputs")
-            _remove_stale(folder)
-            scratch = Path(tempfile.mkdtemp(prefix=f"{_SCRATCH}{os.getpid()}-", dir=folder))
-        with _errors_of(folder):
-            yield scratch
-            _move(scratch, folder, apart_from)
-        made = None
+        with ExitStack() as stack:
+            with _errors_of(folder, "; give another folder"):
+                made = _first_missing(folder)
+                if folder.exists() and not folder.is_dir():
+                    raise FileError(f"{folder} is a file; give a folder for the outputs")
+                folder.mkdir(parents=True, exist_ok=True)
+                if stack.enter_context(locked(folder)):
+                    _remove_stale(folder)
+            yield
     finally:
-        if scratch is not None:
-            shutil.rmtree(scratch, ignore_errors=True)
         if made is not None:
-            shutil.rmtree(made, ignore_errors=True)
+            for path in (folder, *folder.parents):
+                if not path.is_relative_to(made):
+                    break
+                with suppress(OSError):  # what holds something stays
+                    path.rmdir()
 
 
 def _move(scratch: Path, folder: Path, inputs: Sequence[Path]) -> None:
@@ -102,10 +137,15 @@ def _has_content(folder: Path) -> bool:
 
 
 def _remove_stale(folder: Path) -> None:
-    """Delete the scratch folders of processes of this machine that are gone."""
+    """Delete what killed processes left: files half-written, and the scratch folders of those of this machine."""
+    remove_partial(folder, deep=False)
+    for name in BATCH_FOLDERS:
+        if is_inside(folder / name, folder):
+            remove_partial(folder / name)
     for path in folder.glob(f"{_SCRATCH}*"):
         process = re.fullmatch(r"(\d+)-\w+", path.name.removeprefix(_SCRATCH))
-        if process and path.is_dir() and not psutil.pid_exists(int(process[1])):
+        gone = process and (int(process[1]) == os.getpid() or not psutil.pid_exists(int(process[1])))
+        if gone and path.is_dir() and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)
 
 
@@ -135,22 +175,17 @@ def batch_folder(
             yield journal
         return
     folder = Path(folder)
-    made = _prepare(folder, [other for other in apart_from if isinstance(other, Path)], BATCH_FOLDERS)
+    _prepare(folder, [other for other in apart_from if isinstance(other, Path)], BATCH_FOLDERS)
     new: list[Path] = []
-    with Journal(folder) as journal:
+    with only_writer(folder), Journal(folder) as journal:
         try:
             with _errors_of(folder, "; give another folder"):
-                folder.mkdir(parents=True, exist_ok=True)
                 going_on = journal.path.is_file()
                 if _has_content(folder) and not overwrite:
                     _check_goes_on(folder, going_on, resume)
-                _remove_stale(folder)
                 new = [path for path in (folder / "images", folder / "masks", journal.path) if not path.exists()]
                 for name in ("images", "masks"):
                     make_inside(folder, name)
-                for name in BATCH_FOLDERS:
-                    remove_partial(folder / name)
-                remove_partial(folder, deep=False)
                 # a last line cut short must not run into the next
                 journal.write(journal.read().values())
             with _errors_of(folder):
@@ -163,8 +198,6 @@ def batch_folder(
                     journal.path.unlink(missing_ok=True)
                 with suppress(OSError):
                     Record(folder).settle()
-                if made is not None:
-                    shutil.rmtree(made, ignore_errors=True)
             raise
 
 
@@ -224,17 +257,15 @@ def make_inside(folder: Path, name: str) -> Path:
     return path
 
 
-def _prepare(folder: Path, apart_from: Sequence[Path], replaced: Sequence[str]) -> Path | None:
-    """Refuse a folder that is in the way of the inputs; the topmost folder that has to be made for it to exist."""
+def _prepare(folder: Path, apart_from: Sequence[Path], replaced: Sequence[str]) -> None:
+    """Refuse a folder that is in the way of the inputs."""
     check_compression()  # outputs hold PNG: rather now than after hours
-    place = folder.resolve()
+    with _errors_of(folder, "; give another folder"):
+        place = folder.resolve()
     for other in apart_from:
         inside = other.resolve()
         among = any(inside.is_relative_to((folder / name).resolve()) for name in replaced)
         _check_apart(folder, other, place == inside, among)
-    if folder.exists() and not folder.is_dir():
-        raise FileError(f"{folder} is a file; give a folder for the outputs")
-    return _first_missing(folder)
 
 
 def _check_apart(folder: Place, other: Place, same: bool, among: bool) -> None:

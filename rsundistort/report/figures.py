@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..critical.meter import readout_axes
 from ..errors import FileError, InputError
 from ..io.aside import written_aside
+from ..io.outputs import only_writer
 from ..io.record import Record
 from ..model import Solution
 from .content import arrows_of, ladder, longer, view_frame
@@ -73,9 +74,9 @@ def write_figures(out: Path | str, figures: Path | str) -> list[Path]:
         "critical-motion": _sphere,
     }
     record = Record(folder)
-    record.check(f"{name}.{ending}" for name in drawings for ending in ("png", "pdf"))
     written = []
-    with mpl.rc_context(_STYLE):
+    with only_writer(folder), mpl.rc_context(_STYLE):
+        record.check(f"{name}.{ending}" for name in drawings for ending in ("png", "pdf"))
         for name, draw in drawings.items():
             figure = Figure(figsize=(3.4, 2.6))
             if draw(figure, source):
@@ -88,7 +89,6 @@ def write_figures(out: Path | str, figures: Path | str) -> list[Path]:
 def _save(figure: Figure, folder: Path, name: str, record: Record) -> list[Path]:
     paths = []
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         for ending, metadata in (("png", {"Software": None}), ("pdf", {"CreationDate": None, "Producer": None})):
             path = folder / f"{name}.{ending}"
             with record.writing([path.name]), written_aside(path) as aside:

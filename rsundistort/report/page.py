@@ -12,6 +12,7 @@ from typing import Any
 
 from ..errors import RsUndistortWarning
 from ..io.aside import write_aside
+from ..io.outputs import only_writer
 from ..io.record import Record
 from . import content
 from .pictures import Picture, PictureJob, make_pictures
@@ -60,11 +61,12 @@ def write_report(
     for note in source.notes:
         warnings.warn(note, RsUndistortWarning, stacklevel=2)
     record = Record(source.out)
-    record.check([_NAME])
-    pictures = _pictures(source, jobs or os.cpu_count() or 1, progress)
-    page = _page(source, pictures).encode()
-    with record.writing([_NAME]):
-        write_aside(source.out / _NAME, page)
+    with only_writer(source.out):
+        record.check([_NAME])
+        pictures = _pictures(source, jobs or os.cpu_count() or 1, progress)
+        page = _page(source, pictures).encode()
+        with record.writing([_NAME]):
+            write_aside(source.out / _NAME, page)
     return source.out / _NAME
 
 

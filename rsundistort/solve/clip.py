@@ -20,11 +20,11 @@ from ..critical import heal
 from ..errors import RsUndistortWarning
 from ..input.clip import Clip
 from ..input.load import LoadedPhotos
-from ..input.pairing import pairs_to_match
 from ..input.stabilisation import Stabilisation, judge_stabilisation
 from ..io.gyro import GyroLog
+from ..io.kept import Kept
 from ..model import Reconstruction
-from ..sfm import MatchedPhotos, map_photos, match_photos, retriangulate
+from ..sfm import MatchedPhotos, retriangulate
 from ..verdict.clip import ReadoutTime, judge_clip
 from .clip_gyroscope import Felt, felt_gyroscope, readout_of, turns_between
 from .clip_pair import two_frames
@@ -32,6 +32,7 @@ from .clip_pan import turning_only
 from .clip_tracks import follow_points, with_all_frames
 from .model_sequence import rough_options
 from .outcome import Solved
+from .placing import place_photos
 
 __all__ = ["frame_path", "solve_clip"]
 
@@ -62,6 +63,7 @@ def solve_clip(
     seed: int = 0,
     matching: str = "auto",
     gyroscope: GyroLog | None = None,
+    kept: Kept | None = None,
 ) -> Solved:
     """Map the key frames, place all others by what these show, and adjust all as moments of one path.
 
@@ -84,6 +86,8 @@ def solve_clip(
     gyroscope : GyroLog, optional
         A gyroscope's log; else that of the video's own telemetry, if it has any. Its axes and the offset of its clock
         are found.
+    kept : Kept, optional
+        What was done before, and takes what is done.
 
     Returns
     -------
@@ -95,7 +99,9 @@ def solve_clip(
         options = replace(options_of(start := two_frames(clip, keys)), path=path)
         result = bundle_adjust(start, "constant-motion", options, partial(_tell, log, "path"))
     elif result is None:
-        result, options = _travelled(clip, keys, path, options_of, scratch, log, seed, matching)
+        result, options = _travelled(
+            clip, keys, path, options_of, log, lambda: place_photos(keys, scratch, log, seed, matching, kept or Kept())
+        )
     assert options.path is not None
     path = options.path
     alone = readout_of(result)
@@ -140,10 +146,10 @@ def _turned(
 
 def _travelled(
     clip: Clip, keys: LoadedPhotos, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions],
-    scratch: Path, log: StageLog, seed: int, matching: str,
+    log: StageLog, placed: Callable[[], tuple[Reconstruction, MatchedPhotos]],
 ) -> tuple[BundleResult, BundleOptions]:  # fmt: skip
-    """The path of a camera that travels, through the scene that its key frames show."""
-    mapped, matched = _mapped(keys, scratch, log, seed, matching)
+    """The path of a camera that travels, through the scene that its key frames show, placed as of a global shutter."""
+    mapped, matched = placed()
     # a shutter that is not modelled yet would be blamed on the lens
     rough = rough_options(replace(options_of(mapped), refine=()))
     current, result = bundle_adjust(mapped, "global", rough).reconstruction, None
@@ -172,24 +178,6 @@ def _travelled(
 def _at_first(options: BundleOptions) -> BundleOptions:
     """Options of an adjustment of a path that another one follows."""
     return replace(rough_options(options), outlier_rounds=2, spread_rounds=1, deviations="model")
-
-
-def _mapped(
-    keys: LoadedPhotos, scratch: Path, log: StageLog, seed: int, matching: str
-) -> tuple[Reconstruction, MatchedPhotos]:
-    """The key frames, placed as photos of a global shutter."""
-    cameras = keys.cameras
-    log.begin("matching")
-    pairs = pairs_to_match(keys, matching, seed)
-    matched = match_photos(
-        scratch / "database.db", keys.names, keys.features, cameras.cameras, cameras.camera_idx,
-        calibrated=cameras.calibrated, seed=seed, pairs=pairs,
-    )  # fmt: skip
-    log.end("matching")
-    log.begin("mapping", len(keys.names))
-    mapped = map_photos(matched, lambda done: log.tell("mapping", done, len(keys.names)))
-    log.end("mapping", photos=mapped.num_images, points=mapped.num_points, observations=len(mapped.observations))
-    return mapped, matched
 
 
 def _judged(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -28,14 +27,15 @@ from ..bundle import (
 from ..critical import advise, heal, with_remedy
 from ..errors import ReconstructionError, RsUndistortWarning
 from ..input.load import LoadedPhotos
-from ..input.pairing import pairs_to_match
 from ..input.patches import patch_source
 from ..input.photo_cameras import PhotoCameras
+from ..io.kept import Kept
 from ..model import Reconstruction
 from ..model.projection import unproject_points
-from ..sfm import LEAST_MEASUREMENTS, MatchedPhotos, align_tracks, map_photos, match_photos, retriangulate
+from ..sfm import LEAST_MEASUREMENTS, MatchedPhotos, align_tracks, retriangulate
 from ..verdict import Verdict, judge
 from .outcome import Solved
+from .placing import place_photos
 
 __all__ = ["Feedback", "rough_options", "solve_photos", "solve_tracks"]
 
@@ -165,6 +165,7 @@ def solve_photos(
     remedy: str = "auto",
     matching: str = "auto",
     workers: Workers | None = None,
+    kept: Kept | None = None,
 ) -> Solved:
     """Match, map, climb the ladder; then free the keypoints of the shutter, rebuild the tracks and adjust again.
 
@@ -188,18 +189,11 @@ def solve_photos(
         Which photos are matched with each other, of `pairing.MATCHINGS`.
     workers : Workers, optional
         Who reads the photos again, to align the tracks at full size; they stay as the features have them without.
+    kept : Kept, optional
+        What was done before, and takes what is done.
     """
     cameras = photos.cameras
-    log.begin("matching")
-    pairs, num_pairs = pairs_to_match(photos, matching, seed), math.comb(len(photos.names), 2)
-    matched = match_photos(
-        scratch / "database.db", photos.names, photos.features, cameras.cameras, cameras.camera_idx,
-        calibrated=cameras.calibrated, seed=seed, pairs=pairs,
-    )  # fmt: skip
-    log.end("matching", pairs=num_pairs if pairs is None else len(pairs), of_pairs=num_pairs)
-    log.begin("mapping", len(photos.names))
-    mapped = map_photos(matched, lambda done: log.tell("mapping", done, len(photos.names)))
-    log.end("mapping", photos=mapped.num_images, points=mapped.num_points, observations=len(mapped.observations))
+    mapped, matched = place_photos(photos, scratch, log, seed, matching, kept or Kept())
     if mapped.num_images < 3:
         raise ReconstructionError(
             f"only {mapped.num_images} of {len(photos.names)} photos could be joined, the shutter needs three; "

@@ -1,0 +1,55 @@
+"""Which photos show the same, and where they were: the start of all that is solved."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from ..batch.progress import StageLog
+from ..input.load import LoadedPhotos
+from ..input.pairing import pairs_to_match
+from ..io.kept import Kept
+from ..model import Reconstruction
+from ..sfm import MatchedPhotos, map_photos, match_photos
+
+__all__ = ["place_photos"]
+
+
+def place_photos(
+    photos: LoadedPhotos, scratch: Path, log: StageLog, seed: int, matching: str, kept: Kept
+) -> tuple[Reconstruction, MatchedPhotos]:
+    """Match photos and map them, as of a global shutter; what was kept of that is not done again.
+
+    Parameters
+    ----------
+    photos : LoadedPhotos
+        Features and cameras.
+    scratch : Path
+        Folder for the database.
+    log : StageLog
+        Told the progress.
+    seed, matching
+        As in `solve_photos`.
+    kept : Kept
+        What is done is kept in it.
+    """
+    cameras, database = photos.cameras, scratch / "database.db"
+    log.begin("matching")
+    given = database, photos.names, photos.features, cameras.cameras, cameras.camera_idx
+    counts: dict[str, int] | None = kept.get("pairs")
+    if counts is not None and kept.get_file("database", database):
+        matched = MatchedPhotos(*given, calibrated=cameras.calibrated, seed=seed)
+    else:
+        pairs, num_pairs = pairs_to_match(photos, matching, seed), math.comb(len(photos.names), 2)
+        matched = match_photos(*given, calibrated=cameras.calibrated, seed=seed, pairs=pairs)
+        counts = {"pairs": num_pairs if pairs is None else len(pairs), "of_pairs": num_pairs}
+        kept.put_file("database", database)
+        kept.put("pairs", counts)
+    log.end("matching", **counts)
+    log.begin("mapping", len(photos.names))
+    mapped: Reconstruction | None = kept.get("mapped")
+    if mapped is None:
+        mapped = map_photos(matched, lambda done: log.tell("mapping", done, len(photos.names)))
+        kept.put("mapped", mapped)
+    log.end("mapping", photos=mapped.num_images, points=mapped.num_points, observations=len(mapped.observations))
+    return mapped, matched
