@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from . import options as opt
-from .terminal import errors_for_people
+from .terminal import errors_for_people, tell
 
 if TYPE_CHECKING:
     from rsundistort.analysis import PoseAnalysis
@@ -29,7 +29,7 @@ def command(path: Path, readout: str | None, as_json: bool) -> None:
         from rsundistort.analysis import analyze
 
         result = analyze(path, readout)
-    click.echo(json.dumps(result.to_json()) if as_json else _text(result))
+    tell(json.dumps(result.to_json()) if as_json else _text(result))
 
 
 def _text(result: PoseAnalysis) -> str:

@@ -9,9 +9,7 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
-
-from .terminal import Talk, list_failed, table
+from .terminal import Talk, list_failed, table, tell
 
 if TYPE_CHECKING:
     from rsundistort.model import Solution
@@ -27,9 +25,9 @@ _LABEL = 19
 def close(solution: Solution, out: Path, warned: Sequence[str], talk: Talk) -> None:
     """Say what was found; exit code 3 if photos that have a motion could not be rectified."""
     if talk.as_json:
-        click.echo(json.dumps(summary(solution, out, warned)))
+        tell(json.dumps(summary(solution, out, warned)))
     elif talk.to_people:
-        click.echo(closing_table(solution, out))
+        tell(closing_table(solution, out))
     list_failed({image.name: image.reason for image in solution.registered if image.reason}, talk)
 
 

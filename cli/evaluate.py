@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from . import options as opt
-from .terminal import Talk, errors_for_people, progress_bars, table
+from .terminal import Talk, errors_for_people, progress_bars, table, tell
 
 if TYPE_CHECKING:
     from rsundistort.analysis import Evaluation
@@ -38,9 +38,9 @@ def command(
 
         result = evaluate(out, truth, poses=poses, twins=twins, raw=raw, progress=progress)
     if as_json:
-        click.echo(json.dumps(result.to_json()))
+        tell(json.dumps(result.to_json()))
     elif not quiet:
-        click.echo(_text(result))
+        tell(_text(result))
 
 
 def _text(result: Evaluation) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from . import options as opt
-from .terminal import Talk, errors_for_people, progress_bars, table
+from .terminal import Talk, errors_for_people, progress_bars, table, tell
 
 
 @click.group()
@@ -51,7 +51,7 @@ def one(scenes: tuple[Path, ...], out: Path, given: dict[str, Any], quiet: bool)
             for method, metrics in found.items():
                 numbers = (metrics[m]["median"] for m in ("rotation_deg", "translation", "structure"))
                 rows.append((scene, method, *(f"{v:.4f}" for v in numbers), f"{metrics['iterations']['median']:.0f}"))
-        click.echo(f"{table(rows)}\n\nmedians; outputs  {out}")
+        tell(f"{table(rows)}\n\nmedians; outputs  {out}")
 
 
 @command.command()
@@ -87,7 +87,7 @@ def two(still: Path, swung: Path, out: Path, given: dict[str, Any], quiet: bool)
 
         summary = experiment_two(still, swung, out, TwoOptions(**given), progress)
     if not quiet:
-        click.echo(_comparison(summary, out))
+        tell(_comparison(summary, out))
 
 
 def _comparison(summary: dict[str, Any], out: Path) -> str:

@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, requires, version
 import click
 
 from . import options as opt
-from .terminal import errors_for_people, table
+from .terminal import errors_for_people, table, tell
 
 # extras for those who work on the project
 _OURS = ("dev", "docs")
@@ -28,7 +28,7 @@ def command(as_json: bool) -> None:
             "threads": use_threads(0),
             "extras": _extras(),
         }
-    click.echo(json.dumps(found) if as_json else _text(found))
+    tell(json.dumps(found) if as_json else _text(found))
 
 
 def _extras() -> dict[str, dict[str, str | None]]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib
+from typing import Any
 
 import click
 
-from .terminal import warnings_for_people
+from .stopping import stops_for_people
+from .terminal import SOME_FAILED, forget_stdout, stdout_is_lost, warnings_for_people
 
 # name: one line for the list of commands; the command itself is in the module of that name
 _COMMANDS = {
@@ -26,6 +28,18 @@ _COMMANDS = {
 
 class _LazyGroup(click.Group):
     """Imports a command's module when it is asked for: `--help` stays quick."""
+
+    def make_context(self, *args: Any, **named: Any) -> click.Context:
+        with stops_for_people():
+            return super().make_context(*args, **named)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        forget_stdout()
+        with stops_for_people():
+            value = super().invoke(ctx)
+        if stdout_is_lost():
+            ctx.exit(SOME_FAILED)
+        return value
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(_COMMANDS)

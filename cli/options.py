@@ -19,6 +19,9 @@ MAP_KIND_NAMES = ("npz", "exr", "stmap")
 FRAMES_NAMES = ("key", "all")
 MATCHING_NAMES = ("auto", "exhaustive", "neighbours")
 
+#: What an interruption leaves of a work that can be gone on with.
+GOES_ON = "what is done is whole, the same command with --resume goes on"
+
 
 class LocalPath(click.Path):
     """A path, also as a file:// URL; other URLs are refused."""
@@ -88,6 +91,19 @@ jobs_option: Decorator = click.option(
 overwrite_option: Decorator = click.option(
     "--overwrite", is_flag=True, help="Replace what rsundistort wrote in OUT; other files stay."
 )
+
+
+def resume_option(text: str) -> Decorator:
+    """`--resume`, in the words of a command."""
+    return click.option("--resume", is_flag=True, help=text)
+
+
+def check_resume(given: dict[str, Any]) -> None:
+    """Refuse to begin anew and go on at once."""
+    if given.get("overwrite") and given.get("resume"):
+        raise click.UsageError("--overwrite begins anew and --resume goes on; give one of them")
+
+
 scheduler_option: Decorator = click.option(
     "--scheduler",
     metavar="ADDRESS",

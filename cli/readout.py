@@ -11,7 +11,7 @@ import click
 
 from . import options as opt
 from .closing import fitted
-from .terminal import SOME_FAILED, Talk, errors_for_people, progress_bars
+from .terminal import SOME_FAILED, Talk, errors_for_people, progress_bars, tell
 
 if TYPE_CHECKING:
     from rsundistort.solve import MeasuredReadout
@@ -64,9 +64,9 @@ def command(video: Path, given: dict[str, Any], talk: Talk) -> None:
         options = RunOptions(solve=SolveOptions(**given), gyro=gyro, camera=camera)
         found = measure_readout(video, options, progress, jobs=jobs)
     if talk.as_json:
-        click.echo(json.dumps({**found.to_json(), "warnings": list(warned)}))
+        tell(json.dumps({**found.to_json(), "warnings": list(warned)}))
     elif talk.to_people:
-        click.echo("\n".join(_lines(found)))
+        tell("\n".join(_lines(found)))
     if not found.measured:
         sys.exit(SOME_FAILED)
 

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from . import options as opt
-from .terminal import Talk, errors_for_people, list_failed, progress_bars
+from .terminal import Talk, errors_for_people, list_failed, progress_bars, tell
 
 
 @click.command()
@@ -34,11 +34,7 @@ from .terminal import Talk, errors_for_people, list_failed, progress_bars
     opt.jobs_option,
     opt.scheduler_option,
     opt.overwrite_option,
-    click.option(
-        "--resume",
-        is_flag=True,
-        help="Go on with the batch in OUT: pass over what is whole and current, make the rest.",
-    ),
+    opt.resume_option("Go on with the batch in OUT: pass over what is whole and current, make the rest."),
 )
 @opt.talk_options
 def command(photos: Path | str, solution: Path, out: Path | str, given: dict[str, Any], talk: Talk) -> None:
@@ -47,10 +43,8 @@ def command(photos: Path | str, solution: Path, out: Path | str, given: dict[str
     PHOTOS, OUT and the masks are folders, by path or by a URL that fsspec knows (s3://bucket/folder, gs://...).
     Exit code 3 says that some photos failed; they are listed, and the others are done.
     """
-    if given.get("overwrite") and given.get("resume"):
-        raise click.UsageError("--overwrite begins anew and --resume goes on; give one of them")
-    kept = "what is done is whole, the same command with --resume goes on"
-    with errors_for_people(kept) as warned, progress_bars(talk) as progress:
+    opt.check_resume(given)
+    with errors_for_people(opt.GOES_ON) as warned, progress_bars(talk) as progress:
         from rsundistort.batch import rectify_folder
         from rsundistort.io.places import place_of, sizes_under
 
@@ -62,8 +56,8 @@ def command(photos: Path | str, solution: Path, out: Path | str, given: dict[str
     failed = {name: why for name, why in left_out.items() if name not in known}
     if talk.as_json:
         summary = {"out": str(out), "rectified": count, "shutter_model": solved.shutter_model, "left_out": left_out}
-        click.echo(json.dumps({**summary, "warnings": warned}))
+        tell(json.dumps({**summary, "warnings": warned}))
     elif talk.to_people:
         done = f"{count} photo{'s' * (count != 1)} rectified with the {solved.shutter_model} model"
-        click.echo(f"{done}, {len(left_out)} left out: {out}")
+        tell(f"{done}, {len(left_out)} left out: {out}")
     list_failed(failed, talk)

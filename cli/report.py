@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from . import options as opt
-from .terminal import Talk, errors_for_people, progress_bars
+from .terminal import Talk, errors_for_people, progress_bars, tell
 
 
 @click.command()
@@ -40,4 +40,4 @@ def command(out: Path, photos: Path | None, figures: Path | None, jobs: int, qui
         else:
             written = [write_report(out, photos, jobs=jobs, progress=progress)]
     if not quiet:
-        click.echo("\n".join(str(path) for path in written))
+        tell("\n".join(str(path) for path in written))

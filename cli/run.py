@@ -97,10 +97,11 @@ def command(photos: Path, out: Path, measuring: dict[str, Any], given: dict[str,
     The frames of a video share one path of the camera. Its key frames are the photos. OUT gets frames/ (these, as they
     were) and path.csv (pose, velocity and turn at every frame), too.
 
-    OUT stays as it was until the motions are solved. If the rest is interrupted, `rectify --resume` goes on with it.
-    Exit code 3 says that photos with a motion could not be rectified; they are listed, and the others are done.
+    OUT stays as it was until the motions are solved. After an interruption, whatever it was, the same command with
+    --resume goes on. Exit code 3 says that photos with a motion could not be rectified, or that the report could not be
+    written; they are listed, and the rest is done.
     """
-    with errors_for_people() as warned, progress_bars(talk) as progress:
+    with errors_for_people(opt.GOES_ON) as warned, progress_bars(talk) as progress:
         from rsundistort.input import GyroOptions
         from rsundistort.solve import RunOptions, run
 

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from . import options as opt
-from .terminal import Talk, errors_for_people, progress_bars, table
+from .terminal import Talk, errors_for_people, progress_bars, table, tell
 
 
 @click.group()
@@ -121,7 +121,7 @@ def warp(photos: Path, out: Path, given: dict[str, Any], quiet: bool) -> None:
     if not quiet:
         rows = [("photo", "shift px"), *((image.name, f"{image.rs_shift_px:.1f}") for image in truth.images)]
         size = f"\n\nsize     {truth.cameras['1'].width}x{truth.cameras['1'].height}" if given.get("crop") else "\n"
-        click.echo(f"{table(rows)}{size}\noutputs  {out}")
+        tell(f"{table(rows)}{size}\noutputs  {out}")
 
 
 @command.command()
@@ -146,4 +146,4 @@ def scene(recipe: Path, out: Path, given: dict[str, Any], quiet: bool) -> None:
         truth = simulate_scene(recipe, out, SceneOptions(**given), progress)
     if not quiet:
         rows = [("photo", "shift px"), *((image.name, f"{image.rs_shift_px:.1f}") for image in truth.images)]
-        click.echo(f"{table(rows)}\n\noutputs  {out}")
+        tell(f"{table(rows)}\n\noutputs  {out}")

@@ -40,7 +40,7 @@ def command(
     --images says where the photos are. Cameras of the model are the groups of --readout: --readout "camera
     1=left-to-right".
     """
-    with errors_for_people() as warned, progress_bars(talk) as progress:
+    with errors_for_people(opt.GOES_ON) as warned, progress_bars(talk) as progress:
         from rsundistort.solve import solve
 
         solving, rectify, outputs = parts_of(given)

@@ -118,6 +118,9 @@ solve_options = opt.gathered(
     opt.jobs_option,
     opt.scheduler_option,
     opt.overwrite_option,
+    opt.resume_option(
+        "Go on with a run of the same photos and options into OUT that ended early: what it came to is not made again."
+    ),
     click.option(
         "--report/--no-report", default=True, help="Write OUT/report.html; rsundistort report makes it later, too."
     ),
@@ -129,6 +132,7 @@ def parts_of(given: dict[str, Any]) -> tuple[Any, Any, Any]:
     from rsundistort.io import read_known_lengths, read_known_motions
     from rsundistort.solve import OutputOptions, SolveOptions
 
+    opt.check_resume(given)
     if "readout_ms" in given:
         given["readout_s"] = given.pop("readout_ms") / 1e3
     for key, read in (

@@ -11,11 +11,23 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 import click
 
-__all__ = ["SOME_FAILED", "Talk", "errors_for_people", "list_failed", "progress_bars", "table"]
+from .stopping import kept_is, stops_for_people
+
+__all__ = [
+    "SOME_FAILED",
+    "Talk",
+    "errors_for_people",
+    "forget_stdout",
+    "list_failed",
+    "progress_bars",
+    "stdout_is_lost",
+    "table",
+    "tell",
+]
 
 #: Exit code when some photos failed, and the others are done.
 SOME_FAILED = 3
@@ -48,6 +60,33 @@ class Talk:
         return not (self.quiet or self.as_json or self.progress == "json")
 
 
+_stdout = {"lost": False}
+
+
+def tell(text: str) -> None:
+    """Lines on stdout. Who does not read them any more loses no work; a device that takes no more is an error."""
+    try:
+        click.echo(text)
+    except OSError as error:
+        # what is left in its buffer must not fall at the end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if isinstance(error, BrokenPipeError):
+            say("warning: nobody reads stdout any more; the work goes on", fg="yellow")
+        else:
+            _stdout["lost"] = True
+            say(f"error: stdout cannot be written: {error.strerror}", fg="red")
+
+
+def forget_stdout() -> None:
+    """Begin anew."""
+    _stdout["lost"] = False
+
+
+def stdout_is_lost() -> bool:
+    """Whether something was to be told on stdout, and could not be."""
+    return _stdout["lost"]
+
+
 def say(text: str, **style: Any) -> None:
     """A line on stderr; styled if that is a terminal and nobody asked for NO_COLOR."""
     click.secho(text, err=True, color=False if os.environ.get("NO_COLOR") else None, **style)
@@ -70,30 +109,43 @@ def warnings_for_people() -> Iterator[list[str]]:
 
 @contextmanager
 def errors_for_people(kept: str = "nothing was written") -> Iterator[list[str]]:
-    """Known errors become one line and exit code 1; warnings become one line each, and are listed."""
-    import cv2
+    """Known errors become one line and exit code 1; warnings become one line each, and are listed.
 
-    from rsundistort.errors import RsUndistortError
+    So does what the system says of files, memory and threads, wherever it says it. An interruption tells what is
+    `kept`.
+    """
+    kept_is(kept)
+    with stops_for_people(), warnings_for_people() as said:
+        import cv2
 
-    # OpenCV's and libtiff's own lines about broken files: ours say it once, with the name. 0 is silent; the function's
-    # place is OpenCV 4's, or 5's
-    (cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel)(0)
-    with warnings_for_people() as said:
+        from rsundistort.errors import RsUndistortError
+
+        # OpenCV's and libtiff's own lines about broken files: ours say it once, with the name. 0 is silent; the
+        # function's place is OpenCV 4's, or 5's
+        (cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel)(0)
         try:
             yield said
         except RsUndistortError as error:
-            say(f"error: {error}", fg="red")
-            sys.exit(1)
-        except KeyboardInterrupt as stop:
-            say(f"stopped; {stop or kept}")
-            sys.exit(130)
+            _fail(str(error))
+        except (MemoryError, cv2.error) as error:
+            if isinstance(error, cv2.error) and error.code != cv2.Error.StsNoMem:
+                raise
+            _fail("the memory does not suffice; close other programs, or give --jobs 1")
+        except OSError as error:
+            where = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+            _fail(f"{where}{error.strerror or ' '.join(str(error).split())}")
+
+
+def _fail(text: str) -> NoReturn:
+    say(f"error: {text}", fg="red")
+    sys.exit(1)
 
 
 def list_failed(failed: Mapping[str, str], talk: Talk) -> None:
     """What failed and why, and the exit code that says so; nothing if nothing did."""
     if failed:
         lines = ["", "failed:", *(f"  {name}: {why}" for name, why in failed.items())]
-        click.echo("\n".join(lines), err=not talk.to_people)
+        (tell if talk.to_people else say)("\n".join(lines))
         sys.exit(SOME_FAILED)
 
 
@@ -189,7 +241,7 @@ class _Lines:
             "rate": rate and round(rate, 3),
             "eta_s": None if eta is None else round(eta, 1),
         }
-        click.echo(json.dumps(line))
+        tell(json.dumps(line))
 
     def close(self) -> None:
         pass

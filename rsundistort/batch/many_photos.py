@@ -21,7 +21,7 @@ from ..io.record import Record
 from ..model import Reconstruction, Solution
 from .extras import find_extras
 from .geometry import DEPTHS, SceneGeometry
-from .one_photo import PhotoDone, PhotoJob, rectify_photo
+from .one_photo import PhotoDone, PhotoJob, photo_colors, rectify_photo
 from .progress import StageLog
 from .rectify_options import RectifyOptions
 from .workers import Workers
@@ -55,6 +55,7 @@ def rectify_photos(
     resume: bool = False,
     colors: PointColors | None = None,
     go_on: str = "",
+    others: bool = True,
 ) -> dict[str, PhotoDone]:
     """Rectify photos into `out/images` and `out/masks`, each file whole or not at all.
 
@@ -78,6 +79,8 @@ def rectify_photos(
         Takes the colours of the points.
     go_on : str
         How to go on after an interruption, for people.
+    others : bool
+        Whether `resume` leaves what an earlier batch made of other photos.
 
     Returns
     -------
@@ -89,7 +92,7 @@ def rectify_photos(
     done = _still_whole(jobs, names, before, out) if resume else {}
     todo = {name: jobs[name].targets for name in names if name not in done}
     earlier = record.ours(BATCH_FOLDERS)
-    if resume:
+    if resume and others:
         earlier &= {path for entry in before.values() for path in entry.files}
     # what was cut short, or changed, since it was made is made again by `resume`
     record.check(earlier.union(*todo.values()), [file for name in names for file in jobs[name].inputs], again=resume)
@@ -101,6 +104,8 @@ def rectify_photos(
     log.begin("rectifying", len(names), len(done))
     fitting = workers.fitting("rectifying", _most_bytes(scene.solution, todo, options))
     try:
+        if colors is not None:
+            _look_again(jobs, list(done), fitting, colors)
         with closing(_rectified(jobs, todo, record, fitting)) as results:
             for result in results:
                 if not result.problem:
@@ -115,7 +120,7 @@ def rectify_photos(
         raise KeyboardInterrupt(f"{len(done)} of {len(names)} photos are done, {go_on}") from stop
     made = {name: _entry(each) for name, each in done.items() if not each.problem}
     if made:
-        kept = ({name: before[name] for name in before.keys() - done.keys()} if resume else {}) | made
+        kept = ({name: before[name] for name in before.keys() - done.keys()} if resume and others else {}) | made
         record.remove(earlier - {path for entry in kept.values() for path in entry.files})
         record.settle()
         journal.write(kept[name] for name in sorted(kept))
@@ -134,6 +139,17 @@ def _still_whole(
         if entry and entry.fingerprint and entry.fingerprint == jobs[name].fingerprint() and entry.is_whole(sizes):
             found[name] = PhotoDone(name, "", entry.fingerprint, entry.files, entry.turn, entry.depth)
     return found
+
+
+def _look_again(jobs: _Jobs, names: Sequence[str], workers: Workers, colors: PointColors) -> None:
+    """Take the colours of photos that were rectified before."""
+    with closing(workers.map(photo_colors, map(jobs.__getitem__, names), _unseen)) as found:
+        for name, each in zip(names, found, strict=True):
+            colors.add(name, each)
+
+
+def _unseen(job: PhotoJob, why: str) -> NDArray[np.float64]:
+    raise FileError(f"{job.name}: {why}")
 
 
 def _make_room(jobs: _Jobs, targets: Mapping[str, Sequence[str]], out: Place, record: Record) -> None:
@@ -232,13 +248,16 @@ def _entry(done: PhotoDone) -> JournalEntry:
 class PointColors:
     """Mean colour of each point over the photos that see it."""
 
+    _FINE = 2**16
+
     def __init__(self, reconstruction: Reconstruction) -> None:
         obs = reconstruction.observations
         self._place = {name: i for i, name in enumerate(reconstruction.image_names)}
         self._order = np.argsort(obs.frame_idx, kind="stable")
         self._bounds = np.searchsorted(obs.frame_idx[self._order], np.arange(reconstruction.num_images + 1))
         self._xy, self._point_idx = obs.xy_raw, obs.point_idx
-        self._sum = np.zeros((reconstruction.num_points, 3))
+        # whole numbers of 1 / _FINE, whose sum does not depend on the order of the photos
+        self._sum = np.zeros((reconstruction.num_points, 3), np.int64)
         self._count = np.zeros(reconstruction.num_points)
 
     def _of(self, name: str) -> NDArray[np.int64]:
@@ -252,10 +271,10 @@ class PointColors:
     def add(self, name: str, colors: NDArray[np.float64]) -> None:
         """Take the (k, 3) colours at those pixels, 0 to 255."""
         points = self._point_idx[self._of(name)]
-        np.add.at(self._sum, points, colors)
+        np.add.at(self._sum, points, np.rint(self._FINE * colors).astype(np.int64))
         np.add.at(self._count, points, 1)
 
     def rgb(self) -> NDArray[np.uint8]:
         """(n, 3) red, green, blue."""
-        mean = self._sum / np.maximum(self._count, 1)[:, None]
+        mean = self._sum / (self._FINE * np.maximum(self._count, 1)[:, None])
         return np.clip(np.rint(mean), 0, 255).astype(np.uint8)

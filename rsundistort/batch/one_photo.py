@@ -28,7 +28,7 @@ from .extras import AlsoImage
 from .geometry import PhotoGeometry
 from .rectify_options import RectifyOptions
 
-__all__ = ["PhotoDone", "PhotoJob", "check_not_rectified", "rectify_photo", "turn_of"]
+__all__ = ["PhotoDone", "PhotoJob", "check_not_rectified", "feed", "photo_colors", "rectify_photo", "turn_of"]
 
 # the two files of a photo's grid
 _WAYS = ("forward", "inverse")
@@ -106,13 +106,13 @@ class PhotoJob:
         )  # fmt: skip
         posed = self.posed and options.apply_orientation
         try:
-            _feed(digest, replace(self, out=Path(), posed=posed, options=options, sample_xy=None))
+            feed(digest, replace(self, out=Path(), posed=posed, options=options, sample_xy=None))
         except OSError:
             return ""
         return digest.hexdigest()[:32]
 
 
-def _feed(digest: Any, value: Any) -> None:
+def feed(digest: Any, value: Any) -> None:
     """Take a value of plain types, arrays, dataclasses and files into a digest."""
     if isinstance(value, RemoteFile):
         if not value.version:
@@ -120,8 +120,8 @@ def _feed(digest: Any, value: Any) -> None:
         digest.update(f"{value.version};".encode())
     elif is_dataclass(value) and not isinstance(value, type):
         for each in fields(value):
-            _feed(digest, each.name)
-            _feed(digest, getattr(value, each.name))
+            feed(digest, each.name)
+            feed(digest, getattr(value, each.name))
     elif isinstance(value, np.ndarray):
         digest.update(f"{value.dtype.str} {value.shape} ".encode())
         digest.update(np.ascontiguousarray(value).data)
@@ -131,12 +131,12 @@ def _feed(digest: Any, value: Any) -> None:
             digest.update(f"{found.st_size} {found.st_mtime_ns};".encode())
     elif isinstance(value, Mapping):
         for key in sorted(value):
-            _feed(digest, key)
-            _feed(digest, value[key])
+            feed(digest, key)
+            feed(digest, value[key])
     elif isinstance(value, (list, tuple)):
         digest.update(f"{len(value)} ".encode())
         for each in value:
-            _feed(digest, each)
+            feed(digest, each)
     else:
         digest.update(f"{value.item() if isinstance(value, np.generic) else value!r};".encode())
 
@@ -292,6 +292,13 @@ def _warn_of_orientation(name: str, photo: Photo, rest: int) -> None:
     else:
         return
     warnings.warn(text, MetadataWarning, stacklevel=2)
+
+
+def photo_colors(job: PhotoJob) -> NDArray[np.float64]:
+    """(k, 3) colours of a photo that is rectified already, at `PhotoJob.sample_xy`."""
+    assert job.sample_xy is not None
+    with tempfile.TemporaryDirectory(prefix="rsundistort-") as work:
+        return _colors(read_photo(fetched(job.source, Path(work)), job.options.max_megapixels), job.sample_xy)
 
 
 def _colors(photo: Photo, xy: NDArray[np.int64]) -> NDArray[np.float64]:

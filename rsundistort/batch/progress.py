@@ -26,6 +26,8 @@ class StageLog:
         self._callback = callback
         self._began = time.perf_counter()
         self.stages: list[dict[str, Any]] = []
+        #: The one that is under way.
+        self.stage = ""
 
     def tell(self, stage: str, done: int, total: int = 0) -> None:
         """Pass progress on."""
@@ -34,7 +36,7 @@ class StageLog:
 
     def begin(self, stage: str, total: int = 0, done: int = 0) -> None:
         """Start the clock of a stage, of which some may be done already."""
-        self._began = time.perf_counter()
+        self._began, self.stage = time.perf_counter(), stage
         self.tell(stage, done, total)
 
     def end(self, stage: str, **counts: Any) -> None:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import signal
+import sys
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["HALF", "kept_log_level", "poses_of", "quiet_pycolmap", "rigid_of"]
+__all__ = ["HALF", "import_pycolmap", "kept_log_level", "poses_of", "quiet_pycolmap", "rigid_of"]
 
 #: COLMAP's pixel centres are at 0.5, ours at 0.
 HALF = 0.5
@@ -22,8 +24,7 @@ _level: dict[str, int] = {"users": 0, "before": 0}
 @contextmanager
 def kept_log_level() -> Iterator[None]:
     """What pycolmap logs is, after the last of these blocks in any thread, what it was before the first."""
-    import pycolmap
-
+    pycolmap = import_pycolmap()
     with _level_lock:
         if not _level["users"]:
             _level["before"] = pycolmap.logging.minloglevel
@@ -37,13 +38,24 @@ def kept_log_level() -> Iterator[None]:
                 pycolmap.logging.minloglevel = _level["before"]
 
 
+def import_pycolmap() -> Any:
+    """Pycolmap as it is. What its import makes of SIGTERM, the stack of its C++ code, is undone."""
+    is_new = "pycolmap" not in sys.modules
+    import pycolmap
+
+    before = signal.getsignal(signal.SIGTERM)  # Python has not noticed
+    if is_new and before is not None:
+        with suppress(ValueError):  # signals are the main thread's
+            signal.signal(signal.SIGTERM, before)
+    return pycolmap
+
+
 def quiet_pycolmap() -> Any:
     """Pycolmap, quiet, and imported late: it takes half a second, and cv2 must come first (see `io.photos.images`).
 
     For what logs; what only makes its objects imports it as it is, and leaves to users what it logs for them.
     """
-    import pycolmap
-
+    pycolmap = import_pycolmap()
     pycolmap.logging.minloglevel = 3
     return pycolmap
 
@@ -57,6 +69,4 @@ def poses_of(images: Sequence[Any]) -> tuple[NDArray[np.float64], NDArray[np.flo
 
 def rigid_of(R_cw: NDArray[np.float64], center_w: NDArray[np.float64]) -> Any:
     """Pycolmap's pose of a rotation (3, 3) and a centre (3,)."""
-    import pycolmap
-
-    return pycolmap.Rigid3d(np.column_stack([R_cw, -R_cw @ center_w]))
+    return import_pycolmap().Rigid3d(np.column_stack([R_cw, -R_cw @ center_w]))

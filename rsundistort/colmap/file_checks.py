@@ -9,6 +9,7 @@ from pathlib import Path
 from struct import Struct
 
 from ..errors import FileError, FormatError
+from .conventions import import_pycolmap
 
 __all__ = ["check_colmap_cameras", "check_colmap_files"]
 
@@ -32,7 +33,7 @@ def _take(data: Bytes, at: int, kind: Struct) -> int:
 @lru_cache
 def _num_parameters(model: int) -> int:
     """Of a camera of COLMAP's model of this number; 0 of one that it does not know, and then says so itself."""
-    import pycolmap
+    pycolmap = import_pycolmap()
 
     try:
         camera = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1)

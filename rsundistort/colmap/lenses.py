@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..errors import FormatError
 from ..model import Camera
 from ..model.projection import project_points
-from .conventions import HALF
+from .conventions import HALF, import_pycolmap
 
 __all__ = ["camera_from_colmap", "camera_to_colmap", "pinhole_to_colmap", "refined_camera"]
 
@@ -113,7 +113,7 @@ def camera_to_colmap(camera: Camera, calibrated: bool, camera_id: int) -> Any:
 
 def _colmap_camera(camera: Camera, model: str, coefficients: list[float], camera_id: int) -> Any:
     """One of a model whose lens takes these coefficients."""
-    import pycolmap
+    pycolmap = import_pycolmap()
 
     K = camera.K
     focal = [K[0, 0]] if model.startswith("SIMPLE_") else [K[0, 0], K[1, 1]]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..model import Camera, Reconstruction
 from ..model.projection import at_depth, unproject_points
-from .conventions import HALF, rigid_of
+from .conventions import HALF, import_pycolmap, rigid_of
 from .lenses import pinhole_to_colmap
 
 __all__ = ["ModelIds", "colmap_model", "rectified_keypoints", "write_colmap_model"]
@@ -87,7 +87,7 @@ def colmap_model(
     ids : ModelIds, optional
         Counted from one when left out.
     """
-    import pycolmap
+    pycolmap = import_pycolmap()
 
     ids = ids or ModelIds.in_order(reconstruction)
     model = pycolmap.Reconstruction()

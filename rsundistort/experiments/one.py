@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from ..batch.progress import ProgressCallback
 from ..bundle import BundleOptions, bundle_adjust, objective
-from ..errors import FileError, FormatError, InputError
+from ..errors import FormatError, InputError
 from ..evaluation import align_points, rotation_angles_deg
 from ..io.aside import write_aside
 from ..io.outputs import only_writer

@@ -178,7 +178,7 @@ def load_photos(
             f"{folder} holds {len(listed)} photo{'s' * (len(listed) > 1)}; the shutter needs at least {_NUMBERS[least]}"
         )
     mask_of = {} if masks is None else find_masks(local_place(masks).absolute(), listed)
-    before = {name: each for name in listed if (each := kept.get(f"features of {name}")) is not None}
+    before: dict[str, _Loaded] = {name: old for name in listed if (old := kept.get(f"features of {name}"))}
     jobs = (
         _LoadJob(name, folder.absolute() / name, mask_of.get(name), max_features, megapixels, max_megapixels, again)
         for name in listed
@@ -195,7 +195,7 @@ def load_photos(
     results = workers.map(_load, jobs, lambda job, why: _Loaded(problem=f"{job.name}: {why}"))
     with closing(results):
         for name in listed:
-            each: _Loaded = before[name] if name in before else next(results)
+            each = before[name] if name in before else next(results)
             if name not in before and each.features is not None:
                 kept.put(f"features of {name}", each)
             if each.features is None:

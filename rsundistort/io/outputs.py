@@ -22,7 +22,15 @@ from .photos.images import check_compression
 from .places import Place, RemoteFolder
 from .record import Record, is_inside
 
-__all__ = ["BATCH_FOLDERS", "CANNOT_WRITE", "batch_folder", "make_inside", "output_folder", "only_writer"]
+__all__ = [
+    "BATCH_FOLDERS",
+    "CANNOT_WRITE",
+    "batch_folder",
+    "has_content",
+    "make_inside",
+    "only_writer",
+    "output_folder",
+]
 
 #: What a batch fills.
 BATCH_FOLDERS = ("images", "masks", "maps", "also")
@@ -70,7 +78,7 @@ def output_folder(
     with only_writer(folder):
         try:
             with _errors_of(folder, "; give another folder"):
-                if _has_content(folder) and not overwrite:
+                if has_content(folder) and not overwrite:
                     raise FileError(
                         f"{folder} is not empty; give another folder, or --overwrite to replace its outputs"
                     )
@@ -131,7 +139,7 @@ def _move(scratch: Path, folder: Path, inputs: Sequence[Path]) -> None:
             path.replace(folder / name)
 
 
-def _has_content(folder: Path) -> bool:
+def has_content(folder: Path) -> bool:
     """Whether there is more in a folder than what a killed process left behind."""
     return any(not path.name.startswith(_HIDDEN) for path in folder.iterdir())
 
@@ -181,7 +189,7 @@ def batch_folder(
         try:
             with _errors_of(folder, "; give another folder"):
                 going_on = journal.path.is_file()
-                if _has_content(folder) and not overwrite:
+                if has_content(folder) and not overwrite:
                     _check_goes_on(folder, going_on, resume)
                 new = [path for path in (folder / "images", folder / "masks", journal.path) if not path.exists()]
                 for name in ("images", "masks"):

@@ -150,6 +150,17 @@ class Record:
         else:
             delete_in(self._place, [self.NAME])
 
+    def finish(self, key: str) -> None:
+        """Note what the outputs as they are now were made of; whatever is written next takes that back."""
+        self._append([("", key)])
+
+    def is_finished(self, key: str) -> bool:
+        """Whether all is there as it was when that was noted."""
+        if text_in(self._place, self.NAME).splitlines()[-1:] != [_line("", key).strip()]:
+            return False
+        known = {path for path in self._own() if not _is_own(path)}  # the journal goes at the end
+        return self.ours({path.split("/")[0] for path in known}) >= known
+
     def _append(self, entries: Iterable[tuple[str, str | None]]) -> None:
         lines = [_line(path, stamp) for path, stamp in entries]
         if isinstance(self._place, RemoteFolder):

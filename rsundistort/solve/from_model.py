@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, overload
@@ -21,7 +21,7 @@ from ..colmap.rectified_model import ModelIds, colmap_model
 from ..errors import FileError, InputError, ReconstructionError, RsUndistortWarning
 from ..input.gyroscope import known_readouts
 from ..input.photo_cameras import PhotoCameras, check_readouts
-from ..io import ExifFacts, guess_readouts, list_photos, output_folder, output_name, read_exif
+from ..io import ExifFacts, guess_readouts, list_photos, output_folder, output_name, read_exif, read_solution
 from ..io.models import read_model
 from ..io.photos.images import stored_size
 from ..io.places import local_place
@@ -29,6 +29,7 @@ from ..io.record import Record
 from ..model import Reconstruction, Solution
 from ..model.orientation import INVERSE, turn_reconstruction
 from ..sfm import matched_of_database
+from .going_on import RunFolder, key_of, run_folder
 from .model_sequence import Feedback, solve_tracks
 from .outcome import Solved
 from .run_options import OutputOptions, SolveOptions
@@ -56,6 +57,7 @@ def solve(
     database: Path | str | None = None,
     jobs: int = 0,
     overwrite: bool = False,
+    resume: bool = False,
     scheduler: str | None = None,
     progress: ProgressCallback | None = None,
 ) -> Solution: ...
@@ -84,6 +86,7 @@ def solve(
     database: Path | str | None = None,
     jobs: int = 0,
     overwrite: bool = False,
+    resume: bool = False,
     scheduler: str | None = None,
     progress: ProgressCallback | None = None,
 ) -> Solution | tuple[pycolmap.Reconstruction, Solution]:
@@ -111,6 +114,8 @@ def solve(
         rebuilt.
     jobs, overwrite, scheduler
         As in `rectify_folder`, for a model in files.
+    resume : bool
+        As in `run`, for a model in files.
     progress : callable, optional
         Called as (stage, done, total). What it raises stops the work.
 
@@ -136,7 +141,9 @@ def solve(
             raise InputError(f"solve: out is missing; say which folder gets the outputs of {model}")
         workers, outputs = Workers(use_threads(jobs), scheduler), outputs or OutputOptions()
         check_usd(outputs, is_clip=False)
-        return _solve_files(model, out, options, rectify, outputs, images, database, workers, overwrite, progress)
+        return _solve_files(
+            model, out, options, rectify, outputs, images, database, workers, overwrite, resume, progress
+        )
     if not hasattr(model, "reg_image_ids"):
         kind = f"{type(model).__module__}.{type(model).__name__}"
         raise InputError(f"solve: model is a {kind}, expected a folder, a file or a pycolmap.Reconstruction")
@@ -155,6 +162,7 @@ def _solve_files(
     database: Path | str | None,
     workers: Workers,
     overwrite: bool,
+    resume: bool,
     progress: ProgressCallback | None,
 ) -> Solution:
     """From files to files."""
@@ -164,34 +172,67 @@ def _solve_files(
         raise InputError(f"{model} is no COLMAP model, and --database is COLMAP's; leave it out")
     log = StageLog(progress)
     inputs = inputs_of(rectify, model, folder, database)
-    with output_folder(out, overwrite=overwrite, apart_from=inputs, replaced=REPLACED) as scratch:
-        log.begin("model")
-        given = read_model(model)
-        names = [] if folder is None else given.reconstruction.image_names
-        Record(out).check(files_of_run(names, rectify.raw_as, outputs), inputs)
-        photos = {} if folder is None else _look_at(folder, given.reconstruction)
-        given, said = _in_stored_frame(given, photos)
+    # a model is in the files of its folder, or beside it
+    files = [*inputs, model / "sparse", model.parent / "tracks.csv"]
+    with run_folder(out, key_of(files, options, rectify, outputs), log, overwrite=overwrite, resume=resume) as before:
+        if before.finished:
+            return read_solution(out / "solution.json")
+        if before.begun:
+            written: Outputs = before.outputs(log)
+        else:
+            again = overwrite or before.goes_on
+            with output_folder(out, overwrite=again, apart_from=inputs, replaced=REPLACED) as scratch:
+                written = _outputs_of(
+                    model, out, folder, database, options, rectify, outputs, files_in=inputs, log=log, before=before
+                )
+                solution = written.begin(scratch, log)
+            before.begin()
         if folder is not None:
-            given = replace(given, unregistered=_others_in(folder, given, rectify.raw_as))
-        log.end("model", photos=given.reconstruction.num_images, points=given.reconstruction.num_points)
-        facts = {name: fact for name, (_, fact) in photos.items()}
-        solved, ids, rgb = _solve(given, str(model), facts, options, None if database is None else Path(database), log)
-        facts_of_model = {
-            "frame": said,
-            "points": given.reconstruction.num_points,
-            "observations": len(given.reconstruction.observations),
-        }
-        solved = replace(solved, told={"model": facts_of_model})
-        orientations = {name: fact.orientation or 1 for name, fact in facts.items()}
-        times = {} if folder is None else photo_times(folder)
-        written = Outputs.of_solved(
-            solved, options, rectify, outputs, orientations, ids, rgb, folder is not None, times
-        )
-        solution = written.begin(scratch, log)
+            return written.rectify(folder, out, workers, log, before.begun)
+        written.report(out, workers.jobs, log)
+        return read_solution(out / "solution.json") if before.begun else solution
+
+
+def _outputs_of(
+    model: Path,
+    out: Path,
+    folder: Path | None,
+    database: Path | str | None,
+    options: SolveOptions,
+    rectify: RectifyOptions,
+    outputs: OutputOptions,
+    *,
+    files_in: Sequence[Path],
+    log: StageLog,
+    before: RunFolder,
+) -> Outputs:
+    """What is to be written of a model, unless it was kept."""
+    log.begin("model")
+    given = read_model(model)
+    names = [] if folder is None else given.reconstruction.image_names
+    Record(out).check(files_of_run(names, rectify.raw_as, outputs), files_in)
+    before.kept.begin()
+    found: Outputs | None = before.outputs(log)
+    if found is not None:
+        return found
+    photos = {} if folder is None else _look_at(folder, given.reconstruction)
+    given, said = _in_stored_frame(given, photos)
     if folder is not None:
-        return written.rectify(folder, out, workers, log)
-    written.report(out, workers.jobs, log)
-    return solution
+        given = replace(given, unregistered=_others_in(folder, given, rectify.raw_as))
+    log.end("model", photos=given.reconstruction.num_images, points=given.reconstruction.num_points)
+    facts = {name: fact for name, (_, fact) in photos.items()}
+    solved, ids, rgb = _solve(given, str(model), facts, options, None if database is None else Path(database), log)
+    facts_of_model = {
+        "frame": said,
+        "points": given.reconstruction.num_points,
+        "observations": len(given.reconstruction.observations),
+    }
+    solved = replace(solved, told={"model": facts_of_model})
+    orientations = {name: fact.orientation or 1 for name, fact in facts.items()}
+    times = {} if folder is None else photo_times(folder)
+    written = Outputs.of_solved(solved, options, rectify, outputs, orientations, ids, rgb, folder is not None, times)
+    before.solved(written, log)
+    return written
 
 
 def _solve_in_memory(

@@ -18,14 +18,16 @@ from ..input.frames import find_photos
 from ..input.gyroscope import GyroOptions, Readouts, gyro_contradiction, gyro_motions, known_readouts
 from ..input.load import LoadedPhotos, load_photos
 from ..input.photo_cameras import camera_file_of
-from ..io import ExifFacts, is_video, list_photos, output_folder
+from ..io import ExifFacts, is_video, list_photos, output_folder, read_solution
 from ..io.gyro import GyroLog
+from ..io.kept import Kept
 from ..io.motions import Known
 from ..io.places import local_place
 from ..io.record import Record
 from ..io.video import VideoFrames
 from ..model import Reconstruction, Solution
 from .clip import frame_path, solve_clip
+from .going_on import RunFolder, key_of, run_folder
 from .model_sequence import solve_photos
 from .outcome import Solved
 from .run_options import RunOptions, SolveOptions
@@ -42,6 +44,7 @@ def run(
     *,
     jobs: int = 0,
     overwrite: bool = False,
+    resume: bool = False,
     scheduler: str | None = None,
 ) -> Solution:
     """Recover how the camera moved during each photo's readout; write rectified photos, masks and poses.
@@ -53,13 +56,17 @@ def run(
         `out/frames`, are the photos.
     out : path
         Folder for the outputs. It stays as it was until the motions are solved; then it gets the solution, and the
-        rectified photos one by one. Should that be interrupted, `rectify_folder(..., resume=True)` goes on.
+        rectified photos one by one.
     options : RunOptions, optional
         See there.
     progress : callable, optional
         Called as (stage, done, total).
     jobs, overwrite, scheduler
         As in `rectify_folder`.
+    resume : bool
+        Go on with a run of these photos and options into `out` that ended early, however it did: features, matches,
+        mapping, solution and rectified photos that it came to are not made again, and the outputs are what they would
+        have been without the interruption. Without such a run, and outputs, it begins.
 
     Returns
     -------
@@ -74,45 +81,76 @@ def run(
     gyro_files = () if options.gyro is None else (options.gyro.file, options.gyro.times)
     inputs = inputs_of(rectify, photos, *gyro_files, camera_file_of(photos, options.camera))
     check_usd(options.outputs, is_video(photos) and options.every is None and options.sharpest is None)
+    is_clip = is_video(photos) and options.every is None and options.sharpest is None
+    if options.frames == "all" and not is_clip:
+        raise InputError(f"{photos} is no video; --frames all is for one")
+    of_video = [name for name in OF_VIDEOS if _writes(name, options)] if is_clip else []
     replaced = (*REPLACED, "frames") if is_video(photos) else REPLACED
-    with output_folder(out, overwrite=overwrite, apart_from=inputs, replaced=replaced) as scratch:
-        gyro_log = None if options.gyro is None else options.gyro.log()
-        source = find_photos(photos, scratch, options.camera, options.every, options.sharpest, log)
-        folder = source.folder
-        if options.frames == "all" and source.clip is None:
-            raise InputError(f"{photos} is no video; --frames all is for one")
-        frames = [] if source.frames is None else [f"frames/{path.name}" for path in folder.iterdir()]
-        of_video = [] if source.clip is None else [name for name in OF_VIDEOS if _writes(name, options)]
-        names = list_photos(folder, rectify.raw_as)
-        Record(out).check([*frames, *of_video, *files_of_run(names, rectify.raw_as, options.outputs)], inputs)
-        loaded = load_photos(
-            folder, source.camera, options.solve.readout, options.max_features, workers, log,
-            megapixels=options.feature_megapixels, masks=rectify.masks, raw_as=rectify.raw_as, again=rectify.again,
-            max_megapixels=rectify.max_megapixels, least=3 if source.clip is None else 2,
-        )  # fmt: skip
-        _check_anchors(options.solve, loaded.names, photos)
-        bodies = loaded.facts if source.frames is None else [source.frames] * len(loaded.names)
-        if source.clip is None:
-            solved, solving = _solve(options, loaded, bodies, gyro_log, workers, log)
+    with run_folder(out, key_of(inputs, options), log, overwrite=overwrite, resume=resume) as before:
+        if before.finished:
+            return read_solution(out / "solution.json")
+        if before.begun:
+            outputs: Outputs = before.outputs(log)
         else:
-            solved, solving = solve_frames(options, source.clip, loaded, bodies, gyro_log, log), options.solve
-        told = {
-            "max_features": options.max_features,
-            "feature_megapixels": options.feature_megapixels,
-            "matching": options.matching,
-            "video": source.video,
-            "gyro": options.gyro and options.gyro.facts(),
-        }
-        outputs = Outputs.of_solved(
-            replace(solved, told=told), solving, rectify, options.outputs, loaded.orientations,
-            times=photo_times(folder),
-        )  # fmt: skip
-        outputs.begin(scratch, log)
-    # what an earlier run left there is of another path
-    Record(out).remove([name for name in OF_VIDEOS if name not in of_video])
-    if options.frames == "all":
-        outputs.rectify_clip(photos, out, workers, log)
-    return outputs.rectify(folder if source.frames is None else out / "frames", out, workers, log)
+            again = overwrite or before.goes_on
+            with output_folder(out, overwrite=again, apart_from=inputs, replaced=replaced) as scratch:
+                outputs = _solved(photos, out, scratch, options, inputs, of_video, workers, log, before)
+                outputs.begin(scratch, log)
+            before.begin()
+        # what an earlier run left there is of another path
+        Record(out).remove([name for name in OF_VIDEOS if name not in of_video])
+        if options.frames == "all" and before.kept.get(VIDEO) is None:
+            outputs.rectify_clip(photos, out, workers, log)
+            before.kept.put(VIDEO, True)
+        return outputs.rectify(out / "frames" if is_video(photos) else photos, out, workers, log, before.begun)
+
+
+def _solved(
+    photos: Path,
+    out: Path,
+    scratch: Path,
+    options: RunOptions,
+    inputs: Sequence[Path],
+    of_video: Sequence[str],
+    workers: Workers,
+    log: StageLog,
+    before: RunFolder,
+) -> Outputs:
+    """What is to be written, with frames of a video in the scratch folder; what was kept of that is not done again."""
+    rectify, kept = options.rectify, before.kept
+    gyro_log = None if options.gyro is None else options.gyro.log()
+    source = find_photos(photos, scratch, options.camera, options.every, options.sharpest, log)
+    folder = source.folder
+    frames = [] if source.frames is None else [f"frames/{path.name}" for path in folder.iterdir()]
+    names = list_photos(folder, rectify.raw_as)
+    Record(out).check([*frames, *of_video, *files_of_run(names, rectify.raw_as, options.outputs)], inputs)
+    kept.begin()
+    found: Outputs | None = before.outputs(log)
+    if found is not None:
+        return found
+    loaded = load_photos(
+        folder, source.camera, options.solve.readout, options.max_features, workers, log,
+        megapixels=options.feature_megapixels, masks=rectify.masks, raw_as=rectify.raw_as, again=rectify.again,
+        max_megapixels=rectify.max_megapixels, least=3 if source.clip is None else 2, kept=kept,
+    )  # fmt: skip
+    _check_anchors(options.solve, loaded.names, photos)
+    bodies = loaded.facts if source.frames is None else [source.frames] * len(loaded.names)
+    if source.clip is None:
+        solved, solving = _solve(options, loaded, bodies, gyro_log, workers, log, kept)
+    else:
+        solved, solving = solve_frames(options, source.clip, loaded, bodies, gyro_log, log, kept), options.solve
+    told = {
+        "max_features": options.max_features,
+        "feature_megapixels": options.feature_megapixels,
+        "matching": options.matching,
+        "video": source.video,
+        "gyro": options.gyro and options.gyro.facts(),
+    }
+    outputs = Outputs.of_solved(
+        replace(solved, told=told), solving, rectify, options.outputs, loaded.orientations, times=photo_times(folder)
+    )
+    before.solved(outputs, log)
+    return outputs
 
 
 def _writes(name: str, options: RunOptions) -> bool:
@@ -135,6 +173,7 @@ def _solve(
     gyro_log: GyroLog | None,
     workers: Workers,
     log: StageLog,
+    kept: Kept,
 ) -> tuple[Solved, SolveOptions]:
     """What the photos, and a gyroscope's log, come to; and the options with the motions of that."""
     solving, cameras = options.solve, loaded.cameras
@@ -150,7 +189,7 @@ def _solve(
     with tempfile.TemporaryDirectory() as work:
         solved = solve_photos(
             loaded, solving.shutter_model, solving.seed, options_of,
-            Path(work), log, solving.remedy, options.matching, workers,
+            Path(work), log, solving.remedy, options.matching, workers, kept,
         )  # fmt: skip
     rec = solved.shared
     contradictions = [gyro_contradiction(rec, from_gyro), *cameras.contradicted(rec.cameras, options_of(rec))]
@@ -166,6 +205,7 @@ def solve_frames(
     bodies: Sequence[ExifFacts | VideoFrames],
     gyro_log: GyroLog | None,
     log: StageLog,
+    kept: Kept | None = None,
 ) -> Solved:
     """What a video, and a gyroscope's log, come to."""
     solving, cameras = options.solve, keys.cameras
@@ -178,7 +218,7 @@ def solve_frames(
     with tempfile.TemporaryDirectory() as work:
         solved = solve_clip(
             clip, keys, frame_path(clip, readouts.get(0)), lambda _: solving.options_for(cameras), Path(work), log,
-            seed=solving.seed, matching=options.matching, gyroscope=gyro_log,
+            seed=solving.seed, matching=options.matching, gyroscope=gyro_log, kept=kept,
         )  # fmt: skip
     return replace(solved, unregistered=keys.unregistered(solved.shared.image_names), readouts=readouts)
 

@@ -202,16 +202,19 @@ class Outputs:
         except KeyboardInterrupt as stop:
             raise KeyboardInterrupt(f"all but the report is written; go on with: rsundistort report {out}") from stop
 
-    def rectify(self, photos: Path, out: Path, workers: Workers, log: StageLog) -> Solution:
-        """Rectify the photos of a folder into `out`, which `begin` has filled, and write the rest again."""
+    def rectify(self, photos: Path, out: Path, workers: Workers, log: StageLog, resume: bool = False) -> Solution:
+        """Rectify the photos of a folder into `out`, which `begin` has filled, and write the rest again.
+
+        With `resume` photos that are rectified already are passed over.
+        """
         solution, rec, options = self.solution, self.reconstruction, self.rectifying
         colors = None if self.rgb is not None and self.rgb.known.all() else PointColors(rec)
         scene = SceneGeometry(solution, options.depth, ScenePoints.of_reconstruction(rec))
-        go_on = f"whole; go on with: rsundistort rectify {photos} --solution {out / 'solution.json'} -o {out} --resume"
+        go_on = "whole; the same command with --resume goes on"
         with batch_folder(out, overwrite=True) as journal:
             done = rectify_photos(
                 photos, scene, list(rec.image_names), out, options, workers, log, journal,
-                colors=colors, go_on=go_on,
+                colors=colors, go_on=go_on, resume=resume, others=False,
             )  # fmt: skip
         log.begin("writing")
         left_out = {name: each.problem for name, each in done.items() if each.problem}
@@ -232,9 +235,9 @@ class Outputs:
                 f"{out / 'stereo'} holds maps that COLMAP made of an earlier result, and would take for those of this "
                 "one; remove them before you run it", RsUndistortWarning, stacklevel=2,
             )  # fmt: skip
+        self.report(out, workers.jobs, log, photos)
         if not left_out:
             journal.path.unlink()  # nothing to go on with
-        self.report(out, workers.jobs, log, photos)
         return turned
 
     @cached_property

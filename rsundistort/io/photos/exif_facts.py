@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...colmap.conventions import quiet_pycolmap
 from ...errors import RsUndistortError
 from ...model import Camera
 from .containers import metadata_of
@@ -229,9 +230,7 @@ def camera_from_exif(path: Path, width: int, height: int, readout: str = "top-to
 
 
 def _focal_of_model(path: Path, width: int, height: int) -> float | None:
-    import pycolmap
-
-    pycolmap.logging.minloglevel = 3
+    pycolmap = quiet_pycolmap()
     try:
         guess = pycolmap.infer_camera_from_image(path)
     except (RuntimeError, ValueError):

@@ -1,0 +1,37 @@
+"""The installed command: signals are heard before all else is imported, which takes half a second."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from typing import Any
+
+from .stopping import hears_signals
+
+
+def main() -> None:
+    """Run the command."""
+    _open_streams()
+    with hears_signals():
+        from .main import cli
+
+        try:
+            cli()
+        except OSError as error:  # of stdout, by click itself
+            sys.exit(f"error: {error.strerror}")
+
+
+def _open_streams() -> None:
+    """Give closed streams a file that takes all: else the next file that is opened would be taken for them."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        stream: Any = getattr(sys, name)
+        if stream is None:
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest number that is free: this one
+            setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w", encoding="utf-8", closefd=False))
+        elif isinstance(stream, io.TextIOWrapper) and number == 1:
+            stream.reconfigure(errors="backslashreplace")  # a name of a file may be no text
+
+
+if __name__ == "__main__":
+    main()
