@@ -6,6 +6,7 @@ __all__ = [
     "FormatError",
     "InputError",
     "MetadataWarning",
+    "MissingOutputWarning",
     "ReconstructionError",
     "RsUndistortError",
     "RsUndistortWarning",
@@ -43,6 +44,14 @@ class SkippedPhotoWarning(RsUndistortWarning):
 
 class MetadataWarning(RsUndistortWarning):
     """A photo's metadata could not be kept."""
+
+
+class MissingOutputWarning(RsUndistortWarning):
+    """An output that was asked for could not be written, and the others are done; `file` is its name."""
+
+    def __init__(self, text: str, file: str) -> None:
+        super().__init__(text)
+        self.file = file
 
 
 class FileKindWarning(RsUndistortWarning):

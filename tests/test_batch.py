@@ -371,13 +371,13 @@ class Stop:
             self.act()
 
 
-def test_a_run_that_was_interrupted_is_gone_on_with_by_rectify(courtyard, tmp_path):
+def test_a_run_that_was_interrupted_is_gone_on_with(courtyard, tmp_path):
     folder, options = courtyard
 
     def interrupt():
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt, match=r"of 6 photos are done, whole; go on with: rsundistort rectify"):
+    with pytest.raises(KeyboardInterrupt, match=r"of 6 photos are done, whole; the same command with --resume"):
         run(folder / "photos", tmp_path / "out", options, Stop(2, interrupt))
     before = made(tmp_path / "out")
     whole = seen_files(folder / "out")
@@ -386,10 +386,16 @@ def test_a_run_that_was_interrupted_is_gone_on_with_by_rectify(courtyard, tmp_pa
     for name, content in seen_files(tmp_path / "out").items():
         if name.startswith(("images", "masks", "transforms")):
             assert content == whole[name]
-    rectify_folder(folder / "photos", tmp_path / "out" / "solution.json", tmp_path / "out", resume=True)
-    after = seen_files(tmp_path / "out")
-    assert {n: c for n, c in after.items() if "/0" in n} == {n: c for n, c in whole.items() if "/0" in n}
-    assert made(tmp_path / "out").items() >= {n: i for n, i in before.items() if n in COURTYARD_NAMES[:2]}.items()
+    shutil.copytree(tmp_path / "out", tmp_path / "copy")
+    rectify_folder(folder / "photos", tmp_path / "copy" / "solution.json", tmp_path / "copy", resume=True)
+    run(folder / "photos", tmp_path / "out", options, resume=True)
+    for out in (tmp_path / "copy", tmp_path / "out"):
+        after = seen_files(out)
+        assert {n: c for n, c in after.items() if "/0" in n} == {n: c for n, c in whole.items() if "/0" in n}
+    kept = {n: i for n, i in before.items() if n in COURTYARD_NAMES[:2]}
+    assert made(tmp_path / "out").items() >= kept.items()
+    times = ("solution.json", "report.html")
+    assert {n: c for n, c in after.items() if n not in times} == {n: c for n, c in whole.items() if n not in times}
 
 
 def test_a_photo_that_vanishes_from_a_run_is_in_no_model(courtyard, tmp_path):

@@ -41,6 +41,7 @@ NOT_OPTIONS = {
     "as_json",
     "quiet",
     "verbose",
+    "resume",
 }
 
 PHOTO = [

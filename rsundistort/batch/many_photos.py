@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..errors import FileError, SkippedPhotoWarning
 from ..io import find_masks, output_name
 from ..io.journal import Journal, JournalEntry
+from ..io.lock import check_still_there
 from ..io.outputs import BATCH_FOLDERS, make_inside
 from ..io.photos.kinds import kind_of_name
 from ..io.places import Place, RemoteFolder, absolute, files_of, place_of, sizes_under
@@ -168,6 +169,8 @@ def _rectified(
 
     def begun() -> Iterator[PhotoJob]:
         for name, paths in targets.items():
+            if isinstance(jobs.out, Path):
+                check_still_there(jobs.out)
             record.claim(paths)
             yield jobs[name]
 
@@ -194,7 +197,7 @@ class _Jobs:
         posed: bool,
     ) -> None:
         # absolute: workers elsewhere have another working directory
-        self._folder, self._out = absolute(folder), absolute(out)
+        self._folder, self.out = absolute(folder), absolute(out)
         self._files = files_of(self._folder, names)
         self._scene, self._options, self._colors, self._posed = scene, options, colors, posed
         self._extras = find_extras(options.also, names)
@@ -206,7 +209,7 @@ class _Jobs:
         return PhotoJob(
             name=name,
             source=self._files[name],
-            out=self._out,
+            out=self.out,
             image=f"images/{output_name(name, self._options.raw_as)}",
             mask=f"masks/{self._mask_name[name]}",
             geometry=self._scene.of(name),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import tempfile
@@ -21,6 +22,7 @@ from ..io import MAX_MEGAPIXELS, Photo, read_mask, read_photo, write_image
 from ..io.outputs import CANNOT_WRITE
 from ..io.photos.exif import read_orientation
 from ..io.places import File, Place, RemoteFile, fetched
+from ..io.record import is_inside
 from ..model import Depth
 from ..model.orientation import split_mirror, turn_pixels
 from ..rectify import MAP_KINDS, RemapGrid, ViewOptions, rectify
@@ -243,9 +245,9 @@ def _rectify(job: PhotoJob, source: Path, own_mask: Path | None, out: Path) -> P
             metadata = metadata.with_orientation(rest)
         del photo, own  # not beside the encoded one
         writing = True
-        write_image(out / job.image, pixels, metadata, options.quality)
+        write_image(_inside(out, job.image), pixels, metadata, options.quality)
         files[job.image] = (out / job.image).stat().st_size
-        write_image(out / job.mask, mask, flat=True)
+        write_image(_inside(out, job.mask), mask, flat=True)
         files[job.mask] = (out / job.mask).stat().st_size
         for name in _write_extras(job, out, found.depth, turn):
             files[name] = (out / name).stat().st_size
@@ -265,11 +267,9 @@ def _write_extras(job: PhotoJob, out: Path, depth: Depth, turn: int) -> Iterator
         try:
             image = read_photo(each.source, job.options.max_megapixels)
             pixels, _ = rectify(image.pixels, *job.geometry.grid, each.interpolation, depth=depth)
-            write_image(out / each.target, turn_pixels(pixels, turn), image.metadata, job.options.quality)
         except (FileError, InputError) as error:
-            if getattr(error.__cause__, "errno", None) in CANNOT_WRITE:
-                raise
             raise InputError(f"{each.source.parent.name}/{each.source.name}: {error}") from error
+        write_image(_inside(out, each.target), turn_pixels(pixels, turn), image.metadata, job.options.quality)
         yield each.target
     if job.maps is not None and job.options.maps is not None:
         grid = RemapGrid.from_camera(*job.geometry.grid, depth)
@@ -277,8 +277,16 @@ def _write_extras(job: PhotoJob, out: Path, depth: Depth, turn: int) -> Iterator
             map_x, map_y = (turn_pixels(m, turn) for m in (grid.map_x, grid.map_y))
             grid = RemapGrid(map_x, map_y, grid.source_width, grid.source_height)
         for name, each_way in zip(job.targets[-len(_WAYS) :], (grid, grid.inverse()), strict=True):
-            each_way.save(out / name, job.options.maps)
+            each_way.save(_inside(out, name), job.options.maps)
             yield name
+
+
+def _inside(out: Path, name: str) -> Path:
+    """The path of an output, if no link that was laid meanwhile leads elsewhere."""
+    path = out / name
+    if not is_inside(path.parent, out):
+        raise FileError(f"{path.parent} leads out of {out}; remove that link") from OSError(errno.ELOOP, "a link")
+    return path
 
 
 def _warn_of_orientation(name: str, photo: Photo, rest: int) -> None:

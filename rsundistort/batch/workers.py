@@ -23,6 +23,8 @@ __all__ = ["Workers", "use_threads"]
 T = TypeVar("T")
 R = TypeVar("R")
 
+# No machine has more cores, and each thread takes memory.
+_MOST_JOBS = 4096
 # Seconds that a scheduler has to answer.
 _TIMEOUT_S = 10
 # Share of the free memory that photos take together: what they need is an estimate.
@@ -33,8 +35,8 @@ _RETRIES = 2
 
 def use_threads(jobs: int) -> int:
     """Hold OpenCV and the kernels to a number of threads; 0 for all cores. Returns the number."""
-    if jobs < 0:
-        raise InputError(f"jobs={jobs!r}, expected 0 or more")
+    if not 0 <= jobs <= _MOST_JOBS:
+        raise InputError(f"jobs={jobs!r}, expected 0 to {_MOST_JOBS}")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     jobs = jobs or cores
     cv2.setNumThreads(jobs)

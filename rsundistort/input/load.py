@@ -132,6 +132,11 @@ def _most_bytes(folder: Path, names: Sequence[str], megapixels: float, max_megap
     return max(map(bytes_of, names))
 
 
+def _is_text(name: str) -> bool:
+    """Whether a name of a file is text: what is not UTF-8 comes as surrogates."""
+    return not any("\ud800" <= letter <= "\udfff" for letter in name)
+
+
 def load_photos(
     folder: Path,
     camera: str | None,
@@ -177,6 +182,8 @@ def load_photos(
         raise InputError(
             f"{folder} holds {len(listed)} photo{'s' * (len(listed) > 1)}; the shutter needs at least {_NUMBERS[least]}"
         )
+    if no_text := [name for name in listed if not _is_text(name)]:
+        raise InputError(f"{no_text[0]!r} in {folder} is no name in UTF-8, and no model can hold it; rename it")
     mask_of = {} if masks is None else find_masks(local_place(masks).absolute(), listed)
     before: dict[str, _Loaded] = {name: old for name in listed if (old := kept.get(f"features of {name}"))}
     jobs = (

@@ -23,14 +23,9 @@ from .places import Place, RemoteFolder
 from .record import Record, is_inside
 
 __all__ = [
-    "BATCH_FOLDERS",
-    "CANNOT_WRITE",
-    "batch_folder",
-    "has_content",
-    "make_inside",
-    "only_writer",
-    "output_folder",
-]
+    "BATCH_FOLDERS", "CANNOT_WRITE", "batch_folder", "has_content", "make_inside", "only_writer", "output_folder",
+    "work_folder",
+]  # fmt: skip
 
 #: What a batch fills.
 BATCH_FOLDERS = ("images", "masks", "maps", "also")
@@ -38,13 +33,16 @@ BATCH_FOLDERS = ("images", "masks", "maps", "also")
 #: What a full disk, a read-only one, a limit, a folder that is gone say: anything else is not OUT's fault.
 CANNOT_WRITE = (
     errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EPERM, errno.EDQUOT, errno.EIO, errno.EFBIG, errno.ENOENT,
-    errno.ENOTDIR, errno.ESTALE, errno.EMFILE, errno.ENFILE,
+    errno.ENOTDIR, errno.ESTALE, errno.EMFILE, errno.ENFILE, errno.ELOOP,
 )  # fmt: skip
 
 # Hidden names in OUT that are no outputs: scratch folders, with machine and process, the lock, what a run keeps, and
 # the record.
 _HIDDEN = ".rsundistort-"
 _SCRATCH = f"{_HIDDEN}{re.sub(r'[^0-9A-Za-z]', '_', platform.node())}-"
+
+# The same in the folder of temporary files.
+_WORK = _SCRATCH.lstrip(".")
 
 
 @contextmanager
@@ -90,6 +88,34 @@ def output_folder(
         finally:
             if scratch is not None:
                 shutil.rmtree(scratch, ignore_errors=True)
+
+
+@contextmanager
+def work_folder() -> Iterator[Path]:
+    """A temporary folder for a block; those of killed processes of this machine are deleted.
+
+    Raises
+    ------
+    FileError
+        When it cannot be made, or what is written in it does not fit, SQLite's files too.
+    """
+    try:
+        here = Path(tempfile.gettempdir())
+    except OSError as error:
+        raise FileError(f"{' '.join(str(error).split())}; set TMPDIR to a folder that can be written") from error
+    mend = "; set TMPDIR to another folder"
+    _remove_scratch(here, _WORK)
+    with ExitStack() as stack:
+        with _errors_of(here, mend):
+            prefix = f"{_WORK}{os.getpid()}-"
+            work = stack.enter_context(tempfile.TemporaryDirectory(prefix=prefix, ignore_cleanup_errors=True))
+        try:
+            yield Path(work)
+        except RuntimeError as error:  # pycolmap's
+            if "SQLite error" not in str(error):
+                raise
+            said = str(error).partition("SQLite error: ")[2]
+            raise FileError(f"{here} cannot be written: {said}{mend}") from error
 
 
 @contextmanager
@@ -150,9 +176,14 @@ def _remove_stale(folder: Path) -> None:
     for name in BATCH_FOLDERS:
         if is_inside(folder / name, folder):
             remove_partial(folder / name)
-    for path in folder.glob(f"{_SCRATCH}*"):
-        process = re.fullmatch(r"(\d+)-\w+", path.name.removeprefix(_SCRATCH))
-        gone = process and (int(process[1]) == os.getpid() or not psutil.pid_exists(int(process[1])))
+    _remove_scratch(folder, _SCRATCH, own=True)
+
+
+def _remove_scratch(folder: Path, prefix: str, own: bool = False) -> None:
+    """Delete the folders of processes that are gone; `own`, also those of former ones of this process's number."""
+    for path in folder.glob(f"{prefix}*"):
+        process = re.fullmatch(r"(\d+)-\w+", path.name.removeprefix(prefix))
+        gone = process and ((own and int(process[1]) == os.getpid()) or not psutil.pid_exists(int(process[1])))
         if gone and path.is_dir() and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)
 

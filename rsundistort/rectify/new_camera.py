@@ -14,6 +14,9 @@ from ..model.projection import unproject_points
 
 __all__ = ["ViewOptions", "optimal_new_camera", "rectified_roi", "rectified_view"]
 
+# Beyond it a photo of a pixel fits into no file.
+_MOST_SCALE = 1e4
+
 
 @dataclass(frozen=True)
 class ViewOptions:
@@ -40,8 +43,8 @@ class ViewOptions:
                 raise InputError(f"alpha={self.alpha!r}, expected 'keep' or a number from 0 to 1")
         elif self.alpha is not None and not 0.0 <= self.alpha <= 1.0:
             raise InputError(f"alpha={self.alpha}, expected 'keep' or a number from 0 to 1")
-        if not 0.0 < self.scale < np.inf:
-            raise InputError(f"scale={self.scale}, expected a positive number")
+        if not 0.0 < self.scale <= _MOST_SCALE:
+            raise InputError(f"scale={self.scale}, expected a positive number up to {_MOST_SCALE:g}")
         if self.max_size is not None and self.max_size < 2:
             raise InputError(f"max_size={self.max_size}, expected at least 2 pixels")
 

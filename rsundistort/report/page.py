@@ -64,7 +64,7 @@ def write_report(
     with only_writer(source.out):
         record.check([_NAME])
         pictures = _pictures(source, jobs or os.cpu_count() or 1, progress)
-        page = _page(source, pictures).encode()
+        page = _page(source, pictures).encode(errors="backslashreplace")
         with record.writing([_NAME]):
             write_aside(source.out / _NAME, page)
     return source.out / _NAME

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -45,7 +46,7 @@ def matched_of_database(source: Path, database: Path, reconstruction: Reconstruc
         When it does not hold the photos, or holds other keypoints.
     """
     rec = reconstruction
-    with _opened(source) as db:
+    with _opened(source, database.parent) as db:
         ids = dict(db.execute("SELECT name, image_id FROM images"))
         lost = [name for name in rec.image_names if name not in ids]
         if lost:
@@ -63,15 +64,28 @@ def matched_of_database(source: Path, database: Path, reconstruction: Reconstruc
 
 
 @contextmanager
-def _opened(source: Path) -> Iterator[sqlite3.Connection]:
+def _opened(source: Path, work: Path) -> Iterator[sqlite3.Connection]:
     """COLMAP's tables, to be read: pycolmap would make a database that is missing, and change one that is old."""
     if not source.is_file():
         raise FileError(f"{source} is missing; give the database that the model was made from")
+    # what COLMAP has not put into it yet is beside it, and to read both SQLite would write there: so from a copy
+    pending = source.with_name(f"{source.name}-wal")
     try:
-        with closing(sqlite3.connect(f"{source.resolve().as_uri()}?mode=ro", uri=True)) as db:
+        if pending.is_file() and pending.stat().st_size:
+            copy = work / "given.db"
+            shutil.copyfile(source, copy)
+            shutil.copyfile(pending, copy.with_name(f"{copy.name}-wal"))
+            uri = copy.resolve().as_uri()
+        else:
+            uri = f"{source.resolve().as_uri()}?mode=ro&immutable=1"
+        with closing(sqlite3.connect(uri, uri=True)) as db:
             yield db
     except sqlite3.Error as error:
         raise FileError(f"{source} is no COLMAP database: {error}") from error
+    except FileError:
+        raise
+    except OSError as error:
+        raise FileError(f"{source} cannot be copied to {work}: {error.strerror}") from error
 
 
 def _array(db: sqlite3.Connection, table: str, key: str, value: int, dtype: type) -> NDArray[Any]:

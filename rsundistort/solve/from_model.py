@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -23,6 +22,7 @@ from ..input.gyroscope import known_readouts
 from ..input.photo_cameras import PhotoCameras, check_readouts
 from ..io import ExifFacts, guess_readouts, list_photos, output_folder, output_name, read_exif, read_solution
 from ..io.models import read_model
+from ..io.outputs import work_folder
 from ..io.photos.images import stored_size
 from ..io.places import local_place
 from ..io.record import Record
@@ -364,11 +364,11 @@ def _solve(
     def options_of(each: Reconstruction) -> BundleOptions:
         return replace(options.options_for(cameras), outlier_sigma=_OUTLIER_SIGMA)
 
-    with tempfile.TemporaryDirectory() as work:
+    with work_folder() as work:
         matched = None
         if database is not None:
             log.begin("database")
-            matched = matched_of_database(database, Path(work) / "database.db", rec, options.seed)
+            matched = matched_of_database(database, work / "database.db", rec, options.seed)
             log.end("database", keypoints=sum(len(found.xy_raw) for found in matched.features))
         solved = solve_tracks(
             rec,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from ..errors import InputError, RsUndistortWarning
 from ..input.frames import find_photos
 from ..input.load import load_photos
 from ..io import is_video
+from ..io.outputs import work_folder
 from ..io.places import local_place
 from ..verdict.clip import APART, SIGMAS
 from .run import solve_frames
@@ -91,11 +91,11 @@ def measure_readout(
     if not is_video(video):
         raise InputError(f"{video} is no video; a readout time is measured from one")
     log, workers = StageLog(progress), Workers(use_threads(jobs))
-    with tempfile.TemporaryDirectory(prefix="rsundistort-") as work, warnings.catch_warnings():
+    with work_folder() as work, warnings.catch_warnings():
         # no frame is rectified
         warnings.filterwarnings("ignore", "only the lens is taken out", RsUndistortWarning)
         gyro_log = None if options.gyro is None else options.gyro.log()
-        source = find_photos(video, Path(work), options.camera, None, None, log)
+        source = find_photos(video, work, options.camera, None, None, log)
         assert source.clip is not None
         assert source.frames is not None
         loaded = load_photos(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,6 +21,7 @@ from ..io import ExifFacts, is_video, list_photos, output_folder, read_solution
 from ..io.gyro import GyroLog
 from ..io.kept import Kept
 from ..io.motions import Known
+from ..io.outputs import work_folder
 from ..io.places import local_place
 from ..io.record import Record
 from ..io.video import VideoFrames
@@ -186,10 +186,10 @@ def _solve(
     def options_of(rec: Reconstruction) -> BundleOptions:
         return bounded_by_exposure(solving.options_for(cameras), rec, loaded, known_s)
 
-    with tempfile.TemporaryDirectory() as work:
+    with work_folder() as work:
         solved = solve_photos(
             loaded, solving.shutter_model, solving.seed, options_of,
-            Path(work), log, solving.remedy, options.matching, workers, kept,
+            work, log, solving.remedy, options.matching, workers, kept,
         )  # fmt: skip
     rec = solved.shared
     contradictions = [gyro_contradiction(rec, from_gyro), *cameras.contradicted(rec.cameras, options_of(rec))]
@@ -215,9 +215,9 @@ def solve_frames(
             "say --every N for photos that do"
         )
     readouts = known_readouts(bodies, cameras.cameras, cameras.camera_idx, solving.readout_s, gyro_log)
-    with tempfile.TemporaryDirectory() as work:
+    with work_folder() as work:
         solved = solve_clip(
-            clip, keys, frame_path(clip, readouts.get(0)), lambda _: solving.options_for(cameras), Path(work), log,
+            clip, keys, frame_path(clip, readouts.get(0)), lambda _: solving.options_for(cameras), work, log,
             seed=solving.seed, matching=options.matching, gyroscope=gyro_log, kept=kept,
         )  # fmt: skip
     return replace(solved, unregistered=keys.unregistered(solved.shared.image_names), readouts=readouts)

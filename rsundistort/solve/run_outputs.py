@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -23,7 +24,7 @@ from ..batch.rectify_options import RectifyOptions
 from ..batch.views import with_view
 from ..batch.workers import Workers
 from ..colmap.rectified_model import ModelIds
-from ..errors import FileError, InputError, RsUndistortWarning
+from ..errors import FileError, InputError, MissingOutputWarning, RsUndistortWarning
 from ..io import (
     output_folder,
     output_name,
@@ -200,7 +201,9 @@ class Outputs:
             with _only_warned_of():
                 write_report(out, photos, jobs=jobs, progress=log.tell)
         except KeyboardInterrupt as stop:
-            raise KeyboardInterrupt(f"all but the report is written; go on with: rsundistort report {out}") from stop
+            raise KeyboardInterrupt(
+                f"all but the report is written; go on with: rsundistort report {shlex.quote(str(out))}"
+            ) from stop
 
     def rectify(self, photos: Path, out: Path, workers: Workers, log: StageLog, resume: bool = False) -> Solution:
         """Rectify the photos of a folder into `out`, which `begin` has filled, and write the rest again.
@@ -387,4 +390,4 @@ def _only_warned_of() -> Iterator[None]:
         yield
     except Exception as error:
         said = " ".join(str(error).split()) or type(error).__name__
-        warnings.warn(f"no report was written: {said}", RsUndistortWarning, stacklevel=4)
+        warnings.warn(MissingOutputWarning(f"no report was written: {said}", "report.html"), stacklevel=4)
