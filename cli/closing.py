@@ -9,7 +9,7 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .terminal import Talk, list_failed, table, tell
+from .terminal import Said, Talk, list_failed, table, tell
 
 if TYPE_CHECKING:
     from rsundistort.model import Solution
@@ -22,13 +22,14 @@ _COLUMNS = 80
 _LABEL = 19
 
 
-def close(solution: Solution, out: Path, warned: Sequence[str], talk: Talk) -> None:
-    """Say what was found; exit code 3 if photos that have a motion could not be rectified."""
+def close(solution: Solution, out: Path, warned: Said, talk: Talk) -> None:
+    """Say what was found; exit code 3 if photos with a motion could not be rectified, or the report not be written."""
     if talk.as_json:
         tell(json.dumps(summary(solution, out, warned)))
     elif talk.to_people:
         tell(closing_table(solution, out))
-    list_failed({image.name: image.reason for image in solution.registered if image.reason}, talk)
+    failed = {image.name: image.reason for image in solution.registered if image.reason}
+    list_failed(failed | warned.missing, talk)
 
 
 def summary(solution: Solution, out: Path, warned: Sequence[str]) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from .stopping import kept_is, stops_for_people
 
 __all__ = [
     "SOME_FAILED",
+    "Said",
     "Talk",
     "errors_for_people",
     "forget_stdout",
@@ -92,13 +93,23 @@ def say(text: str, **style: Any) -> None:
     click.secho(text, err=True, color=False if os.environ.get("NO_COLOR") else None, **style)
 
 
+class Said(list[str]):
+    """Warnings, and the outputs that are missing by them, with the reason."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.missing: dict[str, str] = {}
+
+
 @contextmanager
-def warnings_for_people() -> Iterator[list[str]]:
+def warnings_for_people() -> Iterator[Said]:
     """Warnings become one line each, and are listed."""
-    said: list[str] = []
+    said = Said()
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
         said.append(str(message))
+        if (file := getattr(message, "file", None)) is not None:
+            said.missing[file] = str(message)
         say(f"warning: {message}", fg="yellow")
 
     with warnings.catch_warnings():
@@ -108,7 +119,7 @@ def warnings_for_people() -> Iterator[list[str]]:
 
 
 @contextmanager
-def errors_for_people(kept: str = "nothing was written") -> Iterator[list[str]]:
+def errors_for_people(kept: str = "nothing was written") -> Iterator[Said]:
     """Known errors become one line and exit code 1; warnings become one line each, and are listed.
 
     So does what the system says of files, memory and threads, wherever it says it. An interruption tells what is

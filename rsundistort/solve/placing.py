@@ -6,6 +6,8 @@ import math
 from pathlib import Path
 
 from ..batch.progress import StageLog
+from ..colmap.conventions import quiet_pycolmap
+from ..errors import ReconstructionError
 from ..input.load import LoadedPhotos
 from ..input.pairing import pairs_to_match
 from ..io.kept import Kept
@@ -13,6 +15,16 @@ from ..model import Reconstruction
 from ..sfm import MatchedPhotos, map_photos, match_photos
 
 __all__ = ["place_photos"]
+
+# Verified matches of a pair that overlaps, beyond doubt.
+_MANY = 100
+
+
+def _num_verified(matched: MatchedPhotos) -> int:
+    """Pairs of photos that overlap beyond doubt."""
+    with quiet_pycolmap().Database.open(matched.database) as db:
+        _, counts = db.read_two_view_geometry_num_inliers()
+    return sum(count >= _MANY for count in counts)
 
 
 def place_photos(
@@ -49,7 +61,15 @@ def place_photos(
     log.begin("mapping", len(photos.names))
     mapped: Reconstruction | None = kept.get("mapped")
     if mapped is None:
-        mapped = map_photos(matched, lambda done: log.tell("mapping", done, len(photos.names)))
+        try:
+            mapped = map_photos(matched, lambda done: log.tell("mapping", done, len(photos.names)))
+        except ReconstructionError as error:
+            if _num_verified(matched) < len(photos.names) - 1:
+                raise
+            raise ReconstructionError(
+                "the photos overlap, but show no parallax: the camera stood still or only turned; "
+                "use photos from places apart"
+            ) from error
         kept.put("mapped", mapped)
     log.end("mapping", photos=mapped.num_images, points=mapped.num_points, observations=len(mapped.observations))
     return mapped, matched
