@@ -223,10 +223,10 @@ def batch_folder(
                 if has_content(folder) and not overwrite:
                     _check_goes_on(folder, going_on, resume)
                 new = [path for path in (folder / "images", folder / "masks", journal.path) if not path.exists()]
+                # a last line cut short must not run into the next; and what is there without it cannot be gone on with
+                journal.write(journal.read().values())
                 for name in ("images", "masks"):
                     make_inside(folder, name)
-                # a last line cut short must not run into the next
-                journal.write(journal.read().values())
             with _errors_of(folder):
                 yield journal
         except BaseException:

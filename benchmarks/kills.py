@@ -1,0 +1,204 @@
+"""Kills `run` and `rectify` at random moments and goes on with them: prints one JSON object a line.
+
+    python benchmarks/kills.py [--kills 100] [--seed 0] [--only run|rectify]
+
+Each run into an empty folder is killed, gone on with (`--resume`), killed again and so on, until it comes to its end;
+then every file is compared with that of an undisturbed run, byte for byte but for the times that a solution and its
+report tell. Half of the signals are SIGKILL, the others SIGTERM and SIGINT, which have to end it in one line and with
+their exit codes. A watcher looks at the outputs all the time: what is visible must be whole. The scene is six photos of
+`courtyard` at half size. Exits 1 if anything differs, is cut short, or cannot be gone on with.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import zipfile
+from pathlib import Path
+
+import cv2
+
+SCENE = Path(__file__).parent.parent / "sample_scenes" / "courtyard"
+COMMAND = [sys.executable, "-m", "rsundistort_cli"]
+SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+
+
+def make_scene(folder: Path) -> None:
+    """Six photos at half size, and their camera."""
+    (folder / "photos").mkdir(parents=True)
+    for path in sorted((SCENE / "photos").iterdir())[:6]:
+        photo = cv2.imread(str(path))
+        cv2.imwrite(str(folder / "photos" / path.name), cv2.resize(photo, None, fx=0.5, fy=0.5))
+    camera = json.loads((SCENE / "camera.json").read_text())
+    (folder / "camera.json").write_text(json.dumps(halved(camera)))
+
+
+def halved(camera: dict) -> dict:
+    """A camera file for photos at half size; pixel centres are whole numbers."""
+    half = dict(camera)
+    half["width"], half["height"] = camera["width"] // 2, camera["height"] // 2
+    half["K"] = [[(each + 0.5 * (j == 2)) / 2 - 0.5 * (j == 2) for j, each in enumerate(row)] for row in camera["K"][:2]]
+    half["K"].append([0, 0, 1])
+    return half
+
+
+def visible(out: Path) -> dict[str, Path]:
+    """Files that a user sees."""
+    if not out.is_dir():
+        return {}
+    paths = (path for path in out.rglob("*") if not any(p.startswith(".") for p in path.relative_to(out).parts))
+    return {path.relative_to(out).as_posix(): path for path in paths if path.is_file()}
+
+
+def comparable(path: Path) -> bytes:
+    """The content without the times that it tells."""
+    data = path.read_bytes()
+    if path.name == "solution.json":
+        value = json.loads(data)
+        for stage in value.get("stages", []):
+            stage.pop("seconds")
+        return json.dumps(value, sort_keys=True).encode()
+    if path.name == "report.html":
+        return re.sub(rb"\d+(\.\d+)? (s|min)\b", b"", data)
+    return data
+
+
+class Watcher:
+    """Looks at the outputs again and again, and notes what is cut short."""
+
+    def __init__(self, out: Path, images: dict[str, bytes]) -> None:
+        self.out, self.images = out, images
+        self.cut: set[str] = set()
+        self.looks = 0
+        self._seen: dict[str, tuple[int, int, int]] = {}
+        self._ended = threading.Event()
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def _watch(self) -> None:
+        while not self._ended.wait(0.005):
+            self.look()
+
+    def look(self) -> None:
+        """Once."""
+        self.looks += 1
+        for name, path in visible(self.out).items():
+            try:
+                facts = path.stat()
+                stamp = facts.st_ino, facts.st_size, facts.st_mtime_ns
+                if self._seen.get(name) != stamp and not self._is_whole(name, path):
+                    self.cut.add(name)
+                self._seen[name] = stamp
+            except FileNotFoundError:
+                continue
+
+    def _is_whole(self, name: str, path: Path) -> bool:
+        data = path.read_bytes()
+        if name.startswith(("images/", "masks/")):
+            return data == self.images[name]
+        if name.endswith(".json"):
+            try:
+                return bool(json.loads(data))
+            except ValueError:
+                return False
+        if name.endswith(".npz"):
+            return zipfile.is_zipfile(path)
+        return bool(data) and (not name.endswith(".html") or data.rstrip().endswith(b"</html>"))
+
+    def end(self) -> None:
+        """Look no more."""
+        self._ended.set()
+
+
+def killed(command: list[str], after_s: float, number: signal.Signals) -> tuple[int, str]:
+    """Exit code and stderr of a command that gets a signal, unless it comes to its end before."""
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    try:
+        process.wait(after_s)
+    except subprocess.TimeoutExpired:
+        process.send_signal(number)
+    said = process.communicate(timeout=300)[1]
+    return process.returncode, said
+
+
+def problem_of(code: int, said: str) -> str:
+    """What is wrong with how it ended; empty if nothing is."""
+    errors = [line for line in said.splitlines() if line.strip() and not line.startswith("warning: ")]
+    if code in (0, -signal.SIGKILL):
+        return " | ".join(errors)
+    # a signal may come before Python, or the command, hears any
+    if code in (-signal.SIGTERM, -signal.SIGINT) and not errors:
+        return ""
+    if code in (128 + signal.SIGTERM, 128 + signal.SIGINT) and len(errors) == 1 and errors[0].startswith("stopped; "):
+        return ""
+    return f"exit code {code}: {' | '.join(errors)[-300:]}"
+
+
+def tried(name: str, command: list[str], folder: Path, kills: int, rng: random.Random) -> dict:
+    """What came of so many kills."""
+    whole = folder / name / "undisturbed" / "out"
+    began = time.perf_counter()
+    subprocess.run([*command, "-o", str(whole)], check=True, stdout=subprocess.DEVNULL)
+    lasts_s = time.perf_counter() - began
+    expected = {each: comparable(path) for each, path in visible(whole).items()}
+    images = {each: path.read_bytes() for each, path in visible(whole).items()}
+    done = ends = looks = 0
+    codes: dict[str, int] = {}
+    problems: list[str] = []
+    while done < kills:
+        out = folder / name / "killed" / "out"
+        shutil.rmtree(out.parent, ignore_errors=True)
+        watcher, code, resume = Watcher(out, images), -1, []
+        while code != 0:
+            number = rng.choice(SIGNALS)
+            code, said = killed([*command, "-o", str(out), *resume], rng.uniform(0.0, lasts_s), number)
+            codes[str(code)] = codes.get(str(code), 0) + 1
+            done += code != 0
+            if problem := problem_of(code, said):
+                problems.append(problem)
+                break
+            resume = ["--resume"]
+        watcher.look()
+        watcher.end()
+        looks, ends = looks + watcher.looks, ends + 1
+        problems += [f"cut short: {each}" for each in sorted(watcher.cut)]
+        found = {each: comparable(path) for each, path in visible(out).items()}
+        problems += [f"differs: {each}" for each in sorted({*found, *expected}) if found.get(each) != expected.get(each)]
+    return {
+        "command": name, "kills": done, "came_to_the_end": ends, "undisturbed_s": round(lasts_s, 1),
+        "exit_codes": codes, "looks": looks, "problems": problems,
+    }  # fmt: skip
+
+
+def main() -> int:
+    """Kill, go on, compare."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", choices=("run", "rectify"))
+    options = parser.parse_args()
+    failed = False
+    with tempfile.TemporaryDirectory() as work:
+        folder = Path(work)
+        make_scene(folder)
+        photos, solution = str(folder / "photos"), str(folder / "run" / "undisturbed" / "out" / "solution.json")
+        run = [*COMMAND, "run", photos, "--camera", str(folder / "camera.json"), "--max-features", "1500", "--quiet"]
+        commands = {"run": run, "rectify": [*COMMAND, "rectify", photos, "--solution", solution, "--quiet"]}
+        for name, command in commands.items():
+            kills = options.kills if options.only in (None, name) else 0
+            found = tried(name, command, folder, kills, random.Random(options.seed))
+            print(json.dumps(found), flush=True)
+            failed |= bool(found["problems"])
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
