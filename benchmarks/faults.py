@@ -119,7 +119,13 @@ def faults(work: Path) -> Iterator[Fault]:
         out = work / name
 
         def on(
-            row: str, codes: tuple[int, ...], *, to: Path, name: str = name, command: list[str] = command, **given: object
+            row: str,
+            codes: tuple[int, ...],
+            *,
+            to: Path,
+            name: str = name,
+            command: list[str] = command,
+            **given: object,
         ) -> Fault:
             return Fault(row, name, codes, [*command, str(to)], **given)  # type: ignore[arg-type]
 
@@ -219,7 +225,9 @@ def main() -> int:
             last = lines[-1].replace(str(work), "...").replace(str(PHOTOS), "PHOTOS") if lines else ""
             if len(last) > 240:
                 last = f"{last[:80]}[...]{last[-120:]}"
-            print(f"| {fault.name} | `{fault.command}` | {code} | {seconds:.0f} | {last.replace('|', '/')} |", flush=True)
+            print(
+                f"| {fault.name} | `{fault.command}` | {code} | {seconds:.0f} | {last.replace('|', '/')} |", flush=True
+            )
     for each in failed:
         print(each, file=sys.stderr)
     return int(bool(failed))

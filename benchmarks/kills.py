@@ -46,7 +46,9 @@ def halved(camera: dict) -> dict:
     """A camera file for photos at half size; pixel centres are whole numbers."""
     half = dict(camera)
     half["width"], half["height"] = camera["width"] // 2, camera["height"] // 2
-    half["K"] = [[(each + 0.5 * (j == 2)) / 2 - 0.5 * (j == 2) for j, each in enumerate(row)] for row in camera["K"][:2]]
+    half["K"] = [
+        [(each + 0.5 * (j == 2)) / 2 - 0.5 * (j == 2) for j, each in enumerate(row)] for row in camera["K"][:2]
+    ]
     half["K"].append([0, 0, 1])
     return half
 
@@ -171,7 +173,9 @@ def tried(name: str, command: list[str], folder: Path, kills: int, rng: random.R
         looks, ends = looks + watcher.looks, ends + 1
         problems += [f"cut short: {each}" for each in sorted(watcher.cut)]
         found = {each: comparable(path) for each, path in visible(out).items()}
-        problems += [f"differs: {each}" for each in sorted({*found, *expected}) if found.get(each) != expected.get(each)]
+        problems += [
+            f"differs: {each}" for each in sorted({*found, *expected}) if found.get(each) != expected.get(each)
+        ]
     return {
         "command": name, "kills": done, "came_to_the_end": ends, "undisturbed_s": round(lasts_s, 1),
         "exit_codes": codes, "looks": looks, "problems": problems,

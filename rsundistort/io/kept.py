@@ -80,8 +80,8 @@ class Kept:
         if path is None:
             return None
         try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {key: file[key] for key in file.files}
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as values:
+                arrays = {key: values[key] for key in values.files}
             return _decoded(json.loads(arrays.pop("tree").tobytes()), arrays)
         except (OSError, ValueError, KeyError, TypeError, AttributeError, ImportError, BadZipFile, EOFError):
             return None
