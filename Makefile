@@ -25,11 +25,14 @@ demo: $(VENV)/.installed
 	@echo "Open $(OUT)/report.html in a browser: before and after, the cameras in 3-D, whether to trust it."
 	@echo "Open $(OUT)/sparse in COLMAP, or $(OUT)/transforms.json in nerfstudio."
 
+# files of tests side by side, a core each: what solves in one does not wait for what waits for a process in another
+TEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+
 test: $(VENV)/.installed
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(TEST)
 
 test-all: $(VENV)/.installed
-	$(BIN)/python -m pytest -m "slow or not slow"
+	OMP_NUM_THREADS=1 $(TEST) -m "slow or not slow"
 
 check: $(VENV)/.installed docs
 	$(BIN)/ruff format --check .

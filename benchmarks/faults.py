@@ -173,7 +173,7 @@ def faults(work: Path) -> Iterator[Fault]:
             )  # fmt: skip
         act = lambda _, to=out / "gone": shutil.rmtree(to, ignore_errors=True)  # noqa: E731
         yield on("OUT removed after the first photo", (1,), to=out / "gone", meanwhile=after_first(out / "gone", act))
-        act = lambda _, to=out / "moved": to.rename(out / "moved-away")  # noqa: E731
+        act = lambda _, to=out / "moved": to.rename(to.with_name("moved-away"))  # noqa: E731
         yield on("OUT moved after the first photo", (1,), to=out / "moved", meanwhile=after_first(out / "moved", act))
         act = lambda _, to=out / "other": move_and_replace(to)  # noqa: E731
         yield on("OUT moved, another in its place", (1,), to=out / "other", meanwhile=after_first(out / "other", act))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 import subprocess
 import sys
 import threading
@@ -222,7 +221,8 @@ def test_sigterm_ends_in_one_line_and_resume_goes_on(batch):
     command = [*COMMAND, "rectify", str(photos), "--solution", str(solution), "-o", str(out), "--jobs", "1"]
     program = (
         "import os, sys, rsundistort.batch.many_photos as m; real = m.rectify_photo\n"
-        f"def act(job):\n    if job.name == 'c.png': os.kill(os.getpid(), {int(signal.SIGTERM)}); import time; time.sleep(0.2)\n"
+        "import signal, time\n"
+        "def act(job):\n    if job.name == 'c.png': os.kill(os.getpid(), signal.SIGTERM); time.sleep(0.2)\n"
         "    return real(job)\n"
         "m.rectify_photo = act; from rsundistort_cli.__main__ import main; main()"
     )
