@@ -11,6 +11,7 @@ from .pairs import choose_pairs, global_descriptors
 from .registration import register_photos
 from .retriangulation import retriangulate
 from .sharpness import edge_width_px
+from .verification import verify_with_shutter
 
 __all__ = [
     "DETECTION_MEGAPIXELS",
@@ -34,4 +35,5 @@ __all__ = [
     "read_num_verified",
     "register_photos",
     "retriangulate",
+    "verify_with_shutter",
 ]

@@ -42,6 +42,7 @@ from ..sfm import (
     read_num_verified,
     register_photos,
     retriangulate,
+    verify_with_shutter,
 )
 from ..verdict import Verdict, judge
 from .outcome import Solved
@@ -210,7 +211,8 @@ def solve_photos(
         scratch / "database.db", photos.names, photos.features, cameras.cameras, cameras.camera_idx,
         calibrated=cameras.calibrated, seed=seed, pairs=pairs,
     )  # fmt: skip
-    log.end("matching", pairs=num_pairs if pairs is None else len(pairs), of_pairs=num_pairs)
+    spread = verify_with_shutter(matched)
+    log.end("matching", pairs=num_pairs if pairs is None else len(pairs), of_pairs=num_pairs, spread_rad=spread)
     log.begin("mapping", len(photos.names))
     mapped = map_photos(matched, lambda done: log.tell("mapping", done, len(photos.names)))
     log.end("mapping", photos=mapped.num_images, points=mapped.num_points, observations=len(mapped.observations))
