@@ -11,14 +11,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rsundistort import Camera, Observations, Reconstruction, RowMotion, Solution, SolvedImage
-from rsundistort.errors import InputError
+from rsundistort import Camera, Observations, Reconstruction, RectifyOptions, RowMotion, Solution, SolvedImage
+from rsundistort.batch.progress import StageLog
+from rsundistort.colmap.rectified_model import ModelIds
+from rsundistort.errors import FormatError, InputError, RsUndistortWarning
 from rsundistort.io.export_scene import ExportScene
 from rsundistort.io.exports import EXPORTS, check_exports
 from rsundistort.io.metashape import read_metashape
 from rsundistort.io.models import read_model
 from rsundistort.model.path import CameraPath
 from rsundistort.model.projection import project_points
+from rsundistort.solve import OutputOptions
+from rsundistort.solve.run_outputs import Outputs
 
 W, H = 640, 480
 
@@ -141,7 +145,7 @@ def test_opf_is_what_its_own_library_takes_and_read_back(tmp_path, name):
         check_poses(scene, rec.image_names, rec.R_cw, rec.center_w)
         np.testing.assert_allclose(rec.cameras[0].K, scene.camera(scene.images[0]).K, atol=1e-9)
     else:
-        assert re.search(r"the worst pixel is off by \d+\.\d px; opf-rectified is exact", said)
+        assert re.search(r"the worst pixel is off by \d+ px; opf-rectified is exact", said)
         raw = scene.solution.cameras["1"]
         np.testing.assert_allclose(rec.cameras[0].K, raw.K, atol=1e-9)
         np.testing.assert_allclose(rec.cameras[0].dist, raw.dist, atol=1e-12)
@@ -172,6 +176,34 @@ def test_opf_of_a_camera_that_only_travels_is_exact(tmp_path):
         at = camera.position + (xy[0, 1] / (H - 1) - 0.5) * camera.rolling_shutter
         again, _ = project_points((point - at) @ R_wc, raw, None, "global")
         np.testing.assert_allclose(again, xy, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda folder: (folder / "project.opf").write_text("{"), "is no OPF project"),
+        (lambda folder: (folder / "project.opf").write_text("[1]"), "is no OPF project"),
+        (lambda folder: (folder / "calibration" / "calibrated_cameras.json").unlink(), "is no OPF project"),
+        (lambda folder: (folder / "calibration" / "matchPixelCoordinates.bin").write_bytes(b""), "is no OPF project"),
+        (lambda folder: _replace(folder / "input_cameras.json", '"id": 1', '"id": 9'), "is no OPF project"),
+        (lambda folder: _replace(folder / "camera_list.json", "0.jpg", "../../x.jpg"), "inside the folder of photos"),
+        (
+            lambda folder: _replace(folder / "calibration" / "calibrated_cameras.json", "perspective", "spherical"),
+            "is spherical, expected perspective",
+        ),
+    ],
+)
+def test_a_damaged_opf_project_is_one_line(tmp_path, damage, message):
+    pytest.importorskip("pyopf")
+    EXPORTS["opf-rectified"].write(tmp_path, made())
+    damage(tmp_path)
+    with pytest.raises(FormatError, match=message) as caught:
+        read_model(tmp_path / "project.opf")
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def _replace(path: Path, old: str, new: str) -> None:
+    path.write_text(path.read_text().replace(old, new))
 
 
 # ---------------------------------------------------------------- NCore
@@ -262,6 +294,25 @@ def test_nukes_camera_shows_points_where_the_frames_do(tmp_path, clip):
 
 
 # ---------------------------------------------------------------- what is asked for
+
+
+def test_exports_lie_beside_the_other_outputs_and_one_that_fails_is_said(tmp_path):
+    """Photos that are turned: OPF has the original ones, which are not."""
+    pytest.importorskip("pyopf")
+    scene = made()
+    options = OutputOptions(exports=("metashape", "nuke", "opensfm", "opf", "opf-rectified"))
+    turns = dict.fromkeys(scene.names, 6)
+    ids = ModelIds.in_order(scene.reconstruction)
+    outputs = Outputs(scene.solution, scene.reconstruction, RectifyOptions(), options, ids, turns, with_photos=False)
+    with pytest.warns(RsUndistortWarning, match="opf: it is not written: .*--apply-orientation"):
+        turned = outputs.begin(tmp_path, StageLog(None))
+    assert not (tmp_path / "opf").exists()
+    for name in ("metashape", "opensfm", "opf-rectified"):
+        for file in EXPORTS[name].files:
+            assert (tmp_path / name / file).is_file()
+    rec = read_model(tmp_path / "opf-rectified" / "project.opf").reconstruction
+    assert (rec.cameras[0].width, rec.cameras[0].height) == (H, W)
+    np.testing.assert_allclose(rec.R_cw[0], turned.image(rec.image_names[0]).R_cw, atol=1e-9)
 
 
 def test_what_there_is_no_writer_for_is_refused():

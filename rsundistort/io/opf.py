@@ -62,7 +62,9 @@ def write_opf(folder: Path, scene: ExportScene) -> str:
         if image.taken_out is not None and stored.shutter_model != "global":
             left = max(left, rotation_left_px(camera, image.taken_out))
     _write(folder, stored, stored.cameras, images, shown, rec, rec.observations.xy_raw, scene, rolling=True)
-    said = [f"rotations during the readout have no room: the worst pixel is off by {left:.1f} px"] if left else []
+    said = []
+    if left > _TOLD_PX:
+        said.append(f"rotations during the readout have no room: the worst pixel is off by {left:.2g} px")
     if lens > _TOLD_PX:
         said.append(f"the lens has no room for all of ours: the worst pixel is off by {lens:.2g} px")
     return "; ".join(said) + ("; opf-rectified is exact" if said else "")

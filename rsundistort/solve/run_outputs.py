@@ -184,7 +184,7 @@ class Outputs:
             turns = {name: turn_of(orientations.get(name, 1), True)[0] for name in rec.image_names}
         ids = replace(ids or ModelIds.in_order(rec), cameras=solved.camera_ids)
         rec = rec.with_motions([solution.image(name).taken_out or RowMotion() for name in rec.image_names])
-        if options.rs_poses and rec.bends:
+        if (options.rs_poses or not {"ncore", "opf"}.isdisjoint(options.exports)) and rec.bends:
             solution = replace(solution, quality={**solution.quality, "rs_poses_px": _left_by_two_poses(rec)})
         return cls(solution, rec, rectifying, options, ids, turns, rgb, with_photos, times or {}, solved)
 
