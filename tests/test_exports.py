@@ -158,6 +158,18 @@ def test_opf_is_what_its_own_library_takes_and_read_back(tmp_path, name):
             np.testing.assert_allclose(rec.observations.xy_raw[mine], expected, atol=2e-3)
 
 
+@pytest.mark.parametrize("name", ["metashape", "nuke", "opensfm", "opf", "opf-rectified"])
+def test_the_same_scene_is_written_the_same(tmp_path, name):
+    if EXPORTS[name].module:
+        pytest.importorskip(EXPORTS[name].module)
+    for place in ("a", "b"):
+        EXPORTS[name].write(tmp_path / place, made())
+    files = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*") if path.is_file())
+    assert len(files) >= len(EXPORTS[name].files)
+    for file in files:
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
+
+
 def test_opf_of_a_camera_that_only_travels_is_exact(tmp_path):
     """By the formula of the paper: at the line v the camera is at `position + (v/(H-1) - 1/2) rolling_shutter`."""
     pytest.importorskip("pyopf")
@@ -224,6 +236,8 @@ def test_ncore_is_read_by_its_own_reader_with_a_pose_at_both_ends(tmp_path, read
     for image in scene.images:
         (tmp_path / image.name).parent.mkdir(exist_ok=True)
         (tmp_path / image.name).write_bytes(b"\xff\xd8 " + image.name.encode())
+    with pytest.raises(InputError, match="say where they are"):
+        EXPORTS["ncore"].write(tmp_path / "ncore", scene)
     assert EXPORTS["ncore"].write(tmp_path / "ncore", replace(scene, source=tmp_path)) == ""
     reader = SequenceComponentGroupsReader([UPath(path) for path in sorted((tmp_path / "ncore").glob("*.zarr"))])
     poses, times = reader.open_component_readers(PosesComponent.Reader)["default"].get_dynamic_pose("rig", "world")

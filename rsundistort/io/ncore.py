@@ -34,7 +34,7 @@ def write_ncore(folder: Path, scene: ExportScene) -> str:
     Raises
     ------
     InputError
-        Of photos that it cannot hold: any but JPEG and PNG.
+        Without photos, or of some that it cannot hold: any but JPEG and PNG.
     """
     from ncore.data.v4 import CameraSensorComponent, IntrinsicsComponent, PosesComponent, SequenceComponentGroupsWriter
     from ncore.impl.common.transformations import HalfClosedInterval
@@ -45,8 +45,8 @@ def write_ncore(folder: Path, scene: ExportScene) -> str:
     others = [image.name for image in images if Path(image.name).suffix.lower() not in _FORMATS]
     if others:
         raise InputError(f"{others[0]} is no JPEG or PNG, which alone NCore holds")
-    if source is None or len(images) < 1:
-        return ""
+    if source is None:
+        raise InputError("it holds the photos; say where they are (--images)")
     folder.mkdir(parents=True, exist_ok=True)
     readout_us = _readouts_us(solution)
     times, poses = [], []

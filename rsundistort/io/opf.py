@@ -16,6 +16,7 @@ from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import quote, unquote, urlparse
+from uuid import NAMESPACE_URL, uuid5
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,7 @@ _GLTF = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 # Errors of a lens that are not worth a word.
 _TOLD_PX = 0.01
 _FULL_FRAME_UM = 36e3
+_IDS = uuid5(NAMESPACE_URL, "urn:rsundistort:opf")
 
 
 def write_opf(folder: Path, scene: ExportScene) -> str:
@@ -141,16 +143,22 @@ def _write(
         R_cw, center_w, way = _middle(solution, image) if rolling else (image.R_cw, image.center_w, None)
         angles = np.degrees(Rotation.from_matrix(R_cw.T @ _FLIP).as_euler("XYZ"))
         calibrated.append(opf.CalibratedCamera(ids[image.name], sensor_id[image.camera_id], angles, center_w, way))
-    objects = ProjectObjects()
-    objects.metadata.name, objects.metadata.description = "rsundistort", "poses found by rsundistort"
     types = CoreProjectItemType
+
+    def metadata(kind: Any, name: str, *sources: Any) -> Any:
+        # the same outputs of the same inputs: ids by name, not by chance
+        return Metadata(id=uuid5(_IDS, name), type=kind, name=name, sources=list(sources))
+
+    objects = ProjectObjects()
+    objects.metadata.id = uuid5(_IDS, "project")
+    objects.metadata.name, objects.metadata.description = "rsundistort", "poses found by rsundistort"
     camera_list = opf.CameraList(
         [opf.CameraData(ids[i.name], quote(uri)) for i, uri in zip(images, shown, strict=True)]
     )
-    camera_list.metadata = Metadata(type=types.CAMERA_LIST, name="camera list")
+    camera_list.metadata = metadata(types.CAMERA_LIST, "camera list")
     inputs = opf.InputCameras(captures, sensors)
     listed = ProjectSource(id=camera_list.metadata.id, type=types.CAMERA_LIST)
-    inputs.metadata = Metadata(type=types.INPUT_CAMERAS, name="input cameras", sources=[listed])
+    inputs.metadata = metadata(types.INPUT_CAMERAS, "input cameras", listed)
     calibration = Calibration(
         calibrated_cameras_objs=[opf.CalibratedCameras(calibrated, [
             opf.CalibratedSensor(sensor_id[key], _internals(cameras[key])) for key in used
@@ -158,7 +166,7 @@ def _write(
         point_cloud_objs=[_points(rec, xy, ids, scene.colors())],
     )  # fmt: skip
     source = ProjectSource(id=inputs.metadata.id, type=types.INPUT_CAMERAS)
-    calibration.metadata = Metadata(type=types.CALIBRATION, name="calibration", sources=[source])
+    calibration.metadata = metadata(types.CALIBRATION, "calibration", source)
     objects.camera_list_objs, objects.input_cameras_objs = [camera_list], [inputs]
     objects.calibration_objs = [calibration]
     save(objects, folder / "project.opf", use_item_name_for_resource_uri=True, write_point_cloud_buffers=True)
