@@ -61,6 +61,13 @@ class ExportScene:
         """The camera of a rectified photo."""
         return self.solution.rectified_cameras[image.camera_id]
 
+    @property
+    def rectified_cameras(self) -> list[Camera]:
+        """The new camera of each camera of the reconstruction."""
+        rec, new = self.reconstruction, self.solution.rectified_cameras
+        first = [rec.image_names[int(np.argmax(rec.camera_idx == k))] for k in range(len(rec.cameras))]
+        return [new[self.solution.image(name).camera_id] for name in first]
+
     def colors(self) -> NDArray[np.uint8]:
         """(n, 3) colours of the points; black where they are unknown."""
         return np.zeros((self.reconstruction.num_points, 3), np.uint8) if self.rgb is None else self.rgb

@@ -113,12 +113,7 @@ def _exif(facts: ExifFacts, camera: Camera, key: str, model: dict[str, Any]) -> 
 
 def _tracks(scene: ExportScene, names: dict[str, str]) -> tuple[str, set[int]]:
     """The text of `tracks.csv`, and the points in it: those that two photos show."""
-    rec, colors = scene.reconstruction, scene.colors()
-    camera_of = {k: scene.solution.image(name).camera_id for k, name in enumerate(rec.image_names)}
-    rectified = [
-        scene.solution.rectified_cameras[camera_of[int(np.argmax(rec.camera_idx == k))]]
-        for k in range(len(rec.cameras))
-    ]
+    rec, colors, rectified = scene.reconstruction, scene.colors(), scene.rectified_cameras
     xy, obs = rectified_keypoints(rec, rectified), rec.observations
     written = np.array([name in names for name in rec.image_names])[obs.frame_idx] & np.isfinite(xy).all(1)
     seen_by = np.bincount(obs.point_idx[written], minlength=rec.num_points)

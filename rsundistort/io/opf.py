@@ -78,10 +78,18 @@ def write_rectified_opf(folder: Path, scene: ExportScene) -> str:
     of = {key: cameras[key] for key in {image.camera_id for image in images}}
     left = max((lens_left_px(camera, _carried(camera)) for camera in of.values()), default=0.0)
     rec = scene.reconstruction
-    ids = {k: scene.solution.image(name).camera_id for k, name in enumerate(rec.image_names)}
-    new = [cameras[ids[int(np.argmax(rec.camera_idx == k))]] for k in range(len(rec.cameras))]
     shown = [f"../images/{scene.names[image.name]}" for image in images]
-    _write(folder, scene.solution, cameras, images, shown, rec, rectified_keypoints(rec, new), scene, rolling=False)
+    _write(
+        folder,
+        scene.solution,
+        cameras,
+        images,
+        shown,
+        rec,
+        rectified_keypoints(rec, scene.rectified_cameras),
+        scene,
+        rolling=False,
+    )
     return f"two focal lengths have no room: the worst pixel is off by {left:.2g} px" if left > _TOLD_PX else ""
 
 
