@@ -19,8 +19,9 @@ from rsundistort.io.export_scene import ExportScene
 from rsundistort.io.exports import EXPORTS, check_exports
 from rsundistort.io.metashape import read_metashape
 from rsundistort.io.models import read_model
+from rsundistort.io.shutter_poses import write_shutter_poses
 from rsundistort.model.path import CameraPath
-from rsundistort.model.projection import project_points
+from rsundistort.model.projection import project_points, unproject_points
 from rsundistort.solve import OutputOptions
 from rsundistort.solve.run_outputs import Outputs
 
@@ -258,6 +259,43 @@ def test_ncore_is_read_by_its_own_reader_with_a_pose_at_both_ends(tmp_path, read
             R, center = image.motion.pose_at(clock, image.R_cw, image.center_w)
             np.testing.assert_allclose(pose[:3, :3], R.T, atol=1e-9)
             np.testing.assert_allclose(pose[:3, 3], center, atol=1e-9)
+
+
+# ---------------------------------------------------------------- gsplat
+
+
+@pytest.mark.parametrize("readout", ["top-to-bottom", "bottom-to-top", "left-to-right"])
+def test_the_loader_for_gsplat_has_the_poses_of_the_first_line_and_the_last(tmp_path, readout):
+    """The block of docs/for-splats.md, of no more than 40 lines: what a line shows is seen from its pose."""
+    import cv2
+
+    page = (Path(__file__).parent.parent / "docs" / "for-splats.md").read_text(encoding="utf-8")
+    code = re.search(r"```python\n(.*?)```", page, flags=re.S)[1].split("\n\ndata = ")[0]
+    assert len(code.splitlines()) <= 40
+    names: dict = {}
+    exec(code, names)
+    scene = made(readout=readout)
+    write_shutter_poses(tmp_path / "rs-poses", scene.stored, {image.name: image.name for image in scene.images}, "x")
+    for image in scene.images:
+        (tmp_path / image.name).parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / image.name), np.full((H, W, 3), 7, np.uint8))
+    data = names["ShutterDataset"](tmp_path, tmp_path)
+    assert (len(data), len(names["ShutterDataset"](tmp_path, tmp_path, "val"))) == (4, 1)
+    raw = scene.stored.cameras["1"]
+    ends = np.array([[W / 2, H / 2], [W / 2, H / 2]])
+    ends[:, raw.clock_axis] = [0.0, raw.num_lines - 1.0][:: int(raw.clock_sign)]
+    for k in range(4):
+        item, image = data[k], scene.images[k + 1]
+        assert (item["image"].shape, item["image"].dtype, item["image_id"]) == ((H, W, 3), np.float32, k)
+        assert item["rolling_shutter"] == f"ROLLING_{readout.upper().replace('-', '_')}"
+        assert item["K"][0, 2] == pytest.approx(raw.K[0, 2] + 0.5)
+        motion = image.motion.in_camera(image.R_cw)
+        for xy, viewmat in zip(ends, (np.linalg.inv(item["camtoworld"]), item["viewmat_rs"]), strict=True):
+            # a point on the ray of that pixel, by the pose of its line, without the shutter
+            ray, _ = unproject_points(xy[None], raw, None, "global")
+            point_w = (np.array([*ray[0], 1.0]) * 9 - viewmat[:3, 3]) @ viewmat[:3, :3]
+            found, _ = project_points(((point_w - image.center_w) @ image.R_cw.T)[None], raw, motion, "constant-motion")
+            np.testing.assert_allclose(found[0], xy, atol=2e-3)  # float32
 
 
 # ---------------------------------------------------------------- Nuke

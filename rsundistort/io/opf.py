@@ -79,17 +79,8 @@ def write_rectified_opf(folder: Path, scene: ExportScene) -> str:
     left = max((lens_left_px(camera, _carried(camera)) for camera in of.values()), default=0.0)
     rec = scene.reconstruction
     shown = [f"../images/{scene.names[image.name]}" for image in images]
-    _write(
-        folder,
-        scene.solution,
-        cameras,
-        images,
-        shown,
-        rec,
-        rectified_keypoints(rec, scene.rectified_cameras),
-        scene,
-        rolling=False,
-    )
+    xy = rectified_keypoints(rec, scene.rectified_cameras)
+    _write(folder, scene.solution, cameras, images, shown, rec, xy, scene, rolling=False)
     return f"two focal lengths have no room: the worst pixel is off by {left:.2g} px" if left > _TOLD_PX else ""
 
 
