@@ -35,7 +35,7 @@ PAGES = {
 #: others are directives of Sphinx.
 LANGUAGES = {"python", "sh", "json", "text", "{toctree}", "{public}", "{eval-rst}"}
 #: Programs that are not ours and not run.
-OTHERS = {"colmap", "docker", "gsplat", "ns-train", "pip", "mkdir", "cp"}
+OTHERS = {"colmap", "docker", "gsplat", "ns-train", "oty", "pip", "mkdir", "cp"}
 #: Commands that are understood but not run: what they need is not here.
 NOT_RUN = {
     "simulate scene": "renders for a minute; tests/test_synthetic_scene.py runs it",
