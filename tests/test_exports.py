@@ -159,6 +159,30 @@ def test_opf_is_what_its_own_library_takes_and_read_back(tmp_path, name):
             np.testing.assert_allclose(rec.observations.xy_raw[mine], expected, atol=2e-3)
 
 
+@pytest.mark.parametrize("name", ["opf-rectified", "nuke"])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("off", [0.0, 1e-9])
+def test_a_pose_whose_angles_fall_together_is_kept(tmp_path, name, axis, off):
+    """Straight down, or to the side: the middle angle is 90 degrees."""
+    if EXPORTS[name].module:
+        pytest.importorskip(EXPORTS[name].module)
+    scene = made()
+    R = Rotation.from_rotvec(np.eye(3)[axis] * (np.pi / 2 - off)).as_matrix()
+    images = [replace(image, R_cw=R if k % 2 else R.T) for k, image in enumerate(scene.solution.images)]
+    scene = replace(scene, solution=replace(scene.solution, images=tuple(images)))
+    EXPORTS[name].write(tmp_path, scene)
+    if name == "nuke":
+        turns = np.radians(np.loadtxt(tmp_path / "camera.chan")[:, 4:7]).T
+        by_x, by_y, by_z = (Rotation.from_rotvec(np.outer(turns[k], np.eye(3)[k])) for k in range(3))
+        turned = (by_y * by_x * by_z).as_matrix()
+        flip = np.diag([1, -1, -1])
+        found = (flip @ turned @ flip).transpose(0, 2, 1)
+    else:
+        found = read_model(tmp_path / "project.opf").reconstruction.R_cw
+    images = sorted(images, key=lambda image: image.name) if name == "nuke" else images
+    np.testing.assert_allclose(found, [image.R_cw for image in images], atol=1e-9)
+
+
 @pytest.mark.parametrize("name", ["metashape", "nuke", "opensfm", "opf", "opf-rectified"])
 def test_the_same_scene_is_written_the_same(tmp_path, name):
     if EXPORTS[name].module:

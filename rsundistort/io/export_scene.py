@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ..model import Camera, Reconstruction, RowMotion, Solution, SolvedImage
 from ..model.path import CameraPath
 from ..model.projection import project_points, unproject_points
 
-__all__ = ["ExportScene", "lens_left_px", "rotation_left_px"]
+__all__ = ["ExportScene", "euler_deg", "lens_left_px", "rotation_left_px"]
 
 # Places on each side of a photo where errors are looked at.
 _LOOKED_AT = 17
@@ -71,6 +74,13 @@ class ExportScene:
     def colors(self) -> NDArray[np.uint8]:
         """(n, 3) colours of the points; black where they are unknown."""
         return np.zeros((self.reconstruction.num_points, 3), np.uint8) if self.rgb is None else self.rgb
+
+
+def euler_deg(rotations: NDArray[np.float64], order: Literal["XYZ", "zxy"]) -> NDArray[np.float64]:
+    """(..., 3) Euler angles of matrices (..., 3, 3), degrees; where two axes fall together, the third angle is zero."""
+    with warnings.catch_warnings():  # gimbal lock: the angles given stand for the matrix all the same, to 1e-9
+        warnings.simplefilter("ignore", UserWarning)
+        return np.asarray(np.degrees(Rotation.from_matrix(rotations).as_euler(order)))
 
 
 def _places(camera: Camera) -> NDArray[np.float64]:

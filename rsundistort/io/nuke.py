@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ..model import Camera
-from .export_scene import ExportScene
+from .export_scene import ExportScene, euler_deg
 from .usd import FILM_WIDTH, FLIP
 
 __all__ = ["write_nuke"]
@@ -42,8 +41,7 @@ def write_nuke(folder: Path, scene: ExportScene) -> str:
         center_w = np.array([image.center_w for image in images]).reshape(-1, 3)
     # camera to world, y up in both; Nuke turns about z first, then x, then y: R = Ry Rx Rz
     turned = FLIP @ R_cw.transpose(0, 2, 1) @ FLIP
-    angles = Rotation.from_matrix(turned).as_euler("zxy")[:, [1, 2, 0]]
-    angles = np.degrees(np.unwrap(angles, axis=0))
+    angles = np.unwrap(euler_deg(turned, "zxy")[:, [1, 2, 0]], axis=0, period=360)
     centers = center_w @ FLIP
     lens = np.array([_lens(camera) for camera in cameras]).reshape(-1, 6)
     (folder / "camera.nk").write_text(_script(frames, centers, angles, lens, cameras), encoding="utf-8")

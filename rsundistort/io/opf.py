@@ -27,7 +27,7 @@ from ..colmap.measured_model import ColmapModel
 from ..colmap.rectified_model import rectified_keypoints
 from ..errors import FormatError, InputError
 from ..model import Camera, Observations, Reconstruction, Solution, SolvedImage
-from .export_scene import ExportScene, lens_left_px, rotation_left_px
+from .export_scene import ExportScene, euler_deg, lens_left_px, rotation_left_px
 from .photos.exif_facts import ExifFacts, read_exif
 
 __all__ = ["opf_model", "write_opf", "write_rectified_opf"]
@@ -140,7 +140,7 @@ def _write(
         captures.append(_capture(Uid64(int=1 + k), sensor_id[image.camera_id], facts))
         assert image.R_cw is not None
         R_cw, center_w, way = _middle(solution, image) if rolling else (image.R_cw, image.center_w, None)
-        angles = np.degrees(Rotation.from_matrix(R_cw.T @ _FLIP).as_euler("XYZ"))
+        angles = euler_deg(R_cw.T @ _FLIP, "XYZ")
         calibrated.append(opf.CalibratedCamera(ids[image.name], sensor_id[image.camera_id], angles, center_w, way))
     types = CoreProjectItemType
 
