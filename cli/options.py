@@ -18,6 +18,7 @@ INTERPOLATION_NAMES = ("cubic", "linear", "lanczos", "nearest")
 MAP_KIND_NAMES = ("npz", "exr", "stmap")
 FRAMES_NAMES = ("key", "all")
 MATCHING_NAMES = ("auto", "exhaustive", "neighbours")
+EXPORT_NAMES = ("metashape", "ncore", "nuke", "opensfm", "opf", "opf-rectified")
 
 
 class LocalPath(click.Path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, overload
@@ -22,6 +22,7 @@ from ..errors import FileError, InputError, ReconstructionError, RsUndistortWarn
 from ..input.gyroscope import known_readouts
 from ..input.photo_cameras import PhotoCameras, check_readouts
 from ..io import ExifFacts, guess_readouts, list_photos, output_folder, output_name, read_exif
+from ..io.metashape import is_metashape
 from ..io.models import read_model
 from ..io.photos.images import stored_size
 from ..io.places import local_place
@@ -29,6 +30,7 @@ from ..io.record import Record
 from ..model import Reconstruction, Solution
 from ..model.orientation import INVERSE, turn_reconstruction
 from ..sfm import matched_of_database
+from .from_poses import measured, posed_photos
 from .model_sequence import Feedback, solve_tracks
 from .outcome import Solved
 from .run_options import OutputOptions, SolveOptions
@@ -96,8 +98,8 @@ def solve(
     ----------
     model : path or pycolmap.Reconstruction
         Folder of a COLMAP model, text or binary; or `sfm_data.json` of OpenMVG, or `reconstruction.json` of OpenSfM
-        with `tracks.csv` beside it. A `pycolmap.Reconstruction` stays as it is; its keypoints must be pixels of the
-        photos as the sensor stored them.
+        with `tracks.csv` beside it; or `cameras.xml` of Metashape, for which `images` are measured. A
+        `pycolmap.Reconstruction` stays as it is; its keypoints must be pixels of the photos as the sensor stored them.
     out : path
         Folder for the outputs, as of `run`; for a model in files.
     options : SolveOptions, optional
@@ -164,18 +166,25 @@ def _solve_files(
         raise InputError(f"{model} is no COLMAP model, and --database is COLMAP's; leave it out")
     log = StageLog(progress)
     inputs = inputs_of(rectify, model, folder, database)
-    with output_folder(out, overwrite=overwrite, apart_from=inputs, replaced=REPLACED) as scratch:
+    with (
+        output_folder(out, overwrite=overwrite, apart_from=inputs, replaced=REPLACED) as scratch,
+        tempfile.TemporaryDirectory() as work,
+    ):
         log.begin("model")
-        given = read_model(model)
-        names = [] if folder is None else given.reconstruction.image_names
-        Record(out).check(files_of_run(names, rectify.raw_as, outputs), inputs)
+
+        def check(names: Sequence[str]) -> None:
+            Record(out).check(files_of_run(names, rectify.raw_as, outputs), inputs)
+
+        given, feedback = _given(model, folder, check, options.seed, rectify, workers, Path(work), log)
         photos = {} if folder is None else _look_at(folder, given.reconstruction)
         given, said = _in_stored_frame(given, photos)
         if folder is not None:
             given = replace(given, unregistered=_others_in(folder, given, rectify.raw_as))
         log.end("model", photos=given.reconstruction.num_images, points=given.reconstruction.num_points)
         facts = {name: fact for name, (_, fact) in photos.items()}
-        solved, ids, rgb = _solve(given, str(model), facts, options, None if database is None else Path(database), log)
+        solved, ids, rgb = _solve(
+            given, str(model), facts, options, None if database is None else Path(database), log, feedback
+        )
         facts_of_model = {
             "frame": said,
             "points": given.reconstruction.num_points,
@@ -192,6 +201,30 @@ def _solve_files(
         return written.rectify(folder, out, workers, log)
     written.report(out, workers.jobs, log)
     return solution
+
+
+def _given(
+    model: Path,
+    folder: Path | None,
+    check: Callable[[Sequence[str]], None],
+    seed: int,
+    rectify: RectifyOptions,
+    workers: Workers,
+    work: Path,
+    log: StageLog,
+) -> tuple[ColmapModel, Feedback | None]:
+    """The model; of one that holds poses only, measured in its photos, and what its tracks can be rebuilt from.
+
+    `check` is told the photos that will be rectified, before any of them is read.
+    """
+    if is_metashape(model):
+        posed = posed_photos(model, folder, rectify.raw_as)
+        assert folder is not None
+        check(posed.labels)
+        return measured(posed, folder, rectify, seed, workers, work, log)
+    given = read_model(model)
+    check([] if folder is None else given.reconstruction.image_names)
+    return given, None
 
 
 def _solve_in_memory(
@@ -309,6 +342,7 @@ def _solve(
     options: SolveOptions,
     database: Path | None,
     log: StageLog,
+    feedback: Feedback | None = None,
 ) -> tuple[Solved, ModelIds, PointRgb]:
     if given.reconstruction.num_images < 3:
         raise ReconstructionError(
@@ -324,11 +358,11 @@ def _solve(
         return replace(options.options_for(cameras), outlier_sigma=_OUTLIER_SIGMA)
 
     with tempfile.TemporaryDirectory() as work:
-        matched = None
         if database is not None:
             log.begin("database")
             matched = matched_of_database(database, Path(work) / "database.db", rec, options.seed)
             log.end("database", keypoints=sum(len(found.xy_raw) for found in matched.features))
+            feedback = Feedback(matched)
         solved = solve_tracks(
             rec,
             cameras,
@@ -337,7 +371,7 @@ def _solve(
             options_of,
             log,
             options.remedy,
-            None if matched is None else Feedback(matched),
+            feedback,
         )
     after = solved.shared
     for text in cameras.contradicted(after.cameras, options_of(after)):
