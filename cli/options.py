@@ -18,6 +18,7 @@ INTERPOLATION_NAMES = ("cubic", "linear", "lanczos", "nearest")
 MAP_KIND_NAMES = ("npz", "exr", "stmap")
 FRAMES_NAMES = ("key", "all")
 MATCHING_NAMES = ("auto", "exhaustive", "neighbours")
+EXPORT_NAMES = ("metashape", "ncore", "nuke", "opensfm", "opf", "opf-rectified")
 
 #: What an interruption leaves of a work that can be gone on with.
 GOES_ON = "what is done is whole, the same command with --resume goes on"

@@ -33,12 +33,12 @@ from .terminal import Talk, errors_for_people, progress_bars
 def command(
     model: Path, out: Path, images: Path | None, database: Path | None, given: dict[str, Any], talk: Talk
 ) -> None:
-    """Find how the camera moved during each photo's readout, from a model of COLMAP, OpenMVG or OpenSfM.
+    """Find how the camera moved during each photo's readout, from a model of another program.
 
-    MODEL is the folder of a COLMAP model, text or binary, OpenMVG's sfm_data.json, or OpenSfM's reconstruction.json
-    with tracks.csv beside it. OUT gets what `rsundistort run` writes; images/ and masks/ if
-    --images says where the photos are. Cameras of the model are the groups of --readout: --readout "camera
-    1=left-to-right".
+    MODEL is the folder of a COLMAP model, text or binary, OpenMVG's sfm_data.json, OpenSfM's reconstruction.json with
+    tracks.csv beside it, an OPF project, or Metashape's cameras.xml, for which the photos are measured. OUT gets what
+    `rsundistort run` writes; images/ and masks/ if --images says where the photos are. Cameras of the model are the
+    groups of --readout: --readout "camera 1=left-to-right".
     """
     with errors_for_people(opt.GOES_ON) as warned, progress_bars(talk) as progress:
         from rsundistort.solve import solve

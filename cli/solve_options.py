@@ -114,6 +114,14 @@ solve_options = opt.gathered(
         is_flag=True,
         help="Of a video: OUT/camera.usda, the camera at every frame and the points of the scene, for Blender.",
     ),
+    click.option(
+        "--export",
+        "exports",
+        multiple=True,
+        type=click.Choice(opt.EXPORT_NAMES),
+        help="Write OUT/NAME for another program: metashape (cameras.xml), opensfm (a project, for ODM), opf (Pix4D, "
+        "the original photos) and opf-rectified, ncore (3DGUT), nuke (camera.nk). May be repeated.",
+    ),
     opt.seed_option,
     opt.jobs_option,
     opt.scheduler_option,

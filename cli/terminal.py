@@ -144,8 +144,8 @@ def errors_for_people(kept: str = "nothing was written") -> Iterator[Said]:
             _fail("the memory does not suffice; close other programs, or give --jobs 1")
         except OSError as error:
             where = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
-            said = error.strerror or " ".join(map(str, filter(None, error.args)))
-            _fail(f"{where}{said or 'the system gives no more memory, threads or files'}")
+            why = error.strerror or " ".join(map(str, filter(None, error.args)))
+            _fail(f"{where}{why or 'the system gives no more memory, threads or files'}")
 
 
 def _fail(text: str) -> NoReturn:

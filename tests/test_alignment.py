@@ -8,8 +8,8 @@ import pytest
 
 from rsundistort.model import Camera, Observations, Reconstruction
 from rsundistort.sfm import PatchPlaces, align_tracks, allowed_patches, cut_patches
+from rsundistort.sfm.epipolar import sampson_distance
 from rsundistort.sfm.features import SIFT_PX
-from rsundistort.sfm.retriangulation import sampson_distance
 
 CAMERA = Camera(320, 240, [[300, 0, 159.5], [0, 300, 119.5], [0, 0, 1]])
 

@@ -92,9 +92,16 @@ def test_wrong_use_is_exit_code_2(invoke, tmp_path, args):
 
 
 def test_choices_are_those_of_the_library():
-    from rsundistort_cli.options import INTERPOLATION_NAMES, MAP_KIND_NAMES, MATCHING_NAMES, READOUT_NAMES
+    from rsundistort_cli.options import (
+        EXPORT_NAMES,
+        INTERPOLATION_NAMES,
+        MAP_KIND_NAMES,
+        MATCHING_NAMES,
+        READOUT_NAMES,
+    )
 
     from rsundistort.input.pairing import MATCHINGS
+    from rsundistort.io.exports import EXPORTS
     from rsundistort.model import READOUTS
     from rsundistort.rectify import INTERPOLATIONS, MAP_KINDS
 
@@ -102,6 +109,7 @@ def test_choices_are_those_of_the_library():
     assert set(INTERPOLATION_NAMES) == set(INTERPOLATIONS)
     assert set(MAP_KIND_NAMES) == set(MAP_KINDS)
     assert MATCHING_NAMES == MATCHINGS
+    assert tuple(EXPORTS) == EXPORT_NAMES
 
 
 # ---------------------------------------------------------------- analyze

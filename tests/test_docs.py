@@ -20,6 +20,7 @@ from rsundistort_cli.main import cli
 
 import rsundistort as rs
 from rsundistort.io import read_camera_file
+from rsundistort.solve import OutputOptions
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = {
@@ -34,7 +35,7 @@ PAGES = {
 #: others are directives of Sphinx.
 LANGUAGES = {"python", "sh", "json", "text", "{toctree}", "{public}", "{eval-rst}"}
 #: Programs that are not ours and not run.
-OTHERS = {"colmap", "gsplat", "ns-train", "pip", "mkdir", "cp"}
+OTHERS = {"colmap", "docker", "gsplat", "ns-train", "oty", "pip", "mkdir", "cp"}
 #: Commands that are understood but not run: what they need is not here.
 NOT_RUN = {
     "simulate scene": "renders for a minute; tests/test_synthetic_scene.py runs it",
@@ -45,6 +46,7 @@ NOT_RUN = {
     "run --frames": "tests/test_clip_outputs.py runs it",
     "readout": "tests/test_clip_outputs.py runs it",
     "run --gyro": "tests/test_gyro.py runs it",
+    "run --export ncore": "needs an extra of 3 GB; tests/test_exports.py runs it where that is",
 }
 
 
@@ -145,7 +147,10 @@ def prepared(tmp_path_factory):
     K = [[400.0, 0.0, 243.0], [0.0, 400.0, 156.375], [0.0, 0.0, 1.0]]
     (place / "camera.json").write_text(json.dumps({"width": 480, "height": 320, "K": K, "dist": []}))
     np.savetxt(place / "K.txt", K)
-    rs.run(place / "PHOTOS", place / "OUT", rs.RunOptions(solve=rs.SolveOptions(shutter_model="rotation")), jobs=2)
+    solving = rs.SolveOptions(shutter_model="rotation")
+    outputs = OutputOptions(rs_poses=True, exports=("metashape", "nuke", "opensfm"))
+    rs.run(place / "PHOTOS", place / "OUT", rs.RunOptions(solve=solving, outputs=outputs), jobs=2)
+    shutil.copy(place / "OUT" / "metashape" / "cameras.xml", place)
     shutil.copytree(place / "OUT" / "sparse", place / "MODEL")
     shutil.copytree(place / "PHOTOS", place / "STILL")
     shutil.copytree(place / "PHOTOS", place / "SWUNG")

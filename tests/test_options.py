@@ -74,6 +74,7 @@ OUTPUTS = [
     (["--sparse-format", "txt"], {"sparse_format": "txt"}),
     (["--rs-poses"], {"rs_poses": True}),
     (["--usd"], {"usd": True}),
+    (["--export", "nuke", "--export", "opensfm"], {"exports": ("nuke", "opensfm")}),
     (["--no-report"], {"report": False}),
 ]
 WORK = [

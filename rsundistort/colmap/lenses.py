@@ -13,7 +13,14 @@ from ..model import Camera
 from ..model.projection import project_points
 from .conventions import HALF, import_pycolmap
 
-__all__ = ["camera_from_colmap", "camera_to_colmap", "pinhole_to_colmap", "refined_camera"]
+__all__ = [
+    "FIT_PX",
+    "camera_from_colmap",
+    "camera_to_colmap",
+    "nearest_camera",
+    "pinhole_to_colmap",
+    "refined_camera",
+]
 
 # COLMAP's camera models that are ours with some of the coefficients zero: the lens, the number of coefficients
 _LENSES = {
@@ -31,7 +38,7 @@ _LENSES = {
 }
 
 #: How far a camera that is fitted to one of another model may be off anywhere in the photo.
-_FIT_PX = 0.05
+FIT_PX = 0.05
 
 
 def camera_from_colmap(found: Any, where: str) -> Camera:
@@ -59,37 +66,66 @@ def _fitted_camera(found: Any, where: str) -> Camera:
     Lenses of FOV or a division model bend rays by a smooth function of the radius, which four coefficients of a fisheye
     or six of a rational lens follow closely; prisms they do not.
     """
-    from scipy.optimize import least_squares  # late: ten megabytes that hardly anybody needs
-
     width, height = found.width, found.height
     x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(0, width, 41), np.linspace(0, height, 31)))
     xy = np.column_stack([x, y])
     rays = np.array(found.cam_from_img(xy), np.float64) if found.model_name != "EQUIRECTANGULAR" else xy[:0]
     best, miss = None, np.inf
     if len(rays) and rays.shape[1] == 2 and np.isfinite(rays).all():
-        K0 = [found.mean_focal_length(), found.mean_focal_length(), found.principal_point_x, found.principal_point_y]
-        for lens, length in (("fisheye", 4), ("pinhole", 8)):
-
-            def camera_of(p: NDArray[np.float64], lens: str = lens) -> Camera:
-                K = np.array([[p[0], 0, p[2] - HALF], [0, p[1], p[3] - HALF], [0, 0, 1]])
-                return Camera(width, height, K, p[4:], lens=lens)
-
-            def error_px(p: NDArray[np.float64], camera_of: Any = camera_of) -> NDArray[np.float64]:
-                ahead = np.column_stack([rays, np.ones(len(rays))])
-                seen = project_points(ahead, camera_of(p), None, "global")[0] + HALF
-                return np.nan_to_num(seen - xy, nan=1e3, posinf=1e3, neginf=-1e3).ravel()
-
-            try:
-                p = least_squares(error_px, [*K0, *np.zeros(length)], x_scale="jac", max_nfev=200).x
-                now = float(np.abs(error_px(p)).max())
-                if now < miss:
-                    best, miss = camera_of(p), now
-            except ValueError:
-                continue
-    if best is None or miss > _FIT_PX:
-        near = "" if best is None else f", which no camera of ours follows to {_FIT_PX} px (to {miss:.2g} px)"
+        f, cx, cy = found.mean_focal_length(), found.principal_point_x - HALF, found.principal_point_y - HALF
+        best, miss = nearest_camera(
+            rays, xy - HALF, Camera(width, height, np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]]))
+        )
+    if best is None or miss > FIT_PX:
+        near = "" if best is None else f", which no camera of ours follows to {FIT_PX} px (to {miss:.2g} px)"
         raise FormatError(f"{where} is {found.model_name}{near}; expected one of {', '.join(_LENSES)}")
     return best
+
+
+def nearest_camera(
+    rays: NDArray[np.float64], xy_raw: NDArray[np.float64], start: Camera
+) -> tuple[Camera | None, float]:
+    """The camera of ours that shows rays nearest to given pixels, and by how many pixels the worst one misses.
+
+    Parameters
+    ----------
+    rays : (n, 2) array
+        Normalized coordinates.
+    xy_raw : (n, 2) array
+        Where the photo shows them, integer centres.
+    start : Camera
+        Size, and the K to begin with.
+
+    Returns
+    -------
+    camera : Camera or None
+        Of a fisheye or a rational lens, whichever misses less; None where neither can be.
+    miss_px : float
+        The largest error in x or y.
+    """
+    from scipy.optimize import least_squares  # late: ten megabytes that hardly anybody needs
+
+    best, miss = None, np.inf
+    ahead = np.column_stack([rays, np.ones(len(rays))])
+    K0 = [start.K[0, 0], start.K[1, 1], start.K[0, 2], start.K[1, 2]]
+    for lens, length in (("fisheye", 4), ("pinhole", 8)):
+
+        def camera_of(p: NDArray[np.float64], lens: str = lens) -> Camera:
+            K = np.array([[p[0], 0, p[2]], [0, p[1], p[3]], [0, 0, 1]])
+            return Camera(start.width, start.height, K, p[4:], lens=lens)
+
+        def error_px(p: NDArray[np.float64], camera_of: Any = camera_of) -> NDArray[np.float64]:
+            seen = project_points(ahead, camera_of(p), None, "global")[0]
+            return np.nan_to_num(seen - xy_raw, nan=1e3, posinf=1e3, neginf=-1e3).ravel()
+
+        try:
+            p = least_squares(error_px, [*K0, *np.zeros(length)], x_scale="jac", max_nfev=200).x
+            now = float(np.abs(error_px(p)).max())
+            if now < miss:
+                best, miss = camera_of(p), now
+        except ValueError:
+            continue
+    return best, miss
 
 
 def pinhole_to_colmap(camera: Camera, camera_id: int) -> Any:

@@ -152,6 +152,7 @@ def load_photos(
     max_megapixels: float = MAX_MEGAPIXELS,
     least: int = 3,
     kept: Kept | None = None,
+    only: Sequence[str] | None = None,
 ) -> LoadedPhotos:
     """Read every photo of a folder once, for its size and features; unusable ones are skipped with a warning.
 
@@ -173,11 +174,13 @@ def load_photos(
         As in `RectifyOptions`.
     least : int
         Photos that there must be, two or three.
+    only : sequence of str, optional
+        Photos that are loaded; all that are there when left out.
     kept : Kept, optional
         What was found before, and takes what is found.
     """
     kept = kept or Kept()
-    listed = list_photos(folder, raw_as)
+    listed = list_photos(folder, raw_as) if only is None else list(only)
     if len(listed) < least:
         raise InputError(
             f"{folder} holds {len(listed)} photo{'s' * (len(listed) > 1)}; the shutter needs at least {_NUMBERS[least]}"

@@ -9,12 +9,13 @@ from ..errors import FileError, FormatError, InputError
 from .json_text import read_json
 from .openmvg import openmvg_model
 from .opensfm import opensfm_model
+from .opf import opf_model
 
 __all__ = ["read_model"]
 
 
 def read_model(path: Path) -> ColmapModel:
-    """The model of a folder (COLMAP), or of a JSON file (OpenMVG's sfm_data.json, OpenSfM's reconstruction.json).
+    """The model of a folder (COLMAP), or of a file: OpenMVG's sfm_data.json, OpenSfM's reconstruction.json, OPF.
 
     Raises
     ------
@@ -24,6 +25,8 @@ def read_model(path: Path) -> ColmapModel:
     path = Path(path)
     if not path.is_file():
         return read_colmap_model(path)
+    if path.suffix.lower() == ".opf":
+        return opf_model(path).once_a_photo()
     mend = "give the folder of a COLMAP model, OpenMVG's sfm_data.json or OpenSfM's reconstruction.json"
     try:
         value = read_json(path)

@@ -14,7 +14,7 @@ from ..model import Camera, RowMotion, Solution, SolvedImage
 from ..model.projection import clock_of
 from .nerfstudio import camera_to_world, write_frames
 
-__all__ = ["write_shutter_poses"]
+__all__ = ["end_poses", "write_shutter_poses"]
 
 #: instant-ngp's time of a pixel: A + B u + C v + D (blur), with u and v from 0 to 1 between the borders of the photo.
 _NGP_SHUTTER = {
@@ -120,6 +120,16 @@ def _pose(solution: Solution, image: SolvedImage, clock: float) -> Pose:
     return motion.pose_at(clock, *pose)
 
 
+def end_poses(solution: Solution, image: SolvedImage) -> tuple[Pose, Pose]:
+    """R_cw and center_w at the centres of the lines of a photo that are read first and last.
+
+    Of the steady motion that is nearest; `image` is in the stored frame.
+    """
+    camera = solution.cameras[image.camera_id]
+    first, last = (_pose(solution, image, _clock(camera, place, border=0.0)) for place in (-0.5, 0.5))
+    return first, last
+
+
 def _bent(solution: Solution, image: SolvedImage, clock: float) -> Pose:
     """The pose that a line has, and not that of the nearest steady motion."""
     assert image.R_cw is not None
@@ -136,10 +146,7 @@ def _viewmat(pose: Pose) -> NDArray[np.float64]:
 
 def _write_gsplat(path: Path, solution: Solution, images: Sequence[SolvedImage], cameras: Sequence[Camera]) -> None:
     """Arguments of gsplat's `rasterization`, a row for each photo."""
-    ends = [
-        [_viewmat(_pose(solution, image, _clock(camera, place, border=0.0))) for place in (-0.5, 0.5)]
-        for image, camera in zip(images, cameras, strict=True)
-    ]
+    ends = [[_viewmat(pose) for pose in end_poses(solution, image)] for image in images]
     viewmats = np.array(ends).reshape(-1, 2, 4, 4)
     lines: dict[str, Any] = {}
     if any(_motion(solution, image).bend is not None for image in images):

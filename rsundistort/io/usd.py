@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from ..model import Camera
 from ..model.path import CameraPath
 
-__all__ = ["write_usd_camera"]
+__all__ = ["FILM_WIDTH", "FLIP", "write_usd_camera"]
 
-# Units of the film back: tenths of a unit of the world by USD's rule, of which only ratios matter.
-_FILM_WIDTH = 36.0
-# Camera axes of USD (right, up, back) in ours (right, down, ahead).
-_FLIP = np.diag([1.0, -1.0, -1.0])
+#: Units of the film back: tenths of a unit of the world by USD's rule, of which only ratios matter.
+FILM_WIDTH = 36.0
+#: Camera axes of USD (right, up, back) in ours (right, down, ahead).
+FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def write_usd_camera(
@@ -53,10 +53,10 @@ def write_usd_camera(
     root = UsdGeom.Xform.Define(stage, "/World")
     stage.SetDefaultPrim(root.GetPrim())
     prim = UsdGeom.Camera.Define(stage, "/World/Camera")
-    mm = _FILM_WIDTH / camera.width
+    mm = FILM_WIDTH / camera.width
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
     prim.CreateFocalLengthAttr(float(fx * mm))
-    prim.CreateHorizontalApertureAttr(_FILM_WIDTH)
+    prim.CreateHorizontalApertureAttr(FILM_WIDTH)
     prim.CreateVerticalApertureAttr(float(camera.height * mm * fx / fy))
     prim.CreateHorizontalApertureOffsetAttr(float((camera.width / 2 - (cx + 0.5)) * mm))
     prim.CreateVerticalApertureOffsetAttr(float(((cy + 0.5) - camera.height / 2) * mm * fx / fy))
@@ -65,11 +65,11 @@ def write_usd_camera(
     pose = prim.AddTransformOp()
     for time, R_cw, center_w in zip(code.tolist(), camera_path.R_cw, camera_path.center_w, strict=True):
         matrix = np.eye(4)  # of row vectors
-        matrix[:3, :3] = _FLIP @ R_cw @ _FLIP
-        matrix[3, :3] = _FLIP @ center_w
+        matrix[:3, :3] = FLIP @ R_cw @ FLIP
+        matrix[3, :3] = FLIP @ center_w
         pose.Set(Gf.Matrix4d(matrix.tolist()), Usd.TimeCode(time))
     cloud = UsdGeom.Points.Define(stage, "/World/Points")
-    cloud.CreatePointsAttr([Gf.Vec3f(*each) for each in (points_w @ _FLIP).tolist()])
+    cloud.CreatePointsAttr([Gf.Vec3f(*each) for each in (points_w @ FLIP).tolist()])
     cloud.CreateWidthsAttr([2e-3 * size])
     cloud.SetWidthsInterpolation(UsdGeom.Tokens.constant)
     prim.GetPrim().CreateAttribute("rsundistort:worldTurned", Sdf.ValueTypeNames.String).Set("y and z negated")

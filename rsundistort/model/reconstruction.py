@@ -259,6 +259,33 @@ class Reconstruction:
                 return rec
             rec = rec.take_photos(keep)
 
+    def with_photos(
+        self,
+        names: Sequence[str],
+        camera_idx: NDArray[np.int64],
+        R_cw: NDArray[np.float64],
+        center_w: NDArray[np.float64],
+        phi: NDArray[np.float64],
+    ) -> Reconstruction:
+        """The reconstruction with more photos at its end, that turn steadily and have no measurements yet."""
+        more = len(names)
+
+        def and_zeros(values: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.concatenate([values, np.zeros((more, *values.shape[1:]))])
+
+        return replace(
+            self,
+            image_names=[*self.image_names, *names],
+            camera_idx=np.concatenate([self.camera_idx, camera_idx]),
+            R_cw=np.concatenate([self.R_cw, R_cw]),
+            center_w=np.concatenate([self.center_w, center_w]),
+            phi=np.concatenate([self.phi, phi]),
+            velocity=and_zeros(self.velocity),
+            variation=and_zeros(self.variation),
+            bend=and_zeros(self.bend),
+            bend_clock=and_zeros(self.bend_clock),
+        )
+
     def take_photos(self, keep: NDArray[np.bool_]) -> Reconstruction:
         """The reconstruction with some photos (m,) only, and the points that two of them show."""
         obs = self.observations.select(keep[self.observations.frame_idx])

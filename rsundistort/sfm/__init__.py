@@ -2,13 +2,16 @@
 
 from .alignment import PatchPlaces, PatchSource, align_tracks, allowed_patches, cut_patches
 from .database import MatchedPhotos
+from .epipolar import read_num_verified
 from .features import DETECTION_MEGAPIXELS, Features, detect_features, detection_bytes, grey_8_bit
 from .imported import matched_of_database
 from .mapping import LEAST_MEASUREMENTS, map_photos
 from .matching import match_photos
 from .pairs import choose_pairs, global_descriptors
+from .registration import register_photos
 from .retriangulation import retriangulate
 from .sharpness import edge_width_px
+from .verification import verify_with_shutter
 
 __all__ = [
     "DETECTION_MEGAPIXELS",
@@ -29,5 +32,8 @@ __all__ = [
     "map_photos",
     "match_photos",
     "matched_of_database",
+    "read_num_verified",
+    "register_photos",
     "retriangulate",
+    "verify_with_shutter",
 ]

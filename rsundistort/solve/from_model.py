@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, overload
@@ -21,6 +21,7 @@ from ..errors import FileError, InputError, ReconstructionError, RsUndistortWarn
 from ..input.gyroscope import known_readouts
 from ..input.photo_cameras import PhotoCameras, check_readouts
 from ..io import ExifFacts, guess_readouts, list_photos, output_folder, output_name, read_exif, read_solution
+from ..io.metashape import is_metashape
 from ..io.models import read_model
 from ..io.outputs import work_folder
 from ..io.photos.images import stored_size
@@ -29,6 +30,7 @@ from ..io.record import Record
 from ..model import Reconstruction, Solution
 from ..model.orientation import INVERSE, turn_reconstruction
 from ..sfm import matched_of_database
+from .from_poses import measured, posed_photos
 from .going_on import RunFolder, key_of, run_folder
 from .model_sequence import Feedback, solve_tracks
 from .outcome import Solved
@@ -99,8 +101,8 @@ def solve(
     ----------
     model : path or pycolmap.Reconstruction
         Folder of a COLMAP model, text or binary; or `sfm_data.json` of OpenMVG, or `reconstruction.json` of OpenSfM
-        with `tracks.csv` beside it. A `pycolmap.Reconstruction` stays as it is; its keypoints must be pixels of the
-        photos as the sensor stored them.
+        with `tracks.csv` beside it; or `cameras.xml` of Metashape, for which `images` are measured. A
+        `pycolmap.Reconstruction` stays as it is; its keypoints must be pixels of the photos as the sensor stored them.
     out : path
         Folder for the outputs, as of `run`; for a model in files.
     options : SolveOptions, optional
@@ -183,7 +185,17 @@ def _solve_files(
             again = overwrite or before.goes_on
             with output_folder(out, overwrite=again, apart_from=inputs, replaced=REPLACED) as scratch:
                 written = _outputs_of(
-                    model, out, folder, database, options, rectify, outputs, files_in=inputs, log=log, before=before
+                    model,
+                    out,
+                    folder,
+                    database,
+                    options,
+                    rectify,
+                    outputs,
+                    files_in=inputs,
+                    workers=workers,
+                    log=log,
+                    before=before,
                 )
                 solution = written.begin(scratch, log)
             before.begin()
@@ -203,36 +215,68 @@ def _outputs_of(
     outputs: OutputOptions,
     *,
     files_in: Sequence[Path],
+    workers: Workers,
     log: StageLog,
     before: RunFolder,
 ) -> Outputs:
     """What is to be written of a model, unless it was kept."""
-    log.begin("model")
-    given = read_model(model)
-    names = [] if folder is None else given.reconstruction.image_names
-    Record(out).check(files_of_run(names, rectify.raw_as, outputs), files_in)
     before.kept.begin()
     found: Outputs | None = before.outputs(log)
     if found is not None:
         return found
-    photos = {} if folder is None else _look_at(folder, given.reconstruction)
-    given, said = _in_stored_frame(given, photos)
-    if folder is not None:
-        given = replace(given, unregistered=_others_in(folder, given, rectify.raw_as))
-    log.end("model", photos=given.reconstruction.num_images, points=given.reconstruction.num_points)
-    facts = {name: fact for name, (_, fact) in photos.items()}
-    solved, ids, rgb = _solve(given, str(model), facts, options, None if database is None else Path(database), log)
-    facts_of_model = {
-        "frame": said,
-        "points": given.reconstruction.num_points,
-        "observations": len(given.reconstruction.observations),
-    }
-    solved = replace(solved, told={"model": facts_of_model})
-    orientations = {name: fact.orientation or 1 for name, fact in facts.items()}
-    times = {} if folder is None else photo_times(folder)
-    written = Outputs.of_solved(solved, options, rectify, outputs, orientations, ids, rgb, folder is not None, times)
+    with work_folder() as work:
+        log.begin("model")
+
+        def check(names: Sequence[str]) -> None:
+            Record(out).check(files_of_run(names, rectify.raw_as, outputs), files_in)
+
+        given, feedback = _given(model, folder, check, options.seed, rectify, workers, work, log)
+        photos = {} if folder is None else _look_at(folder, given.reconstruction)
+        given, said = _in_stored_frame(given, photos)
+        if folder is not None:
+            given = replace(given, unregistered=_others_in(folder, given, rectify.raw_as))
+        log.end("model", photos=given.reconstruction.num_images, points=given.reconstruction.num_points)
+        facts = {name: fact for name, (_, fact) in photos.items()}
+        solved, ids, rgb = _solve(
+            given, str(model), facts, options, None if database is None else Path(database), log, feedback
+        )
+        facts_of_model = {
+            "frame": said,
+            "points": given.reconstruction.num_points,
+            "observations": len(given.reconstruction.observations),
+        }
+        solved = replace(solved, told={"model": facts_of_model})
+        orientations = {name: fact.orientation or 1 for name, fact in facts.items()}
+        times = {} if folder is None else photo_times(folder)
+        written = Outputs.of_solved(
+            solved, options, rectify, outputs, orientations, ids, rgb, folder is not None, times
+        )
     before.solved(written, log)
     return written
+
+
+def _given(
+    model: Path,
+    folder: Path | None,
+    check: Callable[[Sequence[str]], None],
+    seed: int,
+    rectify: RectifyOptions,
+    workers: Workers,
+    work: Path,
+    log: StageLog,
+) -> tuple[ColmapModel, Feedback | None]:
+    """The model; of one that holds poses only, measured in its photos, and what its tracks can be rebuilt from.
+
+    `check` is told the photos that will be rectified, before any of them is read.
+    """
+    if is_metashape(model):
+        posed = posed_photos(model, folder, rectify.raw_as)
+        assert folder is not None
+        check(posed.labels)
+        return measured(posed, folder, rectify, seed, workers, work, log)
+    given = read_model(model)
+    check([] if folder is None else given.reconstruction.image_names)
+    return given, None
 
 
 def _solve_in_memory(
@@ -350,6 +394,7 @@ def _solve(
     options: SolveOptions,
     database: Path | None,
     log: StageLog,
+    feedback: Feedback | None = None,
 ) -> tuple[Solved, ModelIds, PointRgb]:
     if given.reconstruction.num_images < 3:
         raise ReconstructionError(
@@ -365,11 +410,11 @@ def _solve(
         return replace(options.options_for(cameras), outlier_sigma=_OUTLIER_SIGMA)
 
     with work_folder() as work:
-        matched = None
         if database is not None:
             log.begin("database")
             matched = matched_of_database(database, work / "database.db", rec, options.seed)
             log.end("database", keypoints=sum(len(found.xy_raw) for found in matched.features))
+            feedback = Feedback(matched)
         solved = solve_tracks(
             rec,
             cameras,
@@ -378,7 +423,7 @@ def _solve(
             options_of,
             log,
             options.remedy,
-            None if matched is None else Feedback(matched),
+            feedback,
         )
     after = solved.shared
     for text in cameras.contradicted(after.cameras, options_of(after)):

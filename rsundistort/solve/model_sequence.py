@@ -32,7 +32,14 @@ from ..input.photo_cameras import PhotoCameras
 from ..io.kept import Kept
 from ..model import Reconstruction
 from ..model.projection import unproject_points
-from ..sfm import LEAST_MEASUREMENTS, MatchedPhotos, align_tracks, retriangulate
+from ..sfm import (
+    LEAST_MEASUREMENTS,
+    MatchedPhotos,
+    align_tracks,
+    read_num_verified,
+    register_photos,
+    retriangulate,
+)
 from ..verdict import Verdict, judge
 from .outcome import Solved
 from .placing import place_photos
@@ -45,6 +52,11 @@ __all__ = ["Feedback", "rough_options", "solve_photos", "solve_tracks"]
 _SETTLED_PX = 0.2
 _SETTLED_SHARE = 0.01
 _MAX_ROUNDS = 4
+# A photo that turned by more while it was read, in radians, was mapped by thresholds that were not made for it: it may
+# be in a wrong place, and is held against what the others tell.
+_STRONG_RAD = 0.1
+# Photos that are placed anew bring others.
+_MOST_WAVES = 4
 # Places on each side of a photo where that is looked at.
 _LOOKED_AT = 5
 
@@ -116,18 +128,18 @@ def _changed(before: Reconstruction | None, after: Reconstruction) -> float:
     return len(new - old) / max(len(new), 1)
 
 
-def _of_joined(options: BundleOptions, mapped: Reconstruction) -> BundleOptions:
-    """Options without the anchors and lengths of photos that could not be joined."""
+def _of_joined(options: BundleOptions, mapped: Reconstruction, *, says: bool = True) -> BundleOptions:
+    """Options without the anchors and lengths of photos that could not be joined; a warning `says` which."""
     joined = set(mapped.image_names)
     lengths = [each for each in options.lengths if joined >= {each.start[0], each.end[0]}]
     # one alone tells the scale of the world, which changes no photo
     lengths = lengths if len(lengths) > 1 else []
-    if len(lengths) < len(options.lengths):
+    if says and len(lengths) < len(options.lengths):
         apart = sorted({end[0] for each in options.lengths for end in (each.start, each.end)} - joined)
         rest = "those of the others are used" if lengths else "none is used, since ratios need two"
         warnings.warn(f"not joined, so no known length: {', '.join(apart)}; {rest}", RsUndistortWarning, stacklevel=3)
     lost = sorted({*options.held_phi, *options.known_phi, *options.still} - joined)
-    if lost:
+    if says and lost:
         warnings.warn(f"not joined, so no anchor: {', '.join(lost)}", RsUndistortWarning, stacklevel=3)
     return replace(
         options,
@@ -193,7 +205,7 @@ def solve_photos(
         What was done before, and takes what is done.
     """
     cameras = photos.cameras
-    mapped, matched = place_photos(photos, scratch, log, seed, matching, kept or Kept())
+    mapped, matched = place_photos(photos, scratch, log, seed, matching, kept or Kept(), with_shutter=True)
     if mapped.num_images < 3:
         raise ReconstructionError(
             f"only {mapped.num_images} of {len(photos.names)} photos could be joined, the shutter needs three; "
@@ -232,7 +244,8 @@ def solve_tracks(
     directions = _read_out(mapped, cameras, options_of(mapped), log)
     if directions is not None:
         mapped = directions.reconstruction
-    options = _of_joined(with_remedy(options_of(mapped), remedy), mapped)
+    wanted = with_remedy(options_of(mapped), remedy)
+    options = _of_joined(wanted, mapped, says=feedback is None)
     auto = shutter_model == "auto"
     shutter_model = "rotation" if auto else shutter_model
     log.begin("ladder")
@@ -245,6 +258,8 @@ def solve_tracks(
     )
     tracks = result.reconstruction
     if feedback is not None:
+        result = _placed_again(feedback, result, wanted, log)
+        options = _of_joined(wanted, result.reconstruction)
         result, tracks, options = _fed_back(feedback, result, options, log, ends=not auto)
     options = replace(options, phi_sigma_start=result.phi_sigma)
     choice = None
@@ -329,6 +344,36 @@ def _lens_only(verdict: Verdict) -> str:
 def rough_options(options: BundleOptions) -> BundleOptions:
     """Options of an adjustment that another one follows."""
     return replace(options, cost_tolerance=1e-5, spread_rounds=3, spread_tolerance=0.05)
+
+
+def _placed_again(feedback: Feedback, result: BundleResult, wanted: BundleOptions, log: StageLog) -> BundleResult:
+    """Photos that mapping left out, or put into a wrong place since it knows no shutter, placed by what others tell."""
+    if result.reconstruction.shutter_model not in ("rotation", "constant-motion"):
+        return result
+    matched, num_verified, left_out = feedback.matched, read_num_verified(feedback.matched), set[str]()
+    for wave in range(1, _MOST_WAVES + 1):
+        rec = result.reconstruction
+        turns = np.linalg.norm(rec.phi, axis=1) * rec.frame_span()
+        strong = bool(turns.max() > _STRONG_RAD)
+        if not strong and rec.num_images == len(matched.names):
+            break
+        stage = f"registration {wave}"
+        log.begin(stage)
+        scene = retriangulate(matched, rec)
+        found = register_photos(matched, num_verified, scene, joined_too=strong)
+        if found.changes:
+            tracks = retriangulate(matched, found.reconstruction).without_photos(LEAST_MEASUREMENTS)
+            options = rough_options(_of_joined(wanted, tracks, says=False))
+            options = replace(options, phi_sigma_start=result.phi_sigma)
+            result = bundle_adjust(tracks, rec.shutter_model, options, partial(_tell, log, stage))
+        left_out = left_out.union(found.dropped) - {*result.reconstruction.image_names}
+        log.end(stage, added=found.added, moved=found.moved, dropped=found.dropped)
+        if not found.changes:
+            break
+    if left_out:
+        names = ", ".join(sorted(left_out))
+        warnings.warn(f"left out, since they contradict the other photos: {names}", RsUndistortWarning, stacklevel=3)
+    return result
 
 
 def _fed_back(

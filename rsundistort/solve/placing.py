@@ -12,7 +12,7 @@ from ..input.load import LoadedPhotos
 from ..input.pairing import pairs_to_match
 from ..io.kept import Kept
 from ..model import Reconstruction
-from ..sfm import MatchedPhotos, map_photos, match_photos
+from ..sfm import MatchedPhotos, map_photos, match_photos, verify_with_shutter
 
 __all__ = ["place_photos"]
 
@@ -28,7 +28,14 @@ def _num_verified(matched: MatchedPhotos) -> int:
 
 
 def place_photos(
-    photos: LoadedPhotos, scratch: Path, log: StageLog, seed: int, matching: str, kept: Kept
+    photos: LoadedPhotos,
+    scratch: Path,
+    log: StageLog,
+    seed: int,
+    matching: str,
+    kept: Kept,
+    *,
+    with_shutter: bool = False,
 ) -> tuple[Reconstruction, MatchedPhotos]:
     """Match photos and map them, as of a global shutter; what was kept of that is not done again.
 
@@ -44,17 +51,21 @@ def place_photos(
         As in `solve_photos`.
     kept : Kept
         What is done is kept in it.
+    with_shutter : bool
+        Whether pairs that a shutter hides are verified by relative poses that have one.
     """
     cameras, database = photos.cameras, scratch / "database.db"
     log.begin("matching")
     given = database, photos.names, photos.features, cameras.cameras, cameras.camera_idx
-    counts: dict[str, int] | None = kept.get("pairs")
+    counts: dict[str, float] | None = kept.get("pairs")
     if counts is not None and kept.get_file("database", database):
         matched = MatchedPhotos(*given, calibrated=cameras.calibrated, seed=seed)
     else:
         pairs, num_pairs = pairs_to_match(photos, matching, seed), math.comb(len(photos.names), 2)
         matched = match_photos(*given, calibrated=cameras.calibrated, seed=seed, pairs=pairs)
         counts = {"pairs": num_pairs if pairs is None else len(pairs), "of_pairs": num_pairs}
+        if with_shutter:
+            counts["spread_rad"] = verify_with_shutter(matched)
         kept.put_file("database", database)
         kept.put("pairs", counts)
     log.end("matching", **counts)

@@ -17,6 +17,7 @@ from ..input.gyroscope import GyroOptions
 from ..input.pairing import MATCHINGS
 from ..input.photo_cameras import PhotoCameras, check_readouts
 from ..io.cameras import check_sigma
+from ..io.exports import check_exports
 from ..model import Bend, KnownLength, check_shutter_model
 from ..sfm import DETECTION_MEGAPIXELS
 
@@ -126,6 +127,9 @@ class OutputOptions(_Part):
         Whether the poses of the original photos with their shutter are written, for renderers that model it.
     usd : bool
         Of a video with a path: write `camera.usda`, its camera at every frame and the points, for match-moving.
+    exports : sequence of str
+        Programs that the solution is written for besides, each into a folder of its name: "metashape", "ncore", "nuke",
+        "opensfm", "opf" (the original photos) and "opf-rectified".
     report : bool
         Write `report.html`. What it needs is kept in any case: `report.write_report` makes it later.
     """
@@ -133,11 +137,13 @@ class OutputOptions(_Part):
     sparse_format: str = "bin"
     rs_poses: bool = False
     usd: bool = False
+    exports: Sequence[str] = ()
     report: bool = True
 
     def __post_init__(self) -> None:
         if self.sparse_format not in ("bin", "txt"):
             raise InputError(f"sparse_format={self.sparse_format!r}, expected bin or txt")
+        check_exports(self.exports)
 
 
 @dataclass(frozen=True, kw_only=True)

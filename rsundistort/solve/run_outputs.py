@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
+import shutil
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -38,6 +39,8 @@ from ..io import (
     write_trajectory,
     write_transforms,
 )
+from ..io.export_scene import ExportScene
+from ..io.exports import EXPORTS, check_exports
 from ..io.journal import Journal
 from ..io.outputs import batch_folder
 from ..io.places import local_place
@@ -54,7 +57,7 @@ from .run_options import OutputOptions, SolveOptions
 __all__ = ["OF_VIDEOS", "REPLACED", "VIDEO", "Outputs", "check_usd", "files_of_run", "inputs_of", "photo_times"]
 
 #: Folders that a run replaces.
-REPLACED = ("images", "masks", "sparse", "stereo", "rs-poses")
+REPLACED = ("images", "masks", "sparse", "stereo", "rs-poses", *EXPORTS)
 
 #: All frames of a video, rectified.
 VIDEO = "video.mp4"
@@ -73,9 +76,14 @@ _PARTS = ("cameras", "images", "points3D", "rigs", "frames")
 
 
 def files_of_run(names: Sequence[str], raw_as: str, options: OutputOptions) -> list[str]:
-    """All files that the outputs of photos may have: what is in their way is to be told before the work, not after."""
+    """All files that the outputs of photos may have: what is in their way is to be told before the work, not after.
+
+    Refuses photos that an export would confuse.
+    """
+    check_exports(options.exports, names)
     files = [*_FILES, *(f"sparse/{part}.{options.sparse_format}" for part in _PARTS)]
     files += [*_RS_POSES] * options.rs_poses + ["report.html"] * options.report
+    files += [f"{name}/{file}" for name in options.exports for file in EXPORTS[name].files]
     masks = mask_names(names)
     return files + [each for n in names for each in (f"images/{output_name(n, raw_as)}", f"masks/{masks[n]}")]
 
@@ -177,7 +185,7 @@ class Outputs:
             turns = {name: turn_of(orientations.get(name, 1), True)[0] for name in rec.image_names}
         ids = replace(ids or ModelIds.in_order(rec), cameras=solved.camera_ids)
         rec = rec.with_motions([solution.image(name).taken_out or RowMotion() for name in rec.image_names])
-        if options.rs_poses and rec.bends:
+        if (options.rs_poses or not {"ncore", "opf"}.isdisjoint(options.exports)) and rec.bends:
             solution = replace(solution, quality={**solution.quality, "rs_poses_px": _left_by_two_poses(rec)})
         return cls(solution, rec, rectifying, options, ids, turns, rgb, with_photos, times or {}, solved)
 
@@ -228,7 +236,7 @@ class Outputs:
         solution = with_depths(replace(solution, images=tuple(images)), found)
         with output_folder(out, overwrite=True) as scratch:
             rgb = self._rgb(colors)
-            turned = self._models(scratch, solution, left_out, rgb, relative_to(photos, out / "rs-poses"))
+            turned = self._models(scratch, solution, left_out, rgb, relative_to(photos, out / "rs-poses"), photos)
             self._tell_report(scratch, rgb, relative_folder(photos, out))
             log.end("writing")
             turned = replace(turned, stages=tuple(log.stages))
@@ -274,10 +282,11 @@ class Outputs:
         left_out: Mapping[str, str],
         rgb: NDArray[np.uint8] | None,
         photos: PurePath | None,
+        source: Path | None = None,
     ) -> Solution:
         """Write the models for other programs; returns the solution as they have it, turned.
 
-        `photos` is where the original ones are, seen from the folder of their poses.
+        `photos` is where the original ones are, seen from the folder of their poses; `source` the same from here.
         """
         rec, ids, options, raw_as = self.reconstruction, self.ids, self.options, self.rectifying.raw_as
         names = [None if name in left_out else output_name(name, raw_as) for name in rec.image_names]
@@ -289,8 +298,9 @@ class Outputs:
                 f"sparse/: names end at a space in text, such as {cut[0]}; --sparse-format bin "
                 "keeps them", RsUndistortWarning, stacklevel=3,
             )  # fmt: skip
+        originals = {name: name if photos is None else (photos / name).as_posix() for name in written}
+        stored = solution
         if options.rs_poses:
-            originals = {name: name if photos is None else (photos / name).as_posix() for name in written}
             problem = write_shutter_poses(folder / "rs-poses", solution, originals, "../points.ply")
             if problem and last:
                 warnings.warn(f"rs-poses is without transforms.json: {problem}", RsUndistortWarning, stacklevel=3)
@@ -310,7 +320,21 @@ class Outputs:
         masks = mask_names([image.name for image in solution.images])
         files = {name: (f"images/{new}", f"masks/{masks[name]}") for name, new in written.items()}
         write_transforms(folder / "transforms.json", solution, files, "points.ply")
+        path = None if self.solved is None or self.solved.result.path is None else self.solved.result.path.path
+        path = path and turn_path(path, next(iter(self.turns.values()), 1))
+        self._export(folder, ExportScene(solution, rec, written, rgb, stored, source, originals, path), last)
         return solution
+
+    def _export(self, folder: Path, scene: ExportScene, tell: bool) -> None:
+        """Write what else was asked for; trouble with one loses no other."""
+        for name in self.options.exports:
+            try:
+                said = EXPORTS[name].write(folder / name, scene)
+            except InputError as error:
+                said = f"it is not written: {error}"
+                shutil.rmtree(folder / name, ignore_errors=True)
+            if said and tell:
+                warnings.warn(f"{name}: {said}", RsUndistortWarning, stacklevel=4)
 
     def _path(self, folder: Path, new_camera: Camera) -> None:
         """Write where the camera of a video was, and how it moved, at each frame; turned as the key frames are."""

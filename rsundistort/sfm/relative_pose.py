@@ -1,0 +1,262 @@
+"""Where two photos were taken from, seen from each other, if the camera turned while each was read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from .._kernels import epipolar as kernels
+from ..model import Camera
+from ..model.projection import clock_of, unproject_points
+
+__all__ = ["Pair", "RelativePose", "View", "find_relative_pose", "relative_poses"]
+
+# Five points suggest a pose with thresholds of these pixels: what fits a narrow one is a part of the photos that the
+# shutter hardly bends, what fits the wide one most of them.
+_SEARCH_PX = (4.0, 16.0)
+_SEARCHES, _CONFIDENCE = 2000, 0.999
+# Widths of the loss, in pixels: the inliers grow under the wide one. An inlier of the result lies within the last.
+_WIDTHS_PX = (3.0, 1.5)
+INLIER_PX = 4.0
+_LEAST_MATCHES = 15
+_MAX_STEPS, _CONVERGED, _GIVEN_UP = 40, 1e-5, 1e5
+# Prior standard deviation of phi that its estimation starts from, radians a frame, its rounds, and its least value.
+_START_SIGMA, _ROUNDS, _LEAST_SIGMA = 0.1, 6, 1e-4
+
+
+@dataclass(frozen=True)
+class View:
+    """What one photo shows of a list of matches.
+
+    Attributes
+    ----------
+    rays : (n, 3) array
+        Directions of unit length, of the lens but not of the shutter.
+    slopes : (n, 2, 3) array
+        Their derivatives by the pixel's x and y.
+    clock : (n,) array
+        When the pixels were read.
+    rate : (2,) array
+        The clock's derivative by the pixel's x and y.
+    frame_span : float
+        How far the clock runs over the frame.
+    focal_px : float
+        Focal length in pixels.
+    """
+
+    rays: NDArray[np.float64]
+    slopes: NDArray[np.float64]
+    clock: NDArray[np.float64]
+    rate: NDArray[np.float64]
+    frame_span: float
+    focal_px: float
+
+    @classmethod
+    def of(cls, xy_raw: NDArray[np.float64], camera: Camera) -> View:
+        """Of pixels (n, 2)."""
+        axis = camera.clock_axis
+        rate = np.zeros(2)
+        rate[axis] = camera.clock_sign / camera.K[axis, axis]
+        half = 0.5 * np.eye(2)
+        slopes = np.stack([_rays(xy_raw + half[k], camera) - _rays(xy_raw - half[k], camera) for k in (0, 1)], axis=1)
+        return cls(
+            _rays(xy_raw, camera), slopes, clock_of(camera, xy_raw), rate, camera.frame_span, float(camera.K[0, 0])
+        )
+
+    def take(self, keep: NDArray[np.integer]) -> View:
+        """Some of the matches."""
+        return replace(self, rays=self.rays[keep], slopes=self.slopes[keep], clock=self.clock[keep])
+
+    @property
+    def arrays(self) -> tuple[NDArray[np.float64], ...]:
+        """As the kernels take them."""
+        return self.rays, self.slopes, self.clock, self.rate
+
+
+def _rays(xy_raw: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """(n, 3) unit directions of pixels; ahead where the lens has none."""
+    ideal, valid = unproject_points(xy_raw, camera, None, "global")
+    rays = np.column_stack([np.where(valid[:, None], ideal, 0.0), np.ones(len(ideal))])
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """The matches of two photos, as each shows them."""
+
+    first: View
+    second: View
+
+    @cached_property
+    def arrays(self) -> tuple[NDArray[np.float64], ...]:
+        """As the kernels take them."""
+        return *self.first.arrays, *self.second.arrays
+
+    @property
+    def frame_spans(self) -> NDArray[np.float64]:
+        """(6,) clock over the frame, for each component of phi of both."""
+        return np.repeat([self.first.frame_span, self.second.frame_span], 3)
+
+
+@dataclass(frozen=True)
+class RelativePose:
+    """A relative pose with the rotation of both cameras during the readout.
+
+    Attributes
+    ----------
+    R_21, t_21 : (3, 3), (3,) array
+        From the first camera to the second, `x_2 ~ R_21 x_1 + t_21` at their reference rows; t of length 1.
+    phi : (2, 3) array
+        Of the first and of the second, radians per unit of the clock.
+    cost : float
+        What the estimate minimises, squared pixels: robust squares of the distances, and the prior of phi.
+    phi_sigma : (2, 3) array
+        Standard deviations of phi, for noise of one pixel.
+    """
+
+    R_21: NDArray[np.float64]
+    t_21: NDArray[np.float64]
+    phi: NDArray[np.float64]
+    cost: float = np.inf
+    phi_sigma: NDArray[np.float64] | None = None
+
+    def distances_px(self, pair: Pair) -> NDArray[np.float64]:
+        """(n,) Sampson distances of the matches in pixels of the photos as they are, shutters included."""
+        distance = np.empty(len(pair.first.clock))
+        kernels.sampson(*pair.arrays, self.R_21, self.t_21, self.phi[0], self.phi[1], distance)
+        return np.abs(distance)
+
+
+def find_relative_pose(pair: Pair, phi_sigma: float) -> RelativePose | None:
+    """Relative pose of two photos with a shutter, from matches many of which may be wrong.
+
+    Five points suggest poses without a shutter (RANSAC); each is adjusted to all matches with both motions under a
+    robust loss, so that its inliers grow over the photos, and the one that costs least is the answer. The distance is
+    Sampson's by the raw pixels: rows that a motion makes alike have no more distance between them, and no more room for
+    noise either, so that motions which collapse the photos onto a line, as algebraic errors favour them, do not win.
+
+    Parameters
+    ----------
+    pair : Pair
+        Matches.
+    phi_sigma : float
+        Prior standard deviation of the components of phi, radians a frame.
+
+    Returns
+    -------
+    RelativePose
+        Or None if no five points agree on one.
+    """
+    starts = _suggested(pair)
+    if not starts:
+        return None
+    found = [_adjusted(start, pair, phi_sigma, _WIDTHS_PX[0]) for start in starts]
+    return _ahead(_adjusted(min(found, key=lambda each: each.cost), pair, phi_sigma, _WIDTHS_PX[1]), pair)
+
+
+def relative_poses(pairs: Sequence[Pair]) -> tuple[list[RelativePose | None], float]:
+    """Relative poses of many pairs of photos, and the spread of their motions in radians a frame.
+
+    The spread, prior standard deviation of phi, is the one that these motions have (empirical Bayes: squares over what
+    the matches, not the prior, determine): photos without a shutter get none, and poses like those of five points.
+    """
+    poses = [find_relative_pose(pair, _START_SIGMA) for pair in pairs]
+    sigma = _START_SIGMA
+    for _ in range(_ROUNDS):
+        squares, known = [], []
+        for pose, pair in zip(poses, pairs, strict=True):
+            if pose is not None and pose.phi_sigma is not None:
+                squares.append(((pose.phi.ravel() * pair.frame_spans) ** 2).sum())
+                known.append((1.0 - (pose.phi_sigma.ravel() * pair.frame_spans / sigma) ** 2).sum())
+        if not squares:
+            break
+        # the middle of the pairs: one of false matches moves as it likes
+        sigma = max(float(np.sqrt(np.median(squares) / max(np.median(known), 1e-3))), _LEAST_SIGMA)
+        poses = [
+            None if pose is None else _adjusted(pose, pair, sigma, _WIDTHS_PX[1])
+            for pose, pair in zip(poses, pairs, strict=True)
+        ]
+    return [None if pose is None else _ahead(pose, pair) for pose, pair in zip(poses, pairs, strict=True)], sigma
+
+
+def _suggested(pair: Pair) -> list[RelativePose]:
+    """Poses by five points each, without a shutter."""
+    if len(pair.first.clock) < _LEAST_MATCHES:
+        return []
+    x_1, x_2 = (view.rays[:, :2] / view.rays[:, 2:] for view in (pair.first, pair.second))
+    focal_px, poses = 0.5 * (pair.first.focal_px + pair.second.focal_px), []
+    for within in _SEARCH_PX:
+        E, inlier = cv2.findEssentialMat(
+            x_1, x_2, np.eye(3), method=cv2.USAC_DEFAULT, prob=_CONFIDENCE, threshold=within / focal_px,
+            maxIters=_SEARCHES,
+        )  # fmt: skip
+        if E is not None and E.shape == (3, 3):
+            _, R, t, _ = cv2.recoverPose(E, x_1, x_2, np.eye(3), mask=inlier)
+            poses.append(RelativePose(R, t.ravel(), np.zeros((2, 3))))
+    return poses
+
+
+def _adjusted(start: RelativePose, pair: Pair, phi_sigma: float, width: float) -> RelativePose:
+    """Pose and motions by Levenberg and Marquardt's steps under a loss of such a width, in pixels."""
+    weights = (pair.frame_spans / phi_sigma) ** 2
+    H, g = np.empty((11, 11)), np.empty(11)
+
+    def system_of(pose: RelativePose) -> tuple[RelativePose, NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
+        across = _across(pose.t_21)
+        cost = kernels.pair_system(*pair.arrays, pose.R_21, pose.t_21, across, *pose.phi, width, H, g)
+        phi = pose.phi.ravel()
+        A, b = H.copy(), g.copy()
+        A[range(5, 11), range(5, 11)] += weights
+        b[5:] += weights * phi
+        return replace(pose, cost=float(cost + weights @ phi**2)), A, b, across
+
+    (now, A, b, across), damping = system_of(start), 1e-3
+    for _ in range(_MAX_STEPS):
+        step = -np.linalg.solve(A + np.diag(damping * np.diag(A) + 1e-12), b)
+        t = now.t_21 + step[3:5] @ across
+        moved = RelativePose(
+            Rotation.from_rotvec(step[:3]).as_matrix() @ now.R_21, t / np.linalg.norm(t),
+            now.phi + step[5:].reshape(2, 3),
+        )  # fmt: skip
+        then = system_of(moved)
+        if not then[0].cost < now.cost:
+            damping *= 10.0
+            if damping > _GIVEN_UP:
+                break
+            continue
+        settled = now.cost - then[0].cost < _CONVERGED * now.cost
+        (now, A, b, across), damping = then, damping / 10.0
+        if settled:
+            break
+    covariance = np.linalg.inv(A + 1e-9 * np.diag(np.diag(A)) + 1e-12 * np.eye(11))
+    return replace(now, phi_sigma=np.sqrt(np.maximum(np.diag(covariance)[5:], 0.0)).reshape(2, 3))
+
+
+def _across(t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(2, 3) directions at right angles to a unit vector."""
+    first = np.cross(t, np.eye(3)[np.argmin(np.abs(t))])
+    first /= np.linalg.norm(first)
+    return np.array([first, np.cross(t, first)])
+
+
+def _ahead(pose: RelativePose, pair: Pair) -> RelativePose:
+    """The pose with the sign of t that has most points ahead of both cameras."""
+    near = pose.distances_px(pair) < INLIER_PX
+    rays = [
+        (Rotation.from_rotvec(-view.clock[near, None] * phi).apply(view.rays[near]) if near.any() else view.rays[:0])
+        for view, phi in zip((pair.first, pair.second), pose.phi, strict=True)
+    ]
+    # x_2 along s_2, R x_1 along s_1 meet where s_2 x_2 - s_1 R x_1 = t: cross products tell the signs of both
+    x_1, x_2 = rays[0] @ pose.R_21.T, rays[1]
+    normal = np.cross(x_1, x_2)
+    s_1 = np.einsum("ni,ni->n", np.cross(pose.t_21, x_2), -normal)
+    s_2 = np.einsum("ni,ni->n", np.cross(pose.t_21, x_1), -normal)
+    forward = ((s_1 > 0) & (s_2 > 0)).sum() >= ((s_1 < 0) & (s_2 < 0)).sum()
+    return pose if forward else replace(pose, t_21=-pose.t_21)

@@ -1,0 +1,81 @@
+"""Verification of pairs by a relative pose that knows the shutter, where the shutter is strong."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..colmap.conventions import quiet_pycolmap
+from .database import MatchedPhotos
+from .epipolar import MIN_EXPLAINED, Matches, read_matches
+from .relative_pose import INLIER_PX, Pair, View, find_relative_pose, relative_poses
+
+__all__ = ["verify_with_shutter"]
+
+# So many pairs of the most matches, and so many matches of each, tell how strong the shutter is.
+_ASKED, _MATCHES = 6, 300
+# Spread of the rotations over a frame, in radians, from which on pairs are worth it: below, pycolmap's loose thresholds
+# leave no photo out.
+_STRONG_RAD = 0.05
+
+
+def verify_with_shutter(matched: MatchedPhotos) -> float:
+    """Add to the verified matches those that a relative pose with a shutter explains, where photos turned by much.
+
+    A few pairs tell how strong the shutter is. Pairs of weak ones stay as they are: an essential matrix with loose
+    thresholds takes all that is right there.
+
+    Parameters
+    ----------
+    matched : MatchedPhotos
+        Photos with their matches; verified ones are added to its database.
+
+    Returns
+    -------
+    float
+        Spread of the components of phi, in radians a frame.
+    """
+    matches = {pair: found for pair, found in read_matches(matched).items() if len(found) >= MIN_EXPLAINED}
+    most = sorted(matches, key=lambda pair: (-len(matches[pair]), pair))[:_ASKED]
+    if not most:
+        return 0.0
+    _, spread = relative_poses([_pair(matched, pair, matches[pair][:_MATCHES]) for pair in most])
+    if spread >= _STRONG_RAD:
+        _add_explained(matched, matches, spread)
+    return spread
+
+
+def _pair(matched: MatchedPhotos, pair: tuple[int, int], matches: NDArray[np.int64]) -> Pair:
+    """The matches of two photos, as each shows them."""
+    first, second = (
+        View.of(matched.features[photo].xy_raw[matches[:, side]], matched.cameras[matched.camera_idx[photo]])
+        for side, photo in enumerate(pair)
+    )
+    return Pair(first, second)
+
+
+def _add_explained(matched: MatchedPhotos, matches: Matches, spread: float) -> None:
+    """Write the matches that relative poses with such motions explain beside those that are verified already."""
+    pycolmap = quiet_pycolmap()
+    with pycolmap.Database.open(matched.database) as db:
+        verified = set(db.read_two_view_geometry_num_inliers()[0])
+        for (first, second), found in matches.items():
+            views = _pair(matched, (first, second), found)
+            pose = find_relative_pose(views, spread)
+            if pose is None:
+                continue
+            step_px = max(matched.features[photo].step_px for photo in (first, second))
+            explained = found[pose.distances_px(views) < INLIER_PX * step_px]
+            if len(explained) < MIN_EXPLAINED:
+                continue
+            ids = first + 1, second + 1
+            geometry: Any = pycolmap.TwoViewGeometry()
+            if pycolmap.image_pair_to_pair_id(*ids) in verified:
+                geometry = db.read_two_view_geometry(*ids)
+                explained = np.unique(np.concatenate([explained, np.asarray(geometry.inlier_matches)]), axis=0)
+                db.delete_two_view_geometry(*ids)
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            geometry.inlier_matches = explained.astype(np.uint32)
+            db.write_two_view_geometry(*ids, geometry)

@@ -1,0 +1,92 @@
+"""A model that holds poses and cameras only: what its photos show is measured, and triangulated from these poses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from ..batch.progress import StageLog
+from ..batch.rectify_options import RectifyOptions
+from ..batch.workers import Workers
+from ..colmap.measured_model import ColmapModel
+from ..errors import InputError, ReconstructionError
+from ..input.load import load_photos
+from ..input.pairing import pairs_to_match
+from ..io import list_photos
+from ..io.cameras import camera_to_json
+from ..io.metashape import PosedPhotos, named, read_metashape
+from ..model import Observations, Reconstruction
+from ..sfm import LEAST_MEASUREMENTS, match_photos, retriangulate
+from .model_sequence import Feedback
+
+__all__ = ["measured", "posed_photos"]
+
+# As `run` measures by default.
+_MAX_FEATURES = 8192
+
+
+def posed_photos(model: Path, folder: Path | None, raw_as: str) -> PosedPhotos:
+    """Poses of Metashape's `cameras.xml`, of the photos of a folder.
+
+    Raises
+    ------
+    InputError
+        When there is no folder: the file holds no measurements, and they are made in the photos.
+    """
+    if folder is None:
+        raise InputError(
+            f"{model} holds poses and cameras, but no measurements; say where the photos are (--images), which are "
+            "measured anew, or export a COLMAP model, whose tracks are taken"
+        )
+    posed = read_metashape(model)
+    return named(posed, list_photos(folder, raw_as), str(folder))
+
+
+def measured(
+    posed: PosedPhotos, folder: Path, rectify: RectifyOptions, seed: int, workers: Workers, work: Path, log: StageLog
+) -> tuple[ColmapModel, Feedback]:
+    """A model with tracks of the features of the photos that the poses explain, and what these can be rebuilt from.
+
+    Raises
+    ------
+    ReconstructionError
+        When the poses explain next to nothing of what the photos show.
+    """
+    names = list(posed.labels)
+    cameras = {str(k): camera_to_json(camera) for k, camera in zip(posed.camera_ids, posed.cameras, strict=True)}
+    of_photo = {name: str(posed.camera_ids[k]) for name, k in zip(names, posed.camera_idx.tolist(), strict=True)}
+    (work / "cameras.json").write_text(json.dumps({"cameras": cameras, "images": of_photo}), encoding="utf-8")
+    loaded = load_photos(
+        folder, str(work / "cameras.json"), None, _MAX_FEATURES, workers, log, masks=rectify.masks,
+        raw_as=rectify.raw_as, again=rectify.again, max_megapixels=rectify.max_megapixels, only=names,
+    )  # fmt: skip
+    place = [names.index(name) for name in loaded.names]
+    log.begin("matching")
+    matched = match_photos(
+        work / "database.db", loaded.names, loaded.features, posed.cameras, posed.camera_idx[place],
+        seed=seed, pairs=pairs_to_match(loaded, "auto", seed),
+    )  # fmt: skip
+    log.end("matching")
+    empty = Observations(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))
+    given = Reconstruction(
+        posed.cameras, loaded.names, matched.camera_idx, posed.R_cw[place], posed.center_w[place], np.zeros((0, 3)),
+        empty,
+    )  # fmt: skip
+    try:
+        rec = retriangulate(matched, given)
+        count = len(rec.observations)
+    except ReconstructionError:  # not one point
+        count = 0
+    if count < LEAST_MEASUREMENTS * len(names):
+        raise ReconstructionError(
+            f"the poses explain {count} measurements in {len(names)} photos, too few to go on from; check that they "
+            "are of these photos, or let run find poses of its own"
+        )
+    model = ColmapModel(
+        rec, np.array(posed.camera_ids), np.arange(1, 1 + rec.num_images), np.arange(1, 1 + rec.num_points),
+        np.arange(len(rec.observations)), np.zeros((rec.num_points, 3), np.uint8), posed.unposed,
+        self_calibrated=True, has_colors=False,
+    )  # fmt: skip
+    return model, Feedback(matched, loaded, workers)

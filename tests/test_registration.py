@@ -1,0 +1,147 @@
+"""Photos placed in a known scene with strong shutters, against the motions that made them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rsundistort import Camera, Observations, Reconstruction, RowMotion, project_points
+from rsundistort.colmap.conventions import quiet_pycolmap
+from rsundistort.sfm import Features, MatchedPhotos, read_num_verified, register_photos
+from rsundistort.sfm.database import write_photos
+from rsundistort.sfm.epipolar import agreeing_photos, read_matches
+from rsundistort.sfm.registration import place_photo
+
+CAMERA = Camera(1200, 900, [[1000, 0, 600], [0, 1000, 450], [0, 0, 1]])
+NAMES = [f"{k}.jpg" for k in range(6)]
+
+
+def look_at(center, target):
+    z = (target - center) / np.linalg.norm(target - center)
+    x = np.cross([0.1, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.array([x, np.cross(z, x), z])
+
+
+def turned_deg(R_a, R_b):
+    return np.degrees(Rotation.from_matrix(R_a @ R_b.T).magnitude())
+
+
+@pytest.fixture
+def scene(rng):
+    """Points, poses and motions of a quarter of a radian a frame, and what the photos show of them with noise."""
+    points_w = rng.uniform([-3, -2, 5], [3, 2, 9], (500, 3))
+    centers = np.column_stack([np.linspace(-2, 2, 6), rng.normal(0, 0.3, 6), rng.normal(0, 0.3, 6)])
+    R_cw = np.array([look_at(center, np.array([0, 0, 7.0])) for center in centers])
+    phi = rng.normal(0, 0.25, (6, 3)) / CAMERA.frame_span
+    frame, point, xy = [], [], []
+    for i in range(6):
+        uv, valid = project_points((points_w - centers[i]) @ R_cw[i].T, CAMERA, RowMotion(phi[i]))
+        seen = np.flatnonzero(valid & (np.abs(uv - [600, 450]) < [600, 450]).all(1))
+        frame.append(np.full(len(seen), i))
+        point.append(seen)
+        xy.append(uv[seen] + rng.normal(0, 0.5, (len(seen), 2)))
+    observations = Observations(np.concatenate(frame), np.concatenate(point), np.concatenate(xy))
+    return Reconstruction(
+        [CAMERA], NAMES, np.zeros(6, int), R_cw, centers, points_w, observations, phi, shutter_model="rotation"
+    )
+
+
+@pytest.fixture
+def matched(scene, rng, tmp_path):
+    """Its measurements as keypoints, all photos matched with each other, every fifth match wrong."""
+    rows = scene.observations.by_photo(6)
+    features = [
+        Features(scene.observations.xy_raw[each], np.ones(len(each)), np.zeros((len(each), 128), np.uint8))
+        for each in rows
+    ]
+    matched = MatchedPhotos(tmp_path / "database.db", NAMES, features, [CAMERA], np.zeros(6, int), True, 0)
+    pycolmap = quiet_pycolmap()
+    with pycolmap.Database.open(matched.database) as db:
+        write_photos(db, matched)
+        for i in range(6):
+            for j in range(i + 1, 6):
+                points = [scene.observations.point_idx[rows[k]] for k in (i, j)]
+                both = np.intersect1d(*points)
+                first, second = (np.searchsorted(each, both) for each in points)
+                wrong = np.flatnonzero(rng.uniform(size=len(both)) < 0.2)
+                second[wrong] = rng.permutation(second[wrong])
+                pairs = np.column_stack([first, second]).astype(np.uint32)
+                db.write_matches(i + 1, j + 1, pairs)
+                geometry = pycolmap.TwoViewGeometry()
+                geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+                geometry.inlier_matches = pairs[: len(pairs) * 8 // 10]
+                db.write_two_view_geometry(i + 1, j + 1, geometry)
+    return matched
+
+
+def one_photo(scene, photo):
+    rows = scene.observations.by_photo(6)[photo]
+    return scene.points_w[scene.observations.point_idx[rows]], np.array(scene.observations.xy_raw[rows])
+
+
+@pytest.mark.parametrize("share_wrong", [0.0, 0.4, 0.6])
+def test_a_photo_is_placed_with_its_motion(scene, rng, share_wrong):
+    for photo in range(3):
+        points_w, xy = one_photo(scene, photo)
+        wrong = rng.uniform(size=len(xy)) < share_wrong
+        xy[wrong] = rng.uniform([0, 0], [1200, 900], (wrong.sum(), 2))
+        placed = place_photo(points_w, xy, CAMERA)
+        assert turned_deg(placed.R_cw, scene.R_cw[photo]) < 0.05
+        assert np.linalg.norm(placed.center_w - scene.center_w[photo]) < 0.01
+        np.testing.assert_allclose(placed.phi, scene.phi[photo], atol=3e-3)
+        assert placed.fits[~wrong].mean() > 0.99
+        assert placed.fits[wrong].mean() < 0.05 if wrong.any() else True
+
+
+def test_points_seen_by_chance_fit_no_place(scene, rng):
+    points_w, xy = one_photo(scene, 0)
+    placed = place_photo(points_w, rng.uniform([0, 0], [1200, 900], xy.shape), CAMERA)
+    assert placed is None or placed.fits.mean() < 0.1
+
+
+def test_too_few_points_place_nothing(scene):
+    points_w, xy = one_photo(scene, 0)
+    assert place_photo(points_w[:3], xy[:3], CAMERA) is None
+
+
+def test_left_out_photos_are_added_and_wrong_places_mended(scene, matched):
+    spoilt = np.array(scene.R_cw)
+    spoilt[4] = Rotation.from_rotvec([0.1, -0.2, 0.1]).as_matrix() @ spoilt[4]
+    wrong = replace(scene, R_cw=spoilt, phi=scene.phi * (np.arange(6) != 4)[:, None])
+    wrong = wrong.take_photos(np.arange(6) != 5)
+    found = register_photos(matched, read_num_verified(matched), wrong)
+    assert (found.added, found.moved, found.dropped) == (("5.jpg",), ("4.jpg",), ())
+    assert found.reconstruction.image_names == tuple(NAMES)
+    for photo in (4, 5):
+        assert turned_deg(found.reconstruction.R_cw[photo], scene.R_cw[photo]) < 0.05
+        np.testing.assert_allclose(found.reconstruction.phi[photo], scene.phi[photo], atol=3e-3)
+    np.testing.assert_array_equal(found.reconstruction.R_cw[:4], scene.R_cw[:4])
+    only_new = register_photos(matched, read_num_verified(matched), wrong, joined_too=False)
+    assert (only_new.added, only_new.moved, only_new.dropped) == (("5.jpg",), (), ())
+
+
+def test_right_places_stay(scene, matched):
+    found = register_photos(matched, read_num_verified(matched), scene)
+    assert not found.changes
+    assert found.reconstruction.image_names == scene.image_names
+
+
+def test_a_photo_that_fits_nowhere_loses_its_place(scene, matched, rng):
+    # all that the last photo shows is false: its keypoints lie where chance has put them
+    features = list(matched.features)
+    features[5] = replace(features[5], xy_raw=rng.uniform([0, 0], [1200, 900], features[5].xy_raw.shape))
+    mixed = replace(matched, features=features)
+    found = register_photos(mixed, read_num_verified(matched), scene)
+    assert found.dropped == ("5.jpg",)
+    assert "5.jpg" not in found.reconstruction.image_names
+
+
+def test_photos_that_the_poses_do_not_explain_are_told_apart(scene, matched):
+    R_cw = np.array(scene.R_cw)
+    R_cw[:2] = Rotation.from_rotvec([0.2, 0.3, 0.1]).as_matrix() @ R_cw[:2]
+    agreeing = agreeing_photos(matched, read_matches(matched), read_num_verified(matched), replace(scene, R_cw=R_cw))
+    np.testing.assert_array_equal(agreeing, np.arange(6) >= 2)
