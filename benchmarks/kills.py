@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import random
 import re
 import shutil
@@ -55,10 +56,12 @@ def halved(camera: dict) -> dict:
 
 def visible(out: Path) -> dict[str, Path]:
     """Files that a user sees."""
-    if not out.is_dir():
-        return {}
-    paths = (path for path in out.rglob("*") if not any(p.startswith(".") for p in path.relative_to(out).parts))
-    return {path.relative_to(out).as_posix(): path for path in paths if path.is_file()}
+    found = {}
+    for folder, within, files in os.walk(out):  # what goes meanwhile is passed over
+        within[:] = [each for each in within if not each.startswith(".")]
+        paths = (Path(folder, each) for each in files if not each.startswith("."))
+        found |= {path.relative_to(out).as_posix(): path for path in paths}
+    return found
 
 
 def comparable(path: Path) -> bytes:

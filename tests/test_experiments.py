@@ -307,7 +307,7 @@ def test_scenes_of_one_name_are_refused(scene_file, tmp_path):
 
 def test_folders_that_cannot_be_used(scene_file, tmp_path):
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(FileError, match="cannot be made"):
+    with pytest.raises(FileError, match="is a file"):
         experiment_one([scene_file], tmp_path / "file")
     (tmp_path / "settings.json").write_text('{"seed": ')
     with pytest.raises(FormatError, match=r"settings\.json cannot be read"):

@@ -301,7 +301,7 @@ def test_options_are_checked(kind, options, says):
 
 
 def test_number_of_jobs_is_checked(tmp_path):
-    with pytest.raises(InputError, match="jobs=-1, expected 0 or more"):
+    with pytest.raises(InputError, match="jobs=-1, expected 0 to"):
         run(tmp_path, tmp_path / "out", jobs=-1)
     assert not (tmp_path / "out").exists()
 
