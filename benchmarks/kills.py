@@ -139,10 +139,12 @@ def problem_of(code: int, said: str) -> str:
     errors = [line for line in said.splitlines() if line.strip() and not line.startswith("warning: ")]
     if code in (0, -signal.SIGKILL):
         return " | ".join(errors)
-    # a signal may come before Python, or the command, hears any
-    if code in (-signal.SIGTERM, -signal.SIGINT) and not errors:
+    told = len(errors) == 1 and errors[0].startswith("stopped; ")
+    # a signal may come before the command hears any; and one that comes in an `exec`, as imports have them, makes
+    # Python end by SIGINT itself, which shells call 130, too
+    if (code == -signal.SIGTERM and not errors) or (code == -signal.SIGINT and (told or not errors)):
         return ""
-    if code in (128 + signal.SIGTERM, 128 + signal.SIGINT) and len(errors) == 1 and errors[0].startswith("stopped; "):
+    if code in (128 + signal.SIGTERM, 128 + signal.SIGINT) and told:
         return ""
     return f"exit code {code}: {' | '.join(errors)[-300:]}"
 
