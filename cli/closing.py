@@ -49,6 +49,7 @@ def summary(solution: Solution, out: Path, warned: Sequence[str]) -> dict[str, A
         else {key: critical[key] for key in ("flagged", "sigma_log_k", "remedy", "sentence")},
         "readout_time": solution.quality.get("readout_time"),
         "verdict": solution.verdict,
+        "georeference": solution.georeference,
         "doubtful": {image.name: image.doubtful for image in solution.registered if image.doubtful},
         "lens_only": [image.name for image in solution.registered if image.lens_only],
         "not_joined": {image.name: image.reason for image in solution.images if not image.registered},
@@ -95,6 +96,7 @@ def closing_table(solution: Solution, out: Path) -> str:
         *_varying(solution),
         *_fields(solution),
         *_readout_time(solution),
+        *_map(solution),
         *_readout(solution),
         *_depths(solution),
         *_two_poses(solution),
@@ -134,6 +136,14 @@ def fitted(text: str) -> list[str]:
             )
         )
     return lines
+
+
+def _map(solution: Solution) -> list[str]:
+    """Where on the map the solution is, and how well GPS and control points agree with it."""
+    from rsundistort.report import map_facts
+
+    facts = map_facts(solution.georeference)
+    return [f"{label:<{_LABEL}}{text}" if label else f"  {text}" for label, text in facts]
 
 
 def _cameras(solution: Solution) -> list[str]:

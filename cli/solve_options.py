@@ -83,6 +83,20 @@ solve_options = opt.gathered(
         help="Lengths measured in the scene, two or more: photo1, x1, y1, photo2, x2, y2, length, sigma.",
     ),
     click.option(
+        "--crs",
+        metavar="CRS",
+        help="Frame of poses and points: local, metres east, north and up by the photos' GPS; EPSG:..., a "
+        "projected one in metres; none, one of their own. Default: local where three photos' GPS fits; of solve the "
+        "model's.",
+    ),
+    click.option(
+        "--gcp",
+        "control",
+        type=click.Path(exists=True, dir_okay=False, path_type=Path),
+        metavar="CSV",
+        help="Control points, in the CRS: name, photo, x, y, E, N, U, sigma_m, and use, control or check.",
+    ),
+    click.option(
         "--readout-ms",
         type=click.FloatRange(min=0, min_open=True),
         help="Time of the readout of a frame. Default: the gyroscope's log, or a table of cameras.",
@@ -137,7 +151,7 @@ solve_options = opt.gathered(
 
 def parts_of(given: dict[str, Any]) -> tuple[Any, Any, Any]:
     """`SolveOptions`, `RectifyOptions` and `OutputOptions` of what was given; the rest is left in it."""
-    from rsundistort.io import read_known_lengths, read_known_motions
+    from rsundistort.io import read_control_points, read_known_lengths, read_known_motions
     from rsundistort.solve import OutputOptions, SolveOptions
 
     opt.check_resume(given)
@@ -149,6 +163,7 @@ def parts_of(given: dict[str, Any]) -> tuple[Any, Any, Any]:
         ("still", _anchors),
         ("known", lambda path: read_known_motions(path, given.get("readout_s"))),
         ("lengths", read_known_lengths),
+        ("control", read_control_points),
     ):
         if key in given:
             given[key] = read(given[key])

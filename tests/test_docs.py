@@ -45,6 +45,7 @@ NOT_RUN = {
     "run --sharpest": "as --every",
     "run --frames": "tests/test_clip_outputs.py runs it",
     "readout": "tests/test_clip_outputs.py runs it",
+    "run --crs": "its photos need GPS; tests/test_survey.py solves with it",
     "run --gyro": "tests/test_gyro.py runs it",
     "run --export ncore": "needs an extra of 3 GB; tests/test_exports.py runs it where that is",
 }
@@ -158,7 +159,7 @@ def prepared(tmp_path_factory):
     shutil.copy(scene / "recipe.json", place / "recipe.json")
     (place / "labels").mkdir()
     cv2.imwrite(str(place / "labels" / "0001.png"), np.zeros((320, 480), np.uint8))
-    for name in ("walk.mp4", "database.db", "walk.gcsv", "log.csv", "times.csv"):
+    for name in ("walk.mp4", "database.db", "walk.gcsv", "log.csv", "times.csv", "gcp.csv"):
         (place / name).touch()
     _write_gyroscope(place)
     return place

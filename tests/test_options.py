@@ -27,6 +27,7 @@ from rsundistort import (
     solve,
 )
 from rsundistort.errors import InputError
+from rsundistort.model import ControlPoint
 from rsundistort.solve import OutputOptions
 
 # of the command itself, or no options
@@ -44,6 +45,7 @@ NOT_OPTIONS = {
     "resume",
 }
 
+CONTROL = ControlPoint("P", (3.0, 4.0, 5.0), (0.1, 0.1, 0.1), {"a": (1.0, 2.0), "b": (6.0, 7.0)})
 PHOTO = [
     (["--masks", "."], {"masks": Path()}),
     (["--depth", "plane"], {"depth": "plane"}),
@@ -65,6 +67,8 @@ SOLVE = [
     (["--refine", "f,k1"], {"refine": ("f", "k1")}),
     (["--camera-sigma", "f=2"], {"camera_sigma": {"f": 2.0}}),
     (["--still", "a.jpg=5"], {"still": {"a.jpg": 0.005}}),
+    (["--crs", "none"], {"crs": "none"}),
+    (["--gcp", "gcp.csv"], {"control": [CONTROL]}),
     (["--lengths", "lengths.csv"], {"lengths": [KnownLength(("a", 1.0, 2.0), ("a", 3.0, 4.0), 5.0, 0.1)] * 2}),
     (["--readout-ms", "20"], {"readout_s": 0.02}),
     (["--remedy", "none"], {"remedy": "none"}),
@@ -129,6 +133,7 @@ def call_of(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     for name in ("lengths.csv", "log.csv", "t.csv"):
         Path(name).write_text("photo1,x1,y1,photo2,x2,y2,length,sigma\n" + "a,1,2,,3,4,5,0.1\n" * 2)
+    Path("gcp.csv").write_text("name,photo,x,y,E,N,U,sigma_m\nP,a,1,2,3,4,5,0.1\nP,b,6,7,,,,\n")
     Path("s.json").write_text("{}")
 
     def call(name, *arguments):

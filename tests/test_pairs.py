@@ -17,7 +17,7 @@ from rsundistort.errors import InputError
 from rsundistort.input.load import LoadedPhotos
 from rsundistort.input.pairing import capture_sequences, pairs_to_match, places_of
 from rsundistort.input.photo_cameras import PhotoCameras
-from rsundistort.io import ExifFacts
+from rsundistort.io import ExifFacts, GpsFix
 from rsundistort.sfm import Features, choose_pairs, global_descriptors, match_photos
 
 
@@ -164,7 +164,7 @@ def test_order_of_capture_by_clock_then_by_numbers_in_names():
 
 
 def test_places_are_metres_apart():
-    facts = [ExifFacts(place_deg=(55.7, 13.19)), ExifFacts(), ExifFacts(place_deg=(55.7 + 1 / 60, 13.19))]
+    facts = [ExifFacts(fix=GpsFix(55.7, 13.19)), ExifFacts(), ExifFacts(fix=GpsFix(55.7 + 1 / 60, 13.19))]
     places = places_of(facts)
     assert np.isnan(places[1]).all()
     # a minute of latitude is a nautical mile

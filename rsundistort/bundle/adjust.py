@@ -135,10 +135,10 @@ def adjust_sequence(
     """
     options = options or BundleOptions()
     # every model but the last is only a start: what it cannot explain is no outlier, and it need not converge
-    # a shutter that is not modelled yet would be blamed on the lens, and bend known lengths
+    # a shutter that is not modelled yet would be blamed on the lens, and bend what is known of the scene
     rough = replace(
         options, outlier_rounds=0, spread_rounds=0, cost_tolerance=options.round_tolerance, refine=(), lengths=(),
-        deviations="model", residual_field=False,
+        places=None, deviations="model", residual_field=False,
     )  # fmt: skip
     results: dict[str, BundleResult] = {}
     current = replace(reconstruction, phi=np.zeros((reconstruction.num_images, 3)))

@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .normal_equations import Function, Marginals, NormalEquations
+from .normal_equations import PRIORS_ERROR, Function, Marginals, NormalEquations
 
 __all__ = ["Inflation", "Partition", "by_corner", "by_place", "inflated", "inflation", "inflation_of"]
 
@@ -208,6 +208,10 @@ def inflation(
     # a unit counts by its noise's share
     weights = [np.divide(1.0, total, out=np.zeros_like(total), where=total > 0) for total in totals]
     noise = [(weight * (total - prior)).sum(0) for weight, total, prior in zip(weights, totals, priors, strict=True)]
+    # of a difference that is off by so much, less tells nothing: such are poses that only their places hold
+    noise = [
+        np.where(each > PRIORS_ERROR * (total > 0).sum(0), each, 0.0) for each, total in zip(noise, totals, strict=True)
+    ]
     square = residuals.square
     excess = [np.zeros_like(each) for each in noise]
     # what a fit hides is the mean over all photos: of many it takes few families to find

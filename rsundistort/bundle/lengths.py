@@ -11,7 +11,7 @@ from ..errors import InputError
 from ..model import KnownLength, Reconstruction
 from ..model.known_length import End
 
-__all__ = ["LengthResiduals", "check_lengths"]
+__all__ = ["LengthResiduals", "check_lengths", "scale_of_lengths"]
 
 # A point whose measurement lies so near to where the user pointed is the one meant, pixels.
 _REACH_PX = 5.0
@@ -35,6 +35,17 @@ def _nearest_point(reconstruction: Reconstruction, end: End) -> int:
     if not len(mine) or distance.min() > _REACH_PX:
         raise InputError(f"known length: no point was measured within {_REACH_PX:.0f} px of ({x:g}, {y:g}) in {name}")
     return int(obs.point_idx[mine[np.argmin(distance)]])
+
+
+def scale_of_lengths(reconstruction: Reconstruction, lengths: Sequence[KnownLength]) -> tuple[float, float]:
+    """Lengths of a reconstruction over the known ones, their weighted geometric mean, and its relative deviation."""
+    ends = [(_nearest_point(reconstruction, each.start), _nearest_point(reconstruction, each.end)) for each in lengths]
+    points = reconstruction.points_w
+    found = np.log(
+        [np.linalg.norm(points[b] - points[a]) / each.length for (a, b), each in zip(ends, lengths, strict=True)]
+    )
+    weight = np.array([(each.length / each.sigma) ** 2 for each in lengths])
+    return float(np.exp(np.average(found, weights=weight))), float(weight.sum() ** -0.5)
 
 
 class LengthResiduals:

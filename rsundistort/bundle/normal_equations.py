@@ -18,7 +18,7 @@ from .elimination import Elimination
 from .reduced import Factored, Reduced
 from .structure import BlockPattern
 
-__all__ = ["Border", "Coupling", "Function", "Marginals", "NormalEquations", "Step"]
+__all__ = ["PRIORS_ERROR", "Border", "Coupling", "Function", "Marginals", "NormalEquations", "Step"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -26,6 +26,8 @@ Step = tuple[Array, Array, Array]
 
 # Of the priors' precision, for the derivative by it, which is off by at most the square.
 _STEP = 2.0**-8
+#: Relative error of the priors' shares, some times the square of that.
+PRIORS_ERROR = 8 * _STEP**2
 
 
 class Marginals(NamedTuple):
@@ -185,6 +187,8 @@ class NormalEquations:
         Prior that joins pairs of photos; the structure's pattern has their blocks.
     rays : (n, 3) array, optional
         Directions along which no point moves, where all photos are taken from one place.
+    points : tuple of (k,), (k, 3) and (k, 3) arrays, optional
+        Points with a prior of their own, its diagonal Hessian and its gradient.
 
     Attributes
     ----------
@@ -204,6 +208,7 @@ class NormalEquations:
         lengths: tuple[Array, Array],
         coupling: Coupling | None = None,
         rays: Array | None = None,
+        points: tuple[Index, Array, Array] | None = None,
     ) -> None:
         self.cost = cost
         self._elimination = elimination
@@ -223,6 +228,9 @@ class NormalEquations:
             unit = rays / np.linalg.norm(rays, axis=1)[:, None]
             weight = np.trace(self._V, axis1=1, axis2=2)[:, None, None]
             self._V += weight * unit[:, :, None] * unit[:, None]
+        if points is not None:
+            self._V[points[0][:, None], np.arange(3), np.arange(3)] += points[1]
+            self._g_point[points[0]] += points[2]
         self._diagonal, self._g_frame = (self._wide(each) for each in self._gradients(res, J_frame))
         self._diagonal += prior_diag
         self._g_frame += prior_gradient

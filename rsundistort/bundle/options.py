@@ -13,6 +13,7 @@ from ..model import BEND_GROUPS, Bend, KnownLength, Reconstruction
 from .intrinsics import GuessedCameras, check_refined
 from .lengths import check_lengths
 from .path import FramePath, PathSolution
+from .places import KnownPlaces
 
 __all__ = ["DEVIATIONS", "LOSSES", "BundleOptions", "BundleResult"]
 
@@ -119,6 +120,9 @@ class BundleOptions:
         depth, as the angle does.
     lengths : sequence of KnownLength
         Known lengths in the scene, two or more: their ratios are residuals.
+    places : KnownPlaces, optional
+        Where photos were taken and control points are, in the frame of the reconstruction. Three or more hold it, in
+        the place of the photo that does otherwise; fewer say nothing.
     refine : tuple of str
         Intrinsics of each camera that are solved for with the rest: some of f (or fx, fy), cx, cy, k1, k2, p1, p2, k3;
         of a fisheye k1 to k4.
@@ -177,6 +181,7 @@ class BundleOptions:
     known_bends: Mapping[str, Bend] = field(default_factory=dict)
     still: Mapping[str, float] = field(default_factory=dict)
     lengths: Sequence[KnownLength] = ()
+    places: KnownPlaces | None = None
     refine: tuple[str, ...] = ()
     guessed: GuessedCameras | None = None
     factor_limit: float | None = None
@@ -236,6 +241,8 @@ class BundleOptions:
             raise InputError(f"bend_sigma_start={self.bend_sigma_start!r}, expected a positive number, or one a group")
         if self.bends not in range(len(BEND_GROUPS) + 1):
             raise InputError(f"bends={self.bends!r}, expected 0 to {len(BEND_GROUPS)} groups")
+        if self.path is not None and self.places:
+            raise InputError("the path of a video is solved for in a frame of its own; it takes no known places")
         if self.path is not None and (self.known_phi or self.still or self.held_phi):
             raise InputError("the path of a video says how its frames move; it takes no anchors, but known rates")
         if self.max_iterations < 1 or self.outlier_rounds < 0 or self.spread_rounds < 0:

@@ -24,6 +24,7 @@ from .lens_field import LensFields
 from .normal_equations import Border, Coupling, Marginals, NormalEquations, Step
 from .options import LOSSES, BundleOptions
 from .path import PathPrior, PathState
+from .places import KnownPlaces, PlaceResiduals
 from .spreads import Spreads
 from .structure import Structure
 
@@ -63,8 +64,8 @@ class BundleProblem:
     of its intrinsics (log f, cx / fx, cy / fy) if the options say that they vary, and the coefficients of its bends, if
     it has any (`Layout`). Unknowns of a camera: the intrinsics that the options name, as in `moved_camera`, and those
     of `LensFields` if they ask for fields. Seven unknowns are held for the gauge: the pose of the photo with the most
-    observations, and one coordinate of the centre farthest from it. The prior on intrinsics has heavy tails
-    (`prior_weight`), or it is normal.
+    observations, and one coordinate of the centre farthest from it; none
+    where known places hold the frame. The prior on intrinsics has heavy tails (`prior_weight`), or it is normal.
     """
 
     def __init__(
@@ -133,6 +134,7 @@ class BundleProblem:
         of_bends = self.layout.per_bend(spreads.bends, spreads.ways) ** -2.0
         self._own_weight = np.tile(np.concatenate([varied, of_bends]), (len(span), 1))
         self._lengths = LengthResiduals(self._start, options.lengths)
+        self._places = PlaceResiduals(self._start, options.places or KnownPlaces({}))
         self._known, self._known_weight = self._known_motions(span)
         self._free = self._free_unknowns()
         poses = reconstruction.R_cw, reconstruction.center_w
@@ -157,11 +159,15 @@ class BundleProblem:
             i = self._photo(name)
             if self._block > 6:
                 known[i, :3], weight[i, :3] = phi / span[i], (span[i] / sigma) ** 2
+        if self._block > 9:
+            places = self._places
+            known[places.moving, 3:], weight[places.moving, 3:] = places.velocity, places.velocity_sigma**-2.0
         for name, still in self._options.still.items():
             i = self._photo(name)
             if still > 0:
                 way = np.repeat([1.0, self._start.median_depth(i)], 3)[: weight.shape[1]]
                 parts = self._still_parts(i)
+                known[i, parts] = 0.0  # whoever says so knows better than a velocity by GPS
                 weight[i, parts] = ((span[i] / (still * way)) ** 2)[parts]
         return known, weight
 
@@ -186,8 +192,9 @@ class BundleProblem:
         reference = int(np.argmax(np.bincount(self._structure.frame_idx, minlength=rec.num_images)))
         offset = np.abs(rec.center_w - rec.center_w[reference])
         far, axis = np.unravel_index(np.argmax(offset), offset.shape)
-        free[reference, :6] = False
-        free[far, 3 + axis] = False
+        if not self._places.holds_frame:
+            free[reference, :6] = False
+            free[far, 3 + axis] = False
         for name, components in self._options.held_phi.items():
             if self._block > 6:
                 free[self._photo(name), [6 + c for c in components]] = False
@@ -307,6 +314,7 @@ class BundleProblem:
         known = self._known_weight * (motion - self._known) ** 2
         lengths = float(np.sum(self._lengths.residuals(state.points_w) ** 2))
         varied = float(np.sum(self._own_weight * self._own(state) ** 2))
+        lengths += 2.0 * self._places.cost(state.center_w, state.points_w)
         own = float(np.sum(self._motion_weight * motion**2 + known)) + varied
         if self._path is not None and state.path is not None:
             own += 2.0 * self._path.cost(state.R_cw, state.center_w, state.path)
@@ -371,6 +379,7 @@ class BundleProblem:
         moving, own = np.s_[:, 6 : self._block], np.s_[:, self._block :]
         prior_diag[moving] = self._motion_weight + self._known_weight
         prior_gradient[moving] = self._motion_weight * motion + self._known_weight * (motion - self._known)
+        prior_diag[:, 3:6], prior_gradient[:, 3:6] = self._places.on_photos(state.center_w)
         prior_diag[own] = self._own_weight
         prior_gradient[own] = self._own_weight * self._own(state)
         total = cost + self._prior_cost(state)
@@ -395,6 +404,7 @@ class BundleProblem:
         return NormalEquations(
             self._elimination, total, res, J_frame, prior_diag, prior_gradient, border, lengths, coupling,
             state.points_w - state.center_w[0] if self._turns_only else None,
+            self._places.on_points(state.points_w),
         )  # fmt: skip
 
     @property

@@ -110,7 +110,7 @@ def _load(job: _LoadJob) -> _Loaded:
     # a mask that cannot be used stops the run: without it, what it hides would be measured
     mask = None if job.own_mask is None else read_mask(job.own_mask, width, height)
     features = detect_features(photo.pixels, job.max_features, mask, job.megapixels)
-    facts = facts_of_exif(photo.metadata.exif)
+    facts = facts_of_exif(photo.metadata.exif, photo.metadata.xmp)
     edge_px = None
     if facts.exposure_s is not None and facts.exposure_s > LONG_EXPOSURE_S:
         edge_px = edge_width_px(grey_8_bit(photo.pixels))

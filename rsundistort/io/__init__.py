@@ -2,6 +2,7 @@
 
 from ..colmap import read_colmap_cameras, read_colmap_poses, write_colmap_model, write_colmap_workspace
 from .cameras import CameraFile, check_camera_fits, read_camera_file
+from .control_points import read_control_points
 from .depth_maps import find_depth_maps, read_depth_map
 from .gpmf import has_telemetry, read_gpmf
 from .groups import group_of, guess_readouts
@@ -12,6 +13,7 @@ from .motions import read_known_motions
 from .nerfstudio import read_transforms, write_transforms
 from .outputs import output_folder
 from .photos.exif_facts import ExifFacts, camera_from_exif, facts_of_exif, focal_from_exif, read_exif
+from .photos.gps import GpsFix
 from .photos.images import MAX_MEGAPIXELS, RAW_AS, Photo, list_photos, output_name, read_photo, write_image
 from .photos.metadata import Metadata
 from .readout_times import readout_time
@@ -25,6 +27,7 @@ __all__ = [
     "RAW_AS",
     "CameraFile",
     "ExifFacts",
+    "GpsFix",
     "GyroLog",
     "Metadata",
     "Photo",
@@ -49,6 +52,7 @@ __all__ = [
     "read_camera_file",
     "read_colmap_cameras",
     "read_colmap_poses",
+    "read_control_points",
     "read_depth_map",
     "read_exif",
     "read_gpmf",

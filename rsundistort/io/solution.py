@@ -106,6 +106,8 @@ def solution_to_json(solution: Solution) -> dict[str, Any]:
         "quality": dict(solution.quality),
         "stages": list(solution.stages),
     }
+    if solution.georeference is not None:
+        value["georeference"] = dict(solution.georeference)
     result: dict[str, Any] = _plain(value)
     return result
 
@@ -183,6 +185,16 @@ def _verdict(value: dict[str, Any]) -> dict[str, Any] | None:
     return {"shutter": words[0], "shape": words[1], "reasons": words[2:]}
 
 
+def _georeference(value: dict[str, Any]) -> dict[str, Any] | None:
+    said = value.get("georeference")
+    if said is None:
+        return None
+    matrix = np.asarray(said["transformation"], float)
+    if not isinstance(said["crs"], str) or matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise InputError("the georeference has no crs, or its transformation is no 4 x 4 matrix")
+    return dict(said)
+
+
 def _solution_from_json(value: dict[str, Any], where: str) -> Solution:
     cameras = {k: camera_from_json(c, f"camera {k}") for k, c in value["cameras"].items()}
     rectified = {k: Camera(c["width"], c["height"], c["K"]) for k, c in value["rectified_cameras"].items()}
@@ -225,4 +237,5 @@ def _solution_from_json(value: dict[str, Any], where: str) -> Solution:
         options=value.get("options") or {},
         generator=value.get("generator") or {},
         verdict=_verdict(value),
+        georeference=_georeference(value),
     )

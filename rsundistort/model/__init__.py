@@ -2,6 +2,7 @@
 
 from .bend import BEND_GROUPS, Bend
 from .camera import READOUTS, Camera, check_readout, other_axis
+from .control_point import ControlPoint
 from .depth import AtInfinity, Depth, DepthMap, Plane
 from .known_length import KnownLength
 from .motion import SHUTTER_MODELS, RowMotion, check_shutter_model
@@ -15,6 +16,7 @@ __all__ = [
     "AtInfinity",
     "Bend",
     "Camera",
+    "ControlPoint",
     "Depth",
     "DepthMap",
     "KnownLength",

@@ -118,6 +118,8 @@ class Solution:
         Name and seconds of each stage, with what it counted.
     options, generator : mapping
         What it was made with.
+    georeference : mapping or None
+        Where on the map its frame is, and how well that is known; None of a frame of its own.
     verdict : mapping or None
         What to believe of it: `shutter`, `shape` and `reasons`, as in `verdict.Verdict`; None where nobody judged.
     """
@@ -132,6 +134,7 @@ class Solution:
     options: Mapping[str, Any] = field(default_factory=dict)
     generator: Mapping[str, str] = field(default_factory=dict)
     verdict: Mapping[str, Any] | None = None
+    georeference: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         check_shutter_model(self.shutter_model)

@@ -3,12 +3,14 @@
 from .diagnostics import Diagnostics, read_diagnostics, write_diagnostics
 from .figures import write_figures
 from .page import write_report
+from .places import map_facts
 from .source import relative_folder
 from .verdict import Verdict, verdict_of
 
 __all__ = [
     "Diagnostics",
     "Verdict",
+    "map_facts",
     "read_diagnostics",
     "relative_folder",
     "verdict_of",

@@ -175,7 +175,8 @@ def scene(source: Source, upright: Mapping[str, int]) -> dict[str, Any] | None:
     lenses = [solution.cameras[image.camera_id] for image in images]
     turn = np.tile(np.eye(3), (len(images), 1, 1))
     turn[:, :2, :2] = [MATRICES[split_mirror(upright.get(image.name, 1))[0]] for image in images]
-    V = view_frame(turn @ R)
+    # on the map z is up, whatever the cameras look at
+    V = view_frame(turn @ R) if solution.georeference is None else np.eye(3)
     points = np.zeros((0, 3)) if told is None else told.points_w
     reach = _size(centers, points)
     side = min(0.5 * _spacing(centers), 0.12 * reach) or 0.12 * reach

@@ -16,6 +16,7 @@ from ..io.outputs import only_writer
 from ..io.record import Record
 from . import content
 from .pictures import Picture, PictureJob, make_pictures
+from .places import map_facts, map_rows
 from .readout import readout_facts
 from .source import Source, read_source
 from .verdict import advice_of, meter_of, verdict_of
@@ -113,6 +114,8 @@ def _page(source: Source, pictures: dict[str, Picture]) -> str:
         ladder=content.ladder(solution),
         cameras=content.cameras(solution),
         readout=readout_facts(solution.quality["readout_time"]) if solution.quality.get("readout_time") else [],
+        places=map_facts(solution.georeference),
+        place_rows=map_rows(solution.georeference),
         settings=content.settings(solution),
         seconds=sum(float(stage.get("seconds") or 0) for stage in solution.stages),
         json=_json(data),

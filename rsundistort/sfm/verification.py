@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,15 +11,16 @@ from numpy.typing import NDArray
 from ..colmap.conventions import quiet_pycolmap
 from .database import MatchedPhotos
 from .epipolar import MIN_EXPLAINED, Matches, read_matches
-from .relative_pose import INLIER_PX, Pair, View, find_relative_pose, relative_poses
+from .relative_pose import INLIER_PX, Pair, RelativePose, View, find_relative_pose, relative_poses
 
 __all__ = ["verify_with_shutter"]
 
 # So many pairs of the most matches, and so many matches of each, tell how strong the shutter is.
 _ASKED, _MATCHES = 6, 300
-# Spread of the rotations over a frame, in radians, from which on pairs are worth it: below, pycolmap's loose thresholds
-# leave no photo out.
-_STRONG_RAD = 0.05
+_NO_SHUTTER = 1e-4
+# Pairs are worth it where photos turned by so much while they were read, in radians, and where poses without a shutter
+# lose such a share of the matches that they explain with one. What a lens does that nobody knows can look like either.
+_STRONG_RAD, _LOST = 0.05, 0.05
 
 
 def verify_with_shutter(matched: MatchedPhotos) -> float:
@@ -41,10 +43,24 @@ def verify_with_shutter(matched: MatchedPhotos) -> float:
     most = sorted(matches, key=lambda pair: (-len(matches[pair]), pair))[:_ASKED]
     if not most:
         return 0.0
-    _, spread = relative_poses([_pair(matched, pair, matches[pair][:_MATCHES]) for pair in most])
+    step_px = float(np.median([each.step_px for each in matched.features]))
+    pairs = [_pair(matched, pair, matches[pair][:_MATCHES]) for pair in most]
+    poses, spread = relative_poses(pairs)
     if spread >= _STRONG_RAD:
-        _add_explained(matched, matches, spread)
+        without = [find_relative_pose(pair, _NO_SHUTTER) for pair in pairs]
+        if _num_explained(without, pairs, step_px) < (1.0 - _LOST) * _num_explained(poses, pairs, step_px):
+            _add_explained(matched, matches, spread)
     return spread
+
+
+def _num_explained(poses: Sequence[RelativePose | None], pairs: Sequence[Pair], step_px: float) -> int:
+    """Matches that lie near the epipolar planes of poses."""
+    found = (
+        (pose.distances_px(pair) < INLIER_PX * step_px).sum()
+        for pose, pair in zip(poses, pairs, strict=True)
+        if pose is not None
+    )
+    return int(sum(found))
 
 
 def _pair(matched: MatchedPhotos, pair: tuple[int, int], matches: NDArray[np.int64]) -> Pair:

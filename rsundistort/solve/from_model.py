@@ -36,6 +36,7 @@ from .model_sequence import Feedback, solve_tracks
 from .outcome import Solved
 from .run_options import OutputOptions, SolveOptions
 from .run_outputs import REPLACED, Outputs, PointRgb, check_usd, files_of_run, inputs_of, photo_times
+from .survey import survey_of
 
 if TYPE_CHECKING:
     import pycolmap
@@ -406,6 +407,12 @@ def _solve(
         if name not in rec.image_names:
             raise InputError(f"anchor {name!r} is not among the photos of the model")
 
+    survey = None
+    if options.crs is not None or options.control:  # else its frame is the model's
+        sizes = [(rec.camera(i).width, rec.camera(i).height) for i in range(rec.num_images)]
+        told = [facts.get(name, ExifFacts()) for name in rec.image_names]
+        survey = survey_of(options.crs, options.control, rec.image_names, told, sizes)
+
     def options_of(each: Reconstruction) -> BundleOptions:
         return replace(options.options_for(cameras), outlier_sigma=_OUTLIER_SIGMA)
 
@@ -424,6 +431,7 @@ def _solve(
             log,
             options.remedy,
             feedback,
+            survey,
         )
     after = solved.shared
     for text in cameras.contradicted(after.cameras, options_of(after)):

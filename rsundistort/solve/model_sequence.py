@@ -43,6 +43,7 @@ from ..sfm import (
 from ..verdict import Verdict, judge
 from .outcome import Solved
 from .placing import place_photos
+from .survey import Survey
 
 __all__ = ["Feedback", "rough_options", "solve_photos", "solve_tracks"]
 
@@ -178,6 +179,7 @@ def solve_photos(
     matching: str = "auto",
     workers: Workers | None = None,
     kept: Kept | None = None,
+    survey: Survey | None = None,
 ) -> Solved:
     """Match, map, climb the ladder; then free the keypoints of the shutter, rebuild the tracks and adjust again.
 
@@ -203,6 +205,8 @@ def solve_photos(
         Who reads the photos again, to align the tracks at full size; they stay as the features have them without.
     kept : Kept, optional
         What was done before, and takes what is done.
+    survey : Survey, optional
+        Where photos and control points are: the frame is then that of the map.
     """
     cameras = photos.cameras
     mapped, matched = place_photos(photos, scratch, log, seed, matching, kept or Kept(), with_shutter=True)
@@ -212,8 +216,10 @@ def solve_photos(
             "use photos that share more of the scene"
         )
     solved = solve_tracks(
-        mapped, cameras, shutter_model, seed, options_of, log, remedy, Feedback(matched, photos, workers)
+        mapped, cameras, shutter_model, seed, options_of, log, remedy, Feedback(matched, photos, workers), survey
     )
+    if solved.survey is not None:
+        return solved
     # which frame a mapping ends in is chance
     return replace(solved, result=replace(solved.result, reconstruction=solved.shared.normalized()))
 
@@ -227,6 +233,7 @@ def solve_tracks(
     log: StageLog,
     remedy: str = "auto",
     feedback: Feedback | None = None,
+    survey: Survey | None = None,
 ) -> Solved:
     """Climb the ladder from a global-shutter reconstruction, in its frame.
 
@@ -240,11 +247,17 @@ def solve_tracks(
         As in `solve_photos`.
     feedback : Feedback, optional
         The matches behind it: its tracks are then rebuilt with the motions found, until these settle.
+    survey : Survey, optional
+        As in `solve_photos`.
     """
     directions = _read_out(mapped, cameras, options_of(mapped), log)
     if directions is not None:
         mapped = directions.reconstruction
     wanted = with_remedy(options_of(mapped), remedy)
+    if survey is not None:
+        survey, mapped = survey.placed(mapped)
+    if survey is not None:
+        wanted = replace(wanted, places=survey.known(mapped))
     options = _of_joined(wanted, mapped, says=feedback is None)
     auto = shutter_model == "auto"
     shutter_model = "rotation" if auto else shutter_model
@@ -265,6 +278,8 @@ def solve_tracks(
     choice = None
     if auto:
         choice, result, tracks, options = _chosen(feedback, result, tracks, options, seed, log)
+    if survey is not None and survey.holding:
+        survey, result, options = _with_control(survey, result, options, log)
     mended, advice = None, []
     if result.reconstruction.shutter_model != "global":
         log.begin("critical motion")
@@ -286,7 +301,29 @@ def solve_tracks(
     if verdict.lens_only:
         warnings.warn(_lens_only(verdict), RsUndistortWarning, stacklevel=3)
     log.end("verdict", shutter=verdict.shutter, shape=verdict.shape)
-    return Solved(result, global_result, cameras, choice, mended, advice, directions, verdict)
+    solved = Solved(result, global_result, cameras, choice, mended, advice, directions, verdict)
+    return solved if survey is None else _on_the_map(solved, survey, options)
+
+
+def _on_the_map(solved: Solved, survey: Survey, options: BundleOptions) -> Solved:
+    """What was solved with places, where these fit best, with what is to be said of that."""
+    survey, rec = survey.settled(solved.shared)
+    told = survey.georeference(rec, solved.result.covariances, options.lengths)
+    return replace(solved, result=replace(solved.result, reconstruction=rec), survey=survey, georeference=told)
+
+
+def _with_control(
+    survey: Survey, result: BundleResult, options: BundleOptions, log: StageLog
+) -> tuple[Survey | None, BundleResult, BundleOptions]:
+    """The adjustment with control points; as it was where they do not fit it."""
+    log.begin("control points")
+    placed, tracks = survey.controlled(result.reconstruction, result.sigma_px)
+    options = replace(options, places=None if placed is None else placed.known(tracks))
+    if placed is not None:
+        shutter_model = result.reconstruction.shutter_model
+        result = bundle_adjust(tracks, shutter_model, options, partial(_tell, log, "control points"))
+    log.end("control points", points=0 if placed is None else len(placed.holding))
+    return placed, result, options
 
 
 def _chosen(

@@ -20,6 +20,7 @@ from ..rectify import largest_shift_px
 from ..verdict import Verdict
 from ..versions import versions
 from .run_options import SolveOptions
+from .survey import Survey
 
 __all__ = ["Solved", "solution_of"]
 
@@ -59,6 +60,10 @@ class Solved:
         What `solution.json` says of the readout time of a video.
     told : mapping
         What else `solution.json` says of how it was made.
+    survey : Survey or None
+        By what it is on the map.
+    georeference : mapping or None
+        What `solution.json` says of that.
     """
 
     result: BundleResult
@@ -75,6 +80,8 @@ class Solved:
     whole: Reconstruction | None = None
     evidence: Mapping[str, Any] = field(default_factory=dict)
     told: Mapping[str, Any] = field(default_factory=dict)
+    survey: Survey | None = None
+    georeference: Mapping[str, Any] | None = None
 
     @property
     def shared(self) -> Reconstruction:
@@ -188,7 +195,37 @@ def solution_of(solved: Solved, options: SolveOptions, rectify: RectifyOptions) 
         },
         generator=versions(),
         verdict=None if solved.verdict is None else solved.verdict.to_json(),
+        georeference=_georeference(solved),
     )
+
+
+def _georeference(solved: Solved) -> dict[str, Any] | None:
+    """Where on the map the solution is, with the speeds of the cameras where the readout's time is known."""
+    if solved.georeference is None or solved.survey is None:
+        return None
+    rec, positions = solved.shared, solved.survey.positions
+    told = zip(positions.names, positions.speed_m_s.tolist(), strict=True)
+    by_gps = {name: speed for name, speed in told if np.isfinite(speed)}
+    known = solved.survey.known(rec)
+    held = {} if known is None else known.velocities
+    speeds = {}
+    for i, name in enumerate(rec.image_names):
+        readout = solved.readouts.get(int(rec.camera_idx[i]))
+        if readout is None or rec.shutter_model != "constant-motion":
+            continue
+        per_second = rec.camera(i).frame_span / readout[0]
+        velocity = rec.velocity[i] * per_second
+        speed = float(np.linalg.norm(velocity))
+        way = velocity / max(speed, 1e-300)
+        sigma = per_second * float(np.sqrt(way @ solved.result.covariances[i, 9:12, 9:12] @ way))
+        speeds[name] = {
+            "velocity_m_s": velocity.tolist(),
+            "speed_m_s": speed,
+            "sigma_m_s": sigma,
+            "gps_m_s": by_gps.get(name),
+            "held_by_gps": name in held,
+        }
+    return {**solved.georeference, "speeds": speeds}
 
 
 def _images(solved: Solved) -> Iterator[SolvedImage]:

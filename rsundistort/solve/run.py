@@ -32,6 +32,7 @@ from .model_sequence import solve_photos
 from .outcome import Solved
 from .run_options import RunOptions, SolveOptions
 from .run_outputs import OF_VIDEOS, REPLACED, VIDEO, Outputs, check_usd, files_of_run, inputs_of, photo_times
+from .survey import survey_of
 
 __all__ = ["run", "solve_frames"]
 
@@ -186,10 +187,14 @@ def _solve(
     def options_of(rec: Reconstruction) -> BundleOptions:
         return bounded_by_exposure(solving.options_for(cameras), rec, loaded, known_s)
 
+    sizes = [(cameras.of(i).width, cameras.of(i).height) for i in range(len(loaded.names))]
+    told = {k: seconds for k, seconds in known_s.items() if cameras.readout_told[k]}
+    clock_s = {name: told[k] for name, k in zip(loaded.names, cameras.camera_idx.tolist(), strict=True) if k in told}
+    survey = survey_of(solving.crs, solving.control, loaded.names, loaded.facts, sizes, clock_s)
     with work_folder() as work:
         solved = solve_photos(
             loaded, solving.shutter_model, solving.seed, options_of,
-            work, log, solving.remedy, options.matching, workers, kept,
+            work, log, solving.remedy, options.matching, workers, kept, survey,
         )  # fmt: skip
     rec = solved.shared
     contradictions = [gyro_contradiction(rec, from_gyro), *cameras.contradicted(rec.cameras, options_of(rec))]
@@ -209,6 +214,8 @@ def solve_frames(
 ) -> Solved:
     """What a video, and a gyroscope's log, come to."""
     solving, cameras = options.solve, keys.cameras
+    if solving.control or solving.crs not in (None, "none"):
+        raise InputError("frames of a video have no GPS; it takes no --crs and --gcp, say --every N for photos that do")
     if solving.still or solving.known or solving.shutter_model not in ("auto", "constant-motion"):
         raise InputError(
             "the path of a video says how its frames move: it takes no --still, --motions or --model; "

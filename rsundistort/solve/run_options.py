@@ -16,9 +16,10 @@ from ..errors import InputError
 from ..input.gyroscope import GyroOptions
 from ..input.pairing import MATCHINGS
 from ..input.photo_cameras import PhotoCameras, check_readouts
+from ..input.positions import check_crs
 from ..io.cameras import check_sigma
 from ..io.exports import check_exports
-from ..model import Bend, KnownLength, check_shutter_model
+from ..model import Bend, ControlPoint, KnownLength, check_shutter_model
 from ..sfm import DETECTION_MEGAPIXELS
 
 __all__ = ["OutputOptions", "RunOptions", "SolveOptions"]
@@ -70,6 +71,12 @@ class SolveOptions(_Part):
         What is known not to be steady in them, as in `BundleOptions.known_bends`.
     lengths : sequence of KnownLength
         Lengths measured in the scene, as in `BundleOptions.lengths`.
+    crs : str, optional
+        Frame of poses and points: "local", metres east, north and up at the photos' median GPS; a projected one in
+        metres, as pyproj takes it ("EPSG:32632"), less an origin that `Solution.georeference` says; "none", one of
+        their own. By default "local" where GPS of three photos or more fits them; of `solve` the model's.
+    control : sequence of ControlPoint
+        Points on the ground that were measured, in that CRS; without one, the frame is theirs.
     remedy : str
         What to do about a critical motion: "auto", "prior" or "none"; see `critical.heal`.
     readout_s : float, optional
@@ -85,6 +92,8 @@ class SolveOptions(_Part):
     known: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
     known_bends: Mapping[str, Bend] = field(default_factory=dict)
     lengths: Sequence[KnownLength] = ()
+    crs: str | None = None
+    control: Sequence[ControlPoint] = ()
     remedy: str = "auto"
     readout_s: float | None = None
 
@@ -93,6 +102,7 @@ class SolveOptions(_Part):
             check_shutter_model(self.shutter_model)
         check_readouts(self.readout)
         check_sigma(self.camera_sigma, "camera_sigma")
+        check_crs(self.crs)
         with_remedy(self.bundle_options(), self.remedy)
         if self.readout_s is not None and not 0 < self.readout_s < np.inf:
             raise InputError(f"readout_s={self.readout_s!r}, expected a positive number of seconds")

@@ -13,7 +13,8 @@ from ...colmap.conventions import quiet_pycolmap
 from ...errors import RsUndistortError
 from ...model import Camera
 from .containers import metadata_of
-from .exif import EXIF_IFD, GPS_IFD, ORIENTATION, Damaged, Entry, TiffStructure
+from .exif import EXIF_IFD, GPS_IFD, ORIENTATION, Damaged, TiffStructure
+from .gps import GpsFix, fix_of
 from .heif import heif_metadata
 from .kinds import kind_of_content
 
@@ -27,8 +28,6 @@ _FOCAL_LENGTH_IN35MM_FILM, _BODY_SERIAL_NUMBER, _LENS_MODEL = 0xA405, 0xA431, 0x
 _EXIF_IMAGE_WIDTH, _EXIF_IMAGE_HEIGHT = 0xA002, 0xA003
 _FOCAL_PLANE_X_RESOLUTION, _FOCAL_PLANE_RESOLUTION_UNIT = 0xA20E, 0xA210
 _DATE_TIME_ORIGINAL, _SUB_SEC_TIME_ORIGINAL = 0x9003, 0x9291
-# of the GPS IFD: the letter of a hemisphere, and behind it degrees, minutes and seconds
-_LATITUDE_REF, _LONGITUDE_REF = 0x0001, 0x0003
 # mm per FocalPlaneResolutionUnit: inch, cm, mm, micrometre
 _UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 
@@ -59,8 +58,8 @@ class ExifFacts:
         How long the shutter was open, seconds.
     flash : bool or None
         Whether a flash fired.
-    place_deg : (float, float) or None
-        Latitude and longitude by GPS, north and east positive.
+    fix : GpsFix or None
+        Where it was taken, by GPS.
     """
 
     make: str | None = None
@@ -77,7 +76,12 @@ class ExifFacts:
     taken_s: float | None = None
     exposure_s: float | None = None
     flash: bool | None = None
-    place_deg: tuple[float, float] | None = None
+    fix: GpsFix | None = None
+
+    @property
+    def place_deg(self) -> tuple[float, float] | None:
+        """Latitude and longitude by GPS, north and east positive; None of a camera without a fix."""
+        return None if self.fix is None or self.fix.is_nowhere else (self.fix.latitude_deg, self.fix.longitude_deg)
 
 
 def read_exif(path: Path) -> ExifFacts:
@@ -96,20 +100,23 @@ def read_exif(path: Path) -> ExifFacts:
         metadata = heif_metadata(data, Path(path).name) if kind == "HEIC" else metadata_of(data, kind)
     except (KeyError, RsUndistortError):  # a kind without EXIF, or one that needs an extra
         return ExifFacts()
-    return facts_of_exif(metadata.exif)
+    return facts_of_exif(metadata.exif, metadata.xmp)
 
 
-def facts_of_exif(block: bytes) -> ExifFacts:
-    """The facts of an EXIF block, a TIFF structure with or without the head that it has in a JPEG; as `read_exif`."""
+def facts_of_exif(block: bytes, xmp: bytes = b"") -> ExifFacts:
+    """The facts of an EXIF block, a TIFF structure with or without the head that it has in a JPEG; as `read_exif`.
+
+    An XMP packet tells more of the position.
+    """
     try:
         structure = TiffStructure(block.removeprefix(b"Exif\0\0"))
         main = structure.main()[0]
         entries = {**structure.sub(main, EXIF_IFD, "the Exif IFD"), **main}
         gps = structure.sub(main, GPS_IFD, "the GPS IFD")
         facts = _facts({tag: structure.first_value(entry) for tag, entry in entries.items()})
-        return replace(facts, place_deg=_place(structure, gps))
+        return replace(facts, fix=fix_of(structure, gps, xmp))
     except Damaged:
-        return ExifFacts()
+        return ExifFacts(fix=fix_of(None, {}, xmp))
 
 
 def _facts(tags: dict[int, bytes | float | None]) -> ExifFacts:
@@ -163,21 +170,6 @@ def _taken(date: str | None, fraction: str | None) -> float | None:
         return None
     digits = (fraction or "").strip()
     return whole.total_seconds() + (float(f"0.{digits}") if digits.isascii() and digits.isdigit() else 0.0)
-
-
-def _place(structure: TiffStructure, gps: dict[int, Entry]) -> tuple[float, float] | None:
-    """Latitude and longitude; None for the place in the Atlantic where cameras without a fix are."""
-    degrees = []
-    for ref, positive, negative, most in ((_LATITUDE_REF, b"N", b"S", 90), (_LONGITUDE_REF, b"E", b"W", 180)):
-        if ref not in gps or ref + 1 not in gps:
-            return None
-        parts = structure.fractions(gps[ref + 1])
-        value = sum(part / 60**k for k, part in enumerate(parts))
-        letter = structure.value(gps[ref])[:1].upper()
-        if not 1 <= len(parts) <= 3 or letter not in (positive, negative) or not 0 <= value <= most:
-            return None
-        degrees.append(value if letter == positive else -value)
-    return None if degrees == [0, 0] else (degrees[0], degrees[1])
 
 
 def _text(value: bytes | float | None) -> str | None:

@@ -6,9 +6,10 @@ XMP is RDF in XML; a property of a namespace is an attribute or an element of th
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Sequence
 from xml.parsers import expat
 
-__all__ = ["corrected_xmp", "marked_xmp", "rectified_by"]
+__all__ = ["corrected_xmp", "marked_xmp", "rectified_by", "xmp_values"]
 
 _TIFF, _EXIF = "http://ns.adobe.com/tiff/1.0/", "http://ns.adobe.com/exif/1.0/"
 _OURS = "urn:rsundistort:1.0/"
@@ -123,6 +124,20 @@ def corrected_xmp(
     if orientation is not None:
         new = _set(new, _TIFF, "Orientation", str(orientation))
     return (new, []) if _is_well_formed(new) else (packet, ["the XMP could not be corrected"])
+
+
+def xmp_values(packet: bytes, wanted: Iterable[tuple[str, Sequence[str]]]) -> dict[str, str]:
+    """Simple properties of a packet by name, of the first namespace that has each; none of one that is damaged."""
+    if not packet or not _is_well_formed(packet):
+        return {}
+    found: dict[str, str] = {}
+    for namespace, names in wanted:
+        if namespace.rstrip("/").encode() in packet:
+            for name in names:
+                value = None if name in found else _get(packet, namespace, name)
+                if value is not None:
+                    found[name] = value
+    return found
 
 
 def rectified_by(packet: bytes) -> str | None:

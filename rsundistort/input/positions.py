@@ -1,0 +1,192 @@
+"""Where photos were taken, in metres on a map: GPS of EXIF and XMP, and the frame that it is put in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..io import ExifFacts
+from ..io.photos.gps import ALTITUDES
+from ..model.geodesy import ecef_from_geodetic, enu_axes, enu_from_geodetic
+
+__all__ = ["MapFrame", "PhotoPositions", "check_crs", "frame_at", "positions_of"]
+
+Array = NDArray[np.float64]
+
+# Altitudes of one photo that differ by more are of two datums, metres.
+_ANOTHER_DATUM_M = 1.0
+# Of a photo that has no altitude, metres.
+_UNKNOWN_UP_M = 1e4
+# Origins of projections are whole multiples of this, metres.
+_ROUND_M = 100.0
+
+
+@dataclass(frozen=True)
+class PhotoPositions:
+    """Photos that have a position.
+
+    Attributes
+    ----------
+    names : list of str
+        The photos.
+    geodetic : (m, 3) array
+        Latitude and longitude in degrees, altitude in metres as the photos have it.
+    sigma_m : (m, 3) array
+        Standard deviations east, north and up.
+    speed_m_s : (m,) array
+        Over ground; NaN where nothing says it.
+    velocity_m_s : (m, 3) array
+        East, north and up; NaN where nothing says it.
+    told_by : tuple of str
+        What the standard deviations come from.
+    notes : tuple of str
+        What is to be said of them.
+    """
+
+    names: list[str]
+    geodetic: Array
+    sigma_m: Array
+    speed_m_s: Array
+    velocity_m_s: Array
+    told_by: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+@dataclass(frozen=True)
+class MapFrame:
+    """A frame in metres, x east, y north, z up.
+
+    Attributes
+    ----------
+    crs : str
+        "local": east, north and up at the origin; "control": that of the control points; or a projected one, as
+        pyproj takes it, whose coordinates less the origin's are those of the frame.
+    origin : (float, float, float)
+        Of "local" latitude, longitude and altitude; else what is subtracted from east, north and up.
+    """
+
+    crs: str
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def of_geodetic(self, geodetic: Array) -> Array:
+        """Places (m, 3) of latitudes, longitudes and altitudes (m, 3)."""
+        if self.crs == "local":
+            return enu_from_geodetic(geodetic, self.origin)
+        return _projected(self.crs, geodetic) - self.origin
+
+    def of_control(self, place_m: Sequence[float]) -> tuple[float, float, float]:
+        """The place of a control point, which is given in the CRS."""
+        east, north, up = (np.asarray(place_m, np.float64) - self.origin).tolist()
+        return east, north, up
+
+    @property
+    def target(self) -> str:
+        """What `matrix` leads to."""
+        return "EPSG:4978" if self.crs == "local" else self.crs
+
+    @property
+    def matrix(self) -> Array:
+        """(4, 4) from the frame to the CRS; from the local one to metres from the centre of the Earth (EPSG:4978)."""
+        value = np.eye(4)
+        value[:3, 3] = self.origin
+        if self.crs == "local":
+            value[:3, :3] = enu_axes(*self.origin[:2]).T
+            value[:3, 3] = ecef_from_geodetic(self.origin)
+        return value
+
+
+def check_crs(crs: str | None) -> str | None:
+    """The CRS, refused if it is none in metres, or if there is no library to read it with."""
+    if crs not in (None, "local", "none"):
+        _transformer(str(crs))
+    return crs
+
+
+def _transformer(crs: str) -> Any:
+    """From longitude and latitude of WGS 84 to a projection."""
+    try:
+        import pyproj
+    except ImportError:
+        raise InputError(f'--crs {crs} needs pyproj: pip install "rsundistort[survey]"') from None
+    pyproj.network.set_network_enabled(False)  # grids are not fetched
+    try:
+        found = pyproj.CRS.from_user_input(crs)
+    except pyproj.exceptions.CRSError:
+        raise InputError(
+            f"--crs {crs}: no such CRS; expected local, none, or a projected one such as EPSG:32632"
+        ) from None
+    if not found.is_projected or found.is_compound:
+        kind = "compound" if found.is_compound else found.type_name[:1].lower() + found.type_name[1:]
+        raise InputError(f"--crs {crs} ({found.name}) is a {kind}; expected a projected one in metres, without heights")
+    units = {axis.unit_name for axis in found.axis_info}
+    if units != {"metre"}:
+        raise InputError(f"--crs {crs} ({found.name}) is in {', '.join(sorted(units))}; expected one in metres")
+    return pyproj.Transformer.from_crs("EPSG:4326", found, always_xy=True)
+
+
+def _projected(crs: str, geodetic: Array) -> Array:
+    """East, north (m) in a projection, and the altitude as it was."""
+    east, north = _transformer(crs).transform(geodetic[:, 1], geodetic[:, 0])
+    value = np.stack([east, north, geodetic[:, 2]], axis=1)
+    if not np.isfinite(value).all():
+        raise InputError(f"--crs {crs} does not reach to the photos' GPS; give the CRS of their country or UTM zone")
+    return value
+
+
+def frame_at(crs: str, geodetic: Array) -> MapFrame:
+    """The frame of a CRS at the median of positions (m, 3): at that for "local", else rounded and without a height."""
+    middle = np.median(geodetic, axis=0)
+    if crs == "local":
+        return MapFrame("local", (float(middle[0]), float(middle[1]), float(middle[2])))
+    east, north, _ = np.round(_projected(crs, middle[None])[0] / _ROUND_M) * _ROUND_M
+    return MapFrame(crs, (float(east), float(north), 0.0))
+
+
+def positions_of(names: Sequence[str], facts: Sequence[ExifFacts]) -> PhotoPositions:
+    """The photos that have a position, and what is to be said of it."""
+    placed = [(name, fact.fix) for name, fact in zip(names, facts, strict=True) if fact.fix and not fact.fix.is_nowhere]
+    notes = []
+    nowhere = [name for name, fact in zip(names, facts, strict=True) if fact.fix and fact.fix.is_nowhere]
+    if nowhere:
+        notes.append(f"GPS at 0,0 is no position: {_some(nowhere)}")
+    fixes = [fix for _, fix in placed]
+    altitudes = np.array([np.nan if fix.altitude_m is None else fix.altitude_m for fix in fixes])
+    known = np.isfinite(altitudes)
+    middle = float(np.median(altitudes[known])) if known.any() else 0.0
+    if known.any() and not known.all():
+        notes.append(f"{(~known).sum()} photos have GPS without an altitude")
+    for other in ALTITUDES:
+        apart = [
+            fix.altitudes_m[other] - fix.altitude_m
+            for fix in fixes
+            if fix.altitude_m is not None and other in fix.altitudes_m
+        ]
+        if apart and abs(np.median(apart)) > _ANOTHER_DATUM_M:
+            first = next(iter(fixes[0].altitudes_m), "EXIF")
+            notes.append(
+                f"altitudes are of two datums: {other} is {np.median(apart):+.1f} m from {first}'s, which is taken"
+            )
+    sigma = np.array([fix.sigma_m for fix in fixes]).reshape(-1, 3)
+    sigma[~known, 2] = _UNKNOWN_UP_M
+    geodetic = np.array([(fix.latitude_deg, fix.longitude_deg) for fix in fixes]).reshape(-1, 2)
+    return PhotoPositions(
+        [name for name, _ in placed],
+        np.column_stack([geodetic, np.where(known, altitudes, middle)]),
+        sigma,
+        np.array([np.nan if fix.speed_m_s is None else fix.speed_m_s for fix in fixes]),
+        np.array([fix.velocity_m_s or (np.nan,) * 3 for fix in fixes]).reshape(-1, 3),
+        tuple(sorted({fix.told_by for fix in fixes})),
+        tuple(notes),
+    )
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (f", ... ({len(names)})" if len(names) > 3 else "")

@@ -1,0 +1,78 @@
+"""Control points and check points of a survey: CSV files."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from ..errors import FormatError, InputError
+from ..model import ControlPoint
+from .tables import read_table
+
+__all__ = ["read_control_points"]
+
+_COLUMNS = ("name", "photo", "x", "y", "E", "N", "U", "sigma_m")
+_USES = {"": False, "control": False, "check": True}
+
+
+def read_control_points(path: Path | str) -> list[ControlPoint]:
+    """Points whose places were measured, as `SolveOptions.control` takes them.
+
+    Parameters
+    ----------
+    path : path
+        CSV with the header `name, photo, x, y, E, N, U, sigma_m`, a line for each photo that shows a point: pixels of
+        the stored photo (integer centres), the place in metres and its standard deviation. The lines of a point behind
+        its first may leave the place empty. `sigma_up_m` may be a column, where heights are known to another deviation;
+        and `use`, `control` (also where it is empty) or `check`.
+
+    Raises
+    ------
+    FileError, FormatError
+        Not readable; missing columns, numbers that are none, a point that is in two places, or twice in a photo.
+    """
+    path = Path(path)
+    columns, rows = read_table(path)
+    if missing := [column for column in _COLUMNS if column not in columns]:
+        raise FormatError(f"{path} has no column {missing[0]!r}; expected {', '.join(_COLUMNS)}")
+    facts: dict[str, tuple[str, ...]] = {}
+    seen: dict[str, dict[str, tuple[float, float]]] = {}
+    named = (*_COLUMNS[4:], *(each for each in ("sigma_up_m", "use") if each in columns))
+    for number, row in enumerate(rows, start=2):
+        name, photo = row["name"], row["photo"]
+        where = f"{path}, line {number}"
+        if not name or not photo:
+            raise FormatError(f"{where}: expected the name of a point and that of a photo")
+        told = tuple(row[column] for column in named)
+        if told != facts.setdefault(name, told) and any(told):
+            raise FormatError(f"{where}: {name} is given another place, deviation or use than in the lines before")
+        if photo in seen.setdefault(name, {}):
+            raise FormatError(f"{where}: {name} is in {photo} twice")
+        x, y = (_number(row[column], column, where) for column in ("x", "y"))
+        seen[name][photo] = x, y
+    if not facts:
+        raise FormatError(f"{path} holds no control points")
+    return [_point(name, dict(zip(named, told, strict=True)), seen[name], path) for name, told in facts.items()]
+
+
+def _number(text: str, column: str, where: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise FormatError(f"{where}: {column}={text!r}, expected a number")
+    return value
+
+
+def _point(name: str, told: dict[str, str], seen: dict[str, tuple[float, float]], path: Path) -> ControlPoint:
+    where = f"{path}, point {name}"
+    east, north, up, sigma = (_number(told[column], column, where) for column in _COLUMNS[4:])
+    sigma_up = _number(told["sigma_up_m"], "sigma_up_m", where) if told.get("sigma_up_m") else sigma
+    use = told.get("use", "").lower()
+    if use not in _USES:
+        raise FormatError(f"{where}: use={use!r}, expected control or check")
+    try:
+        return ControlPoint(name, (east, north, up), (sigma, sigma, sigma_up), seen, _USES[use])
+    except InputError as error:
+        raise FormatError(f"{path}: {error}") from None

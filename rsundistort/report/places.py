@@ -1,0 +1,79 @@
+"""What is said of a solution's place on the map."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+__all__ = ["map_facts", "map_rows"]
+
+
+def map_facts(told: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    """Label and text of all that is known of the frame, GPS, control points and speeds, for people.
+
+    Parameters
+    ----------
+    told : mapping or None
+        `Solution.georeference`.
+    """
+    if told is None:
+        return []
+    facts = [("map", _frame(told))]
+    if gps := told.get("gps"):
+        text = f"{len(gps['photos'])} photos, {gps['median_m']:.2f} m off in the median"
+        if gps["outliers"]:
+            text += f"; not believed: {', '.join(gps['outliers'])}"
+        if np.abs(gps["offset_m"]).max() > 0.005:
+            east, north, up = gps["offset_m"]
+            text += f"; moved by {east:+.2f}, {north:+.2f}, {up:+.2f} m to the control points"
+        facts.append(("GPS", text))
+    for use in ("control", "check"):
+        off = np.array([each["residual_m"] for each in told.get("control", {}).values() if each["use"] == use])
+        if len(off):
+            across, up = np.sqrt(np.mean(off[:, 0] ** 2 + off[:, 1] ** 2)), np.sqrt(np.mean(off[:, 2] ** 2))
+            facts.append((f"{use} points", f"{len(off)}, {across:.3f} m off across, {up:.3f} m in height (rms)"))
+    facts += _speeds(list(told.get("speeds", {}).values()))
+    if lengths := told.get("lengths"):
+        facts.append(("known lengths", f"{lengths['ratio']:.4f} +- {lengths['sigma']:.4f} times as long on the map"))
+    return facts + [("", note) for note in told.get("notes", ())]
+
+
+def _frame(told: Mapping[str, Any]) -> str:
+    crs, origin = told["crs"], told["origin"]
+    where = {
+        "local": f"east, north, up in metres at {origin[0]:.6f}, {origin[1]:.6f}, {origin[2]:.1f} m",
+        "control": "that of the control points",
+    }.get(crs, f"{crs}, less {origin[0]:.0f}, {origin[1]:.0f} m")
+    place, turn = told["sigma"]["place_m"], told["sigma"]["rotation_deg"]
+    return (
+        f"{where}; known to {max(place[:2]):.2g} m across, {place[2]:.2g} m in height, {max(turn):.2g} deg, scale "
+        f"{100 * told['sigma']['scale']:.2g} %"
+    )
+
+
+def _speeds(speeds: list[Mapping[str, Any]]) -> list[tuple[str, str]]:
+    if not speeds:
+        return []
+    middle = np.median([each["speed_m_s"] for each in speeds])
+    text = f"{middle:.1f} +- {np.median([each['sigma_m_s'] for each in speeds]):.1f} m/s in the median"
+    by_gps = [each["gps_m_s"] for each in speeds if each["gps_m_s"] is not None]
+    if by_gps:
+        text += f", {np.median(by_gps):.1f} m/s by GPS"
+    if any(each.get("held_by_gps") for each in speeds):
+        text += ", whose velocity was believed"
+    return [("speed", text)]
+
+
+def map_rows(told: Mapping[str, Any] | None) -> dict[str, list[dict[str, Any]]]:
+    """Rows of the tables: control points, and photos with GPS, the one that is farthest off first."""
+    if told is None:
+        return {"control": [], "gps": []}
+    control = [{"name": name, **each} for name, each in told.get("control", {}).items()]
+    speeds = told.get("speeds", {})
+    gps = [
+        {"name": name, "speed": speeds.get(name), "off": float(np.linalg.norm(each["residual_m"])), **each}
+        for name, each in told.get("gps", {}).get("photos", {}).items()
+    ]
+    return {"control": control, "gps": sorted(gps, key=lambda row: -row["off"])}
