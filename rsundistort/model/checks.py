@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from numbers import Real
 from pathlib import PurePath
 from typing import Any
 
@@ -10,7 +12,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 
-__all__ = ["check_array", "check_finite", "check_index", "check_photo_name", "check_rotations", "frozen"]
+__all__ = [
+    "check_array",
+    "check_finite",
+    "check_index",
+    "check_kind",
+    "check_number",
+    "check_one_of",
+    "check_photo_name",
+    "check_rotations",
+    "check_size",
+    "check_whole",
+    "frozen",
+]
 
 
 def _shape_text(shape: tuple[int | None, ...]) -> str:
@@ -22,12 +36,29 @@ def _shape_text(shape: tuple[int | None, ...]) -> str:
 def check_array(value: ArrayLike, shape: tuple[int | None, ...], name: str, dtype: Any = np.float64) -> NDArray[Any]:
     """The value as an array of `shape` (None: any length); else an error with expected and got."""
     try:
+        given = np.asarray(value)
+        # texts, None and complex numbers would be taken for others; of nothing NumPy knows no type
+        if given.dtype.kind not in "biuf" and given.size and not _are_numbers(given):
+            raise TypeError
         array = np.asarray(value, dtype=dtype)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: expected numbers of shape {_shape_text(shape)}, got {value!r}") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{name}: expected numbers of shape {_shape_text(shape)}, got {_short(value)}") from error
     if array.ndim != len(shape) or any(s is not None and s != n for s, n in zip(shape, array.shape, strict=True)):
         raise InputError(f"{name}.shape={array.shape}, expected {_shape_text(shape)}")
     return array
+
+
+def _are_numbers(array: NDArray[Any]) -> bool:
+    """Whether Python's own numbers, too large or too exact for NumPy's, are in an array of objects."""
+    return array.dtype.kind == "O" and all(isinstance(each, Real) for each in array.flat)
+
+
+def _short(value: Any) -> str:
+    """A value for an error: of an array what it is, not what it holds."""
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype} {value.shape}"
+    text = repr(value) if not isinstance(value, (list, tuple)) or len(value) < 50 else f"{len(value)} of them"
+    return text if len(text) < 100 else f"{text[:97]}..."
 
 
 def check_finite(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> NDArray[np.float64]:
@@ -38,9 +69,49 @@ def check_finite(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> 
     return array
 
 
+def check_number(value: Any, name: str, low: float = -np.inf, high: float = np.inf) -> float:
+    """A finite number between two, which belong to it."""
+    number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    if not number or not np.isfinite(value) or not low <= value <= high:
+        span = "a number" if np.isinf([low, high]).all() else f"a number from {low:g} to {high:g}"
+        raise InputError(f"{name}={_short(value)}, expected {span}")
+    return float(value)
+
+
+def check_whole(value: Any, name: str, low: int, high: int = 2**31 - 1) -> int:
+    """A whole number between two, which belong to it."""
+    number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    if not number or not low <= value <= high or int(value) != value:
+        most = "" if high == 2**31 - 1 else f" up to {high}"
+        least = "a positive whole number" if low == 1 else f"a whole number, at least {low}"
+        raise InputError(f"{name}={_short(value)}, expected {least}{most}")
+    return int(value)
+
+
+def check_size(value: Any, name: str = "size", least: int = 1) -> tuple[int, int]:
+    """A (width, height) in pixels."""
+    if not isinstance(value, (Sequence, np.ndarray)) or isinstance(value, str) or len(value) != 2:
+        raise InputError(f"{name}={_short(value)}, expected (width, height)")
+    return check_whole(value[0], f"{name}[0]", least), check_whole(value[1], f"{name}[1]", least)
+
+
+def check_kind(value: Any, kind: type, name: str) -> None:
+    """Refuse what is not of a class of ours."""
+    if not isinstance(value, kind):
+        raise InputError(f"{name}: expected a {kind.__name__}, got {_short(value)}")
+
+
+def check_one_of(value: Any, words: Iterable[str], name: str) -> None:
+    """Refuse what is none of some words."""
+    if not isinstance(value, str) or value not in words:
+        raise InputError(f"{name}={_short(value)}, expected one of {', '.join(words)}")
+
+
 def check_index(value: ArrayLike, length: int, upper: int, name: str) -> NDArray[np.int64]:
     """Indices of shape (length,) in [0, upper)."""
     array = check_array(value, (length,), name, np.int64)
+    if not np.array_equal(array, np.asarray(value)):
+        raise InputError(f"{name} holds numbers that are not whole")
     if length and (array.min() < 0 or array.max() >= upper):
         raise InputError(f"{name} goes from {array.min()} to {array.max()}, expected 0 to {upper - 1}")
     return array

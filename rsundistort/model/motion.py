@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from .bend import Bend, bend_table
 from .camera import check_readout
-from .checks import check_finite, frozen
+from .checks import check_finite, check_kind, frozen
 
 __all__ = ["SHUTTER_MODELS", "RowMotion", "check_shutter_model"]
 
@@ -20,11 +20,13 @@ SHUTTER_MODELS: dict[str, int] = {"global": 0, "two-step": 1, "linearized": 2, "
 
 
 _FRAMES = ("world", "camera")
+# Radians while rows of one focal length are read: far beyond a fast turn behind the longest lens.
+_FASTEST = 1000.0
 
 
 def check_shutter_model(name: str) -> int:
     """The code of a shutter model in the kernels."""
-    if name not in SHUTTER_MODELS:
+    if not isinstance(name, str) or name not in SHUTTER_MODELS:
         raise InputError(f"shutter model {name!r}, expected one of {', '.join(SHUTTER_MODELS)}")
     return SHUTTER_MODELS[name]
 
@@ -62,6 +64,10 @@ class RowMotion:
             raise InputError(f"frame={self.frame!r}, expected one of {', '.join(_FRAMES)}")
         for name in ("phi", "velocity"):
             object.__setattr__(self, name, frozen(check_finite(getattr(self, name), (3,), name)))
+        if np.abs(self.phi).max() > _FASTEST:
+            raise InputError(f"phi={self.phi.tolist()}: no camera turns by more than {_FASTEST:g} rad per focal length")
+        if self.bend is not None:
+            check_kind(self.bend, Bend, "bend")
 
     @classmethod
     def of(

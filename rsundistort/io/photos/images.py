@@ -37,6 +37,7 @@ from .raw import read_raw
 from .tiff import as_stored, encode_tiff, tiff_metadata
 
 __all__ = [
+    "LARGEST_SIDE",
     "MAX_MEGAPIXELS",
     "RAW_AS",
     "Photo",
@@ -54,7 +55,8 @@ MAX_MEGAPIXELS = 250.0
 #: Kinds that RAW and HEIC can be written as.
 RAW_AS = ("tif", "jpg", "png")
 
-_MAX_SIDE = 32766  # of cv2.remap
+#: Pixels across or down a photo that `cv2.remap` can count.
+LARGEST_SIDE = 32766
 
 
 @dataclass(frozen=True)
@@ -167,9 +169,9 @@ def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> Photo:
                 f"{path.name} has {width}x{height} pixels, more than the limit of {max_megapixels:g} million; "
                 "raise it with --max-pixels if that is true"
             )
-        if max(width, height) > _MAX_SIDE:
+        if max(width, height) > LARGEST_SIDE:
             raise FileError(
-                f"{path.name} has {width}x{height} pixels; sides above {_MAX_SIDE} cannot be rectified: cut it up"
+                f"{path.name} has {width}x{height} pixels; sides above {LARGEST_SIDE} cannot be rectified: cut it up"
             )
 
     size = picture_size(data, kind)
