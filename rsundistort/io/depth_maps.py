@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, InputError
+from ..errors import FileError, FormatError, InputError
+from ..model.arrays import read_arrays
+from .photos.images import MAX_MEGAPIXELS
+from .photos.kinds import kind_of_content, picture_size
 
 __all__ = ["find_depth_maps", "read_depth_map"]
 
@@ -43,6 +47,21 @@ def find_depth_maps(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     return maps
 
 
+def _picture(path: Path) -> NDArray[Any] | None:
+    try:
+        data = path.read_bytes()
+        size = picture_size(data, kind_of_content(data, path.name))
+        if size is not None and size[0] * size[1] > MAX_MEGAPIXELS * 1e6:
+            raise FileError(f"depth map {path} has {size[0]}x{size[1]} pixels by its header, more than any photo")
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    except FileError:
+        raise
+    except OSError as error:
+        raise FileError(f"depth map {path} cannot be read: {error.strerror}") from error
+    except cv2.error as error:
+        raise FileError(f"depth map {path} cannot be decoded: {error.err}") from error
+
+
 def read_depth_map(path: Path) -> NDArray[np.float32]:
     """A depth map (h, w) as it is in its file.
 
@@ -51,21 +70,16 @@ def read_depth_map(path: Path) -> NDArray[np.float32]:
     FileError, InputError
         When it cannot be read, or is no map of numbers.
     """
-    try:
-        if path.suffix.lower() in (".npy", ".npz"):
-            loaded = np.load(path, allow_pickle=False)
-            if path.suffix.lower() == ".npz":
-                if len(loaded.files) != 1 and "depth" not in loaded.files:
-                    raise InputError(f"{path} holds several arrays, none of them named depth")
-                loaded = loaded["depth" if "depth" in loaded.files else loaded.files[0]]
-        else:
-            loaded = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
-    except InputError:
-        raise
-    except OSError as error:
-        raise FileError(f"depth map {path} cannot be read: {error.strerror or error}") from error
-    except (ValueError, EOFError, KeyError, cv2.error) as error:
-        raise FileError(f"depth map {path} cannot be decoded: {' '.join(str(error).split())[:100]}") from error
+    if path.suffix.lower() in (".npy", ".npz"):
+        try:
+            arrays = read_arrays(path)
+        except (FileError, FormatError) as error:
+            raise FileError(f"depth map {error}") from error
+        if len(arrays) != 1 and "depth" not in arrays:
+            raise InputError(f"{path} holds several arrays, none of them named depth")
+        loaded = arrays["depth"] if "depth" in arrays else next(iter(arrays.values()))
+    else:
+        loaded = _picture(path)
     if loaded is None or np.ndim(loaded) != 2 or loaded.dtype.kind not in "fiu":
         got = "no picture" if loaded is None else f"{loaded.dtype} {loaded.shape}"
         raise InputError(f"depth map {path} is {got}, expected one number per pixel")
