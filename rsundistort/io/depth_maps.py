@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -12,8 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, FormatError, InputError
 from ..model.arrays import read_arrays
-from .photos.images import MAX_MEGAPIXELS
-from .photos.kinds import kind_of_content, picture_size
+from .photos.images import read_plain
 
 __all__ = ["find_depth_maps", "read_depth_map"]
 
@@ -47,21 +45,6 @@ def find_depth_maps(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     return maps
 
 
-def _picture(path: Path) -> NDArray[Any] | None:
-    try:
-        data = path.read_bytes()
-        size = picture_size(data, kind_of_content(data, path.name))
-        if size is not None and size[0] * size[1] > MAX_MEGAPIXELS * 1e6:
-            raise FileError(f"depth map {path} has {size[0]}x{size[1]} pixels by its header, more than any photo")
-        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-    except FileError:
-        raise
-    except OSError as error:
-        raise FileError(f"depth map {path} cannot be read: {error.strerror}") from error
-    except cv2.error as error:
-        raise FileError(f"depth map {path} cannot be decoded: {error.err}") from error
-
-
 def read_depth_map(path: Path) -> NDArray[np.float32]:
     """A depth map (h, w) as it is in its file.
 
@@ -79,8 +62,7 @@ def read_depth_map(path: Path) -> NDArray[np.float32]:
             raise InputError(f"{path} holds several arrays, none of them named depth")
         loaded = arrays["depth"] if "depth" in arrays else next(iter(arrays.values()))
     else:
-        loaded = _picture(path)
-    if loaded is None or np.ndim(loaded) != 2 or loaded.dtype.kind not in "fiu":
-        got = "no picture" if loaded is None else f"{loaded.dtype} {loaded.shape}"
-        raise InputError(f"depth map {path} is {got}, expected one number per pixel")
+        loaded = read_plain(path, "depth map", cv2.IMREAD_UNCHANGED)
+    if loaded.ndim != 2 or loaded.dtype.kind not in "fiu":
+        raise InputError(f"depth map {path} is {loaded.dtype} {loaded.shape}, expected one number per pixel")
     return np.asarray(loaded, np.float32)

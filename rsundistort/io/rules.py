@@ -50,14 +50,16 @@ class Numbers:
 
     def holds(self, value: Any, axis: int = 0) -> bool:
         """Whether the value is of this shape from an axis on."""
-        if axis == len(self.shape):
-            return _is(value, float)
+        if axis + 1 == len(self.shape):
+            length = self.shape[axis]
+            fits = type(value) is list and (length is None or len(value) == length)
+            return fits and all(_is(each, float) for each in value)
         length = self.shape[axis]
         return (
-            isinstance(value, list)
+            type(value) is list
             and (length is None or len(value) == length)
             and all(self.holds(each, axis + 1) for each in value)
-            and (length is not None or axis + 1 == len(self.shape) or len({len(each) for each in value}) < 2)
+            and (self.shape[axis + 1] is not None or len({len(each) for each in value}) < 2)
         )
 
 
@@ -71,6 +73,10 @@ class Between:
     def __str__(self) -> str:
         return f"{_TYPES[type(self.low)]} from {self.low:g} to {self.high:g}"
 
+    def allows(self, value: Any) -> bool:
+        """Whether it is one."""
+        return _is(value, type(self.low)) and self.low <= value <= self.high
+
 
 @dataclass(frozen=True, init=False)
 class OneOf:
@@ -83,6 +89,10 @@ class OneOf:
 
     def __str__(self) -> str:
         return f"one of {', '.join(self.words)}"
+
+    def allows(self, value: Any) -> bool:
+        """Whether it is one."""
+        return isinstance(value, str) and value in self.words
 
 
 @dataclass(frozen=True)
@@ -105,11 +115,21 @@ def shown(value: Any) -> str:
 
 def _is(value: Any, kind: type) -> bool:
     """Whether a value is of a type, in the sense of JSON; numbers are finite."""
-    if kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        return isinstance(value, float) and math.isfinite(value) or isinstance(value, int) and abs(value) < 10**300
-    if kind is int:
-        return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= _LARGEST
-    return kind is not float and isinstance(value, kind)
+    its = type(value)
+    if its is float:
+        return kind is float and math.isfinite(value)
+    if its is int:
+        return (kind is int and -_LARGEST <= value <= _LARGEST) or (kind is float and abs(value) < 10**300)
+    return its is kind
+
+
+class _Wrong(Exception):
+    """What was expected, of which value, and its place: from within outwards."""
+
+    def __init__(self, expected: str, value: Any) -> None:
+        super().__init__(expected)
+        self.value = value
+        self.place: list[str] = []
 
 
 def check(value: Any, rule: Any, where: str = "") -> None:
@@ -120,45 +140,52 @@ def check(value: Any, rule: Any, where: str = "") -> None:
     FormatError
         "images[3].phi: expected three numbers, got 'x'".
     """
-    if isinstance(rule, Maybe):
+    try:
+        _check(value, rule)
+    except _Wrong as wrong:
+        place = (where + "".join(reversed(wrong.place))).removeprefix(".")
+        raise FormatError(f"{place}{': ' if place else ''}expected {wrong}, got {shown(wrong.value)}") from None
+
+
+def _check(value: Any, rule: Any) -> None:
+    kind = type(rule)
+    if kind is type or rule is Any:
+        if rule is not Any and not _is(value, rule):
+            raise _Wrong(_TYPES[rule], value)
+    elif kind is dict:
+        _check_object(value, rule)
+    elif kind is list or kind is tuple:
+        if type(value) is not list or (kind is tuple and len(value) != len(rule)):
+            raise _Wrong("a list" if kind is list else f"a list of {len(rule)}", value)
+        k = -1
+        try:
+            for k, each in enumerate(value):
+                _check(each, rule[0] if kind is list else rule[k])
+        except _Wrong as wrong:
+            wrong.place.append(f"[{k}]")
+            raise
+    elif kind is Maybe:
         if value is not None:
-            check(value, rule.rule, where)
-    elif isinstance(rule, dict):
-        _check_object(value, rule, where)
-    elif isinstance(rule, (list, tuple)):
-        _expect(isinstance(value, list), "a list", value, where)
-        if isinstance(rule, tuple):
-            _expect(len(value) == len(rule), f"a list of {len(rule)}", value, where)
-        for k, each in enumerate(value):
-            check(each, rule[k] if isinstance(rule, tuple) else rule[0], f"{where}[{k}]")
-    elif isinstance(rule, Numbers):
-        _expect(rule.holds(value), str(rule), value, where)
-    elif isinstance(rule, Between):
-        _expect(_is(value, type(rule.low)) and rule.low <= value <= rule.high, str(rule), value, where)
-    elif isinstance(rule, OneOf):
-        _expect(isinstance(value, str) and value in rule.words, str(rule), value, where)
-    elif rule is not Any:
-        _expect(_is(value, rule), _TYPES[rule], value, where)
+            _check(value, rule.rule)
+    elif kind is Numbers:
+        if not rule.holds(value):
+            raise _Wrong(str(rule), value)
+    elif not rule.allows(value):
+        raise _Wrong(str(rule), value)
 
 
-def _check_object(value: Any, rule: dict[Any, Any], where: str) -> None:
-    _expect(isinstance(value, dict), "an object", value, where)
-    if str in rule:
-        for name, each in value.items():
-            check(each, rule[str], _below(where, name))
-        return
-    for name, of_name in rule.items():
-        bare = name.removesuffix("?")
-        if bare in value:
-            check(value[bare], of_name, _below(where, bare))
-        elif bare == name:
-            raise FormatError(f"{where}: lacks {name}" if where else f"lacks {name}")
-
-
-def _below(where: str, name: str) -> str:
-    return f"{where}.{name}" if where else name
-
-
-def _expect(fits: bool, what: str, value: Any, where: str) -> None:
-    if not fits:
-        raise FormatError(f"{where}{': ' if where else ''}expected {what}, got {shown(value)}")
+def _check_object(value: Any, rule: dict[Any, Any]) -> None:
+    if type(value) is not dict:
+        raise _Wrong("an object", value)
+    place = ""
+    try:
+        for name, of_name in rule.items() if str not in rule else zip(value, [rule[str]] * len(value), strict=True):
+            place = name if name in value else name.removesuffix("?")
+            if place in value:
+                _check(value[place], of_name)
+            elif place == name:
+                raise _Wrong(f"an object with {name}", value)
+    except _Wrong as wrong:
+        if wrong.value is not value:
+            wrong.place.append(f".{place}")
+        raise

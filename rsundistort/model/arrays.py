@@ -66,7 +66,7 @@ def _read(file: IO[bytes], size: int) -> NDArray[Any]:
     """The array of a file of so many bytes."""
     header = _HEADERS.get(np.lib.format.read_magic(file))
     if header is None:
-        raise ValueError("it is of a newer version of NumPy's format")
+        raise ValueError("its version of the format is unknown")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what Python says of a header that is no Python
         shape, by_columns, dtype = header(file)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .checks import check_finite, check_one_of, check_whole, frozen
+from .checks import check_finite, check_numbers, check_one_of, check_whole, frozen
 from .field import spline_coefficients, steepest
 
 __all__ = ["LENSES", "READOUTS", "Camera", "check_readout", "other_axis"]
@@ -133,7 +133,7 @@ class Camera:
 
     def _checked_field(self) -> NDArray[np.float64]:
         """The field, refused if it has not enough values, or folds the photo."""
-        if not np.size(self.field):
+        if not check_numbers(self.field, "field").size:
             return np.zeros((0, 0, 2))
         values = check_finite(self.field, (None, None, 2), "field")
         if min(values.shape[:2]) < 4:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from .bend import Bend, bend_table
 from .camera import check_readout
-from .checks import check_finite, check_kind, frozen
+from .checks import check_finite, check_kind, check_one_of, frozen
 
 __all__ = ["SHUTTER_MODELS", "RowMotion", "check_shutter_model"]
 
@@ -60,8 +60,8 @@ class RowMotion:
     frame: str | None = None
 
     def __post_init__(self) -> None:
-        if self.frame not in (None, *_FRAMES):
-            raise InputError(f"frame={self.frame!r}, expected one of {', '.join(_FRAMES)}")
+        if self.frame is not None:
+            check_one_of(self.frame, _FRAMES, "frame")
         for name in ("phi", "velocity"):
             object.__setattr__(self, name, frozen(check_finite(getattr(self, name), (3,), name)))
         if np.abs(self.phi).max() > _FASTEST:

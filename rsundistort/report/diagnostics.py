@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from ..bundle import BundleResult
 from ..errors import FormatError
 from ..evaluation import align_points
-from ..model.arrays import read_arrays
 from ..io.aside import write_aside
 from ..model import Reconstruction
+from ..model.arrays import read_arrays
 from ..model.reprojection import reprojection_residuals
 
 __all__ = ["Diagnostics", "read_diagnostics", "write_diagnostics"]
@@ -27,8 +27,8 @@ _VERSION = 1
 # Types of the arrays, and how many axes they have where their shapes are by them; the others are floats.
 _KINDS: dict[str, tuple[str, int | None]] = {
     "names": ("U", 1), "camera_ids": ("U", 1), "photos": ("U", 0), "histogram": ("iu", 2), "point_idx": ("iu", 1),
-    "rgb": ("u", 2), "row_rms_px": ("f", 2), "row_mean_px": ("f", 4), "cell_mean_px": ("f", 5), "histogram_px": ("f", 1),
-    "points_w": ("f", 2), "global_points_w": ("f", 2),
+    "rgb": ("u", 2), "row_rms_px": ("f", 2), "row_mean_px": ("f", 4), "cell_mean_px": ("f", 5),
+    "histogram_px": ("f", 1), "points_w": ("f", 2), "global_points_w": ("f", 2),
 }  # fmt: skip
 # Points that are kept: what a phone turns smoothly.
 _MAX_POINTS = 15_000

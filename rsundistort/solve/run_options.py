@@ -20,6 +20,7 @@ from ..input.positions import check_crs
 from ..io.cameras import check_sigma
 from ..io.exports import check_exports
 from ..model import Bend, ControlPoint, KnownLength, check_shutter_model
+from ..model.checks import check_fields
 from ..sfm import DETECTION_MEGAPIXELS
 
 __all__ = ["OutputOptions", "RunOptions", "SolveOptions"]
@@ -98,6 +99,7 @@ class SolveOptions(_Part):
     readout_s: float | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if self.shutter_model != "auto":
             check_shutter_model(self.shutter_model)
         check_readouts(self.readout)
@@ -151,6 +153,7 @@ class OutputOptions(_Part):
     report: bool = True
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if self.sparse_format not in ("bin", "txt"):
             raise InputError(f"sparse_format={self.sparse_format!r}, expected bin or txt")
         check_exports(self.exports)
@@ -201,6 +204,7 @@ class RunOptions(_Part):
     gyro: GyroOptions | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if self.max_features < 100:
             raise InputError(f"max_features={self.max_features!r}, expected at least 100")
         if not 0.05 <= self.feature_megapixels < np.inf:

@@ -85,7 +85,9 @@ def xmp(folder: Path) -> None:
 
 def model(folder: Path) -> None:
     names = {path.name for path in folder.iterdir()}
-    found = read_model(folder if "images.bin" in names or "images.txt" in names else folder / min(names - {"tracks.csv"}))
+    found = read_model(
+        folder if "images.bin" in names or "images.txt" in names else folder / min(names - {"tracks.csv"})
+    )
     assert np.isfinite(found.reconstruction.points_w).all()
 
 

@@ -221,4 +221,6 @@ def klv_marks(data: bytes) -> list[int]:
 
 def zip_marks(data: bytes) -> list[int]:
     heads = [match.start() for match in re.finditer(rb"PK..", data)]
-    return [h + step for h in heads for step in (0, 8, 18, 22, 26, 28)] + [m.start() for m in re.finditer(rb"NUMPY", data)]
+    return [h + step for h in heads for step in (0, 8, 18, 22, 26, 28)] + [
+        m.start() for m in re.finditer(rb"NUMPY", data)
+    ]

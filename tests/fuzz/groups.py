@@ -55,6 +55,10 @@ def one_of(**files: st.SearchStrategy[bytes]) -> st.SearchStrategy[Files]:
     )
 
 
+def encoded(suffix: str, pixels: np.ndarray, *options: int) -> bytes:
+    return bytes(cv2.imencode(suffix, pixels, options)[1])
+
+
 def dumped(value: object) -> bytes:
     return json.dumps(value).encode()
 
@@ -143,7 +147,8 @@ def claimed(shape: str, descr: str = "<f8") -> bytes:
 CLAIMS = st.sampled_from([
     claimed("(1000000000,)"), claimed("(2**62,)"), claimed("(99999999999, 99999999999)"), claimed("(-1,)"),
     claimed("(1,)", "|O"), claimed("(8,)", "<c16"), claimed("(3,)", "V0"), claimed("()"), claimed("'x'"),
-    claimed("(" * 500), claimed("(1.5,)"), claimed("(10**1000,)"), claimed("(2, 4)", "<U0"), claimed("(1,)", "<U99999999"),
+    claimed("(" * 500), claimed("(1.5,)"), claimed("(10**1000,)"), claimed("(2, 4)", "<U0"),
+    claimed("(1,)", "<U99999999"),
 ])  # fmt: skip
 
 
@@ -284,7 +289,8 @@ LENGTHS = b"photo1,x1,y1,photo2,x2,y2,length,sigma\na.jpg,1,2,b.jpg,3,4,2.5,0.01
 TIMES = b"name,time_s,frame\na.jpg,0.1,3\nb.jpg,,4\nc.jpg,0.3,5\n"
 GYRO = b"time_s,wx,wy,wz\n" + b"".join(b"%.3f,0.01,-0.02,0.03\n" % (k / 200) for k in range(40))
 JOURNAL = b"".join(
-    dumped({"name": f"{k}.jpg", "fingerprint": "ab" * 8, "files": {f"images/{k}.jpg": 100}, "turn": 1, "depth": None}) + b"\n"
+    dumped({"name": f"{k}.jpg", "fingerprint": "ab" * 8, "files": {f"images/{k}.jpg": 100}, "turn": 1, "depth": None})
+    + b"\n"
     for k in range(3)
 )
 RECORD = b'["images/0.jpg", "100 5"]\n["images/1.jpg", ""]\n["images/1.jpg", null]\n'
@@ -399,7 +405,8 @@ def wholes() -> dict[str, list[Files]]:
         "rectifying": {"solution.json": dumped(small_solution())},
         "cameras": {
             "camera.json": dumped(CAMERA), "cameras.json": dumped(CAMERAS), "calibration.json": dumped(CALIBRATION),
-            "opencv.yaml": YAML, "ros.yaml": ROS, "opencv.xml": XML, "cameras.bin": models_of_colmap["bin"]["cameras.bin"],
+            "opencv.yaml": YAML, "ros.yaml": ROS, "opencv.xml": XML,
+            "cameras.bin": models_of_colmap["bin"]["cameras.bin"],
             "cameras.txt": models_of_colmap["txt"]["cameras.txt"],
         },
         "recipes": {"r.json": dumped(recipe())},
@@ -412,8 +419,8 @@ def wholes() -> dict[str, list[Files]]:
         "telemetry": {"v.mp4": told_video()},
         "videos": {"v.mp4": video()},
         "photos": photos,
-        "masks": {"m.png": bytes(cv2.imencode(".png", mask)[1])},
-        "depth maps": {"d.npy": npy(depth), "d.npz": packed({"depth": depth}), "d.tif": bytes(cv2.imencode(".tif", depth)[1])},
+        "masks": {"m.png": encoded(".png", mask)},
+        "depth maps": {"d.npy": npy(depth), "d.npz": packed({"depth": depth}), "d.tif": encoded(".tif", depth)},
         "diagnostics": {"r.npz": packed(report_arrays())},
         "grids": {"g.npz": packed(GRID)},
         "XMP": {"x.xmp": XMP},

@@ -27,6 +27,7 @@ from .kinds import (
     HEIF_SUFFIXES,
     PHOTO_SUFFIXES,
     RAW_SUFFIXES,
+    can_hold,
     is_whole,
     kind_of_content,
     kind_of_name,
@@ -45,6 +46,7 @@ __all__ = [
     "list_photos",
     "output_name",
     "read_photo",
+    "read_plain",
     "stored_size",
     "write_image",
 ]
@@ -177,6 +179,11 @@ def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> Photo:
     size = picture_size(data, kind)
     if size is not None:
         check_size(*size)
+        if not can_hold(data, kind, size):
+            raise FileError(
+                f"{path.name} has {size[0]}x{size[1]} pixels by its header, far more than its {len(data)} bytes can "
+                "hold; copy it again from the camera"
+            )
     elif kind in ("JPEG", "PNG", "WebP"):
         raise FileError(f"{path.name} cannot be decoded: its header does not say how large it is; copy it again")
     if kind == "RAW":
@@ -227,6 +234,31 @@ def _decode(data: bytes, name: str) -> NDArray[Any]:
         raise FileError(f"{name} cannot be decoded: {error.err}") from error
     if pixels is None or pixels.size == 0:
         raise FileError(f"{name} cannot be decoded; it is no whole photo of a known kind")
+    return pixels
+
+
+def read_plain(path: Path, what: str, flags: int) -> NDArray[Any]:
+    """Pixels of a picture that is no photo, such as a mask, without its metadata; `what` it is, for errors.
+
+    Raises
+    ------
+    FileError
+        When it cannot be read or decoded, or claims more pixels than it can hold or than any photo has.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise FileError(f"{what} {path} cannot be read: {error.strerror}") from error
+    kind = kind_of_content(data, path.name)
+    size = picture_size(data, kind)
+    if size is not None and (size[0] * size[1] > MAX_MEGAPIXELS * 1e6 or not can_hold(data, kind, size)):
+        raise FileError(f"{what} {path} has {size[0]}x{size[1]} pixels by its header, more than it can hold")
+    try:
+        pixels: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    except cv2.error as error:
+        raise FileError(f"{what} {path} cannot be decoded: {error.err}") from error
+    if pixels is None:
+        raise FileError(f"{what} {path} cannot be decoded; it is no picture of a known kind")
     return pixels
 
 

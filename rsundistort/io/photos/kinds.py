@@ -12,6 +12,7 @@ __all__ = [
     "HEIF_SUFFIXES",
     "PHOTO_SUFFIXES",
     "RAW_SUFFIXES",
+    "can_hold",
     "is_whole",
     "jpeg_segments",
     "kind_of_content",
@@ -105,6 +106,18 @@ def picture_size(data: bytes, kind: str) -> tuple[int, int] | None:
     """Width and height in pixels by the header, before anything is decoded; None where it does not say."""
     size = {"JPEG": _jpeg_size, "PNG": _png_size, "WebP": _webp_size, "TIFF": _tiff_size, "HEIC": _heif_size}.get(kind)
     return None if size is None else size(data)
+
+
+def can_hold(data: bytes, kind: str, size: tuple[int, int]) -> bool:
+    """Whether a file is long enough for a picture of this size, however well it was packed.
+
+    zlib packs up to 1032 bytes into one. A JPEG has a bit or more for each block of 64 pixels, 6 for 256 of three
+    channels. In a WebP of one colour pixels take nothing.
+    """
+    width, height = size
+    if kind == "PNG":
+        return width * height * data[24] // 8 <= 1100 * len(data)
+    return kind not in ("JPEG", "TIFF") or width * height <= 8192 * len(data)
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
