@@ -74,11 +74,12 @@ def errors_for_people(kept: str = "nothing was written") -> Iterator[list[str]]:
     import cv2
 
     from rsundistort.errors import RsUndistortError
+    from rsundistort.io.photos.codec_lines import heard
 
-    # OpenCV's and libtiff's own lines about broken files: ours say it once, with the name. 0 is silent; the function's
-    # place is OpenCV 4's, or 5's
-    (cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel)(0)
-    with warnings_for_people() as said:
+    # errors, which are heard: lines of codecs about broken files become ours, with the name. The function's place is
+    # OpenCV 4's, or 5's
+    (cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel)(2)
+    with heard(), warnings_for_people() as said:
         try:
             yield said
         except RsUndistortError as error:

@@ -1,6 +1,7 @@
 """Errors and warnings: one root, each leaf also of the builtin class that a caller expects."""
 
 __all__ = [
+    "DamagedPhotoWarning",
     "FileError",
     "FileKindWarning",
     "FormatError",
@@ -63,6 +64,10 @@ class SkippedPhotoWarning(RsUndistortWarning):
 
 class MetadataWarning(RsUndistortWarning):
     """A photo's metadata could not be kept."""
+
+
+class DamagedPhotoWarning(RsUndistortWarning):
+    """A photo's decoder, or a checksum in its file, says that pixels of it are not what they were."""
 
 
 class FileKindWarning(RsUndistortWarning):

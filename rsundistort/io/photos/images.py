@@ -18,9 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import FileError, FileKindWarning, InputError, MetadataWarning
+from ...errors import DamagedPhotoWarning, FileError, FileKindWarning, InputError, MetadataWarning
 from ..aside import write_aside
 from ..places import Place, files_in, place_of
+from .codec_lines import with_lines
 from .containers import Parts, metadata_of, with_metadata
 from .heif import read_heif
 from .kinds import (
@@ -35,7 +36,7 @@ from .kinds import (
 )
 from .metadata import Metadata
 from .raw import read_raw
-from .tiff import as_stored, encode_tiff, tiff_metadata
+from .tiff import as_stored, damaged_strips, encode_tiff, tiff_metadata
 
 __all__ = [
     "LARGEST_SIDE",
@@ -191,7 +192,14 @@ def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> Photo:
     elif kind == "HEIC":
         pixels, metadata = read_heif(data, path.name)
     else:
-        pixels = _decode(as_stored(data), path.name) if kind == "TIFF" else _decode_file(path, stamp, data)
+        pixels, said = with_lines(
+            lambda: _decode(as_stored(data), path.name) if kind == "TIFF" else _decode_file(path, stamp, data)
+        )
+        if kind == "TIFF" and (count := damaged_strips(data)):
+            said = [f"the checksum of {count} of its strips is wrong"]
+        if said:
+            text = f"{path.name} seems damaged: {said[0]}; if it looks wrong, copy it again from the camera"
+            warnings.warn(text, DamagedPhotoWarning, stacklevel=2)
         metadata = tiff_metadata(data) if kind == "TIFF" else metadata_of(data, kind)
     if kind != named:
         warnings.warn(
@@ -254,12 +262,15 @@ def read_plain(path: Path, what: str, flags: int) -> NDArray[Any]:
     if size is not None and (size[0] * size[1] > MAX_MEGAPIXELS * 1e6 or not can_hold(data, kind, size)):
         raise FileError(f"{what} {path} has {size[0]}x{size[1]} pixels by its header, more than it can hold")
     try:
-        pixels: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+        decoded = with_lines(lambda: cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None)
     except cv2.error as error:
         raise FileError(f"{what} {path} cannot be decoded: {error.err}") from error
+    pixels, said = decoded
     if pixels is None:
         raise FileError(f"{what} {path} cannot be decoded; it is no picture of a known kind")
-    return pixels
+    if said:
+        warnings.warn(f"{what} {path} seems damaged: {said[0]}", DamagedPhotoWarning, stacklevel=2)
+    return np.asarray(pixels)
 
 
 def _encode_params(suffix: str, quality: int, flat: bool) -> list[int]:
