@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import textwrap
 from collections.abc import Mapping, Sequence
 from math import isfinite
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .terminal import Talk, list_failed, table
+from .terminal import Talk, list_failed, say_json, table
 
 if TYPE_CHECKING:
     from rsundistort.model import Solution
@@ -27,7 +26,7 @@ _LABEL = 19
 def close(solution: Solution, out: Path, warned: Sequence[str], talk: Talk) -> None:
     """Say what was found; exit code 3 if photos that have a motion could not be rectified."""
     if talk.as_json:
-        click.echo(json.dumps(summary(solution, out, warned)))
+        say_json(summary(solution, out, warned))
     elif talk.to_people:
         click.echo(closing_table(solution, out))
     list_failed({image.name: image.reason for image in solution.registered if image.reason}, talk)

@@ -15,7 +15,7 @@ from typing import Any
 
 import click
 
-__all__ = ["SOME_FAILED", "Talk", "errors_for_people", "list_failed", "progress_bars", "table"]
+__all__ = ["SOME_FAILED", "Talk", "errors_for_people", "list_failed", "progress_bars", "say_json", "table"]
 
 #: Exit code when some photos failed, and the others are done.
 SOME_FAILED = 3
@@ -64,6 +64,7 @@ def warnings_for_people() -> Iterator[list[str]]:
 
     with warnings.catch_warnings():
         warnings.simplefilter("default")
+        warnings.simplefilter("ignore", RuntimeWarning)  # of NumPy, which are for developers
         warnings.showwarning = show
         yield said
 
@@ -88,6 +89,13 @@ def errors_for_people(kept: str = "nothing was written") -> Iterator[list[str]]:
         except KeyboardInterrupt as stop:
             say(f"stopped; {stop or kept}")
             sys.exit(130)
+
+
+def say_json(value: Any) -> None:
+    """One JSON object on stdout; numbers that JSON lacks, NaN and infinity, are null."""
+    from rsundistort.io.json_text import plain
+
+    click.echo(json.dumps(plain(value), allow_nan=False))
 
 
 def list_failed(failed: Mapping[str, str], talk: Talk) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import FileError, FormatError
 
-__all__ = ["parse_json", "read_json"]
+__all__ = ["parse_json", "plain", "read_json"]
 
 # Brackets within brackets: our own files have seven.
 _DEEPEST = 100
@@ -67,3 +67,18 @@ def read_json(path: Path | str) -> Any:
         raise FormatError(f"{path} is no valid JSON: it is no UTF-8 text") from error
     except ValueError as error:
         raise FormatError(f"{path} is no valid JSON: {error}") from error
+
+
+def plain(value: Any) -> Any:
+    """The value with arrays as lists and NumPy scalars as numbers; NaN and infinity, which JSON lacks, become null."""
+    if isinstance(value, dict):
+        return {k: plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value

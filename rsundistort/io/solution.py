@@ -12,7 +12,7 @@ from ..errors import FormatError, InputError
 from ..model import Bend, Camera, RowMotion, Solution, SolvedImage
 from .aside import write_aside
 from .cameras import camera_from_json, camera_to_json
-from .json_text import read_json
+from .json_text import plain, read_json
 from .photos.images import LARGEST_SIDE, RAW_AS
 from .rules import Between, Maybe, Numbers, OneOf, check, shown
 
@@ -105,21 +105,6 @@ _RULES = {
 }
 
 
-def _plain(value: Any) -> Any:
-    """The value with arrays as lists and NumPy scalars as numbers; NaN becomes null."""
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value
-
-
 def _bend_to_json(bend: Bend) -> dict[str, Any]:
     value = {"clock": bend.clock, "rotation": bend.rotation}
     return value | {"position": bend.position} if bend.moves else value
@@ -191,7 +176,7 @@ def solution_to_json(solution: Solution) -> dict[str, Any]:
     }
     if solution.georeference is not None:
         value["georeference"] = dict(solution.georeference)
-    result: dict[str, Any] = _plain(value)
+    result: dict[str, Any] = plain(value)
     return result
 
 
@@ -202,7 +187,12 @@ def write_solution(path: Path, solution: Solution) -> None:
 
 def solution_to_bytes(solution: Solution) -> bytes:
     """The content of `solution.json`."""
-    return (json.dumps(solution_to_json(solution), indent=1) + "\n").encode()
+    value = solution_to_json(solution)
+    try:
+        check(value, _RULES)
+    except FormatError as error:  # which nobody could read again
+        raise InputError(f"the solution cannot be written: {error}") from error
+    return (json.dumps(value, indent=1, allow_nan=False) + "\n").encode()
 
 
 def read_solution(path: Path, newer: bool = False) -> Solution:
@@ -265,7 +255,7 @@ def _image_from_json(entry: dict[str, Any], where: str) -> SolvedImage:
     try:
         if entry["registered"] and entry.get("phi") is not None:
             velocity = entry.get("velocity") or [0.0, 0.0, 0.0]
-            motion = RowMotion(entry["phi"], velocity, _bend_from_json(entry))
+            motion = RowMotion(np.array(entry["phi"], float), np.array(velocity, float), _bend_from_json(entry))
         roi, sigma = entry.get("roi"), entry.get("sigma_phi")
         return SolvedImage(
             name=entry["name"],

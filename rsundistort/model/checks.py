@@ -122,7 +122,8 @@ def check_kind(value: Any, kind: type, name: str) -> None:
 
 def check_fields(value: Any) -> None:
     """Refuse fields of a dataclass that are of other types than their annotations say; arrays are left to others."""
-    for name, hint in _hints(type(value)).items():
+    kind: Any = type(value)
+    for name, hint in _hints(kind).items():
         check_annotated(getattr(value, name), hint, name)
 
 
@@ -133,7 +134,7 @@ def check_annotated(value: Any, hint: Any, name: str) -> None:
 
 
 @cache
-def _hints(kind: type) -> dict[str, Any]:
+def _hints(kind: Any) -> dict[str, Any]:
     hints = get_type_hints(kind)
     return {each.name: hints[each.name] for each in fields(kind)}
 

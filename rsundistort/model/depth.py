@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from .checks import check_array, check_finite, check_number, check_size, frozen
+from .checks import check_array, check_finite, check_number, check_numbers, check_size, frozen
 
 __all__ = ["AtInfinity", "Depth", "DepthMap", "Plane", "check_depth"]
 
@@ -50,7 +50,10 @@ class Plane:
 
     def inverse_depth(self, rays: ArrayLike) -> NDArray[np.float64]:
         """1 / s of the points s * ray where rays (..., 3) of the camera frame meet the plane; 0 where they do not."""
-        return np.maximum(np.asarray(rays) @ self.normal / self.distance, 0.0)
+        directions = check_numbers(rays, "rays")
+        if directions.shape[-1:] != (3,):
+            raise InputError(f"rays.shape={directions.shape}, expected (..., 3)")
+        return np.maximum(directions @ self.normal / self.distance, 0.0)
 
 
 @dataclass(frozen=True)

@@ -116,7 +116,8 @@ class RemapGrid:
             seen[:] = seen_by(map_x, map_y, self.source_width, self.source_height)
             return bool(seen.all())
 
-        return remap_strips(image, fill, self.size, check_interpolation(interpolation), jobs)
+        flag = check_interpolation(interpolation)
+        return remap_strips(image, fill, self.size, flag, check_whole(jobs, "jobs", 1))
 
     def inverse(self) -> RemapGrid:
         """The way back: for each pixel of the source, which pixel of this grid's image shows it.

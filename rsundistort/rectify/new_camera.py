@@ -174,7 +174,7 @@ def optimal_new_camera(
         Rectangle without empty pixels in any of the rectified photos.
     """
     alpha = check_number(alpha, "alpha", 0.0, 1.0)
-    motions = [motion_of(camera, each) for each in (motion if isinstance(motion, (list, tuple)) else [motion])]
+    motions = [motion_of(camera, each) for each in (motion if isinstance(motion, Sequence) else [motion])]
     width, height = check_size((camera.width, camera.height) if size is None else size, least=2)
     outlines = [_outline(camera, each, shutter_model) for each in motions]
     found = [each for each in outlines if each is not None]
