@@ -58,7 +58,7 @@ _CRITICAL_MOTION = {
     "y_axis_spread_deg?": _NUMBER,
     "sigma_log_k?": _NUMBER,
     "flagged?": Maybe(bool),
-    "anchors?": _BY_NAME,
+    "anchors?": Maybe({str: float}),
     **{f"{name}?": Maybe(str) for name in ("meaning", "remedy", "sentence")},
     **{f"{name}?": Maybe([str]) for name in ("warnings", "advice")},
 }

@@ -91,15 +91,19 @@ def child(tmp_path_factory):
         print(f"| {name} | {made.counts[name, 'read']} | {made.counts[name, 'refused']} |")
 
 
+def lay_out(files: dict[str, bytes], folder: Path) -> None:
+    shutil.rmtree(folder, ignore_errors=True)
+    for path, data in files.items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_bytes(data)
+
+
 def judged(child: Child, name: str, files: dict[str, bytes], work: Path) -> dict[str, object]:
     """What became of an input; what must not be is an error that says which input it was."""
     group = GROUPS[name]
     folder = work / "input"
     every = {**group.beside(), **files}
-    shutil.rmtree(folder, ignore_errors=True)
-    for path, data in every.items():
-        (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        (folder / path).write_bytes(data)
+    lay_out(every, folder)
     outside = {path for path in work.parent.rglob("*") if folder not in path.parents}
     became = child.ask(group.reader, folder)
     size = sum(map(len, every.values()))
@@ -142,7 +146,7 @@ def test_damaged_files(child, tmp_path, name):
             kept = (
                 KEPT / f"{name.replace(' ', '-')}-{len(failures)}" if KEPT else work.parent / f"failed-{len(failures)}"
             )
-            shutil.copytree(work / "input", kept, dirs_exist_ok=True)
+            lay_out({**GROUPS[name].beside(), **files}, kept)
             failures[said.splitlines()[-1]] = f"{kept}: {said}"
 
     (hypothesis.seed(SEED)(tried) if COUNT else tried)()
