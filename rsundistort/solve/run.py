@@ -85,6 +85,7 @@ def run(
         frames = [] if source.frames is None else [f"frames/{path.name}" for path in folder.iterdir()]
         of_video = [] if source.clip is None else [name for name in OF_VIDEOS if _writes(name, options)]
         names = list_photos(folder, rectify.raw_as)
+        options.outputs.check_names(names)
         Record(out).check([*frames, *of_video, *files_of_run(names, rectify.raw_as, options.outputs)], inputs)
         loaded = load_photos(
             folder, source.camera, options.solve.readout, options.max_features, workers, log,

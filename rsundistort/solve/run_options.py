@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..batch.rectify_options import RectifyOptions
 from ..bundle import BundleOptions
+from ..colmap.rectified_model import check_text_names
 from ..critical import with_remedy
 from ..errors import InputError
 from ..input.gyroscope import GyroOptions
@@ -157,6 +158,11 @@ class OutputOptions(_Part):
         if self.sparse_format not in ("bin", "txt"):
             raise InputError(f"sparse_format={self.sparse_format!r}, expected bin or txt")
         check_exports(self.exports)
+
+    def check_names(self, names: Iterable[str]) -> None:
+        """Refuse photos whose names the outputs cannot hold."""
+        if self.sparse_format == "txt":
+            check_text_names(names)
 
 
 @dataclass(frozen=True, kw_only=True)
