@@ -242,7 +242,7 @@ CAMERA = ("intrinsics", 0, "value", "ptr_wrapper", "data")
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda v: v.pop("structure"), "expected an object with structure"),
+        (lambda v: v.pop("structure"), "lacks structure"),
         (lambda v: v.update(structure=[]), "0 points, expected more"),
         (lambda v: v.update(extrinsics=[]), "0 photos with a pose"),
         (lambda v: _set(v, (*VIEW, "filename"), "../../a.jpg"), "inside the folder of photos"),

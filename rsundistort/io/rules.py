@@ -124,10 +124,10 @@ def _is(value: Any, kind: type) -> bool:
 
 
 class _Wrong(Exception):
-    """What was expected, of which value, and its place: from within outwards."""
+    """What is wrong with a value, and its place: from within outwards."""
 
-    def __init__(self, expected: str, value: Any) -> None:
-        super().__init__(expected)
+    def __init__(self, expected: str, value: Any, lacks: str = "") -> None:
+        super().__init__(f"lacks {lacks}" if lacks else f"expected {expected}, got {shown(value)}")
         self.value = value
         self.place: list[str] = []
 
@@ -144,7 +144,7 @@ def check(value: Any, rule: Any, where: str = "") -> None:
         _check(value, rule)
     except _Wrong as wrong:
         place = (where + "".join(reversed(wrong.place))).removeprefix(".")
-        raise FormatError(f"{place}{': ' if place else ''}expected {wrong}, got {shown(wrong.value)}") from None
+        raise FormatError(f"{place}{': ' if place else ''}{wrong}") from None
 
 
 def _check(value: Any, rule: Any) -> None:
@@ -184,7 +184,7 @@ def _check_object(value: Any, rule: dict[Any, Any]) -> None:
             if place in value:
                 _check(value[place], of_name)
             elif place == name:
-                raise _Wrong(f"an object with {name}", value)
+                raise _Wrong("", value, lacks=name)
     except _Wrong as wrong:
         if wrong.value is not value:
             wrong.place.append(f".{place}")

@@ -303,5 +303,5 @@ def load_recipe(path: str | Path) -> Recipe:
         return _parse(data, path.parent)
     except InputError as error:
         raise FormatError(f"{path}: {error}") from error
-    except (TypeError, KeyError, AttributeError, ValueError, OverflowError) as error:
+    except (TypeError, KeyError, IndexError, AttributeError, ValueError, OverflowError) as error:
         raise FormatError(f"{path}: an entry has the wrong type ({error})") from error

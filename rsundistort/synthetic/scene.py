@@ -84,6 +84,9 @@ class Opening:
     reveal: str = ""
     offset_m: tuple[float, float] = (0.0, 0.0)
 
+    def __post_init__(self) -> None:
+        check_fields(self)
+
 
 def wall(patch: Patch, openings: list[Opening]) -> list[Patch]:
     """The patches of a rectangular wall with openings, their sides and backs.

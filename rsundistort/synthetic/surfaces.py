@@ -50,8 +50,10 @@ def _box(entry: Any, where: str, textures: dict[str, Texture], rng: np.random.Ge
 def _flat(entry: Any, where: str, kind: str) -> list[Patch]:
     optional = ("offset_m", "openings") if kind == "rectangle" else ("offset_m",)
     take(entry, where, ("kind", "origin_w", "edge_a", "edge_b", "texture"), optional)
-    offset = tuple(entry.get("offset_m", (0.0, 0.0)))
-    patch = Patch(entry["origin_w"], entry["edge_a"], entry["edge_b"], entry["texture"], offset, kind == "triangle")
+    across, along = check_finite(entry.get("offset_m", (0.0, 0.0)), (2,), f"{where}: offset_m").tolist()
+    patch = Patch(
+        entry["origin_w"], entry["edge_a"], entry["edge_b"], entry["texture"], (across, along), kind == "triangle"
+    )
     if "openings" not in entry:
         return [patch]
     openings = []

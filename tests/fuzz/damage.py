@@ -107,7 +107,7 @@ def tokens(draw, data: bytes):
         elif how == "cut":
             parts = parts[:k]
         elif how == "repeat":
-            parts[k] *= draw(st.sampled_from([2, 100, 20_000]))
+            parts[k] *= min(draw(st.sampled_from([2, 100, 20_000])), 1 + 1_000_000 // len(parts[k]))
         elif how == "line":
             lines = data.split(b"\n")
             m = draw(st.integers(0, len(lines) - 1))

@@ -438,9 +438,9 @@ GRID = {"map_x": np.eye(9, dtype="f4"), "map_y": np.eye(9, dtype="f4"), "source_
 
 GROUPS: dict[str, Group] = {
     "solutions": Group("solution", lambda: one_of(s__json=damage.json_texts(solution())), 1500),
-    "reports": Group("report", reports, 500),
+    "reports": Group("report", reports, 150),
     "rectifying": Group(
-        "rectify", lambda: one_of(solution__json=damage.json_texts(small_solution())), 400, small_photos
+        "rectify", lambda: one_of(solution__json=damage.json_texts(small_solution())), 300, small_photos
     ),
     "cameras": Group("camera", camera_files, 1500),
     "recipes": Group("recipe", lambda: one_of(r__json=damage.json_texts(recipe())), 700),

@@ -166,6 +166,8 @@ def test_a_grid_whose_source_has_no_size(tmp_path):
         (("render", "samples"), 10**9, "no more than 1024"),
         (("render", "jpeg_quality"), [1], "jpeg_quality"),
         (("points",), 10**30, "points="),
+        (("surfaces", 1, "openings", 0, "size_m"), [1.0], r"size_m=\(1\.0,\), expected"),
+        (("surfaces", 1, "openings", 0, "at_m"), 3, "at_m=3, expected"),
     ],
 )
 def test_a_recipe_that_nobody_could_render_is_refused_when_it_is_read(tmp_path, path, value, says):
