@@ -123,7 +123,7 @@ def test_files_that_are_not_damaged(child, tmp_path, name, number):
     assert judged(child, name, wholes()[name][number], tmp_path / "work")["said"] == ""
 
 
-@pytest.mark.timeout(3600 if COUNT else 120)
+@pytest.mark.timeout(3600 if COUNT else 400)
 @pytest.mark.parametrize("name", GROUPS)
 def test_damaged_files(child, tmp_path, name):
     num = -(-COUNT * GROUPS[name].share // sum(each.share for each in GROUPS.values())) if COUNT else 12
