@@ -120,6 +120,15 @@ def test_a_picture_that_claims_more_than_it_holds_is_not_decoded(tmp_path, size)
             read(path)
 
 
+def test_a_chunk_of_a_picture_that_claims_four_gigabytes_makes_no_room(tmp_path):
+    whole = bytes(cv2.imencode(".png", np.full((48, 64), 255, np.uint8))[1])
+    at = whole.index(b"IDAT") + 20
+    (tmp_path / "a.png").write_bytes(whole[: at - 3] + whole[at:])  # what stands behind is no chunk any more
+    for read in (read_photo, lambda path: read_mask(path, 64, 48), read_depth_map):
+        with pytest.raises(FileError, match=r"a\.png (is cut short|cannot be decoded)"):
+            read(tmp_path / "a.png")
+
+
 @pytest.mark.parametrize(
     "data",
     [

@@ -258,6 +258,8 @@ def read_plain(path: Path, what: str, flags: int) -> NDArray[Any]:
     except OSError as error:
         raise FileError(f"{what} {path} cannot be read: {error.strerror}") from error
     kind = kind_of_content(data, path.name)
+    if not is_whole(data):
+        raise FileError(f"{what} {path} cannot be decoded: it is cut short, or damaged")
     size = picture_size(data, kind)
     if size is not None and (size[0] * size[1] > MAX_MEGAPIXELS * 1e6 or not can_hold(data, kind, size)):
         raise FileError(f"{what} {path} has {size[0]}x{size[1]} pixels by its header, more than it can hold")

@@ -73,9 +73,15 @@ def _is_raw(data: bytes, named_raw: bool) -> bool:
 
 
 def is_whole(data: bytes) -> bool:
-    """Whether a JPEG or PNG has its end; some decoders fill what is missing with grey and say nothing."""
+    """Whether a JPEG or PNG has its end; some decoders fill what is missing with grey and say nothing.
+
+    Of a PNG, chunk by chunk: OpenCV makes room for what each claims to hold, 4 GB perhaps.
+    """
     if data[:8] == b"\x89PNG\r\n\x1a\n":
-        return data.rfind(b"IEND") > 0
+        at = 8
+        while at + 12 <= len(data) and data[at + 4 : at + 8] != b"IEND":
+            at += 12 + int.from_bytes(data[at : at + 4], "big")
+        return at + 12 <= len(data) and data[at : at + 4] == bytes(4)
     if data[:2] != b"\xff\xd8":
         return True
     before = max((end for _, _, end in jpeg_segments(data)), default=2)
