@@ -5,7 +5,7 @@ VENV ?= .venv
 BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 OUT ?= demo-out
 
-.PHONY: demo test test-all check format docs bench figures clean
+.PHONY: demo test test-all fuzz check format docs bench figures clean
 
 # made again when the dependencies change
 $(VENV)/.installed: pyproject.toml
@@ -33,6 +33,10 @@ test: $(VENV)/.installed
 
 test-all: $(VENV)/.installed
 	OMP_NUM_THREADS=1 $(TEST) -m "slow or not slow"
+
+# damaged files of every format, some 20,000; RSUNDISTORT_FUZZ_SEED=N repeats a run (docs/hardening.md)
+fuzz: $(VENV)/.installed
+	RSUNDISTORT_FUZZ=$(or $(FUZZ),20000) $(BIN)/python -m pytest -s tests/fuzz -k test_damaged_files
 
 check: $(VENV)/.installed docs
 	$(BIN)/ruff format --check .

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from . import options as opt
-from .terminal import errors_for_people, tell
+from .terminal import errors_for_people, say_json, tell
 
 if TYPE_CHECKING:
     from rsundistort.analysis import PoseAnalysis
@@ -29,7 +28,10 @@ def command(path: Path, readout: str | None, as_json: bool) -> None:
         from rsundistort.analysis import analyze
 
         result = analyze(path, readout)
-    tell(json.dumps(result.to_json()) if as_json else _text(result))
+    if as_json:
+        say_json(result.to_json())
+    else:
+        tell(_text(result))
 
 
 def _text(result: PoseAnalysis) -> str:

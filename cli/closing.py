@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import textwrap
 from collections.abc import Mapping, Sequence
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .terminal import Said, Talk, list_failed, table, tell
+from .terminal import Said, Talk, list_failed, say_json, table, tell
 
 if TYPE_CHECKING:
     from rsundistort.model import Solution
@@ -25,7 +24,7 @@ _LABEL = 19
 def close(solution: Solution, out: Path, warned: Said, talk: Talk) -> None:
     """Say what was found; exit code 3 if photos with a motion could not be rectified, or the report not be written."""
     if talk.as_json:
-        tell(json.dumps(summary(solution, out, warned)))
+        say_json(summary(solution, out, warned))
     elif talk.to_people:
         tell(closing_table(solution, out))
     failed = {image.name: image.reason for image in solution.registered if image.reason}

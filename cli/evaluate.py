@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from . import options as opt
-from .terminal import Talk, errors_for_people, progress_bars, table, tell
+from .terminal import Talk, errors_for_people, progress_bars, say_json, table, tell
 
 if TYPE_CHECKING:
     from rsundistort.analysis import Evaluation
@@ -38,7 +37,7 @@ def command(
 
         result = evaluate(out, truth, poses=poses, twins=twins, raw=raw, progress=progress)
     if as_json:
-        tell(json.dumps(result.to_json()))
+        say_json(result.to_json())
     elif not quiet:
         tell(_text(result))
 

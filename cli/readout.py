@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,7 @@ import click
 
 from . import options as opt
 from .closing import fitted
-from .terminal import SOME_FAILED, Talk, errors_for_people, progress_bars, tell
+from .terminal import SOME_FAILED, Talk, errors_for_people, progress_bars, say_json, tell
 
 if TYPE_CHECKING:
     from rsundistort.solve import MeasuredReadout
@@ -64,7 +63,7 @@ def command(video: Path, given: dict[str, Any], talk: Talk) -> None:
         options = RunOptions(solve=SolveOptions(**given), gyro=gyro, camera=camera)
         found = measure_readout(video, options, progress, jobs=jobs)
     if talk.as_json:
-        tell(json.dumps({**found.to_json(), "warnings": list(warned)}))
+        say_json({**found.to_json(), "warnings": list(warned)})
     elif talk.to_people:
         tell("\n".join(_lines(found)))
     if not found.measured:

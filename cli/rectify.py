@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 
 from . import options as opt
-from .terminal import Talk, errors_for_people, list_failed, progress_bars, tell
+from .terminal import Talk, errors_for_people, list_failed, progress_bars, say_json, tell
 
 
 @click.command()
@@ -56,7 +55,7 @@ def command(photos: Path | str, solution: Path, out: Path | str, given: dict[str
     failed = {name: why for name, why in left_out.items() if name not in known}
     if talk.as_json:
         summary = {"out": str(out), "rectified": count, "shutter_model": solved.shutter_model, "left_out": left_out}
-        tell(json.dumps({**summary, "warnings": warned}))
+        say_json({**summary, "warnings": warned})
     elif talk.to_people:
         done = f"{count} photo{'s' * (count != 1)} rectified with the {solved.shutter_model} model"
         tell(f"{done}, {len(left_out)} left out: {out}")

@@ -49,7 +49,7 @@ def _hear(number: int, _frame: Any) -> None:
     raise KeyboardInterrupt
 
 
-def _watch(pipe: int) -> None:
+def _watch(pipe: int, stderr: int) -> None:
     """End the process if native code does not let Python hear a signal, or a second one comes."""
     number = os.read(pipe, 1)[0]
     until = time.monotonic() + _GRACE_S
@@ -63,7 +63,7 @@ def _watch(pipe: int) -> None:
             continue
     if not _state["said"]:  # past sys.stderr: who holds its lock may be stopped
         with suppress(OSError):
-            os.write(2, f"stopped; {_state['kept']}\n".encode(errors="backslashreplace"))
+            os.write(stderr, f"stopped; {_state['kept']}\n".encode(errors="backslashreplace"))
     os._exit(128 + number)
 
 
@@ -78,6 +78,6 @@ def hears_signals() -> Iterator[None]:
         here, there = os.pipe()
         os.set_blocking(there, False)
         signal.set_wakeup_fd(there, warn_on_full_buffer=False)
-        threading.Thread(target=_watch, args=(here,), daemon=True).start()
+        threading.Thread(target=_watch, args=(here, os.dup(2)), daemon=True).start()
     with stops_for_people():
         yield

@@ -9,7 +9,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
@@ -25,6 +25,7 @@ __all__ = [
     "forget_stdout",
     "list_failed",
     "progress_bars",
+    "say_json",
     "stdout_is_lost",
     "table",
     "tell",
@@ -114,6 +115,7 @@ def warnings_for_people() -> Iterator[Said]:
 
     with warnings.catch_warnings():
         warnings.simplefilter("default")
+        warnings.simplefilter("ignore", RuntimeWarning)  # of NumPy, which are for developers
         warnings.showwarning = show
         yield said
 
@@ -126,14 +128,17 @@ def errors_for_people(kept: str = "nothing was written") -> Iterator[Said]:
     `kept`.
     """
     kept_is(kept)
-    with stops_for_people(), warnings_for_people() as said:
+    with stops_for_people(), ExitStack() as stack:
         import cv2
 
         from rsundistort.errors import RsUndistortError
+        from rsundistort.io.photos.codec_lines import heard
 
-        # OpenCV's and libtiff's own lines about broken files: ours say it once, with the name. 0 is silent; the
-        # function's place is OpenCV 4's, or 5's
-        (cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel)(0)
+        # errors, which are heard: lines of codecs about broken files become ours, with the name. The function's place
+        # is OpenCV 4's, or 5's
+        (cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel)(2)
+        stack.enter_context(heard())
+        said = stack.enter_context(warnings_for_people())
         try:
             yield said
         except RsUndistortError as error:
@@ -151,6 +156,13 @@ def errors_for_people(kept: str = "nothing was written") -> Iterator[Said]:
 def _fail(text: str) -> NoReturn:
     say(f"error: {text}", fg="red")
     sys.exit(1)
+
+
+def say_json(value: Any) -> None:
+    """One JSON object on stdout; numbers that JSON lacks, NaN and infinity, are null."""
+    from rsundistort.io.json_text import plain
+
+    tell(json.dumps(plain(value), allow_nan=False))
 
 
 def list_failed(failed: Mapping[str, str], talk: Talk) -> None:

@@ -1,6 +1,7 @@
 """Errors and warnings: one root, each leaf also of the builtin class that a caller expects."""
 
 __all__ = [
+    "DamagedPhotoWarning",
     "FileError",
     "FileKindWarning",
     "FormatError",
@@ -11,11 +12,28 @@ __all__ = [
     "RsUndistortError",
     "RsUndistortWarning",
     "SkippedPhotoWarning",
+    "one_line",
 ]
+
+
+# Longer than any of ours; a damaged file would have a value of it echoed that fills the screen.
+_LONGEST = 480
+
+
+def one_line(text: str) -> str:
+    """A text without line breaks and other control characters, its middle left out where it is too long."""
+    line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.split()))
+    if len(line) <= _LONGEST:
+        return line
+    # what it is about stands first, how to mend it last
+    return f"{line[: _LONGEST * 2 // 3]} ... {line[-(_LONGEST // 3 - 5) :]}"
 
 
 class RsUndistortError(Exception):
     """Root of every error that rsundistort raises on purpose; its text is one line for a person."""
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
 
 
 class InputError(RsUndistortError, ValueError):
@@ -35,7 +53,10 @@ class ReconstructionError(RsUndistortError, RuntimeError):
 
 
 class RsUndistortWarning(UserWarning):
-    """Root of every warning."""
+    """Root of every warning; its text is one line for a person."""
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
 
 
 class SkippedPhotoWarning(RsUndistortWarning):
@@ -52,6 +73,10 @@ class MissingOutputWarning(RsUndistortWarning):
     def __init__(self, text: str, file: str) -> None:
         super().__init__(text)
         self.file = file
+
+
+class DamagedPhotoWarning(RsUndistortWarning):
+    """A photo's decoder, or a checksum in its file, says that pixels of it are not what they were."""
 
 
 class FileKindWarning(RsUndistortWarning):

@@ -12,7 +12,6 @@ compares with `golden/photo.png` beside the test's file; `pytest --regolden` wri
 from __future__ import annotations
 
 import tempfile
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .errors import FileError, FormatError, InputError
 from .io import read_photo, write_image
+from .model.arrays import read_arrays
 
 __all__ = ["Golden", "assert_images_close"]
 
@@ -250,18 +250,12 @@ def _read(path: Path) -> NDArray[Any]:
     if path.suffix.lower() not in _ARRAY_SUFFIXES:
         return read_photo(path).pixels
     try:
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            return loaded
-        with loaded:
-            if len(loaded.files) != 1:
-                raise FormatError(f"{path} holds {len(loaded.files)} arrays, expected one")
-            only: NDArray[Any] = loaded[loaded.files[0]]
-            return only
-    except FormatError:
-        raise
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        arrays = read_arrays(path)
+    except (FileError, FormatError) as error:
         raise FileError(f"{path} cannot be read as an array: {error}") from error
+    if len(arrays) != 1:
+        raise FormatError(f"{path} holds {len(arrays)} arrays, expected one")
+    return next(iter(arrays.values()))
 
 
 def _save(path: Path, values: NDArray[Any]) -> None:

@@ -302,7 +302,7 @@ def test_simulate_warp_refuses_to_crop_to_a_stamp(invoke, photos, tmp_path):
         ('{"a.png": [1e999, 0, 0]}', "motion of a.png holds NaN or infinity"),
         ('{"a.png": [0, 0]}', "shape=(2,), expected (3,)"),
         ('{"a.png": 3}', "shape=(), expected (3,)"),
-        ('{"a.png": null}', "shape=(), expected (3,)"),
+        ('{"a.png": null}', "expected numbers of shape (3,), got None"),
         pytest.param('{"a.png": "fast"}', "got 'fast'"),
         pytest.param('{"a.png": ["x", "y", "z"]}', "got ['x', 'y', 'z']"),
         pytest.param('{"a.png": [[1], [2, 3]]}', "got [[1], [2, 3]]"),

@@ -196,11 +196,11 @@ def test_maps_that_cannot_be_used_are_refused(tmp_path, rng):
     np.savez(tmp_path / "d.npz", one=np.zeros((2, 2)), two=np.zeros((2, 2)))
     np.save(tmp_path / "e.npy", np.array([{"an": "object"}]), allow_pickle=True)
     for name, says in {
-        "a.npy": "cannot be decoded",
-        "b.tif": "no picture",
+        "a.npy": "is garbled",
+        "b.tif": "no picture of a known kind",
         "c.npy": "expected one number per pixel",
         "d.npz": "several arrays",
-        "e.npy": "cannot be decoded",
+        "e.npy": "is garbled",
     }.items():
         with pytest.raises((FileError, InputError), match=says):
             read_depth_map(tmp_path / name)

@@ -381,7 +381,7 @@ def first(count):
         ({"width": np.ones(2)}, FormatError, "single numbers"),
         ({"K": np.array([["a"] * 3] * 3)}, FormatError, "K holds <U1, expected numbers"),
         ({"K": np.zeros((3, 3))}, FormatError, "both must be positive"),
-        ({"points_w": np.array([None, 1], object)}, FormatError, "is no scene"),
+        ({"points_w": np.array([None, 1], object)}, FormatError, "is garbled: its type is object"),
     ],
 )
 def test_scenes_that_cannot_be_used(tmp_path, changed, error, message):
@@ -397,7 +397,7 @@ def test_files_that_are_no_scene(tmp_path, scene_file):
     garbled[100:200] = b"x" * 100
     for name, content in (("empty", b""), ("text", b"hello"), ("cut", whole[: len(whole) // 2]), ("bad", garbled)):
         (tmp_path / f"{name}.npz").write_bytes(content)
-        with pytest.raises(FormatError, match=rf"{name}\.npz is no scene"):
+        with pytest.raises(FormatError, match=rf"{name}\.npz is garbled"):
             load_scene(tmp_path / f"{name}.npz")
     np.save(tmp_path / "array.npy", np.zeros(3))
     (tmp_path / "array.npy").rename(tmp_path / "array.npz")

@@ -217,7 +217,7 @@ def test_grid_is_applied_as_rectify_does(rng):
 def test_impossible_grids_are_refused(x, y, says):
     with pytest.raises(InputError, match=says):
         RemapGrid(x, y, 5, 5)
-    with pytest.raises(InputError, match="0x5"):
+    with pytest.raises(InputError, match="source_width=0"):
         RemapGrid(np.zeros((2, 2)), np.zeros((2, 2)), 0, 5)
 
 
@@ -290,7 +290,7 @@ def test_files_that_are_no_grids_are_refused(grid, tmp_path):
         with pytest.raises(FormatError, match=name):
             RemapGrid.load(tmp_path / name)
     np.savez(tmp_path / "b.npz", map_x=np.zeros((2, 2)))
-    with pytest.raises(FormatError, match="source_size"):
+    with pytest.raises(FormatError, match="lacks map_y"):
         RemapGrid.load(tmp_path / "b.npz")
     np.savez(tmp_path / "c.npz", map_x=np.array([object()]), map_y=np.zeros(1), source_size=np.ones(2, int))
     with pytest.raises(FormatError, match=r"c\.npz"):

@@ -242,17 +242,29 @@ CAMERA = ("intrinsics", 0, "value", "ptr_wrapper", "data")
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda v: v.pop("structure"), "'structure' is missing"),
+        (lambda v: v.pop("structure"), "lacks structure"),
         (lambda v: v.update(structure=[]), "0 points, expected more"),
         (lambda v: v.update(extrinsics=[]), "0 photos with a pose"),
         (lambda v: _set(v, (*VIEW, "filename"), "../../a.jpg"), "inside the folder of photos"),
         (lambda v: _set(v, CAMERA, {"width": 9, "height": 9}), "no focal length"),
-        (lambda v: _set(v, ("extrinsics", 0, "value", "center"), [0, float("nan"), 0]), "center_w"),
-        (lambda v: _set(v, ("extrinsics", 0, "value", "rotation"), [[1, 0], [0, 1]]), "is not whole|R_cw"),
-        (lambda v: _set(v, ("structure", 0, "value", "X"), [1, 2]), "is not whole|points_w"),
-        (lambda v: _set(v, ("structure", 0, "value", "X"), None), "is not whole|points_w"),
-        (lambda v: _set(v, (*CAMERA, "disto_k3"), [1.0]), "is not whole"),
-        (lambda v: v.update(views=3), "is not whole"),
+        (
+            lambda v: _set(v, ("extrinsics", 0, "value", "center"), [0, float("nan"), 0]),
+            r"extrinsics\[0\].value.center: expected three",
+        ),
+        (
+            lambda v: _set(v, ("extrinsics", 0, "value", "rotation"), [[1, 0], [0, 1]]),
+            r"extrinsics\[0\].value.rotation: expected 3 x 3",
+        ),
+        (
+            lambda v: _set(v, ("structure", 0, "value", "X"), [1, 2]),
+            r"structure\[0\].value.X: expected three numbers, got \[1, 2\]",
+        ),
+        (
+            lambda v: _set(v, ("structure", 0, "value", "X"), None),
+            r"structure\[0\].value.X: expected three numbers, got null",
+        ),
+        (lambda v: _set(v, (*CAMERA, "disto_k3"), [1.0]), "intrinsic 0.disto_k3: expected three numbers"),
+        (lambda v: v.update(views=3), "views: expected a list, got 3"),
     ],
 )
 def test_broken_openmvg_is_one_line(tmp_path, change, message):
@@ -269,9 +281,9 @@ def test_broken_openmvg_is_one_line(tmp_path, change, message):
         (BROWN, None, "tracks.csv cannot be read"),
         (BROWN, "a.jpg 1 2\n", "line 1: 1 columns"),
         (BROWN, "../../a.jpg\t1\t2\t0\t0\n", "inside the folder of photos"),
-        (BROWN, "0.jpg\t0\tx\t0\t0\n", "is not whole"),
-        ({"projection_type": "spherical"}, "", "is spherical, expected one of perspective"),
-        ({"projection_type": "brown"}, "", "'focal_x' is missing"),
+        (BROWN, "0.jpg\t0\tx\t0\t0\n", "line 1: invalid literal"),
+        ({"projection_type": "spherical"}, "", "projection_type: expected one of perspective.*got 'spherical'"),
+        ({"projection_type": "brown"}, "", "has no focal length"),
     ],
 )
 def test_broken_opensfm_is_one_line(tmp_path, camera, tracks, message):

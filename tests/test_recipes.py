@@ -302,7 +302,7 @@ def test_broken_meshes_and_pictures_are_refused_by_name(tmp_path):
     with pytest.raises(FileError, match=r"p\.png"):
         simulate_scene(recipe, tmp_path / "out")
     (tmp_path / "p.png").write_bytes(b"no picture")
-    with pytest.raises(FormatError, match=r"p\.png is no picture"):
+    with pytest.raises(FileError, match=r"p\.png cannot be decoded"):
         simulate_scene(recipe, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

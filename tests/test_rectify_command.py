@@ -138,7 +138,7 @@ def test_maps_turn_with_their_photos(invoke, tmp_path):
     assert abs(found.astype(int) - image)[seen > 0].mean() < 2  # JPEG
 
 
-@pytest.mark.parametrize("name", ["../a.png", "/a.png", "b/../../a.png", "..", ".", "", "a\0.png", 7])
+@pytest.mark.parametrize("name", ["../a.png", "/a.png", "b/../../a.png", "..", ".", "", "a\0.png"])
 def test_names_that_leave_their_folder_are_refused(invoke, tmp_path, name):
     save_textures(tmp_path / "photos", THREE)
     solution_of(tmp_path / "s.json", THREE)

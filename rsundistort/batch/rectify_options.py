@@ -9,6 +9,7 @@ from pathlib import Path
 from ..errors import InputError
 from ..io import MAX_MEGAPIXELS, RAW_AS
 from ..io.places import local_place
+from ..model.checks import check_fields
 from ..rectify import INTERPOLATIONS, MAP_KINDS, ViewOptions
 from .geometry import DEPTHS, check_depth
 
@@ -69,6 +70,7 @@ class RectifyOptions:
         return [each for each in found if each is not None]
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_depth(self.depth)
         for folder, _ in self.also:
             local_place(folder)

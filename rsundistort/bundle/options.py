@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from ..model import BEND_GROUPS, Bend, KnownLength, Reconstruction
+from ..model.checks import check_fields
 from .intrinsics import GuessedCameras, check_refined
 from .lengths import check_lengths
 from .path import FramePath, PathSolution
@@ -190,6 +191,7 @@ class BundleOptions:
     path: FramePath | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self)
         object.__setattr__(self, "refine", check_refined(self.refine))
         object.__setattr__(self, "lengths", check_lengths(self.lengths))
         known = {name: _known(name, *value) for name, value in self.known_phi.items()}

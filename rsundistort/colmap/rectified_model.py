@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import InputError
 from ..model import Camera, Reconstruction
 from ..model.projection import at_depth, unproject_points
 from .conventions import HALF, import_pycolmap, rigid_of
 from .lenses import pinhole_to_colmap
 
-__all__ = ["ModelIds", "colmap_model", "rectified_keypoints", "write_colmap_model"]
+__all__ = ["ModelIds", "check_text_names", "colmap_model", "rectified_keypoints", "write_colmap_model"]
 
 
 @dataclass(frozen=True)
@@ -130,10 +131,21 @@ def colmap_model(
     return model
 
 
+def check_text_names(names: Iterable[str]) -> None:
+    """Refuse photos whose names COLMAP's text files, a line for each photo, cannot hold."""
+    for name in names:
+        if len(f"{name}.".splitlines()) > 1:
+            raise InputError(
+                f"photo {name!r} has a line break in its name, which a model as text cannot hold; rename it"
+            )
+
+
 def write_colmap_model(folder: Path, *model: Any, text: bool = False) -> None:
     """Write cameras, images, points3D, and rigs, frames, of `colmap_model(*model)`, as `.bin` or as `.txt`."""
-    folder.mkdir(parents=True, exist_ok=True)
     found = colmap_model(*model)
+    if text:
+        check_text_names([image.name for image in found.images.values()])
+    folder.mkdir(parents=True, exist_ok=True)
     if text:
         found.write_text(folder)
     else:

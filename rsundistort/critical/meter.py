@@ -139,6 +139,8 @@ def critical_motion(
     turn = check_rotations(R_cw, m, "R_cw")
     if m < 2:
         raise InputError("the meter of critical motions compares photos; it needs at least two poses")
+    if not isinstance(readout, (str, Sequence)):
+        raise InputError(f"readout={readout!r}, expected a direction, or one for each photo")
     directions = [readout] * m if isinstance(readout, str) else list(readout)
     if len(directions) != m:
         raise InputError(f"readout names {len(directions)} directions for {m} photos")

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import Solution
+from ..model.checks import check_kind, check_whole
 
 __all__ = ["MotionErrors", "PoseErrors", "align_points", "motion_errors", "pose_errors", "psnr", "rotation_angles_deg"]
 
@@ -140,8 +141,15 @@ def psnr(image: NDArray[Any], truth: NDArray[Any], mask: NDArray[np.uint8] | Non
         Pixels nearer than this to an invalid one, or to the border, do not count: an interpolation that reaches beyond
         the raw photo is no error of the geometry.
     """
+    for each, name in ((image, "image"), (truth, "truth"), *(() if mask is None else ((mask, "mask"),))):
+        check_kind(each, np.ndarray, name)
+        if each.dtype.kind not in "uif" or each.ndim not in (2, 3) or not each.size:
+            raise InputError(f"{name} is {each.dtype} {each.shape}, expected numbers (h, w[, channels])")
     if image.shape != truth.shape or image.dtype != truth.dtype:
         raise InputError(f"image {image.shape} {image.dtype} and truth {truth.shape} {truth.dtype} do not compare")
+    if mask is not None and (mask.dtype != np.uint8 or mask.shape != image.shape[:2]):
+        raise InputError(f"mask is {mask.dtype} {mask.shape}, expected uint8 {image.shape[:2]}")
+    check_whole(margin_px, "margin_px", 0, max(image.shape[:2]))
     valid = np.full(image.shape[:2], 255, np.uint8) if mask is None else mask
     size = 2 * margin_px + 1
     kept = cv2.erode(valid, np.ones((size, size), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +12,7 @@ from numpy.typing import NDArray
 from ..errors import FileError, FormatError, InputError
 from ..io import read_colmap_poses
 from ..model import Camera
+from ..model.arrays import read_arrays
 from ..model.checks import check_finite, check_index, check_rotations, frozen
 
 __all__ = ["KnownScene", "load_scene"]
@@ -114,25 +113,16 @@ def load_scene(path: Path | str) -> KnownScene:
 
 
 def _from_npz(path: Path) -> KnownScene:
-    try:
-        # NumPy leaves open what it opened itself and could not read
-        with path.open("rb") as file:
-            arrays = np.load(file, allow_pickle=False)
-            if not isinstance(arrays, np.lib.npyio.NpzFile):
-                raise FormatError(f"{path} is no scene: it holds a single array")
-            found = {name: arrays[name] for name in _ARRAYS}
-    except OSError as error:
-        raise FileError(f"{path} cannot be read: {error.strerror or error}") from error
-    except FormatError:
-        raise
-    # what NumPy raises of a file that was cut short or garbled
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise FormatError(f"{path} is no scene: {error}") from error
+    found = read_arrays(path)
+    for name in _ARRAYS:
+        if name not in found:
+            raise FormatError(f"{path} is no scene: it lacks {name}")
     if found["K"].ndim == 3:
         raise InputError(f"{path} has several cameras; the experiment takes scenes of one")
     if found["width"].ndim or found["height"].ndim:
         raise FormatError(f"{path} is no scene: width and height must be single numbers")
-    for name, array in found.items():
+    for name in _ARRAYS:
+        array = found[name]
         if array.dtype.kind not in "fiu":
             raise FormatError(f"{path} is no scene: {name} holds {array.dtype}, expected numbers")
     try:

@@ -17,6 +17,7 @@ from ..io.motions import Known
 from ..io.readout_times import readout_time
 from ..io.video import FRAME_TABLE, VideoFrames
 from ..model import Bend, Camera, Reconstruction
+from ..model.checks import check_fields
 
 __all__ = ["GyroOptions", "Readouts", "gyro_contradiction", "gyro_motions", "known_readouts"]
 
@@ -49,7 +50,8 @@ class GyroOptions:
     times: Path | str | None = None
 
     def __post_init__(self) -> None:
-        if not np.isfinite(self.offset_s):
+        check_fields(self)
+        if not np.isfinite(float(self.offset_s)):
             raise InputError(f"offset of the gyroscope's clock: {self.offset_s!r}, expected seconds")
 
     def log(self) -> GyroLog:

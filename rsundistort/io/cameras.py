@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -15,6 +14,7 @@ from ..colmap import read_colmap_cameras
 from ..errors import FileError, FormatError, InputError
 from ..model import Camera, other_axis
 from .calibrations import camera_from_calibration, is_calibration, parse_xml, parse_yaml
+from .json_text import parse_json
 
 __all__ = [
     "SIGMA_NAMES",
@@ -271,7 +271,7 @@ def _read_file(path: Path, width: int, height: int) -> CameraFile:
 def _parse(content: str) -> tuple[Any, str]:
     """The tree of a text, and its format."""
     if content.startswith("{"):
-        return json.loads(content, object_pairs_hook=_unique), "JSON"
+        return parse_json(content, _unique), "JSON"
     if content.startswith("<"):
         return parse_xml(content), "OpenCV XML"
     return parse_yaml(content), "OpenCV YAML" if "opencv-matrix" in content else "ROS YAML"

@@ -9,7 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, InputError
+from ..errors import FileError, FormatError, InputError
+from ..model.arrays import read_arrays
+from .photos.images import read_plain
 
 __all__ = ["find_depth_maps", "read_depth_map"]
 
@@ -51,22 +53,16 @@ def read_depth_map(path: Path) -> NDArray[np.float32]:
     FileError, InputError
         When it cannot be read, or is no map of numbers.
     """
-    try:
-        if path.suffix.lower() in (".npy", ".npz"):
-            loaded = np.load(path, allow_pickle=False)
-            if path.suffix.lower() == ".npz":
-                if len(loaded.files) != 1 and "depth" not in loaded.files:
-                    raise InputError(f"{path} holds several arrays, none of them named depth")
-                loaded = loaded["depth" if "depth" in loaded.files else loaded.files[0]]
-        else:
-            loaded = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
-    except InputError:
-        raise
-    except OSError as error:
-        raise FileError(f"depth map {path} cannot be read: {error.strerror or error}") from error
-    except (ValueError, EOFError, KeyError, cv2.error) as error:
-        raise FileError(f"depth map {path} cannot be decoded: {' '.join(str(error).split())[:100]}") from error
-    if loaded is None or np.ndim(loaded) != 2 or loaded.dtype.kind not in "fiu":
-        got = "no picture" if loaded is None else f"{loaded.dtype} {loaded.shape}"
-        raise InputError(f"depth map {path} is {got}, expected one number per pixel")
+    if path.suffix.lower() in (".npy", ".npz"):
+        try:
+            arrays = read_arrays(path)
+        except (FileError, FormatError) as error:
+            raise FileError(f"depth map {error}") from error
+        if len(arrays) != 1 and "depth" not in arrays:
+            raise InputError(f"{path} holds several arrays, none of them named depth")
+        loaded = arrays["depth"] if "depth" in arrays else next(iter(arrays.values()))
+    else:
+        loaded = read_plain(path, "depth map", cv2.IMREAD_UNCHANGED)
+    if loaded.ndim != 2 or loaded.dtype.kind not in "fiu":
+        raise InputError(f"depth map {path} is {loaded.dtype} {loaded.shape}, expected one number per pixel")
     return np.asarray(loaded, np.float32)

@@ -15,6 +15,7 @@ from typing import IO, Any
 from ..errors import FileError, InputError
 from ..model.checks import check_photo_name
 from .aside import write_aside
+from .json_text import parse_json
 from .places import RemoteFolder
 
 __all__ = ["Journal", "JournalEntry", "RemoteJournal", "entries_of"]
@@ -159,7 +160,7 @@ def entries_of(text: str) -> dict[str, JournalEntry]:
     entries = {}
     for line in text.splitlines():
         try:
-            entry = _entry(json.loads(line))
+            entry = _entry(parse_json(line))
         except (ValueError, TypeError, KeyError, IndexError, AttributeError):
             continue
         entries[entry.name] = entry

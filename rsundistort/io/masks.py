@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, InputError
+from .photos.images import read_plain
 from .places import File, Place, files_in
 
 __all__ = ["find_masks", "read_mask"]
@@ -70,15 +71,7 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8]:
     FileError, InputError
         When it cannot be read, or is of another size.
     """
-    try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-        pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
-    except OSError as error:
-        raise FileError(f"mask {path} cannot be read: {error.strerror}") from error
-    except cv2.error:
-        pixels = None
-    if pixels is None:
-        raise FileError(f"mask {path} cannot be decoded; expected an 8-bit image, black where pixels do not count")
+    pixels = read_plain(path, "mask", cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels.shape != (height, width):
         raise InputError(
             f"mask {path} has {pixels.shape[1]}x{pixels.shape[0]} pixels, its photo {width}x{height}; "

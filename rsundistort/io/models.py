@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..colmap.measured_model import ColmapModel, read_colmap_model
-from ..errors import FileError, FormatError, InputError
+from ..errors import FormatError, InputError
 from .json_text import read_json
 from .openmvg import openmvg_model
 from .opensfm import opensfm_model
@@ -37,11 +37,6 @@ def read_model(path: Path) -> ColmapModel:
             return openmvg_model(value, str(path)).once_a_photo()
         if isinstance(value, list) and value and isinstance(value[0], dict) and "shots" in value[0]:
             return opensfm_model(value, path).once_a_photo()
-    except (FileError, FormatError):
-        raise
     except InputError as error:
-        raise FormatError(f"{path}: {error}") from error
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
-        missing = f"{error} is missing" if isinstance(error, KeyError) else " ".join(str(error).split())
-        raise FormatError(f"{path} is not whole: {missing}; write it again") from error
+        raise error if str(path) in str(error) else FormatError(f"{path}: {error}") from error
     raise FormatError(f"{path} is no model; {mend}")

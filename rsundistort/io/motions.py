@@ -12,6 +12,9 @@ from .tables import read_table
 
 __all__ = ["read_known_motions"]
 
+# A standard deviation of so many radians knows nothing.
+_UNKNOWN = 1e6
+
 Known = dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
 
 
@@ -66,7 +69,10 @@ def read_known_motions(path: Path | str, readout_s: float | None = None) -> Know
                 phi[k], sigma[k] = scale * float(text), scale * float(spread)
             except ValueError:
                 raise FormatError(f"{where}: {units[0]}{k + 1}={text!r}, sigma={spread!r}: expected numbers") from None
-            if not np.isfinite(phi[k]) or not 0 < sigma[k] < np.inf:
-                raise FormatError(f"{where}: {units[0]}{k + 1}={text}, sigma={spread}: sigma must be positive")
+            if not np.isfinite(phi[k]) or not 0 < sigma[k] < _UNKNOWN:
+                raise FormatError(
+                    f"{where}: {units[0]}{k + 1}={text}, sigma={spread}: sigma must be positive, and an unknown "
+                    "component's cell is empty"
+                )
         found[name] = (phi, sigma)
     return found

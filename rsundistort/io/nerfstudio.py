@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..errors import FormatError, InputError
 from ..model import Camera, Solution
 from .json_text import read_json
+from .rules import Numbers, check
 
 __all__ = ["read_transforms", "write_transforms"]
 
@@ -59,13 +60,15 @@ def read_transforms(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64
     """Poses R_cw (m, 3, 3) and center_w (m, 3) of a `transforms.json`."""
     value = read_json(path)
     try:
-        matrices = np.array([frame["transform_matrix"] for frame in value["frames"]], np.float64).reshape(-1, 4, 4)
-    except (KeyError, TypeError, ValueError) as error:
-        raise FormatError(f"{path} is no transforms.json: expected frames with a transform_matrix each") from error
+        check(value, {"frames": [{"transform_matrix": Numbers(4, 4)}]})
+    except FormatError as error:
+        raise FormatError(f"{path} is no transforms.json: {error}") from error
+    matrices = np.array([frame["transform_matrix"] for frame in value["frames"]], np.float64).reshape(-1, 4, 4)
     # back from OpenGL's axes; a matrix may hold a scale
     axes = matrices[:, :3, :3] @ np.diag([1.0, -1.0, -1.0])
-    length = np.linalg.norm(axes, axis=1, keepdims=True)
-    if not (length > 0).all():
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(axes, axis=1, keepdims=True)
+    if not ((length > 0) & np.isfinite(length)).all():
         raise FormatError(f"{path}: a transform_matrix is no pose")
     return (axes / length).transpose(0, 2, 1), matrices[:, :3, 3]
 

@@ -14,6 +14,7 @@ from ..colmap.cameras_and_poses import checked_name
 from ..colmap.measured_model import ColmapModel
 from ..errors import FormatError
 from ..model import Camera, Observations, Reconstruction
+from .rules import Numbers, check
 
 __all__ = ["openmvg_model"]
 
@@ -26,10 +27,28 @@ _LENSES: dict[str, tuple[str, list[int], int]] = {
 }
 
 
+_POINTER = {"value": {"ptr_wrapper": {"data": {"value0?": dict}}}}
+_POSE = {"rotation": Numbers(3, 3), "center": Numbers(3)}
+_OBSERVATION = {"key": int, "value": {"id_feat": int, "x": Numbers(2)}}
+#: What is read of the file; what pointers hold is checked where they are followed.
+_RULES = {
+    "views": [_POINTER],
+    "intrinsics": [{"key": int, **_POINTER}],
+    "extrinsics": [{"key": int, "value": _POSE}],
+    "structure": [{"key": int, "value": {"X": Numbers(3), "observations": [_OBSERVATION]}}],
+}
+_VIEW = {"id_view": int, "id_pose": int, "id_intrinsic": int, "local_path": str, "filename": str}
+_INTRINSIC = {"width": int, "height": int, "focal_length": float, "principal_point": Numbers(2)}
+
+
 def openmvg_model(value: dict[str, Any], where: str) -> ColmapModel:
     """The model of a parsed `sfm_data.json`; `where` names it in errors. Ids are OpenMVG's and one."""
+    check(value, _RULES)
     poses = {entry["key"]: entry["value"] for entry in value["extrinsics"]}
-    views = {data["id_view"]: data for data in map(_data, value["views"])}
+    listed = [_data(entry) for entry in value["views"]]
+    for k, data in enumerate(listed):
+        check(data, _VIEW, f"views[{k}]")
+    views = {data["id_view"]: data for data in listed}
     names = {key: checked_name(_name(data), where) for key, data in views.items()}
     intrinsics = {entry["key"]: _data(entry) for entry in value["intrinsics"]}
     # OpenMVG gives an id that stands for none to views without a pose or a camera
@@ -82,10 +101,12 @@ def _name(view: dict[str, Any]) -> str:
 def _camera(data: dict[str, Any], where: str) -> Camera:
     if "focal_length" not in data:
         raise FormatError(f"{where} has no focal length; expected a pinhole, radial, brown or fisheye camera")
+    check(data, _INTRINSIC, where)
     f, (cx, cy) = data["focal_length"], data["principal_point"]
     lens, dist = "pinhole", np.zeros(0)
     for key, (kind, order, length) in _LENSES.items():
         if key in data:
+            check(data[key], Numbers(len(order)), f"{where}.{key}")
             lens, dist = kind, np.zeros(length)
-            dist[order] = np.reshape(data[key], len(order))
+            dist[order] = data[key]
     return Camera(data["width"], data["height"], np.array([[f, 0, cx], [0, f, cy], [0, 0, 1.0]]), dist, lens=lens)

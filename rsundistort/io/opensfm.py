@@ -15,6 +15,7 @@ from ..colmap.cameras_and_poses import checked_name
 from ..colmap.measured_model import ColmapModel
 from ..errors import FileError, FormatError
 from ..model import Camera, Observations, Reconstruction
+from .rules import Numbers, OneOf, check
 
 __all__ = ["opensfm_model"]
 
@@ -29,14 +30,36 @@ _LENSES: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 
 
+_SHOT = {"rotation": Numbers(3), "translation": Numbers(3), "camera": str}
+#: What is read of a reconstruction; of its cameras those that have shots.
+_RULES = {
+    "cameras": {str: dict},
+    "shots": {str: _SHOT},
+    "points": {str: {"coordinates": Numbers(3), "color": Numbers(3)}},
+}
+_CAMERA = {
+    "projection_type?": OneOf(*_LENSES),
+    "width": int,
+    "height": int,
+    **{f"{name}?": float for name in ("focal", "focal_x", "focal_y", "c_x", "c_y", "k1", "k2", "k3", "k4", "p1", "p2")},
+}
+
+
 def opensfm_model(value: list[dict[str, Any]], path: Path) -> ColmapModel:
     """The largest of a file's reconstructions. Ids count photos and cameras by name, tracks from one."""
-    found = max(value, key=lambda each: len(each["shots"]))
+    check(value, [{"shots": dict}])
+    largest = max(range(len(value)), key=lambda k: len(value[k]["shots"]))
+    found = value[largest]
+    check(found, _RULES, f"[{largest}]")
     shots, points = found["shots"], found["points"]
     names = [checked_name(name, str(path)) for name in sorted(shots)]
     if len(names) < 2 or not points:
         raise FormatError(f"{path} holds {len(names)} photos and {len(points)} points, expected more")
+    if odd := next((key for key in points if not key.isdecimal() or len(key) > 18), None):
+        raise FormatError(f"{path}: points.{odd}: expected a number for a name")
     labels = sorted({shots[name]["camera"] for name in names})
+    if lost := set(labels) - found["cameras"].keys():
+        raise FormatError(f"{path}: camera {min(lost)!r} of a shot is missing")
     cameras = [_camera(found["cameras"][label], f"{path}: camera {label!r}") for label in labels]
     tracks = sorted(points, key=int)
     R_cw = Rotation.from_rotvec([shots[name]["rotation"] for name in names]).as_matrix()
@@ -66,11 +89,12 @@ def opensfm_model(value: list[dict[str, Any]], path: Path) -> ColmapModel:
 
 
 def _camera(found: dict[str, Any], where: str) -> Camera:
+    check(found, _CAMERA, where)
+    if "focal" not in found and not {"focal_x", "focal_y"} <= found.keys():
+        raise FormatError(f"{where} has no focal length")
     kind = found.get("projection_type", "perspective")
-    if kind not in _LENSES:
-        raise FormatError(f"{where} is {kind}, expected one of {', '.join(_LENSES)}")
     lens, coefficients = _LENSES[kind]
-    width, height = int(found["width"]), int(found["height"])
+    width, height = found["width"], found["height"]
     size = max(width, height)
     fx, fy = (found["focal"],) * 2 if "focal" in found else (found["focal_x"], found["focal_y"])
     center = [0.5 * side - 0.5 + size * found.get(name, 0.0) for side, name in ((width, "c_x"), (height, "c_y"))]
@@ -84,6 +108,8 @@ def _observations(path: Path, names: list[str], tracks: list[str]) -> tuple[Any,
     point_of = {track: k for k, track in enumerate(tracks)}
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise FormatError(f"{path} is no UTF-8 text") from error
     except OSError as error:
         raise FileError(
             f"{path} cannot be read: {error.strerror}; the measurements of reconstruction.json are in it"
@@ -98,6 +124,9 @@ def _observations(path: Path, names: list[str], tracks: list[str]) -> tuple[Any,
         if cells[0] not in photo_of:
             others.add(checked_name(cells[0], str(path)))
         elif cells[1] in point_of:
-            seen.append((photo_of[cells[0]], point_of[cells[1]], *map(float, cells[2:5])))
+            try:
+                seen.append((photo_of[cells[0]], point_of[cells[1]], int(cells[2]), *map(float, cells[3:5])))
+            except ValueError as error:
+                raise FormatError(f"{path}, line {number}: {error}") from error
     table = np.array(seen, np.float64).reshape(-1, 5)
     return (*table[:, :3].T.astype(np.int64), table[:, 3:], others)

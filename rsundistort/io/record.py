@@ -11,6 +11,7 @@ from pathlib import Path, PurePosixPath
 from ..errors import FileError
 from ..model.checks import check_photo_name
 from .journal import Journal, entries_of
+from .json_text import parse_json
 from .places import File, Place, RemoteFolder, delete_in, stamps_of, text_in, write_in
 from .solution import FORMAT
 
@@ -213,7 +214,7 @@ class Record:
                 known.setdefault(path, set()).add(str(size) if entry.fingerprint else _ANY)
         if known:
             with suppress(ValueError, AttributeError):
-                if json.loads(text_in(self._place, "solution.json")).get("format") == FORMAT:
+                if parse_json(text_in(self._place, "solution.json")).get("format") == FORMAT:
                     known["solution.json"] = {_ANY}
         return known
 
@@ -257,7 +258,7 @@ def _parse(text: str) -> dict[str, set[str]]:
     known: dict[str, set[str]] = {}
     for line in text.splitlines():
         try:
-            path, stamp = json.loads(line)
+            path, stamp = parse_json(line)
             stamps = known.setdefault(check_photo_name(path), set())
         except (ValueError, TypeError):
             continue

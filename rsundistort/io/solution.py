@@ -12,7 +12,9 @@ from ..errors import FormatError, InputError
 from ..model import Bend, Camera, RowMotion, Solution, SolvedImage
 from .aside import write_aside
 from .cameras import camera_from_json, camera_to_json
-from .json_text import read_json
+from .json_text import plain, read_json
+from .photos.images import LARGEST_SIDE, RAW_AS
+from .rules import Between, Maybe, Numbers, OneOf, check, shown
 
 __all__ = ["FORMAT", "VERSION", "read_solution", "solution_to_bytes", "solution_to_json", "write_solution"]
 
@@ -22,19 +24,85 @@ VERSION = 1
 BENT_VERSION = 2
 
 
-def _plain(value: Any) -> Any:
-    """The value with arrays as lists and NumPy scalars as numbers; NaN becomes null."""
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value
+# Numbers that are NaN, or infinite, are written as null.
+_NUMBER, _BY_NAME = Maybe(float), Maybe({str: Maybe(float)})
+_AMOUNT = Maybe(Between(0.0, 1e300))
+_SIDE, _PLACE = Between(1, LARGEST_SIDE), Between(0, LARGEST_SIDE)
+
+_IMAGE = {
+    "name": str,
+    "camera_id": str,
+    "registered": bool,
+    "R_cw?": Maybe(Numbers(3, 3)),
+    "center_w?": Maybe(Numbers(3)),
+    "phi?": Maybe(Numbers(3)),
+    "velocity?": Maybe(Numbers(3)),
+    "bend?": Maybe(
+        {"clock": Numbers(None), "rotation": Numbers(None, 3), "position?": Maybe(Numbers(None, 3))},
+    ),
+    "sigma_phi?": Maybe((_NUMBER, _NUMBER, _NUMBER)),
+    "num_observations?": Maybe(Between(0, 2**53)),
+    "rms_px?": _AMOUNT,
+    "rs_shift_px?": _AMOUNT,
+    "depth?": Maybe(str),
+    "translation_shift_px?": _AMOUNT,
+    "reason?": Maybe(str),
+    "turned?": Between(1, 8),
+    "roi?": Maybe((_PLACE, _PLACE, _SIDE, _SIDE)),
+    "doubtful?": Maybe(str),
+    "lens_only?": Maybe(bool),
+}
+_CRITICAL_MOTION = {
+    "singular_values?": Maybe([_NUMBER]),
+    "null_vector?": Maybe([_NUMBER]),
+    "y_axis_spread_deg?": _NUMBER,
+    "sigma_log_k?": _NUMBER,
+    "flagged?": Maybe(bool),
+    "anchors?": Maybe({str: float}),
+    **{f"{name}?": Maybe(str) for name in ("meaning", "remedy", "sentence")},
+    **{f"{name}?": Maybe([str]) for name in ("warnings", "advice")},
+}
+_TIME = {"seconds": float, "sigma": float}
+_READOUT_TIME = {
+    **_TIME,
+    "source": str,
+    "of_frame?": float,
+    "halves?": Maybe([_TIME]),
+    "by_pictures?": Maybe(_TIME),
+    "by_gyroscope?": Maybe(_TIME),
+    "gyroscope?": Maybe({"axes": str, "offset_s": float, "offset_sigma_s": float, "correlation": float}),
+    "stabilisation?": Maybe({"verdict?": Maybe(str), "reason?": Maybe(str)}),
+}
+_QUALITY = {
+    **{f"{name}?": _NUMBER for name in ("num_points", "num_observations", "rms_px", "global_rms_px", "rs_poses_px")},
+    **{f"{name}?": _NUMBER for name in ("focal_sigma", "centre_sigma_focal_lengths")},
+    **{f"held_out_{name}?": _BY_NAME for name in ("rms_px", "error", "gain")},
+    "held_out_kept?": Maybe([str]),
+    "held_out_chosen?": Maybe(str),
+    "sigma_intrinsics?": Maybe({str: _BY_NAME}),
+    "lens_fields?": Maybe({str: _BY_NAME}),
+    "readout_times?": Maybe({str: {"ms": float, "source": str}}),
+    "readout_time?": Maybe(_READOUT_TIME),
+}
+_STAGE = {
+    "name?": str,
+    "seconds?": _NUMBER,
+    "rungs?": Maybe([{"model?": Maybe(str), "rms_px?": _NUMBER, "iterations?": _NUMBER}]),
+}
+#: What `solution.json` holds, as far as it is read; other names may be there.
+_RULES = {
+    "shutter_model": str,
+    "cameras": {str: dict},
+    "rectified_cameras": {str: {"width": _SIDE, "height": _SIDE, "K": Numbers(3, 3)}},
+    "images": [_IMAGE],
+    "verdict?": Maybe({"shutter": str, "shape": str, "reasons?": Maybe([str])}),
+    "critical_motion?": Maybe(_CRITICAL_MOTION),
+    "quality?": Maybe(_QUALITY),
+    "stages?": Maybe([_STAGE]),
+    "options?": Maybe({"raw_as?": Maybe(OneOf(*RAW_AS)), "shutter_model?": Maybe(str)}),
+    "generator?": Maybe({str: Maybe(str)}),
+    "georeference?": Maybe({"crs": str, "transformation": Numbers(4, 4)}),
+}
 
 
 def _bend_to_json(bend: Bend) -> dict[str, Any]:
@@ -47,7 +115,7 @@ def _bend_from_json(entry: dict[str, Any]) -> Bend | None:
     if value is None:
         return None
     clock = np.asarray(value["clock"], float)
-    if clock.ndim != 1 or len(clock) < 2 or not np.allclose(np.diff(clock), np.diff(clock).mean(), rtol=1e-6):
+    if len(clock) < 2 or not np.allclose(np.diff(clock), np.diff(clock).mean(), rtol=1e-6):
         raise InputError(f"the bend of photo {entry['name']} is not read at even steps of the clock")
     rotation = np.asarray(value["rotation"], float)
     if rotation.shape != (len(clock), 3):
@@ -108,7 +176,7 @@ def solution_to_json(solution: Solution) -> dict[str, Any]:
     }
     if solution.georeference is not None:
         value["georeference"] = dict(solution.georeference)
-    result: dict[str, Any] = _plain(value)
+    result: dict[str, Any] = plain(value)
     return result
 
 
@@ -119,7 +187,12 @@ def write_solution(path: Path, solution: Solution) -> None:
 
 def solution_to_bytes(solution: Solution) -> bytes:
     """The content of `solution.json`."""
-    return (json.dumps(solution_to_json(solution), indent=1) + "\n").encode()
+    value = solution_to_json(solution)
+    try:
+        check(value, _RULES)
+    except FormatError as error:  # which nobody could read again
+        raise InputError(f"the solution cannot be written: {error}") from error
+    return (json.dumps(value, indent=1, allow_nan=False) + "\n").encode()
 
 
 def read_solution(path: Path, newer: bool = False) -> Solution:
@@ -149,93 +222,58 @@ def read_solution(path: Path, newer: bool = False) -> Solution:
             "update rsundistort"
         )
     try:
-        return _solution_from_json(value, str(path))
+        check(value, _RULES)
+        return _solution_from_json(value)
     except InputError as error:
         raise FormatError(f"{path}: {error}") from error
-    except KeyError as error:
-        raise FormatError(f"{path} lacks {error}") from error
-    except (TypeError, AttributeError, ValueError, OverflowError) as error:
-        raise FormatError(f"{path} is garbled: {error}") from error
 
 
-def _orientation(entry: dict[str, Any]) -> int:
-    turned = entry.get("turned", 1)
-    if turned not in range(1, 9):
-        raise InputError(f"photo {entry['name']} was turned by {turned!r}, expected an EXIF orientation, 1 to 8")
-    return int(turned)
-
-
-def _roi(entry: dict[str, Any]) -> tuple[int, int, int, int] | None:
-    roi = entry.get("roi")
-    if roi is None:
-        return None
-    whole = isinstance(roi, list) and len(roi) == 4 and all(isinstance(v, int) and v >= 0 for v in roi)
-    if not whole or not (roi[2] and roi[3]):
-        raise InputError(f"photo {entry['name']} has the roi {roi!r}, expected [x, y, width, height]")
-    return roi[0], roi[1], roi[2], roi[3]
-
-
-def _verdict(value: dict[str, Any]) -> dict[str, Any] | None:
-    said = value.get("verdict")
-    if said is None:
-        return None
-    words = [said.get("shutter"), said.get("shape"), *said.get("reasons", ())]
-    if not all(isinstance(word, str) for word in words):
-        raise InputError(f"the verdict is {said!r}, expected shutter, shape and reasons in words")
-    return {"shutter": words[0], "shape": words[1], "reasons": words[2:]}
-
-
-def _georeference(value: dict[str, Any]) -> dict[str, Any] | None:
-    said = value.get("georeference")
-    if said is None:
-        return None
-    matrix = np.asarray(said["transformation"], float)
-    if not isinstance(said["crs"], str) or matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise InputError("the georeference has no crs, or its transformation is no 4 x 4 matrix")
-    return dict(said)
-
-
-def _solution_from_json(value: dict[str, Any], where: str) -> Solution:
-    cameras = {k: camera_from_json(c, f"camera {k}") for k, c in value["cameras"].items()}
+def _solution_from_json(value: dict[str, Any]) -> Solution:
+    cameras = {k: camera_from_json(c, f"cameras.{k}") for k, c in value["cameras"].items()}
     rectified = {k: Camera(c["width"], c["height"], c["K"]) for k, c in value["rectified_cameras"].items()}
-    images = []
-    for entry in value["images"]:
+    for k, entry in enumerate(value["images"]):
         if entry["camera_id"] not in rectified:
-            raise InputError(f"photo {entry['name']} has camera {entry['camera_id']!r}, which is not rectified")
-        motion = None
-        if entry["registered"] and entry.get("phi") is not None:
-            velocity = np.asarray(entry.get("velocity") or [0, 0, 0], float)
-            motion = RowMotion(np.asarray(entry["phi"], float), velocity, _bend_from_json(entry))
-        images.append(
-            SolvedImage(
-                name=entry["name"],
-                camera_id=entry["camera_id"],
-                R_cw=entry.get("R_cw"),
-                center_w=entry.get("center_w"),
-                motion=motion,
-                sigma_phi=None if entry.get("sigma_phi") is None else np.asarray(entry["sigma_phi"], float),
-                num_observations=entry.get("num_observations") or 0,
-                rms_px=entry.get("rms_px"),
-                rs_shift_px=entry.get("rs_shift_px"),
-                depth=entry.get("depth"),
-                translation_shift_px=entry.get("translation_shift_px"),
-                reason=entry.get("reason"),
-                turned=_orientation(entry),
-                roi=_roi(entry),
-                doubtful=None if entry.get("doubtful") is None else str(entry["doubtful"]),
-                lens_only=bool(entry.get("lens_only")),
-            )
-        )
+            raise InputError(f"images[{k}].camera_id: {shown(entry['camera_id'])} is not among rectified_cameras")
+    said = value.get("verdict")
     return Solution(
         shutter_model=value["shutter_model"],
         cameras=cameras,
         rectified_cameras=rectified,
-        images=tuple(images),
+        images=tuple(_image_from_json(entry, f"images[{k}]") for k, entry in enumerate(value["images"])),
         critical_motion=value.get("critical_motion"),
         quality=value.get("quality") or {},
         stages=value.get("stages") or (),
         options=value.get("options") or {},
         generator=value.get("generator") or {},
-        verdict=_verdict(value),
-        georeference=_georeference(value),
+        verdict=said and {**said, "reasons": said.get("reasons") or []},
+        georeference=value.get("georeference"),
     )
+
+
+def _image_from_json(entry: dict[str, Any], where: str) -> SolvedImage:
+    motion = None
+    try:
+        if entry["registered"] and entry.get("phi") is not None:
+            velocity = entry.get("velocity") or [0.0, 0.0, 0.0]
+            motion = RowMotion(np.array(entry["phi"], float), np.array(velocity, float), _bend_from_json(entry))
+        roi, sigma = entry.get("roi"), entry.get("sigma_phi")
+        return SolvedImage(
+            name=entry["name"],
+            camera_id=entry["camera_id"],
+            R_cw=entry.get("R_cw"),
+            center_w=entry.get("center_w"),
+            motion=motion,
+            sigma_phi=None if sigma is None else np.array(sigma, float),
+            num_observations=entry.get("num_observations") or 0,
+            rms_px=entry.get("rms_px"),
+            rs_shift_px=entry.get("rs_shift_px"),
+            depth=entry.get("depth"),
+            translation_shift_px=entry.get("translation_shift_px"),
+            reason=entry.get("reason"),
+            turned=entry.get("turned", 1),
+            roi=None if roi is None else (roi[0], roi[1], roi[2], roi[3]),
+            doubtful=entry.get("doubtful"),
+            lens_only=bool(entry.get("lens_only")),
+        )
+    except InputError as error:
+        raise FormatError(f"{where}: {error}") from error

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..errors import FileError, InputError, RsUndistortError, RsUndistortWarning
 from .outputs import output_folder
 from .photos.exif import ORIENTATION, pack_ifd
-from .photos.images import write_image
+from .photos.images import MAX_MEGAPIXELS, write_image
 from .photos.metadata import Metadata
 
 __all__ = [
@@ -200,6 +200,11 @@ class VideoReader:
         if stream is None:
             self._container.close()
             raise FileError(f"{self.video} holds no pictures")
+        size = (stream.width, stream.height) if stream.codec_context is not None else (0, 0)
+        if not 0 < size[0] * size[1] <= MAX_MEGAPIXELS * 1e6:
+            self._container.close()
+            kind = f"pictures of {size[0]}x{size[1]} pixels" if stream.codec_context is not None else "an unknown codec"
+            raise FileError(f"{self.video} cannot be read as a video: it has {kind}; repair it or copy it again")
         self._stream = stream
         self.tags = dict(self._container.metadata)
         tags = {key.lower(): value for key, value in (*self._container.metadata.items(), *stream.metadata.items())}

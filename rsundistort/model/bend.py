@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from .checks import check_finite, frozen
+from .checks import check_finite, check_whole, frozen
 
 __all__ = ["BEND_GROUPS", "Bend", "bend_functions", "bend_pieces", "bend_table", "splines_at"]
 
@@ -171,6 +171,7 @@ class Bend:
         constant, rate : (2, 3) array
             Of the rotation and of the position: what they are at a clock of 0, and by how much they grow with it.
         """
+        sites = check_whole(sites, "sites", 4, 10**6)
         r = check_finite(clock, (None,), "clock")
         if len(r) < 4 or not (np.diff(r) > 0).all():
             raise InputError("the readings of the clock must ascend, and be four or more")

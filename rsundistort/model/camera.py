@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .checks import check_finite, frozen
+from .checks import check_finite, check_numbers, check_one_of, check_whole, frozen
 from .field import spline_coefficients, steepest
 
 __all__ = ["LENSES", "READOUTS", "Camera", "check_readout", "other_axis"]
@@ -26,8 +26,7 @@ READOUTS: dict[str, tuple[int, float]] = {
 
 def check_readout(readout: str, name: str = "readout") -> tuple[int, float]:
     """Axis of the clock of a readout direction (0 of columns, 1 of rows) and its sign; refused if it is none."""
-    if readout not in READOUTS:
-        raise InputError(f"{name}={readout!r}, expected one of {', '.join(READOUTS)}")
+    check_one_of(readout, READOUTS, name)
     return READOUTS[readout]
 
 
@@ -42,10 +41,17 @@ LENSES: dict[str, tuple[str, ...]] = {
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
 
+# Pixels across or down a photo, and of a focal length or a principal point: numbers beyond are no camera's.
+_LARGEST, _FARTHEST = 10**6, 1e9
 # Slope of a field; from 1 on a photo may fold.
 _STEEPEST = 0.5
 
 _DIST_LENGTHS = {"pinhole": (0, 4, 5, 8, 12), "fisheye": (0, 4)}
+
+
+def _flat(value: Any) -> Any:
+    """Coefficients of any of OpenCV's shapes, (n,), (1, n) or (n, 1), in a row."""
+    return value.ravel() if isinstance(value, np.ndarray) else np.ravel(np.array(value, object))
 
 
 def _first_positive(*polynomials: np.polynomial.Polynomial) -> float:
@@ -107,19 +113,16 @@ class Camera:
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
-            value = getattr(self, name)
-            whole = isinstance(value, (int, float, np.number)) and not isinstance(value, bool) and np.isfinite(value)
-            if not whole or int(value) != value or value < 1:
-                raise InputError(f"{name}={value!r}, expected a positive whole number")
-            object.__setattr__(self, name, int(value))
+            object.__setattr__(self, name, check_whole(getattr(self, name), name, 1, _LARGEST))
         K = check_finite(self.K, (3, 3), "K")
         if K[0, 0] <= 0 or K[1, 1] <= 0:
             raise InputError(f"K has focal lengths {K[0, 0]:g}, {K[1, 1]:g}; both must be positive")
+        if np.abs(K).max() > _FARTHEST or min(K[0, 0], K[1, 1]) < 1 / _FARTHEST:
+            raise InputError(f"K={K.tolist()} px, expected focal lengths and a principal point of a camera")
         if K[0, 1] != 0 or K[1, 0] != 0 or (K[2] != [0, 0, 1]).any():
             raise InputError("K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], without skew")
-        if self.lens not in LENSES:
-            raise InputError(f"lens={self.lens!r}, expected one of {', '.join(LENSES)}")
-        dist = check_finite(np.ravel(self.dist), (None,), "dist")
+        check_one_of(self.lens, LENSES, "lens")
+        dist = check_finite(_flat(self.dist), (None,), "dist")
         lengths = _DIST_LENGTHS[self.lens]
         if len(dist) not in lengths:
             raise InputError(f"dist has {len(dist)} numbers, a {self.lens} lens has one of {lengths} in OpenCV's order")
@@ -130,7 +133,7 @@ class Camera:
 
     def _checked_field(self) -> NDArray[np.float64]:
         """The field, refused if it has not enough values, or folds the photo."""
-        if not np.size(self.field):
+        if not check_numbers(self.field, "field").size:
             return np.zeros((0, 0, 2))
         values = check_finite(self.field, (None, None, 2), "field")
         if min(values.shape[:2]) < 4:

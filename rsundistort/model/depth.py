@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from .checks import check_array, check_finite, frozen
+from .checks import check_array, check_finite, check_number, check_numbers, check_size, frozen
 
-__all__ = ["AtInfinity", "Depth", "DepthMap", "Plane"]
+__all__ = ["AtInfinity", "Depth", "DepthMap", "Plane", "check_depth"]
 
 
 @dataclass(frozen=True)
@@ -44,13 +44,16 @@ class Plane:
         length = float(np.linalg.norm(normal))
         if not length > 0:
             raise InputError("the plane's normal is zero")
-        if not 0 < self.distance < np.inf:
+        if not check_number(self.distance, "distance") > 0:
             raise InputError(f"the plane's distance is {self.distance}, expected a positive number")
         object.__setattr__(self, "normal", frozen(normal / length))
 
     def inverse_depth(self, rays: ArrayLike) -> NDArray[np.float64]:
         """1 / s of the points s * ray where rays (..., 3) of the camera frame meet the plane; 0 where they do not."""
-        return np.maximum(np.asarray(rays) @ self.normal / self.distance, 0.0)
+        directions = check_numbers(rays, "rays")
+        if directions.shape[-1:] != (3,):
+            raise InputError(f"rays.shape={directions.shape}, expected (..., 3)")
+        return np.maximum(directions @ self.normal / self.distance, 0.0)
 
 
 @dataclass(frozen=True)
@@ -74,11 +77,9 @@ class DepthMap:
         depth = check_array(self.depth, (None, None), "depth", np.float32)
         if not (depth > 0).any():
             raise InputError("the depth map holds no positive depth")
-        size = self.size or (depth.shape[1], depth.shape[0])
-        if min(size) < 1:
-            raise InputError(f"size={size}, expected positive (width, height)")
+        size = check_size((depth.shape[1], depth.shape[0]) if self.size is None else self.size)
         object.__setattr__(self, "depth", frozen(depth))
-        object.__setattr__(self, "size", (int(size[0]), int(size[1])))
+        object.__setattr__(self, "size", size)
 
     @cached_property
     def inverse(self) -> NDArray[np.float32]:
@@ -94,3 +95,9 @@ class DepthMap:
 
 
 Depth = AtInfinity | Plane | DepthMap
+
+
+def check_depth(depth: Depth | None) -> None:
+    """Refuse what is neither of these."""
+    if depth is not None and not isinstance(depth, (AtInfinity, Plane, DepthMap)):
+        raise InputError(f"depth: expected AtInfinity, Plane or DepthMap, got {type(depth).__name__}")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import InputError
+from .checks import check_fields
 
 __all__ = ["End", "KnownLength"]
 
@@ -34,6 +35,11 @@ class KnownLength:
     sigma: float
 
     def __post_init__(self) -> None:
+        for name, end in (("start", self.start), ("end", self.end)):
+            fits = isinstance(end, (tuple, list)) and len(end) == 3 and isinstance(end[0], str)
+            if not fits or not all(isinstance(v, (int, float, np.integer, np.floating)) for v in end[1:]):
+                raise InputError(f"known length: {name}={end!r}, expected (photo name, x, y)")
+        check_fields(self)
         for name, value in (("length", self.length), ("sigma", self.sigma)):
             if not 0 < value < np.inf:
                 raise InputError(f"known length from {self.start} to {self.end}: {name}={value!r}, expected above 0")

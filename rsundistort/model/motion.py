@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from .bend import Bend, bend_table
 from .camera import check_readout
-from .checks import check_finite, frozen
+from .checks import check_finite, check_kind, check_number, check_numbers, check_one_of, check_rotation, frozen
 
 __all__ = ["SHUTTER_MODELS", "RowMotion", "check_shutter_model"]
 
@@ -20,11 +20,13 @@ SHUTTER_MODELS: dict[str, int] = {"global": 0, "two-step": 1, "linearized": 2, "
 
 
 _FRAMES = ("world", "camera")
+# Radians while rows of one focal length are read: far beyond a fast turn behind the longest lens.
+_FASTEST = 1000.0
 
 
 def check_shutter_model(name: str) -> int:
     """The code of a shutter model in the kernels."""
-    if name not in SHUTTER_MODELS:
+    if not isinstance(name, str) or name not in SHUTTER_MODELS:
         raise InputError(f"shutter model {name!r}, expected one of {', '.join(SHUTTER_MODELS)}")
     return SHUTTER_MODELS[name]
 
@@ -58,10 +60,14 @@ class RowMotion:
     frame: str | None = None
 
     def __post_init__(self) -> None:
-        if self.frame not in (None, *_FRAMES):
-            raise InputError(f"frame={self.frame!r}, expected one of {', '.join(_FRAMES)}")
+        if self.frame is not None:
+            check_one_of(self.frame, _FRAMES, "frame")
         for name in ("phi", "velocity"):
             object.__setattr__(self, name, frozen(check_finite(getattr(self, name), (3,), name)))
+        if np.abs(self.phi).max() > _FASTEST:
+            raise InputError(f"phi={self.phi.tolist()}: no camera turns by more than {_FASTEST:g} rad per focal length")
+        if self.bend is not None:
+            check_kind(self.bend, Bend, "bend")
 
     @classmethod
     def of(
@@ -113,7 +119,7 @@ class RowMotion:
     def in_camera(self, R_cw: NDArray[np.float64]) -> RowMotion:
         """The motion with its velocity in the camera frame at the reference row, as projection takes it."""
         self._check_frame("world")
-        R = np.asarray(R_cw, np.float64)
+        R = check_rotation(R_cw, "R_cw")
         bend = None if self.bend is None else self.bend.turned(np.eye(3), R)
         return replace(self, velocity=R @ self.velocity, bend=bend, frame="camera")
 
@@ -148,8 +154,9 @@ class RowMotion:
 
     def at(self, clock: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Rotation vector and position (..., 3) against the pose when the clock shows r (...), exact models."""
-        r = np.asarray(clock, np.float64)
-        turn, way = r[..., None] * self.phi, r[..., None] * self.velocity
+        r = check_numbers(clock, "clock")
+        with np.errstate(invalid="ignore"):  # at no moment: NaN
+            turn, way = r[..., None] * self.phi, r[..., None] * self.velocity
         if self.bend is not None:
             bent, moved = self.bend.at(r)
             turn, way = turn + bent, way + moved
@@ -175,8 +182,9 @@ class RowMotion:
         from scipy.spatial.transform import Rotation
 
         self._check_frame("world")
-        turn, way = self.at(clock)
-        return Rotation.from_rotvec(turn).as_matrix() @ np.asarray(R_cw, np.float64), np.asarray(center_w) + way
+        turn, way = self.at(check_number(clock, "clock"))
+        R, center = check_rotation(R_cw, "R_cw"), check_finite(center_w, (3,), "center_w")
+        return Rotation.from_rotvec(turn).as_matrix() @ R, center + way
 
     def imaginary_camera(self, readout: str = "top-to-bottom") -> tuple[float, float]:
         """Aspect ratio and skew, in the direction of the readout, of the camera that the paper puts behind the lens."""

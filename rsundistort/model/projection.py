@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._kernels import projection as kernels
 from .camera import Camera
-from .checks import check_array
+from .checks import check_array, check_kind
 from .field import field_slope, lens_pixels, raw_pixels
 from .motion import RowMotion, check_shutter_model
 
@@ -17,6 +17,7 @@ __all__ = [
     "ProjectionJacobians",
     "at_depth",
     "clock_of",
+    "motion_of",
     "project_points",
     "project_points_with_jacobians",
     "unproject_points",
@@ -33,6 +34,15 @@ class ProjectionJacobians:
     point: NDArray[np.float64]
     phi: NDArray[np.float64]
     velocity: NDArray[np.float64]
+
+
+def motion_of(camera: Camera, motion: RowMotion | None) -> RowMotion:
+    """The motion, or none where it was left out; refused where one of both is something else."""
+    check_kind(camera, Camera, "camera")
+    if motion is None:
+        return RowMotion()
+    check_kind(motion, RowMotion, "motion")
+    return motion
 
 
 def project_points(
@@ -66,7 +76,7 @@ def project_points(
     array([[320.   , 285.417]])
     """
     points = np.ascontiguousarray(check_array(points_c, (None, 3), "points_c"))
-    motion = motion or RowMotion()
+    motion = motion_of(camera, motion)
     intr, lens, axis, sign = camera.kernel_args
     xy, valid = np.empty((len(points), 2)), np.empty(len(points), bool)
     model = check_shutter_model(shutter_model)
@@ -80,7 +90,7 @@ def project_points_with_jacobians(
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], ProjectionJacobians]:
     """As `project_points`, with the exact derivatives of the pixels (the implicit row's included)."""
     points = np.ascontiguousarray(check_array(points_c, (None, 3), "points_c"))
-    motion = motion or RowMotion()
+    motion = motion_of(camera, motion)
     intr, lens, axis, sign = camera.kernel_args
     n = len(points)
     xy, valid = np.empty((n, 2)), np.empty(n, bool)
@@ -152,8 +162,8 @@ def unproject_points(
         False beyond the fold of the lens model, for pixels of a fisheye 90 degrees or more from the axis, and where the
         row model has no inverse.
     """
+    motion = motion_of(camera, motion)
     xy = lens_pixels(camera, np.ascontiguousarray(check_array(xy_raw, (None, 2), "xy_raw")))
-    motion = motion or RowMotion()
     intr, lens, axis, sign = camera.kernel_args
     ideal, valid = np.empty_like(xy), np.empty(len(xy), bool)
     kernels.unproject_points(

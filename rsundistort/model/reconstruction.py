@@ -12,10 +12,16 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from .bend import Bend
 from .camera import Camera
-from .checks import check_finite, check_index, check_rotations, frozen
+from .checks import check_fields, check_finite, check_index, check_numbers, check_rotations, frozen
 from .motion import RowMotion, check_shutter_model
 
 __all__ = ["Observations", "Reconstruction"]
+
+
+def _or(value: Any, default: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+    """The value, or what stands for one that was left out."""
+    array = check_numbers(value, name)
+    return array if array.size else default
 
 
 @dataclass(frozen=True)
@@ -43,7 +49,7 @@ class Observations:
         object.__setattr__(self, "frame_idx", frozen(check_index(self.frame_idx, len(xy), big, "frame_idx")))
         object.__setattr__(self, "point_idx", frozen(check_index(self.point_idx, len(xy), big, "point_idx")))
         object.__setattr__(self, "xy_raw", frozen(xy))
-        sigma = check_finite(self.sigma if np.size(self.sigma) else np.ones(len(xy)), (len(xy),), "sigma")
+        sigma = check_finite(_or(self.sigma, np.ones(len(xy)), "sigma"), (len(xy),), "sigma")
         if (sigma <= 0).any():
             raise InputError("sigma must be positive")
         object.__setattr__(self, "sigma", frozen(sigma))
@@ -108,10 +114,11 @@ class Reconstruction:
     bend_clock: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
+        check_fields(self)
         m = len(self.image_names)
         if len(set(self.image_names)) != m:
             raise InputError("image_names holds a name twice")
-        if not self.cameras:
+        if not len(self.cameras):
             raise InputError("a reconstruction needs at least one camera")
         check_shutter_model(self.shutter_model)
         points_w = check_finite(self.points_w, (None, 3), "points_w")
@@ -123,8 +130,8 @@ class Reconstruction:
         }
         for name in ("phi", "velocity", "variation"):
             value = getattr(self, name)
-            fields[name] = check_finite(value if np.size(value) else np.zeros((m, 3)), (m, 3), name)
-        bent = np.size(self.bend) > 0
+            fields[name] = check_finite(_or(value, np.zeros((m, 3)), name), (m, 3), name)
+        bent = check_numbers(self.bend, "bend").size > 0
         fields["bend"] = check_finite(self.bend if bent else np.zeros((m, 0, 6)), (m, None, 6), "bend")
         fields["bend_clock"] = check_finite(self.bend_clock if bent else np.zeros((m, 2)), (m, 2), "bend_clock")
         for name, value in fields.items():

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .camera import Camera
-from .checks import check_finite, check_photo_name, check_rotations, frozen
+from .checks import check_array, check_fields, check_finite, check_photo_name, check_rotation, frozen
 from .motion import RowMotion, check_shutter_model
 
 __all__ = ["Solution", "SolvedImage"]
@@ -75,14 +75,17 @@ class SolvedImage:
 
     def __post_init__(self) -> None:
         check_photo_name(self.name)
+        check_fields(self)
         if self.R_cw is not None:
-            R = check_rotations(np.asarray(self.R_cw, np.float64)[None], 1, f"R_cw of {self.name}")[0]
-            object.__setattr__(self, "R_cw", frozen(R))
+            object.__setattr__(self, "R_cw", frozen(check_rotation(self.R_cw, f"R_cw of {self.name}")))
         if self.motion is not None:
             object.__setattr__(self, "motion", self.motion.as_in("world"))
         if self.center_w is not None:
             center = check_finite(self.center_w, (3,), f"center_w of {self.name}")
             object.__setattr__(self, "center_w", frozen(center))
+        if self.sigma_phi is not None:
+            sigma = check_array(self.sigma_phi, (3,), f"sigma_phi of {self.name}")
+            object.__setattr__(self, "sigma_phi", frozen(sigma))
 
     @property
     def registered(self) -> bool:
@@ -138,6 +141,7 @@ class Solution:
 
     def __post_init__(self) -> None:
         check_shutter_model(self.shutter_model)
+        check_fields(self)
         names = [image.name for image in self.images]
         if len(set(names)) != len(names):
             raise InputError("the solution names a photo twice")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 import secrets
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from .._kernels import maps as kernels
 from ..errors import FileError, FormatError, InputError
 from ..model import Camera, Depth, RowMotion
-from ..model.checks import check_array, frozen
+from ..model.arrays import read_arrays
+from ..model.checks import check_array, check_size, check_whole, frozen
 from .maps import init_rectify_map, seen_by
 from .photo import check_interpolation, check_photo, remap_strips
 
@@ -25,6 +26,8 @@ MAP_KINDS: dict[str, str] = {"npz": ".npz", "exr": ".exr", "stmap": ".exr"}
 
 # Where a grid points when no pixel answers: outside of every photo, finite, since OpenCV 4 and 5 differ on NaN.
 _NOWHERE = -1e6
+# Packed maps have some pixels a byte; a header that claims more is believed up to a limit that does no harm.
+_MOST_PIXELS_A_BYTE, _LEAST_LIMIT = 4, 1 << 24
 # The attribute of our EXR files, with the kind and the size of the source.
 _ATTRIBUTE = "rsundistort"
 
@@ -63,8 +66,8 @@ class RemapGrid:
             object.__setattr__(self, name, array)
         if self.map_x.shape != self.map_y.shape or not self.map_x.size:
             raise InputError(f"map_x.shape={self.map_x.shape}, map_y.shape={self.map_y.shape}, expected the same")
-        if self.source_width < 1 or self.source_height < 1:
-            raise InputError(f"the source has {self.source_width}x{self.source_height} pixels, expected positive ones")
+        for name in ("source_width", "source_height"):
+            object.__setattr__(self, name, check_whole(getattr(self, name), name, 1))
 
     @classmethod
     def from_camera(
@@ -113,7 +116,8 @@ class RemapGrid:
             seen[:] = seen_by(map_x, map_y, self.source_width, self.source_height)
             return bool(seen.all())
 
-        return remap_strips(image, fill, self.size, check_interpolation(interpolation), jobs)
+        flag = check_interpolation(interpolation)
+        return remap_strips(image, fill, self.size, flag, check_whole(jobs, "jobs", 1))
 
     def inverse(self) -> RemapGrid:
         """The way back: for each pixel of the source, which pixel of this grid's image shows it.
@@ -202,12 +206,15 @@ class RemapGrid:
         if not path.is_file():
             raise FileError(f"{path} is no file; give a grid, .npz or .exr")
         try:
-            if path.suffix.lower() == ".npz":
-                with path.open("rb") as file, np.load(file, allow_pickle=False) as held:
-                    width, height = (int(v) for v in held["source_size"])
-                    return cls(held["map_x"], held["map_y"], width, height)
-            return cls._read_exr(path, source_size)
-        except (KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
+            if path.suffix.lower() != ".npz":
+                return cls._read_exr(path, source_size)
+            held = read_arrays(path)
+            missing = [name for name in ("map_x", "map_y", "source_size") if name not in held]
+            if missing:
+                raise FormatError(f"it lacks {missing[0]}")
+            width, height = check_size(held["source_size"], "source_size")
+            return cls(held["map_x"], held["map_y"], width, height)
+        except InputError as error:
             raise FormatError(f"{path} is no grid: {error}") from error
         except OSError as error:
             raise FileError(f"{path} cannot be read: {error.strerror or error}") from error
@@ -216,20 +223,29 @@ class RemapGrid:
     def _read_exr(cls, path: Path, source_size: tuple[int, int] | None) -> RemapGrid:
         OpenEXR = _openexr()
         try:
+            with OpenEXR.File(str(path), header_only=True) as file:
+                low, high = file.header()["dataWindow"]
+            _check_claim(path, math.prod((np.asarray(high, int) - low + 1).tolist()))
             with OpenEXR.File(str(path), separate_channels=True) as file:
                 told = str(file.header().get(_ATTRIBUTE, "")).split()
                 x, y = (np.asarray(file.channels()[name].pixels, np.float64) for name in "RG")
-        except RuntimeError as error:
+        except (RuntimeError, ValueError, KeyError, TypeError) as error:
             raise FormatError(f"{path} is no OpenEXR file that can be read: {error}") from error
         kind, width, height = told if len(told) == 3 else ("stmap", *(source_size or (0, 0)))
-        width, height = int(width), int(height)
         if not width or not height:
             raise InputError(f"{path} does not say how large its source is; give source_size")
+        width, height = check_size([float(width), float(height)], "source_size")
         if kind == "stmap":
             x, y = x * width - 0.5, (1.0 - y) * height - 0.5
         nowhere = ~(np.isfinite(x) & np.isfinite(y))
         x[nowhere] = y[nowhere] = _NOWHERE
         return cls(x.astype(np.float32), y.astype(np.float32), width, height)
+
+
+def _check_claim(path: Path, pixels: int) -> None:
+    """Refuse a file whose header claims far more pixels than it has bytes for."""
+    if pixels > max(_LEAST_LIMIT, _MOST_PIXELS_A_BYTE * path.stat().st_size):
+        raise FormatError(f"its header claims {pixels} pixels, more than its {path.stat().st_size} bytes hold")
 
 
 def _openexr() -> Any:

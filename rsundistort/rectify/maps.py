@@ -9,8 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 from .._kernels import maps as kernels
 from ..errors import InputError
 from ..model import AtInfinity, Camera, Depth, RowMotion, check_shutter_model
-from ..model.checks import check_finite, check_rotations
+from ..model.checks import check_finite, check_rotation, check_size
+from ..model.depth import check_depth
 from ..model.field import add_field
+from ..model.projection import motion_of
 from .pixel_depths import DepthRows
 
 __all__ = ["fill_rows", "init_rectify_map", "rectified_rays", "seen_by"]
@@ -22,8 +24,9 @@ EDGE_PX = 1e-3
 def rectified_rays(new_K: ArrayLike | None, R: ArrayLike | None, camera: Camera) -> NDArray[np.float64]:
     """(3, 3) matrix from rectified pixels (u, v, 1) to directions in the camera frame."""
     K = camera.K if new_K is None else check_finite(new_K, (3, 3), "new_K")
-    rotation = np.eye(3) if R is None else check_rotations(np.asarray(R, np.float64)[None], 1, "R")[0]
-    if abs(np.linalg.det(K)) < 1e-12:
+    rotation = np.eye(3) if R is None else check_rotation(R, "R")
+    scaled = K / max(np.abs(K).max(), 1e-300)
+    if abs(np.linalg.det(scaled)) < 1e-18:
         raise InputError("new_K is singular")
     return rotation.T @ np.linalg.inv(K)
 
@@ -106,13 +109,12 @@ def init_rectify_map(
     >>> map_x.shape, round(float(map_y[340, 320]), 3)
     ((480, 640), 330.61)
     """
-    width, height = size or (camera.width, camera.height)
-    if width < 1 or height < 1:
-        raise InputError(f"size={size}, expected positive (width, height)")
+    motion = motion_of(camera, motion)
+    check_depth(depth)
+    width, height = check_size((camera.width, camera.height) if size is None else size)
     map_x = np.empty((height, width), np.float32)
     map_y = np.empty((height, width), np.float32)
     rays = rectified_rays(new_K, R, camera)
-    motion = motion or RowMotion()
     rows = DepthRows(depth or AtInfinity(), camera, motion, rays, (width, height))
     fill_rows(camera, motion, shutter_model, rays, 0, map_x, map_y, rows)
     if m1type == cv2.CV_32FC1:

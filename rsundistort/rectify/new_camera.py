@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import Camera, RowMotion
-from ..model.projection import unproject_points
+from ..model.checks import check_fields, check_number, check_size
+from ..model.projection import motion_of, unproject_points
 
 __all__ = ["ViewOptions", "optimal_new_camera", "rectified_roi", "rectified_view"]
 
@@ -38,6 +39,7 @@ class ViewOptions:
     max_size: int | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if isinstance(self.alpha, str):
             if self.alpha != "keep":
                 raise InputError(f"alpha={self.alpha!r}, expected 'keep' or a number from 0 to 1")
@@ -174,12 +176,9 @@ def optimal_new_camera(
     roi : (x, y, width, height)
         Rectangle without empty pixels in any of the rectified photos.
     """
-    if not 0.0 <= alpha <= 1.0:
-        raise InputError(f"alpha={alpha}, expected 0 to 1")
-    width, height = size or (camera.width, camera.height)
-    if width < 2 or height < 2:
-        raise InputError(f"size={size}, expected (width, height) of at least 2")
-    motions = motion if isinstance(motion, Sequence) else [motion]
+    alpha = check_number(alpha, "alpha", 0.0, 1.0)
+    motions = [motion_of(camera, each) for each in (motion if isinstance(motion, Sequence) else [motion])]
+    width, height = check_size((camera.width, camera.height) if size is None else size, least=2)
     outlines = [_outline(camera, each, shutter_model) for each in motions]
     found = [each for each in outlines if each is not None]
     if not found or len(found) < len(outlines):

@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 
 from .._kernels import maps as kernels
 from ..errors import InputError
-from ..model import AtInfinity, Camera, Depth, DepthMap, RowMotion
+from ..model import AtInfinity, Camera, Depth, DepthMap, RowMotion, check_shutter_model
+from ..model.checks import check_kind, check_one_of, check_whole
+from ..model.depth import check_depth
+from ..model.projection import motion_of
 from .coarse import coarse_grid
 from .maps import fill_rows, rectified_rays, seen_by
 from .pixel_depths import DepthRows
@@ -38,11 +41,13 @@ _MAX_SIDE = 32766  # cv2.remap counts in 16 bits
 
 def check_photo(photo: NDArray[Any], width: int, height: int) -> NDArray[Any]:
     """The photo, refused if it is of a kind that cannot be remapped or of another size."""
-    photo = np.asarray(photo)
+    check_kind(photo, np.ndarray, "photo")
     if photo.dtype not in (np.uint8, np.uint16, np.float32) or photo.ndim not in (2, 3):
         raise InputError(f"photo is {photo.dtype} {photo.shape}, expected uint8, uint16 or float32 (h, w[, channels])")
     if photo.shape[:2] != (height, width):
         raise InputError(f"photo has {photo.shape[1]}x{photo.shape[0]} pixels, its camera {width}x{height}")
+    if not photo.size:
+        raise InputError(f"photo is {photo.dtype} {photo.shape}, which holds nothing")
     if max(photo.shape[:2]) > _MAX_SIDE:
         raise InputError(f"photo has {width}x{height} pixels, and OpenCV rectifies sides up to {_MAX_SIDE}")
     return photo
@@ -50,8 +55,7 @@ def check_photo(photo: NDArray[Any], width: int, height: int) -> NDArray[Any]:
 
 def check_interpolation(name: str) -> int:
     """OpenCV's flag of an interpolation."""
-    if name not in INTERPOLATIONS:
-        raise InputError(f"interpolation={name!r}, expected one of {', '.join(INTERPOLATIONS)}")
+    check_one_of(name, INTERPOLATIONS, "interpolation")
     return INTERPOLATIONS[name]
 
 
@@ -96,11 +100,20 @@ def rectify(
         255 where a raw pixel (that counts) answers, else 0: outside of the photo, and where something nearer hid what
         the pixel would show.
     """
+    motion = motion_of(camera, motion)
     photo = check_photo(photo, camera.width, camera.height)
-    if mask is not None and (mask.dtype != np.uint8 or mask.shape != photo.shape[:2]):
-        raise InputError(f"mask is {mask.dtype} {mask.shape}, expected uint8 {photo.shape[:2]}")
+    if mask is not None:
+        check_kind(mask, np.ndarray, "mask")
+        if mask.dtype != np.uint8 or mask.shape != photo.shape[:2]:
+            raise InputError(f"mask is {mask.dtype} {mask.shape}, expected uint8 {photo.shape[:2]}")
+    check_depth(depth)
+    check_shutter_model(shutter_model)
+    jobs = check_whole(jobs, "jobs", 1)
     flag = check_interpolation(interpolation)
-    target = new_camera or camera.pinhole()
+    target = camera.pinhole() if new_camera is None else new_camera
+    check_kind(target, Camera, "new_camera")
+    if max(target.width, target.height) > _MAX_SIDE:
+        raise InputError(f"new_camera has {target.width}x{target.height} pixels, OpenCV fills sides up to {_MAX_SIDE}")
     if not target.is_pinhole:
         raise InputError("new_camera has lens distortion; a rectified photo has none")
     rays = rectified_rays(target.K, None, camera)
@@ -111,7 +124,7 @@ def rectify(
         finer = np.array([[1, 0, 0.5 - 0.5 * factor], [0, 1, 0.5 - 0.5 * factor], [0, 0, factor]]) / factor
         finer_size = (factor * size[0], factor * size[1])
         at = replace(depth, size=finer_size) if isinstance(depth, DepthMap) and depth.size == size else depth
-        return _fill_rows(camera, motion or RowMotion(), shutter_model, rays @ finer, finer_size, at or AtInfinity())
+        return _fill_rows(camera, motion, shutter_model, rays @ finer, finer_size, at or AtInfinity())
 
     samples = 1 if flag == cv2.INTER_NEAREST else _samples(camera, target)
     return remap_strips(photo, fill(1), size, flag, jobs, mask, samples, fill(samples) if samples > 1 else None)
@@ -169,6 +182,13 @@ def remap_strips(
 
     With `samples` a pixel is the mean of samples x samples points, whose map `fill_samples` makes.
     """
+    if photo.ndim == 3 and photo.shape[2] not in (1, 3, 4):
+        # OpenCV moves pixels of other numbers of channels less exactly, those of some not at all
+        alone = [
+            remap_strips(np.ascontiguousarray(photo[..., k]), fill, size, flag, jobs, mask, samples, fill_samples)
+            for k in range(photo.shape[2])
+        ]
+        return np.dstack([values for values, _ in alone]), alone[0][1]
     width, height = size
     rectified = np.empty((height, width, *photo.shape[2:]), photo.dtype)
     valid = np.empty((height, width), np.uint8)

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from .._kernels.depth import EDGE
 from ..errors import InputError
 from ..model import AtInfinity, Camera, Depth, DepthMap, Plane, RowMotion
-from ..model.checks import check_array, check_finite
-from ..model.projection import clock_of, project_points, unproject_points
+from ..model.checks import check_array, check_finite, check_kind, check_numbers
+from ..model.depth import check_depth
+from ..model.projection import clock_of, motion_of, project_points, unproject_points
 from .maps import rectified_rays
 from .pixel_depths import inverse_depth_at
 
@@ -26,13 +27,15 @@ _BISECTIONS = 50
 
 def _as_list(points: ArrayLike, name: str) -> tuple[NDArray[np.float64], tuple[int, ...]]:
     """Points (n, 2) of any of cv2's shapes: (n, 2), (n, 1, 2), (1, n, 2)."""
-    array = np.asarray(points, np.float64)
+    array = check_numbers(points, name)
     if array.ndim not in (2, 3) or array.shape[-1] != 2 or (array.ndim == 3 and 1 not in array.shape[:2]):
         raise InputError(f"{name}.shape={array.shape}, expected (N, 2), (N, 1, 2) or (1, N, 2)")
     return array.reshape(-1, 2), array.shape
 
 
 def _homogeneous(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 3) points of z = 1; those that are no numbers become NaN, since infinity times zero is none."""
+    xy = np.where(np.isfinite(xy).all(1, keepdims=True), xy, np.nan)
     return np.column_stack([xy, np.ones(len(xy))])
 
 
@@ -153,8 +156,9 @@ def undistort_points(
     xy, shape = _as_list(points, "points")
     depth = AtInfinity() if depth is None else depth
     _check_map(depth, P)
+    motion = motion_of(camera, motion)
     rays = rectified_rays(np.eye(3) if P is None else P, R, camera)
-    return _rectified(xy, camera, motion or RowMotion(), shutter_model, rays, depth).reshape(shape)
+    return _rectified(xy, camera, motion, shutter_model, rays, depth).reshape(shape)
 
 
 def distort_points(
@@ -183,6 +187,7 @@ def distort_points(
     xy, shape = _as_list(points, "points")
     depth = AtInfinity() if depth is None else depth
     _check_map(depth, P)
+    motion = motion_of(camera, motion)
     rays = rectified_rays(np.eye(3) if P is None else P, R, camera)
     points_c = _homogeneous(xy) @ rays.T
     if shutter_model != "constant-motion":
@@ -206,6 +211,10 @@ def largest_shift_px(
     It is looked for on a grid of 33 x 33 raw pixels that holds the border and the corners; with a depth, on one of 97 x
     65 pixels of the rectified photo (`new_camera`, else of the camera's own size and K).
     """
+    motion = motion_of(camera, motion)
+    if new_camera is not None:
+        check_kind(new_camera, Camera, "new_camera")
+    check_depth(depth)
     if depth is None or isinstance(depth, AtInfinity) or shutter_model != "constant-motion":
         u, v = np.meshgrid(np.linspace(0, camera.width - 1, 33), np.linspace(0, camera.height - 1, 33))
         raw = np.column_stack([u.ravel(), v.ravel()])

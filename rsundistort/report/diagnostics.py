@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -14,10 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..bundle import BundleResult
-from ..errors import FileError, FormatError
+from ..errors import FormatError
 from ..evaluation import align_points
 from ..io.aside import write_aside
 from ..model import Reconstruction
+from ..model.arrays import read_arrays
 from ..model.reprojection import reprojection_residuals
 
 __all__ = ["Diagnostics", "read_diagnostics", "write_diagnostics"]
@@ -25,6 +24,12 @@ __all__ = ["Diagnostics", "read_diagnostics", "write_diagnostics"]
 _FORMAT = "rsundistort-report"
 _VERSION = 1
 
+# Types of the arrays, and how many axes they have where their shapes are by them; the others are floats.
+_KINDS: dict[str, tuple[str, int | None]] = {
+    "names": ("U", 1), "camera_ids": ("U", 1), "photos": ("U", 0), "histogram": ("iu", 2), "point_idx": ("iu", 1),
+    "rgb": ("u", 2), "row_rms_px": ("f", 2), "row_mean_px": ("f", 4), "cell_mean_px": ("f", 5),
+    "histogram_px": ("f", 1), "points_w": ("f", 2), "global_points_w": ("f", 2),
+}  # fmt: skip
 # Points that are kept: what a phone turns smoothly.
 _MAX_POINTS = 15_000
 # Bins along the readout, of all photos and of one; cells across and down the photo; bars of the histogram.
@@ -158,26 +163,26 @@ def read_diagnostics(path: Path) -> Diagnostics:
         When it is missing, of another version, or garbled.
     """
     path = Path(path)
-    try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-            if str(file["format"]) != _FORMAT:
-                raise FormatError(f"{path} is not of the format {_FORMAT!r}")
-            if int(file["version"]) != _VERSION:
-                raise FormatError(f"{path} has version {int(file['version'])}, this program reads {_VERSION}")
-            values: dict[str, Any] = {each.name: file[each.name] for each in fields(Diagnostics)}
-    except FormatError:
-        raise
-    except OSError as error:
-        raise FileError(f"{path} cannot be read: {error.strerror or error}") from error
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, AttributeError, TypeError) as error:
-        raise FormatError(f"{path} is garbled: {' '.join(str(error).split())}") from error
+    arrays = read_arrays(path)
+    if str(arrays.get("format")) != _FORMAT:
+        raise FormatError(f"{path} is not of the format {_FORMAT!r}")
+    if str(arrays.get("version")) != str(_VERSION):
+        raise FormatError(f"{path} has version {arrays.get('version')}, this program reads {_VERSION}")
+    values: dict[str, Any] = {}
+    for each in fields(Diagnostics):
+        if each.name not in arrays:
+            raise FormatError(f"{path} lacks {each.name}")
+        array, (kinds, axes) = arrays[each.name], _KINDS.get(each.name, ("f", None))
+        if array.dtype.kind not in kinds or (axes is not None and array.ndim != axes):
+            raise FormatError(f"{path}: {each.name} is {array.dtype} {array.shape}")
+        values[each.name] = array.astype(np.float64) if _is_float(array) else array
     for name in ("names", "camera_ids"):
-        values[name] = tuple(str(each) for each in values[name].ravel())
+        values[name] = tuple(str(each) for each in values[name])
     values["photos"] = str(values["photos"])
     try:
-        return Diagnostics(**{name: v.astype(np.float64) if _is_float(v) else v for name, v in values.items()})
-    except IndexError as error:
-        raise FormatError(f"{path} is garbled: {error}") from error
+        return Diagnostics(**values)
+    except FormatError as error:
+        raise FormatError(f"{path}: {error}") from error
 
 
 def _is_float(value: Any) -> bool:

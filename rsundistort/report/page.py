@@ -24,6 +24,9 @@ from .verdict import advice_of, meter_of, verdict_of
 __all__ = ["write_report"]
 
 _NAME = "report.html"
+# What solutions of earlier versions, or of others, may not tell.
+_QUALITY = dict.fromkeys(("num_points", "rms_px", "global_rms_px"))
+_CRITICAL = dict.fromkeys(("meaning", "sentence", "remedy", "anchors", "warnings"))
 
 
 def write_report(
@@ -104,7 +107,8 @@ def _page(source: Source, pictures: dict[str, Picture]) -> str:
         solution=solution,
         verdict=verdict_of(solution),
         meter=meter_of(solution),
-        critical=solution.critical_motion or {},
+        quality={**_QUALITY, **solution.quality},
+        critical={**_CRITICAL, **solution.critical_motion} if solution.critical_motion else {},
         advice=advice_of(solution),
         notes=source.notes,
         photos=content.photos(source),
@@ -117,6 +121,7 @@ def _page(source: Source, pictures: dict[str, Picture]) -> str:
         places=map_facts(solution.georeference),
         place_rows=map_rows(solution.georeference),
         settings=content.settings(solution),
+        stages=[{"name": "", "seconds": 0.0, **stage} for stage in solution.stages],
         seconds=sum(float(stage.get("seconds") or 0) for stage in solution.stages),
         json=_json(data),
         css=(here / "page.css").read_text("utf-8"),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, InputError
 from ..io import read_exif, read_photo
-from ..io.photos.images import stored_size
+from ..io.photos.images import read_plain, stored_size
 from ..io.photos.kinds import kind_of_content
 from ..model.orientation import compose_orientations, turn_pixels
 
@@ -123,9 +123,7 @@ def _decoded(path: Path, side: float) -> NDArray[np.uint8]:
         if max(size) >= factor * side:
             flag = reduced
             break
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flag | cv2.IMREAD_IGNORE_ORIENTATION)
-    if pixels is None:
-        raise FileError(f"{path.name} cannot be decoded")
+    pixels = read_plain(path, "photo", flag | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.asarray(pixels, np.uint8)
 
 

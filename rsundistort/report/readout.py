@@ -22,7 +22,8 @@ def readout_facts(told: Mapping[str, Any]) -> list[tuple[str, str]]:
     """
     source = told["source"]
     origin = source if source.startswith("what") else f"measured from {source}"
-    facts = [("readout time", f"{_time(told)} ({told['of_frame']:.2f} of the frame), {origin}")]
+    share = f" ({told['of_frame']:.2f} of the frame)" if "of_frame" in told else ""  # the truth of a clip has none
+    facts = [("readout time", f"{_time(told)}{share}, {origin}")]
     halves = told.get("halves") or ()
     if halves:
         facts.append(("its halves say", " and ".join(_time(half) for half in halves)))

@@ -124,6 +124,7 @@ def _solved(
     folder = source.folder
     frames = [] if source.frames is None else [f"frames/{path.name}" for path in folder.iterdir()]
     names = list_photos(folder, rectify.raw_as)
+    options.outputs.check_names(names)
     Record(out).check([*frames, *of_video, *files_of_run(names, rectify.raw_as, options.outputs)], inputs)
     kept.begin()
     found: Outputs | None = before.outputs(log)

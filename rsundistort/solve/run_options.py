@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..batch.rectify_options import RectifyOptions
 from ..bundle import BundleOptions
+from ..colmap.rectified_model import check_text_names
 from ..critical import with_remedy
 from ..errors import InputError
 from ..input.gyroscope import GyroOptions
@@ -20,6 +21,7 @@ from ..input.positions import check_crs
 from ..io.cameras import check_sigma
 from ..io.exports import check_exports
 from ..model import Bend, ControlPoint, KnownLength, check_shutter_model
+from ..model.checks import check_fields
 from ..sfm import DETECTION_MEGAPIXELS
 
 __all__ = ["OutputOptions", "RunOptions", "SolveOptions"]
@@ -98,6 +100,7 @@ class SolveOptions(_Part):
     readout_s: float | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if self.shutter_model != "auto":
             check_shutter_model(self.shutter_model)
         check_readouts(self.readout)
@@ -151,9 +154,15 @@ class OutputOptions(_Part):
     report: bool = True
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if self.sparse_format not in ("bin", "txt"):
             raise InputError(f"sparse_format={self.sparse_format!r}, expected bin or txt")
         check_exports(self.exports)
+
+    def check_names(self, names: Iterable[str]) -> None:
+        """Refuse photos whose names the outputs cannot hold."""
+        if self.sparse_format == "txt":
+            check_text_names(names)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,6 +210,7 @@ class RunOptions(_Part):
     gyro: GyroOptions | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if self.max_features < 100:
             raise InputError(f"max_features={self.max_features!r}, expected at least 100")
         if not 0.05 <= self.feature_megapixels < np.inf:

@@ -199,6 +199,7 @@ def clip_of(entry: Any, twins: Any, seed: int) -> Clip:
         num = count(entry["num_frames"], "path: num_frames")
     else:
         num = round(number(entry["duration_s"], "path: duration_s") * fps)
+        count(max(num, 1), "path: frames")
     if num < 2:
         raise FormatError(f"path: {num} frames, a clip needs two or more")
     readout = number(entry["readout"], "path: readout")
@@ -228,7 +229,7 @@ def clip_of(entry: Any, twins: Any, seed: int) -> Clip:
 def _tremor(entry: Any, pan: bool, seed: int) -> Tremor:
     take(entry, "path: tremor", (), ("rotation_deg", "hz", "num", *(() if pan else ("travel_m",))))
     rotation, travel = (number(entry.get(key, 0.0), f"path: tremor: {key}") for key in ("rotation_deg", "travel_m"))
-    num = count(entry.get("num", 5), "path: tremor: num")
+    num = count(entry.get("num", 5), "path: tremor: num", 1000)
     low, high = check_finite(entry.get("hz", (1.0, 12.0)), (2,), "path: tremor: hz").tolist()
     return Tremor(float(np.radians(rotation)), travel, (low, high), num, seed)
 

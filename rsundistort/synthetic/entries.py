@@ -36,8 +36,10 @@ def number(value: Any, where: str) -> float:
     return float(value)
 
 
-def count(value: Any, where: str) -> int:
-    """A whole number of at least 1."""
+def count(value: Any, where: str, most: int = 100_000) -> int:
+    """A whole number of at least 1, and no more than anybody would render."""
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
         raise FormatError(f"{where}: {value!r}, expected a whole number of at least 1")
+    if value > most:
+        raise FormatError(f"{where}: {value}, expected no more than {most}")
     return value

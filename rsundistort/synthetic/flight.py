@@ -116,6 +116,7 @@ def _lines(entry: dict[str, Any], camera: str, flying: bool) -> list[Pose]:
     end = check_finite(entry["end_w"], (3,), "path: end_w")
     look = check_finite(entry.get("look_w", (0.0, 0.0, -1.0)), (3,), "path: look_w")
     num, lines = count(entry["num"], "path: num"), count(entry.get("lines", 1), "path: lines")
+    count(num * lines, "path: num times lines")
     along = end - start
     if np.linalg.norm(along) < 1e-9:
         raise FormatError("path: start_w and end_w are the same place")

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from ..errors import FormatError, InputError
 from ..io.json_text import read_json
 from ..model.camera import Camera
-from ..model.checks import check_finite, check_rotations, frozen
+from ..model.checks import check_finite, check_rotations, check_whole, frozen
 from ..model.motion import RowMotion
 from .clip import Clip, clip_of, is_clip
-from .entries import number, take
+from .entries import count, number, take
 from .flight import Pose, motions_of, poses_and_motions, poses_of
 from .lens import undistort_to_rays
 from .scene import Light, Patch, Scene
@@ -253,13 +253,20 @@ def _parse(data: Any, folder: Path) -> Recipe:
         patches += added
         owners += [f"{where} ({entry['kind']})"] * len(added)
     light = Light(**take(data["light"], "light", (), tuple(f.name for f in fields(Light))))
-    noise = Noise(**take(data.get("noise", {}), "noise", (), ("read_grey", "shot_grey")))
+    noises = take(data.get("noise", {}), "noise", (), ("read_grey", "shot_grey"))
+    noise = Noise(**{name: number(value, f"noise: {name}") for name, value in noises.items()})
     clip = clip_of(data["path"], data.get("twins", {}), seed) if filmed else None
     readout_ms, exposed = _shutter(data.get("shutter"), clip)
     views = _views(data, cameras, readout_ms, exposed, folder) if clip is None else _frames(clip, cameras, exposed)
     options = dict(take(data["render"], "render", ("jpeg_quality",), ("samples", "spread_px", "exposure")))
+    check_whole(options["jpeg_quality"], "render: jpeg_quality", 0, 100)
+    count(options.get("samples", 1), "render: samples", 1024)
+    for key in {"spread_px", "exposure"} & options.keys():
+        number(options[key], f"render: {key}")
+    if not isinstance(data["name"], str):
+        raise FormatError(f"name={data['name']!r}, expected a text")
     num_points = data.get("points", 1000)
-    if not isinstance(num_points, int) or num_points < 0:
+    if isinstance(num_points, bool) or not isinstance(num_points, int) or not 0 <= num_points <= 10**7:
         raise FormatError(f"points={num_points!r}, expected a whole number")
     return Recipe(
         name=data["name"],
@@ -296,5 +303,5 @@ def load_recipe(path: str | Path) -> Recipe:
         return _parse(data, path.parent)
     except InputError as error:
         raise FormatError(f"{path}: {error}") from error
-    except (TypeError, KeyError, AttributeError, ValueError) as error:
+    except (TypeError, KeyError, IndexError, AttributeError, ValueError, OverflowError) as error:
         raise FormatError(f"{path}: an entry has the wrong type ({error})") from error

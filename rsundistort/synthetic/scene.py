@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from .._kernels import raycast
 from ..errors import InputError
-from ..model.checks import check_finite, frozen
+from ..model.checks import check_fields, check_finite, check_number, frozen
 from .textures import Texture
 
 __all__ = ["Light", "Opening", "Patch", "Scene", "box", "wall"]
@@ -82,6 +83,9 @@ class Opening:
     back: str = ""
     reveal: str = ""
     offset_m: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 def wall(patch: Patch, openings: list[Opening]) -> list[Patch]:
@@ -188,10 +192,17 @@ class Light:
     sun_azimuth_deg: float = 230.0
     sun_elevation_deg: float = 40.0
     sun_radius_deg: float = 0.4
-    sun: tuple[float, float, float] = (1.0, 0.93, 0.80)
-    sky: tuple[float, float, float] = (0.30, 0.36, 0.45)
-    bounce: tuple[float, float, float] = (0.50, 0.45, 0.38)
+    sun: Sequence[float] = (1.0, 0.93, 0.80)
+    sky: Sequence[float] = (0.30, 0.36, 0.45)
+    bounce: Sequence[float] = (0.50, 0.45, 0.38)
     clouds: float = 0.5
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        for name in ("sun", "sky", "bounce"):
+            check_finite(getattr(self, name), (3,), f"light: {name}")
+        for name in ("sun_azimuth_deg", "sun_elevation_deg", "sun_radius_deg", "clouds"):
+            check_number(getattr(self, name), f"light: {name}")
 
     def sun_directions(self, num: int) -> NDArray[np.float64]:
         """Unit vectors (num, 3), world frame, towards points spread over the sun's disc."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import FileError, FormatError, InputError
-from ..model.checks import check_finite
+from ..model.checks import check_array, check_finite
 from .entries import count, kind_of, number, take
 from .scene import Opening, Patch, box, wall
 from .textures import Texture
@@ -50,8 +50,10 @@ def _box(entry: Any, where: str, textures: dict[str, Texture], rng: np.random.Ge
 def _flat(entry: Any, where: str, kind: str) -> list[Patch]:
     optional = ("offset_m", "openings") if kind == "rectangle" else ("offset_m",)
     take(entry, where, ("kind", "origin_w", "edge_a", "edge_b", "texture"), optional)
-    offset = tuple(entry.get("offset_m", (0.0, 0.0)))
-    patch = Patch(entry["origin_w"], entry["edge_a"], entry["edge_b"], entry["texture"], offset, kind == "triangle")
+    across, along = check_finite(entry.get("offset_m", (0.0, 0.0)), (2,), f"{where}: offset_m").tolist()
+    patch = Patch(
+        entry["origin_w"], entry["edge_a"], entry["edge_b"], entry["texture"], (across, along), kind == "triangle"
+    )
     if "openings" not in entry:
         return [patch]
     openings = []
@@ -103,9 +105,13 @@ def _height_field(entry: Any, where: str, rng: np.random.Generator) -> list[Patc
         heights = check_finite(entry["heights_m"], (None, None), f"{where}: heights_m")
     else:
         relief = take(entry["relief"], f"{where}.relief", ("amplitude_m", "wavelength_m", "cells"))
+        check_array(relief["cells"], (2,), f"{where}.relief: cells")
         cols, rows = (count(n, f"{where}.relief: cells") + 1 for n in relief["cells"])
+        count(cols * rows, f"{where}.relief: cells, across times along")
         wavelength = number(relief["wavelength_m"], f"{where}.relief: wavelength_m")
         # smooth hills: noise on a grid of half a wavelength, interpolated
+        if not wavelength > 1e-3 * size.max():
+            raise FormatError(f"{where}.relief: wavelength_m={wavelength:g}, expected a thousandth of size_m or more")
         coarse = [max(int(np.ceil(2 * s / wavelength)), 1) + 3 for s in size]
         noise = rng.standard_normal((coarse[1], coarse[0])).astype(np.float32)
         heights = cv2.resize(noise, (cols, rows), interpolation=cv2.INTER_CUBIC).astype(np.float64)

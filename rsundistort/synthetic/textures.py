@@ -10,13 +10,16 @@ import inspect
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Any, get_type_hints
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, FormatError, InputError
+from ..errors import InputError
+from ..io.photos.images import read_plain
+from ..model.checks import check_annotated, check_finite, check_number
 
 __all__ = ["TEXTURE_KINDS", "Texture"]
 
@@ -25,6 +28,8 @@ _Colour = Sequence[float]
 
 # Finest grain in texels: at 1 texel a pixel it is well above the 3 px that bicubic interpolation keeps.
 _GRAIN_TEXELS = 5.0
+# Along one side; of all together a quarter of its square.
+_MOST_TEXELS = 32766
 
 
 @dataclass(frozen=True)
@@ -265,13 +270,7 @@ def ground(canvas: _Canvas, *, colour: _Colour, contrast: float = 0.12) -> _Imag
 
 def picture(canvas: _Canvas, *, path: str) -> _Image:
     """A picture, stretched over the texture; what is finer than a texel is averaged away."""
-    try:
-        data = np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise FileError(f"texture: cannot read {path}: {error.strerror}") from error
-    found = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-    if found is None:
-        raise FormatError(f"texture: {path} is no picture that can be read")
+    found = read_plain(Path(path), "texture", cv2.IMREAD_COLOR)
     shrinks = found.shape[0] > canvas.rows or found.shape[1] > canvas.cols
     resized = cv2.resize(
         found, (canvas.cols, canvas.rows), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
@@ -314,8 +313,19 @@ class Texture:
         unknown, missing = sorted(set(self.options) - set(known)), sorted(wanted - set(self.options))
         if unknown or missing:
             raise InputError(f"texture of kind {self.kind!r}: unknown keys {unknown}, missing keys {missing}")
-        if len(self.size_m) != 2 or min(self.size_m) <= 0 or self.texels_per_m <= 0:
+        hints = get_type_hints(TEXTURE_KINDS[self.kind])
+        for name, value in self.options.items():
+            check_annotated(value, hints[name], f"texture: {name}")
+            if name.endswith("colour"):
+                check_finite(value, (3,), f"texture: {name}")
+        size = check_finite(self.size_m, (2,), "texture: size_m")
+        density = check_number(self.texels_per_m, "texture: texels_per_m")
+        if size.min() <= 0 or density <= 0:
             raise InputError(f"texture: size_m={self.size_m}, texels_per_m={self.texels_per_m}, expected positive")
+        if (size * density).max() > _MOST_TEXELS or (size * density).prod() > _MOST_TEXELS**2 / 4:
+            raise InputError(
+                f"texture: size_m={self.size_m} at {density:g} texels per metre is larger than any picture"
+            )
 
     def pyramid(self, seed: int, name: str) -> list[NDArray[np.uint8]]:
         """Mip levels (rows, cols, 3), RGB, gamma-encoded, each half as large as the one before.

@@ -18,15 +18,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import FileError, FileKindWarning, InputError, MetadataWarning
+from ...errors import DamagedPhotoWarning, FileError, FileKindWarning, InputError, MetadataWarning
 from ..aside import write_aside
 from ..places import Place, files_in, place_of
+from .codec_lines import with_lines
 from .containers import Parts, metadata_of, with_metadata
 from .heif import read_heif
 from .kinds import (
     HEIF_SUFFIXES,
     PHOTO_SUFFIXES,
     RAW_SUFFIXES,
+    can_hold,
     is_whole,
     kind_of_content,
     kind_of_name,
@@ -34,9 +36,10 @@ from .kinds import (
 )
 from .metadata import Metadata
 from .raw import read_raw
-from .tiff import as_stored, encode_tiff, tiff_metadata
+from .tiff import as_stored, damaged_strips, encode_tiff, tiff_metadata
 
 __all__ = [
+    "LARGEST_SIDE",
     "MAX_MEGAPIXELS",
     "RAW_AS",
     "Photo",
@@ -44,6 +47,7 @@ __all__ = [
     "list_photos",
     "output_name",
     "read_photo",
+    "read_plain",
     "stored_size",
     "write_image",
 ]
@@ -54,7 +58,8 @@ MAX_MEGAPIXELS = 250.0
 #: Kinds that RAW and HEIC can be written as.
 RAW_AS = ("tif", "jpg", "png")
 
-_MAX_SIDE = 32766  # of cv2.remap
+#: Pixels across or down a photo that `cv2.remap` can count.
+LARGEST_SIDE = 32766
 
 
 @dataclass(frozen=True)
@@ -167,14 +172,19 @@ def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> Photo:
                 f"{path.name} has {width}x{height} pixels, more than the limit of {max_megapixels:g} million; "
                 "raise it with --max-pixels if that is true"
             )
-        if max(width, height) > _MAX_SIDE:
+        if max(width, height) > LARGEST_SIDE:
             raise FileError(
-                f"{path.name} has {width}x{height} pixels; sides above {_MAX_SIDE} cannot be rectified: cut it up"
+                f"{path.name} has {width}x{height} pixels; sides above {LARGEST_SIDE} cannot be rectified: cut it up"
             )
 
     size = picture_size(data, kind)
     if size is not None:
         check_size(*size)
+        if not can_hold(data, kind, size):
+            raise FileError(
+                f"{path.name} has {size[0]}x{size[1]} pixels by its header, far more than its {len(data)} bytes can "
+                "hold; copy it again from the camera"
+            )
     elif kind in ("JPEG", "PNG", "WebP"):
         raise FileError(f"{path.name} cannot be decoded: its header does not say how large it is; copy it again")
     if kind == "RAW":
@@ -182,7 +192,14 @@ def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> Photo:
     elif kind == "HEIC":
         pixels, metadata = read_heif(data, path.name)
     else:
-        pixels = _decode(as_stored(data), path.name) if kind == "TIFF" else _decode_file(path, stamp, data)
+        pixels, said = with_lines(
+            lambda: _decode(as_stored(data), path.name) if kind == "TIFF" else _decode_file(path, stamp, data)
+        )
+        if kind == "TIFF" and (count := damaged_strips(data)):
+            said = [f"the checksum of {count} of its strips is wrong"]
+        if said:
+            text = f"{path.name} seems damaged: {said[0]}; if it looks wrong, copy it again from the camera"
+            warnings.warn(text, DamagedPhotoWarning, stacklevel=2)
         metadata = tiff_metadata(data) if kind == "TIFF" else metadata_of(data, kind)
     if kind != named:
         warnings.warn(
@@ -226,6 +243,36 @@ def _decode(data: bytes, name: str) -> NDArray[Any]:
     if pixels is None or pixels.size == 0:
         raise FileError(f"{name} cannot be decoded; it is no whole photo of a known kind")
     return pixels
+
+
+def read_plain(path: Path, what: str, flags: int) -> NDArray[Any]:
+    """Pixels of a picture that is no photo, such as a mask, without its metadata; `what` it is, for errors.
+
+    Raises
+    ------
+    FileError
+        When it cannot be read or decoded, or claims more pixels than it can hold or than any photo has.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise FileError(f"{what} {path} cannot be read: {error.strerror}") from error
+    kind = kind_of_content(data, path.name)
+    if not is_whole(data):
+        raise FileError(f"{what} {path} cannot be decoded: it is cut short, or damaged")
+    size = picture_size(data, kind)
+    if size is not None and (size[0] * size[1] > MAX_MEGAPIXELS * 1e6 or not can_hold(data, kind, size)):
+        raise FileError(f"{what} {path} has {size[0]}x{size[1]} pixels by its header, more than it can hold")
+    try:
+        decoded = with_lines(lambda: cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None)
+    except cv2.error as error:
+        raise FileError(f"{what} {path} cannot be decoded: {error.err}") from error
+    pixels, said = decoded
+    if pixels is None:
+        raise FileError(f"{what} {path} cannot be decoded; it is no picture of a known kind")
+    if said:
+        warnings.warn(f"{what} {path} seems damaged: {said[0]}", DamagedPhotoWarning, stacklevel=2)
+    return np.asarray(pixels)
 
 
 def _encode_params(suffix: str, quality: int, flat: bool) -> list[int]:

@@ -12,6 +12,7 @@ __all__ = [
     "HEIF_SUFFIXES",
     "PHOTO_SUFFIXES",
     "RAW_SUFFIXES",
+    "can_hold",
     "is_whole",
     "jpeg_segments",
     "kind_of_content",
@@ -72,9 +73,15 @@ def _is_raw(data: bytes, named_raw: bool) -> bool:
 
 
 def is_whole(data: bytes) -> bool:
-    """Whether a JPEG or PNG has its end; some decoders fill what is missing with grey and say nothing."""
+    """Whether a JPEG or PNG has its end; some decoders fill what is missing with grey and say nothing.
+
+    Of a PNG, chunk by chunk: OpenCV makes room for what each claims to hold, 4 GB perhaps.
+    """
     if data[:8] == b"\x89PNG\r\n\x1a\n":
-        return data.rfind(b"IEND") > 0
+        at = 8
+        while at + 12 <= len(data) and data[at + 4 : at + 8] != b"IEND":
+            at += 12 + int.from_bytes(data[at : at + 4], "big")
+        return at + 12 <= len(data) and data[at : at + 4] == bytes(4)
     if data[:2] != b"\xff\xd8":
         return True
     before = max((end for _, _, end in jpeg_segments(data)), default=2)
@@ -105,6 +112,18 @@ def picture_size(data: bytes, kind: str) -> tuple[int, int] | None:
     """Width and height in pixels by the header, before anything is decoded; None where it does not say."""
     size = {"JPEG": _jpeg_size, "PNG": _png_size, "WebP": _webp_size, "TIFF": _tiff_size, "HEIC": _heif_size}.get(kind)
     return None if size is None else size(data)
+
+
+def can_hold(data: bytes, kind: str, size: tuple[int, int]) -> bool:
+    """Whether a file is long enough for a picture of this size, however well it was packed.
+
+    zlib packs up to 1032 bytes into one. A JPEG has a bit or more for each block of 64 pixels, 6 for 256 of three
+    channels. In a WebP of one colour pixels take nothing.
+    """
+    width, height = size
+    if kind == "PNG":
+        return width * height * data[24] // 8 <= 1100 * len(data)
+    return kind not in ("JPEG", "TIFF") or width * height <= 8192 * len(data)
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:

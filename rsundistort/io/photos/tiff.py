@@ -6,6 +6,7 @@ OpenCV keeps no metadata of a TIFF, follows its orientation whatever one says, a
 from __future__ import annotations
 
 import struct
+import zlib
 from typing import Any
 
 import cv2
@@ -24,9 +25,11 @@ from .exif import (
 )
 from .metadata import Metadata
 
-__all__ = ["as_stored", "encode_tiff", "tiff_metadata"]
+__all__ = ["as_stored", "damaged_strips", "encode_tiff", "tiff_metadata"]
 
 _STRIPS, _STRIP_LENGTHS, _PREDICTOR, _EXTRA_SAMPLES, _XMP, _ICC = 0x0111, 0x0117, 0x013D, 0x0152, 0x02BC, 0x8773
+_COMPRESSION, _TILES, _TILE_LENGTHS = 0x0103, 0x0144, 0x0145
+_DEFLATE = (8, 32946)
 _BYTE, _SHORT, _LONG, _UNDEFINED = 1, 3, 4, 7
 _NO_PREDICTION, _HORIZONTAL = 1, 2
 _NO_COMPRESSION, _LZW = 1, 5
@@ -56,6 +59,31 @@ def as_stored(data: bytes) -> bytes:
     except Damaged:
         return data
     return bytes(patched)
+
+
+def damaged_strips(data: bytes) -> int:
+    """How many strips or tiles, packed by deflate, do not have their checksum: libtiff does not look at it."""
+    try:
+        structure = TiffStructure(data)
+        entries = structure.main()[0]
+        if _COMPRESSION not in entries or structure.number(entries[_COMPRESSION]) not in _DEFLATE:
+            return 0
+        tags = (_STRIPS, _STRIP_LENGTHS) if _STRIPS in entries else (_TILES, _TILE_LENGTHS)
+        starts, lengths = (structure.numbers(entries[tag]) for tag in tags)
+    except (Damaged, KeyError, struct.error):
+        return 0
+    return sum(not _is_whole_stream(data[at : at + length]) for at, length in zip(starts, lengths, strict=False))
+
+
+def _is_whole_stream(packed: bytes) -> bool:
+    inflater = zlib.decompressobj()
+    try:
+        while packed and not inflater.eof:
+            inflater.decompress(packed, 1 << 20)  # bit by bit: it may be of any size
+            packed = inflater.unconsumed_tail
+    except zlib.error:
+        return False
+    return inflater.eof
 
 
 def _pack_pixels(pixels: NDArray[Any], order: str) -> bytes:

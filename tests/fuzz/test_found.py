@@ -1,0 +1,213 @@
+"""What the fuzzer found, each with a name: inputs that once ended in a traceback, took all memory, or hung."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import time
+import zipfile
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("av")
+
+from groups import claimed, npy, packed, recipe, report_arrays, solution
+
+from rsundistort import read_solution, rectify_folder, write_solution
+from rsundistort.errors import FileError, FormatError, InputError
+from rsundistort.io.depth_maps import read_depth_map
+from rsundistort.io.journal import entries_of
+from rsundistort.io.masks import read_mask
+from rsundistort.io.models import read_model
+from rsundistort.io.photos.images import read_photo
+from rsundistort.model.arrays import read_arrays
+from rsundistort.rectify import RemapGrid
+from rsundistort.report import write_report
+from rsundistort.report.diagnostics import read_diagnostics
+from rsundistort.solve import OutputOptions
+from rsundistort.synthetic.recipe import load_recipe
+
+
+def changed(tree, path, value):
+    """The tree with another value at a place; without it where the value is None's type."""
+    holder = tree
+    for key in path[:-1]:
+        holder = holder[key]
+    if value is KeyError:
+        del holder[path[-1]]
+    else:
+        holder[path[-1]] = value
+    return tree
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "says"),
+    [
+        (("images", 1, "phi"), "x", r"images\[1\]\.phi: expected three numbers, got 'x'"),
+        (("images", 0, "phi"), [1e9, 0, 0], r"images\[0\]: phi=.*no camera turns by more than 1000 rad"),
+        (("images", 0, "rms_px"), [1], r"images\[0\]\.rms_px: expected a number from 0"),
+        (("images", 0, "sigma_phi"), [1, 2], r"images\[0\]\.sigma_phi: expected a list of 3, got \[1, 2\]"),
+        (("images", 0, "camera_id"), "9", r"images\[0\]\.camera_id: '9' is not among rectified_cameras"),
+        (("images", 0, "turned"), 9, r"images\[0\]\.turned: expected a whole number from 1 to 8, got 9"),
+        (
+            ("rectified_cameras", "1", "width"),
+            2**31,
+            r"rectified_cameras\.1\.width: expected .* to 32766, got 2147483648",
+        ),
+        (("rectified_cameras", "1", "K", 0, 0), 1e300, "expected focal lengths and a principal point of a camera"),
+        (("quality",), "x", "quality: expected an object, got 'x'"),
+        (("quality", "held_out_rms_px"), [1], r"quality\.held_out_rms_px: expected an object"),
+        (("stages", 0, "seconds"), "x", r"stages\[0\]\.seconds: expected a number, got 'x'"),
+        (("options", "raw_as"), "../x", r"options\.raw_as: expected one of tif, jpg, png"),
+        (("critical_motion", "advice"), "x", r"critical_motion\.advice: expected a list"),
+        (("generator",), [1], "generator: expected an object"),
+        (("images", 0, "name"), "a\nb.jpg" + 100_000 * "x", None),
+    ],
+)
+def test_a_solution_is_refused_by_its_place_before_any_work(tmp_path, path, value, says):
+    (tmp_path / "s.json").write_text(json.dumps(changed(json.loads(json.dumps(solution())), path, value)))
+    if says is None:  # of a name that long nothing can be said but that there is no such photo
+        assert len(repr(read_solution(tmp_path / "s.json").images[0].name)) > 100_000
+        return
+    with pytest.raises(FormatError, match=says) as caught:
+        read_solution(tmp_path / "s.json")
+    assert len(str(caught.value)) < 500
+    with pytest.raises(FormatError, match=says):
+        rectify_folder(tmp_path, tmp_path / "s.json", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["num_points", "global_rms_px", "held_out_error", "readout_time", "sigma_intrinsics"])
+def test_a_report_of_a_solution_that_tells_less(tmp_path, name):
+    tree = changed(json.loads(json.dumps(solution())), ("quality", name), KeyError)
+    del tree["critical_motion"]["anchors"], tree["stages"][0]["seconds"]
+    (tmp_path / "solution.json").write_text(json.dumps(tree))
+    with pytest.warns(UserWarning, match=r"report\.npz is missing"):
+        assert write_report(tmp_path).is_file()
+
+
+def test_what_could_not_be_read_again_is_not_written(tmp_path):
+    whole = read_solution_of(solution(), tmp_path)
+    object.__setattr__(whole, "quality", {"rms_px": "x"})
+    with pytest.raises(InputError, match=r"cannot be written: quality\.rms_px: expected a number"):
+        write_solution(tmp_path / "t.json", whole)
+    assert not (tmp_path / "t.json").exists()
+
+
+def read_solution_of(tree, folder):
+    (folder / "s.json").write_text(json.dumps(tree))
+    return read_solution(folder / "s.json")
+
+
+def png(width, height):
+    """A PNG of 57 bytes that claims a size."""
+    chunks = ((b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0)), (b"IDAT", b""), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
+    )
+
+
+@pytest.mark.parametrize("size", [(15_000, 15_000), (30_000, 30_000), (2**31 - 1, 2**31 - 1)])
+def test_a_picture_that_claims_more_than_it_holds_is_not_decoded(tmp_path, size):
+    path = tmp_path / "a.png"
+    path.write_bytes(png(*size))
+    for read in (read_photo, lambda path: read_mask(path, *size), read_depth_map):
+        with pytest.raises(FileError, match=r"a\.png has \d+x\d+ pixels"):
+            read(path)
+
+
+def test_a_chunk_of_a_picture_that_claims_four_gigabytes_makes_no_room(tmp_path):
+    whole = bytes(cv2.imencode(".png", np.full((48, 64), 255, np.uint8))[1])
+    at = whole.index(b"IDAT") + 20
+    (tmp_path / "a.png").write_bytes(whole[: at - 3] + whole[at:])  # what stands behind is no chunk any more
+    for read in (read_photo, lambda path: read_mask(path, 64, 48), read_depth_map):
+        with pytest.raises(FileError, match=r"a\.png (is cut short|cannot be decoded)"):
+            read(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        claimed("(1000000000,)"), claimed("(-1,)"), claimed("(" * 500), claimed("(1,)", "|O"), claimed("'x'"), b"",
+        b"PK\x03\x04", packed({"depth": np.zeros((40, 40_000_000 // 40))}),
+    ],
+    ids=["large", "negative", "nested", "objects", "text", "empty", "cut", "bomb"],
+)  # fmt: skip
+def test_an_array_that_claims_more_than_it_holds_makes_no_room(tmp_path, data):
+    path = tmp_path / ("a.npz" if data[:2] == b"PK" else "a.npy")
+    path.write_bytes(data)
+    with pytest.raises(FormatError):
+        read_arrays(path)
+    with pytest.raises(FileError, match="depth map"):
+        read_depth_map(path)
+
+
+@pytest.mark.parametrize("name", ["names", "rgb", "row_mean_px", "histogram_px", "points_w"])
+def test_diagnostics_of_no_dimension_or_another_type_are_named(tmp_path, name):
+    for odd in (np.array(1.0), np.array(1j), np.array([True]), np.zeros((1, 1, 1, 1, 1), complex)):
+        (tmp_path / "report.npz").write_bytes(packed({**report_arrays(), name: odd}))
+        with pytest.raises(FormatError, match=name):
+            read_diagnostics(tmp_path / "report.npz")
+
+
+def test_a_grid_whose_source_has_no_size(tmp_path):
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, array in (("map_x", np.eye(3)), ("map_y", np.eye(3)), ("source_size", np.array(3))):
+            archive.writestr(f"{name}.npy", npy(array))
+    (tmp_path / "g.npz").write_bytes(file.getvalue())
+    with pytest.raises(FormatError, match="source_size"):
+        RemapGrid.load(tmp_path / "g.npz")
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "says"),
+    [
+        (("surfaces", -1, "relief", "wavelength_m"), 1e-9, "a thousandth of size_m or more"),
+        (("surfaces", -1, "relief", "cells"), [10**6, 10**6], "no more than 100000"),
+        (("textures", "stone", "texels_per_m"), 1e9, "larger than any picture"),
+        (("textures", "stone", "colour"), "x", "texture: colour='x'"),
+        (("light", "sun"), [1, 2], r"light: sun\.shape"),
+        (("render", "samples"), 10**9, "no more than 1024"),
+        (("render", "jpeg_quality"), [1], "jpeg_quality"),
+        (("points",), 10**30, "points="),
+        (("surfaces", 1, "openings", 0, "size_m"), [1.0], r"size_m=\(1\.0,\), expected"),
+        (("surfaces", 1, "openings", 0, "at_m"), 3, "at_m=3, expected"),
+    ],
+)
+def test_a_recipe_that_nobody_could_render_is_refused_when_it_is_read(tmp_path, path, value, says):
+    (tmp_path / "r.json").write_text(json.dumps(changed(json.loads(json.dumps(recipe())), path, value)))
+    began = time.perf_counter()
+    with pytest.raises(FormatError, match=says):
+        load_recipe(tmp_path / "r.json")
+    assert time.perf_counter() - began < 5
+
+
+def test_a_name_with_a_line_break_does_not_make_a_model_that_nobody_reads():
+    OutputOptions(sparse_format="bin").check_names(["a\nb.jpg"])
+    with pytest.raises(InputError, match="has a line break in its name"):
+        OutputOptions(sparse_format="txt").check_names(["a.jpg", "a\nb.jpg"])
+
+
+def test_a_journal_that_is_nested_without_end_is_passed_over():
+    assert entries_of("[" * 100_000 + "\n" + '{"a": ' * 100_000) == {}
+
+
+def test_a_number_that_no_float_holds_is_named(tmp_path):
+    pose = '{"key": 1, "value": {"rotation": ' + "1" * 400 + "}}"
+    start = '{"sfm_data_version": "0.3", "views": [], "intrinsics": [], "structure": [], "extrinsics": ['
+    (tmp_path / "m.json").write_text(f"{start}{pose}]}}")
+    with pytest.raises(FormatError, match=r"extrinsics\[0\]"):
+        read_model(tmp_path / "m.json")
+
+
+def test_a_mask_of_one_colour_is_small_and_is_read(tmp_path):
+    """What the bound on a picture's size must let pass: zlib packs a thousand to one."""
+    path = tmp_path / "m.png"
+    encoded = cv2.imencode(".png", np.full((6000, 8000), 255, np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]
+    path.write_bytes(bytes(encoded))
+    assert read_mask(path, 8000, 6000).all()
