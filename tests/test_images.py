@@ -401,13 +401,20 @@ def test_a_photo_with_stray_bytes_is_read_as_ever(tmp_path):
     np.testing.assert_array_equal(read_photo(tmp_path / "b.jpg").pixels, read_photo(tmp_path / "a.jpg").pixels)
 
 
-def test_a_header_that_does_not_say_how_large_is_refused_unopened(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("place", "put", "says"),
+    [
+        (slice(8, 12), struct.pack(">I", 0xFFFFFFF0), "is cut short"),  # a chunk of four gigabytes
+        (slice(12, 16), b"tEXt", "does not say how large"),
+    ],
+)
+def test_a_header_that_does_not_say_how_large_is_refused_unopened(tmp_path, monkeypatch, place, put, says):
     monkeypatch.setattr(cv2, "imdecode", None)
     write_image(tmp_path / "a.png", texture(64, 48))
     data = bytearray((tmp_path / "a.png").read_bytes())
-    data[8:12] = struct.pack(">I", 0xFFFFFFF0)  # a chunk of four gigabytes
+    data[place] = put
     (tmp_path / "a.png").write_bytes(data)
-    with pytest.raises(FileError, match="does not say how large"):
+    with pytest.raises(FileError, match=says):
         read_photo(tmp_path / "a.png")
 
 

@@ -114,6 +114,8 @@ def load_scene(path: Path | str) -> KnownScene:
 
 def _from_npz(path: Path) -> KnownScene:
     found = read_arrays(path)
+    if "" in found:
+        raise FormatError(f"{path} is no scene: it holds a single array; write one with np.savez")
     for name in _ARRAYS:
         if name not in found:
             raise FormatError(f"{path} is no scene: it lacks {name}")
