@@ -193,7 +193,7 @@ def with_lens_of(out: Path, truth: Path) -> Path:
     """
     told, found = (json.loads(path.read_text()) for path in (truth, out / "solution.json"))
     own = {each["name"]: each["camera_id"] for each in found["images"]}
-    told["cameras"] = found["cameras"]
+    told |= {key: found[key] for key in ("cameras", "rectified_cameras")}
     told["images"] = [each | {"camera_id": own[each["name"]]} for each in told["images"]]
     path = truth.with_name(f"{truth.stem}-lens-of-{out.name}.json")
     path.write_text(json.dumps(told))
