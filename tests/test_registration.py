@@ -105,7 +105,8 @@ def test_points_seen_by_chance_fit_no_place(scene, rng):
 
 def test_too_few_points_place_nothing(scene):
     points_w, xy = one_photo(scene, 0)
-    assert place_photo(points_w[:3], xy[:3], CAMERA) is None
+    for count in (0, 3):
+        assert place_photo(points_w[:count], xy[:count], CAMERA) is None
 
 
 def test_left_out_photos_are_added_and_wrong_places_mended(scene, matched):
@@ -138,6 +139,12 @@ def test_a_photo_that_fits_nowhere_loses_its_place(scene, matched, rng):
     found = register_photos(mixed, read_num_verified(matched), scene)
     assert found.dropped == ("5.jpg",)
     assert "5.jpg" not in found.reconstruction.image_names
+
+
+def test_pairs_that_were_verified_without_matches_are_passed_over(scene, matched):
+    matches = read_matches(matched)
+    del matches[0, 1]
+    assert agreeing_photos(matched, matches, read_num_verified(matched), scene).all()
 
 
 def test_photos_that_the_poses_do_not_explain_are_told_apart(scene, matched):

@@ -46,22 +46,35 @@ def by_phi(phi, clock, x, y, z, a, b, g0, g1, g2):
     )
 
 
+@kernel(forceinline=True)
+def plane_terms(ray_1, slopes_1, clock_1, rate_1, ray_2, slopes_2, clock_2, rate_2, R, t, phi_1, phi_2):
+    """Of one match x_1, x_2, freed of the shutter, and of its error e = x_2 . t x (R x_1).
+
+    x_1 and x_2 with the factors of their rotations (5 and 5 numbers), R x_1, and the derivatives of e by x_2, by R x_1
+    and by x_1 (3 each); the square of e's derivative by the raw pixels of both.
+    """
+    x, y, z, a_1, b_1 = freed(phi_1, clock_1, ray_1)
+    p, q, r, a_2, b_2 = freed(phi_2, clock_2, ray_2)
+    X = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
+    Y = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
+    Z = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
+    n0, n1, n2 = t[1] * Z - t[2] * Y, t[2] * X - t[0] * Z, t[0] * Y - t[1] * X
+    m0, m1, m2 = q * t[2] - r * t[1], r * t[0] - p * t[2], p * t[1] - q * t[0]
+    h0 = R[0, 0] * m0 + R[1, 0] * m1 + R[2, 0] * m2
+    h1 = R[0, 1] * m0 + R[1, 1] * m1 + R[2, 1] * m2
+    h2 = R[0, 2] * m0 + R[1, 2] * m1 + R[2, 2] * m2
+    square = slope_squared(phi_1, clock_1, slopes_1, rate_1, x, y, z, a_1, b_1, h0, h1, h2)
+    square += slope_squared(phi_2, clock_2, slopes_2, rate_2, p, q, r, a_2, b_2, n0, n1, n2)
+    return x, y, z, a_1, b_1, p, q, r, a_2, b_2, X, Y, Z, n0, n1, n2, m0, m1, m2, h0, h1, h2, square
+
+
 @kernel()
 def sampson(rays_1, slopes_1, clock_1, rate_1, rays_2, slopes_2, clock_2, rate_2, R, t, phi_1, phi_2, distance):
     """Signed Sampson distance of each match, in pixels of the raw photos; inf where no pixel would change it."""
     for k in range(len(clock_1)):
-        x, y, z, a_1, b_1 = freed(phi_1, clock_1[k], rays_1[k])
-        p, q, r, a_2, b_2 = freed(phi_2, clock_2[k], rays_2[k])
-        X = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
-        Y = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
-        Z = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
-        n0, n1, n2 = t[1] * Z - t[2] * Y, t[2] * X - t[0] * Z, t[0] * Y - t[1] * X
-        m0, m1, m2 = q * t[2] - r * t[1], r * t[0] - p * t[2], p * t[1] - q * t[0]
-        h0 = R[0, 0] * m0 + R[1, 0] * m1 + R[2, 0] * m2
-        h1 = R[0, 1] * m0 + R[1, 1] * m1 + R[2, 1] * m2
-        h2 = R[0, 2] * m0 + R[1, 2] * m1 + R[2, 2] * m2
-        square = slope_squared(phi_1, clock_1[k], slopes_1[k], rate_1, x, y, z, a_1, b_1, h0, h1, h2)
-        square += slope_squared(phi_2, clock_2[k], slopes_2[k], rate_2, p, q, r, a_2, b_2, n0, n1, n2)
+        _, _, _, _, _, p, q, r, _, _, _, _, _, n0, n1, n2, _, _, _, _, _, _, square = plane_terms(
+            rays_1[k], slopes_1[k], clock_1[k], rate_1, rays_2[k], slopes_2[k], clock_2[k], rate_2, R, t, phi_1, phi_2
+        )  # fmt: skip
         distance[k] = (n0 * p + n1 * q + n2 * r) / math.sqrt(square) if square > 0.0 else np.inf
 
 
@@ -79,18 +92,9 @@ def pair_system(
     J = np.empty(11)
     cost = 0.0
     for k in range(len(clock_1)):
-        x, y, z, a_1, b_1 = freed(phi_1, clock_1[k], rays_1[k])
-        p, q, r, a_2, b_2 = freed(phi_2, clock_2[k], rays_2[k])
-        X = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
-        Y = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
-        Z = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
-        n0, n1, n2 = t[1] * Z - t[2] * Y, t[2] * X - t[0] * Z, t[0] * Y - t[1] * X
-        m0, m1, m2 = q * t[2] - r * t[1], r * t[0] - p * t[2], p * t[1] - q * t[0]
-        h0 = R[0, 0] * m0 + R[1, 0] * m1 + R[2, 0] * m2
-        h1 = R[0, 1] * m0 + R[1, 1] * m1 + R[2, 1] * m2
-        h2 = R[0, 2] * m0 + R[1, 2] * m1 + R[2, 2] * m2
-        square = slope_squared(phi_1, clock_1[k], slopes_1[k], rate_1, x, y, z, a_1, b_1, h0, h1, h2)
-        square += slope_squared(phi_2, clock_2[k], slopes_2[k], rate_2, p, q, r, a_2, b_2, n0, n1, n2)
+        x, y, z, a_1, b_1, p, q, r, a_2, b_2, X, Y, Z, n0, n1, n2, m0, m1, m2, h0, h1, h2, square = plane_terms(
+            rays_1[k], slopes_1[k], clock_1[k], rate_1, rays_2[k], slopes_2[k], clock_2[k], rate_2, R, t, phi_1, phi_2
+        )  # fmt: skip
         if not square > 0.0:
             cost += width * width
             continue

@@ -130,6 +130,7 @@ def agreeing_photos(
         pair
         for pair, count in num_verified.items()
         if count >= MIN_EXPLAINED
+        and pair in matches  # a database of another program may hold what was verified alone
         and posed[list(pair)].all()
         and freed.explained(*pair, matches[pair]).sum() >= _LEAST_SHARE * count
     ]

@@ -38,6 +38,8 @@ _SEARCH_PX, _WIDE_PX, _NARROWER_PX = (4.0, 16.0), 8.0, (4.0, 2.0)
 # So many measurements tell where to look, and so many of the suggestions are followed to their end.
 _ENOUGH, _TRIED = 400, 2
 _SEARCHES, _CONFIDENCE = 1000, 0.9999
+# Three points suggest up to four poses, and a fourth tells which.
+_LEAST_SUGGESTING = 4
 # Prior standard deviation of phi, in radians a frame: strong shutters have room.
 _PHI_SIGMA = 0.2
 _MAX_STEPS, _CONVERGED, _GIVEN_UP = 20, 1e-3, 1e3
@@ -90,6 +92,8 @@ def place_photo(
     Placed
         Or None where no pose could be found.
     """
+    if len(points_w) < _LEAST_SUGGESTING:
+        return None
     few = _spread_over(len(points_w), _ENOUGH)
     found = [_Pose(R_cw, center_w) for R_cw, center_w in _suggested(points_w[few], xy_raw[few], camera, step_px)]
     found = [_adjusted(pose, points_w[few], xy_raw[few], camera, _WIDE_PX * step_px) for pose in found]
@@ -136,7 +140,7 @@ def _suggested(
     size = float(np.median(np.linalg.norm(points_w - origin, axis=1))) or 1.0
     local = (points_w - origin) / size
     for part in parts:
-        if part.sum() < 4:
+        if part.sum() < _LEAST_SUGGESTING:
             continue
         for within in _SEARCH_PX:
             found, turn, way, _ = cv2.solvePnPRansac(
@@ -247,7 +251,7 @@ def register_photos(
     """
     matches = read_matches(matched)
     shows = _Shown(matched, matches, scene)
-    agreeing = agreeing_photos(matched, matches, num_verified, scene)
+    agreeing = agreeing_photos(matched, matches, num_verified, scene) if joined_too else np.zeros(0, bool)
     index_of = {name: i for i, name in enumerate(scene.image_names)}
     new: dict[int, Placed] = {}
     elsewhere: dict[int, Placed] = {}
@@ -308,17 +312,21 @@ class _Shown:
     """Which points of a scene the keypoints of photos show, by their matches with others."""
 
     def __init__(self, matched: MatchedPhotos, matches: Matches, scene: Reconstruction) -> None:
-        self._matches, self._point_of = matches, _points_of_keypoints(matched, scene)
+        self._point_of = _points_of_keypoints(matched, scene)
+        # by photo: the partner, and the keypoints of the photo and of the partner that match
+        self._partners: dict[int, list[tuple[int, NDArray[np.int64]]]] = {}
+        for (first, second), found in matches.items():
+            self._partners.setdefault(first, []).append((second, found))
+            self._partners.setdefault(second, []).append((first, found[:, ::-1]))
         self._num_photos = scene.track_lengths(np.ones(len(scene.observations), bool))
 
     def by_others(self, photo: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Keypoints of a photo and the points that matches tell they show, each pair once; points of two others."""
         pairs = [np.zeros((0, 2), np.int64)]
-        for (first, second), matches in self._matches.items():
-            own, other, partner = (0, 1, second) if first == photo else (1, 0, first)
-            if photo in (first, second) and partner in self._point_of:
-                point = self._point_of[partner][matches[:, other]]
-                pairs.append(np.column_stack([matches[:, own], point])[point >= 0])
+        for partner, found in self._partners.get(photo, ()):
+            if partner in self._point_of:
+                point = self._point_of[partner][found[:, 1]]
+                pairs.append(np.column_stack([found[:, 0], point])[point >= 0])
         keypoint, point = np.unique(np.concatenate(pairs), axis=0).T
         if photo in self._point_of:
             own_points = self._point_of[photo]
@@ -341,8 +349,9 @@ def _fits(
 def _points_of_keypoints(matched: MatchedPhotos, scene: Reconstruction) -> dict[int, NDArray[np.int64]]:
     """For each photo of a scene the point that each of its keypoints shows, or -1."""
     observations, found = scene.observations, {}
+    photo_of = {name: photo for photo, name in enumerate(matched.names)}
     for i, rows in enumerate(observations.by_photo(scene.num_images)):
-        photo = matched.names.index(scene.image_names[i])
+        photo = photo_of[scene.image_names[i]]
         xy = matched.features[photo].xy_raw
         place = {tuple(each): k for k, each in enumerate(xy.tolist())}
         point = np.full(len(xy), -1)

@@ -16,7 +16,7 @@ from .._kernels import epipolar as kernels
 from ..model import Camera
 from ..model.projection import clock_of, unproject_points
 
-__all__ = ["Pair", "RelativePose", "View", "find_relative_pose", "relative_poses"]
+__all__ = ["INLIER_PX", "NO_SHUTTER", "Pair", "RelativePose", "View", "find_relative_pose", "relative_poses"]
 
 # Five points suggest a pose with thresholds of these pixels: what fits a narrow one is a part of the photos that the
 # shutter hardly bends, what fits the wide one most of them.
@@ -27,8 +27,10 @@ _WIDTHS_PX = (3.0, 1.5)
 INLIER_PX = 4.0
 _LEAST_MATCHES = 15
 _MAX_STEPS, _CONVERGED, _GIVEN_UP = 40, 1e-5, 1e5
-# Prior standard deviation of phi that its estimation starts from, radians a frame, its rounds, and its least value.
-_START_SIGMA, _ROUNDS, _LEAST_SIGMA = 0.1, 6, 1e-4
+# Prior standard deviation of phi that its estimation starts from, radians a frame, and its rounds.
+_START_SIGMA, _ROUNDS = 0.1, 6
+#: Its least value: no shutter.
+NO_SHUTTER = 1e-4
 
 
 @dataclass(frozen=True)
@@ -178,7 +180,7 @@ def relative_poses(pairs: Sequence[Pair]) -> tuple[list[RelativePose | None], fl
         if not squares:
             break
         # the middle of the pairs: one of false matches moves as it likes
-        sigma = max(float(np.sqrt(np.median(squares) / max(np.median(known), 1e-3))), _LEAST_SIGMA)
+        sigma = max(float(np.sqrt(np.median(squares) / max(np.median(known), 1e-3))), NO_SHUTTER)
         poses = [
             None if pose is None else _adjusted(pose, pair, sigma, _WIDTHS_PX[1])
             for pose, pair in zip(poses, pairs, strict=True)

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from ..colmap.conventions import quiet_pycolmap
 from .database import MatchedPhotos
 from .epipolar import MIN_EXPLAINED, Matches, read_matches
-from .relative_pose import INLIER_PX, Pair, RelativePose, View, find_relative_pose, relative_poses
+from .relative_pose import INLIER_PX, NO_SHUTTER, Pair, RelativePose, View, find_relative_pose, relative_poses
 
 __all__ = ["verify_with_shutter"]
 
 # So many pairs of the most matches, and so many matches of each, tell how strong the shutter is.
 _ASKED, _MATCHES = 6, 300
-_NO_SHUTTER = 1e-4
 # Pairs are worth it where photos turned by so much while they were read, in radians, and where poses without a shutter
 # lose such a share of the matches that they explain with one. What a lens does that nobody knows can look like either.
 _STRONG_RAD, _LOST = 0.05, 0.05
@@ -47,7 +46,7 @@ def verify_with_shutter(matched: MatchedPhotos) -> float:
     pairs = [_pair(matched, pair, matches[pair][:_MATCHES]) for pair in most]
     poses, spread = relative_poses(pairs)
     if spread >= _STRONG_RAD:
-        without = [find_relative_pose(pair, _NO_SHUTTER) for pair in pairs]
+        without = [find_relative_pose(pair, NO_SHUTTER) for pair in pairs]
         if _num_explained(without, pairs, step_px) < (1.0 - _LOST) * _num_explained(poses, pairs, step_px):
             _add_explained(matched, matches, spread)
     return spread

@@ -56,6 +56,8 @@ _MAX_ROUNDS = 4
 # A photo that turned by more while it was read, in radians, was mapped by thresholds that were not made for it: it may
 # be in a wrong place, and is held against what the others tell.
 _STRONG_RAD = 0.1
+# A shutter needs so many photos.
+_LEAST_PHOTOS = 3
 # Photos that are placed anew bring others.
 _MOST_WAVES = 4
 # Places on each side of a photo where that is looked at.
@@ -210,7 +212,7 @@ def solve_photos(
     """
     cameras = photos.cameras
     mapped, matched = place_photos(photos, scratch, log, seed, matching, kept or Kept(), with_shutter=True)
-    if mapped.num_images < 3:
+    if mapped.num_images < _LEAST_PHOTOS:
         raise ReconstructionError(
             f"only {mapped.num_images} of {len(photos.names)} photos could be joined, the shutter needs three; "
             "use photos that share more of the scene"
@@ -399,7 +401,12 @@ def _placed_again(feedback: Feedback, result: BundleResult, wanted: BundleOption
         scene = retriangulate(matched, rec)
         found = register_photos(matched, num_verified, scene, joined_too=strong)
         if found.changes:
-            tracks = retriangulate(matched, found.reconstruction).without_photos(LEAST_MEASUREMENTS)
+            tracks = found.reconstruction
+            if tracks.num_images >= _LEAST_PHOTOS:
+                tracks = retriangulate(matched, tracks).without_photos(LEAST_MEASUREMENTS)
+            if tracks.num_images < _LEAST_PHOTOS:  # so little hangs together that nothing tells right from wrong
+                log.end(stage, added=(), moved=(), dropped=())
+                break
             options = rough_options(_of_joined(wanted, tracks, says=False))
             options = replace(options, phi_sigma_start=result.phi_sigma)
             result = bundle_adjust(tracks, rec.shutter_model, options, partial(_tell, log, stage))
