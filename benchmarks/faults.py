@@ -106,6 +106,16 @@ def swap_images(out: Path) -> None:
     (out / "images").symlink_to(out.parent / "elsewhere")
 
 
+def remove(out: Path) -> None:
+    """Take OUT away."""
+    shutil.rmtree(out, ignore_errors=True)
+
+
+def move_away(out: Path) -> None:
+    """Give OUT another name."""
+    out.rename(out.with_name("moved-away"))
+
+
 def move_and_replace(out: Path) -> None:
     """Another folder in the place of OUT."""
     out.rename(out.with_name(f"{out.name}-moved"))
@@ -171,17 +181,14 @@ def faults(work: Path) -> Iterator[Fault]:
                 f"{number.name} after the first photo", (128 + number,), to=to / "late",
                 meanwhile=after_first(to / "late", stop),
             )  # fmt: skip
-        act = lambda _, to=out / "gone": shutil.rmtree(to, ignore_errors=True)  # noqa: E731
-        yield on("OUT removed after the first photo", (1,), to=out / "gone", meanwhile=after_first(out / "gone", act))
-        act = lambda _, to=out / "moved": to.rename(to.with_name("moved-away"))  # noqa: E731
-        yield on("OUT moved after the first photo", (1,), to=out / "moved", meanwhile=after_first(out / "moved", act))
-        act = lambda _, to=out / "other": move_and_replace(to)  # noqa: E731
-        yield on("OUT moved, another in its place", (1,), to=out / "other", meanwhile=after_first(out / "other", act))
-        act = lambda _, to=out / "swap" / "out": swap_images(to)  # noqa: E731
-        yield on(
-            "a link in the place of images/", (1,), to=out / "swap" / "out",
-            meanwhile=after_first(out / "swap" / "out", act),
-        )  # fmt: skip
+        for name, folder, act in (
+            ("OUT removed after the first photo", out / "gone", remove),
+            ("OUT moved after the first photo", out / "moved", move_away),
+            ("OUT moved, another in its place", out / "other", move_and_replace),
+            ("a link in the place of images/", out / "swap" / "out", swap_images),
+        ):
+            meanwhile = after_first(folder, lambda _, act=act, folder=folder: act(folder))
+            yield on(name, (1,), to=folder, meanwhile=meanwhile)
         yield on("a second writer (the second)", (1,), to=out / "two")
 
 
