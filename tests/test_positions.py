@@ -177,7 +177,7 @@ def test_places_on_a_line_tell_no_roll():
 
 # ---------------------------------------------------------------- tables of control points
 
-HEADER = "name,photo,x,y,E,N,U,sigma_m,use\n"
+HEADER = "name,photo,x,y,E,N,U,sigma,use\n"
 GOOD = "A,1.jpg,10,20,100,200,30,0.02,\nA,2.jpg,11,21,,,,,\n"
 GOOD += "B,1.jpg,5,6,101,200,30,0.05,check\nB,2.jpg,5,7,101,200,30,0.05,check\n"
 
@@ -197,7 +197,7 @@ def test_control_points_are_read(tmp_path):
         ("name,photo,x,y\n", "has no column 'E'"),
         (HEADER + "A,1.jpg,ten,20,1,2,3,0.1,\n", "line 2: x='ten', expected a number"),
         (HEADER + "A,1.jpg,1,nan,1,2,3,0.1,\n", "line 2: y='nan', expected a number"),
-        (HEADER + "A,1.jpg,1,2,1,2,3,,\nA,2.jpg,1,2,,,,,\n", "point A: sigma_m='', expected a number"),
+        (HEADER + "A,1.jpg,1,2,1,2,3,,\nA,2.jpg,1,2,,,,,\n", "point A: sigma='', expected a number"),
         (HEADER + "A,1.jpg,1,2,1,2,3,0,\nA,2.jpg,1,2,,,,,\n", "expected metres above 0"),
         (HEADER + "A,1.jpg,1,2,1,2,3,0.1,\n", "is seen in 1 photo; two are needed"),
         (HEADER + "A,1.jpg,1,2,1,2,3,0.1,\nA,1.jpg,1,2,1,2,3,0.1,\n", "line 3: A is in 1.jpg twice"),

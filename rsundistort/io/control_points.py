@@ -11,7 +11,7 @@ from .tables import read_table
 
 __all__ = ["read_control_points"]
 
-_COLUMNS = ("name", "photo", "x", "y", "E", "N", "U", "sigma_m")
+_COLUMNS = ("name", "photo", "x", "y", "E", "N", "U", "sigma")
 _USES = {"": False, "control": False, "check": True}
 
 
@@ -21,9 +21,9 @@ def read_control_points(path: Path | str) -> list[ControlPoint]:
     Parameters
     ----------
     path : path
-        CSV with the header `name, photo, x, y, E, N, U, sigma_m`, a line for each photo that shows a point: pixels of
+        CSV with the header `name, photo, x, y, E, N, U, sigma`, a line for each photo that shows a point: pixels of
         the stored photo (integer centres), the place in metres and its standard deviation. The lines of a point behind
-        its first may leave the place empty. `sigma_up_m` may be a column, where heights are known to another deviation;
+        its first may leave the place empty. `sigma_up` may be a column, where heights are known to another deviation;
         and `use`, `control` (also where it is empty) or `check`.
 
     Raises
@@ -33,11 +33,14 @@ def read_control_points(path: Path | str) -> list[ControlPoint]:
     """
     path = Path(path)
     columns, rows = read_table(path)
+    # other tables of ours say the unit: sigma_m is sigma here
+    columns = [column.removesuffix("_m") for column in columns]
+    rows = [{key.removesuffix("_m"): value for key, value in row.items()} for row in rows]
     if missing := [column for column in _COLUMNS if column not in columns]:
         raise FormatError(f"{path} has no column {missing[0]!r}; expected {', '.join(_COLUMNS)}")
     facts: dict[str, tuple[str, ...]] = {}
     seen: dict[str, dict[str, tuple[float, float]]] = {}
-    named = (*_COLUMNS[4:], *(each for each in ("sigma_up_m", "use") if each in columns))
+    named = (*_COLUMNS[4:], *(each for each in ("sigma_up", "use") if each in columns))
     for number, row in enumerate(rows, start=2):
         name, photo = row["name"], row["photo"]
         where = f"{path}, line {number}"
@@ -68,7 +71,7 @@ def _number(text: str, column: str, where: str) -> float:
 def _point(name: str, told: dict[str, str], seen: dict[str, tuple[float, float]], path: Path) -> ControlPoint:
     where = f"{path}, point {name}"
     east, north, up, sigma = (_number(told[column], column, where) for column in _COLUMNS[4:])
-    sigma_up = _number(told["sigma_up_m"], "sigma_up_m", where) if told.get("sigma_up_m") else sigma
+    sigma_up = _number(told["sigma_up"], "sigma_up", where) if told.get("sigma_up") else sigma
     use = told.get("use", "").lower()
     if use not in _USES:
         raise FormatError(f"{where}: use={use!r}, expected control or check")

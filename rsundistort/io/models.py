@@ -27,7 +27,10 @@ def read_model(path: Path) -> ColmapModel:
         return read_colmap_model(path)
     if path.suffix.lower() == ".opf":
         return opf_model(path).once_a_photo()
-    mend = "give the folder of a COLMAP model, OpenMVG's sfm_data.json or OpenSfM's reconstruction.json"
+    mend = (
+        "give the folder of a COLMAP model, OpenMVG's sfm_data.json, OpenSfM's reconstruction.json, Metashape's "
+        "cameras.xml or an OPF project"
+    )
     try:
         value = read_json(path)
     except FormatError as error:
