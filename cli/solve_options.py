@@ -94,7 +94,7 @@ solve_options = opt.gathered(
         "control",
         type=click.Path(exists=True, dir_okay=False, path_type=Path),
         metavar="CSV",
-        help="Control points, in the CRS: name, photo, x, y, E, N, U, sigma_m, and use, control or check.",
+        help="Control points, in the CRS: name, photo, x, y, E, N, U, sigma, and use, control or check.",
     ),
     click.option(
         "--readout-ms",
