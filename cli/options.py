@@ -80,7 +80,7 @@ camera_option: Decorator = click.option(
     metavar="FILE|FOLDER|NUMBERS",
     help="camera.json, cameras.json, OpenCV or ROS calibration, COLMAP cameras, a text file with the 3x3 matrix K, a "
     "folder of such files named by group, or fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]. "
-    "Default: camera.json or cameras.json in or beside PHOTOS, else EXIF.",
+    "Default: camera.json or cameras.json in or beside PHOTOS, else EXIF, else the focal length that the photos show.",
 )
 readout_option: Decorator = click.option(
     "--readout", type=click.Choice(READOUT_NAMES), help="Direction of the readout in the stored pixels."

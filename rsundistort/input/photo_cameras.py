@@ -22,6 +22,7 @@ from ..io import (
     read_camera_file,
 )
 from ..model import Camera, check_readout
+from ..sfm import USUAL_FOCAL
 
 __all__ = ["GIVEN_SIGMA", "GUESS_SIGMA", "PhotoCameras", "camera_file_of", "check_readouts", "find_cameras"]
 
@@ -62,6 +63,8 @@ class PhotoCameras:
     sigma : sequence of mapping of intrinsic to float
         Standard deviations of each camera that were told, in the units of `GuessedCameras`; others are the defaults of
         `known_to`.
+    without_focal : sequence of int
+        Cameras whose focal length nothing tells: what is usual stands in its place.
     """
 
     cameras: Sequence[Camera]
@@ -72,6 +75,7 @@ class PhotoCameras:
     source: str
     notes: Sequence[str] = ()
     sigma: Sequence[Mapping[str, float]] = ()
+    without_focal: Sequence[int] = ()
 
     def of(self, image: int) -> Camera:
         """The camera of a photo."""
@@ -169,10 +173,10 @@ def find_cameras(
         file = read_camera_file(camera, *sizes[0])
         keys = _keys_in(file, camera, names, sizes, groups)
         known = dict(file.cameras)
-        calibrated, source, notes = True, file.source, list[str]()
+        calibrated, source, notes, usual = True, file.source, list[str](), set[str]()
         in_file, sigma_of = file.readout_told, file.sigma
     else:
-        known, keys, notes = _from_exif(folder, names, sizes, facts, groups)
+        known, keys, notes, usual = _from_exif(folder, names, sizes, facts, groups)
         calibrated, source, in_file, sigma_of = False, "EXIF, refined", frozenset[str](), {}
     labels = list(dict.fromkeys(keys))
     told = check_readouts(readout)
@@ -194,6 +198,7 @@ def find_cameras(
         source,
         tuple(note for note in notes if not told),
         [_relative(sigma_of.get(label, {}), known[label]) for label in labels],
+        [k for k, label in enumerate(labels) if label in usual],
     )
 
 
@@ -235,19 +240,27 @@ def _from_exif(
     sizes: Sequence[tuple[int, int]],
     facts: Sequence[ExifFacts],
     groups: Sequence[str],
-) -> tuple[dict[str, Camera], list[str], list[str]]:
-    """Cameras by group with the focal length of EXIF, the group of each photo, and what was guessed."""
+) -> tuple[dict[str, Camera], list[str], list[str], set[str]]:
+    """Cameras by group with the focal length of EXIF, the group of each photo, what was guessed, groups without EXIF's.
+
+    Where EXIF has none, what is usual stands in its place.
+    """
     directions, notes = guess_readouts(facts, sizes, groups)
     known: dict[str, Camera] = {}
+    usual: dict[str, Camera] = {}
     for name, size, group in zip(names, sizes, groups, strict=True):
         if group not in known:
             guess = camera_from_exif(folder / name, *size, directions[group])
             if guess is not None:
                 known[group] = guess
-    for name, group in zip(names, groups, strict=True):
-        if group not in known:
-            raise InputError(
-                f"{name} has no focal length in its EXIF and there is no camera.json; "
-                "give --camera FILE or --camera fx,fy,cx,cy in pixels"
-            )
-    return known, list(groups), list(notes)
+            elif group not in usual:
+                usual[group] = _usual_camera(*size, directions[group])
+    without = usual.keys() - known.keys()
+    return usual | known, list(groups), list(notes), without
+
+
+def _usual_camera(width: int, height: int, readout: str) -> Camera:
+    """A camera with the focal length that most have."""
+    focal = USUAL_FOCAL[0] * max(width, height)
+    K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+    return Camera(width, height, K, readout=readout)

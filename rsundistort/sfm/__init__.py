@@ -4,6 +4,7 @@ from .alignment import PatchPlaces, PatchSource, align_tracks, allowed_patches, 
 from .database import MatchedPhotos
 from .epipolar import read_num_verified
 from .features import DETECTION_MEGAPIXELS, Features, detect_features, detection_bytes, grey_8_bit
+from .focal_length import USUAL_FOCAL, estimate_focal_length
 from .imported import matched_of_database
 from .mapping import LEAST_MEASUREMENTS, map_photos
 from .matching import match_photos
@@ -16,6 +17,7 @@ from .verification import verify_with_shutter
 __all__ = [
     "DETECTION_MEGAPIXELS",
     "LEAST_MEASUREMENTS",
+    "USUAL_FOCAL",
     "Features",
     "MatchedPhotos",
     "PatchPlaces",
@@ -27,6 +29,7 @@ __all__ = [
     "detect_features",
     "detection_bytes",
     "edge_width_px",
+    "estimate_focal_length",
     "global_descriptors",
     "grey_8_bit",
     "map_photos",

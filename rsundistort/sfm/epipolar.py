@@ -20,6 +20,7 @@ __all__ = [
     "agreeing_photos",
     "read_matches",
     "read_num_verified",
+    "read_verified",
     "sampson_distance",
 ]
 
@@ -87,6 +88,16 @@ def read_matches(matched: MatchedPhotos) -> Matches:
     with pycolmap.Database.open(matched.database) as db:
         pairs = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id in db.read_all_matches()[0]]
         return {(i - 1, j - 1): np.asarray(db.read_matches(i, j), np.int64) for i, j in pairs}
+
+
+def read_verified(matched: MatchedPhotos) -> Matches:
+    """Matches of a database that the epipolar geometry of their pair fits."""
+    pycolmap = quiet_pycolmap()
+    with pycolmap.Database.open(matched.database) as db:
+        pair_ids, geometries = db.read_two_view_geometries()
+    pairs = (pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids)
+    found = zip(pairs, (np.asarray(each.inlier_matches, np.int64) for each in geometries), strict=True)
+    return {(i - 1, j - 1): matches.reshape(-1, 2) for (i, j), matches in found}
 
 
 def read_num_verified(matched: MatchedPhotos) -> dict[tuple[int, int], int]:

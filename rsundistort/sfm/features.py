@@ -55,6 +55,10 @@ class Features:
     descriptors: NDArray[np.uint8]
     step_px: float = 1.0
 
+    def largest(self, count: int) -> Features:
+        """So many of them, the largest."""
+        return Features(self.xy_raw[:count], self.sigma[:count], self.descriptors[:count], self.step_px)
+
 
 def size_sigma(size: NDArray[np.float64]) -> NDArray[np.float64]:
     """Standard deviations of the positions of features of these diameters, relative to the finest ones."""

@@ -24,6 +24,8 @@ def match_photos(
     camera_idx: NDArray[np.int64],
     *,
     calibrated: bool = True,
+    focal_known: bool = True,
+    within_px: float = 4.0 * LOOSE,
     seed: int = 0,
     pairs: NDArray[np.int64] | None = None,
 ) -> MatchedPhotos:
@@ -37,6 +39,10 @@ def match_photos(
         As in `MatchedPhotos`.
     calibrated : bool
         Whether the cameras are known.
+    focal_known : bool
+        Whether their focal lengths are, at least roughly; else pairs are verified without these.
+    within_px : float
+        How far verified matches may lie from their epipolar lines.
     seed : int
         Seed of the verification.
     pairs : (p, 2) int array, optional
@@ -46,12 +52,16 @@ def match_photos(
     matched = MatchedPhotos(database, tuple(names), tuple(features), tuple(cameras), camera_idx, calibrated, seed)
     with pycolmap.Database.open(database) as db:
         write_photos(db, matched)
+        if not focal_known:
+            for camera in db.read_all_cameras():
+                camera.has_prior_focal_length = False
+                db.update_camera(camera)
         sift = pycolmap.FeatureExtractorType.SIFT
         for index, found in enumerate(features):
             db.write_descriptors(index + 1, pycolmap.FeatureDescriptors(type=sift, data=found.descriptors))
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
-    verification = verification_options(4.0 * LOOSE, seed)
+    verification = verification_options(within_px, seed)
     if pairs is None:
         pycolmap.match_exhaustive(database, matching, verification_options=verification, device=pycolmap.Device.cpu)
     else:

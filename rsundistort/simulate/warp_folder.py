@@ -191,6 +191,11 @@ def _camera(photos: Path, name: str, options: WarpOptions) -> tuple[Camera, str]
     height, width = first.pixels.shape[:2]
     facts = [facts_of_exif(first.metadata.exif)]
     found = find_cameras(photos, [name], [(width, height)], facts, options.camera, options.readout)
+    if found.without_focal:
+        raise InputError(
+            f"{name} has no focal length in its EXIF and there is no camera.json; "
+            "give --camera FILE or --camera fx,fy,cx,cy in pixels"
+        )
     return found.of(0), found.source
 
 

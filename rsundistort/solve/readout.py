@@ -15,6 +15,7 @@ from ..batch.workers import Workers, use_threads
 from ..errors import InputError, RsUndistortWarning
 from ..input.frames import find_photos
 from ..input.load import load_photos
+from ..input.unknown_focal import with_focal_lengths
 from ..io import is_video
 from ..io.outputs import work_folder
 from ..io.places import local_place
@@ -102,6 +103,7 @@ def measure_readout(
             source.folder, source.camera, options.solve.readout, options.max_features, workers, log,
             megapixels=options.feature_megapixels, again=True, least=2,
         )  # fmt: skip
+        loaded = with_focal_lengths(loaded, options.solve.seed, log)
         bodies = [source.frames] * len(loaded.names)
         solved = solve_frames(options, source.clip, loaded, bodies, gyro_log, log)
     told = dict(solved.evidence)

@@ -17,6 +17,7 @@ from ..input.frames import find_photos
 from ..input.gyroscope import GyroOptions, Readouts, gyro_contradiction, gyro_motions, known_readouts
 from ..input.load import LoadedPhotos, load_photos
 from ..input.photo_cameras import camera_file_of
+from ..input.unknown_focal import with_focal_lengths
 from ..io import ExifFacts, is_video, list_photos, output_folder, read_solution
 from ..io.gyro import GyroLog
 from ..io.kept import Kept
@@ -135,6 +136,7 @@ def _solved(
         megapixels=options.feature_megapixels, masks=rectify.masks, raw_as=rectify.raw_as, again=rectify.again,
         max_megapixels=rectify.max_megapixels, least=3 if source.clip is None else 2, kept=kept,
     )  # fmt: skip
+    loaded = with_focal_lengths(loaded, options.solve.seed, log, kept)
     _check_anchors(options.solve, loaded.names, photos)
     bodies = loaded.facts if source.frames is None else [source.frames] * len(loaded.names)
     if source.clip is None:

@@ -1,0 +1,99 @@
+"""Focal lengths of cameras of which neither a file nor EXIF tells one: by the photos themselves."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+
+from ..batch.progress import StageLog
+from ..errors import RsUndistortWarning
+from ..io.kept import Kept
+from ..io.outputs import work_folder
+from ..sfm import choose_pairs, global_descriptors
+from ..sfm.epipolar import read_verified
+from ..sfm.focal_length import FocalLength, estimate_focal_length
+from ..sfm.matching import match_photos
+from .load import LoadedPhotos
+from .pairing import capture_sequences, places_of
+
+__all__ = ["with_focal_lengths"]
+
+# So many features of a photo, the largest, and so many pairs of each camera tell it.
+_FEATURES, _PAIRS = 4096, 60
+# Matches of a pair that overlaps.
+_LEAST_MATCHES = 60
+# Of fundamental matrices, in pixels of the image that the features were found in: a shutter bends by some.
+_WITHIN_PX = 4.0
+# Focal lengths that are known worse are as good as not known.
+_WEAK = 0.2
+
+
+def with_focal_lengths(photos: LoadedPhotos, seed: int, log: StageLog, kept: Kept | None = None) -> LoadedPhotos:
+    """The photos with the focal lengths that their matches tell, where nothing else does, and a note that says so.
+
+    Parameters
+    ----------
+    photos : LoadedPhotos
+        Features and cameras.
+    seed : int
+        Seed of every random choice.
+    log : StageLog
+        Told the progress.
+    kept : Kept, optional
+        What was found before, and takes what is found.
+    """
+    cameras, kept = photos.cameras, kept or Kept()
+    if not cameras.without_focal:
+        return photos
+    log.begin("focal length")
+    before: dict[str, FocalLength] = kept.get("focal lengths") or {}
+    found = {k: before.get(str(k)) or _focal_length(photos, k, seed) for k in cameras.without_focal}
+    kept.put("focal lengths", {str(k): each for k, each in found.items()})
+    log.end("focal length", pixels=[each.pixels for each in found.values()])
+    new, sigma, said = list(cameras.cameras), [dict(each) for each in cameras.sigma], []
+    for k, focal in found.items():
+        K = new[k].K.copy()
+        K[0, 0] = K[1, 1] = focal.pixels
+        new[k] = replace(new[k], K=K)
+        sigma[k]["f"] = focal.sigma
+        by = f"by {focal.num_pairs} pairs of them" if focal.num_pairs else "as is usual"
+        value = f"{focal.pixels:.0f} px (+-{100 * focal.sigma:.0f} %) {by}"
+        said.append(f"no focal length in the photos of {cameras.labels[k]}: {value}; give --camera if you know it")
+        if focal.sigma > _WEAK:
+            warnings.warn(f"the photos hardly tell their focal length: {said[-1]}", RsUndistortWarning, stacklevel=3)
+    source = "found from the photos, refined" if len(found) == len(new) else cameras.source
+    known = replace(cameras, cameras=tuple(new), sigma=sigma, source=source, notes=[*cameras.notes, *said])
+    return replace(photos, cameras=known)
+
+
+def _focal_length(photos: LoadedPhotos, camera: int, seed: int) -> FocalLength:
+    """What the photos of a camera tell of it."""
+    cameras = photos.cameras
+    mine = np.flatnonzero(cameras.camera_idx == camera)
+    features = [photos.features[i].largest(_FEATURES) for i in mine.tolist()]
+    names, facts = [photos.names[i] for i in mine.tolist()], [photos.facts[i] for i in mine.tolist()]
+    of_one = np.zeros(len(mine), np.int64)
+    pairs = choose_pairs(
+        len(mine), capture_sequences(names, of_one, facts), places_of(facts),
+        global_descriptors([each.descriptors for each in features], seed),
+    )  # fmt: skip
+    size = cameras.cameras[camera].width, cameras.cameras[camera].height
+    step_px = float(np.median([each.step_px for each in features]))
+    if not len(pairs):
+        return estimate_focal_length([], size)
+    few = pairs[np.unique(np.linspace(0, len(pairs) - 1, _PAIRS).astype(np.int64))]
+    with work_folder() as work:
+        matched = match_photos(
+            work / "database.db", names, features, [cameras.cameras[camera]], of_one,
+            calibrated=False, focal_known=False, within_px=_WITHIN_PX * step_px, seed=seed, pairs=few,
+        )  # fmt: skip
+        verified = read_verified(matched)
+    xy = [each.xy_raw for each in features]
+    shown = [
+        (xy[i][matches[:, 0]], xy[j][matches[:, 1]])
+        for (i, j), matches in verified.items()
+        if len(matches) >= _LEAST_MATCHES
+    ]
+    return estimate_focal_length(shown, size, step_px, seed)

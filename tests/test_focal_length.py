@@ -1,0 +1,104 @@
+"""The focal length of a camera that neither a file nor EXIF tells."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from make_photos import half_courtyard
+from scipy.spatial.transform import Rotation
+
+from rsundistort import read_solution
+from rsundistort.batch.progress import StageLog
+from rsundistort.batch.workers import Workers
+from rsundistort.errors import RsUndistortWarning
+from rsundistort.input.load import load_photos
+from rsundistort.input.unknown_focal import with_focal_lengths
+from rsundistort.sfm import USUAL_FOCAL, estimate_focal_length
+
+SIZE = (1280, 960)
+
+
+def shown(rng, focal, points_w, turn=0.25, travel=1.0, noise_px=0.4, wrong=0.1):
+    """Matches of two photos, some of them wrong."""
+    middle = (np.array(SIZE) - 1) / 2
+    seen = []
+    for _ in range(2):
+        R_cw = Rotation.from_rotvec(rng.normal(0, turn, 3)).as_matrix()
+        x_c = (points_w - travel * rng.normal(0, 1.0, 3)) @ R_cw.T
+        seen.append(x_c)
+    ahead = (seen[0][:, 2] > 0.5) & (seen[1][:, 2] > 0.5)
+    first, second = (
+        focal * x_c[ahead, :2] / x_c[ahead, 2:] + middle + rng.normal(0, noise_px, (ahead.sum(), 2)) for x_c in seen
+    )
+    lost = rng.random(len(second)) < wrong
+    second[lost] = rng.uniform(0, SIZE, (lost.sum(), 2))
+    return first, second
+
+
+def in_a_room(rng):
+    return np.column_stack([rng.uniform(-4, 4, (200, 2)), rng.uniform(4, 12, 200)])
+
+
+@pytest.mark.parametrize("focal", [600.0, 1000.0, 2400.0])
+def test_pairs_of_a_scene_tell_the_focal_length_as_well_as_they_say(rng, focal):
+    found = estimate_focal_length([shown(rng, focal, in_a_room(rng)) for _ in range(10)], SIZE)
+    assert abs(np.log(found.pixels / focal)) < 2.5 * found.sigma
+    assert found.sigma < 0.12
+    assert found.num_pairs == 10
+
+
+@pytest.mark.parametrize("of", ["a plane", "a camera that turned"])
+def test_what_tells_nothing_is_not_believed(rng, of):
+    focal = 1800.0
+    plane = np.column_stack([rng.uniform(-4, 4, (200, 2)), np.full(200, 8.0)])
+    pairs = [
+        shown(rng, focal, plane) if of == "a plane" else shown(rng, focal, in_a_room(rng), travel=0.0)
+        for _ in range(10)
+    ]
+    found = estimate_focal_length(pairs, SIZE)
+    assert found.sigma > 0.15
+    assert abs(np.log(found.pixels / focal)) < 2.5 * found.sigma
+
+
+def test_without_pairs_it_is_what_is_usual():
+    found = estimate_focal_length([], SIZE)
+    assert found.num_pairs == 0
+    assert (found.pixels, found.sigma) == (pytest.approx(USUAL_FOCAL[0] * SIZE[0]), USUAL_FOCAL[1])
+
+
+@pytest.fixture
+def photos(tmp_path):
+    """Photos that a shutter bent, of a focal length of 400 px that nothing tells."""
+    folder = half_courtyard(tmp_path / "in")
+    (folder.parent / "camera.json").unlink()
+    return folder
+
+
+def test_the_focal_length_of_photos_without_one_is_found_and_said(photos):
+    log = StageLog(None)
+    loaded = load_photos(photos, None, None, 2000, Workers(1), log)
+    assert loaded.cameras.without_focal == [0]
+    with warnings.catch_warnings():  # of so strong a shutter, pairs hardly tell it
+        warnings.simplefilter("ignore", RsUndistortWarning)
+        found = with_focal_lengths(loaded, 0, log).cameras
+    (camera,), (sigma,) = found.cameras, found.known_to(loose=False).sigmas
+    assert abs(np.log(camera.K[0, 0] / 400.0)) < 2.5 * sigma["f"]
+    assert "give --camera if you know it" in found.notes[-1]
+    assert not found.calibrated
+
+
+@pytest.mark.slow
+def test_photos_without_a_focal_length_are_solved_with_the_one_that_they_show(invoke, photos):
+    result = invoke("run", photos, "-o", "out", "--no-report", "--model", "rotation")
+    assert result.exit_code == 0, result.output
+    assert "give --camera if you know it" in " ".join(result.stdout.split())
+    K = read_solution("out/solution.json").cameras["1"].K
+    assert K[0, 0] == pytest.approx(400.0, rel=0.01), K
+
+
+def test_a_warp_needs_the_focal_length(invoke, photos):
+    result = invoke("simulate", "warp", photos, "-o", "out", "--seed", "1")
+    assert result.exit_code == 1
+    assert "no focal length" in result.stderr
