@@ -101,17 +101,28 @@ def test_photos_that_opensfm_would_take_for_one_are_refused_before_any_work():
         check_exports(["opensfm"], ["a/0.jpg", "b/0.jpg"])
 
 
-def test_the_gps_of_the_photos_is_kept_for_opensfm(tmp_path):
+def on_the_map(scene: ExportScene, folder: Path, crs: str, origin) -> ExportScene:
+    """The scene in a frame of the map, and its first photo with GPS known to 2 m across."""
     from PIL import Image
 
-    scene = made()
     exif = Image.Exif()
-    exif.get_ifd(0x8825).update({1: "N", 2: (46.0, 30.0, 0.0), 3: "W", 4: (7.0, 15.0, 0.0)})
-    Image.new("RGB", (8, 8)).save(tmp_path / "0.jpg", exif=exif)
-    EXPORTS["opensfm"].write(tmp_path / "out", replace(scene, source=tmp_path))
+    place = {1: "N", 2: (46.0, 30.0, 0.0), 3: "W", 4: (7.0, 15.0, 0.0), 5: b"\0", 6: 431.5, 31: 2.0 * 1.5096}
+    exif.get_ifd(0x8825).update(place)
+    Image.new("RGB", (8, 8)).save(folder / "0.jpg", exif=exif)
+    there = replace(scene.solution, georeference={"crs": crs, "origin": list(origin)})
+    return replace(scene, source=folder, solution=there, stored=there)
+
+
+def test_opensfm_gets_the_gps_of_the_photos_and_where_the_frame_is(tmp_path):
+    scene = on_the_map(made(), tmp_path, "local", (46.5, -7.25, 400.0))
+    EXPORTS["opensfm"].write(tmp_path / "out", scene)
     told = json.loads((tmp_path / "out" / "exif" / "0.jpg.exif").read_text())
-    assert (told["gps"]["latitude"], told["gps"]["longitude"]) == pytest.approx((46.5, -7.25))
+    assert told["gps"] == pytest.approx({"latitude": 46.5, "longitude": -7.25, "altitude": 431.5, "dop": 2.0}, abs=1e-3)
     assert json.loads((tmp_path / "out" / "exif" / "1.jpg.exif").read_text())["gps"] == {}
+    (found,) = json.loads((tmp_path / "out" / "reconstruction.json").read_text())
+    assert found["reference_lla"] == {"latitude": 46.5, "longitude": -7.25, "altitude": 400.0}
+    assert found["shots"]["0.jpg"]["gps_position"] == pytest.approx([0.0, 0.0, 31.5], abs=1e-6)
+    assert json.loads((tmp_path / "out" / "reference_lla.json").read_text()) == found["reference_lla"]
 
 
 # ---------------------------------------------------------------- Metashape
@@ -157,6 +168,27 @@ def test_opf_is_what_its_own_library_takes_and_read_back(tmp_path, name):
         if name == "opf-rectified":
             expected = (x_c / x_c[:, 2:])[rec.observations.point_idx[mine]] @ rec.cameras[0].K[:2].T
             np.testing.assert_allclose(rec.observations.xy_raw[mine], expected, atol=2e-3)
+
+
+def test_opf_gets_the_gps_of_the_photos_and_the_projection(tmp_path):
+    pytest.importorskip("pyopf")
+    from pyopf.io import load
+    from pyopf.resolve import resolve
+
+    scene = on_the_map(made(), tmp_path, "EPSG:32629", (457000.0, 5150000.0, 0.0))
+    EXPORTS["opf-rectified"].write(tmp_path / "opf", scene)
+    project = resolve(load(str(tmp_path / "opf" / "project.opf")))
+    first, second = project.input_cameras.captures[:2]
+    np.testing.assert_allclose(first.geolocation.coordinates, [46.5, -7.25, 431.5])
+    np.testing.assert_allclose(first.geolocation.sigmas[:2], 2.0, rtol=1e-3)
+    assert first.geolocation.crs.definition == "EPSG:4326+5773"
+    assert second.geolocation is None
+    frame = project.scene_reference_frame
+    assert frame.crs.definition == "EPSG:32629"
+    # from E, N, U to the coordinates of the poses
+    np.testing.assert_array_equal(
+        frame.base_to_canonical.transformation_matrix @ [457001.0, 5150002.0, 3.0, 1.0], [1.0, 2.0, 3.0, 1.0]
+    )
 
 
 @pytest.mark.parametrize("name", ["opf-rectified", "nuke"])

@@ -6,6 +6,7 @@ Coordinates have their origin in the middle of the photo and its longer side for
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -15,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from ..colmap.rectified_model import rectified_keypoints
 from ..errors import InputError
 from ..model import Camera
+from ..model.geodesy import enu_from_geodetic
 from .export_scene import ExportScene
 from .photos.exif_facts import ExifFacts, read_exif
 
@@ -42,7 +44,7 @@ def write_opensfm(folder: Path, scene: ExportScene) -> str:
     names = {image.name: PurePosixPath(scene.names[image.name]).name for image in images}
     keys = {image.camera_id: _key(image.camera_id, scene.camera(image)) for image in images}
     cameras = {keys[image.camera_id]: _camera(scene.camera(image)) for image in images}
-    shots = {}
+    shots, reference = {}, _reference(scene.solution.georeference)
     for image in images:
         assert image.R_cw is not None
         assert image.center_w is not None
@@ -55,7 +57,7 @@ def write_opensfm(folder: Path, scene: ExportScene) -> str:
             "camera": keys[image.camera_id],
             "orientation": 1,
             "capture_time": exif["capture_time"],
-            "gps_dop": exif["gps"].get("dop", 0.0),
+            **_on_the_map(exif["gps"], reference),
         }
     colors = scene.colors().astype(float).tolist()
     tracks, used = _tracks(scene, names)
@@ -64,7 +66,11 @@ def write_opensfm(folder: Path, scene: ExportScene) -> str:
         for k, xyz in enumerate(scene.reconstruction.points_w.tolist())
         if k in used
     }
-    _write(folder / "reconstruction.json", [{"cameras": cameras, "shots": shots, "points": points}])
+    found: dict[str, Any] = {"cameras": cameras, "shots": shots, "points": points}
+    if reference is not None:
+        found["reference_lla"] = reference
+        _write(folder / "reference_lla.json", reference)
+    _write(folder / "reconstruction.json", [found])
     _write(folder / "camera_models.json", cameras)
     (folder / "tracks.csv").write_text(tracks, encoding="utf-8")
     lines = "".join(f"../images/{scene.names[image.name]}\n" for image in images)
@@ -95,8 +101,10 @@ def _camera(camera: Camera) -> dict[str, Any]:
 def _exif(facts: ExifFacts, camera: Camera, key: str, model: dict[str, Any]) -> dict[str, Any]:
     """What OpenSfM would read of the photo, without the lens and with the camera of the rectified one."""
     gps: dict[str, float] = {}
-    if facts.place_deg is not None:
-        gps = {"latitude": facts.place_deg[0], "longitude": facts.place_deg[1], "dop": 15.0}
+    if (fix := facts.fix) is not None and facts.place_deg is not None:
+        # its `dop` is an accuracy in metres
+        gps = {"latitude": fix.latitude_deg, "longitude": fix.longitude_deg, "dop": float(max(fix.sigma_m[:2]))}
+        gps |= {} if fix.altitude_m is None else {"altitude": fix.altitude_m}
     return {
         "make": facts.make or "unknown",
         "model": facts.model or "unknown",
@@ -109,6 +117,24 @@ def _exif(facts: ExifFacts, camera: Camera, key: str, model: dict[str, Any]) -> 
         "gps": gps,
         "camera": key,
     }
+
+
+def _reference(georeference: Mapping[str, Any] | None) -> dict[str, float] | None:
+    """Where a frame of metres east, north and up has its origin, as OpenSfM writes it; None of other frames."""
+    if georeference is None or georeference["crs"] != "local":
+        return None
+    return dict(zip(("latitude", "longitude", "altitude"), georeference["origin"], strict=True))
+
+
+def _on_the_map(gps: Mapping[str, float], reference: Mapping[str, float] | None) -> dict[str, Any]:
+    """What a shot says of its GPS: its place in the frame where that is one of the map."""
+    if not gps:
+        return {"gps_dop": 0.0}
+    if reference is None:
+        return {"gps_dop": gps["dop"]}
+    origin = reference["latitude"], reference["longitude"], reference["altitude"]
+    place = np.array([[gps["latitude"], gps["longitude"], gps.get("altitude", origin[2])]])
+    return {"gps_dop": gps["dop"], "gps_position": enu_from_geodetic(place, origin)[0].tolist()}
 
 
 def _tracks(scene: ExportScene, names: dict[str, str]) -> tuple[str, set[int]]:

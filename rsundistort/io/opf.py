@@ -10,7 +10,7 @@ models nothing else, so rotations have no room.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime, timedelta, timezone
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
@@ -38,6 +38,8 @@ _GLTF = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 # Errors of a lens that are not worth a word.
 _TOLD_PX = 0.01
 _FULL_FRAME_UM = 36e3
+# Standard deviation of a height that nothing tells, metres.
+_UNKNOWN_M = 1e4
 _IDS = uuid5(NAMESPACE_URL, "urn:rsundistort:opf")
 
 
@@ -168,7 +170,23 @@ def _write(
     calibration.metadata = metadata(types.CALIBRATION, "calibration", source)
     objects.camera_list_objs, objects.input_cameras_objs = [camera_list], [inputs]
     objects.calibration_objs = [calibration]
+    frame = _scene_frame(solution.georeference)
+    if frame is not None:
+        frame.metadata = metadata(types.SCENE_REFERENCE_FRAME, "scene reference frame")
+        objects.scene_reference_frame_objs = [frame]
     save(objects, folder / "project.opf", use_item_name_for_resource_uri=True, write_point_cloud_buffers=True)
+
+
+def _scene_frame(georeference: Mapping[str, Any] | None) -> Any:
+    """How the positions lie in a projection; None of a frame that is none, for which the format has no room."""
+    from pyopf.crs import BaseToTranslatedCanonicalCrsTransform, Crs, SceneReferenceFrame
+
+    if georeference is None or georeference["crs"] in ("local", "control"):
+        return None
+    shift = -np.array(georeference["origin"], np.float64)
+    return SceneReferenceFrame(
+        BaseToTranslatedCanonicalCrsTransform(np.ones(3), shift, False), Crs(georeference["crs"])
+    )
 
 
 def _capture(uid: Any, sensor_id: Any, facts: ExifFacts) -> Any:
@@ -177,11 +195,16 @@ def _capture(uid: Any, sensor_id: Any, facts: ExifFacts) -> Any:
 
     camera = opf.Camera(uid, sensor_id=sensor_id, model_source=opf.ModelSource.USER, image_orientation=1,
                         pixel_range=opf.StaticPixelRange(0.0, 255.0), pixel_type=opf.PixelType.UINT8)  # fmt: skip
-    place = None
-    if facts.place_deg is not None:
-        place = Geolocation(np.array([*facts.place_deg, 0.0]), Crs("EPSG:4326"), np.array([5.0, 5.0, 1e4]))
+    place, height_m = None, None
+    if (fix := facts.fix) is not None and facts.place_deg is not None:
+        # receivers with RTK tell the height above the ellipsoid, others above the sea
+        crs = Crs("EPSG:4979" if fix.told_by == "RTK" else "EPSG:4326+5773")
+        east, north, up = fix.sigma_m if fix.altitude_m is not None else (*fix.sigma_m[:2], _UNKNOWN_M)
+        # in the order of the axes: latitude first
+        place = Geolocation(np.array([*facts.place_deg, fix.altitude_m or 0.0]), crs, np.array([north, east, up]))
+        height_m = fix.height_m
     taken = datetime(1970, 1, 1, tzinfo=timezone.utc) + timedelta(seconds=facts.taken_s or 0.0)
-    return opf.Capture(uid, [camera], None, uid, opf.RigModelSource.NOT_APPLICABLE, taken, place)
+    return opf.Capture(uid, [camera], height_m, uid, opf.RigModelSource.NOT_APPLICABLE, taken, place)
 
 
 def _middle(

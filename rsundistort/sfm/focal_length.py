@@ -126,6 +126,6 @@ def _lowest(cost: Array) -> float:
 
 def _indifference(cost: Array) -> float:
     """Variance of the logarithms of focal lengths that are about as good as the best."""
-    fine = np.linspace(*np.log(_TRIED[[0, -1]]), 50 * len(_TRIED))
+    fine = np.linspace(np.log(_TRIED[0]), np.log(_TRIED[-1]), 50 * len(_TRIED))
     as_well = np.interp(fine, np.log(_TRIED), cost) < (1.0 + _AS_WELL) * cost.min()
     return float(np.var(fine[as_well])) if as_well.any() else 0.0
