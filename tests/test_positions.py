@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pyproj
 import pytest
+from scipy.spatial.transform import Rotation
 from surveys import ORIGIN, geodetic_of
 from test_exif import ascii_, rational, rationals, with_gps
 
@@ -78,6 +79,29 @@ def test_xmp_of_drones_tells_height_and_velocity():
     )
     assert (alone.fix.latitude_deg, alone.fix.longitude_deg, alone.fix.altitude_m) == (41.03, -83.3, 283.8)
     assert alone.fix.speed_m_s == 3.0
+
+
+@pytest.mark.parametrize(
+    ("angles", "right", "ahead"),
+    [
+        ((0, -90, 0), (1, 0, 0), (0, 0, -1)),
+        ((90, 0, 0), (0, -1, 0), (1, 0, 0)),
+        ((-90, -45, 0), (0, 1, 0), (-(0.5**0.5), 0, -(0.5**0.5))),
+        ((0.01, 0, 90), (0, 0, -1), (0, 1, 0)),
+    ],
+)
+def test_a_gimbal_tells_where_the_camera_looked(angles, right, ahead):
+    names = ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree")
+    found = fix(xmp(DJI, **{name: f"{value:+}" for name, value in zip(names, angles, strict=True)}))
+    assert found.yaw_pitch_roll_deg == angles
+    R_cw = positions_of(["a.jpg"], [ExifFacts(fix=found)]).R_cw[0]
+    np.testing.assert_allclose(R_cw[[0, 2]], [right, ahead], atol=2e-4)
+    assert np.linalg.det(R_cw) == pytest.approx(1.0)
+    assert np.isnan(positions_of(["a.jpg"], [ExifFacts(fix=found, orientation=6)]).R_cw).all()
+
+
+def test_a_gimbal_of_zeros_is_none():
+    assert fix(xmp(DJI, GimbalYawDegree="0", GimbalPitchDegree="0", GimbalRollDegree="0")).yaw_pitch_roll_deg is None
 
 
 def test_xmp_with_entities_is_not_looked_at():
@@ -173,6 +197,19 @@ def test_places_on_a_line_tell_no_roll():
     assert found.sigma_rad[0] == np.inf
     assert np.isfinite(found.sigma_rad[1:]).all()
     assert found.similarity.scale == pytest.approx(30)
+
+
+def test_a_known_rotation_tells_the_roll_of_places_on_a_line(rng):
+    R = Rotation.from_rotvec([0.4, -1.0, 2.0]).as_matrix()
+    x = np.outer(np.linspace(0, 1, 8), [1.0, 0.0, 0.0]) + 1e-3 * rng.normal(size=(8, 3))
+    y = 300 * x @ R.T + 2 + 0.5 * rng.normal(size=(8, 3))
+    told = Rotation.from_rotvec([0.03, -0.05, 0.04]).as_matrix() @ R, 0.08
+    found = fit_similarity(x, y, np.full((8, 3), 0.5), told)
+    apart = Rotation.from_matrix(found.similarity.R @ R.T).as_rotvec()
+    along = R[:, 0]
+    assert abs(apart @ along) < 0.1
+    assert np.linalg.norm(apart - (apart @ along) * along) < 0.01  # what the places tell is theirs
+    assert (found.sigma_rad < 0.1).all()
 
 
 # ---------------------------------------------------------------- tables of control points

@@ -12,6 +12,8 @@ import pytest
 from bundle_scenes import make_scene
 from click.testing import CliRunner
 from rsundistort_cli.main import cli
+from scipy.spatial.transform import Rotation
+from solved_scene import SCENES
 from surveys import READOUT_S, Flight, geodetic_of, with_readout
 
 from rsundistort import BundleOptions, KnownLength, RectifyOptions, SolveOptions, bundle_adjust
@@ -136,6 +138,31 @@ def test_gps_that_does_not_fit_leaves_a_frame_of_its_own(spread):
         survey, rec = survey_of(None, [], flight.names, facts, [(768, 512)] * 10).placed(flight.start)
     assert survey is None
     assert rec is flight.start
+
+
+@pytest.mark.parametrize("with_gimbal", [False, True])
+def test_one_strip_is_put_on_the_map_by_its_gimbal(with_gimbal):
+    flight = Flight()
+    strip = flight.start.take_photos(np.arange(10) < 5)
+    facts = flight.facts(sigma_m=(1.0, 1.0, 1.0))[:5]
+    if with_gimbal:
+        truth = np.load(SCENES / "flyover" / "tracks.npz")["R_cw"][:5]
+        north = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+        turned = Rotation.from_matrix(truth.transpose(0, 2, 1) @ north).as_euler("ZXY", degrees=True)
+        looking = (turned + flight.rng.normal(0, 2.0, turned.shape)) * [-1, 1, 1]
+        facts = [
+            replace(each, fix=replace(each.fix, yaw_pitch_roll_deg=tuple(angles)))
+            for each, angles in zip(facts, looking.tolist(), strict=True)
+        ]
+    survey = survey_of("local", [], strip.image_names, facts, [(768, 512)] * 5)
+    if not with_gimbal:
+        with pytest.warns(RsUndistortWarning, match=r"not on the map: GPS along a line"):
+            assert survey.placed(strip)[0] is None
+        return
+    placed, rec = survey.placed(strip)
+    assert (placed.fit.sigma_rad < np.deg2rad(8.0)).all()
+    apart = Rotation.from_matrix(rec.R_cw @ truth.transpose(0, 2, 1)).magnitude()
+    assert apart.max() < np.deg2rad(8.0)
 
 
 # ---------------------------------------------------------------- refusals

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..io import ExifFacts
-from ..io.photos.gps import ALTITUDES
+from ..io.photos.gps import ALTITUDES, GpsFix
 from ..model.geodesy import ecef_from_geodetic, enu_axes, enu_from_geodetic
 
 __all__ = ["MapFrame", "PhotoPositions", "check_crs", "frame_at", "positions_of"]
@@ -42,6 +43,8 @@ class PhotoPositions:
         Over ground; NaN where nothing says it.
     velocity_m_s : (m, 3) array
         East, north and up; NaN where nothing says it.
+    R_cw : (m, 3, 3) array
+        From axes east, north and up to those of the camera, by its gimbal; NaN where nothing says it.
     told_by : tuple of str
         What the standard deviations come from.
     notes : tuple of str
@@ -53,6 +56,7 @@ class PhotoPositions:
     sigma_m: Array
     speed_m_s: Array
     velocity_m_s: Array
+    R_cw: Array
     told_by: tuple[str, ...]
     notes: tuple[str, ...]
 
@@ -152,7 +156,11 @@ def frame_at(crs: str, geodetic: Array) -> MapFrame:
 
 def positions_of(names: Sequence[str], facts: Sequence[ExifFacts]) -> PhotoPositions:
     """The photos that have a position, and what is to be said of it."""
-    placed = [(name, fact.fix) for name, fact in zip(names, facts, strict=True) if fact.fix and not fact.fix.is_nowhere]
+    there = [fact.fix is not None and not fact.fix.is_nowhere for fact in facts]
+    placed = [
+        (name, fact.fix) for name, fact, is_placed in zip(names, facts, there, strict=True) if is_placed and fact.fix
+    ]
+    upright = [fact.orientation in (None, 1) for fact, is_placed in zip(facts, there, strict=True) if is_placed]
     notes = []
     nowhere = [name for name, fact in zip(names, facts, strict=True) if fact.fix and fact.fix.is_nowhere]
     if nowhere:
@@ -183,9 +191,20 @@ def positions_of(names: Sequence[str], facts: Sequence[ExifFacts]) -> PhotoPosit
         sigma,
         np.array([np.nan if fix.speed_m_s is None else fix.speed_m_s for fix in fixes]),
         np.array([fix.velocity_m_s or (np.nan,) * 3 for fix in fixes]).reshape(-1, 3),
+        np.array([_looking(fix, is_upright) for fix, is_upright in zip(fixes, upright, strict=True)]).reshape(-1, 3, 3),
         tuple(sorted({fix.told_by for fix in fixes})),
         tuple(notes),
     )
+
+
+def _looking(fix: GpsFix, is_upright: bool) -> Array:
+    """From east, north and up to the camera's axes, x to the right and z ahead; a photo stored turned tells nothing."""
+    if fix.yaw_pitch_roll_deg is None or not is_upright:
+        return np.full((3, 3), np.nan)
+    # level and looking north: x east, y down, z north
+    north = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    yaw, pitch, roll = fix.yaw_pitch_roll_deg
+    return np.asarray(Rotation.from_euler("ZXY", [-yaw, pitch, roll], degrees=True).as_matrix() @ north.T).T
 
 
 def _some(names: Sequence[str]) -> str:

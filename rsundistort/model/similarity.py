@@ -121,11 +121,14 @@ def similarity_of(points: Array, targets: Array) -> Similarity:
     return Similarity(scale, R, mean_target - scale * R @ mean)
 
 
-def fit_similarity(points: Array, targets: Array, sigma: Array) -> FittedSimilarity:
+def fit_similarity(
+    points: Array, targets: Array, sigma: Array, rotation: tuple[Array, float] | None = None
+) -> FittedSimilarity:
     """The similarity that takes points (m, 3), three or more, to targets of standard deviations (m, 3).
 
     Robust: the triple whose similarity leaves the least median is the start, weights of Cauchy's loss find the rest.
-    The standard deviations grow with the residuals where these are larger than their own say.
+    The standard deviations grow with the residuals where these are larger than their own say. `rotation` is one that
+    is known, (3, 3), with its standard deviation about each axis in radians: points along a line need it.
     """
     m = len(points)
     if m <= 13:
@@ -134,10 +137,15 @@ def fit_similarity(points: Array, targets: Array, sigma: Array) -> FittedSimilar
         rng = np.random.default_rng(0)
         triples = [tuple(rng.choice(m, 3, replace=False).tolist()) for _ in range(_TRIES)]
     tried = [similarity_of(points, targets)] + [similarity_of(points[[*t]], targets[[*t]]) for t in triples]
-    found = min(tried, key=lambda each: float(np.median(_squares(each, points, targets, sigma))))
+    if rotation is not None:
+        tried += [_rotated(each, points, rotation[0]) for each in tried]
+    found = min(
+        tried,
+        key=lambda each: float(np.median(_squares(each, points, targets, sigma))) + _rotation_square(each, rotation),
+    )
     for _ in range(_STEPS):
         weight = 1 / (1 + _squares(found, points, targets, sigma) / _BEND)
-        found, step, H, middle = _step(found, points, targets, sigma, weight)
+        found, step, H, middle = _step(found, points, targets, sigma, weight, rotation)
         if step < 1e-12:
             break
     square = _squares(found, points, targets, sigma)
@@ -155,6 +163,19 @@ def fit_similarity(points: Array, targets: Array, sigma: Array) -> FittedSimilar
     )  # fmt: skip
 
 
+def _rotated(found: Similarity, points: Array, R: Array) -> Similarity:
+    """The same scale and middle with another rotation."""
+    middle = points.mean(0)
+    return Similarity(found.scale, R, found.of(middle[None])[0] - found.scale * R @ middle)
+
+
+def _rotation_square(found: Similarity, rotation: tuple[Array, float] | None) -> float:
+    """Squared deviation from a rotation that is known, in units of sigma."""
+    if rotation is None:
+        return 0.0
+    return float((Rotation.from_matrix(found.R @ rotation[0].T).magnitude() / rotation[1]) ** 2)
+
+
 def _squares(found: Similarity, points: Array, targets: Array, sigma: Array) -> Array:
     """(m,) squared residuals in units of sigma."""
     value: Array = (((found.of(points) - targets) / sigma) ** 2).sum(1)
@@ -162,8 +183,9 @@ def _squares(found: Similarity, points: Array, targets: Array, sigma: Array) -> 
 
 
 def _step(
-    found: Similarity, points: Array, targets: Array, sigma: Array, weight: Array
-) -> tuple[Similarity, float, Array, Array]:
+    found: Similarity, points: Array, targets: Array, sigma: Array, weight: Array,
+    rotation: tuple[Array, float] | None,
+) -> tuple[Similarity, float, Array, Array]:  # fmt: skip
     """A Gauss-Newton step: the new similarity, its size, the Hessian of shift, turn and scale, and the middle.
 
     Turn and scale are about the middle of the points, and in units that make them as large as shifts.
@@ -179,7 +201,12 @@ def _step(
         J[:, :, 3 + k] = np.cross(np.eye(3)[k], arm) / unit
     J[:, :, 6] = arm / unit
     H = np.einsum("mia,mi,mib->ab", J, by, J)
-    step = -np.linalg.pinv(H, rcond=1e-9, hermitian=True) @ np.einsum("mia,mi,mi->a", J, by, moved - targets)
+    g = np.einsum("mia,mi,mi->a", J, by, moved - targets)
+    if rotation is not None:
+        information = (rotation[1] * unit) ** -2
+        H[range(3, 6), range(3, 6)] += information
+        g[3:6] += information * unit * Rotation.from_matrix(found.R @ rotation[0].T).as_rotvec()
+    step = -np.linalg.pinv(H, rcond=1e-9, hermitian=True) @ g
     # no step is longer than what it is linear in
     factor = float(np.exp(np.clip(step[6] / unit, -1.0, 1.0)))
     R = Rotation.from_rotvec(step[3:6] / unit).as_matrix()

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ..bundle import CONTROL_SIGMA_PX, KnownPlaces, place_control, scale_of_lengths, with_control
 from ..bundle.places import point_of
@@ -31,6 +32,8 @@ _MOST_OFF = 4.0
 _ELSEWHERE_M = 1e5
 # Known lengths that are off by more standard deviations contradict the map.
 _CONTRADICTS = 3.0
+# Of axes by a gimbal and its compass, radians; photos that lie farther off than the second are not believed.
+_GIMBAL_SIGMA, _GIMBAL_OFF = np.deg2rad(5.0), np.deg2rad(20.0)
 # Of a velocity by GPS along each axis, metres a second, and of the time that it is multiplied by, relative.
 _VELOCITY_SIGMA_M_S, _VELOCITY_SHARE = 0.3, 0.03
 
@@ -95,7 +98,7 @@ class Survey:
         names = [name for name in rec.image_names if name in self.places]
         problem = f"{len(names)} of the photos that were joined have GPS, three are needed"
         if len(names) >= _LEAST:
-            fit = fit_similarity(*_of_photos(rec, self.places))
+            fit = fit_similarity(*_of_photos(rec, self.places), self._rotation(rec))
             problem = _misfit(fit, "GPS")
             if not problem:
                 return replace(self, fit=fit), fit.similarity.of_reconstruction(rec)
@@ -103,6 +106,27 @@ class Survey:
             return self, rec
         warnings.warn(f"not on the map: {problem}; poses are in a frame of their own", RsUndistortWarning, stacklevel=4)
         return None, rec
+
+    def _rotation(self, rec: Reconstruction) -> tuple[Array, float] | None:
+        """From a reconstruction's axes to the frame's by the photos' gimbals, and what it is known to; or None.
+
+        The compass errs in all photos alike: many know it no better than one.
+        """
+        told = {
+            name: R_cw
+            for name, R_cw in zip(self.positions.names, self.positions.R_cw, strict=True)
+            if name in self.places and np.isfinite(R_cw).all()
+        }
+        rows = [i for i, name in enumerate(rec.image_names) if name in told]
+        if len(rows) < _LEAST:
+            return None
+        each = Rotation.from_matrix([told[rec.image_names[i]].T @ rec.R_cw[i] for i in rows])
+        apart = np.array([(each * other.inv()).magnitude() for other in each])
+        middle = each[int(np.argmin(np.median(apart, axis=1)))]
+        near = (each * middle.inv()).magnitude() < _GIMBAL_OFF
+        if 2 * near.sum() <= len(rows):  # they contradict each other
+            return None
+        return each[near].mean().as_matrix(), _GIMBAL_SIGMA
 
     def controlled(self, rec: Reconstruction, sigma_px: float) -> tuple[Survey | None, Reconstruction]:
         """The reconstruction with the control points among its points, in the frame that they tell."""
@@ -115,7 +139,7 @@ class Survey:
         survey, targets = replace(self, notes=notes), np.array([each.place_m for each in found.points]).reshape(-1, 3)
         if len(found.points) >= _LEAST:
             sigma = np.array([each.sigma_m for each in found.points])
-            fit = fit_similarity(found.points_w, targets, sigma)
+            fit = fit_similarity(found.points_w, targets, sigma, self._rotation(rec))
             problem = _misfit(fit, "control points", robust=False)
             if problem and self.fit is None:
                 warnings.warn(
@@ -148,7 +172,7 @@ class Survey:
         x = np.concatenate([x, rec.points_w[list(points)]])
         y = np.concatenate([y, np.array([each.place_m for each in points.values()]).reshape(-1, 3)])
         sigma = np.concatenate([sigma, np.array([each.sigma_m for each in points.values()]).reshape(-1, 3)])
-        fit = fit_similarity(x, y, sigma)
+        fit = fit_similarity(x, y, sigma, self._rotation(rec))
         rec = fit.similarity.of_reconstruction(rec)
         survey = replace(self, fit=fit)
         off = survey.outliers(rec)

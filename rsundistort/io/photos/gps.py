@@ -20,6 +20,7 @@ _SPEEDS_M_S = {b"K": 1 / 3.6, b"M": 1609.344 / 3600, b"N": 1852 / 3600}
 _DJI = ("http://www.dji.com/drone-dji/1.0/",)
 _SENSEFLY = ("http://ns.sensefly.com/sensefly/1.0/",)
 _PARROT = ("http://www.parrot.com/drone-parrot/1.0/", "http://www.parrot.com/namespace/drone-parrot/1.0/")
+_GIMBAL = ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree")
 _CAMERA = ("http://pix4d.com/camera/1.0/", "http://ns.sensefly.com/Camera/1.0/", "http://ns.pix4d.com/camera/1.0/")
 
 # what a position may claim to be exact to, metres: the lever arm from antenna to lens is of this size
@@ -58,6 +59,8 @@ class GpsFix:
         All altitudes that the photo holds, by name.
     height_m : float or None
         Above the place of take-off.
+    yaw_pitch_roll_deg : (float, float, float) or None
+        Where the camera looked: clockwise from north, above the horizon, and turned clockwise about that.
     """
 
     latitude_deg: float
@@ -69,6 +72,7 @@ class GpsFix:
     velocity_m_s: tuple[float, float, float] | None = None
     altitudes_m: Mapping[str, float] = field(default_factory=dict)
     height_m: float | None = None
+    yaw_pitch_roll_deg: tuple[float, float, float] | None = None
 
     @property
     def is_nowhere(self) -> bool:
@@ -98,7 +102,7 @@ def fix_of(structure: TiffStructure | None, gps: Mapping[int, Entry], xmp: bytes
         speed = _told_speed(told)
     return GpsFix(
         *place, next(iter(altitudes.values()), None), sigma, told_by, speed, _velocity(structure, gps, told), altitudes,
-        told.get("RelativeAltitude", told.get("Height")),
+        told.get("RelativeAltitude", told.get("Height")), _looking(told),
     )  # fmt: skip
 
 
@@ -182,6 +186,7 @@ def _of_xmp(xmp: bytes) -> dict[str, float]:
         _DJI: (
             "GpsLatitude", "GpsLongitude", "GpsLongtitude", "Latitude", "Longitude", "AbsoluteAltitude",
             "RelativeAltitude", "RtkStdLon", "RtkStdLat", "RtkStdHgt", "FlightXSpeed", "FlightYSpeed", "FlightZSpeed",
+            *_GIMBAL,
         ),
         _SENSEFLY: ("Latitude", "Longitude", "AltitudeAMSL", "AltitudeWGS84", "Height", "GroundSpeed"),
         _PARROT: ("SpeedX", "SpeedY"),
@@ -209,6 +214,15 @@ def _told_place(told: Mapping[str, float]) -> tuple[float, float] | None:
             if abs(north) <= 90 and abs(east) <= 180 and (north or east):
                 return north, east
     return None
+
+
+def _looking(told: Mapping[str, float]) -> tuple[float, float, float] | None:
+    """Yaw, pitch and roll of a gimbal; all zeros are those of a camera without one."""
+    if not told.keys() >= {*_GIMBAL}:
+        return None
+    yaw, pitch, roll = (told[name] for name in _GIMBAL)
+    believed = any((yaw, pitch, roll)) and abs(yaw) <= 360 and abs(pitch) <= 180 and abs(roll) <= 180
+    return (yaw, pitch, roll) if believed else None
 
 
 def _told_speed(told: Mapping[str, float]) -> float | None:
