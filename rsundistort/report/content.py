@@ -185,7 +185,7 @@ def scene(source: Source, upright: Mapping[str, int]) -> dict[str, Any] | None:
         "centers": _packed((centers) @ V.T),
         "frusta": _packed(_frusta(R, centers, lenses, side) @ V.T),
         "axes": _packed(readout_axes(R, [lens.readout for lens in lenses]) @ V.T),
-        "box": _box(points @ V.T, centers @ V.T),
+        "box": _box(_near(points, centers, reach) @ V.T, centers @ V.T),
     }
     if told is not None:
         place = {name: i for i, name in enumerate(told.names)}

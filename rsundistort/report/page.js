@@ -166,12 +166,14 @@
       const plain = {visible: false, showspikes: false};
       const [x, y, z] = scene.box;
       const spans = [x, y, z].map(([low, high]) => high - low), size = 2 / Math.hypot(...spans);
+      // the field of view is that of the height: a narrow page needs more distance
+      const {clientWidth: width, clientHeight: height} = byId("plot-scene"), far = Math.max(1, 1.9 * height / (width || 1));
       return [traces, layout({
         margin: {l: 0, r: 0, t: 0, b: 0}, dragmode: "orbit", uirevision: "kept",
         scene: {
           xaxis: {...plain, range: x}, yaxis: {...plain, range: y}, zaxis: {...plain, range: z}, aspectmode: "manual",
           aspectratio: {x: size * spans[0], y: size * spans[1], z: size * spans[2]},
-          camera: {eye: {x: -0.25, y: -1.55, z: 0.85}, up: {x: 0, y: 0, z: 1}},
+          camera: {eye: {x: -0.25 * far, y: -1.55 * far, z: 0.85 * far}, up: {x: 0, y: 0, z: 1}},
         },
       }), {scrollZoom: true}];
     });
