@@ -1,0 +1,90 @@
+"""Photos that lost their EXIF: the focal length that they show, and what a run makes of it; one JSON object a line.
+
+    python benchmarks/unknown_camera.py [--photos DIR] [--names herz-jesus-8 iphone6 phone dslr drone lund]
+
+`f_reference` is that of `camera.json`, or what a run finds that has the EXIF. `f_pairs` is what pairs of photos say
+before anything is mapped, with its relative standard deviation, and `f` what the run ends with. `walk` of the sample
+scenes is a video without its camera file: `readout_ms` should be 20.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import tempfile
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from rsundistort import RsUndistortWarning, RunOptions, Solution, run
+from rsundistort.solve import OutputOptions
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def solved(photos: Path, out: Path, camera: str | None = None) -> Solution:
+    """What a run makes of photos."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RsUndistortWarning)
+        return run(photos, out, RunOptions(camera=camera, outputs=OutputOptions(report=False)))
+
+
+def focal(solution: Solution) -> float:
+    """The focal length of its photos, the median."""
+    return float(np.median([solution.cameras[image.camera_id].K[0, 0] for image in solution.registered]))
+
+
+def figures_of(solution: Solution, reference: float) -> dict[str, object]:
+    """What is worth comparing."""
+    stage = next(each for each in solution.stages if each["name"] == "focal length")
+    f = focal(solution)
+    return {
+        "f_reference": round(reference, 1),
+        "f_pairs": [round(each, 1) for each in stage["pixels"]],
+        "sigma_pairs": [round(each, 3) for each in stage["sigma"]],
+        "f": round(f, 1),
+        "ratio": round(f / reference, 4),
+        "registered": len(solution.registered),
+        "verdict": solution.quality["verdict"]["shutter"],
+    }
+
+
+def main() -> None:
+    """Measure."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--photos", type=Path, default=ROOT.parent / "shared" / "photos")
+    parser.add_argument("--names", nargs="+", default=["herz-jesus-8", "iphone6", "phone", "dslr", "drone", "lund"])
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
+        clip = work / "walk.mp4"
+        shutil.copy(ROOT / "sample_scenes" / "walk" / "clip.mp4", clip)
+        video = solved(clip, work / "walk")
+        seconds = video.quality["readout_time"]["seconds"]
+        print(
+            json.dumps({"name": "walk", **figures_of(video, 500.0), "readout_ms": round(1e3 * seconds, 2)}), flush=True
+        )
+        for name in args.names:
+            photos = args.photos / name
+            if not photos.is_dir():
+                print(json.dumps({"name": name, "skipped": "no folder of test photos beside the project"}))
+                continue
+            bare = work / name
+            bare.mkdir()
+            for path in sorted(photos.glob("*.[jJ][pP][gG]")):
+                pixels = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+                cv2.imwrite(str(bare / path.name), pixels, [cv2.IMWRITE_JPEG_QUALITY, 98])
+            file = photos / "camera.json"
+            known = (
+                json.loads(file.read_text())["K"][0][0]
+                if file.is_file()
+                else focal(solved(photos, work / f"{name}-exif"))
+            )
+            print(json.dumps({"name": name, **figures_of(solved(bare, work / f"{name}-bare"), known)}), flush=True)
+
+
+if __name__ == "__main__":
+    main()
