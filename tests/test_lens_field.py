@@ -32,7 +32,7 @@ from rsundistort.bundle.spreads import Spreads
 from rsundistort.errors import FormatError, InputError
 from rsundistort.io import read_solution, write_solution
 from rsundistort.io.cameras import camera_from_json, camera_to_json
-from rsundistort.model.field import field_basis, field_over_frame, field_slope, lens_pixels, raw_pixels
+from rsundistort.model.field import field_basis, field_over_frame, field_slope, lens_pixels, raw_pixels, steepest
 from rsundistort.model.orientation import MATRICES, turn_camera, turn_points
 from rsundistort.model.projection import project_points, project_points_with_jacobians, unproject_points
 from rsundistort.model.reprojection import reprojection_residuals
@@ -251,6 +251,16 @@ def options_of(rec):
     sigma = {"f": 1e-2, "cx": 3e-3, "cy": 3e-3, "k1": 0.03, "k2": 0.1, "k3": 0.1, "p1": 3e-4, "p2": 3e-4}
     known = GuessedCameras(rec.cameras, sigma)
     return BundleOptions(refine=INTRINSICS, residual_field=True, deviations="model", guessed=known)
+
+
+def test_steps_that_would_fold_the_photo_are_cut_short(rng):
+    camera = Camera(64, 48, [[50.0, 0, 31.5], [0, 50.0, 23.5], [0, 0, 1]])
+    fields = LensFields([camera], INTRINSICS, "rotation")
+    (camera,) = fields.started([camera])
+    step = 0.9 * np.sign(rng.normal(size=fields.num_unknowns))
+    for _ in range(40):
+        camera = fields.moved(0, camera, step)  # a camera that folds is refused where it is made
+    assert 0.5 * 0.5 < steepest(camera.field, 64, 48) <= 0.5
 
 
 def test_the_gradient_is_that_of_the_cost(rng):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model import Camera, RowMotion
-from ..model.field import field_basis, field_over_frame
+from ..model.field import field_basis, field_over_frame, folds
 from ..model.projection import project_points, unproject_points
 from .intrinsics import moved_camera
 
@@ -23,6 +23,8 @@ _SHAPE = (5, 4)
 _STEP = 1e-4
 # A step that far is astray.
 _MOST_PX = 1.0
+# One that is cut shorter is none.
+_LEAST_PX = 1e-3
 
 
 class LensFields:
@@ -67,9 +69,13 @@ class LensFields:
         return np.stack([reading @ field_over_frame(camera)[1].ravel() for reading, camera in pairs])
 
     def moved(self, index: int, camera: Camera, step: Array) -> Camera:
-        """The camera of an index after a step (nz,) of its unknowns."""
-        change = self._bases[index] @ np.clip(step, -_MOST_PX, _MOST_PX)
-        return replace(camera, field=camera.field + change.reshape(camera.field.shape))
+        """The camera of an index after a step (nz,) of its unknowns; one that would fold the photo is cut short."""
+        change = (self._bases[index] @ np.clip(step, -_MOST_PX, _MOST_PX)).reshape(camera.field.shape)
+        while folds(camera.field + change, camera.width, camera.height):
+            change = change / 2
+            if np.abs(change).max() < _LEAST_PX:
+                return camera
+        return replace(camera, field=camera.field + change)
 
     def jacobian(self, cameras: Sequence[Camera], camera_of_obs: NDArray[np.int64], xy_raw: Array) -> Array:
         """(o, 2, nz) derivatives of the field at pixels (o, 2)."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .checks import check_finite, check_numbers, check_one_of, check_whole, frozen
-from .field import spline_coefficients, steepest
+from .field import folds, spline_coefficients
 
 __all__ = ["LENSES", "READOUTS", "Camera", "check_readout", "other_axis"]
 
@@ -43,8 +43,6 @@ LENSES: dict[str, tuple[str, ...]] = {
 
 # Pixels across or down a photo, and of a focal length or a principal point: numbers beyond are no camera's.
 _LARGEST, _FARTHEST = 10**6, 1e9
-# Slope of a field; from 1 on a photo may fold.
-_STEEPEST = 0.5
 
 _DIST_LENGTHS = {"pinhole": (0, 4, 5, 8, 12), "fisheye": (0, 4)}
 
@@ -138,7 +136,7 @@ class Camera:
         values = check_finite(self.field, (None, None, 2), "field")
         if min(values.shape[:2]) < 4:
             raise InputError(f"field.shape={values.shape}, expected at least 4 rows and 4 columns")
-        if steepest(values, self.width, self.height) > _STEEPEST:
+        if folds(values, self.width, self.height):
             raise InputError(f"field holds values of up to {np.abs(values).max():g} px: it would fold the photo")
         return values
 

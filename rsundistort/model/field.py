@@ -23,6 +23,7 @@ __all__ = [
     "field_basis",
     "field_over_frame",
     "field_slope",
+    "folds",
     "lens_pixels",
     "raw_pixels",
     "spline_coefficients",
@@ -33,6 +34,8 @@ Array = NDArray[np.float64]
 
 # Places across and down at which slopes are looked at.
 _LOOKED_AT = 33
+# Slope of a field; from 1 on a photo may fold.
+_STEEPEST = 0.5
 
 
 def _splines(u: Array, count: int, slope: bool = False) -> Array:
@@ -58,8 +61,13 @@ def spline_coefficients(field: Array) -> Array:
     return np.einsum("jk,il,kla->jia", np.linalg.inv(down), np.linalg.inv(across), field)
 
 
+def folds(field: Array, width: int, height: int) -> bool:
+    """Whether a field is too steep for its photo: from a slope of 1 on it may fold."""
+    return steepest(field, width, height) > _STEEPEST
+
+
 def steepest(field: Array, width: int, height: int) -> float:
-    """Largest slope of a field over a photo, a bound of its matrix norm; from 1 on the photo may fold."""
+    """Largest slope of a field over a photo, a bound of its matrix norm."""
     spline, u = spline_coefficients(field), np.linspace(0, 1, _LOOKED_AT)
     rows, cols = field.shape[:2]
     by_x = np.einsum("nj,mi,jia->nma", _splines(u, rows), _splines(u, cols, True) / width, spline)
