@@ -20,9 +20,10 @@ if TYPE_CHECKING:
 @opt.readout_option
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def command(path: Path, readout: str | None, as_json: bool) -> None:
-    """Say whether a set of camera poses lets the shutter be told from the scene's shape.
+    """Check whether the shutter and the shape of the scene can be told apart from these camera poses.
 
-    PATH is a solution (solution.json, or the output of a run), a COLMAP model, or a transforms.json.
+    PATH is a solution (solution.json, or the folder of a run), a COLMAP model, or a transforms.json. The degeneracy
+    measure is near zero where the poses are a critical motion.
     """
     with errors_for_people():
         from rsundistort.analysis import analyze
@@ -40,7 +41,7 @@ def _text(result: PoseAnalysis) -> str:
     ds, da, *p = meter.null_vector
     lines = [
         f"photos             {result.photos}, readout {', '.join(result.readout)}",
-        f"meter              {meter.value:.3f} of {values}",
+        f"degeneracy         {meter.value:.3f} of {values}",
         f"y axes             {meter.y_axis_spread_deg:.1f} degrees apart (root mean square)",
         f"hidden best        skew {ds:.2f}, aspect {da:.2f}, plane at infinity {', '.join(f'{x:.2f}' for x in p)}",
         f"confounded         {meter.meaning}",

@@ -59,14 +59,14 @@ def summary(solution: Solution, out: Path, warned: Sequence[str]) -> dict[str, A
 
 
 def closing_table(solution: Solution, out: Path) -> str:
-    """What was found, a line a photo, in 80 columns."""
+    """What was found, one line per photo, in 80 columns."""
     from rsundistort.report import verdict_of
 
     rows = [("photo", "measurements", "rms px", "deg/frame", "shift px")]
     for image in solution.images:
         name = image.name if len(image.name) <= 32 else f"...{image.name[-29:]}"
         if image.motion is None:
-            rows.append((name, "-", "-", "-", "not joined"))
+            rows.append((name, "-", "-", "-", "not registered"))
             continue
         span = solution.cameras[image.camera_id].frame_span
         turn = float((image.motion.phi**2).sum() ** 0.5) * span * 57.29577951308232
@@ -114,11 +114,11 @@ def closing_table(solution: Solution, out: Path) -> str:
         lines += [f"  {image.name}: {image.doubtful}" for image in doubtful]
     lens_only = [image.name for image in solution.registered if image.lens_only]
     if lens_only:
-        lines += ["", "lens only (the motion found is not supported, and was not taken out):"]
+        lines += ["", "lens only (the motion found is not supported by the measurements, and was not removed):"]
         lines += ["  all photos" if len(lens_only) == len(solution.registered) else f"  {', '.join(lens_only)}"]
     lost = [image for image in solution.images if not image.registered]
     if lost:
-        lines += ["", "not joined:", *(f"  {image.name}: {image.reason}" for image in lost)]
+        lines += ["", "not registered:", *(f"  {image.name}: {image.reason}" for image in lost)]
     return "\n".join(part for line in lines for part in fitted(line))
 
 
@@ -165,7 +165,7 @@ def _model(solution: Solution) -> list[str]:
     return [
         f"measurements       {solution.quality['num_observations']} of {solution.quality['num_points']} points now, "
         f"{model['observations']} of {model['points']} in the model",
-        f"pixel frame        {frames.get(model['frame'], model['frame'] + ', and turned back')}",
+        f"pixel frame        {frames.get(model['frame'], model['frame'] + ', and rotated back')}",
     ]
 
 
@@ -222,26 +222,26 @@ def _video(solution: Solution) -> list[str]:
     if not video:
         return []
     turned = {3: 180, 6: 90, 8: 270}.get(video["orientation"])
-    said = f", players turn them by {turned} degrees clockwise, the files do not" if turned else ""
+    said = f", players rotate them by {turned} degrees clockwise, the files do not" if turned else ""
     what = "key frames of" if "key_frames" in video else "of"
     return [f"video              {len(solution.images)} {what} {video['frames']} frames{said}"]
 
 
 def _readout_time(solution: Solution) -> list[str]:
-    """Lines on the readout time that a video told, and on what tells against or for it."""
+    """Lines on the readout time that was measured from a video, and on the evidence."""
     from rsundistort.report.readout import readout_facts
 
-    told = solution.quality.get("readout_time")
-    if not told:
+    facts = solution.quality.get("readout_time")
+    if not facts:
         return []
     shown = ["readout time", "gyroscope"]
-    if told["stabilisation"]["verdict"] == "stabilised":
+    if facts["stabilisation"]["verdict"] == "stabilised":
         shown.append("stabilisation")
-    return [f"{label:<{_LABEL}}{text}" for label, text in readout_facts(told) if label in shown]
+    return [f"{label:<{_LABEL}}{text}" for label, text in readout_facts(facts) if label in shown]
 
 
 def _readout(solution: Solution) -> list[str]:
-    """Lines on how fast the photos turned, where the time of the readout is known."""
+    """Lines on how fast the camera rotated, where the time of the readout is known."""
     times = solution.quality.get("readout_times") or {}
     rates = sorted(
         float((image.motion.phi**2).sum() ** 0.5)
@@ -255,7 +255,7 @@ def _readout(solution: Solution) -> list[str]:
         return []
     said = dict.fromkeys(f"{time['ms']:g} ms ({time['source']})" for time in times.values())
     return [
-        f"rates of turn      median {rates[len(rates) // 2]:.1f}, largest {rates[-1]:.1f} deg/s, by a readout of",
+        f"rotation rates     median {rates[len(rates) // 2]:.1f}, largest {rates[-1]:.1f} deg/s, by a readout of",
         *(f"{'':19}{each}" for each in said),
     ]
 
@@ -269,15 +269,15 @@ def _depths(solution: Solution) -> list[str]:
 
 
 def _two_poses(solution: Solution) -> list[str]:
-    """A line on what formats with two poses a photo cannot say of motions that are not steady."""
+    """A line on what formats with two poses per photo cannot express of motions that are not steady."""
     left = solution.quality.get("rs_poses_px")
     if left is None:
         return []
-    return [f"rs-poses           motions are not steady: two poses a photo are off by up to {left:.1f} px"]
+    return [f"rs-poses           motions are not steady: two poses per photo are off by up to {left:.1f} px"]
 
 
 def _held_out(quality: Mapping[str, Any]) -> list[str]:
-    """A line on how well each rung of the ladder foretold measurements that it was not fitted to."""
+    """A line on how well each model of the sequence predicts measurements that it was not fitted to."""
     said, unit = [], " standard errors"
     for model, error in quality["held_out_error"].items():
         gain = quality["held_out_gain"].get(model)

@@ -11,10 +11,10 @@ from .terminal import tell
 @click.command()
 @click.argument("shell", type=click.Choice(("bash", "zsh", "fish")))
 def command(shell: str) -> None:
-    """Print what makes a shell complete commands and options.
+    """Print the script that lets a shell complete commands and options.
 
-    For bash, in ~/.bashrc: eval "$(rsundistort completion bash)"; for zsh likewise in ~/.zshrc; for fish: rsundistort
-    completion fish > ~/.config/fish/completions/rsundistort.fish
+    For bash, put eval "$(rsundistort completion bash)" into ~/.bashrc; for zsh, the same with zsh into ~/.zshrc. For
+    fish, run rsundistort completion fish > ~/.config/fish/completions/rsundistort.fish
     """
     from .main import cli
 

@@ -16,10 +16,18 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("out", type=click.Path(path_type=Path))
-@click.option("--truth", type=click.Path(path_type=Path), required=True, help="ground_truth.json.")
-@click.option("--poses", type=click.Path(path_type=Path), help="A solution to take the true poses from.")
-@click.option("--twins", type=click.Path(path_type=Path), help="Global-shutter photos. Default: global/ by the truth.")
-@click.option("--raw", type=click.Path(path_type=Path), help="Photos before. Default: photos/ by the truth.")
+@click.option("--truth", type=click.Path(path_type=Path), required=True, help="ground_truth.json of the simulation.")
+@click.option("--poses", type=click.Path(path_type=Path), help="Solution whose poses are used as the true ones.")
+@click.option(
+    "--twins",
+    type=click.Path(path_type=Path),
+    help="Folder of the global-shutter references. By default global/ beside the truth.",
+)
+@click.option(
+    "--raw",
+    type=click.Path(path_type=Path),
+    help="Folder of the rolling-shutter photos. By default photos/ beside the truth.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 @opt.quiet_option
 def command(
@@ -31,7 +39,7 @@ def command(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Compare the outputs of a run, in the folder OUT, with the truth."""
+    """Compare the outputs of a run in OUT with the ground truth of a simulation."""
     with errors_for_people(), progress_bars(Talk(quiet, as_json=as_json)) as progress:
         from rsundistort.analysis import evaluate
 
@@ -52,8 +60,8 @@ def _text(result: Evaluation) -> str:
         if errors is not None:
             rows.append((label, f"{errors.mean:.4f}", f"{errors.median:.4f}", f"{errors.max:.4f}"))
     for likeness, label in (
-        (result.psnr_before_db, "raw against twin, dB"),
-        (result.psnr_db, "rectified against twin, dB"),
+        (result.psnr_before_db, "raw against reference, dB"),
+        (result.psnr_db, "rectified against reference, dB"),
     ):
         if likeness is not None:
             rows.append((label, "", f"{likeness.median:.2f}", f"{likeness.min:.2f}"))

@@ -13,7 +13,7 @@ from .terminal import Talk, errors_for_people, progress_bars, table, tell
 
 @click.group()
 def command() -> None:
-    """Repeat the paper's experiments, with its methods and ours."""
+    """Repeat the experiments of the paper, with its methods and with those of this project."""
 
 
 @command.command()
@@ -21,25 +21,28 @@ def command() -> None:
 @opt.out_option
 @opt.gathered(
     "given",
-    click.option("--trials", type=click.IntRange(min=1), default=100, show_default=True, help="Trials a scene."),
+    click.option(
+        "--trials", type=click.IntRange(min=1), default=100, show_default=True, help="Number of trials per scene."
+    ),
     click.option(
         "--motion",
         type=click.Choice(("both", "rotation")),
         default="both",
         show_default=True,
-        help="Rotation and translation as in the paper, or rotation only.",
+        help="Simulated motion: rotation and translation, as in the paper, or rotation only.",
     ),
-    click.option("--method", "methods", multiple=True, metavar="NAME", help="Only this method; may be repeated."),
+    click.option("--method", "methods", multiple=True, metavar="NAME", help="Run this method only. May be repeated."),
     opt.seed_option,
     opt.jobs_option,
 )
 @opt.quiet_option
 def one(scenes: tuple[Path, ...], out: Path, given: dict[str, Any], quiet: bool) -> None:
-    """Bundle adjustment of synthetic measurements of SCENES (.npz, COLMAP models, outputs of runs).
+    """Compare methods of bundle adjustment on synthetic measurements.
 
-    OUT gets trials.jsonl, summary.json, summary.csv and histograms.png; trials that it already holds are not repeated.
+    SCENES are .npz files, COLMAP models or folders of runs. The command writes trials.jsonl, summary.json, summary.csv
+    and histograms.png. Trials that OUT already holds are not repeated.
     """
-    with errors_for_people("the same command goes on where it was"), progress_bars(Talk(quiet)) as progress:
+    with errors_for_people("the same command continues"), progress_bars(Talk(quiet)) as progress:
         from rsundistort.experiments import OneOptions, experiment_one
 
         if given.pop("motion", None) == "rotation":
@@ -68,7 +71,7 @@ def one(scenes: tuple[Path, ...], out: Path, given: dict[str, Any], quiet: bool)
         type=click.Choice(("auto", "constant-motion", "rotation", "linearized", "two-step")),
         default="auto",
         show_default=True,
-        help="How the shutter of SWUNG is modelled, as in run.",
+        help="Model of the shutter of the photos in SWUNG, as for `run`.",
     ),
     opt.seed_option,
     opt.jobs_option,
@@ -76,11 +79,11 @@ def one(scenes: tuple[Path, ...], out: Path, given: dict[str, Any], quiet: bool)
 )
 @opt.quiet_option
 def two(still: Path, swung: Path, out: Path, given: dict[str, Any], quiet: bool) -> None:
-    """Camera positions of real photos taken in motion, against those of photos taken still.
+    """Compare camera positions of real photos taken in motion with those of photos taken at rest.
 
-    STILL and SWUNG are folders of photos with the same names, each pair taken from one place by one camera. OUT gets
-    the outputs of three runs (still/, swung/ and, without a shutter model, swung-global/), summary.json, photos.csv
-    and paths.png.
+    STILL and SWUNG are folders of photos with the same names. Both photos of a pair are taken from one place by one
+    camera. The command writes the outputs of three runs (still/, swung/ and, without a shutter model, swung-global/),
+    summary.json, photos.csv and paths.png.
     """
     with errors_for_people(), progress_bars(Talk(quiet)) as progress:
         from rsundistort.experiments import TwoOptions, experiment_two
@@ -91,20 +94,20 @@ def two(still: Path, swung: Path, out: Path, given: dict[str, Any], quiet: bool)
 
 
 def _comparison(summary: dict[str, Any], out: Path) -> str:
-    """Errors with and without the shutter model, and which photos were joined."""
+    """Errors with and without the shutter model, and the photos that were not registered."""
     rows = [["", "mean", "median", "worst"]]
     for label, metric in (("position error, baselines", "position"), ("rotation error, deg", "rotation_deg")):
         for kind in ("without", "with"):
             v = summary[f"{kind}_shutter_model"][metric]
             numbers = (f"{v[part]:.4f}" for part in ("mean", "median", "max"))
             rows.append([f"{label}, {kind} a shutter model", *numbers])
-    joined = ", ".join(f"{key} {count}" for key, count in summary["registered"].items())
+    counts = ", ".join(f"{key} {count}" for key, count in summary["registered"].items())
     lines = [
         table(rows),
         "",
         f"shutter model      {summary['shutter_model']}",
-        f"photos registered  {joined} of {summary['photos']}; {summary['compared']} compared",
+        f"photos registered  {counts} of {summary['photos']}; {summary['compared']} compared",
     ]
     for key, lost in summary["not_registered"].items():
-        lines += [f"  {key}: {name} not joined: {reason}" for name, reason in lost.items()]
+        lines += [f"  {key}: {name} not registered: {reason}" for name, reason in lost.items()]
     return "\n".join([*lines, f"outputs            {out}"])

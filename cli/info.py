@@ -18,7 +18,7 @@ _OURS = ("dev", "docs")
 @click.command()
 @opt.json_option
 def command(as_json: bool) -> None:
-    """Versions, threads and optional parts."""
+    """Show versions, threads and optional parts."""
     with errors_for_people():
         from rsundistort.batch import use_threads
         from rsundistort.versions import versions

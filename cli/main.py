@@ -12,17 +12,17 @@ from .terminal import SOME_FAILED, forget_stdout, stdout_is_lost, warnings_for_p
 
 # name: one line for the list of commands; the command itself is in the module of that name
 _COMMANDS = {
-    "run": "Photos in, rectified photos and camera poses out.",
-    "solve": "A COLMAP model in, the same without the shutter out.",
-    "readout": "How long a camera takes to read a frame, from a video.",
-    "rectify": "Rectify a folder of photos with a solution.",
-    "analyze": "Whether poses let the shutter be told from the scene's shape.",
-    "simulate": "Photos with a known shutter motion.",
-    "evaluate": "Errors of a run against the truth.",
-    "experiment": "The paper's experiments, on any scene.",
-    "report": "The report of a run again, or its figures for papers.",
-    "info": "Versions, threads and optional parts.",
-    "completion": "What makes a shell complete commands and options.",
+    "run": "Rectify photos or a video, and find the camera poses.",
+    "solve": "Do the same from a model of COLMAP or another program.",
+    "readout": "Measure the readout time of a camera from a video.",
+    "rectify": "Rectify a folder of photos with known motions.",
+    "analyze": "Check whether camera poses are near a critical motion.",
+    "simulate": "Make photos with a known shutter motion.",
+    "evaluate": "Compare the outputs of a run with the truth.",
+    "experiment": "Repeat the experiments of the paper on any scene.",
+    "report": "Write the report of a run again, or figures for papers.",
+    "info": "Show versions, threads and optional parts.",
+    "completion": "Print the completion script of a shell.",
 }
 
 
@@ -59,7 +59,7 @@ class _LazyGroup(click.Group):
 @click.version_option(package_name="rsundistort")
 @click.pass_context
 def cli(context: click.Context) -> None:
-    """Take the rolling shutter out of photos, and find where they were taken from.
+    """Remove rolling-shutter distortion from photos and videos, and find the camera poses.
 
     Start with: rsundistort run PHOTOS -o OUT
     """

@@ -73,24 +73,27 @@ Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 photos_argument: Decorator = click.argument("photos", type=LocalPath(path_type=Path))
 out_option: Decorator = click.option(
-    "-o", "--out", type=LocalPath(path_type=Path), required=True, help="Folder for the outputs."
+    "-o", "--out", type=LocalPath(path_type=Path), required=True, help="Folder that the outputs are written to."
 )
 camera_option: Decorator = click.option(
     "--camera",
     metavar="FILE|FOLDER|NUMBERS",
-    help="camera.json, cameras.json, OpenCV or ROS calibration, COLMAP cameras, a text file with the 3x3 matrix K, a "
-    "folder of such files named by group, or fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]. "
-    "Default: camera.json or cameras.json in or beside PHOTOS, else EXIF, else the focal length that the photos show.",
+    help="Calibration of the camera: camera.json, cameras.json, a calibration of OpenCV or ROS, COLMAP cameras, a text "
+    "file with the 3x3 matrix K, a folder of such files named by group, or fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]. "
+    "By default it is camera.json or cameras.json in or beside PHOTOS, else EXIF, else the focal length that the "
+    "photos show.",
 )
 readout_option: Decorator = click.option(
     "--readout", type=click.Choice(READOUT_NAMES), help="Direction of the readout in the stored pixels."
 )
-seed_option: Decorator = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+seed_option: Decorator = click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all random draws."
+)
 jobs_option: Decorator = click.option(
-    "--jobs", type=click.IntRange(min=0), default=0, help="Threads; 0, the default, takes all cores."
+    "--jobs", type=click.IntRange(min=0), default=0, help="Number of threads. 0, the default, uses all cores."
 )
 overwrite_option: Decorator = click.option(
-    "--overwrite", is_flag=True, help="Replace what rsundistort wrote in OUT; other files stay."
+    "--overwrite", is_flag=True, help="Replace the files that rsundistort wrote in OUT. Other files stay."
 )
 
 
@@ -108,7 +111,7 @@ def check_resume(given: dict[str, Any]) -> None:
 scheduler_option: Decorator = click.option(
     "--scheduler",
     metavar="ADDRESS",
-    help="Work on photos by the workers of the Dask cluster at tcp://host:8786; they see PHOTOS and OUT "
+    help="Process the photos on the workers of a Dask cluster (tcp://host:8786). The workers must see PHOTOS and OUT "
     "under the same paths or URLs.",
 )
 progress_option: Decorator = click.option(
@@ -117,31 +120,33 @@ progress_option: Decorator = click.option(
     type=click.Choice(("bar", "json")),
     default="bar",
     show_default=True,
-    help="json: lines on stdout for other programs, and nothing else there.",
+    help="Form of the progress. json prints JSON lines, and nothing else, on stdout, for other programs.",
 )
 json_option: Decorator = click.option(
-    "--json", "as_json", is_flag=True, help="One JSON object on stdout at the end, instead of what is for people."
+    "--json", "as_json", is_flag=True, help="Print one JSON object at the end instead of the closing table."
 )
-quiet_option: Decorator = click.option("-q", "--quiet", is_flag=True, help="Nothing but warnings and errors.")
+quiet_option: Decorator = click.option("-q", "--quiet", is_flag=True, help="Print warnings and errors only.")
 verbose_option: Decorator = click.option(
-    "-v", "--verbose", is_flag=True, help="A line for each step, also where stderr is no terminal."
+    "-v", "--verbose", is_flag=True, help="Print a line for each step, even if stderr is not a terminal."
 )
 quality_option: Decorator = click.option(
-    "--quality", type=click.IntRange(1, 100), default=98, show_default=True, help="Of JPEG and WebP."
+    "--quality", type=click.IntRange(1, 100), default=98, show_default=True, help="Quality of JPEG and WebP."
 )
 raw_as_option: Decorator = click.option(
     "--raw-as",
     type=click.Choice(("tif", "jpg", "png")),
     default="tif",
     show_default=True,
-    help="What RAW and HEIC are written as; jpg has 8 bits, the others 16.",
+    help="Format in which RAW and HEIC photos are written. jpg has 8 bits, the others have 16.",
 )
 apply_orientation_option: Decorator = click.option(
     "--apply-orientation",
     is_flag=True,
-    help="Turn photos, masks, cameras and poses by the EXIF orientation, which otherwise is carried along.",
+    help="Rotate photos, masks, cameras and poses by the EXIF orientation. By default the tag is copied instead.",
 )
-again_option: Decorator = click.option("--again", is_flag=True, help="Take photos that are rectified already.")
+again_option: Decorator = click.option(
+    "--again", is_flag=True, help="Accept photos that rsundistort has rectified before."
+)
 max_pixels_option: Decorator = click.option(
     "--max-pixels",
     "max_megapixels",
@@ -149,32 +154,37 @@ max_pixels_option: Decorator = click.option(
     default=250.0,
     show_default=True,
     metavar="MILLIONS",
-    help="Photos with more pixels are left out: a small file can claim to be a huge picture.",
+    help="Leave out photos with more pixels. (A small file can claim to be a huge picture.)",
 )
 depth_option: Decorator = click.option(
     "--depth",
     metavar="auto|infinity|plane|points|DIR",
     default="auto",
     show_default=True,
-    help="How far away what the photos show is, which matters where the camera travelled during the readout: on a "
-    "plane, as the known points, or as maps of your own (a.npy, .npz or float .tif for a.jpg: docs/depth.md).",
+    help="Depth of the scene. It matters if the camera travelled during the readout. plane: a plane through the scene; "
+    "points: interpolated between the reconstructed points; DIR: depth maps of your own (a.npy, .npz or float .tif for "
+    "a.jpg, see docs/depth.md).",
 )
 maps_option: Decorator = click.option(
     "--maps",
     type=click.Choice(MAP_KIND_NAMES),
-    help="Write each photo's map and its inverse into OUT/maps: NumPy (npz), OpenEXR in pixels, or the ST map of "
-    "compositing programs (extra exr).",
+    help="Write the map of each photo and its inverse into OUT/maps, as NumPy arrays (npz), as OpenEXR in pixels "
+    "(exr), or as the ST map of compositing programs (stmap). exr and stmap need the extra exr.",
 )
 also_option: Decorator = click.option(
     "--also",
     multiple=True,
     metavar="FOLDER[=INTERPOLATION]",
     callback=also_folders,
-    help="Rectify other images of the same frames alike (a.png for a.jpg): labels, depth, near infrared; by nearest, "
-    "which makes up no values, or as told. May be repeated.",
+    help="Rectify other images of the same frames with the same maps (a.png for a.jpg), such as labels, depth or near "
+    "infrared. The default interpolation is nearest, which invents no values. May be repeated.",
 )
 interpolation_option: Decorator = click.option(
-    "--interpolation", type=click.Choice(INTERPOLATION_NAMES), default="cubic", show_default=True
+    "--interpolation",
+    type=click.Choice(INTERPOLATION_NAMES),
+    default="cubic",
+    show_default=True,
+    help="Interpolation of the rectified photos.",
 )
 
 
@@ -221,18 +231,22 @@ PHOTO_OPTIONS: tuple[Decorator, ...] = (
         "--alpha",
         metavar="keep|0..1",
         callback=view_alpha,
-        help="keep: K and size of the raw photos; 0: no empty pixel in any photo of a camera; 1: every pixel of "
-        "all of them is kept; between: between. Default: keep, or as the solution has it.",
+        help="View of the rectified photos. keep: K and size of the raw photos; 0: no photo of a camera has an empty "
+        "pixel; 1: every pixel of all its photos is kept; numbers between are views between these. By default keep, or "
+        "the view of the solution.",
     ),
     click.option(
         "--scale",
         type=click.FloatRange(min=0, min_open=True),
         default=1.0,
         show_default=True,
-        help="Size of the rectified photos in that of the raw ones; what shrinks is averaged.",
+        help="Size of the rectified photos relative to the raw ones. Photos that shrink are averaged.",
     ),
     click.option(
-        "--max-size", type=click.IntRange(min=2), metavar="PIXELS", help="Longest side of the rectified photos."
+        "--max-size",
+        type=click.IntRange(min=2),
+        metavar="PIXELS",
+        help="Largest width or height of the rectified photos.",
     ),
     interpolation_option,
     quality_option,

@@ -27,13 +27,15 @@ _measure_options = opt.gathered(
     click.option(
         "--readout-ms",
         type=click.FloatRange(min=0, min_open=True),
-        help="A readout time that is known to 2 %, to start from. It is measured only if the video tells it better.",
+        help="A readout time in milliseconds that is known to 2 %. The result differs from it only if the video is "
+        "more exact.",
     ),
     click.option(
         "--gyro",
         type=click.Path(exists=True, dir_okay=False, path_type=Path),
         metavar="FILE",
-        help="A gyroscope's log, as `run` takes it. Its axes and its clock are found. Default: the log in the video.",
+        help="Log of a gyroscope, as for `run`. Its axes and its clock offset are estimated. By default the log in the "
+        "video.",
     ),
     opt.seed_option,
     opt.jobs_option,
@@ -45,12 +47,12 @@ _measure_options = opt.gathered(
 @_measure_options
 @opt.talk_options
 def command(video: Path, given: dict[str, Any], talk: Talk) -> None:
-    """Measure how long the camera takes to read a frame, from a video that it took. Nothing is written.
+    """Measure the readout time of a camera from a video that it took. Nothing is written.
 
-    VIDEO is any clip of a scene at rest. The camera should have shaken, turned or walked. It must not have stabilised
-    the video.
+    VIDEO is any clip of a static scene. The camera should shake, rotate or travel. Its video stabilisation must be
+    off.
 
-    Exit code 3 says that the video does not tell the readout time, and why.
+    Exit code 3 means that the readout time cannot be measured from this video. The reason is printed.
     """
     with errors_for_people() as warned, progress_bars(talk) as progress:
         from rsundistort.input import GyroOptions
@@ -75,5 +77,5 @@ def _lines(found: MeasuredReadout) -> list[str]:
 
     facts = [*readout_facts(found.evidence), ("frames", str(found.evidence["frames"]))]
     if found.problem:
-        facts[0] = ("readout time", f"not told: {found.problem}")
+        facts[0] = ("readout time", f"not measured: {found.problem}")
     return [part for label, text in facts for part in fitted(f"{label:<19}{text}")]

@@ -8,39 +8,44 @@ from typing import Any
 import click
 
 from . import options as opt
+from .sections import Sectioned
 from .terminal import Talk, errors_for_people, list_failed, progress_bars, say_json, tell
 
 
-@click.command()
+@click.command(cls=Sectioned)
 @click.argument("photos", type=opt.PathOrUrl(path_type=Path))
 @click.option(
     "--solution",
     type=opt.LocalPath(path_type=Path),
     required=True,
-    help="solution.json, or a ground-truth file.",
+    help="solution.json of a run, or ground_truth.json of a simulation.",
 )
 @click.option(
-    "-o", "--out", type=opt.PathOrUrl(path_type=Path), required=True, help="Folder for the outputs, or its URL."
+    "-o",
+    "--out",
+    type=opt.PathOrUrl(path_type=Path),
+    required=True,
+    help="Folder or URL that the outputs are written to.",
 )
 @opt.gathered(
     "given",
     click.option(
         "--masks",
         type=opt.PathOrUrl(exists=True, file_okay=False, path_type=Path),
-        help="Folder of masks, a.png for a.jpg: what is black in them is black in OUT/masks.",
+        help="Folder of masks (a.png for a.jpg). Their black pixels are black in OUT/masks.",
     ),
     *opt.PHOTO_OPTIONS,
     opt.jobs_option,
     opt.scheduler_option,
     opt.overwrite_option,
-    opt.resume_option("Go on with the batch in OUT: pass over what is whole and current, make the rest."),
+    opt.resume_option("Continue an interrupted batch. Outputs in OUT that are complete and current are kept."),
 )
 @opt.talk_options
 def command(photos: Path | str, solution: Path, out: Path | str, given: dict[str, Any], talk: Talk) -> None:
     """Rectify the photos of a folder with the motions of a solution.
 
-    PHOTOS, OUT and the masks are folders, by path or by a URL that fsspec knows (s3://bucket/folder, gs://...).
-    Exit code 3 says that some photos failed; they are listed, and the others are done.
+    PHOTOS, OUT and the masks are folders, given by path or by a URL that fsspec supports (s3://bucket/folder,
+    gs://...). Exit code 3 means that some photos failed. They are listed, and all others are complete.
     """
     opt.check_resume(given)
     with errors_for_people(opt.GOES_ON) as warned, progress_bars(talk) as progress:
@@ -50,7 +55,7 @@ def command(photos: Path | str, solution: Path, out: Path | str, given: dict[str
         options = opt.rectify_options(given)
         solved, left_out = rectify_folder(photos, solution, out, options, progress=progress, **given)
         count = len(sizes_under(place_of(out), ["images"]))
-    # of photos that the solution could not join it says so itself
+    # the solution itself names the photos that it could not register
     known = {image.name for image in solved.images if not image.registered}
     failed = {name: why for name, why in left_out.items() if name not in known}
     if talk.as_json:

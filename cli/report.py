@@ -16,21 +16,21 @@ from .terminal import Talk, errors_for_people, progress_bars, tell
     "--photos",
     type=click.Path(path_type=Path),
     metavar="DIR",
-    help="Folder of the original photos. Default: where it was, seen from OUT.",
+    help="Folder of the original photos. By default where it was during the run, relative to OUT.",
 )
 @click.option(
     "--figures",
     type=click.Path(path_type=Path),
     metavar="DIR",
-    help="Write figures for papers into DIR instead, as PNG and PDF: the models, the displacement fields, the paths of "
-    "the cameras and the sphere of the critical motion.",
+    help="Write figures for papers into DIR instead, as PNG and PDF: shutter models, displacement fields, camera paths "
+    "and the sphere of the critical motion.",
 )
 @opt.jobs_option
 @opt.quiet_option
 def command(out: Path, photos: Path | None, figures: Path | None, jobs: int, quiet: bool) -> None:
-    """Write OUT/report.html from what a run left in the folder OUT.
+    """Write OUT/report.html again from the outputs of a run in OUT.
 
-    What is missing, such as photos that were moved, is said, and the rest is shown.
+    The report names what is missing, such as photos that were moved, and shows the rest.
     """
     with errors_for_people(), progress_bars(Talk(quiet)) as progress:
         from rsundistort.report import write_figures, write_report

@@ -9,6 +9,7 @@ import click
 
 from . import options as opt
 from .closing import close
+from .sections import Sectioned
 from .solve_options import parts_of, solve_options
 from .terminal import Talk, errors_for_people, progress_bars
 
@@ -23,45 +24,53 @@ _measure_options = opt.gathered(
         type=click.Choice(opt.FRAMES_NAMES),
         default="key",
         show_default=True,
-        help="Of a video: rectify its key frames, into images/; or all frames as well, into video.mp4.",
+        help="Frames of a video that are rectified. key: the key frames, into images/; all: every frame as well, into "
+        "video.mp4.",
     ),
     click.option(
         "--every",
         type=click.IntRange(min=1),
         metavar="N",
-        help="Of a video: take each N-th frame as a photo by itself; the frames then share no path,",
+        help="Use each N-th frame of a video as a single photo. These photos share no path of the camera.",
     ),
-    click.option("--sharpest", type=click.IntRange(min=1), metavar="N", help="or the sharpest of each N frames."),
+    click.option(
+        "--sharpest",
+        type=click.IntRange(min=1),
+        metavar="N",
+        help="Use the sharpest of each N frames of a video as a single photo.",
+    ),
     click.option(
         "--gyro",
         type=click.Path(exists=True, dir_okay=False, path_type=Path),
         metavar="FILE",
-        help="A gyroscope's log: CSV with time_s, wx, wy, wz in rad/s, or Gyroflow's .gcsv.",
+        help="Log of a gyroscope: CSV with time_s, wx, wy, wz in rad/s, a .gcsv file of Gyroflow, or a video of a "
+        "GoPro.",
     ),
     click.option(
         "--gyro-offset",
         type=float,
         default=0.0,
         metavar="S",
-        help="Seconds that the gyroscope's clock shows when the camera's shows zero.",
+        help="Time in seconds on the gyroscope's clock when the camera's clock shows zero.",
     ),
     click.option(
         "--gyro-axes",
         metavar="XYZ",
-        help="Axes of the gyroscope that point right, down and ahead in the stored pixels; small letters are reversed.",
+        help="Axes of the gyroscope that point right, down and ahead in the stored pixels. Small letters stand for "
+        "reversed axes.",
     ),
     click.option(
         "--photo-times",
         type=click.Path(exists=True, dir_okay=False, path_type=Path),
         metavar="CSV",
-        help="When photos were taken, for --gyro: name, time_s. Default: frames.csv among them.",
+        help="Times at which the photos were taken, for --gyro: name, time_s. By default frames.csv among the photos.",
     ),
     click.option(
         "--max-features",
         type=click.IntRange(min=100),
         default=8192,
         show_default=True,
-        help="Features of a photo, the largest.",
+        help="Largest number of features of a photo.",
     ),
     click.option(
         "--feature-megapixels",
@@ -69,37 +78,37 @@ _measure_options = opt.gathered(
         default=1.0,
         show_default=True,
         metavar="MP",
-        help="Larger photos are shrunk to this to find their features.",
+        help="Size in megapixels at which features are detected. Larger photos are shrunk for it.",
     ),
     click.option(
         "--matching",
         type=click.Choice(opt.MATCHING_NAMES),
         default="auto",
         show_default=True,
-        help="Photos matched with each other: all; neighbours in order of capture, by GPS or in looks; auto: these "
-        "beyond more than 60.",
+        help="Photos that are matched with each other. exhaustive: all pairs; neighbours: neighbours in order of "
+        "capture, by GPS or by appearance; auto: exhaustive up to 60 photos, else neighbours.",
     ),
 )
 
 
-@click.command()
+@click.command(cls=Sectioned)
 @opt.photos_argument
 @opt.out_option
 @_measure_options
 @solve_options
 @opt.talk_options
 def command(photos: Path, out: Path, measuring: dict[str, Any], given: dict[str, Any], talk: Talk) -> None:
-    """Find how the camera moved during each photo's readout, and take it out.
+    """Estimate the camera motion during the readout of each photo, and rectify the photos.
 
-    PHOTOS is a folder of photos that one camera took of one scene, in any order, or a video. OUT gets images/, masks/,
-    sparse/ (COLMAP), transforms.json (nerfstudio), solution.json and report.html.
+    PHOTOS is a folder of photos of one scene, in any order, or a video. The command writes images/, masks/, sparse/
+    (COLMAP), transforms.json (nerfstudio), solution.json and report.html into OUT.
 
-    The frames of a video share one path of the camera. Its key frames are the photos. OUT gets frames/ (these, as they
-    were) and path.csv (pose, velocity and turn at every frame), too.
+    The frames of a video share one path of the camera, and its key frames are used as the photos. The command also
+    writes frames/ (the original key frames) and path.csv (pose, velocity and rotation rate of every frame).
 
-    OUT stays as it was until the motions are solved. After an interruption, whatever it was, the same command with
-    --resume goes on. Exit code 3 says that photos with a motion could not be rectified, or that the report could not be
-    written; they are listed, and the rest is done.
+    Nothing in OUT changes until the motions are solved. After an interruption, the same command with --resume
+    continues. Exit code 3 means that some photos could not be rectified, or that the report could not be written. They
+    are listed, and everything else is complete.
     """
     with errors_for_people(opt.GOES_ON) as warned, progress_bars(talk) as progress:
         from rsundistort.input import GyroOptions

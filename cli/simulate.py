@@ -13,7 +13,7 @@ from .terminal import Talk, errors_for_people, progress_bars, table, tell
 
 @click.group()
 def command() -> None:
-    """Make photos with a known shutter motion, and the truth to judge results by."""
+    """Make photos with a known shutter motion, and the truth to compare results with."""
 
 
 @command.command()
@@ -29,26 +29,27 @@ def command() -> None:
         type=click.FloatRange(min=0),
         default=0.05,
         show_default=True,
-        help="Standard deviation of the rotation over the frame, radians.",
+        help="Standard deviation of the rotation over a frame, in radians.",
     ),
     click.option(
         "--motion",
         type=click.Path(path_type=Path),
-        help="JSON {name: [phi1, phi2, phi3]} in radians per unit of the clock, instead of random motion; or rotations "
-        "by row: CSV with name, row, rx, ry, rz, or JSON {name: {row: [...], rotation: [[rx, ry, rz], ...]}}.",
+        help="File of motions instead of random ones: JSON {name: [phi1, phi2, phi3]} in radians per unit of the "
+        "clock; or rotations by row, as CSV with name, row, rx, ry, rz, or as JSON {name: {row: [...], rotation: "
+        "[[rx, ry, rz], ...]}}.",
     ),
     click.option(
         "--acceleration",
         type=click.FloatRange(min=0),
         default=0.0,
         show_default=True,
-        help="Standard deviation of what the rate of turn changes by over half a frame, as a share of itself.",
+        help="Standard deviation of the change of the rotation rate over half a frame, as a fraction of the rate.",
     ),
     click.option(
         "--vibration",
         type=click.FloatRange(min=0),
         metavar="MRAD",
-        help="Amplitude of a vibration, on top of the motion.",
+        help="Amplitude of a vibration that is added to the motion.",
     ),
     click.option(
         "--vibration-periods",
@@ -57,7 +58,7 @@ def command() -> None:
         nargs=2,
         default=(2.0, 5.0),
         show_default=True,
-        help="Periods of the vibration a frame: drawn between these.",
+        help="Range of the vibration's periods per frame; the number is drawn from it.",
     ),
     click.option(
         "--vibration-axis",
@@ -65,29 +66,30 @@ def command() -> None:
         type=click.Choice(["random", "x", "y", "z"]),
         default="random",
         show_default=True,
-        help="Axis of the camera that it turns about.",
+        help="Axis of the camera about which the vibration rotates it.",
     ),
     click.option(
         "--gyro",
         type=click.Path(path_type=Path),
-        help="Stretches of a gyroscope's log instead of random motion: CSV with time_s, wx, wy, wz, or Gyroflow's "
-        ".gcsv.",
+        help="Log of a gyroscope, of which random parts are used as motions: CSV with time_s, wx, wy, wz, or a .gcsv "
+        "file of Gyroflow.",
     ),
     click.option(
         "--gyro-axes",
         metavar="XYZ",
-        help="Axes of the gyroscope that point right, down and ahead in the stored pixels; small letters are reversed.",
+        help="Axes of the gyroscope that point right, down and ahead in the stored pixels. Small letters stand for "
+        "reversed axes.",
     ),
     click.option(
         "--readout-ms",
         type=click.FloatRange(min=0, min_open=True),
-        help="How long a frame is read, in the time of --gyro. Default: what the log says.",
+        help="Readout time of a frame in milliseconds, for --gyro. By default it is taken from the log.",
     ),
-    click.option("--still", multiple=True, metavar="NAME", help="A photo that does not move."),
+    click.option("--still", multiple=True, metavar="NAME", help="A photo that does not move. May be repeated."),
     click.option(
         "--crop",
         is_flag=True,
-        help="Cut all photos to the largest rectangle that every one fills, and the originals alike into global/.",
+        help="Crop all photos to the largest rectangle that every one fills, and the originals likewise into global/.",
     ),
     opt.quality_option,
     opt.seed_option,
@@ -98,9 +100,9 @@ def command() -> None:
 def warp(photos: Path, out: Path, given: dict[str, Any], quiet: bool) -> None:
     """Warp real photos as if a rotating camera had taken them.
 
-    OUT gets photos/, masks/ (what the originals hold), camera.json and ground_truth.json; with --crop also global/,
-    and camera and truth of the cut photos. --sigma is of the whole frame, also with --crop, and so is what is not
-    steady.
+    The command writes photos/, masks/ (pixels that the originals cover), camera.json and ground_truth.json. With --crop
+    it also writes global/, and camera.json and ground_truth.json describe the cropped photos. --sigma, --acceleration
+    and --vibration always refer to the whole frame.
     """
     with errors_for_people(), progress_bars(Talk(quiet)) as progress:
         from rsundistort.io import read_gyro
@@ -135,10 +137,11 @@ def warp(photos: Path, out: Path, given: dict[str, Any], quiet: bool) -> None:
 )
 @opt.quiet_option
 def scene(recipe: Path, out: Path, given: dict[str, Any], quiet: bool) -> None:
-    """Render the rolling-shutter photos of a scene, with everything that is true about them.
+    """Render rolling-shutter photos or a video of a scene, with the ground truth.
 
-    OUT gets photos/ (or clip.mp4, if the recipe's path is that of a video), global/ (the twins), depth/, global-depth/,
-    tracks.npz, camera.json (cameras.json if there are several), ground_truth.json and the recipe.
+    The command writes photos/ (or clip.mp4, if the recipe describes a video), global/ (the global-shutter references),
+    depth/, global-depth/, tracks.npz, camera.json (cameras.json if there are several), ground_truth.json and the
+    recipe.
     """
     with errors_for_people(), progress_bars(Talk(quiet)) as progress:
         from rsundistort.simulate import SceneOptions, simulate_scene

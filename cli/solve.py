@@ -9,36 +9,37 @@ import click
 
 from . import options as opt
 from .closing import close
+from .sections import Sectioned
 from .solve_options import parts_of, solve_options
 from .terminal import Talk, errors_for_people, progress_bars
 
 
-@click.command()
+@click.command(cls=Sectioned)
 @click.argument("model", type=opt.LocalPath(path_type=Path))
 @opt.out_option
 @click.option(
     "--images",
     type=opt.LocalPath(exists=True, file_okay=False, path_type=Path),
-    help="Folder of the photos that the model names; without it none are rectified.",
+    help="Folder of the photos that the model names. Without it no photo is rectified.",
 )
 @click.option(
     "--database",
     type=click.Path(path_type=Path),
     metavar="DB",
-    help="COLMAP's database behind the model: matches in it that the shutter spoiled are tried again with the motions "
-    "found, and the tracks rebuilt.",
+    help="COLMAP database of the model. Matches that were rejected because of the shutter are verified again with the "
+    "estimated motions, and the tracks are rebuilt.",
 )
 @solve_options
 @opt.talk_options
 def command(
     model: Path, out: Path, images: Path | None, database: Path | None, given: dict[str, Any], talk: Talk
 ) -> None:
-    """Find how the camera moved during each photo's readout, from a model of another program.
+    """Estimate the camera motion during the readout of each photo from a model of another program.
 
-    MODEL is the folder of a COLMAP model, text or binary, OpenMVG's sfm_data.json, OpenSfM's reconstruction.json with
-    tracks.csv beside it, an OPF project, or Metashape's cameras.xml, for which the photos are measured. OUT gets what
-    `rsundistort run` writes; images/ and masks/ if --images says where the photos are. Cameras of the model are the
-    groups of --readout: --readout "camera 1=left-to-right".
+    MODEL is the folder of a COLMAP model (text or binary), sfm_data.json of OpenMVG, reconstruction.json of OpenSfM
+    with tracks.csv beside it, an OPF project, or cameras.xml of Metashape. Metashape's file has no measurements: the
+    photos are measured again. The command writes what `rsundistort run` writes; images/ and masks/ need --images. The
+    cameras of the model are the groups of --readout, as in --readout "camera 1=left-to-right".
     """
     with errors_for_people(opt.GOES_ON) as warned, progress_bars(talk) as progress:
         from rsundistort.solve import solve

@@ -32,13 +32,14 @@ solve_options = opt.gathered(
         multiple=True,
         metavar="[GROUP=]DIRECTION",
         callback=_readout_by_group,
-        help=f"Direction of the readout in the stored pixels: {', '.join(opt.READOUT_NAMES)}; of all photos, or of a "
-        "group (as the closing table names it). By default the camera file's, else guessed and settled by the photos.",
+        help=f"Direction of the readout in the stored pixels: {', '.join(opt.READOUT_NAMES)}. It applies to all "
+        "photos, or to one group, as the closing table names it. By default the direction is taken from the camera "
+        "file, or guessed and then decided by the measurements.",
     ),
     click.option(
         "--masks",
         type=opt.LocalPath(exists=True, file_okay=False, path_type=Path),
-        help="Folder of masks, a.png for a.jpg: what is black in them is not looked at, nor kept in OUT/masks.",
+        help="Folder of masks (a.png for a.jpg). Black pixels are not measured, and they are black in OUT/masks.",
     ),
     click.option(
         "--model",
@@ -46,68 +47,71 @@ solve_options = opt.gathered(
         type=click.Choice(("auto", "constant-motion", "rotation", "linearized", "two-step", "global")),
         default="auto",
         show_default=True,
-        help="How the shutter is modelled; auto is the model that foretells measurements held out from its fit.",
+        help="Model of the shutter. auto chooses the model that best predicts measurements held out from its fit.",
     ),
     click.option(
         "--refine",
         metavar="NAMES",
-        help="Intrinsics to solve for with the rest: some of f (or fx, fy), cx, cy, k1, k2, p1, p2, k3 (of a "
-        "fisheye k1 to k4) with commas between, or none. By default all, as far from a camera that was given, or from "
-        "EXIF's guess, as these usually are off.",
+        help="Intrinsics to refine: names among f (or fx, fy), cx, cy, k1, k2, p1, p2, k3 (of a fisheye k1 to k4), "
+        "with commas between them, or none. By default all are refined, with priors as wide as the usual errors of a "
+        "calibration or of EXIF.",
     ),
     click.option(
         "--camera-sigma",
         metavar="NAME=SIGMA,...",
-        help="How well the camera is known: standard deviations of some of f (or fx, fy), cx, cy in pixels, and of k1, "
-        "k2, k3, p1, p2. Default: the key sigma of camera.json, else what calibrations usually are off by.",
+        help="Standard deviations of the given intrinsics: of f (or fx, fy), cx and cy in pixels, and of k1, k2, k3, "
+        "p1 and p2. By default the key sigma of camera.json, else the usual error of a calibration.",
     ),
     click.option(
         "--still",
         "--anchor",
         multiple=True,
         metavar="NAME[=MRAD]",
-        help="A photo known not to have moved: its phi1, and where cameras travel its whole motion, is held at zero, "
-        "or near zero with so many mrad per frame of standard deviation. May be repeated.",
+        help="A photo that is known not to have moved. Its phi1, or its whole motion if the cameras travel, is "
+        "constrained to zero, or to zero with a standard deviation of MRAD per frame. May be repeated.",
     ),
     click.option(
         "--known",
         type=click.Path(exists=True, dir_okay=False, path_type=Path),
         metavar="CSV",
-        help="Motions known from elsewhere: name, phi1, phi2, phi3 (rad per frame; or omega1.. in rad/s) and sigma.",
+        help="Motions that are known from elsewhere: name, phi1, phi2, phi3 in rad per frame (or omega1, omega2, "
+        "omega3 in rad/s), and sigma.",
     ),
     click.option(
         "--lengths",
         "--length",
         type=click.Path(exists=True, dir_okay=False, path_type=Path),
         metavar="CSV",
-        help="Lengths measured in the scene, two or more: photo1, x1, y1, photo2, x2, y2, length, sigma.",
+        help="Two or more lengths that were measured in the scene: photo1, x1, y1, photo2, x2, y2, length, sigma.",
     ),
     click.option(
         "--crs",
         metavar="CRS",
-        help="Frame of poses and points: local, metres east, north and up by the photos' GPS; EPSG:..., a "
-        "projected one in metres; none, one of their own. Default: local where three photos' GPS fits; of solve the "
-        "model's.",
+        help="Coordinate system of poses and points. local: metres east, north and up, by the GPS of the photos; "
+        "EPSG:...: projected coordinates in metres; none: an arbitrary frame. By default local if the GPS of three "
+        "photos fits; solve keeps the frame of the model.",
     ),
     click.option(
         "--gcp",
         "control",
         type=click.Path(exists=True, dir_okay=False, path_type=Path),
         metavar="CSV",
-        help="Control points, in the CRS: name, photo, x, y, E, N, U, sigma, and use, control or check.",
+        help="Control points in the coordinate system of --crs: name, photo, x, y, E, N, U, sigma, and use (control or "
+        "check).",
     ),
     click.option(
         "--readout-ms",
         type=click.FloatRange(min=0, min_open=True),
-        help="Time of the readout of a frame. Default: the gyroscope's log, or a table of cameras.",
+        help="Readout time of a frame in milliseconds. By default it is taken from the gyroscope's log or from a "
+        "table of cameras.",
     ),
     click.option(
         "--remedy",
         type=click.Choice(("auto", "prior", "none")),
         default="auto",
         show_default=True,
-        help="Where all cameras are level: auto looks for a photo that did not move, prior takes the motions to be "
-        "zero in the mean, none does neither.",
+        help="Remedy if all cameras are level, which is a critical motion. auto looks for a photo that did not move; "
+        "prior assumes that the motions are zero in the mean; none does neither.",
     ),
     *opt.PHOTO_OPTIONS,
     click.option(
@@ -115,36 +119,37 @@ solve_options = opt.gathered(
         type=click.Choice(("bin", "txt")),
         default="bin",
         show_default=True,
-        help="How the COLMAP model is written.",
+        help="Format of the COLMAP model: binary or text.",
     ),
     click.option(
         "--rs-poses",
         is_flag=True,
-        help="OUT/rs-poses: the original photos' cameras and poses with the shutter, for gsplat, instant-ngp and "
-        "3dgs-deblur (docs/outputs.md).",
+        help="Write OUT/rs-poses: cameras and poses of the original photos with their shutter, for gsplat, instant-ngp "
+        "and 3dgs-deblur (see docs/outputs.md).",
     ),
     click.option(
         "--usd",
         is_flag=True,
-        help="Of a video: OUT/camera.usda, the camera at every frame and the points of the scene, for Blender.",
+        help="Write OUT/camera.usda for Blender: the camera of every frame of a video, and the points of the scene.",
     ),
     click.option(
         "--export",
         "exports",
         multiple=True,
         type=click.Choice(opt.EXPORT_NAMES),
-        help="Write OUT/NAME for another program: metashape (cameras.xml), opensfm (a project, for ODM), opf (Pix4D, "
-        "the original photos) and opf-rectified, ncore (3DGUT), nuke (camera.nk). May be repeated.",
+        help="Write OUT/NAME for another program: metashape (cameras.xml), opensfm (a project, also for ODM), opf "
+        "(Pix4D, original photos), opf-rectified (Pix4D, rectified photos), ncore (3DGUT) or nuke (camera.nk). May be "
+        "repeated.",
     ),
     opt.seed_option,
     opt.jobs_option,
     opt.scheduler_option,
     opt.overwrite_option,
     opt.resume_option(
-        "Go on with a run of the same photos and options into OUT that ended early: what it came to is not made again."
+        "Continue an interrupted run of the same photos with the same options. What is finished in OUT is kept."
     ),
     click.option(
-        "--report/--no-report", default=True, help="Write OUT/report.html; rsundistort report makes it later, too."
+        "--report/--no-report", default=True, help="Write OUT/report.html. `rsundistort report` can write it later."
     ),
 )
 

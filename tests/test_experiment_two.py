@@ -281,7 +281,7 @@ def test_command_two(folders, made_up, tmp_path):
     assert result.stderr == ""
     assert "position error, baselines, with a shutter model     0.0000" in result.stdout
     assert "still 6, swung 6, swung-global 5 of 6; 5 compared" in result.stdout
-    assert "swung-global: 5.png not joined" in result.stdout
+    assert "swung-global: 5.png not registered" in result.stdout
     assert all(len(line) <= 100 for line in result.stdout.splitlines()[:5])
     assert made_up[1][2].solve.shutter_model == "two-step"
     again = CliRunner().invoke(cli, args)

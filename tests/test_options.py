@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 import sys
 from dataclasses import fields, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 from click.testing import CliRunner
 from rsundistort_cli.rectify import command as rectify_command
 from rsundistort_cli.run import command as run_command
+from rsundistort_cli.sections import SECTIONS
 from rsundistort_cli.solve import command as solve_command
 
 from rsundistort import (
@@ -204,6 +206,21 @@ def test_known_motions_set_their_field(call_of, tmp_path):
         (known,) = json.loads(call_of(name, "--known", "known.csv")[part]["known"]).items()
         assert known[0] == "a.jpg"
         assert "0.01" in str(known[1])
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_lists_every_option_under_a_heading(name):
+    command = COMMANDS[name][0]
+    text = command.get_help(click.Context(command, help_option_names=["-h", "--help"]))
+    headings = re.findall(r"^(\S.*):$", text, re.MULTILINE)
+    assert headings[0] == "Options for a first run"
+    assert set(headings) <= set(SECTIONS)
+    listed = [name for names in SECTIONS.values() for name in names]
+    options = [each for each in command.params if isinstance(each, click.Option)]
+    assert len(listed) == len(set(listed))
+    assert {each.name for each in options} <= {*listed}
+    for option in options:
+        assert re.search(rf"^  .*{option.opts[0]}\b", text, re.MULTILINE)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
