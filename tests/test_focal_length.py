@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from make_photos import half_courtyard
 from scipy.spatial.transform import Rotation
 
-from rsundistort import read_solution
+from rsundistort import Camera, read_solution
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
-from rsundistort.errors import RsUndistortWarning
+from rsundistort.errors import ReconstructionError, RsUndistortWarning
 from rsundistort.input.load import load_photos
+from rsundistort.input.photo_cameras import PhotoCameras
 from rsundistort.input.unknown_focal import with_focal_lengths
 from rsundistort.sfm import USUAL_FOCAL, estimate_focal_length
 
@@ -87,6 +89,21 @@ def test_the_focal_length_of_photos_without_one_is_found_and_said(photos):
     assert abs(np.log(camera.K[0, 0] / 400.0)) < 2.5 * sigma["f"]
     assert "give --camera if you know it" in found.notes[-1]
     assert not found.calibrated
+
+
+@pytest.mark.parametrize(
+    ("found", "says"),
+    [({"f": 40.0}, "f = 40 would be"), ({"dist": [-2.0, 2.4, 0, 0, -1.0]}, "k1 = -2 would be 10 standard deviations")],
+)
+def test_a_camera_like_none_is_not_believed(found, says):
+    guess = Camera(320, 240, [[272.0, 0, 159.5], [0, 272.0, 119.5], [0, 0, 1]])
+    cameras = PhotoCameras([guess], ["a"], np.zeros(3, int), False, (False,), "", sigma=[{"f": 0.3}], without_focal=[0])
+    f = found.get("f", 300.0)
+    odd = Camera(320, 240, [[f, 0, 159.5], [0, f, 119.5], [0, 0, 1]], found.get("dist", []))
+    cameras.check_plausible([replace(guess, dist=np.array([-0.3, 0.1, 0, 0, 0]))])
+    with pytest.raises(ReconstructionError, match=f"the photos do not tell their camera: {says}.*--camera"):
+        cameras.check_plausible([odd])
+    replace(cameras, without_focal=[]).check_plausible([odd])  # EXIF is another matter
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bundle import BundleOptions, GuessedCameras, deviation, pixels_of
-from ..errors import InputError
+from ..errors import InputError, ReconstructionError
 from ..io import (
     CameraFile,
     ExifFacts,
@@ -35,6 +35,9 @@ GUESS_SIGMA = {
 GIVEN_SIGMA = {
     "f": 1e-3, "cx": 4e-4, "cy": 4e-4, "k1": 3e-3, "k2": 1e-2, "k3": 1e-2, "k4": 1e-2, "p1": 3e-4, "p2": 3e-4
 }  # fmt: skip
+
+# Cameras that nothing told are not believed to be farther off than this, in standard deviations.
+_LIKE_NO_CAMERA = 6.0
 
 #: What `camera.json` files are called where none is named.
 _BESIDE = ("camera.json", "cameras.json")
@@ -106,6 +109,25 @@ class PhotoCameras:
         return replace(
             self, sigma=[{**old, **_relative(sigma, c)} for old, c in zip(told, self.cameras, strict=True)]
         )  # fmt: skip
+
+    def check_plausible(self, cameras: Sequence[Camera]) -> None:
+        """Refuse what was found of cameras that nothing told, if it is like no camera: `cameras` are those found.
+
+        Photos without parallax, or of things that move, make a lens of whatever bends them.
+
+        Raises
+        ------
+        ReconstructionError
+            With what is odd.
+        """
+        for k, name, times in self.known_to(loose=True).surprises(cameras):
+            if k in self.without_focal and times > _LIKE_NO_CAMERA:
+                value = cameras[k].K[0, 0] if name[0] == "f" else dict(cameras[k].coefficients).get(name, np.nan)
+                what = "the principal point is far from the middle" if name in ("cx", "cy") else f"{name} = {value:.3g}"
+                raise ReconstructionError(
+                    f"the photos do not tell their camera: {what} would be {times:.0f} standard deviations from what "
+                    f"cameras of such photos have; give --camera FILE or --camera fx,fy,cx,cy in pixels"
+                )
 
     def contradicted(self, cameras: Sequence[Camera], options: BundleOptions) -> list[str]:
         """What a calibration says and the photos do not, for people; `cameras` are those found with these options."""

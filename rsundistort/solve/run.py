@@ -200,6 +200,7 @@ def _solve(
             work, log, solving.remedy, options.matching, workers, kept, survey,
         )  # fmt: skip
     rec = solved.shared
+    cameras.check_plausible(rec.cameras)
     contradictions = [gyro_contradiction(rec, from_gyro), *cameras.contradicted(rec.cameras, options_of(rec))]
     for text in filter(None, contradictions):
         warnings.warn(text, RsUndistortWarning, stacklevel=3)
@@ -230,6 +231,7 @@ def solve_frames(
             clip, keys, frame_path(clip, readouts.get(0)), lambda _: solving.options_for(cameras), work, log,
             seed=solving.seed, matching=options.matching, gyroscope=gyro_log, kept=kept,
         )  # fmt: skip
+    cameras.check_plausible(solved.shared.cameras)
     return replace(solved, unregistered=keys.unregistered(solved.shared.image_names), readouts=readouts)
 
 
