@@ -102,6 +102,19 @@ def unit_steps(problem, state):
             array[index] = 0.0
 
 
+def common_steps(problem, state, rng):
+    """A step along each unknown of a photo (kind 0), a point (1) and a camera (2), of all of them at once.
+
+    Each goes its own way, forth or back: whose measurements follow another's step shows.
+    """
+    arrays = [np.zeros_like(gradient) for gradient in gradients(problem.linearize(state))]
+    for kind, array in enumerate(arrays):
+        for k in range(array.shape[1]):
+            array[:, k] = rng.choice([-1.0, 1.0], len(array)) * rng.uniform(1.0, 2.0, len(array))
+            yield kind, k, tuple(arrays)
+            array[:, k] = 0.0
+
+
 def scaled(step, h):
     return tuple(h * part for part in step)
 

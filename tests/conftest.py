@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -13,11 +14,18 @@ import numba
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from compiling import compile_once
 from rsundistort_cli.main import cli
 from solved_scene import solve_scene
 
 hypothesis.settings.register_profile("rsundistort", max_examples=40, deadline=None, derandomize=True, database=None)
 hypothesis.settings.load_profile("rsundistort")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _compile_once(tmp_path_factory):
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        compile_once(tmp_path_factory.getbasetemp().parent)  # of all workers
 
 
 @pytest.fixture

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
 
+import numba
 import pytest
+
+from rsundistort._kernels import _jit
+from rsundistort.errors import RsUndistortWarning
 
 MODULE = """
 from rsundistort._kernels._jit import kernel
@@ -22,31 +27,50 @@ FACTOR = 2
 def add(x):
     return x + 0
 """
-CALL = "import numba; from small import twice; print(twice(21)); print(sum(twice.stats.cache_hits.values()))"
+CALL = "from small import twice; print(twice(21), sum(twice.stats.cache_hits.values()))"
+NOWHERE = {"CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator", "CACHE_DIR": os.devnull + "/x"}
 
 
 @pytest.fixture
-def small(tmp_path):
-    """A program with one kernel: what it says, and how often it found the kernel compiled."""
+def written(tmp_path):
+    """A program with one kernel, and where its compiled kernels are kept."""
     (tmp_path / "small.py").write_text(MODULE)
     (tmp_path / "callee.py").write_text(CALLEE)
-
-    def run(expected=42, **environment):
-        kept = {"NUMBA_CACHE_DIR": str(tmp_path / "kept"), "PYTHONPATH": str(tmp_path)}
-        done = subprocess.run(
-            [sys.executable, "-c", CALL], capture_output=True, text=True, env=os.environ | kept | environment
-        )
-        assert done.returncode == 0, done.stderr
-        answer, found = map(int, done.stdout.split())
-        assert answer == expected
-        return found, done.stderr
-
-    return run
+    return tmp_path, tmp_path / "kept"
 
 
-def test_a_kernel_is_compiled_once(small):
-    assert small() == (0, "")
-    assert small() == (1, "")
+@pytest.fixture
+def small(written, monkeypatch):
+    """Starts the program anew, as far as kernels go: how often it found its one compiled."""
+    folder, kept = written
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # sources change within a second
+
+    def run(expected=42, **config):
+        for name, value in ({"CACHE_DIR": str(kept)} | config).items():
+            monkeypatch.setattr(numba.config, name, value)
+        for module in ("small", "callee"):
+            sys.modules.pop(module, None)
+        importlib.invalidate_caches()
+        _jit._stamp.cache_clear()
+        _jit._tell.cache_clear()
+        twice = importlib.import_module("small").twice
+        assert twice(21) == expected
+        return sum(twice.stats.cache_hits.values())
+
+    yield run
+    for module in ("small", "callee"):
+        sys.modules.pop(module, None)
+    _jit._tell.cache_clear()
+
+
+def test_a_kernel_is_compiled_once_for_all_processes(written):
+    folder, kept = written
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(kept)}
+    environment["PYTHONPATH"] = os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
+    for found in ("0", "1"):
+        done = subprocess.run([sys.executable, "-c", CALL], capture_output=True, text=True, env=environment)
+        assert (done.stdout.split(), done.stderr) == (["42", found], "")
 
 
 @pytest.mark.parametrize(
@@ -54,31 +78,28 @@ def test_a_kernel_is_compiled_once(small):
     [("x + 0", "x + 1", 43), ("FACTOR = 2", "FACTOR = 3", 63)],
     ids=["callee", "constant"],
 )
-def test_a_change_in_the_file_of_a_callee_is_noticed(small, tmp_path, old, new, answer):
-    small()
-    (tmp_path / "callee.py").write_text(CALLEE.replace(old, new))
-    assert small(answer) == (0, "")
-    assert small(answer) == (1, "")
+def test_a_change_in_the_file_of_a_callee_is_noticed(small, written, old, new, answer):
+    assert [small(), small()] == [0, 1]
+    (written[0] / "callee.py").write_text(CALLEE.replace(old, new))
+    assert [small(answer), small(answer)] == [0, 1]
 
 
 @pytest.mark.parametrize(("suffix", "length"), [(".nbi", 40), (".nbc", 0)])
-def test_what_was_cut_short_is_compiled_again(small, tmp_path, suffix, length):
+def test_what_was_cut_short_is_compiled_again(small, written, suffix, length):
     small()
-    (damaged,) = (tmp_path / "kept").rglob(f"small.twice*{suffix}")
+    (damaged,) = written[1].rglob(f"small.twice*{suffix}")
     damaged.write_bytes(damaged.read_bytes()[:length])
-    assert [small(), small()] == [(0, ""), (1, "")]
+    assert [small(), small()] == [0, 1]
 
 
 def test_without_a_folder_it_is_compiled_in_memory_and_told_once(small):
-    nowhere = {"NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator", "NUMBA_CACHE_DIR": os.devnull + "/x"}
-    found, said = small(**nowhere)
-    assert found == 0
-    assert said.count("RsUndistortWarning") == 1
-    assert "set NUMBA_CACHE_DIR" in said
+    with pytest.warns(RsUndistortWarning, match="set NUMBA_CACHE_DIR") as told:
+        assert small(**NOWHERE) == 0
+    assert len(told) == 1
 
 
 def test_the_command_says_so_in_one_line(tmp_path):
-    nowhere = {"NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator", "NUMBA_CACHE_DIR": os.devnull + "/x"}
+    nowhere = {f"NUMBA_{name}": value for name, value in NOWHERE.items()}
     program = "from rsundistort_cli.main import cli; cli()"
     command = [sys.executable, "-c", program, "analyze", str(tmp_path / "none")]
     done = subprocess.run(command, capture_output=True, text=True, env=os.environ | nowhere)

@@ -11,6 +11,7 @@ from bundle_scenes import (
     FISHEYE,
     LENS,
     RATIONAL,
+    common_steps,
     dense_system,
     gradients,
     make_scene,
@@ -59,9 +60,9 @@ def test_jacobian_equals_central_differences_through_the_step(model, varying, re
         assert valid.all()
         return res[order] / (0.5 * obs.sigma[:, None])
 
-    for kind, (owner, k), step in unit_steps(problem, state):
+    for kind, k, step in common_steps(problem, state, rng):
         difference = (residuals(scaled(step, h)) - residuals(scaled(step, -h))) / (2 * h)
-        expected = np.where((owners_of[kind] == owner)[:, None], jacobians[kind][:, :, k], 0.0)
+        expected = step[kind][owners_of[kind], k, None] * jacobians[kind][:, :, k]
         # entries are of the size of the focal length over sigma; rounding of 400 px over h is 1e-7 of them
         assert np.abs(difference - expected).max() <= 1e-6 * np.abs(J_frame[:, :, :3]).max()
 
@@ -78,6 +79,8 @@ def test_gradient_equals_central_differences_of_the_cost(model, loss, refine, rn
     assert equations.cost == pytest.approx(problem.cost(state), rel=1e-13)  # sums of the same numbers
     h = 1e-5
     for kind, index, step in unit_steps(problem, state):
+        if refine and kind < 2 and index[0] > 0:
+            continue  # with cameras that stay the others do as one does
         ahead, behind = (problem.cost(problem.retract(state, scaled(step, s))) for s in (h, -h))
         gradient = gradients(equations)[kind]
         # third derivatives give h^2 (f/sigma)^2 = 1e-4 of some 1e4; rounding of the cost over h as little
