@@ -17,7 +17,7 @@ def tried(folder, *args):
     """Exit code, what is said on stderr, and the solution if there is one."""
     with warnings.catch_warnings():
         warnings.simplefilter("default")
-        result = CliRunner().invoke(cli, ["run", "photos", "-o", "out", "--quiet", "--no-report", *args])
+        result = CliRunner().invoke(cli, ["run", "photos", "-o", "out", "--quiet", "--no-report", "--max-features", "700", *args])
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     assert "Traceback" not in result.output
@@ -79,7 +79,7 @@ def test_a_photo_that_is_there_twice_ruins_nothing(photos):
     for path in whole.iterdir():
         shutil.copy(path, photos / path.name)
     shutil.copy(whole / COURTYARD_NAMES[2], photos / "again.png")
-    solution, _ = tried(photos.parent, "--camera", str(whole.parent / "camera.json"))
+    solution, _ = tried(photos.parent, "--camera", str(whole.parent / "camera.json"), "--model", "rotation")
     assert len(solution.registered) == len(COURTYARD_NAMES) + 1
     twin, again = solution.image(COURTYARD_NAMES[2]), solution.image("again.png")
     np.testing.assert_allclose(twin.center_w, again.center_w, atol=0.02)
@@ -94,7 +94,7 @@ def test_of_two_scenes_the_larger_is_solved_and_the_other_named(photos):
     for path in list(mirrored.iterdir())[:3]:
         # upside down and inside out, no feature is one of the others'
         save_png(photos / f"other-{path.name}", 255 - cv2.imread(str(path))[:, ::-1])
-    solution, _ = tried(photos.parent, "--camera", str(whole.parent / "camera.json"))
+    solution, _ = tried(photos.parent, "--camera", str(whole.parent / "camera.json"), "--model", "rotation")
     joined = {image.name for image in solution.registered}
     assert joined == set(COURTYARD_NAMES)
     assert all("shares too little" in image.reason for image in solution.images if image.name not in joined)

@@ -356,7 +356,7 @@ def test_images_that_go_along_are_not_replaced_by_themselves(four):
 def courtyard(tmp_path_factory):
     folder = tmp_path_factory.mktemp("courtyard")
     half_courtyard(folder)
-    options = RunOptions(max_features=2000, solve=SolveOptions(shutter_model="rotation"))
+    options = RunOptions(max_features=700, solve=SolveOptions(shutter_model="rotation"))
     run(folder / "photos", folder / "out", options)
     return folder, options
 
@@ -406,7 +406,7 @@ def test_a_photo_that_vanishes_from_a_run_is_in_no_model(courtyard, tmp_path):
     gone = COURTYARD_NAMES[-1]
     act = Stop(1, lambda: (tmp_path / "photos" / gone).unlink(missing_ok=True))
     options = RunOptions(
-        camera=str(folder / "camera.json"), max_features=2000, solve=SolveOptions(shutter_model="rotation")
+        camera=str(folder / "camera.json"), max_features=700, solve=SolveOptions(shutter_model="rotation")
     )
     with pytest.warns(SkippedPhotoWarning, match=f"{gone} cannot be read"):
         solution = run(tmp_path / "photos", tmp_path / "out", options, act)

@@ -37,7 +37,7 @@ from rsundistort.solve.run_outputs import files_of_run
 from rsundistort.synthetic.warp import largest_rectangle
 
 CAMERA = "300,300,160,120"
-OPTIONS = RunOptions(max_features=2500)
+OPTIONS = RunOptions(max_features=1200)
 BROKEN = "0009.png"
 
 
@@ -138,7 +138,7 @@ def test_outputs_of_a_run(solved):
     for a, b in zip(back.registered, solution.registered, strict=True):
         np.testing.assert_array_equal(a.motion.phi, b.motion.phi)
         np.testing.assert_array_equal(a.R_cw, b.R_cw)
-    assert back.options["max_features"] == 2500
+    assert back.options["max_features"] == 1200
     assert all(stage["seconds"] >= 0 for stage in back.stages)
 
 
@@ -260,7 +260,7 @@ def test_grey_16_bit_and_global_model(courtyard, tmp_path):
         done = cv2.imwrite(str(photos / name.replace(".png", ".tif")), grey.astype(np.uint16) * 257)
         assert done
     shutil.copy(courtyard / "camera.json", photos)
-    solution = run(photos, tmp_path / "out", RunOptions(max_features=2500, solve=SolveOptions(shutter_model="global")))
+    solution = run(photos, tmp_path / "out", RunOptions(max_features=1200, solve=SolveOptions(shutter_model="global")))
     assert len(solution.registered) >= 5
     assert all((image.motion.phi == 0).all() for image in solution.registered)
     image = read_photo(tmp_path / "out" / "images" / "0001.tif").pixels
@@ -427,31 +427,32 @@ CROPPED = "300,310,161.5,118.25,-0.05,0.01,0.001,-0.001"
 TWISTS = {"a.png": [0.05, -0.04, 0.06], "b.png": [-0.03, 0.05, -0.08]}
 
 
-@pytest.fixture(params=READOUTS)
-def crops(request, tmp_path):
-    """One folder warped whole and cropped, through a lens: truth of the crop, its rectangle."""
-    photos = tmp_path / "photos"
+@pytest.fixture(scope="module", params=READOUTS)
+def crops(request, tmp_path_factory):
+    """One folder warped whole and cropped, through a lens: where, the truth of the crop, its rectangle."""
+    folder = tmp_path_factory.mktemp("crops")
+    photos = folder / "photos"
     photos.mkdir()
     for seed, name in enumerate(("a.png", "b.png", "c.png")):
         save_png(photos / name, cv2.GaussianBlur(texture(320, 240, seed), (0, 0), 2.0))
     options = WarpOptions(camera=CROPPED, readout=request.param, motion=TWISTS)
-    simulate_warp(photos, tmp_path / "whole", options)
-    truth = simulate_warp(photos, tmp_path / "cut", replace(options, crop=True))
-    return truth, truth.options["crop_xywh"]
+    simulate_warp(photos, folder / "whole", options)
+    truth = simulate_warp(photos, folder / "cut", replace(options, crop=True))
+    return folder, truth, truth.options["crop_xywh"]
 
 
-def test_cropped_photos_are_the_crop_of_the_whole_ones(crops, tmp_path):
-    _, (x, y, width, height) = crops
+def test_cropped_photos_are_the_crop_of_the_whole_ones(crops):
+    folder, _, (x, y, width, height) = crops
     assert 0.5 * 320 * 240 < width * height < 320 * 240
     kept = np.s_[y : y + height, x : x + width]
     for name in ("a.png", "b.png", "c.png"):
         for cut, whole in (("cut/photos", "whole/photos"), ("cut/masks", "whole/masks"), ("cut/global", "photos")):
-            expected = read_photo(tmp_path / whole / name).pixels[kept]
-            np.testing.assert_array_equal(read_photo(tmp_path / cut / name).pixels, expected)
-        assert (read_photo(tmp_path / "cut" / "masks" / name).pixels == 255).all()
+            expected = read_photo(folder / whole / name).pixels[kept]
+            np.testing.assert_array_equal(read_photo(folder / cut / name).pixels, expected)
+        assert (read_photo(folder / "cut" / "masks" / name).pixels == 255).all()
     # one pixel more on any side, and it leaves the frame or some photo does not fill it
     filled = np.zeros((242, 322), bool)
-    masks = [read_photo(tmp_path / "whole" / "masks" / name).pixels for name in ("a.png", "b.png", "c.png")]
+    masks = [read_photo(folder / "whole" / "masks" / name).pixels for name in ("a.png", "b.png", "c.png")]
     filled[1:-1, 1:-1] = np.min(masks, axis=0) == 255
     x, y = x + 1, y + 1
     assert filled[y : y + height, x : x + width].all()
@@ -461,12 +462,12 @@ def test_cropped_photos_are_the_crop_of_the_whole_ones(crops, tmp_path):
     assert not filled[y : y + height, x + width].all()
 
 
-def test_camera_of_cropped_photos(crops, tmp_path):
-    truth, (x, y, width, height) = crops
-    whole = read_solution(tmp_path / "whole" / "ground_truth.json")
+def test_camera_of_cropped_photos(crops):
+    folder, truth, (x, y, width, height) = crops
+    whole = read_solution(folder / "whole" / "ground_truth.json")
     camera = truth.cameras["1"]
-    assert camera == Camera(**json.loads((tmp_path / "cut" / "camera.json").read_text()))
-    assert camera == read_solution(tmp_path / "cut" / "ground_truth.json").cameras["1"]
+    assert camera == Camera(**json.loads((folder / "cut" / "camera.json").read_text()))
+    assert camera == read_solution(folder / "cut" / "ground_truth.json").cameras["1"]
     assert (camera.width, camera.height) == (width, height)
     np.testing.assert_array_equal(camera.K[:2, 2], [161.5 - x, 118.25 - y])
     np.testing.assert_array_equal(np.diag(camera.K), [300, 310, 1])
@@ -478,13 +479,13 @@ def test_camera_of_cropped_photos(crops, tmp_path):
         assert image.rs_shift_px <= whole.image(image.name).rs_shift_px
 
 
-def test_cropped_photos_rectify_to_their_twins(crops, tmp_path):
+def test_cropped_photos_rectify_to_their_twins(crops):
     """The twins have the lens of the photos: it is put on the rectified photo again by the lens's own map."""
-    truth, _ = crops
+    folder, truth, _ = crops
     camera = truth.cameras["1"]
     for image in truth.images:
-        raw = read_photo(tmp_path / "cut" / "photos" / image.name).pixels
-        twin = read_photo(tmp_path / "cut" / "global" / image.name).pixels
+        raw = read_photo(folder / "cut" / "photos" / image.name).pixels
+        twin = read_photo(folder / "cut" / "global" / image.name).pixels
         rectified, mask = rectify(raw, camera, image.motion)
         flat, flat_mask = rectify(twin, camera)
         # noise of 2 pixels, interpolated once more than the twin and at 1/32 pixel: 52.4 to 52.8 dB

@@ -4,6 +4,7 @@ import base64
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 from urllib.parse import unquote
 
 import cv2
@@ -27,12 +28,26 @@ SECTIONS = ["verdict", "pictures", "scene", "photos", "critical", "ladder", "res
 LEVEL = {"singular_values": [1.9, 1.3, 0.6, 0.2, 0.0], "null_vector": [0, 1.0, 0, 0, 0], "y_axis_spread_deg": 0.1}
 
 
+@pytest.fixture(scope="module")
+def small(solved_courtyard, tmp_path_factory):
+    """The courtyard's photos, and outputs without their report, at a quarter of their size: most of a report's time."""
+    folder = tmp_path_factory.mktemp("small")
+    shutil.copytree(solved_courtyard[0], folder / "out", ignore=shutil.ignore_patterns("report.html"))
+    shutil.copytree(SCENES / "courtyard" / "photos", folder / "photos")
+    for path in (*(folder / "photos").iterdir(), *(folder / "out" / "images").iterdir()):
+        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA))
+    return folder
+
+
 @pytest.fixture
-def copied(solved_courtyard, tmp_path):
-    """Outputs of the courtyard without their report, to be changed; the photos are not found from here."""
-    out = tmp_path / "moved" / "out"
-    shutil.copytree(solved_courtyard[0], out, ignore=shutil.ignore_patterns("report.html"))
-    return out
+def photos(small):
+    return small / "photos"
+
+
+@pytest.fixture
+def copied(small, tmp_path):
+    """These outputs, to be changed; the photos are not found from here."""
+    return Path(shutil.copytree(small / "out", tmp_path / "moved" / "out"))
 
 
 # ---------------------------------------------------------------- what it holds
@@ -170,18 +185,18 @@ def test_names_are_only_names(tmp_path):
 # ---------------------------------------------------------------- what is missing
 
 
-def test_moved_photos_are_said_and_given_anew(copied):
+def test_moved_photos_are_said_and_given_anew(copied, photos):
     assert "original photos are not at hand" in quietly(copied)[0]
     page = page_of(copied)
     assert "original photos are not at hand" in page.text
     assert all(view["before"] is None and view["after"] for view in page.data["views"])
-    write_report(copied, SCENES / "courtyard" / "photos")
+    write_report(copied, photos)
     assert all(view["before"] and view["after"] for view in page_of(copied).data["views"])
 
 
-def test_missing_photos_are_named(copied):
+def test_missing_photos_are_named(copied, photos):
     (copied / "images" / "0003.jpg").unlink()
-    assert quietly(copied, SCENES / "courtyard" / "photos") == ["0003.jpg is missing in images."]
+    assert quietly(copied, photos) == ["0003.jpg is missing in images."]
     assert page_of(copied).data["views"][3]["after"] is None
 
 
@@ -194,28 +209,28 @@ def test_no_photos_at_all(copied):
 
 
 @pytest.mark.parametrize("data", [None, b"garbled"])
-def test_without_diagnostics_the_rest_is_shown(copied, data):
+def test_without_diagnostics_the_rest_is_shown(copied, photos, data):
     (copied / "report.npz").unlink()
     if data is not None:
         (copied / "report.npz").write_bytes(data)
-    said = quietly(copied, SCENES / "courtyard" / "photos")
+    said = quietly(copied, photos)
     assert "residuals and the global shutter's result are not shown" in said[0]
     page = page_of(copied)
     assert page.sections == [each for each in SECTIONS if each != "residuals"]
     assert "global" not in page.data["scene"]
 
 
-def test_diagnostics_of_another_solution_are_not_shown(copied):
+def test_diagnostics_of_another_solution_are_not_shown(copied, photos):
     solution = read_solution(copied / "solution.json")
     write_solution(copied / "solution.json", replace(solution, images=solution.images[1:]))
-    assert "of another solution" in quietly(copied, SCENES / "courtyard" / "photos")[0]
+    assert "of another solution" in quietly(copied, photos)[0]
 
 
-def test_a_newer_solution_is_shown_as_far_as_it_is_understood(copied):
+def test_a_newer_solution_is_shown_as_far_as_it_is_understood(copied, photos):
     path = copied / "solution.json"
     value = json.loads(path.read_text())
     path.write_text(json.dumps(value | {"version": 3, "more": []}))
-    assert "newer version" in quietly(copied, SCENES / "courtyard" / "photos")[0]
+    assert "newer version" in quietly(copied, photos)[0]
     assert "update rsundistort" in page_of(copied).text
     path.write_text(json.dumps(value | {"version": 3, "images": [1]}))
     with pytest.raises(FormatError, match=r"version 3.*update rsundistort"):

@@ -6,9 +6,10 @@ import json
 import os
 import warnings
 from collections.abc import Callable
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import RsUndistortWarning
 from ..io.aside import write_aside
@@ -20,6 +21,9 @@ from .places import map_facts, map_rows
 from .readout import readout_facts
 from .source import Source, read_source
 from .verdict import advice_of, meter_of, verdict_of
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 __all__ = ["write_report"]
 
@@ -87,7 +91,6 @@ def _pictures(
 
 
 def _page(source: Source, pictures: dict[str, Picture]) -> str:
-    from jinja2 import Environment, StrictUndefined
     from plotly.offline import get_plotlyjs
 
     solution = source.solution
@@ -99,10 +102,7 @@ def _page(source: Source, pictures: dict[str, Picture]) -> str:
         "residuals": content.residuals(source),
     }
     here = files(__package__)
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters |= {"number": _number, "seconds": _seconds, "signs": _signs}
-    template = environment.from_string((here / "page.html").read_text("utf-8"))
-    return template.render(
+    return _template().render(
         name=source.out.resolve().name,
         solution=solution,
         verdict=verdict_of(solution),
@@ -128,6 +128,15 @@ def _page(source: Source, pictures: dict[str, Picture]) -> str:
         script=(here / "page.js").read_text("utf-8"),
         plotly=get_plotlyjs(),
     )
+
+
+@cache
+def _template() -> Template:
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters |= {"number": _number, "seconds": _seconds, "signs": _signs}
+    return environment.from_string((files(__package__) / "page.html").read_text("utf-8"))
 
 
 def _json(value: Any) -> str:
