@@ -25,14 +25,15 @@ demo: $(VENV)/.installed
 	@echo "Open $(OUT)/report.html in a browser: before and after, the cameras in 3-D, whether to trust it."
 	@echo "Open $(OUT)/sparse in COLMAP, or $(OUT)/transforms.json in nerfstudio."
 
-# files of tests side by side, a core each: what solves in one does not wait for what waits for a process in another
-TEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+# files of tests side by side, a core each: what solves in one does not wait for what waits for a process in another;
+# a hundred processes start, so that bytecode is kept, whatever the environment says
+TEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
 test: $(VENV)/.installed
-	OMP_NUM_THREADS=1 $(TEST)
+	$(TEST)
 
 test-all: $(VENV)/.installed
-	OMP_NUM_THREADS=1 $(TEST) -m "slow or not slow"
+	$(TEST) -m "slow or not slow"
 
 # damaged files of every format, some 20,000; RSUNDISTORT_FUZZ_SEED=N repeats a run (docs/hardening.md)
 fuzz: $(VENV)/.installed

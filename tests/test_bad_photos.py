@@ -17,7 +17,9 @@ def tried(folder, *args):
     """Exit code, what is said on stderr, and the solution if there is one."""
     with warnings.catch_warnings():
         warnings.simplefilter("default")
-        result = CliRunner().invoke(cli, ["run", "photos", "-o", "out", "--quiet", "--no-report", "--max-features", "700", *args])
+        result = CliRunner().invoke(
+            cli, ["run", "photos", "-o", "out", "--quiet", "--no-report", "--max-features", "700", *args]
+        )
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     assert "Traceback" not in result.output

@@ -96,13 +96,14 @@ def given(kind, xy):
 @all_directions
 @pytest.mark.parametrize("kind", ["plane", "map"])
 def test_grid_is_where_the_row_model_sees_the_points(kind, readout, dist):
-    camera, xy = make_camera(dist, readout), pixel_grid()
+    camera, some = make_camera(dist, readout), np.s_[::7]
+    xy = pixel_grid()[some]
     depth, values = given(kind, xy)
     map_x, map_y = init_rectify_map(camera, MOTION, MODEL, R, depth=depth)
-    seen = map_x.ravel() > -1e5
+    seen = map_x.ravel()[some] > -1e5
     assert seen.mean() > 0.99
     expected = seen_at(rectified_points(xy, values), camera)
-    found = np.column_stack([map_x.ravel(), map_y.ravel()])
+    found = np.column_stack([map_x.ravel(), map_y.ravel()])[some]
     np.testing.assert_allclose(found[seen], expected[seen], rtol=0, atol=1e-4)  # px; float32 of pixels and depths
 
 

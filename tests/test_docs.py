@@ -150,7 +150,7 @@ def prepared(tmp_path_factory):
     np.savetxt(place / "K.txt", K)
     solving = rs.SolveOptions(shutter_model="rotation")
     outputs = OutputOptions(rs_poses=True, exports=("metashape", "nuke", "opensfm"))
-    rs.run(place / "PHOTOS", place / "OUT", rs.RunOptions(solve=solving, outputs=outputs), jobs=2)
+    rs.run(place / "PHOTOS", place / "OUT", rs.RunOptions(max_features=1000, solve=solving, outputs=outputs), jobs=2)
     shutil.copy(place / "OUT" / "metashape" / "cameras.xml", place)
     shutil.copytree(place / "OUT" / "sparse", place / "MODEL")
     shutil.copytree(place / "PHOTOS", place / "STILL")

@@ -3,6 +3,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import cv2
@@ -21,6 +22,7 @@ from rsundistort.experiments import (
     OneOptions,
     experiment_one,
     load_scene,
+    one,
 )
 from rsundistort.experiments.one import draw_motions, draw_trial, errors_of, run_trial
 from rsundistort.io import write_colmap_model
@@ -74,9 +76,11 @@ def four_trials(scene_file, two_trials, tmp_path_factory):
     out = tmp_path_factory.mktemp("trials") / "four"
     shutil.copytree(two_trials[0], out)
     told = []
-    summary = experiment_one(
-        [scene_file], out, OneOptions(trials=4, methods=PAIR, jobs=1), lambda *args: told.append(args)
-    )
+    with pytest.MonkeyPatch.context() as patch:  # not in a process of their own: the first two were
+        patch.setattr(one, "ProcessPoolExecutor", lambda count, _: ThreadPoolExecutor(count))
+        summary = experiment_one(
+            [scene_file], out, OneOptions(trials=4, methods=PAIR, jobs=1), lambda *args: told.append(args)
+        )
     return out, summary, told
 
 

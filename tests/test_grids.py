@@ -141,14 +141,14 @@ def test_forward_and_inverse_compose_to_identity(readout, dist):
     inverse = grid.inverse()
     assert inverse.size == (W, H)
     assert (inverse.source_width, inverse.source_height) == grid.size
-    u, v = np.meshgrid(np.arange(W), np.arange(H))
+    u, v = np.meshgrid(np.arange(0, W, 3), np.arange(0, H, 3))
     for there, back in ((grid, inverse), (inverse, grid)):
-        at = [back.map_y, back.map_x]
+        at = [back.map_y[v, u], back.map_x[v, u]]
         x, y = (
             map_coordinates(np.where(there.seen > 0, each, np.nan).astype(float), at, order=1, mode="nearest")
             for each in (there.map_x, there.map_y)
         )
-        valid = np.isfinite(x) & (back.seen > 0)
+        valid = np.isfinite(x) & (back.seen[v, u] > 0)
         assert valid.mean() > 0.4
         assert np.hypot(x - u, y - v)[valid].max() <= 0.005  # px; bilinear, and float32
 
@@ -159,15 +159,15 @@ def test_forward_and_inverse_compose_to_identity(readout, dist):
 def test_inverse_is_where_undistort_points_sends_the_pixels(model, readout, dist):
     camera = make_camera(dist, readout)
     inverse = RemapGrid.from_camera(camera, MOTION, model).inverse()
-    known = inverse.seen > 0
-    v, u = np.nonzero(np.ones((H, W)))
+    u, v = (each.ravel() for each in np.meshgrid(np.arange(0, W, 3), np.arange(0, H, 3)))
+    known = inverse.seen[v, u] > 0
     expected = undistort_points(np.column_stack([u, v]).astype(float), camera, MOTION, model, P=K)
-    found = np.column_stack([inverse.map_x.ravel(), inverse.map_y.ravel()])
+    found = np.column_stack([inverse.map_x[v, u], inverse.map_y[v, u]])
     # px; bilinear between pixels of a map whose slope changes by 1e-3 a pixel at most, and float32
-    assert abs(found - expected)[known.ravel()].max() <= 2e-3
+    assert abs(found - expected)[known].max() <= 2e-3
     # it knows all that the rectified photo shows
     inner = (expected > 0.01).all(1) & (expected < [W - 1.01, H - 1.01]).all(1)
-    assert known.ravel()[inner].all()
+    assert known[inner].all()
     assert inner.mean() > 0.5
 
 

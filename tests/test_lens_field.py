@@ -358,7 +358,7 @@ def test_a_lens_that_its_model_says_badly_is_told(rng):
 
 
 def test_what_was_found_is_told_and_read_back(rng, tmp_path):
-    rec = scene_with_field(rng, waves, "global")
+    rec = scene_with_field(rng, waves, "global", num_images=8, num_points=300)
     options = replace(options_of(rec), residual_field=False)
     solved = solve_tracks(rec, cameras_of(rec), "auto", 0, lambda _: options, StageLog(None))
     solution = solution_of(solved, SolveOptions(), RectifyOptions())

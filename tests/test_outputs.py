@@ -525,7 +525,7 @@ def test_two_poses_of_a_bent_motion_are_the_best_two_and_the_rest_is_said(tmp_pa
     for i, image in enumerate(solution.images):
         frame = next(each for each in value["frames"] if each["file_path"] == image.name)
         worst, turned = 0.0, []
-        for line in np.linspace(0, (W, H)[axis] - 1, 161):
+        for line in np.linspace(0, (W, H)[axis] - 1, 81):
             xy = np.linspace(0, 1, 20)[:, None] * [W - 1, H - 1]
             xy[:, axis] = line
             r = float(clock_of(camera, xy[:1])[0])
@@ -540,7 +540,7 @@ def test_two_poses_of_a_bent_motion_are_the_best_two_and_the_rest_is_said(tmp_pa
         # the clock at which images run, up to a sixth
         assert bend_px(camera, image.motion.in_camera(image.R_cw), 4.0) == pytest.approx(worst, rel=0.2)
         # of no other steady motion is the rest smaller: it has no mean and no slope
-        assert np.abs(np.polyfit(np.linspace(-1, 1, 161), turned, 1)).max() < 0.03 * np.abs(turned).max()
+        assert np.abs(np.polyfit(np.linspace(-1, 1, 81), turned, 1)).max() < 0.03 * np.abs(turned).max()
         # and each line's own pose is there, too
         lines = read["lines"][i]
         assert sorted(lines[[0, -1]]) == [0, (W, H)[axis] - 1]

@@ -217,7 +217,7 @@ def test_run_and_rectify_keep_masks_out_of_features_and_outputs(tmp_path):
     for name in COURTYARD_NAMES[:3]:  # the last photo has none
         save_png(masks / name, mask)
     options = RunOptions(
-        max_features=2500, solve=SolveOptions(shutter_model="rotation"), rectify=RectifyOptions(masks=masks)
+        max_features=1000, solve=SolveOptions(shutter_model="rotation"), rectify=RectifyOptions(masks=masks)
     )
     solution = run(photos, tmp_path / "out", options)
     shown = [cv2.imread(str(tmp_path / "out" / "masks" / name), cv2.IMREAD_GRAYSCALE) for name in COURTYARD_NAMES[:4]]

@@ -122,7 +122,7 @@ def turned_run(tmp_path_factory):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         options = RunOptions(
-            max_features=2500,
+            max_features=1000,
             solve=SolveOptions(shutter_model="rotation"),
             rectify=RectifyOptions(apply_orientation=True),
         )

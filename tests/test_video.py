@@ -306,7 +306,7 @@ def test_run_of_a_video_with_a_gyroscope(walk, tmp_path, monkeypatch):
     gyro = f"--gyro {walk / 'gyro.csv'} --gyro-offset 7 --gyro-axes xYz --readout-ms 25"
     result = CliRunner().invoke(
         cli,
-        [*f"run {walk / 'walk.mkv'} -o out --every 1 --model rotation --max-features 1500".split(), *gyro.split()],
+        [*f"run {walk / 'walk.mkv'} -o out --every 1 --model rotation --max-features 800".split(), *gyro.split()],
     )
     assert result.exit_code == 0, (result.stderr, result.exception)
     solution = read_solution(tmp_path / "out" / "solution.json")

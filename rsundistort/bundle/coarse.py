@@ -83,7 +83,8 @@ class CoarseSpace:
         size = np.add.reduceat((functions**2)[by_cluster, :, None] * moved[by_cluster, None], start)
         of_clusters, entries = _pairs_of_clusters(pattern, cluster)
         envelope = Envelope.smallest(of_clusters, size.reshape(num, _FUNCTIONS * nb) > _RIDGE)
-        return cls(cluster, by_cluster, start, functions, R_cw, free, entries, envelope)
+        turn = np.array(R_cw)  # which can be written, whosever it was: kernels are compiled for either kind
+        return cls(cluster, by_cluster, start, functions, turn, free, entries, envelope)
 
     def project(self, reduced: Reduced) -> Reduced:
         """The system of the clusters; the cameras' unknowns stay."""

@@ -136,9 +136,9 @@ class RowMotion:
 
     @property
     def velocity_in_camera(self) -> NDArray[np.float64]:
-        """The velocity, of a motion that is not told to be in the world."""
+        """The velocity as the kernels take it, of a motion that is not told to be in the world."""
         self._check_frame("camera")
-        return self.velocity
+        return self.velocity.copy()
 
     @property
     def moves(self) -> bool:
@@ -147,9 +147,12 @@ class RowMotion:
 
     @cached_property
     def kernel_phi(self) -> NDArray[np.float64]:
-        """What the kernels take for phi: that, (3,), or the table of a motion with a bend."""
+        """What the kernels take for phi: that, (3,), or the table of a motion with a bend.
+
+        Arrays that can be written, as the adjustment's are: kernels are compiled for either kind that they meet.
+        """
         if self.bend is None:
-            return self.phi
+            return self.phi.copy()
         return bend_table(self.phi, self.bend.start, self.bend.end, self.bend.values)
 
     def at(self, clock: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -110,7 +110,7 @@ def project_points_with_jacobians(
 
 def _velocity(motion: RowMotion, shutter_model: str) -> NDArray[np.float64]:
     """In the camera's frame; models that know no velocity take any."""
-    return motion.velocity_in_camera if shutter_model == "constant-motion" else motion.velocity
+    return motion.velocity_in_camera if shutter_model == "constant-motion" else motion.velocity.copy()
 
 
 def clock_of(camera: Camera, xy_raw: NDArray[np.float64]) -> NDArray[np.float64]:
