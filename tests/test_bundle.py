@@ -8,8 +8,7 @@ import numba
 import numpy as np
 import pytest
 from bundle_scenes import FISHEYE, LENS, make_scene, noisy_problem, perturbed
-from critical_scenes import named_scene
-from numpy_twin import DIRECTIONS, MODELS, project
+from numpy_twin import DIRECTIONS, MODELS
 from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, Camera, Observations, RowMotion, bundle_adjust
@@ -42,6 +41,20 @@ def relative_poses(rec):
     """Orientations and centres in the frame of photo 0, photo 1 at distance 1: free of the gauge."""
     centers = (rec.center_w - rec.center_w[0]) @ rec.R_cw[0].T
     return rec.R_cw @ rec.R_cw[0].T, centers / np.linalg.norm(centers[1])
+
+
+def sigma_of_variation(result, options):
+    """(m, 3) standard deviations of f, cx and cy of each photo against their means, which are the camera's."""
+    spreads = Spreads(1.0, 1.0, result.focal_sigma, result.centre_sigma)
+    problem = BundleProblem(result.reconstruction, result.reconstruction.shutter_model, options, 0.2, spreads)
+    covariance = problem.linearize(problem.initial_state()).covariance()
+    m, nb = problem._free.shape
+    sigma = np.empty((m, 3))
+    for i, k in np.ndindex(m, 3):
+        function = np.zeros((1, m, nb))
+        function[0, :, nb - 3 + k] = (np.arange(m) == i) - 1 / m
+        sigma[i, k] = np.sqrt(np.sum(function * covariance(function)))
+    return sigma
 
 
 @pytest.mark.parametrize("dist", [[], LENS, FISHEYE], ids=["pinhole", "lens", "fisheye"])
@@ -82,14 +95,15 @@ def test_truth_is_recovered_without_noise(model, rng):
 
 
 def test_a_calibration_that_is_plainly_wrong_is_given_up_and_found_out(rng):
-    rec = make_scene(rng, "rotation", num_images=8, num_points=300, noise_px=0.1, dist=LENS)
+    # three photos of each camera: two may leave it where it was said to be
+    rec = make_scene(rng, "rotation", num_images=12, num_points=200, noise_px=0.1, dist=LENS)
     sigma = {"f": 1e-3, "cx": 4e-4, "cy": 4e-4, "k1": 3e-3}
     wrong = [moved_camera(camera, ("cx",), np.array([0.02])) for camera in rec.cameras]
     guessed = GuessedCameras(wrong, sigma)
     options = BundleOptions(refine=tuple(sigma), guessed=guessed, outlier_rounds=0, sigma_px=0.1)
     found = bundle_adjust(replace(rec, cameras=wrong), "rotation", options).reconstruction
     for camera, true in zip(found.cameras, rec.cameras, strict=True):
-        assert abs(camera.K[0, 2] - true.K[0, 2]) < 0.3 * 0.02 * true.K[0, 0]
+        assert abs(camera.K[0, 2] - true.K[0, 2]) < 0.1 * 0.02 * true.K[0, 0]
     assert {name for _, name, _ in guessed.surprises(found.cameras)} == {"cx"}
     assert not guessed.surprises(wrong)
 
@@ -110,10 +124,13 @@ def test_a_lens_that_varies_from_photo_to_photo_is_found_and_no_shutter_is(rng):
     choice = choose_model(rec, options=options, sigma_px=0.2)
     assert choice.varying
     assert (choice.shutter_model, choice.shutter) == ("global", "not-found")
-    result = bundle_adjust(rec, "global", replace(options, varying=True))
+    options = replace(options, varying=True)
+    result = bundle_adjust(rec, "global", options)
     error = result.reconstruction.variation - varied.variation
-    error -= error.mean(0)  # what they have in common is the camera's
-    assert np.sqrt(np.mean(error**2, 0)) == pytest.approx([0.0] * 3, abs=2e-3)
+    sigma = sigma_of_variation(result, replace(options, loss="squared", sigma_px=0.2))
+    assert sigma.max() < 0.5 * 0.01  # of what varies
+    # 36 values, but what f and centre are off by goes together in poses like these: 0.4 to 1.3 in one scene
+    assert 0.2 < np.sqrt(np.mean(((error - error.mean(0)) / sigma) ** 2)) < 2
     assert 0.005 < result.focal_sigma < 0.02
     assert 0.005 < result.centre_sigma < 0.02
 
@@ -124,8 +141,10 @@ def test_ladder_ends_at_the_truth_and_climbs_in_order(rng):
     results = adjust_sequence(perturbed(truth, rng), progress=lambda model, cost: seen.append(model))
     assert list(results) == ["global", "two-step", "rotation", "constant-motion"]
     assert list(dict.fromkeys(seen)) == list(results)
-    rms = [result.rms_px for result in results.values()]
-    assert rms == sorted(rms, reverse=True)
+    # one that holds another fits better; of two-step and rotation neither holds the other
+    rms = {model: result.rms_px for model, result in results.items()}
+    assert rms["global"] > max(rms["two-step"], rms["rotation"])
+    assert rms["rotation"] > rms["constant-motion"]
     assert (results["global"].reconstruction.phi == 0).all()
     assert (results["rotation"].reconstruction.velocity == 0).all()
     # noise is taken for 0.02 px at least, so phi's deviation for 1e-4; the prior pulls by a small part of that
@@ -180,7 +199,9 @@ def test_spreads_of_the_priors_do_not_depend_on_their_start(rng):
 
 def test_estimated_spread_is_the_mean_square_of_what_is_found_and_what_is_left_open(rng):
     truth = make_scene(rng, "rotation", num_images=8, num_points=60, noise_px=0.5)
-    result = bundle_adjust(perturbed(truth, rng), "rotation", BundleOptions(spread_tolerance=1e-6, spread_rounds=40))
+    # of one noise for all: else the last step is weighed by another than the spread was
+    options = BundleOptions(spread_tolerance=1e-6, spread_rounds=40, deviations="model")
+    result = bundle_adjust(perturbed(truth, rng), "rotation", options)
     square = (result.reconstruction.phi**2 + result.sigma_phi**2) * truth.frame_span()[:, None] ** 2
     assert np.abs(result.reconstruction.phi).max() < 3 * np.sqrt(np.median(square) / 0.455)  # none is cut
     assert result.phi_sigma == pytest.approx(np.sqrt(square.mean()), rel=1e-4)
@@ -209,12 +230,19 @@ def test_residuals_and_errors_scale_with_the_noise(noise_px, rng):
     assert 0.6 * noise_px < result.rms_px < 1.1 * noise_px
     # the median of 1280 residuals knows sigma to 3 %
     assert result.sigma_px == pytest.approx(noise_px, rel=0.15)
-    # normalised errors have a spread of 1 if the deviations are honest; 24 of them, not independent
-    normalised = (result.reconstruction.phi - truth.phi) / result.sigma_phi
-    assert 0.5 < np.sqrt(np.mean(normalised**2)) < 1.6
     # the prior is estimated from 24 values of a true spread of 0.05 / sqrt(3) a unit
     spread = np.sqrt(np.mean((truth.phi * truth.frame_span()[:, None]) ** 2))
     assert result.phi_sigma == pytest.approx(spread, rel=0.25)
+
+
+def test_normalised_errors_of_motions_are_one(rng):
+    squares = []
+    for noise_px in (0.1, 0.5, 2.0) * 4:
+        truth = make_scene(rng, "rotation", num_images=8, num_points=80, noise_px=noise_px)
+        result = bundle_adjust(perturbed(truth, rng), "rotation")
+        squares.append(np.mean(((result.reconstruction.phi - truth.phi) / result.sigma_phi) ** 2))
+    # the 24 of one scene go together, and its mean is known to 40 %: that of twelve to 11 %, its root to 6 %
+    assert np.sqrt(np.mean(squares)) == pytest.approx(1.0, abs=0.25)
 
 
 def test_gross_outliers_are_dropped_and_the_estimate_stays(rng):
@@ -374,7 +402,7 @@ def test_cost_falls_with_each_accepted_step_and_the_reason_is_said(rng):
     assert not short.converged
     assert short.num_iterations == 1
     assert costs == short.cost_history[1:].tolist()
-    at_rest = BundleOptions(outlier_rounds=0, step_tolerance=1e3)
+    at_rest = replace(once, step_tolerance=1e3, deviations="model")  # one solve
     assert bundle_adjust(start, "rotation", at_rest).stop_reason == "step"
 
 
@@ -429,7 +457,7 @@ def test_what_one_kernel_sees_another_does(rng):
         points_w[mine] = rec.center_w[i] + rays @ rec.R_cw[i]
     rec = replace(rec, cameras=cameras, points_w=points_w, observations=Observations(frame_idx, np.arange(len(xy)), xy))
     res, valid = reprojection_residuals(rec)
-    assert valid[seen].mean() > 0.8
+    assert valid[seen].mean() > 0.7  # the others are seen by no row, or by several
     np.testing.assert_allclose(res[valid], 0, atol=1e-6)
     rec = rec.with_points(valid, min_track=1)
     options = BundleOptions(loss="squared", refine=("f", "k1"))
@@ -480,61 +508,10 @@ def test_held_out_measurements_leave_their_tracks_three(rng):
     assert (hold_out(rec, share=0.2, seed=4)[1] != held).any()
 
 
-def test_points_that_no_photo_can_see_come_back(rng):
-    truth = make_scene(rng, "rotation", noise_px=0.3)
-    points = truth.points_w.copy()
-    points[3] = truth.center_w[0] - 5 * truth.R_cw[0, 2]  # behind photo 0
-    points[17] *= 100
-    result = bundle_adjust(replace(truth, points_w=points), "rotation", BundleOptions(outlier_rounds=0))
-    assert result.reconstruction.num_points == truth.num_points
-    found, true = ((rec.points_w[[3, 17]] - rec.center_w[0]) @ rec.R_cw[0].T for rec in (result.reconstruction, truth))
-    np.testing.assert_allclose(found, true, atol=0.05)
-    assert result.rms_px < 0.4
-
-
-def test_points_that_ran_off_to_infinity_come_back(rng):
-    truth = make_scene(rng, "rotation", noise_px=0.3)
-    points = truth.points_w.copy()
-    points[[2, 9, 31]] *= 1e9
-    options = BundleOptions(outlier_rounds=0, loss="squared", sigma_px=0.3)
-    result = bundle_adjust(replace(truth, points_w=points), "rotation", options)
-    found, true = ((rec.points_w - rec.center_w[0]) @ rec.R_cw[0].T for rec in (result.reconstruction, truth))
-    np.testing.assert_allclose(found[[2, 9, 31]], true[[2, 9, 31]], atol=0.05)
-    assert result.rms_px < 0.4
-
-
-def test_points_at_infinity_stay_far(rng):
-    scene = named_scene("10 degrees")
-    points = scene.points_w.copy()
-    points[:5] = 1e7 * (np.array([0.0, 0.0, 1.0]) + 0.1 * rng.normal(size=(5, 3)))
-    phi = rng.uniform(-0.05, 0.05, (scene.num_images, 3))
-    obs = scene.observations
-    xy = np.empty((len(obs), 2))
-    for i in range(scene.num_images):
-        mine = obs.frame_idx == i
-        K = scene.camera(i).K
-        xy[mine] = project(
-            points[obs.point_idx[mine]], scene.R_cw[i], scene.center_w[i], phi[i], "rotation", "top-to-bottom", K, []
-        )
-    xy += 0.3 * rng.normal(size=xy.shape)
-    inside = ((xy > -200) & (xy < 1200)).all(1)
-    start = replace(
-        scene, points_w=points, observations=Observations(obs.frame_idx, obs.point_idx, xy).select(inside),
-        shutter_model="rotation",
-    )  # fmt: skip
-    assert start.track_lengths(np.ones(int(inside.sum()), bool)).min() >= 3
-    options = BundleOptions(outlier_rounds=0, loss="squared", sigma_px=0.3)
-    result = bundle_adjust(start, "rotation", options)
-    assert result.converged
-    assert result.rms_px < 0.35
-    # 0.3 px over 900 are 2 mm at 7 m: what is so far has no measurable parallax
-    assert np.linalg.norm(result.reconstruction.points_w[:5], axis=1).min() > 200
-    assert np.linalg.norm(result.reconstruction.points_w[5:], axis=1).max() < 20
-
-
 def test_objective_of_the_truth_is_above_that_of_the_estimate(rng):
     truth = make_scene(rng, "rotation", noise_px=0.5)
-    options = BundleOptions(outlier_rounds=0, loss="squared", sigma_px=0.5, phi_sigma=0.03)
+    # of the first solve: where measurements seem to hang together by chance, a second one takes more noise
+    options = BundleOptions(outlier_rounds=0, loss="squared", sigma_px=0.5, phi_sigma=0.03, deviations="model")
     result = bundle_adjust(perturbed(truth, rng), "rotation", options)
     assert objective(result.reconstruction, "rotation", options) == pytest.approx(result.cost_history[-1], rel=1e-6)
     assert objective(result.reconstruction, "rotation", options) < objective(truth, "rotation", options)
