@@ -65,7 +65,9 @@ def filmed(
         for _ in range(60):  # the row that shows a point is that of its own image
             at = moment + seconds * clock
             x = np.einsum("nab,nb->na", hand.rotations(at), points - hand.centers(at))
-            clock = np.where(x[:, 2] > 0.5, x[:, 1] / np.maximum(x[:, 2], 0.5), 0.0)
+            before, clock = clock, np.where(x[:, 2] > 0.5, x[:, 1] / np.maximum(x[:, 2], 0.5), 0.0)
+            if np.abs(clock - before).max() < 1e-14:
+                break
         xy = 500 * x[:, :2] / np.maximum(x[:, 2:], 0.5) + [320, 240]
         inside = (x[:, 2] > 0.5) & (xy >= 0).all(1) & (xy <= [639, 479]).all(1)
         frames.append(np.full(inside.sum(), k))

@@ -231,6 +231,7 @@ def of_neighbours(rng, each=20):
     return truth, replace(truth, observations=replace(obs, xy_raw=obs.xy_raw + off))
 
 
+@pytest.mark.slow
 def test_noise_that_neighbours_share_is_noticed(rng):
     """Errors of the mean motion in the metric of its covariance, where all points of a heap are off together."""
     plain, honest, factors = [], [], []

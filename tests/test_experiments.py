@@ -285,6 +285,7 @@ def test_a_torn_last_line_is_run_again(scene_file, two_trials, tmp_path):
     assert results_of(out) == results_of(two_trials[0])
 
 
+@pytest.mark.slow
 def test_results_do_not_depend_on_the_number_of_jobs(scene_file, two_trials, tmp_path):
     experiment_one([scene_file], tmp_path, OneOptions(trials=2, methods=PAIR, jobs=2))
     assert results_of(tmp_path) == results_of(two_trials[0])

@@ -167,6 +167,7 @@ def test_a_camera_that_is_held_level_is_no_longer_critical() -> None:
     assert abs(stretch[1] / stretch[0] - 1) < 0.003
 
 
+@pytest.mark.slow
 def test_the_normalised_error_of_the_readout_is_of_unit_variance() -> None:
     errors = []
     for seed in range(8):

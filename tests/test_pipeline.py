@@ -427,7 +427,12 @@ CROPPED = "300,310,161.5,118.25,-0.05,0.01,0.001,-0.001"
 TWISTS = {"a.png": [0.05, -0.04, 0.06], "b.png": [-0.03, 0.05, -0.08]}
 
 
-@pytest.fixture(scope="module", params=READOUTS)
+DAILY = "top-to-bottom", "right-to-left"  # both axes, both signs
+
+
+@pytest.fixture(
+    scope="module", params=[pytest.param(each, marks=[] if each in DAILY else [pytest.mark.slow]) for each in READOUTS]
+)
 def crops(request, tmp_path_factory):
     """One folder warped whole and cropped, through a lens: where, the truth of the crop, its rectangle."""
     folder = tmp_path_factory.mktemp("crops")

@@ -300,6 +300,7 @@ def test_verdict_counts_photos_and_pixels():
     assert "from 2.00 px to 0.21 px" in verdict.sentences[1]
 
 
+@pytest.mark.slow
 def test_verdicts_of_scenes(solved_courtyard, tmp_path):
     assert verdict_of(solved_courtyard[1]).level == "trust"
     level = solve_scene("colonnade", tmp_path / "level", remedy="none", report=False)
