@@ -1,47 +1,123 @@
-"""What each frame of a path says of its own turn, were it not on the path."""
+"""What each frame of a video says of its own pose and turn, were it on no path."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .options import BundleOptions, BundleResult
-from .problem import BundleProblem
+from ..model import Reconstruction
+from .options import BundleOptions
+from .problem import BundleProblem, State
 from .spreads import Spreads
 
-__all__ = ["phi_of_frames"]
+__all__ = ["OwnMotions", "own_motions"]
 
 Array = NDArray[np.float64]
 
 # Of a frame: rotation, centre, phi.
 _UNKNOWNS = 9
-# A prior that says nothing.
-_LOOSE = 1e6
+# Radians and depths a frame: no hand does as much, so that the prior says nothing.
+_LOOSE = 1.0
+# Rounds of frames by points and points by frames, and steps of the frames in each.
+_ROUNDS, _STEPS = 3, 6
+_NOISE_PX, _LEAST_NOISE_PX = 1.0, 0.02
 
 
-def phi_of_frames(result: BundleResult) -> tuple[Array, Array]:
-    """Phi (m, 3) of frames by their own measurements of the points, and its standard deviations; NaN where these fail.
+@dataclass(frozen=True)
+class OwnMotions:
+    """Poses and turns of frames, each by its own measurements; NaN where these do not tell.
 
-    One Gauss-Newton step of each frame's pose and phi from the solution, whose points and velocities are held: many
-    frames made the points, so that hardly any of them is that of a frame's own phi.
+    Attributes
+    ----------
+    R_cw : (m, 3, 3) array
+        `x_c = R_cw (X_w - center_w)`.
+    phi : (m, 3) array
+        Radians per unit of the clock.
+    sigma_turn, sigma_phi : (m, 3) array
+        Standard deviations of both, by what the fits leave.
     """
-    rec = result.reconstruction
-    problem = BundleProblem(
-        rec, rec.shutter_model, BundleOptions(loss="squared"), result.sigma_px * result.noise_factor,
-        Spreads(_LOOSE, _LOOSE),
-    )  # fmt: skip
-    residuals, J = problem.linearize(problem.initial_state()).blocks
+
+    R_cw: Array
+    phi: Array
+    sigma_turn: Array
+    sigma_phi: Array
+
+
+def own_motions(reconstruction: Reconstruction, *, turns_only: bool = False) -> OwnMotions:
+    """The turn of each frame while it is read, and its pose, by what it shows of points that all frames place.
+
+    Frames are fitted to the points, and these to the frames, in turns and with a robust loss. Nothing joins the frames
+    but their points, and no prior says what they move by, so that frames whose shutters and poses do not belong
+    together are fitted as well as any others. The velocities of the reconstruction are held.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Start; of all frames.
+    turns_only : bool
+        Whether the centres, and the points, stay where they are.
+    """
+    options = BundleOptions(loss="cauchy")
+    problem = BundleProblem(reconstruction, "constant-motion", options, _NOISE_PX, Spreads(_LOOSE, _LOOSE))
+    own = np.array([0, 1, 2, 6, 7, 8] if turns_only else range(_UNKNOWNS))
+    state = problem.initial_state()
+    for last in range(1 if turns_only else _ROUNDS):
+        if last:
+            state = problem.settle(state)
+        state = _fitted(problem, state, own)
+    residuals, J = problem.with_squares().linearize(state).blocks
     frame = problem.measurements[0]
-    H, g = np.zeros((rec.num_images, _UNKNOWNS, _UNKNOWNS)), np.zeros((rec.num_images, _UNKNOWNS))
-    np.add.at(H, frame, np.einsum("oia,oib->oab", J[:, :, :_UNKNOWNS], J[:, :, :_UNKNOWNS]))
-    np.add.at(g, frame, np.einsum("oia,oi->oa", J[:, :, :_UNKNOWNS], residuals))
-    phi, sigma = np.full((2, rec.num_images, 3), np.nan)
-    for i in range(rec.num_images):
-        # unknowns of one size
-        scale = 1.0 / np.sqrt(np.maximum(np.diagonal(H[i]), 1e-300))
-        scaled = scale[:, None] * H[i] * scale
-        if np.linalg.cond(scaled) < 1e12:
-            inverse = scale[:, None] * np.linalg.inv(scaled) * scale
-            phi[i] = rec.phi[i] - (inverse @ g[i])[6:]
-            sigma[i] = np.sqrt(np.diagonal(inverse)[6:])
-    return phi, sigma
+    # heavy tails count as those of normal noise do, and each frame has its own unknowns
+    size, m = np.median(np.abs(residuals)) / 0.6745, reconstruction.num_images
+    share = max(1.0 - len(own) * m / residuals.size, 0.1)
+    noise = max(size * _NOISE_PX / np.sqrt(share), _LEAST_NOISE_PX) / _NOISE_PX
+    believed = np.linalg.norm(residuals, axis=1) < 4.5 * noise
+    H = np.zeros((m, len(own), len(own)))
+    J = J[:, :, own] * believed[:, None, None]
+    np.add.at(H, frame, np.einsum("oia,oib->oab", J, J))
+    sigma = np.full((m, _UNKNOWNS), np.nan)
+    scale, scaled = _scaled(H)
+    told = np.linalg.cond(scaled) < 1e12
+    inverse = np.linalg.inv(scaled[told])
+    sigma[np.ix_(told, own)] = noise * scale[told] * np.sqrt(np.diagonal(inverse, axis1=1, axis2=2))
+    R_cw, phi = state.R_cw.copy(), state.phi.copy()
+    R_cw[~told], phi[~told] = np.nan, np.nan
+    return OwnMotions(R_cw, phi, sigma[:, :3], sigma[:, 6:])
+
+
+def _scaled(H: Array) -> tuple[Array, Array]:
+    """Scales (m, n) of unknowns, and matrices (m, n, n) of unknowns of one size."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(H, axis1=1, axis2=2), 1e-300))
+    return scale, scale[:, :, None] * H * scale[:, None]
+
+
+def _fitted(problem: BundleProblem, state: State, own: NDArray[np.int64]) -> State:
+    """Some steps of Levenberg and Marquardt of every frame on its own."""
+    frame, m = problem.measurements[0], len(state.phi)
+    damping = np.full(m, 1e-3)
+    cost = np.bincount(frame, problem.costs(state), m)
+    for _ in range(_STEPS):
+        residuals, J = problem.linearize(state).blocks
+        J = J[:, :, own]
+        H, g = np.zeros((m, len(own), len(own))), np.zeros((m, len(own)))
+        np.add.at(H, frame, np.einsum("oia,oib->oab", J, J))
+        np.add.at(g, frame, np.einsum("oia,oi->oa", J, residuals))
+        scale, scaled = _scaled(H)
+        scaled += np.maximum(damping, 1e-9)[:, None, None] * np.eye(len(own))
+        step = np.zeros((m, problem.layout.size))
+        step[:, own] = -scale * np.linalg.solve(scaled, (scale * g)[:, :, None])[:, :, 0]
+        still = np.zeros_like(state.points_w), np.zeros((len(state.cameras), 0))
+        moved = problem.retract(state, (step, *still))
+        after = np.bincount(frame, problem.costs(moved), m)
+        better = after < cost
+        damping = np.where(better, 0.1 * damping, 10.0 * damping)
+        cost = np.where(better, after, cost)
+        state = replace(
+            state,
+            R_cw=np.where(better[:, None, None], moved.R_cw, state.R_cw),
+            center_w=np.where(better[:, None], moved.center_w, state.center_w),
+            phi=np.where(better[:, None], moved.phi, state.phi),
+        )
+    return state

@@ -481,12 +481,16 @@ class BundleProblem:
 
     def _track_costs(self, state: State) -> NDArray[np.float64]:
         """(n,) cost of each point's measurements."""
+        total = np.zeros(len(state.points_w))
+        np.add.at(total, self._structure.point_idx, self.costs(state))
+        return total
+
+    def costs(self, state: State) -> NDArray[np.float64]:
+        """(o,) cost of each of the equations' measurements."""
         cost = np.empty(len(self._xy))
         residuals.residual_costs(*self._kernel_args(state), self._clock, cost)
         self._clock_of = state
-        total = np.zeros(len(state.points_w))
-        np.add.at(total, self._structure.point_idx, cost)
-        return total
+        return cost
 
     def retract(self, state: State, step: Step) -> State:
         """The state after a step."""

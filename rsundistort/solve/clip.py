@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..batch.progress import StageLog
 from ..bundle import BundleOptions, BundleResult, bundle_adjust
-from ..bundle.own_motions import phi_of_frames
+from ..bundle.own_motions import own_motions
 from ..bundle.path import FramePath
 from ..critical import heal
 from ..errors import RsUndistortWarning
@@ -38,6 +38,8 @@ __all__ = ["frame_path", "solve_clip"]
 
 # Frames that are placed by fewer measurements say nothing of the path.
 _LEAST_MEASUREMENTS = 15
+# Fewer photos cannot tell motions of their own from the scene.
+_LEAST_OWN = 3
 # A half of a clip needs so many frames to tell a readout time of its own.
 _LEAST_HALF = 4
 # What flow may be off by, pixels, and measurements that may be far off, as a share, where rotations explain the frames.
@@ -50,6 +52,10 @@ _NO_READOUT = 1e-6
 _GIVEN_SIGMA, _TABLE_SIGMA = 0.02, 0.1
 # Known to this share of what it was known to before, it was measured.
 _MEASURED = 0.7
+_OF_STABILISED = "what is taken for frames that were stabilised"
+
+# Result, its options, and whether the frames are as the sensor read them, where they were asked.
+_Found = tuple[BundleResult, BundleOptions, Stabilisation | None]
 
 
 def solve_clip(
@@ -94,19 +100,21 @@ def solve_clip(
     Solved
         Its result is that of the key frames, `whole` the reconstruction of all frames.
     """
-    result, options = _turned(clip, keys, path, options_of, log)
-    if result is None and len(clip.names) == 2:
+    found = _turned(clip, keys, path, options_of, log)
+    if found is None and len(clip.names) == 2:
         options = replace(options_of(start := two_frames(clip, keys)), path=path)
-        result = bundle_adjust(start, "constant-motion", options, partial(_tell, log, "path"))
-    elif result is None:
-        result, options = _travelled(
+        found = bundle_adjust(start, "constant-motion", options, partial(_tell, log, "path")), options, None
+    elif found is None:
+        found = _travelled(
             clip, keys, path, options_of, log, lambda: place_photos(keys, scratch, log, seed, matching, kept or Kept())
         )
+    result, options, filmed = found
     assert options.path is not None
     path = options.path
     alone = readout_of(result)
     log.begin("gyroscope")
-    felt = felt_gyroscope(clip, result, gyroscope)
+    # of frames that were turned since, it says nothing
+    felt = None if _was_stabilised(filmed) else felt_gyroscope(clip, result, gyroscope)
     if felt is not None:
         options = replace(options, path=replace(path, rates=felt.rates(result)))
         result = bundle_adjust(
@@ -115,19 +123,19 @@ def solve_clip(
             partial(_tell, log, "gyroscope"),
         )  # fmt: skip
     log.end("gyroscope", offset_s=None if felt is None else felt.alignment.offset_s)
-    return _judged(clip, keys, result, options, alone, felt, log)
+    return _judged(clip, keys, result, options, alone, felt, filmed, log)
 
 
 def _turned(
     clip: Clip, keys: LoadedPhotos, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions],
     log: StageLog,
-) -> tuple[BundleResult | None, BundleOptions]:  # fmt: skip
+) -> _Found | None:  # fmt: skip
     """The path of a camera that only turns; None where that does not explain the frames."""
     log.begin("rotations")
-    start = turning_only(clip, keys)
-    result, options = None, BundleOptions()
+    start, found = turning_only(clip, keys), None
     if start is not None:
-        options = replace(options_of(start), path=replace(path, turns_only=True))
+        path, filmed = _as_filmed(clip, start, replace(path, turns_only=True))
+        options = replace(options_of(start), path=path)
         result = bundle_adjust(start, "constant-motion", _at_first(options), partial(_tell, log, "rotations"))
         if result.sigma_px < _FLOW_PX and result.num_outliers < _OUTLIERS * len(start.observations):
             result = bundle_adjust(
@@ -138,28 +146,29 @@ def _turned(
                 "the camera only turned: without parallax there are directions, but no places and no scene",
                 RsUndistortWarning, stacklevel=4,
             )  # fmt: skip
-        else:
-            result = None
-    log.end("rotations", explained=result is not None)
-    return result, options
+            found = result, options, filmed
+    log.end("rotations", explained=found is not None)
+    return found
 
 
 def _travelled(
     clip: Clip, keys: LoadedPhotos, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions],
     log: StageLog, placed: Callable[[], tuple[Reconstruction, MatchedPhotos]],
-) -> tuple[BundleResult, BundleOptions]:  # fmt: skip
+) -> _Found:  # fmt: skip
     """The path of a camera that travels, through the scene that its key frames show, placed as of a global shutter."""
     mapped, matched = placed()
-    # a shutter that is not modelled yet would be blamed on the lens
-    rough = rough_options(replace(options_of(mapped), refine=()))
-    current, result = bundle_adjust(mapped, "global", rough).reconstruction, None
+    result: BundleResult | None = None
+    filmed: Stabilisation | None = None
+    current = _by_own_motions(mapped, options_of)
     for stage in ("path", "path again"):
         log.begin("flow")
         followed = follow_points(clip, current)
-        before = None if result is None else result.reconstruction
+        before: Reconstruction | None = None if result is None else result.reconstruction
         whole = with_all_frames(clip, current, followed, before).without_photos(_LEAST_MEASUREMENTS)
         log.end("flow", frames=whole.num_images, of_frames=len(clip.names), observations=len(followed.frame))
         log.begin(stage)
+        if result is None:
+            path, filmed = _as_filmed(clip, whole, path)
         options = replace(options_of(whole), path=path)
         how = _at_first(options) if result is None else replace(options, outlier_rounds=1, spread_rounds=_SPREADS)
         is_first = result is None
@@ -172,7 +181,35 @@ def _travelled(
             # key frames freed of the shutter: what it had torn from their tracks returns
             current = retriangulate(matched, result.of_photos(_are_keys(result, clip)).reconstruction)
     assert result is not None
-    return result, options
+    return result, options, filmed
+
+
+def _by_own_motions(mapped: Reconstruction, options_of: Callable[[Reconstruction], BundleOptions]) -> Reconstruction:
+    """Key frames, each of which turns as it likes: stabilised ones are on no path that their shutters are of."""
+    # a shutter that is not modelled yet would be blamed on the lens
+    rough = replace(rough_options(options_of(mapped)), refine=())
+    current = bundle_adjust(mapped, "global", rough).reconstruction
+    if current.num_images < _LEAST_OWN:
+        return current
+    return bundle_adjust(current, "rotation", replace(rough, outlier_rounds=1, deviations="model")).reconstruction
+
+
+def _as_filmed(clip: Clip, start: Reconstruction, path: FramePath) -> tuple[FramePath, Stabilisation]:
+    """Whether frames are as the sensor read them, and the path that they can share.
+
+    The shutter of frames that were turned since is not that of their path, and any readout time would be false.
+    """
+    filmed = _stabilisation(clip, start, turns_only=path.turns_only)
+    return (_at_once(path) if _was_stabilised(filmed) else path), filmed
+
+
+def _at_once(path: FramePath) -> FramePath:
+    """The path of frames that are read at once."""
+    return replace(path, readout=(0.0, _NO_READOUT * path.frame_s))
+
+
+def _was_stabilised(filmed: Stabilisation | None) -> bool:
+    return filmed is not None and filmed.verdict == "stabilised"
 
 
 def _at_first(options: BundleOptions) -> BundleOptions:
@@ -182,7 +219,7 @@ def _at_first(options: BundleOptions) -> BundleOptions:
 
 def _judged(
     clip: Clip, keys: LoadedPhotos, result: BundleResult, options: BundleOptions, alone: ReadoutTime,
-    felt: Felt | None, log: StageLog,
+    felt: Felt | None, filmed: Stabilisation | None, log: StageLog,
 ) -> Solved:  # fmt: skip
     """What is to be believed of a path, and what is told of its key frames."""
     assert options.path is not None
@@ -192,15 +229,16 @@ def _judged(
         result, remedy = heal(result, options)
         log.end("critical motion", sigma_log_k=remedy.after.sigma_log_k)
     log.begin("halves")
-    halves = _halves(result, options)
+    halves = None if _was_stabilised(filmed) else _halves(result, options)
     log.end("halves", readout_s=None if halves is None else [each.seconds for each in halves])
     log.begin("stabilisation")
-    stabilisation = _stabilisation(result, felt)
+    stabilisation = filmed
+    if stabilisation is None or not _was_stabilised(filmed):
+        stabilisation = _stabilisation(clip, result.reconstruction, felt, turns_only=options.path.turns_only)
     log.end("stabilisation", verdict=stabilisation.verdict)
     of_keys = result.of_photos(_are_keys(result, clip))
     log.begin("comparison with a global shutter")
-    # a path of frames that are read at once
-    at_once = replace(options.path, readout=(0.0, _NO_READOUT * clip.frame_s))
+    at_once = _at_once(options.path)
     global_result = bundle_adjust(
         of_keys.reconstruction, "constant-motion",
         replace(rough_options(options), path=at_once, outlier_rounds=0, deviations="model"),
@@ -222,7 +260,7 @@ def _judged(
     evidence: dict[str, Any] = {
         "seconds": time.seconds,
         "sigma": time.sigma,
-        "source": _source(options, time, felt),
+        "source": _OF_STABILISED if _was_stabilised(filmed) else _source(options, time, felt),
         "of_frame": time.seconds / clip.frame_s,
         "frames": len(path.names),
         "halves": [] if halves is None else [each._asdict() for each in halves],
@@ -280,17 +318,20 @@ def _halves(result: BundleResult, options: BundleOptions) -> tuple[ReadoutTime, 
     return first, second
 
 
-def _stabilisation(result: BundleResult, felt: Felt | None) -> Stabilisation:
+def _stabilisation(
+    clip: Clip, rec: Reconstruction, felt: Felt | None = None, *, turns_only: bool = False
+) -> Stabilisation:
     """Whether the lines of the frames move as the frames do, each frame being asked for its own motion."""
-    assert result.path is not None
-    rec, path = result.reconstruction, result.path.path
-    phi, sigma = phi_of_frames(result)
-    moment = {name: k for k, name in enumerate(result.path.names)}
-    place = np.array([moment[name] for name in rec.image_names])
-    pairs, turns = turns_between(path.part[place], rec.R_cw)
+    number = {name: k for k, name in enumerate(clip.names)}
+    place = np.array([number[name] for name in rec.image_names])
+    found = own_motions(rec, turns_only=turns_only)
+    pairs, turns = turns_between(clip.part[place], found.R_cw)
     span = rec.frame_span()[:, None]
     log, offset_s = (None, 0.0) if felt is None else (felt.log, felt.alignment.offset_s)
-    return judge_stabilisation(path.time_s[place], pairs, turns, phi * span, sigma * span, log=log, offset_s=offset_s)
+    return judge_stabilisation(
+        clip.time_s[place], pairs, turns, found.phi * span, found.sigma_phi * span, log=log, offset_s=offset_s,
+        turn_sigma=np.linalg.norm(found.sigma_turn[pairs], axis=1),
+    )  # fmt: skip
 
 
 def _tell(log: StageLog, stage: str, _cost: float) -> None:
