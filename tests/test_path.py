@@ -11,7 +11,7 @@ from scipy.interpolate import BPoly
 from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, Reconstruction, bundle_adjust
-from rsundistort.bundle.own_motions import phi_of_frames
+from rsundistort.bundle.own_motions import own_motions
 from rsundistort.bundle.path import FramePath, PathPrior, orthogonal, with_path_motions
 from rsundistort.bundle.path import PathState as State
 from rsundistort.errors import InputError
@@ -250,13 +250,27 @@ def test_a_gyroscope_says_what_the_rates_are() -> None:
     assert abs(together.readout_s[0] / FRAME_S - 0.6) < 3 * together.sigma_readout_s[0] / FRAME_S
 
 
-def test_each_frame_says_its_own_turn() -> None:
+def test_each_frame_says_its_own_turn_and_pose() -> None:
     truth, times = filmed(HandHeld(11), 16, noise_px=0.2)
     result = adjusted(truth, times)
-    phi, sigma = phi_of_frames(result)
-    error = (phi - result.reconstruction.phi) / sigma
+    found = own_motions(result.reconstruction)
+    error = (found.phi - result.reconstruction.phi) / found.sigma_phi
     # the path knows them far better than a frame alone
     assert 0.7 < np.sqrt(np.mean(error**2)) < 1.4
+    turn = Rotation.from_matrix(found.R_cw @ result.reconstruction.R_cw.transpose(0, 2, 1)).as_rotvec()
+    assert 0.7 < np.sqrt(np.mean((turn / found.sigma_turn) ** 2)) < 1.4
+
+
+def test_frames_say_their_turns_from_a_start_that_knows_none() -> None:
+    truth, times = filmed(HandHeld(11), 16, noise_px=0.2)
+    result = adjusted(truth, times)
+    expected = own_motions(result.reconstruction)
+    found = own_motions(truth)  # the true points, but no motions
+    assert not truth.phi.any()
+    # the shape of the scene is another one, and with it what all have in common
+    differences = np.diff(found.phi - expected.phi, axis=0) / np.hypot(found.sigma_phi[1:], found.sigma_phi[:-1])
+    assert np.sqrt(np.mean(differences**2)) < 2.0
+    assert np.median(np.abs(np.diff(expected.phi, axis=0) / expected.sigma_phi[1:])) > 5
 
 
 def test_the_state_of_a_path_gives_the_motions() -> None:

@@ -21,6 +21,10 @@ __all__ = ["Clip", "greys_of", "read_clip"]
 _LEAST_KEYS = 8
 # Grey levels of a frame that shows nothing.
 _DARK = 2.0
+_INTERLACED = (
+    "{0} is interlaced: each frame holds two moments, which are on no path; write it anew first: "
+    'ffmpeg -i "{0}" -vf bwdif=mode=send_frame -crf 12 -c:a copy deinterlaced.mp4'
+)
 # Longer than this many of the usual steps between frames, and the recording paused.
 _PAUSE = 20.0
 
@@ -112,7 +116,7 @@ def read_clip(video: Path, folder: Path, progress: Callable[[int, int], None] | 
     Raises
     ------
     InputError
-        Fewer than two frames that show anything, or no times.
+        Fewer than two frames that show anything, no times, or frames that are interlaced.
     FileError
         No video, or damaged at its beginning.
     """
@@ -126,6 +130,8 @@ def read_clip(video: Path, folder: Path, progress: Callable[[int, int], None] | 
             if times and time_s <= times[-1]:
                 num_late += 1
                 continue
+            if picture.interlaced_frame:
+                raise InputError(_INTERLACED.format(video.name))
             grey = _grey(picture)
             if grey.std() < _DARK:
                 continue

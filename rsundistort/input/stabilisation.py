@@ -21,12 +21,13 @@ from ..errors import InputError
 from ..io.gyro import GyroLog
 from ..model.checks import check_array, check_finite
 
-__all__ = ["Regression", "Stabilisation", "judge_stabilisation"]
+__all__ = ["Regression", "Stabilisation", "calmer_than_felt", "judge_stabilisation"]
 
 _Array = NDArray[np.float64]
 
-# Of the time from frame to frame: no rolling shutter is read faster (0.2 of 1/60 s; `io.readout_times`), none slower.
-_FASTEST, _SLOWEST = 0.1, 1.0
+# Of the time from frame to frame: no rolling shutter is read faster (0.2 of 1/60 s; `io.readout_times`), none slower,
+# but rates between frames miss up to a third of a tremor that is nearly as fast as they can show.
+_FASTEST, _SLOWEST = 0.1, 1.5
 # A readout that is known is right to this share.
 _KNOWN_SHARE = 0.3
 # Standard deviations that decide, and the share of the power of a signal that must be left unexplained.
@@ -34,6 +35,10 @@ _SIGMAS, _UNEXPLAINED = 4.0, 0.5
 # Frames turn as the gyroscope says but for the focal length, which may be wrong by a fifth.
 _TURN_SHARE = 0.75
 _FEWEST = 10
+# Frames whose turns may be off together: so many lie between key frames, whose points they show.
+_TOGETHER = 8
+# Frames whose turns change by less than this share of what was felt were turned since: no focal length is so wrong.
+_CALM = 0.5
 
 
 @dataclass(frozen=True)
@@ -43,7 +48,7 @@ class Regression:
     Attributes
     ----------
     slope, sigma : float
-        With its standard deviation, from the spread of what is left.
+        With its standard deviation, from the spread of what is left, in neighbours together.
     correlation : float
         Of both, weighted, about zero: from -1 to 1.
     signal : float
@@ -73,7 +78,8 @@ class Stabilisation:
     reason : str
         One line, with the figures that decide.
     shutter : Regression
-        Turns during the readout by the rate between frames: the slope is the time of the readout in seconds.
+        Turns during the readout by the rate between frames, or the changes of both, whichever tell the slope better: it
+        is the time of the readout in seconds.
     frames_by_gyro, shutter_by_gyro : Regression or None
         Rates between frames, and turns during the readout, by the gyroscope's rates.
     """
@@ -149,7 +155,13 @@ def judge_stabilisation(
     interval = float(np.nanmedian(span)) if np.isfinite(span).any() else np.nan
     rate, rate_noise = vectors / span[:, None], turn_noise / span[:, None]
     at_frames = _rate_at_frames(rate, joined, len(times))
-    shutter = _regress(phi, at_frames, phi_noise)
+    # what lens and scene leave in phi is slow: where it is more than noise, the changes from frame to frame tell better
+    a, b = joined.T
+    of_changes = phi[b] - phi[a], at_frames[b] - at_frames[a], np.hypot(phi_noise[a], phi_noise[b])
+    shutter = min(
+        (_regress(*each, together=_TOGETHER) for each in ((phi, at_frames, phi_noise), of_changes)),
+        key=lambda found: found.sigma,
+    )
     frames_by_gyro = shutter_by_gyro = None
     if log is not None:
         felt = -log.mean(start + offset_s, end + offset_s)
@@ -161,6 +173,41 @@ def judge_stabilisation(
         shutter_by_gyro = _regress(phi, within, phi_noise)
     verdict, reason = _judge(shutter, frames_by_gyro, shutter_by_gyro, interval, readout_s)
     return Stabilisation(verdict, reason, shutter, frames_by_gyro, shutter_by_gyro)
+
+
+def calmer_than_felt(
+    frame_time_s: ArrayLike, pairs: ArrayLike, turns: ArrayLike, turn_sigma: ArrayLike, log: GyroLog
+) -> str:
+    """Why the frames of a video are stabilised, by a gyroscope whose axes and clock need not be known; empty if not.
+
+    What is compared is by how much the turn changes from one frame to the next: that knows no axes and no bias, and
+    little of the offset of a clock.
+
+    Parameters
+    ----------
+    frame_time_s, pairs, turns, turn_sigma
+        As in `judge_stabilisation`.
+    log : GyroLog
+        Of this clip beyond doubt, by a clock that is right to some frames: telemetry of the video itself.
+    """
+    times, joined = np.asarray(frame_time_s, np.float64), np.asarray(pairs)
+    span = (times[joined[:, 1]] - times[joined[:, 0]])[:, None]
+    seen, felt = np.asarray(turns) / span, log.mean(times[joined[:, 0]], times[joined[:, 1]])
+    noise = _noise(turn_sigma, seen, "turn_sigma") / span
+    follows = joined[1:, 0] == joined[:-1, 1]
+    by_frames, by_gyro = (np.linalg.norm(np.diff(each, axis=0)[follows], axis=1) for each in (seen, felt))
+    known = np.isfinite(by_frames) & np.isfinite(by_gyro)
+    if known.sum() < _FEWEST:
+        return ""
+    of_frames, of_gyro = float(np.median(by_frames[known])), float(np.median(by_gyro[known]))
+    # three poses and three axes
+    of_noise = 3.0 * float(np.nanmedian(noise))
+    if of_gyro < _SIGMAS * of_noise or of_frames > _CALM * of_gyro:
+        return ""
+    return (
+        f"stabilised in the camera: from frame to frame the turn changes by {of_frames / of_gyro:.2f} of what the "
+        "camera's own gyroscope felt"
+    )
 
 
 def _noise(sigma: ArrayLike, values: _Array, name: str) -> _Array:
@@ -187,8 +234,11 @@ def _rate_at_frames(rate: _Array, pairs: NDArray[np.integer], num_frames: int) -
     return np.where(np.isfinite(cubic), cubic, near / 2)
 
 
-def _regress(y: _Array, x: _Array, noise: _Array, *, steady: bool = False) -> Regression:
-    """`y = slope x` with a robust loss; without the means of both where a steady difference (a bias) says nothing."""
+def _regress(y: _Array, x: _Array, noise: _Array, *, steady: bool = False, together: int = 1) -> Regression:
+    """`y = slope x` with a robust loss; without the means of both where a steady difference (a bias) says nothing.
+
+    So many neighbours may be off together.
+    """
     there = np.isfinite(x).all(axis=1) & np.isfinite(y).all(axis=1) & (noise > 0).all(axis=1)
     x, y, noise = x[there], y[there], noise[there]
     if len(x) < _FEWEST or not np.any(x):
@@ -208,7 +258,8 @@ def _regress(y: _Array, x: _Array, noise: _Array, *, steady: bool = False) -> Re
         slope = float(inlier @ np.sum(x * y, 1) / (inlier @ np.sum(x * x, 1)))
     left = y - slope * x
     information = inlier @ np.sum(x * x, 1)
-    sigma = np.sqrt(np.sum((inlier * np.sum(x * left, 1)) ** 2)) / information
+    pull = np.pad(inlier * np.sum(x * left, 1), (0, -len(x) % together)).reshape(-1, together)
+    sigma = np.sqrt(max(np.sum(pull**2), np.sum(pull.sum(1) ** 2))) / information
     norms = (inlier @ np.sum(x * x, 1)) * (inlier @ np.sum(y * y, 1))
     power = inlier / inlier.sum() / 3
     return Regression(

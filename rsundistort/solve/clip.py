@@ -14,19 +14,19 @@ from numpy.typing import NDArray
 
 from ..batch.progress import StageLog
 from ..bundle import BundleOptions, BundleResult, bundle_adjust
-from ..bundle.own_motions import own_motions
+from ..bundle.own_motions import OwnMotions, own_motions
 from ..bundle.path import FramePath
 from ..critical import heal
 from ..errors import RsUndistortWarning
 from ..input.clip import Clip
 from ..input.load import LoadedPhotos
-from ..input.stabilisation import Stabilisation, judge_stabilisation
+from ..input.stabilisation import Stabilisation, calmer_than_felt, judge_stabilisation
 from ..io.gyro import GyroLog
 from ..io.kept import Kept
 from ..model import Reconstruction
 from ..sfm import MatchedPhotos, retriangulate
 from ..verdict.clip import ReadoutTime, judge_clip
-from .clip_gyroscope import Felt, felt_gyroscope, readout_of, turns_between
+from .clip_gyroscope import Felt, felt_gyroscope, own_gyroscope, readout_of, turns_between
 from .clip_pair import two_frames
 from .clip_pan import turning_only
 from .clip_tracks import follow_points, with_all_frames
@@ -38,8 +38,6 @@ __all__ = ["frame_path", "solve_clip"]
 
 # Frames that are placed by fewer measurements say nothing of the path.
 _LEAST_MEASUREMENTS = 15
-# Fewer photos cannot tell motions of their own from the scene.
-_LEAST_OWN = 3
 # A half of a clip needs so many frames to tell a readout time of its own.
 _LEAST_HALF = 4
 # What flow may be off by, pixels, and measurements that may be far off, as a share, where rotations explain the frames.
@@ -101,20 +99,22 @@ def solve_clip(
         Its result is that of the key frames, `whole` the reconstruction of all frames.
     """
     found = _turned(clip, keys, path, options_of, log)
+    telemetry = own_gyroscope(clip) if gyroscope is None else None
     if found is None and len(clip.names) == 2:
         options = replace(options_of(start := two_frames(clip, keys)), path=path)
         found = bundle_adjust(start, "constant-motion", options, partial(_tell, log, "path")), options, None
     elif found is None:
         found = _travelled(
-            clip, keys, path, options_of, log, lambda: place_photos(keys, scratch, log, seed, matching, kept or Kept())
-        )
+            clip, keys, path, options_of, log, telemetry,
+            lambda: place_photos(keys, scratch, log, seed, matching, kept or Kept(), of_video=True),
+        )  # fmt: skip
     result, options, filmed = found
     assert options.path is not None
     path = options.path
     alone = readout_of(result)
     log.begin("gyroscope")
     # of frames that were turned since, it says nothing
-    felt = None if _was_stabilised(filmed) else felt_gyroscope(clip, result, gyroscope)
+    felt = None if _was_stabilised(filmed) else felt_gyroscope(result, gyroscope or telemetry)
     if felt is not None:
         options = replace(options, path=replace(path, rates=felt.rates(result)))
         result = bundle_adjust(
@@ -134,8 +134,7 @@ def _turned(
     log.begin("rotations")
     start, found = turning_only(clip, keys), None
     if start is not None:
-        path, filmed = _as_filmed(clip, start, replace(path, turns_only=True))
-        options = replace(options_of(start), path=path)
+        options = replace(options_of(start), path=replace(path, turns_only=True))
         result = bundle_adjust(start, "constant-motion", _at_first(options), partial(_tell, log, "rotations"))
         if result.sigma_px < _FLOW_PX and result.num_outliers < _OUTLIERS * len(start.observations):
             result = bundle_adjust(
@@ -146,20 +145,22 @@ def _turned(
                 "the camera only turned: without parallax there are directions, but no places and no scene",
                 RsUndistortWarning, stacklevel=4,
             )  # fmt: skip
-            found = result, options, filmed
+            found = result, options, None
     log.end("rotations", explained=found is not None)
     return found
 
 
 def _travelled(
     clip: Clip, keys: LoadedPhotos, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions],
-    log: StageLog, placed: Callable[[], tuple[Reconstruction, MatchedPhotos]],
+    log: StageLog, telemetry: GyroLog | None, placed: Callable[[], tuple[Reconstruction, MatchedPhotos]],
 ) -> _Found:  # fmt: skip
     """The path of a camera that travels, through the scene that its key frames show, placed as of a global shutter."""
     mapped, matched = placed()
     result: BundleResult | None = None
     filmed: Stabilisation | None = None
-    current = _by_own_motions(mapped, options_of)
+    # a shutter that is not modelled yet would be blamed on the lens
+    rough = rough_options(replace(options_of(mapped), refine=()))
+    current = bundle_adjust(mapped, "global", rough).reconstruction
     for stage in ("path", "path again"):
         log.begin("flow")
         followed = follow_points(clip, current)
@@ -168,7 +169,7 @@ def _travelled(
         log.end("flow", frames=whole.num_images, of_frames=len(clip.names), observations=len(followed.frame))
         log.begin(stage)
         if result is None:
-            path, filmed = _as_filmed(clip, whole, path)
+            path, filmed = _as_filmed(clip, whole, path, telemetry)
         options = replace(options_of(whole), path=path)
         how = _at_first(options) if result is None else replace(options, outlier_rounds=1, spread_rounds=_SPREADS)
         is_first = result is None
@@ -184,22 +185,21 @@ def _travelled(
     return result, options, filmed
 
 
-def _by_own_motions(mapped: Reconstruction, options_of: Callable[[Reconstruction], BundleOptions]) -> Reconstruction:
-    """Key frames, each of which turns as it likes: stabilised ones are on no path that their shutters are of."""
-    # a shutter that is not modelled yet would be blamed on the lens
-    rough = replace(rough_options(options_of(mapped)), refine=())
-    current = bundle_adjust(mapped, "global", rough).reconstruction
-    if current.num_images < _LEAST_OWN:
-        return current
-    return bundle_adjust(current, "rotation", replace(rough, outlier_rounds=1, deviations="model")).reconstruction
-
-
-def _as_filmed(clip: Clip, start: Reconstruction, path: FramePath) -> tuple[FramePath, Stabilisation]:
+def _as_filmed(
+    clip: Clip, start: Reconstruction, path: FramePath, telemetry: GyroLog | None
+) -> tuple[FramePath, Stabilisation]:
     """Whether frames are as the sensor read them, and the path that they can share.
 
-    The shutter of frames that were turned since is not that of their path, and any readout time would be false.
+    The shutter of frames that were turned since is not that of their path, and any readout time would be false. The
+    telemetry is the video's own.
     """
-    filmed = _stabilisation(clip, start, turns_only=path.turns_only)
+    found = own_motions(start)
+    filmed = _stabilisation(clip, start, found)
+    if filmed.verdict != "none" and telemetry is not None:
+        place = _places(clip, start)
+        pairs, turns = turns_between(clip.part[place], found.R_cw)
+        reason = calmer_than_felt(clip.time_s[place], pairs, turns, _turn_sigma(found, pairs), telemetry)
+        filmed = replace(filmed, verdict="stabilised", reason=reason) if reason else filmed
     return (_at_once(path) if _was_stabilised(filmed) else path), filmed
 
 
@@ -234,7 +234,8 @@ def _judged(
     log.begin("stabilisation")
     stabilisation = filmed
     if stabilisation is None or not _was_stabilised(filmed):
-        stabilisation = _stabilisation(clip, result.reconstruction, felt, turns_only=options.path.turns_only)
+        own = own_motions(result.reconstruction, turns_only=options.path.turns_only)
+        stabilisation = _stabilisation(clip, result.reconstruction, own, felt)
     log.end("stabilisation", verdict=stabilisation.verdict)
     of_keys = result.of_photos(_are_keys(result, clip))
     log.begin("comparison with a global shutter")
@@ -318,20 +319,28 @@ def _halves(result: BundleResult, options: BundleOptions) -> tuple[ReadoutTime, 
     return first, second
 
 
-def _stabilisation(
-    clip: Clip, rec: Reconstruction, felt: Felt | None = None, *, turns_only: bool = False
-) -> Stabilisation:
-    """Whether the lines of the frames move as the frames do, each frame being asked for its own motion."""
-    number = {name: k for k, name in enumerate(clip.names)}
-    place = np.array([number[name] for name in rec.image_names])
-    found = own_motions(rec, turns_only=turns_only)
+def _stabilisation(clip: Clip, rec: Reconstruction, found: OwnMotions, felt: Felt | None = None) -> Stabilisation:
+    """Whether the lines of the frames move as the frames do, each frame having said its own motion."""
+    place = _places(clip, rec)
     pairs, turns = turns_between(clip.part[place], found.R_cw)
     span = rec.frame_span()[:, None]
     log, offset_s = (None, 0.0) if felt is None else (felt.log, felt.alignment.offset_s)
     return judge_stabilisation(
         clip.time_s[place], pairs, turns, found.phi * span, found.sigma_phi * span, log=log, offset_s=offset_s,
-        turn_sigma=np.linalg.norm(found.sigma_turn[pairs], axis=1),
+        turn_sigma=_turn_sigma(found, pairs),
     )  # fmt: skip
+
+
+def _places(clip: Clip, rec: Reconstruction) -> NDArray[np.int64]:
+    """(m,) frames of the clip that the photos of a reconstruction are."""
+    number = {name: k for k, name in enumerate(clip.names)}
+    return np.array([number[name] for name in rec.image_names], np.int64)
+
+
+def _turn_sigma(found: OwnMotions, pairs: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(n, 3) standard deviations of the turns between pairs of frames."""
+    sigma: NDArray[np.float64] = np.linalg.norm(found.sigma_turn[pairs], axis=1)
+    return sigma
 
 
 def _tell(log: StageLog, stage: str, _cost: float) -> None:

@@ -18,7 +18,7 @@ from ..io.gpmf import has_telemetry
 from ..io.gyro import GyroLog, read_gyro
 from ..verdict.clip import ReadoutTime
 
-__all__ = ["Felt", "felt_gyroscope", "readout_of", "turns_between"]
+__all__ = ["Felt", "felt_gyroscope", "own_gyroscope", "readout_of", "turns_between"]
 
 
 @dataclass(frozen=True)
@@ -61,13 +61,19 @@ class Felt:
         }
 
 
-def felt_gyroscope(clip: Clip, result: BundleResult, log: GyroLog | None) -> Felt | None:
+def own_gyroscope(clip: Clip) -> GyroLog | None:
+    """The gyroscope's log in a video's own telemetry; None without one, or, with a warning, if it cannot be read."""
+    if not has_telemetry(clip.video):
+        return None
+    try:
+        return read_gyro(clip.video)
+    except RsUndistortError as error:
+        warnings.warn(f"without the gyroscope of {clip.video.name}: {error}", RsUndistortWarning, stacklevel=4)
+        return None
+
+
+def felt_gyroscope(result: BundleResult, log: GyroLog | None) -> Felt | None:
     """The gyroscope of a clip, aligned with its frames; None without one, or if it is of another clip."""
-    if log is None and has_telemetry(clip.video):
-        try:
-            log = read_gyro(clip.video)
-        except RsUndistortError as error:
-            warnings.warn(f"without the gyroscope of {clip.video.name}: {error}", RsUndistortWarning, stacklevel=5)
     if log is None:
         return None
     assert result.path is not None
@@ -80,9 +86,13 @@ def felt_gyroscope(clip: Clip, result: BundleResult, log: GyroLog | None) -> Fel
 
 
 def turns_between(part: NDArray[np.int64], R_cw: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Neighbouring frames (n, 2) of a part, and the rotations (n, 3) from one to the other."""
+    """Neighbouring frames (n, 2) of a part, and the rotations (n, 3) from one to the other; NaN of unknown ones."""
     first = np.flatnonzero(part[1:] == part[:-1])
-    turns = Rotation.from_matrix(R_cw[first + 1] @ R_cw[first].transpose(0, 2, 1)).as_rotvec()
+    turns = np.full((len(first), 3), np.nan)
+    between = R_cw[first + 1] @ R_cw[first].transpose(0, 2, 1)
+    known = np.isfinite(between).all(axis=(1, 2))
+    if known.any():
+        turns[known] = Rotation.from_matrix(between[known]).as_rotvec()
     return np.stack([first, first + 1], axis=1), turns
 
 

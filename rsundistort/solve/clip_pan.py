@@ -20,6 +20,8 @@ __all__ = ["turn_between", "turning_only"]
 # both frames' lines are taken out, too: the picture moves by fifty from key to key, and travel leaves a part of that.
 _ROOM_PX, _LEFT_PX = 40.0, 0.5
 _LEAST_AGREEING = 12
+# Key frames that are asked first: those of a camera that travels say so there, and the rest need not be followed.
+_FIRST = 8
 _TRIALS = 20
 
 
@@ -32,6 +34,19 @@ def turning_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
     camera = keys.cameras.of(0)
     number = {name: k for k, name in enumerate(clip.names)}
     shown = {number[name]: found.xy_raw for name, found in zip(keys.names, keys.features, strict=True)}
+    first = sorted(shown)[:_FIRST]
+    if len(shown) >= 2 * _FIRST and _chained(clip, camera, {key: shown[key] for key in first}) is None:
+        return None
+    chained = _chained(clip, camera, shown)
+    if chained is None or 2 * len(chained[2]) < len(clip.names):
+        return None
+    return _joined(clip, keys, chained[0], shown, *chained[1:])
+
+
+def _chained(
+    clip: Clip, camera: Camera, shown: dict[int, NDArray[np.float64]]
+) -> tuple[Followed, dict[int, NDArray[np.float64]], dict[int, NDArray[np.float64]]] | None:
+    """What is followed of key frames, their directions, and the rotations of frames; None if they do not only turn."""
     followed = follow(clip, shown, camera)
     rays = _directions(followed.xy_raw, camera)
     own = {key: _directions(shown[key][followed.chosen[key]], camera) for key in followed.chosen}
@@ -45,8 +60,6 @@ def turning_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
             turn = _turn(own[a][followed.place[mine]], rays[mine], _ROOM_PX / float(camera.K[0, 0]))
             if turn is not None:
                 R_cw[k] = turn @ R_cw[a]
-    if 2 * len(R_cw) < len(clip.names):
-        return None
     left = []
     for a, b in pairwise(order):
         if a in R_cw and b in R_cw:
@@ -55,7 +68,7 @@ def turning_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
             left.append(_left_by_shutter(before, rays[mine], camera))
     if not left or not np.median(left) * camera.K[0, 0] < _LEFT_PX:
         return None
-    return _joined(clip, keys, followed, shown, own, R_cw)
+    return followed, own, R_cw
 
 
 def _joined(
