@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from make_photos import texture
 from rsundistort_cli.main import cli
 
-from rsundistort.errors import RsUndistortWarning
+from rsundistort.errors import InputError, RsUndistortWarning
 from rsundistort.input.clip import read_clip
 from rsundistort.io.video import VideoReader
 
@@ -120,14 +120,15 @@ def test_dark_frames_are_left_out(tmp_path):
     assert clip.numbers == (0, 1, 2, 3, 6, 7, 8, 9)
 
 
-def test_an_interlaced_video_is_said_to_be_one(tmp_path):
+def test_an_interlaced_video_is_refused_with_what_mends_it(tmp_path):
     options = {"x264-params": "interlaced=1:tff=1", "flags": "+ildct+ilme"}
     video = encode(tmp_path / "clip.mp4", [view(k) for k in range(10)], options=options)
     with VideoReader(video) as reader:
         if not any(picture.interlaced_frame for _, _, picture in reader):
             pytest.skip("this FFmpeg does not encode interlaced frames")
-    with pytest.warns(RsUndistortWarning, match="interlaced: each frame holds two moments"):
+    with pytest.raises(InputError, match=r'interlaced: each frame holds two moments.* ffmpeg -i "clip\.mp4" -vf bwdif'):
         read_clip(video, tmp_path / "frames")
+    assert not (tmp_path / "frames").exists()
 
 
 def test_ten_bits_and_a_rotation_are_no_trouble(tmp_path):

@@ -170,7 +170,7 @@ def judge_stabilisation(
         frames_by_gyro = _regress(rate, felt, noise, steady=True)
         length = readout_s or 0.5 * interval
         within = -log.mean(times + offset_s - length / 2, times + offset_s + length / 2)
-        shutter_by_gyro = _regress(phi, within, phi_noise)
+        shutter_by_gyro = _regress(phi, within, phi_noise, together=_TOGETHER)
     verdict, reason = _judge(shutter, frames_by_gyro, shutter_by_gyro, interval, readout_s)
     return Stabilisation(verdict, reason, shutter, frames_by_gyro, shutter_by_gyro)
 
@@ -306,7 +306,8 @@ def _judge(
     if unexplained and (detectable or shutter.correlation < 0.5):
         return "stabilised", (
             f"stabilised in the camera: a shutter without its rotation, {shutter.unexplained / shutter.signal:.0%} of "
-            f"what the lines show is not in the rotation between the frames (readout {found})"
+            f"what the lines show is not in the rotation between the frames (readout {found}); shaking faster than "
+            f"{0.5 / interval:.0f} Hz looks the same"
         )
     if detectable and high < least:
         return "stabilised", (

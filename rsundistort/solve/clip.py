@@ -272,7 +272,7 @@ def _judged(
         evidence["by_pictures"] = alone._asdict()
         evidence["gyroscope"] = felt.facts()
         if by_gyro is not None:
-            evidence["by_gyroscope"] = {"seconds": by_gyro.slope, "sigma": by_gyro.sigma}
+            evidence["by_gyroscope"] = felt.readout(by_gyro)._asdict()
     return Solved(
         of_keys, global_result, keys.cameras, remedy=remedy, verdict=verdict,
         whole=result.reconstruction.moved(*world), evidence=evidence,

@@ -14,6 +14,7 @@ from ..bundle import BundleResult
 from ..errors import RsUndistortError, RsUndistortWarning
 from ..input.clip import Clip
 from ..input.gyro_alignment import GyroAlignment, NoAlignment, align_gyro
+from ..input.stabilisation import Regression
 from ..io.gpmf import has_telemetry
 from ..io.gyro import GyroLog, read_gyro
 from ..verdict.clip import ReadoutTime
@@ -36,7 +37,7 @@ class Felt:
     alignment: GyroAlignment
     log: GyroLog
 
-    def rates(self, result: BundleResult) -> dict[str, tuple[NDArray[np.float64], float]]:
+    def rates(self, result: BundleResult) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
         """Rates of the frames that it covers, as `FramePath.rates` takes them, about the time of their middle rows."""
         assert result.path is not None
         half = max(0.5 * abs(readout_of(result).seconds), 0.5 * self.log.step_s)
@@ -45,9 +46,22 @@ class Felt:
         names = [name for name, there in zip(result.path.names, inside, strict=True) if there]
         if not names:
             return {}
-        # the world turns against the camera
-        values = -self.log.mean(at[inside] - half, at[inside] + half)
-        return {name: (rate, self.alignment.rms) for name, rate in zip(names, values, strict=True)}
+        # the world turns against the camera, and by what the pictures call a radian: their focal length cancels in the
+        # readout time only if both speak of the same
+        found, start, end = self.alignment, at[inside] - half, at[inside] + half
+        values = -found.ratio * self.log.mean(start, end)
+        # a clock that is off tells the rates of another moment
+        step = self.log.step_s
+        ahead, behind = (found.ratio * self.log.mean(start + by, end + by) for by in (step, -step))
+        by_clock = found.offset_sigma_s * np.nan_to_num(ahead - behind) / (2 * step)
+        sigma = np.hypot(found.rms, by_clock)
+        return {name: (rate, each) for name, rate, each in zip(names, values, sigma, strict=True)}
+
+    def readout(self, shutter: Regression) -> ReadoutTime:
+        """The readout time by turns of the lines over rates of the gyroscope, in what the pictures call a radian."""
+        seconds, found = shutter.slope / self.alignment.ratio, self.alignment
+        share = np.hypot(shutter.sigma / shutter.slope, found.ratio_sigma / found.ratio) if shutter.slope else np.inf
+        return ReadoutTime(seconds, float(abs(seconds) * share) if shutter.slope else float(shutter.sigma))
 
     def facts(self) -> dict[str, Any]:
         """What `solution.json` says of it."""
