@@ -80,8 +80,16 @@ def own_motions(reconstruction: Reconstruction, *, turns_only: bool = False) -> 
     sigma = np.full((m, _UNKNOWNS), np.nan)
     scale, scaled = _scaled(H)
     told = np.linalg.cond(scaled) < 1e12
-    inverse = np.linalg.inv(scaled[told])
-    sigma[np.ix_(told, own)] = noise * scale[told] * np.sqrt(np.diagonal(inverse, axis1=1, axis2=2))
+    inverse = scale[told, :, None] * np.linalg.inv(scaled[told]) * scale[told, None]
+    variance = noise**2 * np.diagonal(inverse, axis1=1, axis2=2)
+    # neighbours in a frame go wrong together, by lens, waves and leaves: one factor for each kind of unknown
+    corner = problem.partitions(state)[1].group
+    count = int(corner.max(initial=0)) + 1
+    pulls = np.zeros((m * count, len(own)))
+    np.add.at(pulls, frame * count + corner, np.einsum("oia,oi->oa", J, residuals))
+    moved = np.einsum("fab,fcb->fca", inverse, pulls.reshape(m, count, -1)[told])
+    together = np.median((moved**2).sum(1) / variance, axis=0) if told.any() else np.ones(len(own))
+    sigma[np.ix_(told, own)] = np.sqrt(np.maximum(together, 1.0) * variance)
     R_cw, phi = state.R_cw.copy(), state.phi.copy()
     R_cw[~told], phi[~told] = np.nan, np.nan
     return OwnMotions(R_cw, phi, sigma[:, :3], sigma[:, 6:])

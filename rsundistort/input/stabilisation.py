@@ -30,11 +30,18 @@ _Array = NDArray[np.float64]
 _FASTEST, _SLOWEST = 0.1, 1.5
 # A readout that is known is right to this share.
 _KNOWN_SHARE = 0.3
+_SLOWEST_SHARE = 1.0
 # Standard deviations that decide, and the share of the power of a signal that must be left unexplained.
 _SIGMAS, _UNEXPLAINED = 4.0, 0.5
+# Of what lines show, over the power of their noise: noise that is said to be a third of what it is shows eight.
+_SHOWN = 9.0
+# Times the median: no rates of a hand are farther out.
+_FARTHEST = 12.0
 # Frames turn as the gyroscope says but for the focal length, which may be wrong by a fifth.
 _TURN_SHARE = 0.75
 _FEWEST = 10
+# Of a hand's shaking, half a period.
+_CHANGE_S = 0.1
 # Frames whose turns may be off together: so many lie between key frames, whose points they show.
 _TOGETHER = 8
 # Frames whose turns change by less than this share of what was felt were turned since: no focal length is so wrong.
@@ -80,6 +87,11 @@ class Stabilisation:
     shutter : Regression
         Turns during the readout by the rate between frames, or the changes of both, whichever tell the slope better: it
         is the time of the readout in seconds.
+    changes : Regression
+        Changes within a tenth of a second of the one by those of the other.
+    beyond_frames : bool
+        Whether the lines change their turn by more than the frames do in all of the time from one to the next: no
+        readout takes longer, and false poses only make the frames seem to turn by more.
     frames_by_gyro, shutter_by_gyro : Regression or None
         Rates between frames, and turns during the readout, by the gyroscope's rates.
     """
@@ -87,8 +99,15 @@ class Stabilisation:
     verdict: Literal["none", "stabilised", "unknown"]
     reason: str
     shutter: Regression
+    changes: Regression
     frames_by_gyro: Regression | None = None
     shutter_by_gyro: Regression | None = None
+    beyond_frames: bool = False
+
+    @property
+    def shows_shaking(self) -> bool:
+        """Whether the lines show shaking that the frames do not: the one sign that no doubt in the poses makes."""
+        return self.beyond_frames and self.changes.unexplained > max(_UNEXPLAINED * self.changes.signal, _SHOWN)
 
     def __str__(self) -> str:
         return self.reason
@@ -155,13 +174,21 @@ def judge_stabilisation(
     interval = float(np.nanmedian(span)) if np.isfinite(span).any() else np.nan
     rate, rate_noise = vectors / span[:, None], turn_noise / span[:, None]
     at_frames = _rate_at_frames(rate, joined, len(times))
-    # what lens and scene leave in phi is slow: where it is more than noise, the changes from frame to frame tell better
-    a, b = joined.T
-    of_changes = phi[b] - phi[a], at_frames[b] - at_frames[a], np.hypot(phi_noise[a], phi_noise[b])
-    shutter = min(
-        (_regress(*each, together=_TOGETHER) for each in ((phi, at_frames, phi_noise), of_changes)),
-        key=lambda found: found.sigma,
+    # what lens and scene leave in phi is slow: where it is more than noise, changes tell better than levels; and
+    # what is in no rotation shows in them alone
+    step = max(1, round(_CHANGE_S / interval)) if np.isfinite(interval) else 1
+    by_lines, by_frames = (each[step:] - each[:-step] for each in (phi, at_frames))
+    levels, changes = (
+        _regress(*each, together=_TOGETHER)
+        for each in (
+            (phi, at_frames, phi_noise),
+            (by_lines, by_frames, np.hypot(phi_noise[step:], phi_noise[:-step])),
+        )
     )
+    known = np.isfinite(by_lines).all(axis=1) & np.isfinite(by_frames).all(axis=1)
+    in_lines, in_frames = (np.linalg.norm(each[known], axis=1) for each in (by_lines, by_frames))
+    beyond = bool(known.any()) and float(np.median(in_lines)) > _SLOWEST_SHARE * interval * float(np.median(in_frames))
+    shutter = min(levels, changes, key=lambda found: found.sigma)
     frames_by_gyro = shutter_by_gyro = None
     if log is not None:
         felt = -log.mean(start + offset_s, end + offset_s)
@@ -171,8 +198,8 @@ def judge_stabilisation(
         length = readout_s or 0.5 * interval
         within = -log.mean(times + offset_s - length / 2, times + offset_s + length / 2)
         shutter_by_gyro = _regress(phi, within, phi_noise, together=_TOGETHER)
-    verdict, reason = _judge(shutter, frames_by_gyro, shutter_by_gyro, interval, readout_s)
-    return Stabilisation(verdict, reason, shutter, frames_by_gyro, shutter_by_gyro)
+    verdict, reason = _judge(shutter, changes, beyond, frames_by_gyro, shutter_by_gyro, interval, readout_s)
+    return Stabilisation(verdict, reason, shutter, changes, frames_by_gyro, shutter_by_gyro, beyond)
 
 
 def calmer_than_felt(
@@ -244,6 +271,10 @@ def _regress(y: _Array, x: _Array, noise: _Array, *, steady: bool = False, toget
     if len(x) < _FEWEST or not np.any(x):
         signal = float(np.mean((y / noise) ** 2) - 1) if len(y) else 0.0
         return Regression(0.0, np.inf, 0.0, signal, signal, np.inf)
+    # false poses between frames are rates that nobody turns by, and would decide alone
+    size = np.linalg.norm(x, axis=1)
+    near = size <= _FARTHEST * np.median(size)
+    x, y, noise = x[near], y[near], noise[near]
     if steady:
         x, y = x - np.median(x, axis=0), y - np.median(y, axis=0)
     x, y = x / noise, y / noise
@@ -274,6 +305,8 @@ def _regress(y: _Array, x: _Array, noise: _Array, *, steady: bool = False, toget
 
 def _judge(
     shutter: Regression,
+    changes: Regression,
+    beyond: bool,
     frames_by_gyro: Regression | None,
     shutter_by_gyro: Regression | None,
     interval: float,
@@ -287,8 +320,7 @@ def _judge(
         wanted = f"{1e3 * readout_s:.1f} ms"
     found = f"{1e3 * shutter.slope:.1f} +- {1e3 * shutter.sigma:.1f} ms, correlation {shutter.correlation:.2f}"
     low, high = (shutter.slope + side * _SIGMAS * shutter.sigma for side in (-1, 1))
-    shakes = shutter.signal > 1.0  # lines show more than their noise
-    unexplained = shakes and shutter.unexplained > max(_UNEXPLAINED * shutter.signal, 1.0)
+    unexplained = beyond and changes.unexplained > max(_UNEXPLAINED * changes.signal, _SHOWN)
     if frames_by_gyro is not None:
         turns = frames_by_gyro
         if (
@@ -303,9 +335,9 @@ def _judge(
                 line += f", their lines as it says ({1e3 * shutter_by_gyro.slope:.1f} ms)"
             return "stabilised", line
     detectable = _SIGMAS * shutter.reach < least
-    if unexplained and (detectable or shutter.correlation < 0.5):
+    if unexplained:
         return "stabilised", (
-            f"stabilised in the camera: a shutter without its rotation, {shutter.unexplained / shutter.signal:.0%} of "
+            f"stabilised in the camera: a shutter without its rotation, {changes.unexplained / changes.signal:.0%} of "
             f"what the lines show is not in the rotation between the frames (readout {found}); shaking faster than "
             f"{0.5 / interval:.0f} Hz looks the same"
         )

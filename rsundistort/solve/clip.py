@@ -123,7 +123,7 @@ def solve_clip(
             partial(_tell, log, "gyroscope"),
         )  # fmt: skip
     log.end("gyroscope", offset_s=None if felt is None else felt.alignment.offset_s)
-    return _judged(clip, keys, result, options, alone, felt, filmed, log)
+    return _judged(clip, keys, result, options, alone, felt, filmed, telemetry, log)
 
 
 def _turned(
@@ -195,12 +195,27 @@ def _as_filmed(
     """
     found = own_motions(start)
     filmed = _stabilisation(clip, start, found)
-    if filmed.verdict != "none" and telemetry is not None:
-        place = _places(clip, start)
-        pairs, turns = turns_between(clip.part[place], found.R_cw)
-        reason = calmer_than_felt(clip.time_s[place], pairs, turns, _turn_sigma(found, pairs), telemetry)
-        filmed = replace(filmed, verdict="stabilised", reason=reason) if reason else filmed
+    if not filmed.shows_shaking:  # poses that no path holds yet say little else
+        filmed = replace(filmed, verdict="unknown" if filmed.verdict == "stabilised" else filmed.verdict)
+    if telemetry is not None:
+        filmed = _against_telemetry(clip, start, found.R_cw, found, telemetry, filmed)
     return (_at_once(path) if _was_stabilised(filmed) else path), filmed
+
+
+def _against_telemetry(
+    clip: Clip, rec: Reconstruction, R_cw: NDArray[np.float64], own: OwnMotions, telemetry: GyroLog,
+    filmed: Stabilisation,
+) -> Stabilisation:  # fmt: skip
+    """What is said of frames that turn by less than the video's own telemetry felt, unless their lines turn as they do.
+
+    A lens that moves against the shaking leaves the lines with the frames.
+    """
+    if filmed.verdict == "none":
+        return filmed
+    place = _places(clip, rec)
+    pairs, turns = turns_between(clip.part[place], R_cw)
+    reason = calmer_than_felt(clip.time_s[place], pairs, turns, _turn_sigma(own, pairs), telemetry)
+    return replace(filmed, verdict="stabilised", reason=reason) if reason else filmed
 
 
 def _at_once(path: FramePath) -> FramePath:
@@ -219,7 +234,7 @@ def _at_first(options: BundleOptions) -> BundleOptions:
 
 def _judged(
     clip: Clip, keys: LoadedPhotos, result: BundleResult, options: BundleOptions, alone: ReadoutTime,
-    felt: Felt | None, filmed: Stabilisation | None, log: StageLog,
+    felt: Felt | None, filmed: Stabilisation | None, telemetry: GyroLog | None, log: StageLog,
 ) -> Solved:  # fmt: skip
     """What is to be believed of a path, and what is told of its key frames."""
     assert options.path is not None
@@ -236,6 +251,9 @@ def _judged(
     if stabilisation is None or not _was_stabilised(filmed):
         own = own_motions(result.reconstruction, turns_only=options.path.turns_only)
         stabilisation = _stabilisation(clip, result.reconstruction, own, felt)
+        if felt is None and telemetry is not None:
+            on_path = result.reconstruction
+            stabilisation = _against_telemetry(clip, on_path, on_path.R_cw, own, telemetry, stabilisation)
     log.end("stabilisation", verdict=stabilisation.verdict)
     of_keys = result.of_photos(_are_keys(result, clip))
     log.begin("comparison with a global shutter")
