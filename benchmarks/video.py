@@ -10,6 +10,7 @@ Prints one JSON object a line. Clips are rendered into FOLDER once (`clips.py`: 
     pan      random clips from a tripod
     two      two frames whose readout time is known: how far off the corrected positions are
     readout  random walks, gentle to wild: errors of the readout time, and these over their standard deviations
+    stabilised  the same, turned back to smooth paths: which are named; and how many of those as the sensor saw them are
     gopro    ../shared/video: clock, axes and rotation of its gyroscope, readout by pictures and by the gyroscope
 """
 
@@ -29,6 +30,7 @@ import numpy as np
 from clips import clip_folder
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from stabilise import rotations_by_truth, stabilise, zoomed
 
 from rsundistort import Reconstruction, Solution, evaluate, read_solution, rectify, run
 from rsundistort.batch.geometry import SceneGeometry, ScenePoints
@@ -45,7 +47,7 @@ from rsundistort.solve.clip import frame_path, solve_clip
 from rsundistort.solve.outcome import Solved
 
 WALK = Path(__file__).parents[1] / "sample_scenes" / "walk"
-PARTS = ("walk", "level", "pan", "two", "readout", "gopro")
+PARTS = ("walk", "level", "pan", "two", "readout", "stabilised", "gopro")
 
 
 def solved_clip(video: Path, camera: str, readout_s: float | None = None) -> tuple[Solved, float]:
@@ -252,6 +254,26 @@ def readout(args: argparse.Namespace) -> None:
     )  # fmt: skip
 
 
+def stabilised(args: argparse.Namespace) -> None:
+    """Clips as they were read, turned back as wholes (by a Gaussian of so many frames), and freed of the shutter, too."""
+    for seed in range(args.first_seed, args.first_seed + args.num):
+        folder = clip_folder(args.clips, "walk", seed)
+        camera = read_solution(folder / "ground_truth.json").cameras["1"]
+        R_cw, phi = rotations_by_truth(folder)
+        found = {"clip": folder.name}
+        with tempfile.TemporaryDirectory() as scratch:
+            new = zoomed(camera)
+            intrinsics = ",".join(str(each) for each in (new.K[0, 0], new.K[1, 1], new.K[0, 2], new.K[1, 2]))
+            for name, frames, turns in (("smooth", 12.0, None), ("less smooth", 4.0, None), ("without", 12.0, phi)):
+                video = Path(scratch) / f"{name}.mp4"
+                stabilise(folder / "clip.mp4", video, camera, R_cw, frames, turns)
+                solved, _ = solved_clip(video, intrinsics)
+                found[name] = solved.evidence["stabilisation"]["verdict"]
+        solved, _ = solved_clip(folder / "clip.mp4", str(folder / "camera.json"))
+        found["as read"] = solved.evidence["stabilisation"]["verdict"]
+        print(json.dumps(found), flush=True)
+
+
 def gopro(args: argparse.Namespace) -> None:
     """A GoPro with its gyroscope."""
     video = args.shared / "video" / "gopro-hero5-gentle.mp4"
@@ -273,7 +295,7 @@ def main() -> None:
         if part in ("level", "pan", "two"):
             of_kind(part, args)
         else:
-            {"walk": walk, "readout": readout, "gopro": gopro}[part](args)
+            {"walk": walk, "readout": readout, "stabilised": stabilised, "gopro": gopro}[part](args)
 
 
 if __name__ == "__main__":

@@ -30,7 +30,6 @@ _Array = NDArray[np.float64]
 _FASTEST, _SLOWEST = 0.1, 1.5
 # A readout that is known is right to this share.
 _KNOWN_SHARE = 0.3
-_SLOWEST_SHARE = 1.0
 # Standard deviations that decide, and the share of the power of a signal that must be left unexplained.
 _SIGMAS, _UNEXPLAINED = 4.0, 0.5
 # Of what lines show, over the power of their noise: noise that is said to be a third of what it is shows eight.
@@ -174,20 +173,9 @@ def judge_stabilisation(
     interval = float(np.nanmedian(span)) if np.isfinite(span).any() else np.nan
     rate, rate_noise = vectors / span[:, None], turn_noise / span[:, None]
     at_frames = _rate_at_frames(rate, joined, len(times))
-    # what lens and scene leave in phi is slow: where it is more than noise, changes tell better than levels; and
-    # what is in no rotation shows in them alone
-    step = max(1, round(_CHANGE_S / interval)) if np.isfinite(interval) else 1
-    by_lines, by_frames = (each[step:] - each[:-step] for each in (phi, at_frames))
-    levels, changes = (
-        _regress(*each, together=_TOGETHER)
-        for each in (
-            (phi, at_frames, phi_noise),
-            (by_lines, by_frames, np.hypot(phi_noise[step:], phi_noise[:-step])),
-        )
-    )
-    known = np.isfinite(by_lines).all(axis=1) & np.isfinite(by_frames).all(axis=1)
-    in_lines, in_frames = (np.linalg.norm(each[known], axis=1) for each in (by_lines, by_frames))
-    beyond = bool(known.any()) and float(np.median(in_lines)) > _SLOWEST_SHARE * interval * float(np.median(in_frames))
+    levels = _regress(phi, at_frames, phi_noise, together=_TOGETHER)
+    changes, beyond = _of_changes(phi, at_frames, phi_noise, interval)
+    # what lens and scene leave in phi is slow: where it is more than noise, changes tell better than levels
     shutter = min(levels, changes, key=lambda found: found.sigma)
     frames_by_gyro = shutter_by_gyro = None
     if log is not None:
@@ -200,6 +188,21 @@ def judge_stabilisation(
         shutter_by_gyro = _regress(phi, within, phi_noise, together=_TOGETHER)
     verdict, reason = _judge(shutter, changes, beyond, frames_by_gyro, shutter_by_gyro, interval, readout_s)
     return Stabilisation(verdict, reason, shutter, changes, frames_by_gyro, shutter_by_gyro, beyond)
+
+
+def _of_changes(phi: _Array, rate: _Array, noise: _Array, interval: float) -> tuple[Regression, bool]:
+    """Changes of phi (m, 3) by those of the rate, and whether they are more than the frames turn in all of their time.
+
+    What is in no rotation shows in them alone: slow turns of the lines may be what lens and scene leave.
+    """
+    step = max(1, round(_CHANGE_S / interval)) if np.isfinite(interval) else 1
+    lines, frames = (each[step:] - each[:-step] for each in (phi, rate))
+    found = _regress(lines, frames, np.hypot(noise[step:], noise[:-step]), together=_TOGETHER)
+    known = np.isfinite(lines).all(axis=1) & np.isfinite(frames).all(axis=1)
+    if not known.any():
+        return found, False
+    in_lines, in_frames = (float(np.median(np.linalg.norm(each[known], axis=1))) for each in (lines, frames))
+    return found, in_lines > interval * in_frames
 
 
 def calmer_than_felt(
