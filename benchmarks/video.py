@@ -255,7 +255,7 @@ def readout(args: argparse.Namespace) -> None:
 
 
 def stabilised(args: argparse.Namespace) -> None:
-    """Clips as they were read, turned back as wholes (by Gaussians of so many frames), and freed of the shutter, too."""
+    """Clips as they were read, turned back as wholes by Gaussians of so many frames, and freed of the shutter."""
     for seed in range(args.first_seed, args.first_seed + args.num):
         folder = clip_folder(args.clips, "walk", seed)
         camera = read_solution(folder / "ground_truth.json").cameras["1"]

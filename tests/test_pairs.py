@@ -207,11 +207,3 @@ def test_only_the_given_pairs_are_matched(tmp_path):
         ids = db.read_two_view_geometry_num_inliers()[0]
         done = {tuple(k - 1 for k in pycolmap.pair_id_to_image_pair(each)) for each in ids}
     assert done == as_set(pairs)
-
-
-def test_fewer_partners_that_look_alike() -> None:
-    descriptors = np.random.default_rng(0).integers(0, 9, (60, 16))
-    few, many = (choose_pairs(60, [np.arange(60)], None, descriptors, num_similar=k) for k in (3, 10))
-    near = choose_pairs(60, [np.arange(60)])
-    assert len(near) < len(few) <= len(near) + 3 * 60
-    assert {tuple(pair) for pair in few.tolist()} <= {tuple(pair) for pair in many.tolist()}

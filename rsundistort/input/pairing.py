@@ -19,29 +19,19 @@ MATCHINGS = ("auto", "exhaustive", "neighbours")
 
 # neighbours are about 25 for each photo
 _EXHAUSTIVE_TO = 60
-# Of key frames of a video, each of which goes on from the one before: partners that look alike are for loops only.
-_EXHAUSTIVE_KEYS_TO, _SIMILAR_KEYS = 20, 3
 _EARTH_RADIUS_M = 6371e3
 
 
-def pairs_to_match(
-    photos: LoadedPhotos, matching: str, seed: int, *, of_video: bool = False
-) -> NDArray[np.int64] | None:
-    """Photos that are neighbours in the order of capture, by GPS or in looks; None for all pairs there are.
-
-    Key frames of one video need fewer of them than photos that need not overlap with those before and after.
-    """
+def pairs_to_match(photos: LoadedPhotos, matching: str, seed: int) -> NDArray[np.int64] | None:
+    """Photos that are neighbours in the order of capture, by GPS or in looks; None for all pairs there are."""
     num_photos = len(photos.names)
-    few = _EXHAUSTIVE_KEYS_TO if of_video else _EXHAUSTIVE_TO
-    if matching == "exhaustive" or (matching == "auto" and num_photos <= few):
+    if matching == "exhaustive" or (matching == "auto" and num_photos <= _EXHAUSTIVE_TO):
         return None
-    similar = {"num_similar": _SIMILAR_KEYS} if of_video else {}
     return choose_pairs(
         num_photos,
         capture_sequences(photos.names, photos.cameras.camera_idx, photos.facts),
         places_of(photos.facts),
         global_descriptors([each.descriptors for each in photos.features], seed),
-        **similar,
     )
 
 

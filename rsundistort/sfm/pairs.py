@@ -29,7 +29,6 @@ def choose_pairs(
     sequences: Sequence[ArrayLike] = (),
     positions: ArrayLike | None = None,
     descriptors: ArrayLike | None = None,
-    num_similar: int = _SIMILAR,
 ) -> NDArray[np.int64]:
     """Pairs of photos that were taken one after the other, near each other, or that look alike.
 
@@ -45,8 +44,6 @@ def choose_pairs(
         Where they were taken, in any unit of length; NaN where that is not known.
     descriptors : (m, D) array, optional
         As `global_descriptors` gives them; photos of which it is 0 look like none.
-    num_similar : int
-        Partners of each photo that look like it, and are not chosen already.
 
     Returns
     -------
@@ -58,7 +55,7 @@ def choose_pairs(
         pairs.append(_nearest(np.asarray(positions, np.float64)))
     if descriptors is not None:
         # the most similar ones are often those that were chosen already: they would leave no room for a return
-        pairs.append(_most_similar(np.asarray(descriptors), np.concatenate(pairs), num_similar))
+        pairs.append(_most_similar(np.asarray(descriptors), np.concatenate(pairs)))
     chosen = np.sort(np.concatenate(pairs), axis=1)
     chosen = chosen[chosen[:, 0] < chosen[:, 1]]
     return np.column_stack(np.divmod(np.unique(chosen[:, 0] * num_photos + chosen[:, 1]), num_photos))
@@ -84,7 +81,7 @@ def _nearest(positions: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.column_stack([np.repeat(known, found.shape[1]), known[found.ravel()]])
 
 
-def _most_similar(descriptors: NDArray[Any], chosen: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+def _most_similar(descriptors: NDArray[Any], chosen: NDArray[np.int64]) -> NDArray[np.int64]:
     """Each photo with those that look most like it and are not chosen already; of equals the first."""
     known = np.flatnonzero(descriptors.any(1))
     place = np.full(len(descriptors), -1)
@@ -98,7 +95,7 @@ def _most_similar(descriptors: NDArray[Any], chosen: NDArray[np.int64], most: in
         of_block = chosen[(chosen[:, 0] >= first) & (chosen[:, 0] < first + _BLOCK)]
         similarity[of_block[:, 0] - first, of_block[:, 1]] = -np.inf
         similarity[block - first, block] = -np.inf
-        best = np.argsort(-similarity, axis=1, kind="stable")[:, :most]
+        best = np.argsort(-similarity, axis=1, kind="stable")[:, :_SIMILAR]
         row, column = np.nonzero(np.isfinite(np.take_along_axis(similarity, best, axis=1)))
         found.append(np.column_stack([known[block[row]], known[best[row, column]]]))
     return np.concatenate(found)

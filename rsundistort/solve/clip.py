@@ -106,7 +106,7 @@ def solve_clip(
     elif found is None:
         found = _travelled(
             clip, keys, path, options_of, log, telemetry,
-            lambda: place_photos(keys, scratch, log, seed, matching, kept or Kept(), of_video=True),
+            lambda: place_photos(keys, scratch, log, seed, matching, kept or Kept()),
         )  # fmt: skip
     result, options, filmed = found
     assert options.path is not None

@@ -36,7 +36,6 @@ def place_photos(
     kept: Kept,
     *,
     with_shutter: bool = False,
-    of_video: bool = False,
 ) -> tuple[Reconstruction, MatchedPhotos]:
     """Match photos and map them, as of a global shutter; what was kept of that is not done again.
 
@@ -54,8 +53,6 @@ def place_photos(
         What is done is kept in it.
     with_shutter : bool
         Whether pairs that a shutter hides are verified by relative poses that have one.
-    of_video : bool
-        Whether the photos are key frames of one video.
     """
     cameras, database = photos.cameras, scratch / "database.db"
     log.begin("matching")
@@ -64,8 +61,7 @@ def place_photos(
     if counts is not None and kept.get_file("database", database):
         matched = MatchedPhotos(*given, calibrated=cameras.calibrated, seed=seed)
     else:
-        pairs = pairs_to_match(photos, matching, seed, of_video=of_video)
-        num_pairs = math.comb(len(photos.names), 2)
+        pairs, num_pairs = pairs_to_match(photos, matching, seed), math.comb(len(photos.names), 2)
         matched = match_photos(*given, calibrated=cameras.calibrated, seed=seed, pairs=pairs)
         counts = {"pairs": num_pairs if pairs is None else len(pairs), "of_pairs": num_pairs}
         if with_shutter:
