@@ -41,7 +41,7 @@ from rsundistort.model.orientation import turn_path
 from rsundistort.model.path import CameraPath
 from rsundistort.report.readout import readout_facts
 from rsundistort.solve import MeasuredReadout, measure_readout
-from rsundistort.solve.readout import problem_of
+from rsundistort.verdict.clip import problem_of
 
 av = pytest.importorskip("av")
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from ..verdict.clip import problem_of
+
 __all__ = ["readout_facts"]
 
 
@@ -23,7 +25,9 @@ def readout_facts(told: Mapping[str, Any]) -> list[tuple[str, str]]:
     source = told["source"]
     origin = source if source.startswith("what") else f"measured from {source}"
     share = f" ({told['of_frame']:.2f} of the frame)" if "of_frame" in told else ""  # the truth of a clip has none
-    facts = [("readout time", f"{_time(told)}{share}, {origin}")]
+    # what was known before need not be told by the video
+    problem = "" if source.startswith("what") else problem_of(told)
+    facts = [("readout time", f"not measured: {problem}" if problem else f"{_time(told)}{share}, {origin}")]
     halves = told.get("halves") or ()
     if halves:
         facts.append(("its halves say", " and ".join(_time(half) for half in halves)))

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..batch.progress import ProgressCallback, StageLog
 from ..batch.workers import Workers, use_threads
 from ..errors import InputError, RsUndistortWarning
@@ -19,11 +17,11 @@ from ..input.unknown_focal import with_focal_lengths
 from ..io import is_video
 from ..io.outputs import work_folder
 from ..io.places import local_place
-from ..verdict.clip import APART, SIGMAS
+from ..verdict.clip import problem_of
 from .run import solve_frames
 from .run_options import RunOptions
 
-__all__ = ["MeasuredReadout", "measure_readout", "problem_of"]
+__all__ = ["MeasuredReadout", "measure_readout"]
 
 
 @dataclass(frozen=True)
@@ -108,23 +106,3 @@ def measure_readout(
         solved = solve_frames(options, source.clip, loaded, bodies, gyro_log, log)
     told = dict(solved.evidence)
     return MeasuredReadout(told["seconds"], told["sigma"], told["of_frame"], problem_of(told), told)
-
-
-def problem_of(told: Mapping[str, Any]) -> str:
-    """Why a video does not tell its readout time; empty if it does."""
-    stabilised = told["stabilisation"]
-    if stabilised["verdict"] == "stabilised":
-        return str(stabilised["reason"])
-    if told["source"] == "what was known before":
-        return "the video does not tell it better than it was known before"
-    seconds, sigma = told["seconds"], told["sigma"]
-    if not abs(seconds) > SIGMAS * sigma:
-        return f"the camera moved too little: {1e3 * seconds:.1f} +- {1e3 * sigma:.1f} ms"
-    if told["halves"]:
-        first, second = told["halves"]
-        apart = abs(first["seconds"] - second["seconds"]) / np.hypot(first["sigma"], second["sigma"])
-        if apart > APART:
-            return f"the halves of the video contradict each other, {apart:.0f} standard deviations apart"
-    if abs(told["of_frame"]) - SIGMAS * sigma * abs(told["of_frame"] / seconds) > 1:
-        return "it would be longer than from frame to frame: something else bends the frames"
-    return ""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from ..critical import Remedy
 from ..rectify import largest_shift_px
 from .judge import Verdict, height_reasons, loose_reasons, unexplained_reasons
 
-__all__ = ["APART", "SIGMAS", "ReadoutTime", "judge_clip"]
+__all__ = ["APART", "SIGMAS", "ReadoutTime", "judge_clip", "problem_of"]
 
 # Displacements below this are lost in the interpolation of a photo.
 _UNSEEN_PX = 1.0
@@ -90,3 +91,23 @@ def judge_clip(
             )
     lens_only = tuple(rec.image_names) if shutter == "not-determined" else ()
     return Verdict(shutter, "doubtful" if reasons else "trusted", tuple(reasons), {}, lens_only)
+
+
+def problem_of(told: Mapping[str, Any]) -> str:
+    """Why a video does not tell its readout time, by the evidence of `quality.readout_time`; empty if it does."""
+    stabilised = told.get("stabilisation") or {}
+    if stabilised.get("verdict") == "stabilised":
+        return str(stabilised["reason"])
+    if told["source"] == "what was known before":
+        return "the video does not tell it better than it was known before"
+    seconds, sigma = told["seconds"], told["sigma"]
+    if not abs(seconds) > SIGMAS * sigma:
+        return f"the camera moved too little: {1e3 * seconds:.1f} +- {1e3 * sigma:.1f} ms"
+    if told.get("halves"):
+        first, second = told["halves"]
+        apart = abs(first["seconds"] - second["seconds"]) / np.hypot(first["sigma"], second["sigma"])
+        if apart > APART:
+            return f"the halves of the video contradict each other, {apart:.0f} standard deviations apart"
+    if abs(told.get("of_frame", 0.0)) - SIGMAS * sigma * abs(told.get("of_frame", 0.0) / seconds) > 1:
+        return "it would be longer than from frame to frame: something else bends the frames"
+    return ""
