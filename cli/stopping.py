@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import sys
@@ -67,6 +68,19 @@ def _watch(pipe: int, stderr: int) -> None:
     os._exit(128 + number)
 
 
+def _hear_again(lost: sys.UnraisableHookArgs) -> None:
+    """Raise an interruption again that Python dropped, as it does in what native code and the collector call."""
+    if not isinstance(lost.exc_value, KeyboardInterrupt):
+        sys.__unraisablehook__(lost)
+        return
+    main = ctypes.c_ulong(threading.main_thread().ident or 0)
+    raise_in = ctypes.pythonapi.PyThreadState_SetAsyncExc
+    # later: at once it would be in the same call
+    again = threading.Timer(0.01, raise_in, (main, ctypes.py_object(KeyboardInterrupt)))
+    again.daemon = True
+    again.start()
+
+
 @contextmanager
 def hears_signals() -> Iterator[None]:
     """The block may be ended by signals; who ignores one, as nohup does, goes on doing so."""
@@ -74,6 +88,7 @@ def hears_signals() -> Iterator[None]:
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
             signal.signal(number, _hear)
+    sys.unraisablehook = _hear_again
     if os.name == "posix":
         here, there = os.pipe()
         os.set_blocking(there, False)

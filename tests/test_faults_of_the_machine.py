@@ -267,3 +267,18 @@ def test_a_report_that_is_missing_is_exit_code_3(monkeypatch, invoke):
     result = invoke("run", ".", "-o", "out", "--quiet")
     assert result.exit_code == 3
     assert "report.html: no report was written" in result.stderr
+
+
+def test_an_interruption_that_falls_into_a_callback_of_native_code_is_not_lost():
+    script = """
+import ctypes, signal, time
+from rsundistort_cli.stopping import hears_signals
+called = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGTERM))
+with hears_signals():
+    called()
+    for _ in range(300):
+        time.sleep(0.01)
+    print("went on")
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (143, "", "stopped; nothing was written\n")
