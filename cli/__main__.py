@@ -18,8 +18,12 @@ def main() -> None:
 
         try:
             cli()
-        except OSError as error:  # of stdout, by click itself
-            sys.exit(f"error: {error.strerror}")
+        except OSError as error:  # of a stream, by click itself
+            try:
+                sys.stderr.write(f"error: stdout cannot be written: {error.strerror}\n")
+            except OSError:  # then it was this one: click tells there how it was called wrongly
+                sys.exit(2)
+            sys.exit(3)
 
 
 def _open_streams() -> None:

@@ -70,15 +70,24 @@ def _watch(pipe: int, stderr: int) -> None:
 
 def _hear_again(lost: sys.UnraisableHookArgs) -> None:
     """Raise an interruption again that Python dropped, as it does in what native code and the collector call."""
-    if not isinstance(lost.exc_value, KeyboardInterrupt):
+    if isinstance(lost.exc_value, KeyboardInterrupt):
+        threading.Thread(target=_interrupt_main, daemon=True).start()
+    else:
         sys.__unraisablehook__(lost)
-        return
-    main = ctypes.c_ulong(threading.main_thread().ident or 0)
-    raise_in = ctypes.pythonapi.PyThreadState_SetAsyncExc
-    # later: at once it would be in the same call
-    again = threading.Timer(0.01, raise_in, (main, ctypes.py_object(KeyboardInterrupt)))
-    again.daemon = True
-    again.start()
+
+
+def _interrupt_main() -> None:
+    """Raise an interruption in the main thread once it has left the hook, in which it would be dropped again."""
+    main = threading.main_thread().ident or 0
+    while True:
+        time.sleep(0.05)
+        frame = sys._current_frames().get(main)
+        while frame is not None and frame.f_code is not _hear_again.__code__:
+            frame = frame.f_back
+        if frame is None:
+            raise_in = ctypes.pythonapi.PyThreadState_SetAsyncExc
+            raise_in(ctypes.c_ulong(main), ctypes.py_object(KeyboardInterrupt))
+            return
 
 
 @contextmanager

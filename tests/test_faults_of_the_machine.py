@@ -254,6 +254,19 @@ def test_streams_that_take_nothing_stop_no_batch(batch, streams, code, said):
     assert sorted(path.name for path in (out / "images").iterdir()) == NAMES
 
 
+@POSIX
+@pytest.mark.parametrize(
+    ("line", "code", "said"),
+    [
+        ("--help > /dev/full", 3, "error: stdout cannot be written: No space left on device\n"),
+        ("rectify --nothing 2> /dev/full", 2, ""),
+    ],
+)
+def test_help_and_refusals_that_nobody_gets_keep_their_exit_codes(line, code, said):
+    done = subprocess.run(["bash", "-c", f"{' '.join(COMMAND)} {line}"], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (code, said)
+
+
 def test_a_report_that_is_missing_is_exit_code_3(monkeypatch, invoke):
     import warnings
 
