@@ -16,11 +16,12 @@ import pytest
 pytest.importorskip("av")
 
 from groups import claimed, npy, packed, recipe, report_arrays, solution
-from other_groups import CONTROL, SETTINGS, TRIALS, altered, database, kept, lines, opf
+from other_groups import CONTROL, SETTINGS, TRIALS, altered, database, kept, lines, opf, scene
 
 from rsundistort import read_solution, rectify_folder, write_solution
 from rsundistort.errors import FileError, FormatError, InputError
 from rsundistort.experiments.one import check_settings, read_trials
+from rsundistort.experiments.scenes import load_scene
 from rsundistort.io.control_points import read_control_points
 from rsundistort.io.depth_maps import read_depth_map
 from rsundistort.io.journal import entries_of
@@ -306,6 +307,15 @@ def test_damaged_settings_of_an_experiment_are_named(tmp_path, text):
     path.write_text(text, encoding="latin-1")
     with pytest.raises(FormatError, match=r"settings\.json cannot be read; give another folder"):
         check_settings(path, {"seed": 0}, {})
+
+
+@pytest.mark.parametrize("name", ["R_cw", "center_w", "points_w", "frame_idx", "point_idx", "K", "width"])
+def test_a_scene_with_an_array_of_no_dimension_or_five(tmp_path, name):
+    for odd in (np.array(1), np.zeros((1, 1, 1, 1, 1))):
+        if odd.ndim or name != "width":
+            (tmp_path / "s.npz").write_bytes(packed({**scene(), name: odd}))
+            with pytest.raises(FormatError, match=r"s\.npz is no scene: "):
+                load_scene(tmp_path / "s.npz")
 
 
 @pytest.mark.parametrize(
