@@ -22,6 +22,7 @@ from rsundistort import read_solution, rectify_folder, write_solution
 from rsundistort.errors import FileError, FormatError, InputError
 from rsundistort.experiments.one import check_settings, read_trials
 from rsundistort.experiments.scenes import load_scene
+from rsundistort.io.cameras import read_camera_file
 from rsundistort.io.control_points import read_control_points
 from rsundistort.io.depth_maps import read_depth_map
 from rsundistort.io.journal import entries_of
@@ -244,6 +245,14 @@ def test_a_length_whose_square_is_no_number(tmp_path):
     (tmp_path / "l.csv").write_text(text)
     with pytest.raises(FormatError, match=r"line 2: .*length=1e\+200, expected above 0, up to"):
         read_known_lengths(tmp_path / "l.csv")
+
+
+def test_entities_of_a_camera_file_are_not_expanded(tmp_path):
+    levels = "".join(f'<!ENTITY l{k} "{f"&l{k - 1};" * 10}">' for k in range(1, 10))
+    text = f'<?xml version="1.0"?><!DOCTYPE d [<!ENTITY l0 "1 ">{levels}]><opencv_storage>&l9;</opencv_storage>'
+    (tmp_path / "c.xml").write_text(text)
+    with pytest.raises(FormatError, match="it declares a document type, in which entities hide"):
+        read_camera_file(tmp_path / "c.xml", 64, 48)
 
 
 @pytest.mark.parametrize(
