@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sqlite3
 from collections.abc import Callable
 from functools import cache
@@ -12,9 +13,11 @@ from types import SimpleNamespace
 
 import damage
 import numpy as np
+import pillow_heif
 import pycolmap
 from groups import Files, Group, archives, dumped, npy, one_of, packed
 from hypothesis import strategies as st
+from make_photos import exif_block, small_dng, texture
 from test_exports import made
 from test_metashape import FISHEYE, FRAME, xml
 from test_solve import make_database
@@ -74,6 +77,34 @@ def opf_projects() -> st.SearchStrategy[Files]:
         return damage.json_texts(json.loads(data))
 
     return one_damaged(opf(), {"opf": trees, "json": trees, "gltf": trees, "bin": damage.binaries})
+
+
+# ---------------------------------------------------------------- photos of phones and raw ones
+
+
+@cache
+def raw_photos() -> Files:
+    """A HEIC with EXIF, and a DNG."""
+
+    def write(folder: Path) -> None:
+        heic = pillow_heif.from_bytes("BGR", (64, 48), texture(64, 48).tobytes())
+        heic.save(folder / "a.heic", exif=bytes(exif_block(6, 28)))
+        (folder / "a.dng").write_bytes(small_dng(6))
+
+    return in_folder(write)
+
+
+def heic_and_raw() -> st.SearchStrategy[Files]:
+    return one_of(
+        a__heic=damage.binaries(raw_photos()["a.heic"], heic_marks),
+        a__dng=damage.binaries(raw_photos()["a.dng"], damage.tiff_marks),
+    )
+
+
+def heic_marks(data: bytes) -> list[int]:
+    """Boxes, which lie in one that is no plain one, and so are found by their names."""
+    names = rb"ftyp|meta|hdlr|pitm|iloc|iinf|infe|iref|iprp|ipco|ipma|ispe|hvcC|irot|imir|pixi|colr|mdat|Exif"
+    return [max(0, match.start() + step) for match in re.finditer(names, data) for step in (-4, 4, 8, 16)]
 
 
 # ---------------------------------------------------------------- databases
@@ -218,6 +249,7 @@ OTHER_GROUPS: dict[str, Group] = {
         "metashape", lambda: st.one_of(*(one_of(m__xml=damage.tokens(data)) for data in metashape().values())), 500
     ),
     "OPF": Group("opf", opf_projects, 700),
+    "HEIC and RAW": Group("photo", heic_and_raw, 500),
     "databases": Group("database", databases, 700, lambda: database()[0]),
     "trials": Group(
         "trials",
@@ -239,6 +271,7 @@ def other_wholes() -> dict[str, list[Files]]:
         "control points": [{"c.csv": CONTROL}],
         "Metashape": [{name: data} for name, data in metashape().items()],
         "OPF": [opf()],
+        "HEIC and RAW": [{name: data} for name, data in raw_photos().items()],
         "databases": [{"d.db": database()[1]}],
         "trials": [{"trials.jsonl": lines(TRIALS)}, {"settings.json": dumped(SETTINGS)}],
         "scenes": [{"s.npz": packed(scene())}],

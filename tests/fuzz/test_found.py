@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 pytest.importorskip("av")
+pytest.importorskip("pillow_heif")
 
 from groups import claimed, npy, packed, recipe, report_arrays, solution
-from other_groups import CONTROL, SETTINGS, TRIALS, altered, database, kept, lines, opf, scene
+from other_groups import CONTROL, SETTINGS, TRIALS, altered, database, kept, lines, opf, raw_photos, scene
 
 from rsundistort import read_solution, rectify_folder, write_solution
 from rsundistort.errors import FileError, FormatError, InputError
@@ -245,6 +246,16 @@ def test_a_length_whose_square_is_no_number(tmp_path):
     (tmp_path / "l.csv").write_text(text)
     with pytest.raises(FormatError, match=r"line 2: .*length=1e\+200, expected above 0, up to"):
         read_known_lengths(tmp_path / "l.csv")
+
+
+def test_a_heic_that_holds_no_picture_any_more(tmp_path):
+    whole = raw_photos()["a.heic"]
+    (tmp_path / "a.heic").write_bytes(whole.replace(b"infe", b"inf\0", 1))
+    with pytest.raises(FileError, match=r"a\.heic cannot be decoded"):
+        read_photo(tmp_path / "a.heic")
+    (tmp_path / "a.heic").write_bytes(whole.replace(b"hvcC", b"hvc\0"))
+    with pytest.raises(FileError, match=r"a\.heic cannot be decoded"):
+        read_photo(tmp_path / "a.heic")
 
 
 def test_entities_of_a_camera_file_are_not_expanded(tmp_path):
