@@ -203,8 +203,10 @@ def in_use(fault: Fault) -> tuple[int, str, float]:
     first = subprocess.Popen(fault.arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         until(lambda: (out / ".rsundistort-lock").exists())
+        first.send_signal(signal.SIGSTOP)  # however long the second takes
         return tried(Fault(fault.name, fault.command, fault.codes, [*fault.arguments, "--overwrite"]))
     finally:
+        first.send_signal(signal.SIGCONT)
         first.wait(600)
 
 
@@ -213,6 +215,8 @@ def main() -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("--only", default="")
     wanted = parser.parse_args().only
+    # where it was started in the background it is ignored, by what is started here, too
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     failed: list[str] = []
     print("| fault | command | exit code | seconds | last line on stderr |\n| --- | --- | --- | --- | --- |")
     with tempfile.TemporaryDirectory() as folder:

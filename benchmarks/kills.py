@@ -152,8 +152,11 @@ class Stages:
             self._news.wait_for(lambda: stage in self.began or self._ended)
 
 
-def killed(command: list[str], stage: str, after_s: float, number: signal.Signals) -> tuple[int, str, str]:
-    """Exit code, stderr and last stage of a command that gets a signal so long after a stage began, if it still is."""
+def killed(command: list[str], stage: str, after_s: float | None, number: signal.Signals) -> tuple[int, str, str]:
+    """Exit code, stderr and last stage of a command that gets a signal so long after a stage began, if it still is.
+
+    None lets it come to its end.
+    """
     with tempfile.TemporaryFile("w+") as stderr:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stderr, text=True)
         stages = Stages(process)
@@ -230,6 +233,7 @@ def tried(name: str, command: list[str], folder: Path, kills: int, rng: random.R
         watcher.look()
         watcher.end()
         looks += watcher.looks
+        print(f"{name}: {done} kills, {ends} ends, {len(problems)} problems", file=sys.stderr, flush=True)
         problems += [f"cut short: {each}" for each in sorted(watcher.cut)]
     return {
         "command": name, "kills": done, "came_to_the_end": ends, "undisturbed_s": round(lasts_s, 1),
@@ -245,6 +249,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", choices=("run", "rectify"))
     options = parser.parse_args()
+    # where it was started in the background it is ignored, by what is started here, too
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     failed = False
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work)

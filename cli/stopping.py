@@ -18,7 +18,7 @@ __all__ = ["hears_signals", "kept_is", "stops_for_people"]
 _GRACE_S = 5.0
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
 
-_state: dict[str, Any] = {"number": int(signal.SIGINT), "kept": "nothing was written", "said": False}
+_state: dict[str, Any] = {"number": int(signal.SIGINT), "kept": "nothing was written", "said": False, "heard": False}
 
 
 def kept_is(text: str) -> None:
@@ -43,10 +43,14 @@ def stops_for_people() -> Iterator[None]:
         yield
     except KeyboardInterrupt as stop:
         sys.exit(say_stopped(str(stop)))
+    except Exception:
+        if not _state["heard"]:
+            raise
+        sys.exit(say_stopped())  # native code that was being imported makes an error of its own of it
 
 
 def _hear(number: int, _frame: Any) -> None:
-    _state["number"] = number
+    _state.update(number=number, heard=True)
     raise KeyboardInterrupt
 
 

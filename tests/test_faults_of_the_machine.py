@@ -282,6 +282,20 @@ def test_a_report_that_is_missing_is_exit_code_3(monkeypatch, invoke):
     assert "report.html: no report was written" in result.stderr
 
 
+def test_an_interruption_that_native_code_makes_another_error_of_is_one():
+    script = """
+import signal
+from rsundistort_cli.stopping import hears_signals
+with hears_signals():
+    try:
+        signal.raise_signal(signal.SIGTERM)
+    except KeyboardInterrupt as stop:
+        raise RuntimeError("cannot be imported") from stop
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (143, "", "stopped; nothing was written\n")
+
+
 def test_an_interruption_that_falls_into_a_callback_of_native_code_is_not_lost():
     script = """
 import ctypes, signal, time
