@@ -206,6 +206,12 @@ def test_a_journal_that_is_nested_without_end_is_passed_over():
     assert entries_of("[" * 100_000 + "\n" + '{"a": ' * 100_000) == {}
 
 
+def test_a_journal_of_empty_lines_takes_no_time():
+    began = time.process_time()
+    assert entries_of("\n{" * 50_000) == {}
+    assert time.process_time() - began < 1.5
+
+
 def test_a_number_that_no_float_holds_is_named(tmp_path):
     pose = '{"key": 1, "value": {"rotation": ' + "1" * 400 + "}}"
     start = '{"sfm_data_version": "0.3", "views": [], "intrinsics": [], "structure": [], "extrinsics": ['
