@@ -4,9 +4,10 @@
 
 Each run into an empty folder is killed, gone on with (`--resume`), killed again and so on, until it comes to its end;
 then every file is compared with that of an undisturbed run, byte for byte but for the times that a solution and its
-report tell. Half of the signals are SIGKILL, the others SIGTERM and SIGINT, which have to end it in one line and with
-their exit codes. A watcher looks at the outputs all the time: what is visible must be whole. The scene is six photos of
-`courtyard` at half size. Exits 1 if anything differs, is cut short, or cannot be gone on with.
+report tell. Every other kill comes at any time, the ones between in the stage that was hit least so far. Half of the
+signals are SIGKILL, the others SIGTERM and SIGINT, which have to end it in one line and with their exit codes. A
+watcher looks at the outputs all the time: what is visible must be whole. The scene is five photos of `courtyard` at
+half size. Exits 1 if anything differs, is cut short, or cannot be gone on with.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import tempfile
 import threading
 import time
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -34,9 +36,9 @@ SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 
 
 def make_scene(folder: Path) -> None:
-    """Six photos at half size, and their camera."""
+    """Five photos at half size, and their camera."""
     (folder / "photos").mkdir(parents=True)
-    for path in sorted((SCENE / "photos").iterdir())[:6]:
+    for path in sorted((SCENE / "photos").iterdir())[:5]:
         photo = cv2.imread(str(path))
         cv2.imwrite(str(folder / "photos" / path.name), cv2.resize(photo, None, fx=0.5, fy=0.5))
     camera = json.loads((SCENE / "camera.json").read_text())
@@ -123,15 +125,60 @@ class Watcher:
         self._ended.set()
 
 
-def killed(command: list[str], after_s: float, number: signal.Signals) -> tuple[int, str]:
-    """Exit code and stderr of a command that gets a signal, unless it comes to its end before."""
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    try:
-        process.wait(after_s)
-    except subprocess.TimeoutExpired:
-        process.send_signal(number)
-    said = process.communicate(timeout=300)[1]
-    return process.returncode, said
+class Stages:
+    """The stages that a command with `--progress json` has come to: "" at first, then as it names them."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self.began: dict[str, float] = {"": time.perf_counter()}
+        self.last = ""
+        self._news = threading.Condition()
+        self._ended = False
+        threading.Thread(target=self._read, args=(process.stdout,), daemon=True).start()
+
+    def _read(self, stdout: Iterable[str]) -> None:
+        for line in stdout:
+            # "choice: rotation" is a step of the stage "choice"
+            with self._news:
+                self.last = json.loads(line)["stage"].partition(":")[0]
+                self.began.setdefault(self.last, time.perf_counter())
+                self._news.notify_all()
+        with self._news:
+            self._ended = True
+            self._news.notify_all()
+
+    def wait_for(self, stage: str) -> None:
+        """Until it begins, or all has ended."""
+        with self._news:
+            self._news.wait_for(lambda: stage in self.began or self._ended)
+
+
+def killed(command: list[str], stage: str, after_s: float | None, number: signal.Signals) -> tuple[int, str, str]:
+    """Exit code, stderr and last stage of a command that gets a signal so long after a stage began, if it still is.
+
+    None lets it come to its end.
+    """
+    with tempfile.TemporaryFile("w+") as stderr:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stderr, text=True)
+        stages = Stages(process)
+        stages.wait_for(stage)
+        try:
+            process.wait(after_s)
+        except subprocess.TimeoutExpired:
+            process.send_signal(number)
+        last = stages.last
+        code = process.wait(300)
+        stderr.seek(0)
+        return code, stderr.read(), last
+
+
+def undisturbed(command: list[str]) -> dict[str, float]:
+    """How long each stage takes."""
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    stages = Stages(process)
+    if process.wait(600):
+        raise SystemExit(f"{command} fails undisturbed")
+    ends = [*list(stages.began.values())[1:], time.perf_counter()]
+    return {name: end - began for (name, began), end in zip(stages.began.items(), ends, strict=True)}
 
 
 def problem_of(code: int, said: str) -> str:
@@ -152,9 +199,8 @@ def problem_of(code: int, said: str) -> str:
 def tried(name: str, command: list[str], folder: Path, kills: int, rng: random.Random) -> dict:
     """What came of so many kills."""
     whole = folder / name / "undisturbed" / "out"
-    began = time.perf_counter()
-    subprocess.run([*command, "-o", str(whole)], check=True, stdout=subprocess.DEVNULL)
-    lasts_s = time.perf_counter() - began
+    seconds = undisturbed([*command, "-o", str(whole)])
+    stages, lasts_s, hits = list(seconds), sum(seconds.values()), dict.fromkeys(seconds, 0)
     expected = {each: comparable(path) for each, path in visible(whole).items()}
     images = {each: path.read_bytes() for each, path in visible(whole).items()}
     done = ends = looks = 0
@@ -163,27 +209,36 @@ def tried(name: str, command: list[str], folder: Path, kills: int, rng: random.R
     while done < kills:
         out = folder / name / "killed" / "out"
         shutil.rmtree(out.parent, ignore_errors=True)
-        watcher, code, resume = Watcher(out, images), -1, []
+        watcher, code, resume, last = Watcher(out, images), -1, [], ""
         while code != 0:
             number = rng.choice(SIGNALS)
-            code, said = killed([*command, "-o", str(out), *resume], rng.uniform(0.0, lasts_s), number)
+            stage, within_s = "", lasts_s
+            if rng.random() < 0.5:  # what is behind it does not come again
+                stage = min(stages[stages.index(last) :], key=lambda each: (hits[each], rng.random()))
+                within_s = seconds[stage]
+            code, said, reached = killed([*command, "-o", str(out), *resume], stage, rng.uniform(0.0, within_s), number)
             codes[str(code)] = codes.get(str(code), 0) + 1
-            done += code != 0
+            if code != 0:
+                done, last = done + 1, max(last, reached, key=stages.index)
+                hits[reached] += 1
             if problem := problem_of(code, said):
                 problems.append(problem)
                 break
             resume = ["--resume"]
+        else:
+            ends += 1
+            found = {each: comparable(path) for each, path in visible(out).items()}
+            names = sorted({*found, *expected})
+            problems += [f"differs: {each}" for each in names if found.get(each) != expected.get(each)]
         watcher.look()
         watcher.end()
-        looks, ends = looks + watcher.looks, ends + 1
+        looks += watcher.looks
+        print(f"{name}: {done} kills, {ends} ends, {len(problems)} problems", file=sys.stderr, flush=True)
         problems += [f"cut short: {each}" for each in sorted(watcher.cut)]
-        found = {each: comparable(path) for each, path in visible(out).items()}
-        problems += [
-            f"differs: {each}" for each in sorted({*found, *expected}) if found.get(each) != expected.get(each)
-        ]
     return {
         "command": name, "kills": done, "came_to_the_end": ends, "undisturbed_s": round(lasts_s, 1),
-        "exit_codes": codes, "looks": looks, "problems": problems,
+        "killed_in": {stage or "start": count for stage, count in hits.items()}, "exit_codes": codes,
+        "looks": looks, "problems": problems,
     }  # fmt: skip
 
 
@@ -194,13 +249,16 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", choices=("run", "rectify"))
     options = parser.parse_args()
+    # where it was started in the background it is ignored, by what is started here, too
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     failed = False
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work)
         make_scene(folder)
         photos, solution = str(folder / "photos"), str(folder / "run" / "undisturbed" / "out" / "solution.json")
-        run = [*COMMAND, "run", photos, "--camera", str(folder / "camera.json"), "--max-features", "1500", "--quiet"]
-        commands = {"run": run, "rectify": [*COMMAND, "rectify", photos, "--solution", solution, "--quiet"]}
+        run = [*COMMAND, "run", photos, "--camera", str(folder / "camera.json"), "--max-features", "500"]
+        commands = {"run": run, "rectify": [*COMMAND, "rectify", photos, "--solution", solution]}
+        commands = {name: [*command, "--progress", "json"] for name, command in commands.items()}
         for name, command in commands.items():
             kills = options.kills if options.only in (None, name) else 0
             found = tried(name, command, folder, kills, random.Random(options.seed))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import sys
 from typing import Any
 
 from .stopping import hears_signals
+
+_STREAM_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF, errno.EPIPE)
 
 
 def main() -> None:
@@ -18,8 +21,14 @@ def main() -> None:
 
         try:
             cli()
-        except OSError as error:  # of stdout, by click itself
-            sys.exit(f"error: {error.strerror}")
+        except OSError as error:
+            if error.errno not in _STREAM_ERRORS:  # a library that was not given memory to be loaded
+                sys.exit(f"error: {' '.join(str(error).split())}")
+            try:  # of click itself
+                sys.stderr.write(f"error: stdout cannot be written: {error.strerror}\n")
+            except OSError:  # then it was this one: click tells there how it was called wrongly
+                sys.exit(2)
+            sys.exit(3)
 
 
 def _open_streams() -> None:

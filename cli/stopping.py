@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import sys
@@ -17,7 +18,7 @@ __all__ = ["hears_signals", "kept_is", "stops_for_people"]
 _GRACE_S = 5.0
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
 
-_state: dict[str, Any] = {"number": int(signal.SIGINT), "kept": "nothing was written", "said": False}
+_state: dict[str, Any] = {"number": int(signal.SIGINT), "kept": "nothing was written", "said": False, "heard": False}
 
 
 def kept_is(text: str) -> None:
@@ -42,10 +43,14 @@ def stops_for_people() -> Iterator[None]:
         yield
     except KeyboardInterrupt as stop:
         sys.exit(say_stopped(str(stop)))
+    except Exception:
+        if not _state["heard"]:
+            raise
+        sys.exit(say_stopped())  # native code that was being imported makes an error of its own of it
 
 
 def _hear(number: int, _frame: Any) -> None:
-    _state["number"] = number
+    _state.update(number=number, heard=True)
     raise KeyboardInterrupt
 
 
@@ -67,6 +72,28 @@ def _watch(pipe: int, stderr: int) -> None:
     os._exit(128 + number)
 
 
+def _hear_again(lost: sys.UnraisableHookArgs) -> None:
+    """Raise an interruption again that Python dropped, as it does in what native code and the collector call."""
+    if isinstance(lost.exc_value, KeyboardInterrupt):
+        threading.Thread(target=_interrupt_main, daemon=True).start()
+    else:
+        sys.__unraisablehook__(lost)
+
+
+def _interrupt_main() -> None:
+    """Raise an interruption in the main thread once it has left the hook, in which it would be dropped again."""
+    main = threading.main_thread().ident or 0
+    while True:
+        time.sleep(0.05)
+        frame = sys._current_frames().get(main)
+        while frame is not None and frame.f_code is not _hear_again.__code__:
+            frame = frame.f_back
+        if frame is None:
+            raise_in = ctypes.pythonapi.PyThreadState_SetAsyncExc
+            raise_in(ctypes.c_ulong(main), ctypes.py_object(KeyboardInterrupt))
+            return
+
+
 @contextmanager
 def hears_signals() -> Iterator[None]:
     """The block may be ended by signals; who ignores one, as nohup does, goes on doing so."""
@@ -74,6 +101,7 @@ def hears_signals() -> Iterator[None]:
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
             signal.signal(number, _hear)
+    sys.unraisablehook = _hear_again
     if os.name == "posix":
         here, there = os.pipe()
         os.set_blocking(there, False)

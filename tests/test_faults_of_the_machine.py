@@ -254,6 +254,19 @@ def test_streams_that_take_nothing_stop_no_batch(batch, streams, code, said):
     assert sorted(path.name for path in (out / "images").iterdir()) == NAMES
 
 
+@POSIX
+@pytest.mark.parametrize(
+    ("line", "code", "said"),
+    [
+        ("--help > /dev/full", 3, "error: stdout cannot be written: No space left on device\n"),
+        ("rectify --nothing 2> /dev/full", 2, ""),
+    ],
+)
+def test_help_and_refusals_that_nobody_gets_keep_their_exit_codes(line, code, said):
+    done = subprocess.run(["bash", "-c", f"{' '.join(COMMAND)} {line}"], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (code, said)
+
+
 def test_a_report_that_is_missing_is_exit_code_3(monkeypatch, invoke):
     import warnings
 
@@ -267,3 +280,32 @@ def test_a_report_that_is_missing_is_exit_code_3(monkeypatch, invoke):
     result = invoke("run", ".", "-o", "out", "--quiet")
     assert result.exit_code == 3
     assert "report.html: no report was written" in result.stderr
+
+
+def test_an_interruption_that_native_code_makes_another_error_of_is_one():
+    script = """
+import signal
+from rsundistort_cli.stopping import hears_signals
+with hears_signals():
+    try:
+        signal.raise_signal(signal.SIGTERM)
+    except KeyboardInterrupt as stop:
+        raise RuntimeError("cannot be imported") from stop
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (143, "", "stopped; nothing was written\n")
+
+
+def test_an_interruption_that_falls_into_a_callback_of_native_code_is_not_lost():
+    script = """
+import ctypes, signal, time
+from rsundistort_cli.stopping import hears_signals
+called = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGTERM))
+with hears_signals():
+    called()
+    for _ in range(300):
+        time.sleep(0.01)
+    print("went on")
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (143, "", "stopped; nothing was written\n")

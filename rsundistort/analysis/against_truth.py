@@ -116,6 +116,15 @@ def _without_lens(
     return rectify(twin, taken_by, RowMotion(), "global", rectified)
 
 
+def _check_sizes(photo: NDArray[Any], mask: NDArray[Any], shown: NDArray[np.uint8]) -> None:
+    """Refuse a mask or a twin of another size than the photo."""
+    for what, other in (("mask", mask.shape), ("twin", shown.shape)):
+        if other != photo.shape[:2]:
+            raise InputError(
+                f"the {what} has the shape {other}, the rectified photo {photo.shape[:2]}; give those of one camera"
+            )
+
+
 def _image_errors(
     out: Path,
     solution: Solution,
@@ -140,6 +149,7 @@ def _image_errors(
         photo, mask = (turn_pixels(read_photo(path).pixels, INVERSE[turns[image.name]]) for path in files)
         try:
             twin, shown = _without_lens(taken, image, solution, truth)
+            _check_sizes(photo, mask, shown)
             after[image.name] = psnr(photo, twin, np.minimum(mask, shown))
             if (raw / image.name).is_file():
                 # photo and twin have the same lens

@@ -21,14 +21,16 @@ from ..bundle import BundleOptions, bundle_adjust, objective
 from ..errors import FormatError, InputError
 from ..evaluation import align_points, rotation_angles_deg
 from ..io.aside import write_aside
+from ..io.json_text import parse_json, read_json
 from ..io.outputs import only_writer
 from ..io.record import Record
+from ..io.rules import Between, check
 from ..model import Observations, Reconstruction, RowMotion
 from ..synthetic import project_rows
 from .figures import cumulative_histograms, need_matplotlib
 from .scenes import KnownScene, load_scene
 
-__all__ = ["METHODS", "OneOptions", "experiment_one"]
+__all__ = ["METHODS", "OneOptions", "check_settings", "experiment_one", "read_trials", "summarize"]
 
 #: Methods: shutter model, and whether the paper's anchor (phi1 of the first photo) is held. The paper's have no prior.
 METHODS: dict[str, tuple[str, bool]] = {
@@ -41,6 +43,9 @@ METHODS: dict[str, tuple[str, bool]] = {
 }
 _FILES = ("settings.json", "trials.jsonl", "summary.json", "summary.csv", "histograms.png")
 _METRICS = ("rotation_deg", "translation", "structure")
+# what is made of a line of trials.jsonl
+_NUMBERS = (*_METRICS, "iterations", "seconds")
+_LINE = {"scene": str, "trial": int, "method": str} | dict.fromkeys(_NUMBERS, Between(0.0, 1e300))
 # no prior: a spread of so many radians or baselines a frame
 _FREE = 1e4
 
@@ -213,16 +218,17 @@ def _settings(options: OneOptions) -> dict[str, Any]:
     return {k: v for k, v in asdict(options).items() if k not in ("jobs", "trials", "methods")}
 
 
-def _done(path: Path) -> dict[tuple[str, int, str], dict[str, Any]]:
-    """Lines of an earlier run; a line cut short by a crash is left out."""
+def read_trials(path: Path) -> dict[tuple[str, int, str], dict[str, Any]]:
+    """Lines of an earlier run by scene, trial and method; what is cut short or damaged is left out, to be run again."""
     found = {}
     if path.is_file():
-        for line in path.read_text(encoding="utf-8").splitlines():
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
             try:
-                entry = json.loads(line)
-                found[entry["scene"], entry["trial"], entry["method"]] = entry
-            except (ValueError, KeyError, TypeError):
+                entry = parse_json(line)
+                check(entry, _LINE)
+            except ValueError:
                 continue
+            found[entry["scene"], entry["trial"], entry["method"]] = entry
     return found
 
 
@@ -262,7 +268,7 @@ def summarize(entries: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> d
                         "median": float(np.median([entry[key] for entry in mine])),
                         "p90": float(np.percentile([entry[key] for entry in mine], 90)),
                     }
-                    for key in (*_METRICS, "iterations", "seconds")
+                    for key in _NUMBERS
                 }
     return summary
 
@@ -304,7 +310,7 @@ def experiment_one(
     with only_writer(out):
         settings = _settings(options)
         digests = {scene.name: scene.digest for scene in loaded}
-        known = _check_settings(out / "settings.json", settings, digests)
+        known = check_settings(out / "settings.json", settings, digests)
         record = Record(out)
         if not known:  # settings of this experiment: the rest is of it, too
             record.check(_FILES, map(Path, scenes))
@@ -320,7 +326,7 @@ def _experiment_one(
     """The trials that are missing in a folder, and what comes of all of them."""
     trials = out / "trials.jsonl"
     _cut_torn_line(trials)
-    done = _done(trials)
+    done = read_trials(trials)
     jobs = []
     for scene in loaded:
         for trial in range(options.trials):
@@ -366,7 +372,7 @@ def _experiment_one(
     return summary
 
 
-def _check_settings(path: Path, settings: dict[str, Any], digests: dict[str, str]) -> dict[str, str]:
+def check_settings(path: Path, settings: dict[str, Any], digests: dict[str, str]) -> dict[str, str]:
     """Refuse to mix trials of different settings, or of different scenes of one name, in one folder.
 
     The scenes that are in it, with what tells them apart.
@@ -374,10 +380,11 @@ def _check_settings(path: Path, settings: dict[str, Any], digests: dict[str, str
     known: dict[str, str] = {}
     if path.is_file():
         try:
-            earlier = json.loads(path.read_text(encoding="utf-8"))
-            known = dict(earlier.get("scenes", {}))
-        except (ValueError, AttributeError) as error:
+            earlier = read_json(path)
+            check(earlier, {"scenes?": {str: str}})
+        except FormatError as error:
             raise FormatError(f"{path} cannot be read; give another folder") from error
+        known = earlier.get("scenes", {})
         changed = [key for key in settings if earlier.get(key) != settings[key]]
         if changed:
             raise InputError(

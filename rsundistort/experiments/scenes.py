@@ -47,6 +47,9 @@ class KnownScene:
     point_idx: NDArray[np.int64]
 
     def __post_init__(self) -> None:
+        for name, dimensions in (("R_cw", 3), ("points_w", 2), ("frame_idx", 1)):  # whose lengths are taken
+            if np.ndim(getattr(self, name)) != dimensions:
+                raise InputError(f"{name} has the shape {np.shape(getattr(self, name))}, expected {dimensions} axes")
         checked = {
             "R_cw": check_rotations(self.R_cw, len(self.R_cw), "R_cw"),
             "center_w": check_finite(self.center_w, (len(self.R_cw), 3), "center_w"),

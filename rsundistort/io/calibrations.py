@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import FormatError
 from ..model import Camera
+from .xml_text import parse_xml as parse_elements
 
 __all__ = ["camera_from_calibration", "is_calibration", "parse_xml", "parse_yaml"]
 
@@ -76,17 +77,13 @@ def parse_xml(text: str) -> Any:
     Raises
     ------
     ValueError
-        When it is no XML.
+        When it is no XML, or declares a document type.
     """
-    from xml.etree import ElementTree
 
     def value(element: Any) -> Any:
         return {child.tag: value(child) for child in element} if len(element) else (element.text or "").strip()
 
-    try:
-        return value(ElementTree.fromstring(text))
-    except (ElementTree.ParseError, RecursionError) as error:
-        raise ValueError(str(error)) from error
+    return value(parse_elements(text))
 
 
 def is_calibration(tree: Any) -> bool:

@@ -38,6 +38,8 @@ def read_control_points(path: Path | str) -> list[ControlPoint]:
     rows = [{key.removesuffix("_m"): value for key, value in row.items()} for row in rows]
     if missing := [column for column in _COLUMNS if column not in columns]:
         raise FormatError(f"{path} has no column {missing[0]!r}; expected {', '.join(_COLUMNS)}")
+    if twice := [column for column in (*_COLUMNS, "sigma_up", "use") if columns.count(column) > 1]:
+        raise FormatError(f"{path} has two columns {twice[0]!r}; remove one")
     facts: dict[str, tuple[str, ...]] = {}
     seen: dict[str, dict[str, tuple[float, float]]] = {}
     named = (*_COLUMNS[4:], *(each for each in ("sigma_up", "use") if each in columns))

@@ -297,6 +297,8 @@ def _model(project: Any, where: str) -> ColmapModel:
     matrix = np.eye(4) if node.matrix is None else node.matrix
     points_w = (np.asarray(node.position, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]) @ _GLTF.T
     ranges = np.array([matches.point_index_ranges[k] for k in range(len(points_w))], np.int64).reshape(-1, 2)
+    if (ranges.sum(1) > np.size(matches.camera_ids)).any() or ranges[:, 1].sum() > np.size(matches.camera_ids):
+        raise FormatError(f"{where}: points claim more measurements than its tracks hold")
     point = np.repeat(np.arange(len(points_w)), ranges[:, 1])
     within = np.arange(len(point)) - np.repeat(np.cumsum(ranges[:, 1]) - ranges[:, 1], ranges[:, 1])
     at = np.repeat(ranges[:, 0], ranges[:, 1]) + within

@@ -8,38 +8,29 @@ from xml.parsers import expat
 
 from ..errors import FileError, FormatError
 
-__all__ = ["read_xml"]
+__all__ = ["parse_xml", "read_xml"]
 
 # Deeper than any program nests; trees are walked by recursion.
 _DEEPEST = 100
 
 
-def read_xml(path: Path | str) -> ElementTree.Element:
-    """The root of an XML file.
+def parse_xml(data: bytes | str) -> ElementTree.Element:
+    """The root of an XML text; a ValueError whose words are for people where it is none.
 
     A document type is refused: only there can entities be declared, which name other files or stand for more than any
     memory holds.
-
-    Raises
-    ------
-    FileError, FormatError
-        When it cannot be read; when it is no XML, declares a document type, or is nested without end.
     """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise FileError(f"{path} cannot be read: {error.strerror}") from error
     builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
     depth = 0
 
     def refuse(*_: object) -> None:
-        raise FormatError(f"{path} declares a document type, in which entities hide; remove its <!DOCTYPE ...>")
+        raise ValueError("it declares a document type, in which entities hide; remove its <!DOCTYPE ...>")
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal depth
         depth += 1
         if depth > _DEEPEST:
-            raise FormatError(f"{path} is no valid XML: it is nested deeper than {_DEEPEST}")
+            raise ValueError(f"it is nested deeper than {_DEEPEST}")
         builder.start(tag, attributes)
 
     def end(tag: str) -> None:
@@ -51,8 +42,22 @@ def read_xml(path: Path | str) -> ElementTree.Element:
     parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = start, end, builder.data
     try:
         parser.Parse(data, True)
-    except (expat.ExpatError, LookupError, ValueError) as error:
-        if isinstance(error, FormatError):
-            raise
-        raise FormatError(f"{path} is no valid XML: {error}") from error
+    except (expat.ExpatError, LookupError) as error:
+        raise ValueError(str(error)) from error
     return builder.close()
+
+
+def read_xml(path: Path | str) -> ElementTree.Element:
+    """The root of an XML file, as `parse_xml` takes it.
+
+    Raises
+    ------
+    FileError, FormatError
+        When it cannot be read; when it is no XML, declares a document type, or is nested without end.
+    """
+    try:
+        return parse_xml(Path(path).read_bytes())
+    except OSError as error:
+        raise FileError(f"{path} cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise FormatError(f"{path} is no valid XML: {error}") from error

@@ -11,6 +11,9 @@ from ..errors import InputError
 
 __all__ = ["ControlPoint"]
 
+# Beyond, squares lose all digits; the earth's coordinates are below 1e8.
+_FARTHEST_M, _FARTHEST_PX = 1e9, 1e6
+
 
 @dataclass(frozen=True)
 class ControlPoint:
@@ -38,11 +41,11 @@ class ControlPoint:
 
     def __post_init__(self) -> None:
         where = f"control point {self.name!r}"
-        if not np.isfinite(self.place_m).all():
-            raise InputError(f"{where}: E, N, U are {self.place_m}, expected finite numbers")
-        if not all(0 < sigma < np.inf for sigma in self.sigma_m):
-            raise InputError(f"{where}: sigma {self.sigma_m}, expected metres above 0")
-        if not np.isfinite([*self.seen.values()]).all():
-            raise InputError(f"{where}: pixels must be finite numbers")
+        if not (np.abs(self.place_m) <= _FARTHEST_M).all():
+            raise InputError(f"{where}: E, N, U are {self.place_m}, expected metres up to {_FARTHEST_M:g}")
+        if not all(1 / _FARTHEST_M <= sigma <= _FARTHEST_M for sigma in self.sigma_m):
+            raise InputError(f"{where}: sigma {self.sigma_m}, expected metres above 0, up to {_FARTHEST_M:g}")
+        if not (np.abs([*self.seen.values()]) <= _FARTHEST_PX).all():
+            raise InputError(f"{where}: pixels must be finite numbers up to {_FARTHEST_PX:g}")
         if len(self.seen) < 2:
             raise InputError(f"{where} is seen in {len(self.seen)} photo; two are needed to place it")

@@ -12,6 +12,8 @@ from .checks import check_fields
 __all__ = ["End", "KnownLength"]
 
 End = tuple[str, float, float]
+# Beyond, squares of ratios lose all digits, whatever the unit.
+_LONGEST = 1e12
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,10 @@ class KnownLength:
                 raise InputError(f"known length: {name}={end!r}, expected (photo name, x, y)")
         check_fields(self)
         for name, value in (("length", self.length), ("sigma", self.sigma)):
-            if not 0 < value < np.inf:
-                raise InputError(f"known length from {self.start} to {self.end}: {name}={value!r}, expected above 0")
+            if not 1 / _LONGEST <= value <= _LONGEST:
+                raise InputError(
+                    f"known length from {self.start} to {self.end}: {name}={value!r}, expected above 0, up to "
+                    f"{_LONGEST:g}"
+                )
         if not np.isfinite([*self.start[1:], *self.end[1:]]).all():
             raise InputError(f"known length from {self.start} to {self.end}: pixels must be finite numbers")

@@ -302,7 +302,11 @@ XMP = (
     b'<?xpacket begin="\xef\xbb\xbf" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF '
     b'xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description rdf:about="" '
     b'xmlns:tiff="http://ns.adobe.com/tiff/1.0/" xmlns:exif="http://ns.adobe.com/exif/1.0/" '
-    b'xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" tiff:Orientation="6" drone-dji:DewarpData="1,2,3">'
+    b'xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" tiff:Orientation="6" drone-dji:DewarpData="1,2,3" '
+    b'drone-dji:GpsLatitude="47.5" drone-dji:GpsLongitude="8.25" drone-dji:AbsoluteAltitude="+412.3" '
+    b'drone-dji:RtkStdLon="0.01" drone-dji:RtkStdLat="0.01" drone-dji:RtkStdHgt="0.02" drone-dji:GimbalYawDegree="9.5" '
+    b'drone-dji:GimbalPitchDegree="-90" drone-dji:GimbalRollDegree="0" drone-dji:FlightXSpeed="1.5" '
+    b'drone-dji:FlightYSpeed="0" drone-dji:FlightZSpeed="0">'
     b"<exif:PixelXDimension>64</exif:PixelXDimension><exif:PixelYDimension>48</exif:PixelYDimension>"
     b"</rdf:Description></rdf:RDF></x:xmpmeta>"
 )

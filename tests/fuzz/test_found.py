@@ -14,13 +14,21 @@ import numpy as np
 import pytest
 
 pytest.importorskip("av")
+pytest.importorskip("pillow_heif")
 
 from groups import claimed, npy, packed, recipe, report_arrays, solution
+from other_groups import CONTROL, SETTINGS, TRIALS, altered, database, kept, lines, opf, raw_photos, scene
 
 from rsundistort import read_solution, rectify_folder, write_solution
 from rsundistort.errors import FileError, FormatError, InputError
+from rsundistort.experiments.one import check_settings, read_trials
+from rsundistort.experiments.scenes import load_scene
+from rsundistort.io.cameras import read_camera_file
+from rsundistort.io.control_points import read_control_points
 from rsundistort.io.depth_maps import read_depth_map
 from rsundistort.io.journal import entries_of
+from rsundistort.io.kept import Kept
+from rsundistort.io.lengths import read_known_lengths
 from rsundistort.io.masks import read_mask
 from rsundistort.io.models import read_model
 from rsundistort.io.photos.images import read_photo
@@ -28,6 +36,7 @@ from rsundistort.model.arrays import read_arrays
 from rsundistort.rectify import RemapGrid
 from rsundistort.report import write_report
 from rsundistort.report.diagnostics import read_diagnostics
+from rsundistort.sfm.imported import matched_of_database
 from rsundistort.solve import OutputOptions
 from rsundistort.synthetic.recipe import load_recipe
 
@@ -197,6 +206,12 @@ def test_a_journal_that_is_nested_without_end_is_passed_over():
     assert entries_of("[" * 100_000 + "\n" + '{"a": ' * 100_000) == {}
 
 
+def test_a_journal_of_empty_lines_takes_no_time():
+    began = time.process_time()
+    assert entries_of("\n{" * 25_000) == {}
+    assert time.process_time() - began < 2
+
+
 def test_a_number_that_no_float_holds_is_named(tmp_path):
     pose = '{"key": 1, "value": {"rotation": ' + "1" * 400 + "}}"
     start = '{"sfm_data_version": "0.3", "views": [], "intrinsics": [], "structure": [], "extrinsics": ['
@@ -211,3 +226,130 @@ def test_a_mask_of_one_colour_is_small_and_is_read(tmp_path):
     encoded = cv2.imencode(".png", np.full((6000, 8000), 255, np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]
     path.write_bytes(bytes(encoded))
     assert read_mask(path, 8000, 6000).all()
+
+
+# ---------------------------------------------------------------- surveys, other programs, what is kept
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        (b"1000,2000", b"1e300,2000", "expected metres up to 1e"),
+        (b"0.02,0.04", b"1e-300,0.04", "expected metres above 0"),
+        (b"30.5,40", b"1e30,40", "pixels must be finite numbers up to"),
+        (b"sigma_up", b"sigma_m", "two columns 'sigma'"),
+        (b"10,20,", b"nan,20,", "line 2: x='nan', expected a number"),
+    ],
+)
+def test_a_control_point_beyond_the_earth(tmp_path, old, new, says):
+    (tmp_path / "c.csv").write_bytes(CONTROL.replace(old, new, 1))
+    with pytest.raises(FormatError, match=says):
+        read_control_points(tmp_path / "c.csv")
+
+
+def test_a_length_whose_square_is_no_number(tmp_path):
+    text = "photo1,x1,y1,photo2,x2,y2,length,sigma\na.jpg,1,2,b.jpg,3,4,1e200,0.01\n"
+    (tmp_path / "l.csv").write_text(text)
+    with pytest.raises(FormatError, match=r"line 2: .*length=1e\+200, expected above 0, up to"):
+        read_known_lengths(tmp_path / "l.csv")
+
+
+def test_a_heic_that_holds_no_picture_any_more(tmp_path):
+    whole = raw_photos()["a.heic"]
+    (tmp_path / "a.heic").write_bytes(whole.replace(b"infe", b"inf\0", 1))
+    with pytest.raises(FileError, match=r"a\.heic cannot be decoded"):
+        read_photo(tmp_path / "a.heic")
+    (tmp_path / "a.heic").write_bytes(whole.replace(b"hvcC", b"hvc\0"))
+    with pytest.raises(FileError, match=r"a\.heic cannot be decoded"):
+        read_photo(tmp_path / "a.heic")
+
+
+def test_entities_of_a_camera_file_are_not_expanded(tmp_path):
+    levels = "".join(f'<!ENTITY l{k} "{f"&l{k - 1};" * 10}">' for k in range(1, 10))
+    text = f'<?xml version="1.0"?><!DOCTYPE d [<!ENTITY l0 "1 ">{levels}]><opencv_storage>&l9;</opencv_storage>'
+    (tmp_path / "c.xml").write_text(text)
+    with pytest.raises(FormatError, match="it declares a document type, in which entities hide"):
+        read_camera_file(tmp_path / "c.xml", 64, 48)
+
+
+@pytest.mark.parametrize(
+    ("statement", "says"),
+    [
+        ("UPDATE keypoints SET data = x''", "cut short, or of another shape"),
+        ("UPDATE keypoints SET data = 'x'", "cut short, or of another shape"),
+        ("UPDATE keypoints SET rows = 'x'", "cut short, or of another shape"),
+        ("UPDATE keypoints SET cols = 1, rows = rows * cols", "cut short, or of another shape"),
+        ("UPDATE keypoints SET rows = -rows, cols = -cols", "cut short, or of another shape"),
+        ("UPDATE keypoints SET rows = 0", "holds other keypoints"),
+        ("UPDATE keypoints SET data = value(length(data), x'0000c07f')", "no numbers, or in no photo"),
+        ("UPDATE matches SET data = value(length(data), x'ffffffff')", "keypoints that it does not hold"),
+        ("UPDATE matches SET cols = 1, rows = rows * cols", "cut short, or of another shape"),
+        ("ALTER TABLE matches RENAME TO old; CREATE VIEW matches AS SELECT * FROM old", "has no table matches"),
+        (
+            # which has no end
+            "ALTER TABLE images RENAME TO old; CREATE VIEW images AS WITH RECURSIVE c(image_id, name) AS (SELECT 1, "
+            "'x' UNION ALL SELECT image_id + 1, 'x' FROM c) SELECT * FROM c",
+            "has no table images",
+        ),
+    ],
+)
+def test_a_database_of_other_shapes_than_colmaps(tmp_path, statement, says):
+    files, _ = database()
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    (tmp_path / "d.db").write_bytes(altered(statement))
+    rec = read_model(tmp_path).reconstruction
+    (tmp_path / "work").mkdir()
+    with pytest.raises((FileError, InputError), match=says) as caught:
+        matched_of_database(tmp_path / "d.db", tmp_path / "work" / "ours.db", rec)
+    assert "d.db" in str(caught.value)
+
+
+def test_points_of_an_opf_project_that_claim_four_billion_measurements(tmp_path):
+    pytest.importorskip("pyopf")
+    for name, data in opf().items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(data)
+    assert len(read_model(tmp_path / "project.opf").reconstruction.observations) > 0
+    (ranges,) = tmp_path.rglob("matchPointIndexRanges.bin")
+    ranges.write_bytes(b"\xff" * ranges.stat().st_size)
+    with pytest.raises(FormatError, match="points claim more measurements than its tracks hold"):
+        read_model(tmp_path / "project.opf")
+
+
+@pytest.mark.parametrize(
+    "line", [b"[" * 100_000, b'{"a": ' + b"9" * 5000 + b"}", b"\xff\xfe", b'{"scene": "x", "trial": 0, "method": "rs"}']
+)
+def test_a_line_of_trials_that_is_damaged_is_run_again(tmp_path, line):
+    (tmp_path / "trials.jsonl").write_bytes(line + b"\n" + lines(TRIALS))
+    assert list(read_trials(tmp_path / "trials.jsonl").values()) == TRIALS
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "[]", "\xff", '{"scenes": [1]}', '{"scenes": {"a": 1}}'])
+def test_damaged_settings_of_an_experiment_are_named(tmp_path, text):
+    path = tmp_path / "settings.json"
+    path.write_text(json.dumps(SETTINGS))
+    assert check_settings(path, {"seed": 0}, {}) == SETTINGS["scenes"]
+    path.write_text(text, encoding="latin-1")
+    with pytest.raises(FormatError, match=r"settings\.json cannot be read; give another folder"):
+        check_settings(path, {"seed": 0}, {})
+
+
+@pytest.mark.parametrize("name", ["R_cw", "center_w", "points_w", "frame_idx", "point_idx", "K", "width"])
+def test_a_scene_with_an_array_of_no_dimension_or_five(tmp_path, name):
+    for odd in (np.array(1), np.zeros((1, 1, 1, 1, 1))):
+        if odd.ndim or name != "width":
+            (tmp_path / "s.npz").write_bytes(packed({**scene(), name: odd}))
+            with pytest.raises(FormatError, match=r"s\.npz is no scene: "):
+                load_scene(tmp_path / "s.npz")
+
+
+@pytest.mark.parametrize(
+    "tree", ["[" * 100_000, '["array"]', '["tuple", 3]', '["range", [1, 2, 0]]', '["number", "x"]']
+)
+def test_a_kept_value_that_is_damaged_is_missing(tmp_path, tree):
+    store = Kept(tmp_path, "k")
+    store.begin()
+    arrays = {**kept(), "tree": np.frombuffer(tree.encode(), np.uint8)}
+    store.path("x").write_bytes(packed(arrays, compressed=False))
+    assert store.get("x") is None

@@ -20,9 +20,15 @@ import pytest
 if not Path("/proc/self/clear_refs").exists():
     pytest.skip("the most memory that was held is told by Linux alone", allow_module_level=True)
 pytest.importorskip("av")
+pytest.importorskip("pillow_heif")
+pytest.importorskip("pyopf")
 
+import groups
 import hypothesis
-from groups import GROUPS, wholes
+from other_groups import OTHER_GROUPS, other_wholes
+
+GROUPS = groups.GROUPS | OTHER_GROUPS
+WHOLES = groups.wholes() | other_wholes()
 
 SECONDS = 10.0
 MEMORY, TIMES = 500 << 20, 20
@@ -116,11 +122,11 @@ def judged(child: Child, name: str, files: dict[str, bytes], work: Path) -> dict
 
 
 @pytest.mark.parametrize(
-    ("name", "number"), [(name, number) for name, files in wholes().items() for number in range(len(files))]
+    ("name", "number"), [(name, number) for name, files in WHOLES.items() for number in range(len(files))]
 )
 def test_files_that_are_not_damaged(child, tmp_path, name, number):
     (tmp_path / "work").mkdir()
-    assert judged(child, name, wholes()[name][number], tmp_path / "work")["said"] == ""
+    assert judged(child, name, WHOLES[name][number], tmp_path / "work")["said"] == ""
 
 
 @pytest.mark.timeout(3600 if COUNT else 400)

@@ -16,7 +16,7 @@ from .metadata import Metadata
 __all__ = ["heif_metadata", "read_heif"]
 
 # what libheif raises of files that are damaged
-_BROKEN = (ValueError, EOFError, SyntaxError, RuntimeError, OSError)
+_BROKEN = (ValueError, EOFError, SyntaxError, RuntimeError, OSError, IndexError)
 
 # irot turns against the clock in steps of 90 degrees; imir exchanges top and bottom, or left and right
 _ROTATIONS, _MIRRORS = {0: 1, 1: 8, 2: 3, 3: 6}, {0: 4, 1: 2}
