@@ -574,5 +574,5 @@ def test_closing_line_says_what_two_poses_leave(rng):
     left = _left_by_two_poses(rec)
     assert left > 1
     said = closing._two_poses(replace(solution, quality={"rs_poses_px": left}))
-    assert said == [f"rs-poses           motions are not steady: two poses a photo are off by up to {left:.1f} px"]
+    assert said == [f"rs-poses           motions are not steady: two poses per photo are off by up to {left:.1f} px"]
     assert _left_by_two_poses(made) == 0.0

@@ -151,7 +151,7 @@ OTHER_SIZE = json.dumps({"width": 640, "height": 480, "K": [[600, 0, 320], [0, 6
         (_truncated, "0 readable photos of 4"),
         (_two_left, "2 readable photos of 3"),
         (_sizes, "320x240"),
-        (_no_camera, "give --camera"),
+        (_no_camera, "check the camera's focal length"),
         (_with_camera_file(OTHER_SIZE), "640x480"),
         (_with_camera_file("{ no"), "camera.json"),
         (_with_camera_file('{"width": 320}'), "lacks K, height"),

@@ -252,7 +252,6 @@ def invoke(monkeypatch, tmp_path):
         ([], "give --camera"),
         (["--every", "4", "--sharpest", "4"], "--every N or --sharpest N"),
         (["--every", "4"], "2 photos; the shutter needs at least three"),
-        (["--every", "1"], "give --camera"),
         (["--every", "1", "--camera", "300,300,160,120", "--gyro", "gyro.csv"], "Give --readout-ms"),
         (["--every", "1", "--gyro", "gyro.csv", "--gyro-axes", "XX"], "expected X, Y and Z"),
         (["--every", "1", "--camera", "300,300,160,120", "--gyro", "gyro.csv", "--readout-ms", "30"], "covers none"),

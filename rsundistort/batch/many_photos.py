@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import closing
 from pathlib import Path, PurePosixPath
 
@@ -88,8 +88,7 @@ def rectify_photos(
     dict of name to PhotoDone
         Of every photo; those that were left out have a `problem`.
     """
-    before, record = journal.read(), Record(out)
-    jobs = _Jobs(folder, scene, names, out, options, colors, posed)
+    before, record, jobs = journal.read(), Record(out), _Jobs(folder, scene, names, out, options, colors, posed)
     done = _still_whole(jobs, names, before, out) if resume else {}
     todo = {name: jobs[name].targets for name in names if name not in done}
     earlier = record.ours(BATCH_FOLDERS)
@@ -98,10 +97,7 @@ def rectify_photos(
     # what was cut short, or changed, since it was made is made again by `resume`
     record.check(earlier.union(*todo.values()), [file for name in names for file in jobs[name].inputs], again=resume)
     _make_room(jobs, todo, out, record)
-    for name in todo:
-        if name in before:  # from here on its outputs may be of either making
-            journal.add(JournalEntry(name, "", before[name].files))
-    journal.settle()
+    _open_again(todo.keys() & before.keys(), before, journal)
     log.begin("rectifying", len(names), len(done))
     fitting = workers.fitting("rectifying", _most_bytes(scene.solution, todo, options))
     try:
@@ -119,14 +115,25 @@ def rectify_photos(
         raise FileError(f"{error}; {len(done)} of {len(names)} photos are done, {go_on}") from error
     except KeyboardInterrupt as stop:
         raise KeyboardInterrupt(f"{len(done)} of {len(names)} photos are done, {go_on}") from stop
-    made = {name: _entry(each) for name, each in done.items() if not each.problem}
-    if made:
-        kept = ({name: before[name] for name in before.keys() - done.keys()} if resume and others else {}) | made
-        record.remove(earlier - {path for entry in kept.values() for path in entry.files})
-        record.settle()
-        journal.write(kept[name] for name in sorted(kept))
+    if made := {name: _entry(each) for name, each in done.items() if not each.problem}:
+        others_kept = {name: before[name] for name in before.keys() - done.keys()} if resume and others else {}
+        _settle(others_kept | made, earlier, record, journal)
     log.end("rectifying", photos=len(made))
     return {name: done[name] for name in names}
+
+
+def _open_again(names: Set[str], before: Mapping[str, JournalEntry], journal: Journal) -> None:
+    """Write down that outputs of photos may be of either making from here on."""
+    for name in sorted(names):
+        journal.add(JournalEntry(name, "", before[name].files))
+    journal.settle()
+
+
+def _settle(kept: Mapping[str, JournalEntry], earlier: Set[str], record: Record, journal: Journal) -> None:
+    """Delete what an earlier batch wrote and nobody keeps, and write down what is kept."""
+    record.remove(earlier - {path for entry in kept.values() for path in entry.files})
+    record.settle()
+    journal.write(kept[name] for name in sorted(kept))
 
 
 def _still_whole(

@@ -149,17 +149,7 @@ def align_gyro(
         The latter with its reason: too few rotations, a log that does not cover the frames, a camera that stood still
         or turned too evenly, a log of another clip, several offsets that fit, a mirror image.
     """
-    times = check_finite(frame_time_s, (None,), "frame_time_s")
-    joined = np.asarray(pairs)
-    if joined.ndim != 2 or joined.shape[1] != 2 or not np.issubdtype(joined.dtype, np.integer):
-        raise InputError(f"pairs.shape={joined.shape} of {joined.dtype}, expected (n, 2) of int")
-    vectors = check_array(turns, (len(joined), 3), "turns")
-    if len(joined) and (joined.min() < 0 or joined.max() >= len(times)):
-        raise InputError(f"pairs join frames {joined.min()} to {joined.max()} of {len(times)}")
-    start, end = times[joined[:, 0]], times[joined[:, 1]]
-    good = np.isfinite(vectors).all(axis=1) & (end > start)
-    start, end = start[good], end[good]
-    seen = -vectors[good] / (end - start)[:, None]
+    start, end, seen = _rates(frame_time_s, pairs, turns)
     if len(seen) < _FEWEST:
         return NoAlignment(f"{len(seen)} rotations between frames are too few to find a gyroscope by ({_FEWEST})")
 
@@ -202,6 +192,20 @@ def align_gyro(
         num_inliers=fit.num_inliers,
         num_turns=fit.num_turns,
     )
+
+
+def _rates(frame_time_s: ArrayLike, pairs: ArrayLike, turns: ArrayLike) -> tuple[_Array, _Array, _Array]:
+    """Start and end (n,) of intervals between frames, and the rates (n, 3) in them; without false ones."""
+    times = check_finite(frame_time_s, (None,), "frame_time_s")
+    joined = np.asarray(pairs)
+    if joined.ndim != 2 or joined.shape[1] != 2 or not np.issubdtype(joined.dtype, np.integer):
+        raise InputError(f"pairs.shape={joined.shape} of {joined.dtype}, expected (n, 2) of int")
+    vectors = check_array(turns, (len(joined), 3), "turns")
+    if len(joined) and (joined.min() < 0 or joined.max() >= len(times)):
+        raise InputError(f"pairs join frames {joined.min()} to {joined.max()} of {len(times)}")
+    start, end = times[joined[:, 0]], times[joined[:, 1]]
+    good = np.isfinite(vectors).all(axis=1) & (end > start)
+    return start[good], end[good], -vectors[good] / (end - start)[good, None]
 
 
 def _why_not(fit: _Fit, way: _Array, spread: float, interval_s: float) -> str | None:

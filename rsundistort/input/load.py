@@ -137,6 +137,18 @@ def _is_text(name: str) -> bool:
     return not any("\ud800" <= letter <= "\udfff" for letter in name)
 
 
+def _listed(folder: Path, raw_as: str, only: Sequence[str] | None, least: int) -> list[str]:
+    """The photos that are to be loaded; refused where they are too few, or no model can hold a name."""
+    listed = list_photos(folder, raw_as) if only is None else list(only)
+    if len(listed) < least:
+        raise InputError(
+            f"{folder} holds {len(listed)} photo{'s' * (len(listed) > 1)}; the shutter needs at least {_NUMBERS[least]}"
+        )
+    if no_text := [name for name in listed if not _is_text(name)]:
+        raise InputError(f"{no_text[0]!r} in {folder} is no name in UTF-8, and no model can hold it; rename it")
+    return listed
+
+
 def load_photos(
     folder: Path,
     camera: str | None,
@@ -180,13 +192,7 @@ def load_photos(
         What was found before, and takes what is found.
     """
     kept = kept or Kept()
-    listed = list_photos(folder, raw_as) if only is None else list(only)
-    if len(listed) < least:
-        raise InputError(
-            f"{folder} holds {len(listed)} photo{'s' * (len(listed) > 1)}; the shutter needs at least {_NUMBERS[least]}"
-        )
-    if no_text := [name for name in listed if not _is_text(name)]:
-        raise InputError(f"{no_text[0]!r} in {folder} is no name in UTF-8, and no model can hold it; rename it")
+    listed = _listed(folder, raw_as, only, least)
     mask_of = {} if masks is None else find_masks(local_place(masks).absolute(), listed)
     before: dict[str, _Loaded] = {name: old for name in listed if (old := kept.get(f"features of {name}"))}
     jobs = (
@@ -195,10 +201,7 @@ def load_photos(
         if name not in before
     )
     log.begin("features", len(listed), len(before))
-    names: list[str] = []
-    features: list[Features] = []
-    found: list[_Loaded] = []
-    skipped: dict[str, str] = {}
+    found, skipped = dict[str, _Loaded](), dict[str, str]()
     # the headers are not looked at for workers elsewhere, which mind their own memory
     if not workers.scheduler:
         workers = workers.fitting("features", _most_bytes(folder, listed, megapixels, max_megapixels))
@@ -212,20 +215,17 @@ def load_photos(
                 skipped[name] = each.problem
                 warnings.warn(f"skipped: {each.problem}", SkippedPhotoWarning, stacklevel=2)
             else:
-                names.append(name)
-                features.append(each.features)
-                found.append(each)
-            log.tell("features", len(names) + len(skipped), len(listed))
+                found[name] = each
+            log.tell("features", len(found) + len(skipped), len(listed))
+    names, loaded = list(found), list(found.values())
     if len(names) < least:
-        raise InputError(
-            f"{folder} holds {len(names)} readable photo{'s' * (len(names) != 1)} of {len(listed)}; "
-            f"the shutter needs at least {_NUMBERS[least]} ({next(iter(skipped.values()))})"
-        )
-    sizes, facts = [(each.width, each.height) for each in found], [each.facts for each in found]
-    cameras = find_cameras(folder, names, sizes, facts, camera, readout)
+        readable = f"{folder} holds {len(names)} readable photo{'s' * (len(names) != 1)} of {len(listed)}"
+        raise InputError(f"{readable}; the shutter needs at least {_NUMBERS[least]} ({next(iter(skipped.values()))})")
+    facts, features = [each.facts for each in loaded], [each.features for each in loaded if each.features is not None]
+    cameras = find_cameras(folder, names, [(each.width, each.height) for each in loaded], facts, camera, readout)
     log.end("features", photos=len(names), keypoints=sum(len(f.xy_raw) for f in features))
-    orientations = {name: each.orientation for name, each in zip(names, found, strict=True)}
+    orientations = {name: each.orientation for name, each in found.items()}
     return LoadedPhotos(
         names, features, facts, skipped, cameras, orientations, folder.absolute(), mask_of, max_megapixels,
-        [each.edge_px for each in found],
+        [each.edge_px for each in loaded],
     )  # fmt: skip
