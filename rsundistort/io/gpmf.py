@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, FormatError, InputError, RsUndistortError, RsUndistortWarning
+from .ffmpeg_reasons import reason_of
 from .gyro import CAMERA_FROM_GYROFLOW, GyroLog, parse_axes
 
 __all__ = ["GyroPayload", "has_telemetry", "parse_payload", "read_gpmf"]
@@ -188,7 +189,7 @@ def _open(path: Path) -> Any:
         # tags in another encoding are nothing to fail at
         return av.open(f"file:{path}", options={"protocol_whitelist": "file"}, metadata_errors="replace")
     except (OSError, av.error.FFmpegError) as error:
-        raise FileError(f"{path} cannot be read as a video ({error.strerror})") from error
+        raise FileError(f"{path} cannot be read as a video ({reason_of(error)})") from error
 
 
 def _track(container: Any) -> Any:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, InputError, RsUndistortError, RsUndistortWarning
+from .ffmpeg_reasons import reason_of
 from .outputs import output_folder
 from .photos.exif import ORIENTATION, pack_ifd
 from .photos.images import MAX_MEGAPIXELS, write_image
@@ -232,8 +233,8 @@ class VideoReader:
             if isinstance(error, RsUndistortError):
                 raise
             raise FileError(
-                f"{self.video} cannot be read as a video ({error.strerror}); if it was cut short while being recorded, "
-                "repair it or copy it again"
+                f"{self.video} cannot be read as a video ({reason_of(error)}); if it was cut short while being "
+                "recorded, repair it or copy it again"
             ) from error
 
     @property

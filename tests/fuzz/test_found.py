@@ -26,6 +26,7 @@ from rsundistort.experiments.scenes import load_scene
 from rsundistort.io.cameras import read_camera_file
 from rsundistort.io.control_points import read_control_points
 from rsundistort.io.depth_maps import read_depth_map
+from rsundistort.io.gpmf import read_gpmf
 from rsundistort.io.journal import entries_of
 from rsundistort.io.kept import Kept
 from rsundistort.io.lengths import read_known_lengths
@@ -262,6 +263,18 @@ def test_a_heic_that_holds_no_picture_any_more(tmp_path):
     (tmp_path / "a.heic").write_bytes(whole.replace(b"hvcC", b"hvc\0"))
     with pytest.raises(FileError, match=r"a\.heic cannot be decoded"):
         read_photo(tmp_path / "a.heic")
+
+
+def test_a_video_whose_claims_ffmpeg_makes_no_room_for(tmp_path, monkeypatch):
+    import av
+
+    def refused(*_, **__):
+        raise av.error.MemoryError(12, "Cannot allocate memory")
+
+    monkeypatch.setattr(av, "open", refused)
+    (tmp_path / "v.mp4").write_bytes(b"damaged")
+    with pytest.raises(FileError, match=r"cannot be read as a video \(it claims more than FFmpeg makes room for\)"):
+        read_gpmf(tmp_path / "v.mp4")
 
 
 def test_entities_of_a_camera_file_are_not_expanded(tmp_path):
