@@ -165,6 +165,16 @@ def test_one_strip_is_put_on_the_map_by_its_gimbal(with_gimbal):
     assert apart.max() < np.deg2rad(8.0)
 
 
+def test_a_compass_that_errs_does_not_turn_what_gps_tells():
+    flight = Flight()
+    facts = flight.facts(sigma_m=(0.5, 0.5, 1.0))
+    wrong = [replace(each, fix=replace(each.fix, yaw_pitch_roll_deg=(40.0, -90.0, 0.0))) for each in facts]
+    with_it, without = (
+        survey_of("local", [], flight.names, each, [(768, 512)] * 10).placed(flight.start)[1] for each in (wrong, facts)
+    )
+    np.testing.assert_array_equal(with_it.R_cw, without.R_cw)
+
+
 # ---------------------------------------------------------------- refusals
 
 FACTS = [ExifFacts(fix=GpsFix(47.0, 8.0 + 1e-3 * k, 400.0)) for k in range(4)]

@@ -88,7 +88,8 @@ def rectify_photos(
     dict of name to PhotoDone
         Of every photo; those that were left out have a `problem`.
     """
-    before, record, jobs = journal.read(), Record(out), _Jobs(folder, scene, names, out, options, colors, posed)
+    before, record = journal.read(), Record(out)
+    jobs = _Jobs(folder, scene, names, out, options, colors, posed)
     done = _still_whole(jobs, names, before, out) if resume else {}
     todo = {name: jobs[name].targets for name in names if name not in done}
     earlier = record.ours(BATCH_FOLDERS)

@@ -122,11 +122,11 @@ class PhotoCameras:
         """
         for k, name, times in self.known_to(loose=True).surprises(cameras):
             if k in self.without_focal and times > _LIKE_NO_CAMERA:
-                value = cameras[k].K[0, 0] if name[0] == "f" else dict(cameras[k].coefficients).get(name, np.nan)
-                what = "the principal point is far from the middle" if name in ("cx", "cy") else f"{name} = {value:.3g}"
+                (fx, _, cx), (_, fy, cy), _ = cameras[k].K.tolist()
+                value = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **cameras[k].coefficients}[name]
                 raise ReconstructionError(
-                    f"the photos do not tell their camera: {what} would be {times:.0f} standard deviations from what "
-                    f"cameras of such photos have; give --camera FILE or --camera fx,fy,cx,cy in pixels"
+                    f"the photos do not tell their camera: {name} = {value:.3g} would be {times:.0f} standard "
+                    "deviations from what such cameras have; give --camera FILE or --camera fx,fy,cx,cy in pixels"
                 )
 
     def contradicted(self, cameras: Sequence[Camera], options: BundleOptions) -> list[str]:

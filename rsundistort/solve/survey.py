@@ -34,6 +34,8 @@ _ELSEWHERE_M = 1e5
 _CONTRADICTS = 3.0
 # Of axes by a gimbal and its compass, radians; photos that lie farther off than the second are not believed.
 _GIMBAL_SIGMA, _GIMBAL_OFF = np.deg2rad(5.0), np.deg2rad(20.0)
+# So many photos, spread over the flight, are compared each with each for the middle one.
+_SOME = 100
 # Of a velocity by GPS along each axis, metres a second, and of the time that it is multiplied by, relative.
 _VELOCITY_SIGMA_M_S, _VELOCITY_SHARE = 0.3, 0.03
 
@@ -98,7 +100,7 @@ class Survey:
         names = [name for name in rec.image_names if name in self.places]
         problem = f"{len(names)} of the photos that were joined have GPS, three are needed"
         if len(names) >= _LEAST:
-            fit = fit_similarity(*_of_photos(rec, self.places), self._rotation(rec))
+            fit = self._fitted(rec, *_of_photos(rec, self.places))
             problem = _misfit(fit, "GPS")
             if not problem:
                 return replace(self, fit=fit), fit.similarity.of_reconstruction(rec)
@@ -106,6 +108,13 @@ class Survey:
             return self, rec
         warnings.warn(f"not on the map: {problem}; poses are in a frame of their own", RsUndistortWarning, stacklevel=4)
         return None, rec
+
+    def _fitted(self, rec: Reconstruction, points: Array, targets: Array, sigma: Array) -> FittedSimilarity:
+        """The similarity by places; where these do not tell the rotation, gimbals do: compasses err by more."""
+        fit = fit_similarity(points, targets, sigma)
+        if (fit.sigma_rad < _MOST_TURN).all():
+            return fit
+        return fit_similarity(points, targets, sigma, self._rotation(rec))
 
     def _rotation(self, rec: Reconstruction) -> tuple[Array, float] | None:
         """From a reconstruction's axes to the frame's by the photos' gimbals, and what it is known to; or None.
@@ -121,8 +130,9 @@ class Survey:
         if len(rows) < _LEAST:
             return None
         each = Rotation.from_matrix([told[rec.image_names[i]].T @ rec.R_cw[i] for i in rows])
-        apart = np.array([(each * other.inv()).magnitude() for other in each])
-        middle = each[int(np.argmin(np.median(apart, axis=1)))]
+        some = each[np.unique(np.linspace(0, len(rows) - 1, _SOME).astype(np.int64))]
+        apart = np.array([(some * other.inv()).magnitude() for other in some])
+        middle = some[int(np.argmin(np.median(apart, axis=1)))]
         near = (each * middle.inv()).magnitude() < _GIMBAL_OFF
         if 2 * near.sum() <= len(rows):  # they contradict each other
             return None
@@ -139,7 +149,7 @@ class Survey:
         survey, targets = replace(self, notes=notes), np.array([each.place_m for each in found.points]).reshape(-1, 3)
         if len(found.points) >= _LEAST:
             sigma = np.array([each.sigma_m for each in found.points])
-            fit = fit_similarity(found.points_w, targets, sigma, self._rotation(rec))
+            fit = self._fitted(rec, found.points_w, targets, sigma)
             problem = _misfit(fit, "control points", robust=False)
             if problem and self.fit is None:
                 warnings.warn(
@@ -172,7 +182,7 @@ class Survey:
         x = np.concatenate([x, rec.points_w[list(points)]])
         y = np.concatenate([y, np.array([each.place_m for each in points.values()]).reshape(-1, 3)])
         sigma = np.concatenate([sigma, np.array([each.sigma_m for each in points.values()]).reshape(-1, 3)])
-        fit = fit_similarity(x, y, sigma, self._rotation(rec))
+        fit = self._fitted(rec, x, y, sigma)
         rec = fit.similarity.of_reconstruction(rec)
         survey = replace(self, fit=fit)
         off = survey.outliers(rec)

@@ -108,6 +108,6 @@ def problem_of(told: Mapping[str, Any]) -> str:
         apart = abs(first["seconds"] - second["seconds"]) / np.hypot(first["sigma"], second["sigma"])
         if apart > APART:
             return f"the halves of the video contradict each other, {apart:.0f} standard deviations apart"
-    if abs(told.get("of_frame", 0.0)) - SIGMAS * sigma * abs(told.get("of_frame", 0.0) / seconds) > 1:
+    if abs(told.get("of_frame", 0.0)) * (1 - SIGMAS * sigma / abs(seconds)) > 1:
         return "it would be longer than from frame to frame: something else bends the frames"
     return ""
