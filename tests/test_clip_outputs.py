@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from clips import HandHeld
+from clips import HandHeld, poses_at
 from make_photos import texture
 from rsundistort_cli.main import cli
 from scipy.spatial.transform import Rotation
@@ -309,10 +309,10 @@ def test_the_path_of_turned_frames_is_that_of_a_turned_camera(tmp_path):
     np.testing.assert_allclose(turned.R_cw[:, 0], -path.R_cw[:, 1])
     np.testing.assert_allclose(turned.R_cw[:, 1], path.R_cw[:, 0])
     between = np.linspace(0.01, 0.2, 9)
-    R, _ = path.poses_at(between)
-    turned_R, centers = turned.poses_at(between)
+    R, _ = poses_at(path, between)
+    turned_R, centers = poses_at(turned, between)
     np.testing.assert_allclose(turned_R, [[[0, -1, 0], [1, 0, 0], [0, 0, 1]]] @ R, atol=1e-12)
-    np.testing.assert_allclose(centers, path.poses_at(between)[1])
+    np.testing.assert_allclose(centers, poses_at(path, between)[1])
 
 
 # ---------------------------------------------------------------- the readout time

@@ -13,6 +13,7 @@ from scipy.special import stdtr
 
 from ..bundle import BundleResult, ModelChoice
 from ..bundle.choice import clipped_errors, corners, improves, standard_errors
+from ..bundle.layout import motion_end
 from ..critical import Remedy
 from ..model import Reconstruction
 from ..model.field import field_over_frame
@@ -269,10 +270,10 @@ def _explains(result: BundleResult, global_result: BundleResult) -> bool:
     if len(plain.observations) != len(rec.observations):
         return False
     # of fitted measurements, which noise alone leaves below 1 by half of each unknown: so that they compare with 1
-    num, free = len(rec.observations), {"global": 6, "constant-motion": 12}
+    num = len(rec.observations)
     before, after = (
         clipped_errors(each, each.observations, result.sigma_px)[0]
-        + (free.get(each.shutter_model, 9) * each.num_images + 3 * each.num_points) / (2 * num)
+        + (motion_end(each.shutter_model) * each.num_images + 3 * each.num_points) / (2 * num)
         for each in (plain, rec)
     )
     return improves(before, after, standard_errors(before - after, corners(rec, rec.observations)))
