@@ -201,7 +201,7 @@ class _Bars:
         if not self._lines:
             return
         with self._lock:
-            # "ladder: rotation" is a step of the stage "ladder"
+            # "model sequence: rotation" is a step of the stage "model sequence"
             name = stage if self._steps else stage.partition(":")[0]
             if name != self._stage:
                 self._end()

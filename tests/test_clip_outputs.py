@@ -341,7 +341,7 @@ def test_the_readout_time_is_told_with_its_evidence():
     [
         ({}, ""),
         ({"stabilisation": {"verdict": "stabilised", "reason": "stabilised: why"}}, "stabilised: why"),
-        ({"source": "what was known before"}, "does not tell it better than it was known before"),
+        ({"source": "what was known before"}, "does not determine it better than it was known before"),
         ({"sigma": 0.007}, "the camera moved too little: 20.5 +- 7.0 ms"),
         (
             {"halves": [{"seconds": 0.030, "sigma": 0.0005}, {"seconds": 0.0204, "sigma": 0.0005}]},

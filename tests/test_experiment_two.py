@@ -232,7 +232,7 @@ def test_experiment_two_says_which_photos_cannot_be_joined(folders, made_up, mon
 
     def fake(photos, out, options, progress=None, jobs=0):
         if photos.name == "swung":
-            raise ReconstructionError("only 2 of 6 photos could be joined")
+            raise ReconstructionError("only 2 of 6 photos could be registered")
         return good(photos, out, options, progress)
 
     monkeypatch.setattr(two, "run", fake)

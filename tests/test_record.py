@@ -281,9 +281,9 @@ def test_reports_and_figures_of_others_stay(invoke, inputs, tmp_path):
         assert invoke("report", out, "--figures", tmp_path / "figures", "-q").exit_code == 0
     assert (tmp_path / "figures" / "paths.pdf").is_file()
     (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "ladder.png").write_bytes(b"mine")
-    refused(invoke("report", out, "--figures", tmp_path / "other"), "ladder.png would be replaced")
-    assert list(digests(tmp_path / "other")) == ["ladder.png"]
+    (tmp_path / "other" / "models.png").write_bytes(b"mine")
+    refused(invoke("report", out, "--figures", tmp_path / "other"), "models.png would be replaced")
+    assert list(digests(tmp_path / "other")) == ["models.png"]
 
 
 # ---------------------------------------------------------------- version 0.1

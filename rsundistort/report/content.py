@@ -1,4 +1,4 @@
-"""What a report says, as plain values: for the template, and for the scripts in the page."""
+"""The content of a report as plain values: for the template, and for the scripts in the page."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from .source import Source, relative_folder
 __all__ = [
     "arrows_of",
     "cameras",
-    "ladder",
     "longer",
+    "models",
     "motions",
     "photos",
     "residuals",
@@ -34,12 +34,12 @@ __all__ = [
     "view_of",
 ]
 
-# Size of the picture of a motion, and the places along the readout that it is drawn at.
+# Size of the picture of a motion, and the number of its places along the readout.
 _CURVE, _CURVE_PLACES = (240, 120), 97
 # Factors by which arrows may be drawn longer than they are, and the part of a cell that a long one should fill.
 _LONGER = (1, 2, 3, 4, 6, 8, 10, 15, 20, 30, 50)
 _ACROSS = 14
-# Arrows across and down in the picture of what a lens model leaves.
+# Arrows across and down in the picture of a residual field.
 _FIELD_ARROWS = 13, 9
 
 
@@ -79,9 +79,9 @@ def photos(source: Source) -> list[dict[str, Any]]:
 
 
 def motions(solution: Solution) -> list[dict[str, Any]]:
-    """How photos turned while they were read, of those that did not turn steadily: SVG paths for the three axes.
+    """Rotation over the readout of photos that did not rotate steadily: SVG paths for the three axes.
 
-    From the first line on the left to the last on the right; the steady motions that are nearest go with them.
+    From the first line on the left to the last on the right, with the nearest steady motions.
     """
     width, height = _CURVE
     found = []
@@ -221,25 +221,25 @@ def residuals(source: Source) -> dict[str, Any] | None:
     }  # fmt: skip
 
 
-def ladder(solution: Solution) -> list[dict[str, Any]]:
-    """A row of each shutter model that was tried: residuals when it was climbed, errors of held-out measurements."""
+def models(solution: Solution) -> list[dict[str, Any]]:
+    """A row of each shutter model that was tried: residuals of its first fit, errors of held-out measurements."""
     quality = solution.quality
     held_out, errors = quality.get("held_out_rms_px") or {}, quality.get("held_out_error") or {}
     gains, kept = quality.get("held_out_gain") or {}, quality.get("held_out_kept") or ()
     bars = errors or held_out  # solutions of earlier versions have no errors
-    rungs = {
-        str(rung.get("model")): rung
+    fits = {
+        str(fit.get("model")): fit
         for stage in solution.stages
-        if stage.get("name") == "ladder"
-        for rung in stage.get("rungs") or ()
+        if stage.get("name") in ("model sequence", "ladder")  # the latter of version 0.1
+        for fit in stage.get("models") or stage.get("rungs") or ()
     }
-    names = [*bars, *(name for name in SHUTTER_MODELS if name in rungs and name not in bars)]
+    names = [*bars, *(name for name in SHUTTER_MODELS if name in fits and name not in bars)]
     largest = max((float(value) for value in bars.values() if value is not None), default=0.0)
     return [
         {
             "name": name,
-            "rms": rungs.get(name, {}).get("rms_px"),
-            "iterations": rungs.get(name, {}).get("iterations"),
+            "rms": fits.get(name, {}).get("rms_px"),
+            "iterations": fits.get(name, {}).get("iterations"),
             "held_out": held_out.get(name),
             "error": errors.get(name),
             "gain": gains.get(name),
@@ -252,7 +252,7 @@ def ladder(solution: Solution) -> list[dict[str, Any]]:
 
 
 def cameras(solution: Solution) -> list[dict[str, Any]]:
-    """A row of each camera, with the standard deviations of what was solved for."""
+    """A row of each camera, with the standard deviations of its estimated intrinsics."""
     sigmas = solution.quality.get("sigma_intrinsics") or {}
     times = solution.quality.get("readout_times") or {}
     rows = []
@@ -279,7 +279,7 @@ def cameras(solution: Solution) -> list[dict[str, Any]]:
 
 
 def _field(camera: Camera, told: Mapping[str, float]) -> dict[str, Any] | None:
-    """A picture of what a camera's lens model leaves, in thousandths of its width, and its size; None if none."""
+    """A picture of a camera's residual field, in thousandths of its width, and its size; None if it has none."""
     if not camera.field.size:
         return None
     xy, field = (each.reshape(-1, 2) for each in field_over_frame(camera, *_FIELD_ARROWS))
@@ -297,7 +297,7 @@ def _field(camera: Camera, told: Mapping[str, float]) -> dict[str, Any] | None:
 
 
 def settings(solution: Solution) -> list[tuple[str, str]]:
-    """Options by name; empty where nothing was said."""
+    """Options by name; empty where none was given."""
     said = []
     for name, value in solution.options.items():
         if isinstance(value, Mapping):
@@ -320,7 +320,7 @@ def _address(data: bytes | None) -> str | None:
 
 
 def _packed(values: NDArray[np.float64]) -> dict[str, str]:
-    """Points (n, 3) as three arrays in the form that plotly.js takes."""
+    """Points (n, 3) as three arrays for plotly.js."""
     return {
         axis: base64.b64encode(np.ascontiguousarray(values[:, k], "<f4").tobytes()).decode()
         for k, axis in enumerate("xyz")
@@ -349,7 +349,7 @@ def view_frame(R_cw: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _size(centers: NDArray[np.float64], points: NDArray[np.float64]) -> float:
-    """How far the scene reaches from the middle of the cameras, but for its farthest points."""
+    """Extent of the scene from the middle of the cameras, without its farthest points."""
     middle = np.median(centers, axis=0)
     every = centers if not len(points) else points
     distance = np.linalg.norm(every - middle, axis=1)
@@ -379,7 +379,7 @@ def _near_rgb(told: Diagnostics, centers: NDArray[np.float64], reach: float) -> 
 
 
 def _box(points: NDArray[np.float64], centers: NDArray[np.float64]) -> list[list[float]]:
-    """Ranges of the three axes that hold the cameras, and all but the farthest points."""
+    """Ranges of the three axes that contain the cameras, and all but the farthest points."""
     low, high = centers.min(0), centers.max(0)
     if len(points):
         nearest, farthest = np.quantile(points, [0.02, 0.98], axis=0)

@@ -15,7 +15,7 @@ from ..io.aside import written_aside
 from ..io.outputs import only_writer
 from ..io.record import Record
 from ..model import Solution
-from .content import arrows_of, ladder, longer, view_frame
+from .content import arrows_of, longer, models, view_frame
 from .diagnostics import Diagnostics
 from .source import Source, read_source
 from .verdict import meter_of
@@ -38,7 +38,7 @@ _STYLE: dict[str, Any] = {
 def write_figures(out: Path | str, figures: Path | str) -> list[Path]:
     """Draw what a run found as figures for papers, each as PNG and as PDF.
 
-    `ladder` (residuals of the shutter models), `displacement` (the displacement fields of the photos that moved most),
+    `models` (residuals of the shutter models), `displacement` (the displacement fields of the photos that moved most),
     `paths` (where the cameras were, ours and by a global shutter) and `critical-motion` (the axes of readout on the
     sphere); those that the solution has nothing for are left out.
 
@@ -68,7 +68,7 @@ def write_figures(out: Path | str, figures: Path | str) -> list[Path]:
         raise InputError('figures need matplotlib; install it: pip install "rsundistort[figures]"') from error
     source, folder = read_source(Path(out)), Path(figures)
     drawings: dict[str, Callable[[Figure, Source], bool]] = {
-        "ladder": _ladder,
+        "models": _models,
         "displacement": _displacement,
         "paths": _paths,
         "critical-motion": _sphere,
@@ -99,21 +99,21 @@ def _save(figure: Figure, folder: Path, name: str, record: Record) -> list[Path]
     return paths
 
 
-def _ladder(figure: Figure, source: Source) -> bool:
-    rungs = [rung for rung in ladder(source.solution) if rung["held_out"] or rung["rms"]]
-    if not rungs:
+def _models(figure: Figure, source: Source) -> bool:
+    rows = [row for row in models(source.solution) if row["held_out"] or row["rms"]]
+    if not rows:
         return False
     labels = {"error": "held-out error", "held_out": "held-out residual (px)", "rms": "residual (px)"}
-    key = next(key for key in labels if any(rung[key] for rung in rungs))
-    rungs = [rung for rung in rungs if rung[key]]
-    figure.set_size_inches(3.4, 0.6 + 0.32 * len(rungs))
+    key = next(key for key in labels if any(row[key] for row in rows))
+    rows = [row for row in rows if row[key]]
+    figure.set_size_inches(3.4, 0.6 + 0.32 * len(rows))
     axes = figure.add_subplot()
-    values = [rung[key] for rung in rungs]
+    values = [row[key] for row in rows]
     bars = axes.barh(
-        [rung["name"] for rung in rungs],
+        [row["name"] for row in rows],
         values,
         height=0.6,
-        color=[_OURS if rung["chosen"] else _GREY for rung in rungs],
+        color=[_OURS if row["chosen"] else _GREY for row in rows],
     )
     axes.bar_label(bars, labels=[f"{value:.3f}" for value in values], padding=3)
     axes.invert_yaxis()

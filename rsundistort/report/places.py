@@ -1,4 +1,4 @@
-"""What is said of a solution's place on the map."""
+"""The georeferencing of a solution, for people."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["map_facts", "map_rows"]
 
 
 def map_facts(told: Mapping[str, Any] | None) -> list[tuple[str, str]]:
-    """Label and text of all that is known of the frame, GPS, control points and speeds, for people.
+    """Label and text of all that is known of the frame, GPS, control points and speeds.
 
     Parameters
     ----------

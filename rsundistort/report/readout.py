@@ -1,4 +1,4 @@
-"""What is said of the readout time of a video, and of what it rests on."""
+"""The readout time of a video and its evidence, for people."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def _time(told: Mapping[str, Any]) -> str:
 
 
 def readout_facts(told: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Label and text of all that is known of a readout time, for people.
+    """Label and text of all that is known of a readout time.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ def readout_facts(told: Mapping[str, Any]) -> list[tuple[str, str]]:
     source = told["source"]
     origin = source if source.startswith("what") else f"measured from {source}"
     share = f" ({told['of_frame']:.2f} of the frame)" if "of_frame" in told else ""  # the truth of a clip has none
-    # what was known before need not be told by the video
+    # a time that was known before need not follow from the video
     problem = "" if source.startswith("what") else problem_of(told)
     facts = [("readout time", f"not measured: {problem}" if problem else f"{_time(told)}{share}, {origin}")]
     halves = told.get("halves") or ()
@@ -43,5 +43,5 @@ def readout_facts(told: Mapping[str, Any]) -> list[tuple[str, str]]:
                 f"axes {gyro['axes']}, offset {offset:.1f} +- {sigma:.1f} ms, correlation {gyro['correlation']:.3f}",
             )
         )
-    facts.append(("stabilisation", (told.get("stabilisation") or {}).get("reason") or "not looked at"))
+    facts.append(("stabilisation", (told.get("stabilisation") or {}).get("reason") or "not examined"))
     return facts

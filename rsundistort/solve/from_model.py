@@ -32,7 +32,7 @@ from ..model.orientation import INVERSE, turn_reconstruction
 from ..sfm import matched_of_database
 from .from_poses import measured, posed_photos
 from .going_on import RunFolder, key_of, run_folder
-from .model_sequence import Feedback, solve_tracks
+from .model_sequence import TrackSource, solve_tracks
 from .outcome import Solved
 from .run_options import OutputOptions, SolveOptions
 from .run_outputs import REPLACED, Outputs, PointRgb, check_usd, files_of_run, inputs_of, photo_times
@@ -231,7 +231,7 @@ def _outputs_of(
         def check(names: Sequence[str]) -> None:
             Record(out).check(files_of_run(names, rectify.raw_as, outputs), files_in)
 
-        given, feedback = _given(model, folder, check, options.seed, rectify, workers, work, log)
+        given, track_source = _given(model, folder, check, options.seed, rectify, workers, work, log)
         photos = {} if folder is None else _look_at(folder, given.reconstruction)
         given, said = _in_stored_frame(given, photos)
         if folder is not None:
@@ -239,7 +239,7 @@ def _outputs_of(
         log.end("model", photos=given.reconstruction.num_images, points=given.reconstruction.num_points)
         facts = {name: fact for name, (_, fact) in photos.items()}
         solved, ids, rgb = _solve(
-            given, str(model), facts, options, None if database is None else Path(database), log, feedback
+            given, str(model), facts, options, None if database is None else Path(database), log, track_source
         )
         facts_of_model = {
             "frame": said,
@@ -265,7 +265,7 @@ def _given(
     workers: Workers,
     work: Path,
     log: StageLog,
-) -> tuple[ColmapModel, Feedback | None]:
+) -> tuple[ColmapModel, TrackSource | None]:
     """The model; of one that holds poses only, measured in its photos, and what its tracks can be rebuilt from.
 
     `check` is told the photos that will be rectified, before any of them is read.
@@ -395,7 +395,7 @@ def _solve(
     options: SolveOptions,
     database: Path | None,
     log: StageLog,
-    feedback: Feedback | None = None,
+    track_source: TrackSource | None = None,
 ) -> tuple[Solved, ModelIds, PointRgb]:
     if given.reconstruction.num_images < 3:
         raise ReconstructionError(
@@ -421,7 +421,7 @@ def _solve(
             log.begin("database")
             matched = matched_of_database(database, work / "database.db", rec, options.seed)
             log.end("database", keypoints=sum(len(found.xy_raw) for found in matched.features))
-            feedback = Feedback(matched)
+            track_source = TrackSource(matched)
         solved = solve_tracks(
             rec,
             cameras,
@@ -430,7 +430,7 @@ def _solve(
             options_of,
             log,
             options.remedy,
-            feedback,
+            track_source,
             survey,
         )
     after = solved.shared

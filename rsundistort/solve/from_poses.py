@@ -19,7 +19,7 @@ from ..io.cameras import camera_to_json
 from ..io.metashape import PosedPhotos, named, read_metashape
 from ..model import Observations, Reconstruction
 from ..sfm import LEAST_MEASUREMENTS, match_photos, retriangulate
-from .model_sequence import Feedback
+from .model_sequence import TrackSource
 
 __all__ = ["measured", "posed_photos"]
 
@@ -46,7 +46,7 @@ def posed_photos(model: Path, folder: Path | None, raw_as: str) -> PosedPhotos:
 
 def measured(
     posed: PosedPhotos, folder: Path, rectify: RectifyOptions, seed: int, workers: Workers, work: Path, log: StageLog
-) -> tuple[ColmapModel, Feedback]:
+) -> tuple[ColmapModel, TrackSource]:
     """A model with tracks of the features of the photos that the poses explain, and what these can be rebuilt from.
 
     Raises
@@ -89,4 +89,4 @@ def measured(
         np.arange(len(rec.observations)), np.zeros((rec.num_points, 3), np.uint8), posed.unposed,
         self_calibrated=True, has_colors=False,
     )  # fmt: skip
-    return model, Feedback(matched, loaded, workers)
+    return model, TrackSource(matched, loaded, workers)

@@ -45,7 +45,7 @@ from .outcome import Solved
 from .placing import place_photos
 from .survey import Survey
 
-__all__ = ["Feedback", "rough_options", "solve_photos", "solve_tracks"]
+__all__ = ["TrackSource", "rough_options", "solve_photos", "solve_tracks"]
 
 # Feedback ends when no rectified pixel of any photo moves by more than this between two rounds, in pixels of the images
 # that the features were found in; or when less than this share of the measurements is another one than before, so that
@@ -65,7 +65,7 @@ _LOOKED_AT = 5
 
 
 @dataclass(frozen=True)
-class Feedback:
+class TrackSource:
     """What the tracks of photos are rebuilt from.
 
     Attributes
@@ -131,19 +131,21 @@ def _changed(before: Reconstruction | None, after: Reconstruction) -> float:
     return len(new - old) / max(len(new), 1)
 
 
-def _of_joined(options: BundleOptions, mapped: Reconstruction, *, says: bool = True) -> BundleOptions:
+def _of_registered(options: BundleOptions, mapped: Reconstruction, *, says: bool = True) -> BundleOptions:
     """Options without the anchors and lengths of photos that could not be joined; a warning `says` which."""
-    joined = set(mapped.image_names)
-    lengths = [each for each in options.lengths if joined >= {each.start[0], each.end[0]}]
+    registered = set(mapped.image_names)
+    lengths = [each for each in options.lengths if registered >= {each.start[0], each.end[0]}]
     # one alone tells the scale of the world, which changes no photo
     lengths = lengths if len(lengths) > 1 else []
     if says and len(lengths) < len(options.lengths):
-        apart = sorted({end[0] for each in options.lengths for end in (each.start, each.end)} - joined)
+        apart = sorted({end[0] for each in options.lengths for end in (each.start, each.end)} - registered)
         rest = "those of the others are used" if lengths else "none is used, since ratios need two"
-        warnings.warn(f"not joined, so no known length: {', '.join(apart)}; {rest}", RsUndistortWarning, stacklevel=3)
-    lost = sorted({*options.held_phi, *options.known_phi, *options.still} - joined)
+        warnings.warn(
+            f"not registered, so no known length: {', '.join(apart)}; {rest}", RsUndistortWarning, stacklevel=3
+        )
+    lost = sorted({*options.held_phi, *options.known_phi, *options.still} - registered)
     if says and lost:
-        warnings.warn(f"not joined, so no anchor: {', '.join(lost)}", RsUndistortWarning, stacklevel=3)
+        warnings.warn(f"not registered, so no constraint: {', '.join(lost)}", RsUndistortWarning, stacklevel=3)
     return replace(
         options,
         lengths=lengths,
@@ -214,11 +216,11 @@ def solve_photos(
     mapped, matched = place_photos(photos, scratch, log, seed, matching, kept or Kept(), with_shutter=True)
     if mapped.num_images < _LEAST_PHOTOS:
         raise ReconstructionError(
-            f"only {mapped.num_images} of {len(photos.names)} photos could be joined, the shutter needs three; "
+            f"only {mapped.num_images} of {len(photos.names)} photos could be registered, the shutter needs three; "
             "use photos that share more of the scene"
         )
     solved = solve_tracks(
-        mapped, cameras, shutter_model, seed, options_of, log, remedy, Feedback(matched, photos, workers), survey
+        mapped, cameras, shutter_model, seed, options_of, log, remedy, TrackSource(matched, photos, workers), survey
     )
     if solved.survey is not None:
         return solved
@@ -234,7 +236,7 @@ def solve_tracks(
     options_of: Callable[[Reconstruction], BundleOptions],
     log: StageLog,
     remedy: str = "auto",
-    feedback: Feedback | None = None,
+    track_source: TrackSource | None = None,
     survey: Survey | None = None,
 ) -> Solved:
     """Climb the ladder from a global-shutter reconstruction, in its frame.
@@ -247,7 +249,7 @@ def solve_tracks(
         Where its cameras come from.
     shutter_model, seed, options_of, log, remedy
         As in `solve_photos`.
-    feedback : Feedback, optional
+    track_source : TrackSource, optional
         The matches behind it: its tracks are then rebuilt with the motions found, until these settle.
     survey : Survey, optional
         As in `solve_photos`.
@@ -260,26 +262,26 @@ def solve_tracks(
         survey, mapped = survey.placed(mapped)
     if survey is not None:
         wanted = replace(wanted, places=survey.known(mapped))
-    options = _of_joined(wanted, mapped, says=feedback is None)
+    options = _of_registered(wanted, mapped, says=track_source is None)
     auto = shutter_model == "auto"
     shutter_model = "rotation" if auto else shutter_model
-    log.begin("ladder")
+    log.begin("model sequence")
     models = sequence_to(shutter_model)
-    results = adjust_sequence(mapped, models, options, lambda model, _: log.tell(f"ladder: {model}", 0))
+    results = adjust_sequence(mapped, models, options, lambda model, _: log.tell(f"model sequence: {model}", 0))
     result = results[shutter_model]
     log.end(
-        "ladder",
-        rungs=[{"model": k, "rms_px": r.rms_px, "iterations": r.num_iterations} for k, r in results.items()],
+        "model sequence",
+        models=[{"model": k, "rms_px": r.rms_px, "iterations": r.num_iterations} for k, r in results.items()],
     )
     tracks = result.reconstruction
-    if feedback is not None:
-        result = _placed_again(feedback, result, wanted, log)
-        options = _of_joined(wanted, result.reconstruction)
-        result, tracks, options = _fed_back(feedback, result, options, log, ends=not auto)
+    if track_source is not None:
+        result = _registered_again(track_source, result, wanted, log)
+        options = _of_registered(wanted, result.reconstruction)
+        result, tracks, options = _retriangulated(track_source, result, options, log, ends=not auto)
     options = replace(options, phi_sigma_start=result.phi_sigma)
     choice = None
     if auto:
-        choice, result, tracks, options = _chosen(feedback, result, tracks, options, seed, log)
+        choice, result, tracks, options = _chosen(track_source, result, tracks, options, seed, log)
     if survey is not None and survey.holding:
         survey, result, options = _with_control(survey, result, options, log)
     mended, advice = None, []
@@ -295,7 +297,7 @@ def solve_tracks(
     global_result = _without_shutter(result, options)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
     log.begin("verdict")
-    measured = mapped if feedback is None else tracks
+    measured = mapped if track_source is None else tracks
     known = {*options.known_phi, *options.held_phi, *options.still}
     # two standard deviations of the priors that exposures make
     most_phi = {name: 2.0 * limit for name, limit in options.phi_limits.items()}
@@ -329,7 +331,7 @@ def _with_control(
 
 
 def _chosen(
-    feedback: Feedback | None, result: BundleResult, tracks: Reconstruction, options: BundleOptions, seed: int,
+    track_source: TrackSource | None, result: BundleResult, tracks: Reconstruction, options: BundleOptions, seed: int,
     log: StageLog,
 ) -> tuple[ModelChoice, BundleResult, Reconstruction, BundleOptions]:  # fmt: skip
     """The model that the measurements support, adjusted with all of them: its tracks and options."""
@@ -341,7 +343,7 @@ def _chosen(
     options = replace(options, varying=choice.varying, bends=choice.bends, residual_field=choice.residual_field)
     start = replace(tracks, shutter_model=choice.shutter_model)
     # the windows were aligned, and their outliers told, as a model saw them that is given up
-    again = feedback is not None and feedback.workers is not None
+    again = track_source is not None and track_source.workers is not None
     again = again and (choice.shutter_model == "constant-motion" or choice.bends > 0)
     how = rough_options(options) if again else options
     result = bundle_adjust(start, choice.shutter_model, how, partial(_tell, log, "choice"))
@@ -350,8 +352,8 @@ def _chosen(
         residual_field=choice.residual_field, shutter=choice.shutter, agreement=choice.agreement, gain=choice.gain,
         num_held_out=choice.num_held_out,
     )  # fmt: skip
-    if feedback is not None and again:
-        result, tracks, options = _fed_back(feedback, result, options, log, ["alignment again"])
+    if track_source is not None and again:
+        result, tracks, options = _retriangulated(track_source, result, options, log, ["alignment again"])
     return choice, result, tracks, options
 
 
@@ -385,11 +387,13 @@ def rough_options(options: BundleOptions) -> BundleOptions:
     return replace(options, cost_tolerance=1e-5, spread_rounds=3, spread_tolerance=0.05)
 
 
-def _placed_again(feedback: Feedback, result: BundleResult, wanted: BundleOptions, log: StageLog) -> BundleResult:
+def _registered_again(
+    track_source: TrackSource, result: BundleResult, wanted: BundleOptions, log: StageLog
+) -> BundleResult:
     """Photos that mapping left out, or put into a wrong place since it knows no shutter, placed by what others tell."""
     if result.reconstruction.shutter_model not in ("rotation", "constant-motion"):
         return result
-    matched, num_verified, left_out = feedback.matched, read_num_verified(feedback.matched), set[str]()
+    matched, num_verified, left_out = track_source.matched, read_num_verified(track_source.matched), set[str]()
     for wave in range(1, _MOST_WAVES + 1):
         rec = result.reconstruction
         turns = np.linalg.norm(rec.phi, axis=1) * rec.frame_span()
@@ -407,7 +411,7 @@ def _placed_again(feedback: Feedback, result: BundleResult, wanted: BundleOption
             if tracks.num_images < _LEAST_PHOTOS:  # so little hangs together that nothing tells right from wrong
                 log.end(stage, added=(), moved=(), dropped=())
                 break
-            options = rough_options(_of_joined(wanted, tracks, says=False))
+            options = rough_options(_of_registered(wanted, tracks, says=False))
             options = replace(options, phi_sigma_start=result.phi_sigma)
             result = bundle_adjust(tracks, rec.shutter_model, options, partial(_tell, log, stage))
         left_out = left_out.union(found.dropped) - {*result.reconstruction.image_names}
@@ -420,8 +424,8 @@ def _placed_again(feedback: Feedback, result: BundleResult, wanted: BundleOption
     return result
 
 
-def _fed_back(
-    feedback: Feedback, result: BundleResult, options: BundleOptions, log: StageLog, stages: Sequence[str] = (),
+def _retriangulated(
+    track_source: TrackSource, result: BundleResult, options: BundleOptions, log: StageLog, stages: Sequence[str] = (),
     ends: bool = True,
 ) -> tuple[BundleResult, Reconstruction, BundleOptions]:  # fmt: skip
     """Free keypoints of the shutter, rebuild the tracks and adjust, until the photos settle.
@@ -431,8 +435,8 @@ def _fed_back(
     """
     shutter_model = result.reconstruction.shutter_model
     if not stages:
-        stages = [f"feedback {number}" for number in range(1, _MAX_ROUNDS + 1)]
-        stages += ["alignment"] * (feedback.workers is not None)
+        stages = [f"re-triangulation {number}" for number in range(1, _MAX_ROUNDS + 1)]
+        stages += ["alignment"] * (track_source.workers is not None)
     settled, aligns, found = False, False, None
     for stage in stages:
         aligns = stage.startswith("alignment")
@@ -440,16 +444,16 @@ def _fed_back(
             continue
         log.begin(stage)
         before = result.reconstruction
-        tracks = retriangulate(feedback.matched, before, of_two=aligns)
+        tracks = retriangulate(track_source.matched, before, of_two=aligns)
         if aligns:
-            tracks = feedback.aligned(tracks, log)
+            tracks = track_source.aligned(tracks, log)
         elif (changed := _changed(found, tracks)) < _SETTLED_SHARE:
             log.end(stage, changed=changed)
             settled = True
             continue
         found = tracks
         tracks = tracks.without_photos(LEAST_MEASUREMENTS)
-        options = _of_joined(options, tracks)
+        options = _of_registered(options, tracks)
         options = replace(options, phi_sigma_start=result.phi_sigma)
         how = options if ends and aligns else rough_options(options)
         result = bundle_adjust(tracks, shutter_model, how, partial(_tell, log, stage))
@@ -459,7 +463,7 @@ def _fed_back(
             stage, points=after.num_points, observations=len(after.observations), rms_px=result.rms_px,
             iterations=result.num_iterations, stop_reason=result.stop_reason, moved_px=moved,
         )  # fmt: skip
-        settled = moved < _SETTLED_PX * feedback.step_px
+        settled = moved < _SETTLED_PX * track_source.step_px
     if ends and not aligns:
-        result = bundle_adjust(tracks, shutter_model, options, partial(_tell, log, "feedback"))
+        result = bundle_adjust(tracks, shutter_model, options, partial(_tell, log, "re-triangulation"))
     return result, tracks, options
