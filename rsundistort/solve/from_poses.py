@@ -1,4 +1,4 @@
-"""A model that holds poses and cameras only: what its photos show is measured, and triangulated from these poses."""
+"""A model that holds poses and cameras only: its photos are measured, and triangulated from these poses."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def posed_photos(model: Path, folder: Path | None, raw_as: str) -> PosedPhotos:
     Raises
     ------
     InputError
-        When there is no folder: the file holds no measurements, and they are made in the photos.
+        There is no folder: the file holds no measurements, and they are made in the photos.
     """
     if folder is None:
         raise InputError(
@@ -47,12 +47,12 @@ def posed_photos(model: Path, folder: Path | None, raw_as: str) -> PosedPhotos:
 def measured(
     posed: PosedPhotos, folder: Path, rectify: RectifyOptions, seed: int, workers: Workers, work: Path, log: StageLog
 ) -> tuple[ColmapModel, TrackSource]:
-    """A model with tracks of the features of the photos that the poses explain, and what these can be rebuilt from.
+    """A model with tracks of the photos' features that fit the poses, and what new tracks can be made from.
 
     Raises
     ------
     ReconstructionError
-        When the poses explain next to nothing of what the photos show.
+        The poses explain next to none of the matches.
     """
     names = list(posed.labels)
     cameras = {str(k): camera_to_json(camera) for k, camera in zip(posed.camera_ids, posed.cameras, strict=True)}

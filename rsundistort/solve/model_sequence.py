@@ -47,26 +47,26 @@ from .survey import Survey
 
 __all__ = ["TrackSource", "rough_options", "solve_photos", "solve_tracks"]
 
-# Feedback ends when no rectified pixel of any photo moves by more than this between two rounds, in pixels of the images
-# that the features were found in; or when less than this share of the measurements is another one than before, so that
-# what yet moves is not held by tracks.
+# Re-triangulation ends when no rectified pixel of any photo moves by more than this between two rounds, in pixels of
+# the images that the features were detected in; or when less than this share of the measurements changes, so that the
+# tracks do not cause what still moves.
 _SETTLED_PX = 0.2
 _SETTLED_SHARE = 0.01
 _MAX_ROUNDS = 4
-# A photo that turned by more while it was read, in radians, was mapped by thresholds that were not made for it: it may
-# be in a wrong place, and is held against what the others tell.
+# A photo that rotated by more during its readout, in radians, was mapped by thresholds that were not made for it: its
+# pose may be wrong, and is checked with the points of the others.
 _STRONG_RAD = 0.1
-# A shutter needs so many photos.
+# Photos that a shutter needs at least.
 _LEAST_PHOTOS = 3
-# Photos that are placed anew bring others.
+# Rounds of registration: photos that are registered make others possible.
 _MOST_WAVES = 4
-# Places on each side of a photo where that is looked at.
+# Places along each side of a photo where that is measured.
 _LOOKED_AT = 5
 
 
 @dataclass(frozen=True)
 class TrackSource:
-    """What the tracks of photos are rebuilt from.
+    """What new tracks are made from.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class TrackSource:
     photos : LoadedPhotos or None
         The photos themselves.
     workers : Workers or None
-        Who reads them again to align the tracks at full size; None where that is not wanted.
+        Workers that read them again to align the tracks at full size; None if that is not wanted.
     """
 
     matched: MatchedPhotos
@@ -84,7 +84,7 @@ class TrackSource:
 
     @property
     def step_px(self) -> float:
-        """Pixels of the photos to one of those that the features were found in."""
+        """Pixels of the photos per pixel of the images that the features were detected in."""
         return float(np.median([each.step_px for each in self.matched.features]))
 
     def aligned(self, reconstruction: Reconstruction, log: StageLog) -> Reconstruction:
@@ -102,7 +102,7 @@ def _tell(log: StageLog, stage: str, _cost: float) -> None:
 
 
 def _moved_px(before: Reconstruction, after: Reconstruction) -> float:
-    """By how much rectified pixels of the same photos changed, the largest; inf if they are others."""
+    """Largest change of the rectified pixels of the same photos; inf if they are others."""
     if after.image_names != before.image_names:
         return np.inf
     return max(_change_px(before, after, i) for i in range(after.num_images))
@@ -121,7 +121,7 @@ def _change_px(before: Reconstruction, after: Reconstruction, image: int) -> flo
 
 
 def _changed(before: Reconstruction | None, after: Reconstruction) -> float:
-    """Share of a reconstruction's measurements that another does not have; 1 if that is of other photos."""
+    """Share of a reconstruction's measurements that another lacks; 1 if that is of other photos."""
     if before is None or after.image_names != before.image_names:
         return 1.0
     old, new = (
@@ -132,10 +132,10 @@ def _changed(before: Reconstruction | None, after: Reconstruction) -> float:
 
 
 def _of_registered(options: BundleOptions, mapped: Reconstruction, *, says: bool = True) -> BundleOptions:
-    """Options without the anchors and lengths of photos that could not be joined; a warning `says` which."""
+    """Options without the constraints and lengths of photos that are not registered; a warning if it `says` so."""
     registered = set(mapped.image_names)
     lengths = [each for each in options.lengths if registered >= {each.start[0], each.end[0]}]
-    # one alone tells the scale of the world, which changes no photo
+    # one alone determines only the scale of the world, which changes no photo
     lengths = lengths if len(lengths) > 1 else []
     if says and len(lengths) < len(options.lengths):
         apart = sorted({end[0] for each in options.lengths for end in (each.start, each.end)} - registered)
@@ -158,7 +158,7 @@ def _of_registered(options: BundleOptions, mapped: Reconstruction, *, says: bool
 def _read_out(
     mapped: Reconstruction, cameras: PhotoCameras, options: BundleOptions, log: StageLog
 ) -> ReadoutChoice | None:
-    """The directions of readout that nobody told, as the measurements have them; None if all were told."""
+    """The readout directions that were not specified, by the measurements; None if all were."""
     guessed = {k: cameras.labels[k] for k in np.unique(cameras.camera_idx).tolist() if not cameras.readout_told[k]}
     if not guessed:
         return None
@@ -185,18 +185,18 @@ def solve_photos(
     kept: Kept | None = None,
     survey: Survey | None = None,
 ) -> Solved:
-    """Match, map, climb the ladder; then free the keypoints of the shutter, rebuild the tracks and adjust again.
+    """Match, map and adjust the model sequence; then remove the shutter from keypoints, make new tracks and adjust.
 
     Parameters
     ----------
     photos : LoadedPhotos
         Features and cameras.
     shutter_model : str
-        Last rung of the ladder; "auto": solved up to rotation, then the rung that foretells held-out measurements.
+        Last model of the sequence; "auto": up to rotation, then the model that best predicts held-out measurements.
     seed : int
         Seed of every random choice.
     options_of : callable
-        Options of the adjustments for a reconstruction, whose cameras say which way they are read out.
+        Options of the adjustments for a reconstruction, whose cameras have their readout directions.
     scratch : Path
         Folder for the database.
     log : StageLog
@@ -206,11 +206,12 @@ def solve_photos(
     matching : str
         Which photos are matched with each other, of `pairing.MATCHINGS`.
     workers : Workers, optional
-        Who reads the photos again, to align the tracks at full size; they stay as the features have them without.
+        Workers that read the photos again, to align the tracks at full size; without them features keep their
+        positions.
     kept : Kept, optional
-        What was done before, and takes what is done.
+        Results of an earlier run; takes those of this run.
     survey : Survey, optional
-        Where photos and control points are: the frame is then that of the map.
+        Positions of photos and control points: the frame is then that of the map.
     """
     cameras = photos.cameras
     mapped, matched = place_photos(photos, scratch, log, seed, matching, kept or Kept(), with_shutter=True)
@@ -224,7 +225,7 @@ def solve_photos(
     )
     if solved.survey is not None:
         return solved
-    # which frame a mapping ends in is chance
+    # the frame of a mapping is arbitrary
     return replace(solved, result=replace(solved.result, reconstruction=solved.shared.normalized()))
 
 
@@ -239,7 +240,7 @@ def solve_tracks(
     track_source: TrackSource | None = None,
     survey: Survey | None = None,
 ) -> Solved:
-    """Climb the ladder from a global-shutter reconstruction, in its frame.
+    """Adjust the model sequence from a global-shutter reconstruction, in its frame.
 
     Parameters
     ----------
@@ -250,7 +251,7 @@ def solve_tracks(
     shutter_model, seed, options_of, log, remedy
         As in `solve_photos`.
     track_source : TrackSource, optional
-        The matches behind it: its tracks are then rebuilt with the motions found, until these settle.
+        The matches behind it: new tracks are then made with the motions found, until these converge.
     survey : Survey, optional
         As in `solve_photos`.
     """
@@ -299,7 +300,7 @@ def solve_tracks(
     log.begin("verdict")
     measured = mapped if track_source is None else tracks
     known = {*options.known_phi, *options.held_phi, *options.still}
-    # two standard deviations of the priors that exposures make
+    # two standard deviations of the priors by exposure times
     most_phi = {name: 2.0 * limit for name, limit in options.phi_limits.items()}
     verdict = judge(result, global_result, choice, mended, measured, known, most_phi)
     if verdict.lens_only:
@@ -310,7 +311,7 @@ def solve_tracks(
 
 
 def _on_the_map(solved: Solved, survey: Survey, options: BundleOptions) -> Solved:
-    """What was solved with places, where these fit best, with what is to be said of that."""
+    """A georeferenced solution, aligned with its places, and remarks on it."""
     survey, rec = survey.settled(solved.shared)
     told = survey.georeference(rec, solved.result.covariances, options.lengths)
     return replace(solved, result=replace(solved.result, reconstruction=rec), survey=survey, georeference=told)
@@ -319,7 +320,7 @@ def _on_the_map(solved: Solved, survey: Survey, options: BundleOptions) -> Solve
 def _with_control(
     survey: Survey, result: BundleResult, options: BundleOptions, log: StageLog
 ) -> tuple[Survey | None, BundleResult, BundleOptions]:
-    """The adjustment with control points; as it was where they do not fit it."""
+    """The adjustment with control points; as it was if they do not fit it."""
     log.begin("control points")
     placed, tracks = survey.controlled(result.reconstruction, result.sigma_px)
     options = replace(options, places=None if placed is None else placed.known(tracks))
@@ -342,7 +343,7 @@ def _chosen(
     )  # fmt: skip
     options = replace(options, varying=choice.varying, bends=choice.bends, residual_field=choice.residual_field)
     start = replace(tracks, shutter_model=choice.shutter_model)
-    # the windows were aligned, and their outliers told, as a model saw them that is given up
+    # windows were aligned, and outliers found, with a model that is replaced now
     again = track_source is not None and track_source.workers is not None
     again = again and (choice.shutter_model == "constant-motion" or choice.bends > 0)
     how = rough_options(options) if again else options
@@ -373,7 +374,7 @@ def _without_shutter(result: BundleResult, options: BundleOptions) -> BundleResu
 
 
 def _lens_only(verdict: Verdict) -> str:
-    """The photos whose motion is not taken out, for people."""
+    """The photos whose motion is not corrected, for people."""
     count = len(verdict.lens_only)
     names = ", ".join(verdict.lens_only[:3]) + (", ..." if count > 3 else "")
     return (
@@ -390,7 +391,7 @@ def rough_options(options: BundleOptions) -> BundleOptions:
 def _registered_again(
     track_source: TrackSource, result: BundleResult, wanted: BundleOptions, log: StageLog
 ) -> BundleResult:
-    """Photos that mapping left out, or put into a wrong place since it knows no shutter, placed by what others tell."""
+    """Register photos that mapping left out, or gave a wrong pose without a shutter, with the points of the others."""
     if result.reconstruction.shutter_model not in ("rotation", "constant-motion"):
         return result
     matched, num_verified, left_out = track_source.matched, read_num_verified(track_source.matched), set[str]()
@@ -408,7 +409,7 @@ def _registered_again(
             tracks = found.reconstruction
             if tracks.num_images >= _LEAST_PHOTOS:
                 tracks = retriangulate(matched, tracks).without_photos(LEAST_MEASUREMENTS)
-            if tracks.num_images < _LEAST_PHOTOS:  # so little hangs together that nothing tells right from wrong
+            if tracks.num_images < _LEAST_PHOTOS:  # too few are connected to tell right from wrong
                 log.end(stage, added=(), moved=(), dropped=())
                 break
             options = rough_options(_of_registered(wanted, tracks, says=False))
@@ -428,10 +429,10 @@ def _retriangulated(
     track_source: TrackSource, result: BundleResult, options: BundleOptions, log: StageLog, stages: Sequence[str] = (),
     ends: bool = True,
 ) -> tuple[BundleResult, Reconstruction, BundleOptions]:  # fmt: skip
-    """Free keypoints of the shutter, rebuild the tracks and adjust, until the photos settle.
+    """Remove the shutter from keypoints, make new tracks and adjust, until the rectified photos converge.
 
-    The last adjustment, its tracks, and the options without anchors of photos that nothing holds any more. Only the
-    last adjustment is exact, and only where it `ends` the solution: tracks are told apart by pixels.
+    The last adjustment, its tracks, and the options without constraints of photos that are no longer registered. Only
+    the last adjustment is exact, and only if it `ends` the solution: new tracks need pixels only.
     """
     shutter_model = result.reconstruction.shutter_model
     if not stages:
