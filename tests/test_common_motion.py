@@ -257,10 +257,10 @@ def test_what_is_said_is_json_and_only_where_it_costs_something(rng):
         for name in ("parallel", "one portrait")
     )
     assert level.common.is_weak
-    assert "can hardly be told apart" in level.sentence
+    assert "can hardly be distinguished" in level.sentence
     assert "in all photos together phi" in level.sentence
     assert not turned.common.is_weak
-    assert "told apart" not in turned.sentence
+    assert "distinguished" not in turned.sentence
     said = json.loads(json.dumps(level.common.as_json()))
     assert len(said["sigma_phi_rad_per_frame"]) == len(said["sigma_velocity_baselines_per_frame"]) == 3
     assert np.shape(said["correlation"]) == (6, 6)

@@ -134,7 +134,7 @@ def test_gps_that_does_not_fit_leaves_a_frame_of_its_own(spread):
     # all at one place, and a phone's walk around a statue
     places = geodetic_of(np.random.default_rng(0).normal(size=(10, 3)) * spread)
     facts = [ExifFacts(fix=GpsFix(*each)) for each in places.tolist()]
-    with pytest.warns(RsUndistortWarning, match=r"not on the map: GPS along a line, or as near to each other"):
+    with pytest.warns(RsUndistortWarning, match=r"not on the map: GPS along a line, or within its own errors"):
         survey, rec = survey_of(None, [], flight.names, facts, [(768, 512)] * 10).placed(flight.start)
     assert survey is None
     assert rec is flight.start

@@ -429,7 +429,7 @@ def doubted(tmp_path_factory):
     judged = Verdict("found", "trusted", (), {"0003.jpg": "halves differ"}, ("0003.jpg",))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(model_sequence, "judge", lambda *_: judged)
-        with pytest.warns(RsUndistortWarning, match=r"the lens alone is taken out of 1 photo,.* 0003"):
+        with pytest.warns(RsUndistortWarning, match=r"1 photo is corrected for the lens only,.* 0003"):
             solution = solve_scene("courtyard", out, shutter_model="rotation", maps="npz")
     return out, solution
 

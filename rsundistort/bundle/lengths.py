@@ -20,7 +20,7 @@ _REACH_PX = 5.0
 def check_lengths(lengths: Sequence[KnownLength]) -> tuple[KnownLength, ...]:
     """The lengths, refused if there is one alone: it tells the scale of the world, which changes no photo."""
     if len(lengths) == 1:
-        raise InputError("one known length tells the scale of the world only; give two, or a height and a width")
+        raise InputError("one known length determines only the scale of the world; give two, or a height and a width")
     return tuple(lengths)
 
 

@@ -246,7 +246,7 @@ class BundleOptions:
         if self.path is not None and self.places:
             raise InputError("the path of a video is solved for in a frame of its own; it takes no known places")
         if self.path is not None and (self.known_phi or self.still or self.held_phi):
-            raise InputError("the path of a video says how its frames move; it takes no anchors, but known rates")
+            raise InputError("the path of a video says how its frames move; it takes known rates, but no known motions")
         if self.max_iterations < 1 or self.outlier_rounds < 0 or self.spread_rounds < 0:
             raise InputError("max_iterations must be at least 1, outlier_rounds and spread_rounds at least 0")
 

@@ -62,7 +62,7 @@ def _check_solvable(reconstruction: Reconstruction, shutter_model: str, path: Fr
     """Refuse what has no answer: too few photos for a shutter, and photos without parallax."""
     m = reconstruction.num_images
     if shutter_model != "global" and m < 3 and path is None:
-        raise InputError(f"{m} photos cannot tell the shutter from the scene; at least three are needed")
+        raise InputError(f"{m} photos cannot separate the shutter from the scene; at least three are needed")
     if path is not None and path.turns_only:
         return
     if m > 1 and not np.linalg.norm(np.ptp(reconstruction.center_w, axis=0)) > 1e-9 * reconstruction.size:

@@ -71,7 +71,7 @@ def _candidates(
         tilted.append((i, R, pivots[i] - R.T @ ahead))
     count = {1: "one photo", 2: "two photos", 3: "three photos"}[len(tilted)]
     return [
-        ("one photo more, turned by 90 degrees", [(middle, rolled, center_w[middle])]),
+        ("one photo more, rotated by 90 degrees", [(middle, rolled, center_w[middle])]),
         (f"{count} more, tilted up or down by {_TILT_DEG:.0f} degrees", tilted),
     ]
 

@@ -114,7 +114,7 @@ class CommonMotion:
         if not self.of_travel:
             return f"{_TURNS[swap[turn]]} is known worst: {left}"
         way = int(np.argmax(self.shares[3:]))
-        told = "can hardly be told apart" if self.is_weak else "are told apart worst"
+        told = "can hardly be distinguished" if self.is_weak else "are distinguished worst"
         return f"{_TURNS[swap[turn]]} and {_WAYS[swap[way]]} {told}: {left}"
 
 

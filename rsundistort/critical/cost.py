@@ -67,12 +67,12 @@ class ShapeCost:
         if not self.is_flagged:
             return said
         if self.meter.num_photos < 3:
-            return f"{said}, because two photos never tell the shutter from the shape"
+            return f"{said}, because two photos never separate the shutter from the shape"
         if self.meter.y_axis_spread_deg < 1:
             return f"{said}, because all cameras were held level"
         if self.meter.y_axis_spread_deg < 15:
             return f"{said}, because all cameras were held nearly level"
-        return f"{said}, because the cameras were not turned against each other"
+        return f"{said}, because the cameras were not rotated against each other"
 
 
 def _uncertainty(reconstruction: Reconstruction) -> NDArray[np.float64]:

@@ -67,14 +67,14 @@ class CriticalMotion:
     def meaning(self) -> str:
         """What is confounded, in words."""
         if self.num_photos < 3:
-            return "too few photos: two never tell the shutter from the shape of the scene"
+            return "too few photos: two never separate the shutter from the shape of the scene"
         if not self.is_low:
-            return "nothing: the photos are turned enough against each other"
+            return "nothing: the photos are rotated enough against each other"
         ds, da = np.abs(self.null_vector[:2])
         affine = float(np.hypot(ds, da))
         second, first = self.singular_values[3:]
         if affine > 0.9 and second < max(2 * first, _ZERO):
-            return "the scene's skew and aspect ratio: the photos are not turned against each other"
+            return "the scene's skew and aspect ratio: the photos are not rotated against each other"
         if da > 0.9:
             return "the scene's vertical scale: the y axes of the photos are nearly parallel"
         if affine > 0.9:

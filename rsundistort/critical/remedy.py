@@ -72,7 +72,7 @@ class Remedy:
             "anchor": f"{names} most likely did not move and {holds} ({was} without it); {left}",
             "prior": f"no photo is taken to be still, the motions to be zero in the mean; {left}",
             "given": f"with what is known of {names or 'lengths in the scene'}, {left}",
-            "path": f"the path of the video tells how its frames moved; {left}",
+            "path": f"the path of the video determines how its frames moved; {left}",
             "none": left,
         }[self.name]
 
@@ -158,7 +158,7 @@ def contradictions(result: BundleResult, options: BundleOptions, names: Collecti
         if probability[i] < _UNLIKELY:
             turn = np.degrees(np.linalg.norm(motion[i, components[i, 1:]]) * span[i])
             found.append(
-                f"{name} is said to have been still, but it turned by {turn:.2f} degrees about its other axes "
+                f"{name} was specified as still, but it rotated by {turn:.2f} degrees about its other axes "
                 "during the readout; the scene's height is only as right as that"
             )
     return tuple(found)
@@ -241,4 +241,4 @@ def _warnings(cost: ShapeCost) -> tuple[str, ...]:
     """What is to be said of a common motion that displaces the rectified photos by a pixel over the frame."""
     if not (cost.common.is_weak and cost.common.shift_px > _PIXEL):
         return ()
-    return (f"{cost.common.sentence}; a photo that is known not to have moved (--still) would tell",)
+    return (f"{cost.common.sentence}; a photo that is known not to have moved (--still) would resolve it",)

@@ -172,7 +172,7 @@ def align_gyro(
         return NoAlignment("the gyroscope's log does not cover the frames", proper)
     against = _why_not(fit, ways[0], max(spread), interval)
     if against is None and 1 - rival**2 < _AS_GOOD * (1 - proper**2):
-        against = "the camera's turns repeat: several offsets of the gyroscope's clock fit them"
+        against = "the camera's rotations repeat: several offsets of the gyroscope's clock fit them"
     if against is not None:
         return NoAlignment(against, proper)
     tilt = np.arccos(np.clip((np.trace(fit.rotation @ ways[0].T) - 1) / 2, -1, 1))
@@ -212,12 +212,12 @@ def _why_not(fit: _Fit, way: _Array, spread: float, interval_s: float) -> str | 
     """Reason against an alignment by the nearest signed permutation, where rates change by `spread`."""
     if fit.correlation < _LEAST_CORRELATION and spread < _STILL:
         return (
-            f"the camera stood still or turned evenly (its rate changes by {spread:.3f} rad/s): no gyroscope can be "
-            "found by that"
+            f"the camera stood still or rotated uniformly (its rate changes by {spread:.3f} rad/s): no gyroscope can "
+            "be found by that"
         )
     if fit.correlation < _LEAST_CORRELATION:
         return (
-            f"the gyroscope's log does not show the camera's turns (correlation {fit.correlation:.2f}): it is of "
+            f"the gyroscope's log does not show the camera's rotations (correlation {fit.correlation:.2f}): it is of "
             "another clip, or the video is stabilised"
         )
     if np.linalg.det(way) < 0:
@@ -226,7 +226,7 @@ def _why_not(fit: _Fit, way: _Array, spread: float, interval_s: float) -> str | 
             "is: the sign of an axis is wrong, or two axes are exchanged"
         )
     if not fit.sigma[_OFFSET] < interval_s / 2:
-        return "the camera turned too evenly to tell the offset of the gyroscope's clock"
+        return "the camera rotated too uniformly to determine the offset of the gyroscope's clock"
     return None
 
 

@@ -125,7 +125,7 @@ class PhotoCameras:
                 (fx, _, cx), (_, fy, cy), _ = cameras[k].K.tolist()
                 value = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **cameras[k].coefficients}[name]
                 raise ReconstructionError(
-                    f"the photos do not tell their camera: {name} = {value:.3g} would be {times:.0f} standard "
+                    f"the photos do not determine their camera: {name} = {value:.3g} would be {times:.0f} standard "
                     "deviations from what such cameras have; give --camera FILE or --camera fx,fy,cx,cy in pixels"
                 )
 

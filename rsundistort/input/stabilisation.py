@@ -236,7 +236,7 @@ def calmer_than_felt(
     if of_gyro < _SIGMAS * of_noise or of_frames > _CALM * of_gyro:
         return ""
     return (
-        f"stabilised in the camera: from frame to frame the turn changes by {of_frames / of_gyro:.2f} of what the "
+        f"stabilised in the camera: from frame to frame the rotation changes by {of_frames / of_gyro:.2f} of what the "
         "camera's own gyroscope felt"
     )
 
@@ -332,7 +332,7 @@ def _judge(
             and turns.slope + _SIGMAS * turns.sigma < _TURN_SHARE
         ):
             line = (
-                f"stabilised in the camera: the frames turn by {turns.slope:.2f} +- {turns.sigma:.2f} of what the "
+                f"stabilised in the camera: the frames rotate by {turns.slope:.2f} +- {turns.sigma:.2f} of what the "
                 "gyroscope felt"
             )
             if shutter_by_gyro is not None and shutter_by_gyro.slope > _SIGMAS * shutter_by_gyro.sigma:
@@ -352,9 +352,9 @@ def _judge(
         )
     if detectable and low > most:
         return "stabilised", (
-            f"stabilised in the camera: the lines turn by more than the frames (readout {found}, expected "
+            f"stabilised in the camera: the lines rotate by more than the frames (readout {found}, expected "
             f"{1e3 * most:.1f} ms at most)"
         )
     if detectable and high > least and low < most and shutter.slope > _SIGMAS * shutter.sigma:
-        return "none", f"not stabilised: the lines turn as the frames do (readout {found})"
-    return "unknown", f"the camera turned too little to tell whether it was stabilised (readout {found})"
+        return "none", f"not stabilised: the lines rotate as the frames do (readout {found})"
+    return "unknown", f"the camera rotated too little to show whether it was stabilised (readout {found})"

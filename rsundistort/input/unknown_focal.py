@@ -66,7 +66,8 @@ def with_focal_lengths(photos: LoadedPhotos, seed: int, log: StageLog, kept: Kep
         value = f"{focal.pixels:.0f} px (+-{100 * focal.sigma:.0f} %) {by}"
         said.append(f"no focal length in the photos of {cameras.labels[k]}: {value}; give --camera if you know it")
         if focal.sigma > _WEAK:
-            warnings.warn(f"the photos hardly tell their focal length: {said[-1]}", RsUndistortWarning, stacklevel=3)
+            text = f"the photos hardly determine their focal length: {said[-1]}"
+            warnings.warn(text, RsUndistortWarning, stacklevel=3)
     source = "found from the photos, refined" if len(found) == len(new) else cameras.source
     known = replace(cameras, cameras=tuple(new), sigma=sigma, source=source, notes=[*cameras.notes, *said])
     return replace(photos, cameras=known)

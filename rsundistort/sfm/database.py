@@ -165,7 +165,7 @@ def from_pycolmap(model: Any, matched: MatchedPhotos, posed: Reconstruction | No
             point_idx.append(number)
             keypoint.append(element[1])
     if not track_points:
-        raise ReconstructionError("the photos were joined, but no scene point could be triangulated")
+        raise ReconstructionError("the photos were registered, but no scene point could be triangulated")
     frame = np.array(frame_idx)
     found = [matched.features[image_id - 1] for image_id in ids]
     start = np.concatenate([[0], np.cumsum([len(each.sigma) for each in found])])

@@ -142,7 +142,7 @@ def _turned(
                 partial(_tell, log, "rotations"),
             )  # fmt: skip
             warnings.warn(
-                "the camera only turned: without parallax there are directions, but no places and no scene",
+                "the camera only rotated: without parallax there are directions, but no positions and no scene",
                 RsUndistortWarning, stacklevel=4,
             )  # fmt: skip
             found = result, options, None
@@ -267,7 +267,7 @@ def _judged(
     verdict = judge_clip(result, of_keys, halves, clip.frame_s, remedy, against)
     if verdict.lens_only:
         warnings.warn(
-            f"only the lens is taken out of the frames: {verdict.reasons[0]}", RsUndistortWarning, stacklevel=4
+            f"the frames are corrected for the lens only: {verdict.reasons[0]}", RsUndistortWarning, stacklevel=4
         )
     # the frame of a mapping is arbitrary
     rec, found = of_keys.reconstruction, result.path

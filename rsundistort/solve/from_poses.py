@@ -81,7 +81,7 @@ def measured(
         count = 0
     if count < LEAST_MEASUREMENTS * len(names):
         raise ReconstructionError(
-            f"the poses explain {count} measurements in {len(names)} photos, too few to go on from; check that they "
+            f"the poses explain {count} measurements in {len(names)} photos, too few to continue; check that they "
             "are of these photos, or let run find poses of its own"
         )
     model = ColmapModel(

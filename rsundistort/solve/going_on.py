@@ -89,13 +89,13 @@ def run_folder(
         run = RunFolder(out, key, resume)
         if resume and not overwrite and not (run.finished or run.goes_on) and has_content(out):
             raise FileError(
-                f"{out} is not empty, and holds no run with these photos and options that --resume could go on with; "
+                f"{out} is not empty, and holds no run with these photos and options that --resume could continue; "
                 "give another folder, or --overwrite to replace its outputs"
             )
         try:
             yield run
         except KeyboardInterrupt as stop:
-            where = str(stop) or f"{log.stage or 'nothing'} was under way, the same command with --resume goes on"
+            where = str(stop) or f"{log.stage or 'nothing'} was under way, the same command with --resume continues"
             raise KeyboardInterrupt(where) from stop
         except Exception:
             if not (run.goes_on or run.kept.get(_BEGUN)):

@@ -378,8 +378,8 @@ def _lens_only(verdict: Verdict) -> str:
     count = len(verdict.lens_only)
     names = ", ".join(verdict.lens_only[:3]) + (", ..." if count > 3 else "")
     return (
-        f"the lens alone is taken out of {count} photo{'s' * (count > 1)}, since the measurements do not support the "
-        f"motion found: {names}"
+        f"{count} photo{'s are' if count > 1 else ' is'} corrected for the lens only, since the measurements do not "
+        f"support the motion found: {names}"
     )
 
 

@@ -78,7 +78,7 @@ def place_photos(
             if _num_verified(matched) < len(photos.names) - 1:
                 raise
             raise ReconstructionError(
-                "the photos overlap, but show no parallax: the camera stood still or only turned; "
+                "the photos overlap, but show no parallax: the camera stood still or only rotated; "
                 "use photos from places apart"
             ) from error
         kept.put("mapped", mapped)

@@ -93,7 +93,7 @@ def measure_readout(
     log, workers = StageLog(progress), Workers(use_threads(jobs))
     with work_folder() as work, warnings.catch_warnings():
         # no frame is rectified
-        warnings.filterwarnings("ignore", "only the lens is taken out", RsUndistortWarning)
+        warnings.filterwarnings("ignore", "the frames are corrected for the lens only", RsUndistortWarning)
         gyro_log = None if options.gyro is None else options.gyro.log()
         source = find_photos(video, work, options.camera, None, None, log)
         assert source.clip is not None

@@ -210,7 +210,7 @@ class Outputs:
                 write_report(out, photos, jobs=jobs, progress=log.tell)
         except KeyboardInterrupt as stop:
             raise KeyboardInterrupt(
-                f"all but the report is written; go on with: rsundistort report {shlex.quote(str(out))}"
+                f"all but the report is written; continue with: rsundistort report {shlex.quote(str(out))}"
             ) from stop
 
     def rectify(self, photos: Path, out: Path, workers: Workers, log: StageLog, resume: bool = False) -> Solution:
@@ -221,7 +221,7 @@ class Outputs:
         solution, rec, options = self.solution, self.reconstruction, self.rectifying
         colors = None if self.rgb is not None and self.rgb.known.all() else PointColors(rec)
         scene = SceneGeometry(solution, options.depth, ScenePoints.of_reconstruction(rec))
-        go_on = "whole; the same command with --resume goes on"
+        go_on = "whole; the same command with --resume continues"
         with batch_folder(out, overwrite=True) as journal:
             done = rectify_photos(
                 photos, scene, list(rec.image_names), out, options, workers, log, journal,

@@ -99,7 +99,7 @@ class Survey:
         if not self.places:
             return self, rec
         names = [name for name in rec.image_names if name in self.places]
-        problem = f"{len(names)} of the photos that were joined have GPS, three are needed"
+        problem = f"{len(names)} of the registered photos have GPS, three are needed"
         if len(names) >= _LEAST:
             fit = self._fitted(rec, *_of_photos(rec, self.places))
             problem = _misfit(fit, "GPS")
@@ -145,7 +145,7 @@ class Survey:
         lost = [each.name for each in self.holding if each not in found.points]
         notes = [
             *self.notes,
-            *([f"control points that fewer than two joined photos see: {', '.join(lost)}"] * bool(lost)),
+            *([f"control points that fewer than two registered photos see: {', '.join(lost)}"] * bool(lost)),
         ]
         survey, targets = replace(self, notes=notes), np.array([each.place_m for each in found.points]).reshape(-1, 3)
         if len(found.points) >= _LEAST:
@@ -161,7 +161,7 @@ class Survey:
                 rec, survey = fit.similarity.of_reconstruction(rec), replace(survey, fit=fit)
         elif self.fit is None:
             warnings.warn(
-                f"not on the map: {len(found.points)} control points are seen by joined photos, three are needed; "
+                f"not on the map: {len(found.points)} control points are seen by registered photos, three are needed; "
                 "poses are in a frame of their own", RsUndistortWarning, stacklevel=4,
             )  # fmt: skip
             return None, rec
@@ -298,9 +298,9 @@ def _of_photos(rec: Reconstruction, places: Mapping[str, tuple[Array, Array]]) -
 def _misfit(fit: FittedSimilarity, what: str, robust: bool = True) -> str:
     """Why places do not georeference a model; "" if they do."""
     if not (fit.sigma_rad < _MOST_TURN).all():
-        return f"{what} along a line, or as near to each other as they are exact, does not say how the model is turned"
+        return f"{what} along a line, or within its own errors, does not determine the rotation of the model"
     if not fit.sigma_scale < _MOST_SCALE:
-        return f"{what} tells the scale to {100 * fit.sigma_scale:.0f} % only"
+        return f"{what} determines the scale to {100 * fit.sigma_scale:.0f} % only"
     if robust and np.median(fit.deviations) > _MOST_OFF:
         return f"{what} and the poses differ by {np.median(np.linalg.norm(fit.residuals, axis=1)):.1f} m in the median"
     return ""

@@ -224,7 +224,7 @@ def _of_global(choice: ModelChoice | None) -> tuple[str, list[str]]:
         return "not-determined", ["The shutter was not examined, as you asked (--model global)."]
     if choice.num_held_out < _LEAST_HELD_OUT:
         return "not-determined", [
-            f"There are too few measurements to tell a rolling shutter: only {choice.num_held_out} could be held out."
+            f"There are too few measurements to detect a rolling shutter: only {choice.num_held_out} could be held out."
         ]
     if choice.shutter == "not-determined":
         return choice.shutter, [
