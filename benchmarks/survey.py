@@ -7,7 +7,8 @@ with 0.2 px; GPS of 0.5, 0.5 and 1 m a photo and an offset of 12 m in height tha
 pointed at with 0.5 px) and six check points, none of them among the tracks. Check points: residuals in metres and in
 their standard deviations, the share within two of these, and the speed; once with GPS's velocities (0.2 m/s), once
 without, over N flights.
-`rendered`: its rendered photos with that in EXIF and XMP, through `run`, in EPSG:32632.
+`rendered`: its rendered photos with that in EXIF and XMP, through `run`, in EPSG:32632; `exact`: the same check points
+surveyed and pointed at without an error; `floor_m`: what survey and pointing alone leave, in true cameras.
 `drone`: ../shared/photos/drone, GPS of a fixed-wing drone: residuals of positions, heights above the ground and against
 those of the XMP (above the place of take-off), and how well the frame is known.
 """
@@ -30,6 +31,7 @@ import numpy as np
 import pyproj
 
 from rsundistort import RectifyOptions, RunOptions, SolveOptions, read_solution, run
+from rsundistort.bundle.control import place_control
 from rsundistort.io import read_control_points, read_exif
 from rsundistort.solve import OutputOptions
 from rsundistort.solve.outcome import solution_of
@@ -54,9 +56,10 @@ def facts_of(flight: Flight, **options: Any) -> list[Any]:
     return [replace(f, fix=replace(f.fix, altitude_m=f.fix.altitude_m + OFFSET_M)) for f in flight.facts(**options)]
 
 
-def check_figures(told: list[dict[str, Any]]) -> dict[str, Any]:
+def check_figures(told: list[dict[str, Any]], exact: bool = False) -> dict[str, Any]:
     """What check points of georeferences come to."""
-    checks = [each for one in told for each in one["control"].values() if each["use"] == "check"]
+    named = [item for one in told for item in one["control"].items()]
+    checks = [each for name, each in named if each["use"] == "check" and name.endswith("exact") == exact]
     off = np.array([each["residual_m"] for each in checks])
     deviations = off / [each["sigma_m"] for each in checks]
     speeds = [each["speed_m_s"] for one in told for each in one["speeds"].values()]
@@ -113,10 +116,22 @@ def write_survey(folder: Path, seed: int = 0) -> None:
     with (folder / "gcp.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["name", "photo", "x", "y", "E", "N", "U", "sigma_m", "use"])
-        for point in flight.control(of_place=in_utm):
+        for point in flight.control(of_place=in_utm) + flight.exact_checks(of_place=in_utm):
             use = "check" if point.is_check else "control"
             for photo, (x, y) in point.seen.items():
-                writer.writerow([point.name, photo, f"{x:.2f}", f"{y:.2f}", *point.place_m, point.sigma_m[0], use])
+                writer.writerow([point.name, photo, f"{x:.4f}", f"{y:.4f}", *point.place_m, point.sigma_m[0], use])
+
+
+def floor() -> list[float]:
+    """Standard deviations of check points in true cameras, by their survey and pointing alone, rms over the points."""
+    flight = Flight(noise_px=0.0)
+    placed = place_control(flight.truth(), flight.control())
+    variance = [
+        np.asarray(point.sigma_m) ** 2 + np.diagonal(covariance)
+        for point, covariance in zip(placed.points, placed.covariance, strict=True)
+        if point.is_check
+    ]
+    return np.sqrt(np.mean(variance, axis=0)).round(4).tolist()
 
 
 def rendered(work: Path) -> None:
@@ -126,8 +141,8 @@ def rendered(work: Path) -> None:
     run(work / "photos", work / "out", RunOptions(solve=solve, outputs=OutputOptions(report=True)), overwrite=True)
     told = read_solution(work / "out" / "solution.json").georeference
     assert told is not None
-    figures = check_figures([told])
-    print(json.dumps({"rendered": figures, "gps_offset_m": told["gps"]["offset_m"], "sigma": told["sigma"]}))
+    figures = {"rendered": check_figures([told]), "exact": check_figures([told], exact=True), "floor_m": floor()}
+    print(json.dumps({**figures, "gps_offset_m": told["gps"]["offset_m"], "sigma": told["sigma"]}))
 
 
 def drone(work: Path) -> None:

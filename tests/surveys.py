@@ -39,9 +39,11 @@ class Flight:
         truth, tracks = read_solution(scene / "ground_truth.json"), np.load(scene / "tracks.npz")
         self.names = tracks["image_names"].tolist()
         self.center_w, self.points_w = tracks["center_w"], tracks["points_w"]
-        self.velocity = np.array([truth.image(name).motion.velocity for name in self.names])
+        motions = [truth.image(name).motion for name in self.names]
+        self.phi, self.velocity = (np.array([getattr(each, what) for each in motions]) for what in ("phi", "velocity"))
         self.seen = np.isfinite(tracks["xy_raw"]).all(1)
-        self.xy = tracks["xy_raw"] + self.rng.normal(0, noise_px, tracks["xy_raw"].shape)
+        self.true_xy = tracks["xy_raw"]
+        self.xy = self.true_xy + self.rng.normal(0, noise_px, self.true_xy.shape)
         self.frame_idx, self.point_idx = tracks["frame_idx"], tracks["point_idx"]
         counts = np.bincount(self.point_idx[self.seen], minlength=len(self.points_w))
         ground = np.flatnonzero((counts >= 4) & (np.abs(self.points_w[:, 2]) < 6))
@@ -52,8 +54,13 @@ class Flight:
             [truth.cameras["1"]], self.names, np.zeros(len(self.names), int), tracks["R_cw"], self.center_w,
             self.points_w, obs,
         )  # fmt: skip
+        self.unmoved = start
         # a frame of its own, as that of a mapping
         self.start = start.with_points(np.ones(len(obs), bool)).normalized()
+
+    def truth(self):
+        """The true reconstruction, in metres."""
+        return replace(self.unmoved, phi=self.phi, velocity=self.velocity, shutter_model="constant-motion")
 
     def facts(self, sigma_m=(0.5, 0.5, 1.0), off=(), told=None, names=None, speed_sigma=None):
         """EXIF facts with GPS of that noise; photos `off` are 60 m away."""
@@ -83,6 +90,17 @@ class Flight:
             seen = {self.names[self.frame_idx[i]]: tuple(xy) for i, xy in zip(mine, clicked.tolist(), strict=True)}
             place = of_place(self.points_w[point] + self.rng.normal(0, sigma_m, 3))
             found.append(ControlPoint(f"P{k}", tuple(map(float, place)), (sigma_m,) * 3, seen, k >= num_control))
+        return found
+
+    def exact_checks(self, num_control=6, of_place=lambda enu: enu):
+        """The check points again, surveyed and pointed at without an error (a millimetre is the least said)."""
+        found = []
+        for k, point in enumerate(self.marked[num_control:], num_control):
+            mine = np.flatnonzero(self.seen & (self.point_idx == point))
+            exact = self.true_xy[mine].tolist()
+            seen = {self.names[self.frame_idx[i]]: tuple(xy) for i, xy in zip(mine, exact, strict=True)}
+            place = tuple(map(float, of_place(self.points_w[point])))
+            found.append(ControlPoint(f"P{k} exact", place, (0.001,) * 3, seen, True))
         return found
 
     def solved(self, facts=None, crs=None, control=(), **options):

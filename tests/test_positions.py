@@ -93,15 +93,32 @@ def test_xmp_of_drones_tells_height_and_velocity():
 def test_a_gimbal_tells_where_the_camera_looked(angles, right, ahead):
     names = ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree")
     found = fix(xmp(DJI, **{name: f"{value:+}" for name, value in zip(names, angles, strict=True)}))
-    assert found.yaw_pitch_roll_deg == angles
     R_cw = positions_of(["a.jpg"], [ExifFacts(fix=found)]).R_cw[0]
     np.testing.assert_allclose(R_cw[[0, 2]], [right, ahead], atol=2e-4)
     assert np.linalg.det(R_cw) == pytest.approx(1.0)
     assert np.isnan(positions_of(["a.jpg"], [ExifFacts(fix=found, orientation=6)]).R_cw).all()
 
 
+@pytest.mark.parametrize("namespace", ["http://pix4d.com/camera/1.0/", "http://ns.sensefly.com/Camera/1.0/"])
+@pytest.mark.parametrize(
+    ("angles", "right", "ahead"),
+    [
+        ((360, 0, 0), (1, 0, 0), (0, 0, -1)),
+        ((90, 0, 0), (0, -1, 0), (0, 0, -1)),
+        ((0, 90, 0), (1, 0, 0), (0, 1, 0)),  # a pitch of 90 degrees looks at the horizon
+        ((-90, 45, 0), (0, 1, 0), (-(0.5**0.5), 0, -(0.5**0.5))),
+        ((0, 0, 30), (0.75**0.5, 0, -0.5), (-0.5, 0, -(0.75**0.5))),  # the right side down, the view to the left
+    ],
+)
+def test_the_attitude_of_a_camera_that_looks_down(namespace, angles, right, ahead):
+    packet = xmp(namespace, **{name: str(value) for name, value in zip(("Yaw", "Pitch", "Roll"), angles, strict=True)})
+    R_cw = np.array(fix(packet).R_cw)
+    np.testing.assert_allclose(R_cw[[0, 2]], [right, ahead], atol=1e-12)
+    assert np.linalg.det(R_cw) == pytest.approx(1.0)
+
+
 def test_a_gimbal_of_zeros_is_none():
-    assert fix(xmp(DJI, GimbalYawDegree="0", GimbalPitchDegree="0", GimbalRollDegree="0")).yaw_pitch_roll_deg is None
+    assert fix(xmp(DJI, GimbalYawDegree="0", GimbalPitchDegree="0", GimbalRollDegree="0")).R_cw is None
 
 
 def test_xmp_with_entities_is_not_looked_at():

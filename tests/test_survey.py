@@ -147,12 +147,10 @@ def test_one_strip_is_put_on_the_map_by_its_gimbal(with_gimbal):
     facts = flight.facts(sigma_m=(1.0, 1.0, 1.0))[:5]
     if with_gimbal:
         truth = np.load(SCENES / "flyover" / "tracks.npz")["R_cw"][:5]
-        north = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-        turned = Rotation.from_matrix(truth.transpose(0, 2, 1) @ north).as_euler("ZXY", degrees=True)
-        looking = (turned + flight.rng.normal(0, 2.0, turned.shape)) * [-1, 1, 1]
+        noise = Rotation.from_rotvec(np.deg2rad(flight.rng.normal(0, 2.0, (5, 3)))).as_matrix()
         facts = [
-            replace(each, fix=replace(each.fix, yaw_pitch_roll_deg=tuple(angles)))
-            for each, angles in zip(facts, looking.tolist(), strict=True)
+            replace(each, fix=replace(each.fix, R_cw=tuple(R_cw)))
+            for each, R_cw in zip(facts, (noise @ truth).tolist(), strict=True)
         ]
     survey = survey_of("local", [], strip.image_names, facts, [(768, 512)] * 5)
     if not with_gimbal:
@@ -168,7 +166,8 @@ def test_one_strip_is_put_on_the_map_by_its_gimbal(with_gimbal):
 def test_a_compass_that_errs_does_not_turn_what_gps_tells():
     flight = Flight()
     facts = flight.facts(sigma_m=(0.5, 0.5, 1.0))
-    wrong = [replace(each, fix=replace(each.fix, yaw_pitch_roll_deg=(40.0, -90.0, 0.0))) for each in facts]
+    east_of_north = Rotation.from_euler("Z", -40.0, degrees=True).as_matrix() * [[1], [-1], [-1]]
+    wrong = [replace(each, fix=replace(each.fix, R_cw=tuple(east_of_north.tolist()))) for each in facts]
     with_it, without = (
         survey_of("local", [], flight.names, each, [(768, 512)] * 10).placed(flight.start)[1] for each in (wrong, facts)
     )

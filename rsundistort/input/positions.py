@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..io import ExifFacts
-from ..io.photos.gps import ALTITUDES, GpsFix
+from ..io.photos.gps import ALTITUDES
 from ..model.geodesy import ecef_from_geodetic, enu_axes, enu_from_geodetic
 
 __all__ = ["MapFrame", "PhotoPositions", "check_crs", "frame_at", "positions_of"]
@@ -185,26 +184,20 @@ def positions_of(names: Sequence[str], facts: Sequence[ExifFacts]) -> PhotoPosit
     sigma = np.array([fix.sigma_m for fix in fixes]).reshape(-1, 3)
     sigma[~known, 2] = _UNKNOWN_UP_M
     geodetic = np.array([(fix.latitude_deg, fix.longitude_deg) for fix in fixes]).reshape(-1, 2)
+    unknown = np.full((3, 3), np.nan)
     return PhotoPositions(
         [name for name, _ in placed],
         np.column_stack([geodetic, np.where(known, altitudes, middle)]),
         sigma,
         np.array([np.nan if fix.speed_m_s is None else fix.speed_m_s for fix in fixes]),
         np.array([fix.velocity_m_s or (np.nan,) * 3 for fix in fixes]).reshape(-1, 3),
-        np.array([_looking(fix, is_upright) for fix, is_upright in zip(fixes, upright, strict=True)]).reshape(-1, 3, 3),
+        # a photo that is stored turned does not say about which axes
+        np.array(
+            [fix.R_cw if is_upright and fix.R_cw else unknown for fix, is_upright in zip(fixes, upright, strict=True)]
+        ).reshape(-1, 3, 3),
         tuple(sorted({fix.told_by for fix in fixes})),
         tuple(notes),
     )
-
-
-def _looking(fix: GpsFix, is_upright: bool) -> Array:
-    """From east, north and up to the camera's axes, x right and z ahead; NaN for a photo that is stored rotated."""
-    if fix.yaw_pitch_roll_deg is None or not is_upright:
-        return np.full((3, 3), np.nan)
-    # level and looking north: x east, y down, z north
-    north = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    yaw, pitch, roll = fix.yaw_pitch_roll_deg
-    return np.asarray(Rotation.from_euler("ZXY", [-yaw, pitch, roll], degrees=True).as_matrix() @ north.T).T
 
 
 def _some(names: Sequence[str]) -> str:

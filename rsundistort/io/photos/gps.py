@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from .exif import Entry, TiffStructure
 from .xmp import xmp_values
@@ -21,6 +22,7 @@ _DJI = ("http://www.dji.com/drone-dji/1.0/",)
 _SENSEFLY = ("http://ns.sensefly.com/sensefly/1.0/",)
 _PARROT = ("http://www.parrot.com/drone-parrot/1.0/", "http://www.parrot.com/namespace/drone-parrot/1.0/")
 _GIMBAL = ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree")
+_ATTITUDE = ("Yaw", "Pitch", "Roll")
 _CAMERA = ("http://pix4d.com/camera/1.0/", "http://ns.sensefly.com/Camera/1.0/", "http://ns.pix4d.com/camera/1.0/")
 
 # what a position may claim to be exact to, metres: the lever arm from antenna to lens is of this size
@@ -59,8 +61,8 @@ class GpsFix:
         All altitudes that the photo holds, by name.
     height_m : float or None
         Above the place of take-off.
-    yaw_pitch_roll_deg : (float, float, float) or None
-        Where the camera looked: clockwise from north, above the horizon, and turned clockwise about that.
+    R_cw : three rows of three floats or None
+        From east, north and up to the axes of the camera, as gimbal or autopilot measured it.
     """
 
     latitude_deg: float
@@ -72,7 +74,7 @@ class GpsFix:
     velocity_m_s: tuple[float, float, float] | None = None
     altitudes_m: Mapping[str, float] = field(default_factory=dict)
     height_m: float | None = None
-    yaw_pitch_roll_deg: tuple[float, float, float] | None = None
+    R_cw: tuple[tuple[float, float, float], ...] | None = None
 
     @property
     def is_nowhere(self) -> bool:
@@ -102,7 +104,7 @@ def fix_of(structure: TiffStructure | None, gps: Mapping[int, Entry], xmp: bytes
         speed = _told_speed(told)
     return GpsFix(
         *place, next(iter(altitudes.values()), None), sigma, told_by, speed, _velocity(structure, gps, told), altitudes,
-        told.get("RelativeAltitude", told.get("Height")), _looking(told),
+        told.get("RelativeAltitude", told.get("Height")), _rotation(told),
     )  # fmt: skip
 
 
@@ -190,7 +192,7 @@ def _of_xmp(xmp: bytes) -> dict[str, float]:
         ),
         _SENSEFLY: ("Latitude", "Longitude", "AltitudeAMSL", "AltitudeWGS84", "Height", "GroundSpeed"),
         _PARROT: ("SpeedX", "SpeedY"),
-        _CAMERA: ("GPSXYAccuracy", "GPSZAccuracy"),
+        _CAMERA: ("GPSXYAccuracy", "GPSZAccuracy", *_ATTITUDE),
     }  # fmt: skip
     found: dict[str, float] = {}
     for name, text in xmp_values(xmp, [(each, names) for spaces, names in wanted.items() for each in spaces]).items():
@@ -216,13 +218,21 @@ def _told_place(told: Mapping[str, float]) -> tuple[float, float] | None:
     return None
 
 
-def _looking(told: Mapping[str, float]) -> tuple[float, float, float] | None:
-    """Yaw, pitch and roll of a gimbal; all zeros are those of a camera without one."""
-    if not told.keys() >= {*_GIMBAL}:
-        return None
-    yaw, pitch, roll = (told[name] for name in _GIMBAL)
-    believed = any((yaw, pitch, roll)) and abs(yaw) <= 360 and abs(pitch) <= 180 and abs(roll) <= 180
-    return (yaw, pitch, roll) if believed else None
+def _rotation(told: Mapping[str, float]) -> tuple[tuple[float, float, float], ...] | None:
+    """Yaw, pitch and roll as a rotation; all zeros are those of a camera that does not know them.
+
+    All turn about the axes ahead, right and down of north, east and down. DJI's camera looks ahead at zero; that of the
+    `Camera` namespace looks down, the top of its photo ahead (Pix4D, "Yaw, Pitch, Roll and Omega, Phi, Kappa angles").
+    """
+    for names, right, down in ((_GIMBAL, (0, 1, 0), (0, 0, 1)), (_ATTITUDE, (0, 1, 0), (-1, 0, 0))):
+        if told.keys() >= {*names}:
+            yaw, pitch, roll = (told[name] for name in names)
+            if any((yaw, pitch, roll)) and abs(yaw) <= 360 and abs(pitch) <= 180 and abs(roll) <= 180:
+                axes = np.stack([right, down, np.cross(right, down)])
+                turned = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True).as_matrix()
+                north, east, down_w = (turned @ axes.T).tolist()
+                return tuple(zip(east, north, np.negative(down_w).tolist(), strict=True))
+    return None
 
 
 def _told_speed(told: Mapping[str, float]) -> float | None:
