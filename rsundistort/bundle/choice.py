@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..model import SHUTTER_MODELS, Observations, Reconstruction, other_axis
 from ..model.reprojection import reprojection_residuals
-from .adjust import LADDER, bundle_adjust, objective
+from .adjust import MODEL_SEQUENCE, bundle_adjust, objective
 from .options import BundleOptions
 from .remains import CLIP, WAVES, agreement_of_waves, errors_without, half_across_readout, warps, waves
 from .spreads import Spreads
@@ -372,7 +372,7 @@ class _Selection:
 
 def choose_model(
     reconstruction: Reconstruction,
-    models: Sequence[str] = LADDER,
+    models: Sequence[str] = MODEL_SEQUENCE,
     options: BundleOptions | None = None,
     *,
     sigma_px: float,

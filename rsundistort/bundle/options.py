@@ -214,22 +214,11 @@ class BundleOptions:
         if self.deviations not in DEVIATIONS:
             raise InputError(f"deviations={self.deviations!r}, expected one of {', '.join(DEVIATIONS)}")
         positive = (
-            "cost_tolerance",
-            "round_tolerance",
-            "step_tolerance",
-            "initial_damping",
-            "loss_scale",
-            "min_sigma_px",
-            "phi_sigma_start",
-            "velocity_sigma_start",
-            "way_sigma_start",
-            "focal_sigma_start",
-            "centre_sigma_start",
-            "field_sigma_start",
-            "spread_tolerance",
-            "cg_tolerance",
-        )
-        for name in (*positive, "outlier_sigma", "max_damping"):
+            "cost_tolerance", "round_tolerance", "step_tolerance", "initial_damping", "max_damping", "loss_scale",
+            "min_sigma_px", "phi_sigma_start", "velocity_sigma_start", "way_sigma_start", "focal_sigma_start",
+            "centre_sigma_start", "field_sigma_start", "spread_tolerance", "outlier_sigma", "cg_tolerance",
+        )  # fmt: skip
+        for name in positive:
             if not getattr(self, name) > 0:
                 raise InputError(f"{name}={getattr(self, name)!r}, expected a positive number")
         if self.sigma_px is not None and not self.sigma_px > 0:

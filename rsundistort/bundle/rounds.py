@@ -28,7 +28,7 @@ from .path import (
 from .problem import BundleProblem
 from .solver import minimize
 from .spreads import estimated, field_spread, path_spreads, settled, starting_spreads
-from .triangulate import revive_points
+from .triangulate import retriangulated
 
 __all__ = ["Rounds"]
 
@@ -103,7 +103,7 @@ class Rounds:
         if base.num_points:
             _check_solvable(base, shutter_model, options.path)
         self._turns_only = options.path is not None and options.path.turns_only
-        self._base = base if self._turns_only else revive_points(base, shutter_model, from_afar=True)
+        self._base = base if self._turns_only else retriangulated(base, shutter_model, from_afar=True)
         self._keep = np.ones(len(self._base.observations), bool)
         self._sigma_px = options.sigma_px or _noise_px(self._base, shutter_model, options.min_sigma_px)
         self._baseline = reconstruction.baseline
@@ -162,7 +162,7 @@ class Rounds:
             self._spreads = replace(self._spreads, field=field)
         if state.path is not None:
             self._follow_path(problem, equations)
-        self._revived = self._current if self._turns_only else revive_points(self._current, self._model)
+        self._new_points = self._current if self._turns_only else retriangulated(self._current, self._model)
 
     def _follow_path(self, problem: BundleProblem, equations: NormalEquations) -> None:
         """Bend the motions of the next solve as the path of this one bends, and settle its spreads."""
@@ -204,7 +204,7 @@ class Rounds:
             options.deviations == "jackknife" and options.guessed is not None and len(options.refine) > 0
         ) and not self._had_heavy_tails
         return (
-            self._revived is self._current
+            self._new_points is self._current
             and settled(self._weighed_spreads, self._spreads, options.spread_tolerance)
             and abs(self._noise - self._weighed_noise) < _SETTLED_NOISE * self._noise
             and not awaits_tails
@@ -216,7 +216,7 @@ class Rounds:
         if with_same_weights:
             self._spreads, self._noise = self._weighed_spreads, self._weighed_noise
             self._heavy_tails = self._had_heavy_tails
-        self._base = replace(self._revived, observations=self._base.observations)
+        self._base = replace(self._new_points, observations=self._base.observations)
 
     def result(self) -> BundleResult:
         """What the last solve found."""

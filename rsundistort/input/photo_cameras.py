@@ -141,7 +141,7 @@ class PhotoCameras:
             off = f"{apart * pixels_of(cameras[k], [name])[0]:+.3g}{' px' if name[0] in 'fc' else ''}"
             said.append(
                 f"{self.source}: {name} is off by {off} by these photos ({times:.0f} standard deviations), which were "
-                "believed; calibrate again, or say --refine none"
+                "used; calibrate again, or give --refine none"
             )
         return said
 

@@ -45,8 +45,8 @@ _FIELD_ARROWS = 13, 9
 
 def photos(source: Source) -> list[dict[str, Any]]:
     """A row of each photo, in the order of the solution; angles in degrees per frame."""
-    solution, told = source.solution, source.diagnostics
-    place = {} if told is None else {name: i for i, name in enumerate(told.names)}
+    solution, stored = source.solution, source.diagnostics
+    place = {} if stored is None else {name: i for i, name in enumerate(stored.names)}
     raw_as = str(solution.options.get("raw_as") or "tif")
     raw_folder = "" if source.photos is None else relative_folder(source.photos, source.out)
     rows = []
@@ -69,7 +69,7 @@ def photos(source: Source) -> list[dict[str, Any]]:
                 "turn": None if phi is None else float(np.linalg.norm(phi)),
                 "shift": image.rs_shift_px,
                 "measurements": image.num_observations,
-                "rms_before": None if i is None or told is None else float(told.rms_px[0, i]),
+                "rms_before": None if i is None or stored is None else float(stored.rms_px[0, i]),
                 "rms_after": image.rms_px,
                 "after": quote(written) if image.registered and source.after(image.name) else "",
                 "before": quote(f"{raw_folder}/{image.name}") if raw_folder and source.before(image.name) else "",
@@ -117,8 +117,8 @@ def motions(solution: Solution) -> list[dict[str, Any]]:
 
 def view_of(source: Source, pictures: Mapping[str, Picture]) -> list[dict[str, Any]]:
     """The registered photos with their pictures as data addresses and their arrows, thousandths of the width."""
-    solution, told = source.solution, source.diagnostics
-    depths = {} if told is None else dict(zip(told.names, told.depth.tolist(), strict=True))
+    solution, stored = source.solution, source.diagnostics
+    depths = {} if stored is None else dict(zip(stored.names, stored.depth.tolist(), strict=True))
     found = []
     for number, image in enumerate(solution.images):
         picture = pictures.get(image.name)
@@ -165,7 +165,7 @@ def arrows_of(
 
 def scene(source: Source, upright: Mapping[str, int]) -> dict[str, Any] | None:
     """Cameras and points, the z axis up by the photos' orientations; None without poses."""
-    told = source.diagnostics
+    stored = source.diagnostics
     solution = in_stored_frame(source.solution)
     images = [image for image in solution.registered if image.posed]
     if not images:
@@ -177,7 +177,7 @@ def scene(source: Source, upright: Mapping[str, int]) -> dict[str, Any] | None:
     turn[:, :2, :2] = [MATRICES[split_mirror(upright.get(image.name, 1))[0]] for image in images]
     # on the map z is up, whatever the cameras look at
     V = view_frame(turn @ R) if solution.georeference is None else np.eye(3)
-    points = np.zeros((0, 3)) if told is None else told.points_w
+    points = np.zeros((0, 3)) if stored is None else stored.points_w
     reach = _size(centers, points)
     side = min(0.5 * _spacing(centers), 0.12 * reach) or 0.12 * reach
     value: dict[str, Any] = {
@@ -187,36 +187,36 @@ def scene(source: Source, upright: Mapping[str, int]) -> dict[str, Any] | None:
         "axes": _packed(readout_axes(R, [lens.readout for lens in lenses]) @ V.T),
         "box": _box(_near(points, centers, reach) @ V.T, centers @ V.T),
     }
-    if told is not None:
-        place = {name: i for i, name in enumerate(told.names)}
+    if stored is not None:
+        place = {name: i for i, name in enumerate(stored.names)}
         rows = [place[image.name] for image in images]
-        value["shown"] = int(_is_near(told.points_w, centers, reach).sum())
-        value["points"] = _packed(_near(told.points_w, centers, reach) @ V.T)
-        value["colors"] = [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in _near_rgb(told, centers, reach).tolist()]
+        value["shown"] = int(_is_near(stored.points_w, centers, reach).sum())
+        value["points"] = _packed(_near(stored.points_w, centers, reach) @ V.T)
+        value["colors"] = [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in _near_rgb(stored, centers, reach).tolist()]
         value["global"] = {
-            "points": _packed(_near(told.global_points_w, centers, reach) @ V.T),
-            "centers": _packed(told.global_center_w[rows] @ V.T),
-            "frusta": _packed(_frusta(told.global_R_cw[rows], told.global_center_w[rows], lenses, side) @ V.T),
+            "points": _packed(_near(stored.global_points_w, centers, reach) @ V.T),
+            "centers": _packed(stored.global_center_w[rows] @ V.T),
+            "frusta": _packed(_frusta(stored.global_R_cw[rows], stored.global_center_w[rows], lenses, side) @ V.T),
         }
     return value
 
 
 def residuals(source: Source) -> dict[str, Any] | None:
     """The statistics of residuals, for the plots."""
-    told = source.diagnostics
-    if told is None:
+    stored = source.diagnostics
+    if stored is None:
         return None
     cameras = source.solution.cameras
     return {
-        "names": list(told.names),
-        "edges": _numbers(told.histogram_px),
-        "histogram": told.histogram.tolist(),
-        "rows": _numbers(told.row_rms_px),
-        "photo_rows": _numbers(told.row_mean_px),
-        "cells": _numbers(told.cell_mean_px),
-        "cameras": list(told.camera_ids),
+        "names": list(stored.names),
+        "edges": _numbers(stored.histogram_px),
+        "histogram": stored.histogram.tolist(),
+        "rows": _numbers(stored.row_rms_px),
+        "photo_rows": _numbers(stored.row_mean_px),
+        "cells": _numbers(stored.cell_mean_px),
+        "cameras": list(stored.camera_ids),
         "sizes": [
-            [cameras[key].width, cameras[key].height] if key in cameras else [4, 3] for key in told.camera_ids
+            [cameras[key].width, cameras[key].height] if key in cameras else [4, 3] for key in stored.camera_ids
         ],
     }  # fmt: skip
 
@@ -261,12 +261,12 @@ def cameras(solution: Solution) -> list[dict[str, Any]]:
         sigma = sigmas.get(keys[0]) or {}
         lens = {name: value for name, value in camera.coefficients.items() if value or name in sigma}
         values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-        told = {name: sigma.get(name, sigma.get("f") if name[0] == "f" else None) for name in values}
+        sigmas = {name: sigma.get(name, sigma.get("f") if name[0] == "f" else None) for name in values}
         rows.append(
             {
                 "id": keys[0] if len(keys) == 1 else f"{keys[0]} to {keys[-1]}",
                 "size": f"{camera.width} x {camera.height}",
-                "intrinsics": [_value(name, value, told[name], 1) for name, value in values.items()],
+                "intrinsics": [_value(name, value, sigmas[name], 1) for name, value in values.items()],
                 "lens": [_value(name, value, sigma.get(name), 4) for name, value in lens.items()],
                 "model": camera.lens,
                 "readout": camera.readout,
@@ -278,7 +278,7 @@ def cameras(solution: Solution) -> list[dict[str, Any]]:
     return rows
 
 
-def _field(camera: Camera, told: Mapping[str, float]) -> dict[str, Any] | None:
+def _field(camera: Camera, facts: Mapping[str, float]) -> dict[str, Any] | None:
     """A picture of a camera's residual field, in thousandths of its width, and its size; None if it has none."""
     if not camera.field.size:
         return None
@@ -292,7 +292,7 @@ def _field(camera: Camera, told: Mapping[str, float]) -> dict[str, Any] | None:
         "path": "".join(f"M{x:g} {y:g}l{dx:g} {dy:g}" for (x, y), (dx, dy) in shafts),
         "dots": (unit * xy).round(1).tolist(),
         "times": times,
-        **{key: told.get(f"{key}_px") for key in ("rms", "largest", "sigma")},
+        **{key: facts.get(f"{key}_px") for key in ("rms", "largest", "sigma")},
     }
 
 
@@ -374,8 +374,8 @@ def _near(points: NDArray[np.float64], centers: NDArray[np.float64], reach: floa
     return points[_is_near(points, centers, reach)]
 
 
-def _near_rgb(told: Diagnostics, centers: NDArray[np.float64], reach: float) -> NDArray[np.uint8]:
-    return told.rgb[_is_near(told.points_w, centers, reach)] if len(told.rgb) else told.rgb
+def _near_rgb(stored: Diagnostics, centers: NDArray[np.float64], reach: float) -> NDArray[np.uint8]:
+    return stored.rgb[_is_near(stored.points_w, centers, reach)] if len(stored.rgb) else stored.rgb
 
 
 def _box(points: NDArray[np.float64], centers: NDArray[np.float64]) -> list[list[float]]:

@@ -124,12 +124,12 @@ def _models(figure: Figure, source: Source) -> bool:
 
 
 def _displacement(figure: Figure, source: Source) -> bool:
-    solution, told = source.solution, source.diagnostics
+    solution, stored = source.solution, source.diagnostics
     moved = [image for image in solution.registered if image.rs_shift_px is not None]
     moved = sorted(moved, key=lambda image: -(image.rs_shift_px or 0.0))[:_MOST_FIELDS]
     if not moved:
         return False
-    depths = {} if told is None else dict(zip(told.names, told.depth.tolist(), strict=True))
+    depths = {} if stored is None else dict(zip(stored.names, stored.depth.tolist(), strict=True))
     across = min(3, len(moved))
     down = -(-len(moved) // across)
     figure.set_size_inches(2.3 * across, 1.8 * down)
@@ -153,20 +153,20 @@ def _displacement(figure: Figure, source: Source) -> bool:
 
 
 def _paths(figure: Figure, source: Source) -> bool:
-    solution, told = source.solution, source.diagnostics
+    solution, stored = source.solution, source.diagnostics
     images = [image for image in solution.registered if image.posed]
     if not images:
         return False
     R, centers = np.array([image.R_cw for image in images]), np.array([image.center_w for image in images])
     V = view_frame(R)
     plain = None
-    if told is not None:
-        place = {name: i for i, name in enumerate(told.names)}
-        plain = told.global_center_w[[place[image.name] for image in images]]
+    if stored is not None:
+        place = {name: i for i, name in enumerate(stored.names)}
+        plain = stored.global_center_w[[place[image.name] for image in images]]
     figure.set_size_inches(6.2, 2.8)
     for number, (label, pair) in enumerate((("ahead", (0, 1)), ("up", (0, 2))), 1):
         axes = figure.add_subplot(1, 2, number)
-        _mark(axes, told, V, pair, centers)
+        _mark(axes, stored, V, pair, centers)
         if plain is not None:
             axes.plot(*(plain @ V.T)[:, pair].T, "o--", color=_GLOBAL, ms=2.5, label="global shutter")
         axes.plot(*(centers @ V.T)[:, pair].T, "o-", color=_OURS, ms=2.5, label="rolling shutter")
@@ -176,12 +176,12 @@ def _paths(figure: Figure, source: Source) -> bool:
 
 
 def _mark(
-    axes: Any, told: Diagnostics | None, V: NDArray[np.float64], pair: tuple[int, int], centers: NDArray[np.float64]
+    axes: Any, stored: Diagnostics | None, V: NDArray[np.float64], pair: tuple[int, int], centers: NDArray[np.float64]
 ) -> None:
     """The scene's points, faint, behind the paths."""
-    if told is None or not len(told.points_w):
+    if stored is None or not len(stored.points_w):
         return
-    shown = (told.points_w @ V.T)[:, pair]
+    shown = (stored.points_w @ V.T)[:, pair]
     low, high = np.quantile(shown, [0.02, 0.98], axis=0)
     shown = shown[((shown >= low) & (shown <= high)).all(1)]
     axes.plot(*shown.T, ".", color="#c9c9c9", ms=0.6, rasterized=True)

@@ -13,7 +13,7 @@ import numpy as np
 from ..batch.progress import StageLog
 from ..batch.workers import Workers
 from ..bundle import (
-    LADDER,
+    MODEL_SEQUENCE,
     BundleOptions,
     BundleResult,
     ModelChoice,
@@ -338,7 +338,7 @@ def _chosen(
     """The model that the measurements support, adjusted with all of them: its tracks and options."""
     log.begin("choice of the model")
     choice = choose_model(
-        result.reconstruction, LADDER, options, sigma_px=result.sigma_px, seed=seed,
+        result.reconstruction, MODEL_SEQUENCE, options, sigma_px=result.sigma_px, seed=seed,
         progress=lambda model, _: log.tell(f"choice: {model}", 0),
     )  # fmt: skip
     options = replace(options, varying=choice.varying, bends=choice.bends, residual_field=choice.residual_field)

@@ -189,7 +189,7 @@ class Survey:
         off = survey.outliers(rec)
         if off:
             told = ", ".join(f"{name} ({distance:.1f} m)" for name, distance in off.items())
-            warnings.warn(f"GPS that is far off, and not believed: {told}", RsUndistortWarning, stacklevel=4)
+            warnings.warn(f"GPS that is far off, and rejected: {told}", RsUndistortWarning, stacklevel=4)
         return survey, rec
 
     def outliers(self, rec: Reconstruction) -> dict[str, float]:
