@@ -1,4 +1,4 @@
-"""Which camera motions leave the shutter undetermined: the meter, from poses alone."""
+"""The degeneracy measure: which camera motions leave the shutter undetermined, from poses alone."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..model.checks import check_finite, check_rotations, frozen
 
 __all__ = ["CriticalMotion", "critical_motion", "readout_axes"]
 
-# Singular values below this mean nothing but rounding; below `_LOW` the shutter is poorly determined.
+# Singular values below this are rounding; below `_LOW` the shutter is poorly determined.
 _ZERO = 1e-6
 _LOW = 0.15
 
@@ -50,7 +50,7 @@ class CriticalMotion:
 
     @property
     def value(self) -> float:
-        """Smallest singular value: 0 where something is hidden entirely, 0.5 and more for photos turned at will."""
+        """Smallest singular value: 0 where something is hidden entirely, 0.5 and more for photos rotated freely."""
         return float(self.singular_values[-1])
 
     @property
@@ -112,10 +112,10 @@ def critical_motion(
 ) -> CriticalMotion:
     """How well poses determine the shutter: the singular values of the linearised self-calibration.
 
-    To first order a turning rolling-shutter camera is one whose skew and aspect ratio are unknown in every photo (Ito
+    To first order a rotating rolling-shutter camera is one whose skew and aspect ratio are unknown in every photo (Ito
     and Okatani, Eq. 9). What is then known of each photo, focal length and principal point, gives three equations for
-    the reference photo's skew and aspect ratio and the plane at infinity (their Eqs. 15 and 18, linearised where the
-    camera stands still); `docs/critical-motions.md` derives them.
+    the reference photo's skew and aspect ratio and the plane at infinity (their Eqs. 15 and 18, linearised at a camera
+    without motion); `docs/critical-motions.md` derives them.
 
     Parameters
     ----------
