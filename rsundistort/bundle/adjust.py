@@ -20,7 +20,7 @@ __all__ = ["MODEL_SEQUENCE", "adjust_sequence", "bundle_adjust", "objective", "s
 #: Shutter models in the order in which they are adjusted, each from the one before.
 MODEL_SEQUENCE = ("global", "two-step", "rotation", "constant-motion")
 
-# Fall of the cost, as a share, below which a solve ends whose spreads are yet to change.
+# Relative fall of the cost that ends a solve whose prior standard deviations will still change.
 _UNSETTLED_TOLERANCE = 1e-5
 
 
@@ -82,7 +82,7 @@ def bundle_adjust(
         rounds.drop_outliers()
     most = options.spread_rounds + 1
     if not options.outlier_rounds and options.spread_rounds and estimates_spreads(shutter_model, options):
-        # the first spreads are but a guess: their solution need not be exact
+        # the first prior standard deviations are a guess: their solution need not be exact
         rounds.solve(options.round_tolerance)
         rounds.begin_next()
         most -= 1
@@ -130,8 +130,8 @@ def adjust_sequence(
         By model, in the order solved. All but the last are rough: no outliers are dropped from them.
     """
     options = options or BundleOptions()
-    # every model but the last is only a start: what it cannot explain is no outlier, and it need not converge
-    # a shutter that is not modelled yet would be blamed on the lens, and bend what is known of the scene
+    # every model except the last is only a start: what it cannot explain is no outlier, and it need not converge; the
+    # lens would absorb a shutter that is not modelled yet, and bend what is known of the scene
     rough = replace(
         options, outlier_rounds=0, spread_rounds=0, cost_tolerance=options.round_tolerance, refine=(), lengths=(),
         places=None, deviations="model", residual_field=False,

@@ -15,9 +15,9 @@ from .options import BundleOptions
 
 __all__ = ["Layout", "motion_end"]
 
-# Sites where bends are known from elsewhere: twice as dense as those of the finest group.
+# Sites of known bends: twice as dense as those of the finest group.
 _KNOWN_SITES = 2 * list(BEND_GROUPS.values())[-1][0] + 1
-# Groups of bends that positions have, too: what vibrates faster than that turns, but hardly travels.
+# Groups of bends that positions have, too: faster vibration rotates the camera, but hardly displaces it.
 _WAYS = 2
 
 

@@ -1,4 +1,4 @@
-"""Points placed anew that lie where no photo can see them, or at infinity."""
+"""New triangulation of points where no photo can see them, or at infinity."""
 
 from __future__ import annotations
 

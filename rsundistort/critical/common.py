@@ -90,7 +90,7 @@ class CommonMotion:
 
     @property
     def is_hidden(self) -> bool:
-        """Whether the photos' clocks hardly differ: what turns and travels with all photos is told by little else."""
+        """Whether the photos' clocks hardly differ, so that little else determines a common motion."""
         return self.of_travel and self.contrast < _LOW
 
     @property

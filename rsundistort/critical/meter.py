@@ -24,7 +24,7 @@ _EXCHANGE = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]])
 
 @dataclass(frozen=True)
 class CriticalMotion:
-    """How well a set of poses determines the shutter's first-order effect, skew and aspect ratio.
+    """How well a set of poses determines the shutter's first-order effect, skew and aspect ratio: degeneracy measure.
 
     Attributes
     ----------
