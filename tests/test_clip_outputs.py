@@ -233,7 +233,7 @@ def test_frames_that_were_not_placed_lose_their_lens_only(tmp_path):
     lens = Camera(WIDTH, HEIGHT, CAMERA.K, [-0.2, 0, 0, 0, 0])
     geometry = PhotoGeometry("clip", lens, CAMERA, RowMotion(), "global")
     video = encode(tmp_path / "clip.mp4", [view(k) for k in range(5)])
-    with pytest.warns(RsUndistortWarning, match=r"out\.mp4: 5 of 5 frames could not be placed; only the lens was"):
+    with pytest.warns(RsUndistortWarning, match=r"out\.mp4: 5 of 5 frames have no pose and are corrected for the lens"):
         rectify_clip(video, tmp_path / "out.mp4", lambda _: None, geometry, "cubic", Workers(1), StageLog(None))
     for before, after in zip(frames_of(video), frames_of(tmp_path / "out.mp4"), strict=True):
         expected = cv2.undistort(before.to_ndarray(format="gray"), lens.K, lens.dist)

@@ -302,7 +302,7 @@ def test_wrong_anchor_is_obeyed_and_noticed(rng):
     healed, remedy = heal(result, options)
     assert healed.reconstruction.phi[2, 0] == 0.0
     assert remedy.name == "given"
-    assert "02.jpg is said to have been still" in remedy.warnings[0]
+    assert "02.jpg was specified as still" in remedy.warnings[0]
     right = replace(options, held_phi={"05.jpg": (0,)})
     result = bundle_adjust(start, "two-step", right, simpler_first=True)
     assert heal(result, right)[1].warnings == ()
