@@ -33,9 +33,9 @@ from ..io.kept import Kept
 from ..model import Reconstruction
 from ..model.projection import unproject_points
 from ..sfm import (
-    LEAST_MEASUREMENTS,
     MatchedPhotos,
     align_tracks,
+    firmly_joined,
     read_num_verified,
     register_photos,
     retriangulate,
@@ -212,11 +212,7 @@ def solve_photos(
     """
     cameras = photos.cameras
     mapped, matched = place_photos(photos, scratch, log, seed, matching, kept or Kept(), with_shutter=True)
-    if mapped.num_images < _LEAST_PHOTOS:
-        raise ReconstructionError(
-            f"only {mapped.num_images} of {len(photos.names)} photos could be joined, the shutter needs three; "
-            "use photos that share more of the scene"
-        )
+    _check_enough(mapped, len(photos.names))
     solved = solve_tracks(
         mapped, cameras, shutter_model, seed, options_of, log, remedy, Feedback(matched, photos, workers), survey
     )
@@ -385,6 +381,15 @@ def rough_options(options: BundleOptions) -> BundleOptions:
     return replace(options, cost_tolerance=1e-5, spread_rounds=3, spread_tolerance=0.05)
 
 
+def _check_enough(joined: Reconstruction, total: int) -> None:
+    """Refuse what is too little for a shutter."""
+    if joined.num_images < _LEAST_PHOTOS:
+        raise ReconstructionError(
+            f"only {joined.num_images} of {total} photos could be joined, the shutter needs three; "
+            "use photos that share more of the scene"
+        )
+
+
 def _placed_again(feedback: Feedback, result: BundleResult, wanted: BundleOptions, log: StageLog) -> BundleResult:
     """Photos that mapping left out, or put into a wrong place since it knows no shutter, placed by what others tell."""
     if result.reconstruction.shutter_model not in ("rotation", "constant-motion"):
@@ -398,12 +403,13 @@ def _placed_again(feedback: Feedback, result: BundleResult, wanted: BundleOption
             break
         stage = f"registration {wave}"
         log.begin(stage)
-        scene = retriangulate(matched, rec)
+        scene = firmly_joined(retriangulate(matched, rec))
         found = register_photos(matched, num_verified, scene, joined_too=strong)
-        if found.changes:
+        changes = found.changes or scene.num_images < rec.num_images
+        if changes:
             tracks = found.reconstruction
             if tracks.num_images >= _LEAST_PHOTOS:
-                tracks = retriangulate(matched, tracks).without_photos(LEAST_MEASUREMENTS)
+                tracks = firmly_joined(retriangulate(matched, tracks))
             if tracks.num_images < _LEAST_PHOTOS:  # so little hangs together that nothing tells right from wrong
                 log.end(stage, added=(), moved=(), dropped=())
                 break
@@ -412,7 +418,7 @@ def _placed_again(feedback: Feedback, result: BundleResult, wanted: BundleOption
             result = bundle_adjust(tracks, rec.shutter_model, options, partial(_tell, log, stage))
         left_out = left_out.union(found.dropped) - {*result.reconstruction.image_names}
         log.end(stage, added=found.added, moved=found.moved, dropped=found.dropped)
-        if not found.changes:
+        if not changes:
             break
     if left_out:
         names = ", ".join(sorted(left_out))
@@ -448,7 +454,8 @@ def _fed_back(
             settled = True
             continue
         found = tracks
-        tracks = tracks.without_photos(LEAST_MEASUREMENTS)
+        tracks = firmly_joined(tracks)
+        _check_enough(tracks, len(feedback.matched.names))
         options = _of_joined(options, tracks)
         options = replace(options, phi_sigma_start=result.phi_sigma)
         how = options if ends and aligns else rough_options(options)
