@@ -267,10 +267,11 @@ def solve_tracks(
         "ladder",
         rungs=[{"model": k, "rms_px": r.rms_px, "iterations": r.num_iterations} for k, r in results.items()],
     )
-    tracks = result.reconstruction
+    tracks, strong = result.reconstruction, _is_strong(result.reconstruction)
     if feedback is not None:
         result = _placed_again(feedback, result, wanted, log)
         options = _of_joined(wanted, result.reconstruction)
+        strong = strong or _is_strong(result.reconstruction)
         result, tracks, options = _fed_back(feedback, result, options, log, ends=not auto)
     options = replace(options, phi_sigma_start=result.phi_sigma)
     choice = None
@@ -295,7 +296,7 @@ def solve_tracks(
     known = {*options.known_phi, *options.held_phi, *options.still}
     # two standard deviations of the priors that exposures make
     most_phi = {name: 2.0 * limit for name, limit in options.phi_limits.items()}
-    verdict = judge(result, global_result, choice, mended, measured, known, most_phi)
+    verdict = judge(result, global_result, choice, mended, measured, known, most_phi, strong)
     if verdict.lens_only:
         warnings.warn(_lens_only(verdict), RsUndistortWarning, stacklevel=3)
     log.end("verdict", shutter=verdict.shutter, shape=verdict.shape)
@@ -381,6 +382,11 @@ def rough_options(options: BundleOptions) -> BundleOptions:
     return replace(options, cost_tolerance=1e-5, spread_rounds=3, spread_tolerance=0.05)
 
 
+def _is_strong(rec: Reconstruction) -> bool:
+    """Whether photos turned by so much that mapping may have misplaced them."""
+    return bool((np.linalg.norm(rec.phi, axis=1) * rec.frame_span()).max() > _STRONG_RAD)
+
+
 def _check_enough(joined: Reconstruction, total: int) -> None:
     """Refuse what is too little for a shutter."""
     if joined.num_images < _LEAST_PHOTOS:
@@ -397,8 +403,7 @@ def _placed_again(feedback: Feedback, result: BundleResult, wanted: BundleOption
     matched, num_verified, left_out = feedback.matched, read_num_verified(feedback.matched), set[str]()
     for wave in range(1, _MOST_WAVES + 1):
         rec = result.reconstruction
-        turns = np.linalg.norm(rec.phi, axis=1) * rec.frame_span()
-        strong = bool(turns.max() > _STRONG_RAD)
+        strong = _is_strong(rec)
         if not strong and rec.num_images == len(matched.names):
             break
         stage = f"registration {wave}"

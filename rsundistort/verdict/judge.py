@@ -46,6 +46,8 @@ _OUTLIERS = 1 / 3
 # A hand does not repeat itself: motions whose mean is so many times what they differ by, in so many photos, and by
 # chance in one set of a thousand, are the camera's.
 _REPEATED, _LEAST_PHOTOS, _CHANCE = 2.0, 5, 0.001
+# A photo whose direction is known no better, in degrees, has no place.
+_LOST_DEG = 1.0
 # Cosine between ways to turn that are the same.
 _SAME_WAY = 0.9
 
@@ -89,6 +91,7 @@ def judge(
     tracks: Reconstruction | None = None,
     known: Collection[str] = (),
     most_phi: Mapping[str, float] | None = None,
+    strong: bool = False,
 ) -> Verdict:
     """Weigh a solution.
 
@@ -108,6 +111,9 @@ def judge(
         Photos whose motion is known from elsewhere, and needs no support.
     most_phi : mapping of photo name to float, optional
         How far each photo can have turned, radians per frame, by what else is known (its exposure).
+    strong : bool
+        Whether photos turned by so much while they were read that mapping, which knows no shutter, may have misplaced
+        them: only the solution then says where they are.
 
     Returns
     -------
@@ -115,16 +121,20 @@ def judge(
         "trusted" only if nothing speaks against it.
     """
     rec = result.reconstruction
-    reasons = loose_reasons(result) + height_reasons(remedy) + unexplained_reasons(result, choice)
+    unexplained = unexplained_reasons(result, choice)
+    reasons = loose_reasons(result) + height_reasons(remedy) + unexplained
     if rec.shutter_model == "global":
         shutter, why = _of_global(choice)
-        return _verdict(shutter, reasons + why)
+        said = _misplaced(result, bool(unexplained) or shutter != "not-found") if strong else {}
+        return _verdict(shutter, reasons + why, said)
     motions = photo_motions(result)
     outliers = _outliers(rec, tracks)
     doubts = _doubts(result, motions, outliers, most_phi or {})
     # the scene that is held pulls both halves to the motion that it was solved with: they differ by less than is wrong
     torn = (motions.difference_px > np.maximum(_UNSEEN_PX, motions.shift_px / 2)) | (outliers > 0.5)
     shutter, why = _of_motions(result, global_result, choice, motions, torn, known)
+    for name, said in _misplaced(result, bool(unexplained + why)).items() if strong else ():
+        doubts[name].append(said)
     reasons += why
     if not reasons:
         reasons = _of_photos(rec, doubts, motions)
@@ -327,6 +337,24 @@ def _doubts(
                 f"by more than {np.degrees(most_phi[name]):.2f}"
             )
     return doubts
+
+
+def _misplaced(result: BundleResult, unexplained: bool) -> dict[str, str]:
+    """What is to be said against the places of photos that only the solution tells.
+
+    Against all of them where it leaves measurements `unexplained`: a wrong place of one bends those of the others.
+    """
+    names = result.reconstruction.image_names
+    if unexplained or not np.isfinite(result.covariances).all():
+        return dict.fromkeys(names, "its place may be wrong: the solution does not explain what the photos show")
+    sigma_deg = np.degrees(np.sqrt(np.linalg.eigvalsh(result.covariances[:, :3, :3])[:, -1].clip(0.0)))
+    # against the photo that is held the others are as uncertain as it is against them
+    sigma_deg = np.where(sigma_deg > 0, sigma_deg, np.median(sigma_deg[sigma_deg > 0]) if sigma_deg.any() else 0.0)
+    return {
+        name: f"its direction is only known to +-{sigma:.1f} degrees"
+        for name, sigma in zip(names, sigma_deg, strict=True)
+        if sigma > _LOST_DEG
+    }
 
 
 def _of_photos(rec: Reconstruction, doubts: Mapping[str, list[str]], motions: PhotoMotions) -> list[str]:
