@@ -41,6 +41,7 @@ from ..sfm import (
     retriangulate,
 )
 from ..verdict import Verdict, judge
+from .depth_reversal import num_explained, with_right_depths
 from .outcome import Solved
 from .placing import place_photos
 from .survey import Survey
@@ -259,14 +260,7 @@ def solve_tracks(
     options = _of_joined(wanted, mapped, says=feedback is None)
     auto = shutter_model == "auto"
     shutter_model = "rotation" if auto else shutter_model
-    log.begin("ladder")
-    models = sequence_to(shutter_model)
-    results = adjust_sequence(mapped, models, options, lambda model, _: log.tell(f"ladder: {model}", 0))
-    result = results[shutter_model]
-    log.end(
-        "ladder",
-        rungs=[{"model": k, "rms_px": r.rms_px, "iterations": r.num_iterations} for k, r in results.items()],
-    )
+    result = _climbed(mapped, shutter_model, options, log)
     tracks, strong = result.reconstruction, _is_strong(result.reconstruction)
     if feedback is not None:
         result = _placed_again(feedback, result, wanted, log)
@@ -302,6 +296,25 @@ def solve_tracks(
     log.end("verdict", shutter=verdict.shutter, shape=verdict.shape)
     solved = Solved(result, global_result, cameras, choice, mended, advice, directions, verdict)
     return solved if survey is None else _on_the_map(solved, survey, options)
+
+
+def _climbed(mapped: Reconstruction, shutter_model: str, options: BundleOptions, log: StageLog) -> BundleResult:
+    """The solution of the ladder; where photos turned by much, the one that has its depths the right way."""
+    log.begin("ladder")
+    models = sequence_to(shutter_model)
+    results = adjust_sequence(mapped, models, options, lambda model, _: log.tell(f"ladder: {model}", 0))
+    result = results[shutter_model]
+    log.end(
+        "ladder",
+        rungs=[{"model": k, "rms_px": r.rms_px, "iterations": r.num_iterations} for k, r in results.items()],
+    )
+    if not _is_strong(result.reconstruction):
+        return result
+    log.begin("depths")
+    told = with_right_depths(result, options, partial(_tell, log, "depths"))
+    explained = num_explained(result.reconstruction), num_explained(told.reconstruction)
+    log.end("depths", reversed=told is not result, explained=explained)
+    return told
 
 
 def _on_the_map(solved: Solved, survey: Survey, options: BundleOptions) -> Solved:
