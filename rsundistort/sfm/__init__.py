@@ -3,10 +3,11 @@
 from .alignment import PatchPlaces, PatchSource, align_tracks, allowed_patches, cut_patches
 from .database import MatchedPhotos
 from .epipolar import read_num_verified
-from .features import DETECTION_MEGAPIXELS, Features, detect_features, detection_bytes, grey_8_bit
+from .features import DETECTION_MEGAPIXELS, SIFT_PX, Features, detect_features, detection_bytes, grey_8_bit
 from .focal_length import USUAL_FOCAL, estimate_focal_length
 from .imported import matched_of_database
-from .mapping import LEAST_MEASUREMENTS, map_photos
+from .joined import LEAST_MEASUREMENTS, firmly_joined
+from .mapping import map_photos
 from .matching import match_photos
 from .pairs import choose_pairs, global_descriptors
 from .registration import register_photos
@@ -17,6 +18,7 @@ from .verification import verify_with_shutter
 __all__ = [
     "DETECTION_MEGAPIXELS",
     "LEAST_MEASUREMENTS",
+    "SIFT_PX",
     "USUAL_FOCAL",
     "Features",
     "MatchedPhotos",
@@ -30,6 +32,7 @@ __all__ = [
     "detection_bytes",
     "edge_width_px",
     "estimate_focal_length",
+    "firmly_joined",
     "global_descriptors",
     "grey_8_bit",
     "map_photos",

@@ -14,11 +14,9 @@ from ..colmap.lenses import refined_camera
 from ..errors import ReconstructionError
 from ..model import Reconstruction
 from .database import LOOSE, MatchedPhotos, from_pycolmap, pipeline_options, write_photos
+from .joined import LEAST_MEASUREMENTS
 
-__all__ = ["LEAST_MEASUREMENTS", "map_photos"]
-
-#: A photo with fewer measurements is not joined: a wrong place is worse than none.
-LEAST_MEASUREMENTS = 20
+__all__ = ["map_photos"]
 
 # Mapping only has to place the photos; the tracks are rebuilt afterwards. All at once this many of the largest
 # keypoints of each do, or all (seconds of processor time with 2048 / all: herz-jesus-8 2.1 / 4.6, a phone's 16 photos

@@ -33,14 +33,15 @@ from ..io.kept import Kept
 from ..model import Reconstruction
 from ..model.projection import unproject_points
 from ..sfm import (
-    LEAST_MEASUREMENTS,
     MatchedPhotos,
     align_tracks,
+    firmly_joined,
     read_num_verified,
     register_photos,
     retriangulate,
 )
 from ..verdict import Verdict, judge
+from .depth_reversal import num_explained, with_right_depths
 from .outcome import Solved
 from .placing import place_photos
 from .survey import Survey
@@ -215,11 +216,7 @@ def solve_photos(
     """
     cameras = photos.cameras
     mapped, matched = place_photos(photos, scratch, log, seed, matching, kept or Kept(), with_shutter=True)
-    if mapped.num_images < _LEAST_PHOTOS:
-        raise ReconstructionError(
-            f"only {mapped.num_images} of {len(photos.names)} photos could be registered, the shutter needs three; "
-            "use photos that share more of the scene"
-        )
+    _check_enough(mapped, len(photos.names))
     solved = solve_tracks(
         mapped, cameras, shutter_model, seed, options_of, log, remedy, TrackSource(matched, photos, workers), survey
     )
@@ -266,18 +263,12 @@ def solve_tracks(
     options = _of_registered(wanted, mapped, says=track_source is None)
     auto = shutter_model == "auto"
     shutter_model = "rotation" if auto else shutter_model
-    log.begin("model sequence")
-    models = sequence_to(shutter_model)
-    results = adjust_sequence(mapped, models, options, lambda model, _: log.tell(f"model sequence: {model}", 0))
-    result = results[shutter_model]
-    log.end(
-        "model sequence",
-        models=[{"model": k, "rms_px": r.rms_px, "iterations": r.num_iterations} for k, r in results.items()],
-    )
-    tracks = result.reconstruction
+    result = _adjusted_sequence(mapped, shutter_model, options, log)
+    tracks, strong = result.reconstruction, _is_strong(result.reconstruction)
     if track_source is not None:
         result = _registered_again(track_source, result, wanted, log)
         options = _of_registered(wanted, result.reconstruction)
+        strong = strong or _is_strong(result.reconstruction)
         result, tracks, options = _retriangulated(track_source, result, options, log, ends=not auto)
     options = replace(options, phi_sigma_start=result.phi_sigma)
     choice = None
@@ -302,12 +293,33 @@ def solve_tracks(
     known = {*options.known_phi, *options.held_phi, *options.still}
     # two standard deviations of the priors by exposure times
     most_phi = {name: 2.0 * limit for name, limit in options.phi_limits.items()}
-    verdict = judge(result, global_result, choice, mended, measured, known, most_phi)
+    verdict = judge(result, global_result, choice, mended, measured, known, most_phi, strong)
     if verdict.lens_only:
         warnings.warn(_lens_only(verdict), RsUndistortWarning, stacklevel=3)
     log.end("verdict", shutter=verdict.shutter, shape=verdict.shape)
     solved = Solved(result, global_result, cameras, choice, mended, advice, directions, verdict)
     return solved if survey is None else _on_the_map(solved, survey, options)
+
+
+def _adjusted_sequence(
+    mapped: Reconstruction, shutter_model: str, options: BundleOptions, log: StageLog
+) -> BundleResult:
+    """The solution of the model sequence; with strong rotations, the one whose depths are not reversed."""
+    log.begin("model sequence")
+    models = sequence_to(shutter_model)
+    results = adjust_sequence(mapped, models, options, lambda model, _: log.tell(f"model sequence: {model}", 0))
+    result = results[shutter_model]
+    log.end(
+        "model sequence",
+        models=[{"model": k, "rms_px": r.rms_px, "iterations": r.num_iterations} for k, r in results.items()],
+    )
+    if not _is_strong(result.reconstruction):
+        return result
+    log.begin("depths")
+    found = with_right_depths(result, options, partial(_tell, log, "depths"))
+    explained = num_explained(result.reconstruction), num_explained(found.reconstruction)
+    log.end("depths", reversed=found is not result, explained=explained)
+    return found
 
 
 def _on_the_map(solved: Solved, survey: Survey, options: BundleOptions) -> Solved:
@@ -388,6 +400,20 @@ def rough_options(options: BundleOptions) -> BundleOptions:
     return replace(options, cost_tolerance=1e-5, spread_rounds=3, spread_tolerance=0.05)
 
 
+def _is_strong(rec: Reconstruction) -> bool:
+    """Whether photos rotated by so much that mapping may have given them wrong poses."""
+    return bool((np.linalg.norm(rec.phi, axis=1) * rec.frame_span()).max() > _STRONG_RAD)
+
+
+def _check_enough(registered: Reconstruction, total: int) -> None:
+    """Refuse too few photos for a shutter."""
+    if registered.num_images < _LEAST_PHOTOS:
+        raise ReconstructionError(
+            f"only {registered.num_images} of {total} photos could be registered, the shutter needs three; "
+            "use photos that share more of the scene"
+        )
+
+
 def _registered_again(
     track_source: TrackSource, result: BundleResult, wanted: BundleOptions, log: StageLog
 ) -> BundleResult:
@@ -397,18 +423,18 @@ def _registered_again(
     matched, num_verified, left_out = track_source.matched, read_num_verified(track_source.matched), set[str]()
     for wave in range(1, _MOST_WAVES + 1):
         rec = result.reconstruction
-        turns = np.linalg.norm(rec.phi, axis=1) * rec.frame_span()
-        strong = bool(turns.max() > _STRONG_RAD)
+        strong = _is_strong(rec)
         if not strong and rec.num_images == len(matched.names):
             break
         stage = f"registration {wave}"
         log.begin(stage)
-        scene = retriangulate(matched, rec)
+        scene = firmly_joined(retriangulate(matched, rec))
         found = register_photos(matched, num_verified, scene, joined_too=strong)
-        if found.changes:
+        changes = found.changes or scene.num_images < rec.num_images
+        if changes:
             tracks = found.reconstruction
             if tracks.num_images >= _LEAST_PHOTOS:
-                tracks = retriangulate(matched, tracks).without_photos(LEAST_MEASUREMENTS)
+                tracks = firmly_joined(retriangulate(matched, tracks))
             if tracks.num_images < _LEAST_PHOTOS:  # too few are connected to tell right from wrong
                 log.end(stage, added=(), moved=(), dropped=())
                 break
@@ -417,7 +443,7 @@ def _registered_again(
             result = bundle_adjust(tracks, rec.shutter_model, options, partial(_tell, log, stage))
         left_out = left_out.union(found.dropped) - {*result.reconstruction.image_names}
         log.end(stage, added=found.added, moved=found.moved, dropped=found.dropped)
-        if not found.changes:
+        if not changes:
             break
     if left_out:
         names = ", ".join(sorted(left_out))
@@ -453,7 +479,8 @@ def _retriangulated(
             settled = True
             continue
         found = tracks
-        tracks = tracks.without_photos(LEAST_MEASUREMENTS)
+        tracks = firmly_joined(tracks)
+        _check_enough(tracks, len(track_source.matched.names))
         options = _of_registered(options, tracks)
         options = replace(options, phi_sigma_start=result.phi_sigma)
         how = options if ends and aligns else rough_options(options)

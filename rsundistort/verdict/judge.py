@@ -48,6 +48,8 @@ _OUTLIERS = 1 / 3
 # A hand does not repeat itself: motions are the camera's if their mean is this many times their standard deviation, in
 # this many photos, and by chance in one set of a thousand only.
 _REPEATED, _LEAST_PHOTOS, _CHANCE = 2.0, 5, 0.001
+# Largest standard deviation of the direction of a photo whose pose counts as known, degrees.
+_LOST_DEG = 1.0
 # Cosine between axes of rotation that count as the same.
 _SAME_WAY = 0.9
 
@@ -91,6 +93,7 @@ def judge(
     tracks: Reconstruction | None = None,
     known: Collection[str] = (),
     most_phi: Mapping[str, float] | None = None,
+    strong: bool = False,
 ) -> Verdict:
     """Judge a solution.
 
@@ -110,6 +113,9 @@ def judge(
         Photos whose motion is known from elsewhere, and needs no support.
     most_phi : mapping of photo name to float, optional
         Largest rotation of each photo, radians per frame, by other knowledge (its exposure).
+    strong : bool
+        Whether photos rotated so much during the readout that mapping, which knows no shutter, may have given them
+        wrong poses: only the solution then determines these.
 
     Returns
     -------
@@ -117,16 +123,20 @@ def judge(
         "trusted" only if there is no reason against it.
     """
     rec = result.reconstruction
-    reasons = loose_reasons(result) + height_reasons(remedy) + unexplained_reasons(result, choice)
+    unexplained = unexplained_reasons(result, choice)
+    reasons = loose_reasons(result) + height_reasons(remedy) + unexplained
     if rec.shutter_model == "global":
         shutter, why = _of_global(choice)
-        return _verdict(shutter, reasons + why)
+        misplaced = _misplaced(result, bool(unexplained) or shutter != "not-found") if strong else {}
+        return _verdict(shutter, reasons + why, misplaced)
     motions = photo_motions(result)
     outliers = _outliers(rec, tracks)
     doubts = _doubts(result, motions, outliers, most_phi or {})
     # the fixed scene draws both halves to the motion that it was solved with: their difference is less than the error
     torn = (motions.difference_px > np.maximum(_UNSEEN_PX, motions.shift_px / 2)) | (outliers > 0.5)
     shutter, why = _of_motions(result, global_result, choice, motions, torn, known)
+    for name, said in _misplaced(result, bool(unexplained + why)).items() if strong else ():
+        doubts[name].append(said)
     reasons += why
     if not reasons:
         reasons = _of_photos(rec, doubts, motions)
@@ -328,6 +338,24 @@ def _doubts(
                 f"blurred by more than {np.degrees(most_phi[name]):.2f}"
             )
     return doubts
+
+
+def _misplaced(result: BundleResult, unexplained: bool) -> dict[str, str]:
+    """Reasons against the poses of photos that only the solution determines.
+
+    Against all of them if it leaves measurements `unexplained`: a wrong pose of one bends those of the others.
+    """
+    names = result.reconstruction.image_names
+    if unexplained or not np.isfinite(result.covariances).all():
+        return dict.fromkeys(names, "its pose may be wrong: the solution does not explain the measurements")
+    sigma_deg = np.degrees(np.sqrt(np.linalg.eigvalsh(result.covariances[:, :3, :3])[:, -1].clip(0.0)))
+    # relative to the fixed photo the others are as uncertain as it is relative to them
+    sigma_deg = np.where(sigma_deg > 0, sigma_deg, np.median(sigma_deg[sigma_deg > 0]) if sigma_deg.any() else 0.0)
+    return {
+        name: f"its direction is only known to +-{sigma:.1f} degrees"
+        for name, sigma in zip(names, sigma_deg, strict=True)
+        if sigma > _LOST_DEG
+    }
 
 
 def _of_photos(rec: Reconstruction, doubts: Mapping[str, list[str]], motions: PhotoMotions) -> list[str]:
