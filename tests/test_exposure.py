@@ -134,7 +134,7 @@ def test_motions_against_the_exposure_are_looked_for(rng, monkeypatch):
     told = []
 
     def judged(*args):
-        told.append(args[-1])
+        told.append(args[6])
         return judge(*args)
 
     monkeypatch.setattr(model_sequence, "judge", judged)

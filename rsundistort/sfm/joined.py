@@ -36,18 +36,21 @@ def hanging_together(reconstruction: Reconstruction) -> NDArray[np.bool_]:
     from scipy.sparse import csr_matrix  # late: few runs need it
 
     obs, m = reconstruction.observations, reconstruction.num_images
-    shows = csr_matrix((np.ones(len(obs)), (obs.frame_idx, obs.point_idx)), (m, reconstruction.num_points))
+    # what two photos alone show ties no third to them
+    ties = (reconstruction.track_lengths(np.ones(len(obs), bool)) > _LEAST_PHOTOS)[obs.point_idx]
+    where = obs.frame_idx[ties], obs.point_idx[ties]
+    shows = csr_matrix((np.ones(ties.sum()), where), (m, reconstruction.num_points))
     shows.data[:] = 1.0  # what a photo shows twice counts once
     left, largest = np.ones(m, bool), np.zeros(m, bool)
-    while left.sum() > largest.sum():
+    while left.any():
         first = int(np.argmax(np.where(left, shows.sum(1).A1, -1.0)))
         common = (shows @ shows[first].T).toarray().ravel()
         common[first] = -1.0
-        joined = new = (np.arange(m) == first) | (np.arange(m) == np.argmax(np.where(left, common, -1.0)))
+        joined = new = np.isin(np.arange(m), [first, np.argmax(common)])
         count = np.zeros(reconstruction.num_points)
         while new.any():
             count += shows[new].sum(0).A1
-            new = left & ~joined & (shows @ (count >= _LEAST_PHOTOS) >= LEAST_MEASUREMENTS)
+            new = ~joined & (shows @ (count >= _LEAST_PHOTOS) >= LEAST_MEASUREMENTS)
             joined = joined | new
         left = left & ~joined
         if joined.sum() > largest.sum():

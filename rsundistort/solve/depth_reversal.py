@@ -8,7 +8,7 @@ motion", 1997). What little perspective tells the two apart a strong shutter hid
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from ..model import Reconstruction
 from ..model.reprojection import reprojection_residuals
 from ..sfm import SIFT_PX
 
-__all__ = ["num_explained", "with_depths_reversed", "with_right_depths"]
+__all__ = ["DepthChoice", "choose_depths", "num_explained", "with_depths_reversed"]
 
 # Of the noise of features: farther from its prediction no measurement is explained.
 _MOST_SIGMAS = 3.0
@@ -46,9 +46,31 @@ def num_explained(reconstruction: Reconstruction) -> int:
     return int((valid & (np.linalg.norm(residuals, axis=1) <= within)).sum())
 
 
-def with_right_depths(
+@dataclass(frozen=True)
+class DepthChoice:
+    """Outcome of `choose_depths`.
+
+    Attributes
+    ----------
+    result : BundleResult
+        The solution that explains more measurements.
+    explained, explained_reversed : int
+        How many those are as it was, and with its depths reversed.
+    """
+
+    result: BundleResult
+    explained: int
+    explained_reversed: int
+
+    @property
+    def is_reversed(self) -> bool:
+        """Whether the depths are the other way."""
+        return self.explained_reversed > self.explained
+
+
+def choose_depths(
     result: BundleResult, options: BundleOptions, progress: Callable[[float], None] | None = None
-) -> BundleResult:
+) -> DepthChoice:
     """The solution, or the one in which its depths are reversed, whichever explains more measurements.
 
     Parameters
@@ -63,4 +85,5 @@ def with_right_depths(
     rec = result.reconstruction
     options = replace(options, phi_sigma_start=result.phi_sigma)
     other = bundle_adjust(with_depths_reversed(rec), rec.shutter_model, options, progress)
-    return other if num_explained(other.reconstruction) > num_explained(rec) else result
+    explained, otherwise = num_explained(rec), num_explained(other.reconstruction)
+    return DepthChoice(other if otherwise > explained else result, explained, otherwise)

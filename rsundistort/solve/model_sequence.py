@@ -41,7 +41,7 @@ from ..sfm import (
     retriangulate,
 )
 from ..verdict import Verdict, judge
-from .depth_reversal import num_explained, with_right_depths
+from .depth_reversal import choose_depths
 from .outcome import Solved
 from .placing import place_photos
 from .survey import Survey
@@ -316,10 +316,11 @@ def _adjusted_sequence(
     if not _is_strong(result.reconstruction):
         return result
     log.begin("depths")
-    found = with_right_depths(result, options, partial(_tell, log, "depths"))
-    explained = num_explained(result.reconstruction), num_explained(found.reconstruction)
-    log.end("depths", reversed=found is not result, explained=explained)
-    return found
+    depths = choose_depths(result, options, partial(_tell, log, "depths"))
+    log.end(
+        "depths", reversed=depths.is_reversed, explained=depths.explained, explained_reversed=depths.explained_reversed
+    )
+    return depths.result
 
 
 def _on_the_map(solved: Solved, survey: Survey, options: BundleOptions) -> Solved:

@@ -1,0 +1,63 @@
+"""Which photos hang together: sets of photos with more and less in common."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rsundistort import Camera, Observations, Reconstruction
+from rsundistort.sfm import LEAST_MEASUREMENTS, firmly_joined
+from rsundistort.sfm.joined import hanging_together
+
+CAMERA = Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]])
+
+
+def showing(num_photos, *sets):
+    """A reconstruction of so many photos, of which sets (photos, number of points) show points of their own."""
+    frame, point, count = [], [], 0
+    for photos, number in sets:
+        for photo in photos:
+            frame.append(np.full(number, photo))
+            point.append(count + np.arange(number))
+        count += number
+    frame_idx, point_idx = np.concatenate(frame), np.concatenate(point)
+    xy = np.stack([frame_idx, point_idx], axis=1).astype(float)
+    return Reconstruction(
+        [CAMERA], [f"{k}.jpg" for k in range(num_photos)], np.zeros(num_photos, int),
+        np.broadcast_to(np.eye(3), (num_photos, 3, 3)), np.arange(3.0 * num_photos).reshape(-1, 3), np.ones((count, 3)),
+        Observations(frame_idx, point_idx, xy),
+    )  # fmt: skip
+
+
+def test_a_chain_of_threes_hangs_together():
+    chain = showing(8, *(((k, k + 1, k + 2), LEAST_MEASUREMENTS) for k in range(6)))
+    assert hanging_together(chain).all()
+    assert firmly_joined(chain) is chain
+
+
+@pytest.mark.parametrize("ties", [0, LEAST_MEASUREMENTS - 1])
+def test_a_part_that_hangs_on_by_little_is_left_out(ties):
+    # 4, 5 and 6 know each other well; of the others only 3 shows something that two of them show
+    parts = showing(7, ((0, 1, 2, 3), 200), ((4, 5, 6), 300), ((3, 4, 5), ties))
+    assert hanging_together(parts).tolist() == [True] * 4 + [False] * 3
+    kept = firmly_joined(parts)
+    assert kept.image_names == ("0.jpg", "1.jpg", "2.jpg", "3.jpg")
+    assert kept.num_points == 200
+
+
+def test_the_larger_part_is_the_one_of_more_photos():
+    parts = showing(7, ((0, 1, 2), 900), ((3, 4, 5, 6), 100))
+    assert hanging_together(parts).tolist() == [False] * 3 + [True] * 4
+
+
+def test_points_of_one_other_photo_tell_no_place():
+    pair = showing(4, ((0, 1, 2), 100), ((2, 3), 500))
+    assert hanging_together(pair).tolist() == [True] * 3 + [False]
+
+
+def test_a_part_is_joined_once_enough_is_shared():
+    parts = showing(7, ((0, 1, 2, 3), 200), ((4, 5, 6), 300), ((2, 3, 4), LEAST_MEASUREMENTS))
+    # 4 joins by what 2 and 3 show; 5 and 6 share points with 4 alone
+    assert hanging_together(parts).tolist() == [True] * 5 + [False] * 2
+    firmer = showing(7, ((0, 1, 2, 3), 200), ((4, 5, 6), 300), ((2, 3, 4, 5), LEAST_MEASUREMENTS))
+    assert hanging_together(firmer).all()
