@@ -227,12 +227,13 @@ def test_the_same_scene_is_written_the_same(tmp_path, name):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
 
 
-def test_opf_of_a_camera_that_only_travels_is_exact(tmp_path):
-    """By the formula of the paper: at the line v the camera is at `position + (v/(H-1) - 1/2) rolling_shutter`."""
+@pytest.mark.parametrize("readout", ["top-to-bottom", "bottom-to-top"])
+def test_opf_of_a_camera_that_only_travels_is_exact_and_read_back(tmp_path, readout):
+    """By the formula of the paper: at the row v the camera is at `position + (v/(H-1) - 1/2) rolling_shutter`."""
     pytest.importorskip("pyopf")
     from pyopf.io import load
 
-    scene = made()
+    scene = made(readout=readout)
     still = [replace(image, motion=RowMotion(np.zeros(3), image.motion.velocity)) for image in scene.solution.images]
     stored = replace(scene.solution, images=tuple(still))
     assert EXPORTS["opf"].write(tmp_path, replace(scene, stored=stored)) == ""
@@ -245,6 +246,18 @@ def test_opf_of_a_camera_that_only_travels_is_exact(tmp_path):
         at = camera.position + (xy[0, 1] / (H - 1) - 0.5) * camera.rolling_shutter
         again, _ = project_points((point - at) @ R_wc, raw, None, "global")
         np.testing.assert_allclose(again, xy, atol=1e-6)
+    rec = read_model(tmp_path / "project.opf").reconstruction
+    check_poses(scene, rec.image_names, rec.R_cw, rec.center_w)
+    assert rec.shutter_model == "constant-motion"
+    # what is read downwards there travels the other way
+    velocity = np.array([image.motion.velocity for image in still]) * raw.clock_sign
+    np.testing.assert_allclose(rec.velocity, velocity, atol=1e-9)
+
+
+def test_opf_has_no_room_for_columns_read_one_after_the_other(tmp_path):
+    pytest.importorskip("pyopf")
+    with pytest.raises(InputError, match="these are by column; take opf-rectified"):
+        EXPORTS["opf"].write(tmp_path, made(readout="left-to-right"))
 
 
 @pytest.mark.parametrize(

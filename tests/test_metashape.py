@@ -94,6 +94,15 @@ def test_the_transform_of_the_chunk_is_applied(tmp_path):
     assert found.unposed == ("lost",)
 
 
+def test_what_nobody_explains_of_a_shutter_is_left_out_and_told(tmp_path):
+    text = xml(FRAME).replace(
+        "</transform></camera>", "</transform><rolling_shutter>1 0 0 0</rolling_shutter></camera>"
+    )
+    (tmp_path / "c.xml").write_text(text)
+    with pytest.warns(RsUndistortWarning, match="rolling_shutter of 1 cameras, such as a, is left out"):
+        assert read_metashape(tmp_path / "c.xml").labels == ("a",)
+
+
 def test_geocentric_coordinates_are_counted_from_the_middle(tmp_path):
     matrix = np.eye(4)
     matrix[:3, 3] = [4_000_000.25, 500_000.5, 4_900_000.75]

@@ -2,7 +2,7 @@
 
 Its pixels have their centres at 0.5 and principal points count from the middle of the photo. P1 and P2 are OpenCV's p2
 and p1. Poses are camera to world, x right, y down, z ahead. Of a sensor with rolling-shutter compensation a pose is
-that of the middle of the frame; the motions themselves are not in the file.
+that of the middle of the frame. What it found of the motions is in no documented place of the file.
 """
 
 from __future__ import annotations
@@ -87,6 +87,12 @@ def _chunk(chunk: ElementTree.Element, where: str) -> PosedPhotos:
     sensors = {each.attrib["id"]: each for each in chunk.iter("sensor")}
     components = {each.attrib.get("id", ""): each.find("transform") for each in chunk.iter("component")}
     labels, of_sensor, matrices, unposed = [], [], [], []
+    moved = [camera.attrib["label"] for camera in chunk.iter("camera") if camera.find("rolling_shutter") is not None]
+    if moved:
+        warnings.warn(
+            f"{where}: rolling_shutter of {len(moved)} cameras, such as {moved[0]}, is left out, since what "
+            "it means is not published; motions are solved for", RsUndistortWarning, stacklevel=5,
+        )  # fmt: skip
     for camera in chunk.iter("camera"):
         label, pose = camera.attrib["label"], camera.find("transform")
         if camera.attrib.get("enabled", "true").lower() in ("false", "0") or pose is None:
