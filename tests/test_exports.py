@@ -11,7 +11,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rsundistort import Camera, Observations, Reconstruction, RectifyOptions, RowMotion, Solution, SolvedImage
+from rsundistort import (
+    Camera,
+    Observations,
+    Reconstruction,
+    RectifyOptions,
+    RowMotion,
+    Solution,
+    SolvedImage,
+    SolveOptions,
+    solve,
+)
 from rsundistort.batch.progress import StageLog
 from rsundistort.colmap.rectified_model import ModelIds
 from rsundistort.errors import FormatError, InputError, RsUndistortWarning
@@ -109,7 +119,10 @@ def on_the_map(scene: ExportScene, folder: Path, crs: str, origin) -> ExportScen
     place = {1: "N", 2: (46.0, 30.0, 0.0), 3: "W", 4: (7.0, 15.0, 0.0), 5: b"\0", 6: 431.5, 31: 2.0 * 1.5096}
     exif.get_ifd(0x8825).update(place)
     Image.new("RGB", (8, 8)).save(folder / "0.jpg", exif=exif)
-    there = replace(scene.solution, georeference={"crs": crs, "origin": list(origin)})
+    matrix = np.eye(4)
+    matrix[:3, 3] = origin  # of a projection; "local" has its axes there, too
+    told = {"crs": crs, "origin": list(origin), "transformation": matrix.tolist()}
+    there = replace(scene.solution, georeference=told)
     return replace(scene, source=folder, solution=there, stored=there)
 
 
@@ -185,10 +198,37 @@ def test_opf_gets_the_gps_of_the_photos_and_the_projection(tmp_path):
     assert second.geolocation is None
     frame = project.scene_reference_frame
     assert frame.crs.definition == "EPSG:32629"
+    told = read_model(tmp_path / "opf" / "project.opf").georeference
+    assert (told["crs"], told["origin"]) == ("EPSG:32629", [457000.0, 5150000.0, 0.0])
     # from E, N, U to the coordinates of the poses
     np.testing.assert_array_equal(
         frame.base_to_canonical.transformation_matrix @ [457001.0, 5150002.0, 3.0, 1.0], [1.0, 2.0, 3.0, 1.0]
     )
+
+
+def test_a_projection_of_opf_goes_through_solve(tmp_path):
+    """Axes scaled and exchanged, and a constant geoid, as Pix4D may have them."""
+    pytest.importorskip("pyopf")
+    from pyopf.io import load
+
+    EXPORTS["opf-rectified"].write(tmp_path / "in", on_the_map(made(), tmp_path, "EPSG:32629", (457000.0, 5e6, 0.0)))
+    path = tmp_path / "in" / "scene_reference_frame.json"
+    told = json.loads(path.read_text())
+    told["base_to_canonical"] = {"scale": [0.5, 0.5, 1.0], "shift": [-7.0, 9.0, 2.0], "swap_xy": True}
+    told["crs"] = {"definition": "EPSG:32629+5773", "geoid_height": 51.5}
+    path.write_text(json.dumps(told))
+    options, outputs = (
+        SolveOptions(shutter_model="global", readout="top-to-bottom"),
+        OutputOptions(exports=("opf-rectified",)),
+    )
+    solution = solve(tmp_path / "in" / "project.opf", tmp_path / "out", options, outputs=outputs)
+    matrix = np.array(solution.georeference["transformation"])
+    np.testing.assert_allclose(matrix @ [1.0, 2.0, 3.0, 1.0], [-14.0, 16.0, 1.0, 1.0], atol=1e-12)
+    before, after = (load(str(tmp_path / at)) for at in (path, "out/opf-rectified/scene_reference_frame.json"))
+    assert after.crs == before.crs
+    for key in ("scale", "shift", "swap_xy"):
+        np.testing.assert_array_equal(getattr(after.base_to_canonical, key), getattr(before.base_to_canonical, key))
+    assert "EPSG:32629+5773" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", ["opf-rectified", "nuke"])

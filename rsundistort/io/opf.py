@@ -185,10 +185,24 @@ def _scene_frame(georeference: Mapping[str, Any] | None) -> Any:
 
     if georeference is None or georeference["crs"] in ("local", "control"):
         return None
-    shift = -np.array(georeference["origin"], np.float64)
+    matrix = np.linalg.inv(np.array(georeference["transformation"], np.float64))
+    swapped = bool(matrix[0, 0] == 0)
+    scale = np.abs(matrix[:3, :3]).max(0)
     return SceneReferenceFrame(
-        BaseToTranslatedCanonicalCrsTransform(np.ones(3), shift, False), Crs(georeference["crs"])
+        BaseToTranslatedCanonicalCrsTransform(scale, matrix[:3, 3], swapped),
+        Crs(georeference["crs"], georeference.get("geoid_height")),
     )
+
+
+def _georeference(project: Any) -> dict[str, Any] | None:
+    """The projection of a project, and how its coordinates lie in it; None of one without."""
+    frames = project.scene_reference_frame_objs
+    if not frames or not frames[0].crs.definition:
+        return None
+    matrix = np.linalg.inv(np.array(frames[0].base_to_canonical.transformation_matrix, np.float64))
+    crs, geoid = frames[0].crs.definition, frames[0].crs.geoid_height
+    found = {"crs": crs, "origin": matrix[:3, 3].tolist(), "target": crs, "transformation": matrix.tolist()}
+    return found if geoid is None else {**found, "geoid_height": geoid}
 
 
 def _capture(uid: Any, sensor_id: Any, facts: ExifFacts) -> Any:
@@ -319,7 +333,7 @@ def _model(project: Any, where: str) -> ColmapModel:
     return ColmapModel(
         rec, np.arange(1, 1 + len(cameras)), np.arange(1, 1 + len(names)), np.arange(1, 1 + len(points_w)),
         np.asarray(matches.image_points.featureIds, np.int64).ravel()[at], rgb.astype(np.uint8), tuple(unposed),
-        self_calibrated=True, has_colors=node.color is not None,
+        self_calibrated=True, has_colors=node.color is not None, georeference=_georeference(project),
     )  # fmt: skip
 
 
