@@ -183,6 +183,26 @@ def test_opf_is_what_its_own_library_takes_and_read_back(tmp_path, name):
             np.testing.assert_allclose(rec.observations.xy_raw[mine], expected, atol=2e-3)
 
 
+def test_pix4ds_own_converter_makes_the_same_colmap_model_of_opf(tmp_path, monkeypatch):
+    pytest.importorskip("pyopf")
+    from opf_tools.opf2colmap.converter import main
+
+    scene = made()
+    EXPORTS["opf-rectified"].write(tmp_path / "opf", scene)
+    asked = ["opf2colmap", str(tmp_path / "opf" / "project.opf"), "--out-dir", str(tmp_path / "colmap")]
+    monkeypatch.setattr("sys.argv", asked)
+    main()
+    rec = read_model(tmp_path / "colmap").reconstruction
+    check_poses(scene, rec.image_names, rec.R_cw, rec.center_w)
+    np.testing.assert_allclose(rec.cameras[0].K, scene.camera(scene.images[0]).K, atol=1e-9)
+    for k, name in enumerate(rec.image_names):
+        mine = rec.observations.frame_idx == k
+        i = [Path(image.name).name for image in scene.images].index(Path(name).name)
+        expected = shown(scene, i, rec.points_w[rec.observations.point_idx[mine]])
+        np.testing.assert_allclose(rec.observations.xy_raw[mine], expected, atol=2e-3)  # float32
+    assert len(rec.observations) == len(scene.reconstruction.observations)
+
+
 def test_opf_gets_the_gps_of_the_photos_and_the_projection(tmp_path):
     pytest.importorskip("pyopf")
     from pyopf.io import load

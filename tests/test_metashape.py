@@ -96,7 +96,8 @@ def test_the_transform_of_the_chunk_is_applied(tmp_path):
 
 def test_what_nobody_explains_of_a_shutter_is_left_out_and_told(tmp_path):
     text = xml(FRAME).replace(
-        "</transform></camera>", "</transform><rolling_shutter>1 0 0 0</rolling_shutter></camera>"
+        "</transform></camera>",
+        "</transform><rolling_shutter><translation>0 0 1</translation></rolling_shutter></camera>",
     )
     (tmp_path / "c.xml").write_text(text)
     with pytest.warns(RsUndistortWarning, match="rolling_shutter of 1 cameras, such as a, is left out"):

@@ -2,7 +2,8 @@
 
 Its pixels have their centres at 0.5 and principal points count from the middle of the photo. P1 and P2 are OpenCV's p2
 and p1. Poses are camera to world, x right, y down, z ahead. Of a sensor with rolling-shutter compensation a pose is
-that of the middle of the frame. What it found of the motions is in no documented place of the file.
+that of the middle of the frame; `rolling_shutter` of a camera holds a rotation and a translation, and nothing says
+between which lines.
 """
 
 from __future__ import annotations
