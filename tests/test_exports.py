@@ -502,6 +502,10 @@ def test_what_there_is_no_writer_for_is_refused():
 
 
 def test_an_extra_that_is_missing_is_told_before_any_work(monkeypatch):
-    monkeypatch.setattr("rsundistort.io.exports.find_spec", lambda _: None)
-    with pytest.raises(InputError, match=r"--export opf needs the extra opf: pip install \"rsundistort\[opf\]\""):
+    def without(name: str) -> None:
+        raise ImportError(f"No module named '{name}'")
+
+    monkeypatch.setattr("rsundistort.io.exports.import_module", without)
+    said = r"--export opf needs the extra opf: pip install \"rsundistort\[opf\]\" \(No module named 'pyopf'\)"
+    with pytest.raises(InputError, match=said):
         check_exports(["opf"])
