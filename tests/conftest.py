@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import subprocess
 import sys
 import time
 import zlib
+from functools import lru_cache
 
 import hypothesis
 import numba
@@ -18,6 +20,10 @@ from compiling import compile_once
 from rsundistort_cli.main import cli
 from solved_scene import solve_scene
 
+from rsundistort.synthetic import scene
+
+# the compiler of kernels makes millions of objects that stay: to search them again and again takes a tenth of its time
+gc.set_threshold(200_000, 50, 100)
 hypothesis.settings.register_profile("rsundistort", max_examples=40, deadline=None, derandomize=True, database=None)
 hypothesis.settings.load_profile("rsundistort")
 
@@ -26,6 +32,14 @@ hypothesis.settings.load_profile("rsundistort")
 def _compile_once(tmp_path_factory):
     if "PYTEST_XDIST_WORKER" in os.environ:
         compile_once(tmp_path_factory.getbasetemp().parent)  # of all workers
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _skies_once():
+    """Scenes of one light and seed share their sky, a third of a second each."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene, "_sky_image", lru_cache(scene._sky_image))
+        yield
 
 
 @pytest.fixture

@@ -13,6 +13,10 @@ COURTYARD = Path(__file__).parent.parent / "sample_scenes" / "courtyard"
 COURTYARD_NAMES = [f"{k:04}.png" for k in range(1, 7)]
 
 
+# noise hardly shrinks, however long the encoder tries
+_FAST = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+
+
 def texture(width: int, height: int, seed: int = 0, channels: int = 3) -> np.ndarray:
     """Smooth noise, 8 bit: (h, w) for one channel, else (h, w, channels)."""
     noise = np.random.default_rng(seed).integers(0, 256, (height, width, channels), dtype=np.uint8)
@@ -22,14 +26,14 @@ def texture(width: int, height: int, seed: int = 0, channels: int = 3) -> np.nda
 
 
 def save_png(path: Path, pixels: np.ndarray) -> None:
-    path.write_bytes(bytes(cv2.imencode(".png", pixels)[1]))
+    path.write_bytes(bytes(cv2.imencode(".png", pixels, _FAST)[1]))
 
 
 def save_textures(folder: Path, names: list[str], width: int = 320, height: int = 240) -> Path:
     """A folder of photos that have nothing in common."""
     folder.mkdir(parents=True, exist_ok=True)
     for seed, name in enumerate(names):
-        (folder / name).write_bytes(bytes(cv2.imencode(Path(name).suffix, texture(width, height, seed))[1]))
+        (folder / name).write_bytes(bytes(cv2.imencode(Path(name).suffix, texture(width, height, seed), _FAST)[1]))
     return folder
 
 

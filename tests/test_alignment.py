@@ -44,9 +44,10 @@ def photo_of(texture, R_cw, center, gain, rng):
     return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
 
 
-@pytest.fixture
-def plane(rng):
+@pytest.fixture(scope="module")
+def plane():
     """Five photos of a plane, points measured to a pixel in four of them, and where they are really seen."""
+    rng = np.random.default_rng(0)
     texture = Texture(rng)
     centers = np.array([[-0.8, 0.1, -3.0], [-0.3, -0.2, -2.8], [0.1, 0.2, -3.2], [0.5, 0.0, -3.0], [0.9, -0.1, -2.9]])
     R_cw = np.array([look_at(center, [0.1, 0.0, 0.0]) for center in centers])

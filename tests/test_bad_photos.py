@@ -89,16 +89,14 @@ def test_a_photo_that_is_there_twice_ruins_nothing(photos):
 
 def test_of_two_scenes_the_larger_is_solved_and_the_other_named(photos):
     whole = half_courtyard(photos.parent / "scene")
-    for path in whole.iterdir():
-        shutil.copy(path, photos / path.name)
-    other = whole.parent.parent / "other"
-    mirrored = half_courtyard(other)
-    for path in list(mirrored.iterdir())[:3]:
+    for name in COURTYARD_NAMES[:6]:
+        shutil.copy(whole / name, photos / name)
+    for path in [whole / name for name in COURTYARD_NAMES[:3]]:
         # upside down and inside out, no feature is one of the others'
         save_png(photos / f"other-{path.name}", 255 - cv2.imread(str(path))[:, ::-1])
     solution, _ = tried(photos.parent, "--camera", str(whole.parent / "camera.json"), "--model", "rotation")
     joined = {image.name for image in solution.registered}
-    assert joined == set(COURTYARD_NAMES)
+    assert joined == set(COURTYARD_NAMES[:6])
     assert all("shares too little" in image.reason for image in solution.images if image.name not in joined)
 
 

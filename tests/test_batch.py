@@ -242,6 +242,7 @@ def test_killed_at_twenty_random_moments(many, rng):
     check_killed(many, rng.integers(0, 40, 20).tolist())
 
 
+@pytest.mark.slow  # test_faults_of_the_machine ends a batch by another signal
 def test_an_interrupt_leaves_whole_files_and_says_how_to_go_on(many):
     folder, truth = many
     _, err = stop_after(process := begin(folder, "--jobs", "1"), folder / "out", 5, signal.SIGINT, truth)

@@ -240,8 +240,8 @@ def test_sigterm_ends_in_one_line_and_resume_goes_on(batch):
     ("streams", "code", "said"),
     [
         ("> /dev/full", 3, "error: stdout cannot be written: No space left on device\n"),
-        (">&- 2>&- <&-", 0, ""),
-        ("--progress json | head -n 0", 0, None),
+        pytest.param(">&- 2>&- <&-", 0, "", marks=pytest.mark.slow),
+        pytest.param("--progress json | head -n 0", 0, None, marks=pytest.mark.slow),
     ],
     ids=["full", "closed", "reader-gone"],
 )

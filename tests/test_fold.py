@@ -134,12 +134,11 @@ def seen_twice(camera, phi, velocity, depth):
     rays = np.column_stack([(uv - K[:2, 2]) / np.diag(K)[:2], np.ones(len(uv))]) * depth
     # points in the frame of the camera at clock zero
     points = Rotation.from_rotvec(-own[:, None] * phi).apply(rays) + own[:, None] * velocity
-    late, across, near = np.empty((3, len(clock), len(uv)))
-    for k, t in enumerate(clock):
-        seen = Rotation.from_rotvec(t * phi).apply(points - t * velocity)
-        late[k] = sign * seen[:, axis] / seen[:, 2] - t
-        near[k] = seen[:, 2]
-        across[k] = (seen[:, 1 - axis] / seen[:, 2] * K[1 - axis, 1 - axis] + K[1 - axis, 2]) / (size[1 - axis] - 1)
+    turns, t = Rotation.from_rotvec(clock[:, None] * phi).as_matrix(), clock[:, None]
+    seen = (points - t[..., None] * velocity) @ turns.transpose(0, 2, 1)
+    near = seen[..., 2]
+    late = sign * seen[..., axis] / near - t
+    across = (seen[..., 1 - axis] / near * K[1 - axis, 1 - axis] + K[1 - axis, 2]) / (size[1 - axis] - 1)
     met = ((late[1:] >= 0) != (late[:-1] >= 0)) & (across[1:] >= 0) & (across[1:] <= 1) & (near[1:] > 0.999 * depth)
     return bool((met.sum(0) > 1).any())
 

@@ -64,7 +64,7 @@ def in_order(imports):
     [
         "import rsundistort\nimport pycolmap",
         "import rsundistort",
-        "import cv2\nimport pycolmap\nimport rsundistort",
+        pytest.param("import cv2\nimport pycolmap\nimport rsundistort", marks=pytest.mark.slow),
     ],
     ids=in_order,
 )
@@ -85,7 +85,10 @@ def test_png_is_written_where_pycolmap_comes_after_zlib(tmp_path, first):
 
 @pytest.mark.parametrize(
     "first",
-    ["import pycolmap\nimport rsundistort", "import pycolmap\nimport cv2\nimport rsundistort"],
+    [
+        "import pycolmap\nimport rsundistort",
+        pytest.param("import pycolmap\nimport cv2\nimport rsundistort", marks=pytest.mark.slow),
+    ],
     ids=in_order,
 )
 def test_png_and_folders_of_outputs_are_refused_where_pycolmap_came_first(tmp_path, first):

@@ -64,6 +64,7 @@ def small(written, monkeypatch):
     _jit._tell.cache_clear()
 
 
+@pytest.mark.slow
 def test_a_kernel_is_compiled_once_for_all_processes(written):
     folder, kept = written
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(kept)}

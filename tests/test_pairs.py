@@ -131,6 +131,7 @@ def test_products_are_exact_in_single_precision(looks):
     np.testing.assert_array_equal(looks.astype(np.float32) @ looks.T.astype(np.float32), exact)
 
 
+@pytest.mark.slow
 def test_the_choice_does_not_depend_on_threads():
     code = (
         "import sys; sys.path.insert(0, sys.argv[1]); from large_sets import make_street\n"

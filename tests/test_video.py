@@ -249,7 +249,8 @@ def invoke(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ([], "give --camera"),
+        # a scene that slides by tells no focal length, which is known at the end only
+        pytest.param([], "give --camera", marks=pytest.mark.slow),
         (["--every", "4", "--sharpest", "4"], "--every N or --sharpest N"),
         (["--every", "4"], "2 photos; the shutter needs at least three"),
         (["--every", "1", "--camera", "300,300,160,120", "--gyro", "gyro.csv"], "Give --readout-ms"),
