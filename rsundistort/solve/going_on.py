@@ -78,7 +78,7 @@ def run_folder(
 ) -> Iterator[RunFolder]:
     """The folder of a run, which nobody else writes; what is kept is dropped at the end, or if there is no solution.
 
-    An interruption says where it was, and how to go on.
+    An interruption says where it was, and how to go on. So does a disk that is full once all is solved, which stays.
 
     Raises
     ------
@@ -97,9 +97,14 @@ def run_folder(
         except KeyboardInterrupt as stop:
             where = str(stop) or f"{log.stage or 'nothing'} was under way, the same command with --resume goes on"
             raise KeyboardInterrupt(where) from stop
-        except Exception:
-            if not (run.goes_on or run.kept.get(_BEGUN)):
+        except Exception as error:
+            of_the_machine = isinstance(error, FileError) and isinstance(error.__cause__, OSError)
+            stays = run.goes_on or bool(run.kept.get(_BEGUN)) or (of_the_machine and run.kept.get(_OUTPUTS) is not None)
+            if not stays:
                 run.kept.drop()
+            if of_the_machine and ";" not in str(error):
+                mend = "the same command with --resume goes on" if stays else "mend that, or give another folder"
+                raise FileError(f"{error}; {mend}") from error.__cause__
             raise
         if not run.finished:
             Record(out).finish(key)
