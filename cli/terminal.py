@@ -73,7 +73,7 @@ def tell(text: str) -> None:
         # what is left in its buffer must not fall at the end
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if isinstance(error, BrokenPipeError):
-            say("warning: nobody reads stdout any more; the work goes on", fg="yellow")
+            say("warning: nobody reads stdout any more; the work continues", fg="yellow")
         else:
             _stdout["lost"] = True
             say(f"error: stdout cannot be written: {error.strerror}", fg="red")
@@ -216,7 +216,7 @@ class _Bars:
         if not self._lines:
             return
         with self._lock:
-            # "ladder: rotation" is a step of the stage "ladder"
+            # "model sequence: rotation" is a step of the stage "model sequence"
             name = stage if self._steps else stage.partition(":")[0]
             if name != self._stage:
                 self._end()

@@ -230,7 +230,7 @@ def test_sigterm_ends_in_one_line_and_resume_goes_on(batch):
     assert done.returncode == 143, done.stderr
     assert done.stderr.count("\n") == 1
     assert done.stderr.startswith("stopped; ")
-    assert "--resume goes on" in done.stderr
+    assert "--resume continues" in done.stderr
     rectify_folder(photos, solution, out, resume=True)
     assert sorted(path.name for path in (out / "images").iterdir()) == NAMES
 
