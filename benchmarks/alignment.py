@@ -24,7 +24,7 @@ from rsundistort.bundle.options import BundleResult
 from rsundistort.input.load import load_photos
 from rsundistort.sfm import map_photos, match_photos, retriangulate
 from rsundistort.simulate import WarpOptions, simulate_warp
-from rsundistort.solve.model_sequence import Feedback
+from rsundistort.solve.model_sequence import TrackSource
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -66,11 +66,11 @@ def main() -> None:
             result = bundle_adjust(map_photos(matched), "rotation", simpler_first=True)
             result = bundle_adjust(retriangulate(matched, result.reconstruction), "rotation")
             again = BundleOptions(phi_sigma_start=result.phi_sigma)
-            feedback = Feedback(matched, loaded, workers)
+            track_source = TrackSource(matched, loaded, workers)
             tracks = retriangulate(matched, result.reconstruction)
-            aligned = feedback.aligned(tracks, log)
+            aligned = track_source.aligned(tracks, log)
             measured = replace(aligned, observations=aligned.observations.select(np.arange(len(tracks.observations))))
-            more = feedback.aligned(retriangulate(matched, result.reconstruction, of_two=True), log)
+            more = track_source.aligned(retriangulate(matched, result.reconstruction, of_two=True), log)
             for label, each in (
                 ("as SIFT has them", tracks),
                 ("aligned", measured),

@@ -4,7 +4,7 @@
 
 For each set a line of the peer (pycolmap's extract, match exhaustively, map and undistort with default options; with
 the set's camera.json that PINHOLE camera, held), a line of `run` and a line that compares them, each in a process of
-its own; at the end a table. `measurements` are those of a photo that was joined; of the peer also the median number of
+its own; at the end a table. `measurements` are those of a registered photo; of the peer also the median number of
 inliers of verified pairs. `error_px` is COLMAP's mean reprojection error, `rms_px` ours. Further parts:
 
     --memory   peak of `run --jobs 2` on photos of 12 megapixels, and of four of them enlarged to 48
@@ -36,11 +36,11 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 SETS = ("drone", "phone", "dslr", "lund", "iphone6", "herz-jesus-8")
 TIME = {"phone": 0.4, "dslr": 0.4, "herz-jesus-8": 0.6}
-# at least of the peer's, and at most: features of its, feedback of our run
+# at least of the peer's, and at most: features of its, re-triangulation of our run
 LEAST = {"joined": 1.0, "measurements": 1.0}
-MOST = {"features": 0.15, "feedback": 0.15}
+MOST = {"features": 0.15, "re-triangulation": 0.15}
 COLUMNS = (
-    "set", "photos", "joined", "measurements", "px", "seconds", "features s", "feedback", "peak MB", "shift px",
+    "set", "photos", "joined", "measurements", "px", "seconds", "features s", "re-triangulation", "peak MB", "shift px",
     "model",
 )  # fmt: skip
 
@@ -130,7 +130,7 @@ def of_solution(path: Path, found: dict[str, Any]) -> dict[str, Any]:
     solution = json.loads(path.read_text())
     joined = [image for image in solution["images"] if image["registered"]]
     shifts = [image["rs_shift_px"] or 0.0 for image in joined]
-    kinds = ("features", "matching", "mapping", "feedback", "adjustment", "rectifying", "writing")
+    kinds = ("features", "matching", "mapping", "re-triangulation", "adjustment", "rectifying", "writing")
     seconds = dict.fromkeys(kinds, 0.0)
     for stage in solution["stages"]:
         kind = stage["name"].split()[0]
@@ -152,7 +152,7 @@ def of_solution(path: Path, found: dict[str, Any]) -> dict[str, Any]:
 
 def compared(name: str, a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
     """Ratios of ours to the peer's with their targets, and which of them miss."""
-    found = {"feedback": a["seconds"]["feedback"] / a["total_s"]}
+    found = {"re-triangulation": a["seconds"]["re-triangulation"] / a["total_s"]}
     if b:
         found |= {key: a[key] / b[key] for key in LEAST}
         found |= {"time": a["total_s"] / b["total_s"], "features": a["seconds"]["features"] / b["seconds"]["features"]}
@@ -185,9 +185,7 @@ def sets(photos: Path, names: list[str], skip_peer: bool) -> list[str]:
         if "crash" not in a and "crash" not in b:
             show(f"{name}, compared", **compared(name, a, b))
         rows.append(row_of(name, a, b))
-    print(
-        "\nours / COLMAP's; measurements of a photo that was joined; px: rms / mean error; feedback: share of our run"
-    )
+    print("\nours / COLMAP's; measurements of a registered photo; px: rms / mean error; re-triangulation: our share")
     table(rows)
     return failed
 
@@ -202,7 +200,7 @@ def row_of(name: str, a: dict[str, Any], b: dict[str, Any]) -> list[str]:
     rest = ["crashed" if "crash" in a else "-"] * 3
     if "crash" not in a:
         rest = [
-            f"{a['seconds']['feedback'] / a['total_s']:.0%}",
+            f"{a['seconds']['re-triangulation'] / a['total_s']:.0%}",
             f"{a['shift_px_median']}, {a['shift_px_max']}",
             a["shutter_model"],
         ]

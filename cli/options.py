@@ -21,7 +21,7 @@ MATCHING_NAMES = ("auto", "exhaustive", "neighbours")
 EXPORT_NAMES = ("metashape", "ncore", "nuke", "opensfm", "opf", "opf-rectified")
 
 #: What an interruption leaves of a work that can be gone on with.
-GOES_ON = "what is done is whole, the same command with --resume goes on"
+GOES_ON = "what is done is whole, the same command with --resume continues"
 
 
 class LocalPath(click.Path):
@@ -105,7 +105,7 @@ def resume_option(text: str) -> Decorator:
 def check_resume(given: dict[str, Any]) -> None:
     """Refuse to begin anew and go on at once."""
     if given.get("overwrite") and given.get("resume"):
-        raise click.UsageError("--overwrite begins anew and --resume goes on; give one of them")
+        raise click.UsageError("--overwrite begins anew and --resume continues; give one of them")
 
 
 scheduler_option: Decorator = click.option(

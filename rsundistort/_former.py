@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any
 
-from .bundle import LADDER, BundleOptions, BundleResult, adjust_sequence
+from .bundle import MODEL_SEQUENCE, BundleOptions, BundleResult, adjust_sequence
 from .model import Reconstruction
 from .rectify import RemapGrid
 from .solve import solve
@@ -58,7 +58,7 @@ FORMER_NAMES = {
 
 def _climb(
     reconstruction: Reconstruction,
-    rungs: Sequence[str] = LADDER,
+    rungs: Sequence[str] = MODEL_SEQUENCE,
     options: BundleOptions | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> dict[str, BundleResult]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, Observations, Reconstruction
+from rsundistort.model.path import CameraPath
 
 Array = NDArray[np.float64]
 
@@ -86,3 +87,14 @@ def rotation_errors_deg(R_cw: Array, R_true: Array) -> Array:
     U, _, Vt = np.linalg.svd(np.einsum("nab,nac->bc", R_true, R_cw))
     world = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
     return np.degrees(Rotation.from_matrix(R_cw @ world.T @ R_true.transpose(0, 2, 1)).magnitude())
+
+
+def poses_at(path: CameraPath, time_s: Array) -> tuple[Array, Array]:
+    """Poses R_cw (n, 3, 3) and center_w (n, 3) of a path at any times (n,), each by the nearest moment."""
+    R_cw, center_w = [], []
+    for time in time_s:
+        moment = int(np.argmin(np.abs(path.time_s - time)))
+        turn, way = path.near(moment, time - path.time_s[moment])
+        R_cw.append(Rotation.from_rotvec(turn[0]).as_matrix() @ path.R_cw[moment])
+        center_w.append(path.center_w[moment] + way[0])
+    return np.array(R_cw), np.array(center_w)

@@ -173,7 +173,7 @@ def test_the_folder_must_be_empty_or_hold_a_batch(four):
     assert invoke(*arguments(four, "--resume")).exit_code == 0
     result = invoke(*arguments(four))
     assert result.exit_code == 1
-    assert "--resume to go on" in result.stderr
+    assert "--resume to continue" in result.stderr
     assert invoke(*arguments(four, "--resume", "--overwrite")).exit_code == 2
 
 
@@ -248,7 +248,7 @@ def test_an_interrupt_leaves_whole_files_and_says_how_to_go_on(many):
     _, err = stop_after(process := begin(folder, "--jobs", "1"), folder / "out", 5, signal.SIGINT, truth)
     assert process.returncode == 130
     assert err.startswith("stopped; ")
-    assert "--resume goes on" in err
+    assert "--resume continues" in err
     assert len(err.splitlines()) == 1
     assert not list((folder / "out").rglob("*.partial"))
     result = invoke(*arguments(folder, "--resume"))

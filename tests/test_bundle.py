@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, Camera, Observations, RowMotion, bundle_adjust
 from rsundistort.bundle import (
-    LADDER,
+    MODEL_SEQUENCE,
     GuessedCameras,
     adjust_sequence,
     choose_model,
@@ -410,12 +410,12 @@ def test_cost_falls_with_each_accepted_step_and_the_reason_is_said(rng):
 def test_the_model_that_made_the_measurements_is_chosen(model, rng):
     # strong motion, so that every rung's mistake shows against the noise
     truth = make_scene(rng, model, num_images=10, num_points=150, noise_px=0.3, phi_size=0.15)
-    models = LADDER[: max(LADDER.index(model) + 1, 3)]
+    models = MODEL_SEQUENCE[: max(MODEL_SEQUENCE.index(model) + 1, 3)]
     start = adjust_sequence(perturbed(truth, rng), models)["rotation"].reconstruction
     choice = choose_model(start, sigma_px=0.3)
     assert choice.shutter_model == model
     assert list(choice.held_out_rms_px) == list(choice.held_out_error)
-    assert [label for label in choice.held_out_error if label in LADDER] == list(LADDER)
+    assert [label for label in choice.held_out_error if label in MODEL_SEQUENCE] == list(MODEL_SEQUENCE)
     assert choice.kept[0] == "global"
     assert choice.kept[-1] == choice.label == model
     assert choice.shutter == ("not-found" if model == "global" else "found")

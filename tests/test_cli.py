@@ -135,7 +135,7 @@ def test_analyze_a_solution_and_transforms(invoke, tmp_path):
     result = invoke("analyze", "solution.json")
     assert result.exit_code == 0, result.stderr
     assert "vertical scale" in result.stdout
-    assert "turned by 90 degrees" in result.stdout
+    assert "rotated by 90 degrees" in result.stdout
     assert all(len(line) <= 100 for line in result.stdout.splitlines())
     as_json = json.loads(invoke("analyze", tmp_path, "--json").stdout)
     assert as_json["critical"] is True

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from clips import HandHeld
+from clips import HandHeld, poses_at
 from make_photos import texture
 from rsundistort_cli.main import cli
 from scipy.spatial.transform import Rotation
@@ -233,7 +233,7 @@ def test_frames_that_were_not_placed_lose_their_lens_only(tmp_path):
     lens = Camera(WIDTH, HEIGHT, CAMERA.K, [-0.2, 0, 0, 0, 0])
     geometry = PhotoGeometry("clip", lens, CAMERA, RowMotion(), "global")
     video = encode(tmp_path / "clip.mp4", [view(k) for k in range(5)])
-    with pytest.warns(RsUndistortWarning, match=r"out\.mp4: 5 of 5 frames could not be placed; only the lens was"):
+    with pytest.warns(RsUndistortWarning, match=r"out\.mp4: 5 of 5 frames have no pose and are corrected for the lens"):
         rectify_clip(video, tmp_path / "out.mp4", lambda _: None, geometry, "cubic", Workers(1), StageLog(None))
     for before, after in zip(frames_of(video), frames_of(tmp_path / "out.mp4"), strict=True):
         expected = cv2.undistort(before.to_ndarray(format="gray"), lens.K, lens.dist)
@@ -309,10 +309,10 @@ def test_the_path_of_turned_frames_is_that_of_a_turned_camera(tmp_path):
     np.testing.assert_allclose(turned.R_cw[:, 0], -path.R_cw[:, 1])
     np.testing.assert_allclose(turned.R_cw[:, 1], path.R_cw[:, 0])
     between = np.linspace(0.01, 0.2, 9)
-    R, _ = path.poses_at(between)
-    turned_R, centers = turned.poses_at(between)
+    R, _ = poses_at(path, between)
+    turned_R, centers = poses_at(turned, between)
     np.testing.assert_allclose(turned_R, [[[0, -1, 0], [1, 0, 0], [0, 0, 1]]] @ R, atol=1e-12)
-    np.testing.assert_allclose(centers, path.poses_at(between)[1])
+    np.testing.assert_allclose(centers, poses_at(path, between)[1])
 
 
 # ---------------------------------------------------------------- the readout time
@@ -341,13 +341,13 @@ def test_the_readout_time_is_told_with_its_evidence():
     [
         ({}, ""),
         ({"stabilisation": {"verdict": "stabilised", "reason": "stabilised: why"}}, "stabilised: why"),
-        ({"source": "what was known before"}, "does not tell it better than it was known before"),
+        ({"source": "what was known before"}, "does not determine it better than it was known before"),
         ({"sigma": 0.007}, "the camera moved too little: 20.5 +- 7.0 ms"),
         (
             {"halves": [{"seconds": 0.030, "sigma": 0.0005}, {"seconds": 0.0204, "sigma": 0.0005}]},
             "contradict each other, 14 standard deviations apart",
         ),
-        ({"seconds": 0.04, "of_frame": 1.2}, "longer than from frame to frame"),
+        ({"seconds": 0.04, "of_frame": 1.2}, "longer than the time from frame to frame"),
         ({"seconds": -0.0205, "of_frame": -0.615}, ""),
     ],
 )

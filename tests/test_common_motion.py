@@ -257,10 +257,10 @@ def test_what_is_said_is_json_and_only_where_it_costs_something(rng):
         for name in ("parallel", "one portrait")
     )
     assert level.common.is_weak
-    assert "can hardly be told apart" in level.sentence
+    assert "can hardly be distinguished" in level.sentence
     assert "in all photos together phi" in level.sentence
     assert not turned.common.is_weak
-    assert "told apart" not in turned.sentence
+    assert "distinguished" not in turned.sentence
     said = json.loads(json.dumps(level.common.as_json()))
     assert len(said["sigma_phi_rad_per_frame"]) == len(said["sigma_velocity_baselines_per_frame"]) == 3
     assert np.shape(said["correlation"]) == (6, 6)
@@ -364,7 +364,7 @@ def test_a_photo_wrongly_said_to_be_still_is_noticed(rng):
         healed, remedy = heal(bundle_adjust(truth, MODEL, options), options)
         assert remedy.name == "given"
         assert not healed.reconstruction.velocity[int(name[:2])].any()
-        assert any("is said to have been still" in text for text in remedy.warnings) == warned
+        assert any("was specified as still" in text for text in remedy.warnings) == warned
 
 
 def test_a_photo_turned_by_90_degrees_is_advised_for_what_it_tells_of_the_common_motion(rng):

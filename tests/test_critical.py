@@ -302,7 +302,7 @@ def test_wrong_anchor_is_obeyed_and_noticed(rng):
     healed, remedy = heal(result, options)
     assert healed.reconstruction.phi[2, 0] == 0.0
     assert remedy.name == "given"
-    assert "02.jpg is said to have been still" in remedy.warnings[0]
+    assert "02.jpg was specified as still" in remedy.warnings[0]
     right = replace(options, held_phi={"05.jpg": (0,)})
     result = bundle_adjust(start, "two-step", right, simpler_first=True)
     assert heal(result, right)[1].warnings == ()
@@ -385,8 +385,8 @@ def test_lengths_of_photos_that_are_not_joined_are_left_out_and_named(rng):
     good = [KnownLength(seen_at(truth, k), seen_at(truth, k + 1), 1.0, 0.1) for k in range(2)]
     lost = KnownLength(seen_at(truth, 4), ("lost.jpg", 3.0, 4.0), 1.0, 0.1)
     for lengths, says in (
-        ([*good, lost], "not joined, so no known length: lost.jpg; those of the others are used"),
-        ([good[0], lost], "not joined, so no known length: lost.jpg; none is used, since ratios need two"),
+        ([*good, lost], "not registered, so no known length: lost.jpg; those of the others are used"),
+        ([good[0], lost], "not registered, so no known length: lost.jpg; none is used, since ratios need two"),
     ):
         options = BundleOptions(lengths=lengths)
         with pytest.warns(RsUndistortWarning, match=says):

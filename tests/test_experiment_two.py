@@ -97,7 +97,9 @@ def test_comparison_takes_photos_that_all_three_have(poses, rng):
     )
     assert found.names == ("1.png", "2.png", "4.png", "5.png")
     assert found.position["with"] == pytest.approx(np.zeros(4), abs=1e-9)
-    with pytest.raises(InputError, match=r"2 photos were joined in all three .* \(4 still, 4 swung, 6 swung without"):
+    with pytest.raises(
+        InputError, match=r"2 photos were registered in all three .* \(4 still, 4 swung, 6 swung without"
+    ):
         compare_paths(
             solution_of(*poses, lost=NAMES[:2]), solution_of(*poses, lost=NAMES[4:]), solution_of(*poses)
         )  # fmt: skip
@@ -222,7 +224,7 @@ def test_experiment_two_keeps_outputs_unless_told(folders, made_up, tmp_path):
 
 def test_experiment_two_leaves_nothing_where_too_few_are_joined(folders, made_up, monkeypatch, poses, tmp_path):
     monkeypatch.setattr(two, "run", lambda *_, **__: solution_of(*poses, lost=NAMES[:4]))
-    with pytest.raises(InputError, match="2 photos were joined in all three"):
+    with pytest.raises(InputError, match="2 photos were registered in all three"):
         experiment_two(*folders, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
@@ -232,7 +234,7 @@ def test_experiment_two_says_which_photos_cannot_be_joined(folders, made_up, mon
 
     def fake(photos, out, options, progress=None, jobs=0):
         if photos.name == "swung":
-            raise ReconstructionError("only 2 of 6 photos could be joined")
+            raise ReconstructionError("only 2 of 6 photos could be registered")
         return good(photos, out, options, progress)
 
     monkeypatch.setattr(two, "run", fake)

@@ -19,7 +19,7 @@ from rsundistort.io import Metadata, write_image
 from rsundistort.io.photos.exif_facts import ExifFacts, _facts, read_exif
 from rsundistort.sfm import edge_width_px
 from rsundistort.simulate import WarpOptions, simulate_warp
-from rsundistort.solve import model_sequence as ladder
+from rsundistort.solve import model_sequence
 from rsundistort.verdict import judge
 
 
@@ -137,8 +137,8 @@ def test_motions_against_the_exposure_are_looked_for(rng, monkeypatch):
         told.append(args[-1])
         return judge(*args)
 
-    monkeypatch.setattr(ladder, "judge", judged)
+    monkeypatch.setattr(model_sequence, "judge", judged)
     options = BundleOptions(phi_limits={"1.jpg": 1e-5})
-    solved = ladder.solve_tracks(rec, cameras_of(rec), "rotation", 0, lambda _: options, StageLog(None), "none")
+    solved = model_sequence.solve_tracks(rec, cameras_of(rec), "rotation", 0, lambda _: options, StageLog(None), "none")
     assert told == [{"1.jpg": 2e-5}]
     assert solved.verdict is not None

@@ -101,7 +101,7 @@ def test_a_camera_like_none_is_not_believed(found, says):
     f = found.get("f", 300.0)
     odd = Camera(320, 240, [[f, 0, 159.5], [0, f, 119.5], [0, 0, 1]], found.get("dist", []))
     cameras.check_plausible([replace(guess, dist=np.array([-0.3, 0.1, 0, 0, 0]))])
-    with pytest.raises(ReconstructionError, match=f"the photos do not tell their camera: {says}.*--camera"):
+    with pytest.raises(ReconstructionError, match=f"the photos do not determine their camera: {says}.*--camera"):
         cameras.check_plausible([odd])
     replace(cameras, without_focal=[]).check_plausible([odd])  # EXIF is another matter
 

@@ -202,7 +202,7 @@ def test_a_mirror_image_is_named():
 
 
 @pytest.mark.parametrize(
-    ("kind", "says"), [("still", "stood still"), ("even", "turned evenly"), ("repeats", "turns repeat")]
+    ("kind", "says"), [("still", "stood still"), ("even", "rotated uniformly"), ("repeats", "rotations repeat")]
 )
 def test_motions_that_tell_nothing(kind, says):
     found = align_gyro(gyroscope(kind=kind), *frames(kind=kind))

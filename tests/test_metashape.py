@@ -190,9 +190,9 @@ def measure(place, posed, work):
 def test_photos_are_measured_where_the_poses_say(small, tmp_path):
     place, truth = small
     posed = posed_photos(place / "cameras.xml", place / "photos", "tif")
-    model, feedback = measure(place, posed, tmp_path)
+    model, track_source = measure(place, posed, tmp_path)
     rec = model.reconstruction
-    assert len(feedback.matched.names) == 3
+    assert len(track_source.matched.names) == 3
     assert rec.num_points > 300
     for name, R, center in zip(rec.image_names, rec.R_cw, rec.center_w, strict=True):
         np.testing.assert_allclose(R, truth.image(name).R_cw, atol=1e-9)

@@ -264,18 +264,18 @@ def test_a_motion_in_the_other_frame_is_refused_where_it_matters():
     image = SolvedImage("a.jpg", "1", R_cw, np.zeros(3), RowMotion([0.01, 0, 0], [0.1, 0.2, 0]))
     point = [[0.1, 0.2, 5.0]]
     assert image.motion.frame == "world"
-    with pytest.raises(InputError, match=r"told in the world frame, expected the camera frame; call motion.in_camera"):
+    with pytest.raises(InputError, match=r"is in the world frame, expected the camera frame; call motion.in_camera"):
         project_points(point, camera, image.motion, "constant-motion")
     ours = image.motion.in_camera(R_cw)
     unsaid = RowMotion(image.motion.phi, R_cw @ image.motion.velocity)
     for model in ("rotation", "constant-motion"):
         found, expected = (project_points(point, camera, each, model)[0] for each in (ours, unsaid))
         np.testing.assert_array_equal(found, expected)
-    with pytest.raises(InputError, match="told in the camera frame, expected the world frame"):
+    with pytest.raises(InputError, match="is in the camera frame, expected the world frame"):
         ours.in_camera(R_cw)
-    with pytest.raises(InputError, match="told in the camera frame"):
+    with pytest.raises(InputError, match="is in the camera frame"):
         ours.pose_at(0.1, R_cw, np.zeros(3))
-    with pytest.raises(InputError, match="told in the camera frame"):
+    with pytest.raises(InputError, match="is in the camera frame"):
         replace(image, motion=ours)
     # which frame a motion without velocity is told in makes no difference
     turning = replace(image, motion=RowMotion([0.01, 0, 0])).motion

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from clips import HandHeld, filmed, rotation_errors_deg
+from clips import HandHeld, filmed, poses_at, rotation_errors_deg
 from scipy.interpolate import BPoly
 from scipy.spatial.transform import Rotation
 
@@ -114,10 +114,10 @@ def test_a_path_passes_through_its_moments_with_their_rates() -> None:
     hand = HandHeld(1)
     time = np.arange(10) * FRAME_S
     path = true_path(hand, time)
-    R_cw, _ = path.poses_at(time)
+    R_cw, _ = poses_at(path, time)
     np.testing.assert_allclose(R_cw, hand.rotations(time), atol=1e-12)
     fine = np.linspace(time[0], time[-1], 200)
-    R_cw, center_w = path.poses_at(fine)
+    R_cw, center_w = poses_at(path, fine)
     derivatives = np.stack([path.center_w, path.velocity, path.acceleration], axis=1)
     np.testing.assert_allclose(center_w, BPoly.from_derivatives(time, derivatives)(fine), atol=1e-12)
     # a tremor of 11 Hz at 30 frames a second
@@ -138,7 +138,7 @@ def test_the_motion_of_a_frame_is_that_of_the_path_around_it() -> None:
     clock_s = 0.02 / truth.cameras[0].frame_span
     for image in (0, 2, 5):
         clock = np.linspace(*truth.cameras[0].clock_range, 9)
-        R_cw, center_w = found.poses_at(found.time_s[image] + clock * clock_s)
+        R_cw, center_w = poses_at(found, found.time_s[image] + clock * clock_s)
         for rec in (bent, told):
             poses = [rec.motion(image).pose_at(r, rec.R_cw[image], rec.center_w[image]) for r in clock]
             np.testing.assert_allclose([each[0] for each in poses], R_cw, atol=2e-6)

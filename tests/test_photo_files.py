@@ -134,7 +134,7 @@ def turned_run(tmp_path_factory):
 def test_a_run_turns_photos_and_masks(turned_run):
     folder, orientations, solution, plain, said = turned_run
     assert len(said) == 1
-    assert said[0].startswith("0006.png: mirrored by its EXIF orientation 5, it was turned")
+    assert said[0].startswith("0006.png: mirrored by its EXIF orientation 5, it was rotated")
     for name, o in orientations.items():
         turn = {5: 6}.get(o, o)
         for kind in ("images", "masks"):

@@ -226,7 +226,7 @@ def test_a_wrong_anchor_is_obeyed_and_warned_of(courtyard, tmp_path):
     truth = read_solution(courtyard / "ground_truth.json")
     moved = max(truth.images, key=lambda image: np.linalg.norm(image.motion.phi[1:])).name
     options = replace(OPTIONS, solve=SolveOptions(still={moved: 0.0}, shutter_model="rotation"))
-    with pytest.warns(RsUndistortWarning, match=f"{moved} is said to have been still"):
+    with pytest.warns(RsUndistortWarning, match=f"{moved} was specified as still"):
         solution = run(photos, tmp_path / "out", options)
     assert solution.image(moved).motion.phi[0] == 0.0
     assert solution.critical_motion["remedy"] == "given"

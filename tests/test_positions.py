@@ -240,7 +240,7 @@ def test_a_similarity_is_known_as_well_as_it_says_and_names_what_is_off(rng):
         y = true.of(x) + rng.normal(size=x.shape) * sigma
         y[4] += [60.0, 0.0, 0.0]
         found = fit_similarity(x, y, sigma)
-        assert np.flatnonzero(found.outlying).tolist() == [4]
+        assert np.flatnonzero(found.deviations > 4).tolist() == [4]
         moved = found.similarity.R @ true.R.T
         turn = np.array([moved[2, 1] - moved[1, 2], moved[0, 2] - moved[2, 0], moved[1, 0] - moved[0, 1]]) / 2
         errors.append([*turn / found.sigma_rad, (found.similarity.scale / 20 - 1) / found.sigma_scale])

@@ -63,6 +63,13 @@ def test_a_former_name_gives_what_the_present_one_does_and_says_it(module, name)
         assert attribute == name
 
 
+def test_the_former_name_of_the_model_sequence_still_works():
+    with pytest.warns(DeprecationWarning, match="rsundistort.bundle.LADDER is now rsundistort.bundle.MODEL_SEQUENCE"):
+        assert rs.bundle.LADDER is rs.bundle.MODEL_SEQUENCE
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        rs.bundle.nothing  # noqa: B018
+
+
 def test_no_former_name_is_on_top_and_unknown_ones_are_errors():
     assert not set(FORMER_NAMES) & set(rs.__all__)
     for module in map(import_module, MODULES):

@@ -76,7 +76,7 @@ def test_simulate_warp_keeps_files_that_lie_where_its_own_would(invoke, tmp_path
     save_textures(tmp_path / out, ["b.png"])
     before = digests(tmp_path)
     result = invoke("simulate", "warp", "photos", "-o", "taken", "--overwrite", "--crop", *CAMERA)
-    refused(result, f"{out}/b.png would be replaced, and nothing tells that rsundistort wrote it")
+    refused(result, f"{out}/b.png would be replaced, and nothing shows that rsundistort wrote it")
     assert digests(tmp_path) == before
 
 
@@ -121,7 +121,7 @@ def test_run_and_rectify_keep_the_depth_maps(invoke, tmp_path):
     refused(invoke("run", "photos", "-o", "out", "--depth", "out/images", "--overwrite", *CAMERA), "images would be")
     command = ["rectify", "photos", "--solution", "s.json", "-o", "out", "--maps", "npz", "--overwrite"]
     refused(invoke(*command, "--depth", "out/maps"), "maps would be replaced by the outputs")
-    refused(invoke(*command), "a.forward.npz would be replaced, and nothing tells that rsundistort wrote it")
+    refused(invoke(*command), "a.forward.npz would be replaced, and nothing shows that rsundistort wrote it")
     assert digests(tmp_path) == before
 
 
@@ -260,7 +260,7 @@ def test_resuming_keeps_what_lies_where_the_rest_would(invoke, inputs, tmp_path)
     (out / "images" / "c.png").write_bytes(b"mine")
     before = digests(tmp_path)
     command = ["rectify", inputs / "in", "--solution", inputs / "s.json", "-o", out, "--resume"]
-    refused(invoke(*command), "images/c.png would be replaced, and nothing tells that rsundistort wrote it")
+    refused(invoke(*command), "images/c.png would be replaced, and nothing shows that rsundistort wrote it")
     (out / "images" / "c.png").unlink()
     assert invoke(*command).exit_code == 0
     before.pop("out/images/c.png")
@@ -281,9 +281,9 @@ def test_reports_and_figures_of_others_stay(invoke, inputs, tmp_path):
         assert invoke("report", out, "--figures", tmp_path / "figures", "-q").exit_code == 0
     assert (tmp_path / "figures" / "paths.pdf").is_file()
     (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "ladder.png").write_bytes(b"mine")
-    refused(invoke("report", out, "--figures", tmp_path / "other"), "ladder.png would be replaced")
-    assert list(digests(tmp_path / "other")) == ["ladder.png"]
+    (tmp_path / "other" / "models.png").write_bytes(b"mine")
+    refused(invoke("report", out, "--figures", tmp_path / "other"), "models.png would be replaced")
+    assert list(digests(tmp_path / "other")) == ["models.png"]
 
 
 # ---------------------------------------------------------------- version 0.1

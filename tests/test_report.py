@@ -24,7 +24,7 @@ from rsundistort.report import verdict_of, write_figures, write_report
 from rsundistort.report.pictures import PictureJob, _bytes_of_each, _small, make_pictures
 from rsundistort.solve import run_outputs as outputs
 
-SECTIONS = ["verdict", "pictures", "scene", "photos", "critical", "ladder", "residuals", "cameras", "settings"]
+SECTIONS = ["verdict", "pictures", "scene", "photos", "critical", "models", "residuals", "cameras", "settings"]
 LEVEL = {"singular_values": [1.9, 1.3, 0.6, 0.2, 0.0], "null_vector": [0, 1.0, 0, 0, 0], "y_axis_spread_deg": 0.1}
 
 
@@ -267,7 +267,7 @@ def test_trouble_with_the_report_loses_no_run(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("solution", "level", "said"),
     [
-        (hand_made(), "trust", "can be trusted: the cameras were turned enough"),
+        (hand_made(), "trust", "can be trusted: the cameras were rotated enough"),
         (hand_made(critical=LEVEL | {"remedy": "none"}), "doubt", "Do not trust the height of the scene: all cameras"),
         (hand_made(critical=LEVEL), "trust", "although all cameras were held level"),
         (hand_made(critical=LEVEL | {"flagged": True, "sigma_log_k": 0.002, "remedy": "anchor"}), "trust", "trusted"),
@@ -276,8 +276,8 @@ def test_trouble_with_the_report_loses_no_run(monkeypatch, tmp_path):
         (hand_made(critical=LEVEL | {"flagged": True, "sigma_log_k": None}), "doubt", "Do not trust"),
         (hand_made(critical={"sigma_log_k": 0.01}), "care", "with care"),
         (hand_made(critical=False), "care", "not examined"),
-        (hand_made(shift=0.7), "still", "the shutter moved no pixel by as much as one"),
-        (hand_made(shift=3.0, quality={"held_out_rms_px": {"global": 0.5, "rotation": 0.499}}), "still", "held out"),
+        (hand_made(shift=0.7), "still", "the shutter displaced no pixel by as much as one"),
+        (hand_made(shift=3.0, quality={"held_out_rms_px": {"global": 0.5, "rotation": 0.499}}), "still", "held-out"),
         (hand_made(shift=3.0, quality={"held_out_rms_px": {"global": 0.5, "rotation": 0.4}}), "trust", "trusted"),
         (hand_made(shutter_model="global", shift=0.0), "still", "a global shutter explains the photos as well"),
         (hand_made(shutter_model="global", options={"shutter_model": "global"}), "care", "--model auto"),
@@ -287,7 +287,7 @@ def test_verdict(solution, level, said):
     verdict = verdict_of(solution)
     assert verdict.level == level
     assert said in verdict.sentences[2]
-    assert verdict.sentences[0] == "All 3 photos were joined into one scene."
+    assert verdict.sentences[0] == "All 3 photos were registered in one scene."
     assert all(sentence.endswith(".") and sentence[0].isupper() for sentence in verdict.sentences)
 
 
@@ -295,7 +295,7 @@ def test_verdict_counts_photos_and_pixels():
     solution = hand_made(quality={"rms_px": 0.21, "global_rms_px": 2.0})
     lost = SolvedImage("z.jpg", "1", reason="too dark")
     verdict = verdict_of(replace(solution, images=(*solution.images, lost)))
-    assert verdict.sentences[0] == "3 of 4 photos were joined into one scene; 1 was left out."
+    assert verdict.sentences[0] == "3 of 4 photos were registered in one scene; 1 was left out."
     assert "by up to 12 px" in verdict.sentences[1]
     assert "from 2.00 px to 0.21 px" in verdict.sentences[1]
 
@@ -356,7 +356,7 @@ def test_figures_for_papers(solved_courtyard, invoke, tmp_path):
     result = invoke(solved_courtyard[0], "--figures", tmp_path / "figures")
     assert result.exit_code == 0, result.output
     names = [
-        f"{name}.{kind}" for name in ("ladder", "displacement", "paths", "critical-motion") for kind in ("png", "pdf")
+        f"{name}.{kind}" for name in ("models", "displacement", "paths", "critical-motion") for kind in ("png", "pdf")
     ]
     assert sorted(path.name for path in (tmp_path / "figures").glob("[!.]*")) == sorted(names)
     for path in (tmp_path / "figures").glob("*.png"):
@@ -368,7 +368,7 @@ def test_figures_for_papers(solved_courtyard, invoke, tmp_path):
 
 def test_figures_of_names_that_look_like_formulas(tmp_path):
     write_solution(tmp_path / "solution.json", hand_made(["a$_{b$.jpg", "$x$.jpg", "c.jpg"]))
-    assert len(write_figures(tmp_path, tmp_path / "figures")) == 6  # no ladder was climbed
+    assert len(write_figures(tmp_path, tmp_path / "figures")) == 6  # no models were compared
 
 
 # ---------------------------------------------------------------- in a browser

@@ -403,7 +403,7 @@ def test_what_progress_raises_stops_the_work(tmp_path, rng):
         pass
 
     def progress(stage, done, total):
-        if stage.startswith("ladder"):
+        if stage.startswith("model sequence"):
             raise Enough
 
     scene = make_scene(rng)

@@ -54,7 +54,7 @@ def test_by_gps_the_model_is_in_metres_east_north_and_up(by_gps):
     assert np.all(np.abs(np.delete(error, 3, axis=0).mean(0)) < 3 * sigma)
     assert np.linalg.norm(error, axis=1).max() < 1.5
     assert told["gps"]["outliers"] == ["0003.jpg"]
-    assert any("GPS that is far off, and not believed: 0003.jpg (59" in text for text in said)
+    assert any("GPS that is far off, and rejected: 0003.jpg (59" in text for text in said)
     # errors of GPS as they were drawn, 0.5, 0.5 and 1 m, by nine photos less seven unknowns
     assert np.all(np.array(told["gps"]["rms_axes_m"]) < [1.2, 1.2, 2.4])
 
@@ -73,7 +73,7 @@ def test_the_place_on_the_map_is_kept_in_the_solution(by_gps, tmp_path):
 def test_people_are_told_of_the_map(by_gps):
     facts = dict(map_facts(by_gps[1].georeference))
     assert facts["map"].startswith("east, north, up in metres at 47.0000")
-    assert "not believed: 0003.jpg" in facts["GPS"]
+    assert "rejected: 0003.jpg" in facts["GPS"]
     assert map_rows(by_gps[1].georeference)["gps"][0]["name"] == "0003.jpg"
     assert map_facts(None) == []
 
@@ -134,7 +134,7 @@ def test_gps_that_does_not_fit_leaves_a_frame_of_its_own(spread):
     # all at one place, and a phone's walk around a statue
     places = geodetic_of(np.random.default_rng(0).normal(size=(10, 3)) * spread)
     facts = [ExifFacts(fix=GpsFix(*each)) for each in places.tolist()]
-    with pytest.warns(RsUndistortWarning, match=r"not on the map: GPS along a line, or as near to each other"):
+    with pytest.warns(RsUndistortWarning, match=r"not on the map: GPS along a line, or within its own errors"):
         survey, rec = survey_of(None, [], flight.names, facts, [(768, 512)] * 10).placed(flight.start)
     assert survey is None
     assert rec is flight.start

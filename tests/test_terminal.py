@@ -27,8 +27,8 @@ from rsundistort.errors import InputError, RsUndistortWarning
 with errors_for_people(), progress_bars(Talk(verbose="-v" in sys.argv, quiet="-q" in sys.argv)) as progress:
     progress("features", 0, 10)
     progress("features", 10, 10)
-    progress("ladder: global", 0, 0)
-    progress("ladder: rotation", 0, 0)
+    progress("model sequence: global", 0, 0)
+    progress("model sequence: rotation", 0, 0)
     warnings.warn("take another photo", RsUndistortWarning)
     progress("writing", 0, 0)
     raise InputError("no photos; give another folder")
@@ -135,9 +135,9 @@ def test_summary_says_what_the_table_says():
 def test_stages_errors_and_warnings_in_a_terminal():
     said, code = in_a_terminal(TALKER)
     assert code == 1
-    for stage in ("features", "ladder", "writing"):
+    for stage in ("features", "model sequence", "writing"):
         assert stage in said
-    assert "ladder: rotation" not in said
+    assert "model sequence: rotation" not in said
     assert "\x1b[33mwarning: take another photo" in said
     assert "\x1b[31merror: no photos; give another folder" in said
 
@@ -150,17 +150,17 @@ def test_no_color_is_kept():
 
 def test_verbose_tells_steps_and_quiet_only_what_went_wrong():
     said, _ = in_a_terminal(TALKER, "-v")
-    assert "ladder: rotation" in said
+    assert "model sequence: rotation" in said
     quiet, _ = in_a_terminal(TALKER, "-q")
-    assert "ladder" not in quiet
+    assert "model sequence" not in quiet
     assert "warning: " in quiet
 
 
 def test_without_a_terminal_there_are_lines_only_if_asked_for(capsys):
     for talk, lines in ((Talk(), 0), (Talk(verbose=True), 2), (Talk(quiet=True), 0)):
         with progress_bars(talk) as progress:
-            progress("ladder: global", 0, 0)
-            progress("ladder: rotation", 0, 0)
+            progress("model sequence: global", 0, 0)
+            progress("model sequence: rotation", 0, 0)
         assert len(capsys.readouterr().err.splitlines()) == lines
 
 

@@ -370,7 +370,7 @@ def test_the_folder_must_be_empty_or_hold_a_batch(remote):
     assert invoke(*command).exit_code == 0
     result = invoke(*command)
     assert result.exit_code == 1
-    assert "--resume to go on" in result.stderr
+    assert "--resume to continue" in result.stderr
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ from rsundistort.io import write_solution
 from rsundistort.rectify import largest_shift_px
 from rsundistort.report import verdict_of
 from rsundistort.report.displacement import displacement_field
-from rsundistort.solve import model_sequence as ladder
+from rsundistort.solve import model_sequence
 from rsundistort.synthetic.measurements import measure
 from rsundistort.verdict import Verdict, judge, left_along_readout, left_over_frame, photo_motions
 from rsundistort.verdict.judge import _repeated
@@ -140,7 +140,7 @@ def test_a_wrong_lens_is_no_trusted_shape(sigma, rng):
     wrong = replace(rec, cameras=[replace(CAMERA, dist=(LENS[0] + 0.06, *LENS[1:]))])
     for verdict in (chosen(wrong), named(wrong)[1]):
         assert verdict.shape == "doubtful"
-        assert "the lens is not what it is taken for" in verdict.reasons[0]
+        assert "the lens model does not fit the lens" in verdict.reasons[0]
     # and one that is solved for is right again
     assert named(wrong, options=BundleOptions(refine=("k1",)))[1].shape == "trusted"
 
@@ -149,7 +149,7 @@ def test_motions_that_repeat_themselves_are_no_hands(rng):
     alike = named(measured(rng, swung(rng, 0.002) + ROLL))[1]
     assert alike.shutter == "not-determined"
     assert alike.shape == "doubtful"
-    assert "turned alike, by 0." in alike.reasons[0]
+    assert "rotated alike, by 0." in alike.reasons[0]
     assert "about z" in alike.reasons[0]
     # a camera that pans turns on between its photos
     rec = measured(rng, swung(rng, 0.002) + ROLL)
@@ -191,7 +191,7 @@ def test_a_shutter_that_gained_but_was_not_kept_is_not_determined(rng):
         (
             choice_of(gain=5.0, against=("two halves differ",)),
             "not-determined",
-            "was not taken out: two halves differ.",
+            "was not corrected: two halves differ.",
         ),
         (choice_of(gain=1.0), "not-found", ""),
         (choice_of(num_held_out=12), "not-determined", "only 12 could be held out"),
@@ -208,9 +208,7 @@ def test_held_out_measurements_that_are_far_off_speak_against_a_solution(rng):
     far_off = judge(result, None, choice_of("rotation", 10.0, 9.0))
     assert far_off.shutter == "found"
     beyond = f"{3 * result.sigma_px:.1f}"  # sqrt(10 - 1) times the noise
-    assert far_off.reasons == (
-        f"Measurements that were held out are off by {beyond} px more than their noise explains.",
-    )
+    assert far_off.reasons == (f"Held-out measurements are off by {beyond} px more than their noise explains.",)
 
 
 def test_a_scene_that_nothing_holds_together_is_not_trusted(rng):
@@ -261,7 +259,7 @@ def test_a_photo_that_moved_far_more_is_doubtful(rng):
     phi[4] = [0.05, 0.0, 0.05]
     verdict = named(measured(rng, phi))[1]
     assert verdict.doubtful.keys() == {"4.jpg"}
-    assert "times as much as photos of this set do" in verdict.doubtful["4.jpg"]
+    assert "times as much as the other photos do" in verdict.doubtful["4.jpg"]
 
 
 def test_a_photo_that_its_exposure_contradicts_is_doubtful(rng):
@@ -430,8 +428,8 @@ def doubted(tmp_path_factory):
     out = tmp_path_factory.mktemp("doubted") / "out"
     judged = Verdict("found", "trusted", (), {"0003.jpg": "halves differ"}, ("0003.jpg",))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ladder, "judge", lambda *_: judged)
-        with pytest.warns(RsUndistortWarning, match=r"the lens alone is taken out of 1 photo,.* 0003"):
+        patch.setattr(model_sequence, "judge", lambda *_: judged)
+        with pytest.warns(RsUndistortWarning, match=r"1 photo is corrected for the lens only,.* 0003"):
             solution = solve_scene("courtyard", out, shutter_model="rotation", maps="npz")
     return out, solution
 

@@ -145,7 +145,7 @@ def _warn(name: str, num_frames: int, num_late: int, num_lens_only: int) -> None
         warnings.warn(f"{name}: {num_late} frames whose time runs back were left out", RsUndistortWarning, stacklevel=4)
     if num_lens_only:
         warnings.warn(
-            f"{name}: {num_lens_only} of {num_frames} frames could not be placed; only the lens was taken out of them",
+            f"{name}: {num_lens_only} of {num_frames} frames have no pose and are corrected for the lens only",
             RsUndistortWarning, stacklevel=4,
         )  # fmt: skip
 

@@ -295,7 +295,7 @@ def _warn_of_orientation(name: str, photo: Photo, rest: int) -> None:
         text = f"{name}: its EXIF orientation {stored} means nothing and is taken for 1"
     elif rest != 1:
         text = (
-            f"{name}: mirrored by its EXIF orientation {stored}, it was turned and keeps the mirror as its orientation"
+            f"{name}: mirrored by its EXIF orientation {stored}, it was rotated and keeps the mirror as its orientation"
         )
     else:
         return

@@ -1,6 +1,9 @@
 """Rolling-shutter bundle adjustment: problem, solver, priors and gauge."""
 
-from .adjust import LADDER, adjust_sequence, bundle_adjust, objective, sequence_to
+import warnings
+from typing import Any
+
+from .adjust import MODEL_SEQUENCE, adjust_sequence, bundle_adjust, objective, sequence_to
 from .choice import ModelChoice, choose_model
 from .control import CONTROL_SIGMA_PX, PlacedControl, place_control, with_control
 from .direction import ReadoutChoice, choose_readouts
@@ -12,7 +15,7 @@ from .posterior import Posterior, gauge_directions
 
 __all__ = [
     "CONTROL_SIGMA_PX",
-    "LADDER",
+    "MODEL_SEQUENCE",
     "BundleOptions",
     "BundleResult",
     "GuessedCameras",
@@ -34,3 +37,11 @@ __all__ = [
     "sequence_to",
     "with_control",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "LADDER":  # the former name, in this version
+        text = "rsundistort.bundle.LADDER is now rsundistort.bundle.MODEL_SEQUENCE"
+        warnings.warn(text, DeprecationWarning, stacklevel=2)
+        return MODEL_SEQUENCE
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""Bundle adjustment with outlier rounds, and the ladder of shutter models."""
+"""Bundle adjustment with outlier rounds, and the sequence of shutter models."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from .problem import BundleProblem
 from .rounds import Rounds
 from .spreads import estimates_spreads, starting_spreads
 
-__all__ = ["LADDER", "adjust_sequence", "bundle_adjust", "objective", "sequence_to"]
+__all__ = ["MODEL_SEQUENCE", "adjust_sequence", "bundle_adjust", "objective", "sequence_to"]
 
-#: Shutter models in the order in which they are solved, each from the one before.
-LADDER = ("global", "two-step", "rotation", "constant-motion")
+#: Shutter models in the order in which they are adjusted, each from the one before.
+MODEL_SEQUENCE = ("global", "two-step", "rotation", "constant-motion")
 
-# Fall of the cost, as a share, below which a solve ends whose spreads are yet to change.
+# Relative fall of the cost that ends a solve whose prior standard deviations will still change.
 _UNSETTLED_TOLERANCE = 1e-5
 
 
@@ -82,7 +82,7 @@ def bundle_adjust(
         rounds.drop_outliers()
     most = options.spread_rounds + 1
     if not options.outlier_rounds and options.spread_rounds and estimates_spreads(shutter_model, options):
-        # the first spreads are but a guess: their solution need not be exact
+        # the first prior standard deviations are a guess: their solution need not be exact
         rounds.solve(options.round_tolerance)
         rounds.begin_next()
         most -= 1
@@ -100,18 +100,14 @@ def bundle_adjust(
 def sequence_to(shutter_model: str) -> tuple[str, ...]:
     """Shutter models that end at one, each the start of the next."""
     check_shutter_model(shutter_model)
-    if shutter_model == "global":
-        return ("global",)
-    if shutter_model == "two-step":
-        return ("global", "two-step")
-    if shutter_model == "constant-motion":
-        return LADDER
+    if shutter_model in MODEL_SEQUENCE:
+        return MODEL_SEQUENCE[: MODEL_SEQUENCE.index(shutter_model) + 1]
     return ("global", "two-step", shutter_model)
 
 
 def adjust_sequence(
     reconstruction: Reconstruction,
-    models: Sequence[str] = LADDER,
+    models: Sequence[str] = MODEL_SEQUENCE,
     options: BundleOptions | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> dict[str, BundleResult]:
@@ -134,8 +130,8 @@ def adjust_sequence(
         By model, in the order solved. All but the last are rough: no outliers are dropped from them.
     """
     options = options or BundleOptions()
-    # every model but the last is only a start: what it cannot explain is no outlier, and it need not converge
-    # a shutter that is not modelled yet would be blamed on the lens, and bend what is known of the scene
+    # every model except the last is only a start: what it cannot explain is no outlier, and it need not converge; the
+    # lens would absorb a shutter that is not modelled yet, and bend what is known of the scene
     rough = replace(
         options, outlier_rounds=0, spread_rounds=0, cost_tolerance=options.round_tolerance, refine=(), lengths=(),
         places=None, deviations="model", residual_field=False,

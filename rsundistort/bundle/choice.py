@@ -1,4 +1,4 @@
-"""Which shutter model the measurements support: the one that foretells measurements it was not fitted to."""
+"""The shutter model that the measurements support: the one that best predicts measurements held out from its fit."""
 
 from __future__ import annotations
 
@@ -12,41 +12,41 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..model import SHUTTER_MODELS, Observations, Reconstruction, other_axis
 from ..model.reprojection import reprojection_residuals
-from .adjust import LADDER, bundle_adjust, objective
+from .adjust import MODEL_SEQUENCE, bundle_adjust, objective
 from .options import BundleOptions
 from .remains import CLIP, WAVES, agreement_of_waves, errors_without, half_across_readout, warps, waves
 from .spreads import Spreads
 
 __all__ = ["ModelChoice", "choose_model", "clipped_errors", "corners", "hold_out", "improves", "standard_errors"]
 
-# A track gives one measurement away if this many are left: two fix the point, the third checks them.
+# A track may lose one measurement if this many are left: two determine the point, the third checks them.
 _LEFT_OVER = 3
-# Parts of a photo, across and down, whose measurements count once.
+# Parts of a photo, across and down; the measurements of each count once.
 _PARTS = 4
-# A model is better if the held-out error falls by this many standard errors: of models that explain nothing, one in six
-# would pass with one, one in forty does with two.
+# A model is better if the held-out error falls by this many standard errors: one in six models without effect would
+# pass with one, one in forty passes with two.
 _MIN_GAIN = 2.0
-# And by this share.
+# And by this share of the error.
 _MIN_FALL = 0.02
-# Share of an error that is most of it.
+# Share that counts as most of an error.
 _MOST_OF_IT = 0.5
-# Splines along the readout through so many values follow what no model of ours would.
+# Splines along the readout through this many values follow motions that none of the models can.
 _RESTLESS = 49
-# Two halves of a scene must tell the same motions: what they have in common is more than what they differ by. (Warped
-# photos: 0.98 and more; a camera without rolling shutter: 0.1 to 0.5.)
+# Two halves of a scene must show the same motions: what they have in common exceeds their difference. (Warped photos:
+# 0.98 and more; a camera without rolling shutter: 0.1 to 0.5.)
 _MIN_AGREEMENT = 0.5
-# Motions that move no pixel by as much as this, in half of the photos, are none.
+# Motions that displace pixels by less than this, in half of the photos, count as none.
 _UNSEEN_PX = 0.5
-# Of the limit of a spread: one that comes so near would be larger if it could.
+# Share of the limit of a prior standard deviation: an estimate this near would be larger without the limit.
 _AT_LIMIT = 0.99
-# A model that bends to explain what it cannot creeps along its valley; the rest converge in fewer steps.
+# A model that does not fit converges slowly along a narrow valley; the others converge in fewer steps.
 _MOST_STEPS = 15
 
 _VARYING, _FIELD = ", varying lens", ", residual field"
-# Motions that are not steady, by the groups of bends that they take. A cubic that is free in each photo hides the
-# height of the scene, so a rate that changes steadily is tried without it.
+# Unsteady motions, by the groups of bends that they have. A cubic that is free in each photo hides the height of the
+# scene, so a rate that changes steadily is tried without it.
 _BENDS = {0: "", 1: ", accelerating", 2: ", bent", 5: ", vibrating"}
-# Of these, what a smooth warp could be; the rest moves lines faster.
+# Groups that a smooth warp could imitate; the others displace lines faster.
 _SMOOTH_BENDS = 2
 
 
@@ -63,33 +63,33 @@ class ModelChoice:
     varying : bool
         Whether the intrinsics vary from photo to photo, as `BundleOptions.varying`.
     shutter : {"found", "not-found", "not-determined"}
-        Whether there is a rolling shutter: "not-determined" if something bends the photos that a model of the shutter
-        explains in part, or no better than one that is read along the other axis.
+        Whether there is a rolling shutter: "not-determined" if something bends the photos that a shutter model explains
+        in part, or no better than one that is read along the other axis.
     held_out_error : dict of str to float
         Mean over the held-out measurements of half the squared residual in units of the noise, clipped: 1 for noise
-        alone. This decides.
+        alone. The choice depends on it.
     held_out_rms_px : dict of str to float
-        Root mean square of the held-out residuals' parts, long ones clipped.
+        Root mean square of the components of the held-out residuals, long ones clipped.
     gain : dict of str to float
-        How much the held-out error fell against the one kept before, in units of the standard error of that fall. The
-        first has none.
+        Fall of the held-out error against the one kept before, in units of the standard error of that fall. The first
+        has none.
     left : dict of str to float
-        Share of the held-out error that a smooth warp of each photo would take away yet.
+        Part of the held-out error that a smooth warp of each photo would still remove.
     kept : tuple of str
-        Those that were kept, in order.
+        Models that were kept, in order.
     agreement : float or None
-        Correlation of the motions that two halves of the scene tell, each alone; None where it did not come to that.
+        Correlation of the motions that two halves of the scene show, each alone; None if it was not computed.
     against : tuple of str
-        What speaks against a shutter that explained something and was not kept, for people.
+        Reasons against a shutter that explained something and was not kept, for people.
     num_held_out : int
         Measurements held out.
     residual_field : bool
         Whether cameras have fields beside their lens models, as `BundleOptions.residual_field`.
     bends : int
-        How the motions depart from steady ones, as `BundleOptions.bends`.
+        Groups of bends of the motions, as `BundleOptions.bends`.
     restless : bool
-        Whether the lines of the photos move faster yet than any of these models follows; not asked where a shutter is
-        not determined.
+        Whether the lines of the photos move faster than any of these models follows; not tested if a shutter is not
+        determined.
     """
 
     shutter_model: str
@@ -144,8 +144,8 @@ def clipped_errors(rec: Reconstruction, measured: Observations, sigma_px: float)
 def standard_errors(fall: NDArray[np.float64], group: NDArray[np.int64] | None = None) -> float:
     """Mean fall of errors in units of its standard error; 0 if nothing fell.
 
-    Measurements of a group (n,) go up and down together, and count once: what the lens does in a corner of a photo, it
-    does to all measurements there (the cluster-robust variance of a mean).
+    Errors of the measurements of a group (n,) are correlated, and count once: what the lens does in a corner of a
+    photo, it does to all measurements there (the cluster-robust variance of a mean).
     """
     rest = fall - fall.mean() if len(fall) else fall
     sums = rest if group is None else np.bincount(np.unique(group, return_inverse=True)[1], rest)
@@ -156,10 +156,10 @@ def standard_errors(fall: NDArray[np.float64], group: NDArray[np.int64] | None =
 
 
 def improves(before: NDArray[np.float64], after: NDArray[np.float64], gain: float) -> bool:
-    """Whether a model that somebody named explains its measurements well enough for its motions to be believed.
+    """Whether a model that the user named explains its measurements well enough for its motions to be trusted.
 
-    Its errors (n,) must fall by two standard errors (`gain`), and by more than they stay above those of noise alone:
-    there is no other model that it was tried against, so what is left counts against it.
+    Its errors (n,) must fall by two standard errors (`gain`), and by more than their excess over those of noise alone:
+    no other model was tried, so the remaining error counts against it.
     """
     return gain > _MIN_GAIN and (before - after).mean() > max(_MIN_FALL * before.mean(), after.mean() - 1.0)
 
@@ -173,7 +173,7 @@ def corners(rec: Reconstruction, measured: Observations) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class _Fit:
-    """One model fitted, and what it says of the held-out measurements."""
+    """One model fitted, and its held-out errors."""
 
     label: str
     model: str
@@ -188,12 +188,12 @@ class _Fit:
 
     @property
     def is_explained(self) -> bool:
-        """Whether next to nothing is left that any model could explain."""
+        """Whether next to nothing is left that another model could explain."""
         return self.left <= _MIN_FALL * float(self.errors.mean()) if len(self.errors) else True
 
 
 def moved_px(reconstruction: Reconstruction) -> NDArray[np.float64]:
-    """(m,) about how far each photo's motion moves pixels within half a frame from the principal row."""
+    """(m,) approximate displacement of pixels by each photo's motion within half a frame from the principal row."""
     rec = reconstruction
     depth = np.linalg.norm(np.median(rec.points_w, axis=0) - rec.center_w, axis=1)
     angle = np.linalg.norm(rec.phi, axis=1) + np.linalg.norm(rec.velocity, axis=1) / depth
@@ -211,14 +211,14 @@ def read_along_other_axis(reconstruction: Reconstruction) -> Reconstruction:
 
 
 def _turns(rec: Reconstruction) -> NDArray[np.float64]:
-    """(m, k, 3) how each photo's camera is turned at some lines, radians."""
+    """(m, k, 3) rotation vectors of each photo's camera at some lines, radians."""
     motions = [rec.motion(i) for i in range(rec.num_images)]
     ranges = [rec.camera(i).clock_range for i in range(rec.num_images)]
     return np.stack([each.at(np.linspace(*of, WAVES))[0] for each, of in zip(motions, ranges, strict=True)])
 
 
 class _Fits:
-    """Models fitted to nine tenths of the measurements; the rest judges them."""
+    """Models fitted to nine tenths of the measurements and judged by the rest."""
 
     def __init__(
         self,
@@ -229,7 +229,7 @@ class _Fits:
         progress: Callable[[str, float], None] | None,
     ) -> None:
         fitted, held = hold_out(reconstruction, seed=seed)
-        # the gross outliers are gone: squares, and no closer than tells one model from the next
+        # gross outliers were dropped before: squares, and only as exact as the comparison of models requires
         self._rough = replace(
             options, outlier_rounds=0, spread_rounds=4, spread_tolerance=0.05, loss="squared", sigma_px=sigma_px,
             cost_tolerance=1e-5, max_iterations=_MOST_STEPS, lengths=(), deviations="model",
@@ -251,8 +251,8 @@ class _Fits:
             return self.done[label]
         step = None if self._progress is None else partial(self._progress, label)
         options = replace(self._rough, varying=varying, bends=bends, residual_field=residual_field)
-        # the motions given belong to the poses and the lens given: with those of another model they fit nothing. One
-        # that starts at the cheaper of the two never ends above the simpler one, which it holds as a case
+        # the given motions belong to the given poses and lens: with those of another model they do not fit. The cheaper
+        # start guarantees that a model never ends above the simpler one, which it contains
         cost = [objective(start, model, options) for start in starts]
         result = bundle_adjust(starts[int(np.argmin(cost))], model, options, step)
         found, spreads = result.reconstruction, Spreads(result.phi_sigma, result.velocity_sigma)
@@ -276,10 +276,10 @@ class _Fits:
         return other
 
     def agreement(self, fit: _Fit) -> float:
-        """Correlation over photos, axes and lines of the turns that two halves of the scene tell, each fitted alone.
+        """Correlation over photos, axes and lines of the rotations that two halves of the scene show, fitted alone.
 
-        Halves across the readout, so that both see all of it. What a lens leaves bends them differently; only about
-        their means, which a lens can share.
+        The scene is divided across the readout, so that both halves see all of it. A lens error bends them differently;
+        the means over the photos are subtracted, since a lens error can cause them.
         """
         rec = fit.reconstruction
         options = replace(self._rough, varying=fit.varying, bends=fit.bends, phi_sigma=fit.spreads.phi)
@@ -295,7 +295,7 @@ class _Fits:
         return float((one * other).sum() / scale) if scale > 0 else 0.0
 
     def waves(self, fit: _Fit, sites: int = WAVES, least_px: float = 0.0) -> bool:
-        """Whether each photo's lines would move beyond what a smooth warp of it says, by more than nothing.
+        """Whether free displacements of each photo's lines would remove significantly more than a smooth warp of it.
 
         And by more than `least_px`, root mean square.
         """
@@ -314,7 +314,7 @@ class _Fits:
         return agreement_of_waves(fit.reconstruction, self._sigma_px) >= _MIN_AGREEMENT
 
     def at_limit(self, fit: _Fit) -> bool:
-        """Whether the motions would be larger than what is known from elsewhere allows."""
+        """Whether the motions reach the limit that is known from elsewhere."""
         limits = [(fit.spreads.phi, self._rough.phi_sigma_most)]
         if fit.model == "constant-motion":
             limits.append((fit.spreads.velocity, self._rough.velocity_sigma_most))
@@ -325,15 +325,15 @@ class _Fits:
         return standard_errors(before.errors - after.errors, self._group)
 
     def is_better(self, before: _Fit, after: _Fit) -> bool:
-        """Whether that is more than chance, and more than nothing."""
+        """Whether that fall is significant in standard errors and as a share."""
         if not len(self.held_out):
             return False
         fall = float((before.errors - after.errors).mean())
         return self.gain(before, after) > _MIN_GAIN and fall > _MIN_FALL * float(before.errors.mean())
 
 
-class _Rungs:
-    """The best fit yet, from the one without a shutter: what was kept on the way, and what spoke against others."""
+class _Selection:
+    """The best fit so far, beginning without a shutter; the models that were kept, and reasons against others."""
 
     def __init__(self, fits: _Fits, best: _Fit, kept: list[str], gain: dict[str, float]) -> None:
         self._fits = fits
@@ -341,11 +341,11 @@ class _Rungs:
         self.kept, self.gain = kept, gain
         self.against: list[str] = []
 
-    def climb(self, fit: _Fit) -> None:
-        """Take a fit that is better, if it takes away more than a smooth warp of each photo would yet."""
+    def consider(self, fit: _Fit) -> None:
+        """Keep a fit that is better, if it removes more than a smooth warp of each photo would still remove."""
         fits, best = self._fits, self.best
         self.gain[fit.label] = fits.gain(best, fit)
-        # where the two do as well, the exact model of a turn is taken, not its approximation
+        # where both are equally good, the exact rotation is taken, not its approximation
         steady = fit.model == "rotation" and not fit.bends
         exact = best.model == "two-step" and steady and not fits.is_better(fit, best)
         if not exact and not fits.is_better(best, fit):
@@ -354,51 +354,51 @@ class _Rungs:
             self.best = fit
             self.kept.append(fit.label)
         else:
-            self.against.append(f"{fit.label} takes away less of what bends the photos than it leaves")
+            self.against.append(f"{fit.label} removes less of what bends the photos than it leaves")
 
     def bend(self, fit: _Fit) -> None:
-        """Try motions that are not steady beyond a fit, where something smooth is left, or lines would yet move."""
+        """Try unsteady motions after a fit, where something smooth is left, or lines would still move."""
         for bends in _BENDS:
             if bends <= fit.bends:
                 continue
-            # a vibration turns the whole line: what one half of the scene shows of it, the other shows as well
+            # a vibration rotates the whole line: both halves of the scene show it
             if (fit.is_explained or fit.bends >= _SMOOTH_BENDS) and not (
                 self._fits.waves(fit) and self._fits.waves_agree(fit)
             ):
                 return
             fit = self._fits.fit(fit.model, fit.varying, [fit.reconstruction], bends=bends)
-            self.climb(fit)
+            self.consider(fit)
 
 
 def choose_model(
     reconstruction: Reconstruction,
-    rungs: Sequence[str] = LADDER,
+    models: Sequence[str] = MODEL_SEQUENCE,
     options: BundleOptions | None = None,
     *,
     sigma_px: float,
     seed: int = 0,
     progress: Callable[[str, float], None] | None = None,
 ) -> ModelChoice:
-    """Fit models to nine tenths of the measurements, and keep those that foretell the rest better.
+    """Fit models to nine tenths of the measurements, and keep those that predict the rest better.
 
-    First a lens that varies from photo to photo, then the models of the shutter in order, so that these explain what no
-    lens does; then motions that are not steady, where the lines of the photos would yet move so. Better means: the mean
+    First a lens that varies from photo to photo is tried, then the shutter models in order, so that these explain what
+    no lens does; then unsteady motions, where the lines of the photos would still move. A model is better if the mean
     held-out error falls by more than two standard errors, measurements in the same part of the same photo counted once,
-    and by more than two hundredths. A model of the shutter must also take away more than a smooth warp of each photo
-    would yet, be better than itself read along the other axis (what bends photos for another reason can be taken for
-    either), and two halves of the scene must tell the same motions. Last, where something smooth is left, a field of
-    each camera is kept if it is better.
+    and by more than two hundredths. A shutter model must also remove more than a smooth warp of each photo would still
+    remove, and be better than itself read along the other axis (other causes that bend photos fit either axis), and two
+    halves of the scene must show the same motions. Last, where something smooth is left, a residual field of each
+    camera is kept if it is better.
 
     Parameters
     ----------
     reconstruction : Reconstruction
         Measurements without gross outliers, and a start.
-    rungs : sequence of str
-        Models in the order of the ladder, the first without a shutter.
+    models : sequence of str
+        Models in the order of the sequence, the first without a shutter.
     options : BundleOptions, optional
-        Of the fits, which are rough and of plain squares. Without refined intrinsics none vary either.
+        Of the fits, which are approximate and use squares. Without refined intrinsics none vary either.
     sigma_px : float
-        Noise of the measurements, as the last adjustment found it.
+        Noise of the measurements, as estimated by the last adjustment.
     seed : int
         Of the choice of measurements.
     progress : callable, optional
@@ -406,9 +406,9 @@ def choose_model(
     """
     options = options or BundleOptions()
     fits = _Fits(reconstruction, options, sigma_px, seed, progress)
-    climbed = _climbed(fits, rungs, bool(options.refine))
-    plain, best, kept, gain = climbed.plain, climbed.best, climbed.kept, climbed.gain
-    against, agreement = climbed.against, None
+    selection = _selected(fits, models, bool(options.refine))
+    plain, best, kept, gain = selection.plain, selection.best, selection.kept, selection.gain
+    against, agreement = selection.against, None
     if best is not plain:
         against = []
         if np.median(moved_px(best.reconstruction)) < _UNSEEN_PX:
@@ -425,7 +425,7 @@ def choose_model(
     if not len(fits.held_out):
         against.append("no point is seen by three photos, so no measurement could be held out to judge by")
     shutter = "found" if best is not plain else "not-determined" if against else "not-found"
-    # a warp of each photo alone is fitted to few measurements, and takes less away than one that all share
+    # a warp of each photo alone is fitted to few measurements, and removes less than one that all share
     if options.refine and len(fits.held_out) and best.left > _MOST_OF_IT * _MIN_FALL * float(best.errors.mean()):
         label = f"{best.label}{_FIELD}"
         field = fits.fit(best.model, best.varying, [best.reconstruction], label, best.bends, residual_field=True)
@@ -452,46 +452,46 @@ def choose_model(
     )
 
 
-def _climbed(fits: _Fits, rungs: Sequence[str], refines: bool) -> _Rungs:
-    """The models in order: a lens that varies, then those of the shutter, then motions that are not steady."""
+def _selected(fits: _Fits, models: Sequence[str], refines: bool) -> _Selection:
+    """The models in order: a lens that varies, then those of the shutter, then unsteady motions."""
     given = fits.given
-    first = plain = fits.fit(rungs[0], False, [given])
+    first = plain = fits.fit(models[0], False, [given])
     kept, gain = [first.label], dict[str, float]()
     if refines and not first.is_explained:
-        vary = fits.fit(rungs[0], True, [first.reconstruction])
+        vary = fits.fit(models[0], True, [first.reconstruction])
         gain[vary.label] = fits.gain(first, vary)
         if fits.is_better(first, vary):
             plain = vary
             kept.append(vary.label)
     last, varying = plain, plain.varying
-    if varying and "rotation" in rungs:
+    if varying and "rotation" in models:
         # where a shutter alone leaves less than half of what a varying lens does, the lens is not what bends the photos
         alone = fits.fit("rotation", False, [first.reconstruction, given])
         varying = not float(alone.errors.mean()) < _MOST_OF_IT * float(plain.errors.mean())
         last = last if varying else first
-    climbing = _Rungs(fits, plain, kept, gain)
-    for model in rungs[1:]:
-        if climbing.best.bends and climbing.best.is_explained:
+    selection = _Selection(fits, plain, kept, gain)
+    for model in models[1:]:
+        if selection.best.bends and selection.best.is_explained:
             break
-        last = fits.fit(model, varying, [last.reconstruction, given], bends=climbing.best.bends)
-        climbing.climb(last)
+        last = fits.fit(model, varying, [last.reconstruction, given], bends=selection.best.bends)
+        selection.consider(last)
         if SHUTTER_MODELS[model] >= SHUTTER_MODELS["rotation"]:
-            climbing.bend(last)
-            last = climbing.best if climbing.best.model == model else last
-    best = climbing.best
+            selection.bend(last)
+            last = selection.best if selection.best.model == model else last
+    best = selection.best
     if best.bends:
-        # a model that came later may explain what bends explained before it
+        # a later model may explain what bends explained before it
         steady = fits.fit(best.model, best.varying, [best.reconstruction, given])
         if not fits.is_better(steady, best):
-            climbing.best = steady
+            selection.best = steady
             kept.append(steady.label)
-    return climbing
+    return selection
 
 
 def _doubts(fits: _Fits, best: _Fit, plain: _Fit, gain: dict[str, float]) -> tuple[list[str], float | None]:
-    """What speaks against a shutter, for people, and how far two halves of the scene agree on its motions.
+    """Reasons against a shutter, for people, and the correlation of the motions of two halves of the scene.
 
-    One reason is enough, and the last ones take the longest to find.
+    One reason is enough, and the last ones take the longest to compute.
     """
     if fits.at_limit(best):
         return ["the exposure times allow less motion than they would need"], None
@@ -501,12 +501,12 @@ def _doubts(fits: _Fits, best: _Fit, plain: _Fit, gain: dict[str, float]) -> tup
         return ["a shutter that reads along the other axis explains the photos as well"], None
     agreement = fits.agreement(best)
     if agreement < _MIN_AGREEMENT:
-        return [f"two halves of the scene tell different motions (they agree to {agreement:.2f} of 1)"], agreement
+        return [f"two halves of the scene show different motions (correlation {agreement:.2f})"], agreement
     return [], agreement
 
 
 def _with_shared_lens(fits: _Fits, best: _Fit, gain: dict[str, float]) -> _Fit:
-    """A model of the shutter with one lens for all photos, or with one that varies, if that is better."""
+    """A shutter model with one lens for all photos, or with one that varies, if that is better."""
     shared, vary = (
         fits.fit(best.model, each, [best.reconstruction, fits.given], bends=best.bends) for each in (False, True)
     )

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ..model import ControlPoint, Observations, Reconstruction
 from ..model.reprojection import reprojection_residuals
-from .triangulate import revive_points
+from .triangulate import retriangulated
 
 __all__ = ["CONTROL_SIGMA_PX", "PlacedControl", "place_control", "with_control"]
 
@@ -73,7 +73,7 @@ def with_control(reconstruction: Reconstruction, points: Sequence[ControlPoint],
             np.concatenate([obs.sigma, np.full(len(rows), sigma)]),
         ),
     )
-    found = revive_points(joined, rec.shutter_model, from_afar=True).points_w
+    found = retriangulated(joined, rec.shutter_model, from_afar=True).points_w
     return replace(joined, points_w=np.concatenate([rec.points_w, found[rec.num_points :]]))
 
 

@@ -33,10 +33,10 @@ _OF_LENS = {"pinhole": ("k1", "k2", "p1", "p2", "k3"), "fisheye": ("k1", "k2", "
 
 @dataclass(frozen=True)
 class GuessedCameras:
-    """What was believed of the cameras before the photos were looked at: a prior on the intrinsics that are refined.
+    """Prior on the intrinsics that are refined, from what is known of the cameras before the photos.
 
-    Its tails are heavy (`prior_weight`): a calibration that the photos contradict by many standard deviations is given
-    up for what they say.
+    Its tails are heavy (`prior_weight`): a calibration that the photos contradict by many standard deviations yields to
+    them.
 
     Parameters
     ----------
@@ -74,8 +74,8 @@ class GuessedCameras:
         return found
 
 
-# Square of the deviation where the priors on intrinsics bend: normal near the middle, but what lies far off pulls no
-# harder than what lies three deviations off.
+# Square of the deviation where the priors on intrinsics become robust: normal near the middle, but large deviations
+# pull no harder than three standard deviations.
 _TAIL = 9.0
 
 

@@ -1,4 +1,4 @@
-"""How uncertain a solution is by its own residuals, where measurements go wrong together.
+"""Standard deviations of a solution from its own residuals, with correlated measurements.
 
 What lens, scene or shutter model leave out bends neighbouring measurements alike, so that they tell less than as many
 independent ones, whose covariance is the inverse of the Hessian H. The infinitesimal delete-a-group jackknife (Jaeckel,

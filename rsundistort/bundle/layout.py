@@ -13,12 +13,17 @@ from ..model import BEND_GROUPS, SHUTTER_MODELS, Bend, Reconstruction
 from ..model.bend import bend_functions, bend_pieces, splines_at
 from .options import BundleOptions
 
-__all__ = ["Layout"]
+__all__ = ["Layout", "motion_end"]
 
-# Sites where bends are known from elsewhere: twice as dense as those of the finest group.
+# Sites of known bends: twice as dense as those of the finest group.
 _KNOWN_SITES = 2 * list(BEND_GROUPS.values())[-1][0] + 1
-# Groups of bends that positions have, too: what vibrates faster than that turns, but hardly travels.
+# Groups of bends that positions have, too: faster vibration rotates the camera, but hardly displaces it.
 _WAYS = 2
+
+
+def motion_end(shutter_model: str) -> int:
+    """Unknowns of a photo's pose and steady motion: 6, 9 or 12."""
+    return {"global": 6, "constant-motion": 12}.get(shutter_model, 9)
 
 
 @dataclass(frozen=True)
@@ -51,7 +56,7 @@ class Layout:
     @classmethod
     def of(cls, shutter_model: str, options: BundleOptions) -> Layout:
         """That of a model."""
-        motion = {"global": 6, "constant-motion": 12}.get(shutter_model, 9)
+        motion = motion_end(shutter_model)
         exact = SHUTTER_MODELS[shutter_model] >= SHUTTER_MODELS["rotation"]
         functions, group = bend_functions(options.bends) if exact and options.bends else (np.zeros((0, 0)), ())
         known = {name: _at_sites(bend, _KNOWN_SITES) for name, bend in options.known_bends.items() if exact}

@@ -13,14 +13,14 @@ from ..model.known_length import End
 
 __all__ = ["LengthResiduals", "check_lengths", "scale_of_lengths"]
 
-# A point whose measurement lies so near to where the user pointed is the one meant, pixels.
+# Largest distance of a point's measurement from where the user pointed, pixels.
 _REACH_PX = 5.0
 
 
 def check_lengths(lengths: Sequence[KnownLength]) -> tuple[KnownLength, ...]:
-    """The lengths, refused if there is one alone: it tells the scale of the world, which changes no photo."""
+    """The lengths, refused if there is only one: it determines the scale of the world, which changes no photo."""
     if len(lengths) == 1:
-        raise InputError("one known length tells the scale of the world only; give two, or a height and a width")
+        raise InputError("one known length determines only the scale of the world; give two, or a height and a width")
     return tuple(lengths)
 
 

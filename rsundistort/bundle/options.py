@@ -1,4 +1,4 @@
-"""What a bundle adjustment can be told, and what it answers."""
+"""Options and result of a bundle adjustment."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .places import KnownPlaces
 
 __all__ = ["DEVIATIONS", "LOSSES", "BundleOptions", "BundleResult"]
 
-#: What standard deviations are read off: the model of independent noise, or the residuals.
+#: Source of the standard deviations: the residuals, or the model of independent noise.
 DEVIATIONS = ("jackknife", "model")
 
 #: Robust losses and their codes in the kernels.
@@ -43,108 +43,108 @@ class BundleOptions:
     Parameters
     ----------
     max_iterations : int
-        At most this many steps are tried in one solve.
+        Largest number of steps in one solve.
     cost_tolerance : float
         Stop when a step lowers the cost by less than `cost_tolerance * cost`. The cost is about the number of
         observations, and half a unit of it is one standard deviation of one unknown.
     round_tolerance : float
-        The same for the solves before the last outlier round, which only have to tell outliers from the rest, and for
-        the first one if it starts from a guess of the spreads.
+        The same for the solves before the last outlier round, which only separate outliers from the rest, and for the
+        first one if it starts from a guess of the prior standard deviations.
     step_tolerance : float
         Stop when every centre and point moves by less than `step_tolerance` times the scene's size, and every
         angle by less than `step_tolerance` radians.
     initial_damping, max_damping : float
         Levenberg-Marquardt damping, times the diagonal of the normal equations; above the largest, stop.
     loss : {"soft-l1", "huber", "cauchy", "squared"}
-        Robust loss of an observation. Where the outliers are gone the noise of features still has heavy tails: squares
-        of the same measurements give motions that are wrong by 1.1 to 1.4 times as much.
+        Robust loss of an observation. Even without outliers the noise of features has heavy tails: with squares the
+        same measurements give motions that are wrong by 1.1 to 1.4 times as much.
     loss_scale : float
-        Residual length, in standard deviations of the noise, where the loss starts to bend.
+        Residual length, in standard deviations of the noise, beyond which the loss grows more slowly.
     sigma_px : float or None
-        Standard deviation of the measurements in pixels, which weighs them against the priors. None: read off
-        the residuals, robustly, before each solve (never below `min_sigma_px`).
+        Standard deviation of the measurements in pixels, which weighs them against the priors. None: estimated from the
+        residuals, robustly, before each solve (never below `min_sigma_px`).
     min_sigma_px : float
-        Lower limit of that reading.
+        Lower limit of that estimate.
     phi_sigma : float or None
         Standard deviation of the zero-mean prior on each component of phi, in radians per frame. None: estimated with
-        the solution (empirical Bayes, `sigma^2 <- mean(phi^2 + posterior variance of phi)` after each solve), so that
-        a shutter that can hardly be seen is not fitted to noise.
+        the solution (empirical Bayes, `sigma^2 <- mean(phi^2 + posterior variance of phi)` after each solve), so that a
+        shutter that is hardly observable is not fitted to noise.
     phi_sigma_start : float
-        Where that estimate starts; about what a swung hand does.
+        Start of that estimate; about the rotation of a swung hand.
     velocity_sigma, velocity_sigma_start : float or None, float
         The same for each component of the velocity of the constant-motion model, in baselines per frame (a baseline is
         the mean distance of consecutive centres).
     phi_sigma_most, velocity_sigma_most : float or None
-        Upper limits of the two spreads, where something else than the measurements says how far cameras can have moved.
+        Upper limits of the two prior standard deviations, known from another source than the measurements.
     phi_limits : mapping of photo name to float
-        The same of single photos: their prior is no wider than this (radians per frame), and that on their velocity no
-        wider than what displaces their scene, at its median depth, as such a turn does. They tell nothing of the spread
-        of the others.
+        The same for single photos: their prior is no wider than this (radians per frame), and that on their velocity no
+        wider than what displaces their scene, at its median depth, as much. They do not affect the prior of the others.
     varying : bool
         Whether the intrinsics of each photo may differ from its camera's: log f, as a focusing lens changes it, and the
-        principal point, as a stabiliser moves it, each with a zero-mean prior whose spread is estimated.
+        principal point, as a stabiliser moves it, each with a zero-mean prior whose standard deviation is estimated.
     bends : int
-        How many groups of `model.BEND_GROUPS` the motions may depart from steady ones by, 0 to 5, under models that are
-        exact: in their rotation, and of constant-motion by the first two groups in their position. Each group has a
-        zero-mean prior whose spread is estimated, so that what is not there vanishes.
+        Number of groups of `model.BEND_GROUPS` in unsteady motions, 0 to 5, for exact models: in their rotation, and
+        for constant-motion with the first two groups in their position. Each group has a zero-mean prior whose standard
+        deviation is estimated, so that groups that are not needed vanish.
     bend_sigma_start, way_sigma_start : float
-        Where these estimates start: root mean square over the frame, in radians (or of each group), and in baselines.
+        Start of these estimates: root mean square over the frame, in radians (or for each group), and in baselines.
     focal_sigma_start, centre_sigma_start : float
-        Where these estimates start: of log f, and of the principal point in focal lengths.
+        Start of these estimates: of log f, and of the principal point in focal lengths.
     residual_field : bool
-        Whether what the lens models leave is solved for, too: a smooth field of each camera (`Camera.field`) without
-        mean, orthogonal to what the intrinsics express, with a zero-mean prior whose spread is estimated.
+        Whether a residual field of each camera is estimated (`Camera.field`): smooth, without mean, orthogonal to the
+        effect of the intrinsics, with a zero-mean prior whose standard deviation is estimated.
     field_sigma_start : float
-        Where that estimate starts, pixels: of each of some twenty orthogonal fields, root mean square over the frame.
+        Start of that estimate, pixels: of each of some twenty orthogonal fields, root mean square over the frame.
     spread_rounds : int
-        At most this many more solves settle the spreads, until neither changes by more than `spread_tolerance`.
+        Largest number of further solves until no prior standard deviation changes by more than `spread_tolerance`.
     spread_tolerance : float
-        See `spread_rounds`; a share.
+        Largest relative change, see `spread_rounds`.
     outlier_rounds : int
-        Times that observations further than `outlier_sigma` standard deviations are dropped and all is solved again.
+        Number of times that observations farther than `outlier_sigma` standard deviations are dropped and all is solved
+        again.
     outlier_sigma : float
         See `outlier_rounds`.
     min_outlier_px : float
         No observation nearer than this to its prediction is dropped.
     held_phi : mapping of photo name to component indices
-        Hard anchors: components of phi held at zero, e.g. {"0001.jpg": (0,)} is the paper's RS*.
+        Hard constraints: components of phi held at zero, e.g. {"0001.jpg": (0,)} is the paper's RS*.
     known_phi : mapping of photo name to (phi, sigma)
         Motions that are known from elsewhere, each with its standard deviation, (3,) radians per frame; components of
-        infinite sigma are unknown. A soft anchor is a known phi of zero.
+        infinite sigma are unknown. A known phi of zero is a soft constraint.
     known_bends : mapping of photo name to Bend
-        How motions depart from steady ones, where that is known from elsewhere, such as a gyroscope
+        Deviations of motions from steady ones that are known from elsewhere, such as a gyroscope
         (`io.bends_from_gyro`). The start and the end of each are those of the frame.
     still : mapping of photo name to float
-        Photos that did not move but for so many radians per frame (one standard deviation; 0: not at all). Models
-        without a velocity hold their phi1 near zero (the paper's remedy; the measurements tell the rest),
-        constant-motion the whole motion: the velocity to the way that displaces what the photo shows, at its median
-        depth, as the angle does.
+        Photos that did not move by more than this angle per frame in radians (one standard deviation; 0: not at all).
+        Models without a velocity hold their phi1 near zero (the paper's remedy; the measurements determine the rest),
+        constant-motion the whole motion: the velocity up to a translation that displaces the photo's content, at its
+        median depth, as the angle does.
     lengths : sequence of KnownLength
         Known lengths in the scene, two or more: their ratios are residuals.
     places : KnownPlaces, optional
-        Where photos were taken and control points are, in the frame of the reconstruction. Three or more hold it, in
-        the place of the photo that does otherwise; fewer say nothing.
+        Positions of photos and control points, in the frame of the reconstruction. Three or more determine the gauge,
+        in place of the fixed photo; fewer are ignored.
     refine : tuple of str
-        Intrinsics of each camera that are solved for with the rest: some of f (or fx, fy), cx, cy, k1, k2, p1, p2, k3;
-        of a fisheye k1 to k4.
+        Intrinsics of each camera that are estimated: some of f (or fx, fy), cx, cy, k1, k2, p1, p2, k3; for a fisheye
+        k1 to k4.
     guessed : GuessedCameras, optional
-        Prior on these intrinsics; without it they follow the photos alone.
+        Prior on these intrinsics; without it they depend on the photos alone.
     factor_limit : float or None
         Reduced systems whose factorisation takes at most this many multiply-adds are factored, others are solved by
-        preconditioned conjugate gradients. None: what is expected to take less time, judged by the multiply-adds of
+        preconditioned conjugate gradients. None: the method that is expected to take less time, by the multiply-adds of
         the one and the bytes of the other.
     cg_tolerance : float
         Conjugate gradients stop when the residual, in the norm of the preconditioner, falls below `cg_tolerance` times
         the solution, in the norm of the matrix: a step then lacks about the square of it of its decrease of the cost.
     deviations : {"jackknife", "model"}
-        How noisy measurements are taken to be together: "model" as independent ones, each as `sigma_px` says;
-        "jackknife" as residuals show that pull together, in corners of the scene and of the lens. By that the
-        covariances are larger (never smaller than of "model"), and the measurements weigh less against the priors once
-        outliers are gone: the false motion that a lens or a scene leaves does not stand against a prior of mean zero.
+        Noise model of the standard deviations: "model" takes measurements as independent, with `sigma_px`; "jackknife"
+        estimates the correlation of residuals in regions of the scene and of the lens. With the latter the covariances
+        are larger (never smaller than with "model"), and the measurements weigh less against the priors once outliers
+        are dropped: a false motion caused by a lens or a scene yields to a prior of mean zero.
     path : FramePath, optional
-        Frames of a video share one trajectory: neighbours are joined by a prior of white noise on acceleration, phi and
-        velocity are the trajectory's rates times the time that the readout takes, which is solved for. Only
-        constant-motion; takes the place of the priors on phi and velocity.
+        Frames of a video share one trajectory: a prior of white noise on acceleration connects neighbours, phi and
+        velocity are the trajectory's rates times the readout time, which is estimated. For constant-motion only;
+        replaces the priors on phi and velocity.
     """
 
     max_iterations: int = 100
@@ -214,22 +214,11 @@ class BundleOptions:
         if self.deviations not in DEVIATIONS:
             raise InputError(f"deviations={self.deviations!r}, expected one of {', '.join(DEVIATIONS)}")
         positive = (
-            "cost_tolerance",
-            "round_tolerance",
-            "step_tolerance",
-            "initial_damping",
-            "loss_scale",
-            "min_sigma_px",
-            "phi_sigma_start",
-            "velocity_sigma_start",
-            "way_sigma_start",
-            "focal_sigma_start",
-            "centre_sigma_start",
-            "field_sigma_start",
-            "spread_tolerance",
-            "cg_tolerance",
-        )
-        for name in (*positive, "outlier_sigma", "max_damping"):
+            "cost_tolerance", "round_tolerance", "step_tolerance", "initial_damping", "max_damping", "loss_scale",
+            "min_sigma_px", "phi_sigma_start", "velocity_sigma_start", "way_sigma_start", "focal_sigma_start",
+            "centre_sigma_start", "field_sigma_start", "spread_tolerance", "outlier_sigma", "cg_tolerance",
+        )  # fmt: skip
+        for name in positive:
             if not getattr(self, name) > 0:
                 raise InputError(f"{name}={getattr(self, name)!r}, expected a positive number")
         if self.sigma_px is not None and not self.sigma_px > 0:
@@ -246,7 +235,7 @@ class BundleOptions:
         if self.path is not None and self.places:
             raise InputError("the path of a video is solved for in a frame of its own; it takes no known places")
         if self.path is not None and (self.known_phi or self.still or self.held_phi):
-            raise InputError("the path of a video says how its frames move; it takes no anchors, but known rates")
+            raise InputError("the path of a video says how its frames move; it takes known rates, but no known motions")
         if self.max_iterations < 1 or self.outlier_rounds < 0 or self.spread_rounds < 0:
             raise InputError("max_iterations must be at least 1, outlier_rounds and spread_rounds at least 0")
 
@@ -258,7 +247,7 @@ class BundleResult:
     Attributes
     ----------
     reconstruction : Reconstruction
-        The estimate; observations that were dropped as outliers, and points left without two photos, are gone.
+        The estimate, without the observations that were dropped as outliers, and points left without two photos.
     stop_reason : str
         "cost", "step" (converged), "iterations" (ran out) or "damping" (no step lowers the cost any more).
     cost_history : (k,) array
@@ -279,27 +268,27 @@ class BundleResult:
         Those of the positions' bends, baselines.
     covariances : (m, nb, nb) array
         Covariance of each photo's unknowns, the rest being free: rotation (left, radians, camera frame), centre, phi,
-        velocity, as far as the model has them (nb = 6, 9 or 12). The gauge is that of the solve: the photo with the
-        most observations has its pose held, and the centre farthest from it one coordinate; 0 where held.
+        velocity, as far as the model has them (nb = 6, 9 or 12). The gauge is that of the solve: the pose of the photo
+        with the most observations and one coordinate of the centre farthest from it are fixed; 0 where fixed.
     sigma_intrinsics : tuple of dict of name to float
         Standard deviation of each camera's refined intrinsics, in pixels, or as the lens coefficients.
     rms_px : float
-        Root mean square of the residuals' x and y parts.
+        Root mean square of the x and y components of the residuals.
     num_outliers : int
         Observations dropped.
     inflation : (unknowns of a photo,) array
-        How many times larger than of independent measurements the noise's share of the deviations of each kind of
-        unknown is (`BundleOptions.deviations`), 1 or more. The covariances have it in them.
+        Factor (1 or more) by which the standard deviations of each kind of unknown due to noise are larger than with
+        independent noise (`BundleOptions.deviations`). The covariances include it.
     noise_factor : float
         One such factor for all: times `sigma_px` it is the noise that weighed the measurements against the priors.
     field_sigma_px : float
-        Standard deviation of the prior on the unknowns of the cameras' residual fields; 0 where none was solved for.
+        Standard deviation of the prior on the unknowns of the cameras' residual fields; 0 if none was estimated.
     sigma_fields_px : tuple of float
-        Standard deviation of each camera's field, root mean square over its frame; 0 where none was solved for.
+        Standard deviation of each camera's field, root mean square over its frame; 0 if none was estimated.
     path : PathSolution or None
-        The path, of frames that have one.
+        The path of the frames of a video, if they have one.
     path_sigmas : tuple of float
-        The spreads of its prior, of turn and of travel, as `PathPrior` takes them.
+        Standard deviations of its prior, of rotation and of translation, as `PathPrior` takes them.
     """
 
     reconstruction: Reconstruction
@@ -325,7 +314,7 @@ class BundleResult:
     path_sigmas: tuple[float, ...] = ()
 
     def of_photos(self, keep: NDArray[np.bool_]) -> BundleResult:
-        """The same of some photos (m,) only, with the points that two of them show."""
+        """The same for some photos (m,) only, with the points that two of them show."""
         return replace(self, reconstruction=self.reconstruction.take_photos(keep), covariances=self.covariances[keep])
 
     @property
@@ -344,5 +333,5 @@ class BundleResult:
 
     @property
     def converged(self) -> bool:
-        """Whether the last solve ended because nothing was left to gain."""
+        """Whether the last solve converged."""
         return self.stop_reason in ("cost", "step", "damping")

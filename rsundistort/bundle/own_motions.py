@@ -1,4 +1,4 @@
-"""What each frame of a video says of its own pose and turn, were it on no path."""
+"""Pose and rotation of each frame of a video from its own measurements, without a path."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _NOISE_PX, _LEAST_NOISE_PX = 1.0, 0.02
 
 @dataclass(frozen=True)
 class OwnMotions:
-    """Poses and turns of frames, each by its own measurements; NaN where these do not tell.
+    """Poses and rotations of frames, each by its own measurements; NaN where these do not determine them.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class OwnMotions:
     phi : (m, 3) array
         Radians per unit of the clock.
     sigma_turn, sigma_phi : (m, 3) array
-        Standard deviations of both, by what the fits leave.
+        Standard deviations of both, by the residuals of the fits.
     """
 
     R_cw: Array
@@ -46,11 +46,11 @@ class OwnMotions:
 
 
 def own_motions(reconstruction: Reconstruction, *, turns_only: bool = False) -> OwnMotions:
-    """The turn of each frame while it is read, and its pose, by what it shows of points that all frames place.
+    """The rotation of each frame during its readout, and its pose, from points that all frames determine.
 
-    Frames are fitted to the points, and these to the frames, in turns and with a robust loss. Nothing joins the frames
-    but their points, and no prior says what they move by, so that frames whose shutters and poses do not belong
-    together are fitted as well as any others. The velocities of the reconstruction are held.
+    Frames are fitted to the points, and the points to the frames, alternately and with a robust loss. Only their points
+    connect the frames, and no prior constrains their motion, so that frames whose shutters and poses contradict each
+    other are fitted as well as any others. The velocities of the reconstruction are fixed.
 
     Parameters
     ----------

@@ -327,7 +327,7 @@ def of_motions(covariances: Array, with_pace: Array, pace_sigma: Array, state: P
 
 
 def orthogonal(reconstruction: Reconstruction) -> Reconstruction:
-    """The same motions, told as those of the nearest steady ones and bends, and the poses that go with these."""
+    """The same motions as the nearest steady ones and bends, and the poses that belong to these."""
     R_cw, center_w, motions = reconstruction.R_cw.copy(), reconstruction.center_w.copy(), []
     for i in range(reconstruction.num_images):
         start, end = reconstruction.bend_clock[i]

@@ -1,4 +1,4 @@
-"""Places known from elsewhere: where photos were taken, by GPS, and where points on the ground are."""
+"""Known positions: of photos, by GPS, and of points on the ground."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class KnownPlaces:
 
 
 def point_of(reconstruction: Reconstruction, control: ControlPoint) -> int | None:
-    """The point of a reconstruction that a control point is, by a measurement of it that is still believed."""
+    """The point of a reconstruction of a control point, by a measurement that is no outlier."""
     obs = reconstruction.observations
     for name, xy in control.seen.items():
         if name in reconstruction.image_names:

@@ -16,7 +16,7 @@ __all__ = ["CLIP", "WAVES", "agreement_of_waves", "errors_without", "half_across
 
 Functions = Callable[[Reconstruction, Observations], NDArray[np.float64]]
 
-# Longer residuals, in standard deviations, count as this: a wrong match tells nothing about the shutter.
+# Longer residuals, in standard deviations, count as this: a wrong match says nothing about the shutter.
 CLIP = 5.0
 # What a photo's residuals have in common is sought among polynomials of this degree in x and y, whatever bent it.
 _DEGREE = 3

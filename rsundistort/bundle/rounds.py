@@ -1,4 +1,4 @@
-"""The solves of an adjustment that follow each other: outliers drop out, spreads and noise settle."""
+"""Successive solves of an adjustment: outliers are dropped, prior standard deviations and noise converge."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from .path import (
 from .problem import BundleProblem
 from .solver import minimize
 from .spreads import estimated, field_spread, path_spreads, settled, starting_spreads
-from .triangulate import revive_points
+from .triangulate import retriangulated
 
 __all__ = ["Rounds"]
 
-# The factor of the noise is settled if it changes by less than this share.
+# The factor of the noise has converged if it changes by less than this share.
 _SETTLED_NOISE = 0.1
-# The bends of a path are settled if they change by less, radians: a twentieth of a pixel at any focal length in use.
+# The bends of a path have converged if they change by less, radians: a twentieth of a pixel at any focal length in use.
 _SETTLED_BEND = 2e-5
 
 
@@ -59,10 +59,10 @@ def _believed(reconstruction: Reconstruction, options: BundleOptions, sigma: flo
 
 
 def _check_solvable(reconstruction: Reconstruction, shutter_model: str, path: FramePath | None) -> None:
-    """Refuse what has no answer: too few photos for a shutter, and photos without parallax."""
+    """Refuse problems without a solution: too few photos for a shutter, and photos without parallax."""
     m = reconstruction.num_images
     if shutter_model != "global" and m < 3 and path is None:
-        raise InputError(f"{m} photos cannot tell the shutter from the scene; at least three are needed")
+        raise InputError(f"{m} photos cannot separate the shutter from the scene; at least three are needed")
     if path is not None and path.turns_only:
         return
     if m > 1 and not np.linalg.norm(np.ptp(reconstruction.center_w, axis=0)) > 1e-9 * reconstruction.size:
@@ -81,7 +81,7 @@ def _sigma_intrinsics(
 
 
 class Rounds:
-    """Solves of one adjustment, each with what the one before says of outliers, spreads and noise.
+    """Solves of one adjustment, each with outliers, prior standard deviations and noise from the one before.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ class Rounds:
         if base.num_points:
             _check_solvable(base, shutter_model, options.path)
         self._turns_only = options.path is not None and options.path.turns_only
-        self._base = base if self._turns_only else revive_points(base, shutter_model, from_afar=True)
+        self._base = base if self._turns_only else retriangulated(base, shutter_model, from_afar=True)
         self._keep = np.ones(len(self._base.observations), bool)
         self._sigma_px = options.sigma_px or _noise_px(self._base, shutter_model, options.min_sigma_px)
         self._baseline = reconstruction.baseline
@@ -162,10 +162,10 @@ class Rounds:
             self._spreads = replace(self._spreads, field=field)
         if state.path is not None:
             self._follow_path(problem, equations)
-        self._revived = self._current if self._turns_only else revive_points(self._current, self._model)
+        self._new_points = self._current if self._turns_only else retriangulated(self._current, self._model)
 
     def _follow_path(self, problem: BundleProblem, equations: NormalEquations) -> None:
-        """Bend the motions of the next solve as the path of this one bends, and settle its spreads."""
+        """Bend the motions of the next solve as the path of this one, and update its prior standard deviations."""
         state, options = self._solved.state, self._options
         assert options.path is not None
         residuals, variances = equations.coupling_variances()
@@ -186,7 +186,7 @@ class Rounds:
         self._layout = Layout.of(self._model, self._options)
 
     def drop_outliers(self) -> None:
-        """Believe, from the next solve on, what lies as near to the last as its noise allows."""
+        """Keep in the next solve the measurements near to the last within their noise."""
         options = self._options
         self._sigma_px = options.sigma_px or _noise_px(self._current, self._model, options.min_sigma_px)
         self.begin_next()
@@ -198,13 +198,13 @@ class Rounds:
 
     @property
     def are_settled(self) -> bool:
-        """Whether the last solve says of spreads and noise what it was weighed with."""
+        """Whether prior standard deviations and noise by the last solve are those that it was weighed with."""
         options = self._options
         awaits_tails = (
             options.deviations == "jackknife" and options.guessed is not None and len(options.refine) > 0
         ) and not self._had_heavy_tails
         return (
-            self._revived is self._current
+            self._new_points is self._current
             and settled(self._weighed_spreads, self._spreads, options.spread_tolerance)
             and abs(self._noise - self._weighed_noise) < _SETTLED_NOISE * self._noise
             and not awaits_tails
@@ -216,7 +216,7 @@ class Rounds:
         if with_same_weights:
             self._spreads, self._noise = self._weighed_spreads, self._weighed_noise
             self._heavy_tails = self._had_heavy_tails
-        self._base = replace(self._revived, observations=self._base.observations)
+        self._base = replace(self._new_points, observations=self._base.observations)
 
     def result(self) -> BundleResult:
         """What the last solve found."""

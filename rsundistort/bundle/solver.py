@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt; it knows nothing about cameras."""
+"""Levenberg-Marquardt, independent of cameras."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 __all__ = ["LinearSystem", "MinimizeResult", "Problem", "minimize"]
 
-# Steps that keep less than this share of the decrease that they promised have met a bend of the valley.
+# Steps that achieve less than this share of the predicted decrease have met a bend of the valley.
 _GOOD_STEP = 0.8
 
 
@@ -28,7 +28,7 @@ class Problem(Protocol):
     """What is minimised."""
 
     def linearize(self, state: Any, spent: Any = None) -> LinearSystem:
-        """Normal equations and cost at a state; they may be written over those of `spent`, which nobody needs."""
+        """Normal equations and cost at a state; they may be written over those of `spent`, no longer needed."""
 
     def retract(self, state: Any, step: Any) -> Any:
         """The state after a step."""
@@ -37,7 +37,7 @@ class Problem(Protocol):
         """The cost of a state."""
 
     def settle(self, state: Any) -> Any:
-        """A state of lower cost that is found in less time than a step takes, for steps that went astray."""
+        """A state of lower cost, found in less time than a step takes, for steps that the model predicted badly."""
 
     def step_size(self, state: Any, step: Any) -> float:
         """Largest change of an unknown in natural units (radians, scene sizes)."""
@@ -65,11 +65,11 @@ def minimize(
     max_damping: float,
     progress: Callable[[float], None] | None = None,
 ) -> MinimizeResult:
-    """Lower a problem's cost until nothing is left to gain.
+    """Minimise a problem's cost.
 
-    Damping after H. B. Nielsen: the better the quadratic model foretold the decrease, the more damping falls. A step
-    that the model foretold badly is settled before it is judged (Jeong et al., "Pushing the envelope of modern methods
-    for bundle adjustment", 2012, do so with every step): narrow views need half the steps.
+    Damping after H. B. Nielsen: the better the quadratic model predicted the decrease, the more damping falls. A step
+    whose decrease was predicted badly is settled before it is judged (Jeong et al., "Pushing the envelope of modern
+    methods for bundle adjustment", 2012, do so with every step): narrow views need half the steps.
     """
     system = problem.linearize(state)
     cost = system.cost

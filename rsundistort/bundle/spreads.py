@@ -1,4 +1,4 @@
-"""Spreads of the priors on what each photo has of its own, as the photos themselves show them."""
+"""Prior standard deviations of the unknowns of each photo, estimated from the photos."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Spreads", "estimated", "estimates_spreads", "field_spread", "path_sp
 
 # Radians per frame: a hundredth of a pixel at any focal length in use. Keeps the prior's weight finite.
 _MIN_SPREAD = 1e-6
-# Spreads below this (radians, focal lengths) need not settle: a tenth of a pixel.
+# Prior standard deviations below this (radians, focal lengths) need not converge: a tenth of a pixel.
 _SETTLED_AT = 2e-5
 # The same of the fields, which are in pixels.
 _MIN_SPREAD_PX, _SETTLED_PX = 1e-4, 1e-3
@@ -71,9 +71,9 @@ def _spread(
 ) -> float:
     """Spread over photos and axes, per frame, of unknowns (m, 3) per unit of the clock with posterior variances (m, 3).
 
-    `spread` is that of the prior under which they were found. Values beyond three robust spreads count as three: a few
-    photos that moved far more, or that hang on by few measurements, must not loosen the prior of the rest. Held values
-    tell nothing.
+    `spread` is that of the prior under which they were found. Values beyond three robust standard deviations count as
+    three: a few photos that moved far more, or that few measurements connect, must not widen the prior of the rest.
+    Fixed values are left out.
     """
     free = variance > 0
     if not free.any():
@@ -92,7 +92,7 @@ def estimated(
     spreads: Spreads, current: Reconstruction, covariances: NDArray[np.float64], options: BundleOptions,
     layout: Layout, baseline: float,
 ) -> Spreads:  # fmt: skip
-    """The spreads of both priors that a solution shows; those that were given stay."""
+    """Estimates of both prior standard deviations from a solution; given ones stay."""
     variances = np.diagonal(covariances, axis1=1, axis2=2)
     if not np.isfinite(variances).all():
         return spreads
@@ -117,7 +117,7 @@ def estimated(
 def _bend_spreads(
     spreads: Spreads, current: Reconstruction, variances: NDArray[np.float64], layout: Layout
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """The spreads of the groups of bends, of rotations and of positions."""
+    """Prior standard deviations of the groups of bends, of rotations and of positions."""
     ones, found = np.ones(current.num_images), layout.coefficients(current)
     turns = 3 * len(layout.group)
 
@@ -133,7 +133,7 @@ def _bend_spreads(
 
 
 def estimates_spreads(shutter_model: str, options: BundleOptions) -> bool:
-    """Whether a spread is to be estimated."""
+    """Whether a prior standard deviation is estimated."""
     of_turn = shutter_model != "global" and options.phi_sigma is None
     of_way = shutter_model == "constant-motion" and options.velocity_sigma is None
     return (
@@ -142,7 +142,7 @@ def estimates_spreads(shutter_model: str, options: BundleOptions) -> bool:
 
 
 def settled(before: Spreads, after: Spreads, tolerance: float) -> bool:
-    """Whether no spread changed by more than a share; what is as good as nothing may go on falling."""
+    """Whether no prior standard deviation changed by more than a share; negligible ones may keep falling."""
     of_bends = (_SETTLED_AT,) * len(before.bends), (0.0,) * len(before.ways)
     none = Spreads(_SETTLED_AT, 0.0, _SETTLED_AT, _SETTLED_AT, *of_bends, _SETTLED_PX, (0.0,) * len(before.path))
     return all(
@@ -188,7 +188,7 @@ def path_spreads(
 ) -> tuple[float, ...]:
     """Spreads of a path by its residuals (q, 18) and their posterior variances, as `_spread`.
 
-    Of few frames, which hardly tell them, they are drawn to those of a hand.
+    With few frames, which hardly determine them, they are drawn to those of a hand.
     """
     squares, unknown = (prior.unit_squares(each) for each in (residuals**2, variances))
     ones, found = np.ones(len(residuals)), []

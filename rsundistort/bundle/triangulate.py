@@ -1,4 +1,4 @@
-"""Points placed anew that lie where no photo can see them, or at infinity."""
+"""New triangulation of points where no photo can see them, or at infinity."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..model import Reconstruction
 from ..model.projection import clock_of, unproject_points
 from ..model.reprojection import reprojection_residuals
 
-__all__ = ["revive_points"]
+__all__ = ["retriangulated"]
 
 # Rays that do not meet ahead of the cameras are taken to meet this many sizes of the scene away: so near that they pull
 # (at 50 sizes the way back takes five times as many steps).
@@ -38,7 +38,7 @@ def _world_rays(
     return centers, rays / np.linalg.norm(rays, axis=1, keepdims=True), valid
 
 
-def revive_points(reconstruction: Reconstruction, shutter_model: str, from_afar: bool = False) -> Reconstruction:
+def retriangulated(reconstruction: Reconstruction, shutter_model: str, from_afar: bool = False) -> Reconstruction:
     """The reconstruction with points triangulated anew that no adjustment could bring back.
 
     A measurement that cannot be seen (its point is behind the camera) has no derivative, and a point that ran off to

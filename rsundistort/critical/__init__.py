@@ -1,4 +1,4 @@
-"""Critical motions: the meter, what they cost in a solution, and their remedies."""
+"""Critical motions: the degeneracy measure, their cost in a solution, and remedies."""
 
 from .advice import Advice, advise, advise_poses
 from .common import CommonMotion, clock_contrast, common_motion

@@ -1,4 +1,4 @@
-"""What to photograph at the next shoot, and what it would gain for the cameras at hand."""
+"""What to photograph at the next shoot, and its gain for the given cameras."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .meter import critical_motion
 __all__ = ["Advice", "advise", "advise_poses"]
 
 _TILT_DEG = 20.0
-# A photo of the advice sees what a photo at hand sees, if at least this many points stay in it.
+# An advised photo sees what a given photo sees, if at least this many points stay in it.
 _MIN_POINTS = 20
 
 
@@ -31,11 +31,11 @@ class Advice:
     what : str
         In words.
     meter : float
-        Smallest singular value of the meter with them.
+        Smallest singular value of the degeneracy measure with them.
     sigma_log_k : float or None
-        Standard deviation of the height of the scene with them; None where only poses are known.
+        Standard deviation of the height of the scene with them; None if only poses are known.
     shift_px : float or None
-        Displacement of the rectified photos, as of `CommonMotion`, that is left with them; None where the model has no
+        Remaining displacement of the rectified photos with them, as of `CommonMotion`; None if the model has no
         velocity.
     """
 
@@ -56,9 +56,9 @@ class Advice:
 def _candidates(
     R_cw: NDArray[np.float64], center_w: NDArray[np.float64], pivots: NDArray[np.float64]
 ) -> list[tuple[str, list[tuple[int, NDArray[np.float64], NDArray[np.float64]]]]]:
-    """What could be added: words, and the photos as (photo that it repeats, R_cw, center_w).
+    """Photos that could be added: words, and the photos as (photo that it repeats, R_cw, center_w).
 
-    Tilted photos are taken from above or below, turned about the `pivots` (m, 3), what the photos look at.
+    Tilted photos are taken from above or below, rotated about the `pivots` (m, 3), what the photos look at.
     """
     m = len(R_cw)
     middle = int(np.argmin(np.linalg.norm(center_w - center_w.mean(0), axis=1)))
@@ -71,7 +71,7 @@ def _candidates(
         tilted.append((i, R, pivots[i] - R.T @ ahead))
     count = {1: "one photo", 2: "two photos", 3: "three photos"}[len(tilted)]
     return [
-        ("one photo more, turned by 90 degrees", [(middle, rolled, center_w[middle])]),
+        ("one photo more, rotated by 90 degrees", [(middle, rolled, center_w[middle])]),
         (f"{count} more, tilted up or down by {_TILT_DEG:.0f} degrees", tilted),
     ]
 
@@ -80,7 +80,7 @@ def advise_poses(
     R_cw: NDArray[np.float64], center_w: NDArray[np.float64], readout: Sequence[str]
 ) -> list[Advice]:  # fmt: skip
     """Advice from poses alone, (m, 3, 3) and (m, 3), with the readout of each; see `advise`."""
-    # the scene is as far away as the cameras are apart
+    # the distance of the scene is taken as that of the cameras
     distance = np.linalg.norm(center_w - center_w.mean(0), axis=1).max(initial=0.0) or 1.0
     pivots = center_w + distance * R_cw[:, 2]
     found = []
@@ -93,10 +93,10 @@ def advise_poses(
 
 
 def advise(result: BundleResult, options: BundleOptions | None = None) -> list[Advice]:
-    """What a photo turned by 90 degrees, or a few tilted by 20, would gain for the cameras at hand.
+    """The gain of a photo rotated by 90 degrees, or of a few tilted by 20, for the given cameras.
 
-    The views are added to the solution: each repeats a photo, turned, with those of its points that stay in it,
-    measured as well as the others, and with a motion as unknown as theirs.
+    The views are added to the solution: each repeats a photo, rotated, with those of its points that stay in it,
+    measured as well as the others, and with an equally unknown motion.
     """
     rec = result.reconstruction
     obs = rec.observations
@@ -106,7 +106,7 @@ def advise(result: BundleResult, options: BundleOptions | None = None) -> list[A
             for mine in obs.by_photo(rec.num_images)
         ]
     )
-    # views that are imagined have no residuals: theirs are taken to go together as those at hand do
+    # added views have no residuals: their correlation is taken as that of the given ones
     plain = replace(options or BundleOptions(), deviations="model")
     worse = shape_cost(result, options).sigma_log_k / shape_cost(result, plain).sigma_log_k
     found = []
@@ -126,7 +126,7 @@ def advise(result: BundleResult, options: BundleOptions | None = None) -> list[A
 def _with_view(
     rec: Reconstruction, like: int, R_cw: NDArray[np.float64], center_w: NDArray[np.float64]
 ) -> Reconstruction:
-    """The reconstruction with one photo more, of points that another photo sees; unchanged if it sees too few."""
+    """The reconstruction with one more photo of points that another photo sees; unchanged if it sees too few."""
     obs = rec.observations
     camera = rec.camera(like)
     mine = np.flatnonzero(obs.frame_idx == like)

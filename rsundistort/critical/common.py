@@ -1,4 +1,4 @@
-"""What of the motions all photos share, and no measurement tells well: nodding against rising, and the like."""
+"""Motions that all photos share and that measurements hardly determine: nodding against rising, and the like."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ __all__ = ["CommonMotion", "clock_contrast", "common_motion", "row_phi"]
 
 Array = NDArray[np.float64]
 
-# Above this contrast of the clocks photos tell a common motion as they tell others; as the meter's limit.
+# Above this contrast of the clocks photos determine a common motion as well as others; as the limit of the measure.
 _LOW = 0.15
-# Half a pixel from the first row to the last, root mean square: below this there is nothing to mend.
+# Half a pixel from the first row to the last, root mean square: less needs no remedy.
 _SMALL_PX = 0.5 / np.sqrt(12.0)
 # Of a photo's axes right, down and ahead.
 _TURNS, _WAYS = ("nodding", "panning", "rolling"), ("going sideways", "rising", "going ahead")
-# Directions that are sought together; the weakest comes out the sooner.
+# Directions that are searched together; the weakest converges sooner.
 _BLOCK = 4
 _MOST_STEPS = 100
 
 
 @dataclass(frozen=True)
 class CommonMotion:
-    """How well the part of the motions is known that the photos share.
+    """Uncertainty of the part of the motions that the photos share.
 
     Motions are in each photo's row frame: phi1, phi2 and phi3 of the paper in radians per frame, then, if the model has
     it, the velocity across the readout, along it and ahead in baselines per frame (k = 3 or 6).
@@ -39,12 +39,11 @@ class CommonMotion:
     covariance : (k, k) array
         Of the mean of the motions over the photos.
     weakest : (m, k) array
-        One standard deviation of the change of motions that displaces the rectified photos most for how badly it is
-        known.
+        One standard deviation of the change of motions whose uncertainty displaces the rectified photos most.
     shift_px : float
-        By how much, root mean square over all measurements.
+        Its displacement, root mean square over all measurements.
     shares : (k,) array
-        Displacement by each component of it alone, as a share of all of them.
+        Displacement by each of its components alone, as a share of all of them.
     contrast : float
         As of `clock_contrast`.
     by_column : bool
@@ -77,7 +76,7 @@ class CommonMotion:
         return value
 
     def as_json(self) -> dict[str, Any]:
-        """What `solution.json` says of it."""
+        """Its content of `solution.json`."""
         return {
             "sigma_phi_rad_per_frame": self.sigma[:3].tolist(),
             "sigma_velocity_baselines_per_frame": self.sigma[3:].tolist(),
@@ -91,12 +90,12 @@ class CommonMotion:
 
     @property
     def is_hidden(self) -> bool:
-        """Whether the photos' clocks hardly differ: what turns and travels with all photos is told by little else."""
+        """Whether the photos' clocks hardly differ, so that little else determines a common motion."""
         return self.of_travel and self.contrast < _LOW
 
     @property
     def is_weak(self) -> bool:
-        """Whether a common motion is hidden, and it costs something here."""
+        """Whether a common motion is hidden, and its uncertainty matters here."""
         return self.is_hidden and not self.shift_px <= _SMALL_PX
 
     @property
@@ -114,7 +113,7 @@ class CommonMotion:
         if not self.of_travel:
             return f"{_TURNS[swap[turn]]} is known worst: {left}"
         way = int(np.argmax(self.shares[3:]))
-        told = "can hardly be told apart" if self.is_weak else "are told apart worst"
+        told = "can hardly be distinguished" if self.is_weak else "are distinguished worst"
         return f"{_TURNS[swap[turn]]} and {_WAYS[swap[way]]} {told}: {left}"
 
 
@@ -145,7 +144,7 @@ def _row_motion(rec: Reconstruction, nb: int) -> tuple[Array, Array]:
 
 
 def common_motion(result: BundleResult, options: BundleOptions | None = None) -> CommonMotion:
-    """How well the part of the motions is known that the photos share, from the covariance of a solution.
+    """Uncertainty of the part of the motions that the photos share, from the covariance of a solution.
 
     Parameters
     ----------
@@ -197,13 +196,13 @@ def common_motion(result: BundleResult, options: BundleOptions | None = None) ->
 
 
 def clock_contrast(reconstruction: Reconstruction) -> float:
-    """How differently photos time the same points: 0 where a motion that all photos share leaves no trace in them.
+    """Difference of the clocks of the same points: 0 where a motion that all photos share leaves no trace in them.
 
-    A motion of the world during the readout that is the same in all photos moves a point by its clock in each. If
-    these are one clock of the point but for an offset and a factor of each photo, the offset is a change of the photo's
+    A motion of the world during the readout that is the same in all photos moves a point by its clock in each. If these
+    are one clock of the point except for an offset and a factor of each photo, the offset is a change of the photo's
     pose, the factor one of its motion, and the rest a change of the scene's shape (docs/critical-motions.md). This is
-    what is left, root mean square, of the clocks within the photos when the best such clocks are taken out: between 0
-    and 1, and about the share of a motion of its own that a photo shows of a common one.
+    the root mean square of the clocks within the photos that is left when the best such clocks are subtracted: between
+    0 and 1, and about the share of a motion of its own that a photo shows of a common one.
     """
     from scipy.sparse import coo_array, diags_array  # late: few need it
 

@@ -1,4 +1,4 @@
-"""What the weakest change of shape costs in a solution at hand."""
+"""The cost of the weakest change of shape in a given solution."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .meter import CriticalMotion, critical_motion, readout_axes
 
 __all__ = ["ShapeCost", "shape_cost"]
 
-# Below this standard deviation of log k there is nothing to mend: half a pixel over a thousand rows.
+# Below this standard deviation of log k no remedy is needed: half a pixel over a thousand rows.
 _SMALL = 0.0005
 
 _MAX_POWER_STEPS = 200
@@ -23,22 +23,22 @@ _MAX_POWER_STEPS = 200
 
 @dataclass(frozen=True)
 class ShapeCost:
-    """How uncertain the shape of a solution is.
+    """Uncertainty of the shape of a solution.
 
     Attributes
     ----------
     sigma_log_k : float
-        Standard deviation of the logarithm of the scene's scale along the mean axis of readout, against the other two:
-        the points' own, all photos' motions being unknown.
+        Standard deviation of the logarithm of the scene's scale along the mean readout axis, against the other two:
+        that of the points, all photos' motions being unknown.
     weakest_sigma : float
-        Standard deviation along the weakest mode of the whole system: the unit vector over all photos' unknowns that is
-        known worst, among those that are no motion of the world. Rotations and phi in radians, lengths in baselines.
+        Standard deviation along the weakest mode of the whole system: the unit vector over all photos' unknowns with
+        the largest variance, other than motions of the world. Rotations and phi in radians, lengths in baselines.
     weakest_share : float
-        How much of that mode is the vertical scale: square of the correlation of the two, 0 to 1.
+        Share of the vertical scale in that mode: square of the correlation of the two, 0 to 1.
     meter : CriticalMotion
         Of the solution's poses.
     common : CommonMotion
-        How well the part of the motions is known that the photos share.
+        Uncertainty of the part of the motions that the photos share.
     """
 
     sigma_log_k: float
@@ -49,7 +49,7 @@ class ShapeCost:
 
     @property
     def is_flagged(self) -> bool:
-        """Whether the poses are nearly critical, and it costs something here."""
+        """Whether the poses are nearly critical, and this matters here."""
         return self.meter.is_low and not self.sigma_log_k <= _SMALL
 
     @property
@@ -67,16 +67,16 @@ class ShapeCost:
         if not self.is_flagged:
             return said
         if self.meter.num_photos < 3:
-            return f"{said}, because two photos never tell the shutter from the shape"
+            return f"{said}, because two photos never separate the shutter from the shape"
         if self.meter.y_axis_spread_deg < 1:
             return f"{said}, because all cameras were held level"
         if self.meter.y_axis_spread_deg < 15:
             return f"{said}, because all cameras were held nearly level"
-        return f"{said}, because the cameras were not turned against each other"
+        return f"{said}, because the cameras were not rotated against each other"
 
 
 def _uncertainty(reconstruction: Reconstruction) -> NDArray[np.float64]:
-    """(n,) how badly each point is known along its worst direction, in units of a ray's angle times its length.
+    """(n,) uncertainty of each point along its worst direction, in units of a ray's angle times its length.
 
     Large where all who see a point stand in one place, as two copies of a photo do.
     """
@@ -111,14 +111,14 @@ def _log_scale(reconstruction: Reconstruction) -> NDArray[np.float64]:
 
 
 def shape_cost(result: BundleResult, options: BundleOptions | None = None) -> ShapeCost:
-    """How uncertain the shape of a solution is, from its covariance and its poses.
+    """Uncertainty of the shape of a solution, from its covariance and its poses.
 
     Parameters
     ----------
     result : BundleResult
         Of a model with a shutter.
     options : BundleOptions, optional
-        Of the adjustment: its anchors, known motions and refined intrinsics count.
+        Of the adjustment: its constraints, known motions and refined intrinsics count.
 
     Raises
     ------
@@ -138,7 +138,7 @@ def shape_cost(result: BundleResult, options: BundleOptions | None = None) -> Sh
     def free(x: NDArray[np.float64]) -> NDArray[np.float64]:
         return (x.ravel() - basis @ (basis.T @ x.ravel())).reshape(with_photos.shape)
 
-    # power iterations with the covariance in the gauge of least spread: P C P, P projecting off motions of the world
+    # power iterations with the covariance in the gauge of least variance: P C P, P projecting off motions of the world
     x = free(with_photos / unit)
     value = 0.0
     for _ in range(_MAX_POWER_STEPS):

@@ -1,4 +1,4 @@
-"""Which camera motions leave the shutter undetermined: the meter, from poses alone."""
+"""The degeneracy measure: which camera motions leave the shutter undetermined, from poses alone."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..model.checks import check_finite, check_rotations, frozen
 
 __all__ = ["CriticalMotion", "critical_motion", "readout_axes"]
 
-# Singular values below this mean nothing but rounding; below `_LOW` the shutter is poorly determined.
+# Singular values below this are rounding; below `_LOW` the shutter is poorly determined.
 _ZERO = 1e-6
 _LOW = 0.15
 
@@ -24,7 +24,7 @@ _EXCHANGE = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]])
 
 @dataclass(frozen=True)
 class CriticalMotion:
-    """How well a set of poses determines the shutter's first-order effect, skew and aspect ratio.
+    """How well a set of poses determines the shutter's first-order effect, skew and aspect ratio: degeneracy measure.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class CriticalMotion:
 
     @property
     def value(self) -> float:
-        """Smallest singular value: 0 where something is hidden entirely, 0.5 and more for photos turned at will."""
+        """Smallest singular value: 0 where something is hidden entirely, 0.5 and more for photos rotated freely."""
         return float(self.singular_values[-1])
 
     @property
@@ -67,14 +67,14 @@ class CriticalMotion:
     def meaning(self) -> str:
         """What is confounded, in words."""
         if self.num_photos < 3:
-            return "too few photos: two never tell the shutter from the shape of the scene"
+            return "too few photos: two never separate the shutter from the shape of the scene"
         if not self.is_low:
-            return "nothing: the photos are turned enough against each other"
+            return "nothing: the photos are rotated enough against each other"
         ds, da = np.abs(self.null_vector[:2])
         affine = float(np.hypot(ds, da))
         second, first = self.singular_values[3:]
         if affine > 0.9 and second < max(2 * first, _ZERO):
-            return "the scene's skew and aspect ratio: the photos are not turned against each other"
+            return "the scene's skew and aspect ratio: the photos are not rotated against each other"
         if da > 0.9:
             return "the scene's vertical scale: the y axes of the photos are nearly parallel"
         if affine > 0.9:
@@ -112,10 +112,10 @@ def critical_motion(
 ) -> CriticalMotion:
     """How well poses determine the shutter: the singular values of the linearised self-calibration.
 
-    To first order a turning rolling-shutter camera is one whose skew and aspect ratio are unknown in every photo (Ito
+    To first order a rotating rolling-shutter camera is one whose skew and aspect ratio are unknown in every photo (Ito
     and Okatani, Eq. 9). What is then known of each photo, focal length and principal point, gives three equations for
-    the reference photo's skew and aspect ratio and the plane at infinity (their Eqs. 15 and 18, linearised where the
-    camera stands still); `docs/critical-motions.md` derives them.
+    the reference photo's skew and aspect ratio and the plane at infinity (their Eqs. 15 and 18, linearised at a camera
+    without motion); `docs/critical-motions.md` derives them.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What heals a critical motion: a photo that did not move, found by evidence, or named by the user and checked."""
+"""Remedies of a critical motion: a photo that did not move, found by evidence, or named by the user and checked."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from .cost import ShapeCost, shape_cost
 
 __all__ = ["REMEDIES", "Remedy", "contradictions", "heal", "still_probability", "with_remedy"]
 
-#: What can be done about a critical motion. `prior` is the zero-mean prior on phi, whose spread is estimated.
+#: Remedies. `prior` is the zero-mean prior on phi, whose standard deviation is estimated.
 REMEDIES = ("auto", "prior", "none")
 
-# What is left of the motion of a photo that was taken firmly, radians per frame: a pixel or so.
+# Remaining motion of a photo with a firmly held camera, radians per frame: a pixel or so.
 _STILL = 1e-3
-# Share of photos that are still, before anything is known of them.
+# Prior probability that a photo is still.
 _SHARE = 0.1
 # Standard deviation of phi, radians per frame, that stands for no prior.
 _NONE = 10.0
-# A photo whose stillness is less likely than this contradicts who says that it was still.
+# A still photo is contradicted if its stillness is less likely than this.
 _UNLIKELY = 0.01
 # One from the first row to the last, root mean square.
 _PIXEL = 1.0 / np.sqrt(12.0)
@@ -32,20 +32,20 @@ _PIXEL = 1.0 / np.sqrt(12.0)
 
 @dataclass(frozen=True)
 class Remedy:
-    """What was done about a critical motion, and what it left.
+    """The remedy of a critical motion, and its effect.
 
     Attributes
     ----------
     name : str
-        "none needed" (or none possible: the covariance cannot be computed), "anchor" (a photo taken to be still),
-        "prior" (no photo stands out, or none was asked for), "given" (anchors, motions or lengths that the user knows),
-        "path" (frames of a video, whose path says how they move), or "none" (switched off).
+        "none needed" (or none possible: the covariance cannot be computed), "anchor" (a photo taken as still), "prior"
+        (no photo stands out, or none was wanted), "given" (constraints, motions or lengths of the user), "path" (frames
+        of a video, whose path determines how they move), or "none" (switched off).
     anchors : dict of photo name to float
-        Photos taken to be still, as in `BundleOptions.still`, with the standard deviation, radians per frame.
+        Photos taken as still, as in `BundleOptions.still`, with the standard deviation, radians per frame.
     before, after : ShapeCost
-        Of the solutions without and with it.
+        Cost of the solutions without and with it.
     warnings : tuple of str
-        Anchors that the evidence contradicts, and what stays in doubt by a pixel.
+        Constraints that the evidence contradicts, and uncertainties of a pixel and more.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Remedy:
 
     @property
     def sentence(self) -> str:
-        """For people: what was done and why, and the uncertainty left."""
+        """For people: the remedy and its reason, and the remaining uncertainty."""
         left = self.after.sentence
         if self.name == "none needed":
             return left
@@ -72,7 +72,7 @@ class Remedy:
             "anchor": f"{names} most likely did not move and {holds} ({was} without it); {left}",
             "prior": f"no photo is taken to be still, the motions to be zero in the mean; {left}",
             "given": f"with what is known of {names or 'lengths in the scene'}, {left}",
-            "path": f"the path of the video tells how its frames moved; {left}",
+            "path": f"the path of the video determines how its frames moved; {left}",
             "none": left,
         }[self.name]
 
@@ -87,19 +87,18 @@ def with_remedy(options: BundleOptions, remedy: str) -> BundleOptions:
 def _freed(
     result: BundleResult, options: BundleOptions | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
-    """Motions (m, k) and their covariances if no photo were taken to be still."""
+    """Motions (m, k) and their covariances if no photo is taken as still."""
     free = replace(options or BundleOptions(), still={}, held_phi={})
     return Posterior(result, free).motions()
 
 
 def still_probability(result: BundleResult, options: BundleOptions | None = None) -> NDArray[np.float64]:
-    """(m,) probability that each photo did not move, from what all others leave open of its motion.
+    """(m,) probability that each photo did not move, from what all others leave undetermined of its motion.
 
-    Either the photo was still (its motion is zero but for 1 mrad per frame, and for the way that displaces what it
-    shows as much), as one in ten is, or it moved like the rest (zero mean; the robust spread of phi2 and phi3, and that
-    of the prior on the velocity). Each is a prior on its motion in the place of the one that it was adjusted with; that
-    under which the measurements are likelier is the likelier. No other photo is taken to be still, whatever the options
-    say.
+    Either the photo was still (zero motion, up to 1 mrad per frame and the translation that displaces as much), as one
+    in ten is, or it moved like the rest (zero mean; the robust standard deviation of phi2 and phi3, and the prior one
+    of the velocity). Each is a prior on its motion in place of the one it was adjusted with; the likelier one is that
+    under which the measurements are likelier. No other photo is taken as still, whatever the options say.
 
     Parameters
     ----------
@@ -144,7 +143,7 @@ def still_probability(result: BundleResult, options: BundleOptions | None = None
 
 
 def contradictions(result: BundleResult, options: BundleOptions, names: Collection[str]) -> tuple[str, ...]:
-    """Warnings on photos said to be still of which the measurements say that they moved."""
+    """Warnings on photos that were specified as still, if the measurements show that they moved."""
     if not names:
         return ()
     rec = result.reconstruction
@@ -158,31 +157,31 @@ def contradictions(result: BundleResult, options: BundleOptions, names: Collecti
         if probability[i] < _UNLIKELY:
             turn = np.degrees(np.linalg.norm(motion[i, components[i, 1:]]) * span[i])
             found.append(
-                f"{name} is said to have been still, but it turned by {turn:.2f} degrees about its other axes "
+                f"{name} was specified as still, but it rotated by {turn:.2f} degrees about its other axes "
                 "during the readout; the scene's height is only as right as that"
             )
     return tuple(found)
 
 
 def heal(result: BundleResult, options: BundleOptions, remedy: str = "auto") -> tuple[BundleResult, Remedy]:
-    """Find out what a solution's shape is worth, and mend it where it is in doubt.
+    """Measure the uncertainty of a solution's shape, and apply a remedy if it is large.
 
     Parameters
     ----------
     result : BundleResult
         Of a model with a shutter, adjusted with `options`.
     options : BundleOptions
-        Its anchors and known motions are the user's: nothing is added to them.
+        Its constraints and known motions are the user's: nothing is added to them.
     remedy : {"auto", "prior", "none"}
-        "auto": nothing where the poses are not critical, or the height of the scene is known to 0.05 % all the same,
-        and turning is told from travelling to half a pixel; else the photo that most likely did not move becomes a
-        soft anchor, with the standard deviation that the evidence supports, beside the prior. "prior" leaves it at the
-        prior, "none" at what the solution was.
+        "auto": nothing if the poses are not critical, or the height of the scene is known to 0.05 % nevertheless, and
+        rotation is distinguished from translation to half a pixel; else the photo that most likely did not move gets a
+        soft constraint, with the standard deviation that the evidence supports, beside the prior. "prior" leaves it at
+        the prior, "none" at what the solution was.
 
     Returns
     -------
     BundleResult, Remedy
-        The solution, adjusted again if an anchor was added.
+        The solution, adjusted again if a constraint was added.
     """
     if remedy not in REMEDIES:
         raise InputError(f"remedy {remedy!r}, expected one of {', '.join(REMEDIES)}")
@@ -211,10 +210,10 @@ def heal(result: BundleResult, options: BundleOptions, remedy: str = "auto") -> 
 
 
 def _anchor_sigma(result: BundleResult, image: int, probability: float) -> float:
-    """Standard deviation, radians per frame, of an anchor that counts for what a photo's probable stillness does.
+    """Standard deviation, radians per frame, of a constraint with the weight of a photo's probable stillness.
 
-    The estimate is to be the mean of both cases, p times that of a still photo and 1 - p times the one at hand. An
-    anchor of variance s on a value known to a variance C draws it by C / (C + s), and by p C / (C + still) if s is
+    The estimate should be the mean of both cases, p times that of a still photo and 1 - p times the given one. A
+    constraint of variance s on a value known to a variance C draws it by C / (C + s), and by p C / (C + still) if s is
     still / p + C (1 - p) / p.
     """
     rec = result.reconstruction
@@ -238,7 +237,7 @@ def _again(result: BundleResult, options: BundleOptions) -> BundleResult:
 
 
 def _warnings(cost: ShapeCost) -> tuple[str, ...]:
-    """What is to be said of a common motion that displaces the rectified photos by a pixel over the frame."""
+    """Warning of a common motion that displaces the rectified photos by a pixel over the frame."""
     if not (cost.common.is_weak and cost.common.shift_px > _PIXEL):
         return ()
-    return (f"{cost.common.sentence}; a photo that is known not to have moved (--still) would tell",)
+    return (f"{cost.common.sentence}; a photo that is known not to have moved (--still) would resolve it",)

@@ -64,7 +64,7 @@ def compare_paths(still: Solution, with_model: Solution, without: Solution) -> P
     names = sorted(posed[0] & posed[1] & posed[2])
     if len(names) < 3:
         raise InputError(
-            f"{len(names)} photos were joined in all three reconstructions, expected at least three "
+            f"{len(names)} photos were registered in all three reconstructions, expected at least three "
             f"({len(posed[0])} still, {len(posed[1])} swung, {len(posed[2])} swung without a shutter model)"
         )
 
@@ -77,7 +77,7 @@ def compare_paths(still: Solution, with_model: Solution, without: Solution) -> P
     baseline = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).mean())
     # normalized reconstructions have baselines around 1; below this nothing but rounding is left
     if not baseline > 1e-12:
-        raise InputError("the photos taken still were all taken from one place; their path tells nothing")
+        raise InputError("the photos taken still were all taken from one place; they show no path")
     still_w = centers / baseline
     centers_w, position, rotation = {}, {}, {}
     for key, solution in (("with", only(with_model)), ("without", only(without))):

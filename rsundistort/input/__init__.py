@@ -1,4 +1,4 @@
-"""What a run is given: photos or frames, their cameras, times of readout, gyroscopes, and which photos to pair."""
+"""Input of a run: photos or frames, their cameras, readout times, gyroscopes, and the pairs to match."""
 
 from .gyroscope import GyroOptions
 

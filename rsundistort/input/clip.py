@@ -1,4 +1,4 @@
-"""A video as one clip: its key frames as photos, and when every frame was taken."""
+"""A video as one clip: its key frames as photos, and the times of all frames."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ from ..sfm.flow import KeyFrameChooser, flow_size
 
 __all__ = ["Clip", "greys_of", "read_clip"]
 
-# A clip has this many key frames at least, if it has as many frames: what moved little is still seen from its ends.
+# Smallest number of key frames of a clip, if it has as many frames: content that moved little is still seen from its
+# ends.
 _LEAST_KEYS = 8
-# Grey levels of a frame that shows nothing.
+# Standard deviation in grey levels of a frame that shows nothing.
 _DARK = 2.0
 _INTERLACED = (
     "{0} is interlaced: each frame holds two moments, which are on no path; write it anew first: "
     'ffmpeg -i "{0}" -vf bwdif=mode=send_frame -crf 12 -c:a copy deinterlaced.mp4'
 )
-# Longer than this many of the usual steps between frames, and the recording paused.
+# A recording paused if a step between frames is longer than this many usual ones.
 _PAUSE = 20.0
 
 
@@ -40,21 +41,21 @@ class Clip:
     folder : Path
         Where its key frames lie, as PNG files.
     numbers : tuple of int, length n
-        Of the frames among those that could be decoded; what shows nothing is left out.
+        Indices of the frames among those that could be decoded; frames that show nothing are left out.
     names : tuple of str, length n
         Of all frames, also of those that were not written.
     time_s : (n,) array
-        When each was taken, by the container's time stamps; seconds since the first.
+        Time of each, by the container's time stamps; seconds since the first.
     frame_s : float
         The usual time from one frame to the next.
     part : (n,) int array
-        Which frames go on from each other: a cut, or a pause of the recording, begins a new part.
+        Parts of continuous frames: a cut, or a pause of the recording, begins a new part.
     keys : (k,) int array
         The key frames.
     moved_px : (n - 1,) array
-        How far the picture moved to the next frame, the median; NaN over a cut.
+        Median motion of the content to the next frame; NaN over a cut.
     frames : VideoFrames
-        What else is known of them, and of the camera.
+        Further facts about them, and about the camera.
     """
 
     video: Path
@@ -74,7 +75,7 @@ class Clip:
         return tuple(self.names[k] for k in self.keys.tolist())
 
     def facts(self) -> dict[str, Any]:
-        """What `solution.json` says of it."""
+        """Its content of `solution.json`."""
         return {
             "key_frames": len(self.keys),
             "frame_s": self.frame_s,
@@ -83,7 +84,7 @@ class Clip:
 
 
 def _grey(picture: Any) -> NDArray[np.uint8]:
-    """A frame as it is followed: grey, and shrunk if it is large."""
+    """A frame for the flow: grey, and reduced if it is large."""
     width, height = flow_size(picture.width, picture.height)
     if (width, height) == (picture.width, picture.height):
         return np.ascontiguousarray(picture.to_ndarray(format="gray"))
@@ -91,7 +92,7 @@ def _grey(picture: Any) -> NDArray[np.uint8]:
 
 
 def greys_of(clip: Clip, wanted: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Frames of a clip, by their places in it (ascending), as they are followed; one in memory at a time."""
+    """Frames of a clip, by index (ascending), for the flow; one in memory at a time."""
     number_of = {clip.numbers[k]: k for k in wanted}
     with VideoReader(clip.video) as reader:
         for number, _, picture in reader:
@@ -102,7 +103,7 @@ def greys_of(clip: Clip, wanted: Sequence[int]) -> Iterator[tuple[int, NDArray[n
 
 
 def read_clip(video: Path, folder: Path, progress: Callable[[int, int], None] | None = None) -> Clip:
-    """Choose the key frames of a video by how far the picture moved and how sharp they are, and write these.
+    """Choose the key frames of a video by motion of the content and sharpness, and write them.
 
     Parameters
     ----------
@@ -170,12 +171,12 @@ def _write(video: Path, folder: Path, sharpness: Mapping[int, float]) -> VideoFr
 
 
 def _between(num_frames: int, num_keys: int) -> Iterable[int]:
-    """More key frames, spread evenly, where the picture hardly moved."""
+    """More key frames, spread evenly, where the content hardly moved."""
     if num_keys >= _LEAST_KEYS:
         return ()
     return np.linspace(0, num_frames - 1, min(_LEAST_KEYS, num_frames)).round().astype(int).tolist()
 
 
 def _ends(breaks: set[int]) -> Iterable[int]:
-    """The frames on both sides of a break: no path leads beyond them."""
+    """The frames on both sides of a break: no path leads across it."""
     return (k - side for k in breaks for side in (0, 1))

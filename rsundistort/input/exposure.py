@@ -1,4 +1,4 @@
-"""What the exposure time says of the motion: a photo that is sharp did not move far while its shutter was open."""
+"""Bound on the motion by the exposure time: a sharp photo did not move far during its exposure."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from .load import LoadedPhotos
 
 __all__ = ["bounded_by_exposure"]
 
-# Of cameras that the table of readout times lacks: the slowest that are in use.
+# Readout time of cameras that the table lacks: the slowest in use.
 _LONGEST_READOUT_S = 0.05
 
 
 def bounded_by_exposure(
     options: BundleOptions, reconstruction: Reconstruction, photos: LoadedPhotos, readout_s: Mapping[int, float]
 ) -> BundleOptions:
-    """Options whose priors on the motion are bounded by the exposure: of each photo that was exposed for long.
+    """Options whose priors on the motion are bounded by the exposure of each photo that was exposed for long.
 
-    Where all were, the spreads of all are bounded, too, by the one that may have moved most.
+    If all were, the prior standard deviations of all are bounded, too, by the photo that may have moved most.
 
-    The picture of a photo whose steepest edges are b pixels wide moved by about b at most while it was exposed, so by b
-    times readout / exposure during the readout: an angle of that over the focal length, or a way of that times the
-    distance of the scene over the focal length.
+    The content of a photo whose steepest edges are b pixels wide moved by about b at most during the exposure, so by b
+    times readout / exposure during the readout: an angle of that over the focal length, or a translation of that times
+    the distance of the scene over the focal length.
 
     Parameters
     ----------
     options : BundleOptions
         Of the adjustments.
     reconstruction : Reconstruction
-        The photos that were joined, and how far away the scene is.
+        The registered photos, and the distance of the scene.
     photos : LoadedPhotos
-        What their EXIF says, and how sharp they are.
+        Their EXIF, and their sharpness.
     readout_s : mapping of camera to float
         Readout times that are known.
     """

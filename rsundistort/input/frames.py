@@ -16,7 +16,7 @@ __all__ = ["PhotoSource", "find_photos"]
 
 @dataclass(frozen=True)
 class PhotoSource:
-    """Where the photos of a run are.
+    """The place of a run's photos.
 
     Attributes
     ----------
@@ -27,7 +27,7 @@ class PhotoSource:
     frames : VideoFrames or None
         Of the video, if they are frames of one.
     video : dict or None
-        What `solution.json` says of it.
+        Its content of `solution.json`.
     clip : Clip or None
         The video, if its frames are to share one path.
     """
@@ -42,7 +42,7 @@ class PhotoSource:
 def find_photos(
     photos: Path, scratch: Path, camera: str | None, every: int | None, sharpest: int | None, log: StageLog
 ) -> PhotoSource:
-    """A folder as it is; of a video, frames in `scratch/frames`, with the `camera.json` that lies beside the video.
+    """A folder as it is; for a video, frames in `scratch/frames`, with the `camera.json` beside the video.
 
     Frames that neither `every` nor `sharpest` chooses are the key frames of one clip.
     """

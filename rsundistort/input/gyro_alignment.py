@@ -1,15 +1,14 @@
-"""Where a gyroscope lies in the camera, and when its clock shows what: found from the video alone.
+"""Axes and clock of a gyroscope relative to the camera, from the video alone.
 
-Between two frames that were taken a time dt apart the world turns in the camera by `turn` (`Exp(turn) R_cw` is the
-second orientation): the camera's mean rate about its own axes is `-turn / dt`. A gyroscope that is fixed to the camera
-measures `omega` about its axes, with a zero-rate offset (bias), by a clock of its own:
+Between two frames a time dt apart the world rotates in the camera frame by `turn` (`Exp(turn) R_cw` is the second
+orientation): the camera's mean rate about its own axes is `-turn / dt`. A gyroscope that is fixed to the camera
+measures `omega` about its axes, with a zero-rate offset (bias), on a clock of its own:
 
     -turn / dt = s R (mean of omega over the same time, moved by the offset of the clocks - bias) + noise
 
 R takes the gyroscope's axes to the camera's. s is 1 for the true focal length; rotations from a wrong one are too large
-or too small by what it is wrong. The offset is looked for by the correlation that the best R at each offset reaches (a
-Procrustes problem, in closed form); all unknowns are then refined together, with a loss that leaves false rotations
-out.
+or too small by its error. The offset is searched for by the correlation that the best R at each offset reaches (a
+Procrustes problem, in closed form); all unknowns are then refined together, with a loss that excludes wrong rotations.
 """
 
 from __future__ import annotations
@@ -28,42 +27,44 @@ __all__ = ["GyroAlignment", "NoAlignment", "align_gyro"]
 
 _Array = NDArray[np.float64]
 
-# Rotations that an alignment takes at least, and the share of them that the log must cover.
+# Smallest number of rotations of an alignment, and the share of them that the log must cover.
 _FEWEST, _COVERED = 20, 0.6
 # Below, the log is of another clip: white rates reach 0.5 at the best of a thousand offsets, with a hundred rotations.
 _LEAST_CORRELATION = 0.7
-# Another offset, or a mirror image, whose residuals have less than this many times the variance is as good, or better.
+# Another offset, or a mirror image, with residuals of less than this many times the variance counts as good as the
+# best.
 _AS_GOOD, _BETTER = 1.3, 0.7
-# rad/s rms of the rates about their mean. Below, what is seen is noise and wind.
+# rad/s rms of the rates about their mean. Below it, the rates are noise and wind.
 _STILL = 0.02
-# Share of a rate by which it is wrong for the focal length and the lens.
+# Relative error of a rate because of the focal length and the lens.
 _SHARE = 0.05
-# rad. How far a sensor lies off the axes of its camera, where it is meant to lie along them; 15 degrees is another way.
+# rad. Deviation of a sensor from the axes of its camera, if it is meant to be aligned with them; 15 degrees is another
+# orientation.
 _TILT, _OBLIQUE = np.radians(5.0), np.radians(15.0)
-# Twice the log-likelihood by which one way to lie must be better than another to exclude it. Twelve is 0.002 at one in
+# Twice the log-likelihood by which one orientation must be better than another to exclude it. Twelve is 0.002 at one in
 # twenty-four; the residuals of neighbours are not independent.
 _EXCLUDES = 20.0
-# Offsets that are looked at together.
+# Offsets that are computed together.
 _AT_ONCE = 64
 
 
 @dataclass(frozen=True)
 class GyroAlignment:
-    """How a gyroscope's log lies to a video.
+    """Alignment of a gyroscope's log with a video.
 
     Attributes
     ----------
     offset_s, offset_sigma_s : float
-        What the log's clock shows when the camera's shows zero, as `motions_from_gyro` takes it, and its standard
+        Time on the log's clock when the camera's shows zero, as `motions_from_gyro` takes it, and its standard
         deviation.
     camera_from_gyro : (3, 3) array
         Rotation that takes the log's rates to the camera's axes: right, down, ahead. About axes that the motion does
-        not tell it is that of `axes`.
+        not determine it is that of `axes`.
     axes : str or None
-        The signed permutation of the log's axes that is nearest, as `parse_axes` takes it; None where the gyroscope
-        lies more than 15 degrees off all of them. "XYZ" (the log's own axes) where the motion does not exclude it.
+        The nearest signed permutation of the log's axes, as `parse_axes` takes it; None if the gyroscope deviates by
+        more than 15 degrees from all of them. "XYZ" (the log's own axes) if the motion does not exclude it.
     also : tuple of str
-        Other permutations that the motion does not exclude; empty as soon as the camera turned about two axes.
+        Other permutations that the motion does not exclude; empty if the camera rotated about two axes.
     axes_sigma_deg : (3,) array
         Standard deviation of `camera_from_gyro` about the camera's axes.
     bias : (3,) array
@@ -73,9 +74,9 @@ class GyroAlignment:
     correlation : float
         Of the rates of both, without their means, over all axes.
     axis_correlations : (3,) array
-        The same about each axis of the camera; small for an axis about which it hardly turned.
+        The same about each axis of the camera; small for an axis about which it hardly rotated.
     rms : float
-        What is left, rad/s a component, without false rotations.
+        Residual, rad/s per component, without wrong rotations.
     num_inliers, num_turns : int
         Rotations that fit, of those that the log covers.
     """
@@ -131,12 +132,11 @@ def align_gyro(
     Parameters
     ----------
     log : GyroLog
-        In any axes; those of a log of the camera are what its maker says.
+        In any axes; those of a camera's log are as its maker says.
     frame_time_s : (m,) array
-        When the middle lines of the frames were read, by the camera's clock.
+        Times at which the middle lines of the frames were read, on the camera's clock.
     pairs : (n, 2) array of int
-        Frames that each rotation joins, the earlier first. Neighbours are best: what lies between frames far apart is
-        averaged.
+        Frames of each rotation, the earlier first. Neighbours are best: motion between distant frames is averaged.
     turns : (n, 3) array
         Rotation vectors in radians, about the camera's axes: `Exp(turn)` takes directions in the first frame to those
         in the second. False ones, and NaN, are left out.
@@ -147,7 +147,7 @@ def align_gyro(
     -------
     GyroAlignment or NoAlignment
         The latter with its reason: too few rotations, a log that does not cover the frames, a camera that stood still
-        or turned too evenly, a log of another clip, several offsets that fit, a mirror image.
+        or rotated too uniformly, a log of another clip, several offsets that fit, a mirror image.
     """
     start, end, seen = _rates(frame_time_s, pairs, turns)
     if len(seen) < _FEWEST:
@@ -172,7 +172,7 @@ def align_gyro(
         return NoAlignment("the gyroscope's log does not cover the frames", proper)
     against = _why_not(fit, ways[0], max(spread), interval)
     if against is None and 1 - rival**2 < _AS_GOOD * (1 - proper**2):
-        against = "the camera's turns repeat: several offsets of the gyroscope's clock fit them"
+        against = "the camera's rotations repeat: several offsets of the gyroscope's clock fit them"
     if against is not None:
         return NoAlignment(against, proper)
     tilt = np.arccos(np.clip((np.trace(fit.rotation @ ways[0].T) - 1) / 2, -1, 1))
@@ -209,15 +209,15 @@ def _rates(frame_time_s: ArrayLike, pairs: ArrayLike, turns: ArrayLike) -> tuple
 
 
 def _why_not(fit: _Fit, way: _Array, spread: float, interval_s: float) -> str | None:
-    """What speaks against an alignment by the nearest signed permutation, where rates change by `spread`."""
+    """Reason against an alignment by the nearest signed permutation, where rates change by `spread`."""
     if fit.correlation < _LEAST_CORRELATION and spread < _STILL:
         return (
-            f"the camera stood still or turned evenly (its rate changes by {spread:.3f} rad/s): no gyroscope can be "
-            "found by that"
+            f"the camera stood still or rotated uniformly (its rate changes by {spread:.3f} rad/s): no gyroscope can "
+            "be found by that"
         )
     if fit.correlation < _LEAST_CORRELATION:
         return (
-            f"the gyroscope's log does not show the camera's turns (correlation {fit.correlation:.2f}): it is of "
+            f"the gyroscope's log does not show the camera's rotations (correlation {fit.correlation:.2f}): it is of "
             "another clip, or the video is stabilised"
         )
     if np.linalg.det(way) < 0:
@@ -226,7 +226,7 @@ def _why_not(fit: _Fit, way: _Array, spread: float, interval_s: float) -> str | 
             "is: the sign of an axis is wrong, or two axes are exchanged"
         )
     if not fit.sigma[_OFFSET] < interval_s / 2:
-        return "the camera turned too evenly to tell the offset of the gyroscope's clock"
+        return "the camera rotated too uniformly to determine the offset of the gyroscope's clock"
     return None
 
 
@@ -291,7 +291,7 @@ class _Coarse:
         """The best offset, what rotation and mirror image reach there, and the best elsewhere; None if none covers."""
         interval = float(np.median(self.end - self.start))
         step = interval / 2
-        # where the log covers anything at all
+        # only where the log covers anything
         first = max(-largest_s, self.log.time_s[0] - self.end.max())
         last = min(largest_s, self.log.time_s[-1] - self.start.min())
         offsets = np.arange(np.ceil(first / step), np.floor(last / step) + 1) * step
@@ -299,7 +299,7 @@ class _Coarse:
         if not len(either) or not np.isfinite(either.max()):
             return None
         top = int(np.argmax(either))
-        # what is left doubles on both sides of the top; where it is as little again lies another top
+        # the residual doubles on both sides of the maximum; where it is as small again lies another maximum
         left = 1 - np.maximum(either, 0) ** 2
         apart = left > 2 * left[top]
         before, after = np.flatnonzero(apart[:top]), np.flatnonzero(apart[top:])
@@ -316,7 +316,7 @@ class _Coarse:
 
 
 def _signed_permutations(*, mirrored: bool) -> list[_Array]:
-    """24 ways for a sensor to lie along the camera's axes, or their mirror images; the identity comes first."""
+    """24 orientations of a sensor along the camera's axes, or their mirror images; the identity comes first."""
     ways = []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         way = np.zeros((3, 3))
@@ -327,7 +327,7 @@ def _signed_permutations(*, mirrored: bool) -> list[_Array]:
 
 
 def _ways(coarse: _Coarse, offset_s: float, seen: _Array, *, mirrored: bool) -> list[_Array]:
-    """Ways to lie that the motion does not exclude: first the log's own axes if they are one, else the best."""
+    """Orientations that the motion does not exclude: first the log's own axes if they are one, else the best."""
     measured = coarse.log.mean(coarse.start + offset_s, coarse.end + offset_s)
     there = np.isfinite(measured[:, 0])
     measured, seen = measured[there], seen[there]
@@ -349,7 +349,7 @@ def _letters(way: _Array) -> str:
 
 
 def _scale(sizes: _Array, measured: _Array, share: float = _SHARE) -> _Array:
-    """(n,) rad/s that a rate is uncertain by, a component: the median of what is left, and a share of the rate."""
+    """(n,) standard deviation of a rate per component, rad/s: the median residual, and a share of the rate."""
     noise = np.median(sizes) / 1.538  # median of the length of three normal numbers
     return np.hypot(max(noise, 1e-9), share * np.linalg.norm(measured - np.median(measured, axis=0), axis=1))
 
@@ -378,7 +378,7 @@ def _refine(
 ) -> _Fit | None:
     """Gauss-Newton on rotation, bias, ratio and offset, with Cauchy's loss.
 
-    The rotation has a prior about `way`, which only matters where the motion does not tell.
+    The rotation has a prior about `way`, which only matters where the motion does not determine it.
     """
     rotation, shift = way.copy(), np.zeros(3)
     interval = float(np.median(end - start))
@@ -397,9 +397,9 @@ def _refine(
             shift = np.median(y - ratio * turned, axis=0)
         residuals = y - ratio * turned - shift
         sizes = np.linalg.norm(residuals, axis=1)
-        # what the start is wrong by grows with the rate, and must not be taken for false rotations
+        # the error of the start grows with the rate, and must not be taken for wrong rotations
         noise = _scale(sizes, ratio * measured, max(_SHARE, 0.4 * 0.6**iteration))
-        # the share is for telling false rotations only: fast turns are what axes, ratio and offset are read off
+        # the share only detects wrong rotations: fast rotations determine axes, ratio and offset best
         inlier = 1 / (1 + (sizes / (3 * noise)) ** 2)
         weights = inlier / np.min(noise) ** 2
         J = np.empty((len(y), 3, 8))
@@ -421,7 +421,7 @@ def _refine(
         if iteration > 5 and np.abs(step[_OFFSET]) < 1e-7 and np.abs(step).max() < 1e-6:
             break
     inverse = np.linalg.inv(H + prior)
-    # the spread of the gradients, not the noise: rates are not equally exact, and the focal length is wrong for all
+    # the variance of the gradients, not the noise: rates are not equally exact, and the focal length is wrong for all
     sigma = np.sqrt(np.diag(inverse @ meat @ inverse))
     fits = sizes < 4 * noise
     A, B = (x - np.average(x, axis=0, weights=inlier) for x in (y, turned))

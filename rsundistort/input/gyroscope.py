@@ -1,4 +1,4 @@
-"""What a run knows of the time of the readout, and of motions from a gyroscope."""
+"""Readout times of a run, and motions from a gyroscope."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from ..model.checks import check_fields
 
 __all__ = ["GyroOptions", "Readouts", "gyro_contradiction", "gyro_motions", "known_readouts"]
 
-#: By camera: seconds that the readout of a frame takes, and who says so.
+#: By camera: readout time of a frame in seconds, and its source.
 Readouts = dict[int, tuple[float, str]]
 
-# Known motions that a solution misses by this many of their standard deviations are not those of its photos.
+# A solution contradicts known motions that it misses by this many of their standard deviations.
 _FAR = 3.0
 
 
 @dataclass(frozen=True)
 class GyroOptions:
-    """A gyroscope's log, and how its clock and its axes lie to the camera's.
+    """A gyroscope's log, and its clock and axes relative to the camera's.
 
     Parameters
     ----------
     file : path
         As `io.read_gyro` takes it.
     offset_s : float
-        What the clock of the log shows when the camera's shows zero.
+        Time on the log's clock when the camera's shows zero.
     axes : str, optional
         As `io.read_gyro` takes them.
     times : path, optional
@@ -59,7 +59,7 @@ class GyroOptions:
         return read_gyro(self.file, self.axes)
 
     def facts(self) -> dict[str, Any]:
-        """What `solution.json` says of it."""
+        """Its content of `solution.json`."""
         return {"name": Path(self.file).name, "offset_s": self.offset_s, "axes": self.axes}
 
 
@@ -70,10 +70,10 @@ def known_readouts(
     given_s: float | None,
     log: GyroLog | None,
 ) -> Readouts:
-    """Seconds that the readout of a frame takes, and who says so: the user, the gyroscope's log, or the table.
+    """Readout time of a frame in seconds, and its source: the user, the gyroscope's log, or the table.
 
-    By camera; those of which nothing is known are missing. A camera's make and model are those of its first photo, as
-    the EXIF of each or the video says them; nothing is known of them where `bodies` is empty.
+    By camera; unknown ones are missing. A camera's make and model are those of its first photo, by its EXIF or the
+    video; they are unknown if `bodies` is empty.
     """
     if given_s is not None:
         return dict.fromkeys(range(len(cameras)), (given_s, "given"))
@@ -115,12 +115,12 @@ def gyro_motions(
     spans = {name: readout_s[name] or 0.0 for name in times}
     known = motions_from_gyro(log, times, spans, offset_s=gyro.offset_s, steady=False)
     found = bends_from_gyro(log, {name: times[name] for name in known}, spans, cameras, offset_s=gyro.offset_s)
-    # phi goes with the bend: the slope of the turn, not its mean rate
+    # phi belongs to the bend: the slope of the rotation, not its mean rate
     return {name: (found[name][0], sigma) for name, (_, sigma) in known.items()}, {k: v for k, (_, v) in found.items()}
 
 
 def gyro_contradiction(rec: Reconstruction, known: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> str | None:
-    """A warning, if a solution is far from the motions that it was told to be known."""
+    """A warning, if a solution contradicts the known motions."""
     span = rec.frame_span()
     misses = [
         (rec.phi[i] * span[i] - np.asarray(known[name][0])) / np.asarray(known[name][1])

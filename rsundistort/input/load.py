@@ -21,10 +21,10 @@ from .photo_cameras import PhotoCameras, find_cameras
 
 __all__ = ["LONG_EXPOSURE_S", "LoadedPhotos", "load_photos"]
 
-#: Exposures that are longer bound the motion: a camera that turned by a frame's shutter during them would have blurred.
+#: Longer exposures bound the motion: a camera that rotated much would have blurred the photo.
 LONG_EXPOSURE_S = 1 / 250
 
-# What a decoded photo takes for each pixel, at most but for floats; and the size of one whose header does not say.
+# Bytes per pixel of a decoded photo, at most, except for floats; and the size of one whose header has none.
 _BYTES_PER_PIXEL, _SIZE_OF_OTHERS = 16, (8000, 6000)
 
 _NUMBERS = {2: "two", 3: "three"}
@@ -32,16 +32,16 @@ _NUMBERS = {2: "two", 3: "three"}
 
 @dataclass(frozen=True)
 class LoadedPhotos:
-    """What a folder holds.
+    """Content of a folder.
 
     Attributes
     ----------
     names, features, facts : lists of length m
-        Readable photos, and what their EXIF says.
+        Readable photos, their features and EXIF.
     skipped : dict of name to reason
         Unreadable ones.
     cameras : PhotoCameras
-        Which camera took which.
+        The camera of each.
     orientations : mapping of name to int
         Their EXIF orientations.
     folder : Path
@@ -51,7 +51,7 @@ class LoadedPhotos:
     max_megapixels : float
         As in `RectifyOptions`.
     edges_px : sequence of float or None
-        How wide the steepest edges of each photo are, where it was exposed so long that this tells anything.
+        Width of the steepest edges of each photo whose exposure was so long that it matters.
     """
 
     names: list[str]
@@ -66,7 +66,7 @@ class LoadedPhotos:
     edges_px: Sequence[float | None] = ()
 
     def unregistered(self, joined: Sequence[str]) -> dict[str, str]:
-        """Photos that are not among those that were joined, and why."""
+        """Photos that are not registered, and why."""
         lost = sorted({*self.names} - {*joined})
         return {**self.skipped, **dict.fromkeys(lost, "shares too little with the other photos")}
 
@@ -86,7 +86,7 @@ class _LoadJob:
 
 @dataclass(frozen=True)
 class _Loaded:
-    """What was found in a photo; or only the problem with it, or with its mask."""
+    """Features and facts of a photo; or only the problem with it, or with its mask."""
 
     features: Features | None = None
     width: int = 0
@@ -107,7 +107,7 @@ def _load(job: _LoadJob) -> _Loaded:
     except InputError as error:
         return _Loaded(problem=f"{job.name}: {error}")
     height, width = photo.pixels.shape[:2]
-    # a mask that cannot be used stops the run: without it, what it hides would be measured
+    # a mask that cannot be used stops the run: without it, what it excludes would be measured
     mask = None if job.own_mask is None else read_mask(job.own_mask, width, height)
     features = detect_features(photo.pixels, job.max_features, mask, job.megapixels)
     facts = facts_of_exif(photo.metadata.exif, photo.metadata.xmp)
@@ -118,12 +118,12 @@ def _load(job: _LoadJob) -> _Loaded:
 
 
 def _most_bytes(folder: Path, names: Sequence[str], megapixels: float, max_megapixels: float) -> float:
-    """What the largest of the photos takes, about; of those that will be taken."""
+    """Approximate bytes of the largest photo that will be read."""
 
     def bytes_of(name: str) -> float:
         try:
             width, height = stored_size(folder / name) or _SIZE_OF_OTHERS
-        except FileError:  # it is told when its turn comes
+        except FileError:  # it is reported when it is read
             return 0.0
         if width * height > max_megapixels * 1e6:
             return 0.0
@@ -185,11 +185,11 @@ def load_photos(
     masks, raw_as, again, max_megapixels
         As in `RectifyOptions`.
     least : int
-        Photos that there must be, two or three.
+        Smallest number of photos, two or three.
     only : sequence of str, optional
         Photos that are loaded; all that are there when left out.
     kept : Kept, optional
-        What was found before, and takes what is found.
+        Results of an earlier run; takes those of this run.
     """
     kept = kept or Kept()
     listed = _listed(folder, raw_as, only, least)
@@ -202,7 +202,7 @@ def load_photos(
     )
     log.begin("features", len(listed), len(before))
     found, skipped = dict[str, _Loaded](), dict[str, str]()
-    # the headers are not looked at for workers elsewhere, which mind their own memory
+    # headers are not read for workers elsewhere, which limit their own memory
     if not workers.scheduler:
         workers = workers.fitting("features", _most_bytes(folder, listed, megapixels, max_megapixels))
     results = workers.map(_load, jobs, lambda job, why: _Loaded(problem=f"{job.name}: {why}"))

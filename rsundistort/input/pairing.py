@@ -1,4 +1,4 @@
-"""Which photos of a run are matched with each other."""
+"""The photos of a run that are matched with each other."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .load import LoadedPhotos
 
 __all__ = ["MATCHINGS", "capture_sequences", "pairs_to_match", "places_of"]
 
-#: "auto" is "exhaustive" for small sets, and "neighbours" where that spares half of the pairs or more.
+#: "auto" is "exhaustive" for small sets, and "neighbours" where that saves half of the pairs or more.
 MATCHINGS = ("auto", "exhaustive", "neighbours")
 
 # neighbours are about 25 for each photo
@@ -23,7 +23,7 @@ _EARTH_RADIUS_M = 6371e3
 
 
 def pairs_to_match(photos: LoadedPhotos, matching: str, seed: int) -> NDArray[np.int64] | None:
-    """Photos that are neighbours in the order of capture, by GPS or in looks; None for all pairs there are."""
+    """Pairs of neighbours in the order of capture, by GPS or by appearance; None for all pairs."""
     num_photos = len(photos.names)
     if matching == "exhaustive" or (matching == "auto" and num_photos <= _EXHAUSTIVE_TO):
         return None
@@ -40,8 +40,8 @@ def capture_sequences(
 ) -> list[NDArray[np.int64]]:
     """The photos of each camera in the order of capture: by its clock, else by the numbers in their names.
 
-    Clocks of several cameras differ, so each has a sequence of its own. Of a camera some of whose photos hold no time,
-    only the names count; they also tell apart what was taken in the same second.
+    Clocks of several cameras differ, so each has a sequence of its own. If photos of a camera lack a time, only the
+    names count; they also order photos of the same second.
     """
     sequences = []
     for camera in range(int(camera_idx.max()) + 1):

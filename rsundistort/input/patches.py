@@ -18,7 +18,7 @@ from .load import LoadedPhotos
 
 __all__ = ["patch_source"]
 
-# What a photo takes for each pixel while it is read and made grey, and its halvings.
+# Bytes per pixel of a photo while it is read and made grey, with its halvings.
 _BYTES_PER_PIXEL = 16
 
 
@@ -34,7 +34,7 @@ class _PatchJob:
 
 
 def _cut(job: _PatchJob) -> tuple[NDArray[np.uint8], NDArray[np.bool_]] | None:
-    """Patches, and which of them the mask allows; None if the photo cannot be read any more."""
+    """Patches, and which of them the mask allows; None if the photo can no longer be read."""
     try:
         pixels = read_photo(job.source, job.max_megapixels).pixels
     except FileError:
@@ -47,7 +47,7 @@ def _cut(job: _PatchJob) -> tuple[NDArray[np.uint8], NDArray[np.bool_]] | None:
 def patch_source(
     photos: LoadedPhotos, names: Sequence[str], workers: Workers, tell: Callable[[int], None]
 ) -> PatchSource:
-    """What cuts patches out of these photos; `tell` is told how many were read."""
+    """Function that cuts patches out of these photos; `tell` gets the number of photos read."""
     most = max(camera.width * camera.height for camera in photos.cameras.cameras)
     fitting = workers if workers.scheduler else workers.fitting("alignment", _BYTES_PER_PIXEL * most)
 

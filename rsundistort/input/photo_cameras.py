@@ -1,4 +1,4 @@
-"""Which camera took each photo, and which way its shutter runs."""
+"""The camera of each photo, and its readout direction."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from ..sfm import USUAL_FOCAL
 
 __all__ = ["GIVEN_SIGMA", "GUESS_SIGMA", "PhotoCameras", "camera_file_of", "check_readouts", "find_cameras"]
 
-#: How far EXIF may be off (relative f, principal point in focal lengths, lens coefficients): equivalent focal lengths
-#: are rounded to millimetres, focusing and stabilising crop a little, phones hardly distort.
+#: Standard deviations of EXIF's guess (relative f, principal point in focal lengths, lens coefficients): equivalent
+#: focal lengths are rounded to millimetres, focusing and stabilising crop a little, phones hardly distort.
 GUESS_SIGMA = {
     "f": 0.05, "cx": 0.01, "cy": 0.01, "k1": 0.2, "k2": 0.4, "k3": 0.4, "k4": 0.4, "p1": 2e-3, "p2": 2e-3
 }  # fmt: skip
-#: How far a calibration may be off: published ones of good cameras were by half a pixel.
+#: Standard deviations of a calibration: published ones of good cameras were off by half a pixel.
 GIVEN_SIGMA = {
     "f": 1e-3, "cx": 4e-4, "cy": 4e-4, "k1": 3e-3, "k2": 1e-2, "k3": 1e-2, "k4": 1e-2, "p1": 3e-4, "p2": 3e-4
 }  # fmt: skip
 
-# Cameras that nothing told are not believed to be farther off than this, in standard deviations.
+# Estimates of unknown cameras are rejected beyond this many standard deviations.
 _LIKE_NO_CAMERA = 6.0
 
-#: What `camera.json` files are called where none is named.
+#: Names of camera files that are found automatically.
 _BESIDE = ("camera.json", "cameras.json")
 
 
@@ -58,16 +58,16 @@ class PhotoCameras:
     calibrated : bool
         Whether they were given; else they are EXIF's guesses.
     readout_told : tuple of bool
-        Whether the direction of each camera's readout was given; else it is a guess.
+        Whether the readout direction of each camera was given; else it is a guess.
     source : str
         Where they come from, for people.
     notes : sequence of str
-        What was guessed, for people.
+        The guesses, for people.
     sigma : sequence of mapping of intrinsic to float
-        Standard deviations of each camera that were told, in the units of `GuessedCameras`; others are the defaults of
+        Given standard deviations of each camera, in the units of `GuessedCameras`; others are the defaults of
         `known_to`.
     without_focal : sequence of int
-        Cameras whose focal length nothing tells: what is usual stands in its place.
+        Cameras with unknown focal length: they have the usual one.
     """
 
     cameras: Sequence[Camera]
@@ -86,14 +86,14 @@ class PhotoCameras:
 
     @property
     def intrinsics(self) -> tuple[str, ...]:
-        """What is always solved for with the rest, under the prior of `known_to`."""
+        """Intrinsics that are always estimated, under the prior of `known_to`."""
         lenses = {camera.lens for camera in self.cameras}
         focal = ("fx", "fy") if any({"fx", "fy"} & each.keys() for each in self.sigma) else ("f",)
         names = (*focal, "cx", "cy", "k1", "k2", "k3")
         return (*names, *(["k4"] if "fisheye" in lenses else []), *(["p1", "p2"] if "pinhole" in lenses else []))
 
     def known_to(self, loose: bool) -> GuessedCameras:
-        """How well the cameras are known before the photos are looked at: as told, else as calibrations or guesses."""
+        """Prior of the cameras: with the given standard deviations, else those of calibrations or guesses."""
         default = GUESS_SIGMA if loose or not self.calibrated else GIVEN_SIGMA
         sigmas = []
         for told in self.sigma or [{}] * len(self.cameras):
@@ -111,7 +111,7 @@ class PhotoCameras:
         )  # fmt: skip
 
     def check_plausible(self, cameras: Sequence[Camera]) -> None:
-        """Refuse what was found of cameras that nothing told, if it is like no camera: `cameras` are those found.
+        """Refuse implausible estimates of cameras that were unknown: `cameras` are the estimates.
 
         Photos without parallax, or of things that move, make a lens of whatever bends them.
 
@@ -125,12 +125,12 @@ class PhotoCameras:
                 (fx, _, cx), (_, fy, cy), _ = cameras[k].K.tolist()
                 value = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **cameras[k].coefficients}[name]
                 raise ReconstructionError(
-                    f"the photos do not tell their camera: {name} = {value:.3g} would be {times:.0f} standard "
+                    f"the photos do not determine their camera: {name} = {value:.3g} would be {times:.0f} standard "
                     "deviations from what such cameras have; give --camera FILE or --camera fx,fy,cx,cy in pixels"
                 )
 
     def contradicted(self, cameras: Sequence[Camera], options: BundleOptions) -> list[str]:
-        """What a calibration says and the photos do not, for people; `cameras` are those found with these options."""
+        """Calibrations that the photos contradict, for people; `cameras` are the estimates with these options."""
         if options.guessed is None or not self.calibrated:
             return []
         said = []
@@ -141,7 +141,7 @@ class PhotoCameras:
             off = f"{apart * pixels_of(cameras[k], [name])[0]:+.3g}{' px' if name[0] in 'fc' else ''}"
             said.append(
                 f"{self.source}: {name} is off by {off} by these photos ({times:.0f} standard deviations), which were "
-                "believed; calibrate again, or say --refine none"
+                "used; calibrate again, or give --refine none"
             )
         return said
 
@@ -155,7 +155,7 @@ def check_readouts(readout: str | Mapping[str, str] | None) -> dict[str, str]:
 
 
 def camera_file_of(folder: Path, camera: str | None) -> Path | None:
-    """The file or folder that tells the cameras of a folder's photos; None where numbers or EXIF do."""
+    """The file or folder of the cameras of a folder's photos; None if numbers or EXIF give them."""
     if camera is not None:
         return Path(camera) if os.path.exists(camera) else None
     beside = (parent / name for parent in (folder, folder.parent) for name in _BESIDE)
@@ -170,7 +170,7 @@ def find_cameras(
     camera: str | None = None,
     readout: str | Mapping[str, str] | None = None,
 ) -> PhotoCameras:
-    """The cameras of a folder's photos: as told, `camera.json` or `cameras.json` in the folder or beside it, or EXIF.
+    """The cameras of a folder's photos: as given, `camera.json` or `cameras.json` in the folder or beside it, or EXIF.
 
     Parameters
     ----------
@@ -181,12 +181,12 @@ def find_cameras(
     camera : str, optional
         As `io.read_camera_file` takes it.
     readout : str or mapping, optional
-        Direction of the readout of all photos, or by group (the label of a camera); overrides the file's.
+        Readout direction of all photos, or by group (the label of a camera); overrides the file's.
 
     Raises
     ------
     InputError
-        When a photo has no camera, or one of another size.
+        A photo has no camera, or one of another size.
     """
     groups = [group_of(fact, *size) for fact, size in zip(facts, sizes, strict=True)]
     if camera is None and (beside := camera_file_of(folder, None)) is not None:
@@ -263,9 +263,9 @@ def _from_exif(
     facts: Sequence[ExifFacts],
     groups: Sequence[str],
 ) -> tuple[dict[str, Camera], list[str], list[str], set[str]]:
-    """Cameras by group with the focal length of EXIF, the group of each photo, what was guessed, groups without EXIF's.
+    """Cameras by group with the focal length of EXIF, the group of each photo, the guesses, groups without EXIF's.
 
-    Where EXIF has none, what is usual stands in its place.
+    Where EXIF has none, the usual one stands in its place.
     """
     directions, notes = guess_readouts(facts, sizes, groups)
     known: dict[str, Camera] = {}
@@ -282,7 +282,7 @@ def _from_exif(
 
 
 def _usual_camera(width: int, height: int, readout: str) -> Camera:
-    """A camera with the focal length that most have."""
+    """A camera with the usual focal length."""
     focal = USUAL_FOCAL[0] * max(width, height)
     K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
     return Camera(width, height, K, readout=readout)

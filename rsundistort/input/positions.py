@@ -1,4 +1,4 @@
-"""Where photos were taken, in metres on a map: GPS of EXIF and XMP, and the frame that it is put in."""
+"""Positions of photos in metres: GPS of EXIF and XMP, and their frame."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 # Altitudes of one photo that differ by more are of two datums, metres.
 _ANOTHER_DATUM_M = 1.0
-# Of a photo that has no altitude, metres.
+# Standard deviation of the height of a photo without altitude, metres.
 _UNKNOWN_UP_M = 1e4
 # Origins of projections are whole multiples of this, metres.
 _ROUND_M = 100.0
@@ -41,7 +41,7 @@ class PhotoPositions:
     names : list of str
         The photos.
     geodetic : (m, 3) array
-        Latitude and longitude in degrees, altitude in metres as the photos have it.
+        Latitude and longitude in degrees, altitude in metres as in the photos.
     sigma_m : (m, 3) array
         Standard deviations east, north and up.
     speed_m_s : (m,) array
@@ -51,9 +51,9 @@ class PhotoPositions:
     R_cw : (m, 3, 3) array
         From axes east, north and up to those of the camera, by its gimbal; NaN where nothing says it.
     told_by : tuple of str
-        What the standard deviations come from.
+        Source of the standard deviations.
     notes : tuple of str
-        What is to be said of them.
+        Remarks on them.
     """
 
     names: list[str]
@@ -209,7 +209,7 @@ def frame_of_control(crs: str, places_m: Array) -> MapFrame:
 
 
 def positions_of(names: Sequence[str], facts: Sequence[ExifFacts]) -> PhotoPositions:
-    """The photos that have a position, and what is to be said of it."""
+    """The photos that have a position, and remarks on that."""
     there = [fact.fix is not None and not fact.fix.is_nowhere for fact in facts]
     placed = [
         (name, fact.fix) for name, fact, is_placed in zip(names, facts, there, strict=True) if is_placed and fact.fix

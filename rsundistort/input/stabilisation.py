@@ -1,12 +1,12 @@
-"""Whether a video was stabilised in the camera, so that its shutter and its path no longer belong together.
+"""Whether a video was stabilised in the camera, so that its shutter and its path contradict each other.
 
-While a frame is read, in a time T, the world turns in an unstabilised video by phi = T w, where w is the rate at which
-it turns between the frames: T is between 0 and the time from frame to frame, and the same for all frames. A camera that
-stabilises turns each frame as a whole against its shaking, and may take its shutter out, too:
+During the readout of a frame, in a time T, the world in an unstabilised video rotates by phi = T w, where w is the
+rotation rate between the frames: T is between 0 and the time from frame to frame, and the same for all frames. A camera
+that stabilises rotates each frame as a whole against its shaking, and may remove its shutter, too:
 
-- shutter without its rotation: the frames are smooth, but their lines still show the shaking that was taken out;
-- rotation without its shutter: the frames turn, and their lines show less of it than the fastest sensor would;
-- against a gyroscope: the frames turn by less than the camera did, or otherwise.
+- shutter without its rotation: the frames are smooth, but their lines still show the shaking;
+- rotation without its shutter: the frames rotate, and their lines show less of it than the fastest sensor would;
+- against a gyroscope: the frames rotate by less than the camera did, or differently.
 """
 
 from __future__ import annotations
@@ -28,22 +28,23 @@ _Array = NDArray[np.float64]
 # Of the time from frame to frame: no rolling shutter is read faster (0.2 of 1/60 s; `io.readout_times`), none slower,
 # but rates between frames miss up to a third of a tremor that is nearly as fast as they can show.
 _FASTEST, _SLOWEST = 0.1, 1.5
-# A readout that is known is right to this share.
+# Relative standard deviation of a known readout time.
 _KNOWN_SHARE = 0.3
-# Standard deviations that decide, and the share of the power of a signal that must be left unexplained.
+# Standard deviations that are required, and the share of the power of a signal that must be left unexplained.
 _SIGMAS, _UNEXPLAINED = 4.0, 0.5
 # Of what lines show, over the power of their noise: noise that is said to be a third of what it is shows eight.
 _SHOWN = 9.0
-# Times the median: no rates of a hand are farther out.
+# Times the median: rates of a hand are not farther out.
 _FARTHEST = 12.0
-# Frames turn as the gyroscope says but for the focal length, which may be wrong by a fifth.
+# Frames rotate as the gyroscope says except for the focal length, which may be wrong by a fifth.
 _TURN_SHARE = 0.75
 _FEWEST = 10
-# Of a hand's shaking, half a period.
+# Half a period of a hand's shaking.
 _CHANGE_S = 0.1
-# Frames whose turns may be off together: so many lie between key frames, whose points they show.
+# Frames with correlated rotations: this many lie between key frames, whose points they show.
 _TOGETHER = 8
-# Frames whose turns change by less than this share of what was felt were turned since: no focal length is so wrong.
+# Frames whose rotation changes by less than this share of the gyroscope's were rotated afterwards: no focal length is
+# so wrong.
 _CALM = 0.5
 
 
@@ -75,12 +76,12 @@ class Regression:
 
 @dataclass(frozen=True)
 class Stabilisation:
-    """What a video says of its stabilisation.
+    """Evidence for stabilisation in a video.
 
     Attributes
     ----------
     verdict : {"none", "stabilised", "unknown"}
-        "unknown" where the camera turned too little to tell.
+        "unknown" if the camera rotated too little.
     reason : str
         One line, with the figures that decide.
     shutter : Regression
@@ -124,14 +125,14 @@ def judge_stabilisation(
     log: GyroLog | None = None,
     offset_s: float = 0.0,
 ) -> Stabilisation:
-    """Whether the frames of a video turn as their shutters say, and as a gyroscope says.
+    """Whether the frames of a video rotate as their shutters say, and as a gyroscope says.
 
     Parameters
     ----------
     frame_time_s : (m,) array
         When the middle lines of the frames were read.
     pairs : (n, 2) array of int
-        Neighbouring frames that each turn joins, the earlier first.
+        Neighbouring frames of each rotation, the earlier first.
     turns : (n, 3) array
         Rotation vectors of the world in the camera, radians; NaN where unknown.
     phi_frame, phi_sigma : (m, 3) array
@@ -141,7 +142,7 @@ def judge_stabilisation(
     turn_sigma : float or (n, 3) array
         Standard deviation of `turns` in radians.
     readout_s : float, optional
-        Time of the readout, where it is known.
+        Readout time, if it is known.
     log : GyroLog, optional
         About the camera's axes (`GyroAlignment.in_camera`), and known to be of this clip: one of another is taken for
         a proof.
@@ -208,7 +209,7 @@ def _of_changes(phi: _Array, rate: _Array, noise: _Array, interval: float) -> tu
 def calmer_than_felt(
     frame_time_s: ArrayLike, pairs: ArrayLike, turns: ArrayLike, turn_sigma: ArrayLike, log: GyroLog
 ) -> str:
-    """Why the frames of a video are stabilised, by a gyroscope whose axes and clock need not be known; empty if not.
+    """Why frames of a video are stabilised, by a gyroscope with unknown axes and clock; empty if not.
 
     What is compared is by how much the turn changes from one frame to the next: that knows no axes and no bias, and
     little of the offset of a clock.
@@ -235,7 +236,7 @@ def calmer_than_felt(
     if of_gyro < _SIGMAS * of_noise or of_frames > _CALM * of_gyro:
         return ""
     return (
-        f"stabilised in the camera: from frame to frame the turn changes by {of_frames / of_gyro:.2f} of what the "
+        f"stabilised in the camera: from frame to frame the rotation changes by {of_frames / of_gyro:.2f} of what the "
         "camera's own gyroscope felt"
     )
 
@@ -331,7 +332,7 @@ def _judge(
             and turns.slope + _SIGMAS * turns.sigma < _TURN_SHARE
         ):
             line = (
-                f"stabilised in the camera: the frames turn by {turns.slope:.2f} +- {turns.sigma:.2f} of what the "
+                f"stabilised in the camera: the frames rotate by {turns.slope:.2f} +- {turns.sigma:.2f} of what the "
                 "gyroscope felt"
             )
             if shutter_by_gyro is not None and shutter_by_gyro.slope > _SIGMAS * shutter_by_gyro.sigma:
@@ -351,9 +352,9 @@ def _judge(
         )
     if detectable and low > most:
         return "stabilised", (
-            f"stabilised in the camera: the lines turn by more than the frames (readout {found}, expected "
+            f"stabilised in the camera: the lines rotate by more than the frames (readout {found}, expected "
             f"{1e3 * most:.1f} ms at most)"
         )
     if detectable and high > least and low < most and shutter.slope > _SIGMAS * shutter.sigma:
-        return "none", f"not stabilised: the lines turn as the frames do (readout {found})"
-    return "unknown", f"the camera turned too little to tell whether it was stabilised (readout {found})"
+        return "none", f"not stabilised: the lines rotate as the frames do (readout {found})"
+    return "unknown", f"the camera rotated too little to show whether it was stabilised (readout {found})"

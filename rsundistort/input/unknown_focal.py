@@ -1,4 +1,4 @@
-"""Focal lengths of cameras of which neither a file nor EXIF tells one: by the photos themselves."""
+"""Focal lengths of cameras without one in a file or EXIF: from the photos."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from .pairing import capture_sequences, places_of
 
 __all__ = ["with_focal_lengths"]
 
-# So many features of a photo, the largest, and so many pairs of each camera tell it.
+# Number of features of a photo, the largest, and of pairs of each camera that are used.
 _FEATURES, _PAIRS = 4096, 60
 # Matches of a pair that overlaps.
 _LEAST_MATCHES = 60
-# Of fundamental matrices, in pixels of the image that the features were found in: a shutter bends by some.
+# Threshold of fundamental matrices, in pixels of the image that the features were detected in: a shutter bends by some.
 _WITHIN_PX = 4.0
-# Focal lengths that are known worse are as good as not known.
+# Focal lengths with a larger standard deviation count as unknown.
 _WEAK = 0.2
 
 
 def with_focal_lengths(photos: LoadedPhotos, seed: int, log: StageLog, kept: Kept | None = None) -> LoadedPhotos:
-    """The photos with the focal lengths that their matches tell, where nothing else does, and a note that says so.
+    """The photos with focal lengths from their matches, where no other source gives them, and a note on that.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def with_focal_lengths(photos: LoadedPhotos, seed: int, log: StageLog, kept: Kep
     log : StageLog
         Told the progress.
     kept : Kept, optional
-        What was found before, and takes what is found.
+        Results of an earlier run; takes those of this run.
     """
     cameras, kept = photos.cameras, kept or Kept()
     if not cameras.without_focal:
@@ -66,14 +66,15 @@ def with_focal_lengths(photos: LoadedPhotos, seed: int, log: StageLog, kept: Kep
         value = f"{focal.pixels:.0f} px (+-{100 * focal.sigma:.0f} %) {by}"
         said.append(f"no focal length in the photos of {cameras.labels[k]}: {value}; give --camera if you know it")
         if focal.sigma > _WEAK:
-            warnings.warn(f"the photos hardly tell their focal length: {said[-1]}", RsUndistortWarning, stacklevel=3)
+            text = f"the photos hardly determine their focal length: {said[-1]}"
+            warnings.warn(text, RsUndistortWarning, stacklevel=3)
     source = "found from the photos, refined" if len(found) == len(new) else cameras.source
     known = replace(cameras, cameras=tuple(new), sigma=sigma, source=source, notes=[*cameras.notes, *said])
     return replace(photos, cameras=known)
 
 
 def _focal_length(photos: LoadedPhotos, camera: int, seed: int) -> FocalLength:
-    """What the photos of a camera tell of it."""
+    """The focal length of a camera from its photos."""
     cameras = photos.cameras
     mine = np.flatnonzero(cameras.camera_idx == camera)
     features = [photos.features[i].largest(_FEATURES) for i in mine.tolist()]

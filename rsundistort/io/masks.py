@@ -75,7 +75,7 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8]:
     if pixels.shape != (height, width):
         raise InputError(
             f"mask {path} has {pixels.shape[1]}x{pixels.shape[0]} pixels, its photo {width}x{height}; "
-            "masks are of the stored photo, not turned"
+            "masks are of the stored photo, not rotated"
         )
     # masks kept as JPEG are not quite black and white
     return np.where(pixels >= 128, 255, 0).astype(np.uint8)

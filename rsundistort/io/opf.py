@@ -60,7 +60,7 @@ def write_opf(folder: Path, scene: ExportScene) -> str:
     shown = [scene.originals.get(image.name, image.name) for image in images]
     rec = scene.reconstruction
     if any(image.turned != 1 for image in scene.solution.images):
-        raise InputError("points and measurements are turned as the photos are; leave --apply-orientation out")
+        raise InputError("points and measurements are rotated as the photos are; leave --apply-orientation out")
     left, lens = 0.0, 0.0
     for image in images:
         camera = stored.cameras[image.camera_id]

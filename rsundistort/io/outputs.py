@@ -281,9 +281,9 @@ def _check_goes_on(folder: Place, going_on: bool, resume: bool) -> None:
         return
     mend = "; give another folder, or --overwrite to replace its outputs"
     if going_on:
-        mend += ", or --resume to go on with them"
+        mend += ", or --resume to continue with them"
     elif resume:
-        mend = ", and holds no batch that --resume could go on with" + mend
+        mend = ", and holds no batch that --resume could continue" + mend
     raise FileError(f"{folder} is not empty{mend}")
 
 

@@ -89,7 +89,7 @@ class Record:
             if path in known:
                 raise FileError(f"{self._place}/{path} was changed since it was written here{mend}")
             raise FileError(
-                f"{self._place}/{path} would be replaced, and nothing tells that rsundistort wrote it "
+                f"{self._place}/{path} would be replaced, and nothing shows that rsundistort wrote it "
                 f"(version 0.1 kept no record){mend}"
             )
 

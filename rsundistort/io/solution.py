@@ -84,10 +84,12 @@ _QUALITY = {
     "readout_times?": Maybe({str: {"ms": float, "source": str}}),
     "readout_time?": Maybe(_READOUT_TIME),
 }
+_OF_MODEL = {"model?": Maybe(str), "rms_px?": _NUMBER, "iterations?": _NUMBER}
 _STAGE = {
     "name?": str,
     "seconds?": _NUMBER,
-    "rungs?": Maybe([{"model?": Maybe(str), "rms_px?": _NUMBER, "iterations?": _NUMBER}]),
+    "models?": Maybe([_OF_MODEL]),
+    "rungs?": Maybe([_OF_MODEL]),  # what earlier versions call them
 }
 #: What `solution.json` holds, as far as it is read; other names may be there.
 _RULES = {

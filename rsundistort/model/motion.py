@@ -15,12 +15,12 @@ from .checks import check_finite, check_kind, check_number, check_numbers, check
 
 __all__ = ["SHUTTER_MODELS", "RowMotion", "check_shutter_model"]
 
-#: Names of the shutter models and their codes in the kernels, in the order of the ladder.
+#: Names of the shutter models and their codes in the kernels, in the order of the model sequence.
 SHUTTER_MODELS: dict[str, int] = {"global": 0, "two-step": 1, "linearized": 2, "rotation": 3, "constant-motion": 4}
 
 
 _FRAMES = ("world", "camera")
-# Radians while rows of one focal length are read: far beyond a fast turn behind the longest lens.
+# Radians during the readout of one focal length: far beyond a fast rotation with the longest lens.
 _FASTEST = 1000.0
 
 
@@ -42,11 +42,11 @@ class RowMotion:
     velocity : (3,) array
         World units per unit of r (the paper's v).
     bend : Bend, optional
-        How the motion departs from this steady one; heeded by the rotation and constant-motion models. The pose that
-        goes with it is then that of the nearest steady motion at r = 0, not the one at that moment.
+        How the motion deviates from this steady one; used by the rotation and constant-motion models. The pose that
+        belongs to it is then that of the nearest steady motion at r = 0, not the pose at that moment.
     frame : {"world", "camera"}, optional
-        What velocity and bend's positions are told in. A `SolvedImage` has its motion in the world, projection and
-        rectification take it in the camera (`in_camera`), and refuse one that is told to be in the other frame.
+        Frame of the velocity and of the bend's positions. A `SolvedImage` has its motion in the world; projection and
+        rectification take it in the camera (`in_camera`), and refuse one in the other frame.
 
     Examples
     --------
@@ -65,7 +65,9 @@ class RowMotion:
         for name in ("phi", "velocity"):
             object.__setattr__(self, name, frozen(check_finite(getattr(self, name), (3,), name)))
         if np.abs(self.phi).max() > _FASTEST:
-            raise InputError(f"phi={self.phi.tolist()}: no camera turns by more than {_FASTEST:g} rad per focal length")
+            raise InputError(
+                f"phi={self.phi.tolist()}: no camera rotates by more than {_FASTEST:g} rad per focal length"
+            )
         if self.bend is not None:
             check_kind(self.bend, Bend, "bend")
 
@@ -73,16 +75,16 @@ class RowMotion:
     def of(
         cls, clock: ArrayLike, rotation: ArrayLike, position: ArrayLike | None = None, sites: int = 65
     ) -> tuple[RowMotion, NDArray[np.float64], NDArray[np.float64]]:
-        """The motion that passes through readings of a pose, and the pose that it belongs to.
+        """The motion through given poses, and the pose that it belongs to.
 
         Parameters
         ----------
         clock : (k,) array
             Ascending, from the start of the frame to its end.
         rotation, position : (k, 3) array
-            Rotation vectors and positions there against some pose: `Exp(rotation) R_cw` and `center_w + position`.
+            Rotation vectors and positions there relative to some pose: `Exp(rotation) R_cw` and `center_w + position`.
         sites : int
-            Readings of the bend, the cubic spline that is left beside the nearest steady motion.
+            Values of the bend, the cubic spline that remains beside the nearest steady motion.
 
         Returns
         -------
@@ -97,7 +99,7 @@ class RowMotion:
 
         readings = Rotation.from_rotvec(np.array(check_finite(rotation, (None, 3), "rotation")))
         turn = readings[len(readings) // 2]
-        # what is constant goes into the pose; turns do not commute, so that a share of it is left each time
+        # the constant part goes into the pose; rotations do not commute, so that a share of it is left each time
         for _ in range(50):
             bend, constant, rate = Bend.of(clock, (readings * turn.inv()).as_rotvec(), position, sites)
             turn = Rotation.from_rotvec(constant[0]) * turn
@@ -106,7 +108,7 @@ class RowMotion:
         return cls(rate[0], rate[1], bend), turn.as_matrix(), constant[1]
 
     def steady(self, start: float, end: float) -> tuple[RowMotion, NDArray[np.float64], NDArray[np.float64]]:
-        """The steady motion that is nearest while the clock runs from start to end, and the pose it belongs to.
+        """The nearest steady motion while the clock runs from start to end, and the pose it belongs to.
 
         As `of` returns them, without a bend: of least mean square in rotation and in position.
         """
@@ -124,39 +126,39 @@ class RowMotion:
         return replace(self, velocity=R @ self.velocity, bend=bend, frame="camera")
 
     def as_in(self, frame: str) -> RowMotion:
-        """The motion, told to be in a frame; refused if it is told to be in the other, and matters."""
+        """The motion, declared to be in a frame; refused if it is declared to be in the other, and travels."""
         self._check_frame(frame)
         return replace(self, frame=frame)
 
     def _check_frame(self, frame: str) -> None:
-        """Refuse a motion that is told to be in the other frame, if the camera travels."""
+        """Refuse a motion that is declared to be in the other frame, if the camera travels."""
         if self.frame is not None and self.frame != frame and self.moves:
             mend = "" if frame == "world" else "; call motion.in_camera(R_cw)"
-            raise InputError(f"the motion is told in the {self.frame} frame, expected the {frame} frame{mend}")
+            raise InputError(f"the motion is in the {self.frame} frame, expected the {frame} frame{mend}")
 
     @property
     def velocity_in_camera(self) -> NDArray[np.float64]:
-        """The velocity as the kernels take it, of a motion that is not told to be in the world."""
+        """The velocity for the kernels, of a motion that is not declared to be in the world."""
         self._check_frame("camera")
         return self.velocity.copy()
 
     @property
     def moves(self) -> bool:
-        """Whether the camera travels, and does not only turn."""
+        """Whether the camera travels, and does not only rotate."""
         return bool(self.velocity.any()) or (self.bend is not None and self.bend.moves)
 
     @cached_property
     def kernel_phi(self) -> NDArray[np.float64]:
-        """What the kernels take for phi: that, (3,), or the table of a motion with a bend.
+        """Phi for the kernels, (3,), or the table of a motion with a bend.
 
-        Arrays that can be written, as the adjustment's are: kernels are compiled for either kind that they meet.
+        Arrays are writable, as the adjustment's are: kernels are compiled for each kind of array that they meet.
         """
         if self.bend is None:
             return self.phi.copy()
         return bend_table(self.phi, self.bend.start, self.bend.end, self.bend.values)
 
     def at(self, clock: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Rotation vector and position (..., 3) against the pose when the clock shows r (...), exact models."""
+        """Rotation vector and position (..., 3) relative to the pose at the clock r (...), for exact models."""
         r = check_numbers(clock, "clock")
         with np.errstate(invalid="ignore"):  # at no moment: NaN
             turn, way = r[..., None] * self.phi, r[..., None] * self.velocity
@@ -190,7 +192,7 @@ class RowMotion:
         return Rotation.from_rotvec(turn).as_matrix() @ R, center + way
 
     def imaginary_camera(self, readout: str = "top-to-bottom") -> tuple[float, float]:
-        """Aspect ratio and skew, in the direction of the readout, of the camera that the paper puts behind the lens."""
+        """Aspect ratio and skew, in the readout direction, of the imaginary camera of the paper."""
         axis, sign = check_readout(readout)
         # for columns x and y are exchanged, which takes phi to -(phi2, phi1, phi3)
         phi = sign * (self.phi if axis == 1 else -self.phi[[1, 0, 2]])

@@ -153,25 +153,6 @@ class CameraPath:
             ),
         )
 
-    def poses_at(self, time_s: ArrayLike) -> tuple[Array, Array]:
-        """Poses R_cw (n, 3, 3) and center_w (n, 3) at any times (n,)."""
-        time = np.atleast_1d(np.asarray(time_s, np.float64))
-        nearest = self.nearest(time)
-        R_cw, center_w = np.empty((len(time), 3, 3)), np.empty((len(time), 3))
-        for moment in np.unique(nearest).tolist():
-            mine = nearest == moment
-            turn, way = self.near(moment, time[mine] - self.time_s[moment])
-            R_cw[mine] = Rotation.from_rotvec(turn).as_matrix() @ self.R_cw[moment]
-            center_w[mine] = self.center_w[moment] + way
-        return R_cw, center_w
-
-    def nearest(self, time: Array) -> NDArray[np.int64]:
-        """(n,) the moment nearest to each time (n,)."""
-        after = np.clip(np.searchsorted(self.time_s, time), 1, max(len(self.time_s) - 1, 1))
-        after = np.minimum(after, len(self.time_s) - 1)
-        before = np.maximum(after - 1, 0)
-        return np.where(time - self.time_s[before] <= self.time_s[after] - time, before, after)
-
     def row_motion(self, moment: int, clock_range: tuple[float, float], clock_s: float) -> RowMotion:
         """The motion of a frame of the path whose principal row is read at that moment.
 

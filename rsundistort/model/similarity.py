@@ -21,8 +21,6 @@ _TRIES = 300
 # Squared deviations, in units of sigma, where the weight of a place halves: three coordinates of three sigma each.
 _BEND = 27.0
 _STEPS = 50
-# Of a place farther off than this, in standard deviations of its coordinates, little is believed.
-_OUTLIER = 4.0
 
 
 @dataclass(frozen=True)
@@ -103,11 +101,6 @@ class FittedSimilarity:
         turn = np.cross(np.eye(3), arm[:, None]) * self.sigma_rad[:, None]
         value: Array = self.sigma_m**2 + (turn**2).sum(1) + (self.sigma_scale * arm) ** 2
         return value
-
-    @property
-    def outlying(self) -> NDArray[np.bool_]:
-        """(m,) points that are too far off to be believed."""
-        return self.deviations > _OUTLIER
 
 
 def similarity_of(points: Array, targets: Array) -> Similarity:

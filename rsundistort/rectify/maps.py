@@ -83,7 +83,7 @@ def init_rectify_map(
         During the readout, its velocity in the camera frame (`RowMotion.in_camera`); without it the result is
         `cv2.initUndistortRectifyMap`'s, or that of the same name in `cv2.fisheye`.
     shutter_model : {"rotation", "constant-motion", "two-step", "linearized", "global"}
-        Row model; constant-motion alone heeds the velocity.
+        Row model; only constant-motion uses the velocity.
     R : (3, 3) array, optional
         Rotation from the camera frame to the rectified one.
     new_K : (3, 3) array, optional
@@ -93,7 +93,7 @@ def init_rectify_map(
     m1type : {cv2.CV_32FC1, cv2.CV_32FC2, cv2.CV_16SC2}
         Kind of the maps.
     depth : AtInfinity, Plane or DepthMap, optional
-        How far what the photo shows is, on which the effect of the velocity depends; at infinity when left out.
+        Depth of the scene, on which the effect of the velocity depends; at infinity when left out.
 
     Returns
     -------

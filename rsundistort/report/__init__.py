@@ -1,4 +1,4 @@
-"""The report: what a person looks at."""
+"""The report for people."""
 
 from .diagnostics import Diagnostics, read_diagnostics, write_diagnostics
 from .figures import write_figures

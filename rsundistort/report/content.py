@@ -1,4 +1,4 @@
-"""What a report says, as plain values: for the template, and for the scripts in the page."""
+"""The content of a report as plain values: for the template, and for the scripts in the page."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from .source import Source, relative_folder
 __all__ = [
     "arrows_of",
     "cameras",
-    "ladder",
     "longer",
+    "models",
     "motions",
     "photos",
     "residuals",
@@ -34,19 +34,19 @@ __all__ = [
     "view_of",
 ]
 
-# Size of the picture of a motion, and the places along the readout that it is drawn at.
+# Size of the picture of a motion, and the number of its places along the readout.
 _CURVE, _CURVE_PLACES = (240, 120), 97
 # Factors by which arrows may be drawn longer than they are, and the part of a cell that a long one should fill.
 _LONGER = (1, 2, 3, 4, 6, 8, 10, 15, 20, 30, 50)
 _ACROSS = 14
-# Arrows across and down in the picture of what a lens model leaves.
+# Arrows across and down in the picture of a residual field.
 _FIELD_ARROWS = 13, 9
 
 
 def photos(source: Source) -> list[dict[str, Any]]:
     """A row of each photo, in the order of the solution; angles in degrees per frame."""
-    solution, told = source.solution, source.diagnostics
-    place = {} if told is None else {name: i for i, name in enumerate(told.names)}
+    solution, stored = source.solution, source.diagnostics
+    place = {} if stored is None else {name: i for i, name in enumerate(stored.names)}
     raw_as = str(solution.options.get("raw_as") or "tif")
     raw_folder = "" if source.photos is None else relative_folder(source.photos, source.out)
     rows = []
@@ -69,7 +69,7 @@ def photos(source: Source) -> list[dict[str, Any]]:
                 "turn": None if phi is None else float(np.linalg.norm(phi)),
                 "shift": image.rs_shift_px,
                 "measurements": image.num_observations,
-                "rms_before": None if i is None or told is None else float(told.rms_px[0, i]),
+                "rms_before": None if i is None or stored is None else float(stored.rms_px[0, i]),
                 "rms_after": image.rms_px,
                 "after": quote(written) if image.registered and source.after(image.name) else "",
                 "before": quote(f"{raw_folder}/{image.name}") if raw_folder and source.before(image.name) else "",
@@ -79,9 +79,9 @@ def photos(source: Source) -> list[dict[str, Any]]:
 
 
 def motions(solution: Solution) -> list[dict[str, Any]]:
-    """How photos turned while they were read, of those that did not turn steadily: SVG paths for the three axes.
+    """Rotation over the readout of photos that did not rotate steadily: SVG paths for the three axes.
 
-    From the first line on the left to the last on the right; the steady motions that are nearest go with them.
+    From the first line on the left to the last on the right, with the nearest steady motions.
     """
     width, height = _CURVE
     found = []
@@ -117,8 +117,8 @@ def motions(solution: Solution) -> list[dict[str, Any]]:
 
 def view_of(source: Source, pictures: Mapping[str, Picture]) -> list[dict[str, Any]]:
     """The registered photos with their pictures as data addresses and their arrows, thousandths of the width."""
-    solution, told = source.solution, source.diagnostics
-    depths = {} if told is None else dict(zip(told.names, told.depth.tolist(), strict=True))
+    solution, stored = source.solution, source.diagnostics
+    depths = {} if stored is None else dict(zip(stored.names, stored.depth.tolist(), strict=True))
     found = []
     for number, image in enumerate(solution.images):
         picture = pictures.get(image.name)
@@ -165,7 +165,7 @@ def arrows_of(
 
 def scene(source: Source, upright: Mapping[str, int]) -> dict[str, Any] | None:
     """Cameras and points, the z axis up by the photos' orientations; None without poses."""
-    told = source.diagnostics
+    stored = source.diagnostics
     solution = in_stored_frame(source.solution)
     images = [image for image in solution.registered if image.posed]
     if not images:
@@ -177,7 +177,7 @@ def scene(source: Source, upright: Mapping[str, int]) -> dict[str, Any] | None:
     turn[:, :2, :2] = [MATRICES[split_mirror(upright.get(image.name, 1))[0]] for image in images]
     # on the map z is up, whatever the cameras look at
     V = view_frame(turn @ R) if solution.georeference is None else np.eye(3)
-    points = np.zeros((0, 3)) if told is None else told.points_w
+    points = np.zeros((0, 3)) if stored is None else stored.points_w
     reach = _size(centers, points)
     side = min(0.5 * _spacing(centers), 0.12 * reach) or 0.12 * reach
     value: dict[str, Any] = {
@@ -187,59 +187,59 @@ def scene(source: Source, upright: Mapping[str, int]) -> dict[str, Any] | None:
         "axes": _packed(readout_axes(R, [lens.readout for lens in lenses]) @ V.T),
         "box": _box(_near(points, centers, reach) @ V.T, centers @ V.T),
     }
-    if told is not None:
-        place = {name: i for i, name in enumerate(told.names)}
+    if stored is not None:
+        place = {name: i for i, name in enumerate(stored.names)}
         rows = [place[image.name] for image in images]
-        value["shown"] = int(_is_near(told.points_w, centers, reach).sum())
-        value["points"] = _packed(_near(told.points_w, centers, reach) @ V.T)
-        value["colors"] = [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in _near_rgb(told, centers, reach).tolist()]
+        value["shown"] = int(_is_near(stored.points_w, centers, reach).sum())
+        value["points"] = _packed(_near(stored.points_w, centers, reach) @ V.T)
+        value["colors"] = [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in _near_rgb(stored, centers, reach).tolist()]
         value["global"] = {
-            "points": _packed(_near(told.global_points_w, centers, reach) @ V.T),
-            "centers": _packed(told.global_center_w[rows] @ V.T),
-            "frusta": _packed(_frusta(told.global_R_cw[rows], told.global_center_w[rows], lenses, side) @ V.T),
+            "points": _packed(_near(stored.global_points_w, centers, reach) @ V.T),
+            "centers": _packed(stored.global_center_w[rows] @ V.T),
+            "frusta": _packed(_frusta(stored.global_R_cw[rows], stored.global_center_w[rows], lenses, side) @ V.T),
         }
     return value
 
 
 def residuals(source: Source) -> dict[str, Any] | None:
     """The statistics of residuals, for the plots."""
-    told = source.diagnostics
-    if told is None:
+    stored = source.diagnostics
+    if stored is None:
         return None
     cameras = source.solution.cameras
     return {
-        "names": list(told.names),
-        "edges": _numbers(told.histogram_px),
-        "histogram": told.histogram.tolist(),
-        "rows": _numbers(told.row_rms_px),
-        "photo_rows": _numbers(told.row_mean_px),
-        "cells": _numbers(told.cell_mean_px),
-        "cameras": list(told.camera_ids),
+        "names": list(stored.names),
+        "edges": _numbers(stored.histogram_px),
+        "histogram": stored.histogram.tolist(),
+        "rows": _numbers(stored.row_rms_px),
+        "photo_rows": _numbers(stored.row_mean_px),
+        "cells": _numbers(stored.cell_mean_px),
+        "cameras": list(stored.camera_ids),
         "sizes": [
-            [cameras[key].width, cameras[key].height] if key in cameras else [4, 3] for key in told.camera_ids
+            [cameras[key].width, cameras[key].height] if key in cameras else [4, 3] for key in stored.camera_ids
         ],
     }  # fmt: skip
 
 
-def ladder(solution: Solution) -> list[dict[str, Any]]:
-    """A row of each shutter model that was tried: residuals when it was climbed, errors of held-out measurements."""
+def models(solution: Solution) -> list[dict[str, Any]]:
+    """A row of each shutter model that was tried: residuals of its first fit, errors of held-out measurements."""
     quality = solution.quality
     held_out, errors = quality.get("held_out_rms_px") or {}, quality.get("held_out_error") or {}
     gains, kept = quality.get("held_out_gain") or {}, quality.get("held_out_kept") or ()
     bars = errors or held_out  # solutions of earlier versions have no errors
-    rungs = {
-        str(rung.get("model")): rung
+    fits = {
+        str(fit.get("model")): fit
         for stage in solution.stages
-        if stage.get("name") == "ladder"
-        for rung in stage.get("rungs") or ()
+        if stage.get("name") in ("model sequence", "ladder")  # the latter of version 0.1
+        for fit in stage.get("models") or stage.get("rungs") or ()
     }
-    names = [*bars, *(name for name in SHUTTER_MODELS if name in rungs and name not in bars)]
+    names = [*bars, *(name for name in SHUTTER_MODELS if name in fits and name not in bars)]
     largest = max((float(value) for value in bars.values() if value is not None), default=0.0)
     return [
         {
             "name": name,
-            "rms": rungs.get(name, {}).get("rms_px"),
-            "iterations": rungs.get(name, {}).get("iterations"),
+            "rms": fits.get(name, {}).get("rms_px"),
+            "iterations": fits.get(name, {}).get("iterations"),
             "held_out": held_out.get(name),
             "error": errors.get(name),
             "gain": gains.get(name),
@@ -252,7 +252,7 @@ def ladder(solution: Solution) -> list[dict[str, Any]]:
 
 
 def cameras(solution: Solution) -> list[dict[str, Any]]:
-    """A row of each camera, with the standard deviations of what was solved for."""
+    """A row of each camera, with the standard deviations of its estimated intrinsics."""
     sigmas = solution.quality.get("sigma_intrinsics") or {}
     times = solution.quality.get("readout_times") or {}
     rows = []
@@ -261,12 +261,12 @@ def cameras(solution: Solution) -> list[dict[str, Any]]:
         sigma = sigmas.get(keys[0]) or {}
         lens = {name: value for name, value in camera.coefficients.items() if value or name in sigma}
         values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-        told = {name: sigma.get(name, sigma.get("f") if name[0] == "f" else None) for name in values}
+        sigmas = {name: sigma.get(name, sigma.get("f") if name[0] == "f" else None) for name in values}
         rows.append(
             {
                 "id": keys[0] if len(keys) == 1 else f"{keys[0]} to {keys[-1]}",
                 "size": f"{camera.width} x {camera.height}",
-                "intrinsics": [_value(name, value, told[name], 1) for name, value in values.items()],
+                "intrinsics": [_value(name, value, sigmas[name], 1) for name, value in values.items()],
                 "lens": [_value(name, value, sigma.get(name), 4) for name, value in lens.items()],
                 "model": camera.lens,
                 "readout": camera.readout,
@@ -278,8 +278,8 @@ def cameras(solution: Solution) -> list[dict[str, Any]]:
     return rows
 
 
-def _field(camera: Camera, told: Mapping[str, float]) -> dict[str, Any] | None:
-    """A picture of what a camera's lens model leaves, in thousandths of its width, and its size; None if none."""
+def _field(camera: Camera, facts: Mapping[str, float]) -> dict[str, Any] | None:
+    """A picture of a camera's residual field, in thousandths of its width, and its size; None if it has none."""
     if not camera.field.size:
         return None
     xy, field = (each.reshape(-1, 2) for each in field_over_frame(camera, *_FIELD_ARROWS))
@@ -292,12 +292,12 @@ def _field(camera: Camera, told: Mapping[str, float]) -> dict[str, Any] | None:
         "path": "".join(f"M{x:g} {y:g}l{dx:g} {dy:g}" for (x, y), (dx, dy) in shafts),
         "dots": (unit * xy).round(1).tolist(),
         "times": times,
-        **{key: told.get(f"{key}_px") for key in ("rms", "largest", "sigma")},
+        **{key: facts.get(f"{key}_px") for key in ("rms", "largest", "sigma")},
     }
 
 
 def settings(solution: Solution) -> list[tuple[str, str]]:
-    """Options by name; empty where nothing was said."""
+    """Options by name; empty where none was given."""
     said = []
     for name, value in solution.options.items():
         if isinstance(value, Mapping):
@@ -320,7 +320,7 @@ def _address(data: bytes | None) -> str | None:
 
 
 def _packed(values: NDArray[np.float64]) -> dict[str, str]:
-    """Points (n, 3) as three arrays in the form that plotly.js takes."""
+    """Points (n, 3) as three arrays for plotly.js."""
     return {
         axis: base64.b64encode(np.ascontiguousarray(values[:, k], "<f4").tobytes()).decode()
         for k, axis in enumerate("xyz")
@@ -349,7 +349,7 @@ def view_frame(R_cw: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _size(centers: NDArray[np.float64], points: NDArray[np.float64]) -> float:
-    """How far the scene reaches from the middle of the cameras, but for its farthest points."""
+    """Extent of the scene from the middle of the cameras, without its farthest points."""
     middle = np.median(centers, axis=0)
     every = centers if not len(points) else points
     distance = np.linalg.norm(every - middle, axis=1)
@@ -374,12 +374,12 @@ def _near(points: NDArray[np.float64], centers: NDArray[np.float64], reach: floa
     return points[_is_near(points, centers, reach)]
 
 
-def _near_rgb(told: Diagnostics, centers: NDArray[np.float64], reach: float) -> NDArray[np.uint8]:
-    return told.rgb[_is_near(told.points_w, centers, reach)] if len(told.rgb) else told.rgb
+def _near_rgb(stored: Diagnostics, centers: NDArray[np.float64], reach: float) -> NDArray[np.uint8]:
+    return stored.rgb[_is_near(stored.points_w, centers, reach)] if len(stored.rgb) else stored.rgb
 
 
 def _box(points: NDArray[np.float64], centers: NDArray[np.float64]) -> list[list[float]]:
-    """Ranges of the three axes that hold the cameras, and all but the farthest points."""
+    """Ranges of the three axes that contain the cameras, and all but the farthest points."""
     low, high = centers.min(0), centers.max(0)
     if len(points):
         nearest, farthest = np.quantile(points, [0.02, 0.98], axis=0)

@@ -1,4 +1,4 @@
-"""What a report shows beyond `solution.json`: residuals and the global-shutter result, small enough to keep."""
+"""Content of a report beyond `solution.json`: residuals and the global-shutter result, small enough to keep."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ __all__ = ["Diagnostics", "read_diagnostics", "write_diagnostics"]
 _FORMAT = "rsundistort-report"
 _VERSION = 1
 
-# Types of the arrays, and how many axes they have where their shapes are by them; the others are floats.
+# Types of the arrays, and the number of axes where the shape depends on them; the others are floats.
 _KINDS: dict[str, tuple[str, int | None]] = {
     "names": ("U", 1), "camera_ids": ("U", 1), "photos": ("U", 0), "histogram": ("iu", 2), "point_idx": ("iu", 1),
     "rgb": ("u", 2), "row_rms_px": ("f", 2), "row_mean_px": ("f", 4), "cell_mean_px": ("f", 5),
     "histogram_px": ("f", 1), "points_w": ("f", 2), "global_points_w": ("f", 2),
 }  # fmt: skip
-# Points that are kept: what a phone turns smoothly.
+# Points that are kept: as many as a phone rotates smoothly.
 _MAX_POINTS = 15_000
 # Bins along the readout, of all photos and of one; cells across and down the photo; bars of the histogram.
 _ROWS, _ROWS_OF_PHOTO = 32, 12
@@ -40,7 +40,7 @@ _BARS = 61
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """How a solution and a global-shutter adjustment of the same measurements fit; first axes of 2 are in that order.
+    """Fit of a solution and of a global-shutter adjustment to the same measurements; first axes of 2 are in that order.
 
     Attributes
     ----------
@@ -140,14 +140,14 @@ class Diagnostics:
         )
 
     def with_colors(self, rgb: NDArray[np.uint8] | None) -> Diagnostics:
-        """The same with the colours (n, 3) of all points, where they are known."""
+        """The same with the colours (n, 3) of all points, if they are known."""
         return self if rgb is None else replace(self, rgb=rgb[self.point_idx])
 
 
 def write_diagnostics(path: Path, diagnostics: Diagnostics) -> None:
     """Write `report.npz`, whole or not at all."""
     values: dict[str, Any] = {each.name: getattr(diagnostics, each.name) for each in fields(diagnostics)}
-    # what is only looked at needs no more digits
+    # values for display only need
     values = {name: v.astype(np.float32) if _is_float(v) else np.array(v) for name, v in values.items()}
     file = io.BytesIO()
     np.savez_compressed(file, format=np.array(_FORMAT), version=np.array(_VERSION), **values)
@@ -190,7 +190,7 @@ def _is_float(value: Any) -> bool:
 
 
 def _some(count: int) -> NDArray[np.int64]:
-    """Indices of some of so many things, evenly."""
+    """Indices of some of `count` things, evenly spaced."""
     return np.unique(np.linspace(0, max(count - 1, 0), min(count, _MAX_POINTS)).astype(np.int64))
 
 

@@ -1,4 +1,4 @@
-"""Where the shutter moved the pixels of a photo."""
+"""The displacement of a photo's pixels by the shutter."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from ..io.aside import written_aside
 from ..io.outputs import only_writer
 from ..io.record import Record
 from ..model import Solution
-from .content import arrows_of, ladder, longer, view_frame
+from .content import arrows_of, longer, models, view_frame
 from .diagnostics import Diagnostics
 from .source import Source, read_source
 from .verdict import meter_of
@@ -38,7 +38,7 @@ _STYLE: dict[str, Any] = {
 def write_figures(out: Path | str, figures: Path | str) -> list[Path]:
     """Draw what a run found as figures for papers, each as PNG and as PDF.
 
-    `ladder` (residuals of the shutter models), `displacement` (the displacement fields of the photos that moved most),
+    `models` (residuals of the shutter models), `displacement` (the displacement fields of the photos that moved most),
     `paths` (where the cameras were, ours and by a global shutter) and `critical-motion` (the axes of readout on the
     sphere); those that the solution has nothing for are left out.
 
@@ -68,7 +68,7 @@ def write_figures(out: Path | str, figures: Path | str) -> list[Path]:
         raise InputError('figures need matplotlib; install it: pip install "rsundistort[figures]"') from error
     source, folder = read_source(Path(out)), Path(figures)
     drawings: dict[str, Callable[[Figure, Source], bool]] = {
-        "ladder": _ladder,
+        "models": _models,
         "displacement": _displacement,
         "paths": _paths,
         "critical-motion": _sphere,
@@ -99,21 +99,21 @@ def _save(figure: Figure, folder: Path, name: str, record: Record) -> list[Path]
     return paths
 
 
-def _ladder(figure: Figure, source: Source) -> bool:
-    rungs = [rung for rung in ladder(source.solution) if rung["held_out"] or rung["rms"]]
-    if not rungs:
+def _models(figure: Figure, source: Source) -> bool:
+    rows = [row for row in models(source.solution) if row["held_out"] or row["rms"]]
+    if not rows:
         return False
     labels = {"error": "held-out error", "held_out": "held-out residual (px)", "rms": "residual (px)"}
-    key = next(key for key in labels if any(rung[key] for rung in rungs))
-    rungs = [rung for rung in rungs if rung[key]]
-    figure.set_size_inches(3.4, 0.6 + 0.32 * len(rungs))
+    key = next(key for key in labels if any(row[key] for row in rows))
+    rows = [row for row in rows if row[key]]
+    figure.set_size_inches(3.4, 0.6 + 0.32 * len(rows))
     axes = figure.add_subplot()
-    values = [rung[key] for rung in rungs]
+    values = [row[key] for row in rows]
     bars = axes.barh(
-        [rung["name"] for rung in rungs],
+        [row["name"] for row in rows],
         values,
         height=0.6,
-        color=[_OURS if rung["chosen"] else _GREY for rung in rungs],
+        color=[_OURS if row["chosen"] else _GREY for row in rows],
     )
     axes.bar_label(bars, labels=[f"{value:.3f}" for value in values], padding=3)
     axes.invert_yaxis()
@@ -124,12 +124,12 @@ def _ladder(figure: Figure, source: Source) -> bool:
 
 
 def _displacement(figure: Figure, source: Source) -> bool:
-    solution, told = source.solution, source.diagnostics
+    solution, stored = source.solution, source.diagnostics
     moved = [image for image in solution.registered if image.rs_shift_px is not None]
     moved = sorted(moved, key=lambda image: -(image.rs_shift_px or 0.0))[:_MOST_FIELDS]
     if not moved:
         return False
-    depths = {} if told is None else dict(zip(told.names, told.depth.tolist(), strict=True))
+    depths = {} if stored is None else dict(zip(stored.names, stored.depth.tolist(), strict=True))
     across = min(3, len(moved))
     down = -(-len(moved) // across)
     figure.set_size_inches(2.3 * across, 1.8 * down)
@@ -153,20 +153,20 @@ def _displacement(figure: Figure, source: Source) -> bool:
 
 
 def _paths(figure: Figure, source: Source) -> bool:
-    solution, told = source.solution, source.diagnostics
+    solution, stored = source.solution, source.diagnostics
     images = [image for image in solution.registered if image.posed]
     if not images:
         return False
     R, centers = np.array([image.R_cw for image in images]), np.array([image.center_w for image in images])
     V = view_frame(R)
     plain = None
-    if told is not None:
-        place = {name: i for i, name in enumerate(told.names)}
-        plain = told.global_center_w[[place[image.name] for image in images]]
+    if stored is not None:
+        place = {name: i for i, name in enumerate(stored.names)}
+        plain = stored.global_center_w[[place[image.name] for image in images]]
     figure.set_size_inches(6.2, 2.8)
     for number, (label, pair) in enumerate((("ahead", (0, 1)), ("up", (0, 2))), 1):
         axes = figure.add_subplot(1, 2, number)
-        _mark(axes, told, V, pair, centers)
+        _mark(axes, stored, V, pair, centers)
         if plain is not None:
             axes.plot(*(plain @ V.T)[:, pair].T, "o--", color=_GLOBAL, ms=2.5, label="global shutter")
         axes.plot(*(centers @ V.T)[:, pair].T, "o-", color=_OURS, ms=2.5, label="rolling shutter")
@@ -176,12 +176,12 @@ def _paths(figure: Figure, source: Source) -> bool:
 
 
 def _mark(
-    axes: Any, told: Diagnostics | None, V: NDArray[np.float64], pair: tuple[int, int], centers: NDArray[np.float64]
+    axes: Any, stored: Diagnostics | None, V: NDArray[np.float64], pair: tuple[int, int], centers: NDArray[np.float64]
 ) -> None:
     """The scene's points, faint, behind the paths."""
-    if told is None or not len(told.points_w):
+    if stored is None or not len(stored.points_w):
         return
-    shown = (told.points_w @ V.T)[:, pair]
+    shown = (stored.points_w @ V.T)[:, pair]
     low, high = np.quantile(shown, [0.02, 0.98], axis=0)
     shown = shown[((shown >= low) & (shown <= high)).all(1)]
     axes.plot(*shown.T, ".", color="#c9c9c9", ms=0.6, rasterized=True)

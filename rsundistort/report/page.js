@@ -222,18 +222,18 @@
   }
 
   function startResiduals() {
-    const told = data.residuals;
-    if (!told) return;
+    const residuals = data.residuals;
+    if (!residuals) return;
     const middle = (edges) => edges.slice(1).map((edge, i) => (edge + edges[i]) / 2);
     plot("plot-histogram", () => [["global", "ours"].map((tone, k) => ({
-      type: "scatter", mode: "lines", x: middle(told.edges), y: told.histogram[k], line: {color: color(tone), width: 2, shape: "hspline"},
+      type: "scatter", mode: "lines", x: middle(residuals.edges), y: residuals.histogram[k], line: {color: color(tone), width: 2, shape: "hspline"},
       fill: "tozeroy", fillcolor: color(tone) + "22", hovertemplate: "%{x:.2f} px: %{y}<extra></extra>",
     })), layout({xaxis: axis("residual, px", {zeroline: false}), yaxis: axis("x and y parts", {rangemode: "tozero"})})]);
     plot("plot-rows", () => {
       const of = Number(byId("choose-rows").value), traces = [];
       ["global", "ours"].forEach((tone, k) => {
-        const values = of < 0 ? [[told.rows[k], "solid", ""]] : [0, 1].map((part) =>
-          [told.photo_rows[k][of].map((each) => each[part]), part ? "solid" : "dot", part ? "y " : "x "]);
+        const values = of < 0 ? [[residuals.rows[k], "solid", ""]] : [0, 1].map((part) =>
+          [residuals.photo_rows[k][of].map((each) => each[part]), part ? "solid" : "dot", part ? "y " : "x "]);
         for (const [y, dash, part] of values) traces.push({
           type: "scatter", mode: of < 0 ? "lines" : "lines+markers", x: y.map((_, i) => 100 * (i + 0.5) / y.length), y,
           line: {color: color(tone), width: 2, dash}, marker: {size: 5}, hovertemplate: `${part}%{y:.3f} px at %{x:.0f} %<extra></extra>`,
@@ -249,15 +249,15 @@
     const cameraOf = () => Number(byId("choose-cells")?.value || 0);
     const longer = () => {
       let largest = 0;
-      for (const k of [0, 1]) for (const row of told.cells[k][cameraOf()]) for (const [x, y] of row) if (x !== null) largest = Math.max(largest, Math.hypot(x, y));
-      const cell = told.sizes[cameraOf()][0] / told.cells[0][cameraOf()][0].length, factor = 1.2 * cell / Math.max(largest, 1e-6);
+      for (const k of [0, 1]) for (const row of residuals.cells[k][cameraOf()]) for (const [x, y] of row) if (x !== null) largest = Math.max(largest, Math.hypot(x, y));
+      const cell = residuals.sizes[cameraOf()][0] / residuals.cells[0][cameraOf()][0].length, factor = 1.2 * cell / Math.max(largest, 1e-6);
       const ten = 10 ** Math.floor(Math.log10(factor));
       return Math.max(1, ten * (factor / ten >= 5 ? 5 : factor / ten >= 2 ? 2 : 1));
     };
     const drawCells = [];
     ["global", "ours"].forEach((tone, k) => {
       plot(`plot-cells-${tone}`, () => {
-        const cells = told.cells[k][cameraOf()], [width, height] = told.sizes[cameraOf()], down = cells.length, across = cells[0].length;
+        const cells = residuals.cells[k][cameraOf()], [width, height] = residuals.sizes[cameraOf()], down = cells.length, across = cells[0].length;
         const x = [], y = [], heads = {x: [], y: [], text: []}, times = longer();
         cells.forEach((row, i) => row.forEach(([dx, dy], j) => {
           if (dx === null) return;

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["write_report"]
 
 _NAME = "report.html"
-# What solutions of earlier versions, or of others, may not tell.
+# Keys that solutions of earlier versions, or of others, may lack.
 _QUALITY = dict.fromkeys(("num_points", "rms_px", "global_rms_px"))
 _CRITICAL = dict.fromkeys(("meaning", "sentence", "remedy", "anchors", "warnings"))
 
@@ -115,7 +115,7 @@ def _page(source: Source, pictures: dict[str, Picture]) -> str:
         motions=content.motions(solution),
         views=views,
         data=data,
-        ladder=content.ladder(solution),
+        models=content.models(solution),
         cameras=content.cameras(solution),
         readout=readout_facts(solution.quality["readout_time"]) if solution.quality.get("readout_time") else [],
         places=map_facts(solution.georeference),
@@ -158,5 +158,5 @@ def _seconds(value: Any) -> str:
 
 
 def _signs(text: Any) -> str:
-    """Text of the terminal with the signs of print."""
+    """Text of the terminal with typographic signs."""
     return str(text).replace("+-", "±")

@@ -23,14 +23,14 @@ __all__ = ["Picture", "PictureJob", "make_pictures"]
 # Bytes of all pictures of a report, and of one at least and at most: 100 photos fill half of 15 MB, beside plotly.js.
 _ALL_BYTES = 6_000_000
 _BYTES = (5_000, 110_000)
-# What WebP takes for a pixel of a photo that was made smaller, about.
+# Approximate bytes that WebP takes for a pixel of a reduced photo.
 _BYTES_PER_PIXEL = 0.14
 _QUALITIES = (80, 65, 50, 35, 20)
 
 
 @dataclass(frozen=True)
 class PictureJob:
-    """A photo to be made small.
+    """A photo to be reduced.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class Picture:
 def make_pictures(
     jobs: Sequence[PictureJob], threads: int, progress: Callable[[int], None] | None = None
 ) -> list[Picture]:
-    """Small pictures of photos, the smaller the more there are; one photo a thread is in the memory at a time."""
+    """Small pictures of photos, the smaller the more there are; each thread holds one photo in memory at a time."""
     num_bytes = _bytes_of_each(len(jobs))
     pictures = []
     with ThreadPoolExecutor(max(threads, 1)) as pool:

@@ -1,4 +1,4 @@
-"""What is said of a solution's place on the map."""
+"""The georeferencing of a solution, for people."""
 
 from __future__ import annotations
 
@@ -10,48 +10,46 @@ import numpy as np
 __all__ = ["map_facts", "map_rows"]
 
 
-def map_facts(told: Mapping[str, Any] | None) -> list[tuple[str, str]]:
-    """Label and text of all that is known of the frame, GPS, control points and speeds, for people.
+def map_facts(georeference: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    """Label and text of all that is known of the frame, GPS, control points and speeds.
 
     Parameters
     ----------
-    told : mapping or None
+    georeference : mapping or None
         `Solution.georeference`.
     """
-    if told is None:
+    if georeference is None:
         return []
-    facts = [("map", _frame(told))]
-    if gps := told.get("gps"):
+    facts = [("map", _frame(georeference))]
+    if gps := georeference.get("gps"):
         text = f"{len(gps['photos'])} photos, {gps['median_m']:.2f} m off in the median"
         if gps["outliers"]:
-            text += f"; not believed: {', '.join(gps['outliers'])}"
+            text += f"; rejected: {', '.join(gps['outliers'])}"
         if np.abs(gps["offset_m"]).max() > 0.005:
             east, north, up = gps["offset_m"]
             text += f"; moved by {east:+.2f}, {north:+.2f}, {up:+.2f} m to the control points"
         facts.append(("GPS", text))
     for use in ("control", "check"):
-        off = np.array([each["residual_m"] for each in told.get("control", {}).values() if each["use"] == use])
+        off = np.array([each["residual_m"] for each in georeference.get("control", {}).values() if each["use"] == use])
         if len(off):
             across, up = np.sqrt(np.mean(off[:, 0] ** 2 + off[:, 1] ** 2)), np.sqrt(np.mean(off[:, 2] ** 2))
             facts.append((f"{use} points", f"{len(off)}, {across:.3f} m off across, {up:.3f} m in height (rms)"))
-    facts += _speeds(list(told.get("speeds", {}).values()))
-    if lengths := told.get("lengths"):
+    facts += _speeds(list(georeference.get("speeds", {}).values()))
+    if lengths := georeference.get("lengths"):
         facts.append(("known lengths", f"{lengths['ratio']:.4f} +- {lengths['sigma']:.4f} times as long on the map"))
-    return facts + [("", note) for note in told.get("notes", ())]
+    return facts + [("", note) for note in georeference.get("notes", ())]
 
 
-def _frame(told: Mapping[str, Any]) -> str:
-    crs, origin = told["crs"], told["origin"]
+def _frame(georeference: Mapping[str, Any]) -> str:
+    crs, origin = georeference["crs"], georeference["origin"]
     where = {
         "local": f"east, north, up in metres at {origin[0]:.6f}, {origin[1]:.6f}, {origin[2]:.1f} m",
         "control": "that of the control points",
     }.get(crs, f"{crs}, less {origin[0]:.0f}, {origin[1]:.0f} m")
-    if "sigma" not in told:
-        return f"{where}, as the model has it"
-    place, turn = told["sigma"]["place_m"], told["sigma"]["rotation_deg"]
+    place, turn = georeference["sigma"]["place_m"], georeference["sigma"]["rotation_deg"]
     return (
         f"{where}; known to {max(place[:2]):.2g} m across, {place[2]:.2g} m in height, {max(turn):.2g} deg, scale "
-        f"{100 * told['sigma']['scale']:.2g} %"
+        f"{100 * georeference['sigma']['scale']:.2g} %"
     )
 
 
@@ -64,18 +62,18 @@ def _speeds(speeds: list[Mapping[str, Any]]) -> list[tuple[str, str]]:
     if by_gps:
         text += f", {np.median(by_gps):.1f} m/s by GPS"
     if any(each.get("held_by_gps") for each in speeds):
-        text += ", whose velocity was believed"
+        text += ", whose velocity was used"
     return [("speed", text)]
 
 
-def map_rows(told: Mapping[str, Any] | None) -> dict[str, list[dict[str, Any]]]:
+def map_rows(georeference: Mapping[str, Any] | None) -> dict[str, list[dict[str, Any]]]:
     """Rows of the tables: control points, and photos with GPS, the one that is farthest off first."""
-    if told is None:
+    if georeference is None:
         return {"control": [], "gps": []}
-    control = [{"name": name, **each} for name, each in told.get("control", {}).items()]
-    speeds = told.get("speeds", {})
+    control = [{"name": name, **each} for name, each in georeference.get("control", {}).items()]
+    speeds = georeference.get("speeds", {})
     gps = [
         {"name": name, "speed": speeds.get(name), "off": float(np.linalg.norm(each["residual_m"])), **each}
-        for name, each in told.get("gps", {}).get("photos", {}).items()
+        for name, each in georeference.get("gps", {}).get("photos", {}).items()
     ]
     return {"control": control, "gps": sorted(gps, key=lambda row: -row["off"])}

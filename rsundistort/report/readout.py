@@ -1,4 +1,4 @@
-"""What is said of the readout time of a video, and of what it rests on."""
+"""The readout time of a video and its evidence, for people."""
 
 from __future__ import annotations
 
@@ -10,31 +10,32 @@ from ..verdict.clip import problem_of
 __all__ = ["readout_facts"]
 
 
-def _time(told: Mapping[str, Any]) -> str:
-    return f"{1e3 * told['seconds']:.1f} +- {1e3 * told['sigma']:.1f} ms"
+def _time(evidence: Mapping[str, Any]) -> str:
+    return f"{1e3 * evidence['seconds']:.1f} +- {1e3 * evidence['sigma']:.1f} ms"
 
 
-def readout_facts(told: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Label and text of all that is known of a readout time, for people.
+def readout_facts(evidence: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Label and text of all that is known of a readout time.
 
     Parameters
     ----------
-    told : mapping
+    evidence : mapping
         `quality.readout_time` of a solution.
     """
-    source = told["source"]
+    source = evidence["source"]
     origin = source if source.startswith("what") else f"measured from {source}"
-    share = f" ({told['of_frame']:.2f} of the frame)" if "of_frame" in told else ""  # the truth of a clip has none
-    # what was known before need not be told by the video
-    problem = "" if source.startswith("what") else problem_of(told)
-    facts = [("readout time", f"not measured: {problem}" if problem else f"{_time(told)}{share}, {origin}")]
-    halves = told.get("halves") or ()
+    # the ground truth of a clip has no share
+    share = f" ({evidence['of_frame']:.2f} of the frame)" if "of_frame" in evidence else ""
+    # a time that was known before need not follow from the video
+    problem = "" if source.startswith("what") else problem_of(evidence)
+    facts = [("readout time", f"not measured: {problem}" if problem else f"{_time(evidence)}{share}, {origin}")]
+    halves = evidence.get("halves") or ()
     if halves:
         facts.append(("its halves say", " and ".join(_time(half) for half in halves)))
     for key, label in (("by_pictures", "pictures alone"), ("by_gyroscope", "by the gyroscope")):
-        if told.get(key):
-            facts.append((label, _time(told[key])))
-    gyro = told.get("gyroscope")
+        if evidence.get(key):
+            facts.append((label, _time(evidence[key])))
+    gyro = evidence.get("gyroscope")
     if gyro:
         offset, sigma = 1e3 * gyro["offset_s"], 1e3 * gyro["offset_sigma_s"]
         facts.append(
@@ -43,5 +44,5 @@ def readout_facts(told: Mapping[str, Any]) -> list[tuple[str, str]]:
                 f"axes {gyro['axes']}, offset {offset:.1f} +- {sigma:.1f} ms, correlation {gyro['correlation']:.3f}",
             )
         )
-    facts.append(("stabilisation", (told.get("stabilisation") or {}).get("reason") or "not looked at"))
+    facts.append(("stabilisation", (evidence.get("stabilisation") or {}).get("reason") or "not examined"))
     return facts

@@ -1,4 +1,4 @@
-"""A folder of outputs, as far as it is there."""
+"""The content of a folder of outputs, as far as it exists."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Source", "read_source", "relative_folder"]
 
 @dataclass(frozen=True)
 class Source:
-    """What a report is made of.
+    """The input of a report.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Source:
 
 
 def read_source(out: Path, photos: Path | None = None) -> Source:
-    """What there is in a folder of outputs.
+    """Read what exists in a folder of outputs.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def read_source(out: Path, photos: Path | None = None) -> Source:
 
 
 def _solution(path: Path) -> tuple[Solution, list[str]]:
-    """The solution, and what is to be said of it: one of a newer version is shown as far as it can be read."""
+    """The solution, and remarks on it: one of a newer version is shown as far as it can be read."""
     try:
         return read_solution(path), []
     except FormatError as refused:
@@ -103,8 +103,8 @@ def _solution(path: Path) -> tuple[Solution, list[str]]:
 
 
 def _missing(source: Source) -> list[str]:
-    """What photos are not there."""
-    # of those that could not be rectified the solution says why
+    """Remarks on missing photos."""
+    # for those that could not be rectified
     names = [image.name for image in source.solution.registered if image.reason is None]
     if not (source.out / "images").is_dir():
         return []  # solved without photos

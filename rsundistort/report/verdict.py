@@ -1,4 +1,4 @@
-"""What a solution is worth, in three sentences."""
+"""The verdict on a solution in three sentences."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ __all__ = ["Verdict", "advice_of", "meter_of", "verdict_of"]
 
 # Displacements below this are lost in the interpolation of a photo.
 _UNSEEN_PX = 1.0
-# A shutter that lowers the error of held-out measurements by less than this share may as well be noise.
+# A shutter that lowers the error of held-out measurements by less than this share may be noise.
 _LEAST_GAIN = 0.01
-# Of the scene's height: up to the first it is as good as photos measure, beyond the second it is no measure.
-# What all photos share no deviation knows (docs/found.md).
+# Of the scene's height: up to the first it is as good as photos measure, beyond the second it is no measurement. No
+# standard deviation includes errors that all photos share (docs/found.md).
 _SMALL_PERCENT, _LARGE_PERCENT = 0.5, 2.0
 
 _HEADLINES = {"doubt": "Do not trust the height", "care": "Take the height with care"}
@@ -28,7 +28,7 @@ _NOT_EXAMINED = "How far the shape of the scene can be trusted was not examined.
 
 @dataclass(frozen=True)
 class Verdict:
-    """What to believe of a solution.
+    """How far a solution can be trusted.
 
     Attributes
     ----------
@@ -36,9 +36,9 @@ class Verdict:
         "trust", "care" (with a reservation), "doubt" (do not trust the shape of the scene) or "still" (there was
         nothing to correct).
     headline : str
-        In a few words.
+        A few words.
     sentences : tuple of three str
-        How many photos, how strong the shutter was, and whether the shape of the scene can be trusted and why.
+        Number of photos, strength of the shutter, and whether the shape of the scene can be trusted and why.
     """
 
     level: str
@@ -47,7 +47,7 @@ class Verdict:
 
 
 def meter_of(solution: Solution) -> CriticalMotion | None:
-    """The meter of critical motions as the solution has it; None where it has none."""
+    """The degeneracy measure in the solution; None if it has none."""
     said = solution.critical_motion or {}
     try:
         values = np.array(said["singular_values"], float).reshape(5)
@@ -59,7 +59,7 @@ def meter_of(solution: Solution) -> CriticalMotion | None:
 
 
 def advice_of(solution: Solution) -> list[str]:
-    """What to photograph at the next shoot, where the poses are critical: as the solution says, else by the poses."""
+    """What to photograph at the next shoot, if the poses are critical: from the solution, else from the poses."""
     meter = meter_of(solution)
     said = (solution.critical_motion or {}).get("advice")
     if said or meter is None or not meter.is_low or meter.num_photos < 2:
@@ -73,7 +73,7 @@ def advice_of(solution: Solution) -> list[str]:
 def verdict_of(solution: Solution) -> Verdict:
     """The verdict on a solution, in the words of the report and of the command's closing lines.
 
-    It is the one that the solution holds. Those of earlier versions hold none: theirs goes by the height of the scene
+    It is the one in the solution. Solutions of earlier versions have none: theirs follows from the height of the scene
     and the strength of the shutter alone.
     """
     taken_out = [image for image in solution.registered if not image.lens_only]
@@ -86,9 +86,9 @@ def verdict_of(solution: Solution) -> Verdict:
 def _photos(solution: Solution) -> str:
     count, registered = len(solution.images), len(solution.registered)
     if registered == count:
-        return f"All {count} photos were joined into one scene." if count > 1 else "The only photo has a motion."
+        return f"All {count} photos were registered in one scene." if count > 1 else "The only photo has a motion."
     left = "1 was" if count - registered == 1 else f"{count - registered} were"
-    return f"{registered} of {count} photos were joined into one scene; {left} left out."
+    return f"{registered} of {count} photos were registered in one scene; {left} left out."
 
 
 def _not_asked(solution: Solution) -> bool:
@@ -97,25 +97,25 @@ def _not_asked(solution: Solution) -> bool:
 
 def _strength(solution: Solution, shifts: list[float]) -> str:
     if solution.registered and all(image.lens_only for image in solution.registered):
-        return "The lens was taken out of the photos, and no motion."
+        return "The photos were corrected for the lens only."
     if not shifts:
-        return "How far the shutter moved pixels is not known."
+        return "The displacement by the shutter is not known."
     if _not_asked(solution):
         return "The shutter was not modelled, as you asked (--model global)."
     if solution.shutter_model == "global":
-        return "No model of a rolling shutter foretold measurements better than a global shutter does."
+        return "No rolling-shutter model predicted measurements better than a global shutter."
     largest, median = max(shifts), float(np.median(shifts))
-    said = f"The rolling shutter moved pixels by up to {_px(largest)}"
+    said = f"The rolling shutter displaced pixels by up to {_px(largest)}"
     if len(shifts) > 1:
         said += f", in half of the photos by more than {_px(median)}"
     before, after = solution.quality.get("global_rms_px"), solution.quality.get("rms_px")
     if before is None or after is None:
         return f"{said}."
-    return f"{said}; modelling it took the residuals from {before:.2f} px to {after:.2f} px."
+    return f"{said}; modelling it reduced the residuals from {before:.2f} px to {after:.2f} px."
 
 
 def _by_height(solution: Solution, largest: float | None) -> dict[str, Any]:
-    """What a solution without a verdict says of shutter and shape."""
+    """The verdict on a solution that has none."""
     if _not_asked(solution):
         return {"shutter": "not-determined", "shape": "doubtful", "reasons": []}
     if _unneeded(solution, largest):
@@ -127,11 +127,11 @@ def _by_height(solution: Solution, largest: float | None) -> dict[str, Any]:
 
 
 def _shape(solution: Solution, said: Mapping[str, Any], largest: float | None) -> tuple[str, str, str]:
-    """Level, headline and third sentence of what a verdict says."""
+    """Level, headline and third sentence of a verdict."""
     shutter, trusted, reasons = said["shutter"], said["shape"] == "trusted", said["reasons"]
     if _not_asked(solution):
         text = "Whether the shape of the scene can be trusted is not known either: --model auto would say."
-        return "care", "The shutter was not looked at", text
+        return "care", "The shutter was not examined", text
     if trusted and shutter == "not-found":
         reason = _unneeded(solution, largest) or "no shutter can be seen"
         text = f"No correction is needed: {reason}, and the shape of the scene is as good as that of a global shutter."
@@ -139,9 +139,9 @@ def _shape(solution: Solution, said: Mapping[str, Any], largest: float | None) -
     level, sentence = _height(solution)
     if trusted:
         meter = meter_of(solution)
-        why = "the cameras were turned enough against each other to tell the shutter from the shape"
+        why = "the cameras were rotated enough against each other to separate the shutter from the shape"
         if meter is not None and meter.is_low:
-            why = f"although {_level(meter)}, the measurements hold its height"
+            why = f"although {_level(meter)}, the measurements determine its height"
         return "trust", "The shape can be trusted", f"The shape of the scene can be trusted: {why}. {sentence}"
     text = " ".join(reasons)
     if shutter == "not-determined":
@@ -154,7 +154,7 @@ def _shape(solution: Solution, said: Mapping[str, Any], largest: float | None) -
 
 
 def _height(solution: Solution) -> tuple[str, str]:
-    """How far the height of the scene is in doubt ("doubt", "care" or "", if it is not), and a sentence on it."""
+    """Level of doubt about the height of the scene ("doubt", "care" or ""), and a sentence on it."""
     said, meter = solution.critical_motion or {}, meter_of(solution)
     if meter is None:
         return "", ""
@@ -162,8 +162,8 @@ def _height(solution: Solution) -> tuple[str, str]:
     sentence = _sentence(str(said.get("sentence") or ""))
     if meter.is_low and said.get("remedy") == "none":
         return "doubt", (
-            f"Do not trust the height of the scene: {_level(meter)}, which leaves it open to first order, and with the "
-            f"remedy switched off only the model's second-order terms hold it ({_deviation(percent)})."
+            f"Do not trust the height of the scene: {_level(meter)}, so it is undetermined to first order, and with "
+            f"the remedy switched off only the model's second-order terms determine it ({_deviation(percent)})."
         )
     if said.get("flagged") and percent > _LARGE_PERCENT:
         return "doubt", f"Do not trust the height of the scene. {sentence}"
@@ -173,26 +173,26 @@ def _height(solution: Solution) -> tuple[str, str]:
 
 
 def _unneeded(solution: Solution, largest: float | None) -> str:
-    """Why no correction is needed; empty if it is."""
+    """Why no correction is needed; empty if it is needed."""
     if solution.shutter_model == "global":
         return "a global shutter explains the photos as well"
     if largest is not None and largest < _UNSEEN_PX:
-        return "the shutter moved no pixel by as much as one"
+        return "the shutter displaced no pixel by as much as one"
     held_out = solution.quality.get("held_out_rms_px") or {}
     plain, ours = held_out.get("global"), held_out.get(solution.shutter_model)
     if plain and ours and ours > (1 - _LEAST_GAIN) * plain:
-        return "without the shutter, measurements that were held out are foretold as well"
+        return "without the shutter, held-out measurements are predicted as well"
     return ""
 
 
 def _percent(said: Any) -> float:
-    """Standard deviation of the height, per cent; infinite where it is left open."""
+    """Standard deviation of the height, per cent; infinite if it is undetermined."""
     sigma = said.get("sigma_log_k")
     return float("inf") if sigma is None else 100 * float(sigma)
 
 
 def _deviation(percent: float) -> str:
-    return f"to +-{percent:.2g} %" if np.isfinite(percent) else "and they leave it open"
+    return f"to +-{percent:.2g} %" if np.isfinite(percent) else "and they leave it undetermined"
 
 
 def _level(meter: CriticalMotion) -> str:
@@ -202,7 +202,7 @@ def _level(meter: CriticalMotion) -> str:
         return "all cameras were held level"
     if meter.y_axis_spread_deg < 15:
         return "the cameras were held nearly level"
-    return "the cameras were hardly turned against each other"
+    return "the cameras were hardly rotated against each other"
 
 
 def _sentence(text: str) -> str:

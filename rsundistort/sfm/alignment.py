@@ -1,9 +1,9 @@
 """Measurements of tracks at full size: the windows of a track's photos are aligned with that of its best view.
 
-Features are found in shrunk photos, and a blob's centre is seen a little differently by each photo. Once poses and
-points stand, the geometry says how a window around a point looks in every photo; what is left is a shift of a fraction
-of a pixel, which an alignment finds, with its uncertainty, in the full-size photo. It also finds the point where no
-feature was.
+Features are detected in reduced photos, and each photo sees the centre of a blob a little differently. With poses and
+points the geometry predicts the appearance of a window around a point in every photo; what is left is a shift of a
+fraction of a pixel, which an alignment finds, with its uncertainty, in the full-size photo. It also finds the point
+where no feature was.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from .features import SIFT_PX, size_of_sigma
 
 __all__ = ["PatchPlaces", "PatchSource", "align_tracks", "allowed_patches", "cut_patches"]
 
-# Half the side of the cut-outs: a window turned by 45 degrees and stretched by a half, and room for the shift.
+# Half the side of the cut-outs: a window rotated by 45 degrees and stretched by a half, and room for the shift.
 _MARGIN = 24
 _SIDE = 2 * _MARGIN + 1
 # Samples of the window of a feature to its diameter: the window is 2.8 diameters wide.
 _PER_SIZE = 5.0
-# Of the correlation, below which a measurement, and a point where no feature was, is not believed; of the shift of
-# both from where they were expected, in pixels of the image that the features were found in.
+# Smallest correlation of a measurement, and of a point without a feature; largest shift of both from the prediction, in
+# pixels of the image that the features were detected in.
 _LEAST_MEASURED, _LEAST_NEW = 0.7, 0.85
 _MOST_SHIFT = 1.5
-# A photo is asked for a point that it does not show by a feature if it looks at it from within this angle of the
-# best view, and no more than this factor farther or nearer.
+# A point without a feature is searched for in a photo that sees it from within this angle of the best view, and from a
+# distance that differs by this factor at most.
 _MOST_ANGLE_DEG, _MOST_SCALE = 30.0, 1.7
 # Windows with less contrast (standard deviation in grey levels) hold nothing but noise.
 _LEAST_CONTRAST = 3.0
-# No alignment is trusted to better than this, in pixels of the finer window's level: interpolation, compression.
+# No alignment is more exact than this, in pixels of the finer window's level: interpolation, compression.
 _FLOOR_PX = 0.03
-# Photos that have so many points in common are asked for each other's, so many of them at most; nearer to the border
-# nothing is sought.
+# Points in common from which photos are searched for each other's points, and the largest number of these; nothing is
+# searched nearer to the border.
 _LEAST_COMMON, _MOST_PARTNERS, _BORDER_PX = 15, 30, 8
-# Photos with so many measurements are asked for no more.
+# Photos with this many measurements get no more.
 _ENOUGH = 4000
 # Patches in memory at a time (2.4 kB each).
 _BLOCK = 120_000
@@ -50,12 +50,12 @@ _BLOCK = 120_000
 
 @dataclass(frozen=True)
 class PatchPlaces:
-    """Which cut-outs of a photo are wanted.
+    """Cut-outs of a photo.
 
     Attributes
     ----------
     level : (n,) int array
-        Halvings of the photo that they are cut from.
+        Halvings of the photo before they are cut.
     corner : (n, 2) int array
         Column and row of their first pixel there.
     """
@@ -136,7 +136,7 @@ class _Windows:
 
 @dataclass(frozen=True)
 class _Aligned:
-    """What came of windows: their places, correlations, and deviations in pixels; NaN where nothing did."""
+    """Results of windows: places, correlations, and deviations in pixels; NaN for failures."""
 
     xy: NDArray[np.float64]
     correlation: NDArray[np.float64]
@@ -144,12 +144,12 @@ class _Aligned:
 
 
 def align_tracks(reconstruction: Reconstruction, steps_px: Sequence[float], patches_of: PatchSource) -> Reconstruction:
-    """The reconstruction with measurements aligned at full size, and such where no feature was.
+    """The reconstruction with measurements aligned at full size, and new ones where no feature was.
 
     Parameters
     ----------
     reconstruction : Reconstruction
-        Adjusted; its motions and points say how windows look.
+        Adjusted; its motions and points predict the windows.
     steps_px : (m,) sequence of float
         `Features.step_px` of each photo.
     patches_of : callable
@@ -160,7 +160,7 @@ def align_tracks(reconstruction: Reconstruction, steps_px: Sequence[float], patc
     -------
     Reconstruction
         With new observations; those that could not be aligned are as they were, and points that only two photos show
-        are left out: nothing checks these. Points, poses and motions stay.
+        are left out, since nothing checks them. Points, poses and motions stay.
     """
     rec, step = reconstruction, np.asarray(steps_px, np.float64)
     normal = _facing(rec)
@@ -316,7 +316,7 @@ def _align_block(
 def _with_aligned(
     rec: Reconstruction, step: NDArray[np.float64], of_point: NDArray[np.int64], wanted: _Windows, aligned: _Aligned
 ) -> Reconstruction:
-    """The reconstruction with the alignments that are believed."""
+    """The reconstruction with the accepted alignments."""
     obs = rec.observations
     old = len(obs)
     sigma = aligned.sigma_px / SIFT_PX
@@ -327,7 +327,7 @@ def _with_aligned(
     good = (aligned.correlation >= least) & (shift <= _MOST_SHIFT * expected) & (sigma <= expected)
     xy, sigmas = obs.xy_raw.copy(), obs.sigma.copy()
     xy[good[:old]], sigmas[good[:old]] = aligned.xy[:old][good[:old]], sigma[:old][good[:old]]
-    # the best view says which point is meant: it is as good as those that were aligned with it
+    # the best view defines the point: it is as good as those that were aligned with it
     told = np.flatnonzero(good)
     log_mean = np.bincount(wanted.point[told], np.log(sigma[told]), rec.num_points)
     count = np.bincount(wanted.point[told], minlength=rec.num_points)

@@ -1,9 +1,9 @@
 """The pycolmap database of a set of photos, whose keypoints we correct.
 
-Everything that pycolmap sees is a pinhole camera: keypoints are freed of lens and shutter as far as these are known
-and written into its database. Only a fisheye keeps its lens, which pycolmap has too: in a pinhole photo the noise of a
-keypoint would grow with the square of the distance from the centre, 33 times at 80 degrees from the axis. The
-measurements of the adjustment remain the raw pixels.
+Every camera in pycolmap is a pinhole camera: lens and shutter are removed from keypoints as far as these are known, and
+the results written into its database. Only a fisheye keeps its lens, which pycolmap has too: in a pinhole photo the
+noise of a keypoint would grow with the square of the distance from the centre, 33 times at 80 degrees from the axis.
+The measurements of the adjustment remain the raw pixels.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ __all__ = [
     "write_photos",
 ]
 
-#: A shutter that turns by 0.05 rad over the frame moves pixels by tens; epipolar geometry absorbs most of it. With
-#: thresholds four times COLMAP's own, all photos register and tracks stay whole; with its own, a third is cut off.
+#: A rotation by 0.05 rad over the frame moves pixels by tens; epipolar geometry absorbs most of it. With thresholds
+#: four times COLMAP's own, all photos register and tracks stay complete; with its own, a third is cut off.
 LOOSE = 4.0
 
 
@@ -70,7 +70,7 @@ def ideal_keypoints(
 ) -> NDArray[np.float32]:
     """Keypoints without shutter in the camera of the database, COLMAP's centres; where none exists, far outside.
 
-    `own` is the camera as it was when the photo was taken, if it differs.
+    `own` is the camera at the time of the photo, if it differs.
     """
     ideal, valid = unproject_points(features.xy_raw, own or camera, motion, model)
     if camera.lens == "fisheye":
@@ -113,7 +113,7 @@ def verification_options(max_error_px: float, seed: int) -> Any:
     options = quiet_pycolmap().TwoViewGeometryOptions()
     options.ransac.max_error = max_error_px
     options.ransac.random_seed = seed
-    # three of ten matches that are right are found by these all but surely; pairs of which none is take all of them
+    # with three right matches of ten these find them almost surely; pairs without a right one take all of them
     options.ransac.max_num_trials = 3000
     options.detect_watermark = False
     return options
@@ -123,10 +123,10 @@ def pipeline_options(loose: float, seed: int, refine_intrinsics: bool, num_photo
     """Of mapping and triangulation, with thresholds `loose` times COLMAP's own."""
     options = quiet_pycolmap().IncrementalPipelineOptions()
     options.random_seed = seed
-    # one thread: with more, the same seed now and then takes another first pair; small problems are no slower
+    # one thread: with more, the same seed sometimes takes another first pair; small problems are no slower
     options.num_threads = options.mapper.num_threads = 1
     options.extract_colors = False
-    # smaller models are given up and another first pair is tried
+    # smaller models are dropped and another first pair is tried
     options.min_model_size = min(10, max(min(3, num_photos), num_photos // 2))
     options.ba_refine_focal_length = refine_intrinsics
     options.ba_refine_extra_params = refine_intrinsics
@@ -165,7 +165,7 @@ def from_pycolmap(model: Any, matched: MatchedPhotos, posed: Reconstruction | No
             point_idx.append(number)
             keypoint.append(element[1])
     if not track_points:
-        raise ReconstructionError("the photos were joined, but no scene point could be triangulated")
+        raise ReconstructionError("the photos were registered, but no scene point could be triangulated")
     frame = np.array(frame_idx)
     found = [matched.features[image_id - 1] for image_id in ids]
     start = np.concatenate([[0], np.cumsum([len(each.sigma) for each in found])])

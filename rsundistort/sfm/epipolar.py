@@ -1,4 +1,4 @@
-"""Which matches the poses of a reconstruction explain, and which photos contradict the others."""
+"""The matches that fit the poses of a reconstruction, and the photos that contradict the others."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ __all__ = [
     "sampson_distance",
 ]
 
-#: Of a measurement from its prediction, in pixels of the image that the features were found in.
+#: Largest distance of a measurement from its prediction, in pixels of the image that the features were detected in.
 TIGHT_PX = 2.0
-#: A pair with fewer matches that fit is likely to have only such as fit by chance.
+#: A pair with fewer matches that fit may have only such as fit by chance.
 MIN_EXPLAINED = 15
 
 # Of the matches of two photos that one loose epipolar geometry fits, the poses of both must explain this share.
@@ -34,7 +34,7 @@ _LEAST_SHARE = 0.5
 
 
 class FreedMatches:
-    """Matches as a reconstruction sees them: rays freed of lens and shutter.
+    """Matches under a reconstruction: rays without lens and shutter.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class FreedMatches:
         return self._rays[photo]
 
     def explained(self, first: int, second: int, matches: NDArray[np.integer]) -> NDArray[np.bool_]:
-        """(n,) whether both rays of a match lie within tight thresholds of the other's epipolar plane (Sampson).
+        """(n,) whether both rays of a match are within tight thresholds of the other's epipolar plane (Sampson).
 
         Photos are counted as in `matched`; none is explained where one of them has no pose.
         """
@@ -101,7 +101,7 @@ def read_verified(matched: MatchedPhotos) -> Matches:
 
 
 def read_num_verified(matched: MatchedPhotos) -> dict[tuple[int, int], int]:
-    """How many matches of each pair one loose epipolar geometry fits: a database knows it until tracks are rebuilt."""
+    """Number of matches of each pair that fit one loose epipolar geometry, from the database before new tracks."""
     pycolmap = quiet_pycolmap()
     with pycolmap.Database.open(matched.database) as db:
         pair_ids, counts = db.read_two_view_geometry_num_inliers()
@@ -115,7 +115,7 @@ def agreeing_photos(
     num_verified: Mapping[tuple[int, int], int],
     reconstruction: Reconstruction,
 ) -> NDArray[np.bool_]:
-    """Photos of a reconstruction that hang together: the largest set that is linked by pairs which it explains.
+    """Photos of a reconstruction that are connected: the largest set linked by pairs that fit it.
 
     A pair links two photos if their poses explain half of what a loose epipolar geometry does.
 
@@ -129,8 +129,7 @@ def agreeing_photos(
     Returns
     -------
     (m,) bool array
-        By photo of `matched`. False for the rest, which another place in the scene may fit better, and for photos
-        without a pose.
+        By photo of `matched`. False for the rest, which another pose may fit better, and for photos without a pose.
     """
     from scipy.sparse import coo_matrix  # late: few runs need it
     from scipy.sparse.csgraph import connected_components
@@ -155,7 +154,7 @@ def agreeing_photos(
 def sampson_distance(
     x_1: NDArray[np.float64], x_2: NDArray[np.float64], R_21: NDArray[np.float64], t_21: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Distance of matches from a relative pose: to first order, what both must move by to fit it.
+    """Distance of matches from a relative pose: to first order, the displacement of both that makes them fit.
 
     Parameters
     ----------

@@ -21,7 +21,7 @@ __all__ = [
     "size_sigma",
 ]
 
-#: Megapixels that a photo is shrunk to before features are looked for in it, unless told otherwise.
+#: Default size in megapixels at which features are detected.
 DETECTION_MEGAPIXELS = 1.0
 
 #: Standard deviation of the position of the finest features, whose relative one is 1, in pixels.
@@ -47,7 +47,7 @@ class Features:
     descriptors : (n, 128) uint8 array
         RootSIFT, scaled by 512 as COLMAP stores it.
     step_px : float
-        Pixels of the stored photo to one of those that the features were found in: the unit of what they may be off.
+        Pixels of the stored photo per pixel of the image that the features were detected in: the unit of their errors.
     """
 
     xy_raw: NDArray[np.float64]
@@ -56,7 +56,7 @@ class Features:
     step_px: float = 1.0
 
     def largest(self, count: int) -> Features:
-        """So many of them, the largest."""
+        """The largest of them, of this number."""
         return Features(self.xy_raw[:count], self.sigma[:count], self.descriptors[:count], self.step_px)
 
 
@@ -86,13 +86,13 @@ def detect_features(
     photo : (h, w) or (h, w, 3 | 4) array
         8-bit, 16-bit or float (0 to 1) pixels in OpenCV's channel order.
     max_features : int
-        Keep this many, the largest first; those of several orientations count several times.
+        Number that is kept, the largest first; features with several orientations count several times.
     mask : (h, w) uint8 array, optional
         No features where it is 0.
     megapixels : float
-        Larger photos are shrunk to this before.
+        Larger photos are reduced to this size.
     """
-    # the upscaled first octave is off by a quarter of a pixel unless it is asked to be precise (measured on blobs)
+    # the upscaled first octave is off by a quarter of a pixel without the precise option (measured on blobs)
     sift = cv2.SIFT.create(
         nfeatures=0, nOctaveLayers=3, contrastThreshold=0.02, edgeThreshold=10, sigma=1.6, enable_precise_upscale=True
     )
@@ -104,7 +104,7 @@ def detect_features(
     if not keypoints:
         return Features(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.uint8), shrink)
     x, y, size, angle, response = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints]).T
-    # ties by strength and place: the order in which OpenCV's threads found them must not matter
+    # ties by strength and place: the result must not depend on the order of OpenCV's threads
     order = np.lexsort((angle, x, y, -response, -size))[:max_features]
     # twice the pyramid costs less than descriptors of all
     kept, raw = sift.compute(gray, [keypoints[k] for k in order])
@@ -116,7 +116,7 @@ def detect_features(
 
 
 def detection_bytes(width: int, height: int, megapixels: float = DETECTION_MEGAPIXELS) -> float:
-    """Memory that features of a photo of this size take while they are looked for, beside the photo."""
+    """Memory that the detection of features takes for a photo of this size, besides the photo."""
     return float(_BYTES_PER_PIXEL * min(width * height, 1e6 * megapixels))
 
 

@@ -1,4 +1,4 @@
-"""Optical flow between the frames of a video: how far the picture moved, and points of key frames in the others."""
+"""Optical flow between frames of a video: motion of the content, and points of key frames in the others."""
 
 from __future__ import annotations
 
@@ -14,19 +14,20 @@ __all__ = ["FlowTracks", "KeyFrameChooser", "flow_between", "flow_size"]
 
 Grey = NDArray[np.uint8]
 
-# Larger frames are shrunk to this: a twentieth of a pixel there is a tenth in a 4K frame.
+# Larger frames are reduced to this: a twentieth of a pixel there is a tenth in a 4K frame.
 _FLOW_MEGAPIXELS = 2.1
 _WINDOW = (21, 21)
 _LEVELS = 4
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.003)
-# A point that comes back elsewhere, followed there and back again, was lost: pixels.
+# A point that returns elsewhere, followed there and back again, was lost: pixels.
 _BACK_PX = 0.5
-# Corners that the motion of the picture is read off.
+# Corners that measure the motion of the content.
 _CORNERS = 300
-# A key frame follows the last one when the picture has moved by this share of its diagonal, or when so few of the
-# corners are still seen; the sharpest of the frames that moved by `_CANDIDATE` of that is taken.
+# A key frame is due when the content has moved by this share of its diagonal, or when this few of the corners are still
+# seen; the sharpest of the frames that moved by `_CANDIDATE` of that is taken.
 _MOVED, _SEEN, _CANDIDATE = 0.06, 0.5, 0.6
-# But no later than after so many frames: what is followed from one key frame to the next joins all frames between.
+# But no later than after this many frames: points that are followed from one key frame to the next connect all frames
+# between.
 _MOST_GAP = 12
 # Corners that vanish from one frame to the next: another scene.
 _CUT, _LEAST_CORNERS = 0.75, 20
@@ -59,16 +60,16 @@ def _followed(
 
 
 class KeyFrameChooser:
-    """Chooses key frames of a video while its frames go by, and sees where it was cut.
+    """Choose key frames of a video while its frames pass, and find its cuts.
 
     Attributes
     ----------
     keys : list of int
         Frames chosen so far; the first one is.
     cuts : list of int
-        Frames that do not go on from the one before.
+        Frames that do not continue the one before.
     steps : list of float
-        How far the picture moved from each frame to the next, pixels of the flow; NaN over a cut.
+        Motion of the content from each frame to the next, pixels of the flow; NaN over a cut.
     """
 
     def __init__(self) -> None:
@@ -88,7 +89,7 @@ class KeyFrameChooser:
         self._step(grey, sharpness, counts=True)
 
     def finish(self) -> None:
-        """The last frame is a key frame, too: beyond it nothing is held."""
+        """The last frame is a key frame, too: nothing is known beyond it."""
         if self.keys and self.keys[-1] != self._number:
             self.keys.append(self._number)
 
@@ -173,7 +174,7 @@ def flow_between(
 
 
 def _through(greys: Sequence[Grey], key: int, order: Iterable[int], start: NDArray[np.float64]) -> FlowTracks:
-    """Points of a key frame in other frames, in an order in which the picture moves on."""
+    """Points of a key frame in other frames, in an order in which the content moves on."""
     xy0 = np.asarray(start, np.float32).reshape(-1, 2)
     index, xy = np.arange(len(xy0)), xy0
     found = [(np.zeros(0, np.int64), index[:0], xy[:0])]

@@ -1,4 +1,4 @@
-"""The focal length of a camera that nothing tells, from pairs of its photos."""
+"""The unknown focal length of a camera, from pairs of its photos."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ Array = NDArray[np.float64]
 USUAL_FOCAL = (0.85, 0.35)
 # Focal lengths that are tried, over the longer side, with equal ratios.
 _TRIED = np.geomspace(0.35, 3.5, 15)
-# Matches of a pair that are looked at, and pairs that tell anything together.
+# Matches of a pair that are used, and pairs that are conclusive together.
 _MATCHES, _LEAST_PAIRS = 300, 3
-# Where a match counts as an outlier, in pixels of the image that the features were found in; the noise is about one.
+# Distance of an outlier, in pixels of the image that the features were detected in; the noise is about one.
 _OUTLIER_PX, _INLIER_PX = 3.0, 2.0
 _TRIALS = 60
-# Costs that are higher by this share explain the matches as well: a plane, or a camera that hardly travelled, is fitted
-# a little better by shorter focal lengths, whose essential matrices bend more.
+# Costs that are higher by this share count as equal: a plane, or a camera that hardly travelled, is fitted a little
+# better by shorter focal lengths, whose essential matrices bend more.
 _AS_WELL = 0.05
 # Sets of pairs drawn for the standard deviation.
 _DRAWS = 200
-# What a lens and a shutter, which are not known yet, move the estimate by (logarithm): published focal lengths of
-# photos with them differ from it so.
+# Effect of an unknown lens and shutter on the estimate (logarithm): published focal lengths of photos with them differ
+# from it by this.
 _UNMODELLED = 0.05
 
 
 @dataclass(frozen=True)
 class FocalLength:
-    """A focal length and how well it is known.
+    """A focal length and its standard deviation.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class FocalLength:
     sigma : float
         Relative standard deviation.
     num_pairs : int
-        Pairs of photos that it is from; 0 where none tell it, and it is what is usual.
+        Pairs of photos that it is from; 0 if none is conclusive, and it is the usual one.
     """
 
     pixels: float
@@ -55,13 +55,13 @@ class FocalLength:
 def estimate_focal_length(
     pairs: Sequence[tuple[Array, Array]], size: tuple[int, int], step_px: float = 1.0, seed: int = 0
 ) -> FocalLength:
-    """The focal length whose relative poses explain matches best, and what is usual as far as they do not tell.
+    """The focal length whose relative poses fit matches best, combined with the usual one.
 
-    Each pair gets the best essential matrix of each focal length in turn; its matches' truncated Sampson errors,
-    summed over all pairs, are smallest at the right one. Fundamental matrices of single pairs tell the focal length,
-    too (Fetzer et al., WACV 2020), but each of them only weakly; a plane, or a camera that only turned, tells nothing
-    here and adds about the same to all focal lengths. The variance is that of the estimate over sets of pairs that are
-    drawn with replacement, and of the focal lengths that explain the matches about as well.
+    For each focal length each pair gets the best essential matrix; the truncated Sampson errors of its matches, summed
+    over all pairs, are smallest at the right one. Fundamental matrices of single pairs determine the focal length, too
+    (Fetzer et al., WACV 2020), but each of them only weakly; a plane, or a camera that only rotated, adds about the
+    same to all focal lengths. The variance is that of the estimate over sets of pairs drawn with replacement, and of
+    the focal lengths that fit the matches about as well.
 
     Parameters
     ----------

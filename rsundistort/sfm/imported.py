@@ -1,4 +1,4 @@
-"""The matches of somebody else's COLMAP database."""
+"""The matches of a COLMAP database of another program."""
 
 from __future__ import annotations
 
@@ -51,9 +51,9 @@ def matched_of_database(source: Path, database: Path, reconstruction: Reconstruc
     Raises
     ------
     FileError
-        When there is no such database.
+        There is no such database.
     InputError
-        When it does not hold the photos, or holds other keypoints.
+        It does not hold the photos, or holds other keypoints.
     """
     rec = reconstruction
     with _opened(source, database.parent) as db:
@@ -80,7 +80,7 @@ def _opened(source: Path, work: Path) -> Iterator[sqlite3.Connection]:
     """COLMAP's tables, to be read: pycolmap would make a database that is missing, and change one that is old."""
     if not source.is_file():
         raise FileError(f"{source} is missing; give the database that the model was made from")
-    # what COLMAP has not put into it yet is beside it, and to read both SQLite would write there: so from a copy
+    # what COLMAP has not merged yet lies beside it, and SQLite would write there to read both: so from a copy
     pending = source.with_name(f"{source.name}-wal")
     try:
         if pending.is_file() and pending.stat().st_size:
@@ -153,7 +153,7 @@ def _check_keypoints(source: Path, rec: Reconstruction, features: Sequence[Featu
 def _copy_matches(db: sqlite3.Connection, ours: Any, photos: dict[int, tuple[int, int]]) -> int:
     """Copy the matches between photos by their new ids; of pairs without, those that were verified. How many pairs.
 
-    `photos` tells the new id and the number of keypoints by the old id.
+    `photos` gives the new id and the number of keypoints by the old id.
     """
     copied = set()
     for table in ("matches", "two_view_geometries"):

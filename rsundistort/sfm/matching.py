@@ -1,4 +1,4 @@
-"""Which photos are matched with each other, and the matching."""
+"""Matching of photos."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ def match_photos(
     focal_known : bool
         Whether their focal lengths are, at least roughly; else pairs are verified without these.
     within_px : float
-        How far verified matches may lie from their epipolar lines.
+        Largest distance of verified matches from their epipolar lines.
     seed : int
         Seed of the verification.
     pairs : (p, 2) int array, optional
-        Photos to match with each other, as `choose_pairs` gives them; by default each with all others.
+        Pairs to match, as `choose_pairs` gives them; by default all.
     """
     pycolmap = quiet_pycolmap()
     matched = MatchedPhotos(database, tuple(names), tuple(features), tuple(cameras), camera_idx, calibrated, seed)

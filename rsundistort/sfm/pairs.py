@@ -1,4 +1,4 @@
-"""Which photos of a large set are worth matching with each other.
+"""The pairs of a large set that are worth matching.
 
 Everything here is the same whatever the number of threads: the sums that a library may split among them are of
 integers, and small enough for floats to hold them exactly.
@@ -30,9 +30,9 @@ def choose_pairs(
     positions: ArrayLike | None = None,
     descriptors: ArrayLike | None = None,
 ) -> NDArray[np.int64]:
-    """Pairs of photos that were taken one after the other, near each other, or that look alike.
+    """Pairs of photos that are neighbours in order of capture, by place, or by appearance.
 
-    Each photo picks a fixed number of partners of each kind, so that the pairs grow as the photos.
+    Each photo picks a fixed number of partners of each kind, so that the number of pairs is proportional to the photos.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def choose_pairs(
     if positions is not None:
         pairs.append(_nearest(np.asarray(positions, np.float64)))
     if descriptors is not None:
-        # the most similar ones are often those that were chosen already: they would leave no room for a return
+        # the most similar ones are often chosen already: they would leave no room for a return
         pairs.append(_most_similar(np.asarray(descriptors), np.concatenate(pairs)))
     chosen = np.sort(np.concatenate(pairs), axis=1)
     chosen = chosen[chosen[:, 0] < chosen[:, 1]]
@@ -82,7 +82,7 @@ def _nearest(positions: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _most_similar(descriptors: NDArray[Any], chosen: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Each photo with those that look most like it and are not chosen already; of equals the first."""
+    """Each photo with the most similar ones that are not chosen already; of equals the first."""
     known = np.flatnonzero(descriptors.any(1))
     place = np.full(len(descriptors), -1)
     place[known] = np.arange(len(known))
@@ -109,7 +109,7 @@ def _products(these: NDArray[Any], those: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def global_descriptors(descriptors: Sequence[NDArray[np.uint8]], seed: int = 0) -> NDArray[np.int16]:
-    """What each photo looks like as a whole: a vector of locally aggregated descriptors (VLAD).
+    """Appearance of each photo: a vector of locally aggregated descriptors (VLAD).
 
     The codebook is made of the set's own descriptors by k-means. The residuals of a photo's descriptors to their words
     are summed by word; signed roots and equal weights of the words keep what repeats in a photo from counting for more.
@@ -124,8 +124,7 @@ def global_descriptors(descriptors: Sequence[NDArray[np.uint8]], seed: int = 0) 
     Returns
     -------
     (m, D) int16 array
-        Vectors of length 4000 or so, whose scalar products tell how alike two photos are. Zero for photos without
-        features.
+        Vectors of length 4000 or so, whose scalar products measure similarity. Zero for photos without features.
 
     References
     ----------

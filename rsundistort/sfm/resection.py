@@ -1,4 +1,4 @@
-"""Where a photo was taken from, by points that are known."""
+"""The pose of a photo from known points."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 __all__ = ["LEAST_POINTS", "resect"]
 
-# Fewer points that agree tell no pose.
+# Fewer points that agree determine no pose.
 LEAST_POINTS = 12
-# Points that agree are sought around the guess, then around what these say, ever nearer.
+# Points that agree are searched around the guess, then around each result, with smaller tolerances.
 _NARROWER = (4.0, 2.0, 1.0)
 
 
@@ -30,9 +30,9 @@ def resect(
     points_w : (n, 3) array
         The points.
     R_cw, center_w : (3, 3), (3,) array
-        Where it is looked for.
+        Start of the search.
     within : float
-        How far apart, in the coordinates of the rays, a point and its prediction may be in the end: room for the
+        Largest distance in the end, in the coordinates of the rays, of a point and its prediction: room for the
         shutter. Four times that at first.
 
     Returns

@@ -17,11 +17,11 @@ __all__ = ["retriangulate"]
 
 
 def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction, *, of_two: bool = False) -> Reconstruction:
-    """New tracks and points for a reconstruction's poses, from keypoints freed of the shutter.
+    """New tracks and points for a reconstruction's poses, from keypoints without shutter.
 
-    The keypoints are corrected by the reconstruction's motion; matches that its poses explain are triangulated with
-    tight thresholds: measurements that the shutter had cut off return, false ones that the loose thresholds had let in
-    go.
+    The keypoints are corrected by the reconstruction's motion, and matches that fit its poses are triangulated with
+    tight thresholds: measurements that the shutter had cut off return, and false ones that passed the loose thresholds
+    are dropped.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction, *, of_
     options.triangulation.merge_max_reproj_error = tight_px
     options.triangulation.complete_max_reproj_error = tight_px
     options.triangulation.ignore_two_view_tracks = not of_two
-    # poses and cameras are held: once through is enough, our own adjustment follows
+    # poses and cameras are fixed: one pass is enough, our own adjustment follows
     options.ba_global_max_refinements = 1
     model = pycolmap.triangulate_points(
         empty, matched.database, matched.database.parent, matched.database.parent, options=options
@@ -66,7 +66,7 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction, *, of_
 
 
 def _write_explained(db: Any, freed: FreedMatches) -> None:
-    """Write the matches that the poses explain as verified: no pair is searched for a geometry that is known."""
+    """Write the matches that fit the poses as verified: pairs with known geometry need no search for one."""
     pycolmap = quiet_pycolmap()
     for pair_id in db.read_all_matches()[0]:
         first, second = (k - 1 for k in pycolmap.pair_id_to_image_pair(pair_id))

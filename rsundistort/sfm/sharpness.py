@@ -1,4 +1,4 @@
-"""How sharp a photo is: a bound on how far its picture moved while the shutter was open."""
+"""Sharpness of a photo: a bound on the motion of its content during the exposure."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 __all__ = ["edge_width_px"]
 
-# Grey levels that an edge must span, within a window of so many pixels; which of the steepest tells the width.
+# Grey levels that an edge must span, within a window of this many pixels; and the rank of the steepest that counts.
 _LEAST_RANGE, _WINDOW, _STEEPEST = 60, 61, 99.5
 _LEAST_PIXELS = 500
 
@@ -29,7 +29,7 @@ def edge_width_px(gray: NDArray[np.uint8]) -> float | None:
     Returns
     -------
     float or None
-        None where a photo has too few edges to tell.
+        None if a photo has too few edges.
     """
     smooth = cv2.GaussianBlur(gray, (0, 0), 0.8)
     widths = []

@@ -1,4 +1,4 @@
-"""From the frames of a video to one path: poses at any time, motions of all frames, and the time of the readout."""
+"""From the frames of a video to one path: poses at any time, motions of all frames, and the readout time."""
 
 from __future__ import annotations
 
@@ -36,23 +36,23 @@ from .placing import place_photos
 
 __all__ = ["frame_path", "solve_clip"]
 
-# Frames that are placed by fewer measurements say nothing of the path.
+# Frames with a pose from fewer measurements say nothing of the path.
 _LEAST_MEASUREMENTS = 15
-# A half of a clip needs so many frames to tell a readout time of its own.
+# Frames that half of a clip needs to determine a readout time.
 _LEAST_HALF = 4
-# What flow may be off by, pixels, and measurements that may be far off, as a share, where rotations explain the frames.
+# Where rotations explain the frames: error of the flow, pixels, and share of measurements that may be far off.
 _FLOW_PX, _OUTLIERS = 0.25, 0.2
-# Solves that settle the spreads of a path: of hundreds of frames few do.
+# Solves that estimate the prior standard deviations of a path: with hundreds of frames few are enough.
 _SPREADS = 4
-# Of the time between frames: none.
+# Readout time that counts as none, as a share of the time between frames.
 _NO_READOUT = 1e-6
-# Of a readout time that is given, or in the table: its standard deviation, as a share.
+# Standard deviation, as a share, of a readout time that is given, or in the table.
 _GIVEN_SIGMA, _TABLE_SIGMA = 0.02, 0.1
-# Known to this share of what it was known to before, it was measured.
+# A readout time is measured if its standard deviation falls to this share of the one before.
 _MEASURED = 0.7
 _OF_STABILISED = "what is taken for frames that were stabilised"
 
-# Result, its options, and whether the frames are as the sensor read them, where they were asked.
+# Result, its options, and whether the frames are as the sensor read them, if that was tested.
 _Found = tuple[BundleResult, BundleOptions, Stabilisation | None]
 
 
@@ -69,7 +69,7 @@ def solve_clip(
     gyroscope: GyroLog | None = None,
     kept: Kept | None = None,
 ) -> Solved:
-    """Map the key frames, place all others by what these show, and adjust all as moments of one path.
+    """Map the key frames, register all others with their points, and adjust all as moments of one path.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def solve_clip(
         A gyroscope's log; else that of the video's own telemetry, if it has any. Its axes and the offset of its clock
         are found.
     kept : Kept, optional
-        What was done before, and takes what is done.
+        Results of an earlier run; takes those of this run.
 
     Returns
     -------
@@ -113,7 +113,7 @@ def solve_clip(
     path = options.path
     alone = readout_of(result)
     log.begin("gyroscope")
-    # of frames that were turned since, it says nothing
+    # the telemetry of frames that were rotated since says nothing
     felt = None if _was_stabilised(filmed) else felt_gyroscope(result, gyroscope or telemetry)
     if felt is not None:
         options = replace(options, path=replace(path, rates=felt.rates(result)))
@@ -130,7 +130,7 @@ def _turned(
     clip: Clip, keys: LoadedPhotos, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions],
     log: StageLog,
 ) -> _Found | None:  # fmt: skip
-    """The path of a camera that only turns; None where that does not explain the frames."""
+    """The path of a camera that only rotates; None if that does not explain the frames."""
     log.begin("rotations")
     start, found = turning_only(clip, keys), None
     if start is not None:
@@ -142,7 +142,7 @@ def _turned(
                 partial(_tell, log, "rotations"),
             )  # fmt: skip
             warnings.warn(
-                "the camera only turned: without parallax there are directions, but no places and no scene",
+                "the camera only rotated: without parallax there are directions, but no positions and no scene",
                 RsUndistortWarning, stacklevel=4,
             )  # fmt: skip
             found = result, options, None
@@ -154,11 +154,11 @@ def _travelled(
     clip: Clip, keys: LoadedPhotos, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions],
     log: StageLog, telemetry: GyroLog | None, placed: Callable[[], tuple[Reconstruction, MatchedPhotos]],
 ) -> _Found:  # fmt: skip
-    """The path of a camera that travels, through the scene that its key frames show, placed as of a global shutter."""
+    """The path of a camera that travels, from the scene of its key frames, mapped as of a global shutter."""
     mapped, matched = placed()
     result: BundleResult | None = None
     filmed: Stabilisation | None = None
-    # a shutter that is not modelled yet would be blamed on the lens
+    # the lens would absorb a shutter that is not modelled yet
     rough = rough_options(replace(options_of(mapped), refine=()))
     current = bundle_adjust(mapped, "global", rough).reconstruction
     for stage in ("path", "path again"):
@@ -179,7 +179,7 @@ def _travelled(
             stop_reason=result.stop_reason,
         )  # fmt: skip
         if is_first:
-            # key frames freed of the shutter: what it had torn from their tracks returns
+            # key frames without shutter: measurements that it had torn from their tracks return
             current = retriangulate(matched, result.of_photos(_are_keys(result, clip)).reconstruction)
     assert result is not None
     return result, options, filmed
@@ -188,14 +188,14 @@ def _travelled(
 def _as_filmed(
     clip: Clip, start: Reconstruction, path: FramePath, telemetry: GyroLog | None
 ) -> tuple[FramePath, Stabilisation]:
-    """Whether frames are as the sensor read them, and the path that they can share.
+    """Whether frames are as the sensor read them, and the path of those that can share one.
 
-    The shutter of frames that were turned since is not that of their path, and any readout time would be false. The
+    The shutter of frames that were rotated since is not that of their path, and any readout time would be wrong. The
     telemetry is the video's own.
     """
     found = own_motions(start)
     filmed = _stabilisation(clip, start, found)
-    if not filmed.shows_shaking:  # poses that no path holds yet say little else
+    if not filmed.shows_shaking:  # poses without a path say little else
         filmed = replace(filmed, verdict="unknown" if filmed.verdict == "stabilised" else filmed.verdict)
     if telemetry is not None:
         filmed = _against_telemetry(clip, start, found.R_cw, found, telemetry, filmed)
@@ -206,9 +206,9 @@ def _against_telemetry(
     clip: Clip, rec: Reconstruction, R_cw: NDArray[np.float64], own: OwnMotions, telemetry: GyroLog,
     filmed: Stabilisation,
 ) -> Stabilisation:  # fmt: skip
-    """What is said of frames that turn by less than the video's own telemetry felt, unless their lines turn as they do.
+    """The verdict on frames that rotate by less than the video's own telemetry, unless their lines rotate as they do.
 
-    A lens that moves against the shaking leaves the lines with the frames.
+    Lines agree with frames if a lens moves against the shaking.
     """
     if filmed.verdict == "none":
         return filmed
@@ -228,7 +228,7 @@ def _was_stabilised(filmed: Stabilisation | None) -> bool:
 
 
 def _at_first(options: BundleOptions) -> BundleOptions:
-    """Options of an adjustment of a path that another one follows."""
+    """Options of an adjustment of a path that is followed by another one."""
     return replace(rough_options(options), outlier_rounds=2, spread_rounds=1, deviations="model")
 
 
@@ -236,10 +236,10 @@ def _judged(
     clip: Clip, keys: LoadedPhotos, result: BundleResult, options: BundleOptions, alone: ReadoutTime,
     felt: Felt | None, filmed: Stabilisation | None, telemetry: GyroLog | None, log: StageLog,
 ) -> Solved:  # fmt: skip
-    """What is to be believed of a path, and what is told of its key frames."""
+    """The verdict on a path, and the motions of its key frames."""
     assert options.path is not None
     remedy = None
-    if not options.path.turns_only:  # else there is no shape that could be wrong
+    if not options.path.turns_only:  # else there is no shape
         log.begin("critical motion")
         result, remedy = heal(result, options)
         log.end("critical motion", sigma_log_k=remedy.after.sigma_log_k)
@@ -267,9 +267,9 @@ def _judged(
     verdict = judge_clip(result, of_keys, halves, clip.frame_s, remedy, against)
     if verdict.lens_only:
         warnings.warn(
-            f"only the lens is taken out of the frames: {verdict.reasons[0]}", RsUndistortWarning, stacklevel=4
+            f"the frames are corrected for the lens only: {verdict.reasons[0]}", RsUndistortWarning, stacklevel=4
         )
-    # which frame a mapping ends in is chance
+    # the frame of a mapping is arbitrary
     rec, found = of_keys.reconstruction, result.path
     assert found is not None
     world = rec.R_cw[0], rec.center_w[0], 1.0 / rec.baseline
@@ -298,7 +298,7 @@ def _judged(
 
 
 def _source(options: BundleOptions, time: ReadoutTime, felt: Felt | None) -> str:
-    """What the readout time comes from."""
+    """The evidence for the readout time."""
     assert options.path is not None
     measured = "the video" if felt is None else "the video and its gyroscope"
     if options.path.readout is None or time.sigma < _MEASURED * options.path.readout[1]:
@@ -307,7 +307,7 @@ def _source(options: BundleOptions, time: ReadoutTime, felt: Felt | None) -> str
 
 
 def frame_path(clip: Clip, readout: tuple[float, str] | None) -> FramePath:
-    """The path of a clip's frames, whose readout is known to some seconds from some source, or not at all."""
+    """The path of a clip's frames, whose readout time is known from some source, or not at all."""
     known = None
     if readout is not None:
         seconds, source = readout
@@ -322,7 +322,7 @@ def _are_keys(result: BundleResult, clip: Clip) -> NDArray[np.bool_]:
 
 
 def _halves(result: BundleResult, options: BundleOptions) -> tuple[ReadoutTime, ReadoutTime] | None:
-    """What each half of the frames says of the readout; None if there are too few."""
+    """The readout time by each half of the frames; None if there are too few."""
     rec = result.reconstruction
     late = np.arange(rec.num_images) >= rec.num_images // 2
     if rec.num_images < 2 * _LEAST_HALF:
@@ -338,7 +338,7 @@ def _halves(result: BundleResult, options: BundleOptions) -> tuple[ReadoutTime, 
 
 
 def _stabilisation(clip: Clip, rec: Reconstruction, found: OwnMotions, felt: Felt | None = None) -> Stabilisation:
-    """Whether the lines of the frames move as the frames do, each frame having said its own motion."""
+    """Whether the lines of the frames move as the frames do, each frame having its own motion."""
     place = _places(clip, rec)
     pairs, turns = turns_between(clip.part[place], found.R_cw)
     span = rec.frame_span()[:, None]
@@ -356,7 +356,7 @@ def _places(clip: Clip, rec: Reconstruction) -> NDArray[np.int64]:
 
 
 def _turn_sigma(found: OwnMotions, pairs: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(n, 3) standard deviations of the turns between pairs of frames."""
+    """(n, 3) standard deviations of the rotations between pairs of frames."""
     sigma: NDArray[np.float64] = np.linalg.norm(found.sigma_turn[pairs], axis=1)
     return sigma
 

@@ -1,4 +1,4 @@
-"""The gyroscope of a clip: found, aligned with the frames, and what it says of their rates."""
+"""The gyroscope of a clip: found, aligned with the frames, and the rates of these."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ __all__ = ["Felt", "felt_gyroscope", "own_gyroscope", "readout_of", "turns_betwe
 
 @dataclass(frozen=True)
 class Felt:
-    """A gyroscope that is of this clip.
+    """A gyroscope that belongs to this clip.
 
     Attributes
     ----------
     alignment : GyroAlignment
-        How it lies to the camera.
+        Its axes and clock relative to the camera's.
     log : GyroLog
-        About the camera's axes, by its own clock.
+        The log about the camera's axes, on its own clock.
     """
 
     alignment: GyroAlignment
@@ -46,11 +46,11 @@ class Felt:
         names = [name for name, there in zip(result.path.names, inside, strict=True) if there]
         if not names:
             return {}
-        # the world turns against the camera, and by what the pictures call a radian: their focal length cancels in the
-        # readout time only if both speak of the same
+        # the world rotates against the camera, in the radians of the images: their focal length cancels in the readout
+        # time only if both use the same
         found, start, end = self.alignment, at[inside] - half, at[inside] + half
         values = -found.ratio * self.log.mean(start, end)
-        # a clock that is off tells the rates of another moment
+        # a wrong clock gives the rates of another moment
         step = self.log.step_s
         ahead, behind = (found.ratio * self.log.mean(start + by, end + by) for by in (step, -step))
         by_clock = found.offset_sigma_s * np.nan_to_num(ahead - behind) / (2 * step)
@@ -58,13 +58,13 @@ class Felt:
         return {name: (rate, each) for name, rate, each in zip(names, values, sigma, strict=True)}
 
     def readout(self, shutter: Regression) -> ReadoutTime:
-        """The readout time by turns of the lines over rates of the gyroscope, in what the pictures call a radian."""
+        """The readout time by rotations of the lines over rates of the gyroscope, in the radians of the images."""
         seconds, found = shutter.slope / self.alignment.ratio, self.alignment
         share = np.hypot(shutter.sigma / shutter.slope, found.ratio_sigma / found.ratio) if shutter.slope else np.inf
         return ReadoutTime(seconds, float(abs(seconds) * share) if shutter.slope else float(shutter.sigma))
 
     def facts(self) -> dict[str, Any]:
-        """What `solution.json` says of it."""
+        """Its content of `solution.json`."""
         found = self.alignment
         return {
             "axes": found.axes,

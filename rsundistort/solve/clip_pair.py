@@ -1,4 +1,4 @@
-"""A clip of two frames: placed against each other while the shutter runs."""
+"""A clip of two frames: their relative pose with a shutter."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from .clip_tracks import follow
 
 __all__ = ["two_frames"]
 
-# Readouts that are tried, as shares of the time between frames: a fifth more or less leaves little of the shutter.
+# Readout times that are tried, as shares of the time between frames: a fifth more or less leaves little of the shutter.
 _SHARES = (0.0, 0.15, 0.3, 0.45, 0.6, 0.75, 0.9)
-# Of rays that agree on a pose between the frames, in pixels.
+# Tolerance of rays that agree on a pose between the frames, in pixels.
 _WITHIN_PX = 1.0
 _LEAST_AGREEING = 20
 
 
 def two_frames(clip: Clip, keys: LoadedPhotos) -> Reconstruction:
-    """Both frames of a clip, and the points that they share, by the essential matrix of rays freed of the shutter.
+    """Both frames of a clip, and their common points, by the essential matrix of rays without shutter.
 
-    The camera is taken to turn steadily from frame to frame, for the share of the time that explains most points.
+    The camera is assumed to rotate steadily from frame to frame, for the share of the time that explains most points.
 
     Raises
     ------

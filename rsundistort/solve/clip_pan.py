@@ -1,4 +1,4 @@
-"""A clip whose camera only turns: directions instead of points, rotations instead of poses."""
+"""A clip whose camera only rotates: directions instead of points, rotations instead of poses."""
 
 from __future__ import annotations
 
@@ -16,20 +16,21 @@ from .clip_tracks import Followed, follow
 
 __all__ = ["turn_between", "turning_only"]
 
-# Room for the shutter where frames are turned onto each other, pixels; and what may be left in the median when turns of
-# both frames' lines are taken out, too: the picture moves by fifty from key to key, and travel leaves a part of that.
+# Tolerance for the shutter where frames are rotated onto each other, pixels; and median that may be left when rotations
+# of the lines of both frames are removed, too: the content moves by fifty from key to key, and translation leaves a
+# part of that.
 _ROOM_PX, _LEFT_PX = 40.0, 0.5
 _LEAST_AGREEING = 12
-# Key frames that are asked first: those of a camera that travels say so there, and the rest need not be followed.
+# Key frames that are tested first: those of a camera that travels show it there, and the rest need not be followed.
 _FIRST = 8
 _TRIALS = 20
 
 
 def turning_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
-    """All frames of a clip, chained by the rotations between them, with the directions that they show as points.
+    """All frames of a clip, chained by the rotations between them, with directions as points.
 
-    The centres are all at the origin, the points at a distance of 1. None where most frames do not hang together, or
-    are not turned onto each other but for what a shutter leaves.
+    The centres are all at the origin, the points at a distance of 1. None if most frames are not connected, or differ
+    from rotations by more than a shutter explains.
     """
     camera = keys.cameras.of(0)
     number = {name: k for k, name in enumerate(clip.names)}
@@ -46,7 +47,7 @@ def turning_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
 def _chained(
     clip: Clip, camera: Camera, shown: dict[int, NDArray[np.float64]]
 ) -> tuple[Followed, dict[int, NDArray[np.float64]], dict[int, NDArray[np.float64]]] | None:
-    """What is followed of key frames, their directions, and the rotations of frames; None if they do not only turn."""
+    """Followed points of key frames, their directions, and the frames' rotations; None if they do not only rotate."""
     followed = follow(clip, shown, camera)
     rays = _directions(followed.xy_raw, camera)
     own = {key: _directions(shown[key][followed.chosen[key]], camera) for key in followed.chosen}
@@ -75,7 +76,7 @@ def _joined(
     clip: Clip, keys: LoadedPhotos, followed: Followed, shown: dict[int, NDArray[np.float64]],
     own: dict[int, NDArray[np.float64]], R_cw: dict[int, NDArray[np.float64]],
 ) -> Reconstruction:  # fmt: skip
-    """The frames whose rotations are known, and what they show."""
+    """The frames with known rotations, and their measurements."""
     placed = np.array(sorted(R_cw))
     index = np.full(len(clip.names), -1)
     index[placed] = np.arange(len(placed))
@@ -107,12 +108,12 @@ def _directions(xy_raw: NDArray[np.float64], camera: Camera) -> NDArray[np.float
 
 
 def _left_by_shutter(before: NDArray[np.float64], after: NDArray[np.float64], camera: Camera) -> float:
-    """Median distance of directions (n, 3) of two frames, beyond what turns of their lines explain."""
+    """Median distance of directions (n, 3) of two frames, beyond what rotations of their lines explain."""
     seen = np.isfinite(before).all(1) & np.isfinite(after).all(1)
     if seen.sum() < _LEAST_AGREEING:
         return float("inf")
     (u, v), (x, y) = (each[seen, :2].T / each[seen, 2] for each in (before, after))
-    # dx / dt of x = X / Z where X turns, by the three axes
+    # dx / dt of x = X / Z where X rotates about the three axes
     by_turn = np.stack([np.stack([x * y, -(1 + x**2), y], 1), np.stack([1 + y**2, -x * y, -x], 1)], axis=1)
     r_before, r_after = (u, x) if camera.clock_axis == 0 else (v, y)
     A = np.concatenate([by_turn, r_after[:, None, None] * by_turn, -r_before[:, None, None] * by_turn], axis=2)
@@ -129,7 +130,7 @@ def _left_by_shutter(before: NDArray[np.float64], after: NDArray[np.float64], ca
 def turn_between(
     xy_before: NDArray[np.float64], xy_after: NDArray[np.float64], camera: Camera
 ) -> NDArray[np.float64] | None:
-    """The rotation vector that takes what pixels (n, 2) show to what those of another frame show; None if none does."""
+    """The rotation vector from directions of pixels (n, 2) to those in another frame; None if none fits."""
     before, after = _directions(xy_before, camera), _directions(xy_after, camera)
     turn = _turn(before, after, _ROOM_PX / float(camera.K[0, 0]))
     return None if turn is None else np.asarray(Rotation.from_matrix(turn).as_rotvec())

@@ -1,4 +1,4 @@
-"""All frames of a clip, placed by the points of its key frames."""
+"""All frames of a clip, registered with the points of its key frames."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ __all__ = ["Followed", "follow", "follow_points", "with_all_frames"]
 # Points of a key frame that are followed: those of the most key frames first, spread over its cells.
 _POINTS = 120
 _CELLS = 6
-# Room for the shutter where a frame is placed without it, in pixels.
+# Tolerance for the shutter where a frame is registered without it, in pixels.
 _ROOM_PX = 12.0
 
 
 class Followed:
-    """Points of key frames in the frames around them: by key, which of its measurements, and where frames show them.
+    """Points of key frames in the frames around them: their measurements by key, and their places in the frames.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Followed:
         self.xy_raw = np.zeros((0, 2))
 
     def add(self, key: int, frame: NDArray[np.int64], place: NDArray[np.int64], xy_raw: NDArray[np.float64]) -> None:
-        """What was found of a key's points."""
+        """The places found of a key's points."""
         self.frame = np.concatenate([self.frame, frame])
         self.key = np.concatenate([self.key, np.full(len(frame), key)])
         self.place = np.concatenate([self.place, place])
@@ -77,9 +77,9 @@ def _between_keys(clip: Clip, keys: list[int]) -> Iterator[tuple[int, int, list[
 
 
 def follow_points(clip: Clip, reconstruction: Reconstruction) -> Followed:
-    """Follow what the key frames of a reconstruction show of its points to the key frames before and after.
+    """Follow a reconstruction's points in its key frames to the key frames before and after.
 
-    What is chosen are indices of its measurements.
+    The chosen values are indices of its measurements.
     """
     rec, obs = reconstruction, reconstruction.observations
     number = {name: k for k, name in enumerate(clip.names)}
@@ -106,7 +106,7 @@ def follow(
     camera : Camera
         Of the frames.
     worth : mapping of frame number to (n,) int array, optional
-        Of points in the same part of a frame those of more worth are followed; else those that come first.
+        Worth of the points: of those in the same part of a frame the best are followed; by default the first.
     """
     size = camera.width, camera.height
     keys = sorted(shown)
@@ -148,11 +148,11 @@ class CameraPoses:
 def with_all_frames(
     clip: Clip, reconstruction: Reconstruction, followed: Followed, placed_before: Reconstruction | None = None
 ) -> Reconstruction:
-    """A reconstruction of all frames that could be placed, by that of the key frames.
+    """A reconstruction of all frames that could be registered, from that of the key frames.
 
-    Each point that is followed is one of its own, at the place of that which its key frame shows: where flow starts
-    from counts as where the key frame shows it, so that what is off there is off in all frames alike, and moves the
-    point. Points of the key frames tie these together, as before. Frames that have been `placed_before` stay there.
+    Each followed point is a point of its own, at the place of the point in its key frame: the start of the flow counts
+    as the measurement of the key frame, so an error there is the same in all frames, and moves the point. Points of the
+    key frames tie these together, as before. Frames that were `placed_before` keep their poses.
     """
     rec, obs = reconstruction, reconstruction.observations
     number = {name: k for k, name in enumerate(clip.names)}

@@ -1,4 +1,4 @@
-"""The same job from a model of COLMAP or others: its tracks in; motions, rectified photos, an unwarped model out."""
+"""The same job from a model of COLMAP or others: tracks in; motions, rectified photos, an unwarped model out."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from ..model.orientation import INVERSE, turn_reconstruction
 from ..sfm import matched_of_database
 from .from_poses import measured, posed_photos
 from .going_on import RunFolder, key_of, run_folder
-from .model_sequence import Feedback, solve_tracks
+from .model_sequence import TrackSource, solve_tracks
 from .outcome import Solved
 from .run_options import OutputOptions, SolveOptions
 from .run_outputs import REPLACED, Outputs, PointRgb, check_usd, files_of_run, inputs_of, photo_times
@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 
 __all__ = ["solve"]
 
-# Others' keypoints have longer tails than ours, whose large ones weigh less: at 4.5 deviations 5 % of the measurements
-# of the warped herz-jesus-8 are lost and the poses are off by 0.017 deg, at this by 0.013, with 2 % more.
+# Keypoints of other programs have heavier tails than ours: at 4.5 deviations 5 % of the measurements of the warped
+# herz-jesus-8 are lost and the poses are off by 0.017 deg, at this by 0.013, with 2 % more.
 _OUTLIER_SIGMA = 6.0
 
 
@@ -93,7 +93,7 @@ def solve(
     scheduler: str | None = None,
     progress: ProgressCallback | None = None,
 ) -> Solution | tuple[pycolmap.Reconstruction, Solution]:
-    """Recover how the camera moved during each photo's readout from a model of another program.
+    """Estimate the camera's motion during each photo's readout from a model of another program.
 
     From files it writes what `run` writes. From a `pycolmap.Reconstruction` it writes nothing, changes nothing global,
     and several threads may each solve one.
@@ -133,7 +133,7 @@ def solve(
     Raises
     ------
     InputError
-        When `out` is missing for a model in files, or given for a `pycolmap.Reconstruction`.
+        `out` is missing for a model in files, or given for a `pycolmap.Reconstruction`.
     """
     if isinstance(out, SolveOptions):  # until the next version: they were the second argument
         warnings.warn("solve takes options by name: solve(model, options=...)", DeprecationWarning, stacklevel=2)
@@ -220,7 +220,7 @@ def _outputs_of(
     log: StageLog,
     before: RunFolder,
 ) -> Outputs:
-    """What is to be written of a model, unless it was kept."""
+    """The outputs of a model, unless they were kept."""
     before.kept.begin()
     found: Outputs | None = before.outputs(log)
     if found is not None:
@@ -231,7 +231,7 @@ def _outputs_of(
         def check(names: Sequence[str]) -> None:
             Record(out).check(files_of_run(names, rectify.raw_as, outputs), files_in)
 
-        given, feedback = _given(model, folder, check, options.seed, rectify, workers, work, log)
+        given, track_source = _given(model, folder, check, options.seed, rectify, workers, work, log)
         photos = {} if folder is None else _look_at(folder, given.reconstruction)
         given, said = _in_stored_frame(given, photos)
         if folder is not None:
@@ -239,7 +239,7 @@ def _outputs_of(
         log.end("model", photos=given.reconstruction.num_images, points=given.reconstruction.num_points)
         facts = {name: fact for name, (_, fact) in photos.items()}
         solved, ids, rgb = _solve(
-            given, str(model), facts, options, None if database is None else Path(database), log, feedback
+            given, str(model), facts, options, None if database is None else Path(database), log, track_source
         )
         facts_of_model = {
             "frame": said,
@@ -265,10 +265,10 @@ def _given(
     workers: Workers,
     work: Path,
     log: StageLog,
-) -> tuple[ColmapModel, Feedback | None]:
-    """The model; of one that holds poses only, measured in its photos, and what its tracks can be rebuilt from.
+) -> tuple[ColmapModel, TrackSource | None]:
+    """The model; one without measurements is measured in its photos; and what new tracks can be made from.
 
-    `check` is told the photos that will be rectified, before any of them is read.
+    `check` gets the photos that will be rectified, before any of them is read.
     """
     if is_metashape(model):
         posed = posed_photos(model, folder, rectify.raw_as)
@@ -315,7 +315,7 @@ def _others_in(folder: Path, given: ColmapModel, raw_as: str) -> list[str]:
     names = given.reconstruction.image_names
     try:
         listed = list_photos(folder, raw_as, {PurePosixPath(name).parent.as_posix() for name in names} - {"."})
-    except (FileError, InputError):  # what is wrong with others is no matter here
+    except (FileError, InputError):  # errors of others do not matter here
         listed = []
     return sorted({*listed, *given.unregistered} - set(names))
 
@@ -323,9 +323,9 @@ def _others_in(folder: Path, given: ColmapModel, raw_as: str) -> list[str]:
 def _in_stored_frame(
     given: ColmapModel, photos: Mapping[str, tuple[tuple[int, int] | None, ExifFacts]]
 ) -> tuple[ColmapModel, str]:
-    """The model in the frames of the stored photos, and what was found of that, for people.
+    """The model in the frames of the stored photos, and a remark on that, for people.
 
-    Some programs turn photos by their EXIF orientation before they look at them: the sizes tell.
+    Some programs rotate photos by their EXIF orientation before they measure them: the sizes show it.
     """
     rec = given.reconstruction
     turns: dict[str, int] = {}
@@ -363,7 +363,7 @@ def _in_stored_frame(
 def _photo_cameras(
     given: ColmapModel, source: str, facts: Mapping[str, ExifFacts], options: SolveOptions
 ) -> PhotoCameras:
-    """The model's cameras, with the directions of readout that were told or are guessed."""
+    """The model's cameras, with the readout directions that were specified or are guessed."""
     rec = given.reconstruction
     labels = [f"camera {key}" for key in given.camera_ids]
     told = check_readouts(options.readout)
@@ -395,7 +395,7 @@ def _solve(
     options: SolveOptions,
     database: Path | None,
     log: StageLog,
-    feedback: Feedback | None = None,
+    track_source: TrackSource | None = None,
 ) -> tuple[Solved, ModelIds, PointRgb]:
     if given.reconstruction.num_images < 3:
         raise ReconstructionError(
@@ -421,7 +421,7 @@ def _solve(
             log.begin("database")
             matched = matched_of_database(database, work / "database.db", rec, options.seed)
             log.end("database", keypoints=sum(len(found.xy_raw) for found in matched.features))
-            feedback = Feedback(matched)
+            track_source = TrackSource(matched)
         solved = solve_tracks(
             rec,
             cameras,
@@ -430,7 +430,7 @@ def _solve(
             options_of,
             log,
             options.remedy,
-            feedback,
+            track_source,
             survey,
         )
     if solved.survey is None:  # the model's frame is kept

@@ -1,4 +1,4 @@
-"""A model that holds poses and cameras only: what its photos show is measured, and triangulated from these poses."""
+"""A model that holds poses and cameras only: its photos are measured, and triangulated from these poses."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..io.cameras import camera_to_json
 from ..io.metashape import PosedPhotos, named, read_metashape
 from ..model import Observations, Reconstruction
 from ..sfm import LEAST_MEASUREMENTS, match_photos, retriangulate
-from .model_sequence import Feedback
+from .model_sequence import TrackSource
 
 __all__ = ["measured", "posed_photos"]
 
@@ -33,7 +33,7 @@ def posed_photos(model: Path, folder: Path | None, raw_as: str) -> PosedPhotos:
     Raises
     ------
     InputError
-        When there is no folder: the file holds no measurements, and they are made in the photos.
+        There is no folder: the file holds no measurements, and they are made in the photos.
     """
     if folder is None:
         raise InputError(
@@ -46,13 +46,13 @@ def posed_photos(model: Path, folder: Path | None, raw_as: str) -> PosedPhotos:
 
 def measured(
     posed: PosedPhotos, folder: Path, rectify: RectifyOptions, seed: int, workers: Workers, work: Path, log: StageLog
-) -> tuple[ColmapModel, Feedback]:
-    """A model with tracks of the features of the photos that the poses explain, and what these can be rebuilt from.
+) -> tuple[ColmapModel, TrackSource]:
+    """A model with tracks of the photos' features that fit the poses, and what new tracks can be made from.
 
     Raises
     ------
     ReconstructionError
-        When the poses explain next to nothing of what the photos show.
+        The poses explain next to none of the matches.
     """
     names = list(posed.labels)
     cameras = {str(k): camera_to_json(camera) for k, camera in zip(posed.camera_ids, posed.cameras, strict=True)}
@@ -81,7 +81,7 @@ def measured(
         count = 0
     if count < LEAST_MEASUREMENTS * len(names):
         raise ReconstructionError(
-            f"the poses explain {count} measurements in {len(names)} photos, too few to go on from; check that they "
+            f"the poses explain {count} measurements in {len(names)} photos, too few to continue; check that they "
             "are of these photos, or let run find poses of its own"
         )
     model = ColmapModel(
@@ -89,4 +89,4 @@ def measured(
         np.arange(len(rec.observations)), np.zeros((rec.num_points, 3), np.uint8), posed.unposed,
         self_calibrated=True, has_colors=False,
     )  # fmt: skip
-    return model, Feedback(matched, loaded, workers)
+    return model, TrackSource(matched, loaded, workers)

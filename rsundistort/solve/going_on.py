@@ -1,4 +1,4 @@
-"""Runs that are gone on with: what is kept of one until it ends, and of what."""
+"""Runs that are resumed: their state until they end, and its key."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _BEGUN, _OUTPUTS = "begun", "outputs"
 
 
 def key_of(inputs: Sequence[Path], *options: Any) -> str:
-    """What the outputs of a run depend on: versions, options, and size and time of change of all files."""
+    """Key of a run's outputs: versions, options, and size and modification time of all files."""
     digest = hashlib.sha256(repr(versions()).encode())
-    with suppress(OSError):  # what is missing is told where it is read
+    with suppress(OSError):  # a missing file is reported where it is read
         for each in options:
             feed(digest, each)
     for path in inputs:
@@ -35,7 +35,7 @@ def key_of(inputs: Sequence[Path], *options: Any) -> str:
 
 
 class RunFolder:
-    """The outputs of a run, and what is kept of it.
+    """The outputs of a run, and its state.
 
     Parameters
     ----------
@@ -44,31 +44,31 @@ class RunFolder:
     key : str
         See `key_of`.
     resume : bool
-        Whether an earlier run is to be gone on with.
+        Whether an earlier run is resumed.
     """
 
     def __init__(self, out: Path, key: str, resume: bool) -> None:
         self.kept = Kept(out, key)
-        #: Whether the run before came to its end.
+        #: Whether the run before was complete.
         self.finished = resume and Record(out).is_finished(key)
-        #: Whether there is something of it to go on with.
+        #: Whether it can be resumed.
         self.goes_on = resume and not self.finished and self.kept.holds()
-        #: Whether all is written but what the photos tell.
+        #: Whether all is written except what depends on the rectified photos.
         self.begun = self.goes_on and self.kept.get(_BEGUN) is True and self.kept.get(_OUTPUTS) is not None
 
     def outputs(self, log: StageLog) -> Any:
-        """What was solved, with its times in the log; None if nothing was."""
+        """The solution, with its times in the log; None if there is none."""
         found = self.kept.get(_OUTPUTS) if self.goes_on else None
         if found is not None:
             log.stages[:] = found[1]
         return None if found is None else found[0]
 
     def solved(self, outputs: Any, log: StageLog) -> None:
-        """Keep what was solved."""
+        """Keep the solution."""
         self.kept.put(_OUTPUTS, (outputs, log.stages))
 
     def begin(self) -> None:
-        """Note that all is written but what the photos tell."""
+        """Note that all is written except what depends on the rectified photos."""
         self.kept.put(_BEGUN, True)
 
 
@@ -76,30 +76,35 @@ class RunFolder:
 def run_folder(
     out: Path, key: str, log: StageLog, *, overwrite: bool = False, resume: bool = False
 ) -> Iterator[RunFolder]:
-    """The folder of a run, which nobody else writes; what is kept is dropped at the end, or if there is no solution.
+    """The locked folder of a run; its state is removed at the end, or if there is no solution.
 
-    An interruption says where it was, and how to go on.
+    An interruption says where it was, and how to continue. So does a disk that is full after the solution is found.
 
     Raises
     ------
     FileError
-        When there are outputs, but no run that `resume` could go on with.
+        There are outputs, but no run that `resume` could continue.
     """
     with only_writer(out):
         run = RunFolder(out, key, resume)
         if resume and not overwrite and not (run.finished or run.goes_on) and has_content(out):
             raise FileError(
-                f"{out} is not empty, and holds no run with these photos and options that --resume could go on with; "
+                f"{out} is not empty, and holds no run with these photos and options that --resume could continue; "
                 "give another folder, or --overwrite to replace its outputs"
             )
         try:
             yield run
         except KeyboardInterrupt as stop:
-            where = str(stop) or f"{log.stage or 'nothing'} was under way, the same command with --resume goes on"
+            where = str(stop) or f"{log.stage or 'nothing'} was under way, the same command with --resume continues"
             raise KeyboardInterrupt(where) from stop
-        except Exception:
-            if not (run.goes_on or run.kept.get(_BEGUN)):
+        except Exception as error:
+            of_the_machine = isinstance(error, FileError) and "cannot be written" in str(error)
+            stays = run.goes_on or bool(run.kept.get(_BEGUN)) or (of_the_machine and run.kept.get(_OUTPUTS) is not None)
+            if not stays:
                 run.kept.drop()
+            if of_the_machine and ";" not in str(error):
+                mend = "the same command with --resume continues" if stays else "correct that, or give another folder"
+                raise FileError(f"{error}; {mend}") from error
             raise
         if not run.finished:
             Record(out).finish(key)

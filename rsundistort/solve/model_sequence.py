@@ -13,7 +13,7 @@ import numpy as np
 from ..batch.progress import StageLog
 from ..batch.workers import Workers
 from ..bundle import (
-    LADDER,
+    MODEL_SEQUENCE,
     BundleOptions,
     BundleResult,
     ModelChoice,
@@ -45,28 +45,28 @@ from .outcome import Solved
 from .placing import place_photos
 from .survey import Survey
 
-__all__ = ["Feedback", "rough_options", "solve_photos", "solve_tracks"]
+__all__ = ["TrackSource", "rough_options", "solve_photos", "solve_tracks"]
 
-# Feedback ends when no rectified pixel of any photo moves by more than this between two rounds, in pixels of the images
-# that the features were found in; or when less than this share of the measurements is another one than before, so that
-# what yet moves is not held by tracks.
+# Re-triangulation ends when no rectified pixel of any photo moves by more than this between two rounds, in pixels of
+# the images that the features were detected in; or when less than this share of the measurements changes, so that the
+# tracks do not cause what still moves.
 _SETTLED_PX = 0.2
 _SETTLED_SHARE = 0.01
 _MAX_ROUNDS = 4
-# A photo that turned by more while it was read, in radians, was mapped by thresholds that were not made for it: it may
-# be in a wrong place, and is held against what the others tell.
+# A photo that rotated by more during its readout, in radians, was mapped by thresholds that were not made for it: its
+# pose may be wrong, and is checked with the points of the others.
 _STRONG_RAD = 0.1
-# A shutter needs so many photos.
+# Photos that a shutter needs at least.
 _LEAST_PHOTOS = 3
-# Photos that are placed anew bring others.
+# Rounds of registration: photos that are registered make others possible.
 _MOST_WAVES = 4
-# Places on each side of a photo where that is looked at.
+# Places along each side of a photo where that is measured.
 _LOOKED_AT = 5
 
 
 @dataclass(frozen=True)
-class Feedback:
-    """What the tracks of photos are rebuilt from.
+class TrackSource:
+    """What new tracks are made from.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class Feedback:
     photos : LoadedPhotos or None
         The photos themselves.
     workers : Workers or None
-        Who reads them again to align the tracks at full size; None where that is not wanted.
+        Workers that read them again to align the tracks at full size; None if that is not wanted.
     """
 
     matched: MatchedPhotos
@@ -84,7 +84,7 @@ class Feedback:
 
     @property
     def step_px(self) -> float:
-        """Pixels of the photos to one of those that the features were found in."""
+        """Pixels of the photos per pixel of the images that the features were detected in."""
         return float(np.median([each.step_px for each in self.matched.features]))
 
     def aligned(self, reconstruction: Reconstruction, log: StageLog) -> Reconstruction:
@@ -102,7 +102,7 @@ def _tell(log: StageLog, stage: str, _cost: float) -> None:
 
 
 def _moved_px(before: Reconstruction, after: Reconstruction) -> float:
-    """By how much rectified pixels of the same photos changed, the largest; inf if they are others."""
+    """Largest change of the rectified pixels of the same photos; inf if they are others."""
     if after.image_names != before.image_names:
         return np.inf
     return max(_change_px(before, after, i) for i in range(after.num_images))
@@ -121,7 +121,7 @@ def _change_px(before: Reconstruction, after: Reconstruction, image: int) -> flo
 
 
 def _changed(before: Reconstruction | None, after: Reconstruction) -> float:
-    """Share of a reconstruction's measurements that another does not have; 1 if that is of other photos."""
+    """Share of a reconstruction's measurements that another lacks; 1 if that is of other photos."""
     if before is None or after.image_names != before.image_names:
         return 1.0
     old, new = (
@@ -131,19 +131,21 @@ def _changed(before: Reconstruction | None, after: Reconstruction) -> float:
     return len(new - old) / max(len(new), 1)
 
 
-def _of_joined(options: BundleOptions, mapped: Reconstruction, *, says: bool = True) -> BundleOptions:
-    """Options without the anchors and lengths of photos that could not be joined; a warning `says` which."""
-    joined = set(mapped.image_names)
-    lengths = [each for each in options.lengths if joined >= {each.start[0], each.end[0]}]
-    # one alone tells the scale of the world, which changes no photo
+def _of_registered(options: BundleOptions, mapped: Reconstruction, *, says: bool = True) -> BundleOptions:
+    """Options without the constraints and lengths of photos that are not registered; a warning if it `says` so."""
+    registered = set(mapped.image_names)
+    lengths = [each for each in options.lengths if registered >= {each.start[0], each.end[0]}]
+    # one alone determines only the scale of the world, which changes no photo
     lengths = lengths if len(lengths) > 1 else []
     if says and len(lengths) < len(options.lengths):
-        apart = sorted({end[0] for each in options.lengths for end in (each.start, each.end)} - joined)
+        apart = sorted({end[0] for each in options.lengths for end in (each.start, each.end)} - registered)
         rest = "those of the others are used" if lengths else "none is used, since ratios need two"
-        warnings.warn(f"not joined, so no known length: {', '.join(apart)}; {rest}", RsUndistortWarning, stacklevel=3)
-    lost = sorted({*options.held_phi, *options.known_phi, *options.still} - joined)
+        warnings.warn(
+            f"not registered, so no known length: {', '.join(apart)}; {rest}", RsUndistortWarning, stacklevel=3
+        )
+    lost = sorted({*options.held_phi, *options.known_phi, *options.still} - registered)
     if says and lost:
-        warnings.warn(f"not joined, so no anchor: {', '.join(lost)}", RsUndistortWarning, stacklevel=3)
+        warnings.warn(f"not registered, so no constraint: {', '.join(lost)}", RsUndistortWarning, stacklevel=3)
     return replace(
         options,
         lengths=lengths,
@@ -156,7 +158,7 @@ def _of_joined(options: BundleOptions, mapped: Reconstruction, *, says: bool = T
 def _read_out(
     mapped: Reconstruction, cameras: PhotoCameras, options: BundleOptions, log: StageLog
 ) -> ReadoutChoice | None:
-    """The directions of readout that nobody told, as the measurements have them; None if all were told."""
+    """The readout directions that were not specified, by the measurements; None if all were."""
     guessed = {k: cameras.labels[k] for k in np.unique(cameras.camera_idx).tolist() if not cameras.readout_told[k]}
     if not guessed:
         return None
@@ -183,18 +185,18 @@ def solve_photos(
     kept: Kept | None = None,
     survey: Survey | None = None,
 ) -> Solved:
-    """Match, map, climb the ladder; then free the keypoints of the shutter, rebuild the tracks and adjust again.
+    """Match, map and adjust the model sequence; then remove the shutter from keypoints, make new tracks and adjust.
 
     Parameters
     ----------
     photos : LoadedPhotos
         Features and cameras.
     shutter_model : str
-        Last rung of the ladder; "auto": solved up to rotation, then the rung that foretells held-out measurements.
+        Last model of the sequence; "auto": up to rotation, then the model that best predicts held-out measurements.
     seed : int
         Seed of every random choice.
     options_of : callable
-        Options of the adjustments for a reconstruction, whose cameras say which way they are read out.
+        Options of the adjustments for a reconstruction, whose cameras have their readout directions.
     scratch : Path
         Folder for the database.
     log : StageLog
@@ -204,25 +206,26 @@ def solve_photos(
     matching : str
         Which photos are matched with each other, of `pairing.MATCHINGS`.
     workers : Workers, optional
-        Who reads the photos again, to align the tracks at full size; they stay as the features have them without.
+        Workers that read the photos again, to align the tracks at full size; without them features keep their
+        positions.
     kept : Kept, optional
-        What was done before, and takes what is done.
+        Results of an earlier run; takes those of this run.
     survey : Survey, optional
-        Where photos and control points are: the frame is then that of the map.
+        Positions of photos and control points: the frame is then that of the map.
     """
     cameras = photos.cameras
     mapped, matched = place_photos(photos, scratch, log, seed, matching, kept or Kept(), with_shutter=True)
     if mapped.num_images < _LEAST_PHOTOS:
         raise ReconstructionError(
-            f"only {mapped.num_images} of {len(photos.names)} photos could be joined, the shutter needs three; "
+            f"only {mapped.num_images} of {len(photos.names)} photos could be registered, the shutter needs three; "
             "use photos that share more of the scene"
         )
     solved = solve_tracks(
-        mapped, cameras, shutter_model, seed, options_of, log, remedy, Feedback(matched, photos, workers), survey
+        mapped, cameras, shutter_model, seed, options_of, log, remedy, TrackSource(matched, photos, workers), survey
     )
     if solved.survey is not None:
         return solved
-    # which frame a mapping ends in is chance
+    # the frame of a mapping is arbitrary
     return replace(solved, result=replace(solved.result, reconstruction=solved.shared.normalized()))
 
 
@@ -234,10 +237,10 @@ def solve_tracks(
     options_of: Callable[[Reconstruction], BundleOptions],
     log: StageLog,
     remedy: str = "auto",
-    feedback: Feedback | None = None,
+    track_source: TrackSource | None = None,
     survey: Survey | None = None,
 ) -> Solved:
-    """Climb the ladder from a global-shutter reconstruction, in its frame.
+    """Adjust the model sequence from a global-shutter reconstruction, in its frame.
 
     Parameters
     ----------
@@ -247,8 +250,8 @@ def solve_tracks(
         Where its cameras come from.
     shutter_model, seed, options_of, log, remedy
         As in `solve_photos`.
-    feedback : Feedback, optional
-        The matches behind it: its tracks are then rebuilt with the motions found, until these settle.
+    track_source : TrackSource, optional
+        The matches behind it: new tracks are then made with the motions found, until these converge.
     survey : Survey, optional
         As in `solve_photos`.
     """
@@ -260,26 +263,26 @@ def solve_tracks(
         survey, mapped = survey.placed(mapped)
     if survey is not None:
         wanted = replace(wanted, places=survey.known(mapped))
-    options = _of_joined(wanted, mapped, says=feedback is None)
+    options = _of_registered(wanted, mapped, says=track_source is None)
     auto = shutter_model == "auto"
     shutter_model = "rotation" if auto else shutter_model
-    log.begin("ladder")
+    log.begin("model sequence")
     models = sequence_to(shutter_model)
-    results = adjust_sequence(mapped, models, options, lambda model, _: log.tell(f"ladder: {model}", 0))
+    results = adjust_sequence(mapped, models, options, lambda model, _: log.tell(f"model sequence: {model}", 0))
     result = results[shutter_model]
     log.end(
-        "ladder",
-        rungs=[{"model": k, "rms_px": r.rms_px, "iterations": r.num_iterations} for k, r in results.items()],
+        "model sequence",
+        models=[{"model": k, "rms_px": r.rms_px, "iterations": r.num_iterations} for k, r in results.items()],
     )
     tracks = result.reconstruction
-    if feedback is not None:
-        result = _placed_again(feedback, result, wanted, log)
-        options = _of_joined(wanted, result.reconstruction)
-        result, tracks, options = _fed_back(feedback, result, options, log, ends=not auto)
+    if track_source is not None:
+        result = _registered_again(track_source, result, wanted, log)
+        options = _of_registered(wanted, result.reconstruction)
+        result, tracks, options = _retriangulated(track_source, result, options, log, ends=not auto)
     options = replace(options, phi_sigma_start=result.phi_sigma)
     choice = None
     if auto:
-        choice, result, tracks, options = _chosen(feedback, result, tracks, options, seed, log)
+        choice, result, tracks, options = _chosen(track_source, result, tracks, options, seed, log)
     if survey is not None and survey.holding:
         survey, result, options = _with_control(survey, result, options, log)
     mended, advice = None, []
@@ -295,9 +298,9 @@ def solve_tracks(
     global_result = _without_shutter(result, options)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
     log.begin("verdict")
-    measured = mapped if feedback is None else tracks
+    measured = mapped if track_source is None else tracks
     known = {*options.known_phi, *options.held_phi, *options.still}
-    # two standard deviations of the priors that exposures make
+    # two standard deviations of the priors by exposure times
     most_phi = {name: 2.0 * limit for name, limit in options.phi_limits.items()}
     verdict = judge(result, global_result, choice, mended, measured, known, most_phi)
     if verdict.lens_only:
@@ -308,7 +311,7 @@ def solve_tracks(
 
 
 def _on_the_map(solved: Solved, survey: Survey, options: BundleOptions) -> Solved:
-    """What was solved with places, where these fit best, with what is to be said of that."""
+    """A georeferenced solution, aligned with its places, and remarks on it."""
     survey, rec = survey.settled(solved.shared)
     told = survey.georeference(rec, solved.result.covariances, options.lengths)
     return replace(solved, result=replace(solved.result, reconstruction=rec), survey=survey, georeference=told)
@@ -317,7 +320,7 @@ def _on_the_map(solved: Solved, survey: Survey, options: BundleOptions) -> Solve
 def _with_control(
     survey: Survey, result: BundleResult, options: BundleOptions, log: StageLog
 ) -> tuple[Survey | None, BundleResult, BundleOptions]:
-    """The adjustment with control points; as it was where they do not fit it."""
+    """The adjustment with control points; as it was if they do not fit it."""
     log.begin("control points")
     placed, tracks = survey.controlled(result.reconstruction, result.sigma_px)
     options = replace(options, places=None if placed is None else placed.known(tracks))
@@ -329,19 +332,19 @@ def _with_control(
 
 
 def _chosen(
-    feedback: Feedback | None, result: BundleResult, tracks: Reconstruction, options: BundleOptions, seed: int,
+    track_source: TrackSource | None, result: BundleResult, tracks: Reconstruction, options: BundleOptions, seed: int,
     log: StageLog,
 ) -> tuple[ModelChoice, BundleResult, Reconstruction, BundleOptions]:  # fmt: skip
     """The model that the measurements support, adjusted with all of them: its tracks and options."""
     log.begin("choice of the model")
     choice = choose_model(
-        result.reconstruction, LADDER, options, sigma_px=result.sigma_px, seed=seed,
+        result.reconstruction, MODEL_SEQUENCE, options, sigma_px=result.sigma_px, seed=seed,
         progress=lambda model, _: log.tell(f"choice: {model}", 0),
     )  # fmt: skip
     options = replace(options, varying=choice.varying, bends=choice.bends, residual_field=choice.residual_field)
     start = replace(tracks, shutter_model=choice.shutter_model)
-    # the windows were aligned, and their outliers told, as a model saw them that is given up
-    again = feedback is not None and feedback.workers is not None
+    # windows were aligned, and outliers found, with a model that is replaced now
+    again = track_source is not None and track_source.workers is not None
     again = again and (choice.shutter_model == "constant-motion" or choice.bends > 0)
     how = rough_options(options) if again else options
     result = bundle_adjust(start, choice.shutter_model, how, partial(_tell, log, "choice"))
@@ -350,8 +353,8 @@ def _chosen(
         residual_field=choice.residual_field, shutter=choice.shutter, agreement=choice.agreement, gain=choice.gain,
         num_held_out=choice.num_held_out,
     )  # fmt: skip
-    if feedback is not None and again:
-        result, tracks, options = _fed_back(feedback, result, options, log, ["alignment again"])
+    if track_source is not None and again:
+        result, tracks, options = _retriangulated(track_source, result, options, log, ["alignment again"])
     return choice, result, tracks, options
 
 
@@ -371,12 +374,12 @@ def _without_shutter(result: BundleResult, options: BundleOptions) -> BundleResu
 
 
 def _lens_only(verdict: Verdict) -> str:
-    """The photos whose motion is not taken out, for people."""
+    """The photos whose motion is not corrected, for people."""
     count = len(verdict.lens_only)
     names = ", ".join(verdict.lens_only[:3]) + (", ..." if count > 3 else "")
     return (
-        f"the lens alone is taken out of {count} photo{'s' * (count > 1)}, since the measurements do not support the "
-        f"motion found: {names}"
+        f"{count} photo{'s are' if count > 1 else ' is'} corrected for the lens only, since the measurements do not "
+        f"support the motion found: {names}"
     )
 
 
@@ -385,11 +388,13 @@ def rough_options(options: BundleOptions) -> BundleOptions:
     return replace(options, cost_tolerance=1e-5, spread_rounds=3, spread_tolerance=0.05)
 
 
-def _placed_again(feedback: Feedback, result: BundleResult, wanted: BundleOptions, log: StageLog) -> BundleResult:
-    """Photos that mapping left out, or put into a wrong place since it knows no shutter, placed by what others tell."""
+def _registered_again(
+    track_source: TrackSource, result: BundleResult, wanted: BundleOptions, log: StageLog
+) -> BundleResult:
+    """Register photos that mapping left out, or gave a wrong pose without a shutter, with the points of the others."""
     if result.reconstruction.shutter_model not in ("rotation", "constant-motion"):
         return result
-    matched, num_verified, left_out = feedback.matched, read_num_verified(feedback.matched), set[str]()
+    matched, num_verified, left_out = track_source.matched, read_num_verified(track_source.matched), set[str]()
     for wave in range(1, _MOST_WAVES + 1):
         rec = result.reconstruction
         turns = np.linalg.norm(rec.phi, axis=1) * rec.frame_span()
@@ -404,10 +409,10 @@ def _placed_again(feedback: Feedback, result: BundleResult, wanted: BundleOption
             tracks = found.reconstruction
             if tracks.num_images >= _LEAST_PHOTOS:
                 tracks = retriangulate(matched, tracks).without_photos(LEAST_MEASUREMENTS)
-            if tracks.num_images < _LEAST_PHOTOS:  # so little hangs together that nothing tells right from wrong
+            if tracks.num_images < _LEAST_PHOTOS:  # too few are connected to tell right from wrong
                 log.end(stage, added=(), moved=(), dropped=())
                 break
-            options = rough_options(_of_joined(wanted, tracks, says=False))
+            options = rough_options(_of_registered(wanted, tracks, says=False))
             options = replace(options, phi_sigma_start=result.phi_sigma)
             result = bundle_adjust(tracks, rec.shutter_model, options, partial(_tell, log, stage))
         left_out = left_out.union(found.dropped) - {*result.reconstruction.image_names}
@@ -420,19 +425,19 @@ def _placed_again(feedback: Feedback, result: BundleResult, wanted: BundleOption
     return result
 
 
-def _fed_back(
-    feedback: Feedback, result: BundleResult, options: BundleOptions, log: StageLog, stages: Sequence[str] = (),
+def _retriangulated(
+    track_source: TrackSource, result: BundleResult, options: BundleOptions, log: StageLog, stages: Sequence[str] = (),
     ends: bool = True,
 ) -> tuple[BundleResult, Reconstruction, BundleOptions]:  # fmt: skip
-    """Free keypoints of the shutter, rebuild the tracks and adjust, until the photos settle.
+    """Remove the shutter from keypoints, make new tracks and adjust, until the rectified photos converge.
 
-    The last adjustment, its tracks, and the options without anchors of photos that nothing holds any more. Only the
-    last adjustment is exact, and only where it `ends` the solution: tracks are told apart by pixels.
+    The last adjustment, its tracks, and the options without constraints of photos that are no longer registered. Only
+    the last adjustment is exact, and only if it `ends` the solution: new tracks need pixels only.
     """
     shutter_model = result.reconstruction.shutter_model
     if not stages:
-        stages = [f"feedback {number}" for number in range(1, _MAX_ROUNDS + 1)]
-        stages += ["alignment"] * (feedback.workers is not None)
+        stages = [f"re-triangulation {number}" for number in range(1, _MAX_ROUNDS + 1)]
+        stages += ["alignment"] * (track_source.workers is not None)
     settled, aligns, found = False, False, None
     for stage in stages:
         aligns = stage.startswith("alignment")
@@ -440,16 +445,16 @@ def _fed_back(
             continue
         log.begin(stage)
         before = result.reconstruction
-        tracks = retriangulate(feedback.matched, before, of_two=aligns)
+        tracks = retriangulate(track_source.matched, before, of_two=aligns)
         if aligns:
-            tracks = feedback.aligned(tracks, log)
+            tracks = track_source.aligned(tracks, log)
         elif (changed := _changed(found, tracks)) < _SETTLED_SHARE:
             log.end(stage, changed=changed)
             settled = True
             continue
         found = tracks
         tracks = tracks.without_photos(LEAST_MEASUREMENTS)
-        options = _of_joined(options, tracks)
+        options = _of_registered(options, tracks)
         options = replace(options, phi_sigma_start=result.phi_sigma)
         how = options if ends and aligns else rough_options(options)
         result = bundle_adjust(tracks, shutter_model, how, partial(_tell, log, stage))
@@ -459,7 +464,7 @@ def _fed_back(
             stage, points=after.num_points, observations=len(after.observations), rms_px=result.rms_px,
             iterations=result.num_iterations, stop_reason=result.stop_reason, moved_px=moved,
         )  # fmt: skip
-        settled = moved < _SETTLED_PX * feedback.step_px
+        settled = moved < _SETTLED_PX * track_source.step_px
     if ends and not aligns:
-        result = bundle_adjust(tracks, shutter_model, options, partial(_tell, log, "feedback"))
+        result = bundle_adjust(tracks, shutter_model, options, partial(_tell, log, "re-triangulation"))
     return result, tracks, options

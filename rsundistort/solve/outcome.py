@@ -1,4 +1,4 @@
-"""What was found, as a solution."""
+"""Results as a solution."""
 
 from __future__ import annotations
 
@@ -27,43 +27,43 @@ __all__ = ["Solved", "solution_of"]
 
 @dataclass(frozen=True)
 class Solved:
-    """What a reconstruction came to, and what is to be said beside it.
+    """Results of a reconstruction, and remarks on them.
 
     Attributes
     ----------
     result : BundleResult
         Last adjustment.
     global_result : BundleResult
-        A global-shutter adjustment of the same measurements: what not modelling the shutter costs.
+        A global-shutter adjustment of the same measurements, for comparison.
     cameras : PhotoCameras
         The cameras that it began with, and where they come from.
     choice : ModelChoice or None
-        How the model was chosen; None where it was given.
+        The choice of the model; None if it was specified.
     remedy : Remedy or None
-        What was done about a critical motion; None for a global shutter.
+        The remedy of a critical motion; None for a global shutter.
     advice : sequence of Advice
-        For the next shoot, where the poses are critical.
+        Advice for the next shoot, if the poses are critical.
     directions : ReadoutChoice or None
-        What the photos say of directions of the readout that nobody told.
+        The readout directions by the measurements, if they were not specified.
     verdict : Verdict or None
-        What to believe of all this.
+        How far the results can be trusted.
     shared_ids : sequence of int
-        Of the cameras that photos share, in all outputs, if they are not 1, 2, ...; where they vary, the photos' own
-        are numbered.
+        Ids of the cameras that photos share, in all outputs, if not 1, 2, ...; if they vary, the photos' own are
+        numbered.
     unregistered : mapping of name to reason
         Photos that are not in it.
     readouts : mapping of camera index to (seconds, source)
-        Times of the readout, as far as they are known.
+        Readout times, as far as they are known.
     whole : Reconstruction or None
         All frames of a video, whose key frames are the photos.
     evidence : mapping
-        What `solution.json` says of the readout time of a video.
+        The readout time of a video in `solution.json`.
     told : mapping
-        What else `solution.json` says of how it was made.
+        Further options in `solution.json`.
     survey : Survey or None
-        By what it is on the map.
+        The georeferencing.
     georeference : mapping or None
-        What `solution.json` says of that.
+        The georeferencing in `solution.json`.
     """
 
     result: BundleResult
@@ -100,19 +100,19 @@ class Solved:
         return list((not own and self.shared_ids) or range(1, 1 + len(self.reconstruction.cameras)))
 
     def by_camera(self, values: Sequence[Any]) -> dict[str, Any]:
-        """What shared cameras have, by the ids of the outputs: those of the photos, if they vary."""
+        """Values of shared cameras, by the ids of the outputs: those of the photos, if they vary."""
         of_photos = [values[k] for k in self.shared.camera_idx.tolist()]
         return dict(zip(map(str, self.camera_ids), of_photos if self.shared.varies else values, strict=True))
 
 
 def _readouts(rec: Reconstruction, cameras: PhotoCameras) -> str | dict[str, str]:
-    """Direction of the readout of all cameras, or by group where they differ."""
+    """Readout direction of all cameras, or by group if they differ."""
     directions = {label: camera.readout for label, camera in zip(cameras.labels, rec.cameras, strict=True)}
     return rec.cameras[0].readout if len(set(directions.values())) == 1 else directions
 
 
 def _guesses(solved: Solved) -> list[str]:
-    """What was guessed of the cameras, and what the photos said of it, for people."""
+    """Guesses of the cameras, and the result of the measurements, for people."""
     choice, cameras = solved.directions, solved.cameras
     if choice is None or not choice.turned:
         return list(cameras.notes)
@@ -132,7 +132,7 @@ def _image_rms(rec: Reconstruction) -> NDArray[np.float64]:
 
 
 def _critical(solved: Solved) -> dict[str, Any]:
-    """What `solution.json` says of critical motions."""
+    """Critical motions in `solution.json`."""
     remedy = solved.remedy
     assert remedy is not None
     after = remedy.after
@@ -156,7 +156,7 @@ def _critical(solved: Solved) -> dict[str, Any]:
 
 
 def _fields(solved: Solved) -> list[dict[str, float]]:
-    """How large the residual field of each camera is: root mean square and largest over its frame, its deviation."""
+    """Size of the residual field of each camera: root mean square and largest over its frame, standard deviation."""
     lengths = [np.linalg.norm(field_over_frame(c)[1], axis=2) for c in solved.shared.cameras]
     sigmas = solved.result.sigma_fields_px
     return [
@@ -199,10 +199,10 @@ def solution_of(solved: Solved, options: SolveOptions, rectify: RectifyOptions) 
     )
 
 
-def _georeference(solved: Solved) -> Mapping[str, Any] | None:
-    """Where on the map the solution is, with the speeds of the cameras where the readout's time is known."""
-    if solved.georeference is None or solved.survey is None:  # then it is the model's
-        return solved.georeference
+def _georeference(solved: Solved) -> dict[str, Any] | None:
+    """The georeferencing, with the speeds of the cameras where the readout time is known."""
+    if solved.georeference is None or solved.survey is None:
+        return None
     rec, positions = solved.shared, solved.survey.positions
     told = zip(positions.names, positions.speed_m_s.tolist(), strict=True)
     by_gps = {name: speed for name, speed in told if np.isfinite(speed)}
@@ -257,7 +257,7 @@ def _images(solved: Solved) -> Iterator[SolvedImage]:
 
 
 def _quality(solved: Solved) -> dict[str, Any]:
-    """What `solution.json` says of how well all is known."""
+    """Accuracy of the results in `solution.json`."""
     result, shared = solved.result, solved.shared
     readouts = solved.by_camera([solved.readouts.get(k) for k in range(len(shared.cameras))])
     return {
@@ -279,12 +279,12 @@ def _quality(solved: Solved) -> dict[str, Any]:
 
 
 def _bend_sigmas(result: BundleResult) -> dict[str, Any]:
-    """Spreads of the bends by group, of motions that are not steady."""
+    """Prior standard deviations of the bends by group, of unsteady motions."""
     return {"bend_sigmas_rad": dict(zip(BEND_GROUPS, result.bend_sigmas, strict=False))} if result.bend_sigmas else {}
 
 
 def _held_out(choice: ModelChoice | None) -> dict[str, Any]:
-    """What the model was chosen by, by model; empty where it was named."""
+    """Evidence for the choice of the model, by model; empty if it was specified."""
     return {
         "held_out_rms_px": {} if choice is None else choice.held_out_rms_px,
         "held_out_error": {} if choice is None else choice.held_out_error,

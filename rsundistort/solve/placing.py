@@ -1,4 +1,4 @@
-"""Which photos show the same, and where they were: the start of all that is solved."""
+"""Matching and mapping of the photos: the start of all that is solved."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def place_photos(
     *,
     with_shutter: bool = False,
 ) -> tuple[Reconstruction, MatchedPhotos]:
-    """Match photos and map them, as of a global shutter; what was kept of that is not done again.
+    """Match photos and map them, as of a global shutter; results of an earlier run are not computed again.
 
     Parameters
     ----------
@@ -50,9 +50,9 @@ def place_photos(
     seed, matching
         As in `solve_photos`.
     kept : Kept
-        What is done is kept in it.
+        Takes the results, for resuming.
     with_shutter : bool
-        Whether pairs that a shutter hides are verified by relative poses that have one.
+        Whether pairs that a shutter hides are verified by relative poses with a shutter.
     """
     cameras, database = photos.cameras, scratch / "database.db"
     log.begin("matching")
@@ -78,7 +78,7 @@ def place_photos(
             if _num_verified(matched) < len(photos.names) - 1:
                 raise
             raise ReconstructionError(
-                "the photos overlap, but show no parallax: the camera stood still or only turned; "
+                "the photos overlap, but show no parallax: the camera stood still or only rotated; "
                 "use photos from places apart"
             ) from error
         kept.put("mapped", mapped)

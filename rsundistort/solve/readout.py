@@ -1,4 +1,4 @@
-"""How long a camera takes to read a frame, by a video of it."""
+"""The readout time of a camera, from a video of it."""
 
 from __future__ import annotations
 
@@ -26,19 +26,20 @@ __all__ = ["MeasuredReadout", "measure_readout"]
 
 @dataclass(frozen=True)
 class MeasuredReadout:
-    """What a video says of the time in which its camera reads a frame.
+    """The readout time of a camera by a video.
 
     Attributes
     ----------
     seconds, sigma : float
-        From the first line to the last, negative where it runs against its direction; and its standard deviation.
+        From the first line to the last, negative if the lines are read in the opposite direction; and its standard
+        deviation.
     of_frame : float
         Share of the time from frame to frame.
     problem : str
-        Why the video did not tell it; empty if it did.
+        Why the video does not determine it; empty if it does.
     evidence : mapping
-        `quality.readout_time` of a solution: the same by halves, by pictures and gyroscope alone, whether the video was
-        stabilised, and how many frames it rests on.
+        `quality.readout_time` of a solution: the same by halves, by images and gyroscope alone, whether the video was
+        stabilised, and the number of frames.
     """
 
     seconds: float
@@ -49,7 +50,7 @@ class MeasuredReadout:
 
     @property
     def measured(self) -> bool:
-        """Whether the video told it."""
+        """Whether the video determines it."""
         return not self.problem
 
     def to_json(self) -> dict[str, Any]:
@@ -66,15 +67,15 @@ def measure_readout(
 ) -> MeasuredReadout:
     """Measure the readout time of a camera from a video that it took; nothing is written.
 
-    The camera must have shaken or turned, and not have stabilised the video. What it filmed does not matter, if it
-    stood still.
+    The camera must have shaken or rotated, and must not have stabilised the video. The scene may be anything that stood
+    still.
 
     Parameters
     ----------
     video : path
         Any file that FFmpeg decodes.
     options : RunOptions, optional
-        `solve.readout_s` is a first guess, known to 2 %: what the video does not tell better is not measured.
+        `solve.readout_s` is a first guess, known to 2 %: a value that the video does not improve is not measured.
     progress : callable, optional
         Called as (stage, done, total).
     jobs : int
@@ -83,7 +84,7 @@ def measure_readout(
     Returns
     -------
     MeasuredReadout
-        With a `problem` where the video does not tell.
+        With a `problem` if the video does not determine it.
     """
     options = options or RunOptions()
     video = local_place(video)
@@ -92,7 +93,7 @@ def measure_readout(
     log, workers = StageLog(progress), Workers(use_threads(jobs))
     with work_folder() as work, warnings.catch_warnings():
         # no frame is rectified
-        warnings.filterwarnings("ignore", "only the lens is taken out", RsUndistortWarning)
+        warnings.filterwarnings("ignore", "the frames are corrected for the lens only", RsUndistortWarning)
         gyro_log = None if options.gyro is None else options.gyro.log()
         source = find_photos(video, work, options.camera, None, None, log)
         assert source.clip is not None

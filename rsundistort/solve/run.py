@@ -49,7 +49,7 @@ def run(
     resume: bool = False,
     scheduler: str | None = None,
 ) -> Solution:
-    """Recover how the camera moved during each photo's readout; write rectified photos, masks and poses.
+    """Estimate the camera's motion during each photo's readout; write rectified photos, masks and poses.
 
     Parameters
     ----------
@@ -66,9 +66,9 @@ def run(
     jobs, overwrite, scheduler
         As in `rectify_folder`.
     resume : bool
-        Go on with a run of these photos and options into `out` that ended early, however it did: features, matches,
-        mapping, solution and rectified photos that it came to are not made again, and the outputs are what they would
-        have been without the interruption. Without such a run, and outputs, it begins.
+        Resume a run of these photos and options into `out` that ended early, however it did: features, matches,
+        mapping, solution and rectified photos that were complete are not made again, and the outputs are what they
+        would have been without the interruption. If there is neither such a run nor an output, it begins.
 
     Returns
     -------
@@ -99,7 +99,7 @@ def run(
                 outputs = _solved(photos, out, scratch, options, inputs, of_video, workers, log, before)
                 outputs.begin(scratch, log)
             before.begin()
-        # what an earlier run left there is of another path
+        # what an earlier run left there belongs to another path
         Record(out).remove([name for name in OF_VIDEOS if name not in of_video])
         if options.frames == "all" and before.kept.get(VIDEO) is None:
             outputs.rectify_clip(photos, out, workers, log)
@@ -118,7 +118,7 @@ def _solved(
     log: StageLog,
     before: RunFolder,
 ) -> Outputs:
-    """What is to be written, with frames of a video in the scratch folder; what was kept of that is not done again."""
+    """The outputs, with frames of a video in the scratch folder; results of an earlier run are not computed again."""
     rectify, kept = options.rectify, before.kept
     gyro_log = None if options.gyro is None else options.gyro.log()
     source = find_photos(photos, scratch, options.camera, options.every, options.sharpest, log)
@@ -163,7 +163,7 @@ def _writes(name: str, options: RunOptions) -> bool:
 
 
 def _check_anchors(options: SolveOptions, names: Sequence[str], photos: Path) -> None:
-    """Refuse what is known of photos that are not there."""
+    """Refuse constraints on photos that do not exist."""
     ends = (end[0] for each in options.lengths for end in (each.start, each.end))
     for name in (*options.still, *options.known, *ends):
         if name not in names:
@@ -179,7 +179,7 @@ def _solve(
     log: StageLog,
     kept: Kept,
 ) -> tuple[Solved, SolveOptions]:
-    """What the photos, and a gyroscope's log, come to; and the options with the motions of that."""
+    """The result of the photos and a gyroscope's log; and the options with the motions of that log."""
     solving, cameras = options.solve, loaded.cameras
     readouts = known_readouts(bodies, cameras.cameras, cameras.camera_idx, solving.readout_s, gyro_log)
     from_gyro: Known = {}
@@ -216,7 +216,7 @@ def solve_frames(
     log: StageLog,
     kept: Kept | None = None,
 ) -> Solved:
-    """What a video, and a gyroscope's log, come to."""
+    """The result of a video and a gyroscope's log."""
     solving, cameras = options.solve, keys.cameras
     if solving.control or solving.crs not in (None, "none"):
         raise InputError("frames of a video have no GPS; it takes no --crs and --gcp, say --every N for photos that do")
@@ -238,7 +238,7 @@ def solve_frames(
 def _with_gyroscope(
     options: SolveOptions, gyro: GyroOptions, log: GyroLog, loaded: LoadedPhotos, readouts: Readouts
 ) -> tuple[Known, SolveOptions]:
-    """The motions that a gyroscope's log tells, of photos whose motion nobody told, and the options with them."""
+    """The motions by a gyroscope's log, of photos whose motion was not specified, and the options with them."""
     cameras = loaded.cameras
     times = [readouts[k][0] if k in readouts else None for k in cameras.camera_idx.tolist()]
     by_photo = dict(zip(loaded.names, times, strict=True))

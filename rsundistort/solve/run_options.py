@@ -1,4 +1,4 @@
-"""Options of the functions that solve for motions, by what they concern."""
+"""Options of the functions that solve for motions, by topic."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FRAMES = ("key", "all")
 
 
 class _Part:
-    """Options that say where one belongs that was theirs when all were in one class."""
+    """Options that name the class of an option that was theirs when there was one class."""
 
     def __new__(cls, *_: Any, **given: Any) -> Any:
         for name in sorted(given.keys() - cls.__dataclass_fields__.keys()):  # type: ignore[attr-defined]
@@ -52,37 +52,38 @@ class SolveOptions(_Part):
     Parameters
     ----------
     readout : str or mapping of group to str, optional
-        Readout direction of all photos, or of groups; else the camera file's; else it is guessed, and told by the fit.
+        Readout direction of all photos, or of groups; else that of the camera file; else a guess, which the fit
+        decides.
     shutter_model : str
-        "constant-motion", "rotation", "linearized", "two-step", "global", or "auto": the one that foretells held-out
-        measurements best.
+        "constant-motion", "rotation", "linearized", "two-step", "global", or "auto": the one that best predicts
+        held-out measurements.
     seed : int
         Of every random choice.
     refine : tuple of str, optional
-        Intrinsics that are solved for with the rest, as in `BundleOptions`, under a loose prior; () for none. By
-        default all, under a prior as tight as the camera is known: a calibration, or EXIF's guess.
+        Intrinsics that are estimated, as in `BundleOptions`, under a loose prior; () for none. By default all, under a
+        prior as narrow as the camera is known: a calibration, or EXIF's guess.
     camera_sigma : mapping of intrinsic to float
-        Standard deviations of the cameras, in pixels or of the coefficients; else those of the file, else what
-        calibrations, or EXIF, usually are off by.
+        Standard deviations of the intrinsics, in pixels or of the coefficients; else those of the file, else the usual
+        errors of calibrations, or of EXIF.
     still : mapping of photo name to float
-        Photos known not to have moved, or by no more than so many radians per frame (one standard deviation), as in
+        Photos known not to have moved by more than this angle in radians per frame (one standard deviation), as in
         `BundleOptions.still`.
     known : mapping of photo name to (phi, sigma)
         Motions known from elsewhere, as in `BundleOptions.known_phi`.
     known_bends : mapping of photo name to Bend
-        What is known not to be steady in them, as in `BundleOptions.known_bends`.
+        Known deviations from steady motions, as in `BundleOptions.known_bends`.
     lengths : sequence of KnownLength
         Lengths measured in the scene, as in `BundleOptions.lengths`.
     crs : str, optional
-        Frame of poses and points: "local", metres east, north and up at the photos' median GPS; a projected one in
-        metres, as pyproj takes it ("EPSG:32632"), less an origin that `Solution.georeference` says; "none", one of
-        their own. By default "local" where GPS of three photos or more fits them; of `solve` the model's.
+        Frame of poses and points: "local", metres east, north and up at the photos' median GPS; a projection in metres
+        for pyproj ("EPSG:32632"), less an origin in `Solution.georeference`; "none", an arbitrary one. By default
+        "local" where GPS of three photos or more fits them; for `solve` the model's.
     control : sequence of ControlPoint
-        Points on the ground that were measured, in that CRS; without one, the frame is theirs.
+        Points on the ground that were measured, in that CRS; without a CRS, they define the frame.
     remedy : str
         What to do about a critical motion: "auto", "prior" or "none"; see `critical.heal`.
     readout_s : float, optional
-        Time of the readout of a frame; else the log's, else that of the camera in the table, if it is there.
+        Readout time of a frame; else the log's, else that of the camera in the table, if it is there.
     """
 
     readout: str | Mapping[str, str] | None = None
@@ -122,7 +123,7 @@ class SolveOptions(_Part):
         options = self.bundle_options()
         if self.refine == ():
             return options
-        # a calibration that is to be refined is not trusted: no better than a guess, but no worse
+        # a calibration that is named to be refined is not trusted more than a guess, nor less
         cameras = cameras.with_sigma(self.camera_sigma)
         known = cameras.known_to(loose=self.refine is not None)
         return replace(options, refine=self.refine or cameras.intrinsics, guessed=known)
@@ -130,21 +131,21 @@ class SolveOptions(_Part):
 
 @dataclass(frozen=True, kw_only=True)
 class OutputOptions(_Part):
-    """What is written beside the rectified photos.
+    """Outputs besides the rectified photos.
 
     Parameters
     ----------
     sparse_format : str
-        "bin" or "txt": how the COLMAP model is written.
+        Format of the COLMAP model, "bin" or "txt".
     rs_poses : bool
         Whether the poses of the original photos with their shutter are written, for renderers that model it.
     usd : bool
-        Of a video with a path: write `camera.usda`, its camera at every frame and the points, for match-moving.
+        For a video with a path: write `camera.usda`, its camera at every frame and the points, for match-moving.
     exports : sequence of str
-        Programs that the solution is written for besides, each into a folder of its name: "metashape", "ncore", "nuke",
+        Other programs to write the solution for, each into a folder of its name: "metashape", "ncore", "nuke",
         "opensfm", "opf" (the original photos) and "opf-rectified".
     report : bool
-        Write `report.html`. What it needs is kept in any case: `report.write_report` makes it later.
+        Write `report.html`. Its data is kept in any case: `report.write_report` makes it later.
     """
 
     sparse_format: str = "bin"
@@ -167,7 +168,7 @@ class OutputOptions(_Part):
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(_Part):
-    """Options of `run`: how photos are measured; and by what the motions are found, and what is made of the photos.
+    """Options of `run`: how photos are measured, how the motions are estimated, and what is made of the photos.
 
     Parameters
     ----------
@@ -175,24 +176,24 @@ class RunOptions(_Part):
         How the motions are found.
     rectify : RectifyOptions
         What is done to each photo. There are no features where its `masks` are black. With `apply_orientation` photos
-        that it mirrors are turned only, and keep the mirror as their orientation: no camera takes a mirror image.
+        that it mirrors are only rotated, and keep the mirror as their orientation: no camera takes a mirror image.
     outputs : OutputOptions
-        What is written besides.
+        Further outputs.
     camera : str, optional
         File or folder of cameras, or numbers, as `io.read_camera_file` takes them; else `camera.json` or `cameras.json`
         in or beside the folder of photos, else EXIF.
     max_features : int
-        Per photo, the largest.
+        Largest number of features per photo.
     feature_megapixels : float
-        Larger photos are shrunk to this to find their features.
+        Larger photos are reduced to this size to detect their features.
     every, sharpest : int, optional
-        Of a video: each N-th frame, or the sharpest of each N frames, as in `io.extract_frames`; by default its frames
+        For a video: each N-th frame, or the sharpest of each N frames, as in `io.extract_frames`; by default its frames
         share one path, and its key frames are the photos.
     frames : {"key", "all"}
-        Of a video with a path: whether only its key frames are rectified, or all of them, into `video.mp4`, too.
+        For a video with a path: rectify only its key frames, or all frames, into `video.mp4`, too.
     matching : str
-        Photos matched with each other: "exhaustive", all; "neighbours", those taken one after the other, near by GPS,
-        or that look alike; "auto", neighbours in sets of more than 60.
+        Photos that are matched: "exhaustive", all pairs; "neighbours", neighbours in order of capture, by GPS or by
+        appearance; "auto", neighbours in sets of more than 60.
     gyro : GyroOptions, optional
         A gyroscope's log, for the motions that are neither `known` nor those of `still` photos.
     """

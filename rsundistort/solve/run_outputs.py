@@ -63,10 +63,10 @@ REPLACED = ("images", "masks", "sparse", "stereo", "rs-poses", *EXPORTS)
 VIDEO = "video.mp4"
 #: The camera of a video for match-moving.
 USD = "camera.usda"
-#: Files that are there of videos only.
+#: Files that only videos have.
 OF_VIDEOS = ("path.csv", "path.txt", VIDEO, USD)
 
-# What it writes besides the photos.
+# Files besides the photos.
 _FILES = (
     "solution.json", "report.npz", "poses.txt", "points.ply", "transforms.json", "run-colmap-geometric.sh",
     "run-colmap-photometric.sh", "stereo/fusion.cfg", "stereo/patch-match.cfg",
@@ -76,7 +76,7 @@ _PARTS = ("cameras", "images", "points3D", "rigs", "frames")
 
 
 def files_of_run(names: Sequence[str], raw_as: str, options: OutputOptions) -> list[str]:
-    """All files that the outputs of photos may have: what is in their way is to be told before the work, not after.
+    """All files that the outputs of photos may have, to report conflicts before the work.
 
     Refuses photos that an export would confuse.
     """
@@ -89,7 +89,7 @@ def files_of_run(names: Sequence[str], raw_as: str, options: OutputOptions) -> l
 
 
 def check_usd(options: OutputOptions, is_clip: bool) -> None:
-    """Refuse, before any work, a USD camera of what has no path, or without USD's library."""
+    """Refuse, before any work, a USD camera without a path, or without USD's library."""
     if options.usd and not is_clip:
         raise InputError("--usd is for a video whose frames share a path, without --every and --sharpest")
     if options.usd and find_spec("pxr") is None:
@@ -102,7 +102,7 @@ def inputs_of(options: RectifyOptions, *given: Path | str | None) -> list[Path]:
 
 
 def photo_times(folder: Path) -> dict[str, float]:
-    """When the photos of a folder were taken, by the `frames.csv` that lies with frames of a video; {} without one."""
+    """Times of the photos of a folder, by the `frames.csv` beside frames of a video; {} without one."""
     try:
         return read_photo_times(folder / FRAME_TABLE)
     except (FileError, ValueError):  # no such table, or another's
@@ -118,7 +118,7 @@ class PointRgb:
     values : (n, 3) uint8 array
         Red, green, blue.
     known : (n,) bool array
-        Of which points; the photos tell the others.
+        Which points have one; those of the others come from the photos.
     """
 
     values: NDArray[np.uint8]
@@ -127,30 +127,30 @@ class PointRgb:
 
 @dataclass(frozen=True)
 class Outputs:
-    """What is written of a reconstruction, before the photos are rectified and after.
+    """Outputs of a reconstruction, before the photos are rectified and after.
 
     Attributes
     ----------
     solution : Solution
-        In the stored frame, with the rectified cameras that were asked for.
+        The solution in the stored frame, with the rectified cameras.
     reconstruction : Reconstruction
-        Poses, points and measurements, and the motions that are taken out.
+        Poses, points and measurements, and the motions that are corrected.
     rectifying : RectifyOptions
         What is done to each photo.
     options : OutputOptions
         What is written besides.
     ids : ModelIds
-        By which the COLMAP model calls its parts.
+        Ids of the COLMAP model.
     turns : mapping of name to int
         EXIF orientations that are applied.
     rgb : PointRgb or None
-        Colours of points; None where the photos tell them all.
+        Colours of points; None if all come from the photos.
     with_photos : bool
         Whether there are photos to rectify.
     times : mapping of name to float
         When photos were taken, in seconds.
     solved : Solved or None
-        What the report compares; None where there is nothing to.
+        Data of the report; None if there is none.
     """
 
     solution: Solution
@@ -177,7 +177,7 @@ class Outputs:
         with_photos: bool = True,
         times: Mapping[str, float] | None = None,
     ) -> Outputs:
-        """Outputs of what was solved, whose photos have these EXIF orientations."""
+        """Outputs of a solution, whose photos have these EXIF orientations."""
         rec = solved.reconstruction
         solution = with_view(solution_of(solved, solving, rectifying), rectifying.view)
         turns: dict[str, int] = {}
@@ -190,7 +190,7 @@ class Outputs:
         return cls(solution, rec, rectifying, options, ids, turns, rgb, with_photos, times or {}, solved)
 
     def begin(self, folder: Path, log: StageLog) -> Solution:
-        """Write all but the photos and the colours that they tell, so that what comes after can be gone on with."""
+        """Write all except the photos and the colours of points, so that the rest can be resumed."""
         if self.with_photos:
             for name in ("images", "masks"):
                 (folder / name).mkdir()
@@ -202,7 +202,7 @@ class Outputs:
         return turned
 
     def report(self, out: Path, jobs: int, log: StageLog, photos: Path | None = None) -> None:
-        """Write the report of what is in `out`, if it is asked for; a failure is no more than warned of."""
+        """Write the report of `out`, if it is wanted; a failure only causes a warning."""
         if not self.options.report:
             return
         try:
@@ -210,18 +210,18 @@ class Outputs:
                 write_report(out, photos, jobs=jobs, progress=log.tell)
         except KeyboardInterrupt as stop:
             raise KeyboardInterrupt(
-                f"all but the report is written; go on with: rsundistort report {shlex.quote(str(out))}"
+                f"all but the report is written; continue with: rsundistort report {shlex.quote(str(out))}"
             ) from stop
 
     def rectify(self, photos: Path, out: Path, workers: Workers, log: StageLog, resume: bool = False) -> Solution:
         """Rectify the photos of a folder into `out`, which `begin` has filled, and write the rest again.
 
-        With `resume` photos that are rectified already are passed over.
+        With `resume` photos that are complete are skipped.
         """
         solution, rec, options = self.solution, self.reconstruction, self.rectifying
         colors = None if self.rgb is not None and self.rgb.known.all() else PointColors(rec)
         scene = SceneGeometry(solution, options.depth, ScenePoints.of_reconstruction(rec))
-        go_on = "whole; the same command with --resume goes on"
+        go_on = "whole; the same command with --resume continues"
         with batch_folder(out, overwrite=True) as journal:
             done = rectify_photos(
                 photos, scene, list(rec.image_names), out, options, workers, log, journal,
@@ -248,7 +248,7 @@ class Outputs:
             )  # fmt: skip
         self.report(out, workers.jobs, log, photos)
         if not left_out:
-            journal.path.unlink()  # nothing to go on with
+            journal.path.unlink()  # nothing to resume
         return turned
 
     @cached_property
@@ -256,20 +256,20 @@ class Outputs:
         if self.solved is None:
             return None
         shared = self.solved.shared
-        # photos that vary have cameras of their own: what they share goes by that of the first
+        # photos that vary have cameras of their own: shared values are those of the first
         first = [int(np.argmax(shared.camera_idx == k)) for k in range(len(shared.cameras))]
         ids = [self.ids.cameras[k] for k in (first if shared.varies else range(len(shared.cameras)))]
         return Diagnostics.of_results(self.solved.result, self.solved.global_result, ids)
 
     def _tell_report(self, folder: Path, rgb: NDArray[np.uint8] | None, photos: str = "") -> None:
-        """Keep what the report shows beyond the solution."""
+        """Keep the data of the report beyond the solution."""
         with _only_warned_of():
             if self._diagnostics is not None:
                 told = replace(self._diagnostics.with_colors(rgb), photos=photos)
                 write_diagnostics(folder / "report.npz", told)
 
     def _rgb(self, colors: PointColors | None) -> NDArray[np.uint8] | None:
-        """Colours as the photos tell them, where they were not known."""
+        """Colours from the photos, where they were not known."""
         told = None if colors is None else colors.rgb()
         if self.rgb is None or told is None:
             return told if self.rgb is None else self.rgb.values
@@ -284,9 +284,10 @@ class Outputs:
         photos: PurePath | None,
         source: Path | None = None,
     ) -> Solution:
-        """Write the models for other programs; returns the solution as they have it, turned.
+        """Write the models for other programs; returns the rotated solution in them.
 
-        `photos` is where the original ones are, seen from the folder of their poses; `source` the same from here.
+        `photos` is the folder of the original photos, relative to the folder of their poses; `source` the same from
+        here.
         """
         rec, ids, options, raw_as = self.reconstruction, self.ids, self.options, self.rectifying.raw_as
         names = [None if name in left_out else output_name(name, raw_as) for name in rec.image_names]
@@ -306,7 +307,7 @@ class Outputs:
                 warnings.warn(f"rs-poses is without transforms.json: {problem}", RsUndistortWarning, stacklevel=3)
         if self.turns:
             solution, rec = turn_solution(solution, self.turns), turn_reconstruction(rec, self.turns)
-            # turned cameras are further ones, in the same order in both
+            # rotated cameras are further ones, in the same order in both
             ids = replace(ids, cameras=[int(key) for key in solution.cameras])
         new_cameras = [solution.rectified_cameras[str(key)] for key in ids.cameras]
         as_text = options.sparse_format == "txt"
@@ -326,7 +327,7 @@ class Outputs:
         return solution
 
     def _export(self, folder: Path, scene: ExportScene, tell: bool) -> None:
-        """Write what else was asked for; trouble with one loses no other."""
+        """Write the exports; an error of one loses no other."""
         for name in self.options.exports:
             try:
                 said = EXPORTS[name].write(folder / name, scene)
@@ -337,7 +338,7 @@ class Outputs:
                 warnings.warn(f"{name}: {said}", RsUndistortWarning, stacklevel=4)
 
     def _path(self, folder: Path, new_camera: Camera) -> None:
-        """Write where the camera of a video was, and how it moved, at each frame; turned as the key frames are."""
+        """Write the path of the camera of a video; rotated as the key frames are."""
         found = None if self.solved is None else self.solved.result.path
         if found is None:
             return
@@ -353,7 +354,7 @@ class Outputs:
         assert self.solved is not None
         assert self.solved.whole is not None
         whole, solution = self.solved.whole.with_own_cameras(), self.solution
-        # one view for all: the lens that focusing moved is that of each frame
+        # one view for all: each frame has the lens that focusing moved
         new_camera = next(iter(solution.rectified_cameras.values()))
         lens_only = any(image.lens_only for image in solution.registered)
         images = tuple(
@@ -362,7 +363,7 @@ class Outputs:
         )
         cameras = {str(k): camera for k, camera in enumerate(whole.cameras)}
         every = Solution(whole.shutter_model, cameras, dict.fromkeys(cameras, new_camera), images)
-        # maps are those of the key frames: with them, and without them in between, things would jump
+        # depth maps are those of the key frames: with them, and without them in between, things would jump
         depth = self.rectifying.depth if str(self.rectifying.depth) in DEPTHS else "auto"
         scene = SceneGeometry(every, depth, ScenePoints.of_reconstruction(whole))
         placed = {*whole.image_names}
@@ -377,7 +378,7 @@ class Outputs:
             rectify_clip(video, out / VIDEO, geometry_of, still, self.rectifying.interpolation, workers, log)
 
     def _trajectory(self, path: Path, solution: Solution) -> None:
-        """Write the poses by time if that of all photos is known, else by their place among all photos."""
+        """Write the poses by time if all photos have one, else by their index."""
         posed = {k: image for k, image in enumerate(solution.images) if image.posed}
         times = [self.times.get(image.name, np.nan) for image in posed.values()]
         if not np.isfinite(times).all():
@@ -387,7 +388,7 @@ class Outputs:
 
 
 def _left_by_two_poses(rec: Reconstruction) -> float:
-    """Largest displacement in pixels, over the photos, that two poses a photo cannot say; at each one's near points."""
+    """Largest error in pixels, over the photos, of two poses per photo; at each one's near points."""
     left = 0.0
     obs = rec.observations
     for i in range(rec.num_images):
@@ -400,7 +401,7 @@ def _left_by_two_poses(rec: Reconstruction) -> float:
 
 
 def relative_to(folder: Path, start: Path) -> PurePath:
-    """A folder seen from another; whole where nothing leads there, as between drives."""
+    """A folder relative to another; absolute if that is impossible, as between drives."""
     try:
         return PurePath(os.path.relpath(folder.resolve(), start.resolve()))
     except ValueError:
@@ -409,7 +410,7 @@ def relative_to(folder: Path, start: Path) -> PurePath:
 
 @contextmanager
 def _only_warned_of() -> Iterator[None]:
-    """Trouble with the report loses no run."""
+    """An error of the report loses no run."""
     try:
         yield
     except Exception as error:

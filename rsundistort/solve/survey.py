@@ -1,4 +1,4 @@
-"""A reconstruction on the map: by GPS of its photos, and by control points."""
+"""Georeferencing of a reconstruction: by GPS of its photos, and by control points."""
 
 from __future__ import annotations
 
@@ -24,44 +24,45 @@ __all__ = ["Survey", "survey_of"]
 Array = NDArray[np.float64]
 
 _LEAST = 3
-# Places put a model on the map that know how it is turned and how large it is to this: radians, relative.
+# Places georeference a model if they determine its rotation and scale to this: radians, relative.
 _MOST_TURN, _MOST_SCALE = np.deg2rad(10.0), 0.1
-# The half of the photos that lies nearest does so within so many standard deviations of GPS, or it is of other photos.
+# The nearer half of the photos lies within this many standard deviations of GPS, or GPS is of other photos.
 _MOST_OFF = 4.0
 # Control points farther from the photos' GPS are of another CRS, metres.
 _ELSEWHERE_M = 1e5
 # Known lengths that are off by more standard deviations contradict the map.
 _CONTRADICTS = 3.0
-# Of axes by a gimbal and its compass, radians; photos that lie farther off than the second are not believed.
+# Standard deviation of axes by a gimbal and its compass, radians; photos that deviate more than the second are
+# rejected.
 _GIMBAL_SIGMA, _GIMBAL_OFF = np.deg2rad(5.0), np.deg2rad(20.0)
-# So many photos, spread over the flight, are compared each with each for the middle one.
+# Number of photos, spread over the flight, that are compared with each other for the middle one.
 _SOME = 100
-# Of a velocity by GPS along each axis, metres a second, and of the time that it is multiplied by, relative.
+# Standard deviation of a velocity by GPS along each axis, m/s, and of the time that multiplies it, relative.
 _VELOCITY_SIGMA_M_S, _VELOCITY_SHARE = 0.3, 0.03
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What is known of places, in the frame of the map.
+    """Known positions, in the frame of the map.
 
     Attributes
     ----------
     frame : MapFrame
         Of the poses and points.
     positions : PhotoPositions
-        What the photos' GPS says, velocities and rotations along the axes of the frame.
+        The photos' GPS.
     places : mapping of photo name to (place, sigma)
-        Their places in the frame, (3,) each; none where the frame is that of control points.
+        Their places in the frame, (3,) each; none if the frame is that of control points.
     control : sequence of ControlPoint
         In the frame.
     gps_offset_m : (3,) array
-        What is added to GPS to be in line with the control points.
+        Offset that is added to GPS to agree with the control points.
     clock_s : mapping of photo name to float
-        Seconds of a readout whose time and direction were told: GPS then says velocities.
+        Readout times, in seconds, where time and direction were specified: GPS then gives velocities.
     fit : FittedSimilarity or None
-        How the reconstruction was put there.
+        The similarity that was applied to the reconstruction.
     notes : sequence of str
-        What is to be said.
+        Remarks.
     """
 
     frame: MapFrame
@@ -79,7 +80,7 @@ class Survey:
         return [point for point in self.control if not point.is_check]
 
     def known(self, rec: Reconstruction) -> KnownPlaces | None:
-        """What the adjustment of a reconstruction is told; nothing before that is in the frame."""
+        """Positions for the adjustment of a reconstruction; none before that is in the frame."""
         if self.fit is None:
             return None
         velocities = {}
@@ -91,14 +92,14 @@ class Survey:
         return KnownPlaces(self.places, self.holding, velocities)
 
     def placed(self, rec: Reconstruction) -> tuple[Survey | None, Reconstruction]:
-        """The reconstruction in the frame by GPS; as it was, and no survey, where GPS does not fit it.
+        """The reconstruction in the frame by GPS; as it was, and no survey, if GPS does not fit it.
 
-        Where the frame is that of control points, they put it there once motions are known.
+        If the frame is that of control points, they are applied once motions are known.
         """
         if not self.places:
             return self, rec
         names = [name for name in rec.image_names if name in self.places]
-        problem = f"{len(names)} of the photos that were joined have GPS, three are needed"
+        problem = f"{len(names)} of the registered photos have GPS, three are needed"
         if len(names) >= _LEAST:
             fit = self._fitted(rec, *_of_photos(rec, self.places))
             problem = _misfit(fit, "GPS")
@@ -110,16 +111,16 @@ class Survey:
         return None, rec
 
     def _fitted(self, rec: Reconstruction, points: Array, targets: Array, sigma: Array) -> FittedSimilarity:
-        """The similarity by places; where these do not tell the rotation, gimbals do: compasses err by more."""
+        """The similarity by places; if these do not determine the rotation, gimbals do: compasses err by more."""
         fit = fit_similarity(points, targets, sigma)
         if (fit.sigma_rad < _MOST_TURN).all():
             return fit
         return fit_similarity(points, targets, sigma, self._rotation(rec))
 
     def _rotation(self, rec: Reconstruction) -> tuple[Array, float] | None:
-        """From a reconstruction's axes to the frame's by the photos' gimbals, and what it is known to; or None.
+        """Rotation from a reconstruction's axes to the frame's by the gimbals, and its standard deviation; or None.
 
-        The compass errs in all photos alike: many know it no better than one.
+        The error of the compass is the same in all photos: many know it no better than one.
         """
         told = {
             name: R_cw
@@ -139,12 +140,12 @@ class Survey:
         return each[near].mean().as_matrix(), _GIMBAL_SIGMA
 
     def controlled(self, rec: Reconstruction, sigma_px: float) -> tuple[Survey | None, Reconstruction]:
-        """The reconstruction with the control points among its points, in the frame that they tell."""
+        """The reconstruction with the control points among its points, in the frame that they define."""
         found = place_control(rec, self.holding)
         lost = [each.name for each in self.holding if each not in found.points]
         notes = [
             *self.notes,
-            *([f"control points that fewer than two joined photos see: {', '.join(lost)}"] * bool(lost)),
+            *([f"control points that fewer than two registered photos see: {', '.join(lost)}"] * bool(lost)),
         ]
         survey, targets = replace(self, notes=notes), np.array([each.place_m for each in found.points]).reshape(-1, 3)
         if len(found.points) >= _LEAST:
@@ -160,14 +161,14 @@ class Survey:
                 rec, survey = fit.similarity.of_reconstruction(rec), replace(survey, fit=fit)
         elif self.fit is None:
             warnings.warn(
-                f"not on the map: {len(found.points)} control points are seen by joined photos, three are needed; "
+                f"not on the map: {len(found.points)} control points are seen by registered photos, three are needed; "
                 "poses are in a frame of their own", RsUndistortWarning, stacklevel=4,
             )  # fmt: skip
             return None, rec
         elif found.points:
             rec = Similarity(1.0, np.eye(3), (targets - found.points_w).mean(0)).of_reconstruction(rec)
         if self.places and found.points:
-            # what is common to all positions is the receiver's and its datum's, and the control points know better
+            # the common offset of all positions is the receiver's and its datum's, and control points know better
             centers, places, _ = _of_photos(rec, self.places)
             offset = np.median(centers - places, axis=0)
             moved = {name: (place + offset, sigma) for name, (place, sigma) in self.places.items()}
@@ -175,7 +176,7 @@ class Survey:
         return survey, with_control(rec, survey.holding, CONTROL_SIGMA_PX / sigma_px)
 
     def settled(self, rec: Reconstruction) -> tuple[Survey, Reconstruction]:
-        """The adjusted reconstruction where its places fit best: the last steps of an adjustment need not move it."""
+        """The adjusted reconstruction aligned with its places: the last steps of an adjustment need not move it."""
         x, y, sigma = _of_photos(rec, self.places)
         indices = {point_of(rec, each): each for each in self.holding}
         points = {k: each for k, each in indices.items() if k is not None}
@@ -188,11 +189,11 @@ class Survey:
         off = survey.outliers(rec)
         if off:
             told = ", ".join(f"{name} ({distance:.1f} m)" for name, distance in off.items())
-            warnings.warn(f"GPS that is far off, and not believed: {told}", RsUndistortWarning, stacklevel=4)
+            warnings.warn(f"GPS that is far off, and rejected: {told}", RsUndistortWarning, stacklevel=4)
         return survey, rec
 
     def outliers(self, rec: Reconstruction) -> dict[str, float]:
-        """Photos whose GPS is far off, and how far, metres."""
+        """Photos whose GPS is far off, and its error, metres."""
         return {
             name: float(np.linalg.norm(residual))
             for name, (residual, deviation) in self._residuals(rec).items()
@@ -209,7 +210,7 @@ class Survey:
     def georeference(
         self, rec: Reconstruction, covariances: Array, lengths: Sequence[KnownLength] = ()
     ) -> dict[str, Any]:
-        """What `solution.json` says of it; covariances are those of the photos' unknowns."""
+        """Its content of `solution.json`; covariances are those of the photos' unknowns."""
         assert self.fit is not None
         residuals = self._residuals(rec)
         sigma = {name: np.asarray(self.places[name][1]).tolist() for name in residuals}
@@ -248,7 +249,7 @@ class Survey:
         return value
 
     def _control(self, rec: Reconstruction, covariances: Array) -> dict[str, Any]:
-        """Control points by name: where rays of the photos meet less where they are."""
+        """Control points by name: residual of the point where rays of the photos meet."""
         assert self.fit is not None
         found = place_control(rec, self.control, covariances if np.isfinite(covariances).all() else None)
         rows = {}
@@ -266,7 +267,7 @@ class Survey:
         return rows
 
     def _lengths(self, rec: Reconstruction, lengths: Sequence[KnownLength]) -> dict[str, Any]:
-        """Known lengths in metres of the map over what they are said to be, told where they contradict it."""
+        """Ratio of known lengths in metres of the map to the given values, with a warning if they contradict it."""
         assert self.fit is not None
         if not lengths:
             return {}
@@ -295,11 +296,11 @@ def _of_photos(rec: Reconstruction, places: Mapping[str, tuple[Array, Array]]) -
 
 
 def _misfit(fit: FittedSimilarity, what: str, robust: bool = True) -> str:
-    """Why places do not put a model on the map; "" where they do."""
+    """Why places do not georeference a model; "" if they do."""
     if not (fit.sigma_rad < _MOST_TURN).all():
-        return f"{what} along a line, or as near to each other as they are exact, does not say how the model is turned"
+        return f"{what} along a line, or within its own errors, does not determine the rotation of the model"
     if not fit.sigma_scale < _MOST_SCALE:
-        return f"{what} tells the scale to {100 * fit.sigma_scale:.0f} % only"
+        return f"{what} determines the scale to {100 * fit.sigma_scale:.0f} % only"
     if robust and np.median(fit.deviations) > _MOST_OFF:
         return f"{what} and the poses differ by {np.median(np.linalg.norm(fit.residuals, axis=1)):.1f} m in the median"
     return ""
@@ -313,14 +314,14 @@ def survey_of(
     sizes: Sequence[tuple[int, int]],
     clock_s: Mapping[str, float] | None = None,
 ) -> Survey | None:
-    """What is known of the places of photos, in the frame that was asked for; None where that is one of their own.
+    """Known positions of photos, in the frame that was specified; None if that is arbitrary.
 
     Parameters
     ----------
     crs : str, optional
-        "local", "none", or a projection as pyproj takes it; None: local where GPS says enough, and nothing said if not.
+        "local", "none", or a projection for pyproj; None: local if GPS suffices, and no message if not.
     control : sequence of ControlPoint
-        In that CRS; of "local" their frame is the map's.
+        In that CRS; with "local" their frame is the map's.
     names, facts, sizes : sequences of length m
         Photos, what their EXIF says, and their (width, height).
     clock_s : mapping of name to float, optional
@@ -329,7 +330,7 @@ def survey_of(
     Raises
     ------
     InputError
-        The CRS was asked for and too few photos have GPS, or too few control points are known; control points outside
+        The CRS was specified and too few photos have GPS, or too few control points are known; control points outside
         the photos, or far from them.
     """
     if crs == "none":
@@ -367,7 +368,7 @@ def survey_of(
 
 
 def _check_seen(control: Sequence[ControlPoint], sizes: Mapping[str, tuple[int, int]]) -> None:
-    """Refuse control points in photos that are not there, or outside them."""
+    """Refuse control points in photos that do not exist, or outside them."""
     for point in control:
         for name, (x, y) in point.seen.items():
             if name not in sizes:

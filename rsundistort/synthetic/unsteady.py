@@ -1,4 +1,4 @@
-"""Motions that are not steady while a frame is read: accelerations, vibrations, a gyroscope's track, poses by row."""
+"""Unsteady motions during the readout: accelerations, vibrations, a gyroscope's track, poses by row."""
 
 from __future__ import annotations
 
@@ -33,33 +33,33 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-#: Rotation vectors and positions (k, 3) at readings (k,) of the clock.
+#: Rotation vectors and positions (k, 3) at values (k,) of the clock.
 Poses = Callable[[Array], tuple[Array, Array]]
 
 AXES = ("random", "x", "y", "z")
-# A bend's readings: as many as most motions need, and up to as many as there may be.
+# Values of a bend: as many as most motions need, and the largest number.
 _SITES, _MOST_SITES = 65, 1025
-# Readings that a motion is sampled at, and judged: at 1.5 mrad and 100 periods a frame right to 1e-9 rad.
+# Values at which a motion is sampled and checked: at 1.5 mrad and 100 periods a frame right to 1e-9 rad.
 _SAMPLES = 4097
 _TOLERATED_PX = 0.02
-# Steps between the rows of a table: what is longer is a gap.
+# Steps between the rows of a table that count as a gap, in units of the median.
 _GAP_STEPS = 5.0
 
 
 @dataclass(frozen=True)
 class Vibration:
-    """A harmonic shake of random phase.
+    """A harmonic vibration of random phase.
 
     Parameters
     ----------
     amplitude_rad : float
         Of the rotation.
     periods : (float, float)
-        A frame; drawn evenly between these for each photo.
+        Per frame; drawn uniformly between these for each photo.
     axis : str
-        Of the camera, that it turns about: "x", "y", "z", or "random" for each photo.
+        Axis of rotation in the camera frame: "x", "y", "z", or "random" for each photo.
     travel : float
-        Amplitude of the position, world units, of the same frequency and of a direction and phase of its own.
+        Amplitude of the position, world units, with the same frequency and a direction and phase of its own.
     """
 
     amplitude_rad: float = 0.0
@@ -86,15 +86,15 @@ class RowTable:
     Parameters
     ----------
     at : (k,) array
-        Ascending rows (columns, where these are read one after the other), pixels; or readings of the clock.
+        Ascending rows (columns, if these are read one after the other), pixels; or values of the clock.
     rotation : (k, 3) array
-        Rotation vectors in radians: the camera has `Exp(rotation) R_cw` there, R_cw being the pose of the photo.
+        Rotation vectors in radians: the pose there is `Exp(rotation) R_cw`, with R_cw that of the photo.
     position : (k, 3) array, optional
-        What is added to the centre of the camera, world units.
+        Added to the centre of the camera, world units.
     by_clock : bool
         Whether `at` is the clock.
 
-    Between its rows a table is a cubic spline. It must hold all rows of the photo, and no gap.
+    Between its rows a table is a cubic spline. It must cover all rows of the photo, without a gap.
     """
 
     at: Array
@@ -136,7 +136,7 @@ class RowTable:
             raise InputError(
                 f"poses from {self.at[0]:g} to {self.at[-1]:g}, but {what} of the photo from {need[0]:g} to {need[1]:g}"
             )
-        # against the middle, where no rotation vector wraps
+        # relative to the middle, where no rotation vector wraps
         readings = Rotation.from_rotvec(np.array(self.rotation))  # it takes nothing read-only
         middle = readings[len(readings) // 2]
         spline = CubicSpline(self.at, np.hstack([(readings * middle.inv()).as_rotvec(), self.position]))
@@ -151,7 +151,7 @@ class RowTable:
 def unsteady(
     name: str, camera: Camera, steady: RowMotion | RowTable | Poses, share: ArrayLike = 0.0, shake: Poses | None = None
 ) -> tuple[RowMotion, Array, Array]:
-    """What a photo's motion is, with what is not steady in it.
+    """The motion of a photo, with its unsteady part.
 
     Parameters
     ----------
@@ -160,17 +160,18 @@ def unsteady(
     camera : Camera
         Its clock and its size.
     steady : RowMotion, RowTable or function
-        Where it starts from; functions give rotation vectors and positions (k, 3) at readings (k,) of the clock.
+        The motion without the following; functions give rotation vectors and positions (k, 3) at values (k,) of the
+        clock.
     share : (3,) array
-        By how much of itself each component of phi grows from the middle of the frame to its end: the rate is
-        `phi (1 + share s)`, s from -1 to 1.
+        Relative growth of each component of phi from the middle of the frame to its end: the rate is `phi (1 + share
+        s)`, s from -1 to 1.
     shake : function, optional
-        What the camera does on top of it.
+        A vibration that is added.
 
     Returns
     -------
     motion, turn, way
-        As `RowMotion.of`. A spline that misses the motion by more than 0.02 px is told as a warning.
+        As `RowMotion.of`. A spline that deviates from the motion by more than 0.02 px causes a warning.
     """
     start, end = camera.clock_range
     clock = np.linspace(start, end, _SAMPLES)
@@ -213,7 +214,7 @@ def unsteady_motions(
     seed: int,
     still: Collection[str] = (),
 ) -> dict[str, tuple[RowMotion, Array, Array]]:
-    """Motions of photos as of `unsteady`, with accelerations and vibrations drawn by the seed; steady ones stay.
+    """Motions of photos as of `unsteady`, with random accelerations and vibrations; steady ones stay.
 
     `start` is by photo, in the order of `cameras`; `acceleration` as `accelerations` takes it. A still photo does not
     move.
@@ -233,14 +234,14 @@ def unsteady_motions(
 
 
 def accelerations(num: int, sigma: float, seed: int) -> Array:
-    """(num, 3) shares by which components of phi grow over half a frame, normal with this standard deviation."""
+    """(num, 3) relative growth of the components of phi over half a frame, normal with this standard deviation."""
     if not (sigma >= 0 and np.isfinite(sigma)):
         raise InputError(f"acceleration={sigma}, expected a share of 0 or more")
     return sigma * np.random.default_rng([seed, 7]).normal(size=(num, 3))
 
 
 def vibrations(cameras: list[Camera], vibration: Vibration, seed: int) -> list[Poses]:
-    """What a vibration adds to the motion of each photo; the same seed draws the same."""
+    """The vibration of each photo; the same seed draws the same."""
     rng = np.random.default_rng([seed, 8])
     return [_shake(camera, vibration, rng) for camera in cameras]
 
@@ -257,9 +258,9 @@ def _shake(camera: Camera, vibration: Vibration, rng: np.random.Generator) -> Po
 
 
 def tracks(log: GyroLog, cameras: list[Camera], readout_s: float | None, seed: int) -> list[Poses]:
-    """Stretches of a gyroscope's log, as long as the readout: one for each photo, from where there is no gap.
+    """Sections of a gyroscope's log, as long as the readout: one for each photo, without a gap.
 
-    The time of the readout is that of the log if not given.
+    The readout time is that of the log if not given.
     """
     readout_s = log.readout_s if readout_s is None else readout_s
     if readout_s is None or not (readout_s > 0 and np.isfinite(readout_s)):

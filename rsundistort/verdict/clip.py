@@ -1,4 +1,4 @@
-"""What to believe of the path of a video."""
+"""How far the path of a video can be trusted."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["APART", "SIGMAS", "ReadoutTime", "judge_clip", "problem_of"]
 
 # Displacements below this are lost in the interpolation of a photo.
 _UNSEEN_PX = 1.0
-#: Standard deviations that tell a readout time from none, and two of them from each other.
+#: Standard deviations by which a readout time differs from none, and two of them from each other.
 SIGMAS, APART = 3.0, 4.0
 
 
@@ -35,7 +35,7 @@ def judge_clip(
     remedy: Remedy | None = None,
     against: str = "",
 ) -> Verdict:
-    """Weigh the path of a video.
+    """Judge the path of a video.
 
     Parameters
     ----------
@@ -44,19 +44,19 @@ def judge_clip(
     keys : BundleResult
         The same of the key frames only.
     halves : pair of ReadoutTime, optional
-        What the first and the second half of the frames say on their own.
+        The readout times from the first and the second half of the frames.
     frame_s : float
         Time from frame to frame, which no readout exceeds.
     remedy : Remedy, optional
-        How well the height of the scene is known.
+        The remedy of a critical motion, with the uncertainty of the height.
     against : str
-        What says that the frames are no longer as they were read, such as stabilisation; empty if nothing does.
+        The reason why the frames are no longer as they were read, such as stabilisation; empty if there is none.
 
     Returns
     -------
     Verdict
-        "found" if a readout time is told from none and lines are displaced by it, "not-found" if they are not by more
-        than can be seen, whatever the readout may be within its deviations; else "not-determined".
+        "found" if a readout time differs significantly from none and displaces lines, "not-found" if no readout time
+        within its deviations displaces them visibly; else "not-determined".
     """
     assert result.path is not None
     time = ReadoutTime(float(result.path.readout_s[0]), float(result.path.sigma_readout_s[0]))
@@ -73,12 +73,12 @@ def judge_clip(
     else:
         shutter = "not-determined"
         reasons.append(
-            f"The camera moved too little to tell how long a frame takes to be read: {1e3 * time.seconds:.1f} +- "
+            f"The camera moved too little to determine the readout time: {1e3 * time.seconds:.1f} +- "
             f"{1e3 * time.sigma:.1f} ms."
         )
     if shutter == "found" and abs(time.seconds) - SIGMAS * time.sigma > frame_s:
         reasons.append(
-            f"The readout is said to take {1e3 * abs(time.seconds):.1f} ms, longer than the {1e3 * frame_s:.1f} ms "
+            f"The readout appears to take {1e3 * abs(time.seconds):.1f} ms, longer than the {1e3 * frame_s:.1f} ms "
             "from frame to frame: something else bends the frames."
         )
     if halves is not None:
@@ -86,28 +86,28 @@ def judge_clip(
         apart = abs(a.seconds - b.seconds) / float(np.hypot(a.sigma, b.sigma))
         if apart > APART:
             reasons.append(
-                f"The first half of the video says that a frame takes {1e3 * a.seconds:.1f} ms to be read, the second "
-                f"{1e3 * b.seconds:.1f} ms, {apart:.0f} standard deviations apart."
+                f"The readout time is {1e3 * a.seconds:.1f} ms by the first half of the video and "
+                f"{1e3 * b.seconds:.1f} ms by the second, {apart:.0f} standard deviations apart."
             )
     lens_only = tuple(rec.image_names) if shutter == "not-determined" else ()
     return Verdict(shutter, "doubtful" if reasons else "trusted", tuple(reasons), {}, lens_only)
 
 
-def problem_of(told: Mapping[str, Any]) -> str:
-    """Why a video does not tell its readout time, by the evidence of `quality.readout_time`; empty if it does."""
-    stabilised = told.get("stabilisation") or {}
+def problem_of(evidence: Mapping[str, Any]) -> str:
+    """Why a video does not determine its readout time, by `quality.readout_time`; empty if it does."""
+    stabilised = evidence.get("stabilisation") or {}
     if stabilised.get("verdict") == "stabilised":
         return str(stabilised["reason"])
-    if told["source"] == "what was known before":
-        return "the video does not tell it better than it was known before"
-    seconds, sigma = told["seconds"], told["sigma"]
+    if evidence["source"] == "what was known before":
+        return "the video does not determine it better than it was known before"
+    seconds, sigma = evidence["seconds"], evidence["sigma"]
     if not abs(seconds) > SIGMAS * sigma:
         return f"the camera moved too little: {1e3 * seconds:.1f} +- {1e3 * sigma:.1f} ms"
-    if told.get("halves"):
-        first, second = told["halves"]
+    if evidence.get("halves"):
+        first, second = evidence["halves"]
         apart = abs(first["seconds"] - second["seconds"]) / np.hypot(first["sigma"], second["sigma"])
         if apart > APART:
             return f"the halves of the video contradict each other, {apart:.0f} standard deviations apart"
-    if abs(told.get("of_frame", 0.0)) * (1 - SIGMAS * sigma / abs(seconds)) > 1:
-        return "it would be longer than from frame to frame: something else bends the frames"
+    if abs(evidence.get("of_frame", 0.0)) * (1 - SIGMAS * sigma / abs(seconds)) > 1:
+        return "it would be longer than the time from frame to frame: something else bends the frames"
     return ""

@@ -1,4 +1,4 @@
-"""One verdict on a solution, from everything that speaks for it and against it."""
+"""One verdict on a solution, from all evidence for and against it."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from scipy.special import stdtr
 
 from ..bundle import BundleResult, ModelChoice
 from ..bundle.choice import clipped_errors, corners, improves, standard_errors
+from ..bundle.layout import motion_end
 from ..critical import Remedy
 from ..model import Reconstruction
 from ..model.field import field_over_frame
@@ -24,49 +25,50 @@ __all__ = ["Verdict", "height_reasons", "judge", "loose_reasons", "unexplained_r
 
 # Displacements below this are lost in the interpolation of a photo.
 _UNSEEN_PX = 1.0
-# A motion that is known no better than this may do as much harm as good.
+# A motion with a larger standard deviation may do as much harm as good.
 _UNCERTAIN_PX = 2.0
-# Of the scene's height: as good as photos measure. What all photos share no deviation knows (docs/found.md).
+# Of the scene's height: as good as photos measure. No standard deviation includes errors that all photos share
+# (docs/found.md).
 _SMALL_PERCENT = 0.5
-# What may remain in the same places of all photos. A lens that makes motions wrong by half a pixel leaves 0.1 to 0.15
-# even where cameras are turned at will (k1 wrong by 0.03), and less where they are not.
+# Largest residual in the same places of all photos. A lens that makes motions wrong by half a pixel leaves 0.1 to 0.15
+# even where cameras are rotated freely (k1 wrong by 0.03), and less where they are not.
 _LEFT_PX = 0.1
-# What a lens model may leave to a field beside it: more, and it is not the model of this lens.
+# Largest residual field beside a lens model: with more, it is not the model of this lens.
 _FIELD_PX = 0.5
-# Held-out measurements may be off by this beyond their noise.
+# Largest error of held-out measurements beyond their noise.
 _HELD_OUT_PX = 0.5
-# Fewer held-out measurements tell nothing.
+# Fewer held-out measurements are not conclusive.
 _LEAST_HELD_OUT = 30
-# A photo whose motion is so many times the spread of all, one with so few measurements, with all of them in such a
-# share of its frame, or with so many outliers, is to be checked.
+# A photo is doubtful if its motion is this many times the prior standard deviation, if it has this few measurements, if
+# these cover this share of its frame, or with this share of outliers.
 _FAR = 5.0
 _FEW = 2 * LEAST_MEASUREMENTS
 _CORNER = 1 / 16
 _OUTLIERS = 1 / 3
-# A hand does not repeat itself: motions whose mean is so many times what they differ by, in so many photos, and by
-# chance in one set of a thousand, are the camera's.
+# A hand does not repeat itself: motions are the camera's if their mean is this many times their standard deviation, in
+# this many photos, and by chance in one set of a thousand only.
 _REPEATED, _LEAST_PHOTOS, _CHANCE = 2.0, 5, 0.001
-# Cosine between ways to turn that are the same.
+# Cosine between axes of rotation that count as the same.
 _SAME_WAY = 0.9
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What to believe of a solution.
+    """How far a solution can be trusted.
 
     Attributes
     ----------
     shutter : str
-        "found" (a rolling shutter that can be seen, by evidence), "not-found" (none that can be seen), or
-        "not-determined" (the photos do not tell).
+        "found" (evidence for a rolling shutter that can be seen), "not-found" (none that can be seen), or
+        "not-determined" (the photos do not determine it).
     shape : str
-        "trusted", or "doubtful" as soon as a reason speaks against it.
+        "trusted", or "doubtful" if there is any reason against it.
     reasons : tuple of str
-        What speaks against it, in sentences.
+        Reasons against it, in sentences.
     doubtful : mapping of photo name to reason
-        Photos whose motion is to be checked.
+        Photos whose motion should be checked.
     lens_only : tuple of str
-        Photos whose motion is not to be taken out, since their measurements do not support it: all of them where the
+        Photos whose motion is not to be corrected, since their measurements do not support it: all of them if the
         evidence that chose the model does not hold.
     """
 
@@ -77,7 +79,7 @@ class Verdict:
     lens_only: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """What `Solution.verdict` holds: of the whole; the photos have their own."""
+        """The content of `Solution.verdict`: of the whole; the photos have their own."""
         return {"shutter": self.shutter, "shape": self.shape, "reasons": list(self.reasons)}
 
 
@@ -90,29 +92,29 @@ def judge(
     known: Collection[str] = (),
     most_phi: Mapping[str, float] | None = None,
 ) -> Verdict:
-    """Weigh a solution.
+    """Judge a solution.
 
     Parameters
     ----------
     result : BundleResult
         The solution.
     global_result : BundleResult, optional
-        A global-shutter adjustment of the same measurements: what a model that somebody named is compared with.
+        A global-shutter adjustment of the same measurements, to compare a model that the user named with.
     choice : ModelChoice, optional
-        How the model was chosen; None where it was named.
+        The choice of the model; None if the user named it.
     remedy : Remedy, optional
-        What was done about a critical motion, and how well the height of the scene is known; None for a global shutter.
+        The remedy of a critical motion, with the uncertainty of the height of the scene; None for a global shutter.
     tracks : Reconstruction, optional
-        What was measured, before outliers were dropped.
+        The measurements before outliers were dropped.
     known : collection of photo names
         Photos whose motion is known from elsewhere, and needs no support.
     most_phi : mapping of photo name to float, optional
-        How far each photo can have turned, radians per frame, by what else is known (its exposure).
+        Largest rotation of each photo, radians per frame, by other knowledge (its exposure).
 
     Returns
     -------
     Verdict
-        "trusted" only if nothing speaks against it.
+        "trusted" only if there is no reason against it.
     """
     rec = result.reconstruction
     reasons = loose_reasons(result) + height_reasons(remedy) + unexplained_reasons(result, choice)
@@ -122,16 +124,16 @@ def judge(
     motions = photo_motions(result)
     outliers = _outliers(rec, tracks)
     doubts = _doubts(result, motions, outliers, most_phi or {})
-    # the scene that is held pulls both halves to the motion that it was solved with: they differ by less than is wrong
+    # the fixed scene draws both halves to the motion that it was solved with: their difference is less than the error
     torn = (motions.difference_px > np.maximum(_UNSEEN_PX, motions.shift_px / 2)) | (outliers > 0.5)
     shutter, why = _of_motions(result, global_result, choice, motions, torn, known)
     reasons += why
     if not reasons:
         reasons = _of_photos(rec, doubts, motions)
     lost = torn | (_counts(rec) < _FEW) & (motions.sigma_px >= motions.shift_px)
-    # what cannot be seen does no harm
+    # motions that cannot be seen do no harm
     lost &= motions.shift_px >= _UNSEEN_PX
-    # a model that somebody named is obeyed
+    # a model that the user named is applied
     lost |= shutter == "not-determined" and choice is not None
     lens_only = tuple(name for name, each in zip(rec.image_names, lost, strict=True) if each and name not in known)
     return _verdict(shutter, reasons, {name: "; ".join(why) for name, why in doubts.items() if why}, lens_only)
@@ -159,26 +161,26 @@ def _outliers(rec: Reconstruction, tracks: Reconstruction | None) -> NDArray[np.
 
 
 def loose_reasons(result: BundleResult) -> list[str]:
-    """Parts of the scene that nothing holds against each other: the equations then have no single solution."""
+    """Parts of the scene without a common scale: the equations then have no single solution."""
     if np.isfinite(result.covariances).all():
         return []
     rec = result.reconstruction
     weakest = rec.image_names[int(np.argmin(_counts(rec)))]
     return [
-        "The photos hang together by so few measurements that parts of the scene could be scaled against each other; "
-        f"more photos between them would hold it ({weakest} has the fewest)."
+        "So few measurements connect the photos that parts of the scene could be scaled against each other; take more "
+        f"photos between them ({weakest} has the fewest measurements)."
     ]
 
 
 def height_reasons(remedy: Remedy | None) -> list[str]:
-    """How badly the height of the scene is known, if it is."""
+    """A too large uncertainty of the height of the scene."""
     if remedy is None:
         return []
     cost = remedy.after
     if cost.meter.is_low and remedy.name == "none":
         return [
-            "The cameras were not turned against each other, which leaves the height of the scene open, and the remedy "
-            "is switched off."
+            "The cameras were not rotated against each other, so the height of the scene is undetermined, and the "
+            "remedy is switched off."
         ]
     if not 100 * cost.sigma_log_k <= _SMALL_PERCENT:
         return [f"{cost.sentence[0].upper()}{cost.sentence[1:]}."]
@@ -186,22 +188,22 @@ def height_reasons(remedy: Remedy | None) -> list[str]:
 
 
 def unexplained_reasons(result: BundleResult, choice: ModelChoice | None) -> list[str]:
-    """What residuals say against the solution."""
+    """Reasons in the residuals against the solution."""
     reasons = []
     if (left := left_over_frame(result.reconstruction)) >= _LEFT_PX:
         reasons.append(
-            f"In the same places of all photos {left:.2f} px remain unexplained: the lens is not what it is taken for."
+            f"In the same places of all photos {left:.2f} px remain unexplained: the lens model does not fit the lens."
         )
     elif (left := left_along_readout(result.reconstruction)) >= _LEFT_PX:
         reasons.append(
-            f"At the same times of the readout {left:.2f} px remain unexplained: the lens, or how the camera moves "
-            "during the readout, is not what it is taken for."
+            f"At the same times of the readout {left:.2f} px remain unexplained: the model of the lens, or of the "
+            "motion during the readout, does not fit."
         )
     fields = [field_over_frame(camera)[1] for camera in result.reconstruction.cameras]
     if (size := max(float(np.sqrt((field**2).sum(2).mean())) for field in fields)) > _FIELD_PX:
         reasons.append(
-            f"The photos are {size:.1f} px in the mean off from what the lens model says, beyond what any lens of its "
-            "kind does: it is not the model of this lens."
+            f"The photos deviate from the lens model by {size:.1f} px in the mean, more than any lens of its kind: it "
+            "is not the model of this lens."
         )
     if choice is not None:
         error = choice.held_out_error[choice.label]
@@ -212,23 +214,21 @@ def unexplained_reasons(result: BundleResult, choice: ModelChoice | None) -> lis
                 "five periods a frame, or the photos were stabilised line by line."
             )
         if error > 2.0 and beyond_px > _HELD_OUT_PX:
-            reasons.append(
-                f"Measurements that were held out are off by {beyond_px:.1f} px more than their noise explains."
-            )
+            reasons.append(f"Held-out measurements are off by {beyond_px:.1f} px more than their noise explains.")
     return reasons
 
 
 def _of_global(choice: ModelChoice | None) -> tuple[str, list[str]]:
-    """Whether there may be a shutter that was not taken out, and why."""
+    """Whether there may be a shutter that was not corrected, and why."""
     if choice is None:
-        return "not-determined", ["The shutter was not looked at, as you asked (--model global)."]
+        return "not-determined", ["The shutter was not examined, as you asked (--model global)."]
     if choice.num_held_out < _LEAST_HELD_OUT:
         return "not-determined", [
-            f"There are too few measurements to tell a rolling shutter: only {choice.num_held_out} could be held out."
+            f"There are too few measurements to detect a rolling shutter: only {choice.num_held_out} could be held out."
         ]
     if choice.shutter == "not-determined":
         return choice.shutter, [
-            "A rolling shutter would explain a part of what bends the photos, and was not taken out: "
+            "A rolling shutter would explain a part of what bends the photos, and was not corrected: "
             f"{'; '.join(choice.against)}."
         ]
     return choice.shutter, []
@@ -249,17 +249,17 @@ def _of_motions(
     reasons = []
     if choice is None and not (global_result is not None and _explains(result, global_result)):
         reasons.append(
-            f"The {rec.shutter_model} model, which you named, explains no more than remains unexplained even so: its "
-            "motions may be the lens."
+            f"The {rec.shutter_model} model, which you named, explains no more than it leaves unexplained: its "
+            "motions may be an error of the lens."
         )
     if (axis := _repeated(rec)) is not None and not {*known}.issuperset(rec.image_names):
         turn = np.degrees(np.mean(rec.phi[:, axis] * rec.frame_span()))
         reasons.append(
-            f"All photos are said to have turned alike, by {abs(turn):.2f} degrees about {'xyz'[axis]}: an error of "
-            "the lens looks like that, and no hand does it."
+            f"All photos appear to have rotated alike, by {abs(turn):.2f} degrees about {'xyz'[axis]}: an error of the "
+            "lens looks like that, and no hand moves so."
         )
     if 2 * torn.sum() > rec.num_images:
-        reasons.append("In most photos halves of the measurements do not agree that there was the motion found.")
+        reasons.append("In most photos halves of the measurements do not agree on the motion found.")
     return ("not-determined" if reasons else "found"), reasons
 
 
@@ -268,20 +268,21 @@ def _explains(result: BundleResult, global_result: BundleResult) -> bool:
     rec, plain = result.reconstruction, global_result.reconstruction
     if len(plain.observations) != len(rec.observations):
         return False
-    # of fitted measurements, which noise alone leaves below 1 by half of each unknown: so that they compare with 1
-    num, free = len(rec.observations), {"global": 6, "constant-motion": 12}
+    # errors of fitted measurements, which noise alone makes smaller than 1 by half of each unknown: added to compare
+    # with 1
+    num = len(rec.observations)
     before, after = (
         clipped_errors(each, each.observations, result.sigma_px)[0]
-        + (free.get(each.shutter_model, 9) * each.num_images + 3 * each.num_points) / (2 * num)
+        + (motion_end(each.shutter_model) * each.num_images + 3 * each.num_points) / (2 * num)
         for each in (plain, rec)
     )
     return improves(before, after, standard_errors(before - after, corners(rec, rec.observations)))
 
 
 def _repeated(rec: Reconstruction) -> int | None:
-    """The axis of the camera about which all photos turned alike; None if they did not, or not so that it is seen.
+    """The axis of the camera about which all photos rotated alike and visibly; None if there is none.
 
-    Nor if the camera turned so from photo to photo, too: then it panned.
+    None also if the camera rotated so from photo to photo, too: then it panned.
     """
     m = rec.num_images
     if m < _LEAST_PHOTOS:
@@ -300,7 +301,7 @@ def _repeated(rec: Reconstruction) -> int | None:
 def _doubts(
     result: BundleResult, motions: PhotoMotions, outliers: NDArray[np.float64], most_phi: Mapping[str, float]
 ) -> dict[str, list[str]]:
-    """What is to be said against each photo."""
+    """Reasons against each photo."""
     rec = result.reconstruction
     turn = rec.phi * rec.frame_span()[:, None]
     sigma = np.linalg.norm(result.sigma_phi, axis=1) * rec.frame_span()
@@ -320,18 +321,18 @@ def _doubts(
         if motions.sigma_px[i] > _UNCERTAIN_PX:
             said.append(f"its motion is only known to +-{motions.sigma_px[i]:.1f} px")
         if times[i] > _FAR and motions.shift_px[i] > _UNSEEN_PX:
-            said.append(f"it moved {times[i]:.0f} times as much as photos of this set do")
+            said.append(f"it moved {times[i]:.0f} times as much as the other photos do")
         if np.linalg.norm(turn[i]) - 2 * sigma[i] > most_phi.get(name, np.inf):
             said.append(
-                f"it is said to have turned by {np.degrees(np.linalg.norm(turn[i])):.2f} degrees, but would be blurred "
-                f"by more than {np.degrees(most_phi[name]):.2f}"
+                f"it appears to have rotated by {np.degrees(np.linalg.norm(turn[i])):.2f} degrees, but would be "
+                f"blurred by more than {np.degrees(most_phi[name]):.2f}"
             )
     return doubts
 
 
 def _of_photos(rec: Reconstruction, doubts: Mapping[str, list[str]], motions: PhotoMotions) -> list[str]:
-    """What doubtful photos say against a whole that nothing else speaks against."""
-    # a motion that is wrong by this stretches what a photo shows by its share of half the frame, and the scene as much
+    """Reasons in doubtful photos against a whole without other reasons."""
+    # a motion that is wrong by this stretches the photo by its share of half the frame, and the scene as much
     half_px = np.array([min(each.width, each.height) / 2 for each in rec.cameras])[rec.camera_idx]
     percent = 100 * float(np.sqrt(np.mean((motions.difference_px / half_px) ** 2)))
     if percent > _SMALL_PERCENT:

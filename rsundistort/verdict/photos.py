@@ -1,4 +1,4 @@
-"""What the measurements of each photo alone say of its motion, the scene being held."""
+"""The motion of each photo from its own measurements, with the scene fixed."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ __all__ = ["PhotoMotions", "photo_motions"]
 
 Array = NDArray[np.float64]
 
-# Cells of the chequerboard, across and down; places across and down at which the frame is looked at.
+# Cells of the chequerboard, across and down; places across and down at which the frame is sampled.
 _BOARD, _LOOKED_AT = 8, 5
-# Probability that noise alone lets a photo of a set contradict itself.
+# Probability that noise alone makes a photo of a set contradict itself.
 _CHANCE = 0.01
 
 
 @dataclass(frozen=True)
 class PhotoMotions:
-    """What each photo says of its motion; pixels are the largest displacement anywhere in its frame, of first order.
+    """Motion and evidence of each photo; pixels are the largest displacement anywhere in its frame, of first order.
 
     Attributes
     ----------
     shift_px : (m,) array
         By the motion.
     sigma_px : (m,) array
-        Standard deviation of that, with the noise that the photo's own residuals show.
+        Standard deviation of that, with the noise of the photo's own residuals.
     difference_px : (m,) array
-        Between the motions that two halves of the photo's measurements call for; 0 where that may be noise.
+        Between the motions from two halves of the photo's measurements; 0 where that may be noise.
     covered : (m,) array
         Share of the frame in which nine tenths of the measurements lie, across and down.
     """
@@ -46,16 +46,16 @@ class PhotoMotions:
 
 
 def photo_motions(result: BundleResult) -> PhotoMotions:
-    """Look at each photo of a solution alone.
+    """Estimate the motion of each photo of a solution separately.
 
-    Its pose and motion are solved for again from each half of its measurements (left and right, read first and read
-    last, the two colours of a chequerboard), the points being held, under the prior on its motion: one step of
-    Gauss-Newton from the solution, near which they stay.
+    Its pose and motion are estimated again from each half of its measurements (left and right, read first and read
+    last, the two colours of a chequerboard), with fixed points, under the prior on its motion: one step of Gauss-Newton
+    from the solution, which is near.
 
     Parameters
     ----------
     result : BundleResult
-        Of a model with a shutter.
+        The solution, with a shutter model.
     """
     rec = result.reconstruction
     nb = 12 if rec.shutter_model == "constant-motion" else 9
@@ -76,7 +76,7 @@ def photo_motions(result: BundleResult) -> PhotoMotions:
 
 
 def _bent_px(rec: Reconstruction, image: int) -> float:
-    """About how far what is not steady in a photo's turn moves pixels."""
+    """Approximate displacement of pixels by the unsteady part of a photo's rotation."""
     return float(rec.camera(image).K[0, 0] * np.linalg.norm(np.abs(rec.bend[image, :, :3]).max(0, initial=0.0)))
 
 
@@ -152,7 +152,7 @@ class _Photo:
 
     @staticmethod
     def _noise(residuals: Array, unknowns: int) -> float:
-        """Variance of residuals in units of that which weighed them; at least that one."""
+        """Variance of residuals relative to their weights; at least 1."""
         return max(1.0, float((residuals**2).sum()) / max(residuals.size - unknowns, 1))
 
     def _halves(self) -> Iterator[NDArray[np.bool_]]:
@@ -162,7 +162,7 @@ class _Photo:
         yield np.floor(_BOARD * self.xy / self.size).sum(1) % 2 == 1
 
     def difference_px(self, prior: Array, chance: float) -> float:
-        """Largest displacement between the motions of two halves; 0 where noise alone is as unlike by this chance."""
+        """Largest displacement between the motions of two halves; 0 if noise alone differs as much with this chance."""
         if len(self.xy) < 2 * self.J.shape[2]:
             return 0.0
         return max(self._difference_px(half, prior, chance) for half in self._halves())
@@ -183,12 +183,12 @@ class _Photo:
             covariances.append(covariance)
             noise.append(self._noise(residuals + J @ step, nb))
         difference = steps[0] - steps[1]
-        # both are drawn to zero by the same prior: what it does to both is no difference
+        # the same prior draws both to zero: its effect on both is no difference
         first, second = covariances
         shared = (first * prior) @ second
         variance = (first + second - shared - shared.T)[6:, 6:] * max(noise)
         unlike = float(difference @ np.linalg.solve(variance, difference)) / len(difference)
-        # Hotelling's: the noise is read off the same residuals
+        # Hotelling's: the noise is estimated from the same residuals
         if fdtrc(len(difference), max(self.residuals.size - 2 * nb, 1), unlike) > chance:
             return 0.0
         return float(self.shift_px(difference[None])[0])

@@ -1,4 +1,4 @@
-"""Residuals that are no noise: what is the same in all photos, along the readout or over the frame."""
+"""Systematic residuals: those that are the same in all photos, along the readout or over the frame."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ __all__ = ["left_along_readout", "left_over_frame"]
 
 # Parts along the readout, and of the frame across and down.
 _ROWS, _CELLS = 16, np.array([8, 6])
-# Photos that must see a part: the spread of fewer is not known.
+# Photos that must see a part: the variance of fewer is not known.
 _LEAST_PHOTOS = 5
 # Probability that noise alone passes for more.
 _CHANCE = 0.001
 
 
 def left_along_readout(reconstruction: Reconstruction) -> float:
-    """What remains at the same time of the readout of all photos, as `left_over_frame`.
+    """Residual at the same time of the readout of all photos, as `left_over_frame`.
 
-    A shutter that the model does not describe leaves it.
+    A shutter that the model does not describe causes it.
     """
     rec, obs = reconstruction, reconstruction.observations
     share = np.empty(len(obs))
@@ -35,10 +35,10 @@ def left_along_readout(reconstruction: Reconstruction) -> float:
 
 
 def left_over_frame(reconstruction: Reconstruction) -> float:
-    """What remains in the same place of all photos of a camera, in pixels; 0 where that may be noise.
+    """Residual in the same place of all photos of a camera, in pixels; 0 if it may be noise.
 
-    Root mean square over the parts of the frame of the mean residual there, without what noise adds. A lens that is not
-    described right leaves it.
+    Root mean square over the parts of the frame of the mean residual there, without the part of noise. A wrong lens
+    model causes it.
     """
     rec, obs = reconstruction, reconstruction.observations
     sizes = np.array([(each.width, each.height) for each in rec.cameras], float)
@@ -50,8 +50,8 @@ def left_over_frame(reconstruction: Reconstruction) -> float:
 def _systematic(rec: Reconstruction, part: NDArray[np.int64]) -> float:
     """Root mean square of the mean residuals of parts (o,), without noise; 0 if they are no more than noise.
 
-    A photo's measurements in a part go up and down together and count once: the cluster-robust variance of a mean. That
-    of few photos is itself uncertain: it is not taken for less than the mean over all parts makes it.
+    Measurements of a photo in a part are correlated and count once: the cluster-robust variance of a mean. The variance
+    of few photos is itself uncertain: it is not taken as less than the mean over all parts makes it.
     """
     residual, valid = reprojection_residuals(rec)
     m, num = rec.num_images, int(part.max(initial=-1)) + 1

@@ -58,7 +58,7 @@ def changed(tree, path, value):
     ("path", "value", "says"),
     [
         (("images", 1, "phi"), "x", r"images\[1\]\.phi: expected three numbers, got 'x'"),
-        (("images", 0, "phi"), [1e9, 0, 0], r"images\[0\]: phi=.*no camera turns by more than 1000 rad"),
+        (("images", 0, "phi"), [1e9, 0, 0], r"images\[0\]: phi=.*no camera rotates by more than 1000 rad"),
         (("images", 0, "rms_px"), [1], r"images\[0\]\.rms_px: expected a number from 0"),
         (("images", 0, "sigma_phi"), [1, 2], r"images\[0\]\.sigma_phi: expected a list of 3, got \[1, 2\]"),
         (("images", 0, "camera_id"), "9", r"images\[0\]\.camera_id: '9' is not among rectified_cameras"),
