@@ -50,7 +50,7 @@ class Survey:
     frame : MapFrame
         Of the poses and points.
     positions : PhotoPositions
-        The photos' GPS.
+        The photos' GPS, with velocities and rotations along the axes of the frame.
     places : mapping of photo name to (place, sigma)
         Their places in the frame, (3,) each; none if the frame is that of control points.
     control : sequence of ControlPoint
