@@ -1,12 +1,15 @@
 """What other programs make of our exports, and we of their poses. Prints one JSON object.
 
-    python benchmarks/formats.py [--orthority PYTHON]
+    python benchmarks/formats.py [--orthority PYTHON] [--blender PYTHON]
 
 `metashape`: the photos of sample_scenes/courtyard solved without a shutter, as programs without one do, and written as
 `cameras.xml`; `solve` with it and the photos. Median error of the rotation between two photos, degrees, of what was
 given and of what was found. `orthority`: the OpenSfM project of that, read by orthority in an environment of its own
 (`pip install orthority`; PYTHON is its interpreter: its OpenCV would replace ours): the distance in pixels from where a
-point was measured to where its camera shows it, median. Exits 1 if what was found is not ten times as good.
+point was measured to where its camera shows it, median. `blender`: `camera.usda` of a made-up path, imported by Blender
+in an environment of its own (`pip install bpy`): the largest distance in pixels from where our cameras show points to
+where its camera does, of frames upright and wide, with pixels that are square and not. Exits 1 if what was found is not
+ten times as good, or Blender is off by 0.001 px.
 """
 
 from __future__ import annotations
@@ -19,8 +22,11 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from rsundistort import RunOptions, Solution, SolveOptions, read_solution, run, solve
+from rsundistort import Camera, RunOptions, Solution, SolveOptions, read_solution, run, solve
+from rsundistort.io.usd import write_usd_camera
+from rsundistort.model.path import CameraPath
 from rsundistort.solve import OutputOptions
 
 SCENE = Path(__file__).resolve().parent.parent / "sample_scenes" / "courtyard"
@@ -58,6 +64,49 @@ off = np.concatenate(off)
 print(json.dumps({"median_px": float(np.median(off)), "measurements": len(off)}))
 """
 
+# In Blender's environment: pixels of points at each frame, from the upper left corner.
+_BLENDER = """
+import json, sys
+import bpy
+from bpy_extras.object_utils import world_to_camera_view
+from mathutils import Vector
+
+path, width, height, aspect, frames = json.loads(sys.argv[1])
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.ops.wm.usd_import(filepath=path)
+scene = bpy.context.scene
+scene.render.resolution_x, scene.render.resolution_y = width, height
+scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = max(1, aspect), max(1, 1 / aspect)
+camera, points = (next(each for each in bpy.data.objects if each.type == kind) for kind in ("CAMERA", "POINTCLOUD"))
+places = [each.vector.copy() for each in points.data.attributes["position"].data]
+shown = []
+for frame in frames:
+    scene.frame_set(frame)
+    seen = [world_to_camera_view(scene, camera, points.matrix_world @ Vector(each)) for each in places]
+    shown.append([(x * width, (1 - y) * height) for x, y, _ in seen])
+print("shown", json.dumps(shown))
+"""
+
+
+def blender_px(python: str, work: Path) -> float:
+    """The largest distance between Blender's pixels and ours."""
+    rng, frames = np.random.default_rng(0), [0, 1, 2, 4]
+    R_cw = Rotation.from_rotvec(rng.normal(0, 0.2, (4, 3))).as_matrix()
+    path = CameraPath(np.array(frames) / 25, R_cw, rng.normal(0, 1, (4, 3)), *np.zeros((4, 4, 3)))
+    points_w = np.column_stack([rng.uniform(-1, 1, (50, 2)), rng.uniform(6, 12, 50)])
+    x_c = np.einsum("mij,mnj->mni", path.R_cw, points_w - path.center_w[:, None])
+    off = []
+    for width, height in ((640, 360), (360, 640)):
+        for fx, fy in ((500, 500), (500, 505), (505, 500)):
+            camera = Camera(width, height, [[fx, 0, width / 2 + 13], [0, fy, height / 2 - 9], [0, 0, 1]])
+            file = work / f"{width}-{fx}-{fy}.usda"
+            write_usd_camera(file, camera, path, 1 / 25, points_w)
+            asked = json.dumps([str(file), width, height, fy / fx, frames])
+            said = subprocess.run([python, "-c", _BLENDER, asked], check=True, capture_output=True, text=True).stdout
+            shown = json.loads(said.partition("shown ")[2].splitlines()[0])
+            off.append(np.abs(np.array(shown) - 0.5 - (x_c / x_c[..., 2:]) @ camera.K[:2].T).max())
+    return float(max(off))
+
 
 def between_deg(found: Solution, truth: Solution) -> float:
     """Median error of the rotation between two photos."""
@@ -70,7 +119,8 @@ def main() -> int:
     """Print the figures; the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--orthority", metavar="PYTHON")
-    peer = parser.parse_args().orthority
+    parser.add_argument("--blender", metavar="PYTHON")
+    peers = parser.parse_args()
     truth = read_solution(SCENE / "ground_truth.json")
     with tempfile.TemporaryDirectory() as work:
         given, found = Path(work, "given"), Path(work, "found")
@@ -83,14 +133,17 @@ def main() -> int:
             outputs=OutputOptions(exports=("opensfm",), report=False), images=SCENE / "photos",
         )  # fmt: skip
         figures = {"metashape": {"given_deg": between_deg(before, truth), "found_deg": between_deg(after, truth)}}
-        if peer:
+        if peers.blender:
+            figures["blender"] = {"largest_px": blender_px(peers.blender, Path(work))}
+        if peers.orthority:
             read = subprocess.run(
-                [peer, "-W", "ignore", "-c", _READER, str(found / "opensfm")],
+                [peers.orthority, "-W", "ignore", "-c", _READER, str(found / "opensfm")],
                 check=True, capture_output=True, text=True,
             )  # fmt: skip
             figures["orthority"] = json.loads(read.stdout)
     print(json.dumps(figures))
-    return int(10 * figures["metashape"]["found_deg"] > figures["metashape"]["given_deg"])
+    worse = 10 * figures["metashape"]["found_deg"] > figures["metashape"]["given_deg"]
+    return int(worse or figures.get("blender", {}).get("largest_px", 0.0) > 1e-3)
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ def command(video: Path, given: dict[str, Any], talk: Talk) -> None:
 
     Exit code 3 means that the readout time cannot be measured from this video. The reason is printed.
     """
-    with errors_for_people() as warned, progress_bars(talk) as progress:
+    with errors_for_people(needed_gb=2.0) as warned, progress_bars(talk) as progress:
         from rsundistort.input import GyroOptions
         from rsundistort.solve import RunOptions, SolveOptions, measure_readout
 

@@ -110,7 +110,7 @@ def command(photos: Path, out: Path, measuring: dict[str, Any], given: dict[str,
     continues. Exit code 3 means that some photos could not be rectified, or that the report could not be written. They
     are listed, and everything else is complete.
     """
-    with errors_for_people(opt.GOES_ON) as warned, progress_bars(talk) as progress:
+    with errors_for_people(opt.GOES_ON, needed_gb=2.0) as warned, progress_bars(talk) as progress:
         from rsundistort.input import GyroOptions
         from rsundistort.solve import RunOptions, run
 

@@ -121,13 +121,14 @@ def warnings_for_people() -> Iterator[Said]:
 
 
 @contextmanager
-def errors_for_people(kept: str = "nothing was written") -> Iterator[Said]:
+def errors_for_people(kept: str = "nothing was written", needed_gb: float = 1.2) -> Iterator[Said]:
     """Known errors become one line and exit code 1; warnings become one line each, and are listed.
 
     So does what the system says of files, memory and threads, wherever it says it. An interruption tells what is
-    `kept`.
+    `kept`. The block needs addresses of `needed_gb`.
     """
     kept_is(kept)
+    _check_limit(needed_gb)
     with stops_for_people(), ExitStack() as stack:
         import cv2
 
@@ -151,6 +152,20 @@ def errors_for_people(kept: str = "nothing was written") -> Iterator[Said]:
             where = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
             why = error.strerror or " ".join(map(str, filter(None, error.args)))
             _fail(f"{where}{why or 'the system gives no more memory, threads or files'}")
+
+
+def _check_limit(needed_gb: float) -> None:
+    """Refuse a limit of addresses in which native code would crash, or wait for ever, while it is loaded or runs.
+
+    The libraries alone take 1.2 GB of addresses, of which they use a part; threads of a run take more.
+    """
+    try:
+        import resource
+    except ImportError:  # Windows has no such limit
+        return
+    most = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if most != resource.RLIM_INFINITY and most < needed_gb * 1e9:
+        _fail(f"addresses are limited to {most / 1e9:.1f} GB, {needed_gb:g} are needed; raise the limit (ulimit -v)")
 
 
 def _fail(text: str) -> NoReturn:

@@ -433,9 +433,8 @@ def half_empty(tmp_path):
 @pytest.mark.slow
 def test_run_of_a_video_writes_all_its_frames_and_its_path(cut, tmp_path):
     out = tmp_path / "out"
-    result = CliRunner().invoke(
-        cli, ["run", str(cut), "-o", str(out), "--frames", "all", "--max-features", "1000", "--apply-orientation"]
-    )
+    asked = ["--frames", "all", "--max-features", "1000", "--apply-orientation", "--usd", "--export", "nuke"]
+    result = CliRunner().invoke(cli, ["run", str(cut), "-o", str(out), *asked])
     assert result.exit_code == 0, (result.stderr, result.exception)
     solution, rows = read_solution(out / "solution.json"), rows_of(out / "path.csv")
     assert [row["frame"] for row in rows] == [f"cut_{k:06d}.png" for k in range(20)]
@@ -452,7 +451,31 @@ def test_run_of_a_video_writes_all_its_frames_and_its_path(cut, tmp_path):
     assert "readout time       " in result.stdout
     assert "of the frame), measured from the video" in " ".join(result.stdout.split())
     assert "measured from the video" in (out / "report.html").read_text(encoding="utf-8")
-    assert {"path.csv", "path.txt", "video.mp4"} <= written(out)
+    assert {"path.csv", "path.txt", "video.mp4", "camera.usda", "nuke/camera.nk", "nuke/camera.chan"} <= written(out)
+    assert np.loadtxt(out / "nuke" / "camera.chan")[:, 0].tolist() == list(range(1, 21))
+    (camera,) = solution.rectified_cameras.values()
+    check_usd(out / "camera.usda", rows[9], 9, camera)
+
+
+def check_usd(path, row, code, camera):
+    """USD's own camera shows its points where the pose of `path.csv` does."""
+    from pxr import Gf, Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(path))
+    assert (stage.GetTimeCodesPerSecond(), stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (30, 0, 19)
+    frustum = UsdGeom.Camera(stage.GetPrimAtPath("/World/Camera")).GetCamera(code).frustum
+    seen = frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()
+    points = UsdGeom.Points(stage.GetPrimAtPath("/World/Points")).GetPointsAttr().Get()
+    found = np.array([seen.Transform(Gf.Vec3d(*each)) for each in points])[:, :2]
+    pose = {key: float(value) for key, value in row.items() if key != "frame"}
+    R_wc = Rotation.from_quat([pose[f"q{axis}"] for axis in "xyzw"]).as_matrix()
+    x_c = (np.array(points) * [1, -1, -1] - [pose[f"t{axis}"] for axis in "xyz"]) @ R_wc
+    ahead = x_c[:, 2] > 0
+    expected = (x_c / x_c[:, 2:]) @ camera.K[:2].T + 0.5
+    shown = np.column_stack([(1 + found[:, 0]) / 2 * camera.width, (1 - found[:, 1]) / 2 * camera.height])
+    inside = ahead & (expected > 0).all(1) & (expected < [camera.width, camera.height]).all(1)
+    assert inside.sum() > 50
+    np.testing.assert_allclose(shown[inside], expected[inside], atol=1e-3)
 
 
 def written(out):

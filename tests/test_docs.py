@@ -17,8 +17,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from rsundistort_cli.main import cli
+from survey import in_utm, with_position
+from surveys import geodetic_of
 
 import rsundistort as rs
+from rsundistort import io as rs_io
 from rsundistort.io import read_camera_file
 from rsundistort.solve import OutputOptions
 
@@ -45,7 +48,6 @@ NOT_RUN = {
     "run --sharpest": "as --every",
     "run --frames": "tests/test_clip_outputs.py runs it",
     "readout": "tests/test_clip_outputs.py runs it",
-    "run --crs": "its photos need GPS; tests/test_survey.py solves with it",
     "run --gyro": "tests/test_gyro.py runs it",
     "run --export ncore": "needs an extra of 3 GB; tests/test_exports.py runs it where that is",
 }
@@ -176,6 +178,26 @@ def _write_gyroscope(place: Path) -> None:
     (place / "walk.gcsv").write_text(head + "\n".join(samples) + "\n")
 
 
+def _survey(place: Path) -> None:
+    """GPS in PHOTOS, which is 0.5 m off, and gcp.csv, as the scene has them."""
+    rng, tracks = np.random.default_rng(4), np.load(ROOT / "sample_scenes" / "courtyard" / "tracks.npz")
+    for path, center in zip(sorted((place / "PHOTOS").iterdir()), tracks["center_w"], strict=False):
+        fix = rs_io.GpsFix(*geodetic_of([center + rng.normal(0, 0.5, 3)])[0].tolist(), velocity_m_s=(0.0, 0.0, 0.0))
+        path.write_bytes(with_position(path.read_bytes(), rs_io.ExifFacts(fix=fix)))
+    seen = (tracks["frame_idx"] < 4) & np.isfinite(tracks["xy_raw"]).all(1)
+    often = np.flatnonzero(np.bincount(tracks["point_idx"][seen], minlength=len(tracks["points_w"])) == 4)
+    rows = ["name,photo,x,y,E,N,U,sigma,use"]
+    for k, point in enumerate(rng.choice(often, 8, replace=False).tolist()):
+        told = (
+            ",".join(f"{each:.4f}" for each in in_utm(tracks["points_w"][point]))
+            + f",0.01,{'check' if k % 2 else 'control'}"
+        )
+        for row in np.flatnonzero(seen & (tracks["point_idx"] == point)).tolist():
+            x, y = (tracks["xy_raw"][row] + 0.5) / 2 - 0.5  # the photos are halved
+            rows.append(f"P{k},{tracks['image_names'][tracks['frame_idx'][row]]},{x:.3f},{y:.3f},{told}")
+    (place / "gcp.csv").write_text("\n".join(rows) + "\n")
+
+
 @pytest.fixture
 def place(prepared, tmp_path, monkeypatch):
     """A copy of it, the working folder of one page."""
@@ -248,6 +270,8 @@ def test_commands_are_understood(page, place):
 @pytest.mark.parametrize("page", [page for page in with_blocks("sh") if not page.startswith("sample_scenes")])
 def test_commands_run(page, place):
     """One after the other; what an earlier one wrote to the same folder goes first, as the reader would see to it."""
+    if page == "docs/survey.md":
+        _survey(place)
     for line in commands_of(page):
         program, *words = words_of(line)
         if program != "rsundistort":
@@ -262,6 +286,12 @@ def test_commands_run(page, place):
             shutil.rmtree(rest[rest.index("-o") + 1], ignore_errors=True)
         result = CliRunner().invoke(cli, words)
         assert result.exit_code == 0, f"{page}: {line}: {result.output}"
+        if "--gcp" in words:
+            told = rs.read_solution(place / "OUT" / "solution.json").georeference
+            checks = [each["residual_m"] for each in told["control"].values() if each["use"] == "check"]
+            # a pixel of these small photos is 2 cm of the scene, 8 m away
+            assert len(checks) == 4
+            assert np.sqrt(np.mean(np.square(checks))) < 0.05
 
 
 # ---------------------------------------------------------------- the prose

@@ -11,7 +11,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rsundistort import Camera, Observations, Reconstruction, RectifyOptions, RowMotion, Solution, SolvedImage
+from rsundistort import (
+    Camera,
+    Observations,
+    Reconstruction,
+    RectifyOptions,
+    RowMotion,
+    Solution,
+    SolvedImage,
+    SolveOptions,
+    solve,
+)
 from rsundistort.batch.progress import StageLog
 from rsundistort.colmap.rectified_model import ModelIds
 from rsundistort.errors import FormatError, InputError, RsUndistortWarning
@@ -109,7 +119,10 @@ def on_the_map(scene: ExportScene, folder: Path, crs: str, origin) -> ExportScen
     place = {1: "N", 2: (46.0, 30.0, 0.0), 3: "W", 4: (7.0, 15.0, 0.0), 5: b"\0", 6: 431.5, 31: 2.0 * 1.5096}
     exif.get_ifd(0x8825).update(place)
     Image.new("RGB", (8, 8)).save(folder / "0.jpg", exif=exif)
-    there = replace(scene.solution, georeference={"crs": crs, "origin": list(origin)})
+    matrix = np.eye(4)
+    matrix[:3, 3] = origin  # of a projection; "local" has its axes there, too
+    told = {"crs": crs, "origin": list(origin), "transformation": matrix.tolist()}
+    there = replace(scene.solution, georeference=told)
     return replace(scene, source=folder, solution=there, stored=there)
 
 
@@ -170,6 +183,26 @@ def test_opf_is_what_its_own_library_takes_and_read_back(tmp_path, name):
             np.testing.assert_allclose(rec.observations.xy_raw[mine], expected, atol=2e-3)
 
 
+def test_pix4ds_own_converter_makes_the_same_colmap_model_of_opf(tmp_path, monkeypatch):
+    pytest.importorskip("pyopf")
+    from opf_tools.opf2colmap.converter import main
+
+    scene = made()
+    EXPORTS["opf-rectified"].write(tmp_path / "opf", scene)
+    asked = ["opf2colmap", str(tmp_path / "opf" / "project.opf"), "--out-dir", str(tmp_path / "colmap")]
+    monkeypatch.setattr("sys.argv", asked)
+    main()
+    rec = read_model(tmp_path / "colmap").reconstruction
+    check_poses(scene, rec.image_names, rec.R_cw, rec.center_w)
+    np.testing.assert_allclose(rec.cameras[0].K, scene.camera(scene.images[0]).K, atol=1e-9)
+    for k, name in enumerate(rec.image_names):
+        mine = rec.observations.frame_idx == k
+        i = [Path(image.name).name for image in scene.images].index(Path(name).name)
+        expected = shown(scene, i, rec.points_w[rec.observations.point_idx[mine]])
+        np.testing.assert_allclose(rec.observations.xy_raw[mine], expected, atol=2e-3)  # float32
+    assert len(rec.observations) == len(scene.reconstruction.observations)
+
+
 def test_opf_gets_the_gps_of_the_photos_and_the_projection(tmp_path):
     pytest.importorskip("pyopf")
     from pyopf.io import load
@@ -185,10 +218,37 @@ def test_opf_gets_the_gps_of_the_photos_and_the_projection(tmp_path):
     assert second.geolocation is None
     frame = project.scene_reference_frame
     assert frame.crs.definition == "EPSG:32629"
+    told = read_model(tmp_path / "opf" / "project.opf").georeference
+    assert (told["crs"], told["origin"]) == ("EPSG:32629", [457000.0, 5150000.0, 0.0])
     # from E, N, U to the coordinates of the poses
     np.testing.assert_array_equal(
         frame.base_to_canonical.transformation_matrix @ [457001.0, 5150002.0, 3.0, 1.0], [1.0, 2.0, 3.0, 1.0]
     )
+
+
+def test_a_projection_of_opf_goes_through_solve(tmp_path):
+    """Axes scaled and exchanged, and a constant geoid, as Pix4D may have them."""
+    pytest.importorskip("pyopf")
+    from pyopf.io import load
+
+    EXPORTS["opf-rectified"].write(tmp_path / "in", on_the_map(made(), tmp_path, "EPSG:32629", (457000.0, 5e6, 0.0)))
+    path = tmp_path / "in" / "scene_reference_frame.json"
+    told = json.loads(path.read_text())
+    told["base_to_canonical"] = {"scale": [0.5, 0.5, 1.0], "shift": [-7.0, 9.0, 2.0], "swap_xy": True}
+    told["crs"] = {"definition": "EPSG:32629+5773", "geoid_height": 51.5}
+    path.write_text(json.dumps(told))
+    options, outputs = (
+        SolveOptions(shutter_model="global", readout="top-to-bottom"),
+        OutputOptions(exports=("opf-rectified",)),
+    )
+    solution = solve(tmp_path / "in" / "project.opf", tmp_path / "out", options, outputs=outputs)
+    matrix = np.array(solution.georeference["transformation"])
+    np.testing.assert_allclose(matrix @ [1.0, 2.0, 3.0, 1.0], [-14.0, 16.0, 1.0, 1.0], atol=1e-12)
+    before, after = (load(str(tmp_path / at)) for at in (path, "out/opf-rectified/scene_reference_frame.json"))
+    assert after.crs == before.crs
+    for key in ("scale", "shift", "swap_xy"):
+        np.testing.assert_array_equal(getattr(after.base_to_canonical, key), getattr(before.base_to_canonical, key))
+    assert "EPSG:32629+5773" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", ["opf-rectified", "nuke"])
@@ -227,12 +287,13 @@ def test_the_same_scene_is_written_the_same(tmp_path, name):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
 
 
-def test_opf_of_a_camera_that_only_travels_is_exact(tmp_path):
-    """By the formula of the paper: at the line v the camera is at `position + (v/(H-1) - 1/2) rolling_shutter`."""
+@pytest.mark.parametrize("readout", ["top-to-bottom", "bottom-to-top"])
+def test_opf_of_a_camera_that_only_travels_is_exact_and_read_back(tmp_path, readout):
+    """By the formula of the paper: at the row v the camera is at `position + (v/(H-1) - 1/2) rolling_shutter`."""
     pytest.importorskip("pyopf")
     from pyopf.io import load
 
-    scene = made()
+    scene = made(readout=readout)
     still = [replace(image, motion=RowMotion(np.zeros(3), image.motion.velocity)) for image in scene.solution.images]
     stored = replace(scene.solution, images=tuple(still))
     assert EXPORTS["opf"].write(tmp_path, replace(scene, stored=stored)) == ""
@@ -245,6 +306,18 @@ def test_opf_of_a_camera_that_only_travels_is_exact(tmp_path):
         at = camera.position + (xy[0, 1] / (H - 1) - 0.5) * camera.rolling_shutter
         again, _ = project_points((point - at) @ R_wc, raw, None, "global")
         np.testing.assert_allclose(again, xy, atol=1e-6)
+    rec = read_model(tmp_path / "project.opf").reconstruction
+    check_poses(scene, rec.image_names, rec.R_cw, rec.center_w)
+    assert rec.shutter_model == "constant-motion"
+    # what is read downwards there travels the other way
+    velocity = np.array([image.motion.velocity for image in still]) * raw.clock_sign
+    np.testing.assert_allclose(rec.velocity, velocity, atol=1e-9)
+
+
+def test_opf_has_no_room_for_columns_read_one_after_the_other(tmp_path):
+    pytest.importorskip("pyopf")
+    with pytest.raises(InputError, match="these are by column; take opf-rectified"):
+        EXPORTS["opf"].write(tmp_path, made(readout="left-to-right"))
 
 
 @pytest.mark.parametrize(
@@ -429,6 +502,10 @@ def test_what_there_is_no_writer_for_is_refused():
 
 
 def test_an_extra_that_is_missing_is_told_before_any_work(monkeypatch):
-    monkeypatch.setattr("rsundistort.io.exports.find_spec", lambda _: None)
-    with pytest.raises(InputError, match=r"--export opf needs the extra opf: pip install \"rsundistort\[opf\]\""):
+    def without(name: str) -> None:
+        raise ImportError(f"No module named '{name}'")
+
+    monkeypatch.setattr("rsundistort.io.exports.import_module", without)
+    said = r"--export opf needs the extra opf: pip install \"rsundistort\[opf\]\" \(No module named 'pyopf'\)"
+    with pytest.raises(InputError, match=said):
         check_exports(["opf"])

@@ -236,6 +236,18 @@ def test_sigterm_ends_in_one_line_and_resume_goes_on(batch):
 
 
 @POSIX
+@pytest.mark.parametrize(("command", "addresses", "needed"), [("run", 1_600_000, "2"), ("rectify", 600_000, "1.2")])
+def test_native_code_is_not_loaded_where_it_would_crash(tmp_path, command, addresses, needed):
+    options = {"run": "", "rectify": "--solution solution.json"}[command]
+    line = f"ulimit -v {addresses}; exec {sys.executable} -m rsundistort_cli {command} {tmp_path} -o out {options}"
+    done = subprocess.run(line, shell=True, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1
+    (said,) = done.stderr.splitlines()
+    assert said.startswith("error: addresses are limited to ")
+    assert f", {needed} are needed" in said
+
+
+@POSIX
 @pytest.mark.parametrize(
     ("streams", "code", "said"),
     [

@@ -47,7 +47,7 @@ def write(path, *args, **options):
 
 def pixels(lens, fisheye, points):
     """The formulas of Metashape's manual, appendix "Camera models", one point at a time; integer centres."""
-    p = dict.fromkeys(("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2"), 0.0) | lens
+    p = dict.fromkeys(("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4"), 0.0) | lens
     found = []
     for X, Y, Z in points:
         x, y = X / Z, Y / Z
@@ -56,8 +56,9 @@ def pixels(lens, fisheye, points):
             x, y = (x * np.arctan(r0) / r0, y * np.arctan(r0) / r0)
         r = np.hypot(x, y)
         bend = 1 + p["k1"] * r**2 + p["k2"] * r**4 + p["k3"] * r**6 + p["k4"] * r**8
-        xx = x * bend + (p["p1"] * (r**2 + 2 * x**2) + 2 * p["p2"] * x * y)
-        yy = y * bend + (p["p2"] * (r**2 + 2 * y**2) + 2 * p["p1"] * x * y)
+        more = 1 + p["p3"] * r**2 + p["p4"] * r**4
+        xx = x * bend + (p["p1"] * (r**2 + 2 * x**2) + 2 * p["p2"] * x * y) * more
+        yy = y * bend + (p["p2"] * (r**2 + 2 * y**2) + 2 * p["p1"] * x * y) * more
         u = W * 0.5 + p["cx"] + xx * p["f"] + xx * p["b1"] + yy * p["b2"]
         found.append((u - 0.5, H * 0.5 + p["cy"] + yy * p["f"] - 0.5))
     return np.array(found)
@@ -69,6 +70,7 @@ def pixels(lens, fisheye, points):
         (FRAME, "frame", 1e-9),
         (FISHEYE, "equidistant_fisheye", 1e-9),
         (FRAME | {"k4": 3e-3}, "frame", 0.05),
+        (FRAME | {"p3": 0.2, "p4": -0.1}, "frame", 0.05),
     ],
 )
 def test_a_lens_shows_points_where_metashape_does(tmp_path, lens, kind, tolerance):
@@ -92,6 +94,16 @@ def test_the_transform_of_the_chunk_is_applied(tmp_path):
     np.testing.assert_allclose(found.R_cw[0], (turn @ pose).T, atol=1e-12)
     np.testing.assert_allclose(found.center_w[0], 2.5 * turn @ [1, 2, 3] + [10, 20, 30], atol=1e-12)
     assert found.unposed == ("lost",)
+
+
+def test_what_nobody_explains_of_a_shutter_is_left_out_and_told(tmp_path):
+    text = xml(FRAME).replace(
+        "</transform></camera>",
+        "</transform><rolling_shutter><translation>0 0 1</translation></rolling_shutter></camera>",
+    )
+    (tmp_path / "c.xml").write_text(text)
+    with pytest.warns(RsUndistortWarning, match="rolling_shutter of 1 cameras, such as a, is left out"):
+        assert read_metashape(tmp_path / "c.xml").labels == ("a",)
 
 
 def test_geocentric_coordinates_are_counted_from_the_middle(tmp_path):

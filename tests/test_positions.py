@@ -12,7 +12,7 @@ from surveys import ORIGIN, geodetic_of
 from test_exif import ascii_, rational, rationals, with_gps
 
 from rsundistort.errors import FormatError, InputError
-from rsundistort.input.positions import check_crs, frame_at, positions_of
+from rsundistort.input.positions import check_crs, frame_at, frame_of_control, positions_of
 from rsundistort.io import ExifFacts, GpsFix, facts_of_exif, read_control_points
 from rsundistort.model.geodesy import ecef_from_geodetic, enu_from_geodetic
 from rsundistort.model.similarity import Similarity, fit_similarity
@@ -21,6 +21,7 @@ PLACE = {1: ascii_("N"), 2: rationals((47, 1), (30, 1), (0, 1)), 3: ascii_("W"),
 DJI = "http://www.dji.com/drone-dji/1.0/"
 SENSEFLY = "http://ns.sensefly.com/sensefly/1.0/"
 PIX4D = "http://pix4d.com/camera/1.0"
+PARROT = "http://www.parrot.com/namespace/drone-parrot/1.0/"
 
 
 def xmp(namespace, **values):
@@ -90,9 +91,10 @@ def test_xmp_of_drones_tells_height_and_velocity():
         ((0.01, 0, 90), (0, 0, -1), (0, 1, 0)),
     ],
 )
-def test_a_gimbal_tells_where_the_camera_looked(angles, right, ahead):
-    names = ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree")
-    found = fix(xmp(DJI, **{name: f"{value:+}" for name, value in zip(names, angles, strict=True)}))
+@pytest.mark.parametrize(("namespace", "prefix"), [(DJI, "Gimbal"), (PARROT, "Camera")])
+def test_a_gimbal_tells_where_the_camera_looked(namespace, prefix, angles, right, ahead):
+    names = (f"{prefix}YawDegree", f"{prefix}PitchDegree", f"{prefix}RollDegree")
+    found = fix(xmp(namespace, **{name: f"{value:+}" for name, value in zip(names, angles, strict=True)}))
     R_cw = positions_of(["a.jpg"], [ExifFacts(fix=found)]).R_cw[0]
     np.testing.assert_allclose(R_cw[[0, 2]], [right, ahead], atol=2e-4)
     assert np.linalg.det(R_cw) == pytest.approx(1.0)
@@ -179,6 +181,44 @@ def test_a_crs_that_is_not_of_metres_is_refused(crs, says):
     with pytest.raises(InputError, match=says) as error:
         check_crs(crs)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("crs", "stretch"), [("EPSG:3857", "1.47"), ("EPSG:3395", "1.46"), ("EPSG:32638", "1.1")])
+def test_a_projection_that_stretches_the_ground_is_refused(crs, stretch):
+    """Web and world Mercator at 47 degrees, and the UTM zone of a place 35 degrees away."""
+    says = f"--crs {crs}: a metre on the ground is up to {stretch} of its metres there"
+    with pytest.raises(InputError, match=says):
+        frame_at(crs, geodetic_of([(0, 0, 0), (50, 0, 0)]))
+    there = pyproj.Transformer.from_crs(4326, crs, always_xy=True).transform(8.0, 47.0)
+    with pytest.raises(InputError, match=says):
+        frame_of_control(crs, np.array([[*there, 400.0]]))
+
+
+def test_a_projection_whose_axes_are_mirrored_is_refused():
+    with pytest.raises(InputError, match="EPSG:5513 has axes that are not east and north"):
+        frame_at("EPSG:5513", np.array([[50.0, 15.0, 300.0]]))
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:32631", "EPSG:3035", "EPSG:2048"])
+def test_velocities_and_rotations_are_turned_to_the_north_of_the_grid(crs):
+    """By where the projection puts a step of that velocity; EPSG:2048 counts to the west and to the south."""
+    origin = (-33.0, 19.5, 400.0) if crs == "EPSG:2048" else (47.0, 8.0, 400.0)
+    R_cw, velocity = Rotation.from_rotvec([0.3, 2.0, -1.0]).as_matrix(), np.array([7.0, -4.0, 0.5])
+    fact = ExifFacts(fix=GpsFix(*origin, velocity_m_s=tuple(velocity), R_cw=tuple(map(tuple, R_cw.tolist()))))
+    frame = frame_at(crs, np.array([origin]))
+    turned = frame.turned(positions_of(["a.jpg"], [fact]))
+    begin, end = frame.of_geodetic(geodetic_of(np.stack([0 * velocity, velocity]), origin))
+    np.testing.assert_allclose(turned.velocity_m_s[0], end - begin, rtol=4e-3)  # a projection's metres
+    np.testing.assert_allclose(turned.R_cw[0] @ turned.velocity_m_s[0], R_cw @ velocity, atol=1e-12)
+    told = pyproj.Proj(crs).get_factors(origin[1], origin[0]).meridian_convergence
+    # EPSG:3035 keeps areas, not angles: its east and north are turned by 0.1 degrees more and less
+    told += 180.0 * (crs == "EPSG:2048")
+    assert np.degrees(frame.convergence_rad) == pytest.approx(told, abs=0.1 if crs == "EPSG:3035" else 1e-3)
+
+
+def test_a_datum_that_gps_reaches_to_metres_only_is_told():
+    assert frame_at("EPSG:3003", np.array([[42.0, 9.0, 100.0]])).note.startswith("GPS is put into EPSG:3003 to 4 m")
+    assert frame_at("EPSG:32632", np.array([[42.0, 9.0, 100.0]])).note == ""
 
 
 def test_a_projection_needs_its_library(monkeypatch):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,8 @@ class ColmapModel:
         its intrinsics took up some of it.
     has_colors : bool
         Whether the colours are known.
+    georeference : mapping or None
+        Where on the map the model is, as of `Solution`, where it says so.
     """
 
     reconstruction: Reconstruction
@@ -58,6 +60,7 @@ class ColmapModel:
     unregistered: Sequence[str]
     self_calibrated: bool = False
     has_colors: bool = True
+    georeference: Mapping[str, Any] | None = None
 
     def once_a_photo(self) -> ColmapModel:
         """The model with one measurement of a point in a photo, the nearest, and the points that two photos see."""

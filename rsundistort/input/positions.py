@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from ..io import ExifFacts
 from ..io.photos.gps import ALTITUDES
 from ..model.geodesy import ecef_from_geodetic, enu_axes, enu_from_geodetic
 
-__all__ = ["MapFrame", "PhotoPositions", "check_crs", "frame_at", "positions_of"]
+__all__ = ["MapFrame", "PhotoPositions", "check_crs", "frame_at", "frame_of_control", "positions_of"]
 
 Array = NDArray[np.float64]
 
@@ -24,6 +24,12 @@ _ANOTHER_DATUM_M = 1.0
 _UNKNOWN_UP_M = 1e4
 # Origins of projections are whole multiples of this, metres.
 _ROUND_M = 100.0
+# Projections for surveys are true to a fifth of this where they are meant for; heights are not scaled with them.
+_MOST_STRETCH = 0.01
+# A way from one datum to another that is known worse is told, metres.
+_DATUM_M = 1.0
+# Half a step by which projections are differentiated, degrees: ten metres.
+_STEP_DEG = 1e-4
 
 
 @dataclass(frozen=True)
@@ -74,10 +80,16 @@ class MapFrame:
         pyproj takes it, whose coordinates less the origin's are those of the frame.
     origin : (float, float, float)
         Of "local" latitude, longitude and altitude; else what is subtracted from east, north and up.
+    convergence_rad : float
+        By how much east and north are turned in the frame, counter-clockwise: a grid's north is not the north pole's.
+    note : str
+        What is to be said of it.
     """
 
     crs: str
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    convergence_rad: float = 0.0
+    note: str = ""
 
     def of_geodetic(self, geodetic: Array) -> Array:
         """Places (m, 3) of latitudes, longitudes and altitudes (m, 3)."""
@@ -89,6 +101,12 @@ class MapFrame:
         """The place of a control point, which is given in the CRS."""
         east, north, up = (np.asarray(place_m, np.float64) - self.origin).tolist()
         return east, north, up
+
+    def turned(self, positions: PhotoPositions) -> PhotoPositions:
+        """Positions whose velocities and rotations are along the axes of the frame."""
+        c, s = np.cos(self.convergence_rad), np.sin(self.convergence_rad)
+        from_enu = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return replace(positions, velocity_m_s=positions.velocity_m_s @ from_enu.T, R_cw=positions.R_cw @ from_enu.T)
 
     @property
     def target(self) -> str:
@@ -144,13 +162,50 @@ def _projected(crs: str, geodetic: Array) -> Array:
     return value
 
 
+def _convergence(crs: str, place: Array) -> float:
+    """By how much a projection turns east and north at a place (3,), which is refused where it stretches them."""
+    around = place + _STEP_DEG * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
+    there, true = _projected(crs, around)[:, :2], enu_from_geodetic(around, place)[:, :2]
+    jacobian = np.linalg.solve(true[::2] - true[1::2], there[::2] - there[1::2]).T
+    stretch = np.linalg.svd(jacobian, compute_uv=False)
+    if np.abs(stretch - 1).max() > _MOST_STRETCH:
+        raise InputError(
+            f"--crs {crs}: a metre on the ground is up to {stretch[0]:.3g} of its metres there, and heights are "
+            "true; give the UTM zone or the national grid of the place"
+        )
+    if np.linalg.det(jacobian) < 0:
+        raise InputError(f"--crs {crs} has axes that are not east and north; give the CRS that has")
+    return float(np.arctan2(jacobian[1, 0] - jacobian[0, 1], jacobian[0, 0] + jacobian[1, 1]))
+
+
 def frame_at(crs: str, geodetic: Array) -> MapFrame:
-    """The frame of a CRS at the median of positions (m, 3): at that for "local", else rounded and without a height."""
+    """The frame of a CRS at the median of positions (m, 3): at that for "local", else rounded and without a height.
+
+    Raises
+    ------
+    InputError
+        When a projection does not reach there, or is no map in metres there.
+    """
     middle = np.median(geodetic, axis=0)
     if crs == "local":
         return MapFrame("local", (float(middle[0]), float(middle[1]), float(middle[2])))
     east, north, _ = np.round(_projected(crs, middle[None])[0] / _ROUND_M) * _ROUND_M
-    return MapFrame(crs, (float(east), float(north), 0.0))
+    origin = float(east), float(north), 0.0
+    transformer = _transformer(crs)
+    transformer.transform(middle[1], middle[0])
+    known_m = transformer.get_last_used_operation().accuracy
+    note = f"GPS is put into {crs} to {known_m:g} m, since that has a datum of its own" if known_m > _DATUM_M else ""
+    return MapFrame(crs, origin, _convergence(crs, middle), note)
+
+
+def frame_of_control(crs: str, places_m: Array) -> MapFrame:
+    """The frame of a projection at the median of places in it (m, 3), as `frame_at`."""
+    middle = np.median(places_m, axis=0)
+    longitude, latitude = _transformer(crs).transform(middle[0], middle[1], direction="INVERSE")
+    place = np.array([latitude, longitude, middle[2]])
+    if not np.isfinite(place).all():
+        raise InputError(f"--crs {crs} does not reach to the control points; are they in it, E before N?")
+    return replace(frame_at(crs, place[None]), note="")
 
 
 def positions_of(names: Sequence[str], facts: Sequence[ExifFacts]) -> PhotoPositions:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
+from importlib import import_module
 from pathlib import Path
 
 from ..errors import InputError
@@ -48,7 +48,7 @@ _OPF = ("project.opf", "camera_list.json", "input_cameras.json", "calibration/ca
 #: By the name of the option and of the folder in OUT.
 EXPORTS: dict[str, Export] = {
     "metashape": Export(_metashape, ("cameras.xml",)),
-    "ncore": Export(write_ncore, (), "ncore", "ncore"),
+    "ncore": Export(write_ncore, (), "ncore.data.v4", "ncore"),
     "nuke": Export(write_nuke, ("camera.nk", "camera.chan")),
     "opensfm": Export(write_opensfm, ("reconstruction.json", "camera_models.json", "tracks.csv", "image_list.txt")),
     "opf": Export(write_opf, _OPF, "pyopf", "opf"),
@@ -61,10 +61,17 @@ def check_exports(exports: Sequence[str], names: Sequence[str] = ()) -> None:
     for name in exports:
         if name not in EXPORTS:
             raise InputError(f"export={name!r}, expected one of {', '.join(EXPORTS)}")
-        needed = EXPORTS[name]
-        if needed.module and find_spec(needed.module) is None:
-            raise InputError(
-                f'--export {name} needs the extra {needed.extra}: pip install "rsundistort[{needed.extra}]"'
-            )
+        _check_extra(name, EXPORTS[name])
     if "opensfm" in exports:
         check_opensfm_names(list(names))
+
+
+def _check_extra(name: str, needed: Export) -> None:
+    """Refuse an export whose library is not there, or not whole: some are installed without what they need."""
+    if needed.module:
+        try:
+            import_module(needed.module)
+        except ImportError as error:
+            raise InputError(
+                f'--export {name} needs the extra {needed.extra}: pip install "rsundistort[{needed.extra}]" ({error})'
+            ) from error

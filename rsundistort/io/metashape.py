@@ -2,7 +2,8 @@
 
 Its pixels have their centres at 0.5 and principal points count from the middle of the photo. P1 and P2 are OpenCV's p2
 and p1. Poses are camera to world, x right, y down, z ahead. Of a sensor with rolling-shutter compensation a pose is
-that of the middle of the frame; the motions themselves are not in the file.
+that of the middle of the frame; `rolling_shutter` of a camera holds a rotation and a translation, and nothing says
+between which lines.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from .xml_text import read_xml
 __all__ = ["PosedPhotos", "is_metashape", "named", "read_metashape", "write_metashape"]
 
 _VERSION = "1.5.0"
-_PARAMETERS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
+# p3 and p4 are of PhotoScan and the first versions of Metashape
+_PARAMETERS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 # Geocentric and projected coordinates are millions of metres: digits of the cameras' own distances would be lost.
 _FAR, _FAR_OF_SPREAD = 1e5, 100.0
 
@@ -87,6 +89,12 @@ def _chunk(chunk: ElementTree.Element, where: str) -> PosedPhotos:
     sensors = {each.attrib["id"]: each for each in chunk.iter("sensor")}
     components = {each.attrib.get("id", ""): each.find("transform") for each in chunk.iter("component")}
     labels, of_sensor, matrices, unposed = [], [], [], []
+    moved = [camera.attrib["label"] for camera in chunk.iter("camera") if camera.find("rolling_shutter") is not None]
+    if moved:
+        warnings.warn(
+            f"{where}: rolling_shutter of {len(moved)} cameras, such as {moved[0]}, is left out, since what "
+            "it means is not published; motions are solved for", RsUndistortWarning, stacklevel=5,
+        )  # fmt: skip
     for camera in chunk.iter("camera"):
         label, pose = camera.attrib["label"], camera.find("transform")
         if camera.attrib.get("enabled", "true").lower() in ("false", "0") or pose is None:
@@ -175,16 +183,16 @@ def _camera(sensor: ElementTree.Element, where: str) -> Camera:
     cx, cy = width / 2 - 0.5 + p["cx"], height / 2 - 0.5 + p["cy"]
     K = np.array([[p["f"] + p["b1"], 0, cx], [0, p["f"], cy], [0, 0, 1]])
     fisheye = kind != "frame"
-    if not (p["b2"] or (fisheye and (p["p1"] or p["p2"])) or (not fisheye and p["k4"])):
+    others = [name for name in (("b2", "p1", "p2", "p3", "p4") if fisheye else ("b2", "k4", "p3", "p4")) if p[name]]
+    if not others:
         dist = [p["k1"], p["k2"], p["p2"], p["p1"], p["k3"]]
         dist = [p[k] for k in ("k1", "k2", "k3", "k4")] if fisheye else dist
         return Camera(width, height, K, np.array(dist), lens="fisheye" if fisheye else "pinhole")
     rays, xy = _rays_and_pixels(p, fisheye, width, height)
     camera, miss = nearest_camera(rays, xy, Camera(width, height, K))
     if camera is None or miss > FIT_PX:
-        terms = ", ".join(name for name in (("p1", "p2", "b2") if fisheye else ("k4", "b2")) if p[name])
         raise FormatError(
-            f"{where} has {terms}, which no camera of ours follows to {FIT_PX} px (to {miss:.2g} px); "
+            f"{where} has {', '.join(others)}, which no camera of ours follows to {FIT_PX} px (to {miss:.2g} px); "
             "optimize the cameras without"
         )
     return camera
@@ -201,9 +209,10 @@ def _pixels(
         x, y = x * bend, y * bend
     r2 = x * x + y * y
     radial = 1 + r2 * (p["k1"] + r2 * (p["k2"] + r2 * (p["k3"] + r2 * p["k4"])))
+    decentred = 1 + r2 * (p["p3"] + r2 * p["p4"])
     x, y = (
-        x * radial + p["p1"] * (r2 + 2 * x * x) + 2 * p["p2"] * x * y,
-        y * radial + p["p2"] * (r2 + 2 * y * y) + 2 * p["p1"] * x * y,
+        x * radial + decentred * (p["p1"] * (r2 + 2 * x * x) + 2 * p["p2"] * x * y),
+        y * radial + decentred * (p["p2"] * (r2 + 2 * y * y) + 2 * p["p1"] * x * y),
     )
     u = width / 2 + p["cx"] + x * p["f"] + x * p["b1"] + y * p["b2"]
     return np.column_stack([u, height / 2 + p["cy"] + y * p["f"]]) - 0.5

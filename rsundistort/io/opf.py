@@ -2,9 +2,9 @@
 
 Principal points and measurements count from the upper left corner, pixel centres are at 0.5. Angles are omega, phi and
 kappa of camera axes x right, y up, z back; R1 R2 R3 T1 T2 are OpenCV's k1 k2 k3 p1 p2. Points and measurements are
-stored as float32. `rolling_shutter` is how far the camera travelled while the frame was read, from the first line to
-the last, in the coordinates of its position, which is that of the middle: the paper that the specification refers to
-models nothing else, so rotations have no room.
+stored as float32. `rolling_shutter` is how far the camera travelled while the frame was read, from the uppermost row to
+the lowest, in the coordinates of its position, which is that of the middle: the paper that the specification refers to
+models nothing else, so rotations and columns that are read one after the other have no room.
 """
 
 from __future__ import annotations
@@ -55,6 +55,8 @@ def write_opf(folder: Path, scene: ExportScene) -> str:
     images = [stored.image(image.name) for image in scene.images]
     if any(stored.cameras[image.camera_id].lens != "pinhole" for image in images):
         raise InputError("OPF has no fisheye like ours; take opf-rectified")
+    if stored.shutter_model != "global" and any(stored.cameras[image.camera_id].clock_axis == 0 for image in images):
+        raise InputError("OPF takes photos to be read row by row, and these are by column; take opf-rectified")
     shown = [scene.originals.get(image.name, image.name) for image in images]
     rec = scene.reconstruction
     if any(image.turned != 1 for image in scene.solution.images):
@@ -183,10 +185,24 @@ def _scene_frame(georeference: Mapping[str, Any] | None) -> Any:
 
     if georeference is None or georeference["crs"] in ("local", "control"):
         return None
-    shift = -np.array(georeference["origin"], np.float64)
+    matrix = np.linalg.inv(np.array(georeference["transformation"], np.float64))
+    swapped = bool(matrix[0, 0] == 0)
+    scale = np.abs(matrix[:3, :3]).max(0)
     return SceneReferenceFrame(
-        BaseToTranslatedCanonicalCrsTransform(np.ones(3), shift, False), Crs(georeference["crs"])
+        BaseToTranslatedCanonicalCrsTransform(scale, matrix[:3, 3], swapped),
+        Crs(georeference["crs"], georeference.get("geoid_height")),
     )
+
+
+def _georeference(project: Any) -> dict[str, Any] | None:
+    """The projection of a project, and how its coordinates lie in it; None of one without."""
+    frames = project.scene_reference_frame_objs
+    if not frames or not frames[0].crs.definition:
+        return None
+    matrix = np.linalg.inv(np.array(frames[0].base_to_canonical.transformation_matrix, np.float64))
+    crs, geoid = frames[0].crs.definition, frames[0].crs.geoid_height
+    found = {"crs": crs, "origin": matrix[:3, 3].tolist(), "target": crs, "transformation": matrix.tolist()}
+    return found if geoid is None else {**found, "geoid_height": geoid}
 
 
 def _capture(uid: Any, sensor_id: Any, facts: ExifFacts) -> Any:
@@ -210,10 +226,11 @@ def _capture(uid: Any, sensor_id: Any, facts: ExifFacts) -> Any:
 def _middle(
     solution: Solution, image: SolvedImage
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """The pose at the middle of the readout, and the way from its first line to its last."""
+    """The pose at the middle of the readout, and the way from the uppermost row to the lowest."""
     from .shutter_poses import end_poses
 
-    (R_first, first), (R_last, last) = end_poses(solution, image)
+    ends = end_poses(solution, image)
+    (R_first, first), (R_last, last) = ends if solution.cameras[image.camera_id].clock_sign > 0 else ends[::-1]
     turn = Rotation.from_matrix(R_last @ R_first.T).as_rotvec()
     R_cw = Rotation.from_rotvec(turn / 2).as_matrix() @ R_first
     return R_cw, (first + last) / 2, last - first
@@ -305,18 +322,30 @@ def _model(project: Any, where: str) -> ColmapModel:
     uids = np.array([place[uid.int] for uid in matches.camera_uids], np.int64)
     frame = uids[np.asarray(matches.camera_ids, np.int64).ravel()[at]]
     xy = np.asarray(matches.image_points.pixelCoordinates, np.float64)[at] - 0.5
+    camera_idx = np.array([sensors.index(c.sensor_id.int) for c in found.cameras], np.int64)
+    center_w, velocity = _travels(found.cameras, [cameras[k] for k in camera_idx])
     rec = Reconstruction(
-        cameras, names, np.array([sensors.index(c.sensor_id.int) for c in found.cameras], np.int64),
-        R_wc.transpose(0, 2, 1), np.array([c.position for c in found.cameras], np.float64), points_w,
-        Observations(frame, point, xy),
+        cameras, names, camera_idx, R_wc.transpose(0, 2, 1), center_w, points_w, Observations(frame, point, xy),
+        velocity=velocity, shutter_model="constant-motion" if velocity.any() else "global",
     )  # fmt: skip
     rgb = np.zeros((len(points_w), 3), np.uint8) if node.color is None else np.asarray(node.color)[:, :3]
     unposed = [file for uid, file in files.items() if uid not in place]
     return ColmapModel(
         rec, np.arange(1, 1 + len(cameras)), np.arange(1, 1 + len(names)), np.arange(1, 1 + len(points_w)),
         np.asarray(matches.image_points.featureIds, np.int64).ravel()[at], rgb.astype(np.uint8), tuple(unposed),
-        self_calibrated=True, has_colors=node.color is not None,
+        self_calibrated=True, has_colors=node.color is not None, georeference=_georeference(project),
     )  # fmt: skip
+
+
+def _travels(found: Sequence[Any], cameras: Sequence[Camera]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Centres at the principal row (m, 3), and velocities (m, 3) a unit of the clock, of rows read downwards."""
+    position = np.array([c.position for c in found], np.float64).reshape(-1, 3)
+    way = np.array([np.zeros(3) if c.rolling_shutter is None else c.rolling_shutter for c in found]).reshape(-1, 3)
+    rows, f, cy = (np.array(values, np.float64) for values in zip(
+        *((c.height - 1, c.K[1, 1], c.K[1, 2]) for c in cameras), strict=True
+    ))  # fmt: skip
+    velocity = way * (f / rows)[:, None]
+    return position - velocity * ((rows / 2 - cy) / f)[:, None], velocity
 
 
 def _files(uris: dict[int, str]) -> dict[int, str]:

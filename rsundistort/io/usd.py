@@ -45,9 +45,10 @@ def write_usd_camera(
 
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    code = camera_path.time_s / frame_s
-    stage.SetTimeCodesPerSecond(1.0 / frame_s)
-    stage.SetFramesPerSecond(1.0 / frame_s)
+    # whole numbers are such: quotients of times are off by their last digit
+    code, rate = np.round(camera_path.time_s / frame_s, 6), round(1.0 / frame_s, 6)
+    stage.SetTimeCodesPerSecond(rate)
+    stage.SetFramesPerSecond(rate)
     stage.SetStartTimeCode(float(code[0]))
     stage.SetEndTimeCode(float(code[-1]))
     root = UsdGeom.Xform.Define(stage, "/World")

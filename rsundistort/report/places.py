@@ -46,6 +46,8 @@ def _frame(georeference: Mapping[str, Any]) -> str:
         "local": f"east, north, up in metres at {origin[0]:.6f}, {origin[1]:.6f}, {origin[2]:.1f} m",
         "control": "that of the control points",
     }.get(crs, f"{crs}, less {origin[0]:.0f}, {origin[1]:.0f} m")
+    if "sigma" not in georeference:
+        return f"{where}, as in the model"
     place, turn = georeference["sigma"]["place_m"], georeference["sigma"]["rotation_deg"]
     return (
         f"{where}; known to {max(place[:2]):.2g} m across, {place[2]:.2g} m in height, {max(turn):.2g} deg, scale "

@@ -433,6 +433,8 @@ def _solve(
             track_source,
             survey,
         )
+    if solved.survey is None:  # the model's frame is kept
+        solved = replace(solved, georeference=given.georeference)
     after = solved.shared
     for text in cameras.contradicted(after.cameras, options_of(after)):
         warnings.warn(text, RsUndistortWarning, stacklevel=4)

@@ -78,7 +78,7 @@ def run_folder(
 ) -> Iterator[RunFolder]:
     """The locked folder of a run; its state is removed at the end, or if there is no solution.
 
-    An interruption says where it was, and how to continue.
+    An interruption says where it was, and how to continue. So does a disk that is full after the solution is found.
 
     Raises
     ------
@@ -97,9 +97,14 @@ def run_folder(
         except KeyboardInterrupt as stop:
             where = str(stop) or f"{log.stage or 'nothing'} was under way, the same command with --resume continues"
             raise KeyboardInterrupt(where) from stop
-        except Exception:
-            if not (run.goes_on or run.kept.get(_BEGUN)):
+        except Exception as error:
+            of_the_machine = isinstance(error, FileError) and "cannot be written" in str(error)
+            stays = run.goes_on or bool(run.kept.get(_BEGUN)) or (of_the_machine and run.kept.get(_OUTPUTS) is not None)
+            if not stays:
                 run.kept.drop()
+            if of_the_machine and ";" not in str(error):
+                mend = "the same command with --resume continues" if stays else "correct that, or give another folder"
+                raise FileError(f"{error}; {mend}") from error
             raise
         if not run.finished:
             Record(out).finish(key)

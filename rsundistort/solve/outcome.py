@@ -199,10 +199,10 @@ def solution_of(solved: Solved, options: SolveOptions, rectify: RectifyOptions) 
     )
 
 
-def _georeference(solved: Solved) -> dict[str, Any] | None:
+def _georeference(solved: Solved) -> Mapping[str, Any] | None:
     """The georeferencing, with the speeds of the cameras where the readout time is known."""
-    if solved.georeference is None or solved.survey is None:
-        return None
+    if solved.georeference is None or solved.survey is None:  # then it is the model's
+        return solved.georeference
     rec, positions = solved.shared, solved.survey.positions
     told = zip(positions.names, positions.speed_m_s.tolist(), strict=True)
     by_gps = {name: speed for name, speed in told if np.isfinite(speed)}

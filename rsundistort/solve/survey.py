@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from ..bundle import CONTROL_SIGMA_PX, KnownPlaces, place_control, scale_of_lengths, with_control
 from ..bundle.places import point_of
 from ..errors import InputError, RsUndistortWarning
-from ..input.positions import MapFrame, PhotoPositions, frame_at, positions_of
+from ..input.positions import MapFrame, PhotoPositions, frame_at, frame_of_control, positions_of
 from ..io import ExifFacts
 from ..model import ControlPoint, KnownLength, Reconstruction
 from ..model.similarity import FittedSimilarity, Similarity, fit_similarity
@@ -50,7 +50,7 @@ class Survey:
     frame : MapFrame
         Of the poses and points.
     positions : PhotoPositions
-        The photos' GPS.
+        The photos' GPS, with velocities and rotations along the axes of the frame.
     places : mapping of photo name to (place, sigma)
         Their places in the frame, (3,) each; none if the frame is that of control points.
     control : sequence of ControlPoint
@@ -354,8 +354,7 @@ def survey_of(
             warnings.warn(f"not on the map: {'; '.join(said)}", RsUndistortWarning, stacklevel=4)
         return None
     if not len(positions):
-        origin = np.round(np.median([each.place_m for each in holding], axis=0) / 100.0) * 100.0
-        frame = MapFrame(str(crs), (float(origin[0]), float(origin[1]), 0.0))
+        frame = frame_of_control(str(crs), np.array([each.place_m for each in holding]))
     else:
         frame = frame_at(crs or "local", positions.geodetic)
     placed = frame.of_geodetic(positions.geodetic) if len(positions) else np.zeros((0, 3))
@@ -364,7 +363,8 @@ def survey_of(
         if len(placed) and np.linalg.norm(np.median(placed, axis=0)[:2] - each.place_m[:2]) > _ELSEWHERE_M:
             raise InputError(f"control point {each.name!r} lies far from the photos' GPS; is it in {crs}, E before N?")
     places = dict(zip(positions.names, zip(placed, positions.sigma_m, strict=True), strict=True))
-    return Survey(frame, positions, places, in_frame, clock_s=clock_s or {}, notes=positions.notes)
+    notes = [*positions.notes, *([frame.note] * bool(frame.note))]
+    return Survey(frame, frame.turned(positions), places, in_frame, clock_s=clock_s or {}, notes=notes)
 
 
 def _check_seen(control: Sequence[ControlPoint], sizes: Mapping[str, tuple[int, int]]) -> None:

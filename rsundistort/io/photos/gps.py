@@ -22,6 +22,7 @@ _DJI = ("http://www.dji.com/drone-dji/1.0/",)
 _SENSEFLY = ("http://ns.sensefly.com/sensefly/1.0/",)
 _PARROT = ("http://www.parrot.com/drone-parrot/1.0/", "http://www.parrot.com/namespace/drone-parrot/1.0/")
 _GIMBAL = ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree")
+_PARROT_GIMBAL = ("CameraYawDegree", "CameraPitchDegree", "CameraRollDegree")
 _ATTITUDE = ("Yaw", "Pitch", "Roll")
 _CAMERA = ("http://pix4d.com/camera/1.0/", "http://ns.sensefly.com/Camera/1.0/", "http://ns.pix4d.com/camera/1.0/")
 
@@ -191,7 +192,7 @@ def _of_xmp(xmp: bytes) -> dict[str, float]:
             *_GIMBAL,
         ),
         _SENSEFLY: ("Latitude", "Longitude", "AltitudeAMSL", "AltitudeWGS84", "Height", "GroundSpeed"),
-        _PARROT: ("SpeedX", "SpeedY"),
+        _PARROT: ("SpeedX", "SpeedY", *_PARROT_GIMBAL),
         _CAMERA: ("GPSXYAccuracy", "GPSZAccuracy", *_ATTITUDE),
     }  # fmt: skip
     found: dict[str, float] = {}
@@ -221,10 +222,12 @@ def _told_place(told: Mapping[str, float]) -> tuple[float, float] | None:
 def _rotation(told: Mapping[str, float]) -> tuple[tuple[float, float, float], ...] | None:
     """Yaw, pitch and roll as a rotation; all zeros are those of a camera that does not know them.
 
-    All turn about the axes ahead, right and down of north, east and down. DJI's camera looks ahead at zero; that of the
-    `Camera` namespace looks down, the top of its photo ahead (Pix4D, "Yaw, Pitch, Roll and Omega, Phi, Kappa angles").
+    All turn about the axes ahead, right and down of north, east and down. DJI's camera and Parrot's look ahead at zero;
+    that of the `Camera` namespace looks down, the top of its photo ahead (Pix4D, "Yaw, Pitch, Roll and Omega, Phi,
+    Kappa angles").
     """
-    for names, right, down in ((_GIMBAL, (0, 1, 0), (0, 0, 1)), (_ATTITUDE, (0, 1, 0), (-1, 0, 0))):
+    ahead, below = ((0, 1, 0), (0, 0, 1)), ((0, 1, 0), (-1, 0, 0))
+    for names, (right, down) in ((_GIMBAL, ahead), (_PARROT_GIMBAL, ahead), (_ATTITUDE, below)):
         if told.keys() >= {*names}:
             yaw, pitch, roll = (told[name] for name in names)
             if any((yaw, pitch, roll)) and abs(yaw) <= 360 and abs(pitch) <= 180 and abs(roll) <= 180:
