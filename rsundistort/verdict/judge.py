@@ -125,8 +125,8 @@ def judge(
     reasons = loose_reasons(result) + height_reasons(remedy) + unexplained
     if rec.shutter_model == "global":
         shutter, why = _of_global(choice)
-        said = _misplaced(result, bool(unexplained) or shutter != "not-found") if strong else {}
-        return _verdict(shutter, reasons + why, said)
+        misplaced = _misplaced(result, bool(unexplained) or shutter != "not-found") if strong else {}
+        return _verdict(shutter, reasons + why, misplaced)
     motions = photo_motions(result)
     outliers = _outliers(rec, tracks)
     doubts = _doubts(result, motions, outliers, most_phi or {})
