@@ -6,7 +6,7 @@ from .epipolar import read_num_verified
 from .features import DETECTION_MEGAPIXELS, SIFT_PX, Features, detect_features, detection_bytes, grey_8_bit
 from .focal_length import USUAL_FOCAL, estimate_focal_length
 from .imported import matched_of_database
-from .joined import LEAST_MEASUREMENTS, firmly_joined
+from .joined import LEAST_MEASUREMENTS, firmly_joined, hanging_together
 from .mapping import map_photos
 from .matching import match_photos
 from .pairs import choose_pairs, global_descriptors
@@ -35,6 +35,7 @@ __all__ = [
     "firmly_joined",
     "global_descriptors",
     "grey_8_bit",
+    "hanging_together",
     "map_photos",
     "match_photos",
     "matched_of_database",

@@ -12,26 +12,29 @@ __all__ = ["LEAST_MEASUREMENTS", "firmly_joined", "hanging_together"]
 #: A photo with fewer measurements is not joined: a wrong place is worse than none.
 LEAST_MEASUREMENTS = 20
 
+# A point of a known place gives two equations, and a photo with its turn during the readout has nine unknowns: with
+# fewer points it is anywhere.
+_LEAST_TIES = 5
 # A point is known, depth and all, as soon as so many photos show it.
 _LEAST_PHOTOS = 2
 
 
 def firmly_joined(reconstruction: Reconstruction) -> Reconstruction:
-    """The largest part of a reconstruction whose photos hang together, and what they show."""
+    """The largest part of a reconstruction in which equations tell where each photo is, and what its photos show."""
     rec = reconstruction.without_photos(LEAST_MEASUREMENTS)
-    joined = hanging_together(rec)
+    joined = hanging_together(rec, _LEAST_TIES)
     while not joined.all():
         rec = rec.take_photos(joined).without_photos(LEAST_MEASUREMENTS)
-        joined = hanging_together(rec)
+        joined = hanging_together(rec, _LEAST_TIES)
     return rec
 
 
-def hanging_together(reconstruction: Reconstruction) -> NDArray[np.bool_]:
-    """(m,) the largest set of photos of which each shows points whose place the others tell.
+def hanging_together(reconstruction: Reconstruction, least: int = LEAST_MEASUREMENTS) -> NDArray[np.bool_]:
+    """(m,) the largest set of photos of which each shows `least` points whose place the others tell.
 
-    A set grows from a pair: a photo joins if it shows so many points (`LEAST_MEASUREMENTS`) that two of the set show.
-    What two sets show of each other by less can be turned, moved and scaled against each other: residuals are small
-    wherever they are.
+    A set grows from a pair: a photo joins if it shows so many points that two of the set show.
+    Sets that have a photo in common are one, since that tells how they were turned. What two sets show of each other by
+    less can be turned and moved against each other: residuals are small wherever they are.
     """
     from scipy.sparse import csr_matrix  # late: few runs need it
 
@@ -41,18 +44,27 @@ def hanging_together(reconstruction: Reconstruction) -> NDArray[np.bool_]:
     where = obs.frame_idx[ties], obs.point_idx[ties]
     shows = csr_matrix((np.ones(ties.sum()), where), (m, reconstruction.num_points))
     shows.data[:] = 1.0  # what a photo shows twice counts once
-    left, largest = np.ones(m, bool), np.zeros(m, bool)
+
+    def grown(joined: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        new, count = joined, np.zeros(reconstruction.num_points)
+        while new.any():
+            count += shows[new].sum(0).A1
+            new = ~joined & (shows @ (count >= _LEAST_PHOTOS) >= least)
+            joined = joined | new
+        return joined
+
+    left, sets = np.ones(m, bool), list[NDArray[np.bool_]]()
     while left.any():
         first = int(np.argmax(np.where(left, shows.sum(1).A1, -1.0)))
         common = (shows @ shows[first].T).toarray().ravel()
         common[first] = -1.0
-        joined = new = np.isin(np.arange(m), [first, np.argmax(common)])
-        count = np.zeros(reconstruction.num_points)
-        while new.any():
-            count += shows[new].sum(0).A1
-            new = ~joined & (shows @ (count >= _LEAST_PHOTOS) >= LEAST_MEASUREMENTS)
-            joined = joined | new
+        joined = np.arange(m) == first
+        if common.max() >= least:
+            joined = grown(joined | (np.arange(m) == np.argmax(common)))
+        while any(touching := [(each & joined).any() for each in sets]):
+            both = np.any([joined, *(each for each, near in zip(sets, touching, strict=True) if near)], axis=0)
+            sets = [each for each, near in zip(sets, touching, strict=True) if not near]
+            joined = grown(both)
+        sets.append(joined)
         left = left & ~joined
-        if joined.sum() > largest.sum():
-            largest = joined
-    return largest
+    return max(sets, key=lambda each: int(each.sum()), default=left)

@@ -17,7 +17,7 @@ from ..bundle.layout import motion_end
 from ..critical import Remedy
 from ..model import Reconstruction
 from ..model.field import field_over_frame
-from ..sfm import LEAST_MEASUREMENTS
+from ..sfm import LEAST_MEASUREMENTS, hanging_together
 from .photos import PhotoMotions, photo_motions
 from .residuals import left_along_readout, left_over_frame
 
@@ -351,11 +351,14 @@ def _misplaced(result: BundleResult, unexplained: bool) -> dict[str, str]:
     sigma_deg = np.degrees(np.sqrt(np.linalg.eigvalsh(result.covariances[:, :3, :3])[:, -1].clip(0.0)))
     # relative to the fixed photo the others are as uncertain as it is relative to them
     sigma_deg = np.where(sigma_deg > 0, sigma_deg, np.median(sigma_deg[sigma_deg > 0]) if sigma_deg.any() else 0.0)
-    return {
+    said = {
         name: f"its direction is only known to +-{sigma:.1f} degrees"
         for name, sigma in zip(names, sigma_deg, strict=True)
         if sigma > _LOST_DEG
     }
+    joined = hanging_together(result.reconstruction)
+    few = f"it shows fewer than {LEAST_MEASUREMENTS} points whose place the others tell"
+    return said | {name: few for name, held in zip(names, joined, strict=True) if not held}
 
 
 def _of_photos(rec: Reconstruction, doubts: Mapping[str, list[str]], motions: PhotoMotions) -> list[str]:
