@@ -87,6 +87,7 @@ def test_a_photo_that_is_there_twice_ruins_nothing(photos):
     np.testing.assert_allclose(twin.center_w, again.center_w, atol=0.02)
 
 
+@pytest.mark.slow
 def test_of_two_scenes_the_larger_is_solved_and_the_other_named(photos):
     whole = half_courtyard(photos.parent / "scene")
     for name in COURTYARD_NAMES[:6]:

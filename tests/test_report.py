@@ -352,6 +352,7 @@ def test_bad_photos_folder_keeps_the_report(solved_courtyard, invoke, tmp_path):
     assert (solved_courtyard[0] / "report.html").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_figures_for_papers(solved_courtyard, invoke, tmp_path):
     result = invoke(solved_courtyard[0], "--figures", tmp_path / "figures")
     assert result.exit_code == 0, result.output
