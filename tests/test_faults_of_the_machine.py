@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import multiprocessing
 import os
 import subprocess
@@ -16,6 +17,7 @@ from commands import solution_of
 
 from rsundistort import Camera, RowMotion, Solution
 from rsundistort.batch import rectify_folder
+from rsundistort.batch.progress import StageLog
 from rsundistort.errors import FileError, InputError, MissingOutputWarning
 from rsundistort.input.load import load_photos
 from rsundistort.io import write_image
@@ -24,6 +26,7 @@ from rsundistort.io.lock import LOCK_NAME, check_still_there, locked
 from rsundistort.io.outputs import only_writer, output_folder, work_folder
 from rsundistort.io.record import Record
 from rsundistort.rectify import ViewOptions
+from rsundistort.solve.going_on import run_folder
 
 NAMES = ["a.png", "b.png", "c.png", "d.png"]
 COMMAND = [sys.executable, "-m", "rsundistort_cli"]
@@ -233,6 +236,23 @@ def test_sigterm_ends_in_one_line_and_resume_goes_on(batch):
     assert "--resume continues" in done.stderr
     rectify_folder(photos, solution, out, resume=True)
     assert sorted(path.name for path in (out / "images").iterdir()) == NAMES
+
+
+@pytest.mark.parametrize("is_solved", [True, False])
+def test_a_full_disk_of_a_run_says_how_to_continue(tmp_path, is_solved):
+    def fill_the_disk():
+        with run_folder(tmp_path, "key", StageLog(None)) as run:
+            run.kept.begin()
+            if is_solved:
+                run.solved([1.0], StageLog(None))
+            raise FileError(f"{tmp_path} cannot be written") from OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(FileError) as raised:
+        fill_the_disk()
+    mend = "the same command with --resume continues" if is_solved else "correct that, or give another folder"
+    assert str(raised.value) == f"{tmp_path} cannot be written; {mend}"
+    with run_folder(tmp_path, "key", StageLog(None), resume=True) as run:
+        assert run.outputs(StageLog(None)) == ([1.0] if is_solved else None)
 
 
 @POSIX

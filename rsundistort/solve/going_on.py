@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -19,6 +20,8 @@ from ..versions import versions
 __all__ = ["RunFolder", "key_of", "run_folder"]
 
 _BEGUN, _OUTPUTS = "begun", "outputs"
+# What the system says of writing alone.
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
 def key_of(inputs: Sequence[Path], *options: Any) -> str:
@@ -98,13 +101,13 @@ def run_folder(
             where = str(stop) or f"{log.stage or 'nothing'} was under way, the same command with --resume continues"
             raise KeyboardInterrupt(where) from stop
         except Exception as error:
-            of_the_machine = isinstance(error, FileError) and "cannot be written" in str(error)
-            stays = run.goes_on or bool(run.kept.get(_BEGUN)) or (of_the_machine and run.kept.get(_OUTPUTS) is not None)
+            cannot_write = isinstance(error, FileError) and getattr(error.__cause__, "errno", None) in _FULL
+            stays = run.goes_on or bool(run.kept.get(_BEGUN)) or (cannot_write and run.kept.get(_OUTPUTS) is not None)
             if not stays:
                 run.kept.drop()
-            if of_the_machine and ";" not in str(error):
+            if cannot_write and ";" not in str(error):
                 mend = "the same command with --resume continues" if stays else "correct that, or give another folder"
-                raise FileError(f"{error}; {mend}") from error
+                raise FileError(f"{error}; {mend}") from error.__cause__
             raise
         if not run.finished:
             Record(out).finish(key)
