@@ -109,7 +109,7 @@ def herz_jesus(photos: Path, work: Path, seeds: int) -> None:
 def spread_of_halves(photos: Path, draws: int = 16) -> np.ndarray:
     """(draws, 3) mean phi over all photos, rad/row, from random halves of the scene points, around their mean.
 
-    The spread of half samples is that of the whole: no other error model enters than that points are independent.
+    The scatter of half samples is that of the whole: no other error model enters than that points are independent.
     """
     log = StageLog(None)
     with tempfile.TemporaryDirectory() as folder:

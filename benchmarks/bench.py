@@ -5,7 +5,8 @@
 Rectifying one photo (`rectify.py`), a batch (`batch.py`), an iteration of the bundle adjustment (`bundle.py`) and the
 whole run (`speed.py`, with the folder of test photos beside the project). Each line holds name, ours_s, peer_s, ratio,
 floor_s, target and ok; null where there is none. Exits 1 if one is missing or crashed, never because a noisy figure
-missed its target. About half an hour on two cores; with --quick a few minutes, of fewer photos, turns and measurements.
+missed its target. About half an hour on two cores; with --quick a few minutes, of fewer photos, rotations and
+measurements.
 """
 
 from __future__ import annotations

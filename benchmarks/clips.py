@@ -7,7 +7,7 @@ Renders clips of each kind and prints one JSON object a line: how strong the shu
     walk    a walk with a hand's tremor, from gentle to wild; readout 0.2 to 0.9 of the frame's time
     level   the same, held level at all times: all y axes are parallel
     pan     from a tripod, so that there is no parallax
-    two     two frames while the camera turns by 2 to 4 degrees a readout
+    two     two frames while the camera rotates by 2 to 4 degrees a readout
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def path(kind: str, rng: np.random.Generator, num_frames: int) -> dict[str, Any]
 def clip_recipe(kind: str, seed: int, num_frames: int = 60) -> dict[str, Any]:
     """The recipe of a random clip; the same kind and seed give the same.
 
-    Of 40 to 150 frames: the way points are as many, so that shorter ones turn faster; longer ones leave the yard.
+    Of 40 to 150 frames: the way points are as many, so that shorter ones rotate faster; longer ones leave the yard.
     """
     rng = np.random.default_rng([seed, KINDS.index(kind)])
     K = [[FOCAL_PX, 0, WIDTH / 2 + 1.5], [0, FOCAL_PX, HEIGHT / 2 - 1.75], [0, 0, 1]]
@@ -154,7 +154,7 @@ def clip_folder(work: Path, kind: str, seed: int, num_frames: int = 60) -> Path:
 
 
 def main() -> None:
-    """Render clips, and tell of them."""
+    """Render clips, and describe them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--kind", choices=KINDS, nargs="+", default=KINDS)

@@ -6,7 +6,7 @@ On sample_scenes/handheld (k1 k2 p1 p2, all four directions), `distorted` is the
 the row freed of the lens as its clock. That is a pinhole camera with a shutter, whose photo a lens bends afterwards, so
 it is made from the library with cameras that have no lens, and OpenCV's lens.
 
-`psnr_db`: photos rectified with their true motions against their twins, over the pixels that both show; median and
+`psnr_db`: photos rectified with their true motions against their references, over the pixels that both show; median and
 worst photo. `phi_mrad_per_frame`: largest error of any component of phi, of any photo, of a bundle adjustment of the
 scene's true points, for exact measurements and for noise of 0.3 px; `rms_px` what it leaves. `shift_px`: farthest that
 the two maps are apart in a photo, median and worst. Exits 1 if the undistorted row is not the worse one.
@@ -55,18 +55,18 @@ def remapped(photo: NDArray[Any], maps: Any) -> tuple[NDArray[Any], NDArray[np.b
 
 
 def photos() -> dict[str, Any]:
-    """The rectified photos against their twins, and how far the maps are apart."""
+    """The rectified photos against their references, and how far the maps are apart."""
     truth = read_solution(SCENE / "ground_truth.json")
     decibels: dict[str, list[float]] = {"distorted": [], "undistorted": []}
     apart = []
     for image in truth.images:
         camera, motion = truth.cameras[image.camera_id], image.motion or RowMotion()
-        raw, twin = (cv2.imread(str(SCENE / folder / image.name)) for folder in ("photos", "global"))
-        twin, shown = remapped(twin, init_rectify_map(camera))
+        raw, reference = (cv2.imread(str(SCENE / folder / image.name)) for folder in ("photos", "global"))
+        reference, shown = remapped(reference, init_rectify_map(camera))
         maps = {"distorted": init_rectify_map(camera, motion), "undistorted": bent_afterwards(camera, motion)}
         for key, each in maps.items():
             rectified, seen = remapped(raw, each)
-            decibels[key].append(psnr(rectified, twin, np.where(shown & seen, 255, 0).astype(np.uint8)))
+            decibels[key].append(psnr(rectified, reference, np.where(shown & seen, 255, 0).astype(np.uint8)))
         gap = np.hypot(*(a - b for a, b in zip(*maps.values(), strict=True)))
         apart.append(float(gap[seen].max()))
     psnr_db = {key: {"median": float(np.median(v)), "worst": min(v)} for key, v in decibels.items()}

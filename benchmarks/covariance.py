@@ -4,14 +4,15 @@
 
 Measurements of the points of sample_scenes/courtyard with 0.5 px of noise, drawn anew in each trial; all trials start
 at the truth, so their gauge is the same: the pose of one photo and one coordinate of the farthest centre are held
-there. `phi` and `centres`: spread over the trials by predicted standard deviation; root mean square and range over all
+there. `phi` and `centres`: standard deviation over the trials by the predicted one; root mean square and range over all
 free components (of 200 trials, each has a standard error of 5 %).
 
 Then errors by the deviations that are reported (`BundleOptions.deviations`): root mean square over `--few` trials of
 phi, of their mean over the photos, of the height of the scene (log k) and of the centres. The noise is as said, half as
 large again, or comes with smooth errors of its own size: of the lens, the same in all photos, in waves of a photo's
-width or two, or of the scene, others in each photo. The priors' spreads are estimated; `phi_mrad` is the error of phi
-per frame, `factor` by how much more than 0.5 px the noise was that weighed the measurements against the priors.
+width or two, or of the scene, others in each photo. The priors' standard deviations are estimated; `phi_mrad` is the
+error of phi per frame, `factor` by how much more than 0.5 px the noise was that weighed the measurements against the
+priors.
 """
 
 from __future__ import annotations
@@ -51,9 +52,9 @@ def courtyard(model: str) -> Reconstruction:
 
 
 def ratios(model: str, trials: int) -> dict[str, NDArray[np.float64]]:
-    """Spread over trials by predicted standard deviation, of the free components of phi and of the centres."""
+    """Standard deviation over trials by the predicted one, of the free components of phi and of the centres."""
     exact = courtyard(model)
-    # priors that weigh nothing: with them the spread of the estimates is not the posterior's
+    # priors that weigh nothing: with them the standard deviation of the estimates is not the posterior's
     options = BundleOptions(
         loss="squared", outlier_rounds=0, spread_rounds=0, sigma_px=NOISE_PX, phi_sigma=1e3, velocity_sigma=1e3
     )  # fmt: skip

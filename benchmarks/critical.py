@@ -3,16 +3,16 @@
     python benchmarks/critical.py [still] [nobody] [spread] [fountain] [nw-rsba] [--trials N]
 
 `still`: the level cameras and points of sample_scenes/colonnade, random motions of 0.05 rad a frame, one photo (another
-in each trial) still, which the tool is not told: how often `auto` picks it, or another that moved by less than 1 mrad,
+in each trial) still, which the tool is not given: how often `auto` picks it, or another that moved by less than 1 mrad,
 and the error of the scene's vertical scale, beside that without remedy for both models.
-`nobody`: eleven level photos that all moved: the error that the prior leaves, against spread / sqrt(m), and how often
-it lies within two of the reported standard deviations.
-`spread`: the reported standard deviation of log k against the spread of k over the trials, for cameras that are level,
-tilted by 5, 10 and 20 degrees, and with one photo turned by 90.
-`fountain`: ../shared/photos/fountain-small, photos that turned and travelled but for the first: errors of phi and the
+`nobody`: eleven level photos that all moved: the error that the prior leaves, against its standard deviation / sqrt(m),
+and how often it lies within two of the reported standard deviations.
+`spread`: the reported standard deviation of log k against the scatter of k over the trials, for cameras that are level,
+tilted by 5, 10 and 20 degrees, and with one photo rotated by 90.
+`fountain`: ../shared/photos/fountain-small, photos that rotated and travelled but for the first: errors of phi and the
 rectified photos against the true ones, as they are, with the photo that is found still, and with that named.
-`nw-rsba`: meter and sigma(log k) of that generator's problems (../shared/nw-rsba) by class, how many are flagged, and
-the figures of benchmarks/nw_rsba.py with and without the remedy.
+`nw-rsba`: degeneracy measure and sigma(log k) of that generator's problems (../shared/nw-rsba) by class, how many are
+flagged, and the figures of benchmarks/nw_rsba.py with and without the remedy.
 
 Measurements by `project_rows`, plain NumPy, with noise of 0.5 px. The vertical scale is that of the affine map that
 takes the true points to the found ones best, along the mean y axis, against the root of the scale of area across it.
@@ -82,7 +82,7 @@ def with_motion(scene: Reconstruction, rng: np.random.Generator, still: int | No
     """The scene with random motions and noisy measurements.
 
     With a still photo, the paper's motions: an axis uniform on the sphere, a normal angle. Else every component of phi
-    is normal, with the same spread: what a reported standard deviation assumes.
+    is normal, with the same standard deviation: what a reported standard deviation assumes.
     """
     m = scene.num_images
     phi = rng.normal(0, SIGMA_RAD / np.sqrt(3), (m, 3))
@@ -195,7 +195,8 @@ def trial_spread(arguments: tuple[str, str, int]) -> tuple[float, float]:
     numba.set_num_threads(1)
     kind, model, trial = arguments
     scene = named_scene(kind, num_points=300)
-    # the motion is drawn from the prior in each trial: the posterior's spread is that of the errors over both
+    # the motion is drawn from the prior in each trial: the posterior's standard deviation is that of the errors over
+    # both
     rng = np.random.default_rng([9, trial])
     truth = with_motion(scene, rng, None, model)
     options = replace(options_of("prior"), phi_sigma=SIGMA_RAD / np.sqrt(3))

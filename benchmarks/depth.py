@@ -5,8 +5,8 @@
 `flyover` of sample_scenes and `street` (benchmarks/street.json, rendered here: 5 % of the median depth a frame) are
 solved from their photos and rectified at infinity, on the plane, and as the points; the same with the true motion and
 the renderer's depths says what can be reached. Scenes without translation must not lose by it, also when the
-constant-motion model is forced upon them. PSNR is that against the global-shutter twins, over pixels that are valid in
-all of the compared photos. Exits 1 if a figure is missing, never because one missed its target.
+constant-motion model is forced upon them. PSNR is that against the global-shutter references, over pixels that are
+valid in all of the compared photos. Exits 1 if a figure is missing, never because one missed its target.
 """
 
 from __future__ import annotations
@@ -59,15 +59,15 @@ def against_twins(scene: Path, folders: dict[str, Path]) -> dict[str, list[float
     for image in truth.images:
         if not all((out / "images" / image.name).is_file() for out in folders.values()):
             continue
-        twin = read_photo(scene / "global" / image.name).pixels
+        reference = read_photo(scene / "global" / image.name).pixels
         camera = truth.cameras[image.camera_id]
         masks = [read_photo(out / "masks" / f"{Path(image.name).stem}.png").pixels for out in folders.values()]
         if camera.dist.any():
-            twin, seen = rectify(twin, camera)
+            reference, seen = rectify(reference, camera)
             masks.append(seen)
         for name, out in folders.items():
             pixels = read_photo(out / "images" / image.name).pixels
-            found[name].append(psnr(pixels, twin, np.min(masks, axis=0)))
+            found[name].append(psnr(pixels, reference, np.min(masks, axis=0)))
     return found
 
 
@@ -84,15 +84,15 @@ def reachable(scene: Path) -> None:
         assert image.motion is not None
         assert image.R_cw is not None
         camera, motion = truth.cameras[image.camera_id], image.motion.in_camera(image.R_cw)
-        raw, twin = (read_photo(scene / folder / image.name).pixels for folder in ("photos", "global"))
+        raw, reference = (read_photo(scene / folder / image.name).pixels for folder in ("photos", "global"))
         depth = render_depth(recipe.scene, camera, view.at_once())
         without, seen = rectify(raw, camera, motion, "constant-motion")
         flat, _ = rectify(raw, camera, motion, "constant-motion", depth=Plane([0, 0, 1], float(np.median(depth))))
         whole, mask = rectify(raw, camera, motion, "constant-motion", depth=DepthMap(depth))
         mask = np.minimum(mask, seen)
-        far.append(psnr(without, twin, mask))
-        plain.append(psnr(flat, twin, mask))
-        near.append(psnr(whole, twin, mask))
+        far.append(psnr(without, reference, mask))
+        plain.append(psnr(flat, reference, mask))
+        near.append(psnr(whole, reference, mask))
     show(
         f"{scene.name}, true motion", infinity_db=summary(far), median_depth_db=summary(plain),
         true_depth_db=summary(near),
@@ -127,7 +127,7 @@ def estimated(scene: Path, work: Path) -> None:
 
 
 def forced(scene: Path, work: Path) -> None:
-    """Constant-motion forced on a scene whose camera only turned."""
+    """Constant-motion forced on a scene whose camera only rotated."""
     folders = {depth: work / f"{scene.name}-forced-{depth}" for depth in ("auto", "infinity")}
     options = RunOptions(solve=SolveOptions(shutter_model="constant-motion"))
     solution = run(scene / "photos", folders["auto"], options)

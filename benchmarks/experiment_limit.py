@@ -2,11 +2,12 @@
 
     python benchmarks/experiment_limit.py SCENE.npz [...] [--seeds N] [--trials N]
 
-`oracle` starts the constant-motion model at the true parameters and tells it the true spreads of the motion: the
-posterior mode under the very distribution that the motion was drawn from, which no estimator betters on average (to
-second order in the noise). `ratio_reached` is the error of the paper's RS* over that of constant-motion, which is told
-nothing and starts from the global-shutter solution; `ratio_limit` is RS* over the oracle: what any method could reach.
-Medians over the trials. The same for the variant without translation and the rotation model (`turning_...`).
+`oracle` starts the constant-motion model at the true parameters and gives it the true standard deviations of the
+motion: the posterior mode under the very distribution that the motion was drawn from, which no estimator betters on
+average (to second order in the noise). `ratio_reached` is the error of the paper's RS* over that of constant-motion,
+which is given nothing and starts from the global-shutter solution; `ratio_limit` is RS* over the oracle: what any
+method could reach. Medians over the trials. The same for the variant without translation and the rotation model
+(`turning_...`).
 """
 
 from __future__ import annotations
@@ -38,14 +39,14 @@ def from_global(rough: Reconstruction, options: OneOptions) -> Reconstruction:
 
 
 def oracle(truth: Reconstruction, method: str, options: OneOptions) -> dict[str, float]:
-    """Errors of a model from the truth, with the spreads that the motion was drawn with."""
+    """Errors of a model from the truth, with the standard deviations that the motion was drawn with."""
     # the axis is uniform: a component has a third of the angle's variance
-    told = replace(
+    given = replace(
         method_options(method, options),
         phi_sigma=options.rotation_rad / np.sqrt(3.0),
         velocity_sigma=max(options.translation, 1e-6),
     )
-    return errors_of(bundle_adjust(truth, method, told).reconstruction, truth)
+    return errors_of(bundle_adjust(truth, method, given).reconstruction, truth)
 
 
 def trial_errors(scene: KnownScene, method: str, options: OneOptions, trial: int) -> dict[str, dict[str, float]]:

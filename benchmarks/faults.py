@@ -3,7 +3,7 @@
     python benchmarks/faults.py [--only WORD]
 
 Each row is a command with something wrong about the machine: `rectify` on the sample scene `courtyard`, `run` on five
-of its photos at half size. It tells the exit code, how long it took, and the last line on stderr. Disks that are full
+of its photos at half size. It prints the exit code, how long it took, and the last line on stderr. Disks that are full
 or cannot be written are small ones of memory (tmpfs), which only root may mount; without it those rows are left out,
 and said to be. Exits 1 if an exit code is another one than documented, or more than one line is an error, or anything
 looks like a traceback or a native stack.

@@ -231,7 +231,7 @@ def memory(photos: Path) -> list[str]:
 
 
 def survey(folder: Path, num: int) -> None:
-    """Photos of a drone that flies to and fro over hills, each turned a little during its readout; and camera.json.
+    """Photos of a drone that flies to and fro over hills, each rotated a little during its readout; and camera.json.
 
     The ground is noise of all sizes, so nothing looks like anything else. A ray meets the hills where it meets the
     level of the place before; their slopes are gentle, so a few such steps settle.
@@ -296,7 +296,7 @@ def large(num: int = 500, few: int = 125) -> list[str]:
 def warped(photos: Path) -> None:
     """Rotation errors of warped photos, whose lens is found from EXIF, as that of the photos as they are was.
 
-    They are warped by the camera that was found there, or the warp would not be that of a turning camera. What remains
+    They are warped by the camera that was found there, or the warp would not be that of a rotating camera. What remains
     where the true motions are given, and between photos that went through the same remap and encoder without any
     motion, is not the shutter's.
     """
@@ -338,7 +338,7 @@ def warped(photos: Path) -> None:
 
 
 def common_turn_off(solution: Any, reference: Any) -> dict[str, float]:
-    """Rotation errors in degrees less what all cameras are turned by in their own frames: another principal point."""
+    """Rotation errors in degrees less what all cameras are rotated by in their own frames: another principal point."""
     theirs = {image.name: image.R_cw for image in reference.registered}
     both = [(image.R_cw, theirs[image.name]) for image in solution.registered if image.name in theirs]
     R, R_true = (np.array(each) for each in zip(*both, strict=True))

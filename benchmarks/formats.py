@@ -31,7 +31,7 @@ from rsundistort.solve import OutputOptions
 
 SCENE = Path(__file__).resolve().parent.parent / "sample_scenes" / "courtyard"
 
-# In orthority's environment: all photos in its world, which turns ours by the map's convergence.
+# In orthority's environment: all photos in its world, which rotates ours by the map's convergence.
 _READER = """
 import csv, json, sys
 import cv2, numpy as np

@@ -7,8 +7,8 @@ Prints one JSON object a line and at the end a table with targets. Parts, with t
     nothing-invented  photos without rolling shutter (dslr, herz-jesus-8), and with a weak one (phone, lund, iphone6)
     suppressed (2)    herz-jesus-8 warped by 0.003 to 0.05 rad: what is found of it, and what the photos are worth
     coverage (10)     errors in units of the standard deviations that are reported: their root mean square is to be 1
-    better (5)        dB and degrees, of photos of a camera that turned, and of one that turned and travelled
-    directions        what is said of the axis of the readout where nobody tells it
+    better (5)        dB and degrees, of photos of a camera that rotated, and of one that rotated and travelled
+    directions        what is said of the axis of the readout where nobody specifies it
     strong (3)        herz-jesus-8 warped by 0.2 and 0.3 rad: no photo a degree wrong in a scene that is to be trusted
 
 Cameras are "given", the camera.json; "guessed", its focal length 5 % off and no lens, refined under the prior of EXIF's
@@ -130,7 +130,7 @@ class Bench:
 
     @contextmanager
     def case(self, name: str) -> Iterator[None]:
-        """What crashes in here is told, and the rest goes on."""
+        """What crashes in here is reported, and the rest goes on."""
         try:
             yield
         except Exception as error:
@@ -285,7 +285,7 @@ def better(bench: Bench) -> None:
             truth, still = warp / "ground_truth.json", bench.still().out / "solution.json"
             found = rs.evaluate(ran[-1].out, truth, poses=still, twins=bench.photos / HERZ)
             psnr_db += found.psnr_db.photos.values()
-            # the same against twins without the lens that was found: the calibration is no truth to a tenth of a pixel
+            # the same against references without the lens that was found: the calibration is not true to 0.1 px
             own = rs.evaluate(ran[-1].out, with_lens_of(ran[-1].out, truth), twins=bench.photos / HERZ)
             own_lens_db += own.psnr_db.photos.values()
             show(f"{name}, seed {seed}", **ran[-1].facts, **brief(found), own_lens_db=brief(own)["psnr_db"])
@@ -304,7 +304,7 @@ def better(bench: Bench) -> None:
 
 
 def directions(bench: Bench) -> None:
-    """Axes of the readout where nobody tells them; the DSLR has none, and the phone's photos are stored upright."""
+    """Axes of the readout where nobody specifies them; the DSLR has none, and the phone's photos are stored upright."""
     value = json.loads((SCENES / "handheld" / "cameras.json").read_text())
     axes = {key: READOUTS[each.pop("readout")][0] for key, each in value["cameras"].items()}
     withheld, handheld = bench.written(value), SCENES / "handheld" / "photos"

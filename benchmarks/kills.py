@@ -67,7 +67,7 @@ def visible(out: Path) -> dict[str, Path]:
 
 
 def comparable(path: Path) -> bytes:
-    """The content without the times that it tells."""
+    """The content without the times in it."""
     data = path.read_bytes()
     if path.name == "solution.json":
         value = json.loads(data)
@@ -75,7 +75,7 @@ def comparable(path: Path) -> bytes:
             stage.pop("seconds")
         return json.dumps(value, sort_keys=True).encode()
     if path.name == "report.html":
-        return re.sub(rb"\d+(\.\d+)? (s|min)\b", b"", data)
+        return re.sub(rb"(\d+(\.\d+)? (s|min|h)\b *)+", b"", data)
     return data
 
 
@@ -186,12 +186,12 @@ def problem_of(code: int, said: str) -> str:
     errors = [line for line in said.splitlines() if line.strip() and not line.startswith("warning: ")]
     if code in (0, -signal.SIGKILL):
         return " | ".join(errors)
-    told = len(errors) == 1 and errors[0].startswith("stopped; ")
+    printed = len(errors) == 1 and errors[0].startswith("stopped; ")
     # a signal may come before the command hears any; and one that comes in an `exec`, as imports have them, makes
     # Python end by SIGINT itself, which shells call 130, too
-    if (code == -signal.SIGTERM and not errors) or (code == -signal.SIGINT and (told or not errors)):
+    if (code == -signal.SIGTERM and not errors) or (code == -signal.SIGINT and (printed or not errors)):
         return ""
-    if code in (128 + signal.SIGTERM, 128 + signal.SIGINT) and told:
+    if code in (128 + signal.SIGTERM, 128 + signal.SIGINT) and printed:
         return ""
     return f"exit code {code}: {' | '.join(errors)[-300:]}"
 

@@ -1,4 +1,4 @@
-"""What `honest.py` measures: errors over the deviations that are reported, photos against twins; and truths."""
+"""What `honest.py` measures: errors over the deviations that are reported, photos against references; and truths."""
 
 from __future__ import annotations
 
@@ -45,7 +45,8 @@ def normalised_errors(
     Parameters
     ----------
     solution, truth : Solution
-        The truth has motions and poses of all photos that joined; the centres are aligned by the best similarity.
+        The truth has motions and poses of all photos that are registered; the centres are aligned by the best
+        similarity.
     sigmas : mapping of quantity to array, optional
         Standard deviations, before those that the solution has: of phi and mean_phi in radians per frame, of center in
         the solution's frame and after that similarity, of log_k as `log_k_error` says.
@@ -92,7 +93,7 @@ def run_options(**given: Any) -> RunOptions:
 def library_sigmas(result: BundleResult, remedy: Remedy | None, options: BundleOptions) -> dict[str, Any]:
     """Deviations that are not in solution.json, as `normalised_errors` takes them, photos in the order of their names.
 
-    `options` are those of the adjustments; of an anchor that was added to them `remedy` knows.
+    `options` are those of the adjustments; of a constraint that was added to them `remedy` knows.
     """
     rec = result.reconstruction
     if rec.shutter_model == "global":
@@ -109,7 +110,7 @@ def library_sigmas(result: BundleResult, remedy: Remedy | None, options: BundleO
     each = np.zeros((3 * m, m, nb))
     each[:, :, 3:6] = np.eye(3 * m).reshape(3 * m, m, 3)
     covariance = posterior.of_photos(each)[:, :, 3:6].reshape(3 * m, 3 * m)
-    # the best similarity takes off what moves, turns or scales all centres together
+    # the best similarity takes off what moves, rotates or scales all centres together
     moves = np.linalg.qr(gauge_directions(result)[:, :, 3:6].reshape(7, -1).T)[0]
     free = np.eye(3 * m) - moves @ moves.T
     center = np.sqrt(np.diag(free @ covariance @ free)).reshape(m, 3)
@@ -156,10 +157,10 @@ def log_k_error(rec: Reconstruction, truth: Solution) -> float:
 
 
 def against_twins(out: Path, solution: Solution, truth: Solution, twins: Path) -> dict[str, float]:
-    """Rectified photos against twins that are turned as the solution's pose has them, for a lens that was solved for.
+    """Rectified photos against references rotated as the solution's pose has them, for a lens that was solved for.
 
-    A principal point that is off is a pose that is turned, and no error of the photo: so each twin is seen by the
-    solution's camera, turned by what fits the true directions of its pixels best. `psnr_db` is the median over the
+    A principal point that is off is a pose that is rotated, and no error of the photo: so each reference is seen by the
+    solution's camera, rotated by what fits the true directions of its pixels best. `psnr_db` is the median over the
     photos, `left_px` that of the root mean square by which pixels are out of place. The true camera has no lens.
     """
     decibels, left = [], []
@@ -181,22 +182,24 @@ def against_twins(out: Path, solution: Solution, truth: Solution, twins: Path) -
         mask = read_photo(out / "masks" / f"{Path(image.name).stem}.png").pixels
         pair = read_photo(twins / image.name).pixels, np.full(mask.shape, 255, np.uint8)
         how = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-        twin, seen = (cv2.warpPerspective(each, turn, mask.shape[::-1], flags=how) for each in pair)
-        decibels.append(psnr(read_photo(out / "images" / image.name).pixels, twin, np.minimum(mask, seen) // 255 * 255))
+        reference, seen = (cv2.warpPerspective(each, turn, mask.shape[::-1], flags=how) for each in pair)
+        decibels.append(
+            psnr(read_photo(out / "images" / image.name).pixels, reference, np.minimum(mask, seen) // 255 * 255)
+        )
     return {"psnr_db": round(float(np.median(decibels)), 2), "left_px": round(float(np.median(left)), 3)}
 
 
 def with_lens_of(out: Path, truth: Path) -> Path:
-    """A truth file, written beside another, with the cameras that a run found: twins then have that lens taken out.
+    """A truth file, written beside another, with the cameras that a run found, so that references lose that lens.
 
-    What photos lose against such twins is not the doing of a lens that was calibrated otherwise.
+    What photos lose against such references is not the doing of a lens that was calibrated otherwise.
     """
-    told, found = (json.loads(path.read_text()) for path in (truth, out / "solution.json"))
+    content, found = (json.loads(path.read_text()) for path in (truth, out / "solution.json"))
     own = {each["name"]: each["camera_id"] for each in found["images"]}
-    told |= {key: found[key] for key in ("cameras", "rectified_cameras")}
-    told["images"] = [each | {"camera_id": own[each["name"]]} for each in told["images"]]
+    content |= {key: found[key] for key in ("cameras", "rectified_cameras")}
+    content["images"] = [each | {"camera_id": own[each["name"]]} for each in content["images"]]
     path = truth.with_name(f"{truth.stem}-lens-of-{out.name}.json")
-    path.write_text(json.dumps(told))
+    path.write_text(json.dumps(content))
     return path
 
 

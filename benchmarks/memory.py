@@ -3,7 +3,7 @@
     python benchmarks/memory.py
 
 Photos of 12 megapixels, each in a fresh process on one thread: decoded, rectified and encoded again, by kind of file;
-and its features. It is the peak less what the process held before, which Linux tells; `reckoned` is what the batches
+and its features. It is the peak less what the process held before, which Linux reports; `reckoned` is what the batches
 reckon with (`pipeline/write.py`, `sfm/features.py`). Exits 1 if one crashes.
 """
 

@@ -4,8 +4,8 @@
 
 DIR holds general.npz, near-parallel.npz, parallel.npz of twenty problems each. Default options, no knowledge of the
 true motion. Medians; points: rms after the similarity that best aligns the points, in scene units; rotation (mean
-angle) and centres (rms) after the similarity that best aligns the centres. `--spread` multiplies the spreads that the
-estimate of the priors starts from.
+angle) and centres (rms) after the similarity that best aligns the centres. `--spread` multiplies the standard
+deviations that the estimate of the priors starts from.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
     python benchmarks/picture.py [--photo NAME] [--figure FILE]
 
-Runs `rsundistort run` on sample_scenes/courtyard, and beside the photo and its rectified twin shows points and cameras,
-those of a global-shutter reconstruction of the same photos in grey. Needs matplotlib.
+Runs `rsundistort run` on sample_scenes/courtyard, and beside the photo and its rectified reference shows points and
+cameras, those of a global-shutter reconstruction of the same photos in grey. Needs matplotlib.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
     python benchmarks/self_calibration.py [--photos DIR] [--seeds N] [--names lund iphone6]
 
 COLMAP (its features, its matching, its mapping from EXIF's focal length with f and k1 free) maps the photos once for
-each seed; its own spread over seeds is what its answer is worth. Ours is the rotation model with f, k1 and k2 refined,
+each seed; its own scatter over seeds is what its answer is worth. Ours is the rotation model with f, k1 and k2 refined,
 as `run` does it. On the same measurements: what f a global shutter would have them say (`f_of_global_shutter`), and how
 much worse the shutter model fits, in standard errors over the points, when f is held at COLMAP's median or at that of a
 global shutter. The standard deviations of the mean of phi1, with f free and with f known, say whether shutter and lens

@@ -28,7 +28,7 @@ def zoomed(camera: Camera) -> Camera:
 
 
 def rotations_by_truth(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotations (m, 3, 3) of a rendered clip's frames, and how each turns while it is read, (m, 3) per frame."""
+    """Rotations (m, 3, 3) of a rendered clip's frames, and how each rotates while it is read, (m, 3) per frame."""
     truth = read_solution(folder / "ground_truth.json")
     span = truth.cameras["1"].frame_span
     images = [image for image in truth.images if image.R_cw is not None and image.motion is not None]
@@ -62,9 +62,9 @@ def stabilise(
     video: Path, out: Path, camera: Camera, R_cw: NDArray[np.float64], frames: float = 12.0,
     phi: NDArray[np.float64] | None = None,
 ) -> None:  # fmt: skip
-    """Write a clip whose frames turn smoothly, by the rotations (m, 3, 3) that they had.
+    """Write a clip whose frames rotate smoothly, by the rotations (m, 3, 3) that they had.
 
-    Each is turned as a whole; with the turns `phi` (m, 3) radians per frame its shutter is taken out before.
+    Each is rotated as a whole; with the rotations `phi` (m, 3) radians per frame its shutter is taken out before.
     """
     smooth = _smoothed(R_cw, frames)
     new, span = zoomed(camera), camera.frame_span

@@ -7,11 +7,14 @@ Prints one JSON object a line and at the end a table. Parts:
 
     sets      herz-jesus-8 and dslr warped by --rad (0.10, 0.15, 0.20, 0.30) radians a frame (standard deviation of
               each component of phi): photos registered, those that are wrong by more than 1 degree against the photos
-              as they are, errors of the rotations, dB against twins with the lens that was found. A warp whose rows
+              as they are, errors of the rotations, dB against references with the lens found. A warp whose rows
               fold over is no photo that a camera can take: its seed is passed over, and said
     pairs     relative poses of all pairs of the same warps, and of the photos as they are: area under the curve of the
               larger of the errors of rotation and direction up to 5 degrees, on the same matches, of five points
               (OpenCV's USAC, 4 px), of pycolmap, and ours
+    limit     the bound that the measurements of a set impose: those of the photos as they are, each moved as the warp
+              moves it, adjusted from the true poses and motions with the intrinsics in the estimate. No match is lost
+              or wrong; rotations and dB as above
     fountain  fountain-small with its velocity three times as large
 
 Exits 1 if one crashes, never because a figure misses its target (photos right >= 90 %, none wrong and not named; 0.1
@@ -21,14 +24,17 @@ deg and 38 dB up to 0.20).
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import sys
 import tempfile
 import time
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -38,8 +44,10 @@ from scipy.spatial.transform import Rotation
 import rsundistort as rs
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
+from rsundistort.bundle import bundle_adjust
 from rsundistort.colmap.conventions import quiet_pycolmap
 from rsundistort.errors import InputError
+from rsundistort.evaluation import psnr
 from rsundistort.input.load import load_photos
 from rsundistort.io import read_photo
 from rsundistort.sfm import match_photos
@@ -48,7 +56,7 @@ from rsundistort.sfm.relative_pose import Pair, View, relative_poses
 from rsundistort.simulate import WarpOptions, simulate_warp
 
 ROOT = Path(__file__).resolve().parent.parent
-PARTS, SETS, RADIANS = ("sets", "pairs", "fountain"), ("herz-jesus-8", "dslr"), (0.10, 0.15, 0.20, 0.30)
+PARTS, SETS, RADIANS = ("sets", "pairs", "limit", "fountain"), ("herz-jesus-8", "dslr"), (0.10, 0.15, 0.20, 0.30)
 COLUMNS = ("set", "rad", "seed", "joined", "right", "wrong", "deg", "worst", "dB", "least", "before", "s")
 WRONG_DEG, AUC_DEG, LEAST_MATCHES = 1.0, 5.0, 30
 
@@ -59,18 +67,21 @@ def show(name: str, **figures: Any) -> None:
 
 
 def rotation_errors(solution: rs.Solution, still: rs.Solution) -> dict[str, float]:
-    """Degrees by photo, after the common rotation that most photos agree on: a wrong one does not move the others."""
+    """Degrees by photo, see `rotations_off`."""
     truth = {image.name: image.R_cw for image in still.registered}
     images = [image for image in solution.registered if image.name in truth]
-    steps = Rotation.from_matrix(np.array([truth[image.name].T @ image.R_cw for image in images]))
+    errors = rotations_off([image.R_cw for image in images], [truth[image.name] for image in images])
+    return dict(zip([image.name for image in images], errors.tolist(), strict=True))
+
+
+def rotations_off(R_cw: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> np.ndarray:
+    """Degrees, after the common rotation that most photos agree on: a wrong one does not move the others."""
+    steps = Rotation.from_matrix(np.einsum("mji,mjk->mik", np.array(truth), np.array(R_cw)))
     common = steps.mean()
     for _ in range(50):
         off = (steps * common.inv()).magnitude()
         common = steps.mean(1.0 / np.maximum(off, 1e-4))
-    return {
-        image.name: float(np.degrees(error))
-        for image, error in zip(images, (steps * common.inv()).magnitude(), strict=True)
-    }
+    return np.degrees((steps * common.inv()).magnitude())
 
 
 class Bench:
@@ -81,12 +92,21 @@ class Bench:
         self.rows: list[tuple[str, ...]] = []
         self.failed: list[str] = []
         self._still: dict[str, rs.Solution] = {}
+        self._measured: dict[str, tuple[rs.Reconstruction, rs.BundleOptions]] = {}
 
     def still(self, name: str) -> rs.Solution:
         """Solution of the photos as they are."""
         if name not in self._still:
-            out = self.work / f"{name}-still"
-            self._still[name] = rs.run(self.photos / name, out, run_options(shutter_model="global"))
+            out, module = self.work / f"{name}-still", importlib.import_module("rsundistort.solve.run")
+            solve = module.solve_photos
+
+            def kept(*args: Any, **more: Any) -> Any:
+                solved = solve(*args, **more)
+                self._measured[name] = solved.shared, args[3](solved.shared)
+                return solved
+
+            with mock.patch.object(module, "solve_photos", kept):
+                self._still[name] = rs.run(self.photos / name, out, run_options(shutter_model="global"))
         return self._still[name]
 
     def warped(self, name: str, radians: float, seed: int) -> Path | None:
@@ -136,6 +156,44 @@ class Bench:
             f"{found.psnr_before_db.median:.1f}", f"{seconds:.0f}",
         ))  # fmt: skip
 
+    def limit(self, name: str, radians: float, seed: int) -> None:
+        """The adjustment of right matches alone."""
+        self.still(name)
+        rec, options = self._measured[name]
+        phi, xy = np.zeros((len(rec.image_names), 3)), rec.observations.xy_raw.copy()
+        rng, camera_of = np.random.default_rng(seed), [rec.cameras[k] for k in rec.camera_idx]
+        for f, mine in enumerate(rec.observations.by_photo(len(phi))):
+            ideal = rs.undistort_points(xy[mine], camera_of[f], P=camera_of[f].K)
+            moved = np.full_like(ideal, np.nan)
+            while np.isnan(moved).any():  # rows that fold over
+                phi[f] = rng.normal(0.0, radians, 3) / camera_of[f].frame_span
+                moved = rs.distort_points(ideal, camera_of[f], rs.RowMotion(phi[f]), P=camera_of[f].K)
+            xy[mine] = moved
+        sizes = np.array([(camera.width, camera.height) for camera in camera_of])[rec.observations.frame_idx]
+        inside = ((xy > -0.5) & (xy < sizes - 0.5)).all(axis=1)
+        observations = replace(rec.observations, xy_raw=xy).select(inside)
+        start = replace(rec, observations=observations, phi=phi, shutter_model="rotation")
+        # the exposure of the photos as they are does not bound what moves them here
+        free = replace(options, phi_limits={}, phi_sigma_most=None, velocity_sigma_most=None)
+        found = bundle_adjust(start, "rotation", free).reconstruction
+        errors = rotations_off(found.R_cw, rec.R_cw)
+        dB = [
+            _psnr_between(
+                read_photo(self.photos / name / photo).pixels, found.cameras[found.camera_idx[f]],
+                rs.RowMotion(found.phi[f]), rs.RowMotion(phi[f]),
+            )
+            for f, photo in enumerate(rec.image_names)
+        ]  # fmt: skip
+        show(
+            f"limit of {name} by {radians}, seed {seed}", photos=len(phi), measurements=len(observations),
+            median_deg=round(float(np.median(errors)), 4), max_deg=round(float(errors.max()), 4),
+            dB=round(float(np.median(dB)), 2), least_dB=round(min(dB), 2),
+        )  # fmt: skip
+        self.rows.append((
+            f"limit, {name}", str(radians), str(seed), f"{len(phi)}", "", "", f"{np.median(errors):.3f}",
+            f"{errors.max():.3f}", f"{np.median(dB):.1f}", f"{min(dB):.1f}",
+        ))  # fmt: skip
+
     def pairs(self, name: str, radians: float, seed: int) -> None:
         """Relative poses of all pairs of one warp."""
         folder = self.photos / name if radians == 0 else self.warped(name, radians, seed)
@@ -181,6 +239,19 @@ class Bench:
             seconds_a_pair=round(seconds / len(pairs), 3),
         )  # fmt: skip
         self.rows.append(("pairs", str(radians), str(seed), name, *(f"{key} {value}" for key, value in auc.items())))
+
+
+def _psnr_between(pixels: np.ndarray, camera: rs.Camera, found: rs.RowMotion, true: rs.RowMotion) -> float:
+    """What is left of a photo in dB where a rectification takes one motion for another."""
+    step, (height, width) = 16, pixels.shape[:2]
+    grid = np.stack(np.meshgrid(np.arange(0, width, step), np.arange(0, height, step)), axis=2).astype(float)
+    shown = rs.distort_points(grid.reshape(-1, 2), camera, true, P=camera.K)
+    shift = (rs.undistort_points(shown, camera, found, P=camera.K) - grid.reshape(-1, 2)).reshape(grid.shape)
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    dx, dy = (cv2.remap(shift[..., k].astype(np.float32), x / step, y / step, cv2.INTER_LINEAR) for k in range(2))
+    moved = cv2.remap(pixels, x + dx, y + dy, cv2.INTER_LANCZOS4, borderValue=(0, 0, 0))
+    inside = (x + dx > 1) & (x + dx < width - 2) & (y + dy > 1) & (y + dy < height - 2)
+    return float(psnr(moved, pixels, np.where(inside, 255, 0).astype(np.uint8)))
 
 
 def _ideal(view: View) -> np.ndarray:
@@ -303,6 +374,9 @@ def main() -> int:
             for radians in (0.0, 0.05, *args.rad) if "pairs" in args.only else ():
                 for seed in seeds if radians else (0,):
                     bench.pairs(name, radians, seed)
+            for radians in (0.02, *args.rad) if "limit" in args.only else ():
+                for seed in seeds:
+                    bench.limit(name, radians, seed)
         if "fountain" in args.only:
             fountain(bench)
     rows = [COLUMNS, *bench.rows]

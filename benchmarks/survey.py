@@ -9,8 +9,9 @@ their standard deviations, the share within two of these, and the speed; once wi
 without, over N flights.
 `rendered`: its rendered photos with that in EXIF and XMP, through `run`, in EPSG:32632; `exact`: the same check points
 surveyed and pointed at without an error; `floor_m`: what survey and pointing alone leave, in true cameras.
-`drone`: ../shared/photos/drone, GPS of a fixed-wing drone: residuals of positions, heights above the ground and against
-those of the XMP (above the place of take-off), and how well the frame is known.
+`drone`: ../shared/photos/drone, GPS of a fixed-wing drone: residuals of positions, heights against those of the XMP
+(above the place of take-off, used as priors) and against GPS's (used for their level only), and how well the frame is
+known.
 """
 
 from __future__ import annotations
@@ -56,13 +57,13 @@ def facts_of(flight: Flight, **options: Any) -> list[Any]:
     return [replace(f, fix=replace(f.fix, altitude_m=f.fix.altitude_m + OFFSET_M)) for f in flight.facts(**options)]
 
 
-def check_figures(told: list[dict[str, Any]], exact: bool = False) -> dict[str, Any]:
+def check_figures(georeferenced: list[dict[str, Any]], exact: bool = False) -> dict[str, Any]:
     """What check points of georeferences come to."""
-    named = [item for one in told for item in one["control"].items()]
+    named = [item for one in georeferenced for item in one["control"].items()]
     checks = [each for name, each in named if each["use"] == "check" and name.endswith("exact") == exact]
     off = np.array([each["residual_m"] for each in checks])
     deviations = off / [each["sigma_m"] for each in checks]
-    speeds = [each["speed_m_s"] for one in told for each in one["speeds"].values()]
+    speeds = [each["speed_m_s"] for one in georeferenced for each in one["speeds"].values()]
     return {
         "check_points": len(checks),
         "rms_m": np.sqrt(np.mean(off**2, axis=0)).round(4).tolist(),
@@ -75,13 +76,13 @@ def check_figures(told: list[dict[str, Any]], exact: bool = False) -> dict[str, 
 
 def flights(trials: int) -> None:
     for speed_sigma in (0.2, None):
-        told = []
+        georeferenced = []
         for seed in range(trials):
             flight = Flight(seed=seed)
             solved = flight.solved(facts_of(flight, speed_sigma=speed_sigma), CRS, flight.control(of_place=in_utm))
             found = solution_of(with_readout(solved, READOUT_S), SolveOptions(), RectifyOptions()).georeference
-            told.append(found)
-        print(json.dumps({"flights": trials, "gps_velocity": speed_sigma is not None, **check_figures(told)}))
+            georeferenced.append(found)
+        print(json.dumps({"flights": trials, "gps_velocity": speed_sigma is not None, **check_figures(georeferenced)}))
 
 
 def with_position(photo: bytes, fact: Any) -> bytes:
@@ -139,26 +140,31 @@ def rendered(work: Path) -> None:
     control = read_control_points(work / "gcp.csv")
     solve = SolveOptions(crs=CRS, control=control, readout_s=READOUT_S)
     run(work / "photos", work / "out", RunOptions(solve=solve, outputs=OutputOptions(report=True)), overwrite=True)
-    told = read_solution(work / "out" / "solution.json").georeference
-    assert told is not None
-    figures = {"rendered": check_figures([told]), "exact": check_figures([told], exact=True), "floor_m": floor()}
-    print(json.dumps({**figures, "gps_offset_m": told["gps"]["offset_m"], "sigma": told["sigma"]}))
+    georeferenced = read_solution(work / "out" / "solution.json").georeference
+    assert georeferenced is not None
+    figures = {
+        "rendered": check_figures([georeferenced]),
+        "exact": check_figures([georeferenced], exact=True),
+        "floor_m": floor(),
+    }
+    print(json.dumps({**figures, "gps_offset_m": georeferenced["gps"]["offset_m"], "sigma": georeferenced["sigma"]}))
 
 
 def drone(work: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         solution = run(DRONE, work / "drone", RunOptions(outputs=OutputOptions(report=True)), overwrite=True)
-    told = solution.georeference
-    assert told is not None
-    gps = told["gps"]
-    height, above = [], []
+    georeferenced = solution.georeference
+    assert georeferenced is not None
+    gps = georeferenced["gps"]
+    height, above, altitude = [], [], []
     for image in solution.registered:
         fix = read_exif(DRONE / image.name).fix
         if fix is not None and fix.height_m is not None:
             height.append(fix.height_m)
             above.append(image.center_w[2])
-    apart = np.array(above) - height
+            altitude.append(fix.altitude_m)
+    apart, apart_of_gps = np.array(above) - height, np.array(above) - altitude
     print(
         json.dumps(
             {
@@ -166,11 +172,12 @@ def drone(work: Path) -> None:
                 "median_m": round(gps["median_m"], 2),
                 "rms_axes_m": np.round(gps["rms_axes_m"], 2).tolist(),
                 "outliers": gps["outliers"],
-                "sigma_place_m": np.round(told["sigma"]["place_m"], 2).tolist(),
-                "sigma_scale": round(told["sigma"]["scale"], 4),
+                "sigma_place_m": np.round(georeferenced["sigma"]["place_m"], 2).tolist(),
+                "sigma_scale": round(georeferenced["sigma"]["scale"], 4),
                 "height_above_take_off_m": [round(min(height), 1), round(max(height), 1)],
                 "heights_apart_m": round(float(np.std(apart)), 2),
-                "notes": told["notes"],
+                "altitudes_apart_m": round(float(np.std(apart_of_gps)), 2),
+                "notes": georeferenced["notes"],
             }
         )
     )

@@ -4,9 +4,9 @@
 
 Photos that were simulated and rectified with their TRUE motion must come back to what no shutter bent: real photos
 (herz-jesus-8 in the folder of test photos, default ../shared/photos) warped by `simulate warp`, and every folder of
-sample_scenes against its twins. What is lost here no solution can win back. Then: whether the sample scenes are what
-their recipes make (one photo of each and its twin; --all: every file), and how long rendering takes. Targets are
-printed beside the figures; a figure that misses its target is not an error of the program.
+sample_scenes against its references. What is lost here no solution can win back. Then: whether the sample scenes are
+what their recipes make (one photo of each and its reference; --all: every file), and how long rendering takes. Targets
+are printed beside the figures; a figure that misses its target is not an error of the program.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ def median_and_worst(values: list[float]) -> dict[str, float]:
     return {"median": round(float(np.median(values)), 2), "worst": round(float(np.min(values)), 2)}
 
 
-def against_twin(raw: np.ndarray, twin: np.ndarray, camera: Camera, motion: RowMotion) -> float:
-    """PSNR in dB, over valid pixels, of a photo freed of shutter and lens against its twin freed of the lens."""
+def against_twin(raw: np.ndarray, reference: np.ndarray, camera: Camera, motion: RowMotion) -> float:
+    """PSNR in dB, over valid pixels, of a photo freed of shutter and lens against its reference freed of the lens."""
     rectified, mask = rectify(raw, camera, motion)
     if not camera.is_pinhole:
-        twin, seen = rectify(twin, camera)
+        reference, seen = rectify(reference, camera)
         mask = np.minimum(mask, seen)
-    return psnr(rectified, twin, mask)
+    return psnr(rectified, reference, mask)
 
 
 def warped_photos(photos: Path, work: Path, seeds: int) -> None:
@@ -79,14 +79,14 @@ def warped_photos(photos: Path, work: Path, seeds: int) -> None:
 
 
 def scene_twins(scene: Path, truth: Solution) -> None:
-    """Photos of a sample scene, rectified with their true motion, against their twins."""
+    """Photos of a sample scene, rectified with their true motion, against their references."""
     after, before, moving = [], [], []
     for image in truth.images:
         assert image.motion is not None
         camera = truth.cameras[image.camera_id]
-        raw, twin = (read_photo(scene / folder / image.name).pixels for folder in ("photos", "global"))
-        after.append(against_twin(raw, twin, camera, image.motion))
-        before.append(against_twin(raw, twin, camera, RowMotion()))
+        raw, reference = (read_photo(scene / folder / image.name).pixels for folder in ("photos", "global"))
+        after.append(against_twin(raw, reference, camera, image.motion))
+        before.append(against_twin(raw, reference, camera, RowMotion()))
         if image.motion.velocity.any():
             moving.append(image.name)
     show(
@@ -107,8 +107,8 @@ def turning_twins(scene: Path, truth: Solution, photos: int = 3) -> None:
     for view in (recipe.views[number] for number in bent[:photos]):
         camera, motion = recipe.camera(view), RowMotion(phi=view.motion.phi)
         raw = render_view(recipe.scene, camera, replace(view, motion=motion), **recipe.render_options)
-        twin = render_view(recipe.scene, camera, view.at_once(), **recipe.render_options)
-        after.append(against_twin(raw, twin, camera, motion))
+        reference = render_view(recipe.scene, camera, view.at_once(), **recipe.render_options)
+        after.append(against_twin(raw, reference, camera, motion))
     show(
         f"{scene.name} rendered without its translation, true rotation against the twins",
         psnr_db=median_and_worst(after),
@@ -118,7 +118,7 @@ def turning_twins(scene: Path, truth: Solution, photos: int = 3) -> None:
 
 
 def clip_twins(scene: Path, truth: Solution) -> None:
-    """Frames of a clip, rectified with their true motion and depth, against the twins; and what the coding costs."""
+    """Frames of a clip, rectified with true motion and depth, against the references; and what the coding costs."""
     recipe, after, before, coded = load_recipe(scene / "recipe.json"), [], [], []
     with tempfile.TemporaryDirectory() as work:
         frames = Path(work) / "frames"
@@ -128,12 +128,12 @@ def clip_twins(scene: Path, truth: Solution) -> None:
             assert image.motion is not None
             assert image.R_cw is not None
             raw = read_photo(frames / view.name).pixels
-            twin = read_photo((scene / "global" / view.name).with_suffix(".jpg")).pixels
+            reference = read_photo((scene / "global" / view.name).with_suffix(".jpg")).pixels
             depth = DepthMap(render_depth(recipe.scene, camera, view.at_once()))
             motion = image.motion.in_camera(image.R_cw)
             rectified, mask = rectify(raw, camera, motion, "constant-motion", depth=depth)
-            after.append(psnr(rectified, twin, mask))
-            before.append(psnr(raw, twin, mask))
+            after.append(psnr(rectified, reference, mask))
+            before.append(psnr(raw, reference, mask))
             coded.append(psnr(raw, render_view(recipe.scene, camera, view, **recipe.render_options)))
     show(
         f"{scene.name}, true motion and depth against the twins",
@@ -145,7 +145,7 @@ def clip_twins(scene: Path, truth: Solution) -> None:
 
 
 def made_again(scene: Path, folder: Path) -> None:
-    """One photo of a sample scene, the one that the shutter bent most, and its twin, as the recipe makes them now."""
+    """One photo of a sample scene, the most bent one, and its reference, as the recipe renders them now."""
     recipe, truth = load_recipe(scene / "recipe.json"), read_solution(scene / "ground_truth.json")
     number = int(np.argmax([image.rs_shift_px or 0.0 for image in truth.images]))
     view = recipe.views[number]

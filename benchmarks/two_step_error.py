@@ -5,8 +5,8 @@
 Needs matplotlib (`pip install rsundistort[figures]`); half a minute. docs/two-step.md explains the figures.
 
 A camera without lens distortion, 1000 px wide, 3:2, sees a grid of directions that fills its photo. Its shutter runs
-top to bottom while it turns about a random axis. Where it shows the directions is computed with the exact rotation and
-with the two-step model, which is given
+top to bottom while it rotates about a random axis. Where it shows the directions is computed with the exact rotation
+and with the two-step model, which is given
 
 - `same_phi`: the true phi;
 - `fitted`: the phi that brings the two closest, by least squares over the grid: what a solver would find whose poses

@@ -7,8 +7,8 @@ Prints one JSON object a line and at the end a table with targets. Parts, with t
     changing (3)   herz-jesus-8 warped by 0.05 rad a frame, the rate changing by half of itself over half a frame
     vibrating (3)  herz-jesus-8 warped by 0.02 rad, with 1.5 mrad of vibration at 2 to 5 periods a frame
     anchored (3)   the same two with one photo that stood still, and `--still` says so: what the height of the scene is
-                   worth, which level cameras that move so do not tell
-    scene (1)      a rendered scene, from a drone that travels and vibrates, against its twins
+                   worth, which level cameras that move so do not determine
+    scene (1)      a rendered scene, from a drone that travels and vibrates, against its references
     harm (13)      herz-jesus-8 with motions of all kinds, 0 to 0.1 rad: no photo is to come out more than 0.3 dB below
                    what went in unless it is named as doubtful
     steady (2)     steady motions of 0.02 and 0.05 rad, with these models among the choices and without
@@ -90,18 +90,18 @@ class Bench:
         self, part: str, seed: int, folder: Path, twins: Path, poses: Path | None, name: str = "run",
         own_lens: bool = False, **options: Any,
     ) -> Any:  # fmt: skip
-        """Run on a folder with its truth, and tell what came of it; None where it crashed.
+        """Run on a folder with its truth, and report what came of it; None where it crashed.
 
-        With `own_lens` the twins have the lens taken out that was found: what a better lens changes is no harm.
+        With `own_lens` the references have the lens taken out that was found: what a better lens changes is no harm.
         """
         start = time.perf_counter()
         out = folder / name
         try:
             solution = rs.run(folder / "photos", out, run_options(**options), overwrite=True)
             seconds = time.perf_counter() - start
-            told = folder / "ground_truth.json"
-            told = with_lens_of(out, told) if own_lens else told
-            found = rs.evaluate(out, told, poses=poses, twins=twins)
+            truth_file = folder / "ground_truth.json"
+            truth_file = with_lens_of(out, truth_file) if own_lens else truth_file
+            found = rs.evaluate(out, truth_file, poses=poses, twins=twins)
         except Exception as error:
             show(f"{part}, seed {seed}", crash=f"{type(error).__name__}: {error}")
             self.failed.append(part)

@@ -1,17 +1,21 @@
 """Videos as one path: readout times, rotations and rectified frames against the truth, and a GoPro's gyroscope.
 
     python benchmarks/video.py [--only PART ...] [--clips FOLDER] [--num 20] [--first-seed 100] [--shared ../shared]
+                               [--frames 300 600 1200 1800]
 
 Prints one JSON object a line. Clips are rendered into FOLDER once (`clips.py`: 80 s of one core each).
 
-    walk     sample_scenes/walk: readout time, rotations of all frames, frames against their twins; and the same key
+    walk     sample_scenes/walk: readout time, rotations of all frames, frames against references; and the same key
              frames as photos that know nothing of each other
     level    random clips that are held level: the height of the scene, too
     pan      random clips from a tripod
     two      two frames whose readout time is known: how far off the corrected positions are
     readout  random walks, gentle to wild: errors of the readout time, and these over their standard deviations
-    stabilised  the same, turned back to smooth paths: which are named; and how many of those as the sensor saw them are
+    stabilised  the same, rotated back to smooth paths: which are named; and how many of those that the sensor saw are
     gopro    ../shared/video: clock, axes and rotation of its gyroscope, readout by pictures and by the gyroscope
+    peer     `run` of videos, each in a process of its own, beside pycolmap's extract, match sequentially, map and
+             undistort with default options, on the same key frames and with the same camera: seconds and peaks
+    length   the same `run` of the GoPro's video, played to and fro for so many frames: seconds a frame, and peaks
 """
 
 from __future__ import annotations
@@ -25,9 +29,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 from clips import clip_folder
+from field import OURS, PEER, in_child
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from stabilise import rotations_by_truth, stabilise, zoomed
@@ -47,7 +53,8 @@ from rsundistort.solve.clip import frame_path, solve_clip
 from rsundistort.solve.outcome import Solved
 
 WALK = Path(__file__).parents[1] / "sample_scenes" / "walk"
-PARTS = ("walk", "level", "pan", "two", "readout", "stabilised", "gopro")
+GOPRO = "592,592,426.5,239.5"
+PARTS = ("walk", "level", "pan", "two", "readout", "stabilised", "gopro", "peer", "length")
 
 
 def solved_clip(video: Path, camera: str, readout_s: float | None = None) -> tuple[Solved, float]:
@@ -66,7 +73,7 @@ def solved_clip(video: Path, camera: str, readout_s: float | None = None) -> tup
 
 
 def in_true_world(rec: Reconstruction, truth: Solution) -> tuple[NDArray[np.float64], list[str]]:
-    """Rotation errors in degrees after the worlds are turned onto each other, of the frames of both."""
+    """Rotation errors in degrees after the worlds are rotated onto each other, of the frames of both."""
     true = {image.name: image.R_cw for image in truth.images if image.R_cw is not None}
     names = [name for name in rec.image_names if name in true]
     found = np.array([rec.R_cw[rec.image_names.index(name)] for name in names])
@@ -77,7 +84,7 @@ def in_true_world(rec: Reconstruction, truth: Solution) -> tuple[NDArray[np.floa
 
 
 def against_twins(video: Path, solved: Solved) -> dict[str, Any]:
-    """PSNR of frames, as they were read and rectified, against their twins."""
+    """PSNR of frames, as they were read and rectified, against their references."""
     rec = solved.whole
     assert rec is not None
     images = tuple(
@@ -90,10 +97,10 @@ def against_twins(video: Path, solved: Solved) -> dict[str, Any]:
     with VideoReader(video) as reader:
         for number, _, picture in reader:
             name = frame_name(video, number)
-            twin = next(iter((video.parent / "global").glob(f"{Path(name).stem}.*")), None)
-            if twin is None or name not in rec.image_names:
+            reference = next(iter((video.parent / "global").glob(f"{Path(name).stem}.*")), None)
+            if reference is None or name not in rec.image_names:
                 continue
-            pixels, wanted = picture.to_ndarray(format="bgr24"), cv2.imread(str(twin))
+            pixels, wanted = picture.to_ndarray(format="bgr24"), cv2.imread(str(reference))
             geometry = scene.of(name)
             camera, motion, model, new_camera = geometry.grid
             rectified, valid = rectify(pixels, camera, motion, model, new_camera, depth=geometry.find_depth().depth)
@@ -154,7 +161,7 @@ def height_error_percent(folder: Path, solved: Solved) -> float:
     truth = read_solution(folder / "ground_truth.json")
     rec = solved.whole
     assert rec is not None
-    # points by the true cameras' rays would need depths: the scene's own points, seen by the found ones, tell the shape
+    # points by the true cameras' rays would need depths: the scene's own points, seen by the found ones, show the shape
     true = {image.name: (image.R_cw, image.center_w) for image in truth.images}
     R_true = np.array([true[name][0] for name in rec.image_names])
     c_true = np.array([true[name][1] for name in rec.image_names])
@@ -255,7 +262,7 @@ def readout(args: argparse.Namespace) -> None:
 
 
 def stabilised(args: argparse.Namespace) -> None:
-    """Clips as they were read, turned back as wholes by Gaussians of so many frames, and freed of the shutter."""
+    """Clips as they were read, rotated back as wholes by Gaussians of so many frames, and freed of the shutter."""
     for seed in range(args.first_seed, args.first_seed + args.num):
         folder = clip_folder(args.clips, "walk", seed)
         camera = read_solution(folder / "ground_truth.json").cameras["1"]
@@ -277,8 +284,66 @@ def stabilised(args: argparse.Namespace) -> None:
 def gopro(args: argparse.Namespace) -> None:
     """A GoPro with its gyroscope."""
     video = args.shared / "video" / "gopro-hero5-gentle.mp4"
-    solved, cpu_s = solved_clip(video, "592,592,426.5,239.5")
+    solved, cpu_s = solved_clip(video, GOPRO)
     print(json.dumps(dict(solved.evidence) | {"cpu_s": round(cpu_s, 1)}), flush=True)
+
+
+def ours(video: Path, camera: str) -> dict[str, Any]:
+    """Seconds, by stage, and peak of a run of a video in a process of its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        found = in_child(OURS, video, Path(folder), "--camera", camera)
+        if "crash" not in found:
+            solution = json.loads(Path(folder, "out", "solution.json").read_text())
+            found["frames"] = solution["quality"]["readout_time"]["frames"]
+            found["seconds"] = seconds = dict.fromkeys((each["name"] for each in solution["stages"]), 0.0)
+            for each in solution["stages"]:  # one comes twice
+                seconds[each["name"]] = round(seconds[each["name"]] + each["seconds"], 1)
+        return found
+
+
+def peer(args: argparse.Namespace) -> None:
+    """Videos beside pycolmap's chain on their key frames."""
+    chain = PEER.replace("pycolmap.match_exhaustive", "pycolmap.match_sequential")
+    videos = {WALK / "clip.mp4": str(WALK / "camera.json"), args.shared / "video" / "gopro-hero5-gentle.mp4": GOPRO}
+    for video, given in videos.items():
+        with tempfile.TemporaryDirectory() as folder:
+            frames = Path(folder) / "frames"
+            clip = read_clip(video, frames)
+            camera = load_photos(frames, given, None, 64, Workers(0), StageLog(None), least=2).cameras.of(0)
+            (frames / "camera.json").write_text(json.dumps({"K": camera.K.tolist()}))
+            theirs = in_child(chain, frames, Path(folder))
+            if "crash" not in theirs:
+                theirs |= json.loads(Path(folder, "figures.json").read_text())
+        ours(video, given)  # kernels of whatever models it needs
+        found = ours(video, given)
+        said = {"clip": video.parent.name, "key_frames": len(clip.keys), "ours": found, "theirs": theirs}
+        print(json.dumps(said | {"time": round(found["total_s"] / theirs["total_s"], 2)}), flush=True)
+
+
+def to_and_fro(video: Path, out: Path, num_frames: int) -> None:
+    """A video played forwards and backwards until it has so many frames."""
+    with av.open(str(video)) as container:
+        frames = [frame.to_ndarray(format="yuv420p") for frame in container.decode(video=0)]
+        rate, (height, width) = container.streams.video[0].average_rate, frames[0].shape
+    with av.open(str(out), "w") as container:
+        stream = container.add_stream("libx264", rate=rate, options={"crf": "18", "preset": "veryfast"})
+        stream.width, stream.height, stream.pix_fmt = width, height * 2 // 3, "yuv420p"
+        for k in range(num_frames):
+            place = k % (2 * len(frames) - 2)
+            picture = frames[min(place, 2 * len(frames) - 2 - place)]
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="yuv420p")))
+        container.mux(stream.encode())
+
+
+def length(args: argparse.Namespace) -> None:
+    """Time and memory of longer videos."""
+    for num_frames in args.frames:
+        with tempfile.TemporaryDirectory() as folder:
+            video = Path(folder) / "clip.mp4"
+            to_and_fro(args.shared / "video" / "gopro-hero5-gentle.mp4", video, num_frames)
+            found = ours(video, GOPRO)
+        said = {"of_frames": num_frames, "s_per_frame": round(found["total_s"] / num_frames, 3)}
+        print(json.dumps(said | found), flush=True)
 
 
 def main() -> None:
@@ -288,6 +353,7 @@ def main() -> None:
     parser.add_argument("--clips", type=Path, default=Path(tempfile.gettempdir()) / "rsundistort-clips")
     parser.add_argument("--num", type=int, default=20)
     parser.add_argument("--first-seed", type=int, default=100)
+    parser.add_argument("--frames", type=int, nargs="+", default=(300, 600, 1200, 1800))
     parser.add_argument("--shared", type=Path, default=Path(__file__).parents[2] / "shared")
     args = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -295,7 +361,10 @@ def main() -> None:
         if part in ("level", "pan", "two"):
             of_kind(part, args)
         else:
-            {"walk": walk, "readout": readout, "stabilised": stabilised, "gopro": gopro}[part](args)
+            {
+                "walk": walk, "readout": readout, "stabilised": stabilised, "gopro": gopro, "peer": peer,
+                "length": length,
+            }[part](args)  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -3,8 +3,9 @@
     python benchmarks/worth.py [--seeds N]
 
 Cameras and points of sample_scenes/courtyard (f = 800 px), rotations alone, noise of 0.5 px, as in Experiment I of the
-paper (docs/experiments.md) but for the spread of the rotation. `shift_px` is the root mean square over the photos of
-rotation over the frame x focal length: how far the last line is moved against the first. Medians over the seeds.
+paper (docs/experiments.md) but for the standard deviation of the rotation. `shift_px` is the root mean square over the
+photos of rotation over the frame x focal length: how far the last line is moved against the first. Medians over the
+seeds.
 """
 
 from __future__ import annotations

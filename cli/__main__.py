@@ -26,7 +26,7 @@ def main() -> None:
                 sys.exit(f"error: {' '.join(str(error).split())}")
             try:  # of click itself
                 sys.stderr.write(f"error: stdout cannot be written: {error.strerror}\n")
-            except OSError:  # then it was this one: click tells there how it was called wrongly
+            except OSError:  # then it was this one: click says there how it was called wrongly
                 sys.exit(2)
             sys.exit(3)
 

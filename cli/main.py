@@ -21,7 +21,7 @@ _COMMANDS = {
     "evaluate": "Compare the outputs of a run with the truth.",
     "experiment": "Repeat the experiments of the paper on any scene.",
     "report": "Write the report of a run again, or figures for papers.",
-    "info": "Show versions, threads and optional parts.",
+    "info": "Show versions, threads and optional parts, or what a cameras.xml holds.",
     "completion": "Print the completion script of a shell.",
 }
 

@@ -85,7 +85,7 @@ def forget_stdout() -> None:
 
 
 def stdout_is_lost() -> bool:
-    """Whether something was to be told on stdout, and could not be."""
+    """Whether something was to be written to stdout, and could not be."""
     return _stdout["lost"]
 
 
@@ -124,7 +124,7 @@ def warnings_for_people() -> Iterator[Said]:
 def errors_for_people(kept: str = "nothing was written", needed_gb: float = 1.2) -> Iterator[Said]:
     """Known errors become one line and exit code 1; warnings become one line each, and are listed.
 
-    So does what the system says of files, memory and threads, wherever it says it. An interruption tells what is
+    So does what the system says of files, memory and threads, wherever it says it. An interruption says what is
     `kept`. The block needs addresses of `needed_gb`.
     """
     kept_is(kept)

@@ -83,7 +83,7 @@ def filmed(
 
 
 def rotation_errors_deg(R_cw: Array, R_true: Array) -> Array:
-    """(n,) angles between rotations, after the world of the first is turned to that of the second."""
+    """(n,) angles between rotations, after the world of the first is rotated to that of the second."""
     U, _, Vt = np.linalg.svd(np.einsum("nab,nac->bc", R_true, R_cw))
     world = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
     return np.degrees(Rotation.from_matrix(R_cw @ world.T @ R_true.transpose(0, 2, 1)).magnitude())

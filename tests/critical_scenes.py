@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, Observations, Reconstruction
 
-#: Changes of the scene's shape that each set hides: how many singular values of the meter are zero.
+#: Changes of the scene's shape that each set hides: how many singular values of the degeneracy measure are zero.
 HIDDEN = {
     "parallel": 1,
     "parallel, some upside down": 1,
@@ -54,7 +54,7 @@ def named_scene(name: str, m: int = 10, num_points: int = 60, seed: int = 0) -> 
     elif name == "random":
         R_cw = Rotation.random(m, random_state=seed).as_matrix()
     # all look at the cloud from 7 away
-    wander = 1.5 if name == "looking ahead and down" else 0.3  # two orientations tell little from two places
+    wander = 1.5 if name == "looking ahead and down" else 0.3  # two orientations determine little from two places
     centers = -7.0 * R_cw[:, 2] + rng.normal(0, wander, (m, 3))
     if name == "pure translation":
         centers = np.array([0.0, 0.0, -7.0]) + rng.uniform(-1.5, 1.5, (m, 3))

@@ -19,7 +19,7 @@ SCENES = Path(__file__).parent.parent / "sample_scenes"
 
 
 def cameras_of(rec: Reconstruction) -> PhotoCameras:
-    """The cameras of a reconstruction, as if a file had told them."""
+    """The cameras of a reconstruction, as if a file had specified them."""
     count = len(rec.cameras)
     labels = tuple(f"camera {k}" for k in range(count))
     return PhotoCameras(tuple(rec.cameras), labels, rec.camera_idx, True, (True,) * count, "camera.json")
@@ -28,7 +28,7 @@ def cameras_of(rec: Reconstruction) -> PhotoCameras:
 def solve_scene(
     name: str, out: Path, *, unwarped: bool = False, maps: str | None = None, report: bool = True, **options
 ) -> Solution:
-    """What `run` would write of a sample scene, or of its global-shutter twin; `options` as of `SolveOptions`."""
+    """What `run` would write of a sample scene, or of its global-shutter reference; `options` as of `SolveOptions`."""
     asked = SolveOptions(**options)
     truth, tracks = read_solution(SCENES / name / "ground_truth.json"), np.load(SCENES / name / "tracks.npz")
     xy = tracks["xy_global" if unwarped else "xy_raw"]

@@ -83,8 +83,8 @@ def test_a_photo_that_is_there_twice_ruins_nothing(photos):
     shutil.copy(whole / COURTYARD_NAMES[2], photos / "again.png")
     solution, _ = tried(photos.parent, "--camera", str(whole.parent / "camera.json"), "--model", "rotation")
     assert len(solution.registered) == len(COURTYARD_NAMES) + 1
-    twin, again = solution.image(COURTYARD_NAMES[2]), solution.image("again.png")
-    np.testing.assert_allclose(twin.center_w, again.center_w, atol=0.02)
+    original, again = solution.image(COURTYARD_NAMES[2]), solution.image("again.png")
+    np.testing.assert_allclose(original.center_w, again.center_w, atol=0.02)
 
 
 @pytest.mark.slow

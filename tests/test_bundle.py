@@ -1,4 +1,4 @@
-"""Bundle adjustment: what it recovers from the twin's photos, which model it chooses, and what it refuses."""
+"""Bundle adjustment: what it recovers of the plain NumPy model, which model it chooses, and what it refuses."""
 
 from __future__ import annotations
 
@@ -135,6 +135,21 @@ def test_a_lens_that_varies_from_photo_to_photo_is_found_and_no_shutter_is(rng):
     assert 0.005 < result.centre_sigma < 0.02
 
 
+def test_a_lens_that_varies_beside_a_shutter_is_no_velocity(rng):
+    scene = make_scene(rng, "rotation", num_images=12, num_points=150, dist=LENS)
+    varied = replace(scene, variation=rng.normal(0, 0.01, (12, 3)))
+    predicted, _ = reprojection_residuals(
+        replace(varied, observations=replace(scene.observations, xy_raw=0 * scene.observations.xy_raw))
+    )
+    measured = replace(scene.observations, xy_raw=predicted + 0.2 * rng.normal(size=predicted.shape))
+    start = replace(scene, observations=measured, phi=0 * scene.phi, shutter_model="global")
+    options = BundleOptions(
+        refine=("f", "cx", "cy"), guessed=GuessedCameras(start.cameras, {"f": 0.02, "cx": 0.01, "cy": 0.01})
+    )
+    choice = choose_model(start, options=options, sigma_px=0.2)
+    assert (choice.shutter_model, choice.varying, choice.shutter) == ("rotation", True, "found")
+
+
 def test_ladder_ends_at_the_truth_and_climbs_in_order(rng):
     truth = make_scene(rng, "constant-motion")
     seen = []
@@ -199,7 +214,7 @@ def test_spreads_of_the_priors_do_not_depend_on_their_start(rng):
 
 def test_estimated_spread_is_the_mean_square_of_what_is_found_and_what_is_left_open(rng):
     truth = make_scene(rng, "rotation", num_images=8, num_points=60, noise_px=0.5)
-    # of one noise for all: else the last step is weighed by another than the spread was
+    # of one noise for all: else the last step is weighed by another than the prior standard deviation was
     options = BundleOptions(spread_tolerance=1e-6, spread_rounds=40, deviations="model")
     result = bundle_adjust(perturbed(truth, rng), "rotation", options)
     square = (result.reconstruction.phi**2 + result.sigma_phi**2) * truth.frame_span()[:, None] ** 2
@@ -230,7 +245,7 @@ def test_residuals_and_errors_scale_with_the_noise(noise_px, rng):
     assert 0.6 * noise_px < result.rms_px < 1.1 * noise_px
     # the median of 1280 residuals knows sigma to 3 %
     assert result.sigma_px == pytest.approx(noise_px, rel=0.15)
-    # the prior is estimated from 24 values of a true spread of 0.05 / sqrt(3) a unit
+    # the prior is estimated from 24 values of a true standard deviation of 0.05 / sqrt(3) a unit
     spread = np.sqrt(np.mean((truth.phi * truth.frame_span()[:, None]) ** 2))
     assert result.phi_sigma == pytest.approx(spread, rel=0.25)
 
@@ -408,7 +423,7 @@ def test_cost_falls_with_each_accepted_step_and_the_reason_is_said(rng):
 
 @pytest.mark.parametrize("model", ["global", "two-step", "rotation", "constant-motion"])
 def test_the_model_that_made_the_measurements_is_chosen(model, rng):
-    # strong motion, so that every rung's mistake shows against the noise
+    # strong motion, so that every model's mistake shows against the noise
     truth = make_scene(rng, model, num_images=10, num_points=150, noise_px=0.3, phi_size=0.15)
     models = MODEL_SEQUENCE[: max(MODEL_SEQUENCE.index(model) + 1, 3)]
     start = adjust_sequence(perturbed(truth, rng), models)["rotation"].reconstruction
@@ -420,15 +435,15 @@ def test_the_model_that_made_the_measurements_is_chosen(model, rng):
     assert choice.kept[-1] == choice.label == model
     assert choice.shutter == ("not-found" if model == "global" else "found")
     assert choice.agreement is None or choice.agreement > 0.9
-    # what it was made from foretells to the noise, and to what the point's own uncertainty adds
+    # what it was made from predicts to the noise, and to what the point's own uncertainty adds
     assert 0.25 < choice.held_out_rms_px[model] < 0.5
-    assert 140 <= choice.num_held_out <= 150  # a tenth of them, one a track; the ladder dropped a few
+    assert 140 <= choice.num_held_out <= 150  # a tenth of them, one a track; the model sequence dropped a few
     assert choose_model(start, sigma_px=0.3) == choice
 
 
 def test_no_rung_is_worse_than_the_one_inside_it_wherever_the_choice_starts(rng):
-    # phi is per focal length: turns of a quarter radian a frame, found under a lens four times too long, are of a
-    # whole one under the lens that the first rung then finds, and few points are where such photos could see them
+    # phi is per focal length: rotations of a quarter radian a frame, found under a lens four times too long, are of a
+    # whole one under the lens that the first model then finds, and few points are where such photos could see them
     truth = make_scene(rng, "global", num_images=12, num_points=120, noise_px=0.3, dist=[-0.2, 0.05, 0, 0])
     long = [replace(c, K=c.K * [[4, 1, 1], [1, 4, 1], [1, 1, 1]], dist=()) for c in truth.cameras]
     astray = replace(truth, cameras=long, shutter_model="rotation")
@@ -438,12 +453,12 @@ def test_no_rung_is_worse_than_the_one_inside_it_wherever_the_choice_starts(rng)
     assert choice.shutter_model == "global"
     rms = list(choice.held_out_rms_px.values())
     assert 0.25 < rms[0] < 0.4
-    # what a rung fits to noise: 36 unknowns more on 1300 measurements, 72 for the last
+    # what a model fits to noise: 36 unknowns more on 1300 measurements, 72 for the last
     np.testing.assert_allclose(rms, rms[0], rtol=0.03)
 
 
 def test_what_one_kernel_sees_another_does(rng):
-    # turns so strong, under a lens so curved, that from the row of a still camera the search ends elsewhere or nowhere
+    # rotations so strong, under a lens so curved, that the search from a still camera's row ends elsewhere or nowhere
     rec = make_scene(rng, "global", num_images=12, num_points=100)
     rec = replace(rec, phi=rng.uniform(-1.2, 1.2, rec.phi.shape), shutter_model="rotation")
     cameras = [replace(camera, dist=[-0.25, 0.1, 0, 0]) for camera in rec.cameras]

@@ -149,7 +149,7 @@ def test_analyze_a_solution_and_transforms(invoke, tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
     found = json.loads(invoke("analyze", "transforms.json", "--json").stdout)
     np.testing.assert_allclose(found["singular_values"], as_json["singular_values"], atol=1e-9)
-    # read by columns, the same cameras are told apart
+    # read by columns, the same cameras are distinguished
     columns = json.loads(invoke("analyze", "transforms.json", "--readout", "left-to-right", "--json").stdout)
     assert columns["critical"] is False
     assert columns["advice"] == []

@@ -210,7 +210,7 @@ def test_a_clip_is_written_with_its_truth_and_twins(tmp_path):
     frame = read_photo(tmp_path / "frames" / "clip_000005.png").pixels
     assert psnr(photo, frame) > 40
 
-    # frames are judged by the twins that there are
+    # frames are judged by the references that there are
     options = RectifyOptions(depth="infinity")
     rectify_folder(tmp_path / "frames", tmp_path / "a" / "ground_truth.json", tmp_path / "back", options)
     (tmp_path / "back" / "solution.json").write_bytes((tmp_path / "a" / "ground_truth.json").read_bytes())

@@ -293,7 +293,7 @@ def test_path_csv_has_pose_velocity_and_turn_of_the_camera(tmp_path):
     h = 1e-3
     moved = (hand.centers(time + h) - hand.centers(time - h)) / (2 * h)
     np.testing.assert_allclose(columns["vx vy vz"], moved, atol=1e-3)
-    # a gyroscope fixed to the camera: a turn about its own axes takes its axes in the world to those a moment later
+    # a gyroscope fixed to the camera: a rotation about its own axes takes its axes in the world to those a moment later
     later = to_world * Rotation.from_rotvec(h * columns["wx wy wz"])
     true = Rotation.from_matrix(hand.rotations(time + h).transpose(0, 2, 1))
     assert (true.inv() * later).magnitude().max() < 2e-5

@@ -31,7 +31,7 @@ def test_frames_that_were_turned_back_are_named_and_others_are_not(seed):
     span, time_s = truth.frame_span()[0], np.array([*times.values()])
     found = own_motions(start)
     assert said(found, time_s, span).verdict == "none"
-    # turned back as a whole, the frames look on without turning, and their lines show the shaking all the same
+    # rotated back as a whole, the frames look on without rotating, and their lines show the shaking all the same
     still = type(found)(np.tile(found.R_cw[:1], (40, 1, 1)), found.phi, found.sigma_turn, found.sigma_phi)
     assert said(still, time_s, span).verdict == "stabilised"
 

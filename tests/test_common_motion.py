@@ -11,7 +11,7 @@ from critical_scenes import named_scene
 from numpy_twin import project
 from scipy.spatial.transform import Rotation
 
-from rsundistort import BundleOptions, bundle_adjust
+from rsundistort import BundleOptions, Camera, Observations, Reconstruction, bundle_adjust
 from rsundistort.bundle import Posterior
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.bundle.spreads import Spreads
@@ -20,7 +20,7 @@ from rsundistort.errors import InputError
 
 MODEL = "constant-motion"
 NOISE_PX = 0.5
-PHI, WAY = 0.02, 0.15  # spreads: radians a frame, baselines a frame, about as much in the photos
+PHI, WAY = 0.02, 0.15  # prior standard deviations: radians a frame, baselines a frame, about as much in the photos
 KNOWN = BundleOptions(loss="squared", outlier_rounds=0, sigma_px=NOISE_PX, phi_sigma=PHI, velocity_sigma=WAY)
 
 # thousands of calls on problems this small wait for threads longer than they compute
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def pixels(scene):
-    """Where the photos show the points, by the twin."""
+    """Where the photos show the points, by the NumPy version."""
     obs = scene.observations
     xy = np.zeros((len(obs), 2))
     for i in range(scene.num_images):
@@ -50,7 +50,7 @@ def measured(scene, rng=None, noise_px=NOISE_PX):
 
 
 def moving(scene, rng, still=None, phi=PHI, way=WAY):
-    """Random turning and travelling, as the priors have it."""
+    """Random rotations and travels, as the priors have it."""
     span = scene.frame_span()[:, None]
     turn = rng.normal(0, phi, (scene.num_images, 3)) / span
     travel = rng.normal(0, way * scene.baseline, (scene.num_images, 3)) / span
@@ -60,7 +60,7 @@ def moving(scene, rng, still=None, phi=PHI, way=WAY):
 
 
 def row_motion(rec):
-    """(m, 6) turning, radians a frame, and travelling in the camera's frame, baselines a frame; photos of rows."""
+    """(m, 6) rotations, radians a frame, and travels in the camera's frame, baselines a frame; photos of rows."""
     span = rec.frame_span()[:, None]
     travel = np.einsum("mij,mj->mi", rec.R_cw, rec.velocity) / rec.baseline
     return np.hstack([rec.phi, travel]) * span
@@ -89,7 +89,7 @@ HIDING = ["sideways, any relief", "upwards, a wall", "ahead, a wall"]
 def test_photos_that_time_points_alike_have_no_contrast(how, rng):
     scene = measured(arranged(how, rng))
     assert clock_contrast(scene) < 1e-6
-    # a wall that the cameras also turn to, or things at other depths, are told
+    # a wall that the cameras also rotate to, or things at other depths, are distinguished
     relief = replace(scene, points_w=scene.points_w + rng.uniform(-1, 1, scene.points_w.shape) * [0, 0, 2])
     if how != "sideways, any relief":
         assert clock_contrast(measured(relief)) > 0.01
@@ -98,7 +98,7 @@ def test_photos_that_time_points_alike_have_no_contrast(how, rng):
 @pytest.mark.parametrize("how", HIDING)
 @pytest.mark.parametrize("kind", range(7))
 def test_a_motion_of_the_world_by_the_clock_leaves_no_trace_without_contrast(how, kind, rng):
-    """Turns, ways and a growth of the world, the same a unit of the clock in all photos, are changes of its shape."""
+    """Rotations, ways and a growth of the world, the same per unit of the clock in all photos, change its shape."""
     scene = measured(arranged(how, rng))
     turn, way, growth = np.zeros(3), np.zeros(3), 0.0
     if kind < 3:
@@ -210,7 +210,7 @@ def test_common_motion_of_cameras_that_read_columns_is_that_of_rows_turned(rng):
         rows, cameras=cameras, R_cw=quarter @ rows.R_cw, phi=rows.phi @ quarter.T,
         observations=replace(rows.observations, xy_raw=turned),
     )  # fmt: skip
-    # with independent noise: corners of a photo are others in one that is turned
+    # with independent noise: corners of a photo are others in one that is rotated
     model = replace(KNOWN, deviations="model")
     found = [common_motion(bundle_adjust(scene, MODEL, model), model) for scene in (rows, columns)]
     np.testing.assert_allclose(found[1].sigma, found[0].sigma, rtol=1e-3)
@@ -374,3 +374,41 @@ def test_a_photo_turned_by_90_degrees_is_advised_for_what_it_tells_of_the_common
     assert advice
     assert min(each.shift_px for each in advice) < 0.9 * before
     assert "px" in advice[0].sentence
+
+
+def flight(rng, travel):
+    """Ten photos straight down from 6 m above hills of 1.2 m, that travel alike but for 0.03 m a unit of the clock."""
+    camera, m = Camera(800, 600, [[700, 0, 400], [0, 700, 300], [0, 0, 1]], [], "top-to-bottom"), 10
+    points_w = rng.uniform(-1, 1, (150, 3)) * [6.0, 6.0, 1.2]
+    above = np.stack(np.meshgrid([-1.0, 1.0], np.arange(-2.0, 3.0)), axis=2).reshape(-1, 2)
+    center_w = np.column_stack([above, np.full(m, 6.0)]) + 0.1 * rng.normal(size=(m, 3))
+    R_cw = Rotation.from_rotvec(0.03 * rng.normal(size=(m, 3))).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+    velocity = np.einsum("mji,mj->mi", R_cw, travel + 0.03 * rng.normal(size=(m, 3)))
+    point_idx, frame_idx = (a.ravel() for a in np.mgrid[: len(points_w), :m])
+    scene = Reconstruction(
+        [camera], [f"{i}.jpg" for i in range(m)], np.zeros(m, np.int64), R_cw, center_w, points_w,
+        Observations(frame_idx, point_idx, np.zeros((len(point_idx), 2))), 0.012 * rng.normal(size=(m, 3)), velocity,
+        MODEL,
+    )  # fmt: skip
+    xy = pixels(scene)
+    inside = ((xy > 0) & (xy < [800, 600])).all(axis=1)
+    observations = replace(scene.observations, xy_raw=xy + 0.1 * rng.normal(size=xy.shape)).select(inside)
+    return replace(scene, observations=observations)
+
+
+@pytest.mark.parametrize("seed", [20, 21])
+def test_a_velocity_that_all_photos_share_is_not_taken_for_their_nodding(seed):
+    truth = flight(np.random.default_rng(seed), np.array([0.0, -0.3, 0.0]))
+    start = replace(truth, phi=0 * truth.phi, velocity=0 * truth.velocity)
+    result = bundle_adjust(start, MODEL)
+    # under a prior of zero mean: 9 to 16 mrad
+    assert abs((result.reconstruction.phi - truth.phi).mean(0)[0]) < 5e-3
+    _, ahead, _ = truth.baseline * np.array(result.velocity_mean)
+    assert -0.35 < ahead < -0.2
+
+
+def test_velocities_without_a_common_direction_have_no_mean(rng):
+    truth = flight(rng, np.zeros(3))
+    result = bundle_adjust(truth, MODEL)
+    assert (np.abs(result.velocity_mean) <= result.velocity_sigma).all()
+    assert result.velocity_rms == pytest.approx(result.velocity_sigma, rel=0.2)

@@ -1,4 +1,4 @@
-"""Critical motions: the meter against the equations that it linearises and against Hessians, costs, and remedies."""
+"""Critical motions: the degeneracy measure against its equations and Hessians, costs, and remedies."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def meter_of(scene):
 
 
 def with_measurements(scene, phi, model, rng=None):
-    """The scene seen by the twin's model, with or without noise."""
+    """The scene seen by the model of the NumPy version, with or without noise."""
     obs = scene.observations
     xy = np.zeros((len(obs), 2))
     for i in range(scene.num_images):
@@ -78,7 +78,7 @@ def adjusted(scene, rng, still=None, model="rotation", options=None):
     return truth, bundle_adjust(start, model, options, simpler_first=True), options
 
 
-# ---------------------------------------------------------------- the meter
+# ---------------------------------------------------------------- the degeneracy measure
 
 
 @pytest.mark.parametrize("name", HIDDEN)
@@ -222,7 +222,7 @@ def test_level_cameras_leave_the_height_uncertain_and_tilted_ones_do_not(rng):
     assert level.is_flagged
     assert not tilted.is_flagged
     assert level.sigma_log_k > 4 * tilted.sigma_log_k
-    # the prior's mean over ten photos: spread / sqrt(m), about
+    # the prior's mean over ten photos: its standard deviation / sqrt(m), about
     assert level.sigma_log_k == pytest.approx(SIGMA_RAD / np.sqrt(3) / np.sqrt(10) / 0.8, rel=0.6)
     assert "because all cameras were held level" in level.sentence
     assert "because" not in tilted.sentence

@@ -1,4 +1,4 @@
-"""Damage inside pixels: what a codec or a checksum knows of is told by the photo's name, and the photo is rectified."""
+"""Damage inside pixels: what a codec or a checksum detects is reported by photo, and the photo is rectified."""
 
 from __future__ import annotations
 

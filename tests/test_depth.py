@@ -196,7 +196,7 @@ def test_hidden_pixels_of_two_walls_are_those_that_rays_do_not_reach():
     assert hidden.sum() > 300
     # the edge of the square is blurred over a pixel of the map, and a displacement below a pixel hides nothing
     sure = (np.abs(inside) > 1.5) | in_front
-    # lines that graze a corner of it are not told apart
+    # lines that graze a corner of it are not distinguished
     assert (found[sure] != hidden[sure]).sum() <= 5
     assert sure[hidden].mean() > 0.6
     photo = np.full((H, W), 200, np.uint8)
@@ -236,7 +236,7 @@ def test_result_does_not_depend_on_strips_and_threads(rng):
 
 
 def test_a_moved_textured_plane_comes_back(rng):
-    """A photo of a plane, made by the inverse of nothing but the NumPy row model, against its global-shutter twin."""
+    """A photo of a plane, made by the inverse of the NumPy row model alone, against its global-shutter reference."""
     camera, motion = make_camera(), RowMotion([0.02, -0.01, 0.03], [0.5, 0.3, -0.2])
     plane = Plane([0.1, -0.2, 1.0], 5.0)
     texture = cv2.GaussianBlur(rng.uniform(size=(400, 400)).astype(np.float32), (0, 0), 4)
@@ -250,12 +250,12 @@ def test_a_moved_textured_plane_comes_back(rng):
     turned = Rotation.from_rotvec(clock * motion.phi).inv().apply(rays)
     centre = clock * motion.velocity
     raw = shade(centre + ((plane.distance - centre @ plane.normal) / (turned @ plane.normal))[:, None] * turned)
-    twin = shade((plane.distance / (rays @ plane.normal))[:, None] * rays)
+    reference = shade((plane.distance / (rays @ plane.normal))[:, None] * rays)
     rectified, mask = rectify(raw, camera, motion, MODEL, depth=plane)
-    error = np.abs(rectified - twin)[cv2.erode(mask, np.ones((5, 5))) > 0]
+    error = np.abs(rectified - reference)[cv2.erode(mask, np.ones((5, 5))) > 0]
     assert error.max() < 0.01  # of 1; interpolation
     without, _ = rectify(raw, camera, motion, MODEL)
-    assert np.abs(without - twin)[cv2.erode(mask, np.ones((5, 5))) > 0].max() > 0.2
+    assert np.abs(without - reference)[cv2.erode(mask, np.ones((5, 5))) > 0].max() > 0.2
 
 
 # ---------------------------------------------------------------- points
@@ -428,12 +428,12 @@ def test_flight_with_true_motion_and_points_comes_near_its_twin():
     X_c = (tracks["points_w"][tracks["point_idx"][tracks["frame_idx"] == 1]] - image.center_w) @ image.R_cw.T
     xy = X_c[:, :2] / X_c[:, 2:] * np.diag(camera.K)[:2] + camera.K[:2, 2]
     depth = depth_from_points(xy, X_c[:, 2], (camera.width, camera.height))
-    raw, twin = (cv2.imread(str(FLYOVER / kind / image.name)) for kind in ("photos", "global"))
+    raw, reference = (cv2.imread(str(FLYOVER / kind / image.name)) for kind in ("photos", "global"))
     far, seen = rectify(raw, camera, motion, MODEL)
     near, mask = rectify(raw, camera, motion, MODEL, depth=depth)
     both = np.minimum(seen, mask)
-    assert psnr(near, twin, both) > 35  # dB; the true depths reach 38.6
-    assert psnr(near, twin, both) > psnr(far, twin, both) + 8
+    assert psnr(near, reference, both) > 35  # dB; the true depths reach 38.6
+    assert psnr(near, reference, both) > psnr(far, reference, both) + 8
 
 
 @pytest.mark.slow

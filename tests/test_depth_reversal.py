@@ -24,7 +24,7 @@ def looking_at(center_w, target_w):
 
 @pytest.fixture
 def scene(rng):
-    """Photos of a cloud of points from one side, turned by a tenth of a radian a frame, at their true poses."""
+    """Photos of a cloud of points from one side, rotated by a tenth of a radian a frame, at their true poses."""
     points_w = rng.uniform(-1, 1, (300, 3)) * [1.6, 1.0, 1.0] + [0, 0, 7]
     centers = np.column_stack([np.linspace(-2, 2, 6), rng.normal(0, 0.5, 6), rng.normal(0, 0.3, 6)])
     R_cw = np.array([looking_at(center, np.array([0, 0, 7.0])) for center in centers])

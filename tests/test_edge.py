@@ -132,7 +132,7 @@ def test_every_public_name_is_walked():
 
 
 def finite_or_marked(result: object) -> None:
-    """Numbers are numbers: NaN only where points have no place, which the caller is told of by NaN alone."""
+    """Numbers are numbers: NaN only where points have no place, which NaN alone shows."""
     if isinstance(result, tuple) and isinstance(result[-1], np.ndarray) and result[-1].dtype.kind == "b":
         values, valid = result
         assert np.isfinite(values[valid]).all()

@@ -20,6 +20,7 @@ from rsundistort.bundle.envelope import Envelope
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.bundle.reduced import Reduced
 from rsundistort.bundle.solver import minimize
+from rsundistort.bundle.sparse_blocks import SparseBlocks
 from rsundistort.bundle.spreads import Spreads
 from rsundistort.bundle.structure import Structure
 
@@ -88,7 +89,7 @@ def test_product_is_that_of_the_whole_matrix(nb, rng):
     x, y = rng.normal(size=grid.free.shape), np.empty(grid.free.shape)
     for ranges in (1, 3, 8):
         blocks.multiply(
-            (0.0,) * nb, grid.pattern.row_start, grid.pattern.cols, grid.reduced.S, x,
+            grid.pattern.row_start, grid.pattern.cols, grid.reduced.S, x,
             np.empty((ranges, *x.shape)), y,
         )  # fmt: skip
         expected = grid.H[: grid.n, : grid.n] @ x.ravel()
@@ -126,7 +127,7 @@ def test_coarse_space_holds_what_moves_turns_grows_and_bends_a_cluster(rng):
     offset = grid.center_w - grid.center_w.mean(0)
     w = rng.normal(size=3)
     turn, grow, bend, motion = np.zeros((4, *grid.free.shape))
-    turn[:, :3] = -grid.R_cw @ w  # R_cw Exp(-w): the world turns by w
+    turn[:, :3] = -grid.R_cw @ w  # R_cw Exp(-w): the world rotates by w
     turn[:, 3:6] = np.cross(w, offset)
     grow[:, 3:6] = offset
     bend[:, 5] = offset[:, 0] ** 2
@@ -147,7 +148,7 @@ def test_conjugate_gradients_give_the_solution_of_the_whole_system(nb, parts, ca
     size = np.sqrt(np.diag(grid.H))[: grid.n].reshape(x.shape)  # of an unknown: the others drown in the largest
     np.testing.assert_allclose(size * found.x, size * x, rtol=0, atol=1e-8 * np.abs(size * x).max())
     np.testing.assert_allclose(found.y, y, rtol=0, atol=1e-8 * np.abs(y).max(initial=0))
-    # the residual that is told is that of the solution
+    # the residual that is returned is that of the solution
     early = solve_iteratively(grid.reduced, grid.space(), grid.pattern, 1e-12, 2)
     assert not early.converged
     rest = grid.g - grid.H @ np.concatenate([early.x.ravel(), early.y])
@@ -247,6 +248,65 @@ def test_inverse_inside_the_envelope_is_that_of_dense_algebra(rng, monkeypatch, 
     for i in range(m):
         own = np.where(held[i], 0.0, expected[i, :, i])
         np.testing.assert_allclose(blocks[i], own, rtol=1e-9, atol=1e-12 * np.abs(own).max())
+
+
+@pytest.mark.parametrize("nb", [5, 9, 19])  # the last is not unrolled
+def test_sparse_blocks_solve_and_invert_as_dense_algebra_does(rng, nb):
+    grid = Grid(rng, long=7, nb=nb)
+    shape = SparseBlocks.of(grid.pattern, grid.free)
+    factor = shape.factor(grid.reduced.S)
+    scale = 1 / np.sqrt(np.diag(grid.H))[: grid.n]
+    held = ~grid.free.ravel()
+    H = scale[:, None] * grid.H[: grid.n, : grid.n] * scale
+    H[held], H[:, held] = 0.0, 0.0
+    H[held, held] = 1.0
+    expected = scale[:, None] * np.linalg.inv(H) * scale
+    expected[held], expected[:, held] = 0.0, 0.0
+    b = rng.normal(size=(6, *grid.free.shape))
+    found = shape.gather(b)
+    factor.solve(found)
+    x = (b.reshape(6, -1) @ expected).reshape(b.shape)
+    np.testing.assert_allclose(shape.scatter(found), x, rtol=1e-7, atol=1e-9 * np.abs(x).max())
+    dense = expected.reshape(*grid.free.shape, *grid.free.shape)
+    first, second = grid.pattern.cols, grid.pattern.rows  # also those below the diagonal
+    for inverse, f, g in (
+        (factor.inverse_blocks(), np.arange(len(grid.free)), np.arange(len(grid.free))),
+        (factor.inverse_blocks_of(first, second), first, second),
+    ):
+        wanted = dense[f, :, g]
+        size = np.maximum(np.abs(wanted).max(axis=(1, 2), keepdims=True), 1e-300)  # a photo may be held
+        np.testing.assert_allclose(inverse / size, wanted / size, rtol=1e-7, atol=1e-10)
+
+
+def test_sparse_blocks_fill_no_more_than_the_order_of_a_chain_needs(rng):
+    """Frames of a path that see their neighbours, and every tenth of them all others of these."""
+    m = 60
+    keys = np.arange(0, m, 10)
+    pairs = np.array([(k, k + 1) for k in range(m - 1)] + [(a, b) for a in keys for b in keys if a < b])
+    frame_idx, point_idx = pairs.ravel(), np.repeat(np.arange(len(pairs)), 2)
+    pattern = Structure.from_observations(frame_idx, point_idx, m, len(pairs)).pattern
+    shape = SparseBlocks.of(pattern, rng.random((m, 4)) > 0.1)
+    # each frame between keys leaves a block with its next one and one with a key
+    assert len(shape.filled.cols) <= 3 * m + len(keys) ** 2 / 2
+
+
+def test_a_sparse_matrix_that_is_not_positive_is_refused(rng):
+    grid = Grid(rng)
+    S = grid.reduced.S.copy()
+    S[grid.pattern.diagonal[7]] *= 0.01
+    assert SparseBlocks.of(grid.pattern, grid.free).factor(S) is None
+
+
+def test_a_sparse_factor_does_not_depend_on_the_number_of_threads(rng):
+    grid = Grid(rng)
+    shape = SparseBlocks.of(grid.pattern, grid.free)
+    found = []
+    for threads in (1, 2):
+        numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+        factor = shape.factor(grid.reduced.S)
+        found.append((factor.data, factor.inverse_blocks()))
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    np.testing.assert_array_equal(found[0][1], found[1][1])
 
 
 def block(photos, monkeypatch):

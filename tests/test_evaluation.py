@@ -47,7 +47,7 @@ def test_mirrored_world_is_an_error(rng):
 def test_known_rotation_errors_are_recovered(rng):
     R, C = draw_poses(rng, 8)
     R, C = np.repeat(R, 2, axis=0), np.repeat(C, 2, axis=0) + 0.1 * rng.normal(size=(16, 3))
-    # each orientation twice, turned there and back: no common rotation can lower the errors
+    # each orientation twice, rotated there and back: no common rotation can lower the errors
     angles = np.repeat(np.radians([1e-7, 1e-4, 0.01, 0.1, 1, 5, 20, 60]), 2)
     axes = np.repeat(rng.normal(size=(8, 3)), 2, axis=0)
     axes *= (-1.0) ** np.arange(16)[:, None] / np.linalg.norm(axes, axis=1, keepdims=True)

@@ -507,7 +507,7 @@ def test_portraits_among_landscapes_were_turned(facts):
 @pytest.mark.parametrize(
     "photos",
     [
-        # the tag turns them, the pixels lie as they were read
+        # the tag rotates them, the pixels lie as they were read
         [(UPRIGHT, 640, 480), (PHONE, 480, 640)],
         [(UPRIGHT, 640, 480), (PHONE, 640, 480)],
         # nothing to compare with

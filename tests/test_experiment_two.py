@@ -63,7 +63,7 @@ def test_comparison_does_not_see_the_world_frame(poses, rng):
 def test_comparison_measures_in_baselines_and_degrees(poses, rng):
     R, center = poses
     baseline = np.linalg.norm(np.diff(center, axis=0), axis=1).mean()
-    # two turns about one axis of the world that cancel: the best common rotation is none
+    # two rotations about one axis of the world that cancel: the best common rotation is none
     axis = np.array([0.0, 0, np.radians(0.7)])
     turned = R.copy()
     turned[1] = R[1] @ Rotation.from_rotvec(axis).as_matrix()

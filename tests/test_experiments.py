@@ -112,7 +112,7 @@ def test_noise_and_start_are_drawn_anew_in_each_trial(scene):
     assert np.array_equal(a.observations.xy_raw, again.observations.xy_raw)
     assert np.array_equal(start_a.R_cw, start_again.R_cw)
     difference = a.observations.xy_raw - b.observations.xy_raw
-    # two independent noises; 720 values know their spread to 3 %
+    # two independent noises; 720 values know their standard deviation to 3 %
     assert difference.std() == pytest.approx(0.5 * np.sqrt(2), rel=0.1)
     for name in ("R_cw", "center_w", "points_w"):
         assert not np.array_equal(getattr(start_a, name), getattr(start_b, name))
@@ -124,7 +124,7 @@ def test_spread_of_the_motions_is_the_papers(scene):
     span = 480 / 500  # the rows' range in normalised coordinates
     phi = np.array([m.phi for m in motions]) * span
     angle = np.linalg.norm(phi, axis=1)
-    # of 2000 angles: the spread of a normal variable is known to 1.6 %, three of which are the tolerance
+    # of 2000 angles: the standard deviation of a normal variable is known to 1.6 %, three of which are the tolerance
     assert np.sqrt(np.mean(angle**2)) == pytest.approx(0.05, rel=0.05)
     # the angle is normal, not its three components: those would have a mean of 1.6 sigma instead of 0.8
     assert angle.mean() == pytest.approx(0.05 * np.sqrt(2 / np.pi), rel=0.06)
@@ -154,7 +154,7 @@ def test_start_is_as_far_from_the_truth_as_stated(scene):
     R = np.concatenate([np.einsum("mij,mkj->mik", start.R_cw, truth.R_cw) for truth, start in starts])
     moved = np.concatenate([start.center_w - truth.center_w for truth, start in starts])
     points = np.concatenate([start.points_w - truth.points_w for truth, start in starts])
-    # 720 components: their spread is known to 3 %
+    # 720 components: their standard deviation is known to 3 %
     assert np.sqrt(np.mean(rotation_angles_deg(R) ** 2) / 3) == pytest.approx(0.4, rel=0.1)
     assert moved.std() == pytest.approx(0.03, rel=0.1)
     assert points.std() == pytest.approx(0.03, rel=0.03)
@@ -200,7 +200,7 @@ def test_every_method_ends_and_the_anchor_costs_something(scene):
     lines = {line["method"]: line for line in run_trial(scene, OneOptions(), 0)}
     assert list(lines) == list(METHODS)
     for method, line in lines.items():
-        # the paper's methods have no prior, ours one whose spread is not told but estimated
+        # the paper's methods have no prior, ours one whose standard deviation is not given but estimated
         assert (line["phi_sigma"] < 0.1) == (method in ("rotation", "constant-motion"))
         assert line["phi_sigma"] < 0.1 or line["phi_sigma"] == 1e4
         assert line["stop_reason"] in ("cost", "step")

@@ -39,7 +39,7 @@ W, H = 640, 480
 
 
 def made(model: str = "constant-motion", readout: str = "top-to-bottom", f: tuple[float, float] = (500, 500)):
-    """A scene of five photos whose cameras turn and travel, and where each shows thirty points."""
+    """A scene of five photos whose cameras rotate and travel, and where each shows thirty points."""
     rng = np.random.default_rng(8)
     raw = Camera(W, H, [[505, 0, 322.0], [0, 505, 236.5], [0, 0, 1]], [-0.1, 0.02, 1e-3, -2e-3, 0.01], readout)
     new = Camera(W, H, [[f[0], 0, 330.0], [0, f[1], 231.25], [0, 0, 1]])
@@ -478,7 +478,7 @@ def test_nukes_camera_shows_points_where_the_frames_do(tmp_path, clip):
 
 
 def test_exports_lie_beside_the_other_outputs_and_one_that_fails_is_said(tmp_path):
-    """Photos that are turned: OPF has the original ones, which are not."""
+    """Photos that are rotated: OPF has the original ones, which are not."""
     pytest.importorskip("pyopf")
     scene = made()
     options = OutputOptions(exports=("metashape", "nuke", "opensfm", "opf", "opf-rectified"))

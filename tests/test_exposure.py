@@ -117,7 +117,7 @@ def test_a_limit_holds_one_photo_and_leaves_the_others(model, rng):
     assert np.linalg.norm(held.reconstruction.phi[1]) < 0.1 * np.linalg.norm(free.reconstruction.phi[1])
     way = limit * rec.median_depth(1)
     assert (held.sigma_velocity[1] * rec.frame_span()[1] <= 1.01 * way).all()
-    # what is held tells nothing of how far hands move
+    # what is held means nothing for how far hands move
     assert held.phi_sigma == pytest.approx(free.phi_sigma, rel=0.5)
     same = bundle_adjust(rec, model, BundleOptions(phi_limits={"1.jpg": 10.0, "not there.jpg": 1.0}))
     np.testing.assert_allclose(same.reconstruction.phi, free.reconstruction.phi, rtol=0, atol=1e-12)

@@ -1,4 +1,4 @@
-"""Points where no photo can see them, or so far that no parallax tells how far: they come back, or stay far."""
+"""Points where no photo can see them, or so far that no parallax shows how far: they come back, or stay far."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The focal length of a camera that neither a file nor EXIF tells."""
+"""The focal length of a camera that neither a file nor EXIF states."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_without_pairs_it_is_what_is_usual():
 
 @pytest.fixture
 def photos(tmp_path):
-    """Photos that a shutter bent, of a focal length of 400 px that nothing tells."""
+    """Photos that a shutter bent, of an unknown focal length of 400 px."""
     folder = half_courtyard(tmp_path / "in")
     (folder.parent / "camera.json").unlink()
     return folder
@@ -82,7 +82,7 @@ def test_the_focal_length_of_photos_without_one_is_found_and_said(photos):
     log = StageLog(None)
     loaded = load_photos(photos, None, None, 2000, Workers(1), log)
     assert loaded.cameras.without_focal == [0]
-    with warnings.catch_warnings():  # of so strong a shutter, pairs hardly tell it
+    with warnings.catch_warnings():  # of so strong a shutter, pairs hardly determine it
         warnings.simplefilter("ignore", RsUndistortWarning)
         found = with_focal_lengths(loaded, 0, log).cameras
     (camera,), (sigma,) = found.cameras, found.known_to(loose=False).sigmas

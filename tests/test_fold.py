@@ -157,7 +157,7 @@ def test_no_point_of_what_passes_is_seen_twice(readout, rng):
 
 
 def test_speed_is_taken_through_the_lens():
-    """At the edge of a barrel lens a direction runs over fewer pixels a radian, so that a faster turn still passes."""
+    """At the edge of a barrel lens a direction runs over fewer pixels a radian, so faster rotations pass."""
     phi = np.array([-1 / (1 + R_MAX**2), 0, 0]) * 1.02
     assert folds(camera_of(), phi)
     assert not folds(camera_of(dist=[-0.2, 0.0, 0.0, 0.0]), phi)
@@ -183,7 +183,7 @@ def test_bad_arguments_are_refused(phi, velocity, depth, says):
 
 
 def test_bends_count_by_their_own_rate():
-    """Rows fold where the turn is fastest, and not by its mean: half a period of a vibration, computed by hand."""
+    """Rows fold where the rotation is fastest, and not by its mean: half a period of a vibration, computed by hand."""
     camera, (start, end) = camera_of(), (-R_MAX, 239 / 500)
     middle = (start + end) / 2
     # the rate of -a sin(k r) is -a k in the middle row, where 1 + r^2 is 1, and nothing at the ends
@@ -195,7 +195,7 @@ def test_bends_count_by_their_own_rate():
 
     assert not folds(camera, np.zeros(3), bend=shaken(0.99 / k))
     assert folds(camera, np.zeros(3), bend=shaken(1.01 / k))
-    assert not folds(camera, [0.3, 0, 0], bend=shaken(1.2 / k))  # a turn the other way makes up for it
+    assert not folds(camera, [0.3, 0, 0], bend=shaken(1.2 / k))  # a rotation the other way makes up for it
 
 
 def test_travel_that_is_not_steady_folds_rows_by_its_own_rate():

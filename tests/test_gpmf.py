@@ -108,7 +108,7 @@ def test_scale_for_each_axis_none_and_degrees():
 
 @pytest.mark.parametrize("letters", ["ZXY", "YxZ", "zxY", "XYZ", "xyZ"])
 def test_orin_says_which_axis_each_number_is_about(letters):
-    """The camera turns about its own right, down and ahead; the numbers are stored as the letters say."""
+    """The camera rotates about its own right, down and ahead; the numbers are stored as the letters say."""
     omega = np.array([0.3, -0.2, 0.7])
     about = {"X": -omega[0], "Y": -omega[2], "Z": -omega[1]}  # left, back, up
     stored = [about[letter.upper()] * (1 if letter.isupper() else -1) for letter in letters]

@@ -1,4 +1,4 @@
-"""Motions from gyroscopes; the judge is a camera turned in small steps by plain NumPy."""
+"""Motions from gyroscopes; the judge is a camera rotated in small steps by plain NumPy."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_bend_is_what_the_integral_of_the_rate_has_beside_its_line(readout):
     start, end = camera.clock_range
     clock = np.linspace(start, end, 5001)
     at = 0.7 + READOUT_S * ((clock - start) / (end - start) - 0.5)
-    angle = -(1.5 * at - 4 * np.cos(100 * np.pi * at) / (100 * np.pi))  # the world turns the other way
+    angle = -(1.5 * at - 4 * np.cos(100 * np.pi * at) / (100 * np.pi))  # the world rotates the other way
     slope, mean = np.polyfit(clock, angle, 1)
     # samples 0.1 ms apart, linear between: a share of (0.1 ms x 100 pi)^2 / 12 of 4 / 100 pi, 1e-6 rad
     assert phi == pytest.approx(slope * (end - start) * axis, abs=3e-6)
@@ -158,7 +158,7 @@ def test_sigma_grows_with_each_thing_that_is_uncertain(rng):
     assert sigma(steady) == pytest.approx(np.full(3, READOUT_S * np.hypot(0.01, 0.03 * 2.0)))
     swinging = GyroLog(time_s, np.tile(np.sin(2 * np.pi * 3 * (time_s - 1.0))[:, None], 3))
     assert (sigma(swinging, offset_sigma_s=0.01) > 1.3 * sigma(swinging)).all()
-    assert (sigma(swinging) > READOUT_S * 0.1).all()  # it turns by 0.57 rad/s more at the last line than at the first
+    assert (sigma(swinging) > READOUT_S * 0.1).all()  # it rotates by 0.57 rad/s more at the last line than at the first
 
 
 def test_mean_of_a_piecewise_linear_rate_is_exact(rng):
@@ -220,7 +220,7 @@ def test_logs_are_checked(time_s, omega):
 
 def test_axes_name_what_lies_to_the_right_down_and_ahead():
     assert np.array_equal(parse_axes("XYZ"), np.eye(3))
-    # the sensor's y points left, its x down, its z ahead: it turns by (1, 2, 3) about its own axes
+    # the sensor's y points left, its x down, its z ahead: it rotates by (1, 2, 3) about its own axes
     assert parse_axes("yXZ") @ [1, 2, 3] == pytest.approx([-2, 1, 3])
     for text in ("XY", "XXZ", "xyzz", "ABC", ""):
         with pytest.raises(InputError, match="expected X, Y and Z"):
@@ -369,7 +369,7 @@ def test_photos_find_their_times_and_readouts(tmp_path):
     (tmp_path / "frames.csv").write_text("name,time_s\nb.jpg,1.0\nother.jpg,2.0\n")
     known, bends = gyro_motions(tmp_path, gyro, gyro.log(), readouts, cameras)
     assert list(known) == list(bends) == ["b.jpg"]
-    # the slope of the turn, which differs from its mean by what the rate curves: a swing a second in 0.03 s
+    # the slope of the rotation, which differs from its mean by what the rate curves: a swing a second in 0.03 s
     assert known["b.jpg"][0] == pytest.approx(-READOUT_S * mean_rates(1.5, READOUT_S), rel=1e-3)
     assert 0 < np.abs(bends["b.jpg"].rotation).max() < 1e-3
     (tmp_path / "times.csv").write_text("name,time_s\nc.jpg,1.0\n")

@@ -1,4 +1,4 @@
-"""Gyroscopes found from rotations between frames; the judge is a camera that SciPy turns in steps of a millisecond."""
+"""Gyroscopes found from rotations between frames; the judge is a camera rotated by SciPy in steps of a millisecond."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rsundistort.io.gyro import GyroLog, motions_from_gyro, parse_axes
 
 STEP_S, LENGTH_S, FRAME_S = 0.001, 14.0, 1 / 30
 NUM_FRAMES = 300
-FIRST_S = 2.0  # when the first frame is taken, by the clock of the turning camera
+FIRST_S = 2.0  # when the first frame is taken, by the clock of the rotating camera
 
 
 @cache
@@ -43,7 +43,7 @@ def walk(seed=0, kind="hand"):
 
 
 def frames(seed=0, kind="hand", noise_rad=3e-4, scale=1.0, outliers=0):
-    """Times by the camera's clock, which shows zero at the first frame, pairs of neighbours, and turns."""
+    """Times by the camera's clock, which shows zero at the first frame, pairs of neighbours, and rotations."""
     rng = np.random.default_rng(seed + 100)
     _, orientation = walk(seed, kind)
     times = np.arange(NUM_FRAMES) * FRAME_S
@@ -85,7 +85,7 @@ def test_axes_offset_and_bias_are_found(axes):
     assert found.ratio == pytest.approx(1, abs=0.005)
     assert found.correlation > 0.99
     assert (found.axis_correlations > 0.99).all()
-    # 0.3 mrad in each turn of a thirtieth of a second, and what the gyroscope's noise leaves of seven samples
+    # 0.3 mrad in each rotation of a thirtieth of a second, and what the gyroscope's noise leaves of seven samples
     assert found.rms == pytest.approx(np.hypot(3e-4 / FRAME_S, 0.01 / np.sqrt(6.7)), rel=0.15)
     assert axes in str(found)
 
@@ -191,6 +191,15 @@ def test_a_log_of_another_clip_is_refused():
         assert found.correlation < 0.7
 
 
+def test_a_log_that_drifts_is_of_another_clip_wherever_it_fits_best():
+    for seed in range(3):
+        time_s = np.arange(0, 12, 0.005)
+        drift = np.random.default_rng(seed).normal(size=(len(time_s), 3)).cumsum(0)
+        found = align_gyro(GyroLog(time_s, 0.3 * drift / np.abs(drift).max()), *frames())
+        assert isinstance(found, NoAlignment)
+        assert "another clip" in found.reason
+
+
 def test_a_mirror_image_is_named():
     log = gyroscope(offset_s=0.3)
     mirrored = GyroLog(log.time_s, log.omega_c * [1, 1, -1])
@@ -198,7 +207,7 @@ def test_a_mirror_image_is_named():
     assert isinstance(found, NoAlignment)
     assert "mirror image of the camera's, as XYz takes them" in found.reason
     times, pairs, turns = frames()
-    assert "as xyz takes them" in str(align_gyro(log, times, pairs, -turns))  # the sign of turns
+    assert "as xyz takes them" in str(align_gyro(log, times, pairs, -turns))  # the sign of rotations
 
 
 @pytest.mark.parametrize(

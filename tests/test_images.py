@@ -68,7 +68,7 @@ def test_orientation_is_carried_and_not_applied(tmp_path):
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 def test_tiff_is_read_in_the_stored_frame(tmp_path, dtype, orientation):
-    """OpenCV turns a TIFF by its tag, whatever it is told."""
+    """OpenCV rotates a TIFF by its tag, whatever flags it gets."""
     pixels = texture(64, 48).astype(dtype)
     write_image(tmp_path / "a.tif", pixels, Metadata(camera_exif(">", orientation)))
     photo = read_photo(tmp_path / "a.tif")
@@ -242,7 +242,7 @@ def heic(pixels, orientation=1, bits=8, **kwargs):
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_heic_is_read_in_the_stored_frame(tmp_path, orientation):
-    """libheif turns it; the turn becomes the tag again."""
+    """libheif rotates it; the rotation becomes the tag again."""
     stored = cv2.resize(texture(12, 8), (96, 64), interpolation=cv2.INTER_CUBIC)
     (tmp_path / "a.heic").write_bytes(heic(stored, orientation))
     photo = read_photo(tmp_path / "a.heic")
@@ -326,7 +326,7 @@ def test_a_file_is_read_by_its_content(tmp_path, kind, named):
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF", "WebP", "HEIC"])
 def test_a_picture_is_no_raw_file(tmp_path, kind):
-    """Whoever developed it may have turned or cropped it."""
+    """Whoever developed it may have rotated or cropped it."""
     (tmp_path / "a.nef").write_bytes(of_kind(kind))
     with pytest.raises(FileError, match=rf"a\.nef is {kind} by its content, not RAW"):
         read_photo(tmp_path / "a.nef")

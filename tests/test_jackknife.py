@@ -187,7 +187,7 @@ CASES = ("independent", "larger than said", "of the lens", "of the scene")
 
 @pytest.mark.parametrize("case", CASES)
 def test_deviations_are_those_of_the_errors(case, rng):
-    # noise of 0.5 px is what the adjustment is told
+    # noise of 0.5 px is what the adjustment is given
     errors, of_model, of_means = [], [], []
     for _ in range(6):
         noise_px = 0.75 if case == "larger than said" else 0.5
@@ -229,7 +229,7 @@ def test_independent_noise_keeps_the_deviations_of_the_model(rng):
         ratio = getattr(jackknife, name) / getattr(model, name)
         assert 0.99 < np.median(ratio) < 1.3
     for one, other in zip(jackknife.sigma_intrinsics, model.sigma_intrinsics, strict=True):
-        # a camera has two or three photos to tell by
+        # a camera has two or three photos to estimate it from
         assert all(0.95 < one[name] / other[name] < 2.5 for name in ("f", "k1"))
 
 
@@ -248,7 +248,7 @@ def test_what_a_lens_leaves_is_no_motion(rng):
 
 
 def test_photos_at_the_prior_keep_its_deviation(rng):
-    # where the noise tells nothing it is not enlarged either
+    # where the noise is unknown it is not enlarged either
     truth = bent(make_scene(rng, "rotation", num_images=6, num_points=100, noise_px=0.5), rng, by_lens=False)
     obs = truth.observations
     few = truth.with_points((obs.frame_idx != 2) | (obs.point_idx < 5))

@@ -28,6 +28,24 @@ def add(x):
     return x + 0
 """
 CALL = "from small import twice; print(twice(21), sum(twice.stats.cache_hits.values()))"
+# the reduced system of random blocks of six photos
+SUMS = """
+import hashlib
+import numpy as np
+from rsundistort._kernels import schur
+from rsundistort._kernels._jit import unknowns_of
+rng = np.random.default_rng(0)
+m, n, nb = 6, 200, 9
+rows, cols = np.triu_indices(m)
+frame_idx, point_idx = np.tile(np.arange(m), n), np.repeat(np.arange(n), m)
+S, rhs = np.empty((len(cols), nb, nb)), np.empty((m, nb))
+schur.reduced_system(
+    unknowns_of(nb), np.arange(m + 1) * n, np.argsort(frame_idx, kind="stable"), frame_idx, point_idx,
+    np.arange(n + 1) * m, np.searchsorted(rows, np.arange(m + 1)), cols, rng.normal(size=(m * n, 2, nb)),
+    rng.normal(size=(n, 3, 3)), rng.normal(size=(n, 3)), rng.normal(size=(m, nb)), rng.normal(size=(m, nb)), S, rhs,
+)
+print(hashlib.sha256(S.tobytes() + rhs.tobytes()).hexdigest(), sum(schur.reduced_system.stats.cache_hits.values()))
+"""
 NOWHERE = {"CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator", "CACHE_DIR": os.devnull + "/x"}
 
 
@@ -72,6 +90,16 @@ def test_a_kernel_is_compiled_once_for_all_processes(written):
     for found in ("0", "1"):
         done = subprocess.run([sys.executable, "-c", CALL], capture_output=True, text=True, env=environment)
         assert (done.stdout.split(), done.stderr) == (["42", found], "")
+
+
+def test_kernels_read_back_give_the_same_bits_as_those_just_compiled(tmp_path):
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    compiled, kept = (
+        subprocess.run([sys.executable, "-c", SUMS], capture_output=True, text=True, env=environment).stdout.split()
+        for _ in range(2)
+    )
+    assert (compiled[1], kept[1]) == ("0", "1")
+    assert compiled[0] == kept[0]
 
 
 @pytest.mark.parametrize(

@@ -234,7 +234,7 @@ def nothing(x, y):
 
 
 def left_of(camera, pattern, model):
-    """Pattern over a frame, less what intrinsics, turns and motions say of it, and a camera's field: both (n, 2)."""
+    """Pattern over a frame, less what intrinsics, rotations and motions explain, and a camera's field: (n, 2)."""
     xy, found = (each.reshape(-1, 2) for each in field_over_frame(camera))
     bare = replace(camera.pinhole(), K=[[camera.K[0, 0], 0, 399.5], [0, camera.K[1, 1], 299.5], [0, 0, 1]])
     rays = np.column_stack([unproject_points(xy, bare, None, "global")[0], np.ones(len(xy))])

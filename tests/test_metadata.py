@@ -82,7 +82,7 @@ def test_tags_are_kept_in_every_kind(tmp_path, suffix, order):
 def test_opencv_and_pillow_follow_what_is_written(tmp_path, suffix):
     photo = write(tmp_path / f"a{suffix}", Metadata(camera_exif(">"), XMP, ICC))
     if suffix in (".jpg", ".png"):  # OpenCV 5 fails on any TIFF whose tag exchanges the sides, 4 knows none of WebP
-        assert cv2.imread(str(tmp_path / f"a{suffix}"), cv2.IMREAD_COLOR).shape == (64, 48, 3)  # turned by the tag
+        assert cv2.imread(str(tmp_path / f"a{suffix}"), cv2.IMREAD_COLOR).shape == (64, 48, 3)  # rotated by the tag
     with Image.open(tmp_path / f"a{suffix}") as image:
         exif = image.getexif()
         assert exif[0x0112] == 6
@@ -90,7 +90,7 @@ def test_opencv_and_pillow_follow_what_is_written(tmp_path, suffix):
         assert image.info["icc_profile"] == ICC
         assert b"x-default" in image.info["xmp"]
         pixels = np.asarray(image)[..., ::-1]
-        if suffix == ".tif":  # Pillow turns a TIFF
+        if suffix == ".tif":  # Pillow rotates a TIFF
             np.testing.assert_array_equal(pixels, turn_pixels(photo.pixels, 6))
         elif suffix != ".webp":  # no halved colour to be drawn by other means
             np.testing.assert_array_equal(pixels, photo.pixels)

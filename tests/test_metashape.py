@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 
 import cv2
@@ -15,9 +17,9 @@ from rsundistort import RectifyOptions, read_solution
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
 from rsundistort.errors import FileError, FormatError, InputError, ReconstructionError, RsUndistortWarning
-from rsundistort.io.metashape import named, read_metashape, write_metashape
+from rsundistort.io.metashape import named, read_metashape, write_metashape, write_posed_photos
 from rsundistort.model.projection import project_points
-from rsundistort.solve.from_poses import measured, posed_photos
+from rsundistort.solve.from_poses import measured, posed_photos, shutter_terms
 
 W, H = 1200, 900
 COURTYARD = Path(__file__).parent.parent / "sample_scenes" / "courtyard"
@@ -96,14 +98,89 @@ def test_the_transform_of_the_chunk_is_applied(tmp_path):
     assert found.unposed == ("lost",)
 
 
-def test_what_nobody_explains_of_a_shutter_is_left_out_and_told(tmp_path):
-    text = xml(FRAME).replace(
-        "</transform></camera>",
-        "</transform><rolling_shutter><translation>0 0 1</translation></rolling_shutter></camera>",
+def project():
+    """A file as Metashape 2 exports it with rolling-shutter compensation: two photos with its terms, one without."""
+    terms = (
+        "<rolling_shutter><rotation>9.9999812e-01 1.7e-03 -9.1e-04 -1.7e-03 9.9999855e-01 2.2e-04 9.1e-04 -2.2e-04 "
+        "9.9999956e-01</rotation><translation>-3.1415926535897931e-02 1.2e-01 4.4e-03</translation></rolling_shutter>"
     )
-    (tmp_path / "c.xml").write_text(text)
-    with pytest.warns(RsUndistortWarning, match="rolling_shutter of 1 cameras, such as a, is left out"):
-        assert read_metashape(tmp_path / "c.xml").labels == ("a",)
+    plane = "<rolling_shutter><translation>0.02 -0.11 0</translation></rolling_shutter>"
+    photo = (
+        '<camera id="{}" sensor_id="4" component_id="0" label="{}">'
+        "<transform>1 0 0 {} 0 1 0 0 0 0 1 0 0 0 0 1</transform>"
+        "<rotation_covariance>1e-8 0 0 0 1e-8 0 0 0 1e-8</rotation_covariance>"
+        "<location_covariance>1e-4 0 0 0 1e-4 0 0 0 1e-4</location_covariance>{}<orientation>1</orientation>"
+        '<reference x="9.5" y="46.5" z="512.25" enabled="true" rotation_enabled="false"/></camera>'
+    )
+    cameras = photo.format(7, "DJI_0151", 0.125, terms) + photo.format(8, "DJI_0152", 1.5, "")
+    cameras += photo.format(11, "DJI_0153", 3, plane)
+    values = "".join(f"<{name}>{value!r}</{name}>" for name, value in (FRAME | {"b2": 0.01}).items())
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n<document version="2.0.0"><chunk label="Chunk 1" enabled="true">'
+        f'<sensors next_id="5"><sensor id="4" label="FC220 (4.73mm)" type="frame">'
+        f'<resolution width="{W}" height="{H}"/>'
+        '<property name="pixel_width" value="0.0016"/><property name="focal_length" value="4.73"/>'
+        '<property name="layer_index" value="0"/><property name="rolling_shutter" value="true"/>'
+        '<property name="rolling_shutter_flags" value="63"/><bands><band label="Red"/></bands>'
+        f'<data_type>uint8</data_type><calibration type="frame" class="adjusted"><resolution width="{W}" height="{H}"/>'
+        f"{values}</calibration><black_level>0 0 0</black_level></sensor></sensors>"
+        '<components next_id="1"><component id="0" label="Component 1"><transform><rotation locked="true">'
+        "1 0 0 0 1 0 0 0 1</rotation><translation>0 0 0</translation><scale>4</scale></transform></component>"
+        f'</components><cameras next_id="12" next_group_id="0">{cameras}</cameras></chunk></document>'
+    )
+
+
+def test_what_nobody_explains_of_a_shutter_is_kept_as_it_is(tmp_path):
+    (tmp_path / "c.xml").write_text(project())
+    found = read_metashape(tmp_path / "c.xml")
+    assert sorted(found.shutter) == [0, 2]
+    # lengths follow the scale of the component, as centres do; rotations do not
+    np.testing.assert_array_equal(found.shutter[0].translation, 4 * np.array([-3.1415926535897931e-02, 0.12, 4.4e-3]))
+    assert found.shutter[0].rotation[0, 1] == 1.7e-3
+    np.testing.assert_array_equal(found.shutter[2].rotation, np.eye(3))
+    np.testing.assert_allclose(found.center_w[:, 0], [0.5, 6, 12])
+    assert found.sensors[0].shutter == {"rolling_shutter": "true", "rolling_shutter_flags": "63"}
+
+
+def test_a_file_read_and_written_is_the_same(tmp_path):
+    (tmp_path / "c.xml").write_text(project())
+    first = read_metashape(tmp_path / "c.xml")
+    write_posed_photos(tmp_path / "again.xml", first)
+    second = read_metashape(tmp_path / "again.xml")
+    assert second.labels == first.labels == ("DJI_0151", "DJI_0152", "DJI_0153")
+    assert second.camera_ids == first.camera_ids == (5,)
+    assert second.sensors == first.sensors
+    np.testing.assert_array_equal(second.center_w, first.center_w)
+    np.testing.assert_allclose(second.R_cw, first.R_cw, atol=1e-15)
+    assert second.shutter.keys() == first.shutter.keys()
+    for key, terms in first.shutter.items():
+        np.testing.assert_array_equal(second.shutter[key].rotation, terms.rotation)
+        np.testing.assert_array_equal(second.shutter[key].translation, terms.translation)
+
+
+def test_info_shows_the_terms_and_says_why_they_are_not_used(tmp_path):
+    (tmp_path / "c.xml").write_text(project())
+    shown = CliRunner().invoke(cli, ["info", str(tmp_path / "c.xml")])
+    assert shown.exit_code == 0, shown.output
+    assert re.search(r"photos with rolling_shutter +2\n", shown.output)
+    assert "-0.125664 0.48 0.0176" in shown.output
+    assert "Not used as motion: Agisoft does not publish" in shown.output
+    held = json.loads(CliRunner().invoke(cli, ["info", str(tmp_path / "c.xml"), "--json"]).output)
+    assert held["rolling_shutter"]["DJI_0153"]["translation"] == [0.08, -0.44, 0.0]
+    assert held["rolling_shutter"]["DJI_0153"]["angle_deg"] == 0
+    assert held["cameras"]["5"]["rolling_shutter_flags"] == "63"
+
+
+def test_a_solution_keeps_the_terms_and_has_no_motion_of_them(tmp_path):
+    (tmp_path / "c.xml").write_text(project())
+    (tmp_path / "photos").mkdir()
+    for name in ("DJI_0151.JPG", "DJI_0152.JPG", "DJI_0153.JPG"):
+        cv2.imwrite(str(tmp_path / "photos" / name), np.zeros((8, 8), np.uint8))
+    with pytest.warns(RsUndistortWarning, match=r"rolling_shutter of 2 photos, such as DJI_0151\.JPG, .* not used as"):
+        posed = posed_photos(tmp_path / "c.xml", tmp_path / "photos", "tif")
+    kept = shutter_terms(posed)
+    assert sorted(kept) == ["DJI_0151.JPG", "DJI_0153.JPG"]
+    assert kept["DJI_0153.JPG"] == {"rotation": np.eye(3).tolist(), "translation": [0.08, -0.44, 0.0]}
 
 
 def test_geocentric_coordinates_are_counted_from_the_middle(tmp_path):
@@ -132,6 +209,11 @@ def test_geocentric_coordinates_are_counted_from_the_middle(tmp_path):
         (xml(FRAME, matrix=[1.0] * 3), "expected 16 numbers, got 3"),
         (xml(FRAME).replace('sensor_id="0"', 'sensor_id="7"'), "'7' is missing"),
         (xml(FRAME).replace('label="a"', ""), "'label' is missing"),
+        (
+            project().replace("0.02 -0.11 0", "0.02 -0.11"),
+            "rolling_shutter of DJI_0153: translation: expected 3 numbers",
+        ),
+        (project().replace("9.9999855e-01", "nan"), "rolling_shutter of DJI_0151: rotation: expected 9 numbers"),
     ],
 )
 def test_a_damaged_file_is_one_line(tmp_path, text, message):
@@ -172,7 +254,7 @@ def test_photos_are_found_by_name_without_ending_or_folder(tmp_path):
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
-    """Three small photos of courtyard, and what Metashape would say of their global-shutter twins."""
+    """Three small photos of courtyard, and what Metashape would say of their global-shutter references."""
     place = tmp_path_factory.mktemp("metashape")
     (place / "photos").mkdir()
     truth = read_solution(COURTYARD / "ground_truth.json")

@@ -277,7 +277,7 @@ def test_a_motion_in_the_other_frame_is_refused_where_it_matters():
         ours.pose_at(0.1, R_cw, np.zeros(3))
     with pytest.raises(InputError, match="is in the camera frame"):
         replace(image, motion=ours)
-    # which frame a motion without velocity is told in makes no difference
+    # which frame a motion without velocity is given in makes no difference
     turning = replace(image, motion=RowMotion([0.01, 0, 0])).motion
     project_points(point, camera, turning, "constant-motion")
     with pytest.raises(InputError, match="frame='body', expected one of world, camera"):

@@ -22,7 +22,7 @@ NONE = 4294967295  # OpenMVG's id for none
 
 
 def project(points_w, R, center, dist, fisheye, fy, middle, phi):
-    """Pixels with integer centres, by OpenCV; of a camera that turns, by the row that it finds after some rounds."""
+    """Pixels with integer centres, by OpenCV; of a camera that rotates, by the row that it finds after some rounds."""
     K = np.array([[F, 0, middle[0]], [0, fy, middle[1]], [0, 0, 1.0]])
     points = (points_w - center) @ R.T
 

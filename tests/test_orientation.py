@@ -1,4 +1,4 @@
-"""Turned photos and their cameras: OpenCV and projections are the oracles."""
+"""Rotated photos and their cameras: OpenCV and projections are the oracles."""
 
 from __future__ import annotations
 

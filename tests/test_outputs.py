@@ -489,7 +489,7 @@ def test_rs_poses_go_beside_the_model_and_name_the_originals(tmp_path, rng):
     turns = {f"sub {k % 2}/{k}.jpg": 6 for k in range(4)}
     made, _ = outputs_of(rng, tmp_path / "with", OutputOptions(rs_poses=True), turns)
     value = json.loads((tmp_path / "with" / "rs-poses" / "transforms.json").read_text())
-    assert (value["w"], value["h"]) == (W, H)  # as stored, not as turned
+    assert (value["w"], value["h"]) == (W, H)  # as stored, not as rotated
     assert [frame["file_path"] for frame in value["frames"]] == list(made.reconstruction.image_names)
     assert (tmp_path / "with" / "rs-poses" / value["ply_file_path"]).resolve() == tmp_path / "with" / "points.ply"
     R_cw, _ = read_transforms(tmp_path / "with" / "rs-poses" / "transforms.json")
@@ -503,7 +503,7 @@ def test_frames_without_files_are_left_out(tmp_path, rng):
 
 
 def bent_solution(rng, camera, model="constant-motion", scale=1.0):
-    """Motions with a turn and a way that are not steady, and shakes that are of no steady motion."""
+    """Motions with a rotation and a way that are not steady, and shakes that are of no steady motion."""
     _, solution = solved(rng, [camera], model)
     images = []
     for image in solution.images:

@@ -91,7 +91,7 @@ def test_looks_pair_the_most_alike_beyond_the_chosen_ones(rng):
 
 
 def test_a_street_walked_twice_closes_its_loops(street, looks):
-    """No place is known: what joins the two walks was found by looks."""
+    """No place is known: what connects the two walks was found by appearance."""
     share = np.triu(street.common() >= COMMON // 3, 1)  # a third of the benchmark's features
     pairs = choose_pairs(80, [np.arange(80)], None, looks)
     found = np.zeros_like(share)

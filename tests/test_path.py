@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -16,6 +16,7 @@ from rsundistort.bundle.path import FramePath, PathPrior, orthogonal, with_path_
 from rsundistort.bundle.path import PathState as State
 from rsundistort.errors import InputError
 from rsundistort.model.path import CameraPath, inverse_left_jacobians
+from rsundistort.verdict.clip import judge_clip, unfollowed_px
 
 FRAME_S = 1 / 30
 
@@ -274,6 +275,34 @@ def test_frames_say_their_turns_from_a_start_that_knows_none() -> None:
     differences = np.diff(found.phi - expected.phi, axis=0) / np.hypot(found.sigma_phi[1:], found.sigma_phi[:-1])
     assert np.sqrt(np.mean(differences**2)) < 2.0
     assert np.median(np.abs(np.diff(expected.phi, axis=0) / expected.sigma_phi[1:])) > 5
+
+
+@dataclass(frozen=True)
+class Shaken(HandHeld):
+    """By a motor as well."""
+
+    hz: float = 70.0
+
+    def rotations(self, time_s):
+        angle = 2 * np.pi * self.hz * np.asarray(time_s)[:, None] + [0.0, 1.0, 2.0]
+        return Rotation.from_rotvec(0.01 * np.sin(angle)).as_matrix() @ super().rotations(time_s)
+
+
+def test_a_vibration_beyond_the_frame_rate_is_told_from_a_hand() -> None:
+    for hand, least, most in ((HandHeld(0), 0.0, 0.2), (Shaken(1), 1.0, np.inf)):
+        truth, times = filmed(hand, 20)
+        found = adjusted(truth, times).reconstruction
+        assert least <= unfollowed_px(found, own_motions(found)) <= most
+
+
+def test_frames_are_not_bent_by_a_readout_that_cannot_be() -> None:
+    truth, times = filmed(HandHeld(0), 20)
+    found = adjusted(truth, times)  # of 20 ms
+    assert judge_clip(found, found, None, FRAME_S).shutter == "found"
+    verdict = judge_clip(found, found, None, 0.01)
+    assert verdict.shutter == "not-determined"
+    assert verdict.lens_only == tuple(truth.image_names)
+    assert "longer than the 10.0 ms from frame to frame" in verdict.reasons[0]
 
 
 def test_the_state_of_a_path_gives_the_motions() -> None:

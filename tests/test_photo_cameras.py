@@ -93,7 +93,7 @@ def test_standard_deviations_that_cannot_be_are_refused(folder, sigma, says):
 def test_photos_take_the_cameras_that_a_file_names_for_them(folder):
     cameras = {"x": camera_of(WIDE), "y": camera_of(WIDE, f=70.0), "z": camera_of(TALL, "left-to-right")}
     write_cameras(folder / "cameras.json", cameras, {"a.png": "y", "b.png": "x", "c.png": "y", "d.png": "z"})
-    found = find_cameras(folder, NAMES, SIZES)  # in the folder, without being told
+    found = find_cameras(folder, NAMES, SIZES)  # in the folder, without being specified
     assert [found.of(i) for i in range(4)] == [cameras[key] for key in "yxyz"]
     assert (found.calibrated, found.readout_told) == (True, (True, True, True))
 
@@ -111,7 +111,7 @@ def test_a_folder_of_cameras_is_shared_out_by_size_and_by_group(folder, tmp_path
     found = find_cameras(folder, NAMES, SIZES, str(tmp_path / "cameras"))
     assert found.labels == ("phone", "camera-48x64")
     assert found.camera_idx.tolist() == [0, 0, 0, 1]
-    # a second one of the size: only a name can tell
+    # a second one of the size: only a name can distinguish them
     (tmp_path / "cameras" / "drone.json").write_text(json.dumps(camera_to_json(camera_of(WIDE))))
     with pytest.raises(InputError, match=r"several cameras of the size of a\.png.*call its file camera-64x48\.json"):
         find_cameras(folder, NAMES, SIZES, str(tmp_path / "cameras"))

@@ -44,7 +44,7 @@ def save_solution(path, names, width=64, height=48, motion=MOTION, posed=False):
 
 
 def save_oriented(folder, orientations=range(9), suffix=".png"):
-    """One scene as eight cameras would have stored it, turned so that the tag shows it upright; and with the tag 0."""
+    """One scene as eight cameras would have stored it, rotated so that the tag shows it upright; and with the tag 0."""
     folder.mkdir()
     for o in orientations:
         write_image(folder / f"{o}{suffix}", texture(64, 48), Metadata(camera_exif("<", o)))
@@ -157,7 +157,7 @@ def test_the_colmap_model_of_a_turned_run_fits_its_photos(turned_run):
         pixels = read_photo(folder / "out" / "images" / name).pixels
         assert pixels.shape[:2] == (image.camera.height, image.camera.width)
         np.testing.assert_allclose(image.cam_from_world().matrix()[:, :3], ours.R_cw, atol=1e-9)
-        # turned about the optical axis
+        # rotated about the optical axis
         np.testing.assert_allclose(image.projection_center(), plain.image(name).center_w, atol=1e-9)
         np.testing.assert_allclose(ours.R_cw[2], plain.image(name).R_cw[2], atol=1e-12)
     frames = json.loads((folder / "out" / "transforms.json").read_text())["frames"]

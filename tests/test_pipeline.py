@@ -53,7 +53,7 @@ def courtyard(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def solved(courtyard):
-    """One run: its solution, its outputs, what it told."""
+    """One run: its solution, its outputs, its messages."""
     told = []
     with pytest.warns(SkippedPhotoWarning, match=f"skipped: {BROKEN}") as caught:
         solution = run(courtyard / "photos", courtyard / "out", OPTIONS, lambda *args: told.append(args))
@@ -485,15 +485,15 @@ def test_camera_of_cropped_photos(crops):
 
 
 def test_cropped_photos_rectify_to_their_twins(crops):
-    """The twins have the lens of the photos: it is put on the rectified photo again by the lens's own map."""
+    """The references have the lens of the photos: it is put on the rectified photo again by the lens's own map."""
     folder, truth, _ = crops
     camera = truth.cameras["1"]
     for image in truth.images:
         raw = read_photo(folder / "cut" / "photos" / image.name).pixels
-        twin = read_photo(folder / "cut" / "global" / image.name).pixels
+        reference = read_photo(folder / "cut" / "global" / image.name).pixels
         rectified, mask = rectify(raw, camera, image.motion)
-        flat, flat_mask = rectify(twin, camera)
-        # noise of 2 pixels, interpolated once more than the twin and at 1/32 pixel: 52.4 to 52.8 dB
+        flat, flat_mask = rectify(reference, camera)
+        # noise of 2 pixels, interpolated once more than the reference and at 1/32 pixel: 52.4 to 52.8 dB
         assert psnr(rectified, flat, np.minimum(mask, flat_mask), 3) > 50
         assert mask.mean() > 0.8 * 255
 
@@ -506,10 +506,10 @@ def test_crop_of_random_motions_is_drawn_for_the_whole_frame(tmp_path):
     for image in cut.images:
         np.testing.assert_array_equal(image.motion.phi, whole.image(image.name).motion.phi)
         x, y, width, height = cut.options["crop_xywh"]
-        twin = read_photo(tmp_path / "cut" / "global" / image.name).pixels
+        reference = read_photo(tmp_path / "cut" / "global" / image.name).pixels
         original = read_photo(photos / image.name).pixels[y : y + height, x : x + width]
         # quality 100: rounding in 8-bit YCbCr and of the coefficients to whole numbers
-        assert psnr(twin, original) > 48
+        assert psnr(reference, original) > 48
     assert not (tmp_path / "whole" / "global").exists()
 
 

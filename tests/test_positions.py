@@ -101,7 +101,14 @@ def test_a_gimbal_tells_where_the_camera_looked(namespace, prefix, angles, right
     assert np.isnan(positions_of(["a.jpg"], [ExifFacts(fix=found, orientation=6)]).R_cw).all()
 
 
-@pytest.mark.parametrize("namespace", ["http://pix4d.com/camera/1.0/", "http://ns.sensefly.com/Camera/1.0/"])
+@pytest.mark.parametrize(
+    ("namespace", "names"),
+    [
+        ("http://pix4d.com/camera/1.0/", ("Yaw", "Pitch", "Roll")),
+        ("http://ns.sensefly.com/Camera/1.0/", ("Yaw", "Pitch", "Roll")),
+        ("http://ns.sensefly.com/sensefly/1.0/", ("Heading", "PitchAngle", "RollAngle")),
+    ],
+)
 @pytest.mark.parametrize(
     ("angles", "right", "ahead"),
     [
@@ -112,8 +119,8 @@ def test_a_gimbal_tells_where_the_camera_looked(namespace, prefix, angles, right
         ((0, 0, 30), (0.75**0.5, 0, -0.5), (-0.5, 0, -(0.75**0.5))),  # the right side down, the view to the left
     ],
 )
-def test_the_attitude_of_a_camera_that_looks_down(namespace, angles, right, ahead):
-    packet = xmp(namespace, **{name: str(value) for name, value in zip(("Yaw", "Pitch", "Roll"), angles, strict=True)})
+def test_the_attitude_of_a_camera_that_looks_down(namespace, names, angles, right, ahead):
+    packet = xmp(namespace, **{name: str(value) for name, value in zip(names, angles, strict=True)})
     R_cw = np.array(fix(packet).R_cw)
     np.testing.assert_allclose(R_cw[[0, 2]], [right, ahead], atol=1e-12)
     assert np.linalg.det(R_cw) == pytest.approx(1.0)
@@ -141,6 +148,47 @@ def test_altitudes_of_two_datums_are_told():
     told = {"EXIF": 283.8, "AltitudeAMSL": 315.7}
     found = positions_of(["a.jpg"], [ExifFacts(fix=GpsFix(41.0, -83.0, 283.8, altitudes_m=told))])
     assert "altitudes are of two datums: AltitudeAMSL is +31.9 m from EXIF's" in found.notes[0]
+
+
+def levels(altitudes, heights, sigma_up=5.0):
+    """Altitudes and their standard deviations of photos with heights above the take-off."""
+    facts = [
+        ExifFacts(fix=GpsFix(47.0, 8.0, each, (3.0, 3.0, sigma_up), height_m=height))
+        for each, height in zip(altitudes, heights, strict=True)
+    ]
+    return positions_of([f"{k}.jpg" for k in range(len(facts))], facts)
+
+
+def test_heights_above_the_take_off_replace_altitudes_that_are_worse():
+    heights = [60.0, 61.0, 62.5, 64.0, 60.5]
+    found = levels([412.0, 409.5, 415.0, 413.0, 411.0], heights)
+    assert np.diff(found.geodetic[:, 2]) == pytest.approx(np.diff(heights))
+    apart = np.array([352.0, 348.5, 352.5, 349.0, 350.5])  # altitude less height
+    assert found.geodetic[:, 2] - heights == pytest.approx(np.median(apart))
+    assert found.sigma_m[:, 2] == pytest.approx(1.4826 * 1.5)  # the scatter of these, which has the errors of both
+    assert found.common_up_m == 5.0
+    assert "height above take-off" in found.told_by
+    np.testing.assert_array_equal(found.sigma_m[:, :2], 3.0)
+
+
+def test_a_barometer_is_taken_to_be_good_to_a_metre():
+    found = levels([410.0, 412.0, 415.0], [60.0, 62.0, 65.0])  # DJI: altitudes are the heights and a constant
+    assert found.sigma_m[:, 2].tolist() == [1.0, 1.0, 1.0]
+    assert found.geodetic[:, 2].tolist() == [410.0, 412.0, 415.0]
+
+
+@pytest.mark.parametrize(
+    ("altitudes", "heights", "sigma_up", "kept"),
+    [
+        ([410.0, 412.0, 415.0], [60.0, 62.0, 65.0], 0.05, [0, 1, 2]),  # RTK
+        ([410.0, 412.0, 415.0], [60.0, None, 65.0], 5.0, [1]),
+        ([410.0, 412.0, 415.0, 430.0], [60.0, 62.0, 65.0, 60.0], 5.0, [3]),  # another take-off, 20 m higher
+    ],
+)
+def test_altitudes_that_are_better_or_of_another_take_off_stay(altitudes, heights, sigma_up, kept):
+    found = levels(altitudes, heights, sigma_up)
+    assert found.geodetic[kept, 2].tolist() == [altitudes[k] for k in kept]
+    assert found.sigma_m[kept, 2].tolist() == [sigma_up] * len(kept)
 
 
 # ---------------------------------------------------------------- frames
@@ -211,7 +259,7 @@ def test_velocities_and_rotations_are_turned_to_the_north_of_the_grid(crs):
     np.testing.assert_allclose(turned.velocity_m_s[0], end - begin, rtol=4e-3)  # a projection's metres
     np.testing.assert_allclose(turned.R_cw[0] @ turned.velocity_m_s[0], R_cw @ velocity, atol=1e-12)
     told = pyproj.Proj(crs).get_factors(origin[1], origin[0]).meridian_convergence
-    # EPSG:3035 keeps areas, not angles: its east and north are turned by 0.1 degrees more and less
+    # EPSG:3035 keeps areas, not angles: its east and north are rotated by 0.1 degrees more and less
     told += 180.0 * (crs == "EPSG:2048")
     assert np.degrees(frame.convergence_rad) == pytest.approx(told, abs=0.1 if crs == "EPSG:3035" else 1e-3)
 
@@ -265,7 +313,7 @@ def test_a_known_rotation_tells_the_roll_of_places_on_a_line(rng):
     apart = Rotation.from_matrix(found.similarity.R @ R.T).as_rotvec()
     along = R[:, 0]
     assert abs(apart @ along) < 0.1
-    assert np.linalg.norm(apart - (apart @ along) * along) < 0.01  # what the places tell is theirs
+    assert np.linalg.norm(apart - (apart @ along) * along) < 0.01  # what the places determine is theirs
     assert (found.sigma_rad < 0.1).all()
 
 

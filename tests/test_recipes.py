@@ -196,7 +196,7 @@ def test_points_behind_others_are_no_tracks(tmp_path):
 
 
 def test_exposure_blurs_along_the_motion(tmp_path):
-    # turning about the camera's y axis by 0.5 rad per frame smears columns and leaves rows sharp
+    # rotating about the camera's y axis by 0.5 rad per frame smears columns and leaves rows sharp
     given = {"kind": "given", "phi_rad_per_frame": [[0, 0.5, 0], [0, 0, 0]]}
     stripes = {
         "kind": "blocks", "size_m": [6, 6], "texels_per_m": 40, "colour": [230, 230, 230],
@@ -348,7 +348,7 @@ def test_a_camera_that_sees_only_sky_is_refused(tmp_path):
 
 
 def test_rows_that_fold_over_are_refused(tmp_path):
-    # a camera that turns as fast as its rows run (1 rad per unit of the clock, 0.8 a frame) sees one thing in all
+    # a camera that rotates as fast as its rows run (1 rad per unit of the clock, 0.8 a frame) sees one thing in all
     given = {"kind": "given", "phi_rad_per_frame": [[-0.9, 0, 0], [0, 0, 0]]}
     refused(tmp_path, r"0000\.jpg.* fold", motion=given)
     simulate_scene(rendered(tmp_path, motion={**given, "phi_rad_per_frame": [[0.9, 0, 0], [0, 0, 0]]}), tmp_path / "o")

@@ -322,7 +322,7 @@ def test_warp_of_a_bent_motion_turns_each_line_by_itself(readout, dist, rng):
     warped, mask = warp_photo(original, camera, RowMotion(MOTION.phi, bend=bend))
     axis, sign = READOUTS[readout]
     for line in (0, 7, H // 2, H - 1):
-        # the photo of a camera that had the line's turn all the time shows the line as it is
+        # the photo of a camera that had the line's rotation all the time shows the line as it is
         clock = sign * (line - camera.K[axis, 2]) / camera.K[axis, axis]
         turn = clock * MOTION.phi + CubicSpline(bend.clock, bend.rotation)(clock)
         still, still_mask = warp_photo(original, camera, turn / clock)

@@ -116,7 +116,7 @@ def test_rotated_photos_are_shown_upright(tmp_path):
     quietly(out, tmp_path / "photos")
     (turned, *_) = page_of(out).data["views"]
     assert (upright["size"], turned["size"]) == ([320, 240], [240, 320])
-    # a quarter turn clockwise takes (x, y) to (239 - y, x), here in thousandths of the width
+    # a quarter rotation clockwise takes (x, y) to (239 - y, x), here in thousandths of the width
     x, y = 0.320 * np.array(upright["arrows"])[:, 0::2], 0.320 * np.array(upright["arrows"])[:, 1::2]
     expected = np.stack([(239 - y) / 0.240, x / 0.240], axis=-1).reshape(-1, 4)
     np.testing.assert_allclose(np.array(turned["arrows"]), expected, atol=0.3)  # a tenth, rounded twice

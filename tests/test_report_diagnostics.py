@@ -26,7 +26,7 @@ def test_displacement_is_that_of_the_rotation(readout):
     image = SolvedImage("a", "1", motion=motion)
     solution = Solution("rotation", {"1": camera}, {"1": camera.pinhole()}, (image,))
     raw, still = displacement_field(solution, image)
-    # the row is known from the raw pixel: turn its ray back
+    # the row is known from the raw pixel: rotate its ray back
     rays = np.column_stack([(raw - [160, 120]) / 300, np.ones(len(raw))])
     clock = rays[:, 1] if readout == "top-to-bottom" else -rays[:, 0]
     back = Rotation.from_rotvec(-clock[:, None] * motion.phi).apply(rays)

@@ -1,6 +1,6 @@
 """There and back, for any camera and motion: properties that hold whatever hypothesis draws.
 
-Cameras see 25 to 65 degrees along their longer side and turn by up to 0.1 rad per frame. Zero and tiny motions are
+Cameras see 25 to 65 degrees along their longer side and rotate by up to 0.1 rad per frame. Zero and tiny motions are
 drawn on purpose: series and closed forms meet there.
 """
 
@@ -172,7 +172,7 @@ def test_reversed_readout_with_the_negative_motion_is_the_same(camera, rotation,
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-2)  # a step of 1/32 px where rounding differs
 
 
-# what may be done to a stored photo: as it is, turned by 90, 180, 270 degrees, and the mirror image of each
+# what may be done to a stored photo: as it is, rotated by 90, 180, 270 degrees, and the mirror image of each
 ORIENTATIONS = {
     f"{'mirrored ' if mirrored else ''}{90 * turns}": np.linalg.matrix_power([[0, -1], [1, 0]], turns)
     @ np.diag([-1 if mirrored else 1, 1])
@@ -184,7 +184,7 @@ ORIENTATIONS = {
 @settings(max_examples=60)
 @given(cameras(["pinhole", "barrel", "fisheye"]), rotations, MODELS, st.sampled_from(list(ORIENTATIONS)))
 def test_turned_or_mirrored_photo_is_rectified_to_the_turned_or_mirrored_one(camera, rotation, model, orientation):
-    if len(camera.dist) and camera.lens == "pinhole":  # without the tangential part, which would have to be turned too
+    if len(camera.dist) and camera.lens == "pinhole":  # without the tangential part, which would have to be rotated too
         camera = replace(camera, dist=camera.dist * [1, 1, 0, 0])
     turn, motion = ORIENTATIONS[orientation], turned_per_frame(camera, rotation)
     axis, sign = READOUTS[camera.readout]

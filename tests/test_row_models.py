@@ -1,4 +1,4 @@
-"""The row models against the NumPy twin, OpenCV and themselves."""
+"""The row models against the NumPy version, OpenCV and themselves."""
 
 from __future__ import annotations
 

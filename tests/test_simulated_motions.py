@@ -159,7 +159,7 @@ def test_csv_and_json_tables_say_the_same(tmp_path):
 
 
 def test_stretch_of_a_gyroscopes_log_turns_as_it_says():
-    """About one axis in closed form; the world turns the other way in the camera."""
+    """About one axis in closed form; the world rotates the other way in the camera."""
     time_s = np.arange(0, 0.05, 1e-5)  # one stretch of 0.03 s fits at several places: find out which by its phase
     log = GyroLog(time_s, np.outer(2.0 + np.sin(2 * np.pi * 40 * time_s), [0, 1, 0]), 0.03)
     (path,) = tracks(log, [CAMERA], None, 4)

@@ -317,7 +317,7 @@ def test_a_database_that_is_not_the_models_is_refused(tmp_path, rng, what):
 
 
 def turned_model(scene, orientation_of):
-    """The same model of photos that were turned by their EXIF orientation before COLMAP looked at them."""
+    """The same model of photos that were rotated by their EXIF orientation before COLMAP looked at them."""
     given = colmap_model_of(scene.model)
     from rsundistort.colmap.rectified_model import ModelIds
     from rsundistort.model.orientation import turn_reconstruction

@@ -45,7 +45,7 @@ def motion(seed, rms, low_hz, high_hz):
 
 
 def clip(seed, frames, lines, true_s, *, scale=1.0, phi_sigma=PHI_SIGMA, **options):
-    """The verdict on a clip whose frames turn by one motion of the camera, and whose lines by another."""
+    """The verdict on a clip whose frames rotate by one motion of the camera, and whose lines by another."""
     rng = np.random.default_rng(seed + 1000)
     times = np.arange(NUM_FRAMES) * FRAME_S
     pairs = np.column_stack([np.arange(NUM_FRAMES - 1), np.arange(1, NUM_FRAMES)])
@@ -80,7 +80,7 @@ def test_a_clip_as_the_sensor_saw_it(seed, share):
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_shutter_without_its_rotation(seed):
-    """Frames were turned back as a whole: they pan smoothly, their lines still shake."""
+    """Frames were rotated back as a whole: they pan smoothly, their lines still shake."""
     pan, shaking = motion(seed, 0.1, 0.05, 0.3), motion(seed + 50, 0.3, 1, 5)
     found = clip(seed, pan, pan + shaking, 0.02)
     assert found.verdict == "stabilised"

@@ -59,6 +59,34 @@ def test_by_gps_the_model_is_in_metres_east_north_and_up(by_gps):
     assert np.all(np.array(told["gps"]["rms_axes_m"]) < [1.2, 1.2, 2.4])
 
 
+def leveled(seed, with_heights=True):
+    """Survey, model and true centres of a flight whose altitudes are 4 m too high, and known to 5 m."""
+    flight = Flight(seed=seed)
+    facts, rng = flight.facts(sigma_m=(0.5, 0.5, 0.7), told=(0.5, 0.5, 5.0)), np.random.default_rng(seed)
+    fixes = [replace(each.fix, altitude_m=each.fix.altitude_m + 4.0) for each in facts]
+    if with_heights:
+        heights = (flight.center_w[:, 2] - 3.0 + rng.normal(0, 0.5, len(fixes))).tolist()
+        fixes = [replace(fix, height_m=height) for fix, height in zip(fixes, heights, strict=True)]
+    facts = [ExifFacts(fix=fix) for fix in fixes]
+    survey, rec = survey_of(None, [], flight.names, facts, [(768, 512)] * 10).placed(flight.start)
+    true = None if survey is None else survey.frame.of_geodetic(geodetic_of(flight.center_w))
+    return survey, rec, true
+
+
+def test_heights_above_the_take_off_level_a_small_block():
+    plain, better = (leveled(0, each)[0].fit.sigma_rad[:2].max() for each in (False, True))
+    assert better < 0.5 * plain
+    tilts, heights = [], []
+    for seed in range(20):
+        survey, rec, true = leveled(seed)
+        turned, _ = Rotation.align_vectors(rec.center_w - rec.center_w.mean(0), true - true.mean(0))
+        tilts.append(turned.as_rotvec()[:2] / survey.fit.sigma_rad[:2])
+        heights.append((rec.center_w - true).mean(0)[2] / survey.fit.sigma_m[2])
+    # the standard deviations hold, and that of the height contains the 4 m that the altitudes share
+    assert 0.1 < np.mean(np.square(tilts)) < 1.6
+    assert 0.5 < np.abs(heights).max() < 1.2
+
+
 def test_the_place_on_the_map_is_kept_in_the_solution(by_gps, tmp_path):
     solution = solution_of(with_readout(by_gps[1], READOUT_S), SolveOptions(), RectifyOptions())
     write_solution(tmp_path / "solution.json", solution)

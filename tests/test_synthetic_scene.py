@@ -98,7 +98,7 @@ def test_what_a_pixel_sees_projects_back_to_it(readout, dist):
 
 
 def bent(camera, rng):
-    """Ten readings each of a turn and of a way that are not steady."""
+    """Ten readings each of a rotation and of a way that are not steady."""
     axis, sign = DIRECTIONS[camera.readout]
     ends = sign * (np.array([0, [camera.width, camera.height][axis] - 1]) - camera.K[axis, 2]) / camera.K[axis, axis]
     return Bend(*sorted(ends), rng.normal(size=(10, 3)) * 0.003, rng.normal(size=(10, 3)) * 0.01)
@@ -247,7 +247,7 @@ def test_truth_of_the_courtyard_is_what_the_recipe_says(courtyard, truth):
         assert image["skew"] == image["phi"][1]
     assert not np.any(truth["images"][0]["phi"])
     angle = np.linalg.norm([image["phi"] for image in truth["images"][1:]], axis=1) * courtyard.cameras["1"].frame_span
-    assert 0.02 < np.sqrt((angle**2).mean()) < 0.08  # drawn with a spread of 0.05
+    assert 0.02 < np.sqrt((angle**2).mean()) < 0.08  # drawn with a standard deviation of 0.05
 
 
 def test_true_motion_rectifies_the_photos(truth):
@@ -259,17 +259,17 @@ def test_true_motion_rectifies_the_photos(truth):
     before, after = [], []
     for image in truth["images"][1:]:
         raw = cv2.imread(str(COURTYARD / "photos" / image["name"]))
-        twin = cv2.imread(str(COURTYARD / "global" / image["name"]))[np.ix_(rows, columns)].astype(float)
+        reference = cv2.imread(str(COURTYARD / "global" / image["name"]))[np.ix_(rows, columns)].astype(float)
         row = ideal[:, 1]
         for _ in range(5):  # |phi| < 0.11 and r < 0.4: each pass gains a digit of some 50 px
             q = Rotation.from_rotvec(row[:, None] * image["phi"]).apply(ideal)
             row = q[:, 1] / q[:, 2]
-        seen_at = (q[:, :2] / q[:, 2:] * np.diag(camera.K)[:2] + camera.K[:2, 2]).reshape(*twin.shape[:2], 2)
+        seen_at = (q[:, :2] / q[:, 2:] * np.diag(camera.K)[:2] + camera.K[:2, 2]).reshape(*reference.shape[:2], 2)
         rectified = cv2.remap(raw, *np.moveaxis(seen_at.astype(np.float32), 2, 0), cv2.INTER_CUBIC)
         valid = ((seen_at > 1) & (seen_at < [camera.width - 2, camera.height - 2])).all(2)
         assert valid.mean() > 0.85
-        before.append(20 * np.log10(255 / np.sqrt(((raw[np.ix_(rows, columns)] - twin)[valid] ** 2).mean())))
-        after.append(20 * np.log10(255 / np.sqrt(((rectified - twin)[valid] ** 2).mean())))
+        before.append(20 * np.log10(255 / np.sqrt(((raw[np.ix_(rows, columns)] - reference)[valid] ** 2).mean())))
+        after.append(20 * np.log10(255 / np.sqrt(((rectified - reference)[valid] ** 2).mean())))
         # over the raw grid the way back is closed: the row is known
         q = Rotation.from_rotvec(-ideal[:, 1:2] * image["phi"]).apply(ideal)
         shift = (q[:, :2] / q[:, 2:] - ideal[:, :2]) * np.diag(camera.K)[:2]
@@ -297,7 +297,7 @@ def test_sample_scenes_are_small_and_whole():
             continue
         for kind in ("photos", "global"):
             assert sorted(f.name for f in (folder / kind).iterdir()) == [v.name for v in recipe.views]
-    assert total < 17e6  # 12 of photos, and a clip of 3 with its truth and twins
+    assert total < 17e6  # 12 of photos, and a clip of 3 with its truth and references
 
 
 def test_shift_counts_translation_by_depth():

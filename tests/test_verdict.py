@@ -49,7 +49,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def measured(rng, phi, *, num_points=250, noise_px=NOISE_PX, velocity=None):
-    """Photos around a cloud, rolled at will, that turned by phi (m, 3) radians a frame; at the true poses."""
+    """Photos around a cloud, rolled at will, that rotated by phi (m, 3) radians a frame; at the true poses."""
     m = len(phi)
     center_w = rng.normal(size=(m, 3))
     center_w *= 3.5 / np.linalg.norm(center_w, axis=1, keepdims=True)
@@ -151,7 +151,7 @@ def test_motions_that_repeat_themselves_are_no_hands(rng):
     assert alike.shape == "doubtful"
     assert "rotated alike, by 0." in alike.reasons[0]
     assert "about z" in alike.reasons[0]
-    # a camera that pans turns on between its photos
+    # a camera that pans rotates on between its photos
     rec = measured(rng, swung(rng, 0.002) + ROLL)
     pan = np.array([Rotation.from_rotvec([0, 0, 0.3 * i]).as_matrix() for i in range(8)])
     order = replace(

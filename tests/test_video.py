@@ -130,7 +130,7 @@ def test_rotation_is_carried_and_not_applied(tmp_path):
         assert frames.orientation == orientation
         assert photo.pixels.shape == (HEIGHT, WIDTH, 3)
         if hasattr(cv2, "imencodeWithMetadata"):
-            upright = cv2.imread(str(folder / frames.names[0]), cv2.IMREAD_COLOR)  # turns as the EXIF says
+            upright = cv2.imread(str(folder / frames.names[0]), cv2.IMREAD_COLOR)  # rotates as the EXIF says
             turn = {6: cv2.ROTATE_90_CLOCKWISE, 8: cv2.ROTATE_90_COUNTERCLOCKWISE, 3: cv2.ROTATE_180}[orientation]
             assert np.array_equal(upright, cv2.rotate(photo.pixels, turn))
 
@@ -185,8 +185,8 @@ def test_frames_that_build_on_a_damaged_one_are_left_out(tmp_path):
         left = extract_frames(video, tmp_path / "left", every=1)
     assert left.num_damaged > 0
     assert left.time_s == pytest.approx(np.delete(whole.time_s, np.s_[10:20]))
-    for name, twin in zip(left.names, np.delete(whole.names, np.s_[10:20]), strict=True):
-        assert (tmp_path / "left" / name).read_bytes() == (tmp_path / "whole" / twin).read_bytes()
+    for name, same in zip(left.names, np.delete(whole.names, np.s_[10:20]), strict=True):
+        assert (tmp_path / "left" / name).read_bytes() == (tmp_path / "whole" / same).read_bytes()
 
 
 def test_what_is_no_video_is_refused(tmp_path):
@@ -249,7 +249,7 @@ def invoke(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        # a scene that slides by tells no focal length, which is known at the end only
+        # a scene that slides by determines no focal length, which is known at the end only
         pytest.param([], "give --camera", marks=pytest.mark.slow),
         (["--every", "4", "--sharpest", "4"], "--every N or --sharpest N"),
         (["--every", "4"], "2 photos; the shutter needs at least three"),

@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import warnings
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,8 @@ from typing import Any
 import numba
 from numba.core import types
 from numba.core.caching import FunctionCache
+from numba.core.codegen import JITCodeLibrary
+from numba.core.registry import cpu_target
 from numba.extending import overload
 
 from ..errors import RsUndistortWarning
@@ -68,6 +70,35 @@ def _tell(what: str) -> None:
     )
 
 
+class _SelfContained(JITCodeLibrary):
+    """Machine code that runs its own copies of the kernels that it calls.
+
+    Numba leaves these copies open to a link with others of the same name. A process that compiled a callee would run
+    that code, one that read the caller from a file the caller's copy, and the two, optimised in different surroundings,
+    differ by rounding: a second run would not repeat the first. The parallel loops of a kernel, which numba compiles
+    as libraries of their own ("gufuncs"), become part of it and share its copies.
+    """
+
+    def _optimize_final_module(self) -> None:
+        if "gufunc" not in self.name.lower():
+            for function in self._final_module.functions:
+                if not function.is_declaration and function.linkage.name in ("linkonce_odr", "weak_odr"):
+                    function.linkage = "internal"
+        super()._optimize_final_module()
+
+
+@contextmanager
+def _self_contained() -> Iterator[None]:
+    """What is compiled meanwhile is self-contained; numba's lock of its compiler is held."""
+    codegen = cpu_target.target_context.codegen()
+    before = codegen._library_class
+    codegen._library_class = _SelfContained
+    try:
+        yield
+    finally:
+        codegen._library_class = before
+
+
 # fastmath: products are fused into sums, nothing else; infinities and NaN keep their meaning.
 # error_model: a division by zero gives inf, which the validity flags catch, and loops can vectorise.
 # _Kept: compiled once per installation, not per run.
@@ -81,6 +112,7 @@ def kernel(
         dispatcher = numba.njit(
             nogil=True, error_model="numpy", fastmath=set(fastmath), forceinline=forceinline, parallel=parallel
         )(function)
+        dispatcher._compiler.compile = _self_contained()(dispatcher._compiler.compile)
         try:
             dispatcher._cache = _Kept(function)
         except RuntimeError:  # nowhere to keep it

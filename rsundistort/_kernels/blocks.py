@@ -1,24 +1,24 @@
 """A symmetric matrix of blocks, of which the upper triangle is kept: its products, and its projection on clusters.
 
 Block i (nb x nb) of S stands in block row rows[i] and block column cols[i] >= rows[i]; row_start (m + 1,) are the
-ranges of the block rows. `unknowns` stands for nb, see `_jit.unknowns_of`.
+ranges of the block rows.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from ._jit import SUMS, columns, parallel_kernel, prange
+from ._jit import SUMS, parallel_kernel, prange
 
 
 @parallel_kernel(fastmath=SUMS)
-def multiply(unknowns, row_start, cols, S, x, parts, y):
+def multiply(row_start, cols, S, x, parts, y):
     """Product y (m, nb) of S with x; parts (k, m, nb) is room for the shares of k ranges of rows.
 
     Each block is read once, for its place above the diagonal and for that below: bytes are what a product costs. The
     number of ranges, not that of the threads, is the order of the sums.
     """
-    nb = columns(unknowns)
+    nb = x.shape[1]
     m, k = len(x), len(parts)
     for t in prange(k):
         part = parts[t]
@@ -46,7 +46,7 @@ def multiply(unknowns, row_start, cols, S, x, parts, y):
 
 
 @parallel_kernel(fastmath=SUMS)
-def project_blocks(unknowns, turn, free, functions, pair_start, block, left, right, S, E):
+def project_blocks(turn, free, functions, pair_start, block, left, right, S, E):
     """E (pairs, q nb, q nb) = Z_c' S Z_d of each pair of clusters, from the entries that belong to it.
 
     Z is functions[f, k] (m, q) times the unknowns of photo f, of which the first three are turned by turn[f] (m, 3, 3)
@@ -54,7 +54,7 @@ def project_blocks(unknowns, turn, free, functions, pair_start, block, left, rig
     block[s] or, below the diagonal, its transpose; entries pair_start[p] to pair_start[p + 1] belong to pair p, those
     of one photo together.
     """
-    nb = columns(unknowns)
+    nb = S.shape[1]
     q = functions.shape[1]
     for pair in prange(len(E)):
         E[pair] = 0.0

@@ -221,12 +221,16 @@ def invert_envelope(first, offset, parts, data):
                             v += data[at + k] * D_inv[k, c]
                     V[c, 4 * h + r] = v
         for part in prange(parts):
-            out[part, :, 4 * g + 4 : stop] = 0.0
+            for c in range(4):
+                for k in range(4 * g + 4, stop):
+                    out[part, c, k] = 0.0
             for h in range(g + 1 + part, last + 1, parts):
                 if first[h] <= 4 * g:
                     _times_band(data, first, offset, g, h, V, out[part])
         for part in range(1, parts):
-            out[0, :, 4 * g + 4 : stop] += out[part, :, 4 * g + 4 : stop]
+            for c in range(4):
+                for k in range(4 * g + 4, stop):
+                    out[0, c, k] += out[part, c, k]
         for h in range(g + 1, last + 1):
             if first[h] <= 4 * g:
                 for r in range(4):

@@ -343,9 +343,9 @@ def group_gradients(
 
 
 @parallel_kernel(fastmath=SUMS)
-def back_substitute(unknowns, track_start, frame_idx, V_inv, g_point, J, step_frame, step_point):
+def back_substitute(track_start, frame_idx, V_inv, g_point, J, step_frame, step_point):
     """step_point (n, 3) = -V^-1 (g_point + sum Jp' J step_frame)."""
-    nb = columns(unknowns)
+    nb = J.shape[2]
     n = len(V_inv)
     for chunk in prange((n + _CHUNK - 1) // _CHUNK):
         for p in range(chunk * _CHUNK, min(n, (chunk + 1) * _CHUNK)):

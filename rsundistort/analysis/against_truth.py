@@ -56,7 +56,7 @@ def evaluate(
     twins : path, optional
         Folder of global-shutter photos of the same names (or JPEG files of the same stems), taken by the same camera: a
         lens is taken out of them before the comparison. `global` beside the truth file when there is one. Photos
-        without a twin are not compared, if any has one.
+        without a reference are not compared, if any has one.
     raw : path, optional
         Folder of the photos that were rectified, for the figure before; `photos` beside the truth file.
     progress : callable, optional
@@ -97,7 +97,7 @@ def evaluate(
 
 
 def _twin(folder: Path, name: str) -> Path:
-    """Where the twin of a photo is: a frame of a video is called as a PNG file, its twin may be a JPEG."""
+    """Where the reference of a photo is: a frame of a video is called as a PNG file, its reference may be a JPEG."""
     path = folder / output_name(name)
     small = path.with_suffix(".jpg")
     return small if small.is_file() and not path.is_file() else path
@@ -117,7 +117,7 @@ def _without_lens(
 
 
 def _check_sizes(photo: NDArray[Any], mask: NDArray[Any], shown: NDArray[np.uint8]) -> None:
-    """Refuse a mask or a twin of another size than the photo."""
+    """Refuse a mask or a reference of another size than the photo."""
     for what, other in (("mask", mask.shape), ("twin", shown.shape)):
         if other != photo.shape[:2]:
             raise InputError(
@@ -133,7 +133,7 @@ def _image_errors(
     folders: Mapping[str, Path],
     log: StageLog,
 ) -> tuple[PsnrSummary | None, PsnrSummary | None]:
-    """Of the rectified photos against their twins, and of the photos before."""
+    """Of the rectified photos against their references, and of the photos before."""
     twins, raw = folders["twins"], folders["raw"]
     masks = mask_names([image.name for image in solution.images])
     raw_as = solution.options.get("raw_as", "tif")
@@ -152,7 +152,7 @@ def _image_errors(
             _check_sizes(photo, mask, shown)
             after[image.name] = psnr(photo, twin, np.minimum(mask, shown))
             if (raw / image.name).is_file():
-                # photo and twin have the same lens
+                # photo and reference have the same lens
                 before[image.name] = psnr(read_photo(raw / image.name).pixels, taken, mask)
         except InputError as error:
             raise InputError(f"{image.name}: {error}") from error

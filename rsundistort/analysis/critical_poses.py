@@ -1,4 +1,4 @@
-"""The meter of critical motions for poses in files."""
+"""The degeneracy measure of poses in files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["analyze"]
 
 
 def analyze(path: Path | str, readout: str | None = None) -> PoseAnalysis:
-    """Whether poses let the shutter be told from the shape of the scene.
+    """Whether poses let the shutter be distinguished from the shape of the scene.
 
     Parameters
     ----------
@@ -29,7 +29,8 @@ def analyze(path: Path | str, readout: str | None = None) -> PoseAnalysis:
     Returns
     -------
     PoseAnalysis
-        The meter of the poses; what the shape of a solution is worth; advice for the next shoot, if they are critical.
+        The degeneracy measure of the poses; what the shape of a solution is worth; advice for the next shoot, if they
+        are critical.
     """
     path = Path(path)
     if readout is not None:

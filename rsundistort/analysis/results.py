@@ -71,7 +71,7 @@ class Evaluation(_FormerlyDict):
     phi_mrad_per_frame : PhiErrorSummary
         Errors of the rotation during the readout, milliradians per frame.
     psnr_db : PsnrSummary or None
-        Rectified photos against their global-shutter twins.
+        Rectified photos against their global-shutter references.
     psnr_before_db : PsnrSummary or None
         Photos as they were taken against the same.
     """

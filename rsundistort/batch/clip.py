@@ -88,7 +88,7 @@ def rectify_clip(
     workers : Workers
         Its threads are used, and no cluster: the frames come one after the other.
     log : StageLog
-        Told the progress.
+        Gets the progress.
 
     Raises
     ------

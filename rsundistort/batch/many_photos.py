@@ -71,7 +71,7 @@ def rectify_photos(
     out : Path or RemoteFolder
         `batch_folder` made it ready, and gave `journal`.
     options, workers, log, journal
-        What is done to each, where, who is told, and what takes what is done.
+        What is done to each, where, who gets the progress, and what records what is done.
     posed : bool
         Whether they keep poses, which no mirror image has.
     resume : bool

@@ -101,7 +101,7 @@ class PhotoJob:
         """
         digest = hashlib.sha256(f"{_VERSION} {cv2.__version__}".encode())
         # where things lie, and which photos are let in, does not change what comes of them; nor does a pose, but for
-        # how the photo is turned
+        # how the photo is rotated
         options = replace(
             self.options, masks=None, again=False, max_megapixels=MAX_MEGAPIXELS, depth="auto", view=ViewOptions(),
             also=(),

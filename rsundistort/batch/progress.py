@@ -1,4 +1,4 @@
-"""How stages tell how far they are."""
+"""How stages report their progress."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 __all__ = ["ProgressCallback", "StageLog"]
 
 #: Called as (stage, done, total); total is 0 where it is not known.
-#: The first call of a stage tells what was done before.
+#: The first call of a stage reports what was done before.
 ProgressCallback = Callable[[str, int, int], None]
 
 

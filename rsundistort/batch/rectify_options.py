@@ -29,7 +29,7 @@ class RectifyOptions:
     raw_as : {"tif", "jpg", "png"}
         What RAW and HEIC are written as: 16 bit, but for jpg.
     apply_orientation : bool
-        Turn the rectified photos, their masks, cameras and poses by the EXIF orientation, which then is 1.
+        Rotate the rectified photos, their masks, cameras and poses by the EXIF orientation, which then is 1.
     again : bool
         Take photos that are rectified already.
     max_megapixels : float
@@ -40,7 +40,7 @@ class RectifyOptions:
     depth : str or Path
         How far away what the photos show is, for the constant-motion model: "auto", "infinity", "plane", "points", or a
         folder of depth maps, as `io.find_depth_maps` takes it. "auto" is the plane nearest to most points where it
-        foretells the depths as well as a map between the points does, else that map; and infinity for photos that it
+        predicts the depths as well as a map between the points does, else that map; and infinity for photos that it
         would change by half a pixel at most.
     view : ViewOptions
         What the rectified photos show and how large they are; by default as the solution has it.

@@ -185,7 +185,7 @@ _catching = threading.Lock()
 
 @contextmanager
 def _caught_warnings() -> Iterator[list[Warning]]:
-    """Our warnings in this thread; `warnings.catch_warnings` cannot tell threads apart."""
+    """Our warnings in this thread; `warnings.catch_warnings` does not distinguish threads."""
     with _catching:
         if not isinstance(warnings.showwarning, _Catcher):
             warnings.simplefilter("always", RsUndistortWarning)

@@ -54,7 +54,7 @@ def bundle_adjust(
     shutter_model : {"global", "two-step", "linearized", "rotation", "constant-motion"}
         How the shutter is modelled.
     options : BundleOptions, optional
-        Tolerances, loss, priors, anchors.
+        Tolerances, loss, priors, constraints.
     progress : callable, optional
         Called with the cost after each accepted step.
     simpler_first : bool

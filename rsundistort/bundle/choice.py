@@ -255,7 +255,7 @@ class _Fits:
         # start guarantees that a model never ends above the simpler one, which it contains
         cost = [objective(start, model, options) for start in starts]
         result = bundle_adjust(starts[int(np.argmin(cost))], model, options, step)
-        found, spreads = result.reconstruction, Spreads(result.phi_sigma, result.velocity_sigma)
+        found, spreads = result.reconstruction, Spreads(result.phi_sigma, result.velocity_rms)
         errors, rms_px = clipped_errors(found, self.held_out, self._sigma_px)
         smooth = errors_without(warps, found, self.given.observations, self.held_out, self._sigma_px)
         left = max(float(errors.mean() - smooth.mean()), 0.0) if len(errors) else 0.0
@@ -335,8 +335,8 @@ class _Fits:
 class _Selection:
     """The best fit so far, beginning without a shutter; the models that were kept, and reasons against others."""
 
-    def __init__(self, fits: _Fits, best: _Fit, kept: list[str], gain: dict[str, float]) -> None:
-        self._fits = fits
+    def __init__(self, fits: _Fits, best: _Fit, kept: list[str], gain: dict[str, float], refines: bool) -> None:
+        self._fits, self._refines = fits, refines
         self.plain = self.best = best
         self.kept, self.gain = kept, gain
         self.against: list[str] = []
@@ -350,11 +350,28 @@ class _Selection:
         exact = best.model == "two-step" and steady and not fits.is_better(fit, best)
         if not exact and not fits.is_better(best, fit):
             return
+        if best.model == "rotation" and fit.model == "constant-motion" and self._could_be_lens(best, fit):
+            return
         if exact or float((best.errors - fit.errors).mean()) > fit.left:
             self.best = fit
             self.kept.append(fit.label)
         else:
             self.against.append(f"{fit.label} removes less of what bends the photos than it leaves")
+
+    def _could_be_lens(self, best: _Fit, fit: _Fit) -> bool:
+        """Whether a lens that varies explains what a velocity does beyond rotations; it is kept where it does better.
+
+        A lens that focuses and a camera that travels both scale and shift what the photo shows.
+        """
+        fits = self._fits
+        if best.varying or not self._refines:
+            return False
+        vary = fits.fit(best.model, True, [best.reconstruction], bends=best.bends)
+        self.gain[vary.label] = fits.gain(best, vary)
+        if fits.is_better(fit, vary):
+            self.best = vary
+            self.kept.append(vary.label)
+        return not fits.is_better(vary, fit)
 
     def bend(self, fit: _Fit) -> None:
         """Try unsteady motions after a fit, where something smooth is left, or lines would still move."""
@@ -386,7 +403,8 @@ def choose_model(
     held-out error falls by more than two standard errors, measurements in the same part of the same photo counted once,
     and by more than two hundredths. A shutter model must also remove more than a smooth warp of each photo would still
     remove, and be better than itself read along the other axis (other causes that bend photos fit either axis), and two
-    halves of the scene must show the same motions. Last, where something smooth is left, a residual field of each
+    halves of the scene must show the same motions. A velocity must explain more, beyond rotations, than a lens that
+    varies; neither is kept where they are equally good. Last, where something smooth is left, a residual field of each
     camera is kept if it is better.
 
     Parameters
@@ -469,7 +487,7 @@ def _selected(fits: _Fits, models: Sequence[str], refines: bool) -> _Selection:
         alone = fits.fit("rotation", False, [first.reconstruction, given])
         varying = not float(alone.errors.mean()) < _MOST_OF_IT * float(plain.errors.mean())
         last = last if varying else first
-    selection = _Selection(fits, plain, kept, gain)
+    selection = _Selection(fits, plain, kept, gain, refines)
     for model in models[1:]:
         if selection.best.bends and selection.best.is_explained:
             break

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from .._kernels import blocks
-from .._kernels._jit import unknowns_of
 from .envelope import Envelope
 from .reduced import Reduced
 from .structure import BlockPattern
@@ -33,7 +32,7 @@ Index = NDArray[np.int64]
 class CoarseSpace:
     """Changes of the photos' unknowns that are quadratic in the photos' places, in each cluster of photos.
 
-    What bundle adjustment hardly determines (that a cluster moves, turns, grows, or bends with its neighbours) is
+    What bundle adjustment hardly determines (that a cluster moves, rotates, grows, or bends with its neighbours) is
     smooth in the frame of the world, so rotations are taken there. The projection of the reduced system on these
     changes is a reduced system of clusters: q nb unknowns each, function by function.
 
@@ -92,7 +91,7 @@ class CoarseSpace:
         E = np.empty((len(self.envelope.pattern.cols), _FUNCTIONS * nb, _FUNCTIONS * nb))
         with numba.parallel_chunksize(1):
             blocks.project_blocks(
-                unknowns_of(nb), self.turn, self.free.astype(float), self.functions, *self.entries, reduced.S, E
+                self.turn, self.free.astype(float), self.functions, *self.entries, reduced.S, E
             )  # fmt: skip
         diagonal = np.einsum("caa->ca", E[self.envelope.pattern.diagonal])
         E[self.envelope.pattern.diagonal] += _RIDGE * diagonal[:, :, None] * np.eye(_FUNCTIONS * nb)
@@ -115,7 +114,7 @@ class CoarseSpace:
 
 
 def _clusters(graph: scipy.sparse.csr_array, center_w: Array, max_photos: int) -> Index:
-    """Cluster of each photo: bisected across the longest side, and where no common points join the photos."""
+    """Cluster of each photo: bisected across the longest side, and where no common points connect the photos."""
     cluster = np.empty(len(center_w), np.int64)
     waiting = [np.arange(len(center_w))]
     num = 0

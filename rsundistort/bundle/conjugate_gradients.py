@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._kernels import blocks
-from .._kernels._jit import unknowns_of
 from .coarse import CoarseSpace
 from .reduced import Factored, Reduced, factor, products
 from .structure import BlockPattern
@@ -66,7 +65,7 @@ class _Bordered:
         x, y = self.split(v)
         r, p = self._reduced, self._pattern
         Sx = np.empty_like(x)
-        blocks.multiply(unknowns_of(x.shape[1]), p.row_start, p.cols, r.S, x, self._parts, Sx)
+        blocks.multiply(p.row_start, p.cols, r.S, x, self._parts, Sx)
         if not y.size:
             return self.join(Sx, y)
         return self.join(Sx + np.tensordot(y, r.border, 1), products(r.border, x[None])[:, 0] + r.corner @ y)

@@ -64,7 +64,7 @@ def choose_readouts(
     progress : callable, optional
         Called as (model, cost).
     """
-    # anchors are meant for one axis; they do not decide between two
+    # constraints are meant for one axis; they do not decide between two
     rough = replace(
         options or BundleOptions(), outlier_rounds=0, spread_rounds=1, spread_tolerance=0.1, cost_tolerance=1e-3,
         held_phi={}, known_phi={}, still={}, lengths=(), deviations="model",

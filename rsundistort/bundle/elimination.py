@@ -1,4 +1,4 @@
-"""How the reduced system of the photos is solved: an envelope factored, or conjugate gradients."""
+"""How the reduced system of the photos is solved: factored, or by conjugate gradients."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from .coarse import CoarseSpace
 from .conjugate_gradients import solve_iteratively
 from .envelope import Envelope
 from .reduced import Factored, Reduced, factor
+from .sparse_blocks import SparseBlocks
 from .structure import Structure
 
 __all__ = ["Elimination"]
@@ -37,8 +38,8 @@ class Elimination:
         Which photo sees which point.
     free : (m, nb) bool array
         Unknowns that are not held.
-    envelope : Envelope
-        Of the whole system.
+    shape : Envelope or SparseBlocks
+        Of the factor of the whole system.
     space : CoarseSpace or None
         Of the preconditioner, if the system is solved by conjugate gradients.
     cg_tolerance : float
@@ -49,7 +50,7 @@ class Elimination:
 
     structure: Structure
     free: NDArray[np.bool_]
-    envelope: Envelope
+    shape: Envelope | SparseBlocks
     space: CoarseSpace | None
     cg_tolerance: float
     max_cg: int
@@ -62,29 +63,31 @@ class Elimination:
         poses: tuple[Array, Array],
         factor_limit: float | None,
         cg_tolerance: float,
+        on_path: bool = False,
     ) -> Elimination:
         """Choose between factorisation and conjugate gradients, for photos at R_cw (m, 3, 3) and center_w (m, 3).
 
         Conjugate gradients are taken if they are expected to take half the time of the factorisation, or, with a limit,
         if that takes more multiply-adds. In the first case they may take as long as the factorisation, which then
-        solves what they have not.
+        solves what they have not. Frames that are on one path share points with few others, key frames with any: their
+        factor is sparse inside its envelope.
         """
-        envelope = Envelope.smallest(structure.pattern, free)
-        adds = envelope.multiply_adds
+        shape = SparseBlocks.of(structure.pattern, free) if on_path else Envelope.smallest(structure.pattern, free)
+        adds = shape.multiply_adds
         products = 2 * _WAIT * 2 * len(structure.pattern.cols) * free.shape[1] ** 2  # of one iteration
         if adds <= (2 * _EXPECTED_CG * products if factor_limit is None else factor_limit):
-            return cls(structure, free, envelope, None, cg_tolerance, 0)
+            return cls(structure, free, shape, None, cg_tolerance, 0)
         photos = _CLUSTER
         space = CoarseSpace.of(structure.pattern, free, *poses, photos)
         while space.envelope.multiply_adds > _EXPECTED_CG * products and photos < len(free):
             photos *= 2
             space = CoarseSpace.of(structure.pattern, free, *poses, photos)
         if factor_limit is not None:
-            return cls(structure, free, envelope, space, cg_tolerance, _MAX_CG)
+            return cls(structure, free, shape, space, cg_tolerance, _MAX_CG)
         iteration = products + _WAIT * 2 * space.envelope.num_values
         worth = 2 * (space.envelope.multiply_adds + _EXPECTED_CG * iteration) < adds
         return cls(
-            structure, free, envelope, space if worth else None, cg_tolerance, min(_MAX_CG, int(adds / iteration))
+            structure, free, shape, space if worth else None, cg_tolerance, min(_MAX_CG, int(adds / iteration))
         )  # fmt: skip
 
     def solve(self, reduced: Reduced, exact: bool = False) -> tuple[Array, Array, Array, Array] | None:
@@ -104,4 +107,4 @@ class Elimination:
 
     def factored(self, reduced: Reduced) -> Factored | None:
         """The system factored; None if it is not positive."""
-        return factor(reduced, self.envelope)
+        return factor(reduced, self.shape)

@@ -115,7 +115,7 @@ class CholeskyFactor:
 
     Attributes
     ----------
-    envelope : Envelope
+    shape : Envelope
         Where it has entries.
     data : (num_values,) array
         These.
@@ -123,35 +123,35 @@ class CholeskyFactor:
         What rows and columns of the matrix were multiplied by.
     """
 
-    envelope: Envelope
+    shape: Envelope
     data: Array
     scale: Array
 
     def solve(self, B: Array) -> None:
         """Right-hand sides (k, padded rows) become solutions."""
         B *= self.scale
-        kernels.solve_envelope(self.envelope.first, self.envelope.offset, self.data, B)
+        kernels.solve_envelope(self.shape.first, self.shape.offset, self.data, B)
         B *= self.scale
 
     def inverse_blocks(self) -> Array:
         """Diagonal blocks (m, nb, nb) of the inverse; 0 where held."""
-        every = np.arange(len(self.envelope.place))
+        every = np.arange(len(self.shape.place))
         return self.inverse_blocks_of(every, every)
 
     @cached_property
     def _inverse(self) -> Array:
         """Entries of the inverse inside the envelope, of the scaled matrix."""
-        envelope = self.envelope
+        shape = self.shape
         inverse = self.data.copy()
-        parts = _PARTS if envelope.multiply_adds > _WORTH_THREADS else 1
-        kernels.invert_envelope(envelope.first, envelope.offset, parts, inverse)
+        parts = _PARTS if shape.multiply_adds > _WORTH_THREADS else 1
+        kernels.invert_envelope(shape.first, shape.offset, parts, inverse)
         return inverse
 
     def inverse_blocks_of(self, first_row: Index, second_row: Index) -> Array:
-        """Blocks (q, nb, nb) of the inverse, of pairs of block rows that the pattern joins; 0 where held."""
-        envelope = self.envelope
-        first, offset, inverse = envelope.first, envelope.offset, self._inverse
-        of_rows, of_columns = envelope.place[first_row][:, :, None], envelope.place[second_row][:, None]
+        """Blocks (q, nb, nb) of the inverse, of pairs of block rows that the pattern connects; 0 where held."""
+        shape = self.shape
+        first, offset, inverse = shape.first, shape.offset, self._inverse
+        of_rows, of_columns = shape.place[first_row][:, :, None], shape.place[second_row][:, None]
         row, column = np.maximum(of_rows, of_columns), np.minimum(of_rows, of_columns)
         band = row // 4
         at = offset[band] + (row - 4 * band) * (4 * band + 4 - first[band]) + column - first[band]

@@ -53,8 +53,8 @@ class GuessedCameras:
     def __post_init__(self) -> None:
         if not isinstance(self.sigma, Mapping) and len(self.sigma) != len(self.cameras):
             raise InputError(f"{len(self.cameras)} guessed cameras and the sigmas of {len(self.sigma)}")
-        told = [self.sigma] if isinstance(self.sigma, Mapping) else self.sigma
-        for name, value in (each for sigma in told for each in sigma.items()):
+        stated = [self.sigma] if isinstance(self.sigma, Mapping) else self.sigma
+        for name, value in (each for sigma in stated for each in sigma.items()):
             if name not in INTRINSICS or not 0 < value < np.inf:
                 raise InputError(f"guessed {name!r}: sigma {value!r}, expected a positive one of an intrinsic")
 

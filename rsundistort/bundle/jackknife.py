@@ -1,9 +1,10 @@
 """Standard deviations of a solution from its own residuals, with correlated measurements.
 
-What lens, scene or shutter model leave out bends neighbouring measurements alike, so that they tell less than as many
-independent ones, whose covariance is the inverse of the Hessian H. The infinitesimal delete-a-group jackknife (Jaeckel,
-"The infinitesimal jackknife", 1972; White's sandwich, by groups) asks the residuals instead: with g the gradient of a
-group of measurements, the covariance of the noise's share is sum_g (H^-1 g)(H^-1 g)', whatever goes on in the groups.
+What lens, scene or shutter model leave out bends neighbouring measurements alike, so that they contain less information
+than as many independent ones, whose covariance is the inverse of the Hessian H. The infinitesimal delete-a-group
+jackknife (Jaeckel, "The infinitesimal jackknife", 1972; White's sandwich, by groups) asks the residuals instead: with g
+the gradient of a group of measurements, the covariance of the noise's share is sum_g (H^-1 g)(H^-1 g)', whatever goes
+on in the groups.
 
 Two partitions are asked: points by their place (a corner of the scene: measurements of a track are aligned with each
 other, and its neighbours look at the same things) and measurements by their place in the photo, over all photos of a
@@ -208,7 +209,7 @@ def inflation(
     # a unit counts by its noise's share
     weights = [np.divide(1.0, total, out=np.zeros_like(total), where=total > 0) for total in totals]
     noise = [(weight * (total - prior)).sum(0) for weight, total, prior in zip(weights, totals, priors, strict=True)]
-    # of a difference that is off by so much, less tells nothing: such are poses that only their places hold
+    # of a difference that is off by so much, less means nothing: such are poses that only their places hold
     noise = [
         np.where(each > PRIORS_ERROR * (total > 0).sum(0), each, 0.0) for each, total in zip(noise, totals, strict=True)
     ]

@@ -30,10 +30,10 @@ _LEAST_PX = 1e-3
 class LensFields:
     """Fields of cameras in a basis of those that have no mean, and that nothing else expresses.
 
-    Orthogonal over the frame to what a change of the intrinsics of a plain lens does to first order, to what a turn of
-    the camera does, which poses express, and to what motions that all photos share do, of a scene at one depth: a field
-    would be taken for them, and they for it. The basis is orthonormal over the frame: the sum of squares of a camera's
-    unknowns (nz,) is the mean square of its field, pixels squared. Their number is the same for all cameras.
+    Orthogonal over the frame to what a change of the intrinsics of a plain lens does to first order, to what a rotation
+    of the camera does, which poses express, and to what motions that all photos share do, of a scene at one depth: a
+    field would be taken for them, and they for it. The basis is orthonormal over the frame: the sum of squares of a
+    camera's unknowns (nz,) is the mean square of its field, pixels squared. Their number is the same for all cameras.
 
     Parameters
     ----------

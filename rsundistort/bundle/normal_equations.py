@@ -81,7 +81,7 @@ class Border:
 
 @dataclass(frozen=True)
 class Coupling:
-    """Residuals of a prior that joins pairs of photos, q pairs of r residuals.
+    """Residuals of a prior that connects pairs of photos, q pairs of r residuals.
 
     Attributes
     ----------
@@ -181,10 +181,10 @@ class NormalEquations:
     border : Border
         What the photos share.
     lengths : tuple of (q,) and (q, n, 3) arrays
-        Residuals on few points and their Jacobian: they join points, which the elimination takes one by one, so their
-        share of the Hessian is added to its inverse (Woodbury).
+        Residuals on few points and their Jacobian: they connect points, which the elimination takes one by one, so
+        their share of the Hessian is added to its inverse (Woodbury).
     coupling : Coupling, optional
-        Prior that joins pairs of photos; the structure's pattern has their blocks.
+        Prior that connects pairs of photos; the structure's pattern has their blocks.
     rays : (n, 3) array, optional
         Directions along which no point moves, where all photos are taken from one place.
     points : tuple of (k,), (k, 3) and (k, 3) arrays, optional
@@ -566,7 +566,7 @@ class NormalEquations:
         """Steps (n, 3) of the points that go with those of photos and cameras."""
         point = np.empty_like(g_point)
         schur.back_substitute(
-            self._unknowns, self._s.track_start, self._s.frame_idx, V_inv,
+            self._s.track_start, self._s.frame_idx, V_inv,
             self._pulled(g_point, camera), self._J, np.ascontiguousarray(self._seen(frame)), point,
         )  # fmt: skip
         return point

@@ -260,6 +260,8 @@ class BundleResult:
         Standard deviation of the prior on phi, radians per frame: as given, or as estimated.
     velocity_sigma : float
         Standard deviation of the prior on the velocity, baselines per frame; for constant-motion only.
+    velocity_mean : tuple of float
+        Mean of that prior, in the frame of each camera, baselines per frame.
     focal_sigma, centre_sigma : float
         Standard deviations of the variation of log f, and of the principal point in focal lengths; 0 where none varies.
     bend_sigmas : tuple of float
@@ -312,6 +314,12 @@ class BundleResult:
     sigma_fields_px: tuple[float, ...] = ()
     path: PathSolution | None = None
     path_sigmas: tuple[float, ...] = ()
+    velocity_mean: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    @property
+    def velocity_rms(self) -> float:
+        """Root mean square of a component of the velocity by its prior, baselines per frame."""
+        return float(np.sqrt(self.velocity_sigma**2 + np.mean(np.square(self.velocity_mean))))
 
     def of_photos(self, keep: NDArray[np.bool_]) -> BundleResult:
         """The same for some photos (m,) only, with the points that two of them show."""

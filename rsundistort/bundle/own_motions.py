@@ -67,31 +67,31 @@ def own_motions(reconstruction: Reconstruction, *, turns_only: bool = False) -> 
         if last:
             state = problem.settle(state)
         state = _fitted(problem, state, own)
-    residuals, J = problem.with_squares().linearize(state).blocks
+    residuals, J = problem.with_squares().blocks(state)
     frame = problem.measurements[0]
     # heavy tails count as those of normal noise do, and each frame has its own unknowns
     size, m = np.median(np.abs(residuals)) / 0.6745, reconstruction.num_images
     share = max(1.0 - len(own) * m / residuals.size, 0.1)
     noise = max(size * _NOISE_PX / np.sqrt(share), _LEAST_NOISE_PX) / _NOISE_PX
     believed = np.linalg.norm(residuals, axis=1) < 4.5 * noise
-    H = np.zeros((m, len(own), len(own)))
     J = J[:, :, own] * believed[:, None, None]
-    np.add.at(H, frame, np.einsum("oia,oib->oab", J, J))
+    by_frame = _by_frame(frame, m)
+    H = _gradients(by_frame, residuals, J)[0]
     sigma = np.full((m, _UNKNOWNS), np.nan)
     scale, scaled = _scaled(H)
-    told = np.linalg.cond(scaled) < 1e12
-    inverse = scale[told, :, None] * np.linalg.inv(scaled[told]) * scale[told, None]
+    known = np.linalg.cond(scaled) < 1e12
+    inverse = scale[known, :, None] * np.linalg.inv(scaled[known]) * scale[known, None]
     variance = noise**2 * np.diagonal(inverse, axis1=1, axis2=2)
     # neighbours in a frame go wrong together, by lens, waves and leaves: one factor for each kind of unknown
     corner = problem.partitions(state)[1].group
     count = int(corner.max(initial=0)) + 1
     pulls = np.zeros((m * count, len(own)))
     np.add.at(pulls, frame * count + corner, np.einsum("oia,oi->oa", J, residuals))
-    moved = np.einsum("fab,fcb->fca", inverse, pulls.reshape(m, count, -1)[told])
-    together = np.median((moved**2).sum(1) / variance, axis=0) if told.any() else np.ones(len(own))
-    sigma[np.ix_(told, own)] = np.sqrt(np.maximum(together, 1.0) * variance)
+    moved = np.einsum("fab,fcb->fca", inverse, pulls.reshape(m, count, -1)[known])
+    together = np.median((moved**2).sum(1) / variance, axis=0) if known.any() else np.ones(len(own))
+    sigma[np.ix_(known, own)] = np.sqrt(np.maximum(together, 1.0) * variance)
     R_cw, phi = state.R_cw.copy(), state.phi.copy()
-    R_cw[~told], phi[~told] = np.nan, np.nan
+    R_cw[~known], phi[~known] = np.nan, np.nan
     return OwnMotions(R_cw, phi, sigma[:, :3], sigma[:, 6:])
 
 
@@ -101,17 +101,27 @@ def _scaled(H: Array) -> tuple[Array, Array]:
     return scale, scale[:, :, None] * H * scale[:, None]
 
 
+def _by_frame(frame: NDArray[np.int64], num_frames: int) -> list[NDArray[np.int64]]:
+    """Measurements of each frame."""
+    return np.split(np.argsort(frame, kind="stable"), np.cumsum(np.bincount(frame, minlength=num_frames))[:-1])
+
+
+def _gradients(by_frame: list[NDArray[np.int64]], residuals: Array, J: Array) -> tuple[Array, Array]:
+    """J'J (m, n, n) and J'residuals (m, n) of each frame, for Jacobians (o, 2, n)."""
+    n = J.shape[2]
+    rows = [(J[mine].reshape(-1, n), residuals[mine].ravel()) for mine in by_frame]
+    return np.array([A.T @ A for A, _ in rows]), np.array([A.T @ b for A, b in rows])
+
+
 def _fitted(problem: BundleProblem, state: State, own: NDArray[np.int64]) -> State:
     """Some steps of Levenberg and Marquardt of every frame on its own."""
     frame, m = problem.measurements[0], len(state.phi)
+    by_frame = _by_frame(frame, m)
     damping = np.full(m, 1e-3)
     cost = np.bincount(frame, problem.costs(state), m)
     for _ in range(_STEPS):
-        residuals, J = problem.linearize(state).blocks
-        J = J[:, :, own]
-        H, g = np.zeros((m, len(own), len(own))), np.zeros((m, len(own)))
-        np.add.at(H, frame, np.einsum("oia,oib->oab", J, J))
-        np.add.at(g, frame, np.einsum("oia,oi->oa", J, residuals))
+        residuals, J = problem.blocks(state)
+        H, g = _gradients(by_frame, residuals, J[:, :, own])
         scale, scaled = _scaled(H)
         scaled += np.maximum(damping, 1e-9)[:, None, None] * np.eye(len(own))
         step = np.zeros((m, problem.layout.size))

@@ -1,4 +1,4 @@
-"""The path of a video's camera as a prior: white noise on the change of acceleration joins neighbouring frames."""
+"""The path of a video's camera as a prior: white noise on the change of acceleration connects neighbouring frames."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class FramePath:
     part : mapping of photo name to int, optional
         Parts that a cut separates; all in one when left out.
     rates : mapping of photo name to (rate, sigma), optional
-        What a gyroscope says of the turn, (3,) radians per second in the camera frame, and its standard deviation.
+        Rate of rotation by a gyroscope, (3,) radians per second in the camera frame, and its standard deviation.
     turns_only : bool
         Whether the camera stays where it is: centres are held, and points count by their directions.
     """
@@ -137,7 +137,7 @@ class PathPrior:
         Times.
     reconstruction : Reconstruction
         Whose photos they are.
-    spreads : (turn, travel)
+    spreads : (rotation, travel)
         Square roots of the spectral densities Q: radians, and world units, per (time between frames)^(5/2).
     """
 
@@ -236,7 +236,7 @@ class PathPrior:
         return self._whitened(differences).reshape(q, 18), A, B
 
     def unit_squares(self, squares: Array) -> tuple[Array, Array]:
-        """Squares (q, 18) of residuals as those of spreads of 1: of turn and of travel, (q, 9) each."""
+        """Squares (q, 18) of residuals as those of standard deviations of 1: of rotation and of travel, (q, 9) each."""
         by_kind = squares.reshape(-1, 3, 2, 3)
         turn, travel = (by_kind[:, :, k].reshape(-1, 9) * self.spreads[k] ** 2 for k in range(2))
         return turn, travel

@@ -31,8 +31,8 @@ class KnownPlaces:
         Places of cameras and their standard deviations along the axes of the world, (3,) each. Their tails are heavy,
         as those of a prior on a camera: a GPS that was off by far is given up.
     points : sequence of ControlPoint
-        Points of the reconstruction, told by a measurement of theirs; check points hold nothing. Places are in the
-        frame of the reconstruction, too.
+        Points of the reconstruction, identified by one of their measurements; check points hold nothing. Places are in
+        the frame of the reconstruction, too.
     velocities : mapping of photo name to (velocity, sigma)
         Of cameras, (3,) each, world units per unit of the clock.
     """

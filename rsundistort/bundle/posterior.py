@@ -18,14 +18,14 @@ Array = NDArray[np.float64]
 
 
 class Posterior:
-    """Covariances at a result, all unknowns being free but the anchors and the gauge.
+    """Covariances at a result, all unknowns being free but the constraints and the gauge.
 
     Parameters
     ----------
     result : BundleResult
         Where.
     options : BundleOptions, optional
-        Those of the adjustment: anchors, known motions and refined intrinsics count.
+        Those of the adjustment: constraints, known motions and refined intrinsics count.
     """
 
     def __init__(self, result: BundleResult, options: BundleOptions | None = None) -> None:
@@ -34,6 +34,7 @@ class Posterior:
             result.phi_sigma, max(result.velocity_sigma * rec.baseline, 1e-300),
             max(result.focal_sigma, 1e-300), max(result.centre_sigma, 1e-300), result.bend_sigmas,
             tuple(each * rec.baseline for each in result.way_sigmas), result.field_sigma_px, result.path_sigmas,
+            (*(rec.baseline * np.array(result.velocity_mean)).tolist(),),
         )  # fmt: skip
         plain = replace(options or BundleOptions(), loss="squared")
         self._path = None if result.path is None else result.path.state
@@ -113,7 +114,7 @@ class Posterior:
 
 
 def gauge_directions(result: BundleResult) -> Array:
-    """(7, m, nb) changes of the photos' unknowns that move, turn or scale the world, and change no photo."""
+    """(7, m, nb) changes of the photos' unknowns that move, rotate or scale the world, and change no photo."""
     rec = result.reconstruction
     m, nb = result.covariances.shape[:2]
     directions = np.zeros((7, m, nb))

@@ -25,7 +25,7 @@ from .normal_equations import Border, Coupling, Marginals, NormalEquations, Step
 from .options import LOSSES, BundleOptions
 from .path import PathPrior, PathState
 from .places import KnownPlaces, PlaceResiduals
-from .spreads import Spreads
+from .spreads import Spreads, common_velocity
 from .structure import Structure
 
 __all__ = ["BundleProblem", "State"]
@@ -57,7 +57,7 @@ _VARIATION = np.array([INTRINSICS[name] for name in ("f", "cx", "cy")], np.int64
 
 
 class BundleProblem:
-    """Robust reprojection errors and the priors on phi and velocity, with the gauge and the anchors held.
+    """Robust reprojection errors and the priors on phi and velocity, with the gauge and the constrained photos held.
 
     Unknowns of a photo: rotation increment (left, radians), centre (world units), phi (radians per unit of the clock)
     unless the shutter is global, velocity (world units per unit of the clock) if the motion is whole, and the variation
@@ -128,6 +128,9 @@ class BundleProblem:
         span = reconstruction.frame_span()[:, None]
         weight = [np.repeat((span[:, 0] / s)[:, None] ** 2, 3, axis=1) for s in self._motion_spreads(spreads)]
         self._motion_weight = np.hstack(weight)[:, : self._block - 6]
+        self._motion_mean = np.zeros_like(self._motion_weight)
+        if self._block > 9:
+            self._motion_mean[:, 3:] = common_velocity(reconstruction, spreads.travel)
         if self._path is not None:  # which says it all
             self._motion_weight = np.zeros_like(self._motion_weight)
         varied = np.array([spreads.focal, spreads.centre, spreads.centre])[: 3 * options.varying] ** -2.0
@@ -139,7 +142,7 @@ class BundleProblem:
         self._free = self._free_unknowns()
         poses = reconstruction.R_cw, reconstruction.center_w
         self._elimination = Elimination.of(
-            self._structure, self._free, poses, options.factor_limit, options.cg_tolerance
+            self._structure, self._free, poses, options.factor_limit, options.cg_tolerance, self._path is not None
         )  # fmt: skip
         self._size = reconstruction.size
 
@@ -180,7 +183,7 @@ class BundleProblem:
         return [phi1][: self._block - 6]
 
     def _photo(self, name: str) -> int:
-        """Index of an anchor's photo."""
+        """Index of a constraint's photo."""
         if name not in self._start.image_names:
             raise InputError(f"anchor {name!r} is not a photo of the reconstruction")
         return self._start.image_names.index(name)
@@ -315,7 +318,7 @@ class BundleProblem:
         lengths = float(np.sum(self._lengths.residuals(state.points_w) ** 2))
         varied = float(np.sum(self._own_weight * self._own(state) ** 2))
         lengths += 2.0 * self._places.cost(state.center_w, state.points_w)
-        own = float(np.sum(self._motion_weight * motion**2 + known)) + varied
+        own = float(np.sum(self._motion_weight * (motion - self._motion_mean) ** 2 + known)) + varied
         if self._path is not None and state.path is not None:
             own += 2.0 * self._path.cost(state.R_cw, state.center_w, state.path)
         return 0.5 * (own + lengths) + self._camera_priors(state)[2]
@@ -363,6 +366,10 @@ class BundleProblem:
             J_frame[:, :, self._block : self.layout.variation] = self._by_lens(state)[1]
         return res, J_frame, float(cost.sum())
 
+    def blocks(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Weighted residuals (o, 2), and Jacobians of the photos (o, 2, nb)."""
+        return self._jacobians(state)[:2]
+
     def _rows(self, state: State) -> NDArray[np.float64]:
         """(o,) where to look for the rows: as the last cost found them, if it was that of this state; else NaN."""
         if state is not self._clock_of:
@@ -378,7 +385,8 @@ class BundleProblem:
         motion = self._motion(state)
         moving, own = np.s_[:, 6 : self._block], np.s_[:, self._block :]
         prior_diag[moving] = self._motion_weight + self._known_weight
-        prior_gradient[moving] = self._motion_weight * motion + self._known_weight * (motion - self._known)
+        prior_gradient[moving] = self._motion_weight * (motion - self._motion_mean)
+        prior_gradient[moving] += self._known_weight * (motion - self._known)
         prior_diag[:, 3:6], prior_gradient[:, 3:6] = self._places.on_photos(state.center_w)
         prior_diag[own] = self._own_weight
         prior_gradient[own] = self._own_weight * self._own(state)

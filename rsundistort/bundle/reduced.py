@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .envelope import CholeskyFactor, Envelope
+from .sparse_blocks import BlockFactor, SparseBlocks
 
 __all__ = ["Factored", "Reduced", "factor", "products"]
 
@@ -63,7 +64,7 @@ class Factored:
 
     Attributes
     ----------
-    photos : CholeskyFactor
+    photos : CholeskyFactor or BlockFactor
         Of the photos' part.
     frames, cameras : (r, m, nb), (r, k) array
         The changes. Of each of the cameras' unknowns: -S^-1 B' of the photos, and 1 of itself.
@@ -71,7 +72,7 @@ class Factored:
         Their covariance.
     """
 
-    photos: CholeskyFactor
+    photos: CholeskyFactor | BlockFactor
     frames: Array
     cameras: Array
     weights: Array
@@ -84,10 +85,10 @@ class Factored:
     def times(self, b: Array, c: Array) -> tuple[Array, Array]:
         """The inverse times stacks of photos' values (n, m, nb) and of cameras' (n, k)."""
         shares = (products(b, self.frames) + c @ self.cameras.T) @ self.weights
-        envelope = self.photos.envelope
-        rows = envelope.gather(b)
+        shape = self.photos.shape
+        rows = shape.gather(b)
         self.photos.solve(rows)
-        return envelope.scatter(rows) + np.tensordot(shares, self.frames, 1), shares @ self.cameras
+        return shape.scatter(rows) + np.tensordot(shares, self.frames, 1), shares @ self.cameras
 
     def diagonal_blocks(self) -> tuple[Array, Array]:
         """Of the inverse: those of each photo (m, nb, nb), 0 where held, and that of all cameras (k, k)."""
@@ -96,7 +97,7 @@ class Factored:
         return self.photos.inverse_blocks() + np.einsum("sma,smb->mab", shared, self.frames), (cameras + cameras.T) / 2
 
     def pair_blocks(self, first: Index, second: Index) -> Array:
-        """Of the inverse: those of pairs of photos that the pattern joins, (q, nb, nb), 0 where held."""
+        """Of the inverse: those of pairs of photos that the pattern connects, (q, nb, nb), 0 where held."""
         shared = np.einsum("rqa,rs->sqa", self.frames[:, first], self.weights)
         return self.photos.inverse_blocks_of(first, second) + np.einsum("sqa,sqb->qab", shared, self.frames[:, second])
 
@@ -117,13 +118,13 @@ class Factored:
         )
 
 
-def factor(reduced: Reduced, envelope: Envelope) -> Factored | None:
+def factor(reduced: Reduced, shape: Envelope | SparseBlocks) -> Factored | None:
     """The system factored; None if it is not positive."""
-    photos = envelope.factor(reduced.S)
+    photos = shape.factor(reduced.S)
     if photos is None:
         return None
-    rows = envelope.gather(reduced.border)
+    rows = shape.gather(reduced.border)
     photos.solve(rows)
-    X = envelope.scatter(rows)
+    X = shape.scatter(rows)
     cameras = _positive_inverse(reduced.corner - products(reduced.border, X))
     return None if cameras is None else Factored(photos, -X, np.eye(len(X)), cameras)

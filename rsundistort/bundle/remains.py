@@ -24,9 +24,9 @@ _DEGREE = 3
 WAVES = 25
 # Measurements for each coefficient of these, at least.
 _PER_COEFFICIENT = 3
-# Share of their squares that keeps coefficients finite that no measurement tells.
+# Share of their squares that keeps coefficients finite that no measurement determines.
 _RIDGE = 1e-6
-# Standard deviation of the turns that lines are taken to have beyond a steady motion, radians: of a trembling hand
+# Standard deviation of the rotations that lines are taken to have beyond a steady motion, radians: of a trembling hand
 # or of a motor's vibration. It keeps finite what a half shows hardly.
 _TURNED = 5e-4
 _REWEIGHTED = 4
@@ -97,7 +97,7 @@ def errors_without(
 
 
 def _turned(rec: Reconstruction, measured: Observations) -> NDArray[np.float64]:
-    """(n, 2, 3) pixels that each measurement moves by with a small turn of its line, radians about the camera's axes.
+    """(n, 2, 3) pixels a radian that each measurement moves by if its line rotates about the camera's axes.
 
     Without the lens: what is asked is whether two halves show the same.
     """
@@ -125,11 +125,12 @@ def _curves(
 
 
 def agreement_of_waves(rec: Reconstruction, sigma_px: float) -> float:
-    """Correlation over photos, axes and lines of the turns of lines that two halves of the scene show, -1 to 1.
+    """Correlation over photos, axes and lines of the rotations of lines that two halves of the scene show, -1 to 1.
 
-    Beyond a smooth warp of each photo and whatever turns as a polynomial of the clock, which other models have. Each
-    axis counts by the pixels that it moves. Halves as in `half_across_readout`: a vibration turns the whole line, what
-    lens and matches leave differs. Linear, from the residuals, where a fit of each half would take many times as long.
+    Beyond a smooth warp of each photo and whatever rotates as a polynomial of the clock, which other models have. Each
+    axis counts by the pixels that it moves. Halves as in `half_across_readout`: a vibration rotates the whole line,
+    what lens and matches leave differs. Linear, from the residuals, where a fit of each half would take many times as
+    long.
     """
     obs = rec.observations
     res, valid = reprojection_residuals(rec)

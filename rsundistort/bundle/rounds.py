@@ -212,7 +212,7 @@ class Rounds:
         )
 
     def begin_next(self, with_same_weights: bool = False) -> None:
-        """Start the next solve from the last, with what that says of spreads and noise, or as it was weighed."""
+        """Start the next solve from the last, with its prior standard deviations and noise, or as it was weighed."""
         if with_same_weights:
             self._spreads, self._noise = self._weighed_spreads, self._weighed_noise
             self._heavy_tails = self._had_heavy_tails
@@ -254,4 +254,5 @@ class Rounds:
             tuple(np.sqrt(self._problem.fields(state, of_intrinsics)[1].sum(1)).tolist()),
             path,
             spreads.path,
+            velocity_mean=(*(np.array(spreads.travel) / self._baseline).tolist(),),
         )

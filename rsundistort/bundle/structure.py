@@ -94,7 +94,7 @@ class Structure:
         cls, frame_idx: Index, point_idx: Index, num_frames: int, num_points: int,
         joined: tuple[Index, Index] | None = None,
     ) -> Structure:  # fmt: skip
-        """Structure of observations in any order; priors join the pairs of photos `joined`, too."""
+        """Structure of observations in any order; priors connect the pairs of photos `joined`, too."""
         first = np.full(num_points, num_frames)
         np.minimum.at(first, point_idx, frame_idx)
         points = np.argsort(first, kind="stable")

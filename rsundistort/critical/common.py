@@ -113,8 +113,8 @@ class CommonMotion:
         if not self.of_travel:
             return f"{_TURNS[swap[turn]]} is known worst: {left}"
         way = int(np.argmax(self.shares[3:]))
-        told = "can hardly be distinguished" if self.is_weak else "are distinguished worst"
-        return f"{_TURNS[swap[turn]]} and {_WAYS[swap[way]]} {told}: {left}"
+        how = "can hardly be distinguished" if self.is_weak else "are distinguished worst"
+        return f"{_TURNS[swap[turn]]} and {_WAYS[swap[way]]} {how}: {left}"
 
 
 def row_phi(reconstruction: Reconstruction) -> NDArray[np.int64]:

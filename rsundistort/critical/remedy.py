@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..bundle import BundleOptions, BundleResult, Posterior, bundle_adjust
+from ..bundle.spreads import common_velocity
 from ..errors import InputError
 from .common import row_phi
 from .cost import ShapeCost, shape_cost
@@ -116,7 +117,7 @@ def still_probability(result: BundleResult, options: BundleOptions | None = None
     pair = np.abs(motion[np.arange(m)[:, None], row_phi(rec)[:, 1:]] * span[:, None])
     # not the prior's: that was estimated with phi1, which a critical motion leaves at zero
     phi = max(float(np.median(pair)) / 0.6745, 2 * _STILL)
-    velocity = np.maximum(result.velocity_sigma * rec.baseline, 2 * _STILL * depth)
+    velocity = np.maximum(result.velocity_rms * rec.baseline, 2 * _STILL * depth)
 
     def precision(of_phi: ArrayLike, of_velocity: ArrayLike) -> NDArray[np.float64]:
         """(m, k, k) of a prior, per unit of the clock."""
@@ -126,8 +127,12 @@ def still_probability(result: BundleResult, options: BundleOptions | None = None
 
     # of the motion, all that the prior of its own photo did not say: exp(pull x - x' (inside) x / 2)
     inside = np.linalg.inv(covariance)
-    pull = np.einsum("mij,mj->mi", inside, motion)
-    inside = inside - precision(result.phi_sigma, max(result.velocity_sigma * rec.baseline, 1e-300))
+    own = precision(result.phi_sigma, max(result.velocity_sigma * rec.baseline, 1e-300))
+    mean = np.zeros_like(motion)
+    travels = common_velocity(rec, rec.baseline * np.array(result.velocity_mean))
+    mean[:, 3:] = travels[:, : motion.shape[1] - 3]
+    pull = np.einsum("mij,mj->mi", inside, motion) - np.einsum("mij,mj->mi", own, mean)
+    inside = inside - own
 
     def evidence(prior: NDArray[np.float64]) -> NDArray[np.float64]:
         """(m,) log likelihoods of a prior, up to a constant."""
@@ -231,7 +236,7 @@ def _again(result: BundleResult, options: BundleOptions) -> BundleResult:
     rec = result.reconstruction
     again = replace(
         options, outlier_rounds=0, sigma_px=result.sigma_px, bend_sigma_start=result.bend_sigmas or 1e-3,
-        phi_sigma_start=result.phi_sigma, velocity_sigma_start=result.velocity_sigma or options.velocity_sigma_start,
+        phi_sigma_start=result.phi_sigma, velocity_sigma_start=result.velocity_rms or options.velocity_sigma_start,
     )  # fmt: skip
     return replace(bundle_adjust(rec, rec.shutter_model, again), num_outliers=result.num_outliers)
 

@@ -46,7 +46,7 @@ _METRICS = ("rotation_deg", "translation", "structure")
 # what is made of a line of trials.jsonl
 _NUMBERS = (*_METRICS, "iterations", "seconds")
 _LINE = {"scene": str, "trial": int, "method": str} | dict.fromkeys(_NUMBERS, Between(0.0, 1e300))
-# no prior: a spread of so many radians or baselines a frame
+# no prior: a standard deviation of so many radians or baselines a frame
 _FREE = 1e4
 
 
@@ -190,9 +190,9 @@ def run_trial(scene: KnownScene, options: OneOptions, trial: int) -> list[dict[s
         chosen = method_options(method, options)
         result = bundle_adjust(rough if method == "wo-rs" else start, model, chosen)
         seconds = time.perf_counter() - began
-        # the method's own cost of the true parameters, with the spreads it ended with
+        # the method's own cost of the true parameters, with the prior standard deviations it ended with
         final = replace(
-            chosen, phi_sigma=result.phi_sigma, velocity_sigma=max(result.velocity_sigma, 1e-9), spread_rounds=0
+            chosen, phi_sigma=result.phi_sigma, velocity_sigma=max(result.velocity_rms, 1e-9), spread_rounds=0
         )  # fmt: skip
         true_cost = objective(truth, model, final)
         lines.append(

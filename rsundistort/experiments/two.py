@@ -129,9 +129,9 @@ def experiment_two(
             (_WITHOUT, swung, "global"),
         ):
             each = replace(common, solve=replace(solving, shutter_model=model))
-            told = None if progress is None else _within(progress, key)
+            within = None if progress is None else _within(progress, key)
             try:
-                solutions[key] = run(photos, scratch / key, each, told, jobs=options.jobs)
+                solutions[key] = run(photos, scratch / key, each, within, jobs=options.jobs)
             except ReconstructionError as error:
                 raise ReconstructionError(f"{photos}: {error}") from error
         found = compare_paths(solutions[_STILL], solutions[_WITH], solutions[_WITHOUT])

@@ -169,7 +169,11 @@ def align_gyro(
     ways = _ways(coarse, offset, seen, mirrored=mirrored > proper and 1 - mirrored**2 < _BETTER * (1 - proper**2))
     fit = _refine(log, start, end, seen, offset, ways[0], coarse.ratio(offset))
     if fit is None:
-        return NoAlignment("the gyroscope's log does not cover the frames", proper)
+        # a log that hardly fits anywhere fits best where it ends
+        covers = (
+            "the gyroscope's log does not cover the frames" if proper >= _LEAST_CORRELATION else _other_clip(proper)
+        )
+        return NoAlignment(covers, proper)
     against = _why_not(fit, ways[0], max(spread), interval)
     if against is None and 1 - rival**2 < _AS_GOOD * (1 - proper**2):
         against = "the camera's rotations repeat: several offsets of the gyroscope's clock fit them"
@@ -216,10 +220,7 @@ def _why_not(fit: _Fit, way: _Array, spread: float, interval_s: float) -> str | 
             "be found by that"
         )
     if fit.correlation < _LEAST_CORRELATION:
-        return (
-            f"the gyroscope's log does not show the camera's rotations (correlation {fit.correlation:.2f}): it is of "
-            "another clip, or the video is stabilised"
-        )
+        return _other_clip(fit.correlation)
     if np.linalg.det(way) < 0:
         return (
             f"the gyroscope's axes are a mirror image of the camera's, as {_letters(way)} takes them, which no sensor "
@@ -228,6 +229,13 @@ def _why_not(fit: _Fit, way: _Array, spread: float, interval_s: float) -> str | 
     if not fit.sigma[_OFFSET] < interval_s / 2:
         return "the camera rotated too uniformly to determine the offset of the gyroscope's clock"
     return None
+
+
+def _other_clip(correlation: float) -> str:
+    return (
+        f"the gyroscope's log does not show the camera's rotations (correlation {correlation:.2f}): it is of another "
+        "clip, or the video is stabilised"
+    )
 
 
 def _without_jumps(seen: _Array, at_s: _Array, log: GyroLog, interval_s: float) -> _Array:

@@ -179,7 +179,7 @@ def load_photos(
     workers : Workers
         Where it is done.
     log : StageLog
-        Told the progress.
+        Gets the progress.
     megapixels : float
         As in `detect_features`.
     masks, raw_as, again, max_megapixels

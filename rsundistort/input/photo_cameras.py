@@ -96,18 +96,18 @@ class PhotoCameras:
         """Prior of the cameras: with the given standard deviations, else those of calibrations or guesses."""
         default = GUESS_SIGMA if loose or not self.calibrated else GIVEN_SIGMA
         sigmas = []
-        for told in self.sigma or [{}] * len(self.cameras):
-            sigma = {**default, "fx": default["f"], "fy": default["f"], **told}
-            if "f" in told:
-                sigma |= {name: told.get(name, told["f"]) for name in ("fx", "fy")}
+        for specified in self.sigma or [{}] * len(self.cameras):
+            sigma = {**default, "fx": default["f"], "fy": default["f"], **specified}
+            if "f" in specified:
+                sigma |= {name: specified.get(name, specified["f"]) for name in ("fx", "fy")}
             sigmas.append(sigma)
         return GuessedCameras(self.cameras, sigmas)
 
     def with_sigma(self, sigma: Mapping[str, float]) -> PhotoCameras:
         """The same, all cameras known to these standard deviations, in pixels or of the coefficients."""
-        told = self.sigma or [{}] * len(self.cameras)
+        specified = self.sigma or [{}] * len(self.cameras)
         return replace(
-            self, sigma=[{**old, **_relative(sigma, c)} for old, c in zip(told, self.cameras, strict=True)]
+            self, sigma=[{**old, **_relative(sigma, c)} for old, c in zip(specified, self.cameras, strict=True)]
         )  # fmt: skip
 
     def check_plausible(self, cameras: Sequence[Camera]) -> None:
@@ -148,10 +148,10 @@ class PhotoCameras:
 
 def check_readouts(readout: str | Mapping[str, str] | None) -> dict[str, str]:
     """Directions by group, the empty name for all others; refused where one is no direction."""
-    told = {"": readout} if isinstance(readout, str) else dict(readout or {})
-    for group, direction in told.items():
+    specified = {"": readout} if isinstance(readout, str) else dict(readout or {})
+    for group, direction in specified.items():
         check_readout(direction, f"readout of {group}" if group else "readout")
-    return told
+    return specified
 
 
 def camera_file_of(folder: Path, camera: str | None) -> Path | None:
@@ -201,14 +201,14 @@ def find_cameras(
         known, keys, notes, usual = _from_exif(folder, names, sizes, facts, groups)
         calibrated, source, in_file, sigma_of = False, "EXIF, refined", frozenset[str](), {}
     labels = list(dict.fromkeys(keys))
-    told = check_readouts(readout)
-    unknown = sorted(told.keys() - {"", *labels})
+    specified = check_readouts(readout)
+    unknown = sorted(specified.keys() - {"", *labels})
     if unknown:
         raise InputError(f"readout of {unknown[0]!r}: no such group of photos, there are {', '.join(labels)}")
     cameras = []
     for label in labels:
         found = known[label]
-        direction = told.get(label, told.get(""))
+        direction = specified.get(label, specified.get(""))
         cameras.append(found if direction is None else replace(found, readout=direction))
     place = {label: k for k, label in enumerate(labels)}
     return PhotoCameras(
@@ -216,9 +216,9 @@ def find_cameras(
         tuple(labels),
         np.array([place[key] for key in keys], np.int64),
         calibrated,
-        tuple(label in told or "" in told or label in in_file for label in labels),
+        tuple(label in specified or "" in specified or label in in_file for label in labels),
         source,
-        tuple(note for note in notes if not told),
+        tuple(note for note in notes if not specified),
         [_relative(sigma_of.get(label, {}), known[label]) for label in labels],
         [k for k, label in enumerate(labels) if label in usual],
     )

@@ -22,11 +22,17 @@ Array = NDArray[np.float64]
 _ANOTHER_DATUM_M = 1.0
 # Standard deviation of the height of a photo without altitude, metres.
 _UNKNOWN_UP_M = 1e4
+# Standard deviation of a barometer's heights during a flight, metres: 10 Pa of weather or wind are 0.8 m of air.
+_BAROMETER_M = 1.0
+# Heights that differ from altitudes otherwise than the rest by more standard deviations count from another take-off.
+_ANOTHER_START = 3.0
+# Median absolute deviation to standard deviation, of a normal distribution.
+_MAD = 1.4826
 # Origins of projections are whole multiples of this, metres.
 _ROUND_M = 100.0
 # Projections for surveys are true to a fifth of this where they are meant for; heights are not scaled with them.
 _MOST_STRETCH = 0.01
-# A way from one datum to another that is known worse is told, metres.
+# A way from one datum to another that is known worse is reported, metres.
 _DATUM_M = 1.0
 # Half a step by which projections are differentiated, degrees: ten metres.
 _STEP_DEG = 1e-4
@@ -45,15 +51,17 @@ class PhotoPositions:
     sigma_m : (m, 3) array
         Standard deviations east, north and up.
     speed_m_s : (m,) array
-        Over ground; NaN where nothing says it.
+        Over ground; NaN where unknown.
     velocity_m_s : (m, 3) array
-        East, north and up; NaN where nothing says it.
+        East, north and up; NaN where unknown.
     R_cw : (m, 3, 3) array
-        From axes east, north and up to those of the camera, by its gimbal; NaN where nothing says it.
+        From axes east, north and up to those of the camera, by its gimbal; NaN where unknown.
     told_by : tuple of str
         Source of the standard deviations.
     notes : tuple of str
         Remarks on them.
+    common_up_m : float
+        Standard deviation of an error that all altitudes share, which `sigma_m` does not contain.
     """
 
     names: list[str]
@@ -64,6 +72,7 @@ class PhotoPositions:
     R_cw: Array
     told_by: tuple[str, ...]
     notes: tuple[str, ...]
+    common_up_m: float = 0.0
 
     def __len__(self) -> int:
         return len(self.names)
@@ -81,9 +90,9 @@ class MapFrame:
     origin : (float, float, float)
         Of "local" latitude, longitude and altitude; else what is subtracted from east, north and up.
     convergence_rad : float
-        By how much east and north are turned in the frame, counter-clockwise: a grid's north is not the north pole's.
+        By how much east and north are rotated in the frame, counter-clockwise: a grid's north is not the north pole's.
     note : str
-        What is to be said of it.
+        A remark on it.
     """
 
     crs: str
@@ -163,7 +172,7 @@ def _projected(crs: str, geodetic: Array) -> Array:
 
 
 def _convergence(crs: str, place: Array) -> float:
-    """By how much a projection turns east and north at a place (3,), which is refused where it stretches them."""
+    """By how much a projection rotates east and north at a place (3,), which is refused where it stretches them."""
     around = place + _STEP_DEG * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
     there, true = _projected(crs, around)[:, :2], enu_from_geodetic(around, place)[:, :2]
     jacobian = np.linalg.solve(true[::2] - true[1::2], there[::2] - there[1::2]).T
@@ -238,6 +247,10 @@ def positions_of(names: Sequence[str], facts: Sequence[ExifFacts]) -> PhotoPosit
             )
     sigma = np.array([fix.sigma_m for fix in fixes]).reshape(-1, 3)
     sigma[~known, 2] = _UNKNOWN_UP_M
+    heights = np.array([np.nan if fix.height_m is None else fix.height_m for fix in fixes])
+    altitudes, leveled, common_up_m = _leveled(altitudes, heights, sigma[:, 2])
+    by_height = leveled != sigma[:, 2]
+    sigma[:, 2] = leveled
     geodetic = np.array([(fix.latitude_deg, fix.longitude_deg) for fix in fixes]).reshape(-1, 2)
     unknown = np.full((3, 3), np.nan)
     return PhotoPositions(
@@ -246,13 +259,36 @@ def positions_of(names: Sequence[str], facts: Sequence[ExifFacts]) -> PhotoPosit
         sigma,
         np.array([np.nan if fix.speed_m_s is None else fix.speed_m_s for fix in fixes]),
         np.array([fix.velocity_m_s or (np.nan,) * 3 for fix in fixes]).reshape(-1, 3),
-        # a photo that is stored turned does not say about which axes
+        # a photo that is stored rotated does not say about which axes
         np.array(
             [fix.R_cw if is_upright and fix.R_cw else unknown for fix, is_upright in zip(fixes, upright, strict=True)]
         ).reshape(-1, 3, 3),
-        tuple(sorted({fix.told_by for fix in fixes})),
+        tuple(sorted({fix.told_by for fix in fixes} | ({"height above take-off"} if by_height.any() else set()))),
         tuple(notes),
+        common_up_m,
     )
+
+
+def _leveled(altitudes: Array, heights: Array, sigma_up: Array) -> tuple[Array, Array, float]:
+    """Altitudes (m,) by heights above the take-off, their standard deviations, and that of their common error.
+
+    Where altitudes and heights of a barometer differ by nearly the same in all photos, the errors of both are nearly
+    common, and many photos do not average them out. The rest is as large as these differences scatter, and a metre at
+    least. A photo keeps its altitude if that is the better one, or if its difference is another one: it was taken in a
+    flight from another place, or one of the two is wrong. NaN is none.
+    """
+    apart = altitudes - heights
+    both = np.isfinite(apart)
+    if not both.any():
+        return altitudes, sigma_up, 0.0
+    middle = float(np.median(apart[both]))
+    off = np.abs(apart - middle)
+    sigma = max(_BAROMETER_M, _MAD * float(np.median(off[both])))
+    better = both & (off <= _ANOTHER_START * sigma) & (sigma < sigma_up)
+    if not better.any():
+        return altitudes, sigma_up, 0.0
+    common_up_m = float(np.median(sigma_up[better]))
+    return np.where(better, heights + middle, altitudes), np.where(better, sigma, sigma_up), common_up_m
 
 
 def _some(names: Sequence[str]) -> str:

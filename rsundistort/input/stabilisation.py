@@ -55,7 +55,7 @@ class Regression:
     Attributes
     ----------
     slope, sigma : float
-        With its standard deviation, from the spread of what is left, in neighbours together.
+        With its standard deviation, from the scatter of what is left, in neighbours together.
     correlation : float
         Of both, weighted, about zero: from -1 to 1.
     signal : float
@@ -85,15 +85,15 @@ class Stabilisation:
     reason : str
         One line, with the figures that decide.
     shutter : Regression
-        Turns during the readout by the rate between frames, or the changes of both, whichever tell the slope better: it
-        is the time of the readout in seconds.
+        Rotations during the readout by the rate between frames, or the changes of both, whichever determine the slope
+        better: it is the time of the readout in seconds.
     changes : Regression
         Changes within a tenth of a second of the one by those of the other.
     beyond_frames : bool
-        Whether the lines change their turn by more than the frames do in all of the time from one to the next: no
-        readout takes longer, and false poses only make the frames seem to turn by more.
+        Whether the lines change their rotation by more than the frames do in all of the time from one to the next: no
+        readout takes longer, and false poses only make the frames seem to rotate by more.
     frames_by_gyro, shutter_by_gyro : Regression or None
-        Rates between frames, and turns during the readout, by the gyroscope's rates.
+        Rates between frames, and rotations during the readout, by the gyroscope's rates.
     """
 
     verdict: Literal["none", "stabilised", "unknown"]
@@ -136,7 +136,7 @@ def judge_stabilisation(
     turns : (n, 3) array
         Rotation vectors of the world in the camera, radians; NaN where unknown.
     phi_frame, phi_sigma : (m, 3) array
-        Turns of the world in the camera during the readout of each frame, in radians per frame, found without any
+        Rotations of the world in the camera during the readout of each frame, in radians per frame, found without any
         knowledge of `turns`; NaN where unknown. Their standard deviations, or one for all; too small by a factor of
         1.4, they do no harm.
     turn_sigma : float or (n, 3) array
@@ -176,12 +176,12 @@ def judge_stabilisation(
     at_frames = _rate_at_frames(rate, joined, len(times))
     levels = _regress(phi, at_frames, phi_noise, together=_TOGETHER)
     changes, beyond = _of_changes(phi, at_frames, phi_noise, interval)
-    # what lens and scene leave in phi is slow: where it is more than noise, changes tell better than levels
+    # what lens and scene leave in phi is slow: where it is more than noise, changes determine it better than levels
     shutter = min(levels, changes, key=lambda found: found.sigma)
     frames_by_gyro = shutter_by_gyro = None
     if log is not None:
         felt = -log.mean(start + offset_s, end + offset_s)
-        # of turns without a known noise, that of the gyroscope is all there is
+        # of rotations without a known noise, that of the gyroscope is all there is
         noise = np.hypot(rate_noise, log.noise * np.sqrt(np.minimum(1.0, log.step_s / interval)))
         frames_by_gyro = _regress(rate, felt, noise, steady=True)
         length = readout_s or 0.5 * interval
@@ -192,9 +192,9 @@ def judge_stabilisation(
 
 
 def _of_changes(phi: _Array, rate: _Array, noise: _Array, interval: float) -> tuple[Regression, bool]:
-    """Changes of phi (m, 3) by those of the rate, and whether they are more than the frames turn in all of their time.
+    """Changes of phi (m, 3) by those of the rate, and whether they exceed the rotations of whole frames.
 
-    What is in no rotation shows in them alone: slow turns of the lines may be what lens and scene leave.
+    What is in no rotation shows in them alone: slow rotations of the lines may be what lens and scene leave.
     """
     step = max(1, round(_CHANGE_S / interval)) if np.isfinite(interval) else 1
     lines, frames = (each[step:] - each[:-step] for each in (phi, rate))
@@ -211,7 +211,7 @@ def calmer_than_felt(
 ) -> str:
     """Why frames of a video are stabilised, by a gyroscope with unknown axes and clock; empty if not.
 
-    What is compared is by how much the turn changes from one frame to the next: that knows no axes and no bias, and
+    What is compared is by how much the rotation changes from one frame to the next: that knows no axes and no bias, and
     little of the offset of a clock.
 
     Parameters
@@ -275,14 +275,14 @@ def _regress(y: _Array, x: _Array, noise: _Array, *, steady: bool = False, toget
     if len(x) < _FEWEST or not np.any(x):
         signal = float(np.mean((y / noise) ** 2) - 1) if len(y) else 0.0
         return Regression(0.0, np.inf, 0.0, signal, signal, np.inf)
-    # false poses between frames are rates that nobody turns by, and would decide alone
+    # false poses between frames are rates that nobody rotates by, and would decide alone
     size = np.linalg.norm(x, axis=1)
     near = size <= _FARTHEST * np.median(size)
     x, y, noise = x[near], y[near], noise[near]
     if steady:
         x, y = x - np.median(x, axis=0), y - np.median(y, axis=0)
     x, y = x / noise, y / noise
-    # false turns are large and pull: the start is the slope of one frame that leaves the smallest median
+    # false rotations are large and pull: the start is the slope of one frame that leaves the smallest median
     with np.errstate(invalid="ignore", divide="ignore"):
         slopes = np.sum(x * y, 1) / np.sum(x * x, 1)
     slopes = np.append(np.quantile(slopes[np.isfinite(slopes)], np.linspace(0, 1, 101)), 0.0)

@@ -40,7 +40,7 @@ def with_focal_lengths(photos: LoadedPhotos, seed: int, log: StageLog, kept: Kep
     seed : int
         Seed of every random choice.
     log : StageLog
-        Told the progress.
+        Gets the progress.
     kept : Kept, optional
         Results of an earlier run; takes those of this run.
     """

@@ -26,7 +26,7 @@ __all__ = [
     "read_camera_file",
 ]
 
-#: Intrinsics whose standard deviations a file may tell.
+#: Intrinsics whose standard deviations a file may state.
 SIGMA_NAMES = ("f", "fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
 
 _REQUIRED = {"width", "height", "K"}
@@ -56,7 +56,7 @@ def camera_from_json(value: Any, where: str) -> Camera:
 
 
 def sigma_from_json(value: Any, where: str) -> dict[str, float]:
-    """Standard deviations by intrinsic, in pixels or of coefficients, of a parsed `camera.json`; {} if none told."""
+    """Standard deviations by intrinsic, in pixels or of coefficients, of a parsed `camera.json`; {} without any."""
     sigma = value.get("sigma") or {}
     if not isinstance(sigma, dict):
         raise FormatError(f'{where}: sigma is {sigma!r}, expected an object such as {{"f": 1.5, "k1": 0.003}}')
@@ -131,8 +131,8 @@ def read_camera_file(text: str | Path, width: int, height: int) -> CameraFile:
     ----------
     text : str or Path
         A file (`camera.json`, `cameras.json`, the nine numbers of K, a calibration of OpenCV or ROS, COLMAP's
-        `cameras.txt` or `cameras.bin`), told by its content; a folder with a COLMAP model, or with such files of one
-        camera each; or "fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]".
+        `cameras.txt` or `cameras.bin`), recognised by its content; a folder with a COLMAP model, or with such files of
+        one camera each; or "fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]".
     width, height : int
         Size of the photos, for formats that hold none.
 
@@ -220,7 +220,7 @@ def _read_folder(folder: Path, width: int, height: int) -> CameraFile:
     file_of: dict[str, Path] = {}
     cameras = {}
     sigma = {}
-    told = set()
+    stated = set()
     for file in files:
         other = file_of.setdefault(file.stem, file)
         if other != file:
@@ -231,9 +231,9 @@ def _read_folder(folder: Path, width: int, height: int) -> CameraFile:
         (cameras[file.stem],) = found.cameras.values()
         sigma[file.stem] = next(iter(found.sigma.values()), {})
         if found.readout_told:
-            told.add(file.stem)
+            stated.add(file.stem)
     source = f"{folder} ({len(cameras)} camera file{'s' * (len(cameras) > 1)})"
-    return CameraFile(cameras, source=source, readout_told=frozenset(told), sigma=sigma)
+    return CameraFile(cameras, source=source, readout_told=frozenset(stated), sigma=sigma)
 
 
 def _read_file(path: Path, width: int, height: int) -> CameraFile:
@@ -263,9 +263,9 @@ def _read_file(path: Path, width: int, height: int) -> CameraFile:
         raise FormatError(f"{path} holds no camera; expected {_KINDS}")
     if "cameras" in tree:
         return _several_of_json(tree, path)
-    told = frozenset({_ONLY} if "readout" in tree else ())
+    stated = frozenset({_ONLY} if "readout" in tree else ())
     camera, sigma = camera_from_json(tree, str(path)), sigma_from_json(tree, str(path))
-    return CameraFile({_ONLY: camera}, source=str(path), readout_told=told, sigma={_ONLY: sigma})
+    return CameraFile({_ONLY: camera}, source=str(path), readout_told=stated, sigma={_ONLY: sigma})
 
 
 def _parse(content: str) -> tuple[Any, str]:

@@ -48,8 +48,8 @@ def read_control_points(path: Path | str) -> list[ControlPoint]:
         where = f"{path}, line {number}"
         if not name or not photo:
             raise FormatError(f"{where}: expected the name of a point and that of a photo")
-        told = tuple(row[column] for column in named)
-        if told != facts.setdefault(name, told) and any(told):
+        stated = tuple(row[column] for column in named)
+        if stated != facts.setdefault(name, stated) and any(stated):
             raise FormatError(f"{where}: {name} is given another place, deviation or use than in the lines before")
         if photo in seen.setdefault(name, {}):
             raise FormatError(f"{where}: {name} is in {photo} twice")
@@ -57,7 +57,7 @@ def read_control_points(path: Path | str) -> list[ControlPoint]:
         seen[name][photo] = x, y
     if not facts:
         raise FormatError(f"{path} holds no control points")
-    return [_point(name, dict(zip(named, told, strict=True)), seen[name], path) for name, told in facts.items()]
+    return [_point(name, dict(zip(named, stated, strict=True)), seen[name], path) for name, stated in facts.items()]
 
 
 def _number(text: str, column: str, where: str) -> float:
@@ -70,11 +70,11 @@ def _number(text: str, column: str, where: str) -> float:
     return value
 
 
-def _point(name: str, told: dict[str, str], seen: dict[str, tuple[float, float]], path: Path) -> ControlPoint:
+def _point(name: str, stated: dict[str, str], seen: dict[str, tuple[float, float]], path: Path) -> ControlPoint:
     where = f"{path}, point {name}"
-    east, north, up, sigma = (_number(told[column], column, where) for column in _COLUMNS[4:])
-    sigma_up = _number(told["sigma_up"], "sigma_up", where) if told.get("sigma_up") else sigma
-    use = told.get("use", "").lower()
+    east, north, up, sigma = (_number(stated[column], column, where) for column in _COLUMNS[4:])
+    sigma_up = _number(stated["sigma_up"], "sigma_up", where) if stated.get("sigma_up") else sigma
+    use = stated.get("use", "").lower()
     if use not in _USES:
         raise FormatError(f"{where}: use={use!r}, expected control or check")
     try:

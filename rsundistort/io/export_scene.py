@@ -29,9 +29,9 @@ class ExportScene:
     Attributes
     ----------
     solution : Solution
-        Poses and rectified cameras, turned as the rectified photos are.
+        Poses and rectified cameras, rotated as the rectified photos are.
     reconstruction : Reconstruction
-        Points and measurements, turned too.
+        Points and measurements, rotated too.
     names : mapping of photo name to file name
         Of the rectified photos in `OUT/images`.
     rgb : (n, 3) uint8 array or None

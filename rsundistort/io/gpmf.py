@@ -231,7 +231,7 @@ def _payloads(container: Any, stream: Any) -> tuple[list[tuple[float, float, Gyr
 
 
 def _global_readout(path: Path) -> float | None:
-    """Time of the readout that the file tells once for all frames (moov, udta, GPMF), in seconds."""
+    """Readout time that the file states once for all frames (moov, udta, GPMF), in seconds."""
     with path.open("rb") as file:
         start, end = 0, path.stat().st_size
         for name in (b"moov", b"udta", b"GPMF"):
@@ -260,10 +260,10 @@ def _sample_times(
     """Times of all samples, and whether payloads are too far from uniform times to be believed uniform."""
     count = np.array([len(payload.rates) for payload in payloads])
     counted = np.cumsum(count) - count
-    told = np.array([counted[i] if p.num_before is None else p.num_before for i, p in enumerate(payloads)])
+    stated = np.array([counted[i] if p.num_before is None else p.num_before for i, p in enumerate(payloads)])
     # numbers that run back, or make more than nine of ten samples lost, are not believed
-    believed = (np.diff(told) >= count[:-1]).all() and told[-1] + count[-1] - told[0] <= 10 * count.sum()
-    first = told - told[0] if believed else counted
+    believed = (np.diff(stated) >= count[:-1]).all() and stated[-1] + count[-1] - stated[0] <= 10 * count.sum()
+    first = stated - stated[0] if believed else counted
     at_s = start_s
     if (stamps := _stamps(payloads, start_s)) is not None:
         at_s = stamps

@@ -1,4 +1,4 @@
-"""Which photos one camera took in one mode, and which of them were turned after readout."""
+"""Which photos one camera took in one mode, and which of them were rotated after readout."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def guess_readouts(
 ) -> tuple[dict[str, str], list[str]]:
     """Readout direction of each group of a mixed folder, and what to say of it.
 
-    Sensors lie on their long side. A camera that gave photos of W x H and of H x W, without an orientation tag, turned
+    Sensors lie on their long side. A camera that gave photos of W x H and of H x W, without an orientation tag, rotated
     the pixels of the portrait ones after readout: theirs runs along the other axis. Which way round it runs cannot be
     seen, and does not matter: to reverse the readout is to negate the motion.
 
@@ -59,7 +59,7 @@ def guess_readouts(
     facts, sizes, groups : sequences of length m
         Of each photo what its EXIF says, the (width, height) of its stored pixels, and its label as of `group_of`.
     readout : str
-        Of photos that were not turned.
+        Of photos that were not rotated.
 
     Returns
     -------
@@ -70,7 +70,7 @@ def guess_readouts(
     """
     across = other_axis(readout)
     frames = {(_body(fact), *size) for fact, size in zip(facts, sizes, strict=True)}
-    # a tag that turns the photo for people says that nobody has turned its pixels
+    # a tag that rotates the photo for people says that nobody has rotated its pixels
     tagged = {group for fact, group in zip(facts, groups, strict=True) if fact.orientation not in (None, 1)}
     readouts = {}
     for fact, (width, height), group in zip(facts, sizes, groups, strict=True):

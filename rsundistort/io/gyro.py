@@ -2,7 +2,7 @@
 
 The sign. While the clock r runs, the orientation of a photo is `R_cw(r) = Exp(r phi) R_cw`. A gyroscope measures omega,
 the rate of the camera about its own axes: `R_wc(t + dt) = R_wc(t) Exp(omega dt)`. Transposed, that is
-`R_cw(t + dt) = Exp(-omega dt) R_cw(t)`: the world turns the other way in the camera. The clock runs forwards in time,
+`R_cw(t + dt) = Exp(-omega dt) R_cw(t)`: the world rotates the other way in the camera. The clock runs forwards in time,
 whatever the direction of the readout, and over the whole frame within the time of the readout T. So `phi = -T omega`
 per frame.
 """
@@ -51,7 +51,7 @@ _COLUMNS = ("time_s", "wx", "wy", "wz")
 
 @dataclass(frozen=True)
 class GyroLog:
-    """Rates of turn of a camera.
+    """Rates of rotation of a camera.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class GyroLog:
         """(k, 3) rotation vectors of the world in the camera at times (k,), against the first of them.
 
         `Exp(turn) R_cw` is the orientation then, R_cw that at the first time. Between neighbouring times the axis of
-        the turn is held; what that leaves falls with the square of the steps.
+        the rotation is held; what that leaves falls with the square of the steps.
         """
         from scipy.spatial.transform import Rotation
 
@@ -348,7 +348,7 @@ def bends_from_gyro(
     *,
     offset_s: float = 0.0,
 ) -> dict[str, tuple[NDArray[np.float64], Bend]]:
-    """How photos turned while they were read: the steady motion that is nearest, and how the turn departs from it.
+    """How photos rotated while they were read: the nearest steady motion, and how the rotation departs from it.
 
     Parameters
     ----------
@@ -360,10 +360,10 @@ def bends_from_gyro(
     Returns
     -------
     dict of photo name to (phi, Bend)
-        phi (3,) in radians per frame: the slope of the turn, where `motions_from_gyro` has its mean rate. The bend is
-        as `BundleOptions.known_bends` takes it, orthogonal to 1 and to the clock, a spline of 65 readings: a
+        phi (3,) in radians per frame: the slope of the rotation, where `motions_from_gyro` has its mean rate. The bend
+        is as `BundleOptions.known_bends` takes it, orthogonal to 1 and to the clock, a spline of 65 readings: a
         vibration of 1.5 mrad is right to 4e-5 rad at 10 periods a frame. The rates are integrated to rotations, so it
-        is right for turns about changing axes, too. Photos that the log does not cover are left out.
+        is right for rotations about changing axes, too. Photos that the log does not cover are left out.
     """
     found = {}
     for name, time_s in times_s.items():
@@ -407,7 +407,7 @@ def gyro_offset(
         As `motions_from_gyro` takes it: where the rates explain the rotations best.
     correlation : float
         Of both there, from -1 to 1. Below about 0.8, or with few photos, the offset is not to be believed; a camera
-        that turns evenly has none that can be seen.
+        that rotates evenly has none that can be seen.
 
     Raises
     ------

@@ -1,16 +1,22 @@
 """Metashape's `cameras.xml` (File, Export, Export Cameras; and Import Cameras).
 
 Its pixels have their centres at 0.5 and principal points count from the middle of the photo. P1 and P2 are OpenCV's p2
-and p1. Poses are camera to world, x right, y down, z ahead. Of a sensor with rolling-shutter compensation a pose is
-that of the middle of the frame; `rolling_shutter` of a camera holds a rotation and a translation, and nothing says
-between which lines.
+and p1. Poses are camera to world, x right, y down, z ahead.
+
+With rolling-shutter compensation a camera has `rolling_shutter`, a rotation and a translation (`Camera.shutter` of
+Metashape's Python interface, which calls it the rolling shutter correction model). Agisoft's support says what they
+are, not how they enter the projection: two parameters, "axis shift XY in the plane of the photo" (regularized), or six,
+"shift along the XYZ axes and rotation along the XYZ axes" (full; forum, topic 14670). The translation is therefore one
+in the axes of the camera. Whether both count from the first line to the last or from the middle to the border, and
+their signs, is not published, and no reader of the file that we know of applies them. So they are kept as they are, and
+no motion is made of them.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from xml.etree import ElementTree
 
@@ -23,13 +29,62 @@ from ..model import Camera, Solution
 from ..model.checks import check_rotations
 from .xml_text import read_xml
 
-__all__ = ["PosedPhotos", "is_metashape", "named", "read_metashape", "write_metashape"]
+__all__ = [
+    "PosedPhotos",
+    "Sensor",
+    "ShutterTerms",
+    "is_metashape",
+    "named",
+    "read_metashape",
+    "write_metashape",
+    "write_posed_photos",
+]
 
 _VERSION = "1.5.0"
 # p3 and p4 are of PhotoScan and the first versions of Metashape
 _PARAMETERS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 # Geocentric and projected coordinates are millions of metres: digits of the cameras' own distances would be lost.
 _FAR, _FAR_OF_SPREAD = 1e5, 100.0
+
+
+@dataclass(frozen=True)
+class ShutterTerms:
+    """What Metashape estimated of a photo's shutter. No motion: between which lines it counts is not published.
+
+    Attributes
+    ----------
+    rotation : (3, 3) array
+        As in the file; the identity where it has none.
+    translation : (3,) array
+        In the camera's axes, in the units of the centres; zero where the file has none.
+    """
+
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+
+    @property
+    def angle_deg(self) -> float:
+        """Angle of the rotation, degrees, 0 to 180."""
+        return float(np.degrees(np.arccos(np.clip((np.trace(self.rotation) - 1) / 2, -1, 1))))
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor as the file describes it; `PosedPhotos.cameras` has what we make of it.
+
+    Attributes
+    ----------
+    kind : {"frame", "fisheye", "equidistant_fisheye"}
+        Type of its calibration.
+    parameters : mapping of name to value
+        Of the calibration, by Metashape's names: f, cx, cy, ... The principal point counts from the middle.
+    shutter : mapping of name to text
+        Its properties on rolling-shutter compensation: `rolling_shutter`, `rolling_shutter_flags`.
+    """
+
+    kind: str
+    parameters: Mapping[str, float]
+    shutter: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -48,6 +103,10 @@ class PosedPhotos:
         `x_c = R_cw (X_w - center_w)`.
     unposed : tuple of str
         Photos without a pose.
+    sensors : tuple of Sensor
+        Of the cameras, as the file describes them.
+    shutter : mapping of int to ShutterTerms
+        `rolling_shutter` by the position of the photo, of those that have it.
     """
 
     labels: tuple[str, ...]
@@ -57,6 +116,8 @@ class PosedPhotos:
     R_cw: NDArray[np.float64]
     center_w: NDArray[np.float64]
     unposed: tuple[str, ...] = ()
+    sensors: tuple[Sensor, ...] = ()
+    shutter: Mapping[int, ShutterTerms] = field(default_factory=dict)
 
 
 def is_metashape(path: Path) -> bool:
@@ -64,7 +125,7 @@ def is_metashape(path: Path) -> bool:
     return path.suffix.lower() == ".xml" and path.is_file()
 
 
-def read_metashape(path: Path) -> PosedPhotos:
+def read_metashape(path: Path | str) -> PosedPhotos:
     """Cameras and poses of a `cameras.xml`, of its chunk with most of them, in the coordinates of its transform.
 
     Raises
@@ -72,6 +133,7 @@ def read_metashape(path: Path) -> PosedPhotos:
     FileError, FormatError
         When there is none; when a lens is none that a camera of ours follows.
     """
+    path = Path(path)
     root = read_xml(path)
     chunks = [root] if root.tag == "chunk" else root.findall("chunk")
     if not chunks:
@@ -88,13 +150,9 @@ def read_metashape(path: Path) -> PosedPhotos:
 def _chunk(chunk: ElementTree.Element, where: str) -> PosedPhotos:
     sensors = {each.attrib["id"]: each for each in chunk.iter("sensor")}
     components = {each.attrib.get("id", ""): each.find("transform") for each in chunk.iter("component")}
-    labels, of_sensor, matrices, unposed = [], [], [], []
-    moved = [camera.attrib["label"] for camera in chunk.iter("camera") if camera.find("rolling_shutter") is not None]
-    if moved:
-        warnings.warn(
-            f"{where}: rolling_shutter of {len(moved)} cameras, such as {moved[0]}, is left out, since what "
-            "it means is not published; motions are solved for", RsUndistortWarning, stacklevel=5,
-        )  # fmt: skip
+    labels: list[str] = []
+    of_sensor, matrices, unposed = [], [], []
+    shutter: dict[int, ShutterTerms] = {}
     for camera in chunk.iter("camera"):
         label, pose = camera.attrib["label"], camera.find("transform")
         if camera.attrib.get("enabled", "true").lower() in ("false", "0") or pose is None:
@@ -104,11 +162,16 @@ def _chunk(chunk: ElementTree.Element, where: str) -> PosedPhotos:
         transform = chunk.find("transform")
         if transform is None:
             transform = components.get(camera.attrib.get("component_id", ""))
+        to_world, scale = _to_world(transform, where)
+        terms = camera.find("rolling_shutter")
+        if terms is not None:
+            shutter[len(labels)] = _shutter_terms(terms, scale, f"{where}: rolling_shutter of {label}")
         labels.append(label)
         of_sensor.append(camera.attrib["sensor_id"])
-        matrices.append(_to_world(transform, where) @ matrix)
+        matrices.append(to_world @ matrix)
     used = sorted(set(of_sensor), key=int)
-    cameras = tuple(_camera(sensors[key], f"{where}: sensor {key}") for key in used)
+    described = [_sensor(sensors[key], f"{where}: sensor {key}") for key in used]
+    cameras = tuple(_camera(*each, f"{where}: sensor {key}") for key, each in zip(used, described, strict=True))
     poses = np.array(matrices, np.float64).reshape(-1, 4, 4)
     length = np.cbrt(np.linalg.det(poses[:, :3, :3]))
     if not (np.isfinite(poses).all() and (length > 0).all()):
@@ -117,7 +180,17 @@ def _chunk(chunk: ElementTree.Element, where: str) -> PosedPhotos:
     return PosedPhotos(
         tuple(labels), cameras, tuple(int(key) + 1 for key in used), np.array([used.index(k) for k in of_sensor], int),
         check_rotations(R_cw, len(labels), "the rotations"), _near(poses[:, :3, 3], where), tuple(unposed),
+        tuple(sensor for sensor, _, _ in described), shutter,
     )  # fmt: skip
+
+
+def _shutter_terms(element: ElementTree.Element, scale: float, where: str) -> ShutterTerms:
+    """The terms of a photo, its translation in the units of the transformed centres."""
+    rotation, translation = element.find("rotation"), element.find("translation")
+    return ShutterTerms(
+        np.eye(3) if rotation is None else _numbers(rotation, 9, f"{where}: rotation").reshape(3, 3),
+        np.zeros(3) if translation is None else scale * _numbers(translation, 3, f"{where}: translation"),
+    )
 
 
 def _near(center_w: NDArray[np.float64], where: str) -> NDArray[np.float64]:
@@ -134,20 +207,21 @@ def _near(center_w: NDArray[np.float64], where: str) -> NDArray[np.float64]:
     return center_w - middle
 
 
-def _to_world(transform: ElementTree.Element | None, where: str) -> NDArray[np.float64]:
-    """The (4, 4) similarity of a chunk's coordinates; none where there is no scale."""
-    matrix = np.eye(4)
+def _to_world(transform: ElementTree.Element | None, where: str) -> tuple[NDArray[np.float64], float]:
+    """The (4, 4) similarity of a chunk's coordinates, and its scale; none where there is no scale."""
+    matrix, scale = np.eye(4), 1.0
     if transform is None or not len(transform):
-        return matrix
-    parts = {tag: transform.find(tag) for tag in ("rotation", "translation", "scale")}
-    rotation, translation, scale = parts["rotation"], parts["translation"], parts["scale"]
+        return matrix, scale
+    found = {tag: transform.find(tag) for tag in ("rotation", "translation", "scale")}
+    rotation, translation, factor = found["rotation"], found["translation"], found["scale"]
     if rotation is not None:
         matrix[:3, :3] = _numbers(rotation, 9, f"{where}: rotation of the chunk").reshape(3, 3)
-    if scale is not None:
-        matrix[:3, :3] *= _numbers(scale, 1, f"{where}: scale of the chunk")
+    if factor is not None:
+        scale = float(_numbers(factor, 1, f"{where}: scale of the chunk")[0])
+        matrix[:3, :3] *= scale
     if translation is not None:
         matrix[:3, 3] = _numbers(translation, 3, f"{where}: translation of the chunk")
-    return matrix
+    return matrix, scale
 
 
 def _numbers(element: ElementTree.Element, count: int, where: str) -> NDArray[np.float64]:
@@ -160,7 +234,8 @@ def _numbers(element: ElementTree.Element, count: int, where: str) -> NDArray[np
     return found
 
 
-def _camera(sensor: ElementTree.Element, where: str) -> Camera:
+def _sensor(sensor: ElementTree.Element, where: str) -> tuple[Sensor, int, int]:
+    """A sensor, and width and height of its photos."""
     found = sorted(sensor.findall("calibration"), key=lambda each: each.attrib.get("class") == "initial")
     if not found:
         raise FormatError(f"{where} has no calibration; align the photos first")
@@ -173,16 +248,20 @@ def _camera(sensor: ElementTree.Element, where: str) -> Camera:
     kind = calibration.attrib.get("type", sensor.attrib.get("type", "frame"))
     if kind not in ("frame", "fisheye", "equidistant_fisheye"):
         raise FormatError(f"{where} is {kind}, expected frame or fisheye")
-    p = dict.fromkeys(_PARAMETERS, 0.0)
-    for name in _PARAMETERS:
-        value = calibration.find(name)
-        if value is not None:
-            p[name] = float(_numbers(value, 1, f"{where}: {name}")[0])
-    if p["f"] <= 0:
-        raise FormatError(f"{where} has the focal length {p['f']:g}, expected a positive one in pixels")
+    values = {name: calibration.find(name) for name in _PARAMETERS}
+    p = {key: float(_numbers(each, 1, f"{where}: {key}")[0]) for key, each in values.items() if each is not None}
+    if p.get("f", 0.0) <= 0:
+        raise FormatError(f"{where} has the focal length {p.get('f', 0.0):g}, expected a positive one in pixels")
+    properties = {each.attrib.get("name", ""): each.attrib.get("value", "") for each in sensor.findall("property")}
+    shutter = {key: value for key, value in properties.items() if key.startswith("rolling_shutter")}
+    return Sensor(kind, p, shutter), width, height
+
+
+def _camera(sensor: Sensor, width: int, height: int, where: str) -> Camera:
+    p = {name: sensor.parameters.get(name, 0.0) for name in _PARAMETERS}
     cx, cy = width / 2 - 0.5 + p["cx"], height / 2 - 0.5 + p["cy"]
     K = np.array([[p["f"] + p["b1"], 0, cx], [0, p["f"], cy], [0, 0, 1]])
-    fisheye = kind != "frame"
+    fisheye = sensor.kind != "frame"
     others = [name for name in (("b2", "p1", "p2", "p3", "p4") if fisheye else ("b2", "k4", "p3", "p4")) if p[name]]
     if not others:
         dist = [p["k1"], p["k2"], p["p2"], p["p1"], p["k3"]]
@@ -249,35 +328,69 @@ def write_metashape(path: Path, solution: Solution, names: Mapping[str, str]) ->
     """
     images = [image for image in solution.registered if image.posed and image.name in names]
     used = list(dict.fromkeys(image.camera_id for image in images))
+    cameras = tuple(solution.rectified_cameras[key] for key in used)
+    stems = [PurePosixPath(names[image.name]).stem for image in images]
+    labels = tuple(
+        stem if stems.count(stem) == 1 else names[image.name] for image, stem in zip(images, stems, strict=True)
+    )
+    posed = PosedPhotos(
+        labels, cameras, tuple(range(1, 1 + len(used))),
+        np.array([used.index(image.camera_id) for image in images], np.int64),
+        np.array([image.R_cw for image in images], np.float64).reshape(-1, 3, 3),
+        np.array([image.center_w for image in images], np.float64).reshape(-1, 3),
+        sensors=tuple(map(_rectified_sensor, cameras)),
+    )  # fmt: skip
+    write_posed_photos(path, posed, [f"rectified camera {key}" for key in used])
+
+
+def write_posed_photos(path: Path | str, posed: PosedPhotos, sensor_labels: Sequence[str] = ()) -> None:
+    """Write a `cameras.xml` of what `read_metashape` gives: labels, poses, sensors, `rolling_shutter`.
+
+    Read again, all numbers are the same; those of rotations to rounding. There is no transform of the chunk any more,
+    since it was applied when the file was read. Photos without a pose are left out.
+
+    Parameters
+    ----------
+    path : Path or str
+        File to write.
+    posed : PosedPhotos
+        With the sensors of all its cameras.
+    sensor_labels : sequence of str, optional
+        Names of the sensors; "camera" and a number when left out.
+    """
+    if len(posed.sensors) != len(posed.cameras):
+        raise InputError(f"posed has {len(posed.sensors)} sensors and {len(posed.cameras)} cameras, expected one each")
     document = ElementTree.Element("document", version=_VERSION)
     chunk = ElementTree.SubElement(document, "chunk", label="rsundistort", enabled="true")
-    sensors = ElementTree.SubElement(chunk, "sensors", next_id=str(len(used)))
-    for key, camera_id in enumerate(used):
-        _add_sensor(sensors, key, camera_id, solution.rectified_cameras[camera_id])
-    cameras = ElementTree.SubElement(chunk, "cameras", next_id=str(len(images)), next_group_id="0")
-    stems = [PurePosixPath(names[image.name]).stem for image in images]
-    for key, (image, stem) in enumerate(zip(images, stems, strict=True)):
-        assert image.R_cw is not None
-        assert image.center_w is not None
-        label = stem if stems.count(stem) == 1 else names[image.name]
-        camera = ElementTree.SubElement(
-            cameras, "camera", id=str(key), sensor_id=str(used.index(image.camera_id)), label=label, enabled="true"
-        )
+    sensors = ElementTree.SubElement(chunk, "sensors", next_id=str(max(posed.camera_ids, default=0)))
+    labels = sensor_labels or [f"camera {key}" for key in posed.camera_ids]
+    for key, label, sensor, camera in zip(posed.camera_ids, labels, posed.sensors, posed.cameras, strict=True):
+        _add_sensor(sensors, key - 1, label, sensor, camera)
+    cameras = ElementTree.SubElement(chunk, "cameras", next_id=str(len(posed.labels)), next_group_id="0")
+    for key, label in enumerate(posed.labels):
+        sensor_id = str(posed.camera_ids[posed.camera_idx[key]] - 1)
+        photo = ElementTree.SubElement(cameras, "camera", id=str(key), sensor_id=sensor_id, label=label, enabled="true")
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = image.R_cw.T, image.center_w
-        ElementTree.SubElement(camera, "transform").text = " ".join(map(repr, pose.ravel().tolist()))
-        ElementTree.SubElement(camera, "orientation").text = "1"
+        pose[:3, :3], pose[:3, 3] = posed.R_cw[key].T, posed.center_w[key]
+        ElementTree.SubElement(photo, "transform").text = _text(pose)
+        terms = posed.shutter.get(key)
+        if terms is not None:
+            element = ElementTree.SubElement(photo, "rolling_shutter")
+            ElementTree.SubElement(element, "rotation").text = _text(terms.rotation)
+            ElementTree.SubElement(element, "translation").text = _text(terms.translation)
+        ElementTree.SubElement(photo, "orientation").text = "1"
     ElementTree.indent(document)
+    path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     ElementTree.ElementTree(document).write(path, encoding="UTF-8", xml_declaration=True)
 
 
-def _add_sensor(sensors: ElementTree.Element, key: int, label: str, camera: Camera) -> None:
-    size = {"width": str(camera.width), "height": str(camera.height)}
-    sensor = ElementTree.SubElement(sensors, "sensor", id=str(key), label=f"rectified camera {label}", type="frame")
-    ElementTree.SubElement(sensor, "resolution", size)
-    calibration = ElementTree.SubElement(sensor, "calibration", {"type": "frame", "class": "adjusted"})
-    ElementTree.SubElement(calibration, "resolution", size)
+def _text(numbers: NDArray[np.float64]) -> str:
+    return " ".join(map(repr, numbers.ravel().tolist()))
+
+
+def _rectified_sensor(camera: Camera) -> Sensor:
+    """The sensor of a camera without distortion."""
     K = camera.K
     values = {
         "f": K[1, 1],
@@ -285,9 +398,19 @@ def _add_sensor(sensors: ElementTree.Element, key: int, label: str, camera: Came
         "cy": K[1, 2] + 0.5 - camera.height / 2,
         "b1": K[0, 0] - K[1, 1],
     }
-    for name, value in values.items():
-        if value:
-            ElementTree.SubElement(calibration, name).text = repr(float(value))
+    return Sensor("frame", {name: float(value) for name, value in values.items() if value})
+
+
+def _add_sensor(sensors: ElementTree.Element, key: int, label: str, described: Sensor, camera: Camera) -> None:
+    size = {"width": str(camera.width), "height": str(camera.height)}
+    sensor = ElementTree.SubElement(sensors, "sensor", id=str(key), label=label, type=described.kind)
+    ElementTree.SubElement(sensor, "resolution", size)
+    for name, value in described.shutter.items():
+        ElementTree.SubElement(sensor, "property", name=name, value=value)
+    calibration = ElementTree.SubElement(sensor, "calibration", {"type": described.kind, "class": "adjusted"})
+    ElementTree.SubElement(calibration, "resolution", size)
+    for name, number in described.parameters.items():
+        ElementTree.SubElement(calibration, name).text = repr(number)
 
 
 def named(posed: PosedPhotos, files: Sequence[str], where: str) -> PosedPhotos:

@@ -1,4 +1,4 @@
-"""Models of other programs, told by what they are."""
+"""Models of other programs, recognised by their content."""
 
 from __future__ import annotations
 

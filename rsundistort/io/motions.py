@@ -26,8 +26,9 @@ def read_known_motions(path: Path | str, readout_s: float | None = None) -> Know
     path : path
         CSV with a header: `name`; `phi1, phi2, phi3` in radians per frame, or `omega1, omega2, omega3` in radians per
         second, about the camera's axes (x right, y down, z ahead in the stored pixels); and `sigma`, or `sigma1,
-        sigma2, sigma3`, in the same unit. An empty cell is an unknown component. Both turn the world in the camera's
-        axes, the way of phi: a gyroscope, which feels the camera turn, has the other sign (`io.read_gyro` sees to it).
+        sigma2, sigma3`, in the same unit. An empty cell is an unknown component. Both rotate the world in the camera's
+        axes, the way of phi: a gyroscope, which feels the camera rotate, has the other sign (`io.read_gyro` sees to
+        it).
     readout_s : float, optional
         Time of the readout of a frame in seconds, which rad/s need.
 

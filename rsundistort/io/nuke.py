@@ -21,7 +21,7 @@ _FIRST = 1
 def write_nuke(folder: Path, scene: ExportScene) -> str:
     """Write `camera.nk` and `camera.chan`: of a video with a path every frame, else the photos by name, from 1.
 
-    The world is turned so that y is up, as in `camera.usda`: y and z are negated. The film back is as wide as 36 mm;
+    The world is rotated so that y is up, as in `camera.usda`: y and z are negated. The film back is as wide as 36 mm;
     `win_translate` is where the principal point is not in the middle, in halves of the width, and `win_scale` the ratio
     of focal lengths. Nothing is left over: the text is empty.
     """
@@ -39,7 +39,7 @@ def write_nuke(folder: Path, scene: ExportScene) -> str:
         cameras = [scene.camera(image) for image in images]
         R_cw = np.array([image.R_cw for image in images]).reshape(-1, 3, 3)
         center_w = np.array([image.center_w for image in images]).reshape(-1, 3)
-    # camera to world, y up in both; Nuke turns about z first, then x, then y: R = Ry Rx Rz
+    # camera to world, y up in both; Nuke rotates about z first, then x, then y: R = Ry Rx Rz
     turned = FLIP @ R_cw.transpose(0, 2, 1) @ FLIP
     angles = np.unwrap(euler_deg(turned, "zxy")[:, [1, 2, 0]], axis=0, period=360)
     centers = center_w @ FLIP

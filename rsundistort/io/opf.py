@@ -38,7 +38,7 @@ _GLTF = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 # Errors of a lens that are not worth a word.
 _TOLD_PX = 0.01
 _FULL_FRAME_UM = 36e3
-# Standard deviation of a height that nothing tells, metres.
+# Standard deviation of an unknown height, metres.
 _UNKNOWN_M = 1e4
 _IDS = uuid5(NAMESPACE_URL, "urn:rsundistort:opf")
 
@@ -213,7 +213,7 @@ def _capture(uid: Any, sensor_id: Any, facts: ExifFacts) -> Any:
                         pixel_range=opf.StaticPixelRange(0.0, 255.0), pixel_type=opf.PixelType.UINT8)  # fmt: skip
     place, height_m = None, None
     if (fix := facts.fix) is not None and facts.place_deg is not None:
-        # receivers with RTK tell the height above the ellipsoid, others above the sea
+        # receivers with RTK give the height above the ellipsoid, others above the sea
         crs = Crs("EPSG:4979" if fix.told_by == "RTK" else "EPSG:4326+5773")
         east, north, up = fix.sigma_m if fix.altitude_m is not None else (*fix.sigma_m[:2], _UNKNOWN_M)
         # in the order of the axes: latitude first
@@ -329,6 +329,8 @@ def _model(project: Any, where: str) -> ColmapModel:
         velocity=velocity, shutter_model="constant-motion" if velocity.any() else "global",
     )  # fmt: skip
     rgb = np.zeros((len(points_w), 3), np.uint8) if node.color is None else np.asarray(node.color)[:, :3]
+    if len(rgb) != len(points_w):
+        raise FormatError(f"{where}: {len(points_w)} points have {len(rgb)} colours")
     unposed = [file for uid, file in files.items() if uid not in place]
     return ColmapModel(
         rec, np.arange(1, 1 + len(cameras)), np.arange(1, 1 + len(names)), np.arange(1, 1 + len(points_w)),

@@ -68,7 +68,7 @@ def output_folder(
     ------
     FileError
         Before the block is entered, when the folder is in use or cannot be written; at its end, when a file that is not
-        ours is in the way. `Record.check` tells that earlier, of names that are known.
+        ours is in the way. `Record.check` reports that earlier, of names that are known.
     """
     folder = Path(folder)
     _prepare(folder, apart_from, replaced)

@@ -248,7 +248,7 @@ def sizes_under(place: Place, within: Collection[str]) -> dict[str, int]:
 
 
 def stamps_of(place: Place, paths: Iterable[str]) -> dict[str, str]:
-    """Of files of a folder that are there, their size and what tells that they changed; "" for links and folders."""
+    """Of files of a folder that are there, their size and what shows that they changed; "" for links and folders."""
     if isinstance(place, RemoteFolder):
         listings: dict[str, Mapping[str, Any]] = {}
         found = {}

@@ -1,6 +1,6 @@
 """How long cameras take to read a frame: facts of others, each with its source, in `readout_times.csv`.
 
-They turn rotations per frame into rotations per second, and say which samples of a gyroscope belong to a photo. A
+They convert rotations per frame into rotations per second, and say which samples of a gyroscope belong to a photo. A
 solution never depends on them.
 """
 

@@ -33,7 +33,7 @@ Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
 def write_shutter_poses(folder: Path, solution: Solution, photos: Mapping[str, str], points: str) -> str:
     """Write `gsplat.npz` and `transforms.json` (instant-ngp and 3dgs-deblur) of the photos as they were taken.
 
-    The models that turn by an approximation (two-step, linearized) are written as the rotation of the same phi. Two
+    The models that rotate by an approximation (two-step, linearized) are written as the rotation of the same phi. Two
     poses a photo, or one rate, are those of the steady motion that is nearest: `rectify.bend_px` says what that leaves.
 
     Parameters
@@ -187,7 +187,7 @@ def _write_gsplat(path: Path, solution: Solution, images: Sequence[SolvedImage],
 
 
 def _readout_time(solution: Solution, images: Sequence[SolvedImage]) -> tuple[float, str] | None:
-    """The time that 3dgs-deblur is told of all photos, and its unit; None where it cannot follow."""
+    """The time that 3dgs-deblur is given for all photos, and its unit; None where it cannot follow."""
     used = {image.camera_id for image in images}
     if any(solution.cameras[key].clock_axis == 0 for key in used):
         return None  # it knows of rows only

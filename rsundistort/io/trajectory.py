@@ -45,7 +45,7 @@ def _quaternions(R_cw: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def write_path(path: Path, names: Sequence[str], camera_path: CameraPath) -> None:
-    """Write the path of a camera as CSV, a line for each frame: pose as in `write_trajectory`, velocity, turn.
+    """Write the path of a camera as CSV, a line for each frame: pose as in `write_trajectory`, velocity, rotation.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def write_path(path: Path, names: Sequence[str], camera_path: CameraPath) -> Non
     camera_path : CameraPath
         Written are its times in seconds, the camera in the world, its velocity in world units per second, and its
         angular velocity about its own axes (x right, y down, z ahead) in radians per second, which is minus
-        `CameraPath.rate`: as the camera turns, the world turns the other way in it.
+        `CameraPath.rate`: as the camera rotates, the world rotates the other way in it.
     """
     moved = np.column_stack(
         [camera_path.center_w, _quaternions(camera_path.R_cw), camera_path.velocity, -camera_path.rate]

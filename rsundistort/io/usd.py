@@ -38,7 +38,7 @@ def write_usd_camera(
 
     Notes
     -----
-    The stage is in the world of the solution turned so that y is up: x right, y up, z back of the first camera. Its
+    The stage is in the world of the solution rotated so that y is up: x right, y up, z back of the first camera. Its
     film back is as wide as 36 mm, with offsets where the principal point is not in the middle.
     """
     from pxr import Gf, Sdf, Usd, UsdGeom

@@ -135,7 +135,7 @@ def _picture_of(pixels: Pixels, form: str) -> Any:
 class VideoWriter:
     """Writes frames into an MP4 file that has the rest from another video.
 
-    Used in a `with` statement. Frames keep their time stamps, their colours mean the same, players turn them alike,
+    Used in a `with` statement. Frames keep their time stamps, their colours mean the same, players rotate them alike,
     and the packets of sound are copied as they are.
 
     Parameters

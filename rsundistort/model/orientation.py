@@ -1,8 +1,9 @@
 """The eight EXIF orientations: what they do to pixels, cameras, poses and motions.
 
-An orientation o takes the stored frame to the shown one by a signed permutation of the axes, `MATRICES[o]`: a turn by a
-multiple of 90 degrees, after which 2, 4, 5 and 7 mirror. A turn of the image is a turn of the camera about its optical
-axis. A mirror image is no camera's: photos with a pose are turned, and what is left of their tag is to mirror (tag 2).
+An orientation o takes the stored frame to the shown one by a signed permutation of the axes, `MATRICES[o]`: a rotation
+by a multiple of 90 degrees, after which 2, 4, 5 and 7 mirror. A rotation of the image is a rotation of the camera about
+its optical axis. A mirror image is no camera's: photos with a pose are rotated, and what is left of their tag is to
+mirror (tag 2).
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def compose_orientations(first: int, then: int) -> int:
 
 
 def split_mirror(orientation: int) -> tuple[int, int]:
-    """An orientation as a turn (1, 3, 6 or 8) and what is left after it: 1, or 2 to mirror left and right."""
+    """An orientation as a rotation (1, 3, 6 or 8) and what is left after it: 1, or 2 to mirror left and right."""
     if np.linalg.det(MATRICES[orientation]) > 0:
         return orientation, 1
     return compose_orientations(orientation, 2), 2
@@ -108,7 +109,7 @@ def turn_camera(camera: Camera, orientation: int) -> Camera:
     readout = next(name for name, way in READOUTS.items() if way == (along, float(clock[along])))
     dist = np.array(camera.dist)
     if len(dist) >= 4 and getattr(camera, "lens", "pinhole") == "pinhole":
-        # decentering shifts by 2 x (p . x) + p r^2 with p = (p2, p1): p turns with the axes, and so does a thin prism
+        # decentering shifts by 2 x (p . x) + p r^2 with p = (p2, p1): p rotates with the axes, and so does a thin prism
         dist[[3, 2]] = matrix @ dist[[3, 2]]
         if len(dist) == 12:
             dist[[8, 10]], dist[[9, 11]] = matrix @ dist[[8, 10]], matrix @ dist[[9, 11]]
@@ -118,7 +119,7 @@ def turn_camera(camera: Camera, orientation: int) -> Camera:
 
 
 def _turned_field(camera: Camera, matrix: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The field (rows, cols, 2) of a camera whose axes a signed permutation turns."""
+    """The field (rows, cols, 2) of a camera whose axes a signed permutation rotates."""
     field = camera.field @ matrix.T
     if matrix[0, 0] == 0:
         field = field.transpose(1, 0, 2)
@@ -161,26 +162,26 @@ def turn_path(path: CameraPath, orientation: int) -> CameraPath:
 
 
 def _new_places(pairs: set[tuple[int, int]], count: int) -> dict[tuple[int, int], int]:
-    """Place of each (camera, orientation): the camera's own when it is not turned, else one after all cameras."""
+    """Place of each (camera, orientation): the camera's own when it is not rotated, else one after all cameras."""
     turned = sorted(pair for pair in pairs if pair[1] != 1)
     return {pair: pair[0] for pair in pairs} | {pair: count + k for k, pair in enumerate(turned)}
 
 
 def turn_solution(solution: Solution, orientations: Mapping[str, int]) -> Solution:
-    """A solution of photos that were turned after they were rectified.
+    """A solution of photos that were rotated after they were rectified.
 
     Parameters
     ----------
     solution : Solution
         Of the photos as they were.
     orientations : mapping of photo name to int
-        How each was turned; those left out were not.
+        How each was rotated; those left out were not.
 
     Returns
     -------
     Solution
-        Raw and rectified cameras, poses and motions in the frames of the turned photos. Each camera and orientation
-        that occur together get a camera of their own; `SolvedImage.turned` says how the frame was turned.
+        Raw and rectified cameras, poses and motions in the frames of the rotated photos. Each camera and orientation
+        that occur together get a camera of their own; `SolvedImage.turned` says how the frame was rotated.
 
     Raises
     ------
@@ -208,12 +209,12 @@ def turn_solution(solution: Solution, orientations: Mapping[str, int]) -> Soluti
 
 
 def in_stored_frame(solution: Solution) -> Solution:
-    """The solution of the photos as the sensor stored them, of one whose photos may have been turned."""
+    """The solution of the photos as the sensor stored them, of one whose photos may have been rotated."""
     return turn_solution(solution, {image.name: INVERSE[image.turned] for image in solution.images})
 
 
 def turn_reconstruction(reconstruction: Reconstruction, orientations: Mapping[str, int]) -> Reconstruction:
-    """A reconstruction from turned photos: cameras, poses, motions and measurements; the scene stays.
+    """A reconstruction from rotated photos: cameras, poses, motions and measurements; the scene stays.
 
     Parameters
     ----------

@@ -73,7 +73,7 @@ class CameraPath:
     rate_change, acceleration : (m, 3) array
         How fast rate and velocity change, per second.
     part : (m,) int array, optional
-        Moments of different parts are not joined: between them the video was cut.
+        Moments of different parts are not connected: between them the video was cut.
     """
 
     time_s: Array

@@ -197,7 +197,7 @@ class Reconstruction:
         return self.bend.shape[1] > 0
 
     def frame_span(self) -> NDArray[np.float64]:
-        """(m,) how far each photo's clock runs over its frame: turns phi into radians per frame."""
+        """(m,) how far each photo's clock runs over its frame: converts phi into radians per frame."""
         return np.array([self.camera(i).frame_span for i in range(self.num_images)])
 
     @property
@@ -274,7 +274,7 @@ class Reconstruction:
         center_w: NDArray[np.float64],
         phi: NDArray[np.float64],
     ) -> Reconstruction:
-        """The reconstruction with more photos at its end, that turn steadily and have no measurements yet."""
+        """The reconstruction with more photos at its end, that rotate steadily and have no measurements yet."""
         more = len(names)
 
         def and_zeros(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -78,7 +78,7 @@ class FittedSimilarity:
     sigma_m : (3,) array
         Standard deviations of its place.
     sigma_rad : (3,) array
-        Of the rotation about the axes of the target; inf about an axis that nothing tells.
+        Of the rotation about the axes of the target; inf about an axis that nothing determines.
     sigma_scale : float
         Of the scale, relative.
     residuals : (m, 3) array
@@ -143,7 +143,7 @@ def fit_similarity(
             break
     square = _squares(found, points, targets, sigma)
     excess = max(1.0, float((weight * square).sum()) / max(3 * m - 7, 1))
-    # what nothing tells has no curvature
+    # what nothing determines has no curvature
     values, vectors = np.linalg.eigh(H)
     with np.errstate(divide="ignore"):
         variance = np.where(values > 1e-9 * values.max(), 1 / np.maximum(values, 1e-300), np.inf)
@@ -179,9 +179,9 @@ def _step(
     found: Similarity, points: Array, targets: Array, sigma: Array, weight: Array,
     rotation: tuple[Array, float] | None,
 ) -> tuple[Similarity, float, Array, Array]:  # fmt: skip
-    """A Gauss-Newton step: the new similarity, its size, the Hessian of shift, turn and scale, and the middle.
+    """A Gauss-Newton step: the new similarity, its size, the Hessian of shift, rotation and scale, and the middle.
 
-    Turn and scale are about the middle of the points, and in units that make them as large as shifts.
+    Rotation and scale are about the middle of the points, and in units that make them as large as shifts.
     """
     moved = found.of(points)
     by = weight[:, None] / sigma**2

@@ -45,8 +45,8 @@ class SolvedImage:
     reason : str or None
         Why the photo did not register; of one that did, why it could not be rectified.
     turned : int
-        EXIF orientation by which the photo was turned after it was rectified: pose, motion and cameras are those of
-        the turned frame. 1 in the stored frame.
+        EXIF orientation by which the photo was rotated after it was rectified: pose, motion and cameras are those of
+        the rotated frame. 1 in the stored frame.
     roi : (x, y, width, height) or None
         Rectangle of the rectified photo without empty pixels, if there is one.
     doubtful : str or None

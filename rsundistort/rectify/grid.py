@@ -1,4 +1,4 @@
-"""Remap grids as values: to keep, to give to other programs, to turn round, to push other images through."""
+"""Remap grids as values: to keep, to give to other programs, to invert, to apply to other images."""
 
 from __future__ import annotations
 

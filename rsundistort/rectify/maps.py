@@ -73,7 +73,7 @@ def init_rectify_map(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
     """Maps for `cv2.remap` that take lens and shutter out of a photo, in the manner of `cv2.initUndistortRectifyMap`.
 
-    A fisheye's photo becomes a pinhole's like any other; `R` turns the view towards what lies far from the axis.
+    A fisheye's photo becomes a pinhole's like any other; `R` rotates the view towards what lies far from the axis.
 
     Parameters
     ----------

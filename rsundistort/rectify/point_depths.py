@@ -130,7 +130,7 @@ def prefers_plane(
     depth: NDArray[np.float64],
     size: tuple[int, int],
 ) -> bool:
-    """Whether a plane foretells the depths of half of the points at least as well as a map of the other half does.
+    """Whether a plane predicts the depths of half of the points at least as well as a map of the other half does.
 
     Parameters
     ----------

@@ -230,7 +230,7 @@ def largest_shift_px(
 def bend_px(camera: Camera, motion: RowMotion, depth: float = np.inf) -> float:
     """Largest displacement in pixels by which a photo departs from one that the nearest steady motion would have taken.
 
-    What is left where a motion is told by two poses, or by one rate; 0 where it is steady.
+    What is left where a motion is described by two poses, or by one rate; 0 where it is steady.
 
     Parameters
     ----------

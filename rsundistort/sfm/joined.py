@@ -9,10 +9,10 @@ from ..model import Reconstruction
 
 __all__ = ["LEAST_MEASUREMENTS", "firmly_joined", "hanging_together"]
 
-#: A photo with fewer measurements is not joined: a wrong place is worse than none.
+#: A photo with fewer measurements is not registered: a wrong place is worse than none.
 LEAST_MEASUREMENTS = 20
 
-# A point of a known place gives two equations, and a photo with its turn during the readout has nine unknowns: with
+# A point of a known place gives two equations, and a photo with its rotation during the readout has nine unknowns: with
 # fewer points it is anywhere.
 _LEAST_TIES = 5
 # A point is known, depth and all, as soon as so many photos show it.
@@ -20,7 +20,7 @@ _LEAST_PHOTOS = 2
 
 
 def firmly_joined(reconstruction: Reconstruction) -> Reconstruction:
-    """The largest part of a reconstruction in which equations tell where each photo is, and what its photos show."""
+    """The largest part of a reconstruction whose poses are determined by equations, and what its photos show."""
     rec = reconstruction.without_photos(LEAST_MEASUREMENTS)
     joined = hanging_together(rec, _LEAST_TIES)
     while not joined.all():
@@ -30,11 +30,11 @@ def firmly_joined(reconstruction: Reconstruction) -> Reconstruction:
 
 
 def hanging_together(reconstruction: Reconstruction, least: int = LEAST_MEASUREMENTS) -> NDArray[np.bool_]:
-    """(m,) the largest set of photos of which each shows `least` points whose place the others tell.
+    """(m,) the largest set of photos of which each shows `least` points whose place the others determine.
 
-    A set grows from a pair: a photo joins if it shows so many points that two of the set show.
-    Sets that have a photo in common are one, since that tells how they were turned. What two sets show of each other by
-    less can be turned and moved against each other: residuals are small wherever they are.
+    A set grows from a pair: a photo is added if it shows so many points that two of the set show. Sets that have a
+    photo in common are one, since that determines how they were rotated. What two sets show of each other by less can
+    be rotated and moved against each other: residuals are small wherever they are.
     """
     from scipy.sparse import csr_matrix  # late: few runs need it
 

@@ -56,7 +56,7 @@ def map_photos(matched: MatchedPhotos, progress: Callable[[int], None] | None = 
     """Global-shutter reconstruction with room for shutter distortion.
 
     All photos are placed at once (pycolmap's global mapper). Where that leaves some out, they are also placed one after
-    the other with loosened thresholds, and the attempt that joins more counts. A camera that is a guess is refined.
+    the other with loosened thresholds, and the attempt that registers more counts. A camera that is a guess is refined.
 
     Parameters
     ----------
@@ -68,12 +68,12 @@ def map_photos(matched: MatchedPhotos, progress: Callable[[int], None] | None = 
     Returns
     -------
     Reconstruction
-        The photos that could be joined.
+        The photos that could be registered.
 
     Raises
     ------
     ReconstructionError
-        When no two photos could be joined.
+        When no two photos could be registered.
     """
     total = len(matched.names)
     found = None
@@ -99,7 +99,7 @@ def _with_more(best: Reconstruction | None, other: Reconstruction | None) -> Rec
 
 
 def _mapped_at_once(matched: MatchedPhotos, limit: int | None) -> Reconstruction | None:
-    """What the global mapper joins of the largest keypoints, without photos that hang on by few measurements."""
+    """What the global mapper registers by the largest keypoints, without photos that hang on by few measurements."""
     work = matched.database.parent / f"mapping-global-{limit}"
     work.mkdir()
     options = _global_options(matched)
@@ -108,7 +108,7 @@ def _mapped_at_once(matched: MatchedPhotos, limit: int | None) -> Reconstruction
 
 
 def _mapped_one_by_one(matched: MatchedPhotos, progress: Callable[[int], None] | None) -> Reconstruction | None:
-    """What incremental mapping joins.
+    """What incremental mapping registers.
 
     With the largest keypoints first, then with all, then with less loose thresholds, until all photos are in one model
     or nothing is gained. A guessed camera is refined first, with tight thresholds: loose ones let the focal length run
@@ -135,7 +135,7 @@ def _firmly_joined(model: Any, matched: MatchedPhotos) -> Reconstruction | None:
 
 
 def _refined(matched: MatchedPhotos, model: Any) -> MatchedPhotos:
-    """The photos with the cameras that mapping refined; one that took none of the joined photos stays a guess."""
+    """The photos with the cameras that mapping refined; one that took none of the registered photos stays a guess."""
     cameras = [
         refined_camera(model.cameras[k + 1], camera) if k + 1 in model.cameras else camera
         for k, camera in enumerate(matched.cameras)
@@ -155,7 +155,7 @@ def _best_model(
 ) -> Any:
     """The pycolmap model with the most photos over attempts (number of keypoints, looseness), or None.
 
-    They end when all photos are joined, or when one with all keypoints gains nothing.
+    They end when all photos are registered, or when one with all keypoints gains nothing.
     """
     pycolmap = quiet_pycolmap()
     total = len(matched.names)

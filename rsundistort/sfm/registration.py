@@ -1,7 +1,7 @@
 """Photos placed one by one in a scene that is known, each with the motion of its own shutter.
 
 Mapping places photos as if they had no shutter. Where it is strong some get no place, or a wrong one; what the others
-tell of the scene, once their motion is known, finds the right one.
+show of the scene, once their motion is known, finds the right one.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ __all__ = ["Placed", "Registration", "place_photo", "register_photos"]
 _LEAST_POINTS, _LEAST_SHARE = 30, 0.25
 # Another place is the right one if so many times as many measurements fit it.
 _CLEARLY = 1.25
-# Points tell of a photo's place if so many other photos show them: it may have led them astray.
+# Points determine a photo's place if so many other photos show them: it may have led them astray.
 _LEAST_OTHERS = 2
 # Measurements that fit lie this near to their prediction, in thresholds of tracks: the scene is still a rough one.
 _FIT = 2.0
-# Within a part of the frame the shutter moves little: three points from there tell where to look.
+# Within a part of the frame the shutter moves little: three points from there show where to look.
 _PARTS = 3
 # Thresholds of that search, in pixels, and then those of the adjustment, whose inliers grow around the ones found.
 _SEARCH_PX, _WIDE_PX, _NARROWER_PX = (4.0, 16.0), 8.0, (4.0, 2.0)
-# So many measurements tell where to look, and so many of the suggestions are followed to their end.
+# So many measurements show where to look, and so many of the suggestions are followed to their end.
 _ENOUGH, _TRIED = 400, 2
 _SEARCHES, _CONFIDENCE = 1000, 0.9999
-# Three points suggest up to four poses, and a fourth tells which.
+# Three points suggest up to four poses, and a fourth decides which.
 _LEAST_SUGGESTING = 4
 # Prior standard deviation of phi, in radians a frame: strong shutters have room.
 _PHI_SIGMA = 0.2
@@ -49,7 +49,7 @@ _FAR_PX = 1e6
 
 @dataclass(frozen=True)
 class Placed:
-    """Where a photo was taken from, and how its camera turned while it was read.
+    """Where a photo was taken from, and how its camera rotated while it was read.
 
     Attributes
     ----------
@@ -120,7 +120,7 @@ class _Pose:
 
 
 def _spread_over(count: int, most: int) -> NDArray[np.int64]:
-    """Indices of so many of a list, evenly spread."""
+    """Indices of so many of a list, evenly distributed."""
     return np.arange(count) if count <= most else np.linspace(0, count - 1, most).astype(np.int64)
 
 
@@ -230,14 +230,14 @@ def register_photos(
     *,
     joined_too: bool = True,
 ) -> Registration:
-    """Place photos by what the others tell of the scene, each with a motion of its own, where that explains more.
+    """Register photos by what the others show of the scene, each with a motion of its own, where that explains more.
 
     Parameters
     ----------
     matched : MatchedPhotos
         Keypoints and matches.
     num_verified : mapping of (first, second) to int
-        As `read_num_verified` tells them.
+        As `read_num_verified` returns them.
     scene : Reconstruction
         Poses, motions, points; its measurements are keypoints of `matched`.
     joined_too : bool
@@ -321,7 +321,7 @@ class _Shown:
         self._num_photos = scene.track_lengths(np.ones(len(scene.observations), bool))
 
     def by_others(self, photo: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Keypoints of a photo and the points that matches tell they show, each pair once; points of two others."""
+        """Keypoints of a photo and the points that they show by the matches, each pair once; points of two others."""
         pairs = [np.zeros((0, 2), np.int64)]
         for partner, found in self._partners.get(photo, ()):
             if partner in self._point_of:

@@ -1,4 +1,4 @@
-"""Where two photos were taken from, seen from each other, if the camera turned while each was read."""
+"""Where two photos were taken from, seen from each other, if the camera rotated while each was read."""
 
 from __future__ import annotations
 
@@ -164,9 +164,9 @@ def find_relative_pose(pair: Pair, phi_sigma: float) -> RelativePose | None:
 
 
 def relative_poses(pairs: Sequence[Pair]) -> tuple[list[RelativePose | None], float]:
-    """Relative poses of many pairs of photos, and the spread of their motions in radians a frame.
+    """Relative poses of many pairs of photos, and the prior standard deviation of phi, radians a frame.
 
-    The spread, prior standard deviation of phi, is the one that these motions have (empirical Bayes: squares over what
+    That prior standard deviation is the one that these motions have (empirical Bayes: squares over what
     the matches, not the prior, determine): photos without a shutter get none, and poses like those of five points.
     """
     poses = [find_relative_pose(pair, _START_SIGMA) for pair in pairs]
@@ -255,7 +255,7 @@ def _ahead(pose: RelativePose, pair: Pair) -> RelativePose:
         (Rotation.from_rotvec(-view.clock[near, None] * phi).apply(view.rays[near]) if near.any() else view.rays[:0])
         for view, phi in zip((pair.first, pair.second), pose.phi, strict=True)
     ]
-    # x_2 along s_2, R x_1 along s_1 meet where s_2 x_2 - s_1 R x_1 = t: cross products tell the signs of both
+    # x_2 along s_2, R x_1 along s_1 meet where s_2 x_2 - s_1 R x_1 = t: cross products give the signs of both
     x_1, x_2 = rays[0] @ pose.R_21.T, rays[1]
     normal = np.cross(x_1, x_2)
     s_1 = np.einsum("ni,ni->n", np.cross(pose.t_21, x_2), -normal)

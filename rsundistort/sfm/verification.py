@@ -15,17 +15,17 @@ from .relative_pose import INLIER_PX, NO_SHUTTER, Pair, RelativePose, View, find
 
 __all__ = ["verify_with_shutter"]
 
-# So many pairs of the most matches, and so many matches of each, tell how strong the shutter is.
+# So many pairs of the most matches, and so many matches of each, show how strong the shutter is.
 _ASKED, _MATCHES = 6, 300
-# Pairs are worth it where photos turned by so much while they were read, in radians, and where poses without a shutter
+# Pairs are worth it where photos rotated by so much while they were read, in radians, and where poses without a shutter
 # lose such a share of the matches that they explain with one. What a lens does that nobody knows can look like either.
 _STRONG_RAD, _LOST = 0.05, 0.05
 
 
 def verify_with_shutter(matched: MatchedPhotos) -> float:
-    """Add to the verified matches those that a relative pose with a shutter explains, where photos turned by much.
+    """Add to the verified matches those that a relative pose with a shutter explains, where photos rotated by much.
 
-    A few pairs tell how strong the shutter is. Pairs of weak ones stay as they are: an essential matrix with loose
+    A few pairs show how strong the shutter is. Pairs of weak ones stay as they are: an essential matrix with loose
     thresholds takes all that is right there.
 
     Parameters
@@ -36,7 +36,7 @@ def verify_with_shutter(matched: MatchedPhotos) -> float:
     Returns
     -------
     float
-        Spread of the components of phi, in radians a frame.
+        Prior standard deviation of the components of phi, in radians a frame.
     """
     matches = {pair: found for pair, found in read_matches(matched).items() if len(found) >= MIN_EXPLAINED}
     most = sorted(matches, key=lambda pair: (-len(matches[pair]), pair))[:_ASKED]

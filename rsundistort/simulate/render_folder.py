@@ -66,13 +66,12 @@ def simulate_scene(
 ) -> Solution:
     """Render a recipe: rolling-shutter photos and what is true about them.
 
-    Writes `photos/`, or of a recipe whose path is that of a video `clip.mp4`; `global/`, their global-shutter twins,
-    from the pose of the principal row, without noise and blur, of a video of some frames only; `depth/` and
-    `global-depth/` of what has twins (float32 TIFF, z in the camera at the moment of the pixel's line, inf where
+    Writes `photos/`, or of a recipe whose path is that of a video `clip.mp4`; `global/`, their global-shutter
+    references, from the pose of the principal row, without noise and blur, of a video of some frames only; `depth/` and
+    `global-depth/` of what has references (float32 TIFF, z in the camera at the moment of the pixel's line, inf where
     nothing is); `tracks.npz` (points on the surfaces with the pixels that show them; keys as in `TruePoints`, with `K`,
-    `width`, `height`, `R_cw`, `center_w`, `image_names` of the photos); `camera.json`, or `cameras.json` where
-    there are several; `ground_truth.json`; and the recipe with the files that it names. The same
-    recipe gives the same bytes.
+    `width`, `height`, `R_cw`, `center_w`, `image_names` of the photos); `camera.json`, or `cameras.json` where there
+    are several; `ground_truth.json`; and the recipe with the files that it names. The same recipe gives the same bytes.
 
     Parameters
     ----------
@@ -138,10 +137,10 @@ def simulate_scene(
 
 
 def _write_photos(folder: Path, recipe: Recipe, twins: set[str], depth: bool, log: StageLog) -> None:
-    """The photos, or the video, with the twins and depth maps of those that have them."""
+    """The photos, or the video, with the references and depth maps of those that have them."""
 
     def rendered() -> Iterator[tuple[View, NDArray[np.uint8]]]:
-        """The photos, whose twins and depth maps are written meanwhile."""
+        """The photos, whose references and depth maps are written meanwhile."""
         for number, view in enumerate(recipe.views):
             yield view, add_noise(_render(recipe, view), recipe.noise, recipe.scene.seed, number)
             if view.name in twins:
@@ -160,18 +159,18 @@ def _render(recipe: Recipe, view: View) -> NDArray[np.uint8]:
 
 
 def _write_twin(folder: Path, recipe: Recipe, view: View, depth: bool) -> None:
-    """The global-shutter twin of a photo, and the depth maps of both."""
-    twin = view.at_once()
-    photo = _encode_jpeg(_render(recipe, twin), recipe.jpeg_quality)
+    """The global-shutter reference of a photo, and the depth maps of both."""
+    reference = view.at_once()
+    photo = _encode_jpeg(_render(recipe, reference), recipe.jpeg_quality)
     (folder / "global" / _file_of(recipe, "global", view.name)).write_bytes(photo)
     if depth:
-        for to, each in (("depth", view), ("global-depth", twin)):
+        for to, each in (("depth", view), ("global-depth", reference)):
             values = render_depth(recipe.scene, recipe.camera(view), each)
             (folder / to / _file_of(recipe, to, view.name)).write_bytes(bytes(cv2.imencode(".tif", values)[1]))
 
 
 def _file_of(recipe: Recipe, folder: str, name: str) -> str:
-    """Name of a photo's file in a folder: depth maps are TIFF, twins of a clip's frames JPEG, which are smaller."""
+    """Name of a photo's file in a folder: depth maps are TIFF, references of a clip's frames JPEG, since smaller."""
     suffix = ".tif" if "depth" in folder else ".jpg" if recipe.clip else Path(name).suffix
     return Path(name).with_suffix(suffix).name
 

@@ -52,7 +52,7 @@ class WarpOptions:
         Standard deviation of the rotation over the frame, in radians.
     motion : mapping of name to (3,) phi or RowTable, optional
         Given motions, radians per unit of the clock, or rotations by row; photos not named do not move. Instead of
-        random ones. A rotation that is constant stays out, so that the photo remains the twin.
+        random ones. A rotation that is constant stays out, so that the photo remains the reference.
     gyro : GyroLog, optional
         Motions are stretches of this log, drawn at random, instead of steady ones.
     readout_s : float, optional
@@ -66,8 +66,8 @@ class WarpOptions:
         Photos that do not move.
     crop : bool
         Cut all photos to the largest rectangle that every warped photo fills, the same for all, and write the originals
-        cut alike as twins into `global/`. Motions are drawn for the whole frame, so the rotation over the rows that are
-        left is smaller.
+        cut alike as references into `global/`. Motions are drawn for the whole frame, so the rotation over the rows
+        that are left is smaller.
     seed, jobs, quality, overwrite
         As in `RunOptions`.
     """
@@ -120,11 +120,11 @@ def simulate_warp(
     """Photos as if a rotating camera had taken them, with the truth.
 
     Writes `photos/` (warped), `masks/` (255 where the original had the direction), `camera.json` and
-    `ground_truth.json`. The originals are the global-shutter twins; with the option `crop` they are cut to the same
-    rectangle, in `global/`, and camera and truth are those of the cut photos. The twins have the lens of the photos,
-    which rectified photos have not. What they lose would count as an error of the photos compared with them, so they
-    are stored without loss, and JPEG at quality 100 (55 dB from the original where quality 98 is 49: measured on a
-    photo of a facade). The EXIF of cut photos still tells the angle of the whole frame: go by `camera.json`.
+    `ground_truth.json`. The originals are the global-shutter references; with the option `crop` they are cut to the
+    same rectangle, in `global/`, and camera and truth are those of the cut photos. The references have the lens of the
+    photos, which rectified photos have not. What they lose would count as an error of the photos compared with them, so
+    they are stored without loss, and JPEG at quality 100 (55 dB from the original where quality 98 is 49: measured on a
+    photo of a facade). The EXIF of cut photos still gives the angle of the whole frame: go by `camera.json`.
 
     Parameters
     ----------
@@ -202,10 +202,10 @@ def _camera(photos: Path, name: str, options: WarpOptions) -> tuple[Camera, str]
 def _write_photos(
     folder: Path, name: str, photo: Photo, warped: NDArray[Any], crop: Rectangle | None, quality: int
 ) -> None:
-    """Write what a photo was warped to, and its twin if they are cut."""
-    # a photo that is sharp and was exposed for long tells that its camera did not move
-    told = photo.metadata.without_exposure()
-    write_image(folder / "photos" / name, _cut(warped, crop), told, quality)
+    """Write what a photo was warped to, and its reference if they are cut."""
+    # a photo that is sharp and was exposed for long shows that its camera did not move
+    metadata = photo.metadata.without_exposure()
+    write_image(folder / "photos" / name, _cut(warped, crop), metadata, quality)
     if crop is not None:
         # above 100, WebP is stored without loss
         best = 101 if name.lower().endswith(".webp") else 100

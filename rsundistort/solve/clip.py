@@ -25,7 +25,7 @@ from ..io.gyro import GyroLog
 from ..io.kept import Kept
 from ..model import Reconstruction
 from ..sfm import MatchedPhotos, retriangulate
-from ..verdict.clip import ReadoutTime, judge_clip
+from ..verdict.clip import ReadoutTime, judge_clip, unfollowed_px
 from .clip_gyroscope import Felt, felt_gyroscope, own_gyroscope, readout_of, turns_between
 from .clip_pair import two_frames
 from .clip_pan import turning_only
@@ -247,9 +247,10 @@ def _judged(
     halves = None if _was_stabilised(filmed) else _halves(result, options)
     log.end("halves", readout_s=None if halves is None else [each.seconds for each in halves])
     log.begin("stabilisation")
-    stabilisation = filmed
+    stabilisation, vibration_px = filmed, 0.0
     if stabilisation is None or not _was_stabilised(filmed):
         own = own_motions(result.reconstruction, turns_only=options.path.turns_only)
+        vibration_px = unfollowed_px(result.reconstruction, own)
         stabilisation = _stabilisation(clip, result.reconstruction, own, felt)
         if felt is None and telemetry is not None:
             on_path = result.reconstruction
@@ -264,7 +265,7 @@ def _judged(
     )  # fmt: skip
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
     against = stabilisation.reason if stabilisation.verdict == "stabilised" else ""
-    verdict = judge_clip(result, of_keys, halves, clip.frame_s, remedy, against)
+    verdict = judge_clip(result, of_keys, halves, clip.frame_s, remedy, against, vibration_px)
     if verdict.lens_only:
         warnings.warn(
             f"the frames are corrected for the lens only: {verdict.reasons[0]}", RsUndistortWarning, stacklevel=4

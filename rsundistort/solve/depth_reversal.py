@@ -1,8 +1,8 @@
 """The other scene that photos of a long lens show as well: its depths reversed.
 
 Rays of a long lens are nearly parallel, and of parallel rays a scene and its mirror image, seen by cameras that are
-turned accordingly, make the same photos (Necker's reversal; Szeliski and Kang, "Shape ambiguities in structure from
-motion", 1997). What little perspective tells the two apart a strong shutter hides, until it is known.
+rotated accordingly, make the same photos (Necker's reversal; Szeliski and Kang, "Shape ambiguities in structure from
+motion", 1997). What little perspective distinguishes the two a strong shutter hides, until it is known.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from ..io.record import Record
 from ..model import Reconstruction, Solution
 from ..model.orientation import INVERSE, turn_reconstruction
 from ..sfm import matched_of_database
-from .from_poses import measured, posed_photos
+from .from_poses import measured, posed_photos, shutter_terms
 from .going_on import RunFolder, key_of, run_folder
 from .model_sequence import TrackSource, solve_tracks
 from .outcome import Solved
@@ -231,7 +231,7 @@ def _outputs_of(
         def check(names: Sequence[str]) -> None:
             Record(out).check(files_of_run(names, rectify.raw_as, outputs), files_in)
 
-        given, track_source = _given(model, folder, check, options.seed, rectify, workers, work, log)
+        given, track_source, kept = _given(model, folder, check, options.seed, rectify, workers, work, log)
         photos = {} if folder is None else _look_at(folder, given.reconstruction)
         given, said = _in_stored_frame(given, photos)
         if folder is not None:
@@ -245,6 +245,7 @@ def _outputs_of(
             "frame": said,
             "points": given.reconstruction.num_points,
             "observations": len(given.reconstruction.observations),
+            **kept,
         }
         solved = replace(solved, told={"model": facts_of_model})
         orientations = {name: fact.orientation or 1 for name, fact in facts.items()}
@@ -265,19 +266,21 @@ def _given(
     workers: Workers,
     work: Path,
     log: StageLog,
-) -> tuple[ColmapModel, TrackSource | None]:
-    """The model; one without measurements is measured in its photos; and what new tracks can be made from.
+) -> tuple[ColmapModel, TrackSource | None, Mapping[str, Any]]:
+    """The model, what new tracks can be made from, and what the solution keeps of the file.
 
+    One without measurements is measured in its photos.
     `check` gets the photos that will be rectified, before any of them is read.
     """
     if is_metashape(model):
         posed = posed_photos(model, folder, rectify.raw_as)
         assert folder is not None
         check(posed.labels)
-        return measured(posed, folder, rectify, seed, workers, work, log)
+        kept = {"rolling_shutter": shutter_terms(posed)} if posed.shutter else {}
+        return *measured(posed, folder, rectify, seed, workers, work, log), kept
     given = read_model(model)
     check([] if folder is None else given.reconstruction.image_names)
-    return given, None
+    return given, None, {}
 
 
 def _solve_in_memory(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +13,7 @@ from ..batch.progress import StageLog
 from ..batch.rectify_options import RectifyOptions
 from ..batch.workers import Workers
 from ..colmap.measured_model import ColmapModel
-from ..errors import InputError, ReconstructionError
+from ..errors import InputError, ReconstructionError, RsUndistortWarning
 from ..input.load import load_photos
 from ..input.pairing import pairs_to_match
 from ..io import list_photos
@@ -21,7 +23,7 @@ from ..model import Observations, Reconstruction
 from ..sfm import LEAST_MEASUREMENTS, match_photos, retriangulate
 from .model_sequence import TrackSource
 
-__all__ = ["measured", "posed_photos"]
+__all__ = ["measured", "posed_photos", "shutter_terms"]
 
 # As `run` measures by default.
 _MAX_FEATURES = 8192
@@ -40,8 +42,22 @@ def posed_photos(model: Path, folder: Path | None, raw_as: str) -> PosedPhotos:
             f"{model} holds poses and cameras, but no measurements; say where the photos are (--images), which are "
             "measured anew, or export a COLMAP model, whose tracks are taken"
         )
-    posed = read_metashape(model)
-    return named(posed, list_photos(folder, raw_as), str(folder))
+    posed = named(read_metashape(model), list_photos(folder, raw_as), str(folder))
+    if posed.shutter:
+        warnings.warn(
+            f"{model}: rolling_shutter of {len(posed.shutter)} photos, such as {posed.labels[min(posed.shutter)]}, is "
+            "kept in the solution, but not used as motion, since Agisoft does not publish what it counts from; "
+            "motions are solved for", RsUndistortWarning, stacklevel=5,
+        )  # fmt: skip
+    return posed
+
+
+def shutter_terms(posed: PosedPhotos) -> dict[str, Any]:
+    """Metashape's `rolling_shutter` by photo, as the solution keeps it."""
+    return {
+        posed.labels[key]: {"rotation": terms.rotation.tolist(), "translation": terms.translation.tolist()}
+        for key, terms in posed.shutter.items()
+    }
 
 
 def measured(

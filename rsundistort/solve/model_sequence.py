@@ -201,7 +201,7 @@ def solve_photos(
     scratch : Path
         Folder for the database.
     log : StageLog
-        Told the progress.
+        Gets the progress.
     remedy : str
         What to do about a critical motion, of `critical.REMEDIES`.
     matching : str
@@ -326,8 +326,8 @@ def _adjusted_sequence(
 def _on_the_map(solved: Solved, survey: Survey, options: BundleOptions) -> Solved:
     """A georeferenced solution, aligned with its places, and remarks on it."""
     survey, rec = survey.settled(solved.shared)
-    told = survey.georeference(rec, solved.result.covariances, options.lengths)
-    return replace(solved, result=replace(solved.result, reconstruction=rec), survey=survey, georeference=told)
+    georeference = survey.georeference(rec, solved.result.covariances, options.lengths)
+    return replace(solved, result=replace(solved.result, reconstruction=rec), survey=survey, georeference=georeference)
 
 
 def _with_control(
@@ -436,7 +436,7 @@ def _registered_again(
             tracks = found.reconstruction
             if tracks.num_images >= _LEAST_PHOTOS:
                 tracks = firmly_joined(retriangulate(matched, tracks))
-            if tracks.num_images < _LEAST_PHOTOS:  # too few are connected to tell right from wrong
+            if tracks.num_images < _LEAST_PHOTOS:  # too few are connected to distinguish right from wrong
                 log.end(stage, added=(), moved=(), dropped=())
                 break
             options = rough_options(_of_registered(wanted, tracks, says=False))

@@ -46,7 +46,7 @@ def place_photos(
     scratch : Path
         Folder for the database.
     log : StageLog
-        Told the progress.
+        Gets the progress.
     seed, matching
         As in `solve_photos`.
     kept : Kept

@@ -113,24 +113,25 @@ class Survey:
     def _fitted(self, rec: Reconstruction, points: Array, targets: Array, sigma: Array) -> FittedSimilarity:
         """The similarity by places; if these do not determine the rotation, gimbals do: compasses err by more."""
         fit = fit_similarity(points, targets, sigma)
-        if (fit.sigma_rad < _MOST_TURN).all():
-            return fit
-        return fit_similarity(points, targets, sigma, self._rotation(rec))
+        if not (fit.sigma_rad < _MOST_TURN).all():
+            fit = fit_similarity(points, targets, sigma, self._rotation(rec))
+        common_up = 0.0 if self.holding else self.positions.common_up_m  # control points know better
+        return replace(fit, sigma_m=np.hypot(fit.sigma_m, [0.0, 0.0, common_up]))
 
     def _rotation(self, rec: Reconstruction) -> tuple[Array, float] | None:
         """Rotation from a reconstruction's axes to the frame's by the gimbals, and its standard deviation; or None.
 
         The error of the compass is the same in all photos: many know it no better than one.
         """
-        told = {
+        rotations = {
             name: R_cw
             for name, R_cw in zip(self.positions.names, self.positions.R_cw, strict=True)
             if name in self.places and np.isfinite(R_cw).all()
         }
-        rows = [i for i, name in enumerate(rec.image_names) if name in told]
+        rows = [i for i, name in enumerate(rec.image_names) if name in rotations]
         if len(rows) < _LEAST:
             return None
-        each = Rotation.from_matrix([told[rec.image_names[i]].T @ rec.R_cw[i] for i in rows])
+        each = Rotation.from_matrix([rotations[rec.image_names[i]].T @ rec.R_cw[i] for i in rows])
         some = each[np.unique(np.linspace(0, len(rows) - 1, _SOME).astype(np.int64))]
         apart = np.array([(some * other.inv()).magnitude() for other in some])
         middle = some[int(np.argmin(np.median(apart, axis=1)))]
@@ -188,8 +189,8 @@ class Survey:
         survey = replace(self, fit=fit)
         off = survey.outliers(rec)
         if off:
-            told = ", ".join(f"{name} ({distance:.1f} m)" for name, distance in off.items())
-            warnings.warn(f"GPS that is far off, and rejected: {told}", RsUndistortWarning, stacklevel=4)
+            rejected = ", ".join(f"{name} ({distance:.1f} m)" for name, distance in off.items())
+            warnings.warn(f"GPS that is far off, and rejected: {rejected}", RsUndistortWarning, stacklevel=4)
         return survey, rec
 
     def outliers(self, rec: Reconstruction) -> dict[str, float]:

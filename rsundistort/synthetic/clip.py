@@ -81,7 +81,7 @@ class Tremor:
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Where a camera is, and how it is turned, as a smooth function of time.
+    """Where a camera is, and how it is rotated, as a smooth function of time.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ class Clip:
     readout : float
         Share of the time of a frame for which it is read, above 0 and up to 1.
     twins_every : int
-        Frames whose number is a multiple of this have a global-shutter twin.
+        Frames whose number is a multiple of this have a global-shutter reference.
     """
 
     NAME = "clip.mp4"
@@ -185,7 +185,7 @@ def is_clip(entry: Any) -> bool:
 
 
 def clip_of(entry: Any, twins: Any, seed: int) -> Clip:
-    """The clip of a recipe's path, which `is_clip`, and of its twins."""
+    """The clip of a recipe's path, which `is_clip`, and of its global-shutter references."""
     pan = kind_of(entry, "path", CLIP_KINDS) == "pan"
     required = ("kind", "fps", "readout", "way", *(("center_w",) if pan else ()))
     optional = ("num_frames", "duration_s", "tremor", "level", *(() if pan else ("steps",)))

@@ -41,7 +41,7 @@ def look_at(center_w: ArrayLike, target_w: ArrayLike, roll_deg: float = 0.0, up_
     center_w, target_w : (3,) array
         World frame.
     roll_deg : float
-        Turn of the camera about the viewing direction, clockwise as the photographer sees it; at 0 the x axis
+        Rotation of the camera about the viewing direction, clockwise as the photographer sees it; at 0 the x axis
         is perpendicular to `up_w`.
     up_w : (3,) array
         What is up in the photo.
@@ -126,7 +126,7 @@ def _lines(entry: dict[str, Any], camera: str, flying: bool) -> list[Pose]:
         raise FormatError("path: lines that rise straight up have no side to lie on")
     spacing = number(entry.get("line_spacing_m", 0.0), "path: line_spacing_m")
     roll = number(entry.get("roll_deg", 0.0), "path: roll_deg")
-    # looking down, the flight direction is up in the photo, on the way back too: the drone turns
+    # looking down, the flight direction is up in the photo, on the way back too: the drone rotates
     steep = abs(look[2]) > 0.99 * np.linalg.norm(look)
     poses = []
     for line in range(lines):
@@ -169,7 +169,7 @@ def _directions(rng: np.random.Generator, num: int) -> NDArray[np.float64]:
 def motions_of(entry: Any, poses: list[Pose], frame_spans: list[float], seed: int) -> list[RowMotion]:
     """Motion of each photo: random, given, or none.
 
-    Random motion turns about an axis uniform on the sphere by an angle over the frame drawn from N(0, sigma^2), and
+    Random motion rotates about an axis uniform on the sphere by an angle over the frame drawn from N(0, sigma^2), and
     moves alike; `drift_m_per_frame` carries the camera along its path besides.
     """
     kind = kind_of(entry, "motion", KINDS)

@@ -131,7 +131,7 @@ def _line_speed(
 
     def position(late: float) -> NDArray[np.float64]:
         """Pixels (n, 2) of what the rays see, `late` after its own moment."""
-        # X(t) = Exp(theta(t)) (X(0) - way(t)), so the camera's way is turned by all of the time gone
+        # X(t) = Exp(theta(t)) (X(0) - way(t)), so the camera's way is rotated by all of the time gone
         turn, way = motion.at(clock + late)
         return distort_rays(Rotation.from_rotvec(turn).apply(level - (way - gone) * inverse_depth[:, None]), camera)
 

@@ -18,8 +18,8 @@ from .lens import distort_rays
 
 __all__ = ["Measured", "clock_of", "measure", "project_rows"]
 
-# the speed of the turn, |phi| and what a bend adds, contracts the fixed point: 0.2 rad per frame needs some 20 steps to
-# rounding
+# the speed of the rotation, |phi| and what a bend adds, contracts the fixed point: 0.2 rad per frame needs some 20
+# steps to rounding
 _MAX_STEPS = 200
 _STILL = 1e-14
 

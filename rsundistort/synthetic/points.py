@@ -28,7 +28,7 @@ class TruePoints:
     frame_idx, point_idx : (o,) int64 array
         Photo and point of each measurement.
     xy_raw, xy_global : (o, 2) array
-        Exact pixel in the rolling-shutter photo, and in its global-shutter twin (nan where the twin does not show
+        Exact pixel in the rolling-shutter photo, and in its global-shutter reference (nan where that does not show
         the point).
     """
 
@@ -40,7 +40,7 @@ class TruePoints:
 
 
 def _seen(recipe: Recipe, number: int, points_w: NDArray[np.float64], still: bool) -> NDArray[np.float64]:
-    """Pixels (n, 2) where a photo, or its twin, shows points; nan where it does not."""
+    """Pixels (n, 2) where a photo, or its global-shutter reference, shows points; nan where it does not."""
     view = recipe.views[number]
     view = view.at_once() if still else view
     camera = recipe.camera(view)
@@ -76,6 +76,6 @@ def true_points(recipe: Recipe) -> TruePoints:
     shown = np.isfinite(raw[..., 0])
     kept = shown.sum(0) >= 2
     points, raw, shown = points[kept], raw[:, kept], shown[:, kept]
-    twin = np.array([_seen(recipe, k, points, True) for k in range(len(recipe.views))])
+    reference = np.array([_seen(recipe, k, points, True) for k in range(len(recipe.views))])
     frame, point = np.nonzero(shown)
-    return TruePoints(points, frame, point, raw[frame, point], twin[frame, point])
+    return TruePoints(points, frame, point, raw[frame, point], reference[frame, point])

@@ -60,7 +60,7 @@ class View:
     exposure: float = 0.0
 
     def at_once(self) -> View:
-        """The view of the global-shutter twin: the same pose, without motion."""
+        """The view of the global-shutter reference: the same pose, without motion."""
         return View(self.name, self.R_cw, self.center_w, RowMotion(), self.camera_id)
 
     def __post_init__(self) -> None:
@@ -107,7 +107,7 @@ class Recipe:
     jpeg_quality : int
         Of the files, 0-100.
     noise : Noise
-        Of the rolling-shutter photos; the twins have none.
+        Of the rolling-shutter photos; the global-shutter references have none.
     readout_ms : float or None
         Time over which a frame is read, where the recipe says it.
     clip : Clip or None
@@ -139,7 +139,7 @@ class Recipe:
 
     @property
     def twins(self) -> tuple[View, ...]:
-        """The views that have a global-shutter twin: all photos, and some frames of a clip."""
+        """The views that have a global-shutter reference: all photos, and some frames of a clip."""
         return self.views if self.clip is None else self.views[:: self.clip.twins_every]
 
 

@@ -89,8 +89,8 @@ def _develop(radiance: NDArray[np.float64], exposure: float) -> NDArray[np.uint8
 def _footprint(num: int, spread_px: float) -> NDArray[np.float64]:
     """Offsets (num, 2) of a pixel's samples in pixels: a Gaussian in num strata of equal probability.
 
-    No two samples share a row or a column of strata: a lattice would render nearly level edges in a few steps
-    only, and it is there that a rectified photo would differ from its twin (by 2 dB with a 4 x 4 lattice).
+    No two samples share a row or a column of strata: a lattice would render nearly level edges in a few steps only, and
+    it is there that a rectified photo would differ from its global-shutter reference (by 2 dB with a 4 x 4 lattice).
     """
     quantile = np.array([NormalDist(0, spread_px).inv_cdf((k + 0.5) / num) for k in range(num)])
     stride = next(s for s in range(int(0.618 * num) or 1, 0, -1) if gcd(s, num) == 1)

@@ -142,16 +142,16 @@ def box(
     top: str = "",
     offset_m: Any = None,
 ) -> list[Patch]:
-    """The six sides of a box that stands at center_w (of its foot), turned about the vertical.
+    """The six sides of a box that stands at center_w (of its foot), rotated about the vertical.
 
     Parameters
     ----------
     center_w, size_m : (3,) array
-        Centre of the foot and lengths along the turned x, the turned y and z; metres.
+        Centre of the foot and lengths along the rotated x, the rotated y and z; metres.
     texture, top : str
         Texture of the sides, and of top and bottom (that of the sides if empty).
     yaw_deg : float
-        Turn about z, counter-clockwise from above.
+        Rotation about z, counter-clockwise from above.
     offset_m : (6, 2) array, optional
         Where each face begins on its texture.
     """

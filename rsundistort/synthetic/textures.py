@@ -42,7 +42,7 @@ class _Canvas:
     rng: np.random.Generator
 
     def noise(self, wavelength_m: float, stretch: tuple[float, float] = (1.0, 1.0)) -> _Image:
-        """Smooth noise of unit spread (rows, cols); `stretch` lengthens its grain along x and y."""
+        """Smooth noise of unit standard deviation (rows, cols); `stretch` lengthens its grain along x and y."""
         step = [max(wavelength_m * self.texels_per_m, _GRAIN_TEXELS) / 2 * s for s in stretch]
         size = [int(np.ceil(n / s)) + 3 for n, s in zip((self.cols, self.rows), step, strict=True)]
         grid = self.rng.standard_normal((size[1], size[0])).astype(np.float32)
@@ -50,10 +50,10 @@ class _Canvas:
         scale = np.array([[1 / step[0], 0, shift[0]], [0, 1 / step[1], shift[1]]])
         flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
         field_ = cv2.warpAffine(grid, scale, (self.cols, self.rows), flags=flags, borderMode=cv2.BORDER_REFLECT)
-        return np.asarray(field_ / 0.72, np.float32)  # 0.72: what interpolation leaves of the unit spread
+        return np.asarray(field_ / 0.72, np.float32)  # 0.72: what interpolation leaves of the unit standard deviation
 
     def fractal(self, coarse_m: float, fine_m: float, gain: float = 0.8) -> _Image:
-        """Sum of octaves of noise from coarse to fine, of unit spread."""
+        """Sum of octaves of noise from coarse to fine, of unit standard deviation."""
         total = np.zeros((self.rows, self.cols), np.float32)
         power, weight, wavelength = 0.0, 1.0, coarse_m
         while wavelength >= fine_m * 0.99:

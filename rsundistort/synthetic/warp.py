@@ -106,7 +106,7 @@ def _lookup(camera: Camera, motion: RowMotion | ArrayLike) -> tuple[NDArray[np.f
     else:
         clock = np.repeat((sign * (u - K[0, 2]) / K[0, 0])[None, :], h, axis=0)
     ideal = undistort_to_rays(np.dstack(np.meshgrid(u, v)), camera)
-    # one rotation a row (or column): turn its rays by it
+    # one rotation a row (or column): rotate its rays by it
     steps = clock[:, 0] if axis == 1 else clock[0]
     R = Rotation.from_rotvec(-motion.at(steps)[0]).as_matrix()
     rays = np.dstack([ideal, np.ones((h, w))])

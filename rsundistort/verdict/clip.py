@@ -8,11 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..bundle import BundleResult
+from ..bundle.own_motions import OwnMotions
 from ..critical import Remedy
+from ..model import Reconstruction
 from ..rectify import largest_shift_px
 from .judge import Verdict, height_reasons, loose_reasons, unexplained_reasons
 
-__all__ = ["APART", "SIGMAS", "ReadoutTime", "judge_clip", "problem_of"]
+__all__ = ["APART", "SIGMAS", "ReadoutTime", "judge_clip", "problem_of", "unfollowed_px"]
 
 # Displacements below this are lost in the interpolation of a photo.
 _UNSEEN_PX = 1.0
@@ -34,6 +36,7 @@ def judge_clip(
     frame_s: float,
     remedy: Remedy | None = None,
     against: str = "",
+    vibration_px: float = 0.0,
 ) -> Verdict:
     """Judge the path of a video.
 
@@ -51,12 +54,14 @@ def judge_clip(
         The remedy of a critical motion, with the uncertainty of the height.
     against : str
         The reason why the frames are no longer as they were read, such as stabilisation; empty if there is none.
+    vibration_px : float
+        What frames rotate beyond their path, as `unfollowed_px` gives it.
 
     Returns
     -------
     Verdict
         "found" if a readout time differs significantly from none and displaces lines, "not-found" if no readout time
-        within its deviations displaces them visibly; else "not-determined".
+        within its deviations displaces them visibly; else, and if it would be longer than possible, "not-determined".
     """
     assert result.path is not None
     time = ReadoutTime(float(result.path.readout_s[0]), float(result.path.sigma_readout_s[0]))
@@ -68,6 +73,14 @@ def judge_clip(
         return Verdict("not-determined", "doubtful", (f"{against}.", *reasons), {}, tuple(rec.image_names))
     if not most > _UNSEEN_PX:
         shutter = "not-found"
+    elif abs(time.seconds) - SIGMAS * time.sigma > frame_s:
+        # whatever bends them, corrected as by a shutter they would be bent the more
+        shutter = "not-determined"
+        reasons.insert(
+            0,
+            f"The readout appears to take {1e3 * abs(time.seconds):.1f} ms, longer than the {1e3 * frame_s:.1f} ms "
+            "from frame to frame: something else bends the frames.",
+        )
     elif abs(time.seconds) > SIGMAS * time.sigma:
         shutter = "found"
     else:
@@ -76,10 +89,10 @@ def judge_clip(
             f"The camera moved too little to determine the readout time: {1e3 * time.seconds:.1f} +- "
             f"{1e3 * time.sigma:.1f} ms."
         )
-    if shutter == "found" and abs(time.seconds) - SIGMAS * time.sigma > frame_s:
+    if vibration_px > _UNSEEN_PX:
         reasons.append(
-            f"The readout appears to take {1e3 * abs(time.seconds):.1f} ms, longer than the {1e3 * frame_s:.1f} ms "
-            "from frame to frame: something else bends the frames."
+            f"The frames rotate by {vibration_px:.1f} px more than their path explains: the camera vibrates faster "
+            "than half of the frame rate, or something else bends the frames."
         )
     if halves is not None:
         a, b = halves
@@ -91,6 +104,23 @@ def judge_clip(
             )
     lens_only = tuple(rec.image_names) if shutter == "not-determined" else ()
     return Verdict(shutter, "doubtful" if reasons else "trusted", tuple(reasons), {}, lens_only)
+
+
+def unfollowed_px(reconstruction: Reconstruction, own: OwnMotions) -> float:
+    """How far the first and last lines of frames are displaced by rotations that they show, and their path does not.
+
+    Robust standard deviation for one axis, in pixels, without that of the frames' own rotations. A path follows
+    rotations up to half of the frame rate; a motor, or a mount, may shake a camera faster.
+    """
+    pixels = 0.5 * reconstruction.frame_span()[:, None] * np.array([each.K[0, 0] for each in reconstruction.cameras])[
+        reconstruction.camera_idx, None
+    ]  # fmt: skip
+    apart, sigma = pixels * (own.phi - reconstruction.phi), pixels * own.sigma_phi
+    known = np.isfinite(apart) & np.isfinite(sigma)
+    if not known.any():
+        return 0.0
+    # median of the square of a normal variable
+    return float(np.sqrt(max(np.median((apart**2)[known]) / 0.455 - np.median((sigma**2)[known]), 0.0)))
 
 
 def problem_of(evidence: Mapping[str, Any]) -> str:

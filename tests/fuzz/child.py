@@ -32,7 +32,7 @@ from rsundistort.io.gyro import read_gyro
 from rsundistort.io.journal import entries_of
 from rsundistort.io.kept import Kept
 from rsundistort.io.masks import read_mask
-from rsundistort.io.metashape import named, read_metashape
+from rsundistort.io.metashape import named, read_metashape, write_posed_photos
 from rsundistort.io.models import read_model
 from rsundistort.io.nerfstudio import read_transforms
 from rsundistort.io.photos.exif_facts import read_exif
@@ -134,6 +134,8 @@ def report(folder: Path) -> None:
 def metashape(folder: Path) -> None:
     found = read_metashape(only(folder))
     assert np.isfinite(found.center_w).all()
+    write_posed_photos(folder / "again.xml", found)
+    assert read_metashape(folder / "again.xml").labels == found.labels
     with suppress(RsUndistortError):  # labels are what they are
         named(found, [f"{label}.jpg" for label in found.labels if "/" not in label], "photos")
 

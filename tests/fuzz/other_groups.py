@@ -19,7 +19,7 @@ from groups import Files, Group, archives, dumped, npy, one_of, packed
 from hypothesis import strategies as st
 from make_photos import exif_block, small_dng, texture
 from test_exports import made
-from test_metashape import FISHEYE, FRAME, xml
+from test_metashape import FISHEYE, FRAME, project, xml
 from test_solve import make_database
 
 from rsundistort import Camera
@@ -63,7 +63,7 @@ def metashape() -> Files:
     written = in_folder(lambda folder: EXPORTS["metashape"].write(folder, made()))
     return {
         "frame.xml": xml(FRAME, transform=chunk).encode(), "fisheye.xml": xml(FISHEYE, "fisheye").encode(),
-        "cameras.xml": written["cameras.xml"],
+        "cameras.xml": written["cameras.xml"], "project.xml": project().encode(),
     }  # fmt: skip
 
 

@@ -330,6 +330,20 @@ def test_points_of_an_opf_project_that_claim_four_billion_measurements(tmp_path)
         read_model(tmp_path / "project.opf")
 
 
+def test_points_of_an_opf_project_whose_colours_are_lost(tmp_path):
+    pytest.importorskip("pyopf")
+    for name, data in opf().items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(data)
+    (path,) = tmp_path.rglob("*.gltf")
+    cloud = json.loads(path.read_text())
+    (mesh,) = cloud["meshes"]
+    cloud["accessors"][mesh["primitives"][0]["attributes"]["COLOR_0"]]["count"] = 0
+    path.write_text(json.dumps(cloud))
+    with pytest.raises(FormatError, match="points have 0 colours"):
+        read_model(tmp_path / "project.opf")
+
+
 @pytest.mark.parametrize(
     "line", [b"[" * 100_000, b'{"a": ' + b"9" * 5000 + b"}", b"\xff\xfe", b'{"scene": "x", "trial": 0, "method": "rs"}']
 )

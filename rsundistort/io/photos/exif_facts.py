@@ -49,7 +49,7 @@ class ExifFacts:
     digital_zoom : float or None
         Above 1 where the camera enlarged the middle of its picture.
     orientation : int or None
-        1 to 8; how to turn the stored pixels for a person.
+        1 to 8; how to rotate the stored pixels for a person.
     width, height : int or None
         Size of the photo in pixels, as EXIF claims it.
     taken_s : float or None
@@ -106,7 +106,7 @@ def read_exif(path: Path) -> ExifFacts:
 def facts_of_exif(block: bytes, xmp: bytes = b"") -> ExifFacts:
     """The facts of an EXIF block, a TIFF structure with or without the head that it has in a JPEG; as `read_exif`.
 
-    An XMP packet tells more of the position.
+    An XMP packet contains more on the position.
     """
     try:
         structure = TiffStructure(block.removeprefix(b"Exif\0\0"))

@@ -24,6 +24,7 @@ _PARROT = ("http://www.parrot.com/drone-parrot/1.0/", "http://www.parrot.com/nam
 _GIMBAL = ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree")
 _PARROT_GIMBAL = ("CameraYawDegree", "CameraPitchDegree", "CameraRollDegree")
 _ATTITUDE = ("Yaw", "Pitch", "Roll")
+_SENSEFLY_ATTITUDE = ("Heading", "PitchAngle", "RollAngle")
 _CAMERA = ("http://pix4d.com/camera/1.0/", "http://ns.sensefly.com/Camera/1.0/", "http://ns.pix4d.com/camera/1.0/")
 
 # what a position may claim to be exact to, metres: the lever arm from antenna to lens is of this size
@@ -88,24 +89,24 @@ def fix_of(structure: TiffStructure | None, gps: Mapping[int, Entry], xmp: bytes
 
     EXIF counts where both have a value; nothing that is damaged or out of range does.
     """
-    told = _of_xmp(xmp)
+    stated = _of_xmp(xmp)
     place = _place(structure, gps) if structure is not None else None
     if place in (None, (0, 0)):
-        place = _told_place(told) or place
+        place = _told_place(stated) or place
     if place is None:
         return None
     altitudes: dict[str, float] = {}
     stored = None if structure is None else _altitude(structure, gps)
     if stored is not None:
         altitudes["EXIF"] = stored
-    altitudes |= {name: told[name] for name in ALTITUDES if name in told}
-    sigma, told_by = _sigma(structure, gps, told)
+    altitudes |= {name: stated[name] for name in ALTITUDES if name in stated}
+    sigma, told_by = _sigma(structure, gps, stated)
     speed = None if structure is None else _speed(structure, gps)
     if speed is None:
-        speed = _told_speed(told)
+        speed = _told_speed(stated)
     return GpsFix(
-        *place, next(iter(altitudes.values()), None), sigma, told_by, speed, _velocity(structure, gps, told), altitudes,
-        told.get("RelativeAltitude", told.get("Height")), _rotation(told),
+        *place, next(iter(altitudes.values()), None), sigma, told_by, speed, _velocity(structure, gps, stated),
+        altitudes, stated.get("RelativeAltitude", stated.get("Height")), _rotation(stated),
     )  # fmt: skip
 
 
@@ -143,11 +144,11 @@ def _speed(structure: TiffStructure, gps: Mapping[int, Entry]) -> float | None:
 
 
 def _velocity(
-    structure: TiffStructure | None, gps: Mapping[int, Entry], told: Mapping[str, float]
+    structure: TiffStructure | None, gps: Mapping[int, Entry], stated: Mapping[str, float]
 ) -> tuple[float, float, float] | None:
     """East, north and up; DJI's axes are north, east and down. A track by the compass is not by the map's north."""
-    if {"FlightXSpeed", "FlightYSpeed", "FlightZSpeed"} <= told.keys():
-        return told["FlightYSpeed"], told["FlightXSpeed"], -told["FlightZSpeed"]
+    if {"FlightXSpeed", "FlightYSpeed", "FlightZSpeed"} <= stated.keys():
+        return stated["FlightYSpeed"], stated["FlightXSpeed"], -stated["FlightZSpeed"]
     speed = None if structure is None else _speed(structure, gps)
     if structure is None or speed is None or _TRACK_REF not in gps:
         return None
@@ -158,7 +159,7 @@ def _velocity(
 
 
 def _sigma(
-    structure: TiffStructure | None, gps: Mapping[int, Entry], told: Mapping[str, float]
+    structure: TiffStructure | None, gps: Mapping[int, Entry], stated: Mapping[str, float]
 ) -> tuple[tuple[float, float, float], str]:
     """Standard deviations east, north and up, and what says so, the most direct first."""
 
@@ -166,11 +167,11 @@ def _sigma(
         east, north, up = np.clip(values, *_SIGMA_M).tolist()
         return east, north, up
 
-    if {"RtkStdLon", "RtkStdLat", "RtkStdHgt"} <= told.keys() and told["RtkStdLon"] > 0:
-        return bounded(told["RtkStdLon"], told["RtkStdLat"], told["RtkStdHgt"]), "RTK"
-    across = told.get("GPSXYAccuracy", 0.0)
+    if {"RtkStdLon", "RtkStdLat", "RtkStdHgt"} <= stated.keys() and stated["RtkStdLon"] > 0:
+        return bounded(stated["RtkStdLon"], stated["RtkStdLat"], stated["RtkStdHgt"]), "RTK"
+    across = stated.get("GPSXYAccuracy", 0.0)
     if across > 0:
-        up = told.get("GPSZAccuracy", 0.0)
+        up = stated.get("GPSZAccuracy", 0.0)
         return bounded(across, across, up if up > 0 else _VERTICAL * across), "accuracy"
     if structure is not None:
         radius = _number(structure, gps, _POSITIONING_ERROR, 1e-3, 1e5)
@@ -191,7 +192,9 @@ def _of_xmp(xmp: bytes) -> dict[str, float]:
             "RelativeAltitude", "RtkStdLon", "RtkStdLat", "RtkStdHgt", "FlightXSpeed", "FlightYSpeed", "FlightZSpeed",
             *_GIMBAL,
         ),
-        _SENSEFLY: ("Latitude", "Longitude", "AltitudeAMSL", "AltitudeWGS84", "Height", "GroundSpeed"),
+        _SENSEFLY: (
+            "Latitude", "Longitude", "AltitudeAMSL", "AltitudeWGS84", "Height", "GroundSpeed", *_SENSEFLY_ATTITUDE,
+        ),
         _PARROT: ("SpeedX", "SpeedY", *_PARROT_GIMBAL),
         _CAMERA: ("GPSXYAccuracy", "GPSZAccuracy", *_ATTITUDE),
     }  # fmt: skip
@@ -207,29 +210,32 @@ def _of_xmp(xmp: bytes) -> dict[str, float]:
     return found
 
 
-def _told_place(told: Mapping[str, float]) -> tuple[float, float] | None:
+def _told_place(stated: Mapping[str, float]) -> tuple[float, float] | None:
     """Latitude and longitude of XMP; some of DJI's have a slip in the name."""
     for latitude, longitude in (
         ("GpsLatitude", "GpsLongitude"), ("GpsLatitude", "GpsLongtitude"), ("Latitude", "Longitude"),
     ):  # fmt: skip
-        if latitude in told and longitude in told:
-            north, east = told[latitude], told[longitude]
+        if latitude in stated and longitude in stated:
+            north, east = stated[latitude], stated[longitude]
             if abs(north) <= 90 and abs(east) <= 180 and (north or east):
                 return north, east
     return None
 
 
-def _rotation(told: Mapping[str, float]) -> tuple[tuple[float, float, float], ...] | None:
+def _rotation(stated: Mapping[str, float]) -> tuple[tuple[float, float, float], ...] | None:
     """Yaw, pitch and roll as a rotation; all zeros are those of a camera that does not know them.
 
-    All turn about the axes ahead, right and down of north, east and down. DJI's camera and Parrot's look ahead at zero;
-    that of the `Camera` namespace looks down, the top of its photo ahead (Pix4D, "Yaw, Pitch, Roll and Omega, Phi,
-    Kappa angles").
+    All rotate about the axes ahead, right and down of north, east and down. DJI's camera and Parrot's look ahead at
+    zero; that of the `Camera` namespace looks down, the top of its photo ahead (Pix4D, "Yaw, Pitch, Roll and Omega,
+    Phi, Kappa angles"). So does that of senseFly's wings, whose angles are those of the aircraft (13 photos solved
+    without them: the top of the photo is 0 degrees off the heading in the mean, 10 from photo to photo).
     """
     ahead, below = ((0, 1, 0), (0, 0, 1)), ((0, 1, 0), (-1, 0, 0))
-    for names, (right, down) in ((_GIMBAL, ahead), (_PARROT_GIMBAL, ahead), (_ATTITUDE, below)):
-        if told.keys() >= {*names}:
-            yaw, pitch, roll = (told[name] for name in names)
+    for names, (right, down) in (
+        (_GIMBAL, ahead), (_PARROT_GIMBAL, ahead), (_ATTITUDE, below), (_SENSEFLY_ATTITUDE, below),
+    ):  # fmt: skip
+        if stated.keys() >= {*names}:
+            yaw, pitch, roll = (stated[name] for name in names)
             if any((yaw, pitch, roll)) and abs(yaw) <= 360 and abs(pitch) <= 180 and abs(roll) <= 180:
                 axes = np.stack([right, down, np.cross(right, down)])
                 turned = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True).as_matrix()
@@ -238,10 +244,10 @@ def _rotation(told: Mapping[str, float]) -> tuple[tuple[float, float, float], ..
     return None
 
 
-def _told_speed(told: Mapping[str, float]) -> float | None:
-    if "GroundSpeed" in told:
-        return told["GroundSpeed"] if told["GroundSpeed"] >= 0 else None
+def _told_speed(stated: Mapping[str, float]) -> float | None:
+    if "GroundSpeed" in stated:
+        return stated["GroundSpeed"] if stated["GroundSpeed"] >= 0 else None
     for across, ahead in (("FlightXSpeed", "FlightYSpeed"), ("SpeedX", "SpeedY")):
-        if across in told and ahead in told:
-            return float(np.hypot(told[across], told[ahead]))
+        if across in stated and ahead in stated:
+            return float(np.hypot(stated[across], stated[ahead]))
     return None

@@ -18,7 +18,7 @@ __all__ = ["heif_metadata", "read_heif"]
 # what libheif raises of files that are damaged
 _BROKEN = (ValueError, EOFError, SyntaxError, RuntimeError, OSError, IndexError)
 
-# irot turns against the clock in steps of 90 degrees; imir exchanges top and bottom, or left and right
+# irot rotates anticlockwise in steps of 90 degrees; imir exchanges top and bottom, or left and right
 _ROTATIONS, _MIRRORS = {0: 1, 1: 8, 2: 3, 3: 6}, {0: 4, 1: 2}
 
 
@@ -61,8 +61,8 @@ def heif_metadata(data: bytes, name: str) -> Metadata:
 def read_heif(data: bytes, name: str) -> tuple[NDArray[np.uint16], Metadata]:
     """Pixels in the stored frame, BGR(A) or grey, 16 bit; and the metadata.
 
-    libheif turns the pixels by the file's irot and imir properties, which are what counts in HEIF: that is undone, and
-    becomes the EXIF orientation, whatever the EXIF said.
+    libheif rotates the pixels by the file's irot and imir properties, which are what counts in HEIF: that is undone,
+    and becomes the EXIF orientation, whatever the EXIF said.
     """
     try:
         image = _opened(data, name)

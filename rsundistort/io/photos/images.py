@@ -52,7 +52,7 @@ __all__ = [
     "write_image",
 ]
 
-#: Photos of more pixels are refused, unless told otherwise: a small file can claim to be a huge picture.
+#: Photos of more pixels are refused, unless specified otherwise: a small file can claim to be a huge picture.
 MAX_MEGAPIXELS = 250.0
 
 #: Kinds that RAW and HEIC can be written as.
@@ -163,7 +163,7 @@ def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> Photo:
         raise FileError(f"{path.name} cannot be decoded; it is no photo of a known kind")
     named = kind_of_name(path.name)
     if named == "RAW" != kind:
-        # turned or cropped by whoever made it of the RAW, perhaps: no longer what the sensor's rows saw
+        # rotated or cropped by whoever made it of the RAW, perhaps: no longer what the sensor's rows saw
         raise FileError(f"{path.name} is {kind} by its content, not RAW; if it is a photo of its own, rename it")
 
     def check_size(width: int, height: int) -> None:

@@ -42,7 +42,7 @@ def kind_of_name(name: str) -> str:
 
 
 def kind_of_content(data: bytes, name: str) -> str:
-    """The kind that the content is of, as in `kind_of_name`; the ending tells RAW from what looks like TIFF."""
+    """The kind that the content is of, as in `kind_of_name`; the ending distinguishes RAW from what looks like TIFF."""
     if data[:3] == b"\xff\xd8\xff":
         return "JPEG"
     if data[:8] == b"\x89PNG\r\n\x1a\n":

@@ -16,7 +16,7 @@ from .tiff import tiff_metadata
 
 __all__ = ["read_raw"]
 
-# LibRaw's turns as EXIF orientations
+# LibRaw's rotations as EXIF orientations
 _FLIPS = {3: 3, 5: 8, 6: 6}
 
 

@@ -48,7 +48,7 @@ def tiff_metadata(data: bytes, without: frozenset[int] = frozenset()) -> Metadat
 
 
 def as_stored(data: bytes) -> bytes:
-    """The file with tags such that OpenCV leaves its pixels as they are: not turned, not multiplied by alpha."""
+    """The file with tags such that OpenCV leaves its pixels as they are: not rotated, not multiplied by alpha."""
     patched = bytearray(data)
     try:
         structure = TiffStructure(data)
