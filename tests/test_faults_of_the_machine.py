@@ -23,7 +23,7 @@ from rsundistort.input.load import load_photos
 from rsundistort.io import write_image
 from rsundistort.io.kept import Kept
 from rsundistort.io.lock import LOCK_NAME, check_still_there, locked
-from rsundistort.io.outputs import only_writer, output_folder, work_folder
+from rsundistort.io.outputs import held_inside, only_writer, output_folder, work_folder
 from rsundistort.io.record import Record
 from rsundistort.rectify import ViewOptions
 from rsundistort.solve.going_on import run_folder
@@ -167,6 +167,33 @@ def test_links_laid_meanwhile_are_not_written_through(batch, tmp_path):
     with pytest.raises(FileError, match=r"images leads out of .*; remove that link; [1-3] of 4 photos are done"):
         rectify_folder(photos, solution, out, jobs=1, progress=swap)
     assert not list((tmp_path / "elsewhere").iterdir())
+
+
+@POSIX
+@pytest.mark.parametrize("moment", ["before", "while it is open"])
+def test_no_moment_is_left_for_a_link(tmp_path, moment):
+    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    (out / "images").mkdir(parents=True)
+    elsewhere.mkdir()
+
+    def swap(now):
+        if now == moment:
+            (out / "images").rename(out / "before")
+            (out / "images").symlink_to(elsewhere)
+
+    swap("before")
+
+    def write():
+        with held_inside(out, "images/a.png") as path:
+            if not path.is_relative_to("/proc"):
+                pytest.skip("open folders have no names here")
+            swap("while it is open")
+            write_image(path, np.zeros((20, 20, 3), np.uint8))
+
+    with pytest.raises(FileError, match=r"out/images leads out of .*out; remove that link$") as caught:
+        write()
+    assert caught.value.__cause__.errno == errno.ELOOP
+    assert not list(elsewhere.iterdir())
 
 
 def test_a_folder_that_vanishes_ends_in_one_line(batch):

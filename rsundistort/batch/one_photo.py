@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 import tempfile
@@ -19,10 +18,9 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, InputError, MetadataWarning
 from ..io import MAX_MEGAPIXELS, Photo, read_mask, read_photo, write_image
-from ..io.outputs import CANNOT_WRITE
+from ..io.outputs import CANNOT_WRITE, held_inside
 from ..io.photos.exif import read_orientation
 from ..io.places import File, Place, RemoteFile, fetched
-from ..io.record import is_inside
 from ..model import Depth
 from ..model.orientation import split_mirror, turn_pixels
 from ..rectify import MAP_KINDS, RemapGrid, ViewOptions, rectify
@@ -245,12 +243,14 @@ def _rectify(job: PhotoJob, source: Path, own_mask: Path | None, out: Path) -> P
             metadata = metadata.with_orientation(rest)
         del photo, own  # not beside the encoded one
         writing = True
-        write_image(_inside(out, job.image), pixels, metadata, options.quality)
-        files[job.image] = (out / job.image).stat().st_size
-        write_image(_inside(out, job.mask), mask, flat=True)
-        files[job.mask] = (out / job.mask).stat().st_size
-        for name in _write_extras(job, out, found.depth, turn):
-            files[name] = (out / name).stat().st_size
+        with held_inside(out, job.image) as path:
+            write_image(path, pixels, metadata, options.quality)
+            files[job.image] = path.stat().st_size
+        with held_inside(out, job.mask) as path:
+            write_image(path, mask, flat=True)
+            files[job.mask] = path.stat().st_size
+        for name, size in _write_extras(job, out, found.depth, turn):
+            files[name] = size
     except (FileError, InputError, MemoryError, cv2.error) as error:
         if writing and getattr(error.__cause__, "errno", None) in CANNOT_WRITE:
             raise
@@ -261,32 +261,28 @@ def _rectify(job: PhotoJob, source: Path, own_mask: Path | None, out: Path) -> P
     return PhotoDone(job.name, "", "", files, turn, note, colors)
 
 
-def _write_extras(job: PhotoJob, out: Path, depth: Depth, turn: int) -> Iterator[str]:
-    """Write the other images of a photo's frame and its grids; their names, each when it is there."""
+def _write_extras(job: PhotoJob, out: Path, depth: Depth, turn: int) -> Iterator[tuple[str, int]]:
+    """Write the other images of a photo's frame and its grids; their names and sizes, each when it is there."""
     for each in job.also:
         try:
             image = read_photo(each.source, job.options.max_megapixels)
             pixels, _ = rectify(image.pixels, *job.geometry.grid, each.interpolation, depth=depth)
         except (FileError, InputError) as error:
             raise InputError(f"{each.source.parent.name}/{each.source.name}: {error}") from error
-        write_image(_inside(out, each.target), turn_pixels(pixels, turn), image.metadata, job.options.quality)
-        yield each.target
+        with held_inside(out, each.target) as path:
+            write_image(path, turn_pixels(pixels, turn), image.metadata, job.options.quality)
+            size = path.stat().st_size
+        yield each.target, size
     if job.maps is not None and job.options.maps is not None:
         grid = RemapGrid.from_camera(*job.geometry.grid, depth)
         if turn != 1:
             map_x, map_y = (turn_pixels(m, turn) for m in (grid.map_x, grid.map_y))
             grid = RemapGrid(map_x, map_y, grid.source_width, grid.source_height)
         for name, each_way in zip(job.targets[-len(_WAYS) :], (grid, grid.inverse()), strict=True):
-            each_way.save(_inside(out, name), job.options.maps)
-            yield name
-
-
-def _inside(out: Path, name: str) -> Path:
-    """The path of an output, if no link that was laid meanwhile leads elsewhere."""
-    path = out / name
-    if not is_inside(path.parent, out):
-        raise FileError(f"{path.parent} leads out of {out}; remove that link") from OSError(errno.ELOOP, "a link")
-    return path
+            with held_inside(out, name) as path:
+                each_way.save(path, job.options.maps)
+                size = path.stat().st_size
+            yield name, size
 
 
 def _warn_of_orientation(name: str, photo: Photo, rest: int) -> None:

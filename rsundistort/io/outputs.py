@@ -23,8 +23,8 @@ from .places import Place, RemoteFolder
 from .record import Record, is_inside
 
 __all__ = [
-    "BATCH_FOLDERS", "CANNOT_WRITE", "batch_folder", "has_content", "make_inside", "only_writer", "output_folder",
-    "work_folder",
+    "BATCH_FOLDERS", "CANNOT_WRITE", "batch_folder", "has_content", "held_inside", "make_inside", "only_writer",
+    "output_folder", "work_folder",
 ]  # fmt: skip
 
 #: What a batch fills.
@@ -43,6 +43,9 @@ _SCRATCH = f"{_HIDDEN}{re.sub(r'[^0-9A-Za-z]', '_', platform.node())}-"
 
 # The same in the folder of temporary files.
 _WORK = _SCRATCH.lstrip(".")
+
+# Where an open folder has a name that no link changes, by its number.
+_OPEN_FOLDERS = Path("/proc/self/fd")
 
 
 @contextmanager
@@ -290,10 +293,53 @@ def _check_goes_on(folder: Place, going_on: bool, resume: bool) -> None:
 def make_inside(folder: Path, name: str) -> Path:
     """The folder `name` in `folder`, made if missing; refused if a link would lead it elsewhere."""
     path = folder / name
-    if not is_inside(path, folder):
-        raise FileError(f"{path} leads out of {folder}; remove that link")
+    _check_inside(path, path, folder)
     path.mkdir(parents=True, exist_ok=True)
     return path
+
+
+@contextmanager
+def held_inside(folder: Path, name: str) -> Iterator[Path]:
+    """A path to write the output `name` at, which links that are laid meanwhile lead nowhere else.
+
+    Where the system lets open folders be named (Linux), it leads through the folder that was opened and looked at;
+    elsewhere it is the path as it was looked at.
+
+    Raises
+    ------
+    FileError
+        When links lead out of the folder, before or when the block has ended; its cause has the number ELOOP.
+    """
+    path = folder / name
+    within = path.parent
+    if not _OPEN_FOLDERS.is_dir():
+        _check_inside(within, within, folder)
+        yield path
+        _check_inside(within, within, folder)
+        return
+    try:
+        held = os.open(within, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise FileError(f"{path} cannot be written: {error.strerror}") from error
+    through = _OPEN_FOLDERS / str(held)
+    try:
+        _check_inside(within, through, folder)
+        yield through / path.name
+        _check_inside(within, within, folder)
+        if not os.path.samestat(within.stat(), os.fstat(held)):
+            raise FileNotFoundError(errno.ENOENT, "its folder was exchanged")
+    except FileError as error:
+        raise FileError(str(error).replace(str(through), str(within))) from error.__cause__
+    except OSError as error:
+        raise FileError(f"{path} cannot be written: {error.strerror}") from error
+    finally:
+        os.close(held)
+
+
+def _check_inside(name: Path, path: Path, folder: Path) -> None:
+    """Refuse what leads out of the folder; `name` is told."""
+    if not is_inside(path, folder):
+        raise FileError(f"{name} leads out of {folder}; remove that link") from OSError(errno.ELOOP, "a link")
 
 
 def _prepare(folder: Path, apart_from: Sequence[Path], replaced: Sequence[str]) -> None:
