@@ -32,7 +32,7 @@ def objective(reconstruction: Reconstruction, shutter_model: str, options: Bundl
     """
     if options.sigma_px is None:
         raise InputError("the objective needs sigma_px: half a sum of squares means nothing without the noise")
-    spreads = starting_spreads(options, Layout.of(shutter_model, options), reconstruction.baseline)
+    spreads = starting_spreads(options, Layout.of(shutter_model, options), reconstruction)
     problem = BundleProblem(reconstruction, shutter_model, options, options.sigma_px, spreads, heavy_tails=False)
     return problem.cost(problem.initial_state())
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from .._kernels import schur
 from .._kernels._jit import unknowns_of
+from .common_motion import CommonPrior
 from .elimination import Elimination
 from .reduced import Factored, Reduced
 from .structure import BlockPattern
@@ -189,6 +190,9 @@ class NormalEquations:
         Directions along which no point moves, where all photos are taken from one place.
     points : tuple of (k,), (k, 3) and (k, 3) arrays, optional
         Points with a prior of their own, its diagonal Hessian and its gradient.
+    common : CommonPrior, optional
+        Which of the photos' priors have means that are the last unknowns of their cameras. Their weights and gradients
+        are in `prior_diag` and `prior_gradient`, and in those of the border.
 
     Attributes
     ----------
@@ -209,6 +213,7 @@ class NormalEquations:
         coupling: Coupling | None = None,
         rays: Array | None = None,
         points: tuple[Index, Array, Array] | None = None,
+        common: CommonPrior | None = None,
     ) -> None:
         self.cost = cost
         self._elimination = elimination
@@ -243,6 +248,7 @@ class NormalEquations:
         diagonal, g_camera = self._gradients(res, border.J)
         self._camera_diagonal = border.sum_photos(diagonal)
         self._g_camera = border.sum_photos(g_camera) + border.prior_gradient.ravel()
+        self._common = common
         self._lengths = lengths[1]
         self._g_point += np.einsum("q,qna->na", *lengths)
 
@@ -300,6 +306,8 @@ class NormalEquations:
                     s.frame_start, s.frame_order, s.frame_idx, s.point_idx, s.track_start,
                     self._border.camera_of_frame, self._J, self._border.J, V_inv, g_point, rows, rhs_camera,
                 )  # fmt: skip
+        if self._common is not None:
+            rows += self._common_rows
         # nothing pulls at a camera that took none of the photos, whatever holds it
         unused = np.repeat(np.bincount(self._border.camera_of_frame, minlength=self._border.num_cameras) == 0, nc)
         held = self._border.prior_diag.ravel() + damping * self._camera_diagonal + unused
@@ -322,6 +330,21 @@ class NormalEquations:
     def num_shared(self) -> int:
         """Number of unknowns of all cameras."""
         return len(self._g_camera)
+
+    @cached_property
+    def _common_rows(self) -> Array:
+        """(m, nb + nc, k) what means of priors add to the Hessian: of photos by all cameras, of cameras by these."""
+        assert self._common is not None
+        weight, J = self._common
+        h, nc, own = J.shape[2], self._border.J.shape[2], self._border.camera_of_frame
+        m, nb = weight.shape
+        rows = np.zeros((m, nb + nc, self.num_shared))
+        columns = own[:, None] * nc + np.arange(nc - h, nc)
+        pull = weight[:, :, None] * J
+        photo = np.arange(m)[:, None]
+        rows[photo, :nb, columns] = -pull.transpose(0, 2, 1)
+        rows[photo, nb + nc - h :, columns] = np.einsum("mah,mag->mgh", J, pull).transpose(0, 2, 1)
+        return rows
 
     @cached_property
     def _reduced(self) -> Reduced:
@@ -358,14 +381,15 @@ class NormalEquations:
         photos, cameras = self.inverse.diagonal_blocks()
         return self._seen(photos)[:, : photos.shape[1] - self._num_unseen], cameras
 
-    def photos_by_shared(self, unknown: int) -> Array:
-        """(m, nb) covariances of photos' unknowns with one that each shares with those of its camera."""
+    def photos_by_shared(self, last: int) -> Array:
+        """(m, nb, last) covariances of photos' unknowns with the last that each shares with those of its camera."""
         border = self._border
         if self.inverse is None:
-            return np.full(self._seen(self._g_frame).shape, np.nan)
-        column = border.camera_of_frame * border.J.shape[2] + unknown
-        found: Array = self.inverse.photos_by_cameras()[np.arange(self.num_photos), :, column]
-        return self._seen(found)
+            return np.full((*self._seen(self._g_frame).shape, last), np.nan)
+        end = (border.camera_of_frame + 1)[:, None] * border.J.shape[2]
+        columns = end + np.arange(-last, 0)
+        found = self.inverse.photos_by_cameras()[np.arange(self.num_photos)[:, None], :, columns]
+        return self._seen(found.transpose(0, 2, 1).swapaxes(1, 2)).swapaxes(1, 2)
 
     def coupling_variances(self) -> tuple[Array, Array]:
         """Residuals (q, r) of the coupling, and their variances, all unknowns being free."""
@@ -391,7 +415,13 @@ class NormalEquations:
         if self._coupling is not None:
             self._coupling.add_to(S, self._s.pattern, scale - 1.0)
         corner = self._reduced.corner + np.diag((scale - 1.0) * self._border.prior_diag.ravel())
-        other._reduced = replace(self._reduced, S=S, corner=corner)
+        border = self._reduced.border
+        if self._common is not None:
+            nb = self._prior_diag.shape[1]
+            of_photos, of_cameras = np.split((scale - 1.0) * self._common_rows, [nb], axis=1)
+            border = border + np.where(self._elimination.free, of_photos.transpose(2, 0, 1), 0.0)
+            corner = corner + self._border.sum_photos(of_cameras)
+        other._reduced = replace(self._reduced, S=S, border=border, corner=corner)
         return other
 
     def covariance(self, inflation: Array | float = 1.0) -> Callable[[Array], Array]:
@@ -422,13 +452,20 @@ class NormalEquations:
     def _by_priors(self, vectors: Array) -> Array:
         """H^-1 P H^-1 of the photos' unknowns times vectors (k, m, nb), P the priors' precision."""
         assert self.inverse is not None
-        frame, camera = self.inverse.times(self._wide(vectors), np.zeros((len(vectors), len(self._g_camera))))
-        return self._seen(self.inverse.times(self._of_priors(frame), self._border.prior_diag.ravel() * camera)[0])
+        found = self.inverse.times(self._wide(vectors), np.zeros((len(vectors), len(self._g_camera))))
+        return self._seen(self.inverse.times(*self._of_priors(*found))[0])
 
-    def _of_priors(self, frame: Array) -> Array:
-        """The priors' precision times photos' values (..., m, nb)."""
-        own = self._prior_diag * frame
-        return own if self._coupling is None else own + self._coupling.times(frame)
+    def _of_priors(self, frame: Array, camera: Array) -> tuple[Array, Array]:
+        """The priors' precision times stacks of photos' values (n, m, nb) and of cameras' (n, k)."""
+        by_frame, by_camera = self._prior_diag * frame, self._border.prior_diag.ravel() * camera
+        if self._coupling is not None:
+            by_frame += self._coupling.times(frame)
+        if self._common is not None:
+            of_photos, of_cameras = np.split(self._common_rows, [frame.shape[2]], axis=1)
+            by_frame += np.einsum("mak,nk->nma", of_photos, camera)
+            by_camera += np.einsum("mak,nma->nk", of_photos, frame)
+            by_camera += camera @ self._border.sum_photos(of_cameras)
+        return by_frame, by_camera
 
     def function_of_points(self, weights: Array) -> Function | None:
         """What is known of sum(weights * points), weights (n, 3); None where the system cannot be factored."""
@@ -437,13 +474,13 @@ class NormalEquations:
         if solved is None or self.inverse is None:
             return None
         frame, point, camera = solved[:3]
-        weighed = self._of_priors(frame), self._border.prior_diag.ravel() * camera
+        of_frame, of_camera = self._of_priors(frame[None], camera[None])
         return Function(
             variance=float((weights * point).sum()),
-            of_priors=float((weighed[0] * frame).sum() + (weighed[1] * camera).sum()),
+            of_priors=float((of_frame[0] * frame).sum() + (of_camera[0] * camera).sum()),
             of_lengths=float((np.einsum("qna,na->q", self._lengths, point) ** 2).sum()),
             with_photos=self._seen(frame),
-            with_photos_of_priors=self._seen(self.inverse.times(weighed[0][None], weighed[1][None])[0][0]),
+            with_photos_of_priors=self._seen(self.inverse.times(of_frame, of_camera)[0][0]),
             pulls=self._moved(frame, point, camera),
         )
 
@@ -469,6 +506,11 @@ class NormalEquations:
             g_frame += self._coupling.pull(drawn, len(g_frame))
         g_camera = self._border.sum_photos(self._gradients(noise, self._border.J)[1])
         g_camera = g_camera + np.sqrt(self._border.prior_diag.ravel()) * of_cameras
+        if self._common is not None:
+            weight, J = self._common
+            by_mean = np.zeros((len(weight), self._border.J.shape[2]))
+            by_mean[:, -J.shape[2] :] = np.einsum("mah,ma->mh", J, np.sqrt(weight) * self._wide(of_photos))
+            g_camera -= self._border.sum_photos(by_mean)
         reduced, V_inv = self.reduce(0.0, g_frame, g_point, g_camera)
         frame, camera = self.inverse.solve(reduced.b, reduced.c)
         point = self._point_steps(V_inv, g_point, frame, camera)

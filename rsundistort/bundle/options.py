@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from ..model import BEND_GROUPS, Bend, KnownLength, Reconstruction
 from ..model.checks import check_fields
+from .common_motion import CommonMotion
 from .intrinsics import GuessedCameras, check_refined
 from .lengths import check_lengths
 from .path import FramePath, PathSolution
@@ -260,8 +261,6 @@ class BundleResult:
         Standard deviation of the prior on phi, radians per frame: as given, or as estimated.
     velocity_sigma : float
         Standard deviation of the prior on the velocity, baselines per frame; for constant-motion only.
-    velocity_mean : tuple of float
-        Mean of that prior, in the frame of each camera, baselines per frame.
     focal_sigma, centre_sigma : float
         Standard deviations of the variation of log f, and of the principal point in focal lengths; 0 where none varies.
     bend_sigmas : tuple of float
@@ -291,6 +290,8 @@ class BundleResult:
         The path of the frames of a video, if they have one.
     path_sigmas : tuple of float
         Standard deviations of its prior, of rotation and of translation, as `PathPrior` takes them.
+    common : CommonMotion or None
+        Means of the priors on phi and velocity, if they were solved for.
     """
 
     reconstruction: Reconstruction
@@ -314,12 +315,13 @@ class BundleResult:
     sigma_fields_px: tuple[float, ...] = ()
     path: PathSolution | None = None
     path_sigmas: tuple[float, ...] = ()
-    velocity_mean: tuple[float, ...] = (0.0, 0.0, 0.0)
+    common: CommonMotion | None = None
 
     @property
     def velocity_rms(self) -> float:
         """Root mean square of a component of the velocity by its prior, baselines per frame."""
-        return float(np.sqrt(self.velocity_sigma**2 + np.mean(np.square(self.velocity_mean))))
+        mean = 0.0 if self.common is None else float(np.mean(self.common.values[:, 3:] ** 2))
+        return float(np.sqrt(self.velocity_sigma**2 + mean))
 
     def of_photos(self, keep: NDArray[np.bool_]) -> BundleResult:
         """The same for some photos (m,) only, with the points that two of them show."""

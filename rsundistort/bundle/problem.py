@@ -15,6 +15,7 @@ from .._kernels import residuals
 from ..errors import InputError
 from ..model import Camera, Reconstruction, check_shutter_model
 from ..model.reprojection import camera_arrays, motion_tables, observed_lens_pixels, plain_arrays
+from .common_motion import CommonPrior, MotionMeans
 from .elimination import Elimination
 from .intrinsics import INTRINSICS, check_lenses, deviation, moved_camera, prior_weight
 from .jackknife import Partition, by_corner, by_place
@@ -25,7 +26,7 @@ from .normal_equations import Border, Coupling, Marginals, NormalEquations, Step
 from .options import LOSSES, BundleOptions
 from .path import PathPrior, PathState
 from .places import KnownPlaces, PlaceResiduals
-from .spreads import Spreads, common_velocity
+from .spreads import Spreads
 from .structure import Structure
 
 __all__ = ["BundleProblem", "State"]
@@ -36,7 +37,8 @@ class State:
     """What a step changes: cameras, poses, shutter motion, variation and points, as in `Reconstruction`.
 
     Of the bends (m, 3 k) coefficients along `Layout.functions`, of the rotation, then of the position, three by three.
-    Of frames on a path, phi and velocity are those of its rates.
+    Of frames on a path, phi and velocity are those of its rates. Means (cameras, 6) of the motions are in the frame of
+    the camera, radians and world units per frame; (cameras, 0) if they are not solved for.
     """
 
     cameras: tuple[Camera, ...]
@@ -47,6 +49,7 @@ class State:
     variation: NDArray[np.float64]
     bend: NDArray[np.float64]
     points_w: NDArray[np.float64]
+    means: NDArray[np.float64]
     path: PathState | None = None
 
 
@@ -62,10 +65,11 @@ class BundleProblem:
     Unknowns of a photo: rotation increment (left, radians), centre (world units), phi (radians per unit of the clock)
     unless the shutter is global, velocity (world units per unit of the clock) if the motion is whole, and the variation
     of its intrinsics (log f, cx / fx, cy / fy) if the options say that they vary, and the coefficients of its bends, if
-    it has any (`Layout`). Unknowns of a camera: the intrinsics that the options name, as in `moved_camera`, and those
-    of `LensFields` if they ask for fields. Seven unknowns are held for the gauge: the pose of the photo with the most
-    observations, and one coordinate of the centre farthest from it; none
-    where known places hold the frame. The prior on intrinsics has heavy tails (`prior_weight`), or it is normal.
+    it has any (`Layout`). Unknowns of a camera: the intrinsics that the options name, as in `moved_camera`, those of
+    `LensFields` if they ask for fields, and the means of its photos' motions if `Spreads` say how large they may be.
+    Seven unknowns are held for the gauge: the pose of the photo with the most observations, and one coordinate of the
+    centre farthest from it; none where known places hold the frame. The prior on intrinsics has heavy tails
+    (`prior_weight`), or it is normal.
     """
 
     def __init__(
@@ -77,6 +81,7 @@ class BundleProblem:
         spreads: Spreads,
         heavy_tails: bool = True,
         path: PathState | None = None,
+        means: NDArray[np.float64] | None = None,
     ) -> None:
         self._model = check_shutter_model(shutter_model)
         obs = reconstruction.observations
@@ -128,9 +133,6 @@ class BundleProblem:
         span = reconstruction.frame_span()[:, None]
         weight = [np.repeat((span[:, 0] / s)[:, None] ** 2, 3, axis=1) for s in self._motion_spreads(spreads)]
         self._motion_weight = np.hstack(weight)[:, : self._block - 6]
-        self._motion_mean = np.zeros_like(self._motion_weight)
-        if self._block > 9:
-            self._motion_mean[:, 3:] = common_velocity(reconstruction, spreads.travel)
         if self._path is not None:  # which says it all
             self._motion_weight = np.zeros_like(self._motion_weight)
         varied = np.array([spreads.focal, spreads.centre, spreads.centre])[: 3 * options.varying] ** -2.0
@@ -140,6 +142,12 @@ class BundleProblem:
         self._places = PlaceResiduals(self._start, options.places or KnownPlaces({}))
         self._known, self._known_weight = self._known_motions(span)
         self._free = self._free_unknowns()
+        self._means, self._means_start = None, means
+        if spreads.means:
+            # what a photo's own limit bounds is no sample of the others
+            limited = [options.phi_limits.get(name, np.inf) < spreads.phi for name in reconstruction.image_names]
+            shares = self._free[:, 6:12] & ~np.array(limited)[:, None]
+            self._means = MotionMeans.of(reconstruction, spreads.means, shares)
         poses = reconstruction.R_cw, reconstruction.center_w
         self._elimination = Elimination.of(
             self._structure, self._free, poses, options.factor_limit, options.cg_tolerance, self._path is not None
@@ -228,8 +236,14 @@ class BundleProblem:
         if self._path is not None:
             path = path or self._path.start(start)
             motion = path.motions(start.camera_idx)
+        means = self._means_start
+        if self._means is None:
+            means = np.zeros((len(cameras), 0))
+        elif means is None:
+            means = self._means.most_likely(self._motion_weight, motion, len(cameras))
         return State(
-            cameras, start.R_cw, start.center_w, motion[:, :3], motion[:, 3:], variation, bend, start.points_w, path
+            cameras, start.R_cw, start.center_w, motion[:, :3], motion[:, 3:], variation, bend, start.points_w, means,
+            path,
         )  # fmt: skip
 
     def with_squares(self) -> BundleProblem:
@@ -308,6 +322,11 @@ class BundleProblem:
             return state.path.rates
         return np.hstack([state.phi, state.velocity])[:, : self._block - 6]
 
+    def _own_motion(self, state: State) -> NDArray[np.float64]:
+        """(m, nb - 6) what each photo's motion has of its own, beside the mean."""
+        motion = self._motion(state)
+        return motion if self._means is None else motion - self._means.at(state.means)
+
     def _own(self, state: State) -> NDArray[np.float64]:
         """(m, k) unknowns behind those: variation and bends."""
         return np.hstack([state.variation[:, : 3 * self._options.varying], state.bend])
@@ -318,7 +337,7 @@ class BundleProblem:
         lengths = float(np.sum(self._lengths.residuals(state.points_w) ** 2))
         varied = float(np.sum(self._own_weight * self._own(state) ** 2))
         lengths += 2.0 * self._places.cost(state.center_w, state.points_w)
-        own = float(np.sum(self._motion_weight * (motion - self._motion_mean) ** 2 + known)) + varied
+        own = float(np.sum(self._motion_weight * self._own_motion(state) ** 2 + known)) + varied
         if self._path is not None and state.path is not None:
             own += 2.0 * self._path.cost(state.R_cw, state.center_w, state.path)
         return 0.5 * (own + lengths) + self._camera_priors(state)[2]
@@ -338,6 +357,12 @@ class BundleProblem:
             diagonal = np.hstack([diagonal, np.full(values.shape, self._field_weight)])
             gradient = np.hstack([gradient, self._field_weight * values])
             total += 0.5 * self._field_weight * float((values**2).sum())
+        if self._means is not None:
+            weight_of_means = np.broadcast_to(self._means.sigmas**-2.0, state.means.shape)
+            pull = self._means.pull(self._motion_weight, self._motion(state), state.means)
+            diagonal = np.hstack([diagonal, weight_of_means])
+            gradient = np.hstack([gradient, weight_of_means * state.means + pull])
+            total += 0.5 * float((weight_of_means * state.means**2).sum())
         if self._path is not None and state.path is not None:
             weight_of_pace = self._path.pace_sigma[:, None] ** -2.0
             diagonal = np.hstack([diagonal, weight_of_pace])
@@ -385,14 +410,18 @@ class BundleProblem:
         motion = self._motion(state)
         moving, own = np.s_[:, 6 : self._block], np.s_[:, self._block :]
         prior_diag[moving] = self._motion_weight + self._known_weight
-        prior_gradient[moving] = self._motion_weight * (motion - self._motion_mean)
+        prior_gradient[moving] = self._motion_weight * self._own_motion(state)
         prior_gradient[moving] += self._known_weight * (motion - self._known)
         prior_diag[:, 3:6], prior_gradient[:, 3:6] = self._places.on_photos(state.center_w)
         prior_diag[own] = self._own_weight
         prior_gradient[own] = self._own_weight * self._own(state)
         total = cost + self._prior_cost(state)
         border = Border(self._camera_jacobians(state), self._start.camera_idx, *self._camera_priors(state)[:2])
-        coupling = None
+        coupling = common = None
+        if self._means is not None:
+            border = replace(border, J=np.pad(border.J, ((0, 0), (0, 0), (0, 6))))
+            around = (0, 0), (6, self.layout.size - 12)
+            common = CommonPrior(np.pad(self._motion_weight, around), np.pad(self._means.directions, (*around, (0, 0))))
         if self._path is not None and state.path is not None:
             moves = self._start.camera_idx[self._structure.frame_idx]
             own_rates = state.path.rates[self._structure.frame_idx]
@@ -412,7 +441,7 @@ class BundleProblem:
         return NormalEquations(
             self._elimination, total, res, J_frame, prior_diag, prior_gradient, border, lengths, coupling,
             state.points_w - state.center_w[0] if self._turns_only else None,
-            self._places.on_points(state.points_w),
+            self._places.on_points(state.points_w), common,
         )  # fmt: skip
 
     @property
@@ -508,7 +537,7 @@ class BundleProblem:
             cameras = tuple(moved_camera(c, self._refine, s[:own]) for c, s in zip(cameras, intrinsics, strict=True))
         if self._fields is not None:
             moved = self._fields.moved
-            last = intrinsics.shape[1] - (self._path is not None)
+            last = intrinsics.shape[1] - (self._path is not None) - state.means.shape[1]
             cameras = tuple(moved(k, c, s[own:last]) for k, (c, s) in enumerate(zip(cameras, intrinsics, strict=True)))
         phi = state.phi + frame[:, 6:9] if self._block > 6 else state.phi
         velocity = state.velocity + frame[:, 9:12] if self._block > 9 else state.velocity
@@ -528,6 +557,7 @@ class BundleProblem:
             else state.variation,
             state.bend + frame[:, self.layout.variation : self.layout.size],
             state.points_w + point,
+            state.means + intrinsics[:, intrinsics.shape[1] - state.means.shape[1] :],
             path,
         )
 
@@ -544,5 +574,6 @@ class BundleProblem:
         moved = np.abs(frame[:, [3, 4, 5, *range(9, self._block), *range(ways, frame.shape[1])]]).max() / self._size
         lengths = max(moved, float((np.abs(point) / depth[:, None]).max(initial=0)))
         of_lens = np.abs(intrinsics[:, : len(self._refine)]).max(initial=0.0)
-        of_fields = np.abs(intrinsics[:, len(self._refine) :]).max(initial=0.0) / float(self._start.cameras[0].K[0, 0])
+        fields = intrinsics[:, len(self._refine) : intrinsics.shape[1] - state.means.shape[1]]
+        of_fields = np.abs(fields).max(initial=0.0) / float(self._start.cameras[0].K[0, 0])
         return float(max(angles, lengths, of_lens, of_fields))

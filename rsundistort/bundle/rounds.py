@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..model import Reconstruction
 from ..model.reprojection import reprojection_residuals
+from .common_motion import CommonMotion
 from .intrinsics import pixels_of
 from .jackknife import Inflation, inflated, inflation
 from .layout import Layout
@@ -27,7 +28,7 @@ from .path import (
 )  # fmt: skip
 from .problem import BundleProblem
 from .solver import minimize
-from .spreads import estimated, field_spread, path_spreads, settled, starting_spreads
+from .spreads import Common, estimated, field_spread, path_spreads, settled, starting_spreads
 from .triangulate import retriangulated
 
 __all__ = ["Rounds"]
@@ -108,7 +109,7 @@ class Rounds:
         self._sigma_px = options.sigma_px or _noise_px(self._base, shutter_model, options.min_sigma_px)
         self._baseline = reconstruction.baseline
         self._layout = Layout.of(shutter_model, options)
-        self._spreads = self._weighed_spreads = starting_spreads(options, self._layout, self._baseline)
+        self._spreads = self._weighed_spreads = starting_spreads(options, self._layout, self._base)
         self._noise = self._weighed_noise = 1.0
         # Measurements that seem more exact than they are would pull the intrinsics over the hump of a prior with heavy
         # tails, and they would not come back: it is normal until the noise is known
@@ -116,6 +117,7 @@ class Rounds:
         self._damping = options.initial_damping
         self._iterations = 0
         self._path: PathState | None = None
+        self._means: NDArray[np.float64] | None = None
         self._path_moved = np.inf
 
     def solve(self, cost_tolerance: float, is_judged: bool = False) -> None:
@@ -124,7 +126,7 @@ class Rounds:
         believed = replace(self._base, observations=self._base.observations.select(self._keep))
         problem = self._problem = BundleProblem(
             believed, self._model, options, self._sigma_px * self._noise, self._spreads,
-            heavy_tails=self._heavy_tails, path=self._path,
+            heavy_tails=self._heavy_tails, path=self._path, means=self._means,
         )  # fmt: skip
         self._solved = minimize(
             problem,
@@ -145,7 +147,7 @@ class Rounds:
         equations = problem.with_squares().linearize(state)
         self._marginals = equations.marginal_covariances(of_priors=asks_residuals)
         if state.path is not None:
-            self._with_pace = equations.photos_by_shared(equations.num_shared // equations.num_cameras - 1)
+            self._with_pace = equations.photos_by_shared(1)[:, :, 0]
         self._weighed_noise, self._had_heavy_tails = self._noise, self._heavy_tails
         per_camera = equations.num_shared // equations.num_cameras
         self._inflation = Inflation(np.ones(len(self._marginals.photos[0])), np.ones(per_camera))
@@ -154,8 +156,10 @@ class Rounds:
             self._noise, self._heavy_tails = self._inflation.noise, True
         self._weighed_spreads = self._spreads
         self._spreads = estimated(
-            self._spreads, self._current, self._marginals.photos, options, self._layout, self._baseline
-        )
+            self._spreads, self._current, self._marginals.photos, options, self._layout, self._baseline,
+            self._common(equations),
+        )  # fmt: skip
+        self._means = state.means if state.means.size else None
         if options.residual_field:
             values, variances = problem.fields(state, self._marginals.cameras)
             field = field_spread(values, variances, self._weighed_spreads.field)
@@ -163,6 +167,19 @@ class Rounds:
         if state.path is not None:
             self._follow_path(problem, equations)
         self._new_points = self._current if self._turns_only else retriangulated(self._current, self._model)
+
+    def _common(self, equations: NormalEquations) -> Common | None:
+        """What the last solve found of the means of the motions."""
+        state, current = self._solved.state, self._current
+        if not state.means.size:
+            return None
+        variances = np.diagonal(self._marginals.cameras).reshape(len(state.means), -1)[:, -6:]
+        span = current.frame_span()
+        # of the motions in their cameras' frames
+        together = span[:, None, None] * equations.photos_by_shared(6)[:, 6:12]
+        travels = np.einsum("mak,mka->ma", current.R_cw, together[:, 3:, 3:])
+        with_motions = np.hstack([np.einsum("maa->ma", together[:, :3, :3]), travels])
+        return Common(state.means, variances[current.camera_idx], with_motions)
 
     def _follow_path(self, problem: BundleProblem, equations: NormalEquations) -> None:
         """Bend the motions of the next solve as the path of this one, and update its prior standard deviations."""
@@ -254,5 +271,13 @@ class Rounds:
             tuple(np.sqrt(self._problem.fields(state, of_intrinsics)[1].sum(1)).tolist()),
             path,
             spreads.path,
-            velocity_mean=(*(np.array(spreads.travel) / self._baseline).tolist(),),
+            common=self._common_motion(),
         )
+
+    def _common_motion(self) -> CommonMotion | None:
+        if self._means is None:
+            return None
+        per_unit = np.repeat([1.0, 1.0 / self._baseline], 3)
+        variances = np.diagonal(self._marginals.cameras).reshape(len(self._means), -1)[:, -6:]
+        sigmas = (*(np.array(self._weighed_spreads.means) * per_unit).tolist(),)
+        return CommonMotion(self._means * per_unit, np.sqrt(np.maximum(variances, 0.0)) * per_unit, sigmas)

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ..model import Reconstruction
+from .common_motion import mean_sigmas
 from .layout import Layout
 from .options import BundleOptions
 from .path import PathPrior
 
 __all__ = [
+    "Common",
     "Spreads",
-    "common_velocity",
     "estimated",
     "estimates_spreads",
     "field_spread",
+    "has_means",
     "path_spreads",
     "settled",
     "starting_spreads",
@@ -29,10 +32,8 @@ _MIN_SPREAD = 1e-6
 _SETTLED_AT = 2e-5
 # The same of the fields, which are in pixels.
 _MIN_SPREAD_PX, _SETTLED_PX = 1e-4, 1e-3
-# A mean velocity has converged if it changes by less than this share of the standard deviation about it.
-_SETTLED_TRAVEL = 0.05
-# A mean velocity counts beyond so many standard errors.
-_SIGNIFICANT = 2.0
+# Prior standard deviations of means have converged if they change by less than this share: they hardly weigh.
+_SETTLED_MEANS = 0.2
 # A lens that its model says so badly needs another model.
 _MOST_PX = 1.0
 
@@ -49,7 +50,7 @@ _LARGEST_CHANGE = 4.0
 
 @dataclass(frozen=True)
 class Spreads:
-    """Standard deviations of the priors on what each photo has of its own, and the mean of one of them.
+    """Standard deviations of the priors on what each photo has of its own, and on what photos have in common.
 
     Attributes
     ----------
@@ -67,9 +68,9 @@ class Spreads:
         Of the unknowns of the cameras' residual fields, pixels.
     path : tuple of float
         Of a path, if there is one: rotation and travel, as `PathPrior` takes them.
-    travel : tuple of float
-        Mean of the prior on the velocity, in the frame of each camera, world units per frame. All others are zero: a
-        drone flies on, but its rotations have no direction.
+    means : tuple of float
+        Of the means of a camera's motions, if there are any: rotation about and travel along each of its axes, radians
+        and world units per frame.
     """
 
     phi: float
@@ -80,7 +81,7 @@ class Spreads:
     ways: tuple[float, ...] = ()
     field: float = 1.0
     path: tuple[float, ...] = ()
-    travel: tuple[float, ...] = (0.0, 0.0, 0.0)
+    means: tuple[float, ...] = ()
 
 
 def _spread(
@@ -105,71 +106,76 @@ def _spread(
     return float(np.clip(np.sqrt(seen / known), spread / _LARGEST_CHANGE, spread * _LARGEST_CHANGE))
 
 
+class Common(NamedTuple):
+    """Means of the motions of photos: values (cameras, 6), variances (m, 6), and covariances with the motions (m, 6).
+
+    In the frames of the cameras, radians and world units per frame, as are the motions.
+    """
+
+    values: NDArray[np.float64]
+    variances: NDArray[np.float64]
+    with_motions: NDArray[np.float64]
+
+
 def estimated(
     spreads: Spreads, current: Reconstruction, covariances: NDArray[np.float64], options: BundleOptions,
-    layout: Layout, baseline: float,
+    layout: Layout, baseline: float, common: Common | None = None,
 ) -> Spreads:  # fmt: skip
-    """Estimates of both prior standard deviations from a solution; given ones stay."""
+    """Estimates of the prior standard deviations from a solution; given ones stay."""
     variances = np.diagonal(covariances, axis1=1, axis2=2)
     if not np.isfinite(variances).all():
         return spreads
-    span = current.frame_span()
-    motion = variances[:, 6 : layout.motion]
+    own, own_variances = _own_motions(current, covariances[:, 6 : layout.motion, 6 : layout.motion], common)
     limited = [options.phi_limits.get(name, np.inf) < spreads.phi for name in current.image_names]
-    motion = np.where(np.array(limited)[:, None], 0.0, motion)
+    own_variances = np.where(np.array(limited)[:, None], 0.0, own_variances)
+    ones = np.ones(len(own))
     phi, velocity, focal, centre = spreads.phi, spreads.velocity, spreads.focal, spreads.centre
-    travel = np.zeros(3)
-    if options.phi_sigma is None and motion.shape[1] > 0:
-        phi = _spread(current.phi, motion[:, :3], span, spreads.phi) + _MIN_SPREAD
-    if options.velocity_sigma is None and motion.shape[1] > 3:
-        own, variance = _in_cameras(current, np.where(motion[:, 3:, None] > 0, covariances[:, 9:12, 9:12], 0.0))
-        travel = _travel(own * span[:, None], variance, np.array(spreads.travel), options)
-        velocity = _spread(own - travel / span[:, None], variance, span, spreads.velocity)
-        velocity += _MIN_SPREAD * current.baseline
+    means = spreads.means
+    if options.phi_sigma is None and own.shape[1] > 0:
+        phi = _spread(own[:, :3], own_variances[:, :3], ones, spreads.phi) + _MIN_SPREAD
+    if options.velocity_sigma is None and own.shape[1] > 3:
+        velocity = _spread(own[:, 3:], own_variances[:, 3:], ones, spreads.velocity) + _MIN_SPREAD * current.baseline
+    if common is not None:
+        variances = np.zeros_like(common.values)
+        variances[current.camera_idx] = common.variances
+        means = mean_sigmas(velocity, _depth(current), common.values, variances)
     if options.varying:
-        ones, varied = np.ones(len(span)), current.variation
+        varied = current.variation
         of_varied = variances[:, layout.motion : layout.variation]
         focal = _spread(varied[:, :1], of_varied[:, :1], ones, spreads.focal) + _MIN_SPREAD
         centre = _spread(varied[:, 1:], of_varied[:, 1:], ones, spreads.centre) + _MIN_SPREAD
     bends, ways = _bend_spreads(spreads, current, variances[:, layout.variation :], layout)
     return _bounded(
-        Spreads(phi, velocity, focal, centre, bends, ways, spreads.field, spreads.path, (*travel.tolist(),)),
-        options,
-        baseline,
+        Spreads(phi, velocity, focal, centre, bends, ways, spreads.field, spreads.path, means), options, baseline
     )
 
 
-def _in_cameras(
-    current: Reconstruction, covariances: NDArray[np.float64]
+def _depth(reconstruction: Reconstruction) -> float:
+    """Median over the photos."""
+    return float(np.median([reconstruction.median_depth(i) for i in range(reconstruction.num_images)]))
+
+
+def _own_motions(
+    current: Reconstruction, covariances: NDArray[np.float64], common: Common | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Velocities (m, 3) in the frames of the cameras, and their variances."""
-    R = current.R_cw
-    return np.einsum("mij,mj->mi", R, current.velocity), np.einsum("mij,mjk,mik->mi", R, covariances, R)
+    """What each photo's motion has of its own (m, k), in the camera's frame and per frame, and its variances.
 
-
-def common_velocity(reconstruction: Reconstruction, travel: ArrayLike) -> NDArray[np.float64]:
-    """Velocities (m, 3), world units per unit of the clock, of photos that all travel by `travel` (`Spreads`)."""
-    world = np.einsum("mji,j->mi", reconstruction.R_cw, np.asarray(travel, float))
-    return np.asarray(world / reconstruction.frame_span()[:, None])
-
-
-def _travel(
-    velocity: NDArray[np.float64], variance: NDArray[np.float64], before: NDArray[np.float64], options: BundleOptions
-) -> NDArray[np.float64]:
-    """Mean velocity (3,) of the photos in the frames of their cameras, per frame, as far as it is not by chance.
-
-    A component within two standard errors of zero is none, and others are shrunk by James and Stein's estimator. (A
-    mean once free is drawn no longer: one by chance would grow along what the measurements hardly determine.) The
-    velocities were found under the mean `before`, which drew them, so that a round leaves a share of the error, 0 to 1:
-    the step from it is doubled, which leaves 2 share - 1. Zero where the exposure bounds the motions: a common one is
-    bounded with them.
+    Variances are 0 where a motion is held.
     """
-    free = velocity[(variance > 0).all(1)]
-    if options.velocity_sigma_most is not None or len(free) < 3:
-        return np.zeros(3)
-    mean, chance = free.mean(0), free.var(axis=0, ddof=1) / len(free)
-    shrunk = mean * (1.0 - chance / np.maximum(mean**2, 1e-300))
-    return np.where(mean**2 > _SIGNIFICANT**2 * chance, 2.0 * shrunk - before, 0.0)
+    span = current.frame_span()[:, None]
+    k = covariances.shape[1]
+    held = np.diagonal(covariances, axis1=1, axis2=2) <= 0
+    to_camera = np.zeros((len(span), 6, 6))
+    to_camera[:, :3, :3], to_camera[:, 3:, 3:] = np.eye(3), current.R_cw
+    to_camera = to_camera[:, :k, :k]
+    own = span * np.einsum("mab,mb->ma", to_camera, np.hstack([current.phi, current.velocity])[:, :k])
+    variances = span**2 * np.einsum("mab,mbc,mac->ma", to_camera, covariances, to_camera)
+    if common is not None:
+        own = own - common.values[current.camera_idx]
+        variances = variances + common.variances - 2.0 * common.with_motions
+    # a photo whose velocity is held in part has none of its own to learn from
+    held[:, 3:] = held[:, 3:].any(1, keepdims=True)
+    return own, np.where(held, 0.0, np.maximum(variances, 1e-300))
 
 
 def _bend_spreads(
@@ -207,9 +213,16 @@ def settled(before: Spreads, after: Spreads, tolerance: float) -> bool:
     of_bends = (_SETTLED_AT,) * len(before.bends), (0.0,) * len(before.ways)
     phi, velocity = (np.inf, np.inf) if before.path else (_SETTLED_AT, 0.0)
     none = Spreads(
-        phi, velocity, _SETTLED_AT, _SETTLED_AT, *of_bends, _SETTLED_PX, (0.0,) * len(before.path), (np.inf,) * 3
+        phi,
+        velocity,
+        _SETTLED_AT,
+        _SETTLED_AT,
+        *of_bends,
+        _SETTLED_PX,
+        (0.0,) * len(before.path),
+        (np.inf,) * len(before.means),
     )
-    if (np.abs(np.subtract(after.travel, before.travel)) > _SETTLED_TRAVEL * after.velocity).any():
+    if any(abs(new - old) > _SETTLED_MEANS * new for old, new in zip(before.means, after.means, strict=True)):
         return False
     return all(
         abs(new - old) <= tolerance * new or max(old, new) < least
@@ -217,8 +230,9 @@ def settled(before: Spreads, after: Spreads, tolerance: float) -> bool:
     )
 
 
-def starting_spreads(options: BundleOptions, layout: Layout, baseline: float) -> Spreads:
+def starting_spreads(options: BundleOptions, layout: Layout, reconstruction: Reconstruction) -> Spreads:
     """Those that are given, or at which the estimation begins."""
+    baseline = reconstruction.baseline
     start = Spreads(
         options.phi_sigma or options.phi_sigma_start,
         (options.velocity_sigma or options.velocity_sigma_start) * baseline,
@@ -229,7 +243,18 @@ def starting_spreads(options: BundleOptions, layout: Layout, baseline: float) ->
         options.field_sigma_start,
         () if options.path is None else (_TURN_START, _TRAVEL_START * baseline),
     )
+    if has_means(layout, options):
+        start = replace(start, means=mean_sigmas(start.velocity, _depth(reconstruction)))
     return _bounded(start, options, baseline)
+
+
+def has_means(layout: Layout, options: BundleOptions) -> bool:
+    """Whether motions have means that are solved for.
+
+    That takes velocities, of a prior that is estimated and that no exposure bounds: a common one is bounded with them.
+    """
+    estimates = options.velocity_sigma is None and options.velocity_sigma_most is None
+    return layout.motion > 9 and estimates and options.path is None
 
 
 def _bounded(spreads: Spreads, options: BundleOptions, baseline: float) -> Spreads:
@@ -239,7 +264,7 @@ def _bounded(spreads: Spreads, options: BundleOptions, baseline: float) -> Sprea
     return Spreads(
         min(spreads.phi, phi), min(spreads.velocity, velocity), min(spreads.focal, _MOST_VARIED),
         min(spreads.centre, _MOST_VARIED), tuple(min(each, phi) for each in spreads.bends), spreads.ways,
-        min(spreads.field, _MOST_PX), spreads.path, spreads.travel,
+        min(spreads.field, _MOST_PX), spreads.path, spreads.means,
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..bundle import BundleOptions, BundleResult, Posterior, bundle_adjust
-from ..bundle.spreads import common_velocity
+from ..bundle.common_motion import MotionMeans
 from ..errors import InputError
 from .common import row_phi
 from .cost import ShapeCost, shape_cost
@@ -127,12 +127,11 @@ def still_probability(result: BundleResult, options: BundleOptions | None = None
 
     # of the motion, all that the prior of its own photo did not say: exp(pull x - x' (inside) x / 2)
     inside = np.linalg.inv(covariance)
-    own = precision(result.phi_sigma, max(result.velocity_sigma * rec.baseline, 1e-300))
-    mean = np.zeros_like(motion)
-    travels = common_velocity(rec, rec.baseline * np.array(result.velocity_mean))
-    mean[:, 3:] = travels[:, : motion.shape[1] - 3]
-    pull = np.einsum("mij,mj->mi", inside, motion) - np.einsum("mij,mj->mi", own, mean)
-    inside = inside - own
+    mean, phi_sigma, velocity_sigma = _expected(result)
+    own = precision(phi_sigma, np.maximum(velocity_sigma, 1e-300))
+    pull = np.einsum("mij,mj->mi", inside, motion) - np.einsum("mij,mj->mi", own, mean[:, : motion.shape[1]])
+    value, vector = np.linalg.eigh(inside - own)  # nothing where nothing else is known
+    inside = np.einsum("mij,mj,mkj->mik", vector, np.maximum(value, 0.0), vector)
 
     def evidence(prior: NDArray[np.float64]) -> NDArray[np.float64]:
         """(m,) log likelihoods of a prior, up to a constant."""
@@ -145,6 +144,18 @@ def still_probability(result: BundleResult, options: BundleOptions | None = None
     odds -= evidence(precision(phi, velocity))
     probability: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-np.clip(odds, -500, 500)))
     return probability
+
+
+def _expected(result: BundleResult) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Motions (m, 6) of photos by their prior, and its standard deviations (m,) of phi and velocity, per frame."""
+    rec, common = result.reconstruction, result.common
+    own = np.array([result.phi_sigma, result.velocity_sigma * rec.baseline])
+    if common is None:
+        return np.zeros((rec.num_images, 6)), *np.repeat(own[:, None], rec.num_images, axis=1)
+    per_unit = np.repeat([1.0, rec.baseline], 3)
+    means = MotionMeans.of(rec, common.sigmas, np.ones((rec.num_images, 6), bool)).at(per_unit * common.values)
+    of_means = np.mean((per_unit * common.deviations).reshape(-1, 2, 3) ** 2, axis=2)[rec.camera_idx]
+    return means, *np.sqrt(own**2 + of_means).T
 
 
 def contradictions(result: BundleResult, options: BundleOptions, names: Collection[str]) -> tuple[str, ...]:

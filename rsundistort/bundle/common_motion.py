@@ -1,0 +1,111 @@
+"""What the motions of a camera's photos have in common: the mean of their priors, which is solved for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model import Reconstruction
+
+__all__ = ["CommonMotion", "CommonPrior", "MotionMeans", "mean_sigmas"]
+
+Array = NDArray[np.float64]
+
+# Drones and people on their way travel alike, but for a part of their speed. (Were the mean drawn to zero as if it were
+# a sample of what varies, an orbit's would be lost, and its rotation with it.)
+_MUCH = 3.0
+
+
+@dataclass(frozen=True)
+class CommonMotion:
+    """Means of the motions of each camera's photos, in the frame of the camera.
+
+    Attributes
+    ----------
+    values : (cameras, 6) array
+        Rotation, radians per frame, and travel, baselines per frame.
+    deviations : (cameras, 6) array
+        Their standard deviations.
+    sigmas : (6,) tuple of float
+        Those of their priors, whose means are zero.
+    """
+
+    values: Array
+    deviations: Array
+    sigmas: tuple[float, ...]
+
+
+class CommonPrior(NamedTuple):
+    """What the normal equations take of priors whose means photos share: weights (m, nb), derivatives (m, nb, h).
+
+    The residual of an unknown x of a photo is sqrt(weight) (x - derivative mean), of its camera's h means.
+    """
+
+    weight: Array
+    J: Array
+
+
+@dataclass(frozen=True)
+class MotionMeans:
+    """How the unknown motions of photos depend on the means of their cameras.
+
+    Attributes
+    ----------
+    directions : (m, 6, 6) array
+        Motions, in the world frame per unit of the clock, by means, in the frame of the camera per frame. 0 for what a
+        photo does not share.
+    camera_idx : (m,) int array
+        Camera of each photo.
+    sigmas : (6,) array
+        Standard deviations of the priors on the means: radians, and world units.
+    """
+
+    directions: Array
+    camera_idx: NDArray[np.int64]
+    sigmas: Array
+
+    @classmethod
+    def of(cls, reconstruction: Reconstruction, sigmas: tuple[float, ...], shares: NDArray[np.bool_]) -> MotionMeans:
+        """Those of a reconstruction; `shares` (m, 6) says which components of its photos' motions have a mean."""
+        directions = np.zeros((reconstruction.num_images, 6, 6))
+        directions[:, :3, :3] = np.eye(3)
+        directions[:, 3:, 3:] = reconstruction.R_cw.transpose(0, 2, 1)
+        directions *= shares[:, :, None] / reconstruction.frame_span()[:, None, None]
+        return cls(directions, reconstruction.camera_idx, np.array(sigmas))
+
+    def at(self, means: Array) -> Array:
+        """Motions (m, 6) of photos that move as the means (cameras, 6) say."""
+        value: Array = np.einsum("mak,mk->ma", self.directions, means[self.camera_idx])
+        return value
+
+    def pull(self, weight: Array, motion: Array, means: Array) -> Array:
+        """Gradient (cameras, 6) of the photos' priors, of weights (m, 6), by the means."""
+        total = np.zeros_like(means)
+        by_photo = np.einsum("mak,ma->mk", self.directions, weight * (motion - self.at(means)))
+        np.add.at(total, self.camera_idx, -by_photo)
+        return total
+
+    def most_likely(self, weight: Array, motion: Array, num_cameras: int) -> Array:
+        """Means (cameras, 6) where the priors of motions (m, 6), of weights (m, 6), and of the means cost least."""
+        total = np.zeros((num_cameras, 6, 6))
+        np.add.at(total, self.camera_idx, np.einsum("mak,ma,mal->mkl", self.directions, weight, self.directions))
+        pull = -self.pull(weight, motion, np.zeros((num_cameras, 6)))
+        return np.asarray(np.linalg.solve(total + np.diag(self.sigmas**-2.0), pull[..., None])[..., 0], np.float64)
+
+
+def mean_sigmas(
+    velocity_sigma: float, depth: float, means: Array | None = None, variances: Array | None = None
+) -> tuple[float, ...]:
+    """Standard deviations of the priors on means, from estimates (cameras, 6) and their posterior variances.
+
+    A velocity in common is expected to be a few times what the photos have of their own, or as large as it is found; a
+    rotation in common, as large as one that keeps in view what a camera passes at that velocity: its travel by the
+    depth.
+    """
+    velocity = _MUCH * velocity_sigma
+    if means is not None and variances is not None:
+        velocity = max(velocity, float(np.sqrt((means**2 + variances)[:, 3:].mean())))
+    return (*[velocity / depth] * 3, *[velocity] * 3)
