@@ -410,5 +410,4 @@ def test_a_velocity_that_all_photos_share_is_not_taken_for_their_nodding(seed):
 def test_velocities_without_a_common_direction_have_no_mean(rng):
     truth = flight(rng, np.zeros(3))
     result = bundle_adjust(truth, MODEL)
-    assert (np.abs(result.common.values[0, 3:]) <= result.velocity_sigma).all()
-    assert result.velocity_rms == pytest.approx(result.velocity_sigma, rel=0.2)
+    assert (np.abs(result.common.values) <= 2.5 * result.common.deviations)[:, 3:].all()

@@ -15,7 +15,7 @@ from .._kernels import residuals
 from ..errors import InputError
 from ..model import Camera, Reconstruction, check_shutter_model
 from ..model.reprojection import camera_arrays, motion_tables, observed_lens_pixels, plain_arrays
-from .common_motion import CommonPrior, MotionMeans
+from .common_motion import LEAST_PHOTOS, CommonPrior, MotionMeans
 from .elimination import Elimination
 from .intrinsics import INTRINSICS, check_lenses, deviation, moved_camera, prior_weight
 from .jackknife import Partition, by_corner, by_place
@@ -144,9 +144,10 @@ class BundleProblem:
         self._free = self._free_unknowns()
         self._means, self._means_start = None, means
         if spreads.means:
-            # what a photo's own limit bounds is no sample of the others
+            # what a photo's own limit bounds is no sample of the others, and few photos are none of their camera
             limited = [options.phi_limits.get(name, np.inf) < spreads.phi for name in reconstruction.image_names]
-            shares = self._free[:, 6:12] & ~np.array(limited)[:, None]
+            few = np.bincount(reconstruction.camera_idx)[reconstruction.camera_idx] < LEAST_PHOTOS
+            shares = self._free[:, 6:12] & ~(few | limited)[:, None]
             self._means = MotionMeans.of(reconstruction, spreads.means, shares)
         poses = reconstruction.R_cw, reconstruction.center_w
         self._elimination = Elimination.of(
@@ -443,6 +444,12 @@ class BundleProblem:
             state.points_w - state.center_w[0] if self._turns_only else None,
             self._places.on_points(state.points_w), common,
         )  # fmt: skip
+
+    @property
+    def shares(self) -> NDArray[np.bool_]:
+        """(m, 6) which components of the photos' motions have a mean."""
+        assert self._means is not None
+        return np.asarray(self._means.directions.any(axis=2))
 
     @property
     def path(self) -> PathPrior:

@@ -174,12 +174,13 @@ class Rounds:
         if not state.means.size:
             return None
         variances = np.diagonal(self._marginals.cameras).reshape(len(state.means), -1)[:, -6:]
-        span = current.frame_span()
+        span, shares = current.frame_span(), self._problem.shares
         # of the motions in their cameras' frames
         together = span[:, None, None] * equations.photos_by_shared(6)[:, 6:12]
         travels = np.einsum("mak,mka->ma", current.R_cw, together[:, 3:, 3:])
         with_motions = np.hstack([np.einsum("maa->ma", together[:, :3, :3]), travels])
-        return Common(state.means, variances[current.camera_idx], with_motions)
+        of_photos = state.means[current.camera_idx], variances[current.camera_idx], with_motions
+        return Common(*(np.where(shares, each, 0.0) for each in of_photos))
 
     def _follow_path(self, problem: BundleProblem, equations: NormalEquations) -> None:
         """Bend the motions of the next solve as the path of this one, and update its prior standard deviations."""

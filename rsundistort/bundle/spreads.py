@@ -107,9 +107,9 @@ def _spread(
 
 
 class Common(NamedTuple):
-    """Means of the motions of photos: values (cameras, 6), variances (m, 6), and covariances with the motions (m, 6).
+    """Means of the motions of photos (m, 6), their variances, and their covariances with the motions.
 
-    In the frames of the cameras, radians and world units per frame, as are the motions.
+    In the frames of the cameras, radians and world units per frame, as are the motions; 0 where a motion has none.
     """
 
     values: NDArray[np.float64]
@@ -136,9 +136,8 @@ def estimated(
     if options.velocity_sigma is None and own.shape[1] > 3:
         velocity = _spread(own[:, 3:], own_variances[:, 3:], ones, spreads.velocity) + _MIN_SPREAD * current.baseline
     if common is not None:
-        variances = np.zeros_like(common.values)
-        variances[current.camera_idx] = common.variances
-        means = mean_sigmas(velocity, _depth(current), common.values, variances)
+        squares = (common.values**2 + common.variances)[:, 3:]
+        means = mean_sigmas(velocity, _depth(current), squares[squares.any(1)])
     if options.varying:
         varied = current.variation
         of_varied = variances[:, layout.motion : layout.variation]
@@ -171,7 +170,7 @@ def _own_motions(
     own = span * np.einsum("mab,mb->ma", to_camera, np.hstack([current.phi, current.velocity])[:, :k])
     variances = span**2 * np.einsum("mab,mbc,mac->ma", to_camera, covariances, to_camera)
     if common is not None:
-        own = own - common.values[current.camera_idx]
+        own = own - common.values
         variances = variances + common.variances - 2.0 * common.with_motions
     # a photo whose velocity is held in part has none of its own to learn from
     held[:, 3:] = held[:, 3:].any(1, keepdims=True)
