@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..model import Reconstruction
 
-__all__ = ["LEAST_PHOTOS", "CommonMotion", "CommonPrior", "MotionMeans", "mean_sigmas"]
+__all__ = ["LEAST_PHOTOS", "CommonMotion", "MotionMeans", "mean_sigmas"]
 
 Array = NDArray[np.float64]
 
@@ -39,16 +38,6 @@ class CommonMotion:
     values: Array
     deviations: Array
     sigmas: tuple[float, ...]
-
-
-class CommonPrior(NamedTuple):
-    """What the normal equations take of priors whose means photos share: weights (m, nb), derivatives (m, nb, h).
-
-    The residual of an unknown x of a photo is sqrt(weight) (x - derivative mean), of its camera's h means.
-    """
-
-    weight: Array
-    J: Array
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,212 @@
+"""Means of the motions of a camera's photos, which are solved for: the linear system, and what they are for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bundle_scenes import dense_system, gradients, make_scene, perturbed, scaled, unit_steps
+from numpy_twin import project
+
+from rsundistort import BundleOptions, Camera, Observations, Reconstruction, bundle_adjust
+from rsundistort.bundle import Posterior
+from rsundistort.bundle.common_motion import LEAST_PHOTOS
+from rsundistort.bundle.problem import BundleProblem
+from rsundistort.bundle.spreads import Spreads
+from rsundistort.synthetic import look_at
+
+# thousands of calls on problems this small wait for threads longer than they compute
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+MODEL = "constant-motion"
+MEANS = (0.02, 0.02, 0.02, 0.3, 0.3, 0.3)
+
+
+def shared_problem(rng, refine=(), factor_limit=1e10, num_images=9):
+    """Photos of a camera that has a mean, and a last one of another, which has none."""
+    scene = make_scene(rng, MODEL, num_images=num_images, num_points=30, noise_px=1.0)
+    scene = replace(scene, cameras=scene.cameras[:2], camera_idx=np.arange(num_images) // (num_images - 1))
+    start = replace(perturbed(scene, rng, 0.01, 0.02), phi=scene.phi, velocity=scene.velocity)
+    options = BundleOptions(loss="squared", factor_limit=factor_limit, cg_tolerance=1e-13, refine=refine)
+    problem = BundleProblem(start, MODEL, options, 0.5, Spreads(0.03, 0.1, means=MEANS))
+    state = problem.initial_state()
+    return problem, replace(state, means=state.means + 0.1 * rng.normal(size=state.means.shape) * MEANS)
+
+
+def whole_system(problem, state):
+    """Hessian and gradient of photos, points, and of the intrinsics and means of each camera, from residuals."""
+    H, g, free = dense_system(problem, state)
+    m, nb = problem._free.shape
+    cameras, nr = len(state.cameras), len(problem._refine)
+    nc = nr + 6
+    first = m * nb + 3 * problem._start.num_points
+    place = np.concatenate([np.arange(first), *(first + c * nc + np.arange(nr) for c in range(cameras))])
+    J, res = np.zeros((6 * (m + cameras), first + cameras * nc)), np.zeros(6 * (m + cameras))
+    span = problem._start.frame_span()
+    for i in range(m):
+        rows = slice(6 * i, 6 * i + 6)
+        sqrt_weight = np.repeat(span[i] / np.array([0.03, 0.1]), 3)
+        J[rows, i * nb + 6 : i * nb + 12] = np.diag(sqrt_weight)
+        motion = np.concatenate([state.phi[i], state.velocity[i]])
+        if problem._start.camera_idx[i] == 0:
+            T = np.zeros((6, 6))
+            T[:3, :3], T[3:, 3:] = np.eye(3) / span[i], problem._start.R_cw[i].T / span[i]
+            J[rows, first + nr : first + nc] = -sqrt_weight[:, None] * T
+            motion = motion - T @ state.means[0]
+        res[rows] = sqrt_weight * motion
+    for c in range(cameras):
+        rows = slice(6 * (m + c), 6 * (m + c) + 6)
+        J[rows, first + c * nc + nr : first + (c + 1) * nc] = np.diag(1 / np.array(MEANS))
+        res[rows] = state.means[c] / MEANS
+    wide, gradient = J.T @ J, J.T @ res
+    # the dense system has the priors of motions without means already
+    weight = np.zeros((m, nb))
+    weight[:, 6:9], weight[:, 9:12] = (span / 0.03)[:, None] ** 2, (span / 0.1)[:, None] ** 2
+    H[: m * nb, : m * nb] -= np.diag(weight.ravel())
+    g[: m * nb] -= (weight * np.hstack([np.zeros((m, 6)), state.phi, state.velocity])).ravel()
+    wide[np.ix_(place, place)] += H
+    gradient[place] += g
+    return wide, gradient, np.concatenate([free[:first], np.ones(cameras * nc, bool)])
+
+
+@pytest.mark.parametrize("refine", [(), ("f", "k1")], ids=["calibrated", "refined"])
+@pytest.mark.parametrize("factor_limit", [1e10, -1], ids=["factored", "conjugate gradients"])
+@pytest.mark.parametrize("damping", [0.0, 1e-2])
+def test_means_join_the_system(damping, factor_limit, refine, rng):
+    problem, state = shared_problem(rng, refine, factor_limit)
+    H, g, free = whole_system(problem, state)
+    seen = np.diag(dense_system(problem, state)[0])
+    D = np.zeros(len(H))
+    m, nb = problem._free.shape
+    first, nc, nr = m * nb + 3 * problem._start.num_points, len(refine) + 6, len(refine)
+    D[:first] = seen[:first]  # means are not damped: their priors hold them
+    for c in range(2):
+        D[first + c * nc : first + c * nc + nr] = seen[first + c * nr : first + (c + 1) * nr]
+    damped = H + damping * np.diag(D)
+    scale = 1 / np.sqrt(np.diag(damped)[free])
+    inverse = scale[:, None] * np.linalg.inv(scale[:, None] * damped[np.ix_(free, free)] * scale) * scale
+    expected = np.zeros(len(g))
+    expected[free] = -inverse @ g[free]
+    equations = problem.linearize(state)
+    assert equations.cost == pytest.approx(problem.cost(state), rel=1e-12)
+    parts, predicted = equations.solve(damping)
+    step = np.concatenate([part.ravel() for part in parts])
+    np.testing.assert_allclose(step, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
+    assert predicted == pytest.approx(-(g @ expected + 0.5 * expected @ H @ expected), rel=1e-7)
+
+
+def test_the_gradient_of_means_equals_central_differences_of_the_cost(rng):
+    problem, state = shared_problem(rng)
+    equations, h = problem.linearize(state), 1e-5
+    for kind, index, step in unit_steps(problem, state):
+        if kind == 2 or (kind == 0 and index[0] in (0, 8)):
+            ahead, behind = (problem.cost(problem.retract(state, scaled(step, s))) for s in (h, -h))
+            gradient = gradients(equations)[kind]
+            assert abs((ahead - behind) / (2 * h) - gradient[index]) <= 1e-6 * np.abs(gradient).max()
+
+
+def test_covariances_with_means_are_those_of_the_whole_inverse(rng):
+    problem, state = shared_problem(rng, ("f",))
+    H, _, free = whole_system(problem, state)
+    equations = problem.linearize(state)
+    scale = 1 / np.sqrt(np.diag(H)[free])
+    whole = np.zeros_like(H)
+    whole[np.ix_(free, free)] = scale[:, None] * np.linalg.inv(scale[:, None] * H[np.ix_(free, free)] * scale) * scale
+    m, nb = problem._free.shape
+    marginals = equations.marginal_covariances()
+    expected = np.array([whole[nb * i : nb * i + nb, nb * i : nb * i + nb] for i in range(m)])
+    size = np.sqrt(np.einsum("iaa,ibb->iab", expected, expected))
+    np.testing.assert_array_less(np.abs(marginals.photos - expected), 1e-7 * size + 1e-300)
+    k = len(marginals.cameras)
+    np.testing.assert_allclose(marginals.cameras, whole[-k:, -k:], rtol=0, atol=1e-7 * np.abs(whole[-k:, -k:]).max())
+    vector = rng.normal(size=(1, m, nb))
+    reference = (whole[: m * nb, : m * nb] @ vector.ravel()).reshape(m, nb)
+    np.testing.assert_allclose(equations.covariance()(vector)[0], reference, atol=1e-7 * np.abs(reference).max())
+    shared = np.array([whole[nb * i : nb * i + nb, -k + 1 : -k + 7] for i in range(m - 1)])
+    np.testing.assert_allclose(equations.photos_by_shared(6)[:-1], shared, atol=1e-7 * np.abs(shared).max())
+    # the priors' share, H^-1 P H^-1: P is what is left without measurements
+    P = H - (lambda J: J.T @ J)(measured_rows(problem, state, len(H), 1))
+    share = whole @ P @ whole
+    reference = (share[: m * nb, : m * nb] @ vector.ravel()).reshape(m, nb)
+    np.testing.assert_allclose(equations._by_priors(vector)[0], reference, atol=1e-6 * np.abs(reference).max())
+    of_photos = np.array([share[nb * i : nb * i + nb, nb * i : nb * i + nb] for i in range(m)])
+    np.testing.assert_allclose(marginals.photos_of_priors, of_photos, atol=2e-4 * np.abs(of_photos).max())
+    weights = rng.normal(size=(problem._start.num_points, 3))
+    found = equations.function_of_points(problem.in_order(weights))
+    b = np.zeros(len(H))
+    b[m * nb : m * nb + weights.size] = weights[problem._structure.points].ravel()
+    assert found.variance == pytest.approx(b @ whole @ b, rel=1e-7)
+    assert found.of_priors == pytest.approx(b @ share @ b, rel=1e-6)
+
+
+def measured_rows(problem, state, size, nr):
+    """Jacobian (2 o, size) of the measurements alone."""
+    _, J_frame, _ = problem._jacobians(state)
+    J_camera = problem._camera_jacobians(state)
+    obs = problem._start.observations.select(problem._structure.order)
+    m, nb = problem._free.shape
+    first = m * nb + 3 * problem._start.num_points
+    J = np.zeros((len(obs), 2, size))
+    for k in range(len(obs)):
+        f, p = nb * obs.frame_idx[k], m * nb + 3 * obs.point_idx[k]
+        c = first + (nr + 6) * problem._start.camera_idx[obs.frame_idx[k]]
+        J[k, :, f : f + nb], J[k, :, p : p + 3] = J_frame[k], -J_frame[k, :, 3:6]
+        J[k, :, c : c + nr] = J_camera[k]
+    return J.reshape(-1, size)
+
+
+def test_cameras_of_few_photos_share_nothing(rng):
+    for num_images, shares in ((LEAST_PHOTOS, False), (LEAST_PHOTOS + 1, True)):
+        problem, _ = shared_problem(rng, num_images=num_images)
+        assert problem.shares[:-1].all() == shares
+        assert not problem.shares[-1].any()
+        assert problem.initial_state().means.any(1).tolist() == [shares, False]
+
+
+def aimed(rng, turns, photos=14):
+    """Photos on an orbit of radius 4 around a thing of 1.3, that travel by 0.05 along it while they are read.
+
+    They rotate with the orbit, so that they stay aimed, or not at all; and a little each for itself.
+    """
+    camera = Camera(1600, 1200, [[1300, 0, 800], [0, 1300, 600], [0, 0, 1]], [], "top-to-bottom")
+    angle = np.linspace(0, 2 * np.pi, photos, endpoint=False) + 0.03 * rng.normal(size=photos)
+    center_w = np.column_stack([4 * np.sin(angle), -4 * np.cos(angle), 0.6 + 0.5 * rng.normal(size=photos)])
+    points_w = rng.uniform(-1, 1, (300, 3)) * [1.3, 1.3, 0.9]
+    R_cw = np.array([look_at(center, np.zeros(3)) for center in center_w])
+    phi = -0.0125 * turns * R_cw[:, :, 2] + 0.004 * rng.normal(size=(photos, 3))
+    velocity = 0.05 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    velocity += 0.012 * rng.normal(size=(photos, 3))
+    point_idx, frame_idx = (a.ravel() for a in np.mgrid[: len(points_w), :photos])
+    xy = np.empty((len(points_w), photos, 2))
+    span = 1200 / 1300
+    for i in range(photos):
+        motion = phi[i] / span, MODEL, camera.readout, camera.K, [], velocity[i] / span
+        xy[:, i] = project(points_w, R_cw[i], center_w[i], *motion)
+    facing = np.einsum("na,na->n", points_w[point_idx], center_w[frame_idx]) > 0.3
+    xy = xy.reshape(-1, 2) + 0.2 * rng.normal(size=(len(point_idx), 2))
+    inside = facing & ((xy > 0) & (xy < [1600, 1200])).all(1)
+    observations = Observations(frame_idx, point_idx, xy).select(inside)
+    names, same = [f"{i:02}.jpg" for i in range(photos)], np.zeros(photos, np.int64)
+    return Reconstruction(
+        [camera], names, same, R_cw, center_w, points_w, observations, phi / span, velocity / span, MODEL
+    )
+
+
+@pytest.mark.parametrize("turns", [1.0, 0.0])
+def test_rotation_and_travel_of_an_orbit_are_told_apart_as_far_as_their_deviations_say(turns, rng):
+    square = []
+    for _ in range(3):
+        truth = aimed(rng, turns)
+        start = replace(truth, phi=0 * truth.phi, velocity=0 * truth.velocity)
+        options = BundleOptions(deviations="jackknife")
+        result = bundle_adjust(start, MODEL, options)
+        error = (result.reconstruction.phi - truth.phi).mean(0) * truth.frame_span()[0]
+        vectors = np.zeros((3, truth.num_images, 12))
+        vectors[np.arange(3), :, 6 + np.arange(3)] = truth.frame_span()[0] / truth.num_images
+        posterior = Posterior(result, options)
+        sigma = np.sqrt(np.einsum("kma,kma->k", posterior.of_photos(vectors), vectors))
+        square.append((error / sigma) ** 2)
+        # with a mean of zero, the yaw was 12 mrad off at a standard deviation of 0.5
+        assert abs(error[1]) < 8e-3
+    assert np.sqrt(np.mean(square)) < 2.0
