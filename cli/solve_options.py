@@ -111,7 +111,7 @@ solve_options = opt.gathered(
         default="auto",
         show_default=True,
         help="Remedy if all cameras are level, which is a critical motion. auto looks for a photo that did not move; "
-        "prior assumes that the motions are zero in the mean; none does neither.",
+        "prior relies on the prior of the motions alone; none does neither.",
     ),
     *opt.PHOTO_OPTIONS,
     click.option(

@@ -71,7 +71,7 @@ class Remedy:
             names = f"{names} and {len(self.anchors) - 3} more"
         return {
             "anchor": f"{names} most likely did not move and {holds} ({was} without it); {left}",
-            "prior": f"no photo is taken to be still, the motions to be zero in the mean; {left}",
+            "prior": f"no photo is taken to be still; only the prior holds what their motions have in common; {left}",
             "given": f"with what is known of {names or 'lengths in the scene'}, {left}",
             "path": f"the path of the video determines how its frames moved; {left}",
             "none": left,
