@@ -9,16 +9,12 @@ from numpy.typing import NDArray
 
 from ..model import Reconstruction
 
-__all__ = ["LEAST_PHOTOS", "CommonMotion", "MotionMeans", "mean_sigmas"]
+__all__ = ["LEAST_PHOTOS", "CommonMotion", "MotionMeans"]
 
 Array = NDArray[np.float64]
 
 #: Photos whose motions have a mean: as many as that has unknowns.
 LEAST_PHOTOS = 6
-
-# Drones and people on their way travel alike, but for a part of their speed. (Were the mean drawn to zero as if it were
-# a sample of what varies, an orbit's would be lost, and its rotation with it.)
-_MUCH = 3.0
 
 
 @dataclass(frozen=True)
@@ -86,16 +82,3 @@ class MotionMeans:
         np.add.at(total, self.camera_idx, np.einsum("mak,ma,mal->mkl", self.directions, weight, self.directions))
         pull = -self.pull(weight, motion, np.zeros((num_cameras, 6)))
         return np.asarray(np.linalg.solve(total + np.diag(self.sigmas**-2.0), pull[..., None])[..., 0], np.float64)
-
-
-def mean_sigmas(velocity_sigma: float, depth: float, squares: Array | None = None) -> tuple[float, ...]:
-    """Standard deviations of the priors on means, from what is expected of the squares (k, 3) of common velocities.
-
-    A velocity in common is expected to be a few times what the photos have of their own, or as large as it is found; a
-    rotation in common, as large as one that keeps in view what a camera passes at that velocity: its travel by the
-    depth.
-    """
-    velocity = _MUCH * velocity_sigma
-    if squares is not None and squares.size:
-        velocity = max(velocity, float(np.sqrt(squares.mean())))
-    return (*[velocity / depth] * 3, *[velocity] * 3)

@@ -180,7 +180,8 @@ class Rounds:
         travels = np.einsum("mak,mka->ma", current.R_cw, together[:, 3:, 3:])
         with_motions = np.hstack([np.einsum("maa->ma", together[:, :3, :3]), travels])
         of_photos = state.means[current.camera_idx], variances[current.camera_idx], with_motions
-        return Common(*(np.where(shares, each, 0.0) for each in of_photos))
+        means, of_means, together = (np.where(shares, each, 0.0) for each in of_photos)
+        return Common(means, of_means, together, (state.means, variances))
 
     def _follow_path(self, problem: BundleProblem, equations: NormalEquations) -> None:
         """Bend the motions of the next solve as the path of this one, and update its prior standard deviations."""

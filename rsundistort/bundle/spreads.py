@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model import Reconstruction
-from .common_motion import mean_sigmas
 from .layout import Layout
 from .options import BundleOptions
 from .path import PathPrior
@@ -34,6 +33,10 @@ _SETTLED_AT = 2e-5
 _MIN_SPREAD_PX, _SETTLED_PX = 1e-4, 1e-3
 # Prior standard deviations of means have converged if they change by less than this share: they hardly weigh.
 _SETTLED_MEANS = 0.2
+# A velocity in common by what photos have of their own, at first: drones and people on their way travel alike, but for
+# a part of their speed. (Were the mean drawn to zero as a sample of what varies, that of an orbit would be lost, and
+# its rotation with it.)
+_MUCH = 3.0
 # A lens that its model says so badly needs another model.
 _MOST_PX = 1.0
 
@@ -109,12 +112,14 @@ def _spread(
 class Common(NamedTuple):
     """Means of the motions of photos (m, 6), their variances, and their covariances with the motions.
 
-    In the frames of the cameras, radians and world units per frame, as are the motions; 0 where a motion has none.
+    In the frames of the cameras, radians and world units per frame, as are the motions; 0 where a motion has none. And
+    those of the cameras and their variances, (cameras, 6).
     """
 
     values: NDArray[np.float64]
     variances: NDArray[np.float64]
     with_motions: NDArray[np.float64]
+    of_cameras: tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def estimated(
@@ -136,8 +141,7 @@ def estimated(
     if options.velocity_sigma is None and own.shape[1] > 3:
         velocity = _spread(own[:, 3:], own_variances[:, 3:], ones, spreads.velocity) + _MIN_SPREAD * current.baseline
     if common is not None:
-        squares = (common.values**2 + common.variances)[:, 3:]
-        means = mean_sigmas(velocity, _depth(current), squares[squares.any(1)])
+        means = _mean_sigmas(common, velocity, spreads.means, current)
     if options.varying:
         varied = current.variation
         of_varied = variances[:, layout.motion : layout.variation]
@@ -147,6 +151,34 @@ def estimated(
     return _bounded(
         Spreads(phi, velocity, focal, centre, bends, ways, spreads.field, spreads.path, means), options, baseline
     )
+
+
+def _mean_sigmas(
+    common: Common, velocity_sigma: float, sigmas: tuple[float, ...], current: Reconstruction
+) -> tuple[float, ...]:
+    """Standard deviations of the priors on means; `sigmas` are those under which they were found.
+
+    A velocity in common is expected to be a few times what the photos have of their own, or as large as it is found. A
+    rotation in common is none, of a camera that only shakes, or at most one that keeps in view what a camera passes:
+    its travel by the depth. About each axis the prior says as little as the measurements alone (a unit-information
+    prior; Kass and Wasserman, 1995), and less by the odds that these give against none: what they hardly show is
+    halved, what they show stays.
+    """
+    velocity, depth = _MUCH * velocity_sigma, _depth(current)
+    sharing = np.flatnonzero(common.variances.any(1))
+    if not len(sharing):
+        return (*[velocity / depth] * 3, *[velocity] * 3)
+    cameras = np.unique(current.camera_idx[sharing])
+    values, variances = (each[cameras] for each in common.of_cameras)
+    velocity = max(velocity, float(np.sqrt((values**2 + variances)[:, 3:].mean())))
+    aimed, phi = (velocity / depth) ** 2, []
+    for value, variance, sigma in zip(values.T[:3], variances.T[:3], sigmas, strict=False):
+        # by the measurements alone
+        known = np.maximum(1.0 / variance - sigma**-2.0, 1e-3 / aimed)
+        square = (value / (variance * known)) ** 2
+        odds = float(0.5 * (square * known * aimed / (aimed + 1.0 / known)).sum())
+        phi.append(float(np.sqrt(min(aimed, np.exp(min(odds, 100.0)) / known.mean()))))
+    return (*phi, *[velocity] * 3)
 
 
 def _depth(reconstruction: Reconstruction) -> float:
@@ -221,8 +253,9 @@ def settled(before: Spreads, after: Spreads, tolerance: float) -> bool:
         (0.0,) * len(before.path),
         (np.inf,) * len(before.means),
     )
-    if any(abs(new - old) > _SETTLED_MEANS * new for old, new in zip(before.means, after.means, strict=True)):
-        return False
+    for old, new in zip(before.means, after.means, strict=True):
+        if abs(new - old) > _SETTLED_MEANS * new and max(old, new) > _SETTLED_AT:
+            return False
     return all(
         abs(new - old) <= tolerance * new or max(old, new) < least
         for old, new, least in zip(*(np.hstack(astuple(each)) for each in (before, after, none)), strict=True)
@@ -243,7 +276,8 @@ def starting_spreads(options: BundleOptions, layout: Layout, reconstruction: Rec
         () if options.path is None else (_TURN_START, _TRAVEL_START * baseline),
     )
     if has_means(layout, options):
-        start = replace(start, means=mean_sigmas(start.velocity, _depth(reconstruction)))
+        way = _MUCH * start.velocity
+        start = replace(start, means=(*[way / _depth(reconstruction)] * 3, *[way] * 3))
     return _bounded(start, options, baseline)
 
 
