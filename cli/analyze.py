@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 @opt.readout_option
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def command(path: Path, readout: str | None, as_json: bool) -> None:
-    """Check whether the shutter and the shape of the scene can be told apart from these camera poses.
+    """Check whether the shutter and the shape of the scene can be distinguished from these camera poses.
 
     PATH is a solution (solution.json, or the folder of a run), a COLMAP model, or a transforms.json. The degeneracy
     measure is near zero where the poses are a critical motion.

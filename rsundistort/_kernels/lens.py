@@ -6,7 +6,7 @@ import math
 
 from ._jit import kernel
 
-# Newton in the plane and on cubics stops at steps below this.
+# Newton's method in the plane and on cubics stops at steps below this.
 ROW_TOL = 1e-14
 MAX_NEWTON = 30
 

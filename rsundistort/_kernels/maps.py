@@ -43,7 +43,7 @@ def fill_map(model, axis, sign, intr, lens, phi, rays, row0, map_x, map_y):
     vel = np.zeros(3)
     rows, cols = map_x.shape
     for i in range(rows):
-        # the clock of the last two pixels foretells that of the next
+        # the clock of the last two pixels predicts that of the next
         t1 = t2 = math.nan
         for j in range(cols):
             x, y, z = _ray(rays, j, row0 + i)

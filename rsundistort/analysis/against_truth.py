@@ -118,7 +118,7 @@ def _without_lens(
 
 def _check_sizes(photo: NDArray[Any], mask: NDArray[Any], shown: NDArray[np.uint8]) -> None:
     """Refuse a mask or a reference of another size than the photo."""
-    for what, other in (("mask", mask.shape), ("twin", shown.shape)):
+    for what, other in (("mask", mask.shape), ("reference", shown.shape)):
         if other != photo.shape[:2]:
             raise InputError(
                 f"the {what} has the shape {other}, the rectified photo {photo.shape[:2]}; give those of one camera"

@@ -48,7 +48,7 @@ class Advice:
     def sentence(self) -> str:
         """For people."""
         if self.sigma_log_k is None:
-            return f"{self.what}: the meter would read {self.meter:.2f}"
+            return f"{self.what}: the degeneracy measure would be {self.meter:.2f}"
         said = f"{self.what}: the height would be uncertain by +-{100 * self.sigma_log_k:.2g} %"
         return said if self.shift_px is None else f"{said}, the rectified photos by {self.shift_px:.2g} px"
 

@@ -77,7 +77,7 @@ def cumulative_histograms(entries: Sequence[Mapping[str, Any]], methods: Sequenc
 def plan_axes(center_w: NDArray[np.float64], R_cw: NDArray[np.float64]) -> NDArray[np.float64]:
     """Two unit vectors (2, 3): right and up of a drawing that shows a camera path from where it varies least.
 
-    Seen from above rather than from below (a mirrored path would mislead), turned so that the cameras look up the
+    Seen from above rather than from below (a mirrored path would mislead), rotated so that the cameras look up the
     page rather than down.
 
     Parameters

@@ -32,7 +32,7 @@ from .scenes import KnownScene, load_scene
 
 __all__ = ["METHODS", "OneOptions", "check_settings", "experiment_one", "read_trials", "summarize"]
 
-#: Methods: shutter model, and whether the paper's anchor (phi1 of the first photo) is held. The paper's have no prior.
+#: Methods: shutter model, and whether the paper's constraint (phi1 of the first photo) is held. Those of the paper have no prior.
 METHODS: dict[str, tuple[str, bool]] = {
     "wo-rs": ("global", False),
     "rs": ("two-step", False),
@@ -233,7 +233,7 @@ def read_trials(path: Path) -> dict[tuple[str, int, str], dict[str, Any]]:
 
 
 def _cut_torn_line(path: Path) -> None:
-    """Cut off what a crash left of a line: the next one must not join it."""
+    """Cut off what a crash left of a line: the next one must not continue it."""
     if path.is_file():
         whole = path.read_bytes().rfind(b"\n") + 1
         os.truncate(path, whole)
@@ -375,7 +375,7 @@ def _experiment_one(
 def check_settings(path: Path, settings: dict[str, Any], digests: dict[str, str]) -> dict[str, str]:
     """Refuse to mix trials of different settings, or of different scenes of one name, in one folder.
 
-    The scenes that are in it, with what tells them apart.
+    Its scenes, with the parameters that distinguish them.
     """
     known: dict[str, str] = {}
     if path.is_file():

@@ -107,7 +107,7 @@ def experiment_two(
     Raises
     ------
     InputError, ReconstructionError
-        When the names differ, or fewer than three photos are joined in all three reconstructions.
+        When the names differ, or fewer than three photos are registered in all three reconstructions.
     """
     options = options or TwoOptions()
     still, swung, out = Path(still), Path(swung), Path(out)
@@ -178,7 +178,7 @@ def _summary(
 
 
 def _write_csv(path: Path, names: Sequence[str], solutions: Mapping[str, Solution], found: PathComparison) -> None:
-    """A line for each photo; errors are empty where it was not joined in all three reconstructions."""
+    """A line for each photo; errors are empty where it was not registered in all three reconstructions."""
     place = {name: k for k, name in enumerate(found.names)}
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")

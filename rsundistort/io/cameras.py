@@ -170,7 +170,7 @@ def _how_to_fit(camera: Camera, width: int, height: int) -> str:
     if (camera.width, camera.height) == (height, width):
         stored = "portrait" if height > width else "landscape"
         return (
-            f"they are stored in {stored}, turned since they were read out: give a camera with width and height, fx "
+            f"they are stored in {stored}, rotated since they were read out: give a camera with width and height, fx "
             f"and fy, cx and cy exchanged and the readout {other_axis(camera.readout)}"
         )
     factor = Fraction(width, camera.width)

@@ -207,7 +207,7 @@ def _sphere(figure: Figure, source: Source) -> bool:
     axes.set_axis_off()
     axes.view_init(elev=20, azim=-65)
     if meter is not None:
-        figure.suptitle(f"meter {meter.value:.3f}, axes {meter.y_axis_spread_deg:.1f}° apart", fontsize=8)
+        figure.suptitle(f"degeneracy {meter.value:.3f}, axes {meter.y_axis_spread_deg:.1f}° apart", fontsize=8)
     return True
 
 

@@ -85,7 +85,7 @@ def map_photos(matched: MatchedPhotos, progress: Callable[[int], None] | None = 
         found = _with_more(found, _mapped_one_by_one(matched, progress))
     if found is None:
         raise ReconstructionError(
-            f"none of the {len(matched.names)} photos overlap enough to be joined; "
+            f"none of the {len(matched.names)} photos overlap enough to be registered; "
             "use photos that share more of the scene, or check the camera's focal length"
         )
     return found

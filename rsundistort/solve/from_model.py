@@ -355,7 +355,7 @@ def _in_stored_frame(
         )  # fmt: skip
     if not turns:
         return given, "stored" if photos else "not looked at"
-    said = f"turned by the EXIF orientation in {len(turns)} of {rec.num_images} photos"
+    said = f"rotated by the EXIF orientation in {len(turns)} of {rec.num_images} photos"
     turned = turn_reconstruction(rec, turns)
     ids = list(given.camera_ids)
     free = (k for k in range(1, 2 + max(ids) + len(turned.cameras)) if k not in ids)

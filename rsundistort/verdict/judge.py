@@ -357,7 +357,7 @@ def _misplaced(result: BundleResult, unexplained: bool) -> dict[str, str]:
         if sigma > _LOST_DEG
     }
     joined = hanging_together(result.reconstruction)
-    few = f"it shows fewer than {LEAST_MEASUREMENTS} points whose place the others tell"
+    few = f"it shows fewer than {LEAST_MEASUREMENTS} points whose place the others determine"
     return said | {name: few for name, held in zip(names, joined, strict=True) if not held}
 
 
