@@ -349,7 +349,7 @@ def turned_model(scene, orientation_of):
     return model
 
 
-def test_a_model_of_turned_photos_is_turned_back(tmp_path, rng):
+def test_a_model_of_rotated_photos_is_rotated_back(tmp_path, rng):
     scene = make_scene(rng)
     photos = save_photos(tmp_path / "photos")
     for name in NAMES[:3]:

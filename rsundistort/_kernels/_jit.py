@@ -28,8 +28,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 class _Kept(FunctionCache):
     """Compiled kernels in files, where possible: a damaged file, or one that cannot be written, means compiling again.
 
-    Kernels of other sources are compiled again, too. Numba asks only whether a kernel's own file is the same; a kernel holds
-    the code and the constants of those that it calls, too, and these may stand in any file beside it.
+    Kernels of other sources are compiled again, too. Numba asks only whether a kernel's own file is the same; a kernel
+    holds the code and the constants of those that it calls, too, and these may stand in any file beside it.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:

@@ -65,7 +65,7 @@ def _sample(patch, x, y, M, half, out):
 
 @kernel()
 def _normalise(values, weight, total):
-    """Subtract the mean and scale to a weighted length of one, which removes brightness and contrast; the former length."""
+    """Subtract the mean and scale to a weighted length of one, without brightness and contrast; the length before."""
     mean, square = 0.0, 0.0
     for n in range(_SAMPLES):
         mean += weight[n] * values[n]

@@ -163,7 +163,7 @@ def solve_envelope(first, offset, data, B):
 
 @kernel(fastmath=SUMS)
 def _times_band(data, first, offset, g, h, V, out):
-    """Add the product of band h of the inverse (both triangles) and V (4, n) to out (4, n), in the columns after band g."""
+    """Add band h of the inverse (both triangles) times V (4, n) to out (4, n), in the columns after band g."""
     low, width = 4 * g + 4, 4 * h + 4 - first[h]
     at = offset[h] + low - first[h]
     z0, z1, z2, z3 = data[at:], data[at + width :], data[at + 2 * width :], data[at + 3 * width :]

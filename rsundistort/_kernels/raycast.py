@@ -232,7 +232,7 @@ def render_rows(geometry, look, R_cw, center_w, by_column, first_row, xy_norm, s
 
     `xy_norm` (rows, cols, n, 2): ideal normalised coordinates of the n samples of each pixel, `spacing` between them in
     the same units. `R_cw` (lines, times, 3, 3) and `center_w` (lines, times, 3): poses of each sensor line at moments
-    of its exposure, which the samples take one after the other; lines are rows, or columns if by_column. `suns` (n, 3): towards the
+    of its exposure, one for each sample; lines are rows, or columns if by_column. `suns` (n, 3): towards the
     point of the sun's disc that sample k looks at.
     """
     light, light_grid, sky, colours = look[8:]

@@ -13,7 +13,8 @@ from .projection import CHUNK, CONSTANT_MOTION, ROTATION, project
 
 # Largest share of the curvature along a residual that a robust loss removes. Removing all of it would send points of
 # two photos whose rays miss each other far off, and damp the step of everything else until it hardly moves; removing
-# none makes convergence linear. (Steps of a solve of aligned tracks: 125 with 0.99, 88 with 0.5, 49 with 0.3, 50 with none.)
+# none makes convergence linear. (Steps of a solve of aligned tracks: 125 with 0.99, 88 with 0.5, 49 with 0.3, 50 with
+# none.)
 _MOST_SHARE = 0.3
 # Cost of an observation that cannot be projected (behind the camera): its point must not profit from it.
 _INVALID_PX = 100.0

@@ -292,7 +292,7 @@ def border_rows(
             _add_product_to(rhs[f], -e0, -e1, J_camera[k, 0], J_camera[k, 1])
             n, end = track_start[p], track_start[p + 1]
             while n < end:
-                # the shares of one camera's photos in a track are summed before they are multiplied with the photo's own
+                # shares of one camera's photos in a track are summed before they are multiplied with the photo's own
                 camera = camera_of_frame[frame_idx[n]]
                 r0[:] = 0.0
                 r1[:] = 0.0

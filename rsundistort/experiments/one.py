@@ -32,7 +32,7 @@ from .scenes import KnownScene, load_scene
 
 __all__ = ["METHODS", "OneOptions", "check_settings", "experiment_one", "read_trials", "summarize"]
 
-#: Methods: shutter model, and whether the paper's constraint (phi1 of the first photo) is held. Those of the paper have no prior.
+#: Methods: shutter model, and whether the paper's constraint (phi1 of the first photo) is held. They have no prior.
 METHODS: dict[str, tuple[str, bool]] = {
     "wo-rs": ("global", False),
     "rs": ("two-step", False),

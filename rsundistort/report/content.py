@@ -10,7 +10,7 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from ..critical.meter import readout_axes
+from ..critical.degeneracy import readout_axes
 from ..io import output_name
 from ..model import SHUTTER_MODELS, Camera, Solution, SolvedImage
 from ..model.field import field_over_frame

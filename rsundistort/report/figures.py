@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..critical.meter import readout_axes
+from ..critical.degeneracy import readout_axes
 from ..errors import FileError, InputError
 from ..io.aside import written_aside
 from ..io.outputs import only_writer
@@ -18,7 +18,7 @@ from ..model import Solution
 from .content import arrows_of, longer, models, view_frame
 from .diagnostics import Diagnostics
 from .source import Source, read_source
-from .verdict import meter_of
+from .verdict import degeneracy_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -188,7 +188,7 @@ def _mark(
 
 
 def _sphere(figure: Figure, source: Source) -> bool:
-    meter = meter_of(source.solution)
+    degeneracy = degeneracy_of(source.solution)
     axes_w = _readout_axes(source.solution)
     if not len(axes_w):
         return False
@@ -206,8 +206,10 @@ def _sphere(figure: Figure, source: Source) -> bool:
     axes.set_box_aspect((1, 1, 1), zoom=1.45)
     axes.set_axis_off()
     axes.view_init(elev=20, azim=-65)
-    if meter is not None:
-        figure.suptitle(f"degeneracy {meter.value:.3f}, axes {meter.y_axis_spread_deg:.1f}° apart", fontsize=8)
+    if degeneracy is not None:
+        figure.suptitle(
+            f"degeneracy {degeneracy.value:.3f}, axes {degeneracy.y_axis_spread_deg:.1f}° apart", fontsize=8
+        )
     return True
 
 

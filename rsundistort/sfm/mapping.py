@@ -13,8 +13,8 @@ from ..colmap.conventions import quiet_pycolmap
 from ..colmap.lenses import refined_camera
 from ..errors import ReconstructionError
 from ..model import Reconstruction
+from .connected import LEAST_MEASUREMENTS
 from .database import LOOSE, MatchedPhotos, from_pycolmap, pipeline_options, write_photos
-from .joined import LEAST_MEASUREMENTS
 
 __all__ = ["map_photos"]
 
@@ -104,7 +104,7 @@ def _mapped_at_once(matched: MatchedPhotos, limit: int | None) -> Reconstruction
     work.mkdir()
     options = _global_options(matched)
     models = quiet_pycolmap().global_mapping(_mapping_database(matched, work, limit), work, work, options)
-    return _firmly_joined(_largest(models.values()), matched)
+    return _firmly_connected(_largest(models.values()), matched)
 
 
 def _mapped_one_by_one(matched: MatchedPhotos, progress: Callable[[int], None] | None) -> Reconstruction | None:
@@ -121,10 +121,10 @@ def _mapped_one_by_one(matched: MatchedPhotos, progress: Callable[[int], None] |
             matched = _refined(matched, refined)
         matched = replace(matched, calibrated=True)
     attempts = [(_MAPPING_KEYPOINTS, LOOSE), (None, LOOSE), (None, 2.0), (None, 1.0)]
-    return _firmly_joined(_best_model(matched, attempts, progress), matched)
+    return _firmly_connected(_best_model(matched, attempts, progress), matched)
 
 
-def _firmly_joined(model: Any, matched: MatchedPhotos) -> Reconstruction | None:
+def _firmly_connected(model: Any, matched: MatchedPhotos) -> Reconstruction | None:
     """Our reconstruction of a pycolmap model, or of none; photos that hang on by few measurements are left out."""
     if model is None or not model.num_points3D():
         return None

@@ -247,7 +247,7 @@ def _outputs_of(
             "observations": len(given.reconstruction.observations),
             **kept,
         }
-        solved = replace(solved, told={"model": facts_of_model})
+        solved = replace(solved, facts={"model": facts_of_model})
         orientations = {name: fact.orientation or 1 for name, fact in facts.items()}
         times = {} if folder is None else photo_times(folder)
         written = Outputs.of_solved(
@@ -369,8 +369,8 @@ def _photo_cameras(
     """The model's cameras, with the readout directions that were specified or are guessed."""
     rec = given.reconstruction
     labels = [f"camera {key}" for key in given.camera_ids]
-    told = check_readouts(options.readout)
-    unknown = sorted(told.keys() - {"", *labels})
+    specified = check_readouts(options.readout)
+    unknown = sorted(specified.keys() - {"", *labels})
     if unknown:
         raise InputError(f"readout of {unknown[0]!r}: no such camera, there are {', '.join(labels)}")
     of_photo = [labels[k] for k in rec.camera_idx.tolist()]
@@ -378,16 +378,16 @@ def _photo_cameras(
     guessed, notes = guess_readouts([facts.get(name, ExifFacts()) for name in rec.image_names], sizes, of_photo)
     cameras = []
     for label, camera in zip(labels, rec.cameras, strict=True):
-        direction = told.get(label, told.get("", guessed.get(label, camera.readout)))
+        direction = specified.get(label, specified.get("", guessed.get(label, camera.readout)))
         cameras.append(replace(camera, readout=direction))
     return PhotoCameras(
         tuple(cameras),
         tuple(labels),
         rec.camera_idx,
         calibrated=not given.self_calibrated,
-        readout_told=tuple(label in told or "" in told for label in labels),
+        readout_specified=tuple(label in specified or "" in specified for label in labels),
         source=f"{source}, refined" if given.self_calibrated else source,
-        notes=() if told else tuple(notes),
+        notes=() if specified else tuple(notes),
     )
 
 
@@ -413,8 +413,8 @@ def _solve(
     survey = None
     if options.crs is not None or options.control:  # else its frame is the model's
         sizes = [(rec.camera(i).width, rec.camera(i).height) for i in range(rec.num_images)]
-        told = [facts.get(name, ExifFacts()) for name in rec.image_names]
-        survey = survey_of(options.crs, options.control, rec.image_names, told, sizes)
+        exif = [facts.get(name, ExifFacts()) for name in rec.image_names]
+        survey = survey_of(options.crs, options.control, rec.image_names, exif, sizes)
 
     def options_of(each: Reconstruction) -> BundleOptions:
         return replace(options.options_for(cameras), outlier_sigma=_OUTLIER_SIGMA)

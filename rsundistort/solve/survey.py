@@ -233,7 +233,7 @@ class Survey:
             believed = np.array([name not in off for name in residuals])
             length = np.linalg.norm(apart, axis=1)
             value["gps"] = {
-                "sigma_from": list(self.positions.told_by),
+                "sigma_from": list(self.positions.sigma_from),
                 "median_m": float(np.median(length)),
                 "median_axes_m": np.median(np.abs(apart), axis=0).tolist(),
                 "rms_axes_m": np.sqrt(np.mean(apart[believed] ** 2, axis=0)).tolist() if believed.any() else None,
