@@ -5,9 +5,9 @@
 BEFORE is a commit, or the folder of a checkout; the other state is the folder `--after`, this one by default. Both run
 the same commands on the same inputs: `run` and `evaluate` on `sample_scenes/courtyard` (`make demo`), `simulate scene`
 on its recipe with small photos, `simulate warp`, `rectify` with the true motions, `solve` on a model of the true points
-with and without photos, `analyze`, and `run` on the first frames of a rendered clip. Times and versions are left out of
-the comparison. A file that differs is named with its first line that does; exits 1 if there is one, other than the words
-of `report.html` and of what the commands print.
+with and without photos, `analyze`, and `run` on the clip of `sample_scenes/walk`. Times and versions are left out of
+the comparison. A file that differs is named with its first line that does. Exits 1 if there is one, other than the
+words of `report.html` and of what the commands print.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def run(tree: Path, arguments: list[str], stdout: Path) -> int:
         # elsewhere: the folder that Python is started in would be searched first
         done = subprocess.run(
             [sys.executable, "-m", "rsundistort_cli", *arguments],
-            cwd=alias, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, check=False,
+            cwd=alias, env=environment, capture_output=True, text=True, check=False,
         )  # fmt: skip
     if done.returncode not in (0, 3):
         print(json.dumps({"command": arguments, "exit": done.returncode, "stderr": done.stderr[-2000:]}), flush=True)
@@ -133,8 +133,8 @@ def first_difference(before: bytes, after: bytes) -> str:
 def compared(before: Path, after: Path) -> tuple[int, dict[str, str]]:
     """Number of files of two folders, and those that differ."""
     files = [visible(before), visible(after)]
-    different = {name: "only before" for name in files[0].keys() - files[1].keys()}
-    different |= {name: "only after" for name in files[1].keys() - files[0].keys()}
+    different = dict.fromkeys(files[0].keys() - files[1].keys(), "only before")
+    different |= dict.fromkeys(files[1].keys() - files[0].keys(), "only after")
     for name in sorted(files[0].keys() & files[1].keys()):
         contents = plain(files[0][name], before.parent), plain(files[1][name], after.parent)
         if contents[0] != contents[1]:
