@@ -36,7 +36,7 @@ def inputs(folder: Path) -> None:
     """What the commands read: a small recipe, a recipe of a clip, and a model of the true points."""
     recipe = json.loads((SCENE / "recipe.json").read_text())
     camera = recipe["camera"] | {"width": 240, "height": 160, "K": [[200, 0, 121.0], [0, 200, 78.0], [0, 0, 1]]}
-    recipe |= {"camera": camera, "path": recipe["path"][:4], "render": recipe["render"] | {"samples": 4}}
+    recipe |= {"camera": camera, "render": recipe["render"] | {"samples": 4}}
     (folder / "small.json").write_text(json.dumps(recipe))
     tracks, truth = np.load(SCENE / "tracks.npz"), json.loads((SCENE / "ground_truth.json").read_text())
     poses = {image["name"]: image for image in truth["images"]}

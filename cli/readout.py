@@ -18,12 +18,7 @@ if TYPE_CHECKING:
 _measure_options = opt.gathered(
     "given",
     opt.camera_option,
-    click.option(
-        "--readout",
-        type=click.Choice(opt.READOUT_NAMES),
-        metavar="DIRECTION",
-        help=f"Direction of the readout in the stored pixels: {', '.join(opt.READOUT_NAMES)}.",
-    ),
+    opt.readout_option,
     click.option(
         "--readout-ms",
         type=click.FloatRange(min=0, min_open=True),

@@ -46,7 +46,6 @@ solve_options = opt.gathered(
         "shutter_model",
         type=click.Choice(("auto", "constant-motion", "rotation", "linearized", "two-step", "global")),
         default="auto",
-        show_default=True,
         help="Model of the shutter. auto chooses the model that best predicts measurements held out from its fit.",
     ),
     click.option(
@@ -109,7 +108,6 @@ solve_options = opt.gathered(
         "--remedy",
         type=click.Choice(("auto", "prior", "none")),
         default="auto",
-        show_default=True,
         help="Remedy if all cameras are level, which is a critical motion. auto looks for a photo that did not move; "
         "prior assumes that the motions are zero in the mean; none does neither.",
     ),
@@ -118,7 +116,6 @@ solve_options = opt.gathered(
         "--sparse-format",
         type=click.Choice(("bin", "txt")),
         default="bin",
-        show_default=True,
         help="Format of the COLMAP model: binary or text.",
     ),
     click.option(

@@ -7,11 +7,12 @@ from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from struct import Struct
+from typing import Any
 
 from ..errors import FileError, FormatError
-from .conventions import import_pycolmap
+from .conventions import import_pycolmap, quiet_pycolmap
 
-__all__ = ["check_colmap_cameras", "check_colmap_files"]
+__all__ = ["check_colmap_cameras", "check_colmap_files", "pycolmap_model"]
 
 # models of large scenes have gigabytes of points
 Bytes = mmap.mmap
@@ -97,6 +98,21 @@ def check_colmap_files(folder: Path) -> None:
         path = folder / name
         if path.is_file():
             _check(path, after)
+
+
+def pycolmap_model(folder: Path) -> Any:
+    """The `pycolmap.Reconstruction` of a folder, whose files are checked first.
+
+    Raises
+    ------
+    FileError, FormatError
+        It cannot be read.
+    """
+    check_colmap_files(folder)
+    try:
+        return quiet_pycolmap().Reconstruction(folder)
+    except Exception as error:  # pycolmap raises what its C++ raised
+        raise FileError(f"{folder} is no COLMAP model: {' '.join(str(error).split())}") from error
 
 
 def check_colmap_cameras(path: Path) -> None:

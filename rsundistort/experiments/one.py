@@ -26,8 +26,9 @@ from ..io.outputs import only_writer
 from ..io.record import Record
 from ..io.rules import Between, check
 from ..model import Observations, Reconstruction, RowMotion
+from ..report.figures import need_matplotlib
 from ..synthetic import project_rows
-from .figures import cumulative_histograms, need_matplotlib
+from .figures import cumulative_histograms
 from .scenes import KnownScene, load_scene
 
 __all__ = ["METHODS", "OneOptions", "check_settings", "experiment_one", "read_trials", "summarize"]

@@ -18,10 +18,11 @@ from ..input.photo_cameras import camera_file_of
 from ..io import list_photos, output_folder
 from ..io.record import Record
 from ..model import Solution, check_shutter_model
+from ..report.figures import need_matplotlib
 from ..solve import RunOptions, SolveOptions, run
 from ..solve.run_outputs import files_of_run
 from ..versions import versions
-from .figures import camera_paths, need_matplotlib
+from .figures import camera_paths
 from .paths import PathComparison, compare_paths
 
 __all__ = ["TwoOptions", "experiment_two"]

@@ -23,7 +23,7 @@ from .verdict import degeneracy_of
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["write_figures"]
+__all__ = ["need_matplotlib", "write_figures"]
 
 _OURS, _GLOBAL, _GREY = "#0f7f86", "#c46b1d", "#9a9a9a"
 # Photos of which the displacement field is drawn: those that the shutter moved most.
@@ -61,11 +61,9 @@ def write_figures(out: Path | str, figures: Path | str) -> list[Path]:
     FileError, FormatError
         When there is no solution, or the figures cannot be written.
     """
-    try:
-        import matplotlib as mpl
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise InputError('figures need matplotlib; install it: pip install "rsundistort[figures]"') from error
+    figure_of = need_matplotlib()
+    import matplotlib as mpl
+
     source, folder = read_source(Path(out)), Path(figures)
     drawings: dict[str, Callable[[Figure, Source], bool]] = {
         "models": _models,
@@ -78,12 +76,22 @@ def write_figures(out: Path | str, figures: Path | str) -> list[Path]:
     with only_writer(folder), mpl.rc_context(_STYLE):
         record.check(f"{name}.{ending}" for name in drawings for ending in ("png", "pdf"))
         for name, draw in drawings.items():
-            figure = Figure(figsize=(3.4, 2.6))
+            figure = figure_of(figsize=(3.4, 2.6))
             if draw(figure, source):
                 written += _save(figure, folder, name, record)
     if not written:
         raise InputError(f"{out} holds no registered photo: there is nothing to draw")
     return written
+
+
+def need_matplotlib() -> Any:
+    """The class of figures; an error for people where matplotlib is missing."""
+    try:
+        # not pyplot: it would choose a window system, and a library must not change what its user chose
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise InputError('figures need matplotlib; install it: pip install "rsundistort[figures]"') from error
+    return Figure
 
 
 def _save(figure: Figure, folder: Path, name: str, record: Record) -> list[Path]:

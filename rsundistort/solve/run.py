@@ -167,7 +167,7 @@ def _check_anchors(options: SolveOptions, names: Sequence[str], photos: Path) ->
     ends = (end[0] for each in options.lengths for end in (each.start, each.end))
     for name in (*options.still, *options.known, *ends):
         if name not in names:
-            raise InputError(f"anchor {name!r} is not among the photos of {photos}")
+            raise InputError(f"constraint on {name!r}, which is not among the photos of {photos}")
 
 
 def _solve(
