@@ -231,8 +231,8 @@ PHOTO_OPTIONS: tuple[Decorator, ...] = (
         metavar="keep|0..1",
         callback=view_alpha,
         help="View of the rectified photos. keep: K and size of the raw photos; 0: no photo of a camera has an empty "
-        "pixel; 1: every pixel of all its photos is kept; numbers between are views between these. By default keep, or "
-        "the view of the solution.",
+        "pixel; 1: every pixel of all its photos is kept; numbers between are views between these. The default is "
+        "keep, or the view of the solution.",
     ),
     click.option(
         "--scale",

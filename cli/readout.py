@@ -30,7 +30,7 @@ _measure_options = opt.gathered(
         type=click.Path(exists=True, dir_okay=False, path_type=Path),
         metavar="FILE",
         help="Log of a gyroscope, as for `run`. Its axes and its clock offset are estimated. By default the log in the "
-        "video.",
+        "video is used.",
     ),
     opt.seed_option,
     opt.jobs_option,

@@ -57,7 +57,8 @@ _measure_options = opt.gathered(
         "--photo-times",
         type=click.Path(exists=True, dir_okay=False, path_type=Path),
         metavar="CSV",
-        help="Times at which the photos were taken, for --gyro: name, time_s. By default frames.csv among the photos.",
+        help="Times at which the photos were taken, for --gyro: name, time_s. By default they are read from "
+        "frames.csv among the photos.",
     ),
     click.option(
         "--max-features",

@@ -59,7 +59,7 @@ solve_options = opt.gathered(
         "--camera-sigma",
         metavar="NAME=SIGMA,...",
         help="Standard deviations of the given intrinsics: of f (or fx, fy), cx and cy in pixels, and of k1, k2, k3, "
-        "p1 and p2. By default the key sigma of camera.json, else the usual error of a calibration.",
+        "p1 and p2. By default they are those of the key sigma of camera.json, else the usual errors of a calibration.",
     ),
     click.option(
         "--still",
@@ -87,8 +87,8 @@ solve_options = opt.gathered(
         "--crs",
         metavar="CRS",
         help="Coordinate system of poses and points. local: metres east, north and up, by the GPS of the photos; "
-        "EPSG:...: projected coordinates in metres; none: an arbitrary frame. By default local if the GPS of three "
-        "photos fits; solve keeps the frame of the model.",
+        "EPSG:...: projected coordinates in metres; none: an arbitrary frame. The default is local if the GPS of "
+        "three photos fits; solve keeps the frame of the model.",
     ),
     click.option(
         "--gcp",

@@ -363,7 +363,7 @@ def test_a_model_of_rotated_photos_is_rotated_back(tmp_path, rng):
     solution = rs.solve(model, tmp_path / "out", OPTIONS, images=photos)
     # the shutter runs over the rows of the sensor, whichever way people hold the camera
     assert np.abs(phi_errors(solution, scene)).max() < 2.5e-3
-    assert "turned" in solution.options["model"]["frame"]
+    assert "rotated" in solution.options["model"]["frame"]
     assert "3 of 6" in solution.options["model"]["frame"]
 
 

@@ -133,7 +133,7 @@ def _image_errors(
     folders: Mapping[str, Path],
     log: StageLog,
 ) -> tuple[PsnrSummary | None, PsnrSummary | None]:
-    """Of the rectified photos against their references, and of the photos before."""
+    """Signal-to-noise ratios of the rectified photos against their references, and of the photos before."""
     twins, raw = folders["twins"], folders["raw"]
     masks = mask_names([image.name for image in solution.images])
     raw_as = solution.options.get("raw_as", "tif")

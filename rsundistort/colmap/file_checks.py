@@ -33,7 +33,7 @@ def _take(data: Bytes, at: int, kind: Struct) -> int:
 
 @lru_cache
 def _num_parameters(model: int) -> int:
-    """Of a camera of COLMAP's model of this number; 0 of one that it does not know, and then says so itself."""
+    """Number of parameters of COLMAP's camera model of this number; 0 for one that COLMAP refuses itself."""
     pycolmap = import_pycolmap()
 
     try:
@@ -134,7 +134,7 @@ def _check(path: Path, after: Callable[[Bytes, int], int]) -> None:
 
 
 def _walk(data: Bytes, after: Callable[[Bytes, int], int]) -> None:
-    """From entry to entry, as many as the file counts."""
+    """Go from entry to entry, as many as the file counts."""
     count, at = _take(data, 0, _COUNT), _COUNT.size
     for _ in range(count):
         if at >= len(data):

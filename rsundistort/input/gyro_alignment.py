@@ -351,7 +351,7 @@ def _ways(coarse: _Coarse, offset_s: float, seen: _Array, *, mirrored: bool) -> 
 
 
 def _letters(way: _Array) -> str:
-    """As `parse_axes` reads it."""
+    """The axes in the form that `parse_axes` reads."""
     columns = np.argmax(np.abs(way), axis=1)
     return "".join("XYZ"[k] if way[row, k] > 0 else "xyz"[k] for row, k in enumerate(columns))
 
@@ -451,7 +451,7 @@ def _exp(vector: _Array) -> _Array:
 
 
 def _rotation_vector(matrix: _Array) -> _Array:
-    """Of the rotation between two matrices, which may both be mirror images."""
+    """The rotation vector between two matrices, which may both be mirror images."""
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_matrix(matrix).as_rotvec(), np.float64)

@@ -141,7 +141,7 @@ def check_crs(crs: str | None) -> str | None:
 
 
 def _transformer(crs: str) -> Any:
-    """From longitude and latitude of WGS 84 to a projection."""
+    """The transformation from longitude and latitude of WGS 84 to a projection."""
     try:
         import pyproj
     except ImportError:
@@ -172,7 +172,7 @@ def _projected(crs: str, geodetic: Array) -> Array:
 
 
 def _convergence(crs: str, place: Array) -> float:
-    """By how much a projection rotates east and north at a place (3,), which is refused where it stretches them."""
+    """The rotation of east and north by a projection at a place (3,), which is refused where it stretches them."""
     around = place + _STEP_DEG * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
     there, true = _projected(crs, around)[:, :2], enu_from_geodetic(around, place)[:, :2]
     jacobian = np.linalg.solve(true[::2] - true[1::2], there[::2] - there[1::2]).T

@@ -206,7 +206,7 @@ def _level(degeneracy: CriticalMotion) -> str:
 
 
 def _sentence(text: str) -> str:
-    """With a capital and a full stop; names of photos keep their letters."""
+    """The text with a capital and a full stop; names of photos keep their letters."""
     text = text.strip()
     if text.split(" ")[0] in ("the", "no", "with"):
         text = text[0].upper() + text[1:]

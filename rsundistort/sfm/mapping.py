@@ -185,7 +185,7 @@ def _best_model(
 
 
 def _global_options(matched: MatchedPhotos) -> Any:
-    """Of the global mapper; seeds and threads as in `pipeline_options`."""
+    """Options of the global mapper; seeds and threads are those of `pipeline_options`."""
     options = quiet_pycolmap().GlobalPipelineOptions()
     mapper = options.mapper
     options.num_threads = mapper.num_threads = 1

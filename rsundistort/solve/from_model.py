@@ -179,7 +179,7 @@ class _Job:
 
 
 def _solve_files(job: _Job, overwrite: bool, resume: bool, progress: ProgressCallback | None) -> Solution:
-    """From files to files."""
+    """Solve a model in files, and write files."""
     model, out = job.model, job.out
     if job.database is not None and model.is_file():
         raise InputError(f"{model} is no COLMAP model, and --database is COLMAP's; leave it out")
@@ -259,7 +259,7 @@ def _solve_in_memory(
     database: Path | str | None,
     progress: ProgressCallback | None,
 ) -> tuple[pycolmap.Reconstruction, Solution]:
-    """From a `pycolmap.Reconstruction` to another one."""
+    """Solve a `pycolmap.Reconstruction`, and return another one."""
     log = StageLog(progress)
     given = colmap_model_of(reconstruction)
     with kept_log_level():

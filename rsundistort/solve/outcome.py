@@ -85,7 +85,7 @@ class Solved:
 
     @property
     def shared(self) -> Reconstruction:
-        """With poses, motions and points, and the cameras that photos share."""
+        """The reconstruction with the cameras that photos share."""
         return self.result.reconstruction
 
     @property
@@ -95,7 +95,7 @@ class Solved:
 
     @property
     def camera_ids(self) -> list[int]:
-        """Of the cameras of `reconstruction`, in all outputs."""
+        """Ids of the cameras of `reconstruction`, in all outputs."""
         own = self.shared.varies
         return list((not own and self.shared_ids) or range(1, 1 + len(self.reconstruction.cameras)))
 

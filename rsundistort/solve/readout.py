@@ -54,7 +54,7 @@ class MeasuredReadout:
         return not self.problem
 
     def to_json(self) -> dict[str, Any]:
-        """As plain values."""
+        """The result as plain values."""
         return {"measured": self.measured, "problem": self.problem, **self.evidence}
 
 

@@ -202,7 +202,7 @@ class Survey:
         }
 
     def _residuals(self, rec: Reconstruction) -> dict[str, tuple[Array, float]]:
-        """By photo: centre less its place, and root mean square of that in standard deviations."""
+        """Centre less place of each photo, and the root mean square of that in standard deviations."""
         centers, places, sigma = _of_photos(rec, self.places)
         names = [name for name in rec.image_names if name in self.places]
         deviations = np.sqrt((((centers - places) / sigma) ** 2).mean(1))
