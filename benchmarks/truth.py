@@ -90,7 +90,7 @@ def scene_references(scene: Path, truth: Solution) -> None:
         if image.motion.velocity.any():
             moving.append(image.name)
     show(
-        f"{scene.name}, true rotation against the twins",
+        f"{scene.name}, true rotation against the references",
         psnr_db=median_and_worst(after),
         psnr_before_db=median_and_worst(before),
         translating_photos=f"{len(moving)}/{len(truth.images)}",
@@ -110,7 +110,7 @@ def rotating_references(scene: Path, truth: Solution, photos: int = 3) -> None:
         reference = render_view(recipe.scene, camera, view.at_once(), **recipe.render_options)
         after.append(against_reference(raw, reference, camera, motion))
     show(
-        f"{scene.name} rendered without its translation, true rotation against the twins",
+        f"{scene.name} rendered without its translation, true rotation against the references",
         psnr_db=median_and_worst(after),
         photos=f"the {len(after)} that the shutter bends most, before JPEG",
         target=">= 38 dB",
@@ -136,7 +136,7 @@ def clip_references(scene: Path, truth: Solution) -> None:
             before.append(psnr(raw, reference, mask))
             coded.append(psnr(raw, render_view(recipe.scene, camera, view, **recipe.render_options)))
     show(
-        f"{scene.name}, true motion and depth against the twins",
+        f"{scene.name}, true motion and depth against the references",
         psnr_db=median_and_worst(after),
         psnr_before_db=median_and_worst(before),
         coding_alone_db=median_and_worst(coded),

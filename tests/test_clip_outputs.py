@@ -318,7 +318,7 @@ def test_the_path_of_rotated_frames_is_that_of_a_rotated_camera(tmp_path):
 # ---------------------------------------------------------------- the readout time
 
 
-TOLD = {
+STATED = {
     "seconds": 0.0205, "sigma": 0.0003, "source": "the video", "of_frame": 0.615, "frames": 90,
     "halves": [{"seconds": 0.0206, "sigma": 0.0005}, {"seconds": 0.0204, "sigma": 0.0005}],
     "stabilisation": {"verdict": "none", "reason": "not stabilised"},
@@ -326,11 +326,11 @@ TOLD = {
 
 
 def test_the_readout_time_is_reported_with_its_evidence():
-    facts = dict(readout_facts(TOLD))
+    facts = dict(readout_facts(STATED))
     assert facts["readout time"] == "20.5 +- 0.3 ms (0.61 of the frame), measured from the video"
     assert facts["its halves say"] == "20.6 +- 0.5 ms and 20.4 +- 0.5 ms"
     gyro = {"axes": "yxz", "offset_s": -0.0177, "offset_sigma_s": 0.0002, "correlation": 0.9991, "rotation_ratio": 1.0}
-    facts = dict(readout_facts({**TOLD, "source": "what was known before", "gyroscope": gyro, "halves": []}))
+    facts = dict(readout_facts({**STATED, "source": "what was known before", "gyroscope": gyro, "halves": []}))
     assert facts["readout time"].endswith("(0.61 of the frame), what was known before")
     assert facts["gyroscope"] == "axes yxz, offset -17.7 +- 0.2 ms, correlation 0.999"
     assert "its halves say" not in facts
@@ -352,7 +352,7 @@ def test_the_readout_time_is_reported_with_its_evidence():
     ],
 )
 def test_readout_says_whether_the_video_tells(tmp_path, monkeypatch, changed, says):
-    stated = {**TOLD, **changed}
+    stated = {**STATED, **changed}
     found = MeasuredReadout(stated["seconds"], stated["sigma"], stated["of_frame"], problem_of(stated), stated)
     assert found.measured is (not says)
     monkeypatch.setattr(sys.modules["rsundistort.solve"], "measure_readout", lambda *_, **__: found)

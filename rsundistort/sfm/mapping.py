@@ -23,7 +23,7 @@ __all__ = ["map_photos"]
 # 2.0 / 4.4).
 # It takes others than incremental mapping does where photos hang together weakly: 13 instead of 8 of a drone's 14, 29
 # instead of 27 in lund; so the other way is tried only where it leaves out more than a quarter.
-_PLACING_KEYPOINTS, _ENOUGH_JOINED = 2048, 0.75
+_PLACING_KEYPOINTS, _ENOUGH_REGISTERED = 2048, 0.75
 
 # Mapping one after the other only has to place the photos: it gets this many of the largest keypoints of each. All of
 # them come back when the tracks are rebuilt. (herz-jesus-8: 16384 keypoints map in 4.7 s, 4096
@@ -81,7 +81,7 @@ def map_photos(matched: MatchedPhotos, progress: Callable[[int], None] | None = 
         found = _with_more(found, _mapped_at_once(matched, limit))
         if found is not None and found.num_images == total:
             return found
-    if found is None or found.num_images < _ENOUGH_JOINED * total:
+    if found is None or found.num_images < _ENOUGH_REGISTERED * total:
         found = _with_more(found, _mapped_one_by_one(matched, progress))
     if found is None:
         raise ReconstructionError(

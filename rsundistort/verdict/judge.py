@@ -356,9 +356,9 @@ def _misplaced(result: BundleResult, unexplained: bool) -> dict[str, str]:
         for name, sigma in zip(names, sigma_deg, strict=True)
         if sigma > _LOST_DEG
     }
-    joined = connected_photos(result.reconstruction)
+    connected = connected_photos(result.reconstruction)
     few = f"it shows fewer than {LEAST_MEASUREMENTS} points whose place the others determine"
-    return said | {name: few for name, held in zip(names, joined, strict=True) if not held}
+    return said | {name: few for name, held in zip(names, connected, strict=True) if not held}
 
 
 def _of_photos(rec: Reconstruction, doubts: Mapping[str, list[str]], motions: PhotoMotions) -> list[str]:
