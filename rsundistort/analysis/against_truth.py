@@ -82,7 +82,7 @@ def evaluate(
     chosen = {k: Path(given) if given is not None else default for k, (given, default) in folders.items()}
     for key, (given, _) in folders.items():
         if given is not None and not chosen[key].is_dir():
-            raise FileError(f"{chosen[key]} is no folder; give the folder of the {key} photos")
+            raise FileError(f"{chosen[key]} is no folder; --{key} takes a folder of photos")
     if chosen["twins"].is_dir():
         after, before = _image_errors(out, solution, turns, true_solution, chosen, StageLog(progress))
     return Evaluation(
