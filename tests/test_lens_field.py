@@ -337,7 +337,7 @@ def test_adjustments_that_do_not_ask_keep_a_given_field(rng):
 
 
 @pytest.mark.parametrize(("pattern", "kept"), [(waves, True), (nothing, False)])
-def test_a_field_is_kept_where_it_predicts_measurements(pattern, kept, rng):
+def test_a_field_is_kept_where_it_foretells_measurements(pattern, kept, rng):
     rec = scene_with_field(rng, pattern, "global")
     options = replace(options_of(rec), residual_field=False)
     choice = choose_model(rec, ["global"], options, sigma_px=0.1)
