@@ -130,7 +130,7 @@ class CameraPath:
         return turn, way
 
     def _towards(self, moment: int, other: int, offset: Array) -> tuple[Array, Array]:
-        """The state as `near` gives it, from one neighbour."""
+        """As `near`, on the side of one neighbour."""
         dt = self.time_s[other] - self.time_s[moment]
         xi = Rotation.from_matrix(self.R_cw[other] @ self.R_cw[moment].T).as_rotvec()
         J = inverse_left_jacobians(xi)

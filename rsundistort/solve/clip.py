@@ -42,7 +42,7 @@ _LEAST_MEASUREMENTS = 15
 _LEAST_HALF = 4
 # Rotations explain the frames up to this error of the flow in pixels, and this share of outliers.
 _FLOW_PX, _OUTLIERS = 0.25, 0.2
-# Number of solves that estimate the prior standard deviations of a path: with hundreds of frames few are enough.
+# Solves that estimate the prior standard deviations of a path: with hundreds of frames few are enough.
 _SPREADS = 4
 # Readout time that counts as none, as a share of the time between frames.
 _NO_READOUT = 1e-6
