@@ -135,9 +135,9 @@ def limits(photos: Path, warped: Path) -> None:
         for image in truth.registered:
             assert image.motion is not None
             raw = cv2.imread(str(warped / "photos" / image.name), cv2.IMREAD_UNCHANGED)
-            twin = cv2.imread(str(photos / image.name), cv2.IMREAD_UNCHANGED)
+            reference = cv2.imread(str(photos / image.name), cv2.IMREAD_UNCHANGED)
             rectified, mask = rectify(raw, truth.cameras["1"], RowMotion(image.motion.phi + error))
-            values.append(psnr(rectified, np.asarray(twin), mask))
+            values.append(psnr(rectified, np.asarray(reference), mask))
         return float(np.median(values))
 
     show(

@@ -49,7 +49,7 @@ from rsundistort import (
     run,
 )
 from rsundistort.critical import heal, shape_cost, with_remedy
-from rsundistort.critical.meter import readout_axes
+from rsundistort.critical.degeneracy import readout_axes
 from rsundistort.evaluation import psnr
 from rsundistort.solve import OutputOptions
 from rsundistort.synthetic import project_rows
@@ -57,7 +57,7 @@ from rsundistort.synthetic import project_rows
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 from critical_scenes import named_scene  # noqa: E402
-from numpy_twin import project  # noqa: E402  (the paper's model, in plain NumPy)
+from numpy_reference import project  # noqa: E402  (the paper's model, in plain NumPy)
 
 NOISE_PX = 0.5
 SIGMA_RAD = 0.05
@@ -169,7 +169,7 @@ def trial_still(trial: int) -> dict[str, Any]:
     ):
         result, done = solved(truth, np.random.default_rng([6, trial]), model, remedy)
         error = log_vertical_scale(result.reconstruction, truth)
-        out[name] = {"error": error, "sigma": done.after.sigma_log_k, "meter": done.after.meter.value}
+        out[name] = {"error": error, "sigma": done.after.sigma_log_k, "meter": done.after.degeneracy.value}
         if name == "auto":
             picked = [truth.image_names.index(anchor) for anchor in done.anchors]
             out["picked"] = bool(picked) and moved[picked[0]] < 1e-3
@@ -350,14 +350,14 @@ def show_outsider(_pool: ProcessPoolExecutor, _trials: int) -> None:
             costs.append(done.before)
             before.append(nw_rsba.errors(result.reconstruction, arrays, k))
             after.append(nw_rsba.errors(healed.reconstruction, arrays, k))
-        meters = [cost.meter.value for cost in costs]
+        values = [cost.degeneracy.value for cost in costs]
         sigmas = [cost.sigma_log_k for cost in costs]
         print(
             json.dumps(
                 {
                     "name": f"nw-rsba {name}",
                     "flagged": f"{sum(cost.is_flagged for cost in costs)}/{len(costs)}",
-                    "meter": [round(min(meters), 3), round(max(meters), 3)],
+                    "meter": [round(min(values), 3), round(max(values), 3)],
                     "sigma_percent": [percent(min(sigmas)), percent(max(sigmas))],
                     "points_rotation_centres": {
                         "none": np.median(before, axis=0).round(4).tolist(),

@@ -52,7 +52,7 @@ def show(name: str, **figures: Any) -> None:
     print(json.dumps({"name": name, **figures}), flush=True)
 
 
-def against_twins(scene: Path, folders: dict[str, Path]) -> dict[str, list[float]]:
+def against_references(scene: Path, folders: dict[str, Path]) -> dict[str, list[float]]:
     """PSNR in dB of each photo of each folder of outputs, over what all of them show."""
     truth = read_solution(scene / "ground_truth.json")
     found: dict[str, list[float]] = {name: [] for name in folders}
@@ -112,7 +112,7 @@ def estimated(scene: Path, work: Path) -> None:
             rectify_folder(scene / "photos", out / "solution.json", folders[depth], depth=depth)
     else:
         folders["infinity"] = out
-    figures = against_twins(scene, folders)
+    figures = against_references(scene, folders)
     used = [image.depth for image in solution.registered if image.depth]
     show(
         f"{scene.name}, estimated motion and depth",
@@ -132,7 +132,7 @@ def forced(scene: Path, work: Path) -> None:
     options = RunOptions(solve=SolveOptions(shutter_model="constant-motion"))
     solution = run(scene / "photos", folders["auto"], options)
     rectify_folder(scene / "photos", folders["auto"] / "solution.json", folders["infinity"], depth="infinity")
-    figures = against_twins(scene, folders)
+    figures = against_references(scene, folders)
     used = [image.depth for image in solution.registered if image.depth]
     show(
         f"{scene.name}, constant-motion forced",

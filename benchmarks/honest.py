@@ -34,7 +34,7 @@ from unittest import mock
 
 import numpy as np
 from measures import (
-    against_twins,
+    against_references,
     fountain_truth,
     library_sigmas,
     log_k_error,
@@ -228,15 +228,17 @@ def brief(found: Evaluation) -> dict[str, Any]:
 
 def suppressed(bench: Bench) -> None:
     """What is found of a shutter that is there, by how strong it is and how well the camera is known."""
-    given, twins = np.nan, bench.photos / HERZ
+    given, references = np.nan, bench.photos / HERZ
     for sigma, which in ((sigma, which) for sigma in (0.003, 0.01, 0.02, 0.05) for which in CAMERAS):
         name, ran, found = f"suppressed: by {sigma}, {which}", list[Ran](), list[list[float]]()
         with bench.case(name):
             for seed in bench.numbers(2):
                 warp = bench.warped(sigma, seed)
                 each = bench.run(warp / "photos", **bench.camera(which, warp / "camera.json"))
-                figures = brief(rs.evaluate(each.out, warp / "ground_truth.json", twins=twins))
-                turned = against_twins(each.out, each.solution, rs.read_solution(warp / "ground_truth.json"), twins)
+                figures = brief(rs.evaluate(each.out, warp / "ground_truth.json", twins=references))
+                turned = against_references(
+                    each.out, each.solution, rs.read_solution(warp / "ground_truth.json"), references
+                )
                 show(f"{name}, seed {seed}", **each.facts, **figures, turned=turned, **each.evidence)
                 ran.append(each)
                 found.append([np.mean(figures["phi_mrad_per_frame"]), figures["psnr_db"]["median"], *turned.values()])

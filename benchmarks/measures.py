@@ -28,7 +28,7 @@ from rsundistort.bundle import BundleResult, Posterior, gauge_directions
 from rsundistort.bundle.triangulate import _world_rays
 from rsundistort.critical import Remedy
 from rsundistort.critical.common import row_phi
-from rsundistort.critical.meter import readout_axes
+from rsundistort.critical.degeneracy import readout_axes
 from rsundistort.evaluation import align_points, motion_errors, psnr
 from rsundistort.io import read_photo
 from rsundistort.io.cameras import camera_from_json
@@ -156,7 +156,7 @@ def log_k_error(rec: Reconstruction, truth: Solution) -> float:
     return float(1.5 * np.log(along) - 0.5 * np.log(np.abs(np.linalg.det(B))))
 
 
-def against_twins(out: Path, solution: Solution, truth: Solution, twins: Path) -> dict[str, float]:
+def against_references(out: Path, solution: Solution, truth: Solution, references: Path) -> dict[str, float]:
     """Rectified photos against references rotated as the solution's pose has them, for a lens that was solved for.
 
     A principal point that is off is a pose that is rotated, and no error of the photo: so each reference is seen by the
@@ -180,7 +180,7 @@ def against_twins(out: Path, solution: Solution, truth: Solution, twins: Path) -
         apart = cv2.perspectiveTransform(xy[None], turn)[0] - (true_rays @ taken_by.K.T)[:, :2]
         left.append(float(np.sqrt((apart[valid] ** 2).sum(1).mean())))
         mask = read_photo(out / "masks" / f"{Path(image.name).stem}.png").pixels
-        pair = read_photo(twins / image.name).pixels, np.full(mask.shape, 255, np.uint8)
+        pair = read_photo(references / image.name).pixels, np.full(mask.shape, 255, np.uint8)
         how = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
         reference, seen = (cv2.warpPerspective(each, turn, mask.shape[::-1], flags=how) for each in pair)
         decibels.append(

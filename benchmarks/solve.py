@@ -120,7 +120,7 @@ def show(name: str, **figures: Any) -> None:
     print(json.dumps({"name": name, **figures}), flush=True)
 
 
-def told(code: str, *arguments: object) -> dict[str, Any]:
+def printed(code: str, *arguments: object) -> dict[str, Any]:
     """What a program in a process of its own prints last."""
     command = [sys.executable, "-c", code, *map(str, arguments)]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
@@ -130,13 +130,13 @@ def told(code: str, *arguments: object) -> dict[str, Any]:
 def real_photos(photos: Path, work: Path) -> None:
     """Models of warped photos."""
     K = json.dumps(json.loads((photos / "camera.json").read_text())["K"])
-    truth = told(MODEL, photos, work / "unwarped", K, 1)
+    truth = printed(MODEL, photos, work / "unwarped", K, 1)
     rs.solve(work / "unwarped" / "model", work / "truth", rs.SolveOptions(shutter_model="global"))
     reference = rs.read_solution(work / "truth" / "solution.json")
     simulate_warp(photos, work / "warp", WarpOptions(sigma_rad=0.05, seed=0))
     warped = work / "warp" / "photos"
     for kind, loose in (("default", 1), ("loosened", 4)):
-        given = told(MODEL, warped, work / kind, K, loose)
+        given = printed(MODEL, warped, work / kind, K, loose)
         before = rs.read_solution(rs_of(work / kind / "model", work / f"{kind}-global"))
         for database in (None, work / kind / "database.db"):
             out = work / f"{kind}-{'alone' if database is None else 'database'}"
@@ -155,8 +155,8 @@ def real_photos(photos: Path, work: Path) -> None:
                 target="<= 0.15 deg" if database is None else "<= 0.1 deg, >= 0.95",
                 ok=bool(errors.mean() <= (0.15 if database is None else 0.1) and (database is None or share >= 0.95)),
             )
-        rebuilt = told(MODEL, out / "images", work / f"{kind}-rebuilt", K, 1)
-        refit = told(REFIT, work / f"{kind}-rebuilt" / "database.db", out / "images", out / "sparse")
+        rebuilt = printed(MODEL, out / "images", work / f"{kind}-rebuilt", K, 1)
+        refit = printed(REFIT, work / f"{kind}-rebuilt" / "database.db", out / "images", out / "sparse")
         ratio = rebuilt["error_px"] / truth["error_px"]
         show(
             f"pycolmap on OUT of {kind} thresholds",
@@ -187,7 +187,7 @@ def large_model(observations: int, work: Path) -> None:
         rec.cameras, rec.image_names, rec.camera_idx, rec.R_cw, rec.center_w, rec.points_w, rec.observations
     )
     write_colmap_model(folder, as_global, list(rec.cameras), list(rec.image_names))
-    ours, peer = told(OURS, folder, work / "street-out"), told(PEER, folder)
+    ours, peer = printed(OURS, folder, work / "street-out"), printed(PEER, folder)
     show(
         f"solve, {rec.num_images} photos, {len(rec.observations)} measurements",
         ours_s=round(ours["s"], 1),

@@ -45,7 +45,7 @@ def median_and_worst(values: list[float]) -> dict[str, float]:
     return {"median": round(float(np.median(values)), 2), "worst": round(float(np.min(values)), 2)}
 
 
-def against_twin(raw: np.ndarray, reference: np.ndarray, camera: Camera, motion: RowMotion) -> float:
+def against_reference(raw: np.ndarray, reference: np.ndarray, camera: Camera, motion: RowMotion) -> float:
     """PSNR in dB, over valid pixels, of a photo freed of shutter and lens against its reference freed of the lens."""
     rectified, mask = rectify(raw, camera, motion)
     if not camera.is_pinhole:
@@ -66,8 +66,8 @@ def warped_photos(photos: Path, work: Path, seeds: int) -> None:
             original = read_photo(photos / image.name).pixels
             raw = read_photo(out / "photos" / image.name).pixels
             warped, mask = warp_photo(original, camera, image.motion)
-            whole.append(against_twin(raw, original, camera, image.motion))
-            interpolated.append(against_twin(warped, original, camera, image.motion))
+            whole.append(against_reference(raw, original, camera, image.motion))
+            interpolated.append(against_reference(warped, original, camera, image.motion))
             stored.append(psnr(raw, warped, mask))
         show(
             f"herz-jesus-8 warped by 0.05, seed {seed}, true motion",
@@ -78,29 +78,29 @@ def warped_photos(photos: Path, work: Path, seeds: int) -> None:
         )
 
 
-def scene_twins(scene: Path, truth: Solution) -> None:
+def scene_references(scene: Path, truth: Solution) -> None:
     """Photos of a sample scene, rectified with their true motion, against their references."""
     after, before, moving = [], [], []
     for image in truth.images:
         assert image.motion is not None
         camera = truth.cameras[image.camera_id]
         raw, reference = (read_photo(scene / folder / image.name).pixels for folder in ("photos", "global"))
-        after.append(against_twin(raw, reference, camera, image.motion))
-        before.append(against_twin(raw, reference, camera, RowMotion()))
+        after.append(against_reference(raw, reference, camera, image.motion))
+        before.append(against_reference(raw, reference, camera, RowMotion()))
         if image.motion.velocity.any():
             moving.append(image.name)
     show(
-        f"{scene.name}, true rotation against the twins",
+        f"{scene.name}, true rotation against the references",
         psnr_db=median_and_worst(after),
         psnr_before_db=median_and_worst(before),
         translating_photos=f"{len(moving)}/{len(truth.images)}",
         target="none: rotation alone does not undo translation" if moving else ">= 38 dB",
     )
     if moving:
-        turning_twins(scene, truth)
+        rotating_references(scene, truth)
 
 
-def turning_twins(scene: Path, truth: Solution, photos: int = 3) -> None:
+def rotating_references(scene: Path, truth: Solution, photos: int = 3) -> None:
     """Photos of a scene whose camera also travels, rendered with the rotation alone and rectified with it."""
     recipe, after = load_recipe(scene / "recipe.json"), []
     bent = np.argsort([-(image.rs_shift_px or 0.0) for image in truth.images])
@@ -108,22 +108,22 @@ def turning_twins(scene: Path, truth: Solution, photos: int = 3) -> None:
         camera, motion = recipe.camera(view), RowMotion(phi=view.motion.phi)
         raw = render_view(recipe.scene, camera, replace(view, motion=motion), **recipe.render_options)
         reference = render_view(recipe.scene, camera, view.at_once(), **recipe.render_options)
-        after.append(against_twin(raw, reference, camera, motion))
+        after.append(against_reference(raw, reference, camera, motion))
     show(
-        f"{scene.name} rendered without its translation, true rotation against the twins",
+        f"{scene.name} rendered without its translation, true rotation against the references",
         psnr_db=median_and_worst(after),
         photos=f"the {len(after)} that the shutter bends most, before JPEG",
         target=">= 38 dB",
     )
 
 
-def clip_twins(scene: Path, truth: Solution) -> None:
+def clip_references(scene: Path, truth: Solution) -> None:
     """Frames of a clip, rectified with true motion and depth, against the references; and what the coding costs."""
     recipe, after, before, coded = load_recipe(scene / "recipe.json"), [], [], []
     with tempfile.TemporaryDirectory() as work:
         frames = Path(work) / "frames"
-        extract_frames(scene / "clip.mp4", frames, every=recipe.clip.twins_every if recipe.clip else 1)
-        for view in recipe.twins:
+        extract_frames(scene / "clip.mp4", frames, every=recipe.clip.references_every if recipe.clip else 1)
+        for view in recipe.references:
             camera, image = recipe.camera(view), truth.image(view.name)
             assert image.motion is not None
             assert image.R_cw is not None
@@ -136,7 +136,7 @@ def clip_twins(scene: Path, truth: Solution) -> None:
             before.append(psnr(raw, reference, mask))
             coded.append(psnr(raw, render_view(recipe.scene, camera, view, **recipe.render_options)))
     show(
-        f"{scene.name}, true motion and depth against the twins",
+        f"{scene.name}, true motion and depth against the references",
         psnr_db=median_and_worst(after),
         psnr_before_db=median_and_worst(before),
         coding_alone_db=median_and_worst(coded),
@@ -233,7 +233,7 @@ def main() -> None:
         clips = [scene for scene in scenes if (scene / "clip.mp4").is_file()]
         for scene in scenes:
             truth = read_solution(scene / "ground_truth.json")
-            (clip_twins if scene in clips else scene_twins)(scene, truth)
+            (clip_references if scene in clips else scene_references)(scene, truth)
         # a clip is made again as a whole, which takes minutes
         for scene in scenes if args.all else [scene for scene in scenes if scene not in clips]:
             scene_again(scene, work / scene.name, args.all)

@@ -87,7 +87,7 @@ class Bench:
         return out
 
     def measure(
-        self, part: str, seed: int, folder: Path, twins: Path, poses: Path | None, name: str = "run",
+        self, part: str, seed: int, folder: Path, references: Path, poses: Path | None, name: str = "run",
         own_lens: bool = False, **options: Any,
     ) -> Any:  # fmt: skip
         """Run on a folder with its truth, and report what came of it; None where it crashed.
@@ -101,7 +101,7 @@ class Bench:
             seconds = time.perf_counter() - start
             truth_file = folder / "ground_truth.json"
             truth_file = with_lens_of(out, truth_file) if own_lens else truth_file
-            found = rs.evaluate(out, truth_file, poses=poses, twins=twins)
+            found = rs.evaluate(out, truth_file, poses=poses, twins=references)
         except Exception as error:
             show(f"{part}, seed {seed}", crash=f"{type(error).__name__}: {error}")
             self.failed.append(part)
@@ -166,26 +166,26 @@ def main() -> int:
         def seeds(own: int) -> range:
             return range(args.first_seed, args.first_seed + (args.seeds or own))
 
-        twins = bench.photos / HERZ
+        references = bench.photos / HERZ
         if "changing" in args.only:
             for seed in seeds(3):
-                bench.measure("changing", seed, bench.warped(0.05, seed, change=0.5), twins, bench.still)
+                bench.measure("changing", seed, bench.warped(0.05, seed, change=0.5), references, bench.still)
         if "vibrating" in args.only:
             for seed in seeds(3):
-                bench.measure("vibrating", seed, bench.warped(0.02, seed, shake=1.5e-3), twins, bench.still)
+                bench.measure("vibrating", seed, bench.warped(0.02, seed, shake=1.5e-3), references, bench.still)
         if "anchored" in args.only:
             for seed in seeds(3):
                 for sigma, change, shake in ((0.05, 0.5, 0.0), (0.02, 0.0, 1.5e-3)):
                     name = "anchored, vibrating" if shake else "anchored, changing"
                     folder = bench.warped(sigma, seed, change, shake, (STOOD,))
-                    bench.measure(name, seed, folder, twins, bench.still, still={STOOD: 1e-4})
+                    bench.measure(name, seed, folder, references, bench.still, still={STOOD: 1e-4})
         if "scene" in args.only:
             for seed in seeds(1):
                 scene(bench, seed)
         if "harm" in args.only:
-            harm(bench, seeds(1), twins)
+            harm(bench, seeds(1), references)
         if "steady" in args.only:
-            steady(bench, seeds(2), twins)
+            steady(bench, seeds(2), references)
         if bench.errors:
             show("coverage", phi_over_sigma=pooled(bench.errors), runs=len(bench.errors))
     widths = [max(len(row[k]) for row in [COLUMNS, *bench.rows]) for k in range(len(COLUMNS))]
@@ -194,14 +194,14 @@ def main() -> int:
     return bool(bench.failed)
 
 
-def harm(bench: Bench, seeds: Sequence[int], twins: Path) -> None:
+def harm(bench: Bench, seeds: Sequence[int], references: Path) -> None:
     """Photos that come out worse than they went in, and are not named."""
     photos, silent = 0, dict[str, float]()
     for seed in seeds:
         for k, (sigma, change, shake) in enumerate(HARM):
             folder = bench.warped(sigma, 100 * seed + k, change, shake)
             name = f"harm by {sigma}, {change}, {shake}"
-            found = bench.measure(name, seed, folder, twins, bench.still, own_lens=True, quality=100)
+            found = bench.measure(name, seed, folder, references, bench.still, own_lens=True, quality=100)
             if found is not None:
                 photos += found["joined"]
                 worse = {f"{folder.name}/{k}": v for k, v in found["worse"].items() if k not in found["doubtful"]}
@@ -209,14 +209,14 @@ def harm(bench: Bench, seeds: Sequence[int], twins: Path) -> None:
     show("harm", photos=photos, worse_and_not_named=silent)
 
 
-def steady(bench: Bench, seeds: Sequence[int], twins: Path) -> None:
+def steady(bench: Bench, seeds: Sequence[int], references: Path) -> None:
     """What steady motions lose, and how much longer they take."""
     for sigma in (0.02, 0.05):
         for seed in seeds:
             folder = bench.warped(sigma, seed)
             with mock.patch("rsundistort.bundle.choice._BENDS", {0: ""}):
-                without = bench.measure(f"steady by {sigma}, without", seed, folder, twins, bench.still)
-            among = bench.measure(f"steady by {sigma}", seed, folder, twins, bench.still)
+                without = bench.measure(f"steady by {sigma}, without", seed, folder, references, bench.still)
+            among = bench.measure(f"steady by {sigma}", seed, folder, references, bench.still)
             if without and among:
                 loss, times = without["dB"] - among["dB"], among["s"] / without["s"]
                 show(f"steady by {sigma}, seed {seed}", loss_db=round(loss, 2), times=round(times, 2))

@@ -83,7 +83,7 @@ def in_true_world(rec: Reconstruction, truth: Solution) -> tuple[NDArray[np.floa
     return np.degrees(Rotation.from_matrix(found @ world.T @ wanted.transpose(0, 2, 1)).magnitude()), names
 
 
-def against_twins(video: Path, solved: Solved) -> dict[str, Any]:
+def against_references(video: Path, solved: Solved) -> dict[str, Any]:
     """PSNR of frames, as they were read and rectified, against their references."""
     rec = solved.whole
     assert rec is not None
@@ -211,7 +211,7 @@ def height_error_percent(folder: Path, solved: Solved) -> float:
 def walk(args: argparse.Namespace) -> None:
     """The sample, as a clip and as photos."""
     solved, cpu_s = solved_clip(WALK / "clip.mp4", str(WALK / "camera.json"))
-    print(json.dumps(judged(WALK, solved, cpu_s) | against_twins(WALK / "clip.mp4", solved)), flush=True)
+    print(json.dumps(judged(WALK, solved, cpu_s) | against_references(WALK / "clip.mp4", solved)), flush=True)
     with tempfile.TemporaryDirectory() as out:
         began = time.process_time()
         options = RunOptions(camera=str(WALK / "camera.json"), every=9)
@@ -235,7 +235,7 @@ def of_kind(kind: str, args: argparse.Namespace) -> list[dict[str, Any]]:
             continue
         value = judged(folder, solved, cpu_s)
         if kind in ("pan", "walk"):
-            value |= against_twins(folder / "clip.mp4", solved)
+            value |= against_references(folder / "clip.mp4", solved)
         if kind == "two":
             value |= positions(folder, solved)
         if kind == "level":

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 @opt.readout_option
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def command(path: Path, readout: str | None, as_json: bool) -> None:
-    """Check whether the shutter and the shape of the scene can be told apart from these camera poses.
+    """Check whether the shutter and the shape of the scene can be distinguished from these camera poses.
 
     PATH is a solution (solution.json, or the folder of a run), a COLMAP model, or a transforms.json. The degeneracy
     measure is near zero where the poses are a critical motion.
@@ -36,15 +36,15 @@ def command(path: Path, readout: str | None, as_json: bool) -> None:
 
 
 def _text(result: PoseAnalysis) -> str:
-    meter = result.meter
-    values = ", ".join(f"{value:.3f}" for value in meter.singular_values)
-    ds, da, *p = meter.null_vector
+    degeneracy = result.degeneracy
+    values = ", ".join(f"{value:.3f}" for value in degeneracy.singular_values)
+    ds, da, *p = degeneracy.null_vector
     lines = [
         f"photos             {result.photos}, readout {', '.join(result.readout)}",
-        f"degeneracy         {meter.value:.3f} of {values}",
-        f"y axes             {meter.y_axis_spread_deg:.1f} degrees apart (root mean square)",
+        f"degeneracy         {degeneracy.value:.3f} of {values}",
+        f"y axes             {degeneracy.y_axis_spread_deg:.1f} degrees apart (root mean square)",
         f"hidden best        skew {ds:.2f}, aspect {da:.2f}, plane at infinity {', '.join(f'{x:.2f}' for x in p)}",
-        f"confounded         {meter.meaning}",
+        f"confounded         {degeneracy.meaning}",
     ]
     if result.sentence:
         lines += ["", *textwrap.wrap(result.sentence, 80)]

@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 @click.option(
     "--twins",
     type=click.Path(path_type=Path),
-    help="Folder of the global-shutter references. By default global/ beside the truth.",
+    help="Folder of the global-shutter references. By default it is global/ beside the truth.",
 )
 @click.option(
     "--raw",
     type=click.Path(path_type=Path),
-    help="Folder of the rolling-shutter photos. By default photos/ beside the truth.",
+    help="Folder of the rolling-shutter photos. By default it is photos/ beside the truth.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 @opt.quiet_option

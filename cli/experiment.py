@@ -21,14 +21,11 @@ def command() -> None:
 @opt.out_option
 @opt.gathered(
     "given",
-    click.option(
-        "--trials", type=click.IntRange(min=1), default=100, show_default=True, help="Number of trials per scene."
-    ),
+    click.option("--trials", type=click.IntRange(min=1), default=100, help="Number of trials per scene."),
     click.option(
         "--motion",
         type=click.Choice(("both", "rotation")),
         default="both",
-        show_default=True,
         help="Simulated motion: rotation and translation, as in the paper, or rotation only.",
     ),
     click.option("--method", "methods", multiple=True, metavar="NAME", help="Run this method only. May be repeated."),
@@ -70,7 +67,6 @@ def one(scenes: tuple[Path, ...], out: Path, given: dict[str, Any], quiet: bool)
         "shutter_model",
         type=click.Choice(("auto", "constant-motion", "rotation", "linearized", "two-step")),
         default="auto",
-        show_default=True,
         help="Model of the shutter of the photos in SWUNG, as for `run`.",
     ),
     opt.seed_option,

@@ -86,11 +86,9 @@ camera_option: Decorator = click.option(
 readout_option: Decorator = click.option(
     "--readout", type=click.Choice(READOUT_NAMES), help="Direction of the readout in the stored pixels."
 )
-seed_option: Decorator = click.option(
-    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all random draws."
-)
+seed_option: Decorator = click.option("--seed", type=click.IntRange(min=0), default=0, help="Seed of all random draws.")
 jobs_option: Decorator = click.option(
-    "--jobs", type=click.IntRange(min=0), default=0, help="Number of threads. 0, the default, uses all cores."
+    "--jobs", type=click.IntRange(min=0), default=0, help="Number of threads. 0 uses all cores."
 )
 overwrite_option: Decorator = click.option(
     "--overwrite", is_flag=True, help="Replace the files that rsundistort wrote in OUT. Other files stay."
@@ -119,7 +117,6 @@ progress_option: Decorator = click.option(
     "progress_form",
     type=click.Choice(("bar", "json")),
     default="bar",
-    show_default=True,
     help="Form of the progress. json prints JSON lines, and nothing else, on stdout, for other programs.",
 )
 json_option: Decorator = click.option(
@@ -130,13 +127,12 @@ verbose_option: Decorator = click.option(
     "-v", "--verbose", is_flag=True, help="Print a line for each step, even if stderr is not a terminal."
 )
 quality_option: Decorator = click.option(
-    "--quality", type=click.IntRange(1, 100), default=98, show_default=True, help="Quality of JPEG and WebP."
+    "--quality", type=click.IntRange(1, 100), default=98, help="Quality of JPEG and WebP."
 )
 raw_as_option: Decorator = click.option(
     "--raw-as",
     type=click.Choice(("tif", "jpg", "png")),
     default="tif",
-    show_default=True,
     help="Format in which RAW and HEIC photos are written. jpg has 8 bits, the others have 16.",
 )
 apply_orientation_option: Decorator = click.option(
@@ -152,15 +148,19 @@ max_pixels_option: Decorator = click.option(
     "max_megapixels",
     type=click.FloatRange(min=0, min_open=True),
     default=250.0,
-    show_default=True,
     metavar="MILLIONS",
     help="Leave out photos with more pixels. (A small file can claim to be a huge picture.)",
+)
+gyro_axes_option: Decorator = click.option(
+    "--gyro-axes",
+    metavar="XYZ",
+    help="Axes of the gyroscope that point right, down and ahead in the stored pixels. Small letters stand for "
+    "reversed axes.",
 )
 depth_option: Decorator = click.option(
     "--depth",
     metavar="auto|infinity|plane|points|DIR",
     default="auto",
-    show_default=True,
     help="Depth of the scene. It matters if the camera travelled during the readout. plane: a plane through the scene; "
     "points: interpolated between the reconstructed points; DIR: depth maps of your own (a.npy, .npz or float .tif for "
     "a.jpg, see docs/depth.md).",
@@ -183,7 +183,6 @@ interpolation_option: Decorator = click.option(
     "--interpolation",
     type=click.Choice(INTERPOLATION_NAMES),
     default="cubic",
-    show_default=True,
     help="Interpolation of the rectified photos.",
 )
 
@@ -232,14 +231,13 @@ PHOTO_OPTIONS: tuple[Decorator, ...] = (
         metavar="keep|0..1",
         callback=view_alpha,
         help="View of the rectified photos. keep: K and size of the raw photos; 0: no photo of a camera has an empty "
-        "pixel; 1: every pixel of all its photos is kept; numbers between are views between these. By default keep, or "
-        "the view of the solution.",
+        "pixel; 1: every pixel of all its photos is kept; numbers between are views between these. The default is "
+        "keep, or the view of the solution.",
     ),
     click.option(
         "--scale",
         type=click.FloatRange(min=0, min_open=True),
         default=1.0,
-        show_default=True,
         help="Size of the rectified photos relative to the raw ones. Photos that shrink are averaged.",
     ),
     click.option(

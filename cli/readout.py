@@ -18,12 +18,7 @@ if TYPE_CHECKING:
 _measure_options = opt.gathered(
     "given",
     opt.camera_option,
-    click.option(
-        "--readout",
-        type=click.Choice(opt.READOUT_NAMES),
-        metavar="DIRECTION",
-        help=f"Direction of the readout in the stored pixels: {', '.join(opt.READOUT_NAMES)}.",
-    ),
+    opt.readout_option,
     click.option(
         "--readout-ms",
         type=click.FloatRange(min=0, min_open=True),
@@ -35,7 +30,7 @@ _measure_options = opt.gathered(
         type=click.Path(exists=True, dir_okay=False, path_type=Path),
         metavar="FILE",
         help="Log of a gyroscope, as for `run`. Its axes and its clock offset are estimated. By default the log in the "
-        "video.",
+        "video is used.",
     ),
     opt.seed_option,
     opt.jobs_option,

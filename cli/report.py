@@ -16,7 +16,7 @@ from .terminal import Talk, errors_for_people, progress_bars, tell
     "--photos",
     type=click.Path(path_type=Path),
     metavar="DIR",
-    help="Folder of the original photos. By default where it was during the run, relative to OUT.",
+    help="Folder of the original photos. By default it is looked for where it was during the run.",
 )
 @click.option(
     "--figures",

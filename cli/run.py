@@ -23,7 +23,6 @@ _measure_options = opt.gathered(
         "--frames",
         type=click.Choice(opt.FRAMES_NAMES),
         default="key",
-        show_default=True,
         help="Frames of a video that are rectified. key: the key frames, into images/; all: every frame as well, into "
         "video.mp4.",
     ),
@@ -53,30 +52,24 @@ _measure_options = opt.gathered(
         metavar="S",
         help="Time in seconds on the gyroscope's clock when the camera's clock shows zero.",
     ),
-    click.option(
-        "--gyro-axes",
-        metavar="XYZ",
-        help="Axes of the gyroscope that point right, down and ahead in the stored pixels. Small letters stand for "
-        "reversed axes.",
-    ),
+    opt.gyro_axes_option,
     click.option(
         "--photo-times",
         type=click.Path(exists=True, dir_okay=False, path_type=Path),
         metavar="CSV",
-        help="Times at which the photos were taken, for --gyro: name, time_s. By default frames.csv among the photos.",
+        help="Times at which the photos were taken, for --gyro: name, time_s. By default they are read from "
+        "frames.csv among the photos.",
     ),
     click.option(
         "--max-features",
         type=click.IntRange(min=100),
         default=8192,
-        show_default=True,
         help="Largest number of features of a photo.",
     ),
     click.option(
         "--feature-megapixels",
         type=click.FloatRange(min=0.05),
         default=1.0,
-        show_default=True,
         metavar="MP",
         help="Size in megapixels at which features are detected. Larger photos are shrunk for it.",
     ),
@@ -84,7 +77,6 @@ _measure_options = opt.gathered(
         "--matching",
         type=click.Choice(opt.MATCHING_NAMES),
         default="auto",
-        show_default=True,
         help="Photos that are matched with each other. exhaustive: all pairs; neighbours: neighbours in order of "
         "capture, by GPS or by appearance; auto: exhaustive up to 60 photos, else neighbours.",
     ),

@@ -10,16 +10,7 @@ import click
 from . import options as opt
 from .terminal import Talk, errors_for_people, progress_bars, table, tell
 
-
-@click.group()
-def command() -> None:
-    """Make photos with a known shutter motion, and the truth to compare results with."""
-
-
-@command.command()
-@opt.photos_argument
-@opt.out_option
-@opt.gathered(
+_warp_options = opt.gathered(
     "given",
     opt.camera_option,
     opt.readout_option,
@@ -28,7 +19,6 @@ def command() -> None:
         "sigma_rad",
         type=click.FloatRange(min=0),
         default=0.05,
-        show_default=True,
         help="Standard deviation of the rotation over a frame, in radians.",
     ),
     click.option(
@@ -42,7 +32,6 @@ def command() -> None:
         "--acceleration",
         type=click.FloatRange(min=0),
         default=0.0,
-        show_default=True,
         help="Standard deviation of the change of the rotation rate over half a frame, as a fraction of the rate.",
     ),
     click.option(
@@ -57,7 +46,6 @@ def command() -> None:
         type=float,
         nargs=2,
         default=(2.0, 5.0),
-        show_default=True,
         help="Range of the vibration's periods per frame; the number is drawn from it.",
     ),
     click.option(
@@ -65,7 +53,6 @@ def command() -> None:
         "axis",
         type=click.Choice(["random", "x", "y", "z"]),
         default="random",
-        show_default=True,
         help="Axis of the camera about which the vibration rotates it.",
     ),
     click.option(
@@ -74,12 +61,7 @@ def command() -> None:
         help="Log of a gyroscope, of which random parts are used as motions: CSV with time_s, wx, wy, wz, or a .gcsv "
         "file of Gyroflow.",
     ),
-    click.option(
-        "--gyro-axes",
-        metavar="XYZ",
-        help="Axes of the gyroscope that point right, down and ahead in the stored pixels. Small letters stand for "
-        "reversed axes.",
-    ),
+    opt.gyro_axes_option,
     click.option(
         "--readout-ms",
         type=click.FloatRange(min=0, min_open=True),
@@ -96,6 +78,17 @@ def command() -> None:
     opt.jobs_option,
     opt.overwrite_option,
 )
+
+
+@click.group()
+def command() -> None:
+    """Make photos with a known shutter motion, and the truth to compare results with."""
+
+
+@command.command()
+@opt.photos_argument
+@opt.out_option
+@_warp_options
 @opt.quiet_option
 def warp(photos: Path, out: Path, given: dict[str, Any], quiet: bool) -> None:
     """Warp real photos as if a rotating camera had taken them.
@@ -131,7 +124,7 @@ def warp(photos: Path, out: Path, given: dict[str, Any], quiet: bool) -> None:
 @opt.out_option
 @opt.gathered(
     "given",
-    click.option("--depth/--no-depth", default=True, show_default=True, help="Write depth maps."),
+    click.option("--depth/--no-depth", default=True, help="Write depth maps."),
     opt.jobs_option,
     opt.overwrite_option,
 )

@@ -46,7 +46,6 @@ solve_options = opt.gathered(
         "shutter_model",
         type=click.Choice(("auto", "constant-motion", "rotation", "linearized", "two-step", "global")),
         default="auto",
-        show_default=True,
         help="Model of the shutter. auto chooses the model that best predicts measurements held out from its fit.",
     ),
     click.option(
@@ -60,7 +59,7 @@ solve_options = opt.gathered(
         "--camera-sigma",
         metavar="NAME=SIGMA,...",
         help="Standard deviations of the given intrinsics: of f (or fx, fy), cx and cy in pixels, and of k1, k2, k3, "
-        "p1 and p2. By default the key sigma of camera.json, else the usual error of a calibration.",
+        "p1 and p2. By default they are those of the key sigma of camera.json, else the usual errors of a calibration.",
     ),
     click.option(
         "--still",
@@ -88,8 +87,8 @@ solve_options = opt.gathered(
         "--crs",
         metavar="CRS",
         help="Coordinate system of poses and points. local: metres east, north and up, by the GPS of the photos; "
-        "EPSG:...: projected coordinates in metres; none: an arbitrary frame. By default local if the GPS of three "
-        "photos fits; solve keeps the frame of the model.",
+        "EPSG:...: projected coordinates in metres; none: an arbitrary frame. The default is local if the GPS of "
+        "three photos fits; solve keeps the frame of the model.",
     ),
     click.option(
         "--gcp",
@@ -109,7 +108,6 @@ solve_options = opt.gathered(
         "--remedy",
         type=click.Choice(("auto", "prior", "none")),
         default="auto",
-        show_default=True,
         help="Remedy if all cameras are level, which is a critical motion. auto looks for a photo that did not move; "
         "prior relies on the prior of the motions alone; none does neither.",
     ),
@@ -118,7 +116,6 @@ solve_options = opt.gathered(
         "--sparse-format",
         type=click.Choice(("bin", "txt")),
         default="bin",
-        show_default=True,
         help="Format of the COLMAP model: binary or text.",
     ),
     click.option(

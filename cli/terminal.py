@@ -261,15 +261,15 @@ class _Lines:
     def __init__(self) -> None:
         self._stage = ""
         self._first = 0
-        self._began = self._told = 0.0
+        self._began = self._said = 0.0
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         now = time.perf_counter()
         if stage != self._stage:
             self._stage, self._first, self._began = stage, done, now
-        elif done < total and now - self._told < self._EVERY_S:
+        elif done < total and now - self._said < self._EVERY_S:
             return
-        self._told = now
+        self._said = now
         count, seconds = done - self._first, now - self._began
         rate = count / seconds if count > 0 and seconds > 0 else None
         eta = (total - done) / rate if rate and total else None

@@ -27,6 +27,19 @@ myst_heading_anchors = 3  # links to headings, as code hosts make them
 for _name in cli.list_commands(click.Context(cli)):  # by which they are called; their functions are all `command`
     cli.get_command(click.Context(cli), _name).name = _name
 
+
+def _show_defaults(command: click.Command) -> None:
+    """Say it of each option: `cli` says it of all, in a setting that sphinx-click does not see."""
+    for option in command.params:
+        if isinstance(option, click.Option):
+            option.show_default = not option.is_flag and option.to_info_dict()["default"] is not None
+    for each in getattr(command, "commands", {}).values():
+        _show_defaults(each)
+
+
+for _name in cli.list_commands(click.Context(cli)):
+    _show_defaults(cli.get_command(click.Context(cli), _name))
+
 default_role = "literal"  # single backticks of docstrings
 
 autodoc_member_order = "bysource"

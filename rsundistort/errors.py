@@ -49,7 +49,7 @@ class FormatError(InputError):
 
 
 class ReconstructionError(RsUndistortError, RuntimeError):
-    """The photos could not be joined into one reconstruction."""
+    """The photos could not be registered in one reconstruction."""
 
 
 class RsUndistortWarning(UserWarning):

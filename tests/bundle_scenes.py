@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy_twin import DIRECTIONS, Fisheye, lens_of, project
+from numpy_reference import DIRECTIONS, Fisheye, lens_of, project
 from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, Camera, Observations, Reconstruction

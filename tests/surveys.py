@@ -62,11 +62,11 @@ class Flight:
         """The true reconstruction, in metres."""
         return replace(self.unmoved, phi=self.phi, velocity=self.velocity, shutter_model="constant-motion")
 
-    def facts(self, sigma_m=(0.5, 0.5, 1.0), off=(), told=None, names=None, speed_sigma=None):
+    def facts(self, sigma_m=(0.5, 0.5, 1.0), off=(), stated=None, names=None, speed_sigma=None):
         """EXIF facts with GPS of that noise; photos `off` are 60 m away."""
         noise = self.rng.normal(size=self.center_w.shape) * sigma_m
         noise[list(off), 0] += 60.0
-        sigma = tuple(float(each) for each in (sigma_m if told is None else told))
+        sigma = tuple(float(each) for each in (sigma_m if stated is None else stated))
         places = geodetic_of(self.center_w + noise).tolist()
         moving = [None] * len(places)
         if speed_sigma is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from importlib import import_module
 from pathlib import Path
@@ -44,3 +45,20 @@ def test_a_photo_passes_each_room_once():
     way = PAGE.split("## The way of a photo")[1].split("##")[0]
     rooms = re.findall(r"^\d+\. `([\w.]+)\.\w+`", way, re.MULTILINE)
     assert len(rooms) == len(set(rooms)) <= 9
+
+
+def test_files_functions_and_commands_are_short():
+    for path in [*ROOT.glob("rsundistort/**/*.py"), *ROOT.glob("cli/*.py")]:
+        text = path.read_text(encoding="utf-8")
+        assert text.count("\n") <= 600, path
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef):
+                # of a command its options count, too
+                first = min([node.lineno, *(each.lineno for each in node.decorator_list)])
+                assert node.end_lineno - first <= 80, f"{path.name}: {node.name}"
+
+
+def test_lines_of_markdown_are_short_but_for_tables():
+    for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("sample_scenes/**/*.md")]:
+        for line in path.read_text(encoding="utf-8").splitlines():
+            assert len(line) <= 120 or line.startswith("|"), f"{path.name}: {line}"

@@ -269,7 +269,7 @@ def test_a_photo_that_vanishes_midway(four):
     assert list(left_out) == ["d.jpg"]
 
 
-def test_photos_that_the_solution_does_not_name_are_told(four):
+def test_photos_that_the_solution_does_not_name_are_reported(four):
     save_png(four / "in" / "stray.png", texture(320, 240))
     result = invoke(*arguments(four))
     assert result.exit_code == 3
@@ -277,7 +277,7 @@ def test_photos_that_the_solution_does_not_name_are_told(four):
     assert "4 photos rectified" in result.stdout
 
 
-def test_photos_that_could_not_be_joined_are_no_failure(four):
+def test_photos_that_could_not_be_registered_are_no_failure(four):
     solution = read_solution(four / "s.json")
     lost = replace(solution.images[0], motion=None, reason="shares too little")
     write_solution(four / "s.json", replace(solution, images=(lost, *solution.images[1:])))

@@ -283,10 +283,10 @@ def test_bends_are_recovered_and_the_spreads_of_their_groups(rng, model, way):
 def test_a_known_bend_is_taken_and_the_rest_is_found(rng):
     truth = make_scene(rng, groups=2, turn=3e-3)
     known = {name: truth.motion(i).bend for i, name in enumerate(truth.image_names)}
-    told = bundle_adjust(still(truth), "rotation", BundleOptions(known_bends=known))
-    assert told.rms_px < 1.05 * NOISE_PX
+    stated = bundle_adjust(still(truth), "rotation", BundleOptions(known_bends=known))
+    assert stated.rms_px < 1.05 * NOISE_PX
     np.testing.assert_allclose(
-        told.reconstruction.motion(2).at(0.3)[0] - 0.3 * told.reconstruction.phi[2],
+        stated.reconstruction.motion(2).at(0.3)[0] - 0.3 * stated.reconstruction.phi[2],
         known["2.jpg"].at(0.3)[0],
         atol=1e-9,
     )
@@ -320,7 +320,7 @@ def sheared_by_line(truth, rng, same):
 
 
 @pytest.mark.parametrize(("same", "least", "most"), [(True, 0.8, 1.0), (False, -0.3, 0.3)])
-def test_only_turns_of_whole_lines_agree_between_halves(rng, same, least, most):
+def test_only_rotations_of_whole_lines_agree_between_halves(rng, same, least, most):
     truth = make_scene(rng, groups=0, num_points=900)
     assert least < agreement_of_waves(sheared_by_line(truth, rng, same), NOISE_PX) <= most
 
@@ -352,7 +352,7 @@ def test_lines_that_move_faster_than_any_model_are_noticed(rng):
     assert "move faster" in " ".join(verdict.reasons)
 
 
-def test_a_reconstruction_turned_or_thinned_keeps_its_bends(rng):
+def test_a_reconstruction_rotated_or_thinned_keeps_its_bends(rng):
     truth = make_scene(rng, "constant-motion", way=0.01, num_points=50)
     other = truth.normalized()
     for i in range(truth.num_images):

@@ -8,7 +8,7 @@ import numba
 import numpy as np
 import pytest
 from bundle_scenes import FISHEYE, LENS, make_scene, noisy_problem, perturbed
-from numpy_twin import DIRECTIONS, MODELS
+from numpy_reference import DIRECTIONS, MODELS
 from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, Camera, Observations, RowMotion, bundle_adjust
@@ -59,7 +59,7 @@ def sigma_of_variation(result, options):
 
 @pytest.mark.parametrize("dist", [[], LENS, FISHEYE], ids=["pinhole", "lens", "fisheye"])
 @pytest.mark.parametrize("model", MODELS)
-def test_residuals_and_gradient_vanish_at_the_truth_of_the_twin(model, dist, rng):
+def test_residuals_and_gradient_vanish_at_the_truth_of_the_numpy_model(model, dist, rng):
     rec = make_scene(rng, model, dist=dist)
     res, valid = reprojection_residuals(rec)
     assert valid.all()
@@ -150,7 +150,7 @@ def test_a_lens_that_varies_beside_a_shutter_is_no_velocity(rng):
     assert (choice.shutter_model, choice.varying, choice.shutter) == ("rotation", True, "found")
 
 
-def test_ladder_ends_at_the_truth_and_climbs_in_order(rng):
+def test_the_model_sequence_ends_at_the_truth_and_runs_in_order(rng):
     truth = make_scene(rng, "constant-motion")
     seen = []
     results = adjust_sequence(perturbed(truth, rng), progress=lambda model, cost: seen.append(model))
@@ -441,7 +441,7 @@ def test_the_model_that_made_the_measurements_is_chosen(model, rng):
     assert choose_model(start, sigma_px=0.3) == choice
 
 
-def test_no_rung_is_worse_than_the_one_inside_it_wherever_the_choice_starts(rng):
+def test_no_stage_is_worse_than_the_one_inside_it_wherever_the_choice_starts(rng):
     # phi is per focal length: rotations of a quarter radian a frame, found under a lens four times too long, are of a
     # whole one under the lens that the first model then finds, and few points are where such photos could see them
     truth = make_scene(rng, "global", num_images=12, num_points=120, noise_px=0.3, dist=[-0.2, 0.05, 0, 0])
@@ -504,7 +504,7 @@ def test_without_motion_the_guess_of_the_readout_stays(rng):
     assert choice.reconstruction.cameras == rec.cameras
 
 
-def test_a_camera_whose_readout_was_told_is_left_alone(rng):
+def test_a_camera_whose_readout_was_specified_is_left_alone(rng):
     rec = make_scene(rng, "rotation", num_images=8, num_points=100, noise_px=0.3)
     assert list(choose_readouts(rec, [2]).gain) == [2]
     assert choose_readouts(rec, []).gain == {}

@@ -336,7 +336,7 @@ def test_camera_json_round_trip(tmp_path, lens, length):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "stated"),
     [
         ({"cameras": {}}, "no camera"),
         ({"cameras": [1]}, "expected"),
@@ -349,12 +349,12 @@ def test_camera_json_round_trip(tmp_path, lens, length):
     ],
     ids=str,
 )
-def test_cameras_json_that_make_no_sense_are_refused(tmp_path, change, told):
+def test_cameras_json_that_make_no_sense_are_refused(tmp_path, change, stated):
     value = {"cameras": {"1": camera_to_json(calibrated())}, "images": {"a.jpg": "1"}, **change}
     (tmp_path / "cameras.json").write_text(json.dumps(value))
     with pytest.raises(FormatError) as error:
         read_camera_file(tmp_path / "cameras.json", 640, 480)
-    assert told in one_line(error)
+    assert stated in one_line(error)
     assert "cameras.json" in one_line(error)
 
 
@@ -445,7 +445,7 @@ def test_a_camera_of_another_size_is_refused_with_what_to_do():
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "stated"),
     [
         ("camera_matrix", "kamera_matrix", "no camera"),
         ("distortion_coefficients", "distortion_coeficients", "distortioncoeficients"),
@@ -472,7 +472,7 @@ def test_a_camera_of_another_size_is_refused_with_what_to_do():
     ],
     ids=str,
 )
-def test_ros_calibrations_that_make_no_sense_are_refused(tmp_path, old, new, told):
+def test_ros_calibrations_that_make_no_sense_are_refused(tmp_path, old, new, stated):
     text = ros_text(calibrated())
     assert old in text
     path = tmp_path / "c.yaml"
@@ -480,7 +480,7 @@ def test_ros_calibrations_that_make_no_sense_are_refused(tmp_path, old, new, tol
     with pytest.raises(FormatError) as error:
         read_one(path)
     assert str(path) in one_line(error)
-    assert told in one_line(error)
+    assert stated in one_line(error)
 
 
 @pytest.mark.parametrize(

@@ -229,7 +229,7 @@ def test_evaluate_refuses(invoke, tmp_path):
     assert tree(tmp_path) == before
 
 
-def test_evaluate_refuses_twins_of_another_size(invoke, tmp_path):
+def test_evaluate_refuses_references_of_another_size(invoke, tmp_path):
     for folder in ("out/images", "out/masks", "twins"):
         (tmp_path / folder).mkdir(parents=True)
     solution_of(tmp_path / "out" / "solution.json", THREE)
@@ -239,7 +239,7 @@ def test_evaluate_refuses_twins_of_another_size(invoke, tmp_path):
         save_png(tmp_path / "out" / "masks" / name, np.full((240, 320), 255, np.uint8))
         save_png(tmp_path / "twins" / name, np.zeros((480, 640, 3), np.uint8))
     says = error_line(invoke("evaluate", "out", "--truth", "truth.json", "--twins", "twins"))
-    assert "the twin has the shape (480, 640), the rectified photo (240, 320)" in says
+    assert "the reference has the shape (480, 640), the rectified photo (240, 320)" in says
 
 
 # ---------------------------------------------------------------- simulate

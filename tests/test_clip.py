@@ -144,7 +144,7 @@ def test_motion_is_the_speed_of_the_path_times_the_readout(tmp_path):
     np.testing.assert_allclose(misses[0] / misses[1], 16, rtol=0.2)
 
 
-def test_a_pan_turns_about_one_place(tmp_path):
+def test_a_pan_rotates_about_one_place(tmp_path):
     recipe = recipe_of(tmp_path, path=PAN)
     assert len(recipe.views) == 5
     assert recipe.clip.readout_s == pytest.approx(0.032)
@@ -174,7 +174,7 @@ def test_y_axes_of_a_level_clip_are_parallel_at_all_times(tmp_path):
     assert np.ptp([view.center_w[2] for view in recipe.views]) > 0.02
 
 
-def test_a_clip_is_written_with_its_truth_and_twins(tmp_path):
+def test_a_clip_is_written_with_its_truth_and_references(tmp_path):
     pytest.importorskip("av")
     source = tmp_path / "source"
     source.mkdir()
@@ -182,11 +182,11 @@ def test_a_clip_is_written_with_its_truth_and_twins(tmp_path):
     for out in ("a", "b"):
         simulate_scene(source / "recipe.json", tmp_path / out)
     names = sorted(p.relative_to(tmp_path / "a").as_posix() for p in (tmp_path / "a").rglob("*") if p.is_file())
-    twins = [f"clip_{k:06d}" for k in (0, 4, 8)]
+    references = [f"clip_{k:06d}" for k in (0, 4, 8)]
     assert names == sorted([
         ".rsundistort-written", "camera.json", "clip.mp4", "ground_truth.json", "recipe.json", "tracks.npz",
-        *(f"global/{stem}.jpg" for stem in twins),
-        *(f"{folder}/{stem}.tif" for folder in ("depth", "global-depth") for stem in twins),
+        *(f"global/{stem}.jpg" for stem in references),
+        *(f"{folder}/{stem}.tif" for folder in ("depth", "global-depth") for stem in references),
     ])  # fmt: skip
     for name in names[1:]:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
@@ -201,10 +201,10 @@ def test_a_clip_is_written_with_its_truth_and_twins(tmp_path):
     assert truth.options["readout_ms"] == pytest.approx(24)
     for image, view in zip(truth.images, recipe.views, strict=True):
         back = replace(view, R_cw=image.R_cw, center_w=image.center_w, motion=image.motion)
-        for told, rendered in zip(
+        for stated, rendered in zip(
             line_poses(recipe.cameras["1"], back), line_poses(recipe.cameras["1"], view), strict=True
         ):
-            np.testing.assert_allclose(told, rendered, atol=1e-13)
+            np.testing.assert_allclose(stated, rendered, atol=1e-13)
     # a decoded frame is the photo but for the coding
     photo = render_view(recipe.scene, recipe.cameras["1"], recipe.views[5], samples=4)
     frame = read_photo(tmp_path / "frames" / "clip_000005.png").pixels
@@ -215,7 +215,7 @@ def test_a_clip_is_written_with_its_truth_and_twins(tmp_path):
     rectify_folder(tmp_path / "frames", tmp_path / "a" / "ground_truth.json", tmp_path / "back", options)
     (tmp_path / "back" / "solution.json").write_bytes((tmp_path / "a" / "ground_truth.json").read_bytes())
     found = evaluate(tmp_path / "back", tmp_path / "a" / "ground_truth.json", raw=tmp_path / "frames")
-    assert sorted(found.psnr_db.photos) == [f"{stem}.png" for stem in twins]
+    assert sorted(found.psnr_db.photos) == [f"{stem}.png" for stem in references]
     assert found.rotation_deg.max < 1e-9
 
 
@@ -223,7 +223,7 @@ def test_two_frames_are_a_clip(tmp_path):
     path = {**PATH, "num_frames": 2, "way": WAY[:2]}
     recipe = recipe_of(tmp_path, path=path, twins=None)
     assert [view.name for view in recipe.views] == ["clip_000000.png", "clip_000001.png"]
-    assert [view.name for view in recipe.twins] == ["clip_000000.png"]
+    assert [view.name for view in recipe.references] == ["clip_000000.png"]
 
 
 def test_exposure_of_a_clip_is_a_share_of_its_readout(tmp_path):
@@ -277,7 +277,9 @@ def test_committed_walk_is_what_its_recipe_makes():
     for image, view in zip(truth.images, recipe.views, strict=True):
         np.testing.assert_allclose(image.R_cw, view.R_cw, atol=1e-12)
         np.testing.assert_allclose(image.motion.phi, view.motion.phi, atol=1e-12)
-    assert sorted(path.stem for path in (WALK / "global").iterdir()) == [Path(view.name).stem for view in recipe.twins]
+    assert sorted(path.stem for path in (WALK / "global").iterdir()) == [
+        Path(view.name).stem for view in recipe.references
+    ]
     assert (WALK / "clip.mp4").stat().st_size <= 3e6
 
 
@@ -298,15 +300,15 @@ def test_true_motion_takes_the_shutter_out_of_the_walk(tmp_path):
     recipe, truth = load_recipe(WALK / "recipe.json"), read_solution(WALK / "ground_truth.json")
     extract_frames(WALK / "clip.mp4", tmp_path / "frames", every=9)
     before, after = [], []
-    for view in recipe.twins[::3]:
+    for view in recipe.references[::3]:
         raw = read_photo(tmp_path / "frames" / view.name).pixels
-        twin = read_photo((WALK / "global" / view.name).with_suffix(".jpg")).pixels
+        reference = read_photo((WALK / "global" / view.name).with_suffix(".jpg")).pixels
         depth = DepthMap(render_depth(recipe.scene, recipe.cameras["1"], view.at_once()))
         image = truth.image(view.name)
         motion = image.motion.in_camera(image.R_cw)
         rectified, mask = rectify(raw, truth.cameras["1"], motion, "constant-motion", depth=depth)
-        after.append(psnr(rectified, twin, mask))
-        before.append(psnr(raw, twin, mask))
+        after.append(psnr(rectified, reference, mask))
+        before.append(psnr(raw, reference, mask))
     assert np.median(after) > 35
     assert np.median(before) < 30
 

@@ -278,7 +278,7 @@ def rows_of(path):
     return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
 
 
-def test_path_csv_has_pose_velocity_and_turn_of_the_camera(tmp_path):
+def test_path_csv_has_pose_velocity_and_rotation_of_the_camera(tmp_path):
     hand, time = HandHeld(3), np.arange(12) / 30
     names = [f"clip, one_{k:06d}.png" for k in range(12)]
     write_path(tmp_path / "path.csv", names, path_of(hand, time))
@@ -302,7 +302,7 @@ def test_path_csv_has_pose_velocity_and_turn_of_the_camera(tmp_path):
 COLUMNS = ["tx ty tz", "qx qy qz qw", "vx vy vz", "wx wy wz"]
 
 
-def test_the_path_of_turned_frames_is_that_of_a_turned_camera(tmp_path):
+def test_the_path_of_rotated_frames_is_that_of_a_rotated_camera(tmp_path):
     path = path_of(HandHeld(4), np.arange(8) / 30)
     turned = turn_path(path, 6)
     # shown clockwise, what points right is what pointed up
@@ -318,19 +318,19 @@ def test_the_path_of_turned_frames_is_that_of_a_turned_camera(tmp_path):
 # ---------------------------------------------------------------- the readout time
 
 
-TOLD = {
+STATED = {
     "seconds": 0.0205, "sigma": 0.0003, "source": "the video", "of_frame": 0.615, "frames": 90,
     "halves": [{"seconds": 0.0206, "sigma": 0.0005}, {"seconds": 0.0204, "sigma": 0.0005}],
     "stabilisation": {"verdict": "none", "reason": "not stabilised"},
 }  # fmt: skip
 
 
-def test_the_readout_time_is_told_with_its_evidence():
-    facts = dict(readout_facts(TOLD))
+def test_the_readout_time_is_reported_with_its_evidence():
+    facts = dict(readout_facts(STATED))
     assert facts["readout time"] == "20.5 +- 0.3 ms (0.61 of the frame), measured from the video"
     assert facts["its halves say"] == "20.6 +- 0.5 ms and 20.4 +- 0.5 ms"
     gyro = {"axes": "yxz", "offset_s": -0.0177, "offset_sigma_s": 0.0002, "correlation": 0.9991, "rotation_ratio": 1.0}
-    facts = dict(readout_facts({**TOLD, "source": "what was known before", "gyroscope": gyro, "halves": []}))
+    facts = dict(readout_facts({**STATED, "source": "what was known before", "gyroscope": gyro, "halves": []}))
     assert facts["readout time"].endswith("(0.61 of the frame), what was known before")
     assert facts["gyroscope"] == "axes yxz, offset -17.7 +- 0.2 ms, correlation 0.999"
     assert "its halves say" not in facts
@@ -352,8 +352,8 @@ def test_the_readout_time_is_told_with_its_evidence():
     ],
 )
 def test_readout_says_whether_the_video_tells(tmp_path, monkeypatch, changed, says):
-    told = {**TOLD, **changed}
-    found = MeasuredReadout(told["seconds"], told["sigma"], told["of_frame"], problem_of(told), told)
+    stated = {**STATED, **changed}
+    found = MeasuredReadout(stated["seconds"], stated["sigma"], stated["of_frame"], problem_of(stated), stated)
     assert found.measured is (not says)
     monkeypatch.setattr(sys.modules["rsundistort.solve"], "measure_readout", lambda *_, **__: found)
     (tmp_path / "clip.mp4").write_bytes(b"")
@@ -362,7 +362,7 @@ def test_readout_says_whether_the_video_tells(tmp_path, monkeypatch, changed, sa
     assert result.exit_code == as_json.exit_code == (3 if says else 0)
     assert says in " ".join(result.stdout.split())
     assert max(map(len, result.stdout.splitlines())) <= 80
-    assert json.loads(as_json.stdout) == {"measured": not says, "problem": found.problem, **told, "warnings": []}
+    assert json.loads(as_json.stdout) == {"measured": not says, "problem": found.problem, **stated, "warnings": []}
 
 
 @pytest.mark.parametrize(
@@ -445,9 +445,9 @@ def test_run_of_a_video_writes_all_its_frames_and_its_path(cut, tmp_path):
     after, before = frames_of(out / "video.mp4"), frames_of(cut)
     assert len(after) == 20
     inner = np.s_[20:-20, 20:-20]
-    twin = cv2.imread(str(WALK / "global" / "clip_000009.jpg"))[inner]
+    reference = cv2.imread(str(WALK / "global" / "clip_000009.jpg"))[inner]
     found, raw = (each[9].to_ndarray(format="bgr24")[inner] for each in (after, before))
-    assert psnr(found, twin) > max(34, psnr(raw, twin) + 6)
+    assert psnr(found, reference) > max(34, psnr(raw, reference) + 6)
     assert "readout time       " in result.stdout
     assert "of the frame), measured from the video" in " ".join(result.stdout.split())
     assert "measured from the video" in (out / "report.html").read_text(encoding="utf-8")

@@ -24,7 +24,7 @@ def said(found, time_s, frame_span):
 
 
 @pytest.mark.parametrize("seed", [11, 12])
-def test_frames_that_were_turned_back_are_named_and_others_are_not(seed):
+def test_frames_that_were_rotated_back_are_named_and_others_are_not(seed):
     """From a start that knows no shutter, as videos have it."""
     truth, times = filmed(HandHeld(seed), 40, noise_px=0.2)
     start = bundle_adjust(truth, "global", BundleOptions(outlier_rounds=0, deviations="model")).reconstruction
@@ -42,7 +42,7 @@ def shaking(time_s):
 
 
 @pytest.mark.parametrize(("left", "named"), [(1.0, False), (0.8, False), (0.1, True)])
-def test_a_gyroscope_of_any_axes_and_bias_names_frames_that_turn_too_little(left, named):
+def test_a_gyroscope_of_any_axes_and_bias_names_frames_that_rotate_too_little(left, named):
     """With a sensor that lies otherwise, a clock that is off by three frames, and a focal length that is wrong."""
     time_s = np.arange(90) * FRAME_S
     pairs = np.column_stack([np.arange(89), np.arange(1, 90)])

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from critical_scenes import named_scene
-from numpy_twin import project
+from numpy_reference import project
 from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, Camera, Observations, Reconstruction, bundle_adjust
@@ -137,7 +137,7 @@ def test_a_motion_of_the_world_by_the_clock_leaves_no_trace_without_contrast(how
 @pytest.mark.parametrize(
     ("name", "low"), [("parallel", True), ("10 degrees", False), ("20 degrees", False), ("one portrait", False)]
 )  # fmt: skip
-def test_contrast_grows_as_cameras_are_turned(name, low):
+def test_contrast_grows_as_cameras_are_rotated(name, low):
     found = clock_contrast(measured(named_scene(name, num_points=300)))
     assert 0.05 < found < 1
     assert (found < 0.15) == low
@@ -197,7 +197,7 @@ def test_the_weakest_change_displaces_the_photos_by_what_is_said(rng):
     assert common.shift_px < np.sqrt(whole) < 3 * common.shift_px
 
 
-def test_common_motion_of_cameras_that_read_columns_is_that_of_rows_turned(rng):
+def test_common_motion_of_cameras_that_read_columns_is_that_of_rows_rotated(rng):
     rows = measured(moving(named_scene("parallel", num_points=80), rng), rng)
     quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()
     cameras = [
@@ -327,7 +327,7 @@ def test_still_photos_that_are_known_to_have_moved_are_refused():
 ESTIMATED = BundleOptions(loss="squared", outlier_rounds=0, sigma_px=NOISE_PX)
 
 
-def test_auto_finds_the_photo_that_neither_turned_nor_travelled(rng):
+def test_auto_finds_the_photo_that_neither_rotated_nor_travelled(rng):
     better = 0
     for _ in range(4):
         truth = measured(moving(named_scene("parallel", num_points=150), rng, still=5), rng)
@@ -346,7 +346,7 @@ def test_auto_finds_the_photo_that_neither_turned_nor_travelled(rng):
     assert better >= 3
 
 
-def test_a_photo_that_only_turned_not_is_no_still_one(rng):
+def test_a_photo_that_did_not_rotate_but_travelled_is_no_still_one(rng):
     scene = moving(named_scene("parallel", num_points=150), rng)
     phi = scene.phi.copy()
     phi[5] = 0.0
@@ -367,7 +367,7 @@ def test_a_photo_wrongly_said_to_be_still_is_noticed(rng):
         assert any("was specified as still" in text for text in remedy.warnings) == warned
 
 
-def test_a_photo_turned_by_90_degrees_is_advised_for_what_it_tells_of_the_common_motion(rng):
+def test_a_photo_rotated_by_90_degrees_is_advised_for_what_it_tells_of_the_common_motion(rng):
     result = bundle_adjust(measured(moving(named_scene("parallel", num_points=150), rng), rng), MODEL, KNOWN)
     before = shape_cost(result, KNOWN).common.shift_px
     advice = advise(result, KNOWN)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from critical_scenes import HIDDEN, named_scene
-from numpy_twin import project
+from numpy_reference import project
 from scipy.spatial.transform import Rotation
 from solved_scene import cameras_of
 
@@ -41,7 +41,7 @@ def readout_of(scene):
     return [scene.camera(i).readout for i in range(scene.num_images)]
 
 
-def meter_of(scene):
+def degeneracy_of(scene):
     return critical_motion(scene.R_cw, scene.center_w, readout_of(scene))
 
 
@@ -83,29 +83,29 @@ def adjusted(scene, rng, still=None, model="rotation", options=None):
 
 @pytest.mark.parametrize("name", HIDDEN)
 def test_meter_is_zero_where_the_shape_is_hidden_and_only_there(name):
-    meter = meter_of(named_scene(name))
-    values = meter.singular_values
+    degeneracy = degeneracy_of(named_scene(name))
+    values = degeneracy.singular_values
     assert values.shape == (5,)
     assert (np.diff(values) <= 0).all()
     assert (values[5 - HIDDEN[name] :] < 1e-9).all()
     assert (values[: 5 - HIDDEN[name]] > 0.1).all()
-    assert meter.num_hidden == HIDDEN[name]
+    assert degeneracy.num_hidden == HIDDEN[name]
 
 
 @pytest.mark.parametrize("name", ["parallel", "parallel, some upside down", "one portrait, read by columns"])
 def test_parallel_axes_hide_the_vertical_scale(name):
-    meter = meter_of(named_scene(name))
-    np.testing.assert_allclose(meter.null_vector, [0, 1, 0, 0, 0], atol=1e-9)
-    assert "vertical scale" in meter.meaning
-    assert meter.y_axis_spread_deg < 1e-5
-    assert meter.is_low
+    degeneracy = degeneracy_of(named_scene(name))
+    np.testing.assert_allclose(degeneracy.null_vector, [0, 1, 0, 0, 0], atol=1e-9)
+    assert "vertical scale" in degeneracy.meaning
+    assert degeneracy.y_axis_spread_deg < 1e-5
+    assert degeneracy.is_low
 
 
 def test_meanings():
-    assert "too few photos" in meter_of(named_scene("two views")).meaning
-    assert "skew and aspect ratio:" in meter_of(named_scene("pure translation")).meaning
-    assert meter_of(named_scene("random")).meaning.startswith("nothing")
-    assert meter_of(named_scene("20 degrees")).y_axis_spread_deg == pytest.approx(20, rel=0.5)
+    assert "too few photos" in degeneracy_of(named_scene("two views")).meaning
+    assert "skew and aspect ratio:" in degeneracy_of(named_scene("pure translation")).meaning
+    assert degeneracy_of(named_scene("random")).meaning.startswith("nothing")
+    assert degeneracy_of(named_scene("20 degrees")).y_axis_spread_deg == pytest.approx(20, rel=0.5)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -150,7 +150,7 @@ def test_meter_equals_finite_differences_of_the_equations_of_self_calibration(se
 
 def test_meter_does_not_change_with_the_world_or_the_order_of_the_photos(rng):
     scene = named_scene("10 degrees")
-    expected = meter_of(scene)
+    expected = degeneracy_of(scene)
     turn = Rotation.random(random_state=1).as_matrix()
     order = rng.permutation(scene.num_images)
     R_cw = (scene.R_cw @ turn.T)[order]
@@ -380,7 +380,7 @@ def test_bad_lengths_are_refused(end, length, sigma, says, rng):
         BundleOptions(lengths=[good])
 
 
-def test_lengths_of_photos_that_are_not_joined_are_left_out_and_named(rng):
+def test_lengths_of_photos_that_are_not_registered_are_left_out_and_named(rng):
     truth = with_measurements(named_scene("random"), np.zeros((10, 3)), "rotation")
     good = [KnownLength(seen_at(truth, k), seen_at(truth, k + 1), 1.0, 0.1) for k in range(2)]
     lost = KnownLength(seen_at(truth, 4), ("lost.jpg", 3.0, 4.0), 1.0, 0.1)
@@ -455,7 +455,7 @@ def test_advice_raises_the_meter_and_lowers_the_uncertainty(rng):
     advice = advise(result, options)
     assert [each.what.split(" more")[0] for each in advice] == ["one photo", "three photos"]
     for each in advice:
-        assert each.meter > before.meter.value + 0.1
+        assert each.degeneracy > before.degeneracy.value + 0.1
         assert each.sigma_log_k < 0.5 * before.sigma_log_k
         assert "the height would be uncertain by" in each.sentence
 

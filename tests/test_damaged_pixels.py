@@ -27,7 +27,7 @@ def damaged(path, *options):
     return path
 
 
-def test_a_strip_whose_checksum_is_wrong_is_told_by_name(tmp_path):
+def test_a_strip_whose_checksum_is_wrong_is_reported_by_name(tmp_path):
     path = damaged(tmp_path / "a.tif", cv2.IMWRITE_TIFF_COMPRESSION, DEFLATE)
     with pytest.warns(DamagedPhotoWarning, match=r"a\.tif seems damaged: the checksum of 1 of its strips"):
         read_photo(path)
@@ -45,7 +45,7 @@ def test_a_png_whose_checksum_is_wrong_is_refused_by_name(tmp_path):
         read_photo(damaged(tmp_path / "a.png"))
 
 
-def test_of_photos_that_are_read_side_by_side_the_damaged_one_is_told(tmp_path):
+def test_of_photos_that_are_read_side_by_side_the_damaged_one_is_reported(tmp_path):
     names = [f"{k}.jpg" for k in range(12)]
     for seed, name in enumerate(names):
         (tmp_path / name).write_bytes(bytes(cv2.imencode(".jpg", texture(320, 240, seed))[1]))

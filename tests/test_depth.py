@@ -7,9 +7,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy_twin
+import numpy_reference
 import pytest
-from numpy_twin import DIRECTIONS
+from numpy_reference import DIRECTIONS
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial.transform import Rotation
 
@@ -35,7 +35,7 @@ from rsundistort.synthetic import project_rows
 
 W, H = 200, 160
 K = np.array([[210.0, 0, 97.3], [0, 205.0, 81.6], [0, 0, 1]])
-make_camera = partial(numpy_twin.make_camera, W, H, K)
+make_camera = partial(numpy_reference.make_camera, W, H, K)
 LENS = [-0.12, 0.03, 0.001, -0.002]
 VELOCITY = np.array([0.6, -0.3, 0.4])  # m per unit of the clock; the frame is 0.8 of it
 MOTION = RowMotion([0.04, -0.03, 0.05], VELOCITY)
@@ -43,7 +43,7 @@ R = Rotation.from_rotvec([0.02, -0.05, 0.1]).as_matrix()
 MODEL = "constant-motion"
 
 all_directions = pytest.mark.parametrize("readout", DIRECTIONS)
-FISHEYE = numpy_twin.Fisheye((0.02, -0.01, 0.003, -0.001))
+FISHEYE = numpy_reference.Fisheye((0.02, -0.01, 0.003, -0.001))
 with_and_without_lens = pytest.mark.parametrize("dist", [[], LENS, FISHEYE], ids=["pinhole", "lens", "fisheye"])
 depths = pytest.mark.parametrize("kind", ["plane", "map", "points"])
 
@@ -420,7 +420,7 @@ def test_plane_is_preferred_where_all_is_flat_only(rng):
 FLYOVER = Path(__file__).parent.parent / "sample_scenes" / "flyover"
 
 
-def test_flight_with_true_motion_and_points_comes_near_its_twin():
+def test_flight_with_true_motion_and_points_comes_near_its_reference():
     """The renderer knows nothing of the row models; the points are 300 or so that a photo shows."""
     truth, tracks = read_solution(FLYOVER / "ground_truth.json"), np.load(FLYOVER / "tracks.npz")
     image = truth.images[1]

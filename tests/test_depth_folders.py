@@ -9,7 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy_twin
+import numpy_reference
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -35,7 +35,7 @@ from rsundistort.synthetic import measure
 
 W, H = 200, 160
 K = np.array([[210.0, 0, 97.3], [0, 205.0, 81.6], [0, 0, 1]])
-make_camera = partial(numpy_twin.make_camera, W, H, K)
+make_camera = partial(numpy_reference.make_camera, W, H, K)
 LENS = [-0.12, 0.03, 0.001, -0.002]
 MODEL = "constant-motion"
 

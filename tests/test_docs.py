@@ -188,13 +188,13 @@ def _survey(place: Path) -> None:
     often = np.flatnonzero(np.bincount(tracks["point_idx"][seen], minlength=len(tracks["points_w"])) == 4)
     rows = ["name,photo,x,y,E,N,U,sigma,use"]
     for k, point in enumerate(rng.choice(often, 8, replace=False).tolist()):
-        told = (
+        stated = (
             ",".join(f"{each:.4f}" for each in in_utm(tracks["points_w"][point]))
             + f",0.01,{'check' if k % 2 else 'control'}"
         )
         for row in np.flatnonzero(seen & (tracks["point_idx"] == point)).tolist():
             x, y = (tracks["xy_raw"][row] + 0.5) / 2 - 0.5  # the photos are halved
-            rows.append(f"P{k},{tracks['image_names'][tracks['frame_idx'][row]]},{x:.3f},{y:.3f},{told}")
+            rows.append(f"P{k},{tracks['image_names'][tracks['frame_idx'][row]]},{x:.3f},{y:.3f},{stated}")
     (place / "gcp.csv").write_text("\n".join(rows) + "\n")
 
 
@@ -287,8 +287,8 @@ def test_commands_run(page, place):
         result = CliRunner().invoke(cli, words)
         assert result.exit_code == 0, f"{page}: {line}: {result.output}"
         if "--gcp" in words:
-            told = rs.read_solution(place / "OUT" / "solution.json").georeference
-            checks = [each["residual_m"] for each in told["control"].values() if each["use"] == "check"]
+            stated = rs.read_solution(place / "OUT" / "solution.json").georeference
+            checks = [each["residual_m"] for each in stated["control"].values() if each["use"] == "check"]
             # a pixel of these small photos is 2 cm of the scene, 8 m away
             assert len(checks) == 4
             assert np.sqrt(np.mean(np.square(checks))) < 0.05

@@ -117,7 +117,7 @@ def test_coarse_system_is_the_projection(nb, rng):
     np.testing.assert_allclose(coarse.border.reshape(len(B), -1), B @ Z, rtol=0, atol=1e-11 * np.abs(B).max())
 
 
-def test_coarse_space_holds_what_moves_turns_grows_and_bends_a_cluster(rng):
+def test_coarse_space_holds_what_moves_rotates_grows_and_bends_a_cluster(rng):
     grid = Grid(rng, nb=12)
     grid.free[:] = True
     # flat: the height of the photos is not among the functions
@@ -152,8 +152,8 @@ def test_conjugate_gradients_give_the_solution_of_the_whole_system(nb, parts, ca
     early = solve_iteratively(grid.reduced, grid.space(), grid.pattern, 1e-12, 2)
     assert not early.converged
     rest = grid.g - grid.H @ np.concatenate([early.x.ravel(), early.y])
-    told = np.concatenate([early.residual.ravel(), early.camera_residual])
-    np.testing.assert_allclose(told[grid.unheld], rest[grid.unheld], rtol=0, atol=1e-12 * np.abs(grid.g).max())
+    stated = np.concatenate([early.residual.ravel(), early.camera_residual])
+    np.testing.assert_allclose(stated[grid.unheld], rest[grid.unheld], rtol=0, atol=1e-12 * np.abs(grid.g).max())
 
 
 @pytest.mark.parametrize("tolerance", [0.1, 0.01])

@@ -494,7 +494,7 @@ def guess(*photos, readout="top-to-bottom"):
 
 
 @pytest.mark.parametrize("facts", [UPRIGHT, ExifFacts(), replace(PHONE, orientation=None)])
-def test_portraits_among_landscapes_were_turned(facts):
+def test_portraits_among_landscapes_were_rotated(facts):
     directions, notes = guess((facts, 640, 480), (facts, 480, 640), (facts, 480, 640))
     assert directions == ["top-to-bottom", "left-to-right", "left-to-right"]
     assert "2 portrait photos" in notes[0]

@@ -37,7 +37,7 @@ def solution_of(R_cw, center_w, names=None, model="rotation", lost=()):
             images.append(SolvedImage(name, "1", reason="shares too little with the other photos"))
         else:
             images.append(SolvedImage(name, "1", R_cw[i], center_w[i], RowMotion([0.01, 0.02, 0.03])))
-    options = {"camera": "as told"}
+    options = {"camera": "as specified"}
     return Solution(
         model, {"1": camera}, {"1": camera.pinhole()}, tuple(images), options=options, quality={"rms_px": 0.5}
     )
@@ -167,9 +167,9 @@ def made_up(monkeypatch, poses, rng):
 
 
 def test_experiment_two_writes_what_it_promises(folders, made_up, tmp_path):
-    out, told = tmp_path / "out", []
+    out, steps = tmp_path / "out", []
     options = TwoOptions(camera="500,500,320,240", readout="bottom-to-top", seed=3, jobs=1)
-    summary = experiment_two(*folders, out, options, lambda *args: told.append(args))
+    summary = experiment_two(*folders, out, options, lambda *args: steps.append(args))
     assert [(photos, name, o.solve.shutter_model) for photos, name, o, _ in made_up] == [
         ("still", "still", "global"),
         ("swung", "swung", "auto"),
@@ -179,7 +179,7 @@ def test_experiment_two_writes_what_it_promises(folders, made_up, tmp_path):
         assert (passed.camera, passed.solve.readout, passed.solve.seed, jobs) == (
             "500,500,320,240", "bottom-to-top", 3, 1,
         )  # fmt: skip
-    assert [stage for stage, _, _ in told] == ["still: matching", "swung: matching", "swung-global: matching"]
+    assert [stage for stage, _, _ in steps] == ["still: matching", "swung: matching", "swung-global: matching"]
     assert sorted(path.name for path in out.iterdir()) == [
         ".rsundistort-written", "paths.png", "photos.csv", "still", "summary.json", "swung", "swung-global",
     ]  # fmt: skip
@@ -204,7 +204,7 @@ def test_experiment_two_writes_what_it_promises(folders, made_up, tmp_path):
     assert cv2.imread(str(out / "paths.png")) is not None
 
 
-def test_experiment_two_keeps_outputs_unless_told(folders, made_up, tmp_path):
+def test_experiment_two_keeps_outputs_unless_specified(folders, made_up, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "summary.json").write_text("precious")
@@ -222,14 +222,14 @@ def test_experiment_two_keeps_outputs_unless_told(folders, made_up, tmp_path):
     assert (out / "summary.json").is_file()
 
 
-def test_experiment_two_leaves_nothing_where_too_few_are_joined(folders, made_up, monkeypatch, poses, tmp_path):
+def test_experiment_two_leaves_nothing_where_too_few_are_registered(folders, made_up, monkeypatch, poses, tmp_path):
     monkeypatch.setattr(two, "run", lambda *_, **__: solution_of(*poses, lost=NAMES[:4]))
     with pytest.raises(InputError, match="2 photos were registered in all three"):
         experiment_two(*folders, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_experiment_two_says_which_photos_cannot_be_joined(folders, made_up, monkeypatch, tmp_path):
+def test_experiment_two_says_which_photos_cannot_be_registered(folders, made_up, monkeypatch, tmp_path):
     good = two.run
 
     def fake(photos, out, options, progress=None, jobs=0):
@@ -296,7 +296,7 @@ def test_command_two(folders, made_up, tmp_path):
 
 
 @pytest.mark.slow
-def test_courtyard_swung_against_its_still_twins(tmp_path):
+def test_courtyard_swung_against_its_still_references(tmp_path):
     swung = half_courtyard(tmp_path / "swung")
     still = tmp_path / "still"
     still.mkdir()

@@ -75,13 +75,13 @@ def four_trials(scene_file, two_trials, tmp_path_factory):
     """Two more in a copy of that folder."""
     out = tmp_path_factory.mktemp("trials") / "four"
     shutil.copytree(two_trials[0], out)
-    told = []
+    steps = []
     with pytest.MonkeyPatch.context() as patch:  # not in a process of their own: the first two were
         patch.setattr(one, "ProcessPoolExecutor", lambda count, _: ThreadPoolExecutor(count))
         summary = experiment_one(
-            [scene_file], out, OneOptions(trials=4, methods=PAIR, jobs=1), lambda *args: told.append(args)
+            [scene_file], out, OneOptions(trials=4, methods=PAIR, jobs=1), lambda *args: steps.append(args)
         )
-    return out, summary, told
+    return out, summary, steps
 
 
 # ---------------------------------------------------------------- one: the protocol
@@ -269,9 +269,9 @@ def test_finished_trials_are_not_run_again(two_trials, four_trials):
     assert len(before) == 4
     assert after[:4] == before
     assert set(results_of(four_trials[0])) == {(trial, method) for trial in range(4) for method in PAIR}
-    told = four_trials[2]
-    assert told[0] == ("trials", 0, 2)
-    assert told[-1] == ("trials", 2, 2)
+    steps = four_trials[2]
+    assert steps[0] == ("trials", 0, 2)
+    assert steps[-1] == ("trials", 2, 2)
 
 
 def test_a_torn_last_line_is_run_again(scene_file, two_trials, tmp_path):

@@ -121,16 +121,18 @@ def on_the_map(scene: ExportScene, folder: Path, crs: str, origin) -> ExportScen
     Image.new("RGB", (8, 8)).save(folder / "0.jpg", exif=exif)
     matrix = np.eye(4)
     matrix[:3, 3] = origin  # of a projection; "local" has its axes there, too
-    told = {"crs": crs, "origin": list(origin), "transformation": matrix.tolist()}
-    there = replace(scene.solution, georeference=told)
+    stated = {"crs": crs, "origin": list(origin), "transformation": matrix.tolist()}
+    there = replace(scene.solution, georeference=stated)
     return replace(scene, source=folder, solution=there, stored=there)
 
 
 def test_opensfm_gets_the_gps_of_the_photos_and_where_the_frame_is(tmp_path):
     scene = on_the_map(made(), tmp_path, "local", (46.5, -7.25, 400.0))
     EXPORTS["opensfm"].write(tmp_path / "out", scene)
-    told = json.loads((tmp_path / "out" / "exif" / "0.jpg.exif").read_text())
-    assert told["gps"] == pytest.approx({"latitude": 46.5, "longitude": -7.25, "altitude": 431.5, "dop": 2.0}, abs=1e-3)
+    stated = json.loads((tmp_path / "out" / "exif" / "0.jpg.exif").read_text())
+    assert stated["gps"] == pytest.approx(
+        {"latitude": 46.5, "longitude": -7.25, "altitude": 431.5, "dop": 2.0}, abs=1e-3
+    )
     assert json.loads((tmp_path / "out" / "exif" / "1.jpg.exif").read_text())["gps"] == {}
     (found,) = json.loads((tmp_path / "out" / "reconstruction.json").read_text())
     assert found["reference_lla"] == {"latitude": 46.5, "longitude": -7.25, "altitude": 400.0}
@@ -218,8 +220,8 @@ def test_opf_gets_the_gps_of_the_photos_and_the_projection(tmp_path):
     assert second.geolocation is None
     frame = project.scene_reference_frame
     assert frame.crs.definition == "EPSG:32629"
-    told = read_model(tmp_path / "opf" / "project.opf").georeference
-    assert (told["crs"], told["origin"]) == ("EPSG:32629", [457000.0, 5150000.0, 0.0])
+    stated = read_model(tmp_path / "opf" / "project.opf").georeference
+    assert (stated["crs"], stated["origin"]) == ("EPSG:32629", [457000.0, 5150000.0, 0.0])
     # from E, N, U to the coordinates of the poses
     np.testing.assert_array_equal(
         frame.base_to_canonical.transformation_matrix @ [457001.0, 5150002.0, 3.0, 1.0], [1.0, 2.0, 3.0, 1.0]
@@ -233,10 +235,10 @@ def test_a_projection_of_opf_goes_through_solve(tmp_path):
 
     EXPORTS["opf-rectified"].write(tmp_path / "in", on_the_map(made(), tmp_path, "EPSG:32629", (457000.0, 5e6, 0.0)))
     path = tmp_path / "in" / "scene_reference_frame.json"
-    told = json.loads(path.read_text())
-    told["base_to_canonical"] = {"scale": [0.5, 0.5, 1.0], "shift": [-7.0, 9.0, 2.0], "swap_xy": True}
-    told["crs"] = {"definition": "EPSG:32629+5773", "geoid_height": 51.5}
-    path.write_text(json.dumps(told))
+    stated = json.loads(path.read_text())
+    stated["base_to_canonical"] = {"scale": [0.5, 0.5, 1.0], "shift": [-7.0, 9.0, 2.0], "swap_xy": True}
+    stated["crs"] = {"definition": "EPSG:32629+5773", "geoid_height": 51.5}
+    path.write_text(json.dumps(stated))
     options, outputs = (
         SolveOptions(shutter_model="global", readout="top-to-bottom"),
         OutputOptions(exports=("opf-rectified",)),
@@ -501,7 +503,7 @@ def test_what_there_is_no_writer_for_is_refused():
         check_exports(["maya"])
 
 
-def test_an_extra_that_is_missing_is_told_before_any_work(monkeypatch):
+def test_an_extra_that_is_missing_is_reported_before_any_work(monkeypatch):
     def without(name: str) -> None:
         raise ImportError(f"No module named '{name}'")
 

@@ -50,7 +50,7 @@ def test_exposures_that_cannot_be_are_missing(stored, found):
 
 
 @pytest.mark.parametrize(("stored", "found"), [(0.0, False), (1.0, True), (16.0, False), (25.0, True), (None, None)])
-def test_a_flash_that_fired_is_told(stored, found):
+def test_a_flash_that_fired_is_reported(stored, found):
     assert _facts({0x9209: stored}).flash is found
 
 
@@ -131,14 +131,14 @@ def test_limits_that_are_none_are_refused(limit):
 
 def test_motions_against_the_exposure_are_looked_for(rng, monkeypatch):
     rec = make_scene(rng, "rotation", noise_px=0.3)
-    told = []
+    stated = []
 
     def judged(*args):
-        told.append(args[6])
+        stated.append(args[6])
         return judge(*args)
 
     monkeypatch.setattr(model_sequence, "judge", judged)
     options = BundleOptions(phi_limits={"1.jpg": 1e-5})
     solved = model_sequence.solve_tracks(rec, cameras_of(rec), "rotation", 0, lambda _: options, StageLog(None), "none")
-    assert told == [{"1.jpg": 2e-5}]
+    assert stated == [{"1.jpg": 2e-5}]
     assert solved.verdict is not None

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from bundle_scenes import make_scene
 from critical_scenes import named_scene
-from numpy_twin import project
+from numpy_reference import project
 
 from rsundistort import BundleOptions, Observations, bundle_adjust
 

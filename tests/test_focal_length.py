@@ -51,7 +51,7 @@ def test_pairs_of_a_scene_tell_the_focal_length_as_well_as_they_say(rng, focal):
     assert found.num_pairs == 10
 
 
-@pytest.mark.parametrize("of", ["a plane", "a camera that turned"])
+@pytest.mark.parametrize("of", ["a plane", "a camera that rotated"])
 def test_what_tells_nothing_is_not_believed(rng, of):
     focal = 1800.0
     plane = np.column_stack([rng.uniform(-4, 4, (200, 2)), np.full(200, 8.0)])

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from numpy_twin import Fisheye, lens_of
+from numpy_reference import Fisheye, lens_of
 from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera

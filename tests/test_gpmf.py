@@ -293,7 +293,7 @@ def test_times_are_uniform_though_payloads_hold_what_there_happened_to_be(tmp_pa
 
 
 @pytest.mark.parametrize("with_total", [True, False])
-def test_samples_are_counted_where_no_total_is_told(tmp_path, with_total):
+def test_samples_are_counted_where_no_total_is_given(tmp_path, with_total):
     log = read_gpmf(mux(tmp_path / "a.mp4", telemetry([400, 400, 400, 40], with_total=with_total)))
     assert log.time_s == pytest.approx(np.arange(1240) / RATE_HZ, abs=1e-9)
 
@@ -349,13 +349,13 @@ def test_readout_of_newer_cameras_stands_once_beside_the_movie(tmp_path):
     path = mux(tmp_path / "a.mp4", telemetry([400] * 2))
     assert read_gpmf(path).readout_s is None
     data = bytearray(path.read_bytes())
-    told = nested(b"DEVC", number(b"SROT", b"f", "f", 15.4))
-    data += struct.pack(">I4s", 8 + len(told), b"GPMF") + told  # FFmpeg writes moov last, and udta last in it
+    stated = nested(b"DEVC", number(b"SROT", b"f", "f", 15.4))
+    data += struct.pack(">I4s", 8 + len(stated), b"GPMF") + stated  # FFmpeg writes moov last, and udta last in it
     for name in (b"moov", b"udta"):
         at = data.rindex(name) - 4
         (size,) = struct.unpack(">I", data[at : at + 4])
-        assert at + size + 8 + len(told) == len(data)
-        data[at : at + 4] = struct.pack(">I", size + 8 + len(told))
+        assert at + size + 8 + len(stated) == len(data)
+        data[at : at + 4] = struct.pack(">I", size + 8 + len(stated))
     path.write_bytes(data)
     assert read_gpmf(path).readout_s == pytest.approx(0.0154)
 

@@ -6,9 +6,9 @@ from functools import partial
 
 import cv2
 import numpy as np
-import numpy_twin
+import numpy_reference
 import pytest
-from numpy_twin import DIRECTIONS, MODELS, Fisheye
+from numpy_reference import DIRECTIONS, MODELS, Fisheye
 from scipy.ndimage import map_coordinates
 
 from rsundistort import Camera, Plane, RemapGrid, RowMotion, init_rectify_map, rectify, undistort_points
@@ -18,7 +18,7 @@ from rsundistort.rectify.maps import EDGE_PX, fill_rows, rectified_rays
 
 W, H = 640, 480
 K = np.array([[520.0, 0, 315.3], [0, 510.0, 246.6], [0, 0, 1]])
-make_camera = partial(numpy_twin.make_camera, W, H, K)
+make_camera = partial(numpy_reference.make_camera, W, H, K)
 LENS = [-0.12, 0.03, 0.001, -0.002]
 FISHEYE = Fisheye([0.03, -0.01, 0.004, -0.001])
 RATIONAL = [0.1, -0.05, 0.001, -0.002, 0.01, 0.25, 0.02, 0.005, 0.002, -0.001, 0.001, 0.0015]

@@ -67,7 +67,7 @@ def test_phi_is_minus_the_mean_rate_over_the_readout():
 
 
 @pytest.mark.parametrize("readout", READOUTS)
-def test_sign_by_a_camera_that_is_turned_step_by_step(readout):
+def test_sign_by_a_camera_that_is_rotated_step_by_step(readout):
     """A gyroscope's rates, integrated sample by sample, show each point where the row model with that phi does."""
     camera = Camera(640, 480, [[600, 0, 319.5], [0, 600, 239.5], [0, 0, 1]], readout=readout)
     rng = np.random.default_rng(1)
@@ -170,7 +170,7 @@ def test_mean_of_a_piecewise_linear_rate_is_exact(rng):
     assert uneven.mean(np.array(10.3), np.array(31.7)) == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_solution_far_from_the_gyroscope_is_told():
+def test_a_solution_far_from_the_gyroscope_is_reported():
     rec = named_scene("random", m=4)
     found = np.array([[0.02, -0.01, 0.03], [0.01, 0.02, 0.0], [-0.02, 0.01, 0.01], [0.0, 0.0, 0.02]])
     rec = replace(rec, shutter_model="rotation", phi=found / rec.frame_span()[:, None])
@@ -387,13 +387,13 @@ def test_who_says_how_long_the_readout_takes():
     camera = Camera(1280, 720, [[1000, 0, 640], [0, 1000, 360], [0, 0, 1]])
     other = Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]])
     frames = VideoFrames(("a.png",), np.zeros(1), 1, 0, 1, "Apple", "iPhone 6s")
-    told = log(readout_s=0.02)
+    stated = log(readout_s=0.02)
 
     def known(given_s, log_):
         return known_readouts([frames] * 2, [camera, other], [0, 1], given_s, log_)
 
-    assert known(0.03, told) == {0: (0.03, "given"), 1: (0.03, "given")}
-    assert known(None, told) == dict.fromkeys((0, 1), (0.02, "the gyroscope's log"))
+    assert known(0.03, stated) == {0: (0.03, "given"), 1: (0.03, "given")}
+    assert known(None, stated) == dict.fromkeys((0, 1), (0.02, "the gyroscope's log"))
     found = known(None, log())
     assert list(found) == [0]  # the other's size is not in the table
     assert found[0][0] == pytest.approx(0.01501)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bundle_scenes import FISHEYE, LENS, RATIONAL, gradients, make_scene, perturbed, scaled, unit_steps
-from numpy_twin import Fisheye
+from numpy_reference import Fisheye
 
 from rsundistort import BundleOptions, bundle_adjust
 from rsundistort.bundle import (

@@ -121,10 +121,10 @@ def test_what_was_cut_short_is_compiled_again(small, written, suffix, length):
     assert [small(), small()] == [0, 1]
 
 
-def test_without_a_folder_it_is_compiled_in_memory_and_told_once(small):
-    with pytest.warns(RsUndistortWarning, match="set NUMBA_CACHE_DIR") as told:
+def test_without_a_folder_it_is_compiled_in_memory_and_reported_once(small):
+    with pytest.warns(RsUndistortWarning, match="set NUMBA_CACHE_DIR") as stated:
         assert small(**NOWHERE) == 0
-    assert len(told) == 1
+    assert len(stated) == 1
 
 
 def test_the_command_says_so_in_one_line(tmp_path):

@@ -150,7 +150,7 @@ def test_maps_and_rectified_photos_are_without_it(rng):
 
 
 @pytest.mark.parametrize("orientation", list(MATRICES))
-def test_turned_photos_have_a_turned_field(orientation, rng):
+def test_rotated_photos_have_a_rotated_field(orientation, rng):
     camera = camera_with_field(rng)
     xy = pixels(rng, camera)
     turned = turn_camera(camera, orientation)
@@ -346,7 +346,7 @@ def test_a_field_is_kept_where_it_foretells_measurements(pattern, kept, rng):
     assert kept or choice.held_out_error.keys() == {"global"}
 
 
-def test_a_lens_that_its_model_says_badly_is_told(rng):
+def test_a_lens_that_its_model_says_badly_is_reported(rng):
     camera = camera_with_field(rng, size_px=0.02)
     rec = replace(scene_with_field(rng, nothing, "global", num_images=5, num_points=60))
     result = bundle_adjust(rec, "global", BundleOptions())
@@ -357,28 +357,28 @@ def test_a_lens_that_its_model_says_badly_is_told(rng):
     assert ["not the model of this lens" in " ".join(each) for each in reasons] == [False, True]
 
 
-def test_what_was_found_is_told_and_read_back(rng, tmp_path):
+def test_what_was_found_is_stored_and_read_back(rng, tmp_path):
     rec = scene_with_field(rng, waves, "global", num_images=8, num_points=300)
     options = replace(options_of(rec), residual_field=False)
     solved = solve_tracks(rec, cameras_of(rec), "auto", 0, lambda _: options, StageLog(None))
     solution = solution_of(solved, SolveOptions(), RectifyOptions())
     field = solution.cameras["1"].field
     assert field.shape == (4, 5, 2)
-    told = solution.quality["lens_fields"]["1"]
+    stated = solution.quality["lens_fields"]["1"]
     lengths = np.linalg.norm(field_over_frame(solution.cameras["1"])[1], axis=2)
-    assert told["largest_px"] == lengths.max()
-    assert told["rms_px"] > 5 * told["sigma_px"] > 0
+    assert stated["largest_px"] == lengths.max()
+    assert stated["rms_px"] > 5 * stated["sigma_px"] > 0
     write_solution(tmp_path / "solution.json", solution)
     again = read_solution(tmp_path / "solution.json")
     assert again.cameras == solution.cameras
     assert not again.rectified_cameras["1"].field.size
     (row,) = content.cameras(again)
-    assert row["field"]["rms"] == told["rms_px"]
+    assert row["field"]["rms"] == stated["rms_px"]
     # arrows are about as long as their cells; the field is larger between them
     assert 0.5 < row["field"]["times"] * lengths.max() * 13 / 800 < 1.2
     assert len(row["field"]["dots"]) == 13 * 9
     (line,) = _fields(again)
-    assert f"{told['rms_px']:.2f} px in the mean" in line
+    assert f"{stated['rms_px']:.2f} px in the mean" in line
 
 
 def test_without_a_field_nothing_is_said(rng):

@@ -78,8 +78,8 @@ def test_only_as_many_photos_as_fit(monkeypatch, each, jobs, threads_each):
         warnings.simplefilter("always")
         fitting = Workers(8).fitting("rectifying", each)
     assert fitting == Workers(jobs, None, threads_each)
-    told = [str(each.message).split(" at once")[0] for each in said]
-    assert told == [f"rectifying: {jobs} of 8 photos"] * (jobs < 8)
+    stated = [str(each.message).split(" at once")[0] for each in said]
+    assert stated == [f"rectifying: {jobs} of 8 photos"] * (jobs < 8)
 
 
 def test_photos_of_no_size_need_no_memory():

@@ -369,7 +369,7 @@ def damage(kind):
      "many entries", "no header"],
 )  # fmt: skip
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_damaged_exif_is_carried_and_told_once(tmp_path, suffix, kind):
+def test_damaged_exif_is_carried_and_reported_once(tmp_path, suffix, kind):
     exif = damage(kind)
     (tmp_path / "in.jpg").write_bytes(tagged_jpeg(texture(64, 48), [(0xE1, b"Exif\0\0" + exif)]))
     photo = read_photo(tmp_path / "in.jpg")

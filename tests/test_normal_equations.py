@@ -20,7 +20,7 @@ from bundle_scenes import (
     scaled,
     unit_steps,
 )
-from numpy_twin import MODELS, Fisheye
+from numpy_reference import MODELS, Fisheye
 
 from rsundistort import BundleOptions
 from rsundistort.bundle.problem import BundleProblem

@@ -12,6 +12,8 @@ from pathlib import Path
 import click
 import pytest
 from click.testing import CliRunner
+from rsundistort_cli import experiment, simulate
+from rsundistort_cli.readout import command as readout_command
 from rsundistort_cli.rectify import command as rectify_command
 from rsundistort_cli.run import command as run_command
 from rsundistort_cli.sections import SECTIONS
@@ -29,8 +31,12 @@ from rsundistort import (
     solve,
 )
 from rsundistort.errors import InputError
+from rsundistort.experiments import OneOptions, TwoOptions
+from rsundistort.io import GyroLog
 from rsundistort.model import ControlPoint
+from rsundistort.simulate import SceneOptions, WarpOptions
 from rsundistort.solve import OutputOptions
+from rsundistort.synthetic import Vibration
 
 # of the command itself, or no options
 NOT_OPTIONS = {
@@ -124,6 +130,55 @@ TRIED = [(name, part, *each) for name, parts in PARTS.items() for part, tried in
 # no file holds what a gyroscope knows; the parts of `RunOptions` are seen by themselves
 WITHOUT_OPTION = {"known", "known_bends", "solve", "rectify", "outputs"}
 
+COMMON = [(["--seed", "3"], {"seed": 3}), (["--jobs", "2"], {"jobs": 2})]
+# of commands with one class of options: command, module and name of the function, its options, arguments, tried ones
+OTHERS = [
+    (
+        simulate.warp, "rsundistort.simulate", "simulate_warp", WarpOptions(), ["photos", "-o", "out"],
+        [
+            *COMMON,
+            (["--camera", "c.json"], {"camera": "c.json"}),
+            (["--readout", "left-to-right"], {"readout": "left-to-right"}),
+            (["--sigma", "0.1"], {"sigma_rad": 0.1}),
+            (["--motion", "motion.json"], {"motion": {"a": [1.0, 2.0, 3.0]}}),
+            (["--acceleration", "0.5"], {"acceleration": 0.5}),
+            (["--vibration", "2"], {"vibration": Vibration(2e-3)}),
+            (["--vibration", "2", "--vibration-periods", "3", "4"], {"vibration": Vibration(2e-3, (3.0, 4.0))}),
+            (["--vibration", "2", "--vibration-axis", "x"], {"vibration": Vibration(2e-3, axis="x")}),
+            (["--gyro", "log.csv"], {"gyro": GyroLog([0, 1], [[1, 2, 3]] * 2)}),
+            (["--gyro", "log.csv", "--gyro-axes", "YZX"], {"gyro": GyroLog([0, 1], [[2, 3, 1]] * 2)}),
+            (["--readout-ms", "20"], {"readout_s": 0.02}),
+            (["--still", "a.jpg", "--still", "b.jpg"], {"still": ("a.jpg", "b.jpg")}),
+            (["--crop"], {"crop": True}),
+            (["--quality", "80"], {"quality": 80}),
+            (["--overwrite"], {"overwrite": True}),
+        ],
+    ),
+    (
+        simulate.scene, "rsundistort.simulate", "simulate_scene", SceneOptions(), ["recipe.json", "-o", "out"],
+        [COMMON[1], (["--no-depth"], {"depth": False}), (["--overwrite"], {"overwrite": True})],
+    ),
+    (
+        experiment.one, "rsundistort.experiments", "experiment_one", OneOptions(), ["scene.npz", "-o", "out"],
+        [
+            *COMMON,
+            (["--trials", "3"], {"trials": 3}),
+            (["--motion", "rotation"], {"translation": 0.0}),
+            (["--method", "rs", "--method", "rotation"], {"methods": ("rs", "rotation")}),
+        ],
+    ),
+    (
+        experiment.two, "rsundistort.experiments", "experiment_two", TwoOptions(), ["still", "swung", "-o", "out"],
+        [
+            *COMMON,
+            (["--camera", "c.json"], {"camera": "c.json"}),
+            (["--readout", "left-to-right"], {"readout": "left-to-right"}),
+            (["--model", "rotation"], {"shutter_model": "rotation"}),
+            (["--overwrite"], {"overwrite": True}),
+        ],
+    ),
+]  # fmt: skip
+
 
 class Seen(Exception):
     """Carries what a command calls its function with."""
@@ -193,11 +248,71 @@ def test_the_default_that_help_shows_is_that_of_the_field(name, part, arguments,
     (field,) = changed
     option = next(each for each in COMMANDS[name][0].params if arguments[-2:][0] in [*each.opts, *each.secondary_opts])
     shown = option.to_info_dict()["default"]
-    if not option.show_default:
+    if shown is None:  # without a default the library is not passed any
         return
-    of_view = {"scale": "scale", "alpha": "alpha", "max_size": "max_size"}.get(option.name)
-    kept = getattr(DEFAULTS[name][part], field)
-    assert shown == (getattr(kept, of_view) if of_view else kept)
+    kept = getattr(DEFAULTS[name][part], field) if part else untouched(name)[part][field]
+    if field == "gyro":
+        kept = GyroOptions("log.csv").offset_s
+    elif field == "view":
+        kept = getattr(kept, option.name)
+    assert shown == kept
+
+
+@pytest.mark.parametrize(("command", "module", "function", "options", "required", "tried"), OTHERS)
+def test_options_of_other_commands_set_their_fields(
+    command, module, function, options, required, tried, monkeypatch, tmp_path
+):
+    monkeypatch.chdir(tmp_path)
+    Path("log.csv").write_text("time_s,wx,wy,wz\n0,1,2,3\n1,1,2,3\n")
+    Path("motion.json").write_text('{"a": [1, 2, 3]}')
+
+    def stop(*given, **named):
+        raise Seen(*(each for each in given if isinstance(each, type(options))))
+
+    monkeypatch.setattr(sys.modules[module], function, stop)
+
+    def call(*arguments):
+        result = CliRunner().invoke(command, [*required, *arguments])
+        assert isinstance(result.exception, Seen), result.output
+        return as_plain(result.exception.args[0])
+
+    assert call() == as_plain(options)
+    for arguments, changed in tried:
+        assert call(*arguments) == as_plain(replace(options, **changed))
+    named = [each for each in command.params if isinstance(each, click.Option)]
+    flags = {flag for arguments, _ in tried for flag in arguments}
+    untried = {each.name for each in named if not flags & {*each.opts, *each.secondary_opts}}
+    assert untried <= NOT_OPTIONS
+    for option in named:
+        kept = [getattr(options, field) for arguments, (field,) in tried if arguments[0] in option.opts]
+        shown = option.to_info_dict()["default"]
+        if shown is not None and kept and option.name != "motion":  # which has a name of its own for two fields
+            assert shown == kept[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "jobs"),
+    [
+        ([], RunOptions(), 0),
+        (["--camera", "c.json"], RunOptions(camera="c.json"), 0),
+        (["--readout", "left-to-right"], RunOptions(solve=SolveOptions(readout="left-to-right")), 0),
+        (["--readout-ms", "20"], RunOptions(solve=SolveOptions(readout_s=0.02)), 0),
+        (["--gyro", "log.csv"], RunOptions(gyro=GyroOptions(Path("log.csv"))), 0),
+        (["--seed", "3"], RunOptions(solve=SolveOptions(seed=3)), 0),
+        (["--jobs", "2"], RunOptions(), 2),
+    ],
+)
+def test_options_of_readout_set_their_fields(arguments, options, jobs, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    for name in ("clip.mp4", "log.csv"):
+        Path(name).touch()
+
+    def stop(video, given, progress, *, jobs):
+        raise Seen(given, jobs)
+
+    monkeypatch.setattr(sys.modules["rsundistort.solve"], "measure_readout", stop)
+    result = CliRunner().invoke(readout_command, ["clip.mp4", *arguments])
+    assert result.exception.args == (options, jobs)
 
 
 def test_known_motions_set_their_field(call_of, tmp_path):

@@ -75,7 +75,7 @@ def project(points_w, solution, image, model):
     return project_points(points_c, solution.cameras[image.camera_id], motion, model)
 
 
-def test_pixels_are_turned_as_opencv_turns_them(tmp_path):
+def test_pixels_are_rotated_as_opencv_rotates_them(tmp_path):
     """OpenCV follows the EXIF orientation of a JPEG on reading."""
     stored = np.random.default_rng(0).integers(0, 256, (6, 9, 3), dtype=np.uint8).repeat(16, 0).repeat(16, 1)
     data = bytes(cv2.imencode(".jpg", stored)[1])
@@ -110,7 +110,7 @@ def test_orientations_compose_like_the_pixels():
 
 @pytest.mark.parametrize("model", ["global", "two-step", "linearized", "rotation", "constant-motion"])
 @pytest.mark.parametrize("readout", READOUTS)
-def test_turned_solution_sees_the_points_at_the_turned_pixels(rng, readout, model):
+def test_rotated_solution_sees_the_points_at_the_rotated_pixels(rng, readout, model):
     before = solution(rng, readout, model, [str(o) for o in TURNS])
     after = turn_solution(before, {str(o): o for o in TURNS})
     for o in TURNS:
@@ -150,7 +150,7 @@ def test_a_posed_photo_is_not_mirrored(rng):
             turn_solution(solution(rng), {"a": o})
 
 
-def test_turning_a_photo_and_rectifying_it_commute(rng):
+def test_rotating_a_photo_and_rectifying_it_commute(rng):
     photo = cv2.GaussianBlur(rng.integers(0, 256, (480, 640), dtype=np.uint8), (0, 0), 3)
     image = solution(rng).images[0]
     plain, mask = rectify(photo, camera(), image.motion)
@@ -178,7 +178,7 @@ def test_cameras_are_shared_by_photos_of_one_orientation(rng):
     assert after.cameras["2"].readout == "right-to-left"
 
 
-def test_a_turned_solution_is_written_read_and_turned_back(tmp_path, rng):
+def test_a_rotated_solution_is_written_read_and_rotated_back(tmp_path, rng):
     before = solution(rng)
     after = turn_solution(before, {"a": 6, "c": 3})
     write_solution(tmp_path / "s.json", after)
@@ -193,7 +193,7 @@ def test_a_turned_solution_is_written_read_and_turned_back(tmp_path, rng):
         assert back.cameras[new.camera_id].readout == before.cameras["1"].readout
 
 
-def test_a_turned_reconstruction_has_the_same_residuals_and_cameras(rng):
+def test_a_rotated_reconstruction_has_the_same_residuals_and_cameras(rng):
     before = solution(rng)
     points_w = points_before(rng, before.images[0].R_cw, before.images[0].center_w)
     frames, points = np.repeat(np.arange(3), 50), np.tile(np.arange(50), 3)
@@ -217,7 +217,7 @@ def test_a_turned_reconstruction_has_the_same_residuals_and_cameras(rng):
         turn_reconstruction(rec, {"a": 2})
 
 
-def test_a_garbled_turn_is_refused(tmp_path, rng):
+def test_a_garbled_rotation_is_refused(tmp_path, rng):
     write_solution(tmp_path / "s.json", turn_solution(solution(rng), {"a": 6}))
     text = (tmp_path / "s.json").read_text()
     (tmp_path / "s.json").write_text(text.replace('"turned": 6', '"turned": 9'))
@@ -225,7 +225,7 @@ def test_a_garbled_turn_is_refused(tmp_path, rng):
         read_solution(tmp_path / "s.json")
 
 
-def test_fisheye_distortion_does_not_turn():
+def test_fisheye_distortion_does_not_rotate():
     fields = Camera.__dataclass_fields__
     if "lens" not in fields:
         pytest.skip("no fisheye lens yet")

@@ -67,7 +67,7 @@ def solved(rng, cameras, model="constant-motion", times=None, names=None):
     keys = [str(1 + k) for k in range(len(cameras))]
     images = [SolvedImage(n, keys[idx[i]], R[i], center[i], motions[i]) for i, n in enumerate(names)]
     named = dict(zip(keys, cameras, strict=True))
-    quality = {"readout_times": {key: {"ms": ms, "source": "told"} for key, ms in (times or {}).items()}}
+    quality = {"readout_times": {key: {"ms": ms, "source": "given"} for key, ms in (times or {}).items()}}
     pinholes = {key: camera.pinhole() for key, camera in named.items()}
     return rec, Solution(model, named, pinholes, images, quality=quality)
 
@@ -179,7 +179,7 @@ def test_dense_fusion_of_colmap_runs_in_the_workspace(tmp_path, rng):
     assert (tmp_path / "fused.ply").stat().st_size > 15 * len(points)
 
 
-def test_depth_maps_of_an_earlier_result_stay_and_are_told_of(tmp_path, rng):
+def test_depth_maps_of_an_earlier_result_stay_and_are_reported(tmp_path, rng):
     """COLMAP made them, and would take them for those of the new photos."""
     made, _ = outputs_of(rng, tmp_path / "first", OutputOptions(report=False), names=[f"{k}.png" for k in range(4)])
     for name in made.reconstruction.image_names:
@@ -202,7 +202,7 @@ def test_workspace_only_where_there_are_photos(tmp_path, rng):
 
 
 @pytest.mark.parametrize("orientations", [(6, 6, 6, 6), (1, 6, 8, 3)])
-def test_turned_photos_have_their_cameras_in_the_model(tmp_path, rng, orientations):
+def test_rotated_photos_have_their_cameras_in_the_model(tmp_path, rng, orientations):
     import pycolmap
 
     names = [f"sub {k % 2}/{k}.jpg" for k in range(4)]
@@ -406,7 +406,7 @@ def gsplat_pose(start, end, t):
     return turn, (1 - t) * start[:3, 3] + t * end[:3, 3]
 
 
-def test_gsplat_bends_the_path_between_by_an_eighth_of_the_turn_squared(tmp_path, rng):
+def test_gsplat_bends_the_path_between_by_an_eighth_of_the_rotation_squared(tmp_path, rng):
     _, solution = solved(rng, [camera_of()])
     write_shutter_poses(tmp_path, solution, {image.name: image.name for image in solution.images}, "points.ply")
     read = np.load(tmp_path / "gsplat.npz")
@@ -532,8 +532,8 @@ def test_two_poses_of_a_bent_motion_are_the_best_two_and_the_rest_is_said(tmp_pa
             R_cw, center = image.motion.pose_at(r, image.R_cw, image.center_w)
             rays = np.column_stack([(xy - camera.K[:2, 2]) / np.diag(camera.K)[:2], np.ones(20)])
             X_w = 4.0 * rays @ R_cw + center
-            R_wc, told = ngp_pose(frame, (xy[0] + 0.5) / [W, H])
-            off = cv_project((X_w - told) @ R_wc, camera.K, camera.dist, False) - xy
+            R_wc, stated = ngp_pose(frame, (xy[0] + 0.5) / [W, H])
+            off = cv_project((X_w - stated) @ R_wc, camera.K, camera.dist, False) - xy
             worst = max(worst, np.linalg.norm(off, axis=1).max())
             turned.append((Rotation.from_matrix(R_wc.T) * Rotation.from_matrix(R_cw).inv()).as_rotvec())
         # here at the moment of the line that the point was on, and not at that of the one it has gone to: the share of

@@ -181,7 +181,7 @@ def photos_of(num):
     )
 
 
-def test_small_sets_are_matched_exhaustively_unless_told():
+def test_small_sets_are_matched_exhaustively_unless_specified():
     assert pairs_to_match(photos_of(60), "auto", 0) is None
     assert pairs_to_match(photos_of(200), "exhaustive", 0) is None
     assert len(pairs_to_match(photos_of(20), "neighbours", 0)) < math.comb(20, 2)

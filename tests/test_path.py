@@ -132,7 +132,7 @@ def test_the_motion_of_a_frame_is_that_of_the_path_around_it() -> None:
     prior = PathPrior(path, truth, (0.01, 0.1))
     state = replace(prior.start(truth), pace=prior.pace_prior)
     bent = with_path_motions(truth, path, state)
-    told = orthogonal(bent)
+    stated = orthogonal(bent)
     from rsundistort.bundle.path import path_solution
 
     found = path_solution(truth, path, state, np.zeros(1)).path
@@ -140,7 +140,7 @@ def test_the_motion_of_a_frame_is_that_of_the_path_around_it() -> None:
     for image in (0, 2, 5):
         clock = np.linspace(*truth.cameras[0].clock_range, 9)
         R_cw, center_w = poses_at(found, found.time_s[image] + clock * clock_s)
-        for rec in (bent, told):
+        for rec in (bent, stated):
             poses = [rec.motion(image).pose_at(r, rec.R_cw[image], rec.center_w[image]) for r in clock]
             np.testing.assert_allclose([each[0] for each in poses], R_cw, atol=2e-6)
             np.testing.assert_allclose([each[1] for each in poses], center_w, atol=2e-6)
@@ -217,9 +217,9 @@ def test_a_known_readout_time_is_believed() -> None:
 )
 def test_a_path_that_cannot_be_is_refused(change: dict[str, object], says: str) -> None:
     truth, times = filmed(HandHeld(8), 6)
-    told = {"time_s": times, "frame_s": FRAME_S, **change}
+    stated = {"time_s": times, "frame_s": FRAME_S, **change}
     with pytest.raises(InputError, match=says):
-        bundle_adjust(truth, "constant-motion", BundleOptions(path=FramePath(**told)))  # type: ignore[arg-type]
+        bundle_adjust(truth, "constant-motion", BundleOptions(path=FramePath(**stated)))  # type: ignore[arg-type]
 
 
 def test_frames_on_a_path_move_by_constant_motion() -> None:
@@ -228,7 +228,7 @@ def test_frames_on_a_path_move_by_constant_motion() -> None:
         bundle_adjust(truth, "rotation", BundleOptions(path=FramePath(times, FRAME_S)))
 
 
-def test_a_camera_that_only_turns_tells_the_readout_time() -> None:
+def test_a_camera_that_only_rotates_tells_the_readout_time() -> None:
     truth, times = filmed(HandHeld(9, walks=False), 24)
     directions = truth.points_w / np.linalg.norm(truth.points_w, axis=1)[:, None]
     start = replace(truth, points_w=directions)
@@ -254,7 +254,7 @@ def test_a_gyroscope_says_what_the_rates_are() -> None:
     assert abs(together.readout_s[0] / FRAME_S - 0.6) < 3 * together.sigma_readout_s[0] / FRAME_S
 
 
-def test_each_frame_says_its_own_turn_and_pose() -> None:
+def test_each_frame_says_its_own_rotation_and_pose() -> None:
     truth, times = filmed(HandHeld(11), 16, noise_px=0.2)
     result = adjusted(truth, times)
     found = own_motions(result.reconstruction)
@@ -265,7 +265,7 @@ def test_each_frame_says_its_own_turn_and_pose() -> None:
     assert 0.7 < np.sqrt(np.mean((turn / found.sigma_turn) ** 2)) < 1.4
 
 
-def test_frames_say_their_turns_from_a_start_that_knows_none() -> None:
+def test_frames_say_their_rotations_from_a_start_that_knows_none() -> None:
     truth, times = filmed(HandHeld(11), 16, noise_px=0.2)
     result = adjusted(truth, times)
     expected = own_motions(result.reconstruction)
@@ -288,7 +288,7 @@ class Shaken(HandHeld):
         return Rotation.from_rotvec(0.01 * np.sin(angle)).as_matrix() @ super().rotations(time_s)
 
 
-def test_a_vibration_beyond_the_frame_rate_is_told_from_a_hand() -> None:
+def test_a_vibration_beyond_the_frame_rate_is_distinguished_from_a_hand() -> None:
     for hand, least, most in ((HandHeld(0), 0.0, 0.2), (Shaken(1), 1.0, np.inf)):
         truth, times = filmed(hand, 20)
         found = adjusted(truth, times).reconstruction

@@ -95,7 +95,7 @@ def test_photos_take_the_cameras_that_a_file_names_for_them(folder):
     write_cameras(folder / "cameras.json", cameras, {"a.png": "y", "b.png": "x", "c.png": "y", "d.png": "z"})
     found = find_cameras(folder, NAMES, SIZES)  # in the folder, without being specified
     assert [found.of(i) for i in range(4)] == [cameras[key] for key in "yxyz"]
-    assert (found.calibrated, found.readout_told) == (True, (True, True, True))
+    assert (found.calibrated, found.readout_specified) == (True, (True, True, True))
 
 
 def test_a_photo_that_the_file_forgets_is_named(folder):
@@ -134,23 +134,23 @@ def test_what_the_user_says_of_the_readout_overrides_the_file_and_the_guess(fold
         SolveOptions(readout={"z": "upwards"})
 
 
-def test_directions_that_nobody_told_are_guesses(folder, tmp_path):
+def test_directions_that_nobody_specified_are_guesses(folder, tmp_path):
     camera = camera_to_json(camera_of(WIDE))
     del camera["readout"]
     (tmp_path / "c.json").write_text(json.dumps(camera))
-    assert find_cameras(folder, NAMES[:3], SIZES[:3], str(tmp_path / "c.json")).readout_told == (False,)
-    assert find_cameras(folder, NAMES[:3], SIZES[:3], "60,60,32,24").readout_told == (False,)
-    assert find_cameras(folder, NAMES[:3], SIZES[:3], "60,60,32,24", "left-to-right").readout_told == (True,)
+    assert find_cameras(folder, NAMES[:3], SIZES[:3], str(tmp_path / "c.json")).readout_specified == (False,)
+    assert find_cameras(folder, NAMES[:3], SIZES[:3], "60,60,32,24").readout_specified == (False,)
+    assert find_cameras(folder, NAMES[:3], SIZES[:3], "60,60,32,24", "left-to-right").readout_specified == (True,)
 
 
-def test_exif_groups_photos_and_turned_ones_are_read_out_across(tmp_path):
+def test_exif_groups_photos_and_rotated_ones_are_read_out_across(tmp_path):
     for name, (width, height) in zip(NAMES, SIZES, strict=True):
         path = tmp_path / name.replace("png", "jpg")
         write_image(path, texture(width, height), Metadata(exif=bytes(exif_block(1, focal_35mm=28))))
     names = [name.replace("png", "jpg") for name in NAMES]
     found = find_cameras(tmp_path, names, SIZES)
     assert [camera.readout for camera in found.cameras] == ["top-to-bottom", "left-to-right"]
-    assert (found.calibrated, found.readout_told) == (False, (False, False))
+    assert (found.calibrated, found.readout_specified) == (False, (False, False))
     assert len(found.notes) == 1
     assert "portrait" in found.notes[0]
     assert found.cameras[0].K[0, 0] == found.cameras[1].K[0, 0]

@@ -67,7 +67,7 @@ def test_tag_and_frame_stay_as_they_are(tmp_path):
         assert before.metadata.exif.startswith(out.metadata.exif[:100])
 
 
-def test_applied_orientation_turns_the_finished_output(tmp_path):
+def test_applied_orientation_rotates_the_finished_output(tmp_path):
     names = save_oriented(tmp_path / "in")
     solution = save_solution(tmp_path / "s.json", names)
     rectify_folder(tmp_path / "in", solution, tmp_path / "plain")
@@ -88,7 +88,7 @@ def test_applied_orientation_turns_the_finished_output(tmp_path):
         np.testing.assert_array_equal(shown, read_photo(tmp_path / "out" / "images" / name).pixels)
 
 
-def test_a_turned_solution_rectifies_the_stored_photos_again(tmp_path):
+def test_a_rotated_solution_rectifies_the_stored_photos_again(tmp_path):
     names = save_oriented(tmp_path / "in", range(1, 9))
     rectify_folder(tmp_path / "in", save_solution(tmp_path / "s.json", names), tmp_path / "plain")
     rectify_folder(tmp_path / "in", tmp_path / "s.json", tmp_path / "out", apply_orientation=True)
@@ -131,7 +131,7 @@ def turned_run(tmp_path_factory):
     return folder, orientations, solution, plain, [str(w.message) for w in caught]
 
 
-def test_a_run_turns_photos_and_masks(turned_run):
+def test_a_run_rotates_photos_and_masks(turned_run):
     folder, orientations, solution, plain, said = turned_run
     assert len(said) == 1
     assert said[0].startswith("0006.png: mirrored by its EXIF orientation 5, it was rotated")
@@ -145,7 +145,7 @@ def test_a_run_turns_photos_and_masks(turned_run):
         assert plain.image(name).turned == 1
 
 
-def test_the_colmap_model_of_a_turned_run_fits_its_photos(turned_run):
+def test_the_colmap_model_of_a_rotated_run_fits_its_photos(turned_run):
     """Judged by pycolmap: points project to the keypoints as well as they do in the stored frame."""
     folder, orientations, solution, plain, _ = turned_run
     model = pycolmap.Reconstruction(folder / "out" / "sparse")
@@ -165,7 +165,7 @@ def test_the_colmap_model_of_a_turned_run_fits_its_photos(turned_run):
         assert (frame["h"], frame["w"]) == read_photo(folder / "out" / "images" / name).pixels.shape[:2]
 
 
-def test_a_turned_run_is_evaluated_like_any_other(turned_run):
+def test_a_rotated_run_is_evaluated_like_any_other(turned_run):
     folder, _, _, _, _ = turned_run
     plain, turned = (
         evaluate(folder / out, folder / "ground_truth.json", twins=folder / "photos") for out in ("plain", "out")

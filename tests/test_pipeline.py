@@ -54,11 +54,11 @@ def courtyard(tmp_path_factory):
 @pytest.fixture(scope="module")
 def solved(courtyard):
     """One run: its solution, its outputs, its messages."""
-    told = []
+    steps = []
     with pytest.warns(SkippedPhotoWarning, match=f"skipped: {BROKEN}") as caught:
-        solution = run(courtyard / "photos", courtyard / "out", OPTIONS, lambda *args: told.append(args))
+        solution = run(courtyard / "photos", courtyard / "out", OPTIONS, lambda *args: steps.append(args))
     assert len(caught) == 1
-    return solution, courtyard / "out", told
+    return solution, courtyard / "out", steps
 
 
 # ---------------------------------------------------------------- run
@@ -102,7 +102,7 @@ def test_poses_and_motions_are_near_the_truth(courtyard, solved):
     assert result.phi_mrad_per_frame.mean < 0.25 * still  # the photos do move
 
 
-def test_twins_are_nearer_to_the_rectified_photos(courtyard, solved, tmp_path):
+def test_references_are_nearer_to_the_rectified_photos(courtyard, solved, tmp_path):
     truth = read_solution(courtyard / "ground_truth.json")
     camera = truth.cameras["1"]
     for name in COURTYARD_NAMES:
@@ -178,14 +178,14 @@ def test_transforms_of_a_run(solved):
         assert (out / frame["mask_path"]).is_file()
 
 
-def test_progress_is_told(solved):
-    _, _, told = solved
-    stages = [stage for stage, _, _ in told]
+def test_progress_is_reported(solved):
+    _, _, steps = solved
+    stages = [stage for stage, _, _ in steps]
     assert stages[0] == "features"
     assert {"matching", "mapping", "rectifying", "writing"} <= set(stages)
-    assert ("features", 7, 7) in told
-    assert ("rectifying", 6, 6) in told
-    assert all(0 <= done <= total or total == 0 for _, done, total in told)
+    assert ("features", 7, 7) in steps
+    assert ("rectifying", 6, 6) in steps
+    assert all(0 <= done <= total or total == 0 for _, done, total in steps)
 
 
 @pytest.mark.filterwarnings("ignore::rsundistort.errors.SkippedPhotoWarning")
@@ -484,7 +484,7 @@ def test_camera_of_cropped_photos(crops):
         assert image.rs_shift_px <= whole.image(image.name).rs_shift_px
 
 
-def test_cropped_photos_rectify_to_their_twins(crops):
+def test_cropped_photos_rectify_to_their_references(crops):
     """The references have the lens of the photos: it is put on the rectified photo again by the lens's own map."""
     folder, truth, _ = crops
     camera = truth.cameras["1"]
@@ -513,7 +513,7 @@ def test_crop_of_random_motions_is_drawn_for_the_whole_frame(tmp_path):
     assert not (tmp_path / "whole" / "global").exists()
 
 
-def test_webp_twins_lose_nothing(tmp_path):
+def test_webp_references_lose_nothing(tmp_path):
     photos = save_textures(tmp_path / "photos", ["a.webp"])
     truth = simulate_warp(photos, tmp_path / "cut", WarpOptions(camera=CAMERA, crop=True))
     x, y, width, height = truth.options["crop_xywh"]

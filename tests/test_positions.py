@@ -46,7 +46,7 @@ def test_exif_tells_place_altitude_and_speed():
 
 
 @pytest.mark.parametrize(
-    ("entries", "packet", "sigma", "told_by"),
+    ("entries", "packet", "sigma", "sigma_from"),
     [
         ({}, b"", (3.0, 3.0, 5.0), "default"),
         ({11: rational(4, 1)}, b"", (6.0, 6.0, 10.0), "DOP"),
@@ -57,10 +57,10 @@ def test_exif_tells_place_altitude_and_speed():
         ({}, xmp(DJI, RtkStdLon="x", RtkStdLat="0.04", RtkStdHgt="0.09"), (3.0, 3.0, 5.0), "default"),
     ],
 )
-def test_the_most_direct_statement_of_the_accuracy_counts(entries, packet, sigma, told_by):
+def test_the_most_direct_statement_of_the_accuracy_counts(entries, packet, sigma, sigma_from):
     found = fix(packet, {**PLACE, **entries})
     assert found.sigma_m == pytest.approx(sigma, rel=0.01)
-    assert found.told_by == told_by
+    assert found.sigma_from == sigma_from
 
 
 def test_xmp_of_drones_tells_height_and_velocity():
@@ -144,9 +144,9 @@ def test_a_camera_without_a_fix_has_no_position():
     assert found.notes == ("GPS at 0,0 is no position: a.jpg",)
 
 
-def test_altitudes_of_two_datums_are_told():
-    told = {"EXIF": 283.8, "AltitudeAMSL": 315.7}
-    found = positions_of(["a.jpg"], [ExifFacts(fix=GpsFix(41.0, -83.0, 283.8, altitudes_m=told))])
+def test_altitudes_of_two_datums_are_reported():
+    stated = {"EXIF": 283.8, "AltitudeAMSL": 315.7}
+    found = positions_of(["a.jpg"], [ExifFacts(fix=GpsFix(41.0, -83.0, 283.8, altitudes_m=stated))])
     assert "altitudes are of two datums: AltitudeAMSL is +31.9 m from EXIF's" in found.notes[0]
 
 
@@ -167,7 +167,7 @@ def test_heights_above_the_take_off_replace_altitudes_that_are_worse():
     assert found.geodetic[:, 2] - heights == pytest.approx(np.median(apart))
     assert found.sigma_m[:, 2] == pytest.approx(1.4826 * 1.5)  # the scatter of these, which has the errors of both
     assert found.common_up_m == 5.0
-    assert "height above take-off" in found.told_by
+    assert "height above take-off" in found.sigma_from
     np.testing.assert_array_equal(found.sigma_m[:, :2], 3.0)
 
 
@@ -248,7 +248,7 @@ def test_a_projection_whose_axes_are_mirrored_is_refused():
 
 
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:32631", "EPSG:3035", "EPSG:2048"])
-def test_velocities_and_rotations_are_turned_to_the_north_of_the_grid(crs):
+def test_velocities_and_rotations_are_rotated_to_the_north_of_the_grid(crs):
     """By where the projection puts a step of that velocity; EPSG:2048 counts to the west and to the south."""
     origin = (-33.0, 19.5, 400.0) if crs == "EPSG:2048" else (47.0, 8.0, 400.0)
     R_cw, velocity = Rotation.from_rotvec([0.3, 2.0, -1.0]).as_matrix(), np.array([7.0, -4.0, 0.5])
@@ -258,13 +258,13 @@ def test_velocities_and_rotations_are_turned_to_the_north_of_the_grid(crs):
     begin, end = frame.of_geodetic(geodetic_of(np.stack([0 * velocity, velocity]), origin))
     np.testing.assert_allclose(turned.velocity_m_s[0], end - begin, rtol=4e-3)  # a projection's metres
     np.testing.assert_allclose(turned.R_cw[0] @ turned.velocity_m_s[0], R_cw @ velocity, atol=1e-12)
-    told = pyproj.Proj(crs).get_factors(origin[1], origin[0]).meridian_convergence
+    stated = pyproj.Proj(crs).get_factors(origin[1], origin[0]).meridian_convergence
     # EPSG:3035 keeps areas, not angles: its east and north are rotated by 0.1 degrees more and less
-    told += 180.0 * (crs == "EPSG:2048")
-    assert np.degrees(frame.convergence_rad) == pytest.approx(told, abs=0.1 if crs == "EPSG:3035" else 1e-3)
+    stated += 180.0 * (crs == "EPSG:2048")
+    assert np.degrees(frame.convergence_rad) == pytest.approx(stated, abs=0.1 if crs == "EPSG:3035" else 1e-3)
 
 
-def test_a_datum_that_gps_reaches_to_metres_only_is_told():
+def test_a_datum_that_gps_reaches_to_metres_only_is_reported():
     assert frame_at("EPSG:3003", np.array([[42.0, 9.0, 100.0]])).note.startswith("GPS is put into EPSG:3003 to 4 m")
     assert frame_at("EPSG:32632", np.array([[42.0, 9.0, 100.0]])).note == ""
 
@@ -308,8 +308,8 @@ def test_a_known_rotation_tells_the_roll_of_places_on_a_line(rng):
     R = Rotation.from_rotvec([0.4, -1.0, 2.0]).as_matrix()
     x = np.outer(np.linspace(0, 1, 8), [1.0, 0.0, 0.0]) + 1e-3 * rng.normal(size=(8, 3))
     y = 300 * x @ R.T + 2 + 0.5 * rng.normal(size=(8, 3))
-    told = Rotation.from_rotvec([0.03, -0.05, 0.04]).as_matrix() @ R, 0.08
-    found = fit_similarity(x, y, np.full((8, 3), 0.5), told)
+    stated = Rotation.from_rotvec([0.03, -0.05, 0.04]).as_matrix() @ R, 0.08
+    found = fit_similarity(x, y, np.full((8, 3), 0.5), stated)
     apart = Rotation.from_matrix(found.similarity.R @ R.T).as_rotvec()
     along = R[:, 0]
     assert abs(apart @ along) < 0.1

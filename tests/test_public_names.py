@@ -98,7 +98,7 @@ def test_the_package_and_its_benchmarks_use_no_former_name():
                 assert node.attr not in former, path
 
 
-def test_simpler_first_starts_each_model_from_the_one_before_as_climb_did(rng):
+def test_simpler_first_starts_each_model_from_the_one_before_as_the_former_function_did(rng):
     truth = make_scene(rng, "rotation")
     start, costs = perturbed(truth, rng), []
     result = bundle_adjust(start, "rotation", progress=costs.append, simpler_first=True)
@@ -154,18 +154,20 @@ def test_evaluations_are_written_as_before():
 
 
 def test_analyses_are_written_as_before():
-    meter = critical_motion(np.tile(np.eye(3), (3, 1, 1)), np.eye(3))
-    found = PoseAnalysis(3, ("top-to-bottom",), meter, advice=("Turn one.",))
+    degeneracy = critical_motion(np.tile(np.eye(3), (3, 1, 1)), np.eye(3))
+    found = PoseAnalysis(3, ("top-to-bottom",), degeneracy, advice=("Rotate one.",))
     written = json.loads(json.dumps(found.to_json()))
     assert list(written) == [
         "photos", "readout", "singular_values", "null_vector", "y_axis_spread_deg", "meaning", "critical", "sentence",
         "advice",
     ]  # fmt: skip
     assert written["readout"] == ["top-to-bottom"]
-    assert written["singular_values"] == meter.singular_values.tolist()
+    assert written["singular_values"] == degeneracy.singular_values.tolist()
     assert written["critical"] is True
     assert written["sentence"] is None
-    assert written["advice"] == ["Turn one."]
+    assert written["advice"] == ["Rotate one."]
+    with pytest.warns(DeprecationWarning, match="PoseAnalysis.meter is now PoseAnalysis.degeneracy"):
+        assert found.meter is degeneracy
 
 
 def test_entries_of_the_former_dicts_answer_with_a_warning():

@@ -226,8 +226,8 @@ def test_noise_has_the_spread_that_the_recipe_says(tmp_path):
     assert noisy.std() == pytest.approx(np.sqrt(9 + 16 * 128 / 255), rel=0.02)
     assert noisy.mean() == pytest.approx(128, abs=0.1)
     assert (add_noise(flat, recipe.noise, 3, 1) != noisy).any()
-    photo, twin = (cv2.imread(str(tmp_path / "out" / d / "0000.jpg")).astype(float) for d in ("photos", "global"))
-    assert (photo - twin).std() > 1.5
+    photo, reference = (cv2.imread(str(tmp_path / "out" / d / "0000.jpg")).astype(float) for d in ("photos", "global"))
+    assert (photo - reference).std() > 1.5
 
 
 def test_paths_lead_where_they_say(tmp_path):

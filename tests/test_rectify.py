@@ -6,9 +6,9 @@ from functools import partial
 
 import cv2
 import numpy as np
-import numpy_twin
+import numpy_reference
 import pytest
-from numpy_twin import DIRECTIONS, MODELS, Fisheye, lens, undistort_with_opencv
+from numpy_reference import DIRECTIONS, MODELS, Fisheye, lens, undistort_with_opencv
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
@@ -30,7 +30,7 @@ from rsundistort.synthetic.warp import warp_photo
 
 W, H = 200, 160
 K = np.array([[210.0, 0, 97.3], [0, 205.0, 81.6], [0, 0, 1]])
-make_camera = partial(numpy_twin.make_camera, W, H, K)
+make_camera = partial(numpy_reference.make_camera, W, H, K)
 LENS = [-0.12, 0.03, 0.001, -0.002]
 FISHEYE = Fisheye([0.03, -0.01, 0.004, -0.001])
 RATIONAL = [0.1, -0.05, 0.001, -0.002, 0.01, 0.25, 0.02, 0.005, 0.002, -0.001, 0.001, 0.0015]
@@ -316,7 +316,7 @@ def test_largest_shift_is_that_of_the_farthest_pixel(readout):
 
 @with_and_without_lens
 @all_directions
-def test_warp_of_a_bent_motion_turns_each_line_by_itself(readout, dist, rng):
+def test_warp_of_a_bent_motion_rotates_each_line_by_itself(readout, dist, rng):
     camera, original = make_camera(dist, readout), smooth_photo(rng)
     bend = Bend(*camera.clock_range, rng.normal(size=(9, 3)) * 0.01)
     warped, mask = warp_photo(original, camera, RowMotion(MOTION.phi, bend=bend))

@@ -119,7 +119,7 @@ def test_rectify_writes_maps_both_ways(invoke, tmp_path):
         assert np.median(off) <= 3  # grey levels; twice interpolated
 
 
-def test_maps_turn_with_their_photos(invoke, tmp_path):
+def test_maps_rotate_with_their_photos(invoke, tmp_path):
     (tmp_path / "photos").mkdir()
     exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"
     jpeg = cv2.imencode(".jpg", texture(320, 240), [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()

@@ -121,7 +121,7 @@ def test_left_out_photos_are_added_and_wrong_places_mended(scene, matched):
         assert turned_deg(found.reconstruction.R_cw[photo], scene.R_cw[photo]) < 0.05
         np.testing.assert_allclose(found.reconstruction.phi[photo], scene.phi[photo], atol=3e-3)
     np.testing.assert_array_equal(found.reconstruction.R_cw[:4], scene.R_cw[:4])
-    only_new = register_photos(matched, read_num_verified(matched), wrong, joined_too=False)
+    only_new = register_photos(matched, read_num_verified(matched), wrong, registered_too=False)
     assert (only_new.added, only_new.moved, only_new.dropped) == (("5.jpg",), (), ())
 
 
@@ -147,7 +147,7 @@ def test_pairs_that_were_verified_without_matches_are_passed_over(scene, matched
     assert agreeing_photos(matched, matches, read_num_verified(matched), scene).all()
 
 
-def test_photos_that_the_poses_do_not_explain_are_told_apart(scene, matched):
+def test_photos_that_the_poses_do_not_explain_are_distinguished(scene, matched):
     R_cw = np.array(scene.R_cw)
     R_cw[:2] = Rotation.from_rotvec([0.2, 0.3, 0.1]).as_matrix() @ R_cw[:2]
     agreeing = agreeing_photos(matched, read_matches(matched), read_num_verified(matched), replace(scene, R_cw=R_cw))

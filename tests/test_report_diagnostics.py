@@ -84,24 +84,24 @@ def test_steady_motions_have_no_section(solved_courtyard):
 
 def test_residuals_of_photos_are_those_of_the_solution(solved_courtyard):
     out, solution = solved_courtyard
-    told = read_diagnostics(out / "report.npz")
-    assert told.names == tuple(image.name for image in solution.images)
-    np.testing.assert_allclose(told.rms_px[1], [image.rms_px for image in solution.images], rtol=1e-5)
+    stated = read_diagnostics(out / "report.npz")
+    assert stated.names == tuple(image.name for image in solution.images)
+    np.testing.assert_allclose(stated.rms_px[1], [image.rms_px for image in solution.images], rtol=1e-5)
     counts = np.array([image.num_observations for image in solution.images])
     for k, whole in ((0, solution.quality["global_rms_px"]), (1, solution.quality["rms_px"])):
-        assert np.sqrt(np.average(told.rms_px[k] ** 2, weights=counts)) == pytest.approx(whole, rel=0.01)
+        assert np.sqrt(np.average(stated.rms_px[k] ** 2, weights=counts)) == pytest.approx(whole, rel=0.01)
     # 0.2 px of noise in, minus what the fit absorbs
-    assert 0.15 < np.nanmean(told.row_rms_px[1]) < 0.22
-    assert np.nanmean(told.row_rms_px[0]) > 5 * np.nanmean(told.row_rms_px[1])
-    assert told.histogram[1].sum() == pytest.approx(2 * counts.sum(), rel=0.01)
-    assert told.rgb.shape == told.points_w.shape
+    assert 0.15 < np.nanmean(stated.row_rms_px[1]) < 0.22
+    assert np.nanmean(stated.row_rms_px[0]) > 5 * np.nanmean(stated.row_rms_px[1])
+    assert stated.histogram[1].sum() == pytest.approx(2 * counts.sum(), rel=0.01)
+    assert stated.rgb.shape == stated.points_w.shape
 
 
 def test_global_result_lies_beside_the_solution(solved_courtyard):
     out, solution = solved_courtyard
-    told = read_diagnostics(out / "report.npz")
+    stated = read_diagnostics(out / "report.npz")
     centers = np.array([image.center_w for image in solution.images])
-    away = np.linalg.norm(told.global_center_w - centers, axis=1)
+    away = np.linalg.norm(stated.global_center_w - centers, axis=1)
     assert 0 < away.max() < 0.2 * np.linalg.norm(np.ptp(centers, axis=0))
 
 
@@ -121,10 +121,10 @@ def test_a_similarity_is_taken_out(solved_courtyard, rng):
 
 
 def test_diagnostics_of_a_thousand_photos_are_small(solved_courtyard, tmp_path, rng):
-    told = read_diagnostics(solved_courtyard[0] / "report.npz")
+    stated = read_diagnostics(solved_courtyard[0] / "report.npz")
     many, points = 1000, 15_000
     big = replace(
-        told, names=tuple(f"{i:05}.jpg" for i in range(many)), rms_px=rng.random((2, many)), depth=rng.random(many),
+        stated, names=tuple(f"{i:05}.jpg" for i in range(many)), rms_px=rng.random((2, many)), depth=rng.random(many),
         row_mean_px=rng.normal(size=(2, many, 12, 2)), points_w=rng.normal(size=(points, 3)),
         global_points_w=rng.normal(size=(points, 3)), point_idx=np.arange(points),
         rgb=rng.integers(0, 256, (points, 3), dtype=np.uint8), global_R_cw=rng.normal(size=(many, 3, 3)),

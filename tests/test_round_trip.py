@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy_twin import Fisheye, lens_of
+from numpy_reference import Fisheye, lens_of
 
 from rsundistort import (
     Camera,
@@ -183,7 +183,7 @@ ORIENTATIONS = {
 
 @settings(max_examples=60)
 @given(cameras(["pinhole", "barrel", "fisheye"]), rotations, MODELS, st.sampled_from(list(ORIENTATIONS)))
-def test_turned_or_mirrored_photo_is_rectified_to_the_turned_or_mirrored_one(camera, rotation, model, orientation):
+def test_rotated_or_mirrored_photo_is_rectified_to_the_rotated_or_mirrored_one(camera, rotation, model, orientation):
     if len(camera.dist) and camera.lens == "pinhole":  # without the tangential part, which would have to be rotated too
         camera = replace(camera, dist=camera.dist * [1, 1, 0, 0])
     turn, motion = ORIENTATIONS[orientation], turned_per_frame(camera, rotation)

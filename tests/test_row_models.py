@@ -5,18 +5,18 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
-import numpy_twin
+import numpy_reference
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from numpy_twin import DIRECTIONS, MODELS, Fisheye, lens, project_normalised, undistort_with_opencv
+from numpy_reference import DIRECTIONS, MODELS, Fisheye, lens, project_normalised, undistort_with_opencv
 
 from rsundistort import Camera, RowMotion, project_points, unproject_points
 from rsundistort.errors import InputError
 from rsundistort.model.projection import project_points_with_jacobians
 
 K = np.array([[410.0, 0, 201.0], [0, 400.0, 148.5], [0, 0, 1]])
-make_camera = partial(numpy_twin.make_camera, 400, 300, K)
+make_camera = partial(numpy_reference.make_camera, 400, 300, K)
 FOCAL = np.array([410.0, 400.0])
 RATIONAL = [0.1, -0.05, 0.001, -0.002, 0.01, 0.25, 0.02, 0.005]
 LENSES = {
@@ -46,14 +46,14 @@ def draw_motions(rng, n=6):
 @all_lenses
 @all_directions
 @all_models
-def test_forward_equals_the_numpy_twin(model, readout, dist, rng):
+def test_forward_equals_the_numpy_model(model, readout, dist, rng):
     camera, points = make_camera(dist, readout), draw_points(rng)
     for motion in draw_motions(rng):
         xy, valid = project_points(points, camera, motion, model)
         assert valid.all()
-        twin = project_normalised(points, motion.phi, model, readout, dist, motion.velocity)
+        reference = project_normalised(points, motion.phi, model, readout, dist, motion.velocity)
         # both solve the row to 1e-14 or better and then round a few dozen times
-        assert np.abs((xy - K[:2, 2]) / FOCAL - twin).max() <= 1e-12
+        assert np.abs((xy - K[:2, 2]) / FOCAL - reference).max() <= 1e-12
 
 
 @all_lenses
@@ -215,9 +215,9 @@ def test_fisheye_up_to_the_side(model, readout, rng):
         points = rays * rng.uniform(1, 2, (40, 1))
         xy, valid, J = project_points_with_jacobians(points, camera, motion, model)
         assert valid.all()
-        twin = project_normalised(points, phi, model, readout, dist, motion.velocity)
+        reference = project_normalised(points, phi, model, readout, dist, motion.velocity)
         # at 84 degrees x/z is 10, and its rounding ten times that of the tests above
-        assert np.abs((xy - K[:2, 2]) / FOCAL - twin).max() <= 1e-12
+        assert np.abs((xy - K[:2, 2]) / FOCAL - reference).max() <= 1e-12
         for j, step in enumerate(h * np.eye(3)):
             ends = [project_points(points + s * step, camera, motion, model)[0] for s in (1, -1)]
             # z is down to 0.1: the third derivative over h^2 leaves 1e-9 of the focal length, rounding 1e-7
@@ -296,5 +296,5 @@ def test_any_direction_is_seen_by_the_row_that_it_lands_on(phi, x, y, readout):
     assume(any(phi))
     camera = make_camera(LENSES["8-parameters"], readout)
     xy, _ = project_points([[x, y, 1.0]], camera, RowMotion(phi))
-    twin = project_normalised([[x, y, 1.0]], phi, "rotation", readout, LENSES["8-parameters"])
-    assert np.abs((xy - K[:2, 2]) / FOCAL - twin).max() <= 1e-12  # as in the comparison above
+    reference = project_normalised([[x, y, 1.0]], phi, "rotation", readout, LENSES["8-parameters"])
+    assert np.abs((xy - K[:2, 2]) / FOCAL - reference).max() <= 1e-12  # as in the comparison above

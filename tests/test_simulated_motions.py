@@ -37,7 +37,7 @@ def lines_of(camera):
     return lines, sign * (lines - camera.K[axis, 2]) / camera.K[axis, axis]
 
 
-def test_accelerated_turn_about_one_axis_has_its_closed_form():
+def test_accelerated_rotation_about_one_axis_has_its_closed_form():
     clock = readings(CAMERA)
     middle, half = clock.mean(), (clock[-1] - clock[0]) / 2
     phi, share = np.array([0, 0.06, 0]), np.array([9.0, 0.5, -9.0])
@@ -53,7 +53,7 @@ def test_accelerated_turn_about_one_axis_has_its_closed_form():
 
 
 @pytest.mark.parametrize("readout", READOUTS)
-def test_vibration_and_turn_about_any_axes_are_those_of_each_line(readout):
+def test_vibration_and_rotation_about_any_axes_are_those_of_each_line(readout):
     camera = Camera(320, 240, CAMERA.K, [], readout)
     shake = vibrations([camera], Vibration(3e-3, (4, 5), travel=0.02), 3)[0]
     steady = RowMotion([0.05, -0.1, 0.08], [0.3, -0.1, 0.2])
@@ -127,10 +127,10 @@ TURNS = [[0.0, 0.01 * k, 0.0] for k in (0, 1, 3, 4)]
 )
 def test_bad_tables_say_what_is_wrong_and_where(tmp_path, rows, turns, says):
     (tmp_path / "m.json").write_text(json.dumps({"b.png": {"row": rows, "rotation": np.asarray(turns).tolist()}}))
-    with pytest.raises((InputError, FormatError), match=says) as told:
+    with pytest.raises((InputError, FormatError), match=says) as stated:
         unsteady("b.png", CAMERA, read_motion_file(tmp_path / "m.json")["b.png"])
-    assert "b.png" in str(told.value)
-    assert "\n" not in str(told.value)
+    assert "b.png" in str(stated.value)
+    assert "\n" not in str(stated.value)
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_csv_and_json_tables_say_the_same(tmp_path):
     assert by_json["a.png"] == [0, 0, 0.1]
 
 
-def test_stretch_of_a_gyroscopes_log_turns_as_it_says():
+def test_stretch_of_a_gyroscopes_log_rotates_as_it_says():
     """About one axis in closed form; the world rotates the other way in the camera."""
     time_s = np.arange(0, 0.05, 1e-5)  # one stretch of 0.03 s fits at several places: find out which by its phase
     log = GyroLog(time_s, np.outer(2.0 + np.sin(2 * np.pi * 40 * time_s), [0, 1, 0]), 0.03)
@@ -179,7 +179,7 @@ def test_stretch_of_a_gyroscopes_log_turns_as_it_says():
     assert tracks(log, [CAMERA], 0.03, 4)[0](clock)[0] == pytest.approx(path(clock)[0])
 
 
-def test_turns_of_a_log_compose_as_rotations_do(rng):
+def test_rotations_of_a_log_compose_as_rotations_do(rng):
     time_s = np.arange(0, 1, 1e-3)
     log = GyroLog(time_s, rng.normal(size=3) + np.outer(np.sin(20 * time_s), rng.normal(size=3)))
     at = np.linspace(0.1, 0.9, 401)
@@ -269,9 +269,9 @@ def test_what_is_not_steady_changes_no_draw_of_the_steady_part(tmp_path):
 )
 def test_warps_that_make_no_sense_are_refused(tmp_path, options, says):
     photos = save_textures(tmp_path / "photos", ["a.png", "b.png"])
-    with pytest.raises(InputError, match=says) as told:
+    with pytest.raises(InputError, match=says) as stated:
         simulate_warp(photos, tmp_path / "out", WarpOptions(camera=GIVEN, **options))
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(stated.value)
     assert not (tmp_path / "out").exists()
 
 

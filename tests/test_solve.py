@@ -349,7 +349,7 @@ def turned_model(scene, orientation_of):
     return model
 
 
-def test_a_model_of_turned_photos_is_turned_back(tmp_path, rng):
+def test_a_model_of_rotated_photos_is_rotated_back(tmp_path, rng):
     scene = make_scene(rng)
     photos = save_photos(tmp_path / "photos")
     for name in NAMES[:3]:
@@ -363,7 +363,7 @@ def test_a_model_of_turned_photos_is_turned_back(tmp_path, rng):
     solution = rs.solve(model, tmp_path / "out", OPTIONS, images=photos)
     # the shutter runs over the rows of the sensor, whichever way people hold the camera
     assert np.abs(phi_errors(solution, scene)).max() < 2.5e-3
-    assert "turned" in solution.options["model"]["frame"]
+    assert "rotated" in solution.options["model"]["frame"]
     assert "3 of 6" in solution.options["model"]["frame"]
 
 

@@ -104,7 +104,7 @@ def test_a_rotation_without_its_shutter(seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_smooth_frames_with_the_lines_of_smooth_frames_are_told_by_a_gyroscope_alone(seed):
+def test_smooth_frames_with_the_lines_of_smooth_frames_are_detected_by_a_gyroscope_alone(seed):
     pan, shaking = motion(seed, 0.3, 0.05, 0.3), motion(seed + 50, 0.3, 1, 5)
     assert clip(seed, pan, pan, 0.02).verdict == "none"  # nothing in the pictures says otherwise
     found = clip(seed, pan, pan, 0.02, log=log_of(pan + shaking))
@@ -124,14 +124,14 @@ def test_a_wrong_focal_length_and_a_bias_are_not_taken_for_stabilisation(seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_camera_that_hardly_turns_tells_nothing(seed):
+def test_a_camera_that_hardly_rotates_tells_nothing(seed):
     still = motion(seed, 0.005, 0.5, 5)
     for frames, lines in ((still, still), (NOTHING, still), (still, NOTHING), (NOTHING, NOTHING)):
         assert clip(seed, frames, lines, 0.02).verdict == "unknown"
         assert clip(seed, frames, lines, 0.02, readout_s=0.02).verdict == "unknown"
 
 
-def test_false_turns_and_missing_ones_change_nothing():
+def test_false_rotations_and_missing_ones_change_nothing():
     hand = motion(0, 0.1, 0.05, 0.3) + motion(50, 0.3, 1, 5)
     rng = np.random.default_rng(0)
     times = np.arange(NUM_FRAMES) * FRAME_S

@@ -47,22 +47,22 @@ def by_gps():
 
 def test_by_gps_the_model_is_in_metres_east_north_and_up(by_gps):
     flight, solved, said = by_gps
-    told, rec = solved.georeference, solved.shared
-    assert told["crs"] == "local"
+    stated, rec = solved.georeference, solved.shared
+    assert stated["crs"] == "local"
     error = rec.center_w - solved.survey.frame.of_geodetic(geodetic_of(flight.center_w))
-    sigma = np.array(told["sigma"]["place_m"])
+    sigma = np.array(stated["sigma"]["place_m"])
     assert np.all(np.abs(np.delete(error, 3, axis=0).mean(0)) < 3 * sigma)
     assert np.linalg.norm(error, axis=1).max() < 1.5
-    assert told["gps"]["outliers"] == ["0003.jpg"]
+    assert stated["gps"]["outliers"] == ["0003.jpg"]
     assert any("GPS that is far off, and rejected: 0003.jpg (59" in text for text in said)
     # errors of GPS as they were drawn, 0.5, 0.5 and 1 m, by nine photos less seven unknowns
-    assert np.all(np.array(told["gps"]["rms_axes_m"]) < [1.2, 1.2, 2.4])
+    assert np.all(np.array(stated["gps"]["rms_axes_m"]) < [1.2, 1.2, 2.4])
 
 
 def leveled(seed, with_heights=True):
     """Survey, model and true centres of a flight whose altitudes are 4 m too high, and known to 5 m."""
     flight = Flight(seed=seed)
-    facts, rng = flight.facts(sigma_m=(0.5, 0.5, 0.7), told=(0.5, 0.5, 5.0)), np.random.default_rng(seed)
+    facts, rng = flight.facts(sigma_m=(0.5, 0.5, 0.7), stated=(0.5, 0.5, 5.0)), np.random.default_rng(seed)
     fixes = [replace(each.fix, altitude_m=each.fix.altitude_m + 4.0) for each in facts]
     if with_heights:
         heights = (flight.center_w[:, 2] - 3.0 + rng.normal(0, 0.5, len(fixes))).tolist()
@@ -98,7 +98,7 @@ def test_the_place_on_the_map_is_kept_in_the_solution(by_gps, tmp_path):
     assert matrix[:3, :3] @ matrix[:3, :3].T == pytest.approx(np.eye(3), abs=1e-12)
 
 
-def test_people_are_told_of_the_map(by_gps):
+def test_people_are_reported_the_map(by_gps):
     facts = dict(map_facts(by_gps[1].georeference))
     assert facts["map"].startswith("east, north, up in metres at 47.0000")
     assert "rejected: 0003.jpg" in facts["GPS"]
@@ -112,15 +112,15 @@ def test_control_points_and_gps_in_a_projection():
     # a receiver that is off by as much in all photos
     facts = [replace(each, fix=replace(each.fix, altitude_m=each.fix.altitude_m + 12.0)) for each in facts]
     solved = flight.solved(facts, "EPSG:32632", flight.control(of_place=to_utm))
-    told = solved.georeference
-    assert told["gps"]["offset_m"][2] == pytest.approx(-12.0, abs=1.5)
-    checks = [each for each in told["control"].values() if each["use"] == "check"]
+    stated = solved.georeference
+    assert stated["gps"]["offset_m"][2] == pytest.approx(-12.0, abs=1.5)
+    checks = [each for each in stated["control"].values() if each["use"] == "check"]
     assert len(checks) == 6
     deviations = np.array([np.divide(each["residual_m"], each["sigma_m"]) for each in checks])
     # of 18 standard normals one is beyond 2; the poses' own errors, which sigma does not have, add to them
     assert (np.abs(deviations) < 2).mean() > 0.75
     assert np.abs(deviations).max() < 4
-    origin, place = np.array(told["origin"]), np.array(to_utm(flight.points_w[flight.marked[0]]))
+    origin, place = np.array(stated["origin"]), np.array(to_utm(flight.points_w[flight.marked[0]]))
     held = {each.name: each.place_m for each in solved.survey.control}
     assert held["P0"] == pytest.approx(tuple(place - origin), abs=0.1)
     speeds = solution_of(with_readout(solved, READOUT_S), SolveOptions(), RectifyOptions()).georeference["speeds"]
@@ -142,7 +142,7 @@ def test_no_crs_keeps_a_frame_of_its_own():
     assert survey_of("none", [], NAMES, FACTS, SIZES) is None
 
 
-def test_lengths_that_contradict_the_map_are_told():
+def test_lengths_that_contradict_the_map_are_reported():
     flight = Flight()
     obs, true = flight.start.observations, flight.start.points_w
     pairs = [(5, 300), (50, 400)]
@@ -191,7 +191,7 @@ def test_one_strip_is_put_on_the_map_by_its_gimbal(with_gimbal):
     assert apart.max() < np.deg2rad(8.0)
 
 
-def test_a_compass_that_errs_does_not_turn_what_gps_tells():
+def test_a_compass_that_errs_does_not_rotate_what_gps_tells():
     flight = Flight()
     facts = flight.facts(sigma_m=(0.5, 0.5, 1.0))
     east_of_north = Rotation.from_euler("Z", -40.0, degrees=True).as_matrix() * [[1], [-1], [-1]]
@@ -229,7 +229,7 @@ def test_what_cannot_be_put_on_the_map_is_refused(crs, control, facts, says):
         survey_of(crs, control, NAMES, facts, SIZES)
 
 
-def test_one_photo_with_gps_is_told():
+def test_one_photo_with_gps_is_reported():
     with pytest.warns(RsUndistortWarning, match="not on the map: 1 of 4 photos have a GPS position"):
         assert survey_of(None, [], NAMES, [FACTS[0], *[ExifFacts()] * 3], SIZES) is None
 

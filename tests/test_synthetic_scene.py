@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from numpy_twin import Fisheye, lens, lens_of
+from numpy_reference import Fisheye, lens, lens_of
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 

@@ -114,7 +114,7 @@ def test_closing_table_tells_what_the_model_was_chosen_by():
 def test_closing_table_fits_80_columns():
     names = ["0001.jpg", f"{'a' * 90}.jpg", "sub/folder/of/many/levels/photo with a long name.jpg"]
     text = closing_table(
-        solution(names, advice=["Take a photo turned by 90 degrees about the line of sight " * 3]), Path("out")
+        solution(names, advice=["Take a photo rotated by 90 degrees about the line of sight " * 3]), Path("out")
     )
     assert max(len(line) for line in text.splitlines()) <= 80
     for said in ("3 of 4", "constant-motion", "lost.jpg", "at the next shoot", "f 3000.0 +- 1.0"):

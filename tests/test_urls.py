@@ -307,7 +307,7 @@ def test_a_store_that_takes_no_more_stops_the_batch_and_can_be_gone_on_with(remo
     assert held(fs, "memory://bucket/out") == truth
 
 
-def test_a_folder_that_may_not_be_written_is_told_before_any_work(remote, monkeypatch):
+def test_a_folder_that_may_not_be_written_is_reported_before_any_work(remote, monkeypatch):
     folder, _, fs = remote
 
     def refuse(self, path, value, **kwargs):

@@ -349,7 +349,7 @@ def test_a_photo_that_moved_two_ways_is_left_alone(rng):
 # ---------------------------------------------------------------- residuals
 
 
-def test_what_remains_is_told_from_noise(rng):
+def test_what_remains_is_distinguished_from_noise(rng):
     rec = measured(rng, np.zeros((10, 3)))
     assert left_over_frame(rec) == left_along_readout(rec) == 0
     xy = rec.observations.xy_raw

@@ -62,8 +62,8 @@ def rows(folder):
 
 def test_every_nth_frame_with_its_time(tmp_path):
     video = lossless(tmp_path / "clip one.mkv", [view(k) for k in range(25)])
-    told = []
-    frames = extract_frames(video, tmp_path / "out", every=10, progress=lambda *args: told.append(args))
+    steps = []
+    frames = extract_frames(video, tmp_path / "out", every=10, progress=lambda *args: steps.append(args))
     assert frames.names == ("clip one_000000.png", "clip one_000010.png", "clip one_000020.png")
     assert sorted(path.name for path in (tmp_path / "out").glob("[!.]*")) == [*frames.names, "frames.csv"]
     for name, number in zip(frames.names, (0, 10, 20), strict=True):
@@ -75,7 +75,7 @@ def test_every_nth_frame_with_its_time(tmp_path):
     assert [int(row["frame"]) for row in table] == [0, 10, 20]
     assert [float(row["time_s"]) for row in table] == pytest.approx(frames.time_s, abs=1e-6)
     assert (frames.num_frames, frames.num_damaged, frames.orientation) == (25, 0, 1)
-    assert told[-1][0] == 25
+    assert steps[-1][0] == 25
 
 
 def test_the_sharpest_of_each_group(tmp_path):

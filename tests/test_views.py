@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from numpy_twin import DIRECTIONS
+from numpy_reference import DIRECTIONS
 
 from rsundistort import Camera, DepthMap, Plane, RowMotion, Solution, SolvedImage, optimal_new_camera, rectify
 from rsundistort import undistort_points as undistort
@@ -201,7 +201,7 @@ def test_view_that_no_camera_has_is_refused_with_the_camera():
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_roi_turns_with_the_photo(orientation):
+def test_roi_rotates_with_the_photo(orientation):
     solution = with_view(solution_of(), ViewOptions())
     turned = turn_solution(solution, {image.name: orientation for image in solution.images})
     for before, after in zip(solution.registered, turned.registered, strict=True):

@@ -1,4 +1,4 @@
-"""Compiled kernels: arrays and scalars in, arrays out, codes instead of exceptions.
+"""Compiled kernels, which take and fill arrays and return codes instead of exceptions.
 
 Conventions of lenses, motions, projections, maps and residuals:
 `lens` is (13,): OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 and the squared undistorted radius where the radial part

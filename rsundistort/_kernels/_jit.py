@@ -26,10 +26,10 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 class _Kept(FunctionCache):
-    """Compiled kernels in files, where these can be had: what is damaged, or cannot be written, is compiled again.
+    """Compiled kernels in files, where possible: a damaged file, or one that cannot be written, means compiling again.
 
-    So is what was compiled of other sources. Numba asks only whether a kernel's own file is the same; a kernel holds
-    the code and the constants of those that it calls, too, and these may stand in any file beside it.
+    Kernels of other sources are compiled again, too. Numba asks only whether a kernel's own file is the same; a kernel
+    holds the code and the constants of those that it calls, too, and these may stand in any file beside it.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -40,7 +40,7 @@ class _Kept(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
             return super().load_overload(sig, target_context)
-        except Exception:  # whatever pickle makes of a file that was cut short
+        except Exception:  # pickle raises many kinds for a file that was cut short
             with suppress(OSError):
                 self.flush()
             return None

@@ -16,11 +16,11 @@ from ._jit import kernel, parallel_kernel, prange
 HALF = 7
 _SIDE = 2 * HALF + 1
 _SAMPLES = _SIDE * _SIDE
-# Of the samples: the middle counts more. A sum within the kernel would depend on the number of threads.
+# Weights of the samples, larger in the middle. A sum within the kernel would depend on the number of threads.
 _WEIGHT = np.exp(-0.5 * (np.add.outer(*2 * (np.arange(-HALF, HALF + 1) ** 2,)) / (0.6 * HALF) ** 2)).ravel()
 _TOTAL = float(_WEIGHT.sum())
 _MOST_STEPS = 30
-# steps that only shift the window, before it may also turn, stretch and shear
+# Number of steps that only shift the window, before it may also rotate, stretch and shear.
 _SHIFTS = 2
 # of the centre, in samples: it has come to rest; it is lost
 _AT_REST, _LOST = 0.01, 4.0
@@ -34,7 +34,7 @@ def _line(row, j, u0, u1, u2, u3):
 
 @kernel(forceinline=True)
 def _cubic(patch, x, y):
-    """Bicubic (Keys, a = -1/2) value at a place; the caller sees to it that four pixels lie around."""
+    """Bicubic (Keys, a = -1/2) value at a place; the caller makes sure that four pixels lie around it."""
     j, i = int(x), int(y)
     a, b = x - j, y - i
     u0, u1 = a * (-0.5 + a * (1.0 - 0.5 * a)), 1.0 + a * a * (-2.5 + 1.5 * a)
@@ -65,7 +65,7 @@ def _sample(patch, x, y, M, half, out):
 
 @kernel()
 def _normalise(values, weight, total):
-    """Take the mean out, and give a weighted length of one: brightness and contrast count for nothing. The length."""
+    """Subtract the mean and scale to a weighted length of one, without brightness and contrast; the length before."""
     mean, square = 0.0, 0.0
     for n in range(_SAMPLES):
         mean += weight[n] * values[n]
@@ -84,7 +84,8 @@ def _normalise(values, weight, total):
 def _jacobian(wide, weight, total, template, length, J):
     """Derivatives (samples, 6) of the normalised template.
 
-    In the four parts of what turns and stretches the window and its two shifts; wide is one sample wider all around.
+    They are by the four entries of the matrix that deforms the window, and by its two shifts; `wide` is one sample
+    wider all around.
     """
     width = _SIDE + 2
     mean, along = np.zeros(6), np.zeros(6)
@@ -105,7 +106,7 @@ def _jacobian(wide, weight, total, template, length, J):
 
 @kernel()
 def _gradient(values, template, weight, J, g):
-    """The weighted sum of squares of what is left, and its derivatives (6,)."""
+    """The weighted sum of squared differences, and its derivatives (6,)."""
     least = 0.0
     g0, g1, g2, g3, g4, g5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for n in range(_SAMPLES):
@@ -142,7 +143,7 @@ def _align_one(template_patch, patch, place, M, weight, total, least_contrast, c
             for m in range(k + 1):
                 H[k, m] += weight[n] * J[n, k] * J[n, m]
     for k in range(6):
-        # what a window without texture along one direction cannot tell is left as it is
+        # a direction without texture in the window does not determine its unknowns, which stay as they are
         H[k, k] += 1e-3 * H[k, k] + 1e-9
         for m in range(k):
             H[m, k] = H[k, m]
@@ -200,17 +201,17 @@ def align(patches, first, second, place, M, least_contrast, centre, correlation,
     first, second : (p,) int arrays
         Patches to align.
     place : (p, 2, 2) array
-        Of the window's centre in the first and, as far as known, in the second.
+        Places of the window's centre in the first and, as far as known, in the second.
     M : (p, 2, 2, 2) array
-        Pixels to a sample in both.
+        Pixels per sample in both.
     least_contrast : float
         Standard deviation below which a window holds nothing to align.
     centre : (p, 2) array
-        Set: the place in the second, where they could be aligned.
+        Output: the place in the second, where they could be aligned.
     correlation : (p,) array
-        Set: weighted normalised cross-correlation there; NaN where they could not be aligned.
+        Output: weighted normalised cross-correlation there; NaN where they could not be aligned.
     covariance : (p, 2, 2) array
-        Set there: of the centre, pixels of the second patch, as the rest of the differences has it.
+        Output: covariance of the centre there, in pixels of the second patch, by the remaining differences.
     """
     for p in prange(len(first)):
         correlation[p] = _align_one(

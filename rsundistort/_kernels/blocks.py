@@ -1,4 +1,4 @@
-"""A symmetric matrix of blocks, of which the upper triangle is kept: its products, and its projection on clusters.
+"""Products of a symmetric matrix of blocks, of which the upper triangle is stored, and its projection on clusters.
 
 Block i (nb x nb) of S stands in block row rows[i] and block column cols[i] >= rows[i]; row_start (m + 1,) are the
 ranges of the block rows.
@@ -15,8 +15,8 @@ from ._jit import SUMS, parallel_kernel, prange
 def multiply(row_start, cols, S, x, parts, y):
     """Product y (m, nb) of S with x; parts (k, m, nb) is room for the shares of k ranges of rows.
 
-    Each block is read once, for its place above the diagonal and for that below: bytes are what a product costs. The
-    number of ranges, not that of the threads, is the order of the sums.
+    Each block is read once, for its place above the diagonal and for that below, since reading dominates the time of a
+    product. The number of ranges, not that of the threads, sets the order of the sums.
     """
     nb = x.shape[1]
     m, k = len(x), len(parts)
@@ -49,7 +49,7 @@ def multiply(row_start, cols, S, x, parts, y):
 def project_blocks(turn, free, functions, pair_start, block, left, right, S, E):
     """E (pairs, q nb, q nb) = Z_c' S Z_d of each pair of clusters, from the entries that belong to it.
 
-    Z is functions[f, k] (m, q) times the unknowns of photo f, of which the first three are turned by turn[f] (m, 3, 3)
+    Z is functions[f, k] (m, q) times the unknowns of photo f, of which the first three are rotated by turn[f] (m, 3, 3)
     and those that are held (free[f, a] is 0) vanish. Entry s is the part of S between the photos left[s] and right[s],
     block[s] or, below the diagonal, its transpose; entries pair_start[p] to pair_start[p + 1] belong to pair p, those
     of one photo together.

@@ -1,4 +1,4 @@
-"""Inverse depths of pixels, and which pixels something nearer hides.
+"""Inverse depths of pixels, and the pixels that something nearer hides.
 
 `field` is a map of inverse depths that is stretched over the rectified photo as `cv2.resize` does, `scale` (2,) its
 pixels per pixel of the photo in x and y.
@@ -10,12 +10,12 @@ import math
 
 from ._jit import kernel
 
-# Things that stand next to each other hide nothing: a claim counts from this displacement (pixels) on.
+# Displacement in pixels from which a point counts as hidden: things that stand next to each other hide nothing.
 _LEAST_PX = 1.0
 _STEP_PX = 0.5
-# Where a surface falls back so many times faster than the line of sight comes nearer, it ends.
+# A surface ends where it recedes this many times faster than the line of sight comes nearer.
 EDGE = 4.0
-# Slopes of the field are known for tiles of so many pixels of the photo.
+# Pixels of the photo on a side of the tiles for which slopes of the field are known.
 TILE_PX = 16
 
 

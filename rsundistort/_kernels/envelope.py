@@ -12,7 +12,7 @@ import numpy as np
 
 from ._jit import SUMS, kernel, parallel_kernel, prange
 
-# Bands that take a column of the factor together: with their own rows they fit in the cache of a processor.
+# Number of bands that use a column of the factor together: with their own rows they fit in a processor's cache.
 _TOGETHER = 8
 
 
@@ -119,12 +119,12 @@ def factor_envelope(first, offset, panel, data):
 def solve_envelope(first, offset, data, B):
     """B (k, n): right-hand sides become solutions, n a multiple of four.
 
-    Four at a time: the factor is read from memory, and that is what a solution costs.
+    Four are solved at a time, since reading the factor from memory dominates the time of a solution.
     """
     for quad in prange((len(B) + 3) // 4):
         j = 4 * quad
         last = len(B) - 1
-        # what is beyond the last is the last once more, in a copy that nobody reads
+        # those beyond the last repeat it, in a copy that is not read
         x0 = B[j]
         x1 = B[j + 1] if j + 1 <= last else B[last].copy()
         x2 = B[j + 2] if j + 2 <= last else B[last].copy()
@@ -163,7 +163,7 @@ def solve_envelope(first, offset, data, B):
 
 @kernel(fastmath=SUMS)
 def _times_band(data, first, offset, g, h, V, out):
-    """Add to out (4, n) what band h of the inverse makes of V (4, n), in the columns after band g; both triangles."""
+    """Add band h of the inverse (both triangles) times V (4, n) to out (4, n), in the columns after band g."""
     low, width = 4 * g + 4, 4 * h + 4 - first[h]
     at = offset[h] + low - first[h]
     z0, z1, z2, z3 = data[at:], data[at + width :], data[at + 2 * width :], data[at + 3 * width :]

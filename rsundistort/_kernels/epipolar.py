@@ -1,4 +1,4 @@
-"""Two photos with a shutter each: how far matches are from their epipolar planes, and the normal equations of that."""
+"""Distances of matches from their epipolar planes in two photos with a shutter each, and their normal equations."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def by_phi(phi, clock, x, y, z, a, b, g0, g1, g2):
 
 @kernel(forceinline=True)
 def plane_terms(ray_1, slopes_1, clock_1, rate_1, ray_2, slopes_2, clock_2, rate_2, R, t, phi_1, phi_2):
-    """Of one match x_1, x_2, freed of the shutter, and of its error e = x_2 . t x (R x_1).
+    """The geometry of one match x_1, x_2 without the shutter, and of its error e = x_2 . t x (R x_1).
 
     x_1 and x_2 with the factors of their rotations (5 and 5 numbers), R x_1, and the derivatives of e by x_2, by R x_1
     and by x_1 (3 each); the square of e's derivative by the raw pixels of both.

@@ -6,7 +6,7 @@ import math
 
 from ._jit import kernel
 
-# Newton in the plane and on cubics stops at steps below this.
+# Newton's method in the plane and on cubics stops at steps below this.
 ROW_TOL = 1e-14
 MAX_NEWTON = 30
 
@@ -92,7 +92,7 @@ def _fisheye(lens, x, y):
 
 @kernel()
 def _unfisheye(lens, xd, yd):
-    """As `undistort`, of a fisheye: Newton on the angle, kept between bounds. No ray at 90 degrees and beyond."""
+    """As `undistort`, of a fisheye: Newton on the angle, kept between bounds. Rays end at 90 degrees."""
     radius = math.sqrt(xd * xd + yd * yd)
     if radius == 0.0:
         return xd, yd, True

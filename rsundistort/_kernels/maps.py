@@ -24,7 +24,7 @@ def _ray(rays, u, v):
 
 @kernel(forceinline=True)
 def _raw_pixel(ok, intr, out):
-    """The raw pixel that `project` found; if none answers, one far outside of every photo.
+    """The raw pixel that `project` found; without one, a pixel far outside of every photo.
 
     It is finite: a NaN is handled differently by OpenCV 4 and 5.
     """
@@ -43,7 +43,7 @@ def fill_map(model, axis, sign, intr, lens, phi, rays, row0, map_x, map_y):
     vel = np.zeros(3)
     rows, cols = map_x.shape
     for i in range(rows):
-        # the clock of the last two pixels foretells that of the next
+        # the clock of the last two pixels predicts that of the next
         t1 = t2 = math.nan
         for j in range(cols):
             x, y, z = _ray(rays, j, row0 + i)
@@ -65,7 +65,7 @@ def fill_map_at_depth(axis, sign, intr, lens, phi, vel, rays, inverse_depth, row
         t1 = t2 = math.nan
         for j in range(cols):
             x, y, z = _ray(rays, j, row0 + i)
-            # the scale of a scene does not show: the ray, and the velocity times the inverse depth
+            # the scale of a scene cannot be seen: the ray, and the velocity times the inverse depth, suffice
             ok = z > 0.0 and project_exact(
                 axis, sign, lens, x, y, z, phi, vel, float(inverse_depth[i, j]), 2.0 * t1 - t2, out, False
             )
@@ -93,9 +93,9 @@ def _nodes_of_row(nodes, p, s, column):
 
 @kernel(forceinline=True)
 def _interpolate_row(column_x, column_y, k, at, low, right, bottom, row_x, row_y, row_seen):
-    """A row of a patch from its nodes k ... k + 3; seen is what lies between low and right, or bottom.
+    """A row of a patch from its nodes k ... k + 3; pixels between low and right, or bottom, are seen.
 
-    Returned is how many pixels do not.
+    The number of pixels that are not seen is returned.
     """
     x0, xa, xb, xc = _powers(column_x[k], column_x[k + 1], column_x[k + 2], column_x[k + 3])
     y0, ya, yb, yc = _powers(column_y[k], column_y[k + 1], column_y[k + 2], column_y[k + 3])
@@ -117,11 +117,11 @@ def interpolate_map(
     model, axis, sign, intr, lens, phi, rays, nodes_x, nodes_y, smooth, spacing, band, edge, width, height, row0,
     map_x, map_y, seen,
 ):  # fmt: skip
-    """As `fill_map`, by cubics between nodes of the grid; and which pixels see the raw photo.
+    """As `fill_map`, by cubics between nodes of the grid, with the pixels that see the raw photo.
 
     Patches of 3 x 3 cells have 4 x 4 of the nodes, (3 m + 1, 3 n + 1) in all, `spacing` pixels apart. Exact instead are
     patches that are not `smooth` (m, n), and pixels within `band` of where seeing ends, `edge` pixels beyond the
-    outermost centres of the raw photo (width, height). `seen` gets 255 or 0; returned is how many are 0.
+    outermost centres of the raw photo (width, height). `seen` gets 255 or 0; the number of zeros is returned.
     """
     out = np.empty(21)
     vel = np.zeros(3)
@@ -219,8 +219,8 @@ def invert_map(map_x, map_y, back_x, back_y):
 def fixed_point(map_x, map_y, xy, fraction):
     """OpenCV's CV_16SC2 map, rounded to 1/32 pixel: `xy` is a view of (rows, cols, 2) int16 as (rows, cols) int32.
 
-    As `cv2.convertMaps`, at a quarter of its time: 32-bit integers throughout, which vectorise. Positions beyond 32,767
-    px wrap around.
+    It equals `cv2.convertMaps`, in a quarter of its time, since it uses 32-bit integers throughout, which vectorise.
+    Positions beyond 32,767 px wrap around.
     """
     rows, cols = map_x.shape
     for i in range(rows):

@@ -9,7 +9,7 @@ from ._jit import kernel
 
 @kernel(forceinline=True)
 def rodrigues(t2):
-    """Of an angle t given by its square: sin t / t and (1 - cos t) / t^2, to rounding at any angle."""
+    """The factors sin t / t and (1 - cos t) / t^2 of an angle t given by its square, to rounding at any angle."""
     if t2 < 0.25:  # what is left out is below t^14 / 15! = 5e-17
         a = t2 * (1 / 5040 - t2 * (1 / 362880 - t2 * (1 / 39916800 - t2 * (1 / 6227020800))))
         b = t2 * (1 / 40320 - t2 * (1 / 3628800 - t2 * (1 / 479001600 - t2 * (1 / 87178291200))))
@@ -76,7 +76,7 @@ def path(phi, vel, moving, t):
 
 @kernel(forceinline=True)
 def interval(n, s):
-    """Of a place s in n intervals of length 1: which one, where in it, and how far beyond the first or the last."""
+    """The interval of a place s among n of length 1, the place in it, and the distance beyond the first or the last."""
     i = min(max(int(min(max(s, 0.0), float(n))), 0), n - 1)
     u = min(max(s - i, 0.0), 1.0)
     return i, u, s - i - u

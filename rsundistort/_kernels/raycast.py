@@ -1,6 +1,6 @@
 """Ray caster of the synthetic scenes: nearest hits, shadows, sky light, textures.
 
-It shares no function with the row models it is the judge of. Conventions of every function here: `geometry`
+It shares no function with the row models that it checks. Conventions of every function here: `geometry`
 and `look` are the tuples that `synthetic.scene.Scene` builds. A patch is a parallelogram (or the triangle
 that is half of it), origin + s*edge_a + t*edge_b, whose front is the side of cross(edge_a, edge_b); it is
 seen from both sides. `geometry` = (planes (p, 12): unit normal, its offset, and the dual vectors that give s
@@ -232,7 +232,7 @@ def render_rows(geometry, look, R_cw, center_w, by_column, first_row, xy_norm, s
 
     `xy_norm` (rows, cols, n, 2): ideal normalised coordinates of the n samples of each pixel, `spacing` between them in
     the same units. `R_cw` (lines, times, 3, 3) and `center_w` (lines, times, 3): poses of each sensor line at moments
-    of its exposure, which the samples take in turn; lines are rows, or columns if by_column. `suns` (n, 3): towards the
+    of its exposure, one for each sample; lines are rows, or columns if by_column. `suns` (n, 3): towards the
     point of the sun's disc that sample k looks at.
     """
     light, light_grid, sky, colours = look[8:]

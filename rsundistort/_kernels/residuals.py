@@ -11,17 +11,18 @@ from .lens import distort, lens_basis, undistort
 from .motion import cubic, interval, moves, path, rodrigues, rotate
 from .projection import CHUNK, CONSTANT_MOTION, ROTATION, project
 
-# The most of the curvature along a residual that a robust loss takes away. All of it would send points of two photos
-# whose rays miss each other far off, and damp the step of everything else until it hardly moves; none of it makes
-# convergence linear. (Steps of a solve of aligned tracks: 125 with 0.99, 88 with 0.5, 49 with 0.3, 50 with none.)
+# Largest share of the curvature along a residual that a robust loss removes. Removing all of it would send points of
+# two photos whose rays miss each other far off, and damp the step of everything else until it hardly moves; removing
+# none makes convergence linear. (Steps of a solve of aligned tracks: 125 with 0.99, 88 with 0.5, 49 with 0.3, 50 with
+# none.)
 _MOST_SHARE = 0.3
-# What an observation costs that cannot be projected (behind the camera): its point must not profit from it.
+# Cost of an observation that cannot be projected (behind the camera): its point must not profit from it.
 _INVALID_PX = 100.0
 
 
 @kernel(forceinline=True)
 def _loss(kind, s, scale2):
-    """Robust loss rho(s) of a squared residual, rho'(s), and the share of curvature that it takes away along r.
+    """Robust loss rho(s) of a squared residual, rho'(s), and the share of curvature that it removes along r.
 
     Kinds: 0 squared, 1 Huber, 2 Cauchy, 3 soft L1. The share is -2 s rho''/rho' as far as `_MOST_SHARE`, so that the
     Hessian rho' J'(I - share r r'/s) J stays well within the positive.
@@ -40,7 +41,7 @@ def _loss(kind, s, scale2):
 
 @kernel(forceinline=True)
 def _weights(kind, r0, r1, scale2):
-    """Of a whitened residual r: rho, w, keep and the symmetric M = m00, m01, m11, for r w / keep and M J.
+    """Factors of a whitened residual r: rho, w, keep and the symmetric M = m00, m01, m11, for r w / keep and M J.
 
     J <- sqrt(rho') (I - a n n') J and r <- sqrt(rho') r / (1 - a), n = r/|r|: the gradient stays rho' J'r and J'J
     becomes the Hessian of `_loss`.
@@ -68,7 +69,7 @@ def _camera_frame(R, center, velocity, point, vel_c):
 
 @kernel(forceinline=True)
 def _measured_row(axis, sign, intr, xy):
-    """Where the search for a measurement's row starts: from elsewhere, what one kernel sees another may not."""
+    """Where the search for a measurement's row starts; it must be the same in all kernels, for the same result."""
     return sign * (xy[axis] - intr[2 + axis]) / intr[axis]
 
 

@@ -2,8 +2,8 @@
 
 Observations are sorted by point (`track_start` (n+1,) are the ranges of their tracks); `frame_order` lists them by
 photo (`frame_start` (m+1,)). Of each observation only the Jacobian J (o, 2, nb) of its
-photo is kept: that of its point is minus that of the photo's centre, J_p = -J[:, :, 3:6]. So all that the elimination
-needs of a pair of photos is a 2x2 matrix between their Jacobians, and W = J'J_p is never written. `unknowns` stands for
+photo is stored: that of its point is minus that of the photo's centre, J_p = -J[:, :, 3:6]. Therefore the elimination
+needs only a 2x2 matrix between the Jacobians of a pair of photos, and W = J'J_p is never written. `unknowns` stands for
 nb, see `_jit.unknowns_of`: loops over a small block unroll. Every loop in parallel owns what it writes, so sums do not
 depend on the number of threads.
 """
@@ -74,7 +74,7 @@ def _invert_spd3(A, damping, B):
     b, c, e = A[0, 1], A[0, 2], A[1, 2]
     c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
     det = a * c00 + b * c01 + c * c02
-    # a product of the diagonal that cancels to nothing: the point has no parallax, it is left where it is
+    # the determinant cancels to nothing: the point has no parallax and stays where it is
     if not det > 1e-14 * a * d * f:
         B[:] = 0.0
         return
@@ -143,7 +143,8 @@ def covisible_columns(frame_start, frame_order, frame_idx, point_idx, track_star
 def _add_product(typingctx, unknowns, S, i, J, k, n, m00, m01, m10, m11):
     """S[i] += J[k]' M J[n], rows of blocks as vectors.
 
-    Written for LLVM itself: numba unrolls loops over so few columns into scalars, at four times the time.
+    It is written in LLVM's own instructions: numba unrolls loops over so few columns into scalars, which takes four
+    times as long.
     """
 
     def generate(context, builder, signature, args):
@@ -212,7 +213,7 @@ def _times(x0, x1, x2, B, p):
 def _between(u0, u1, u2, w0, w1, w2, J, k, n):
     """M of two measurements of a track, 2x2: 1 if k = n, less J_p,k V^-1 J_p,n'; u and w are rows of -J_p,k V^-1.
 
-    J_p,n is minus J's columns of the centre: the sign turns, so that products with M are added.
+    J_p,n is minus J's columns of the centre: the sign is reversed, so that products with M are added.
     """
     c0, c1, c2 = J[n, 0, 3], J[n, 0, 4], J[n, 0, 5]
     d0, d1, d2 = J[n, 1, 3], J[n, 1, 4], J[n, 1, 5]
@@ -291,7 +292,7 @@ def border_rows(
             _add_product_to(rhs[f], -e0, -e1, J_camera[k, 0], J_camera[k, 1])
             n, end = track_start[p], track_start[p + 1]
             while n < end:
-                # what photos of one camera have in a track is summed before it meets the photo's own
+                # shares of one camera's photos in a track are summed before they are multiplied with the photo's own
                 camera = camera_of_frame[frame_idx[n]]
                 r0[:] = 0.0
                 r1[:] = 0.0
@@ -311,7 +312,7 @@ def border_rows(
 def group_gradients(
     frame_start, frame_order, point_idx, track_start, res, J, J_camera, V_inv, group, g_frame, g_camera
 ):  # fmt: skip
-    """What groups of measurements have in J'r - W V^-1 Jp'r: g_frame (m, groups, nb), g_camera (m, groups, nc).
+    """Shares of groups of measurements in J'r - W V^-1 Jp'r: g_frame (m, groups, nb), g_camera (m, groups, nc).
 
     A measurement k pulls at its point, and thereby at all photos n of its track: J_n' (1_nk - J_p,n V^-1 J_p,k') r_k.
     """
@@ -322,7 +323,7 @@ def group_gradients(
         for s in range(frame_start[f], frame_start[f + 1]):
             n = frame_order[s]
             p = point_idx[n]
-            # J_p is minus these: the sign of their product does not turn
+            # J_p is minus these: the sign of their product stays
             u0, u1, u2 = _times(J[n, 0, 3], J[n, 0, 4], J[n, 0, 5], V_inv, p)
             w0, w1, w2 = _times(J[n, 1, 3], J[n, 1, 4], J[n, 1, 5], V_inv, p)
             for k in range(track_start[p], track_start[p + 1]):

@@ -17,7 +17,7 @@ from ._jit import SUMS, columns, kernel, parallel_kernel, prange
 def eliminate(row_start, cols, order, joined):
     """An order in which block rows fill few blocks, each time the one with the fewest neighbours (minimum degree).
 
-    joined (m, m) bool, false before, gets the neighbours that each row has as its turn comes; the diagonal is left out.
+    joined (m, m) bool, false before, gets the neighbours of each row when it is eliminated, without the diagonal.
     """
     m = len(order)
     for f in range(m):
@@ -61,7 +61,7 @@ def _place(row_start, cols, row, col):
 def fill_blocks(row_start, cols, first, second, S, scale, free, U):
     """Blocks S (blocks, nb, nb), between rows first[i] and second[i] in either order, into those of U, scaled.
 
-    scale, free (m, nb); what is held is that of the identity.
+    scale, free (m, nb); rows of held unknowns are those of the identity.
     """
     U[:] = 0.0
     nb = S.shape[1]
@@ -140,7 +140,7 @@ def factor_blocks(unknowns, row_start, cols, U):
 def solve_blocks(row_start, cols, U, x):
     """Right-hand sides x (k, m, nb) become solutions.
 
-    Four at a time: the factor is read from memory, and that is what a solution costs.
+    Four are solved at a time, since reading the factor from memory dominates the time of a solution.
     """
     m, nb = x.shape[1:]
     for quad in prange((len(x) + 3) // 4):

@@ -82,7 +82,7 @@ def evaluate(
     chosen = {k: Path(given) if given is not None else default for k, (given, default) in folders.items()}
     for key, (given, _) in folders.items():
         if given is not None and not chosen[key].is_dir():
-            raise FileError(f"{chosen[key]} is no folder; give the folder of the {key} photos")
+            raise FileError(f"{chosen[key]} is no folder; --{key} takes a folder of photos")
     if chosen["twins"].is_dir():
         after, before = _image_errors(out, solution, turns, true_solution, chosen, StageLog(progress))
     return Evaluation(
@@ -96,7 +96,7 @@ def evaluate(
     )
 
 
-def _twin(folder: Path, name: str) -> Path:
+def _reference_path(folder: Path, name: str) -> Path:
     """Where the reference of a photo is: a frame of a video is called as a PNG file, its reference may be a JPEG."""
     path = folder / output_name(name)
     small = path.with_suffix(".jpg")
@@ -104,21 +104,21 @@ def _twin(folder: Path, name: str) -> Path:
 
 
 def _without_lens(
-    twin: NDArray[Any], image: SolvedImage, solution: Solution, truth: Solution
+    reference: NDArray[Any], image: SolvedImage, solution: Solution, truth: Solution
 ) -> tuple[NDArray[Any], NDArray[np.uint8]]:
     """A global-shutter photo as the rectified camera would have taken it, and the mask of what it shows."""
     by_name = {each.name: each for each in truth.images}
     taken_by = truth.cameras[by_name[image.name].camera_id] if image.name in by_name else None
     rectified = solution.rectified_cameras[image.camera_id]
-    whole = np.full(twin.shape[:2], 255, np.uint8)
+    whole = np.full(reference.shape[:2], 255, np.uint8)
     if taken_by is None or taken_by.is_pinhole:
-        return twin, whole
-    return rectify(twin, taken_by, RowMotion(), "global", rectified)
+        return reference, whole
+    return rectify(reference, taken_by, RowMotion(), "global", rectified)
 
 
 def _check_sizes(photo: NDArray[Any], mask: NDArray[Any], shown: NDArray[np.uint8]) -> None:
     """Refuse a mask or a reference of another size than the photo."""
-    for what, other in (("mask", mask.shape), ("twin", shown.shape)):
+    for what, other in (("mask", mask.shape), ("reference", shown.shape)):
         if other != photo.shape[:2]:
             raise InputError(
                 f"the {what} has the shape {other}, the rectified photo {photo.shape[:2]}; give those of one camera"
@@ -133,24 +133,24 @@ def _image_errors(
     folders: Mapping[str, Path],
     log: StageLog,
 ) -> tuple[PsnrSummary | None, PsnrSummary | None]:
-    """Of the rectified photos against their references, and of the photos before."""
+    """Signal-to-noise ratios of the rectified photos against their references, and of the photos before."""
     twins, raw = folders["twins"], folders["raw"]
     masks = mask_names([image.name for image in solution.images])
     raw_as = solution.options.get("raw_as", "tif")
     after: dict[str, float] = {}
     before: dict[str, float] = {}
-    twin_of = {image.name: _twin(twins, image.name) for image in solution.registered}
-    some = any(path.is_file() for path in twin_of.values())
-    registered = [image for image in solution.registered if twin_of[image.name].is_file() or not some]
+    reference_of = {image.name: _reference_path(twins, image.name) for image in solution.registered}
+    some = any(path.is_file() for path in reference_of.values())
+    registered = [image for image in solution.registered if reference_of[image.name].is_file() or not some]
     log.begin("comparing", len(registered))
     for done, image in enumerate(registered, start=1):
-        taken = read_photo(twin_of[image.name]).pixels
+        taken = read_photo(reference_of[image.name]).pixels
         files = out / "images" / output_name(image.name, raw_as), out / "masks" / masks[image.name]
         photo, mask = (turn_pixels(read_photo(path).pixels, INVERSE[turns[image.name]]) for path in files)
         try:
-            twin, shown = _without_lens(taken, image, solution, truth)
+            reference, shown = _without_lens(taken, image, solution, truth)
             _check_sizes(photo, mask, shown)
-            after[image.name] = psnr(photo, twin, np.minimum(mask, shown))
+            after[image.name] = psnr(photo, reference, np.minimum(mask, shown))
             if (raw / image.name).is_file():
                 # photo and reference have the same lens
                 before[image.name] = psnr(read_photo(raw / image.name).pixels, taken, mask)

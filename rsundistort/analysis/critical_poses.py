@@ -56,8 +56,8 @@ def analyze(path: Path | str, readout: str | None = None) -> PoseAnalysis:
             sentence = solution.critical_motion.get("sentence")
             advice = solution.critical_motion.get("advice")
     if len(R_cw) < 2:
-        raise InputError(f"{path} holds {len(R_cw)} poses; the meter compares at least two")
-    meter = critical_motion(R_cw, center_w, directions)
-    if advice is None and meter.is_low:
+        raise InputError(f"{path} holds {len(R_cw)} poses; the degeneracy measure compares at least two")
+    degeneracy = critical_motion(R_cw, center_w, directions)
+    if advice is None and degeneracy.is_low:
         advice = [each.sentence for each in advise_poses(R_cw, center_w, directions)]
-    return PoseAnalysis(len(R_cw), tuple(sorted(set(directions))), meter, sentence, tuple(advice or ()))
+    return PoseAnalysis(len(R_cw), tuple(sorted(set(directions))), degeneracy, sentence, tuple(advice or ()))

@@ -99,7 +99,7 @@ class PoseAnalysis(_FormerlyDict):
         Poses that were analysed.
     readout : tuple of str
         Directions of readout among them.
-    meter : CriticalMotion
+    degeneracy : CriticalMotion
         How well the poses determine the shutter.
     sentence : str or None
         What the shape of the solution is worth; None of bare poses.
@@ -109,20 +109,26 @@ class PoseAnalysis(_FormerlyDict):
 
     photos: int
     readout: tuple[str, ...]
-    meter: CriticalMotion
+    degeneracy: CriticalMotion
     sentence: str | None = None
     advice: tuple[str, ...] = ()
+
+    @property
+    def meter(self) -> CriticalMotion:
+        """Former name of `degeneracy`, in this version."""
+        warnings.warn("PoseAnalysis.meter is now PoseAnalysis.degeneracy", DeprecationWarning, stacklevel=2)
+        return self.degeneracy
 
     def to_json(self) -> dict[str, Any]:
         """What `rsundistort analyze --json` prints."""
         return {
             "photos": self.photos,
             "readout": list(self.readout),
-            "singular_values": self.meter.singular_values.tolist(),
-            "null_vector": self.meter.null_vector.tolist(),
-            "y_axis_spread_deg": self.meter.y_axis_spread_deg,
-            "meaning": self.meter.meaning,
-            "critical": self.meter.is_low,
+            "singular_values": self.degeneracy.singular_values.tolist(),
+            "null_vector": self.degeneracy.null_vector.tolist(),
+            "y_axis_spread_deg": self.degeneracy.y_axis_spread_deg,
+            "meaning": self.degeneracy.meaning,
+            "critical": self.degeneracy.is_low,
             "sentence": self.sentence,
             "advice": list(self.advice),
         }

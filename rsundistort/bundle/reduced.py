@@ -91,18 +91,18 @@ class Factored:
         return shape.scatter(rows) + np.tensordot(shares, self.frames, 1), shares @ self.cameras
 
     def diagonal_blocks(self) -> tuple[Array, Array]:
-        """Of the inverse: those of each photo (m, nb, nb), 0 where held, and that of all cameras (k, k)."""
+        """Blocks of the inverse of each photo (m, nb, nb), 0 where held, and that of all cameras (k, k)."""
         shared = np.einsum("rma,rs->sma", self.frames, self.weights)
         cameras = self.cameras.T @ self.weights @ self.cameras
         return self.photos.inverse_blocks() + np.einsum("sma,smb->mab", shared, self.frames), (cameras + cameras.T) / 2
 
     def pair_blocks(self, first: Index, second: Index) -> Array:
-        """Of the inverse: those of pairs of photos that the pattern connects, (q, nb, nb), 0 where held."""
+        """Blocks of the inverse of pairs of photos that the pattern connects, (q, nb, nb), 0 where held."""
         shared = np.einsum("rqa,rs->sqa", self.frames[:, first], self.weights)
         return self.photos.inverse_blocks_of(first, second) + np.einsum("sqa,sqb->qab", shared, self.frames[:, second])
 
     def photos_by_cameras(self) -> Array:
-        """Of the inverse: between photos and cameras, (m, nb, k)."""
+        """Blocks of the inverse between photos and cameras, (m, nb, k)."""
         return np.einsum("rma,rs,sk->mak", self.frames, self.weights, self.cameras)
 
     def joined(self, frames: Array, cameras: Array, weights: Array) -> Factored:

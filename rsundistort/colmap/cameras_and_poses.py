@@ -13,7 +13,7 @@ from ..errors import FileError, FormatError, InputError
 from ..model import Camera
 from ..model.checks import check_photo_name
 from .conventions import HALF, poses_of, quiet_pycolmap
-from .file_checks import check_colmap_cameras, check_colmap_files
+from .file_checks import check_colmap_cameras, check_colmap_files, pycolmap_model
 from .lenses import camera_from_colmap
 
 __all__ = ["checked_name", "read_colmap_cameras", "read_colmap_poses"]
@@ -95,11 +95,7 @@ def read_colmap_poses(folder: Path, any_lens: bool = False) -> tuple[Any, ...]:
     cameras, names, camera_idx, R_cw, center_w, points_w, frame_idx, point_idx
         As in `Reconstruction`.
     """
-    check_colmap_files(folder)
-    try:
-        model = quiet_pycolmap().Reconstruction(folder)
-    except Exception as error:  # pycolmap raises what its C++ raised
-        raise FileError(f"{folder} is no COLMAP model: {error}") from error
+    model = pycolmap_model(folder)
     ids = sorted(model.cameras)
     cameras = []
     for camera_id in ids:

@@ -7,11 +7,12 @@ from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from struct import Struct
+from typing import Any
 
 from ..errors import FileError, FormatError
-from .conventions import import_pycolmap
+from .conventions import import_pycolmap, quiet_pycolmap
 
-__all__ = ["check_colmap_cameras", "check_colmap_files"]
+__all__ = ["check_colmap_cameras", "check_colmap_files", "pycolmap_model"]
 
 # models of large scenes have gigabytes of points
 Bytes = mmap.mmap
@@ -32,7 +33,7 @@ def _take(data: Bytes, at: int, kind: Struct) -> int:
 
 @lru_cache
 def _num_parameters(model: int) -> int:
-    """Of a camera of COLMAP's model of this number; 0 of one that it does not know, and then says so itself."""
+    """Number of parameters of COLMAP's camera model of this number; 0 for one that COLMAP refuses itself."""
     pycolmap = import_pycolmap()
 
     try:
@@ -99,6 +100,21 @@ def check_colmap_files(folder: Path) -> None:
             _check(path, after)
 
 
+def pycolmap_model(folder: Path) -> Any:
+    """The `pycolmap.Reconstruction` of a folder, whose files are checked first.
+
+    Raises
+    ------
+    FileError, FormatError
+        It cannot be read.
+    """
+    check_colmap_files(folder)
+    try:
+        return quiet_pycolmap().Reconstruction(folder)
+    except Exception as error:  # pycolmap raises what its C++ raised
+        raise FileError(f"{folder} is no COLMAP model: {' '.join(str(error).split())}") from error
+
+
 def check_colmap_cameras(path: Path) -> None:
     """The same of a file of cameras alone, whatever its name."""
     _check(path, _after_camera)
@@ -118,7 +134,7 @@ def _check(path: Path, after: Callable[[Bytes, int], int]) -> None:
 
 
 def _walk(data: Bytes, after: Callable[[Bytes, int], int]) -> None:
-    """From entry to entry, as many as the file counts."""
+    """Go from entry to entry, as many as the file counts."""
     count, at = _take(data, 0, _COUNT), _COUNT.size
     for _ in range(count):
         if at >= len(data):

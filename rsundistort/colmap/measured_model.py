@@ -14,8 +14,8 @@ from ..errors import FileError, FormatError
 from ..model import Observations, Reconstruction
 from ..model.reprojection import reprojection_residuals
 from .cameras_and_poses import checked_name
-from .conventions import HALF, poses_of, quiet_pycolmap
-from .file_checks import check_colmap_files
+from .conventions import HALF, poses_of
+from .file_checks import pycolmap_model
 from .lenses import camera_from_colmap
 from .rectified_model import ModelIds
 
@@ -140,12 +140,7 @@ def read_colmap_model(folder: Path) -> ColmapModel:
         raise FileError(f"{folder} is no folder; give the folder with cameras, images and points3D of a COLMAP model")
     if not any(all((folder / f"{part}.{kind}").is_file() for part in _PARTS) for kind in ("bin", "txt")):
         raise FileError(f"{folder} is no COLMAP model; give the folder with its cameras, images and points3D")
-    check_colmap_files(folder)
-    try:
-        model = quiet_pycolmap().Reconstruction(folder)
-    except Exception as error:  # pycolmap raises what its C++ raised
-        raise FileError(f"{folder} is no COLMAP model: {' '.join(str(error).split())}") from error
-    return colmap_model_of(model, str(folder))
+    return colmap_model_of(pycolmap_model(folder), str(folder))
 
 
 def colmap_model_of(model: Any, where: str = "the model") -> ColmapModel:

@@ -3,7 +3,7 @@
 from .advice import Advice, advise, advise_poses
 from .common import CommonMotion, clock_contrast, common_motion
 from .cost import ShapeCost, shape_cost
-from .meter import CriticalMotion, critical_motion
+from .degeneracy import CriticalMotion, critical_motion
 from .remedy import REMEDIES, Remedy, heal, still_probability, with_remedy
 
 __all__ = [

@@ -13,7 +13,7 @@ from ..bundle import BundleOptions, BundleResult
 from ..model import Observations, Reconstruction
 from ..model.projection import project_points
 from .cost import ShapeCost, shape_cost
-from .meter import critical_motion
+from .degeneracy import critical_motion
 
 __all__ = ["Advice", "advise", "advise_poses"]
 
@@ -30,7 +30,7 @@ class Advice:
     ----------
     what : str
         In words.
-    meter : float
+    degeneracy : float
         Smallest singular value of the degeneracy measure with them.
     sigma_log_k : float or None
         Standard deviation of the height of the scene with them; None if only poses are known.
@@ -40,7 +40,7 @@ class Advice:
     """
 
     what: str
-    meter: float
+    degeneracy: float
     sigma_log_k: float | None = None
     shift_px: float | None = None
 
@@ -48,7 +48,7 @@ class Advice:
     def sentence(self) -> str:
         """For people."""
         if self.sigma_log_k is None:
-            return f"{self.what}: the meter would read {self.meter:.2f}"
+            return f"{self.what}: the degeneracy measure would be {self.degeneracy:.2f}"
         said = f"{self.what}: the height would be uncertain by +-{100 * self.sigma_log_k:.2g} %"
         return said if self.shift_px is None else f"{said}, the rectified photos by {self.shift_px:.2g} px"
 
@@ -119,7 +119,7 @@ def advise(result: BundleResult, options: BundleOptions | None = None) -> list[A
             imagined = replace(result, reconstruction=more, covariances=np.zeros((m + len(photos), nb, nb)))
             cost: ShapeCost = shape_cost(imagined, plain)
             shift = cost.common.shift_px if cost.common.of_travel else None
-            found.append(Advice(what, cost.meter.value, worse * cost.sigma_log_k, shift))
+            found.append(Advice(what, cost.degeneracy.value, worse * cost.sigma_log_k, shift))
     return found
 
 

@@ -11,7 +11,7 @@ from ..bundle import BundleOptions, BundleResult, Posterior, gauge_directions
 from ..errors import InputError
 from ..model import Reconstruction
 from .common import CommonMotion, common_motion
-from .meter import CriticalMotion, critical_motion, readout_axes
+from .degeneracy import CriticalMotion, critical_motion, readout_axes
 
 __all__ = ["ShapeCost", "shape_cost"]
 
@@ -35,7 +35,7 @@ class ShapeCost:
         the largest variance, other than motions of the world. Rotations and phi in radians, lengths in baselines.
     weakest_share : float
         Share of the vertical scale in that mode: square of the correlation of the two, 0 to 1.
-    meter : CriticalMotion
+    degeneracy : CriticalMotion
         Of the solution's poses.
     common : CommonMotion
         Uncertainty of the part of the motions that the photos share.
@@ -44,13 +44,13 @@ class ShapeCost:
     sigma_log_k: float
     weakest_sigma: float
     weakest_share: float
-    meter: CriticalMotion
+    degeneracy: CriticalMotion
     common: CommonMotion
 
     @property
     def is_flagged(self) -> bool:
         """Whether the poses are nearly critical, and this matters here."""
-        return self.meter.is_low and not self.sigma_log_k <= _SMALL
+        return self.degeneracy.is_low and not self.sigma_log_k <= _SMALL
 
     @property
     def sentence(self) -> str:
@@ -66,11 +66,11 @@ class ShapeCost:
         said = f"the height of the scene is uncertain by +-{value} % (one standard deviation)"
         if not self.is_flagged:
             return said
-        if self.meter.num_photos < 3:
+        if self.degeneracy.num_photos < 3:
             return f"{said}, because two photos never separate the shutter from the shape"
-        if self.meter.y_axis_spread_deg < 1:
+        if self.degeneracy.y_axis_spread_deg < 1:
             return f"{said}, because all cameras were held level"
-        if self.meter.y_axis_spread_deg < 15:
+        if self.degeneracy.y_axis_spread_deg < 15:
             return f"{said}, because all cameras were held nearly level"
         return f"{said}, because the cameras were not rotated against each other"
 
@@ -153,6 +153,6 @@ def shape_cost(result: BundleResult, options: BundleOptions | None = None) -> Sh
         sigma_log_k=float(np.sqrt(variance)),
         weakest_sigma=float(np.sqrt(value)),
         weakest_share=float(min(share, 1.0)),
-        meter=critical_motion(rec.R_cw, rec.center_w, readout),
+        degeneracy=critical_motion(rec.R_cw, rec.center_w, readout),
         common=common_motion(result, options),
     )

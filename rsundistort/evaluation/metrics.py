@@ -110,7 +110,7 @@ def pose_errors(solution: Solution, truth: Solution) -> PoseErrors:
 def motion_errors(solution: Solution, truth: Solution) -> MotionErrors:
     """Errors of phi of a solution; photos are matched by name.
 
-    A readout that is taken to run the other way turns the sign of phi and is no error.
+    A readout that is taken to run the other way reverses the sign of phi and is no error.
     """
     true_of = {image.name: image for image in truth.images if image.motion is not None}
     names, errors = [], []

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..report.figures import need_matplotlib
 from .paths import PathComparison
 
-__all__ = ["camera_paths", "cumulative_histograms", "need_matplotlib", "plan_axes"]
+__all__ = ["camera_paths", "cumulative_histograms", "plan_axes"]
 
 _LABELS = {
     "wo-rs": "w/o RS",
@@ -27,16 +27,6 @@ _AXES = {
     "translation": "translation error [baselines]",
     "structure": "structure error [baselines]",
 }
-
-
-def need_matplotlib() -> Any:
-    """The class of figures; an error for people where matplotlib is missing."""
-    try:
-        # not pyplot: it would choose a window system, and a library must not change what its user chose
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise InputError("figures need matplotlib; pip install 'rsundistort[figures]'") from error
-    return Figure
 
 
 def cumulative_histograms(entries: Sequence[Mapping[str, Any]], methods: Sequence[str], path: Path) -> None:
@@ -77,7 +67,7 @@ def cumulative_histograms(entries: Sequence[Mapping[str, Any]], methods: Sequenc
 def plan_axes(center_w: NDArray[np.float64], R_cw: NDArray[np.float64]) -> NDArray[np.float64]:
     """Two unit vectors (2, 3): right and up of a drawing that shows a camera path from where it varies least.
 
-    Seen from above rather than from below (a mirrored path would mislead), turned so that the cameras look up the
+    Seen from above rather than from below (a mirrored path would mislead), rotated so that the cameras look up the
     page rather than down.
 
     Parameters

@@ -26,13 +26,14 @@ from ..io.outputs import only_writer
 from ..io.record import Record
 from ..io.rules import Between, check
 from ..model import Observations, Reconstruction, RowMotion
+from ..report.figures import need_matplotlib
 from ..synthetic import project_rows
-from .figures import cumulative_histograms, need_matplotlib
+from .figures import cumulative_histograms
 from .scenes import KnownScene, load_scene
 
 __all__ = ["METHODS", "OneOptions", "check_settings", "experiment_one", "read_trials", "summarize"]
 
-#: Methods: shutter model, and whether the paper's anchor (phi1 of the first photo) is held. The paper's have no prior.
+#: Methods: shutter model, and whether the paper's constraint (phi1 of the first photo) is held. They have no prior.
 METHODS: dict[str, tuple[str, bool]] = {
     "wo-rs": ("global", False),
     "rs": ("two-step", False),
@@ -233,7 +234,7 @@ def read_trials(path: Path) -> dict[tuple[str, int, str], dict[str, Any]]:
 
 
 def _cut_torn_line(path: Path) -> None:
-    """Cut off what a crash left of a line: the next one must not join it."""
+    """Cut off what a crash left of a line: the next one must not continue it."""
     if path.is_file():
         whole = path.read_bytes().rfind(b"\n") + 1
         os.truncate(path, whole)
@@ -375,7 +376,7 @@ def _experiment_one(
 def check_settings(path: Path, settings: dict[str, Any], digests: dict[str, str]) -> dict[str, str]:
     """Refuse to mix trials of different settings, or of different scenes of one name, in one folder.
 
-    The scenes that are in it, with what tells them apart.
+    Its scenes, with the parameters that distinguish them.
     """
     known: dict[str, str] = {}
     if path.is_file():

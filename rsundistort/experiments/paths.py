@@ -85,7 +85,7 @@ def compare_paths(still: Solution, with_model: Solution, without: Solution) -> P
         scale, A, shift = align_points(found, still_w)
         centers_w[key] = scale * found @ A.T + shift
         # orientations are aligned by themselves: of a walk along a straight line, the similarity of the centres leaves
-        # the turn about that line open
+        # the rotation about that line open
         errors = pose_errors(solution, truth)
         position[key], rotation[key] = errors.center, errors.rotation_deg
     return PathComparison(tuple(names), still_w, R_cw, centers_w, position, rotation)

@@ -18,10 +18,11 @@ from ..input.photo_cameras import camera_file_of
 from ..io import list_photos, output_folder
 from ..io.record import Record
 from ..model import Solution, check_shutter_model
+from ..report.figures import need_matplotlib
 from ..solve import RunOptions, SolveOptions, run
 from ..solve.run_outputs import files_of_run
 from ..versions import versions
-from .figures import camera_paths, need_matplotlib
+from .figures import camera_paths
 from .paths import PathComparison, compare_paths
 
 __all__ = ["TwoOptions", "experiment_two"]
@@ -107,7 +108,7 @@ def experiment_two(
     Raises
     ------
     InputError, ReconstructionError
-        When the names differ, or fewer than three photos are joined in all three reconstructions.
+        When the names differ, or fewer than three photos are registered in all three reconstructions.
     """
     options = options or TwoOptions()
     still, swung, out = Path(still), Path(swung), Path(out)
@@ -178,7 +179,7 @@ def _summary(
 
 
 def _write_csv(path: Path, names: Sequence[str], solutions: Mapping[str, Solution], found: PathComparison) -> None:
-    """A line for each photo; errors are empty where it was not joined in all three reconstructions."""
+    """A line for each photo; errors are empty where it was not registered in all three reconstructions."""
     place = {name: k for k, name in enumerate(found.names)}
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")

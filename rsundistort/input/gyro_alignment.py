@@ -23,7 +23,7 @@ from ..errors import InputError
 from ..io.gyro import GyroLog
 from ..model.checks import check_array, check_finite
 
-__all__ = ["GyroAlignment", "NoAlignment", "align_gyro"]
+__all__ = ["GyroAlignment", "NoAlignment", "align_gyro", "check_pairs"]
 
 _Array = NDArray[np.float64]
 
@@ -198,13 +198,18 @@ def align_gyro(
     )
 
 
-def _rates(frame_time_s: ArrayLike, pairs: ArrayLike, turns: ArrayLike) -> tuple[_Array, _Array, _Array]:
-    """Start and end (n,) of intervals between frames, and the rates (n, 3) in them; without false ones."""
-    times = check_finite(frame_time_s, (None,), "frame_time_s")
+def check_pairs(pairs: ArrayLike, turns: ArrayLike) -> tuple[NDArray[np.int64], _Array]:
+    """Pairs of frames (n, 2) and the rotations (n, 3) between them; other shapes and types are refused."""
     joined = np.asarray(pairs)
     if joined.ndim != 2 or joined.shape[1] != 2 or not np.issubdtype(joined.dtype, np.integer):
         raise InputError(f"pairs.shape={joined.shape} of {joined.dtype}, expected (n, 2) of int")
-    vectors = check_array(turns, (len(joined), 3), "turns")
+    return joined, check_array(turns, (len(joined), 3), "turns")
+
+
+def _rates(frame_time_s: ArrayLike, pairs: ArrayLike, turns: ArrayLike) -> tuple[_Array, _Array, _Array]:
+    """Start and end (n,) of intervals between frames, and the rates (n, 3) in them; without false ones."""
+    times = check_finite(frame_time_s, (None,), "frame_time_s")
+    joined, vectors = check_pairs(pairs, turns)
     if len(joined) and (joined.min() < 0 or joined.max() >= len(times)):
         raise InputError(f"pairs join frames {joined.min()} to {joined.max()} of {len(times)}")
     start, end = times[joined[:, 0]], times[joined[:, 1]]
@@ -351,7 +356,7 @@ def _ways(coarse: _Coarse, offset_s: float, seen: _Array, *, mirrored: bool) -> 
 
 
 def _letters(way: _Array) -> str:
-    """As `parse_axes` reads it."""
+    """The axes in the form that `parse_axes` reads."""
     columns = np.argmax(np.abs(way), axis=1)
     return "".join("XYZ"[k] if way[row, k] > 0 else "xyz"[k] for row, k in enumerate(columns))
 
@@ -451,7 +456,7 @@ def _exp(vector: _Array) -> _Array:
 
 
 def _rotation_vector(matrix: _Array) -> _Array:
-    """Of the rotation between two matrices, which may both be mirror images."""
+    """The rotation vector between two matrices, which may both be mirror images."""
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_matrix(matrix).as_rotvec(), np.float64)

@@ -65,9 +65,9 @@ class LoadedPhotos:
     max_megapixels: float
     edges_px: Sequence[float | None] = ()
 
-    def unregistered(self, joined: Sequence[str]) -> dict[str, str]:
+    def unregistered(self, registered: Sequence[str]) -> dict[str, str]:
         """Photos that are not registered, and why."""
-        lost = sorted({*self.names} - {*joined})
+        lost = sorted({*self.names} - {*registered})
         return {**self.skipped, **dict.fromkeys(lost, "shares too little with the other photos")}
 
 

@@ -57,7 +57,7 @@ class PhotoCameras:
         Camera of each photo.
     calibrated : bool
         Whether they were given; else they are EXIF's guesses.
-    readout_told : tuple of bool
+    readout_specified : tuple of bool
         Whether the readout direction of each camera was given; else it is a guess.
     source : str
         Where they come from, for people.
@@ -74,7 +74,7 @@ class PhotoCameras:
     labels: Sequence[str]
     camera_idx: NDArray[np.int64]
     calibrated: bool
-    readout_told: tuple[bool, ...]
+    readout_specified: tuple[bool, ...]
     source: str
     notes: Sequence[str] = ()
     sigma: Sequence[Mapping[str, float]] = ()
@@ -196,7 +196,7 @@ def find_cameras(
         keys = _keys_in(file, camera, names, sizes, groups)
         known = dict(file.cameras)
         calibrated, source, notes, usual = True, file.source, list[str](), set[str]()
-        in_file, sigma_of = file.readout_told, file.sigma
+        in_file, sigma_of = file.readout_specified, file.sigma
     else:
         known, keys, notes, usual = _from_exif(folder, names, sizes, facts, groups)
         calibrated, source, in_file, sigma_of = False, "EXIF, refined", frozenset[str](), {}

@@ -56,7 +56,7 @@ class PhotoPositions:
         East, north and up; NaN where unknown.
     R_cw : (m, 3, 3) array
         From axes east, north and up to those of the camera, by its gimbal; NaN where unknown.
-    told_by : tuple of str
+    sigma_from : tuple of str
         Source of the standard deviations.
     notes : tuple of str
         Remarks on them.
@@ -70,7 +70,7 @@ class PhotoPositions:
     speed_m_s: Array
     velocity_m_s: Array
     R_cw: Array
-    told_by: tuple[str, ...]
+    sigma_from: tuple[str, ...]
     notes: tuple[str, ...]
     common_up_m: float = 0.0
 
@@ -141,7 +141,7 @@ def check_crs(crs: str | None) -> str | None:
 
 
 def _transformer(crs: str) -> Any:
-    """From longitude and latitude of WGS 84 to a projection."""
+    """The transformation from longitude and latitude of WGS 84 to a projection."""
     try:
         import pyproj
     except ImportError:
@@ -172,7 +172,7 @@ def _projected(crs: str, geodetic: Array) -> Array:
 
 
 def _convergence(crs: str, place: Array) -> float:
-    """By how much a projection rotates east and north at a place (3,), which is refused where it stretches them."""
+    """The rotation of east and north by a projection at a place (3,), which is refused where it stretches them."""
     around = place + _STEP_DEG * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
     there, true = _projected(crs, around)[:, :2], enu_from_geodetic(around, place)[:, :2]
     jacobian = np.linalg.solve(true[::2] - true[1::2], there[::2] - there[1::2]).T
@@ -263,7 +263,7 @@ def positions_of(names: Sequence[str], facts: Sequence[ExifFacts]) -> PhotoPosit
         np.array(
             [fix.R_cw if is_upright and fix.R_cw else unknown for fix, is_upright in zip(fixes, upright, strict=True)]
         ).reshape(-1, 3, 3),
-        tuple(sorted({fix.told_by for fix in fixes} | ({"height above take-off"} if by_height.any() else set()))),
+        tuple(sorted({fix.sigma_from for fix in fixes} | ({"height above take-off"} if by_height.any() else set()))),
         tuple(notes),
         common_up_m,
     )

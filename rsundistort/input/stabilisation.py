@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from ..io.gyro import GyroLog
 from ..model.checks import check_array, check_finite
+from .gyro_alignment import check_pairs
 
 __all__ = ["Regression", "Stabilisation", "calmer_than_felt", "judge_stabilisation"]
 
@@ -160,10 +161,7 @@ def judge_stabilisation(
         Shapes that do not fit, or a readout that is not positive.
     """
     times = check_finite(frame_time_s, (None,), "frame_time_s")
-    joined = np.asarray(pairs)
-    if joined.ndim != 2 or joined.shape[1] != 2 or not np.issubdtype(joined.dtype, np.integer):
-        raise InputError(f"pairs.shape={joined.shape} of {joined.dtype}, expected (n, 2) of int")
-    vectors = check_array(turns, (len(joined), 3), "turns")
+    joined, vectors = check_pairs(pairs, turns)
     phi = check_array(phi_frame, (len(times), 3), "phi_frame")
     phi_noise = _noise(phi_sigma, phi, "phi_sigma")
     turn_noise = _noise(turn_sigma, vectors, "turn_sigma")

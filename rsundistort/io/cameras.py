@@ -103,7 +103,7 @@ class CameraFile:
         Where the file says which photo is whose, else empty.
     source : str
         The file and its kind, for people.
-    readout_told : set of id
+    readout_specified : set of id
         Cameras whose file says which way they are read out; of the others "top-to-bottom" is but a guess.
     sigma : dict of id to standard deviations
         Where the file says how well a camera is known: by intrinsic, in pixels or of the coefficients.
@@ -112,7 +112,7 @@ class CameraFile:
     cameras: Mapping[str, Camera]
     camera_of_image: Mapping[str, str] = field(default_factory=dict)
     source: str = ""
-    readout_told: frozenset[str] = frozenset()
+    readout_specified: frozenset[str] = frozenset()
     sigma: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
@@ -170,7 +170,7 @@ def _how_to_fit(camera: Camera, width: int, height: int) -> str:
     if (camera.width, camera.height) == (height, width):
         stored = "portrait" if height > width else "landscape"
         return (
-            f"they are stored in {stored}, turned since they were read out: give a camera with width and height, fx "
+            f"they are stored in {stored}, rotated since they were read out: give a camera with width and height, fx "
             f"and fy, cx and cy exchanged and the readout {other_axis(camera.readout)}"
         )
     factor = Fraction(width, camera.width)
@@ -230,10 +230,10 @@ def _read_folder(folder: Path, width: int, height: int) -> CameraFile:
             raise InputError(f"{file} holds {len(found.cameras)} cameras; in a folder each file holds one")
         (cameras[file.stem],) = found.cameras.values()
         sigma[file.stem] = next(iter(found.sigma.values()), {})
-        if found.readout_told:
+        if found.readout_specified:
             stated.add(file.stem)
     source = f"{folder} ({len(cameras)} camera file{'s' * (len(cameras) > 1)})"
-    return CameraFile(cameras, source=source, readout_told=frozenset(stated), sigma=sigma)
+    return CameraFile(cameras, source=source, readout_specified=frozenset(stated), sigma=sigma)
 
 
 def _read_file(path: Path, width: int, height: int) -> CameraFile:
@@ -265,7 +265,7 @@ def _read_file(path: Path, width: int, height: int) -> CameraFile:
         return _several_of_json(tree, path)
     stated = frozenset({_ONLY} if "readout" in tree else ())
     camera, sigma = camera_from_json(tree, str(path)), sigma_from_json(tree, str(path))
-    return CameraFile({_ONLY: camera}, source=str(path), readout_told=stated, sigma={_ONLY: sigma})
+    return CameraFile({_ONLY: camera}, source=str(path), readout_specified=stated, sigma={_ONLY: sigma})
 
 
 def _parse(content: str) -> tuple[Any, str]:

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, FormatError, InputError, RsUndistortError, RsUndistortWarning
-from .ffmpeg_reasons import reason_of
+from ..errors import FormatError, InputError, RsUndistortError, RsUndistortWarning
+from .ffmpeg_reasons import ffmpeg_errors
 from .gyro import CAMERA_FROM_GYROFLOW, GyroLog, parse_axes
 
 __all__ = ["GyroPayload", "has_telemetry", "parse_payload", "read_gpmf"]
@@ -185,11 +185,9 @@ def _open(path: Path) -> Any:
         import av
     except ImportError:
         raise InputError(f'{path.name} is a video, which needs PyAV: pip install "rsundistort[video]"') from None
-    try:
+    with ffmpeg_errors(f"{path} cannot be read as a video"):
         # tags in another encoding are nothing to fail at
         return av.open(f"file:{path}", options={"protocol_whitelist": "file"}, metadata_errors="replace")
-    except (OSError, av.error.FFmpegError) as error:
-        raise FileError(f"{path} cannot be read as a video ({reason_of(error)})") from error
 
 
 def _track(container: Any) -> Any:

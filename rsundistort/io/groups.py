@@ -81,6 +81,6 @@ def guess_readouts(
         return readouts, []
     photos, were, are = ("photo", "was", "is") if count == 1 else ("photos", "were", "are")
     return readouts, [
-        f"{count} portrait {photos} of a camera that took landscape ones too {were} turned after readout, to go by "
+        f"{count} portrait {photos} of a camera that took landscape ones too {were} rotated after readout, to go by "
         f"the missing orientation tag: {are} taken as read out {across}, the others {readout}"
     ]

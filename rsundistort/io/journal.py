@@ -111,7 +111,7 @@ class RemoteJournal(Journal):
         super().__init__(Path(self._work.name))
         self._folder = folder
         self._due = 0.0
-        self._told = True
+        self._said = True
 
     def fetch(self) -> None:
         """Begin with what is in the folder."""
@@ -120,27 +120,27 @@ class RemoteJournal(Journal):
     def write(self, entries: Iterable[JournalEntry]) -> None:
         """Begin anew with these, in one stroke."""
         super().write(entries)
-        self._told = False
+        self._said = False
         self.settle()
 
     def add(self, entry: JournalEntry) -> None:
         """Note that a photo is done."""
         super().add(entry)
-        self._told = False
+        self._said = False
         if time.monotonic() > self._due:
             self.settle()
 
     def settle(self) -> None:
         """Put it."""
-        if not self._told:
+        if not self._said:
             began = time.monotonic()
             self._folder.write(self.NAME, self.path.read_bytes())
             ended = time.monotonic()
-            self._due, self._told = ended + max(self._EVERY_S, self._TIMES * (ended - began)), True
+            self._due, self._said = ended + max(self._EVERY_S, self._TIMES * (ended - began)), True
 
     def drop(self) -> None:
         """Leave no journal in the folder."""
-        self._told = True
+        self._said = True
         self._folder.delete([self.NAME])
 
     def __exit__(

@@ -36,7 +36,7 @@ _FLIP = np.diag([1.0, -1.0, -1.0])
 # glTF has y up, OPF z: what its own converter undoes.
 _GLTF = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 # Errors of a lens that are not worth a word.
-_TOLD_PX = 0.01
+_REPORTED_PX = 0.01
 _FULL_FRAME_UM = 36e3
 # Standard deviation of an unknown height, metres.
 _UNKNOWN_M = 1e4
@@ -69,9 +69,9 @@ def write_opf(folder: Path, scene: ExportScene) -> str:
             left = max(left, rotation_left_px(camera, image.taken_out))
     _write(folder, stored, stored.cameras, images, shown, rec, rec.observations.xy_raw, scene, rolling=True)
     said = []
-    if left > _TOLD_PX:
+    if left > _REPORTED_PX:
         said.append(f"rotations during the readout have no room: the worst pixel is off by {left:.2g} px")
-    if lens > _TOLD_PX:
+    if lens > _REPORTED_PX:
         said.append(f"the lens has no room for all of ours: the worst pixel is off by {lens:.2g} px")
     return "; ".join(said) + ("; opf-rectified is exact" if said else "")
 
@@ -85,7 +85,7 @@ def write_rectified_opf(folder: Path, scene: ExportScene) -> str:
     shown = [f"../images/{scene.names[image.name]}" for image in images]
     xy = rectified_keypoints(rec, scene.rectified_cameras)
     _write(folder, scene.solution, cameras, images, shown, rec, xy, scene, rolling=False)
-    return f"two focal lengths have no room: the worst pixel is off by {left:.2g} px" if left > _TOLD_PX else ""
+    return f"two focal lengths have no room: the worst pixel is off by {left:.2g} px" if left > _REPORTED_PX else ""
 
 
 def _carried(camera: Camera) -> Camera:
@@ -214,7 +214,7 @@ def _capture(uid: Any, sensor_id: Any, facts: ExifFacts) -> Any:
     place, height_m = None, None
     if (fix := facts.fix) is not None and facts.place_deg is not None:
         # receivers with RTK give the height above the ellipsoid, others above the sea
-        crs = Crs("EPSG:4979" if fix.told_by == "RTK" else "EPSG:4326+5773")
+        crs = Crs("EPSG:4979" if fix.sigma_from == "RTK" else "EPSG:4326+5773")
         east, north, up = fix.sigma_m if fix.altitude_m is not None else (*fix.sigma_m[:2], _UNKNOWN_M)
         # in the order of the axes: latitude first
         place = Geolocation(np.array([*facts.place_deg, fix.altitude_m or 0.0]), crs, np.array([north, east, up]))

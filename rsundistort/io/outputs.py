@@ -337,7 +337,7 @@ def held_inside(folder: Path, name: str) -> Iterator[Path]:
 
 
 def _check_inside(name: Path, path: Path, folder: Path) -> None:
-    """Refuse what leads out of the folder; `name` is told."""
+    """Refuse what leads out of the folder; `name` is for the message."""
     if not is_inside(path, folder):
         raise FileError(f"{name} leads out of {folder}; remove that link") from OSError(errno.ELOOP, "a link")
 

@@ -165,7 +165,7 @@ class RemoteFile:
 
     @property
     def name(self) -> str:
-        """Without its folders."""
+        """The name without folders."""
         return PurePosixPath(self.path).name
 
 

@@ -6,7 +6,7 @@ import csv
 import struct
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, InputError, RsUndistortError, RsUndistortWarning
-from .ffmpeg_reasons import reason_of
+from ..errors import FileError, InputError, RsUndistortWarning
+from .ffmpeg_reasons import ffmpeg_errors
 from .outputs import output_folder
 from .photos.exif import ORIENTATION, pack_ifd
 from .photos.images import MAX_MEGAPIXELS, write_image
@@ -222,20 +222,9 @@ class VideoReader:
         with self._explained():
             yield from self.decoded
 
-    @contextmanager
-    def _explained(self) -> Iterator[None]:
-        """Errors of FFmpeg as those of the file."""
-        import av
-
-        try:
-            yield
-        except (OSError, av.error.FFmpegError) as error:
-            if isinstance(error, RsUndistortError):
-                raise
-            raise FileError(
-                f"{self.video} cannot be read as a video ({reason_of(error)}); if it was cut short while being "
-                "recorded, repair it or copy it again"
-            ) from error
+    def _explained(self) -> AbstractContextManager[None]:
+        mend = "; if it was cut short while being recorded, repair it or copy it again"
+        return ffmpeg_errors(f"{self.video} cannot be read as a video", mend)
 
     @property
     def num_frames(self) -> int:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -14,7 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, RsUndistortError, RsUndistortWarning
+from ..errors import RsUndistortWarning
+from .ffmpeg_reasons import ffmpeg_errors
 from .video import VideoReader
 from .video_writer import X264_PARAMS
 
@@ -258,17 +258,8 @@ class VideoWriter:
         ]
         return max(Fraction(0), min(starts, default=Fraction(0)))
 
-    @contextmanager
-    def _explained(self) -> Iterator[None]:
-        """Errors of FFmpeg as those of the file."""
-        import av
-
-        try:
-            yield
-        except (OSError, av.error.FFmpegError) as error:
-            if isinstance(error, RsUndistortError):
-                raise
-            raise FileError(f"the rectified video cannot be written ({error.strerror})") from error
+    def _explained(self) -> AbstractContextManager[None]:
+        return ffmpeg_errors("the rectified video cannot be written", reading=False)
 
 
 def codec_bits(pixel_format: str) -> int:

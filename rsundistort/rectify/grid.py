@@ -227,11 +227,11 @@ class RemapGrid:
                 low, high = file.header()["dataWindow"]
             _check_claim(path, math.prod((np.asarray(high, int) - low + 1).tolist()))
             with OpenEXR.File(str(path), separate_channels=True) as file:
-                told = str(file.header().get(_ATTRIBUTE, "")).split()
+                words = str(file.header().get(_ATTRIBUTE, "")).split()
                 x, y = (np.asarray(file.channels()[name].pixels, np.float64) for name in "RG")
         except (RuntimeError, ValueError, KeyError, TypeError) as error:
             raise FormatError(f"{path} is no OpenEXR file that can be read: {error}") from error
-        kind, width, height = told if len(told) == 3 else ("stmap", *(source_size or (0, 0)))
+        kind, width, height = words if len(words) == 3 else ("stmap", *(source_size or (0, 0)))
         if not width or not height:
             raise InputError(f"{path} does not say how large its source is; give source_size")
         width, height = check_size([float(width), float(height)], "source_size")

@@ -51,9 +51,20 @@ def _inverse_depths(
     return np.asarray(1.0 / given)
 
 
-def _check_map(depth: Depth | ArrayLike, P: ArrayLike | None) -> None:
+def _checked(
+    points: ArrayLike,
+    camera: Camera,
+    motion: RowMotion | None,
+    R: ArrayLike | None,
+    P: ArrayLike | None,
+    depth: Depth | ArrayLike | None,
+) -> tuple[NDArray[np.float64], tuple[int, ...], RowMotion, NDArray[np.float64], Depth | ArrayLike]:
+    """Arguments of both directions: points (n, 2), their shape, the motion, rays of `rectified_rays`, and the depth."""
+    xy, shape = _as_list(points, "points")
+    depth = AtInfinity() if depth is None else depth
     if isinstance(depth, DepthMap) and P is None:
         raise InputError("a depth map has the pixels of the rectified photo: P is needed")
+    return xy, shape, motion_of(camera, motion), rectified_rays(np.eye(3) if P is None else P, R, camera), depth
 
 
 def _rectified(
@@ -153,11 +164,7 @@ def undistort_points(
         NaN where the lens or the shutter model has no inverse. Where the rectified photo hides what a raw pixel shows,
         the edge of what hides it.
     """
-    xy, shape = _as_list(points, "points")
-    depth = AtInfinity() if depth is None else depth
-    _check_map(depth, P)
-    motion = motion_of(camera, motion)
-    rays = rectified_rays(np.eye(3) if P is None else P, R, camera)
+    xy, shape, motion, rays, depth = _checked(points, camera, motion, R, P, depth)
     return _rectified(xy, camera, motion, shutter_model, rays, depth).reshape(shape)
 
 
@@ -184,11 +191,7 @@ def distort_points(
     array of the shape of `points`
         Pixels of the raw photo; NaN where none shows the point.
     """
-    xy, shape = _as_list(points, "points")
-    depth = AtInfinity() if depth is None else depth
-    _check_map(depth, P)
-    motion = motion_of(camera, motion)
-    rays = rectified_rays(np.eye(3) if P is None else P, R, camera)
+    xy, shape, motion, rays, depth = _checked(points, camera, motion, R, P, depth)
     points_c = _homogeneous(xy) @ rays.T
     if shutter_model != "constant-motion":
         return project_points(points_c, camera, motion, shutter_model)[0].reshape(shape)

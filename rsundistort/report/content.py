@@ -10,7 +10,7 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from ..critical.meter import readout_axes
+from ..critical.degeneracy import readout_axes
 from ..io import output_name
 from ..model import SHUTTER_MODELS, Camera, Solution, SolvedImage
 from ..model.field import field_over_frame
@@ -142,7 +142,7 @@ def view_of(source: Source, pictures: Mapping[str, Picture]) -> list[dict[str, A
 
 
 def longer(largest: Sequence[float]) -> int:
-    """By what arrows are to be drawn longer than they are, all alike, by the longest of each photo in photo widths."""
+    """The factor by which all arrows are drawn longer, by the longest of each photo in photo widths."""
     long = float(np.quantile(largest, 0.9)) if len(largest) else 0.0
     return max((factor for factor in _LONGER if factor * long <= 1.2 / _ACROSS), default=1) if long > 0 else 1
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..critical.meter import readout_axes
+from ..critical.degeneracy import readout_axes
 from ..errors import FileError, InputError
 from ..io.aside import written_aside
 from ..io.outputs import only_writer
@@ -18,12 +18,12 @@ from ..model import Solution
 from .content import arrows_of, longer, models, view_frame
 from .diagnostics import Diagnostics
 from .source import Source, read_source
-from .verdict import meter_of
+from .verdict import degeneracy_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["write_figures"]
+__all__ = ["need_matplotlib", "write_figures"]
 
 _OURS, _GLOBAL, _GREY = "#0f7f86", "#c46b1d", "#9a9a9a"
 # Photos of which the displacement field is drawn: those that the shutter moved most.
@@ -61,11 +61,9 @@ def write_figures(out: Path | str, figures: Path | str) -> list[Path]:
     FileError, FormatError
         When there is no solution, or the figures cannot be written.
     """
-    try:
-        import matplotlib as mpl
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise InputError('figures need matplotlib; install it: pip install "rsundistort[figures]"') from error
+    figure_of = need_matplotlib()
+    import matplotlib as mpl
+
     source, folder = read_source(Path(out)), Path(figures)
     drawings: dict[str, Callable[[Figure, Source], bool]] = {
         "models": _models,
@@ -78,12 +76,22 @@ def write_figures(out: Path | str, figures: Path | str) -> list[Path]:
     with only_writer(folder), mpl.rc_context(_STYLE):
         record.check(f"{name}.{ending}" for name in drawings for ending in ("png", "pdf"))
         for name, draw in drawings.items():
-            figure = Figure(figsize=(3.4, 2.6))
+            figure = figure_of(figsize=(3.4, 2.6))
             if draw(figure, source):
                 written += _save(figure, folder, name, record)
     if not written:
         raise InputError(f"{out} holds no registered photo: there is nothing to draw")
     return written
+
+
+def need_matplotlib() -> Any:
+    """The class of figures; an error for people where matplotlib is missing."""
+    try:
+        # not pyplot: it would choose a window system, and a library must not change what its user chose
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise InputError('figures need matplotlib; install it: pip install "rsundistort[figures]"') from error
+    return Figure
 
 
 def _save(figure: Figure, folder: Path, name: str, record: Record) -> list[Path]:
@@ -188,7 +196,7 @@ def _mark(
 
 
 def _sphere(figure: Figure, source: Source) -> bool:
-    meter = meter_of(source.solution)
+    degeneracy = degeneracy_of(source.solution)
     axes_w = _readout_axes(source.solution)
     if not len(axes_w):
         return False
@@ -206,8 +214,10 @@ def _sphere(figure: Figure, source: Source) -> bool:
     axes.set_box_aspect((1, 1, 1), zoom=1.45)
     axes.set_axis_off()
     axes.view_init(elev=20, azim=-65)
-    if meter is not None:
-        figure.suptitle(f"meter {meter.value:.3f}, axes {meter.y_axis_spread_deg:.1f}° apart", fontsize=8)
+    if degeneracy is not None:
+        figure.suptitle(
+            f"degeneracy {degeneracy.value:.3f}, axes {degeneracy.y_axis_spread_deg:.1f}° apart", fontsize=8
+        )
     return True
 
 

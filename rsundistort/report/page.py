@@ -20,7 +20,7 @@ from .pictures import Picture, PictureJob, make_pictures
 from .places import map_facts, map_rows
 from .readout import readout_facts
 from .source import Source, read_source
-from .verdict import advice_of, meter_of, verdict_of
+from .verdict import advice_of, degeneracy_of, verdict_of
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -106,7 +106,7 @@ def _page(source: Source, pictures: dict[str, Picture]) -> str:
         name=source.out.resolve().name,
         solution=solution,
         verdict=verdict_of(solution),
-        meter=meter_of(solution),
+        degeneracy=degeneracy_of(solution),
         quality={**_QUALITY, **solution.quality},
         critical={**_CRITICAL, **solution.critical_motion} if solution.critical_motion else {},
         advice=advice_of(solution),

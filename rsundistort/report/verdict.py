@@ -12,7 +12,7 @@ from ..critical import CriticalMotion, advise_poses
 from ..model import Solution
 from ..model.orientation import in_stored_frame
 
-__all__ = ["Verdict", "advice_of", "meter_of", "verdict_of"]
+__all__ = ["Verdict", "advice_of", "degeneracy_of", "verdict_of"]
 
 # Displacements below this are lost in the interpolation of a photo.
 _UNSEEN_PX = 1.0
@@ -46,7 +46,7 @@ class Verdict:
     sentences: tuple[str, str, str]
 
 
-def meter_of(solution: Solution) -> CriticalMotion | None:
+def degeneracy_of(solution: Solution) -> CriticalMotion | None:
     """The degeneracy measure in the solution; None if it has none."""
     said = solution.critical_motion or {}
     try:
@@ -60,9 +60,9 @@ def meter_of(solution: Solution) -> CriticalMotion | None:
 
 def advice_of(solution: Solution) -> list[str]:
     """What to photograph at the next shoot, if the poses are critical: from the solution, else from the poses."""
-    meter = meter_of(solution)
+    degeneracy = degeneracy_of(solution)
     said = (solution.critical_motion or {}).get("advice")
-    if said or meter is None or not meter.is_low or meter.num_photos < 2:
+    if said or degeneracy is None or not degeneracy.is_low or degeneracy.num_photos < 2:
         return [str(each) for each in said or ()]
     images = [image for image in in_stored_frame(solution).registered if image.posed]
     R, centers = np.array([image.R_cw for image in images]), np.array([image.center_w for image in images])
@@ -121,7 +121,7 @@ def _by_height(solution: Solution, largest: float | None) -> dict[str, Any]:
     if _unneeded(solution, largest):
         return {"shutter": "not-found", "shape": "trusted", "reasons": []}
     level, sentence = _height(solution)
-    if meter_of(solution) is None or "flagged" not in (solution.critical_motion or {}):
+    if degeneracy_of(solution) is None or "flagged" not in (solution.critical_motion or {}):
         level, sentence = "care", _NOT_EXAMINED
     return {"shutter": "found", "shape": "doubtful" if level else "trusted", "reasons": [sentence] if level else []}
 
@@ -138,10 +138,10 @@ def _shape(solution: Solution, said: Mapping[str, Any], largest: float | None) -
         return "still", "No correction needed", text
     level, sentence = _height(solution)
     if trusted:
-        meter = meter_of(solution)
+        degeneracy = degeneracy_of(solution)
         why = "the cameras were rotated enough against each other to separate the shutter from the shape"
-        if meter is not None and meter.is_low:
-            why = f"although {_level(meter)}, the measurements determine its height"
+        if degeneracy is not None and degeneracy.is_low:
+            why = f"although {_level(degeneracy)}, the measurements determine its height"
         return "trust", "The shape can be trusted", f"The shape of the scene can be trusted: {why}. {sentence}"
     text = " ".join(reasons)
     if shutter == "not-determined":
@@ -155,15 +155,15 @@ def _shape(solution: Solution, said: Mapping[str, Any], largest: float | None) -
 
 def _height(solution: Solution) -> tuple[str, str]:
     """Level of doubt about the height of the scene ("doubt", "care" or ""), and a sentence on it."""
-    said, meter = solution.critical_motion or {}, meter_of(solution)
-    if meter is None:
+    said, degeneracy = solution.critical_motion or {}, degeneracy_of(solution)
+    if degeneracy is None:
         return "", ""
     percent = _percent(said)
     sentence = _sentence(str(said.get("sentence") or ""))
-    if meter.is_low and said.get("remedy") == "none":
+    if degeneracy.is_low and said.get("remedy") == "none":
         return "doubt", (
-            f"Do not trust the height of the scene: {_level(meter)}, so it is undetermined to first order, and with "
-            f"the remedy switched off only the model's second-order terms determine it ({_deviation(percent)})."
+            f"Do not trust the height of the scene: {_level(degeneracy)}, so it is undetermined to first order, and "
+            f"with the remedy switched off only the model's second-order terms determine it ({_deviation(percent)})."
         )
     if said.get("flagged") and percent > _LARGE_PERCENT:
         return "doubt", f"Do not trust the height of the scene. {sentence}"
@@ -195,18 +195,18 @@ def _deviation(percent: float) -> str:
     return f"to +-{percent:.2g} %" if np.isfinite(percent) else "and they leave it undetermined"
 
 
-def _level(meter: CriticalMotion) -> str:
-    if meter.num_photos < 3:
+def _level(degeneracy: CriticalMotion) -> str:
+    if degeneracy.num_photos < 3:
         return "there are too few photos"
-    if meter.y_axis_spread_deg < 1:
+    if degeneracy.y_axis_spread_deg < 1:
         return "all cameras were held level"
-    if meter.y_axis_spread_deg < 15:
+    if degeneracy.y_axis_spread_deg < 15:
         return "the cameras were held nearly level"
     return "the cameras were hardly rotated against each other"
 
 
 def _sentence(text: str) -> str:
-    """With a capital and a full stop; names of photos keep their letters."""
+    """The text with a capital and a full stop; names of photos keep their letters."""
     text = text.strip()
     if text.split(" ")[0] in ("the", "no", "with"):
         text = text[0].upper() + text[1:]

@@ -1,12 +1,12 @@
 """Structure from motion around pycolmap: features, pairs, matching, mapping, re-triangulation."""
 
 from .alignment import PatchPlaces, PatchSource, align_tracks, allowed_patches, cut_patches
+from .connected import LEAST_MEASUREMENTS, connected_photos, firmly_connected
 from .database import MatchedPhotos
 from .epipolar import read_num_verified
 from .features import DETECTION_MEGAPIXELS, SIFT_PX, Features, detect_features, detection_bytes, grey_8_bit
 from .focal_length import USUAL_FOCAL, estimate_focal_length
 from .imported import matched_of_database
-from .joined import LEAST_MEASUREMENTS, firmly_joined, hanging_together
 from .mapping import map_photos
 from .matching import match_photos
 from .pairs import choose_pairs, global_descriptors
@@ -27,15 +27,15 @@ __all__ = [
     "align_tracks",
     "allowed_patches",
     "choose_pairs",
+    "connected_photos",
     "cut_patches",
     "detect_features",
     "detection_bytes",
     "edge_width_px",
     "estimate_focal_length",
-    "firmly_joined",
+    "firmly_connected",
     "global_descriptors",
     "grey_8_bit",
-    "hanging_together",
     "map_photos",
     "match_photos",
     "matched_of_database",

@@ -328,9 +328,9 @@ def _with_aligned(
     xy, sigmas = obs.xy_raw.copy(), obs.sigma.copy()
     xy[good[:old]], sigmas[good[:old]] = aligned.xy[:old][good[:old]], sigma[:old][good[:old]]
     # the best view defines the point: it is as good as those that were aligned with it
-    told = np.flatnonzero(good)
-    log_mean = np.bincount(wanted.point[told], np.log(sigma[told]), rec.num_points)
-    count = np.bincount(wanted.point[told], minlength=rec.num_points)
+    good_idx = np.flatnonzero(good)
+    log_mean = np.bincount(wanted.point[good_idx], np.log(sigma[good_idx]), rec.num_points)
+    count = np.bincount(wanted.point[good_idx], minlength=rec.num_points)
     known = count > 0
     sigmas[of_point[known]] = np.exp(log_mean[known] / count[known])
     new = np.flatnonzero(good[old:]) + old

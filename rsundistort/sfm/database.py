@@ -109,7 +109,7 @@ def write_photos(db: Any, matched: MatchedPhotos, limit: int | None = None) -> N
 
 
 def verification_options(max_error_px: float, seed: int) -> Any:
-    """Of the geometric verification of pairs."""
+    """Options of the geometric verification of pairs."""
     options = quiet_pycolmap().TwoViewGeometryOptions()
     options.ransac.max_error = max_error_px
     options.ransac.random_seed = seed
@@ -120,7 +120,7 @@ def verification_options(max_error_px: float, seed: int) -> Any:
 
 
 def pipeline_options(loose: float, seed: int, refine_intrinsics: bool, num_photos: int) -> Any:
-    """Of mapping and triangulation, with thresholds `loose` times COLMAP's own."""
+    """Options of mapping and triangulation, with thresholds `loose` times COLMAP's own."""
     options = quiet_pycolmap().IncrementalPipelineOptions()
     options.random_seed = seed
     # one thread: with more, the same seed sometimes takes another first pair; small problems are no slower

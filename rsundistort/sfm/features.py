@@ -121,7 +121,7 @@ def detection_bytes(width: int, height: int, megapixels: float = DETECTION_MEGAP
 
 
 def _shrinking(num_pixels: int, megapixels: float) -> float:
-    """By which factor the sides of a photo are divided."""
+    """The factor by which the sides of a photo are divided."""
     return math.sqrt(max(1.0, num_pixels / (1e6 * megapixels)))
 
 

@@ -13,8 +13,8 @@ from ..colmap.conventions import quiet_pycolmap
 from ..colmap.lenses import refined_camera
 from ..errors import ReconstructionError
 from ..model import Reconstruction
+from .connected import LEAST_MEASUREMENTS
 from .database import LOOSE, MatchedPhotos, from_pycolmap, pipeline_options, write_photos
-from .joined import LEAST_MEASUREMENTS
 
 __all__ = ["map_photos"]
 
@@ -23,7 +23,7 @@ __all__ = ["map_photos"]
 # 2.0 / 4.4).
 # It takes others than incremental mapping does where photos hang together weakly: 13 instead of 8 of a drone's 14, 29
 # instead of 27 in lund; so the other way is tried only where it leaves out more than a quarter.
-_PLACING_KEYPOINTS, _ENOUGH_JOINED = 2048, 0.75
+_PLACING_KEYPOINTS, _ENOUGH_REGISTERED = 2048, 0.75
 
 # Mapping one after the other only has to place the photos: it gets this many of the largest keypoints of each. All of
 # them come back when the tracks are rebuilt. (herz-jesus-8: 16384 keypoints map in 4.7 s, 4096
@@ -81,11 +81,11 @@ def map_photos(matched: MatchedPhotos, progress: Callable[[int], None] | None = 
         found = _with_more(found, _mapped_at_once(matched, limit))
         if found is not None and found.num_images == total:
             return found
-    if found is None or found.num_images < _ENOUGH_JOINED * total:
+    if found is None or found.num_images < _ENOUGH_REGISTERED * total:
         found = _with_more(found, _mapped_one_by_one(matched, progress))
     if found is None:
         raise ReconstructionError(
-            f"none of the {len(matched.names)} photos overlap enough to be joined; "
+            f"none of the {len(matched.names)} photos overlap enough to be registered; "
             "use photos that share more of the scene, or check the camera's focal length"
         )
     return found
@@ -104,7 +104,7 @@ def _mapped_at_once(matched: MatchedPhotos, limit: int | None) -> Reconstruction
     work.mkdir()
     options = _global_options(matched)
     models = quiet_pycolmap().global_mapping(_mapping_database(matched, work, limit), work, work, options)
-    return _firmly_joined(_largest(models.values()), matched)
+    return _firmly_connected(_largest(models.values()), matched)
 
 
 def _mapped_one_by_one(matched: MatchedPhotos, progress: Callable[[int], None] | None) -> Reconstruction | None:
@@ -121,10 +121,10 @@ def _mapped_one_by_one(matched: MatchedPhotos, progress: Callable[[int], None] |
             matched = _refined(matched, refined)
         matched = replace(matched, calibrated=True)
     attempts = [(_MAPPING_KEYPOINTS, LOOSE), (None, LOOSE), (None, 2.0), (None, 1.0)]
-    return _firmly_joined(_best_model(matched, attempts, progress), matched)
+    return _firmly_connected(_best_model(matched, attempts, progress), matched)
 
 
-def _firmly_joined(model: Any, matched: MatchedPhotos) -> Reconstruction | None:
+def _firmly_connected(model: Any, matched: MatchedPhotos) -> Reconstruction | None:
     """Our reconstruction of a pycolmap model, or of none; photos that hang on by few measurements are left out."""
     if model is None or not model.num_points3D():
         return None
@@ -185,7 +185,7 @@ def _best_model(
 
 
 def _global_options(matched: MatchedPhotos) -> Any:
-    """Of the global mapper; seeds and threads as in `pipeline_options`."""
+    """Options of the global mapper; seeds and threads are those of `pipeline_options`."""
     options = quiet_pycolmap().GlobalPipelineOptions()
     mapper = options.mapper
     options.num_threads = mapper.num_threads = 1

@@ -228,7 +228,7 @@ def register_photos(
     num_verified: Mapping[tuple[int, int], int],
     scene: Reconstruction,
     *,
-    joined_too: bool = True,
+    registered_too: bool = True,
 ) -> Registration:
     """Register photos by what the others show of the scene, each with a motion of its own, where that explains more.
 
@@ -240,7 +240,7 @@ def register_photos(
         As `read_num_verified` returns them.
     scene : Reconstruction
         Poses, motions, points; its measurements are keypoints of `matched`.
-    joined_too : bool
+    registered_too : bool
         Whether photos that have a place are held against it; else only the others are placed.
 
     Returns
@@ -251,14 +251,14 @@ def register_photos(
     """
     matches = read_matches(matched)
     shows = _Shown(matched, matches, scene)
-    agreeing = agreeing_photos(matched, matches, num_verified, scene) if joined_too else np.zeros(0, bool)
+    agreeing = agreeing_photos(matched, matches, num_verified, scene) if registered_too else np.zeros(0, bool)
     index_of = {name: i for i, name in enumerate(scene.image_names)}
     new: dict[int, Placed] = {}
     elsewhere: dict[int, Placed] = {}
     dropped = []
     for photo, name in enumerate(matched.names):
         i = index_of.get(name)
-        if i is not None and not joined_too:
+        if i is not None and not registered_too:
             continue
         keypoint, point = shows.by_others(photo)
         camera = scene.cameras[matched.camera_idx[photo]] if i is None else scene.camera(i)

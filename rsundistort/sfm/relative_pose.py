@@ -62,7 +62,7 @@ class View:
 
     @classmethod
     def of(cls, xy_raw: NDArray[np.float64], camera: Camera) -> View:
-        """Of pixels (n, 2)."""
+        """Normalised rays of pixels (n, 2)."""
         axis = camera.clock_axis
         rate = np.zeros(2)
         rate[axis] = camera.clock_sign / camera.K[axis, axis]
@@ -78,7 +78,7 @@ class View:
 
     @property
     def arrays(self) -> tuple[NDArray[np.float64], ...]:
-        """As the kernels take them."""
+        """Arguments of the kernels."""
         return self.rays, self.slopes, self.clock, self.rate
 
 
@@ -98,7 +98,7 @@ class Pair:
 
     @cached_property
     def arrays(self) -> tuple[NDArray[np.float64], ...]:
-        """As the kernels take them."""
+        """Arguments of the kernels."""
         return *self.first.arrays, *self.second.arrays
 
     @property

@@ -106,14 +106,14 @@ def simulate_scene(
     read = {} if source is None else {"recipe.json": source, **{name: source.parent / name for name in loaded.files}}
     # a recipe is also rendered where it was copied to
     copied = {name: file for name, file in read.items() if not ((out / name).exists() and file.samefile(out / name))}
-    twins = {view.name for view in loaded.twins}
+    references = {view.name for view in loaded.references}
     folders = (*(() if loaded.clip else ("photos",)), "global", *(("depth", "global-depth") if options.depth else ()))
     with output_folder(out, overwrite=options.overwrite, apart_from=list(read.values())) as scratch:
         made = [
             f"{folder}/{_file_of(loaded, folder, view.name)}"
             for folder in folders
             for view in loaded.views
-            if folder == "photos" or view.name in twins
+            if folder == "photos" or view.name in references
         ]
         clip = [] if loaded.clip is None else [loaded.clip.NAME]
         Record(out).check([*made, *clip, *_FILES, _cameras_file(loaded), *copied], read.values())
@@ -123,7 +123,7 @@ def simulate_scene(
         for folder in folders:
             (scratch / folder).mkdir()
         log.begin("rendering", len(loaded.views))
-        _write_photos(scratch, loaded, twins, options.depth, log)
+        _write_photos(scratch, loaded, references, options.depth, log)
         log.end("rendering")
         truth = _truth(loaded, points)
         _write_cameras(scratch, loaded)
@@ -136,15 +136,15 @@ def simulate_scene(
     return truth
 
 
-def _write_photos(folder: Path, recipe: Recipe, twins: set[str], depth: bool, log: StageLog) -> None:
+def _write_photos(folder: Path, recipe: Recipe, references: set[str], depth: bool, log: StageLog) -> None:
     """The photos, or the video, with the references and depth maps of those that have them."""
 
     def rendered() -> Iterator[tuple[View, NDArray[np.uint8]]]:
         """The photos, whose references and depth maps are written meanwhile."""
         for number, view in enumerate(recipe.views):
             yield view, add_noise(_render(recipe, view), recipe.noise, recipe.scene.seed, number)
-            if view.name in twins:
-                _write_twin(folder, recipe, view, depth)
+            if view.name in references:
+                _write_reference(folder, recipe, view, depth)
             log.tell("rendering", number + 1, len(recipe.views))
 
     if recipe.clip is not None:
@@ -158,7 +158,7 @@ def _render(recipe: Recipe, view: View) -> NDArray[np.uint8]:
     return render_view(recipe.scene, recipe.camera(view), view, **recipe.render_options)
 
 
-def _write_twin(folder: Path, recipe: Recipe, view: View, depth: bool) -> None:
+def _write_reference(folder: Path, recipe: Recipe, view: View, depth: bool) -> None:
     """The global-shutter reference of a photo, and the depth maps of both."""
     reference = view.at_once()
     photo = _encode_jpeg(_render(recipe, reference), recipe.jpeg_quality)

@@ -156,8 +156,8 @@ def simulate_warp(
     camera_file = camera_file_of(photos, options.camera)
     inputs = [photos] if camera_file is None else [photos, camera_file]
     with output_folder(out, overwrite=options.overwrite, apart_from=inputs, replaced=folders) as scratch:
-        twins = [f"{folder}/{output_name(name)}" for folder in folders if folder != "masks" for name in names]
-        made = ["camera.json", "ground_truth.json", *twins, *(f"masks/{name}" for name in masks.values())]
+        references = [f"{folder}/{output_name(name)}" for folder in folders if folder != "masks" for name in names]
+        made = ["camera.json", "ground_truth.json", *references, *(f"masks/{name}" for name in masks.values())]
         Record(out).check(made, inputs)
         whole, source = _camera(photos, names[0], options)
         motions = _motions(photos, names, whole, options)

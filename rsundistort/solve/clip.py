@@ -40,13 +40,13 @@ __all__ = ["frame_path", "solve_clip"]
 _LEAST_MEASUREMENTS = 15
 # Frames that half of a clip needs to determine a readout time.
 _LEAST_HALF = 4
-# Where rotations explain the frames: error of the flow, pixels, and share of measurements that may be far off.
+# Rotations explain the frames up to this error of the flow in pixels, and this share of outliers.
 _FLOW_PX, _OUTLIERS = 0.25, 0.2
 # Solves that estimate the prior standard deviations of a path: with hundreds of frames few are enough.
 _SPREADS = 4
 # Readout time that counts as none, as a share of the time between frames.
 _NO_READOUT = 1e-6
-# Standard deviation, as a share, of a readout time that is given, or in the table.
+# Relative standard deviation of a readout time that is specified, or from the table.
 _GIVEN_SIGMA, _TABLE_SIGMA = 0.02, 0.1
 # A readout time is measured if its standard deviation falls to this share of the one before.
 _MEASURED = 0.7
@@ -84,7 +84,7 @@ def solve_clip(
     scratch : Path
         Folder for the database.
     log : StageLog
-        Told the progress.
+        Receives the progress.
     seed, matching
         As in `solve_photos`.
     gyroscope : GyroLog, optional
@@ -130,7 +130,7 @@ def _turned(
     clip: Clip, keys: LoadedPhotos, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions],
     log: StageLog,
 ) -> _Found | None:  # fmt: skip
-    """The path of a camera that only rotates; None if that does not explain the frames."""
+    """The path of a camera that only rotates; None if rotations do not explain the frames."""
     log.begin("rotations")
     start, found = turning_only(clip, keys), None
     if start is not None:

@@ -17,7 +17,7 @@ from ..sfm.resection import resect
 
 __all__ = ["Followed", "follow", "follow_points", "with_all_frames"]
 
-# Points of a key frame that are followed: those of the most key frames first, spread over its cells.
+# Number of points of a key frame that are followed: those of the most key frames first, from all its cells.
 _POINTS = 120
 _CELLS = 6
 # Tolerance for the shutter where a frame is registered without it, in pixels.
@@ -30,9 +30,9 @@ class Followed:
     Attributes
     ----------
     chosen : mapping of frame number to (n,) int array
-        Of each key: indices of the measurements that are followed.
+        Indices of the measurements of each key that are followed.
     frame, key, place : (o,) int array
-        Of what was found: frame, key frame, and place among those of the key.
+        Frame, key frame, and place among those of the key, of each measurement.
     xy_raw : (o, 2) array
         Pixels.
     """
@@ -152,7 +152,7 @@ def with_all_frames(
 
     Each followed point is a point of its own, at the place of the point in its key frame: the start of the flow counts
     as the measurement of the key frame, so an error there is the same in all frames, and moves the point. Points of the
-    key frames tie these together, as before. Frames that were `placed_before` keep their poses.
+    key frames connect these, as before. Frames that were `placed_before` keep their poses.
     """
     rec, obs = reconstruction, reconstruction.observations
     number = {name: k for k, name in enumerate(clip.names)}

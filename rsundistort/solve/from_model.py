@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, overload
 
@@ -144,9 +144,9 @@ def solve(
             raise InputError(f"solve: out is missing; say which folder gets the outputs of {model}")
         workers, outputs = Workers(use_threads(jobs), scheduler), outputs or OutputOptions()
         check_usd(outputs, is_clip=False)
-        return _solve_files(
-            model, out, options, rectify, outputs, images, database, workers, overwrite, resume, progress
-        )
+        folder = None if images is None else local_place(images)
+        job = _Job(local_place(model), local_place(out), folder, database, options, rectify, outputs, workers)
+        return _solve_files(job, overwrite, resume, progress)
     if not hasattr(model, "reg_image_ids"):
         kind = f"{type(model).__module__}.{type(model).__name__}"
         raise InputError(f"solve: model is a {kind}, expected a folder, a file or a pycolmap.Reconstruction")
@@ -155,131 +155,100 @@ def solve(
     return _solve_in_memory(model, options, rectify, database, progress)
 
 
-def _solve_files(
-    model: Path | str,
-    out: Path | str,
-    options: SolveOptions,
-    rectify: RectifyOptions,
-    outputs: OutputOptions,
-    images: Path | str | None,
-    database: Path | str | None,
-    workers: Workers,
-    overwrite: bool,
-    resume: bool,
-    progress: ProgressCallback | None,
-) -> Solution:
-    """From files to files."""
-    model, out = local_place(model), local_place(out)
-    folder = None if images is None else local_place(images)
-    if database is not None and model.is_file():
+@dataclass(frozen=True)
+class _Job:
+    """Arguments of `solve` of a model in files."""
+
+    model: Path
+    out: Path
+    images: Path | None
+    database: Path | str | None
+    options: SolveOptions
+    rectify: RectifyOptions
+    outputs: OutputOptions
+    workers: Workers
+
+    @property
+    def inputs(self) -> list[Path]:
+        """Files and folders that are read."""
+        return inputs_of(self.rectify, self.model, self.images, self.database)
+
+    def check_names(self, names: Sequence[str]) -> None:
+        """Refuse photos to rectify, before any of them is read, where their outputs would replace other files."""
+        Record(self.out).check(files_of_run(names, self.rectify.raw_as, self.outputs), self.inputs)
+
+
+def _solve_files(job: _Job, overwrite: bool, resume: bool, progress: ProgressCallback | None) -> Solution:
+    """Solve a model in files, and write files."""
+    model, out = job.model, job.out
+    if job.database is not None and model.is_file():
         raise InputError(f"{model} is no COLMAP model, and --database is COLMAP's; leave it out")
     log = StageLog(progress)
-    inputs = inputs_of(rectify, model, folder, database)
     # a model is in the files of its folder, or beside it
-    files = [*inputs, model / "sparse", model.parent / "tracks.csv"]
-    with run_folder(out, key_of(files, options, rectify, outputs), log, overwrite=overwrite, resume=resume) as before:
+    key = key_of([*job.inputs, model / "sparse", model.parent / "tracks.csv"], job.options, job.rectify, job.outputs)
+    with run_folder(out, key, log, overwrite=overwrite, resume=resume) as before:
         if before.finished:
             return read_solution(out / "solution.json")
         if before.begun:
             written: Outputs = before.outputs(log)
         else:
             again = overwrite or before.goes_on
-            with output_folder(out, overwrite=again, apart_from=inputs, replaced=REPLACED) as scratch:
-                written = _outputs_of(
-                    model,
-                    out,
-                    folder,
-                    database,
-                    options,
-                    rectify,
-                    outputs,
-                    files_in=inputs,
-                    workers=workers,
-                    log=log,
-                    before=before,
-                )
+            with output_folder(out, overwrite=again, apart_from=job.inputs, replaced=REPLACED) as scratch:
+                written = _outputs_of(job, log, before)
                 solution = written.begin(scratch, log)
             before.begin()
-        if folder is not None:
-            return written.rectify(folder, out, workers, log, before.begun)
-        written.report(out, workers.jobs, log)
+        if job.images is not None:
+            return written.rectify(job.images, out, job.workers, log, before.begun)
+        written.report(out, job.workers.jobs, log)
         return read_solution(out / "solution.json") if before.begun else solution
 
 
-def _outputs_of(
-    model: Path,
-    out: Path,
-    folder: Path | None,
-    database: Path | str | None,
-    options: SolveOptions,
-    rectify: RectifyOptions,
-    outputs: OutputOptions,
-    *,
-    files_in: Sequence[Path],
-    workers: Workers,
-    log: StageLog,
-    before: RunFolder,
-) -> Outputs:
+def _outputs_of(job: _Job, log: StageLog, before: RunFolder) -> Outputs:
     """The outputs of a model, unless they were kept."""
     before.kept.begin()
     found: Outputs | None = before.outputs(log)
     if found is not None:
         return found
+    folder = job.images
     with work_folder() as work:
         log.begin("model")
-
-        def check(names: Sequence[str]) -> None:
-            Record(out).check(files_of_run(names, rectify.raw_as, outputs), files_in)
-
-        given, track_source, kept = _given(model, folder, check, options.seed, rectify, workers, work, log)
+        given, track_source, kept = _given(job, work, log)
         photos = {} if folder is None else _look_at(folder, given.reconstruction)
         given, said = _in_stored_frame(given, photos)
         if folder is not None:
-            given = replace(given, unregistered=_others_in(folder, given, rectify.raw_as))
+            given = replace(given, unregistered=_others_in(folder, given, job.rectify.raw_as))
         log.end("model", photos=given.reconstruction.num_images, points=given.reconstruction.num_points)
         facts = {name: fact for name, (_, fact) in photos.items()}
-        solved, ids, rgb = _solve(
-            given, str(model), facts, options, None if database is None else Path(database), log, track_source
-        )
+        solved, ids, rgb = _solve(given, str(job.model), facts, job.options, job.database, log, track_source)
         facts_of_model = {
             "frame": said,
             "points": given.reconstruction.num_points,
             "observations": len(given.reconstruction.observations),
             **kept,
         }
-        solved = replace(solved, told={"model": facts_of_model})
+        solved = replace(solved, facts={"model": facts_of_model})
         orientations = {name: fact.orientation or 1 for name, fact in facts.items()}
         times = {} if folder is None else photo_times(folder)
         written = Outputs.of_solved(
-            solved, options, rectify, outputs, orientations, ids, rgb, folder is not None, times
+            solved, job.options, job.rectify, job.outputs, orientations, ids, rgb, folder is not None, times
         )
     before.solved(written, log)
     return written
 
 
-def _given(
-    model: Path,
-    folder: Path | None,
-    check: Callable[[Sequence[str]], None],
-    seed: int,
-    rectify: RectifyOptions,
-    workers: Workers,
-    work: Path,
-    log: StageLog,
-) -> tuple[ColmapModel, TrackSource | None, Mapping[str, Any]]:
+def _given(job: _Job, work: Path, log: StageLog) -> tuple[ColmapModel, TrackSource | None, Mapping[str, Any]]:
     """The model, what new tracks can be made from, and what the solution keeps of the file.
 
     One without measurements is measured in its photos.
-    `check` gets the photos that will be rectified, before any of them is read.
     """
-    if is_metashape(model):
-        posed = posed_photos(model, folder, rectify.raw_as)
-        assert folder is not None
-        check(posed.labels)
+    if is_metashape(job.model):
+        posed = posed_photos(job.model, job.images, job.rectify.raw_as)
+        assert job.images is not None
+        job.check_names(posed.labels)
         kept = {"rolling_shutter": shutter_terms(posed)} if posed.shutter else {}
-        return *measured(posed, folder, rectify, seed, workers, work, log), kept
-    given = read_model(model)
-    check([] if folder is None else given.reconstruction.image_names)
+        return *measured(posed, job.images, job.rectify, job.options.seed, job.workers, work, log), kept
+    given = read_model(job.model)
+    job.check_names([] if job.images is None else given.reconstruction.image_names)
     return given, None, {}
 
 
@@ -290,11 +259,11 @@ def _solve_in_memory(
     database: Path | str | None,
     progress: ProgressCallback | None,
 ) -> tuple[pycolmap.Reconstruction, Solution]:
-    """From a `pycolmap.Reconstruction` to another one."""
+    """Solve a `pycolmap.Reconstruction`, and return another one."""
     log = StageLog(progress)
     given = colmap_model_of(reconstruction)
     with kept_log_level():
-        solved, ids, rgb = _solve(given, "the model", {}, options, None if database is None else Path(database), log)
+        solved, ids, rgb = _solve(given, "the model", {}, options, database, log)
     outputs = Outputs.of_solved(solved, options, rectify, OutputOptions(), {}, ids, rgb)
     rec, solution = outputs.reconstruction, outputs.solution
     names = [output_name(name, rectify.raw_as) for name in rec.image_names]
@@ -355,7 +324,7 @@ def _in_stored_frame(
         )  # fmt: skip
     if not turns:
         return given, "stored" if photos else "not looked at"
-    said = f"turned by the EXIF orientation in {len(turns)} of {rec.num_images} photos"
+    said = f"rotated by the EXIF orientation in {len(turns)} of {rec.num_images} photos"
     turned = turn_reconstruction(rec, turns)
     ids = list(given.camera_ids)
     free = (k for k in range(1, 2 + max(ids) + len(turned.cameras)) if k not in ids)
@@ -369,8 +338,8 @@ def _photo_cameras(
     """The model's cameras, with the readout directions that were specified or are guessed."""
     rec = given.reconstruction
     labels = [f"camera {key}" for key in given.camera_ids]
-    told = check_readouts(options.readout)
-    unknown = sorted(told.keys() - {"", *labels})
+    specified = check_readouts(options.readout)
+    unknown = sorted(specified.keys() - {"", *labels})
     if unknown:
         raise InputError(f"readout of {unknown[0]!r}: no such camera, there are {', '.join(labels)}")
     of_photo = [labels[k] for k in rec.camera_idx.tolist()]
@@ -378,16 +347,16 @@ def _photo_cameras(
     guessed, notes = guess_readouts([facts.get(name, ExifFacts()) for name in rec.image_names], sizes, of_photo)
     cameras = []
     for label, camera in zip(labels, rec.cameras, strict=True):
-        direction = told.get(label, told.get("", guessed.get(label, camera.readout)))
+        direction = specified.get(label, specified.get("", guessed.get(label, camera.readout)))
         cameras.append(replace(camera, readout=direction))
     return PhotoCameras(
         tuple(cameras),
         tuple(labels),
         rec.camera_idx,
         calibrated=not given.self_calibrated,
-        readout_told=tuple(label in told or "" in told for label in labels),
+        readout_specified=tuple(label in specified or "" in specified for label in labels),
         source=f"{source}, refined" if given.self_calibrated else source,
-        notes=() if told else tuple(notes),
+        notes=() if specified else tuple(notes),
     )
 
 
@@ -396,7 +365,7 @@ def _solve(
     source: str,
     facts: Mapping[str, ExifFacts],
     options: SolveOptions,
-    database: Path | None,
+    database: Path | str | None,
     log: StageLog,
     track_source: TrackSource | None = None,
 ) -> tuple[Solved, ModelIds, PointRgb]:
@@ -408,13 +377,13 @@ def _solve(
     rec = replace(given.reconstruction, cameras=cameras.cameras)
     for name in (*options.still, *options.known):
         if name not in rec.image_names:
-            raise InputError(f"anchor {name!r} is not among the photos of the model")
+            raise InputError(f"constraint on {name!r}, which is not among the photos of the model")
 
     survey = None
     if options.crs is not None or options.control:  # else its frame is the model's
         sizes = [(rec.camera(i).width, rec.camera(i).height) for i in range(rec.num_images)]
-        told = [facts.get(name, ExifFacts()) for name in rec.image_names]
-        survey = survey_of(options.crs, options.control, rec.image_names, told, sizes)
+        exif = [facts.get(name, ExifFacts()) for name in rec.image_names]
+        survey = survey_of(options.crs, options.control, rec.image_names, exif, sizes)
 
     def options_of(each: Reconstruction) -> BundleOptions:
         return replace(options.options_for(cameras), outlier_sigma=_OUTLIER_SIGMA)
@@ -422,19 +391,11 @@ def _solve(
     with work_folder() as work:
         if database is not None:
             log.begin("database")
-            matched = matched_of_database(database, work / "database.db", rec, options.seed)
+            matched = matched_of_database(Path(database), work / "database.db", rec, options.seed)
             log.end("database", keypoints=sum(len(found.xy_raw) for found in matched.features))
             track_source = TrackSource(matched)
         solved = solve_tracks(
-            rec,
-            cameras,
-            options.shutter_model,
-            options.seed,
-            options_of,
-            log,
-            options.remedy,
-            track_source,
-            survey,
+            rec, cameras, options.shutter_model, options.seed, options_of, log, options.remedy, track_source, survey
         )
     if solved.survey is None:  # the model's frame is kept
         solved = replace(solved, georeference=given.georeference)

@@ -35,7 +35,7 @@ from ..model.projection import unproject_points
 from ..sfm import (
     MatchedPhotos,
     align_tracks,
-    firmly_joined,
+    firmly_connected,
     read_num_verified,
     register_photos,
     retriangulate,
@@ -160,7 +160,7 @@ def _read_out(
     mapped: Reconstruction, cameras: PhotoCameras, options: BundleOptions, log: StageLog
 ) -> ReadoutChoice | None:
     """The readout directions that were not specified, by the measurements; None if all were."""
-    guessed = {k: cameras.labels[k] for k in np.unique(cameras.camera_idx).tolist() if not cameras.readout_told[k]}
+    guessed = {k: cameras.labels[k] for k in np.unique(cameras.camera_idx).tolist() if not cameras.readout_specified[k]}
     if not guessed:
         return None
     log.begin("readout")
@@ -429,13 +429,13 @@ def _registered_again(
             break
         stage = f"registration {wave}"
         log.begin(stage)
-        scene = firmly_joined(retriangulate(matched, rec))
-        found = register_photos(matched, num_verified, scene, joined_too=strong)
+        scene = firmly_connected(retriangulate(matched, rec))
+        found = register_photos(matched, num_verified, scene, registered_too=strong)
         changes = found.changes or scene.num_images < rec.num_images
         if changes:
             tracks = found.reconstruction
             if tracks.num_images >= _LEAST_PHOTOS:
-                tracks = firmly_joined(retriangulate(matched, tracks))
+                tracks = firmly_connected(retriangulate(matched, tracks))
             if tracks.num_images < _LEAST_PHOTOS:  # too few are connected to distinguish right from wrong
                 log.end(stage, added=(), moved=(), dropped=())
                 break
@@ -480,7 +480,7 @@ def _retriangulated(
             settled = True
             continue
         found = tracks
-        tracks = firmly_joined(tracks)
+        tracks = firmly_connected(tracks)
         _check_enough(tracks, len(track_source.matched.names))
         options = _of_registered(options, tracks)
         options = replace(options, phi_sigma_start=result.phi_sigma)

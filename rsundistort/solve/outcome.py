@@ -58,7 +58,7 @@ class Solved:
         All frames of a video, whose key frames are the photos.
     evidence : mapping
         The readout time of a video in `solution.json`.
-    told : mapping
+    facts : mapping
         Further options in `solution.json`.
     survey : Survey or None
         The georeferencing.
@@ -79,13 +79,13 @@ class Solved:
     readouts: Mapping[int, tuple[float, str]] = field(default_factory=dict)
     whole: Reconstruction | None = None
     evidence: Mapping[str, Any] = field(default_factory=dict)
-    told: Mapping[str, Any] = field(default_factory=dict)
+    facts: Mapping[str, Any] = field(default_factory=dict)
     survey: Survey | None = None
     georeference: Mapping[str, Any] | None = None
 
     @property
     def shared(self) -> Reconstruction:
-        """With poses, motions and points, and the cameras that photos share."""
+        """The reconstruction with the cameras that photos share."""
         return self.result.reconstruction
 
     @property
@@ -95,7 +95,7 @@ class Solved:
 
     @property
     def camera_ids(self) -> list[int]:
-        """Of the cameras of `reconstruction`, in all outputs."""
+        """Ids of the cameras of `reconstruction`, in all outputs."""
         own = self.shared.varies
         return list((not own and self.shared_ids) or range(1, 1 + len(self.reconstruction.cameras)))
 
@@ -137,10 +137,10 @@ def _critical(solved: Solved) -> dict[str, Any]:
     assert remedy is not None
     after = remedy.after
     return {
-        "singular_values": after.meter.singular_values.tolist(),
-        "null_vector": after.meter.null_vector.tolist(),
-        "y_axis_spread_deg": after.meter.y_axis_spread_deg,
-        "meaning": after.meter.meaning,
+        "singular_values": after.degeneracy.singular_values.tolist(),
+        "null_vector": after.degeneracy.null_vector.tolist(),
+        "y_axis_spread_deg": after.degeneracy.y_axis_spread_deg,
+        "meaning": after.degeneracy.meaning,
         "sigma_log_k": after.sigma_log_k,
         "sigma_log_k_before": remedy.before.sigma_log_k,
         "weakest_sigma": after.weakest_sigma,
@@ -191,7 +191,7 @@ def solution_of(solved: Solved, options: SolveOptions, rectify: RectifyOptions) 
             "lengths": len(options.lengths),
             "remedy": options.remedy,
             "depth": str(rectify.depth),
-            **solved.told,
+            **solved.facts,
         },
         generator=versions(),
         verdict=None if solved.verdict is None else solved.verdict.to_json(),
@@ -204,8 +204,8 @@ def _georeference(solved: Solved) -> Mapping[str, Any] | None:
     if solved.georeference is None or solved.survey is None:  # then it is the model's
         return solved.georeference
     rec, positions = solved.shared, solved.survey.positions
-    told = zip(positions.names, positions.speed_m_s.tolist(), strict=True)
-    by_gps = {name: speed for name, speed in told if np.isfinite(speed)}
+    of_gps = zip(positions.names, positions.speed_m_s.tolist(), strict=True)
+    by_gps = {name: speed for name, speed in of_gps if np.isfinite(speed)}
     known = solved.survey.known(rec)
     held = {} if known is None else known.velocities
     speeds = {}

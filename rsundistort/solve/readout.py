@@ -54,7 +54,7 @@ class MeasuredReadout:
         return not self.problem
 
     def to_json(self) -> dict[str, Any]:
-        """As plain values."""
+        """The result as plain values."""
         return {"measured": self.measured, "problem": self.problem, **self.evidence}
 
 
@@ -105,5 +105,5 @@ def measure_readout(
         loaded = with_focal_lengths(loaded, options.solve.seed, log)
         bodies = [source.frames] * len(loaded.names)
         solved = solve_frames(options, source.clip, loaded, bodies, gyro_log, log)
-    told = dict(solved.evidence)
-    return MeasuredReadout(told["seconds"], told["sigma"], told["of_frame"], problem_of(told), told)
+    evidence = dict(solved.evidence)
+    return MeasuredReadout(evidence["seconds"], evidence["sigma"], evidence["of_frame"], problem_of(evidence), evidence)

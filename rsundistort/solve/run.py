@@ -143,7 +143,7 @@ def _solved(
         solved, solving = _solve(options, loaded, bodies, gyro_log, workers, log, kept)
     else:
         solved, solving = solve_frames(options, source.clip, loaded, bodies, gyro_log, log, kept), options.solve
-    told = {
+    facts = {
         "max_features": options.max_features,
         "feature_megapixels": options.feature_megapixels,
         "matching": options.matching,
@@ -151,7 +151,7 @@ def _solved(
         "gyro": options.gyro and options.gyro.facts(),
     }
     outputs = Outputs.of_solved(
-        replace(solved, told=told), solving, rectify, options.outputs, loaded.orientations, times=photo_times(folder)
+        replace(solved, facts=facts), solving, rectify, options.outputs, loaded.orientations, times=photo_times(folder)
     )
     before.solved(outputs, log)
     return outputs
@@ -167,7 +167,7 @@ def _check_anchors(options: SolveOptions, names: Sequence[str], photos: Path) ->
     ends = (end[0] for each in options.lengths for end in (each.start, each.end))
     for name in (*options.still, *options.known, *ends):
         if name not in names:
-            raise InputError(f"anchor {name!r} is not among the photos of {photos}")
+            raise InputError(f"constraint on {name!r}, which is not among the photos of {photos}")
 
 
 def _solve(
@@ -191,8 +191,8 @@ def _solve(
         return bounded_by_exposure(solving.options_for(cameras), rec, loaded, known_s)
 
     sizes = [(cameras.of(i).width, cameras.of(i).height) for i in range(len(loaded.names))]
-    told = {k: seconds for k, seconds in known_s.items() if cameras.readout_told[k]}
-    clock_s = {name: told[k] for name, k in zip(loaded.names, cameras.camera_idx.tolist(), strict=True) if k in told}
+    known = {k: seconds for k, seconds in known_s.items() if cameras.readout_specified[k]}
+    clock_s = {name: known[k] for name, k in zip(loaded.names, cameras.camera_idx.tolist(), strict=True) if k in known}
     survey = survey_of(solving.crs, solving.control, loaded.names, loaded.facts, sizes, clock_s)
     with work_folder() as work:
         solved = solve_photos(

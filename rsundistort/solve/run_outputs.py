@@ -265,15 +265,15 @@ class Outputs:
         """Keep the data of the report beyond the solution."""
         with _only_warned_of():
             if self._diagnostics is not None:
-                told = replace(self._diagnostics.with_colors(rgb), photos=photos)
-                write_diagnostics(folder / "report.npz", told)
+                diagnostics = replace(self._diagnostics.with_colors(rgb), photos=photos)
+                write_diagnostics(folder / "report.npz", diagnostics)
 
     def _rgb(self, colors: PointColors | None) -> NDArray[np.uint8] | None:
         """Colours from the photos, where they were not known."""
-        told = None if colors is None else colors.rgb()
-        if self.rgb is None or told is None:
-            return told if self.rgb is None else self.rgb.values
-        return np.where(self.rgb.known[:, None], self.rgb.values, told)
+        found = None if colors is None else colors.rgb()
+        if self.rgb is None or found is None:
+            return found if self.rgb is None else self.rgb.values
+        return np.where(self.rgb.known[:, None], self.rgb.values, found)
 
     def _models(
         self,

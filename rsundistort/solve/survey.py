@@ -202,7 +202,7 @@ class Survey:
         }
 
     def _residuals(self, rec: Reconstruction) -> dict[str, tuple[Array, float]]:
-        """By photo: centre less its place, and root mean square of that in standard deviations."""
+        """Centre less place of each photo, and the root mean square of that in standard deviations."""
         centers, places, sigma = _of_photos(rec, self.places)
         names = [name for name in rec.image_names if name in self.places]
         deviations = np.sqrt((((centers - places) / sigma) ** 2).mean(1))
@@ -233,7 +233,7 @@ class Survey:
             believed = np.array([name not in off for name in residuals])
             length = np.linalg.norm(apart, axis=1)
             value["gps"] = {
-                "sigma_from": list(self.positions.told_by),
+                "sigma_from": list(self.positions.sigma_from),
                 "median_m": float(np.median(length)),
                 "median_axes_m": np.median(np.abs(apart), axis=0).tolist(),
                 "rms_axes_m": np.sqrt(np.mean(apart[believed] ** 2, axis=0)).tolist() if believed.any() else None,

@@ -137,7 +137,7 @@ class Clip:
         Frames a second.
     readout : float
         Share of the time of a frame for which it is read, above 0 and up to 1.
-    twins_every : int
+    references_every : int
         Frames whose number is a multiple of this have a global-shutter reference.
     """
 
@@ -147,7 +147,7 @@ class Clip:
     num_frames: int
     fps: Fraction
     readout: float
-    twins_every: int = 10
+    references_every: int = 10
 
     @property
     def readout_s(self) -> float:
@@ -184,7 +184,7 @@ def is_clip(entry: Any) -> bool:
     return isinstance(entry, dict) and entry.get("kind") in CLIP_KINDS
 
 
-def clip_of(entry: Any, twins: Any, seed: int) -> Clip:
+def clip_of(entry: Any, references: Any, seed: int) -> Clip:
     """The clip of a recipe's path, which `is_clip`, and of its global-shutter references."""
     pan = kind_of(entry, "path", CLIP_KINDS) == "pan"
     required = ("kind", "fps", "readout", "way", *(("center_w",) if pan else ()))
@@ -217,7 +217,7 @@ def clip_of(entry: Any, twins: Any, seed: int) -> Clip:
         sway=number(steps.get("side_m", 0.0), "path: steps: side_m"),
         level=level,
     )
-    every = count(take(twins, "twins", (), ("every",)).get("every", 10), "twins: every")
+    every = count(take(references, "twins", (), ("every",)).get("every", 10), "twins: every")
     clip = Clip(path, num, Fraction(fps).limit_denominator(1001), readout, every)
     try:
         path.at(clip.time_s)

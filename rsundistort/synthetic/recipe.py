@@ -138,9 +138,9 @@ class Recipe:
         return self.cameras[view.camera_id]
 
     @property
-    def twins(self) -> tuple[View, ...]:
+    def references(self) -> tuple[View, ...]:
         """The views that have a global-shutter reference: all photos, and some frames of a clip."""
-        return self.views if self.clip is None else self.views[:: self.clip.twins_every]
+        return self.views if self.clip is None else self.views[:: self.clip.references_every]
 
 
 def _texture(entry: Any, where: str, folder: Path) -> Texture:

@@ -17,7 +17,7 @@ from ..bundle.layout import motion_end
 from ..critical import Remedy
 from ..model import Reconstruction
 from ..model.field import field_over_frame
-from ..sfm import LEAST_MEASUREMENTS, hanging_together
+from ..sfm import LEAST_MEASUREMENTS, connected_photos
 from .photos import PhotoMotions, photo_motions
 from .residuals import left_along_readout, left_over_frame
 
@@ -187,7 +187,7 @@ def height_reasons(remedy: Remedy | None) -> list[str]:
     if remedy is None:
         return []
     cost = remedy.after
-    if cost.meter.is_low and remedy.name == "none":
+    if cost.degeneracy.is_low and remedy.name == "none":
         return [
             "The cameras were not rotated against each other, so the height of the scene is undetermined, and the "
             "remedy is switched off."
@@ -356,9 +356,9 @@ def _misplaced(result: BundleResult, unexplained: bool) -> dict[str, str]:
         for name, sigma in zip(names, sigma_deg, strict=True)
         if sigma > _LOST_DEG
     }
-    joined = hanging_together(result.reconstruction)
-    few = f"it shows fewer than {LEAST_MEASUREMENTS} points whose place the others tell"
-    return said | {name: few for name, held in zip(names, joined, strict=True) if not held}
+    connected = connected_photos(result.reconstruction)
+    few = f"it shows fewer than {LEAST_MEASUREMENTS} points whose place the others determine"
+    return said | {name: few for name, held in zip(names, connected, strict=True) if not held}
 
 
 def _of_photos(rec: Reconstruction, doubts: Mapping[str, list[str]], motions: PhotoMotions) -> list[str]:

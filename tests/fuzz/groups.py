@@ -379,7 +379,7 @@ def video(frames: int = 6) -> bytes:
 
 
 @cache
-def told_video() -> bytes:
+def video_with_telemetry() -> bytes:
     with TemporaryDirectory() as folder:
         return mux(Path(folder, "v.mp4"), telemetry([40] * 3), frames=3).read_bytes()
 
@@ -420,7 +420,7 @@ def wholes() -> dict[str, list[Files]]:
         "lengths": {"l.csv": LENGTHS},
         "times": {"t.csv": TIMES},
         "gyroscopes": {"g.csv": GYRO, "g.gcsv": GCSV.format(orientation="XYZ").encode()},
-        "telemetry": {"v.mp4": told_video()},
+        "telemetry": {"v.mp4": video_with_telemetry()},
         "videos": {"v.mp4": video()},
         "photos": photos,
         "masks": {"m.png": encoded(".png", mask)},
@@ -467,7 +467,9 @@ GROUPS: dict[str, Group] = {
     "GPMF": Group(
         "gpmf", lambda: one_of(p__bin=damage.binaries(payload(gyro(COUNTS, total=403)), damage.klv_marks)), 200
     ),
-    "telemetry": Group("telemetry", lambda: one_of(v__mp4=damage.binaries(told_video(), damage.box_marks)), 300),
+    "telemetry": Group(
+        "telemetry", lambda: one_of(v__mp4=damage.binaries(video_with_telemetry(), damage.box_marks)), 300
+    ),
     "videos": Group("video", lambda: one_of(v__mp4=damage.binaries(video(), damage.box_marks)), 250),
     "photos": Group("photo", photos, 1400),
     "masks": Group("mask", masks, 150),

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 if not Path("/proc/self/clear_refs").exists():
-    pytest.skip("the most memory that was held is told by Linux alone", allow_module_level=True)
+    pytest.skip("the most memory that was held is known on Linux alone", allow_module_level=True)
 pytest.importorskip("av")
 pytest.importorskip("pillow_heif")
 pytest.importorskip("pyopf")

@@ -53,7 +53,7 @@ class GpsFix:
         Above whatever the camera takes for zero: the sea, or the ellipsoid.
     sigma_m : (float, float, float)
         Standard deviations east, north and up.
-    told_by : str
+    sigma_from : str
         What says so: "RTK", "accuracy", "positioning error", "DOP", or "default".
     speed_m_s : float or None
         Over ground.
@@ -71,7 +71,7 @@ class GpsFix:
     longitude_deg: float
     altitude_m: float | None = None
     sigma_m: tuple[float, float, float] = DEFAULT_SIGMA_M
-    told_by: str = "default"
+    sigma_from: str = "default"
     speed_m_s: float | None = None
     velocity_m_s: tuple[float, float, float] | None = None
     altitudes_m: Mapping[str, float] = field(default_factory=dict)
@@ -92,7 +92,7 @@ def fix_of(structure: TiffStructure | None, gps: Mapping[int, Entry], xmp: bytes
     stated = _of_xmp(xmp)
     place = _place(structure, gps) if structure is not None else None
     if place in (None, (0, 0)):
-        place = _told_place(stated) or place
+        place = _specified_place(stated) or place
     if place is None:
         return None
     altitudes: dict[str, float] = {}
@@ -100,12 +100,12 @@ def fix_of(structure: TiffStructure | None, gps: Mapping[int, Entry], xmp: bytes
     if stored is not None:
         altitudes["EXIF"] = stored
     altitudes |= {name: stated[name] for name in ALTITUDES if name in stated}
-    sigma, told_by = _sigma(structure, gps, stated)
+    sigma, sigma_from = _sigma(structure, gps, stated)
     speed = None if structure is None else _speed(structure, gps)
     if speed is None:
-        speed = _told_speed(stated)
+        speed = _specified_speed(stated)
     return GpsFix(
-        *place, next(iter(altitudes.values()), None), sigma, told_by, speed, _velocity(structure, gps, stated),
+        *place, next(iter(altitudes.values()), None), sigma, sigma_from, speed, _velocity(structure, gps, stated),
         altitudes, stated.get("RelativeAltitude", stated.get("Height")), _rotation(stated),
     )  # fmt: skip
 
@@ -210,7 +210,7 @@ def _of_xmp(xmp: bytes) -> dict[str, float]:
     return found
 
 
-def _told_place(stated: Mapping[str, float]) -> tuple[float, float] | None:
+def _specified_place(stated: Mapping[str, float]) -> tuple[float, float] | None:
     """Latitude and longitude of XMP; some of DJI's have a slip in the name."""
     for latitude, longitude in (
         ("GpsLatitude", "GpsLongitude"), ("GpsLatitude", "GpsLongtitude"), ("Latitude", "Longitude"),
@@ -244,7 +244,7 @@ def _rotation(stated: Mapping[str, float]) -> tuple[tuple[float, float, float], 
     return None
 
 
-def _told_speed(stated: Mapping[str, float]) -> float | None:
+def _specified_speed(stated: Mapping[str, float]) -> float | None:
     if "GroundSpeed" in stated:
         return stated["GroundSpeed"] if stated["GroundSpeed"] >= 0 else None
     for across, ahead in (("FlightXSpeed", "FlightYSpeed"), ("SpeedX", "SpeedY")):

@@ -57,7 +57,7 @@ class Metadata:
         return replace(self, xmp=marked_xmp(self.xmp, version))
 
     def only_mark(self) -> Metadata:
-        """Without the XMP, but for the mark of having been rectified."""
+        """The same without the XMP, except for the mark of having been rectified."""
         version = self.rectified_by
         return replace(self, xmp=b"" if version is None else marked_xmp(b"", version))
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rsundistort import Camera, Observations, Reconstruction
-from rsundistort.sfm import LEAST_MEASUREMENTS, firmly_joined
-from rsundistort.sfm.joined import hanging_together
+from rsundistort.sfm import LEAST_MEASUREMENTS, firmly_connected
+from rsundistort.sfm.connected import connected_photos
 
 CAMERA = Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]])
 
@@ -31,16 +31,16 @@ def showing(num_photos, *sets):
 
 def test_a_chain_of_threes_hangs_together():
     chain = showing(8, *(((k, k + 1, k + 2), LEAST_MEASUREMENTS) for k in range(6)))
-    assert hanging_together(chain).all()
-    assert firmly_joined(chain) is chain
+    assert connected_photos(chain).all()
+    assert firmly_connected(chain) is chain
 
 
 @pytest.mark.parametrize("ties", [0, 4, LEAST_MEASUREMENTS - 1])
-def test_a_part_that_hangs_on_by_little_is_told_and_by_nothing_left_out(ties):
+def test_a_part_that_hangs_on_by_little_is_reported_and_by_nothing_left_out(ties):
     # 4, 5 and 6 know each other well; of the others only 3 shows something that two of them show
     parts = showing(7, ((0, 1, 2, 3), 200), ((4, 5, 6), 300), ((3, 4, 5), ties))
-    assert hanging_together(parts).tolist() == [True] * 4 + [False] * 3
-    kept = firmly_joined(parts)
+    assert connected_photos(parts).tolist() == [True] * 4 + [False] * 3
+    kept = firmly_connected(parts)
     if ties > 4:
         assert kept is parts
         return
@@ -49,15 +49,15 @@ def test_a_part_that_hangs_on_by_little_is_told_and_by_nothing_left_out(ties):
 
 def test_the_larger_part_is_the_one_of_more_photos():
     parts = showing(7, ((0, 1, 2), 900), ((3, 4, 5, 6), 100))
-    assert hanging_together(parts).tolist() == [False] * 3 + [True] * 4
+    assert connected_photos(parts).tolist() == [False] * 3 + [True] * 4
 
 
 def test_points_of_one_other_photo_tell_no_place():
     pair = showing(4, ((0, 1, 2), 100), ((2, 3), 500))
-    assert hanging_together(pair).tolist() == [True] * 3 + [False]
+    assert connected_photos(pair).tolist() == [True] * 3 + [False]
 
 
 def test_parts_with_a_photo_in_common_are_one():
     # 4 knows its place among 0 to 3 by what 2 and 3 show, and 5 and 6 know theirs by 4
     parts = showing(7, ((0, 1, 2, 3), 200), ((4, 5, 6), 300), ((2, 3, 4), LEAST_MEASUREMENTS))
-    assert hanging_together(parts).all()
+    assert connected_photos(parts).all()

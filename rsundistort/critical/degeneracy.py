@@ -34,7 +34,7 @@ class CriticalMotion:
         ratio of the photos can hide.
     null_vector : (5,) array
         The change that is hidden best: skew `ds` and aspect ratio `da` of the reference photo (where the smallest value
-        is lowest), and the plane at infinity `p (3,)` in units of one over the spread of the centres. Length 1, the
+        is lowest), and the plane at infinity `p (3,)` in units of one over the extent of the centres. Length 1, the
         largest entry positive.
     y_axis_spread_deg : float
         Root mean square angle between the axes along which the photos were read out (y for rows, x for columns), taken
@@ -138,7 +138,7 @@ def critical_motion(
     m = len(centers)
     turn = check_rotations(R_cw, m, "R_cw")
     if m < 2:
-        raise InputError("the meter of critical motions compares photos; it needs at least two poses")
+        raise InputError("the degeneracy measure compares photos; it needs at least two poses")
     if not isinstance(readout, (str, Sequence)):
         raise InputError(f"readout={readout!r}, expected a direction, or one for each photo")
     directions = [readout] * m if isinstance(readout, str) else list(readout)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ..model import Reconstruction
 
-__all__ = ["LEAST_MEASUREMENTS", "firmly_joined", "hanging_together"]
+__all__ = ["LEAST_MEASUREMENTS", "connected_photos", "firmly_connected"]
 
 #: A photo with fewer measurements is not registered: a wrong place is worse than none.
 LEAST_MEASUREMENTS = 20
@@ -19,17 +19,17 @@ _LEAST_TIES = 5
 _LEAST_PHOTOS = 2
 
 
-def firmly_joined(reconstruction: Reconstruction) -> Reconstruction:
+def firmly_connected(reconstruction: Reconstruction) -> Reconstruction:
     """The largest part of a reconstruction whose poses are determined by equations, and what its photos show."""
     rec = reconstruction.without_photos(LEAST_MEASUREMENTS)
-    joined = hanging_together(rec, _LEAST_TIES)
-    while not joined.all():
-        rec = rec.take_photos(joined).without_photos(LEAST_MEASUREMENTS)
-        joined = hanging_together(rec, _LEAST_TIES)
+    connected = connected_photos(rec, _LEAST_TIES)
+    while not connected.all():
+        rec = rec.take_photos(connected).without_photos(LEAST_MEASUREMENTS)
+        connected = connected_photos(rec, _LEAST_TIES)
     return rec
 
 
-def hanging_together(reconstruction: Reconstruction, least: int = LEAST_MEASUREMENTS) -> NDArray[np.bool_]:
+def connected_photos(reconstruction: Reconstruction, least: int = LEAST_MEASUREMENTS) -> NDArray[np.bool_]:
     """(m,) the largest set of photos of which each shows `least` points whose place the others determine.
 
     A set grows from a pair: a photo is added if it shows so many points that two of the set show. Sets that have a
@@ -45,26 +45,26 @@ def hanging_together(reconstruction: Reconstruction, least: int = LEAST_MEASUREM
     shows = csr_matrix((np.ones(ties.sum()), where), (m, reconstruction.num_points))
     shows.data[:] = 1.0  # what a photo shows twice counts once
 
-    def grown(joined: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        new, count = joined, np.zeros(reconstruction.num_points)
+    def grown(connected: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        new, count = connected, np.zeros(reconstruction.num_points)
         while new.any():
             count += shows[new].sum(0).A1
-            new = ~joined & (shows @ (count >= _LEAST_PHOTOS) >= least)
-            joined = joined | new
-        return joined
+            new = ~connected & (shows @ (count >= _LEAST_PHOTOS) >= least)
+            connected = connected | new
+        return connected
 
     left, sets = np.ones(m, bool), list[NDArray[np.bool_]]()
     while left.any():
         first = int(np.argmax(np.where(left, shows.sum(1).A1, -1.0)))
         common = (shows @ shows[first].T).toarray().ravel()
         common[first] = -1.0
-        joined = np.arange(m) == first
+        connected = np.arange(m) == first
         if common.max() >= least:
-            joined = grown(joined | (np.arange(m) == np.argmax(common)))
-        while any(touching := [(each & joined).any() for each in sets]):
-            both = np.any([joined, *(each for each, near in zip(sets, touching, strict=True) if near)], axis=0)
+            connected = grown(connected | (np.arange(m) == np.argmax(common)))
+        while any(touching := [(each & connected).any() for each in sets]):
+            both = np.any([connected, *(each for each, near in zip(sets, touching, strict=True) if near)], axis=0)
             sets = [each for each, near in zip(sets, touching, strict=True) if not near]
-            joined = grown(both)
-        sets.append(joined)
-        left = left & ~joined
+            connected = grown(both)
+        sets.append(connected)
+        left = left & ~connected
     return max(sets, key=lambda each: int(each.sum()), default=left)
