@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bundle_scenes import dense_system, gradients, make_scene, perturbed, scaled, unit_steps
-from numpy_twin import project
+from numpy_reference import project
 
 from rsundistort import BundleOptions, Camera, Observations, Reconstruction, bundle_adjust
 from rsundistort.bundle import Posterior
@@ -194,7 +194,7 @@ def aimed(rng, turns, photos=14):
 
 
 @pytest.mark.parametrize("turns", [1.0, 0.0])
-def test_rotation_and_travel_of_an_orbit_are_told_apart_as_far_as_their_deviations_say(turns, rng):
+def test_rotation_and_travel_of_an_orbit_are_separated_as_far_as_their_deviations_say(turns, rng):
     square = []
     for _ in range(3):
         truth = aimed(rng, turns)

@@ -143,18 +143,22 @@ class BundleProblem:
         self._places = PlaceResiduals(self._start, options.places or KnownPlaces({}))
         self._known, self._known_weight = self._known_motions(span)
         self._free = self._free_unknowns()
-        self._means, self._means_start = None, means
-        if spreads.means:
-            # what a photo's own limit bounds is no sample of the others, and few photos are none of their camera
-            limited = [options.phi_limits.get(name, np.inf) < spreads.phi for name in reconstruction.image_names]
-            few = np.bincount(reconstruction.camera_idx)[reconstruction.camera_idx] < LEAST_PHOTOS
-            shares = self._free[:, 6:12] & ~(few | limited)[:, None]
-            self._means = MotionMeans.of(reconstruction, spreads.means, shares)
+        self._means, self._means_start = self._motion_means(spreads), means
         poses = reconstruction.R_cw, reconstruction.center_w
         self._elimination = Elimination.of(
             self._structure, self._free, poses, options.factor_limit, options.cg_tolerance, self._path is not None
         )  # fmt: skip
         self._size = reconstruction.size
+
+    def _motion_means(self, spreads: Spreads) -> MotionMeans | None:
+        """How motions depend on their means, if these are solved for."""
+        if not spreads.means:
+            return None
+        # what a photo's own limit bounds is no sample of the others, and few photos are none of their camera
+        limits, start = self._options.phi_limits, self._start
+        limited = [limits.get(name, np.inf) < spreads.phi for name in start.image_names]
+        few = np.bincount(start.camera_idx)[start.camera_idx] < LEAST_PHOTOS
+        return MotionMeans.of(start, spreads.means, self._free[:, 6:12] & ~(few | limited)[:, None])
 
     def _motion_spreads(self, spreads: Spreads) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Standard deviations (m,) of the priors on phi and velocity, per frame, no wider than a photo's own limit."""
