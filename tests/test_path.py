@@ -305,6 +305,46 @@ def test_frames_are_not_bent_by_a_readout_that_cannot_be() -> None:
     assert "longer than the 10.0 ms from frame to frame" in verdict.reasons[0]
 
 
+@dataclass(frozen=True)
+class Steady(HandHeld):
+    """A camera on a tripod that pans by a twentieth of a degree from frame to frame."""
+
+    walks: bool = False
+
+    def rotations(self, time_s):
+        return Rotation.from_rotvec(0.001 * 30 * np.asarray(time_s)[:, None] * [0.0, 1.0, 0.0]).as_matrix()
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_readout_longer_than_the_time_between_frames_is_bounded_and_not_determined(sign: int) -> None:
+    truth, times = filmed(Steady(), 20)
+    start = replace(truth, points_w=truth.points_w / np.linalg.norm(truth.points_w, axis=1)[:, None])
+    obs = truth.observations
+    # lines that are shifted as if the camera panned ten times as fast, or the other way, while it is read
+    skewed = obs.xy_raw + sign * 0.012 * (obs.xy_raw[:, 1:] - 240) * [1.0, 0.0]
+    path = FramePath(times, FRAME_S, turns_only=True)
+    found = bundle_adjust(
+        replace(start, observations=replace(obs, xy_raw=skewed)), "constant-motion", BundleOptions(path=path)
+    )
+    assert found.path is not None
+    assert abs(found.path.readout_s[0]) < 1.15 * FRAME_S
+    assert abs(found.path.unbounded_s[0]) > abs(found.path.readout_s[0])
+    assert found.path.sigma_readout_s[0] > 0.1 * FRAME_S  # the bound says nothing of where within it
+    assert found.num_iterations < 60
+    assert judge_clip(found, found, None, FRAME_S).shutter == "not-determined"
+
+
+def test_standard_deviations_of_a_readout_within_its_bound_know_nothing_of_it() -> None:
+    truth, times = filmed(HandHeld(3), 20, readout=0.99)
+    found = adjusted(truth, times).path
+    assert found is not None
+    assert abs(found.unbounded_s[0] - 0.99 * FRAME_S) < 3 * found.sigma_readout_s[0]
+    # one that is given may be longer
+    longer = adjusted(truth, times, readout=(1.5 * FRAME_S, 1e-6)).path
+    assert longer is not None
+    np.testing.assert_allclose(longer.readout_s, 1.5 * FRAME_S, rtol=1e-3)
+
+
 def test_the_state_of_a_path_gives_the_motions() -> None:
     state = State(np.arange(12.0).reshape(2, 6), np.zeros((2, 6)), np.array([0.5, 2.0]))
     np.testing.assert_array_equal(state.motions(np.array([1, 0])), [np.arange(6) * 2.0, np.arange(6, 12) * 0.5])

@@ -31,6 +31,9 @@ Index = NDArray[np.int64]
 # Before anything is known of a readout: it takes about half of the time to the next frame, give or take as much, so
 # that neither a global shutter nor one that runs the other way is excluded.
 _READOUT_SHARE, _READOUT_SIGMA = 0.5, 1.0
+# A readout ends before that of the next frame begins: standard deviation, in times between frames, by which one may
+# exceed that. It stands for times of frames that are not exact, and keeps the cost smooth.
+_EXCESS_SIGMA = 0.02
 # Frames that a path is taken to have run at, from rest, before its first one.
 _FRAMES_BEFORE = 100.0
 
@@ -75,6 +78,11 @@ class FramePath:
         if self.readout is None:
             return _READOUT_SHARE, _READOUT_SIGMA
         return self.readout[0] / self.frame_s, self.readout[1] / self.frame_s
+
+    @property
+    def readout_most(self) -> float:
+        """The longest readout, in times between frames: one, unless a longer one is given."""
+        return max(1.0, abs(self.readout_prior[0]))
 
     def known_rates(self, names: Sequence[str]) -> tuple[Array, Array]:
         """Rates (m, 6) that are known, and their weights, from one frame to the next; weight 0 where none is."""
@@ -158,6 +166,7 @@ class PathPrior:
         share, sigma = path.readout_prior
         span = np.array([camera.frame_span for camera in reconstruction.cameras])
         self.pace_prior, self.pace_sigma = share / span, sigma / span
+        self.pace_most, self.excess_sigma = path.readout_most / span, _EXCESS_SIGMA / span
         self._camera_idx = reconstruction.camera_idx
 
     def start(self, reconstruction: Reconstruction) -> PathState:
@@ -198,9 +207,20 @@ class PathPrior:
     def cost(self, R_cw: Array, center_w: Array, state: PathState) -> float:
         """Half the sum of squares, with that of the pace."""
         apart = (state.pace - self.pace_prior) / self.pace_sigma
+        excess = _excess(state.pace, self.pace_most) / self.excess_sigma
         begun = state.changes[self.begins] / self.begins_sigma
         squares = (self.residuals(R_cw, center_w, state) ** 2).sum() + (apart**2).sum() + (begun**2).sum()
-        return 0.5 * float(squares)
+        return 0.5 * float(squares + (excess**2).sum())
+
+    def prior_on_pace(self, state: PathState, bounded: bool = True) -> tuple[Array, Array]:
+        """Diagonal Hessian and gradient (cameras,) of what is known of the pace.
+
+        The bound is no evidence of where within it a readout lies: standard deviations are those without it
+        (`bounded` False).
+        """
+        excess = _excess(state.pace, self.pace_most) if bounded else np.zeros_like(state.pace)
+        at_bound, weight = np.where(excess != 0, self.excess_sigma**-2.0, 0.0), self.pace_sigma**-2.0
+        return weight + at_bound, weight * (state.pace - self.pace_prior) + at_bound * excess
 
     def prior_on_changes(self, state: PathState) -> tuple[Array, Array]:
         """Diagonal Hessian and gradient (m, 6) of what is known of the changes beforehand."""
@@ -252,6 +272,16 @@ def _by_xi(xi: Array, x: Array) -> Array:
     )
 
 
+def _excess(pace: Array, most: Array) -> Array:
+    """(cameras,) how far readouts are longer than the longest one, with their sign."""
+    return np.sign(pace) * np.maximum(np.abs(pace) - most, 0.0)
+
+
+def free_pace(pace: Array, sigma: Array, most: Array, excess_sigma: Array) -> Array:
+    """(cameras,) pace without the bound, by a Gauss-Newton step from it; standard deviations are those without."""
+    return pace + _excess(pace, most) * (sigma / excess_sigma) ** 2
+
+
 def camera_path(reconstruction: Reconstruction, path: FramePath, state: PathState) -> tuple[CameraPath, Index]:
     """The path through a reconstruction's poses, and its photos in the order of time."""
     order, time, part = path.order(reconstruction.image_names)
@@ -295,7 +325,9 @@ class PathSolution:
         The photo of each moment.
     readout_s, sigma_readout_s : (cameras,) array
         Time of the readout of a frame, seconds, negative where it runs against its direction; and its standard
-        deviation.
+        deviation, without what is due to its bound, the time between frames.
+    unbounded_s : (cameras,) array
+        What the measurements ask for without the bound, to first order: another time only where they contradict it.
     """
 
     path: CameraPath
@@ -303,14 +335,18 @@ class PathSolution:
     names: tuple[str, ...]
     readout_s: Array
     sigma_readout_s: Array
+    unbounded_s: Array
 
 
 def path_solution(reconstruction: Reconstruction, path: FramePath, state: PathState, pace_sigma: Array) -> PathSolution:
     """The path through a reconstruction's poses, and the readout time by pace and standard deviation (cameras,)."""
     found, frames = camera_path(reconstruction, path, state)
-    span_s = np.array([camera.frame_span for camera in reconstruction.cameras]) * path.frame_s
+    span = np.array([camera.frame_span for camera in reconstruction.cameras])
+    free = free_pace(state.pace, pace_sigma, path.readout_most / span, _EXCESS_SIGMA / span)
+    span_s = span * path.frame_s
     names = tuple(reconstruction.image_names[k] for k in frames.tolist())
-    return PathSolution(found, state, names, state.pace * span_s, pace_sigma * span_s)
+    times = (each * span_s for each in (state.pace, pace_sigma, free))
+    return PathSolution(found, state, names, *times)
 
 
 def of_motions(covariances: Array, with_pace: Array, pace_sigma: Array, state: PathState, camera_idx: Index) -> Array:

@@ -67,6 +67,7 @@ _READOUT_TIME = {
     **_TIME,
     "source": str,
     "of_frame?": float,
+    "unbounded_seconds?": float,
     "halves?": Maybe([_TIME]),
     "by_pictures?": Maybe(_TIME),
     "by_gyroscope?": Maybe(_TIME),

@@ -282,6 +282,7 @@ def _judged(
         "sigma": time.sigma,
         "source": _OF_STABILISED if _was_stabilised(filmed) else _source(options, time, felt),
         "of_frame": time.seconds / clip.frame_s,
+        "unbounded_seconds": float(found.unbounded_s[0]),
         "frames": len(path.names),
         "halves": [] if halves is None else [each._asdict() for each in halves],
         "stabilisation": {"verdict": stabilisation.verdict, "reason": stabilisation.reason},

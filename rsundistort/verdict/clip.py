@@ -65,6 +65,7 @@ def judge_clip(
     """
     assert result.path is not None
     time = ReadoutTime(float(result.path.readout_s[0]), float(result.path.sigma_readout_s[0]))
+    beyond = abs(float(result.path.unbounded_s[0])) - SIGMAS * time.sigma
     reasons = loose_reasons(keys) + height_reasons(remedy) + unexplained_reasons(keys, None)
     rec = keys.reconstruction
     shift = max(largest_shift_px(rec.camera(i), rec.motion(i), rec.shutter_model) for i in range(rec.num_images))
@@ -73,13 +74,13 @@ def judge_clip(
         return Verdict("not-determined", "doubtful", (f"{against}.", *reasons), {}, tuple(rec.image_names))
     if not most > _UNSEEN_PX:
         shutter = "not-found"
-    elif abs(time.seconds) - SIGMAS * time.sigma > frame_s:
+    elif beyond > frame_s:
         # whatever bends them, corrected as by a shutter they would be bent the more
         shutter = "not-determined"
         reasons.insert(
             0,
-            f"The readout appears to take {1e3 * abs(time.seconds):.1f} ms, longer than the {1e3 * frame_s:.1f} ms "
-            "from frame to frame: something else bends the frames.",
+            f"The readout appears to take longer than the {1e3 * frame_s:.1f} ms from frame to frame: something else "
+            "bends the frames.",
         )
     elif abs(time.seconds) > SIGMAS * time.sigma:
         shutter = "found"
@@ -138,6 +139,7 @@ def problem_of(evidence: Mapping[str, Any]) -> str:
         apart = abs(first["seconds"] - second["seconds"]) / np.hypot(first["sigma"], second["sigma"])
         if apart > APART:
             return f"the halves of the video contradict each other, {apart:.0f} standard deviations apart"
-    if abs(evidence.get("of_frame", 0.0)) * (1 - SIGMAS * sigma / abs(seconds)) > 1:
+    frame_s = abs(seconds / evidence["of_frame"]) if evidence.get("of_frame") else np.inf
+    if abs(evidence.get("unbounded_seconds", seconds)) - SIGMAS * sigma > frame_s:
         return "it would be longer than the time from frame to frame: something else bends the frames"
     return ""
