@@ -69,6 +69,7 @@ _READOUT_TIME = {
     "of_frame?": float,
     "unbounded_seconds?": float,
     "halves?": Maybe([_TIME]),
+    "by_speed?": Maybe([_TIME]),
     "by_pictures?": Maybe(_TIME),
     "by_gyroscope?": Maybe(_TIME),
     "gyroscope?": Maybe({"axes": str, "offset_s": float, "offset_sigma_s": float, "correlation": float}),
