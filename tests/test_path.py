@@ -10,12 +10,13 @@ from clips import HandHeld, filmed, poses_at, rotation_errors_deg
 from scipy.interpolate import BPoly
 from scipy.spatial.transform import Rotation
 
-from rsundistort import BundleOptions, Reconstruction, bundle_adjust
+from rsundistort import BundleOptions, Observations, Reconstruction, bundle_adjust
 from rsundistort.bundle.own_motions import own_motions
 from rsundistort.bundle.path import FramePath, PathPrior, orthogonal, with_path_motions
 from rsundistort.bundle.path import PathState as State
 from rsundistort.errors import InputError
 from rsundistort.model.path import CameraPath, inverse_left_jacobians
+from rsundistort.solve.clip import readouts_of_halves
 from rsundistort.verdict.clip import judge_clip, unfollowed_px
 
 FRAME_S = 1 / 30
@@ -343,6 +344,30 @@ def test_standard_deviations_of_a_readout_within_its_bound_know_nothing_of_it() 
     longer = adjusted(truth, times, readout=(1.5 * FRAME_S, 1e-6)).path
     assert longer is not None
     np.testing.assert_allclose(longer.readout_s, 1.5 * FRAME_S, rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_halves_of_a_video_ask_for_their_own_readout_times_though_they_begin_at_that_of_the_whole() -> None:
+    hand = HandHeld(4)
+    (first, times), (second, _) = (filmed(hand, 32, readout=share, num_points=150) for share in (0.4, 0.7))
+    place = {tuple(point): i for i, point in enumerate(first.points_w)}
+    same = np.array([place.get(tuple(point), -1) for point in second.points_w])
+    a, b = first.observations, second.observations
+    early, late = a.frame_idx < 16, (b.frame_idx >= 16) & (same[b.point_idx] >= 0)
+    both = Observations(
+        *(
+            np.concatenate([of_a[early], of_b[late]])
+            for of_a, of_b in (
+                (a.frame_idx, b.frame_idx), (a.point_idx, same[b.point_idx]), (a.xy_raw, b.xy_raw),
+            )
+        )
+    )  # fmt: skip
+    truth = replace(first, observations=both).with_points(np.ones(len(both), bool))
+    found = readouts_of_halves(adjusted(truth, times), BundleOptions(path=FramePath(times, FRAME_S)))
+    assert found is not None
+    for half, share in zip(found, (0.4, 0.7), strict=True):
+        assert abs(half.seconds / FRAME_S - share) < 3 * half.sigma / FRAME_S
+        assert half.sigma < 0.03 * FRAME_S
 
 
 def test_the_state_of_a_path_gives_the_motions() -> None:

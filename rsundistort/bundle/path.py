@@ -417,7 +417,8 @@ def orthogonal(reconstruction: Reconstruction) -> Reconstruction:
     phi, velocity = np.empty((2, rec.num_images, 3))
     for span in np.unique(rec.bend_clock, axis=0):
         mine = np.flatnonzero((rec.bend_clock == span).all(1))
-        clock = np.linspace(*span, 4 * sites)
+        start, end = span.tolist()
+        clock = np.linspace(start, end, 4 * sites)
         moved = splines_at(sites, np.linspace(0, 1, len(clock))) @ rec.bend[mine]
         moved[..., :3] += clock[:, None] * rec.phi[mine, None]
         moved[..., 3:] += clock[:, None] * rec.velocity[mine, None]

@@ -35,7 +35,7 @@ from .model_sequence import rough_options
 from .outcome import Solved
 from .placing import place_photos
 
-__all__ = ["frame_path", "solve_clip"]
+__all__ = ["frame_path", "readouts_of_halves", "solve_clip"]
 
 # Frames with a pose from fewer measurements say nothing of the path.
 _LEAST_MEASUREMENTS = 15
@@ -267,7 +267,7 @@ def _judged(
         result, remedy = heal(result, options)
         log.end("critical motion", sigma_log_k=remedy.after.sigma_log_k)
     log.begin("halves")
-    halves = None if _was_stabilised(filmed) else _halves(result, options)
+    halves = None if _was_stabilised(filmed) else readouts_of_halves(result, options)
     log.end("halves", readout_s=None if halves is None else [each.seconds for each in halves])
     log.begin("stabilisation")
     stabilisation, vibration_px, speeds = filmed, 0.0, None
@@ -348,14 +348,14 @@ def _are_keys(result: BundleResult, clip: Clip) -> NDArray[np.bool_]:
     return np.array([name in keys for name in result.reconstruction.image_names])
 
 
-def _halves(result: BundleResult, options: BundleOptions) -> tuple[ReadoutTime, ReadoutTime] | None:
+def readouts_of_halves(result: BundleResult, options: BundleOptions) -> tuple[ReadoutTime, ReadoutTime] | None:
     """The readout time by each half of the frames; None if there are too few."""
     rec = result.reconstruction
     late = np.arange(rec.num_images) >= rec.num_images // 2
     if rec.num_images < 2 * _LEAST_HALF:
         return None
     assert options.path is not None
-    # two steps from the whole are enough: the frames differ little, but for the readout time that each half asks for
+    # poses are those of the whole, as good as; a tolerance this small lets each half find its own readout time
     pictures = replace(options.path, rates={}, start=_start_of(result))
     how = replace(
         rough_options(options), path=pictures, outlier_rounds=0, spread_rounds=1, cost_tolerance=1e-6, refine=()
