@@ -1,13 +1,14 @@
-"""Kills `run` and `rectify` at random moments and goes on with them: prints one JSON object a line.
+"""Kills `run`, `rectify` and `run` of a video at random moments and goes on with them: prints one JSON object a line.
 
-    python benchmarks/kills.py [--kills 100] [--seed 0] [--only run|rectify]
+    python benchmarks/kills.py [--kills 100] [--seed 0] [--only run|rectify|video]
 
 Each run into an empty folder is killed, gone on with (`--resume`), killed again and so on, until it comes to its end;
 then every file is compared with that of an undisturbed run, byte for byte but for the times that a solution and its
 report tell. Every other kill comes at any time, the ones between in the stage that was hit least so far. Half of the
 signals are SIGKILL, the others SIGTERM and SIGINT, which have to end it in one line and with their exit codes. A
 watcher looks at the outputs all the time: what is visible must be whole. The scene is five photos of `courtyard` at
-half size. Exits 1 if anything differs, is cut short, or cannot be gone on with.
+half size; the video, a second of `walk` at half size, of which every frame is written. Exits 1 if anything differs, is
+cut short, or cannot be gone on with.
 """
 
 from __future__ import annotations
@@ -28,9 +29,11 @@ import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 
+import av
 import cv2
 
 SCENE = Path(__file__).parent.parent / "sample_scenes" / "courtyard"
+WALK = SCENE.parent / "walk"
 COMMAND = [sys.executable, "-m", "rsundistort_cli"]
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 
@@ -43,6 +46,19 @@ def make_scene(folder: Path) -> None:
         cv2.imwrite(str(folder / "photos" / path.name), cv2.resize(photo, None, fx=0.5, fy=0.5))
     camera = json.loads((SCENE / "camera.json").read_text())
     (folder / "camera.json").write_text(json.dumps(halved(camera)))
+
+
+def make_clip(folder: Path, num_frames: int = 30) -> None:
+    """The first frames of a video at half size, and their camera."""
+    camera = halved(json.loads((WALK / "camera.json").read_text()))
+    (folder / "clip.json").write_text(json.dumps(camera))
+    with av.open(str(WALK / "clip.mp4")) as source, av.open(str(folder / "clip.mp4"), "w") as target:
+        stream = target.add_stream("libx264", rate=30, options={"crf": "14"})
+        stream.width, stream.height, stream.pix_fmt = camera["width"], camera["height"], "yuv420p"
+        for _, frame in zip(range(num_frames), source.decode(video=0), strict=False):
+            small = frame.reformat(camera["width"], camera["height"], "yuv420p")
+            target.mux(stream.encode(av.VideoFrame.from_ndarray(small.to_ndarray(), format="yuv420p")))
+        target.mux(stream.encode())
 
 
 def halved(camera: dict) -> dict:
@@ -109,7 +125,7 @@ class Watcher:
 
     def _is_whole(self, name: str, path: Path) -> bool:
         data = path.read_bytes()
-        if name.startswith(("images/", "masks/")):
+        if name.startswith(("images/", "masks/")) or name.endswith(".mp4"):
             return data == self.images[name]
         if name.endswith(".json"):
             try:
@@ -247,7 +263,7 @@ def main() -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", choices=("run", "rectify"))
+    parser.add_argument("--only", choices=("run", "rectify", "video"))
     options = parser.parse_args()
     # where it was started in the background it is ignored, by what is started here, too
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -258,6 +274,11 @@ def main() -> int:
         photos, solution = str(folder / "photos"), str(folder / "run" / "undisturbed" / "out" / "solution.json")
         run = [*COMMAND, "run", photos, "--camera", str(folder / "camera.json"), "--max-features", "500"]
         commands = {"run": run, "rectify": [*COMMAND, "rectify", photos, "--solution", solution]}
+        make_clip(folder)
+        commands["video"] = [
+            *COMMAND, "run", str(folder / "clip.mp4"), "--camera", str(folder / "clip.json"), "--frames", "all",
+            "--max-features", "800",
+        ]  # fmt: skip
         commands = {name: [*command, "--progress", "json"] for name, command in commands.items()}
         for name, command in commands.items():
             kills = options.kills if options.only in (None, name) else 0

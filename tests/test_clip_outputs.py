@@ -41,6 +41,7 @@ from rsundistort.model.orientation import turn_path
 from rsundistort.model.path import CameraPath
 from rsundistort.report.readout import readout_facts
 from rsundistort.solve import MeasuredReadout, measure_readout
+from rsundistort.solve.run_outputs import Outputs
 from rsundistort.verdict.clip import problem_of
 
 av = pytest.importorskip("av")
@@ -455,6 +456,24 @@ def test_run_of_a_video_writes_all_its_frames_and_its_path(cut, tmp_path):
     assert np.loadtxt(out / "nuke" / "camera.chan")[:, 0].tolist() == list(range(1, 21))
     (camera,) = solution.rectified_cameras.values()
     check_usd(out / "camera.usda", rows[9], 9, camera)
+
+
+@pytest.mark.slow
+def test_a_run_that_is_interrupted_behind_its_video_keeps_the_video_and_its_stage(cut, tmp_path, monkeypatch):
+    out, options = tmp_path / "out", RunOptions(frames="all", max_features=1000)
+
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Outputs, "rectify", stop)
+        with pytest.raises(KeyboardInterrupt):
+            run(cut, out, options)
+    before = (out / "video.mp4").stat().st_mtime_ns
+    names = [stage["name"] for stage in run(cut, out, options, resume=True).stages]
+    assert (out / "video.mp4").stat().st_mtime_ns == before
+    assert names.count("video") == 1
+    assert names[names.index("video") + 1] == "rectifying"
 
 
 def check_usd(path, row, code, camera):

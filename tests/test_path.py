@@ -10,12 +10,13 @@ from clips import HandHeld, filmed, poses_at, rotation_errors_deg
 from scipy.interpolate import BPoly
 from scipy.spatial.transform import Rotation
 
-from rsundistort import BundleOptions, Reconstruction, bundle_adjust
+from rsundistort import BundleOptions, Observations, Reconstruction, bundle_adjust
 from rsundistort.bundle.own_motions import own_motions
 from rsundistort.bundle.path import FramePath, PathPrior, orthogonal, with_path_motions
 from rsundistort.bundle.path import PathState as State
 from rsundistort.errors import InputError
 from rsundistort.model.path import CameraPath, inverse_left_jacobians
+from rsundistort.solve.clip import readouts_of_halves
 from rsundistort.verdict.clip import judge_clip, unfollowed_px
 
 FRAME_S = 1 / 30
@@ -303,6 +304,70 @@ def test_frames_are_not_bent_by_a_readout_that_cannot_be() -> None:
     assert verdict.shutter == "not-determined"
     assert verdict.lens_only == tuple(truth.image_names)
     assert "longer than the 10.0 ms from frame to frame" in verdict.reasons[0]
+
+
+@dataclass(frozen=True)
+class Steady(HandHeld):
+    """A camera on a tripod that pans by a twentieth of a degree from frame to frame."""
+
+    walks: bool = False
+
+    def rotations(self, time_s):
+        return Rotation.from_rotvec(0.001 * 30 * np.asarray(time_s)[:, None] * [0.0, 1.0, 0.0]).as_matrix()
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_readout_longer_than_the_time_between_frames_is_bounded_and_not_determined(sign: int) -> None:
+    truth, times = filmed(Steady(), 20)
+    start = replace(truth, points_w=truth.points_w / np.linalg.norm(truth.points_w, axis=1)[:, None])
+    obs = truth.observations
+    # lines that are shifted as if the camera panned ten times as fast, or the other way, while it is read
+    skewed = obs.xy_raw + sign * 0.012 * (obs.xy_raw[:, 1:] - 240) * [1.0, 0.0]
+    path = FramePath(times, FRAME_S, turns_only=True)
+    found = bundle_adjust(
+        replace(start, observations=replace(obs, xy_raw=skewed)), "constant-motion", BundleOptions(path=path)
+    )
+    assert found.path is not None
+    assert abs(found.path.readout_s[0]) < 1.15 * FRAME_S
+    assert abs(found.path.unbounded_s[0]) > abs(found.path.readout_s[0])
+    assert found.path.sigma_readout_s[0] > 0.1 * FRAME_S  # the bound says nothing of where within it
+    assert found.num_iterations < 60
+    assert judge_clip(found, found, None, FRAME_S).shutter == "not-determined"
+
+
+def test_standard_deviations_of_a_readout_within_its_bound_know_nothing_of_it() -> None:
+    truth, times = filmed(HandHeld(3), 20, readout=0.99)
+    found = adjusted(truth, times).path
+    assert found is not None
+    assert abs(found.unbounded_s[0] - 0.99 * FRAME_S) < 3 * found.sigma_readout_s[0]
+    # one that is given may be longer
+    longer = adjusted(truth, times, readout=(1.5 * FRAME_S, 1e-6)).path
+    assert longer is not None
+    np.testing.assert_allclose(longer.readout_s, 1.5 * FRAME_S, rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_halves_of_a_video_ask_for_their_own_readout_times_though_they_begin_at_that_of_the_whole() -> None:
+    hand = HandHeld(4)
+    (first, times), (second, _) = (filmed(hand, 32, readout=share, num_points=150) for share in (0.4, 0.7))
+    place = {tuple(point): i for i, point in enumerate(first.points_w)}
+    same = np.array([place.get(tuple(point), -1) for point in second.points_w])
+    a, b = first.observations, second.observations
+    early, late = a.frame_idx < 16, (b.frame_idx >= 16) & (same[b.point_idx] >= 0)
+    both = Observations(
+        *(
+            np.concatenate([of_a[early], of_b[late]])
+            for of_a, of_b in (
+                (a.frame_idx, b.frame_idx), (a.point_idx, same[b.point_idx]), (a.xy_raw, b.xy_raw),
+            )
+        )
+    )  # fmt: skip
+    truth = replace(first, observations=both).with_points(np.ones(len(both), bool))
+    found = readouts_of_halves(adjusted(truth, times), BundleOptions(path=FramePath(times, FRAME_S)))
+    assert found is not None
+    for half, share in zip(found, (0.4, 0.7), strict=True):
+        assert abs(half.seconds / FRAME_S - share) < 3 * half.sigma / FRAME_S
+        assert half.sigma < 0.03 * FRAME_S
 
 
 def test_the_state_of_a_path_gives_the_motions() -> None:

@@ -22,6 +22,8 @@ MODEL_SEQUENCE = ("global", "two-step", "rotation", "constant-motion")
 
 # Relative fall of the cost that ends a solve whose prior standard deviations will still change.
 _UNSETTLED_TOLERANCE = 1e-5
+# The same of a path, whose frames a start from another adjustment knows well.
+_UNSETTLED_PATH = 1e-4
 
 
 def objective(reconstruction: Reconstruction, shutter_model: str, options: BundleOptions) -> float:
@@ -81,15 +83,17 @@ def bundle_adjust(
         rounds.solve(options.round_tolerance)
         rounds.drop_outliers()
     most = options.spread_rounds + 1
-    if not options.outlier_rounds and options.spread_rounds and estimates_spreads(shutter_model, options):
+    is_guess = options.path is None or options.path.start is None
+    if is_guess and not options.outlier_rounds and options.spread_rounds and estimates_spreads(shutter_model, options):
         # the first prior standard deviations are a guess: their solution need not be exact
         rounds.solve(options.round_tolerance)
         rounds.begin_next()
         most -= 1
-    exact = options.cost_tolerance >= _UNSETTLED_TOLERANCE
+    unsettled = _UNSETTLED_TOLERANCE if is_guess else _UNSETTLED_PATH
+    exact = options.cost_tolerance >= unsettled
     for left in reversed(range(most)):
         exact = exact or left == 0
-        rounds.solve(options.cost_tolerance if exact else _UNSETTLED_TOLERANCE, is_judged=True)
+        rounds.solve(options.cost_tolerance if exact else unsettled, is_judged=True)
         if rounds.are_settled and exact:
             break
         exact = exact or rounds.are_settled

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,4 +123,10 @@ class Layout:
 
 def _at_sites(bend: Bend, num_sites: int) -> NDArray[np.float64]:
     """(n, 6) values of a bend at as many sites as others have."""
-    return np.hstack(bend.at(np.linspace(bend.start, bend.end, num_sites)))
+    return np.asarray(_between(len(bend.values), num_sites) @ bend.values)
+
+
+@lru_cache(maxsize=8)
+def _between(num_own: int, num_sites: int) -> NDArray[np.float64]:
+    """(n, k) splines through one value each of k sites, at n sites."""
+    return splines_at(num_own, np.linspace(0, 1, num_sites))

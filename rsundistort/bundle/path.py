@@ -10,13 +10,16 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
-from ..model import Bend, Reconstruction, RowMotion
+from ..model import Bend, Reconstruction
+from ..model.bend import splines_at
+from ..model.motion import steady_parts
 from ..model.path import CameraPath, cross_matrices, inverse_left_jacobians
 
 __all__ = [
     "FramePath",
     "PathPrior",
     "PathSolution",
+    "PathStart",
     "PathState",
     "of_motions",
     "orthogonal",
@@ -31,8 +34,43 @@ Index = NDArray[np.int64]
 # Before anything is known of a readout: it takes about half of the time to the next frame, give or take as much, so
 # that neither a global shutter nor one that runs the other way is excluded.
 _READOUT_SHARE, _READOUT_SIGMA = 0.5, 1.0
+# A readout ends before that of the next frame begins: standard deviation, in times between frames, by which one may
+# exceed that. It stands for times of frames that are not exact, and keeps the cost smooth.
+_EXCESS_SIGMA = 0.02
 # Frames that a path is taken to have run at, from rest, before its first one.
 _FRAMES_BEFORE = 100.0
+
+
+@dataclass(frozen=True)
+class PathStart:
+    """What an adjustment found of a path, for the next one to begin with.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Frames, in the order of the state.
+    state : PathState
+        How they move; its world is that of the reconstruction that begins there.
+    spreads : (rotation, travel)
+        Prior standard deviations, as `PathPrior` takes them.
+    noise : float, optional
+        Factor of the noise, where the residuals have said so.
+    """
+
+    names: tuple[str, ...]
+    state: PathState
+    spreads: tuple[float, ...]
+    noise: float | None = None
+
+    def in_order(self, names: Sequence[str], otherwise: PathState) -> PathState:
+        """The state of other frames; of those without one, another's, whose cameras are the same."""
+        place = {name: i for i, name in enumerate(self.names)}
+        mine = np.array([place.get(name, -1) for name in names])
+        rates, changes = (
+            np.where((mine >= 0)[:, None], own[mine], other)
+            for own, other in ((self.state.rates, otherwise.rates), (self.state.changes, otherwise.changes))
+        )
+        return PathState(rates, changes, self.state.pace)
 
 
 @dataclass(frozen=True)
@@ -54,6 +92,8 @@ class FramePath:
         Rate of rotation by a gyroscope, (3,) radians per second in the camera frame, and its standard deviation.
     turns_only : bool
         Whether the camera stays where it is: centres are held, and points count by their directions.
+    start : PathStart, optional
+        The path of an adjustment of these frames before, where the next one begins.
     """
 
     time_s: Mapping[str, float]
@@ -62,6 +102,7 @@ class FramePath:
     part: Mapping[str, int] = field(default_factory=dict)
     rates: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
     turns_only: bool = False
+    start: PathStart | None = None
 
     def __post_init__(self) -> None:
         if not 0 < self.frame_s < np.inf:
@@ -75,6 +116,11 @@ class FramePath:
         if self.readout is None:
             return _READOUT_SHARE, _READOUT_SIGMA
         return self.readout[0] / self.frame_s, self.readout[1] / self.frame_s
+
+    @property
+    def readout_most(self) -> float:
+        """The longest readout, in times between frames: one, unless a longer one is given."""
+        return max(1.0, abs(self.readout_prior[0]))
 
     def known_rates(self, names: Sequence[str]) -> tuple[Array, Array]:
         """Rates (m, 6) that are known, and their weights, from one frame to the next; weight 0 where none is."""
@@ -158,9 +204,15 @@ class PathPrior:
         share, sigma = path.readout_prior
         span = np.array([camera.frame_span for camera in reconstruction.cameras])
         self.pace_prior, self.pace_sigma = share / span, sigma / span
+        self.pace_most, self.excess_sigma = path.readout_most / span, _EXCESS_SIGMA / span
         self._camera_idx = reconstruction.camera_idx
 
-    def start(self, reconstruction: Reconstruction) -> PathState:
+    def start(self, reconstruction: Reconstruction, known: PathStart | None = None) -> PathState:
+        """The state that an adjustment begins with: as far as it is `known`, that one."""
+        differences = self._by_differences(reconstruction)
+        return differences if known is None else known.in_order(reconstruction.image_names, differences)
+
+    def _by_differences(self, reconstruction: Reconstruction) -> PathState:
         """Rates by differences of the poses of neighbours, and the pace that is likeliest before the photos."""
         m = reconstruction.num_images
         total, count = np.zeros((m, 6)), np.zeros((m, 1))
@@ -198,9 +250,20 @@ class PathPrior:
     def cost(self, R_cw: Array, center_w: Array, state: PathState) -> float:
         """Half the sum of squares, with that of the pace."""
         apart = (state.pace - self.pace_prior) / self.pace_sigma
+        excess = _excess(state.pace, self.pace_most) / self.excess_sigma
         begun = state.changes[self.begins] / self.begins_sigma
         squares = (self.residuals(R_cw, center_w, state) ** 2).sum() + (apart**2).sum() + (begun**2).sum()
-        return 0.5 * float(squares)
+        return 0.5 * float(squares + (excess**2).sum())
+
+    def prior_on_pace(self, state: PathState, bounded: bool = True) -> tuple[Array, Array]:
+        """Diagonal Hessian and gradient (cameras,) of what is known of the pace.
+
+        The bound is no evidence of where within it a readout lies: standard deviations are those without it
+        (`bounded` False).
+        """
+        excess = _excess(state.pace, self.pace_most) if bounded else np.zeros_like(state.pace)
+        at_bound, weight = np.where(excess != 0, self.excess_sigma**-2.0, 0.0), self.pace_sigma**-2.0
+        return weight + at_bound, weight * (state.pace - self.pace_prior) + at_bound * excess
 
     def prior_on_changes(self, state: PathState) -> tuple[Array, Array]:
         """Diagonal Hessian and gradient (m, 6) of what is known of the changes beforehand."""
@@ -252,6 +315,16 @@ def _by_xi(xi: Array, x: Array) -> Array:
     )
 
 
+def _excess(pace: Array, most: Array) -> Array:
+    """(cameras,) how far readouts are longer than the longest one, with their sign."""
+    return np.sign(pace) * np.maximum(np.abs(pace) - most, 0.0)
+
+
+def free_pace(pace: Array, sigma: Array, most: Array, excess_sigma: Array) -> Array:
+    """(cameras,) pace without the bound, by a Gauss-Newton step from it; standard deviations are those without."""
+    return pace + _excess(pace, most) * (sigma / excess_sigma) ** 2
+
+
 def camera_path(reconstruction: Reconstruction, path: FramePath, state: PathState) -> tuple[CameraPath, Index]:
     """The path through a reconstruction's poses, and its photos in the order of time."""
     order, time, part = path.order(reconstruction.image_names)
@@ -265,12 +338,17 @@ def camera_path(reconstruction: Reconstruction, path: FramePath, state: PathStat
 def with_path_motions(reconstruction: Reconstruction, path: FramePath, state: PathState) -> Reconstruction:
     """The reconstruction with the motion of each frame as the path has it around its principal row."""
     found, order = camera_path(reconstruction, path, state)
-    clock_s = state.pace * path.frame_s
-    motions = {}
-    for moment, image in enumerate(order.tolist()):
-        camera = reconstruction.camera(image)
-        motions[image] = found.row_motion(moment, camera.clock_range, float(clock_s[reconstruction.camera_idx[image]]))
-    return reconstruction.with_motions([motions[i] for i in range(reconstruction.num_images)])
+    clock_s, camera_idx = state.pace * path.frame_s, reconstruction.camera_idx[order]
+    m, parts, clock = len(order), [], np.zeros((len(order), 2))
+    for k, camera in enumerate(reconstruction.cameras):
+        moments = np.flatnonzero(camera_idx == k)
+        parts.append((order[moments], found.row_motions(moments, camera.clock_range, float(clock_s[k]))))
+        clock[order[moments]] = camera.clock_range
+    values = [np.zeros((m, *each.shape[1:])) for each in parts[0][1]]
+    for mine, motions in parts:
+        for value, each in zip(values, motions, strict=True):
+            value[mine] = each
+    return replace(reconstruction, phi=values[0], velocity=values[1], bend=values[2], bend_clock=clock)
 
 
 def path_bends(reconstruction: Reconstruction, path: FramePath, state: PathState) -> dict[str, Bend]:
@@ -295,7 +373,9 @@ class PathSolution:
         The photo of each moment.
     readout_s, sigma_readout_s : (cameras,) array
         Time of the readout of a frame, seconds, negative where it runs against its direction; and its standard
-        deviation.
+        deviation, without what is due to its bound, the time between frames.
+    unbounded_s : (cameras,) array
+        What the measurements ask for without the bound, to first order: another time only where they contradict it.
     """
 
     path: CameraPath
@@ -303,14 +383,18 @@ class PathSolution:
     names: tuple[str, ...]
     readout_s: Array
     sigma_readout_s: Array
+    unbounded_s: Array
 
 
 def path_solution(reconstruction: Reconstruction, path: FramePath, state: PathState, pace_sigma: Array) -> PathSolution:
     """The path through a reconstruction's poses, and the readout time by pace and standard deviation (cameras,)."""
     found, frames = camera_path(reconstruction, path, state)
-    span_s = np.array([camera.frame_span for camera in reconstruction.cameras]) * path.frame_s
+    span = np.array([camera.frame_span for camera in reconstruction.cameras])
+    free = free_pace(state.pace, pace_sigma, path.readout_most / span, _EXCESS_SIGMA / span)
+    span_s = span * path.frame_s
     names = tuple(reconstruction.image_names[k] for k in frames.tolist())
-    return PathSolution(found, state, names, state.pace * span_s, pace_sigma * span_s)
+    times = (each * span_s for each in (state.pace, pace_sigma, free))
+    return PathSolution(found, state, names, *times)
 
 
 def of_motions(covariances: Array, with_pace: Array, pace_sigma: Array, state: PathState, camera_idx: Index) -> Array:
@@ -328,11 +412,17 @@ def of_motions(covariances: Array, with_pace: Array, pace_sigma: Array, state: P
 
 def orthogonal(reconstruction: Reconstruction) -> Reconstruction:
     """The same motions as the nearest steady ones and bends, and the poses that belong to these."""
-    R_cw, center_w, motions = reconstruction.R_cw.copy(), reconstruction.center_w.copy(), []
-    for i in range(reconstruction.num_images):
-        start, end = reconstruction.bend_clock[i]
-        clock = np.linspace(start, end, 4 * reconstruction.bend.shape[1])
-        motion, turn, way = RowMotion.of(clock, *reconstruction.motion(i).at(clock), sites=reconstruction.bend.shape[1])
-        R_cw[i], center_w[i] = turn @ R_cw[i], center_w[i] + way
-        motions.append(replace(motion, frame="world"))
-    return replace(reconstruction.with_motions(motions), R_cw=R_cw, center_w=center_w)
+    rec, sites = reconstruction, reconstruction.bend.shape[1]
+    R_cw, center_w, bend = rec.R_cw.copy(), rec.center_w.copy(), np.empty_like(rec.bend)
+    phi, velocity = np.empty((2, rec.num_images, 3))
+    for span in np.unique(rec.bend_clock, axis=0):
+        mine = np.flatnonzero((rec.bend_clock == span).all(1))
+        start, end = span.tolist()
+        clock = np.linspace(start, end, 4 * sites)
+        moved = splines_at(sites, np.linspace(0, 1, len(clock))) @ rec.bend[mine]
+        moved[..., :3] += clock[:, None] * rec.phi[mine, None]
+        moved[..., 3:] += clock[:, None] * rec.velocity[mine, None]
+        rest, turn, way, rate = steady_parts(clock, moved, sites)
+        R_cw[mine], center_w[mine] = turn @ R_cw[mine], center_w[mine] + way
+        phi[mine], velocity[mine], bend[mine] = rate[:, 0], rate[:, 1], rest
+    return replace(rec, R_cw=R_cw, center_w=center_w, phi=phi, velocity=velocity, bend=bend)

@@ -97,7 +97,7 @@ class BundleProblem:
         if not reconstruction.bends:
             photos = range(reconstruction.num_images)
             self._bend_clock = np.array([reconstruction.camera(i).clock_range for i in photos])
-        self._path, self._path_start = None, path
+        self._path, self._path_start, self._bounded = None, path, True
         self._turns_only = options.path is not None and options.path.turns_only
         if options.path is not None:
             if shutter_model != "constant-motion":
@@ -253,14 +253,14 @@ class BundleProblem:
         )  # fmt: skip
 
     def with_squares(self) -> BundleProblem:
-        """The same without a robust loss, for covariances.
+        """The same without a robust loss, and without the bound of the readout time, for covariances.
 
         The curvature of a robust loss is not the inverse of a covariance: of normal noise it would be too small by a
         quarter. That of squares is right for normal noise, and to the safe side for noise with heavy tails.
         """
         plain = copy(self)
         plain._options = replace(self._options, loss="squared")
-        plain._lens_of = None
+        plain._lens_of, plain._bounded = None, False
         return plain
 
     def covariances(self, state: State) -> Marginals:
@@ -370,9 +370,9 @@ class BundleProblem:
             gradient = np.hstack([gradient, weight_of_means * state.means + pull])
             total += 0.5 * float((weight_of_means * state.means**2).sum())
         if self._path is not None and state.path is not None:
-            weight_of_pace = self._path.pace_sigma[:, None] ** -2.0
-            diagonal = np.hstack([diagonal, weight_of_pace])
-            gradient = np.hstack([gradient, weight_of_pace * (state.path.pace - self._path.pace_prior)[:, None]])
+            weight, slope_of_pace = self._path.prior_on_pace(state.path, self._bounded)
+            diagonal = np.hstack([diagonal, weight[:, None]])
+            gradient = np.hstack([gradient, slope_of_pace[:, None]])
         return diagonal, gradient, total
 
     def _jacobians(

@@ -19,6 +19,7 @@ from .normal_equations import NormalEquations
 from .options import BundleOptions, BundleResult
 from .path import (
     FramePath,
+    PathPrior,
     PathState,
     of_motions,
     orthogonal,
@@ -103,22 +104,32 @@ class Rounds:
         base = reconstruction.with_points(np.ones(len(reconstruction.observations), bool))
         if base.num_points:
             _check_solvable(base, shutter_model, options.path)
+        self._path: PathState | None = None
+        self._path_moved = np.inf
+        start = None if options.path is None else options.path.start
+        if options.path is not None and start is not None:
+            prior = PathPrior(options.path, base, (start.spreads[0], start.spreads[1]))
+            self._path = prior.start(base, start)
+            base = with_path_motions(base, options.path, self._path)
+            self._options = options = replace(options, known_bends=path_bends(base, options.path, self._path))
         self._turns_only = options.path is not None and options.path.turns_only
         self._base = base if self._turns_only else retriangulated(base, shutter_model, from_afar=True)
         self._keep = np.ones(len(self._base.observations), bool)
         self._sigma_px = options.sigma_px or _noise_px(self._base, shutter_model, options.min_sigma_px)
         self._baseline = reconstruction.baseline
         self._layout = Layout.of(shutter_model, options)
-        self._spreads = self._weighed_spreads = starting_spreads(options, self._layout, self._base)
-        self._noise = self._weighed_noise = 1.0
+        self._spreads = starting_spreads(options, self._layout, self._base)
+        self._noise = 1.0
+        if start is not None:
+            self._spreads = replace(self._spreads, path=start.spreads)
+            self._noise = start.noise or 1.0
+        self._weighed_spreads, self._weighed_noise = self._spreads, self._noise
         # Measurements that seem more exact than they are would pull the intrinsics over the hump of a prior with heavy
         # tails, and they would not come back: it is normal until the noise is known
-        self._heavy_tails = self._had_heavy_tails = False
+        self._heavy_tails = self._had_heavy_tails = start is not None and start.noise is not None
         self._damping = options.initial_damping
         self._iterations = 0
-        self._path: PathState | None = None
         self._means: NDArray[np.float64] | None = None
-        self._path_moved = np.inf
 
     def solve(self, cost_tolerance: float, is_judged: bool = False) -> None:
         """Solve once. One that is judged says how uncertain it is by its residuals, if the options ask for that."""

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from .checks import check_finite, check_whole, frozen
 
-__all__ = ["BEND_GROUPS", "Bend", "bend_functions", "bend_pieces", "bend_table", "splines_at"]
+__all__ = ["BEND_GROUPS", "Bend", "bend_functions", "bend_pieces", "bend_table", "parts_of", "splines_at"]
 
 Array = NDArray[np.float64]
 
@@ -116,6 +116,19 @@ def splines_at(num_sites: int, place: Array) -> Array:
     return _values_at(np.eye(num_sites), np.asarray(place, np.float64) * (num_sites - 1))
 
 
+def parts_of(clock: Array, readings: Array, sites: int) -> tuple[Array, Array, Array]:
+    """Of readings (k, c), at ascending times of the clock (k,): bends (sites, c), constants and rates (c,)."""
+    from scipy.interpolate import CubicSpline
+
+    values = CubicSpline(clock, readings)(np.linspace(clock[0], clock[-1], sites))
+    place, gram = np.linspace(-1, 1, sites), _gram(sites)
+    ones = np.ones(sites)
+    mean = (ones @ gram @ values) / (ones @ gram @ ones)
+    slope = (place @ gram @ values) / (place @ gram @ place)
+    rate = slope * 2 / (clock[-1] - clock[0])
+    return values - mean - place[:, None] * slope, mean - rate * (clock[0] + clock[-1]) / 2, rate
+
+
 @dataclass(frozen=True)
 class Bend:
     """How rotation and position depart from those of a steady motion, while the clock runs over a frame.
@@ -177,17 +190,7 @@ class Bend:
             raise InputError("the readings of the clock must ascend, and be four or more")
         turn = check_finite(rotation, (len(r), 3), "rotation")
         way = np.zeros_like(turn) if position is None else check_finite(position, (len(r), 3), "position")
-        from scipy.interpolate import CubicSpline
-
-        at = np.linspace(r[0], r[-1], sites)
-        values = CubicSpline(r, np.hstack([turn, way]))(at)
-        place, gram = np.linspace(-1, 1, sites), _gram(sites)
-        ones = np.ones(sites)
-        mean = (ones @ gram @ values) / (ones @ gram @ ones)
-        slope = (place @ gram @ values) / (place @ gram @ place)
-        rest = values - mean - place[:, None] * slope
-        rate = slope * 2 / (r[-1] - r[0])
-        constant = mean - rate * (r[0] + r[-1]) / 2
+        rest, constant, rate = parts_of(r, np.hstack([turn, way]), sites)
         return cls(float(r[0]), float(r[-1]), rest[:, :3], rest[:, 3:]), constant.reshape(2, 3), rate.reshape(2, 3)
 
     @property

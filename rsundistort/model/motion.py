@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from .bend import Bend, bend_table
+from .bend import Bend, bend_table, parts_of
 from .camera import check_readout
 from .checks import check_finite, check_kind, check_number, check_numbers, check_one_of, check_rotation, frozen
 
-__all__ = ["SHUTTER_MODELS", "RowMotion", "check_shutter_model"]
+__all__ = ["SHUTTER_MODELS", "RowMotion", "check_shutter_model", "steady_parts"]
 
 #: Names of the shutter models and their codes in the kernels, in the order of the model sequence.
 SHUTTER_MODELS: dict[str, int] = {"global": 0, "two-step": 1, "linearized": 2, "rotation": 3, "constant-motion": 4}
@@ -29,6 +29,46 @@ def check_shutter_model(name: str) -> int:
     if not isinstance(name, str) or name not in SHUTTER_MODELS:
         raise InputError(f"shutter model {name!r}, expected one of {', '.join(SHUTTER_MODELS)}")
     return SHUTTER_MODELS[name]
+
+
+def steady_parts(
+    clock: NDArray[np.float64], moved: NDArray[np.float64], sites: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """What `RowMotion.of` says of one frame, of k frames at once.
+
+    Parameters
+    ----------
+    clock : (n,) array
+        Ascending, from the start of the frames to their end.
+    moved : (k, n, 6) array
+        Rotation vectors and positions there relative to some poses.
+    sites : int
+        Values of the bends.
+
+    Returns
+    -------
+    bend : (k, sites, 6) array
+        Beside the nearest steady motions.
+    turn, way : (k, 3, 3), (k, 3) array
+        The poses that go with these have rotations `turn R_cw` and centres `center_w + way`.
+    rate : (k, 2, 3) array
+        Phi and velocity.
+    """
+    from scipy.spatial.transform import Rotation
+
+    k, n = moved.shape[:2]
+    readings = Rotation.from_rotvec(moved[..., :3].reshape(-1, 3)).as_matrix().reshape(k, n, 3, 3)
+    turn = readings[:, n // 2]
+    # the constant part goes into the pose; rotations do not commute, so that a share of it is left each time
+    for _ in range(10):
+        left = Rotation.from_matrix((readings @ turn[:, None].transpose(0, 1, 3, 2)).reshape(-1, 3, 3)).as_rotvec()
+        both = np.concatenate([left.reshape(k, n, 3), moved[..., 3:]], axis=2)
+        rest, constant, rate = parts_of(clock, both.transpose(1, 0, 2).reshape(n, -1), sites)
+        constant = constant.reshape(k, 2, 3)
+        turn = Rotation.from_rotvec(constant[:, 0]).as_matrix() @ turn
+        if np.abs(constant[:, 0]).max(initial=0.0) < 1e-15:
+            break
+    return rest.reshape(sites, k, 6).transpose(1, 0, 2), turn, constant[:, 1], rate.reshape(k, 2, 3)
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from .checks import check_finite, check_index, check_rotations, frozen
-from .motion import RowMotion
 
 __all__ = ["CameraPath", "cross_matrices", "inverse_left_jacobians"]
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 # Sites of the bend that a frame gets from the path: cubics on both sides of the principal row.
 _SITES = 17
@@ -40,7 +40,7 @@ def inverse_left_jacobians(xi: Array) -> Array:
 
 
 def _hermite(u: Array) -> Array:
-    """(5, n) quintic functions of u: for value, slope and curvature at 1, and for slope and curvature at 0."""
+    """(5, ...) quintic functions of u: for value, slope and curvature at 1, and for slope and curvature at 0."""
     v = 1 - u
     return np.stack(
         [
@@ -115,66 +115,73 @@ class CameraPath:
         `Exp(rotation) R_cw` and `center_w + position`. Up to the neighbouring moments these lie on the path; beyond
         them, and where there is none, they go on as the path does there.
         """
-        offset = np.atleast_1d(np.asarray(offset_s, np.float64))
+        turn, way = self._around(np.array([moment]), np.atleast_1d(np.asarray(offset_s, np.float64)))
+        return turn[0], way[0]
+
+    def _around(self, moments: Index, offset: Array) -> tuple[Array, Array]:
+        """As `near`, (k, n, 3) of k moments."""
         turn, way = (
-            offset[:, None] * slope + 0.5 * offset[:, None] ** 2 * bend
-            for slope, bend in (
-                (self.rate[moment], self.rate_change[moment]),
-                (self.velocity[moment], self.acceleration[moment]),
-            )
+            offset[:, None] * slope[moments, None] + 0.5 * offset[:, None] ** 2 * bend[moments, None]
+            for slope, bend in ((self.rate, self.rate_change), (self.velocity, self.acceleration))
         )
-        for other, on_this_side in ((moment - 1, offset < 0), (moment + 1, offset > 0)):
-            joined = 0 <= other < len(self.time_s) and self.part[other] == self.part[moment]
-            if joined and on_this_side.any():
-                turn[on_this_side], way[on_this_side] = self._towards(moment, other, offset[on_this_side])
+        for step, on_this_side in ((-1, offset < 0), (1, offset > 0)):
+            other = np.clip(moments + step, 0, len(self.time_s) - 1)
+            joined = (other != moments) & (self.part[other] == self.part[moments])
+            if joined.any() and on_this_side.any():
+                there = np.ix_(joined, on_this_side)
+                turn[there], way[there] = self._towards(moments[joined], other[joined], offset[on_this_side])
         return turn, way
 
-    def _towards(self, moment: int, other: int, offset: Array) -> tuple[Array, Array]:
-        """As `near`, on the side of one neighbour."""
-        dt = self.time_s[other] - self.time_s[moment]
-        xi = Rotation.from_matrix(self.R_cw[other] @ self.R_cw[moment].T).as_rotvec()
+    def _towards(self, moments: Index, others: Index, offset: Array) -> tuple[Array, Array]:
+        """As `_around`, on the side of one neighbour of each."""
+        dt = self.time_s[others] - self.time_s[moments]
+        xi = Rotation.from_matrix(self.R_cw[others] @ self.R_cw[moments].transpose(0, 2, 1)).as_rotvec()
         J = inverse_left_jacobians(xi)
-        step = self.center_w[other] - self.center_w[moment]
-        u = np.minimum(offset / dt, 1.0)
-        weights = _hermite(u) * np.array([1.0, dt, dt**2, dt, dt**2])[:, None]
-        beyond = (offset - dt * u)[:, None]
+        step = self.center_w[others] - self.center_w[moments]
+        u = np.minimum(offset / dt[:, None], 1.0)
+        weights = _hermite(u) * np.stack([np.ones_like(dt), dt, dt**2, dt, dt**2])[:, :, None]
+        beyond = (offset - dt[:, None] * u)[:, :, None]
 
         def along(end: tuple[Array, Array, Array], start: tuple[Array, Array]) -> Array:
-            within: Array = weights.T @ np.stack([*end, *start])
-            return within + beyond * end[1] + 0.5 * beyond**2 * end[2]
+            within: Array = np.einsum("fkn,fka->kna", weights, np.stack([*end, *start]))
+            return within + beyond * end[1][:, None] + 0.5 * beyond**2 * end[2][:, None]
 
         return (
             along(
-                (xi, J @ self.rate[other], J @ self.rate_change[other]), (self.rate[moment], self.rate_change[moment])
+                (xi, *(np.einsum("kab,kb->ka", J, each[others]) for each in (self.rate, self.rate_change))),
+                (self.rate[moments], self.rate_change[moments]),
             ),
             along(
-                (step, self.velocity[other], self.acceleration[other]),
-                (self.velocity[moment], self.acceleration[moment]),
+                (step, self.velocity[others], self.acceleration[others]),
+                (self.velocity[moments], self.acceleration[moments]),
             ),
         )
 
-    def row_motion(self, moment: int, clock_range: tuple[float, float], clock_s: float) -> RowMotion:
-        """The motion of a frame of the path whose principal row is read at that moment.
+    def row_motions(
+        self, moments: ArrayLike, clock_range: tuple[float, float], clock_s: float
+    ) -> tuple[Array, Array, Array]:
+        """Motions of frames of the path whose principal rows are read at these moments.
 
         Parameters
         ----------
-        moment : int
-            Index of the frame.
+        moments : (k,) int array
+            Indices of the frames.
         clock_range : (start, end)
-            Of its camera (`Camera.clock_range`).
+            Of their camera (`Camera.clock_range`).
         clock_s : float
             Seconds to a unit of the clock.
 
         Returns
         -------
-        RowMotion
-            In the world, against the pose at that moment. Its bend is what the path departs by from its tangent there,
-            so it need not be orthogonal to 1 and to the clock.
+        phi, velocity : (k, 3) array
+            Radians, and world units in the world, per unit of the clock, against the poses at these moments.
+        bend : (k, n, 6) array
+            Rotation and position, at even readings of the clock, by which the path departs from its tangents there, so
+            that they need not be orthogonal to 1 and to the clock.
         """
-        from .bend import Bend
-
+        chosen = np.asarray(moments, np.int64)
         clock = np.linspace(*clock_range, _SITES)
-        turn, way = self.near(moment, clock * clock_s)
-        phi, velocity = clock_s * self.rate[moment], clock_s * self.velocity[moment]
-        bend = Bend(*clock_range, turn - clock[:, None] * phi, way - clock[:, None] * velocity)
-        return RowMotion(phi, velocity, bend, "world")
+        turn, way = self._around(chosen, clock * clock_s)
+        phi, velocity = clock_s * self.rate[chosen], clock_s * self.velocity[chosen]
+        bend = np.concatenate([turn - clock[:, None] * phi[:, None], way - clock[:, None] * velocity[:, None]], axis=2)
+        return phi, velocity, bend

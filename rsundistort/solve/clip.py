@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..batch.progress import StageLog
 from ..bundle import BundleOptions, BundleResult, bundle_adjust
 from ..bundle.own_motions import OwnMotions, own_motions
-from ..bundle.path import FramePath
+from ..bundle.path import FramePath, PathStart
 from ..critical import heal
 from ..errors import RsUndistortWarning
 from ..input.clip import Clip
@@ -26,6 +26,7 @@ from ..io.kept import Kept
 from ..model import Reconstruction
 from ..sfm import MatchedPhotos, retriangulate
 from ..verdict.clip import ReadoutTime, judge_clip, unfollowed_px
+from ..verdict.speeds import readouts_by_speed
 from .clip_gyroscope import Felt, felt_gyroscope, own_gyroscope, readout_of, turns_between
 from .clip_pair import two_frames
 from .clip_pan import turning_only
@@ -34,7 +35,7 @@ from .model_sequence import rough_options
 from .outcome import Solved
 from .placing import place_photos
 
-__all__ = ["frame_path", "solve_clip"]
+__all__ = ["frame_path", "readouts_of_halves", "solve_clip"]
 
 # Frames with a pose from fewer measurements say nothing of the path.
 _LEAST_MEASUREMENTS = 15
@@ -42,8 +43,11 @@ _LEAST_MEASUREMENTS = 15
 _LEAST_HALF = 4
 # Rotations explain the frames up to this error of the flow in pixels, and this share of outliers.
 _FLOW_PX, _OUTLIERS = 0.25, 0.2
-# Solves that estimate the prior standard deviations of a path: with hundreds of frames few are enough.
-_SPREADS = 4
+# Solves that estimate the prior standard deviations of a path, and the share by which these may still change: with
+# hundreds of frames few are enough.
+_SPREADS, _SETTLED = 4, 0.05
+# Relative fall of the cost that ends an adjustment of a path that another one follows.
+_ROUGH_COST = 1e-4
 # Readout time that counts as none, as a share of the time between frames.
 _NO_READOUT = 1e-6
 # Relative standard deviation of a readout time that is specified, or from the table.
@@ -116,10 +120,10 @@ def solve_clip(
     # the telemetry of frames that were rotated since says nothing
     felt = None if _was_stabilised(filmed) else felt_gyroscope(result, gyroscope or telemetry)
     if felt is not None:
-        options = replace(options, path=replace(path, rates=felt.rates(result)))
+        options = replace(options, path=replace(path, rates=felt.rates(result), start=_start_of(result)))
         result = bundle_adjust(
             result.reconstruction, "constant-motion",
-            replace(options, outlier_rounds=0, spread_rounds=_SPREADS),
+            replace(options, outlier_rounds=0, spread_rounds=_SPREADS, spread_tolerance=_SETTLED),
             partial(_tell, log, "gyroscope"),
         )  # fmt: skip
     log.end("gyroscope", offset_s=None if felt is None else felt.alignment.offset_s)
@@ -138,7 +142,11 @@ def _turned(
         result = bundle_adjust(start, "constant-motion", _at_first(options), partial(_tell, log, "rotations"))
         if result.sigma_px < _FLOW_PX and result.num_outliers < _OUTLIERS * len(start.observations):
             result = bundle_adjust(
-                result.reconstruction, "constant-motion", replace(options, outlier_rounds=1, spread_rounds=_SPREADS),
+                result.reconstruction, "constant-motion",
+                replace(
+                    options, outlier_rounds=1, spread_rounds=_SPREADS, spread_tolerance=_SETTLED,
+                    path=replace(path, turns_only=True, start=_start_of(result)),
+                ),
                 partial(_tell, log, "rotations"),
             )  # fmt: skip
             warnings.warn(
@@ -170,8 +178,12 @@ def _travelled(
         log.begin(stage)
         if result is None:
             path, filmed = _as_filmed(clip, whole, path, telemetry)
-        options = replace(options_of(whole), path=path)
-        how = _at_first(options) if result is None else replace(options, outlier_rounds=1, spread_rounds=_SPREADS)
+        options = replace(options_of(whole), path=path if result is None else replace(path, start=_start_of(result)))
+        how = (
+            _at_first(options)
+            if result is None
+            else replace(options, outlier_rounds=1, spread_rounds=_SPREADS, spread_tolerance=_SETTLED)
+        )
         is_first = result is None
         result = bundle_adjust(whole, "constant-motion", how, partial(_tell, log, stage))
         log.end(
@@ -218,6 +230,15 @@ def _against_telemetry(
     return replace(filmed, verdict="stabilised", reason=reason) if reason else filmed
 
 
+def _start_of(result: BundleResult, *, at_once: bool = False) -> PathStart:
+    """What an adjustment found of a path, for the next one; or of the same frames if they are read at once."""
+    assert result.path is not None
+    state, noise = result.path.state, result.noise_factor if result.noise_factor != 1.0 else None
+    if at_once:
+        state = replace(state, pace=np.zeros_like(state.pace))
+    return PathStart(tuple(result.reconstruction.image_names), state, result.path_sigmas, noise)
+
+
 def _at_once(path: FramePath) -> FramePath:
     """The path of frames that are read at once."""
     return replace(path, readout=(0.0, _NO_READOUT * path.frame_s))
@@ -229,7 +250,9 @@ def _was_stabilised(filmed: Stabilisation | None) -> bool:
 
 def _at_first(options: BundleOptions) -> BundleOptions:
     """Options of an adjustment of a path that is followed by another one."""
-    return replace(rough_options(options), outlier_rounds=2, spread_rounds=1, deviations="model")
+    return replace(
+        rough_options(options), outlier_rounds=2, spread_rounds=1, cost_tolerance=_ROUGH_COST, deviations="model"
+    )
 
 
 def _judged(
@@ -244,13 +267,14 @@ def _judged(
         result, remedy = heal(result, options)
         log.end("critical motion", sigma_log_k=remedy.after.sigma_log_k)
     log.begin("halves")
-    halves = None if _was_stabilised(filmed) else _halves(result, options)
+    halves = None if _was_stabilised(filmed) else readouts_of_halves(result, options)
     log.end("halves", readout_s=None if halves is None else [each.seconds for each in halves])
     log.begin("stabilisation")
-    stabilisation, vibration_px = filmed, 0.0
+    stabilisation, vibration_px, speeds = filmed, 0.0, None
     if stabilisation is None or not _was_stabilised(filmed):
         own = own_motions(result.reconstruction, turns_only=options.path.turns_only)
         vibration_px = unfollowed_px(result.reconstruction, own)
+        speeds = _by_speed(clip, result, own)
         stabilisation = _stabilisation(clip, result.reconstruction, own, felt)
         if felt is None and telemetry is not None:
             on_path = result.reconstruction
@@ -258,14 +282,14 @@ def _judged(
     log.end("stabilisation", verdict=stabilisation.verdict)
     of_keys = result.of_photos(_are_keys(result, clip))
     log.begin("comparison with a global shutter")
-    at_once = _at_once(options.path)
+    at_once = replace(_at_once(options.path), start=_start_of(result, at_once=True))
     global_result = bundle_adjust(
         of_keys.reconstruction, "constant-motion",
-        replace(rough_options(options), path=at_once, outlier_rounds=0, deviations="model"),
+        replace(rough_options(options), path=at_once, outlier_rounds=0, spread_rounds=0, deviations="model"),
     )  # fmt: skip
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
     against = stabilisation.reason if stabilisation.verdict == "stabilised" else ""
-    verdict = judge_clip(result, of_keys, halves, clip.frame_s, remedy, against, vibration_px)
+    verdict = judge_clip(result, of_keys, halves, clip.frame_s, remedy, against, vibration_px, speeds)
     if verdict.lens_only:
         warnings.warn(
             f"the frames are corrected for the lens only: {verdict.reasons[0]}", RsUndistortWarning, stacklevel=4
@@ -282,8 +306,10 @@ def _judged(
         "sigma": time.sigma,
         "source": _OF_STABILISED if _was_stabilised(filmed) else _source(options, time, felt),
         "of_frame": time.seconds / clip.frame_s,
+        "unbounded_seconds": float(found.unbounded_s[0]),
         "frames": len(path.names),
         "halves": [] if halves is None else [each._asdict() for each in halves],
+        "by_speed": [] if speeds is None else [each._asdict() for each in speeds],
         "stabilisation": {"verdict": stabilisation.verdict, "reason": stabilisation.reason},
     }
     if felt is not None:
@@ -322,15 +348,18 @@ def _are_keys(result: BundleResult, clip: Clip) -> NDArray[np.bool_]:
     return np.array([name in keys for name in result.reconstruction.image_names])
 
 
-def _halves(result: BundleResult, options: BundleOptions) -> tuple[ReadoutTime, ReadoutTime] | None:
+def readouts_of_halves(result: BundleResult, options: BundleOptions) -> tuple[ReadoutTime, ReadoutTime] | None:
     """The readout time by each half of the frames; None if there are too few."""
     rec = result.reconstruction
     late = np.arange(rec.num_images) >= rec.num_images // 2
     if rec.num_images < 2 * _LEAST_HALF:
         return None
     assert options.path is not None
-    pictures = replace(options.path, rates={})
-    how = replace(rough_options(options), path=pictures, outlier_rounds=0, spread_rounds=1, refine=())
+    # poses are those of the whole, as good as; a tolerance this small lets each half find its own readout time
+    pictures = replace(options.path, rates={}, start=_start_of(result))
+    how = replace(
+        rough_options(options), path=pictures, outlier_rounds=0, spread_rounds=1, cost_tolerance=1e-6, refine=()
+    )
     parts = [rec.take_photos(keep) for keep in (~late, late)]
     if any(part.num_images < _LEAST_HALF or part.num_points < _LEAST_MEASUREMENTS for part in parts):
         return None
@@ -347,6 +376,16 @@ def _stabilisation(clip: Clip, rec: Reconstruction, found: OwnMotions, felt: Fel
     return judge_stabilisation(
         clip.time_s[place], pairs, turns, found.phi * span, found.sigma_phi * span, log=log, offset_s=offset_s,
         turn_sigma=_turn_sigma(found, pairs),
+    )  # fmt: skip
+
+
+def _by_speed(clip: Clip, result: BundleResult, found: OwnMotions) -> tuple[ReadoutTime, ReadoutTime] | None:
+    """The readout time by slow and by fast rotations of the frames."""
+    rec = result.reconstruction
+    place, span = _places(clip, rec), rec.frame_span()[:, None]
+    return readouts_by_speed(
+        clip.time_s[place], clip.part[place], found.R_cw, found.sigma_turn, found.phi * span, found.sigma_phi * span,
+        readout_of(result).seconds,
     )  # fmt: skip
 
 

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from ..batch.progress import ProgressCallback, StageLog
 from ..batch.workers import Workers, use_threads
@@ -101,9 +102,15 @@ def run(
             before.begin()
         # what an earlier run left there belongs to another path
         Record(out).remove([name for name in OF_VIDEOS if name not in of_video])
-        if options.frames == "all" and before.kept.get(VIDEO) is None:
-            outputs.rectify_clip(photos, out, workers, log)
-            before.kept.put(VIDEO, True)
+        if options.frames == "all":
+            stages: list[dict[str, Any]] | None = before.kept.get(VIDEO)
+            if stages is None:
+                known = len(log.stages)
+                outputs.rectify_clip(photos, out, workers, log)
+                stages = log.stages[known:]
+                before.kept.put(VIDEO, stages)
+            else:
+                log.stages += stages
         return outputs.rectify(out / "frames" if is_video(photos) else photos, out, workers, log, before.begun)
 
 

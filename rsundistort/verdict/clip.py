@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from ..critical import Remedy
 from ..model import Reconstruction
 from ..rectify import largest_shift_px
 from .judge import Verdict, height_reasons, loose_reasons, unexplained_reasons
+from .speeds import ReadoutTime
 
 __all__ = ["APART", "SIGMAS", "ReadoutTime", "judge_clip", "problem_of", "unfollowed_px"]
 
@@ -20,13 +21,8 @@ __all__ = ["APART", "SIGMAS", "ReadoutTime", "judge_clip", "problem_of", "unfoll
 _UNSEEN_PX = 1.0
 #: Standard deviations by which a readout time differs from none, and two of them from each other.
 SIGMAS, APART = 3.0, 4.0
-
-
-class ReadoutTime(NamedTuple):
-    """Time of the readout of a frame in seconds, and its standard deviation."""
-
-    seconds: float
-    sigma: float
+# Share of the readout time by slow rotations that fast ones must show: noise in the poses hides some of it.
+_SHOWN_FAST = 0.5
 
 
 def judge_clip(
@@ -37,6 +33,7 @@ def judge_clip(
     remedy: Remedy | None = None,
     against: str = "",
     vibration_px: float = 0.0,
+    speeds: tuple[ReadoutTime, ReadoutTime] | None = None,
 ) -> Verdict:
     """Judge the path of a video.
 
@@ -56,6 +53,8 @@ def judge_clip(
         The reason why the frames are no longer as they were read, such as stabilisation; empty if there is none.
     vibration_px : float
         What frames rotate beyond their path, as `unfollowed_px` gives it.
+    speeds : pair of ReadoutTime, optional
+        The readout times by slow and by fast rotations, as `readouts_by_speed` gives them.
 
     Returns
     -------
@@ -65,6 +64,7 @@ def judge_clip(
     """
     assert result.path is not None
     time = ReadoutTime(float(result.path.readout_s[0]), float(result.path.sigma_readout_s[0]))
+    beyond = abs(float(result.path.unbounded_s[0])) - SIGMAS * time.sigma
     reasons = loose_reasons(keys) + height_reasons(remedy) + unexplained_reasons(keys, None)
     rec = keys.reconstruction
     shift = max(largest_shift_px(rec.camera(i), rec.motion(i), rec.shutter_model) for i in range(rec.num_images))
@@ -73,13 +73,13 @@ def judge_clip(
         return Verdict("not-determined", "doubtful", (f"{against}.", *reasons), {}, tuple(rec.image_names))
     if not most > _UNSEEN_PX:
         shutter = "not-found"
-    elif abs(time.seconds) - SIGMAS * time.sigma > frame_s:
+    elif beyond > frame_s:
         # whatever bends them, corrected as by a shutter they would be bent the more
         shutter = "not-determined"
         reasons.insert(
             0,
-            f"The readout appears to take {1e3 * abs(time.seconds):.1f} ms, longer than the {1e3 * frame_s:.1f} ms "
-            "from frame to frame: something else bends the frames.",
+            f"The readout appears to take longer than the {1e3 * frame_s:.1f} ms from frame to frame: something else "
+            "bends the frames.",
         )
     elif abs(time.seconds) > SIGMAS * time.sigma:
         shutter = "found"
@@ -94,6 +94,12 @@ def judge_clip(
             f"The frames rotate by {vibration_px:.1f} px more than their path explains: the camera vibrates faster "
             "than half of the frame rate, or something else bends the frames."
         )
+    if speeds is not None and _runs_the_other_way(*speeds):
+        reasons.append(
+            f"Slow rotations ask for a readout time of {1e3 * speeds[0].seconds:.1f} ms, fast ones for "
+            f"{1e3 * speeds[1].seconds:.1f} +- {1e3 * speeds[1].sigma:.1f} ms: the camera vibrates faster than half of "
+            "the frame rate, and the readout time may be wrong."
+        )
     if halves is not None:
         a, b = halves
         apart = abs(a.seconds - b.seconds) / float(np.hypot(a.sigma, b.sigma))
@@ -104,6 +110,13 @@ def judge_clip(
             )
     lens_only = tuple(rec.image_names) if shutter == "not-determined" else ()
     return Verdict(shutter, "doubtful" if reasons else "trusted", tuple(reasons), {}, lens_only)
+
+
+def _runs_the_other_way(slow: ReadoutTime, fast: ReadoutTime) -> bool:
+    """Whether fast rotations are not those of the lines, but show in the frames as others."""
+    sign = np.sign(slow.seconds)
+    missing = sign * (_SHOWN_FAST * slow.seconds - fast.seconds)
+    return bool(missing > APART * np.hypot(fast.sigma, _SHOWN_FAST * slow.sigma))
 
 
 def unfollowed_px(reconstruction: Reconstruction, own: OwnMotions) -> float:
@@ -138,6 +151,13 @@ def problem_of(evidence: Mapping[str, Any]) -> str:
         apart = abs(first["seconds"] - second["seconds"]) / np.hypot(first["sigma"], second["sigma"])
         if apart > APART:
             return f"the halves of the video contradict each other, {apart:.0f} standard deviations apart"
-    if abs(evidence.get("of_frame", 0.0)) * (1 - SIGMAS * sigma / abs(seconds)) > 1:
+    if evidence.get("by_speed"):
+        slow, fast = (ReadoutTime(each["seconds"], each["sigma"]) for each in evidence["by_speed"])
+        if _runs_the_other_way(slow, fast):
+            return (
+                "the camera vibrates faster than half of the frame rate: slow and fast rotations contradict each other"
+            )
+    frame_s = abs(seconds / evidence["of_frame"]) if evidence.get("of_frame") else np.inf
+    if abs(evidence.get("unbounded_seconds", seconds)) - SIGMAS * sigma > frame_s:
         return "it would be longer than the time from frame to frame: something else bends the frames"
     return ""

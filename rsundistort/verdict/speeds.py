@@ -1,0 +1,113 @@
+"""The readout time by slow and by fast rotations: they differ where a camera vibrates faster than its frames show."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+__all__ = ["ReadoutTime", "readouts_by_speed"]
+
+Array = NDArray[np.float64]
+
+# Fewer frames than this of one part have no spectrum to speak of.
+_FEWEST = 24
+# Periods in a part that a rotation has at least: slower ones are what lens and scene leave, and the window's edge.
+_LEAST_PERIODS = 2
+# A Hann window spreads each rotation over three frequencies: what is left of neighbours goes together.
+_TOGETHER = 1.5
+
+
+class ReadoutTime(NamedTuple):
+    """Time of the readout of a frame in seconds, and its standard deviation."""
+
+    seconds: float
+    sigma: float
+
+
+def readouts_by_speed(
+    time_s: Array, part: NDArray[np.int64], R_cw: Array, turn_sigma: Array, phi: Array, phi_sigma: Array,
+    readout_s: float,
+) -> tuple[ReadoutTime, ReadoutTime] | None:  # fmt: skip
+    """The readout time by rotations slower and faster than a quarter of the frame rate.
+
+    The lines of a frame rotate by the readout time times the rate of the frames. A rotation faster than half of the
+    frame rate F shows in the frames as one of F less its frequency that runs the other way, whose rate has the other
+    sign: then fast rotations ask for another readout time than slow ones, most likely for a negative one. Both spectra
+    are compared, so that rates need no differences of frames, which would miss fast ones.
+
+    Parameters
+    ----------
+    time_s, part : (m,) array
+        When the middle lines of the frames were read, and the parts that cuts separate.
+    R_cw, turn_sigma : (m, 3, 3), (m, 3) array
+        Rotations of the frames, each found from its own measurements, and their standard deviations; NaN where unknown.
+    phi, phi_sigma : (m, 3) array
+        Likewise rotations during the readout, radians per frame.
+    readout_s : float
+        The readout time that was found: lines average over it.
+
+    Returns
+    -------
+    pair of ReadoutTime or None
+        By slow and by fast rotations; None if there are too few frames, or a kind of rotation is lost in the noise.
+    """
+    spectra = [
+        _spectra(time_s[mine], R_cw[mine], turn_sigma[mine], phi[mine], phi_sigma[mine], readout_s)
+        for each in np.unique(part)
+        if len(mine := np.flatnonzero(part == each)) >= _FEWEST
+    ]
+    if not spectra:
+        return None
+    fast, lines, rates, line_noise, rate_noise = (np.concatenate(each) for each in zip(*spectra, strict=True))
+    found = [_slope(lines[mine], rates[mine], line_noise[mine], rate_noise[mine], readout_s) for mine in (~fast, fast)]
+    slow, rest = found
+    return None if slow is None or rest is None else (slow, rest)
+
+
+def _spectra(
+    time_s: Array, R_cw: Array, turn_sigma: Array, phi: Array, phi_sigma: Array, readout_s: float
+) -> tuple[NDArray[np.bool_], NDArray[np.complex128], NDArray[np.complex128], Array, Array]:
+    """Whether frequencies (n,) are fast; spectra (n, 3) of phi and of the rates; and power (n, 3) of their noise."""
+    known = np.isfinite(R_cw).all(axis=(1, 2)) & np.isfinite(phi).all(1) & np.isfinite(phi_sigma).all(1)
+    if known.sum() < _FEWEST:
+        none = np.zeros((0, 3))
+        return np.zeros(0, bool), none.astype(complex), none.astype(complex), none, none
+    time, R, lines = time_s[known], R_cw[known], phi[known]
+    steps = Rotation.from_matrix(R[1:] @ R[:-1].transpose(0, 2, 1)).as_rotvec()
+    turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    step_s = float(np.median(np.diff(time)))
+    length = time[-1] - time[0] + step_s
+    # the rate of a path under a window: that of both, less the window's own
+    phase = 2 * np.pi * (time - time[0] + 0.5 * step_s) / length
+    window, slope = 0.5 * (1 - np.cos(phase)), np.pi / length * np.sin(phase)
+    turned -= np.average(turned, axis=0, weights=window)
+    frequency = np.arange(_LEAST_PERIODS, int(0.5 * length / step_s)) / length
+    waves = np.exp(-2j * np.pi * frequency[:, None] * time)
+    circular = 2j * np.pi * frequency[:, None]
+    # a steady motion that is fitted to a period shows less of it, in its rate and in its pose
+    z = np.maximum(np.pi * frequency * abs(readout_s), 1e-3)
+    shown = 3 * (np.sin(z) - z * np.cos(z)) / z**2 / np.sin(z)
+    rates = (circular * (waves @ (window[:, None] * turned)) - waves @ (slope[:, None] * turned)) * shown[:, None]
+    of_turns, of_lines = turn_sigma[known] ** 2, phi_sigma[known] ** 2
+    rate_noise = np.abs(circular) ** 2 * (window**2 @ of_turns) + slope**2 @ of_turns
+    line_noise = np.broadcast_to(window**2 @ of_lines, rate_noise.shape)
+    fast = frequency > 0.25 / step_s
+    return fast, waves @ (window[:, None] * lines), rates, line_noise, rate_noise * shown[:, None] ** 2
+
+
+def _slope(
+    lines: NDArray[np.complex128], rates: NDArray[np.complex128], line_noise: Array, rate_noise: Array, about: float
+) -> ReadoutTime | None:
+    """What the rates are multiplied by in the lines, by the scatter of what is left; None if no rate shows."""
+    weight = 1.0 / (line_noise + about**2 * rate_noise)
+    power = float((weight * (np.abs(rates) ** 2 - rate_noise)).sum())
+    chance = float((weight * rate_noise).sum())
+    if not power > chance:
+        return None
+    slope = float((weight * (lines * rates.conj()).real).sum()) / power
+    left = np.maximum(np.abs(lines - slope * rates) ** 2, line_noise + slope**2 * rate_noise)
+    variance = 0.5 * _TOGETHER * float((weight**2 * np.abs(rates) ** 2 * left).sum()) / power**2
+    return ReadoutTime(slope, float(np.sqrt(variance)))

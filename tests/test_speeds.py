@@ -1,0 +1,88 @@
+"""The readout time by slow and by fast rotations, of frames whose lines are fitted here one by one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from clips import HandHeld
+from scipy.spatial.transform import Rotation
+
+from rsundistort.verdict.clip import problem_of
+from rsundistort.verdict.speeds import readouts_by_speed
+
+FRAME_S = 1 / 30
+NOISE = 2e-4
+
+
+def lines_of(rotations_at, time_s, readout_s):
+    """Rotation (m, 3, 3) in the middle of each frame, and rotation over it (m, 3): the steady motion nearest to it."""
+    late = np.linspace(-0.5, 0.5, 33) * readout_s
+    R_cw, phi = [], []
+    for time in time_s:
+        middle = rotations_at(np.array([time]))[0]
+        turns = Rotation.from_matrix(rotations_at(time + late) @ middle.T).as_rotvec()
+        slope, constant = np.polyfit(late / readout_s, turns, 1)
+        R_cw.append(Rotation.from_rotvec(constant).as_matrix() @ middle)
+        phi.append(slope)
+    return np.array(R_cw), np.array(phi)
+
+
+def by_speed(rotations_at, rng, readout_s=0.02, num=60, part=None):
+    """The two readout times of frames with noise."""
+    time_s = np.arange(num) * FRAME_S
+    R_cw, phi = lines_of(rotations_at, time_s, readout_s)
+    R_cw = Rotation.from_rotvec(rng.normal(0, NOISE, (num, 3))).as_matrix() @ R_cw
+    sigma = np.full((num, 3), NOISE)
+    phi = phi + rng.normal(0, NOISE, (num, 3))
+    return readouts_by_speed(time_s, np.zeros(num, int) if part is None else part, R_cw, sigma, phi, sigma, readout_s)
+
+
+def shaken(seed, hz, size):
+    """A hand, and a vibration of one frequency."""
+
+    def rotations(time_s):
+        angle = 2 * np.pi * hz * np.asarray(time_s)[:, None] + [0.0, 1.0, 2.0]
+        return Rotation.from_rotvec(size * np.sin(angle)).as_matrix() @ HandHeld(seed).rotations(time_s)
+
+    return rotations
+
+
+@pytest.mark.parametrize("readout_s", [0.008, 0.02, 0.03])
+@pytest.mark.parametrize("hz", [9.0, 12.5])
+def test_slow_and_fast_rotations_of_a_hand_ask_for_the_same_readout_time(rng, readout_s, hz):
+    found = by_speed(shaken(1, hz, 0.003), rng, readout_s)
+    assert found is not None
+    for seconds, sigma in found:
+        assert abs(seconds - readout_s) < 4 * sigma + 0.03 * readout_s
+        assert sigma < 0.1 * readout_s
+
+
+@pytest.mark.parametrize("hz", [15.7, 17.0, 20.0])
+def test_a_vibration_faster_than_half_of_the_frame_rate_runs_the_other_way(rng, hz):
+    slow, fast = by_speed(shaken(1, hz, 0.003), rng)
+    assert abs(slow.seconds - 0.02) < 4 * slow.sigma
+    # what the frames show has a rate of this share of that of the lines, and its sign is the other
+    shown = -0.02 * hz / (30 - hz)
+    assert fast.seconds < 0.3 * shown
+    told = {"seconds": 0.024, "sigma": 0.0005, "of_frame": 0.72, "source": "the video"}
+    assert problem_of(told) == ""
+    assert "vibrates faster" in problem_of(told | {"by_speed": [each._asdict() for each in (slow, fast)]})
+
+
+def test_a_readout_against_its_direction_has_the_same_sign_at_all_speeds(rng):
+    hand = shaken(1, 11.0, 0.003)
+    time_s = np.arange(60) * FRAME_S
+    R_cw, phi = lines_of(hand, time_s, 0.02)
+    sigma = np.full((60, 3), NOISE)
+    slow, fast = readouts_by_speed(time_s, np.zeros(60, int), R_cw, sigma, -phi, sigma, -0.02)
+    assert slow.seconds == pytest.approx(-0.02, rel=0.02)
+    assert fast.seconds == pytest.approx(-0.02, rel=0.05)
+    told = {"seconds": -0.02, "sigma": 0.0005, "of_frame": -0.6, "source": "the video"}
+    assert problem_of(told | {"by_speed": [slow._asdict(), fast._asdict()]}) == ""
+
+
+def test_nothing_is_said_of_few_frames_of_gaps_or_of_rotations_lost_in_the_noise(rng):
+    assert by_speed(shaken(1, 9.0, 0.003), rng, num=20) is None
+    assert by_speed(shaken(1, 9.0, 0.003), rng, num=40, part=np.repeat([0, 1], 20)) is None
+    still = by_speed(lambda time_s: np.tile(np.eye(3), (len(time_s), 1, 1)), rng)
+    assert still is None
