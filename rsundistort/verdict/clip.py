@@ -89,6 +89,18 @@ def judge_clip(
             f"The camera moved too little to determine the readout time: {1e3 * time.seconds:.1f} +- "
             f"{1e3 * time.sigma:.1f} ms."
         )
+    reasons += _contradictions(vibration_px, speeds, halves)
+    lens_only = tuple(rec.image_names) if shutter == "not-determined" else ()
+    return Verdict(shutter, "doubtful" if reasons else "trusted", tuple(reasons), {}, lens_only)
+
+
+def _contradictions(
+    vibration_px: float,
+    speeds: tuple[ReadoutTime, ReadoutTime] | None,
+    halves: tuple[ReadoutTime, ReadoutTime] | None,
+) -> list[str]:
+    """Why the readout time may be wrong, whatever its standard deviation."""
+    reasons = []
     if vibration_px > _UNSEEN_PX:
         reasons.append(
             f"The frames rotate by {vibration_px:.1f} px more than their path explains: the camera vibrates faster "
@@ -108,8 +120,7 @@ def judge_clip(
                 f"The readout time is {1e3 * a.seconds:.1f} ms by the first half of the video and "
                 f"{1e3 * b.seconds:.1f} ms by the second, {apart:.0f} standard deviations apart."
             )
-    lens_only = tuple(rec.image_names) if shutter == "not-determined" else ()
-    return Verdict(shutter, "doubtful" if reasons else "trusted", tuple(reasons), {}, lens_only)
+    return reasons
 
 
 def _runs_the_other_way(slow: ReadoutTime, fast: ReadoutTime) -> bool:
