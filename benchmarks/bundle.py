@@ -142,12 +142,12 @@ def ours(folder: Path, model: str, repeat: int) -> dict[str, Any]:
     """Time per iteration of our solver, in this process."""
     from rsundistort import BundleOptions, Camera, Observations, Reconstruction
     from rsundistort.bundle import elimination
+    from rsundistort.bundle.prior_sigmas import PriorSigmas
     from rsundistort.bundle.problem import BundleProblem
     from rsundistort.bundle.solver import minimize
-    from rsundistort.bundle.spreads import Spreads
 
     def problem(rec: Any, **options: Any) -> Any:
-        return BundleProblem(rec, model, BundleOptions(loss="squared", **options), 0.5, Spreads(0.03, 0.3))
+        return BundleProblem(rec, model, BundleOptions(loss="squared", **options), 0.5, PriorSigmas(0.03, 0.3))
 
     def solve(problem: Any) -> Any:
         return minimize(
@@ -300,12 +300,12 @@ def floor(rec: Any, nb: int) -> tuple[float, float]:
 def covariances() -> None:
     """Time of the covariances of blocks of photos, over that of the solution of the same system for every unknown."""
     from rsundistort import BundleOptions
+    from rsundistort.bundle.prior_sigmas import PriorSigmas
     from rsundistort.bundle.problem import BundleProblem
-    from rsundistort.bundle.spreads import Spreads
 
     for photos in (30, 125, 500):
         rec = make_problem("block", PER_PHOTO * photos)
-        problem = BundleProblem(rec, "rotation", BundleOptions(loss="squared"), 0.5, Spreads(0.03, 0.3))
+        problem = BundleProblem(rec, "rotation", BundleOptions(loss="squared"), 0.5, PriorSigmas(0.03, 0.3))
         state = problem.initial_state()
 
         def timed(of_priors: bool, problem: Any = problem, state: Any = state) -> float:

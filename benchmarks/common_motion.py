@@ -148,7 +148,7 @@ def main() -> int:
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     for kind in args.kinds:
         found = figures(kind, seeds)
-        with mock.patch("rsundistort.bundle.spreads.has_means", return_value=False):
+        with mock.patch("rsundistort.bundle.prior_sigmas.has_means", return_value=False):
             zero = figures(kind, seeds)
         print(json.dumps({"kind": kind, "scenes": len(seeds), **found, "means_of_zero": zero}), flush=True)
     return 0

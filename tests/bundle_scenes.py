@@ -9,8 +9,8 @@ from numpy_reference import DIRECTIONS, Fisheye, lens_of, project
 from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, Camera, Observations, Reconstruction
+from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
-from rsundistort.bundle.spreads import Spreads
 
 LENS = [-0.12, 0.03, 0.001, -0.002]
 FISHEYE = Fisheye([0.05, -0.02, 0.01, -0.004])
@@ -82,7 +82,7 @@ def noisy_problem(rng, model, loss="squared", factor_limit=1e10, sigma_px=0.5, r
     if varying:
         start = replace(start, variation=rng.normal(size=(num_images, 3)) * [0.05, 0.02, 0.02])
     options = BundleOptions(loss=loss, factor_limit=factor_limit, cg_tolerance=1e-13, refine=refine, varying=varying)
-    problem = BundleProblem(start, model, options, sigma_px, Spreads(0.03, 0.1, 0.02, 0.01))
+    problem = BundleProblem(start, model, options, sigma_px, PriorSigmas(0.03, 0.1, 0.02, 0.01))
     return problem, problem.initial_state()
 
 

@@ -23,9 +23,9 @@ from rsundistort import (
     unproject_points,
 )
 from rsundistort.bundle import choose_model
+from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.bundle.remains import agreement_of_waves, half_across_readout
-from rsundistort.bundle.spreads import Spreads
 from rsundistort.errors import InputError
 from rsundistort.model import BEND_GROUPS, Bend
 from rsundistort.model.bend import bend_functions, splines_at
@@ -244,7 +244,9 @@ def still(rec):
 def test_derivatives_of_the_adjustment(rng, model, way):
     truth = make_scene(rng, model, way=way, num_points=60, noise_px=2.0)
     options = BundleOptions(bends=GROUPS, loss="squared")
-    problem = BundleProblem(truth, model, options, 0.5, Spreads(0.03, 0.1, bends=(1e-3,) * GROUPS, ways=(0.01,) * 2))
+    problem = BundleProblem(
+        truth, model, options, 0.5, PriorSigmas(0.03, 0.1, bends=(1e-3,) * GROUPS, ways=(0.01,) * 2)
+    )
     state = problem.initial_state()
     residuals, J, _ = problem._jacobians(state)
     residuals, J, h = residuals.copy(), J.copy(), 1e-6

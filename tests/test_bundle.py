@@ -22,8 +22,8 @@ from rsundistort.bundle import (
 )
 from rsundistort.bundle.choice import hold_out
 from rsundistort.bundle.intrinsics import moved_camera
+from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
-from rsundistort.bundle.spreads import Spreads
 from rsundistort.errors import InputError
 from rsundistort.model import READOUTS
 from rsundistort.model.projection import unproject_points
@@ -45,7 +45,7 @@ def relative_poses(rec):
 
 def sigma_of_variation(result, options):
     """(m, 3) standard deviations of f, cx and cy of each photo against their means, which are the camera's."""
-    spreads = Spreads(1.0, 1.0, result.focal_sigma, result.centre_sigma)
+    spreads = PriorSigmas(1.0, 1.0, result.focal_sigma, result.centre_sigma)
     problem = BundleProblem(result.reconstruction, result.reconstruction.shutter_model, options, 0.2, spreads)
     covariance = problem.linearize(problem.initial_state()).covariance()
     m, nb = problem._free.shape
@@ -65,7 +65,7 @@ def test_residuals_and_gradient_vanish_at_the_truth_of_the_numpy_model(model, di
     assert valid.all()
     assert np.abs(res).max() < 1e-9  # px: 1e-12 times the focal length
     options = BundleOptions(loss="squared")
-    problem = BundleProblem(rec, model, options, 1.0, Spreads(1e9, 1e9))  # else the priors pull
+    problem = BundleProblem(rec, model, options, 1.0, PriorSigmas(1e9, 1e9))  # else the priors pull
     equations = problem.linearize(problem.initial_state())
     # Jacobians of 1000 px times residuals of 1e-12 to 1e-10 px, summed over 60 points or 6 photos
     assert np.abs(equations._g_frame).max() < 1e-5
@@ -225,7 +225,7 @@ def test_estimated_spread_is_the_mean_square_of_what_is_found_and_what_is_left_o
 def test_settling_moves_points_alone_and_never_to_a_higher_cost(rng):
     truth = make_scene(rng, "rotation", noise_px=0.5)
     start = replace(truth, points_w=truth.points_w + 0.02 * rng.normal(size=truth.points_w.shape))
-    problem = BundleProblem(start, "rotation", BundleOptions(loss="squared"), 0.5, Spreads(0.03, 0.03))
+    problem = BundleProblem(start, "rotation", BundleOptions(loss="squared"), 0.5, PriorSigmas(0.03, 0.03))
     state = problem.initial_state()
     before = problem._track_costs(state)
     settled = problem.settle(state)
@@ -476,7 +476,7 @@ def test_what_one_kernel_sees_another_does(rng):
     np.testing.assert_allclose(res[valid], 0, atol=1e-6)
     rec = rec.with_points(valid, min_track=1)
     options = BundleOptions(loss="squared", refine=("f", "k1"))
-    fresh, other = (BundleProblem(rec, "rotation", options, 1.0, Spreads(1.0, 1.0)) for _ in range(2))
+    fresh, other = (BundleProblem(rec, "rotation", options, 1.0, PriorSigmas(1.0, 1.0)) for _ in range(2))
     state = fresh.initial_state()
     np.testing.assert_allclose(fresh.linearize(state).cost, other.cost(state), rtol=1e-12)
     of_lens = fresh._camera_jacobians(state)

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, Camera, Observations, Reconstruction, bundle_adjust
 from rsundistort.bundle import Posterior
+from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
-from rsundistort.bundle.spreads import Spreads
 from rsundistort.critical import advise, clock_contrast, common_motion, heal, shape_cost, still_probability
 from rsundistort.errors import InputError
 
@@ -300,7 +300,7 @@ def test_the_velocity_of_a_softly_still_photo_counts_as_the_angle_that_displaces
         turn, travel = np.zeros((2, scene.num_images, 3))
         turn[3], travel[3] = phi, velocity
         moved = measured(replace(scene, phi=turn, velocity=travel))
-        problem = BundleProblem(moved, MODEL, options, NOISE_PX, Spreads(1e6, 1e6))
+        problem = BundleProblem(moved, MODEL, options, NOISE_PX, PriorSigmas(1e6, 1e6))
         return problem.cost(problem.initial_state())
 
     nothing = np.zeros(3)

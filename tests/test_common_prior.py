@@ -12,8 +12,8 @@ from numpy_reference import project
 from rsundistort import BundleOptions, Camera, Observations, Reconstruction, bundle_adjust
 from rsundistort.bundle import Posterior
 from rsundistort.bundle.common_motion import LEAST_PHOTOS
+from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
-from rsundistort.bundle.spreads import Spreads
 from rsundistort.synthetic import look_at
 
 # thousands of calls on problems this small wait for threads longer than they compute
@@ -29,7 +29,7 @@ def shared_problem(rng, refine=(), factor_limit=1e10, num_images=9):
     scene = replace(scene, cameras=scene.cameras[:2], camera_idx=np.arange(num_images) // (num_images - 1))
     start = replace(perturbed(scene, rng, 0.01, 0.02), phi=scene.phi, velocity=scene.velocity)
     options = BundleOptions(loss="squared", factor_limit=factor_limit, cg_tolerance=1e-13, refine=refine)
-    problem = BundleProblem(start, MODEL, options, 0.5, Spreads(0.03, 0.1, means=MEANS))
+    problem = BundleProblem(start, MODEL, options, 0.5, PriorSigmas(0.03, 0.1, means=MEANS))
     state = problem.initial_state()
     return problem, replace(state, means=state.means + 0.1 * rng.normal(size=state.means.shape) * MEANS)
 

@@ -22,8 +22,8 @@ from rsundistort import (
     critical_motion,
 )
 from rsundistort.batch.progress import StageLog
+from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
-from rsundistort.bundle.spreads import Spreads
 from rsundistort.critical import advise, heal, shape_cost, still_probability, with_remedy
 from rsundistort.errors import InputError
 from rsundistort.io import read_known_lengths, read_known_motions
@@ -166,7 +166,7 @@ def test_hessian_without_a_gauge_has_as_many_zeros_as_the_meter_says(name):
     scene = named_scene(name, num_points=80)
     scene = with_measurements(scene, np.zeros((scene.num_images, 3)), "two-step")
     options = BundleOptions(loss="squared", outlier_rounds=0)
-    problem = BundleProblem(scene, "two-step", options, 1.0, Spreads(1e9, 1e9))
+    problem = BundleProblem(scene, "two-step", options, 1.0, PriorSigmas(1e9, 1e9))
     state = problem.initial_state()
     _, J_frame, _ = problem._jacobians(state)
     obs = problem._start.observations.select(problem._structure.order)

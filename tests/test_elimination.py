@@ -17,11 +17,11 @@ from rsundistort.bundle.coarse import CoarseSpace
 from rsundistort.bundle.conjugate_gradients import solve_iteratively
 from rsundistort.bundle.elimination import Elimination
 from rsundistort.bundle.envelope import Envelope
+from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.bundle.reduced import Reduced
 from rsundistort.bundle.solver import minimize
 from rsundistort.bundle.sparse_blocks import SparseBlocks
-from rsundistort.bundle.spreads import Spreads
 from rsundistort.bundle.structure import Structure
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -320,7 +320,11 @@ def test_iterations_do_not_grow_with_the_block(model, monkeypatch):
     counts = []
     for photos in (100, 400):
         problem = BundleProblem(
-            block(photos, monkeypatch), model, BundleOptions(loss="squared", factor_limit=-1), 0.5, Spreads(0.03, 0.3)
+            block(photos, monkeypatch),
+            model,
+            BundleOptions(loss="squared", factor_limit=-1),
+            0.5,
+            PriorSigmas(0.03, 0.3),
         )
         e = problem._elimination
         reduced, _ = problem.linearize(problem.initial_state()).reduce(1e-7)
@@ -335,7 +339,7 @@ def test_steps_by_conjugate_gradients_end_where_factored_ones_do(monkeypatch):
     ends = []
     for factor_limit in (-1, 1e15):
         options = BundleOptions(loss="squared", factor_limit=factor_limit)
-        problem = BundleProblem(rec, "rotation", options, 0.5, Spreads(0.03, 0.3))
+        problem = BundleProblem(rec, "rotation", options, 0.5, PriorSigmas(0.03, 0.3))
         ends.append(
             minimize(
                 problem, problem.initial_state(), max_iterations=30, cost_tolerance=1e-7, step_tolerance=1e-10,
@@ -351,5 +355,5 @@ def test_steps_by_conjugate_gradients_end_where_factored_ones_do(monkeypatch):
 
 @pytest.mark.parametrize(("photos", "iterated"), [(20, False), (200, False), (800, True)])
 def test_large_systems_are_iterated_and_small_ones_factored(photos, iterated, monkeypatch):
-    problem = BundleProblem(block(photos, monkeypatch), "rotation", BundleOptions(), 0.5, Spreads(0.03, 0.3))
+    problem = BundleProblem(block(photos, monkeypatch), "rotation", BundleOptions(), 0.5, PriorSigmas(0.03, 0.3))
     assert (problem._elimination.space is not None) == iterated

@@ -15,8 +15,8 @@ from rsundistort.bundle import (
     choose_model,
 )
 from rsundistort.bundle.intrinsics import moved_camera
+from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
-from rsundistort.bundle.spreads import Spreads
 from rsundistort.errors import InputError
 from rsundistort.model.reprojection import reprojection_residuals
 
@@ -98,7 +98,7 @@ def guessing_problem(rng, used=4):
 
 def test_gradient_of_the_prior_on_intrinsics_equals_central_differences(rng):
     rec, options = guessing_problem(rng)
-    problem = BundleProblem(rec, "rotation", options, 1.0, Spreads(0.03, 0.1))
+    problem = BundleProblem(rec, "rotation", options, 1.0, PriorSigmas(0.03, 0.1))
     state = problem.initial_state()
     equations = problem.linearize(state)
     expected = gradients(equations)[2]

@@ -11,8 +11,8 @@ from bundle_scenes import dense_system, make_scene, noisy_problem
 from rsundistort import BundleOptions, KnownLength, bundle_adjust
 from rsundistort.bundle import Posterior
 from rsundistort.bundle.jackknife import Partition, by_corner, by_place, inflated, inflation
+from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
-from rsundistort.bundle.spreads import Spreads
 from rsundistort.critical.cost import _log_scale
 from rsundistort.errors import InputError
 
@@ -115,7 +115,7 @@ def test_pulls_of_known_lengths_are_those_of_the_whole_system(rng):
         return (given.image_names[obs.frame_idx[k]], *obs.xy_raw[k])
 
     lengths = [KnownLength(end(0), end(1), 1.0, 0.01), KnownLength(end(2), end(3), 2.0, 0.03)]
-    joined = BundleProblem(given, "rotation", replace(problem._options, lengths=lengths), 0.5, Spreads(0.03, 0.1))
+    joined = BundleProblem(given, "rotation", replace(problem._options, lengths=lengths), 0.5, PriorSigmas(0.03, 0.1))
     _, _, H, _ = whole_jacobian(joined, state)
     (m, nb), free = joined._free.shape, dense_system(joined, state)[2]
     J = np.zeros((2, len(H)))

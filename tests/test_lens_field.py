@@ -27,8 +27,8 @@ from rsundistort.batch.progress import StageLog
 from rsundistort.bundle import choose_model
 from rsundistort.bundle.intrinsics import GuessedCameras, moved_camera
 from rsundistort.bundle.lens_field import LensFields
+from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
-from rsundistort.bundle.spreads import Spreads
 from rsundistort.errors import FormatError, InputError
 from rsundistort.io import read_solution, write_solution
 from rsundistort.io.cameras import camera_from_json, camera_to_json
@@ -269,7 +269,7 @@ def test_the_gradient_is_that_of_the_cost(rng):
     turn = Rotation.from_rotvec(0.002 * rng.normal(size=(5, 3))).as_matrix()
     rec = replace(rec, cameras=[camera], R_cw=turn @ rec.R_cw)
     options = replace(options_of(rec), loss="soft-l1")
-    problem = BundleProblem(rec, "rotation", options, 0.5, Spreads(0.03, 0.1, field=0.2))
+    problem = BundleProblem(rec, "rotation", options, 0.5, PriorSigmas(0.03, 0.1, field=0.2))
     state = problem.initial_state()
     equations = problem.linearize(state)
     gradient = equations._g_camera

@@ -23,8 +23,8 @@ from bundle_scenes import (
 from numpy_reference import MODELS, Fisheye
 
 from rsundistort import BundleOptions
+from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
-from rsundistort.bundle.spreads import Spreads
 from rsundistort.model import KnownLength
 from rsundistort.model.reprojection import reprojection_residuals
 
@@ -151,7 +151,7 @@ def test_conjugate_gradients_of_several_clusters_give_the_factored_step(model, r
     steps = []
     for factor_limit in (1e10, -1):
         options = BundleOptions(loss="squared", factor_limit=factor_limit, cg_tolerance=1e-13, refine=refine)
-        problem = BundleProblem(start, model, options, 0.5, Spreads(0.03, 0.1))
+        problem = BundleProblem(start, model, options, 0.5, PriorSigmas(0.03, 0.1))
         assert (problem._elimination.space is not None) == (factor_limit < 0)
         steps.append(problem.linearize(problem.initial_state()).solve(1e-4)[0])
     for factored, iterated in zip(*steps, strict=True):
@@ -186,7 +186,7 @@ def test_known_lengths_join_the_system(damping, refine, rng):
 
     lengths = [KnownLength(end(0), end(1), 1.0, 0.01), KnownLength(end(2), end(3), 2.0, 0.03)]
     lengths.append(KnownLength(end(1), end(4), 1.5, 0.02))
-    joined = BundleProblem(given, "rotation", replace(problem._options, lengths=lengths), 0.5, Spreads(0.03, 0.1))
+    joined = BundleProblem(given, "rotation", replace(problem._options, lengths=lengths), 0.5, PriorSigmas(0.03, 0.1))
     H, g, free = dense_system(joined, state)
     m, nb = joined._free.shape
     points = slice(m * nb, m * nb + 3 * given.num_points)

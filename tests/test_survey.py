@@ -18,8 +18,8 @@ from surveys import READOUT_S, Flight, geodetic_of, with_readout
 
 from rsundistort import BundleOptions, KnownLength, RectifyOptions, SolveOptions, bundle_adjust
 from rsundistort.bundle import KnownPlaces
+from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
-from rsundistort.bundle.spreads import Spreads
 from rsundistort.errors import InputError, RsUndistortWarning
 from rsundistort.io import ExifFacts, GpsFix, read_solution, write_solution
 from rsundistort.model import ControlPoint
@@ -273,7 +273,7 @@ def test_the_gradient_with_known_places_is_that_of_the_cost(rng):
         places_of(truth, rng, 0.05), [control_of(truth, k) for k in (3, 7)], {"1.jpg": ([0.1] * 3, [0.02] * 3)}
     )
     problem = BundleProblem(
-        truth, "constant-motion", BundleOptions(places=known, sigma_px=1.0), 1.0, Spreads(0.05, 0.1)
+        truth, "constant-motion", BundleOptions(places=known, sigma_px=1.0), 1.0, PriorSigmas(0.05, 0.1)
     )
     state = problem.initial_state()
     equations = problem.linearize(state)

@@ -11,9 +11,9 @@ from ..errors import InputError
 from ..model import Reconstruction, check_shutter_model
 from .layout import Layout
 from .options import BundleOptions, BundleResult
+from .prior_sigmas import estimates_sigmas, starting_sigmas
 from .problem import BundleProblem
 from .rounds import Rounds
-from .spreads import estimates_spreads, starting_spreads
 
 __all__ = ["MODEL_SEQUENCE", "adjust_sequence", "bundle_adjust", "objective", "sequence_to"]
 
@@ -34,8 +34,8 @@ def objective(reconstruction: Reconstruction, shutter_model: str, options: Bundl
     """
     if options.sigma_px is None:
         raise InputError("the objective needs sigma_px: half a sum of squares means nothing without the noise")
-    spreads = starting_spreads(options, Layout.of(shutter_model, options), reconstruction)
-    problem = BundleProblem(reconstruction, shutter_model, options, options.sigma_px, spreads, heavy_tails=False)
+    sigmas = starting_sigmas(options, Layout.of(shutter_model, options), reconstruction)
+    problem = BundleProblem(reconstruction, shutter_model, options, options.sigma_px, sigmas, heavy_tails=False)
     return problem.cost(problem.initial_state())
 
 
@@ -84,7 +84,7 @@ def bundle_adjust(
         rounds.drop_outliers()
     most = options.spread_rounds + 1
     is_guess = options.path is None or options.path.start is None
-    if is_guess and not options.outlier_rounds and options.spread_rounds and estimates_spreads(shutter_model, options):
+    if is_guess and not options.outlier_rounds and options.spread_rounds and estimates_sigmas(shutter_model, options):
         # the first prior standard deviations are a guess: their solution need not be exact
         rounds.solve(options.round_tolerance)
         rounds.begin_next()

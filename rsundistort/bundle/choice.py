@@ -14,8 +14,8 @@ from ..model import SHUTTER_MODELS, Observations, Reconstruction, other_axis
 from ..model.reprojection import reprojection_residuals
 from .adjust import MODEL_SEQUENCE, bundle_adjust, objective
 from .options import BundleOptions
+from .prior_sigmas import PriorSigmas
 from .remains import CLIP, WAVES, agreement_of_waves, errors_without, half_across_readout, warps, waves
-from .spreads import Spreads
 
 __all__ = ["ModelChoice", "choose_model", "clipped_errors", "corners", "hold_out", "improves", "standard_errors"]
 
@@ -184,7 +184,7 @@ class _Fit:
     errors: NDArray[np.float64]
     rms_px: float
     left: float
-    spreads: Spreads
+    sigmas: PriorSigmas
 
     @property
     def is_explained(self) -> bool:
@@ -255,11 +255,11 @@ class _Fits:
         # start guarantees that a model never ends above the simpler one, which it contains
         cost = [objective(start, model, options) for start in starts]
         result = bundle_adjust(starts[int(np.argmin(cost))], model, options, step)
-        found, spreads = result.reconstruction, Spreads(result.phi_sigma, result.velocity_rms)
+        found, sigmas = result.reconstruction, PriorSigmas(result.phi_sigma, result.velocity_rms)
         errors, rms_px = clipped_errors(found, self.held_out, self._sigma_px)
         smooth = errors_without(warps, found, self.given.observations, self.held_out, self._sigma_px)
         left = max(float(errors.mean() - smooth.mean()), 0.0) if len(errors) else 0.0
-        self.done[label] = _Fit(label, model, varying, bends, residual_field, found, errors, rms_px, left, spreads)
+        self.done[label] = _Fit(label, model, varying, bends, residual_field, found, errors, rms_px, left, sigmas)
         return self.done[label]
 
     def along_other_axis(self, fit: _Fit, plain: _Fit) -> _Fit:
@@ -282,8 +282,8 @@ class _Fits:
         the means over the photos are subtracted, since a lens error can cause them.
         """
         rec = fit.reconstruction
-        options = replace(self._rough, varying=fit.varying, bends=fit.bends, phi_sigma=fit.spreads.phi)
-        options = replace(options, velocity_sigma=fit.spreads.velocity or None)
+        options = replace(self._rough, varying=fit.varying, bends=fit.bends, phi_sigma=fit.sigmas.phi)
+        options = replace(options, velocity_sigma=fit.sigmas.velocity or None)
         first = half_across_readout(rec)
         try:
             halves = [bundle_adjust(rec.take_points(half), fit.model, options) for half in (first, ~first)]
@@ -315,9 +315,9 @@ class _Fits:
 
     def at_limit(self, fit: _Fit) -> bool:
         """Whether the motions reach the limit that is known from elsewhere."""
-        limits = [(fit.spreads.phi, self._rough.phi_sigma_most)]
+        limits = [(fit.sigmas.phi, self._rough.phi_sigma_most)]
         if fit.model == "constant-motion":
-            limits.append((fit.spreads.velocity, self._rough.velocity_sigma_most))
+            limits.append((fit.sigmas.velocity, self._rough.velocity_sigma_most))
         return any(most is not None and spread >= _AT_LIMIT * most for spread, most in limits)
 
     def gain(self, before: _Fit, after: _Fit) -> float:

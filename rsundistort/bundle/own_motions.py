@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from ..model import Reconstruction
 from .options import BundleOptions
+from .prior_sigmas import PriorSigmas
 from .problem import BundleProblem, State
-from .spreads import Spreads
 
 __all__ = ["OwnMotions", "own_motions"]
 
@@ -60,7 +60,7 @@ def own_motions(reconstruction: Reconstruction, *, turns_only: bool = False) -> 
         Whether the centres, and the points, stay where they are.
     """
     options = BundleOptions(loss="cauchy")
-    problem = BundleProblem(reconstruction, "constant-motion", options, _NOISE_PX, Spreads(_LOOSE, _LOOSE))
+    problem = BundleProblem(reconstruction, "constant-motion", options, _NOISE_PX, PriorSigmas(_LOOSE, _LOOSE))
     own = np.array([0, 1, 2, 6, 7, 8] if turns_only else range(_UNKNOWNS))
     state = problem.initial_state()
     for last in range(1 if turns_only else _ROUNDS):

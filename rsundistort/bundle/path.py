@@ -51,7 +51,7 @@ class PathStart:
         Frames, in the order of the state.
     state : PathState
         How they move; its world is that of the reconstruction that begins there.
-    spreads : (rotation, travel)
+    sigmas : (rotation, travel)
         Prior standard deviations, as `PathPrior` takes them.
     noise : float, optional
         Factor of the noise, where the residuals have said so.
@@ -59,7 +59,7 @@ class PathStart:
 
     names: tuple[str, ...]
     state: PathState
-    spreads: tuple[float, ...]
+    sigmas: tuple[float, ...]
     noise: float | None = None
 
     def in_order(self, names: Sequence[str], otherwise: PathState) -> PathState:
@@ -183,11 +183,11 @@ class PathPrior:
         Times.
     reconstruction : Reconstruction
         Whose photos they are.
-    spreads : (rotation, travel)
+    sigmas : (rotation, travel)
         Square roots of the spectral densities Q: radians, and world units, per (time between frames)^(5/2).
     """
 
-    def __init__(self, path: FramePath, reconstruction: Reconstruction, spreads: tuple[float, float]) -> None:
+    def __init__(self, path: FramePath, reconstruction: Reconstruction, sigmas: tuple[float, float]) -> None:
         order, time, part = path.order(reconstruction.image_names)
         joined = part[order[1:]] == part[order[:-1]]
         self.first, self.second = order[:-1][joined], order[1:][joined]
@@ -197,10 +197,10 @@ class PathPrior:
         powers = [[dt**5 / 20, dt**4 / 8, dt**3 / 6], [dt**4 / 8, dt**3 / 3, dt**2 / 2], [dt**3 / 6, dt**2 / 2, dt]]
         # unit variance: times the inverse of the covariance's Cholesky factor
         self._whitening = np.linalg.inv(np.linalg.cholesky(np.array(powers).transpose(2, 0, 1)))
-        self.spreads = spreads
+        self.sigmas = sigmas
         # nothing comes before the first frame of a part: its changes are those of a path that began at rest
         self.begins = np.setdiff1d(self.first, self.second)
-        self.begins_sigma = np.sqrt(_FRAMES_BEFORE) * np.repeat(spreads, 3)
+        self.begins_sigma = np.sqrt(_FRAMES_BEFORE) * np.repeat(sigmas, 3)
         share, sigma = path.readout_prior
         span = np.array([camera.frame_span for camera in reconstruction.cameras])
         self.pace_prior, self.pace_sigma = share / span, sigma / span
@@ -243,7 +243,7 @@ class PathPrior:
 
     def _whitened(self, differences: Array) -> Array:
         """(q, 3, 6, ...) divided by their standard deviations."""
-        spread = np.repeat(self.spreads, 3).reshape(6, *(1,) * (differences.ndim - 3))
+        spread = np.repeat(self.sigmas, 3).reshape(6, *(1,) * (differences.ndim - 3))
         value: Array = np.einsum("qij,qj...->qi...", self._whitening, differences) / spread
         return value
 
@@ -301,7 +301,7 @@ class PathPrior:
     def unit_squares(self, squares: Array) -> tuple[Array, Array]:
         """Squares (q, 18) of residuals as those of standard deviations of 1: of rotation and of travel, (q, 9) each."""
         by_kind = squares.reshape(-1, 3, 2, 3)
-        turn, travel = (by_kind[:, :, k].reshape(-1, 9) * self.spreads[k] ** 2 for k in range(2))
+        turn, travel = (by_kind[:, :, k].reshape(-1, 9) * self.sigmas[k] ** 2 for k in range(2))
         return turn, travel
 
 

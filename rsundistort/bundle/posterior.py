@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from .jackknife import inflation_of
 from .options import BundleOptions, BundleResult
+from .prior_sigmas import PriorSigmas
 from .problem import BundleProblem
-from .spreads import Spreads
 
 __all__ = ["Posterior", "gauge_directions"]
 
@@ -31,7 +31,7 @@ class Posterior:
     def __init__(self, result: BundleResult, options: BundleOptions | None = None) -> None:
         rec = result.reconstruction
         per_unit = np.repeat([1.0, rec.baseline], 3)
-        spreads = Spreads(
+        sigmas = PriorSigmas(
             result.phi_sigma, max(result.velocity_sigma * rec.baseline, 1e-300),
             max(result.focal_sigma, 1e-300), max(result.centre_sigma, 1e-300), result.bend_sigmas,
             tuple(each * rec.baseline for each in result.way_sigmas), result.field_sigma_px, result.path_sigmas,
@@ -40,7 +40,7 @@ class Posterior:
         plain = replace(options or BundleOptions(), loss="squared")
         self._path = None if result.path is None else result.path.state
         self._problem = BundleProblem(
-            rec, rec.shutter_model, plain, result.sigma_px * result.noise_factor, spreads, path=self._path,
+            rec, rec.shutter_model, plain, result.sigma_px * result.noise_factor, sigmas, path=self._path,
             means=None if result.common is None else per_unit * result.common.values,
         )  # fmt: skip
         self._state = self._problem.initial_state()

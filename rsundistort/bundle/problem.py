@@ -27,7 +27,7 @@ from .normal_equations import Marginals, NormalEquations, Step
 from .options import LOSSES, BundleOptions
 from .path import PathPrior, PathState
 from .places import KnownPlaces, PlaceResiduals
-from .spreads import Spreads
+from .prior_sigmas import PriorSigmas
 from .structure import Structure
 
 __all__ = ["BundleProblem", "State"]
@@ -67,7 +67,7 @@ class BundleProblem:
     unless the shutter is global, velocity (world units per unit of the clock) if the motion is whole, and the variation
     of its intrinsics (log f, cx / fx, cy / fy) if the options say that they vary, and the coefficients of its bends, if
     it has any (`Layout`). Unknowns of a camera: the intrinsics that the options name, as in `moved_camera`, those of
-    `LensFields` if they ask for fields, and the means of its photos' motions if `Spreads` say how large they may be.
+    `LensFields` if they ask for fields, and the means of its photos' motions if `PriorSigmas` say how large these are.
     Seven unknowns are held for the gauge: the pose of the photo with the most observations, and one coordinate of the
     centre farthest from it; none where known places hold the frame. The prior on intrinsics has heavy tails
     (`prior_weight`), or it is normal.
@@ -79,7 +79,7 @@ class BundleProblem:
         shutter_model: str,
         options: BundleOptions,
         sigma_px: float,
-        spreads: Spreads,
+        sigmas: PriorSigmas,
         heavy_tails: bool = True,
         path: PathState | None = None,
         means: NDArray[np.float64] | None = None,
@@ -102,7 +102,7 @@ class BundleProblem:
         if options.path is not None:
             if shutter_model != "constant-motion":
                 raise InputError(f"frames on a path move by constant-motion, not by {shutter_model}")
-            self._path = PathPrior(options.path, reconstruction, (spreads.path[0], spreads.path[1]))
+            self._path = PathPrior(options.path, reconstruction, (sigmas.path[0], sigmas.path[1]))
         structure = Structure.from_observations(
             obs.frame_idx, obs.point_idx, reconstruction.num_images, reconstruction.num_points,
             None if self._path is None else (self._path.first, self._path.second),
@@ -129,43 +129,43 @@ class BundleProblem:
         if self._fields is not None:
             camera = reconstruction.camera_idx[self._structure.frame_idx]
             self._field_jacobian = self._fields.jacobian(reconstruction.cameras, camera, self._xy)
-        self._field_weight = spreads.field**-2.0 if options.residual_field else 0.0
+        self._field_weight = sigmas.field**-2.0 if options.residual_field else 0.0
         self._refine_codes = np.array([INTRINSICS[name] for name in options.refine], np.int64)
         span = reconstruction.frame_span()[:, None]
-        weight = [np.repeat((span[:, 0] / s)[:, None] ** 2, 3, axis=1) for s in self._motion_spreads(spreads)]
+        weight = [np.repeat((span[:, 0] / s)[:, None] ** 2, 3, axis=1) for s in self._motion_sigmas(sigmas)]
         self._motion_weight = np.hstack(weight)[:, : self._block - 6]
         if self._path is not None:  # which says it all
             self._motion_weight = np.zeros_like(self._motion_weight)
-        varied = np.array([spreads.focal, spreads.centre, spreads.centre])[: 3 * options.varying] ** -2.0
-        of_bends = self.layout.per_bend(spreads.bends, spreads.ways) ** -2.0
+        varied = np.array([sigmas.focal, sigmas.centre, sigmas.centre])[: 3 * options.varying] ** -2.0
+        of_bends = self.layout.per_bend(sigmas.bends, sigmas.ways) ** -2.0
         self._own_weight = np.tile(np.concatenate([varied, of_bends]), (len(span), 1))
         self._lengths = LengthResiduals(self._start, options.lengths)
         self._places = PlaceResiduals(self._start, options.places or KnownPlaces({}))
         self._known, self._known_weight = self._known_motions(span)
         self._free = self._free_unknowns()
-        self._means, self._means_start = self._motion_means(spreads), means
+        self._means, self._means_start = self._motion_means(sigmas), means
         poses = reconstruction.R_cw, reconstruction.center_w
         self._elimination = Elimination.of(
             self._structure, self._free, poses, options.factor_limit, options.cg_tolerance, self._path is not None
         )  # fmt: skip
         self._size = reconstruction.size
 
-    def _motion_means(self, spreads: Spreads) -> MotionMeans | None:
+    def _motion_means(self, sigmas: PriorSigmas) -> MotionMeans | None:
         """How motions depend on their means, if these are solved for."""
-        if not spreads.means:
+        if not sigmas.means:
             return None
         # what a photo's own limit bounds is no sample of the others, and few photos are none of their camera
         limits, start = self._options.phi_limits, self._start
-        limited = [limits.get(name, np.inf) < spreads.phi for name in start.image_names]
+        limited = [limits.get(name, np.inf) < sigmas.phi for name in start.image_names]
         few = np.bincount(start.camera_idx)[start.camera_idx] < LEAST_PHOTOS
-        return MotionMeans.of(start, spreads.means, self._free[:, 6:12] & ~(few | limited)[:, None])
+        return MotionMeans.of(start, sigmas.means, self._free[:, 6:12] & ~(few | limited)[:, None])
 
-    def _motion_spreads(self, spreads: Spreads) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _motion_sigmas(self, sigmas: PriorSigmas) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Standard deviations (m,) of the priors on phi and velocity, per frame, no wider than a photo's own limit."""
         limits = self._options.phi_limits
         most = np.array([limits.get(name, np.inf) for name in self._start.image_names])
         depths = [self._start.median_depth(i) if np.isfinite(each) else 1.0 for i, each in enumerate(most)]
-        return np.minimum(most, spreads.phi), np.minimum(most * depths, spreads.velocity)
+        return np.minimum(most, sigmas.phi), np.minimum(most * depths, sigmas.velocity)
 
     def _known_motions(self, span: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Motions (m, nb - 6) known from elsewhere, per unit of the clock, and their weights."""

@@ -27,9 +27,9 @@ from .path import (
     path_solution,
     with_path_motions,
 )  # fmt: skip
+from .prior_sigmas import Common, estimated, field_prior_sigma, path_prior_sigmas, settled, starting_sigmas
 from .problem import BundleProblem
 from .solver import minimize
-from .spreads import Common, estimated, field_spread, path_spreads, settled, starting_spreads
 from .triangulate import retriangulated
 
 __all__ = ["Rounds"]
@@ -108,7 +108,7 @@ class Rounds:
         self._path_moved = np.inf
         start = None if options.path is None else options.path.start
         if options.path is not None and start is not None:
-            prior = PathPrior(options.path, base, (start.spreads[0], start.spreads[1]))
+            prior = PathPrior(options.path, base, (start.sigmas[0], start.sigmas[1]))
             self._path = prior.start(base, start)
             base = with_path_motions(base, options.path, self._path)
             self._options = options = replace(options, known_bends=path_bends(base, options.path, self._path))
@@ -118,12 +118,12 @@ class Rounds:
         self._sigma_px = options.sigma_px or _noise_px(self._base, shutter_model, options.min_sigma_px)
         self._baseline = reconstruction.baseline
         self._layout = Layout.of(shutter_model, options)
-        self._spreads = starting_spreads(options, self._layout, self._base)
+        self._sigmas = starting_sigmas(options, self._layout, self._base)
         self._noise = 1.0
         if start is not None:
-            self._spreads = replace(self._spreads, path=start.spreads)
+            self._sigmas = replace(self._sigmas, path=start.sigmas)
             self._noise = start.noise or 1.0
-        self._weighed_spreads, self._weighed_noise = self._spreads, self._noise
+        self._weighed_sigmas, self._weighed_noise = self._sigmas, self._noise
         # Measurements that seem more exact than they are would pull the intrinsics over the hump of a prior with heavy
         # tails, and they would not come back: it is normal until the noise is known
         self._heavy_tails = self._had_heavy_tails = start is not None and start.noise is not None
@@ -136,7 +136,7 @@ class Rounds:
         options = self._options
         believed = replace(self._base, observations=self._base.observations.select(self._keep))
         problem = self._problem = BundleProblem(
-            believed, self._model, options, self._sigma_px * self._noise, self._spreads,
+            believed, self._model, options, self._sigma_px * self._noise, self._sigmas,
             heavy_tails=self._heavy_tails, path=self._path, means=self._means,
         )  # fmt: skip
         self._solved = minimize(
@@ -165,16 +165,16 @@ class Rounds:
         if asks_residuals:
             self._inflation = inflation(equations, problem.partitions(state), self._marginals, self._noise)
             self._noise, self._heavy_tails = self._inflation.noise, True
-        self._weighed_spreads = self._spreads
-        self._spreads = estimated(
-            self._spreads, self._current, self._marginals.photos, options, self._layout, self._baseline,
+        self._weighed_sigmas = self._sigmas
+        self._sigmas = estimated(
+            self._sigmas, self._current, self._marginals.photos, options, self._layout, self._baseline,
             self._common(equations),
         )  # fmt: skip
         self._means = state.means if state.means.size else None
         if options.residual_field:
             values, variances = problem.fields(state, self._marginals.cameras)
-            field = field_spread(values, variances, self._weighed_spreads.field)
-            self._spreads = replace(self._spreads, field=field)
+            field = field_prior_sigma(values, variances, self._weighed_sigmas.field)
+            self._sigmas = replace(self._sigmas, field=field)
         if state.path is not None:
             self._follow_path(problem, equations)
         self._new_points = self._current if self._turns_only else retriangulated(self._current, self._model)
@@ -200,8 +200,8 @@ class Rounds:
         assert options.path is not None
         residuals, variances = equations.coupling_variances()
         if np.isfinite(variances).all():
-            self._spreads = replace(
-                self._spreads, path=path_spreads(problem.path, residuals, variances, self._baseline)
+            self._sigmas = replace(
+                self._sigmas, path=path_prior_sigmas(problem.path, residuals, variances, self._baseline)
             )
         self._path = state.path
         bends = path_bends(self._current, options.path, state.path)
@@ -235,7 +235,7 @@ class Rounds:
         ) and not self._had_heavy_tails
         return (
             self._new_points is self._current
-            and settled(self._weighed_spreads, self._spreads, options.spread_tolerance)
+            and settled(self._weighed_sigmas, self._sigmas, options.spread_tolerance)
             and abs(self._noise - self._weighed_noise) < _SETTLED_NOISE * self._noise
             and not awaits_tails
             and (options.path is None or self._path_moved < _SETTLED_BEND)
@@ -244,7 +244,7 @@ class Rounds:
     def begin_next(self, with_same_weights: bool = False) -> None:
         """Start the next solve from the last, with its prior standard deviations and noise, or as it was weighed."""
         if with_same_weights:
-            self._spreads, self._noise = self._weighed_spreads, self._weighed_noise
+            self._sigmas, self._noise = self._weighed_sigmas, self._weighed_noise
             self._heavy_tails = self._had_heavy_tails
         self._base = replace(self._new_points, observations=self._base.observations)
 
@@ -252,7 +252,7 @@ class Rounds:
         """What the last solve found."""
         current, options, layout, state = self._current, self._options, self._layout, self._solved.state
         res, valid = reprojection_residuals(current)
-        weighed, spreads = self._weighed_noise, self._spreads
+        weighed, sigmas = self._weighed_noise, self._sigmas
         by = self._inflation.photos / weighed, self._inflation.cameras / weighed
         covariances, of_intrinsics = inflated(self._marginals, *by)
         path = None
@@ -268,22 +268,22 @@ class Rounds:
             self._solved.cost_history,
             self._iterations,
             self._sigma_px,
-            spreads.phi,
-            spreads.velocity / self._baseline,
-            spreads.focal if options.varying else 0.0,
-            spreads.centre if options.varying else 0.0,
-            spreads.bends,
-            tuple(each / self._baseline for each in spreads.ways),
+            sigmas.phi,
+            sigmas.velocity / self._baseline,
+            sigmas.focal if options.varying else 0.0,
+            sigmas.centre if options.varying else 0.0,
+            sigmas.bends,
+            tuple(each / self._baseline for each in sigmas.ways),
             covariances[:, : layout.motion, : layout.motion],
             _sigma_intrinsics(current, options.refine, of_intrinsics),
             float(np.sqrt(np.mean(res[valid] ** 2))) if valid.any() else float("nan"),
             len(self._given.observations) - len(current.observations),
             self._inflation.photos,
             weighed,
-            self._weighed_spreads.field if options.residual_field else 0.0,
+            self._weighed_sigmas.field if options.residual_field else 0.0,
             tuple(np.sqrt(self._problem.fields(state, of_intrinsics)[1].sum(1)).tolist()),
             path,
-            spreads.path,
+            sigmas.path,
             common=self._common_motion(),
         )
 
@@ -292,5 +292,5 @@ class Rounds:
             return None
         per_unit = np.repeat([1.0, 1.0 / self._baseline], 3)
         variances = np.diagonal(self._marginals.cameras).reshape(len(self._means), -1)[:, -6:]
-        sigmas = (*(np.array(self._weighed_spreads.means) * per_unit).tolist(),)
+        sigmas = (*(np.array(self._weighed_sigmas.means) * per_unit).tolist(),)
         return CommonMotion(self._means * per_unit, np.sqrt(np.maximum(variances, 0.0)) * per_unit, sigmas)

@@ -15,22 +15,22 @@ from .path import PathPrior
 
 __all__ = [
     "Common",
-    "Spreads",
+    "PriorSigmas",
     "estimated",
-    "estimates_spreads",
-    "field_spread",
+    "estimates_sigmas",
+    "field_prior_sigma",
     "has_means",
-    "path_spreads",
+    "path_prior_sigmas",
     "settled",
-    "starting_spreads",
+    "starting_sigmas",
 ]
 
 # Radians per frame: a hundredth of a pixel at any focal length in use. Keeps the prior's weight finite.
-_MIN_SPREAD = 1e-6
+_MIN_SIGMA = 1e-6
 # Prior standard deviations below this (radians, focal lengths) need not converge: a tenth of a pixel.
 _SETTLED_AT = 2e-5
 # The same of the fields, which are in pixels.
-_MIN_SPREAD_PX, _SETTLED_PX = 1e-4, 1e-3
+_MIN_SIGMA_PX, _SETTLED_PX = 1e-4, 1e-3
 # Prior standard deviations of means have converged if they change by less than this share: they hardly weigh.
 _SETTLED_MEANS = 0.2
 # A velocity in common by what photos have of their own, at first: drones and people on their way travel alike, but for
@@ -52,7 +52,7 @@ _LARGEST_CHANGE = 4.0
 
 
 @dataclass(frozen=True)
-class Spreads:
+class PriorSigmas:
     """Standard deviations of the priors on what each photo has of its own, and on what photos have in common.
 
     Attributes
@@ -87,12 +87,12 @@ class Spreads:
     means: tuple[float, ...] = ()
 
 
-def _spread(
-    values: NDArray[np.float64], variance: NDArray[np.float64], span: NDArray[np.float64], spread: float
+def _prior_sigma(
+    values: NDArray[np.float64], variance: NDArray[np.float64], span: NDArray[np.float64], sigma: float
 ) -> float:
     """Prior standard deviation, per frame, of unknowns (m, 3) per unit of the clock with posterior variances (m, 3).
 
-    It is estimated over photos and axes; `spread` is that under which they were found. Values beyond three robust
+    It is estimated over photos and axes; `sigma` is that under which they were found. Values beyond three robust
     standard deviations count as three: a few photos that moved far more, or that few measurements connect, must not
     widen the prior of the rest. Fixed values are left out.
     """
@@ -105,8 +105,8 @@ def _spread(
     seen = float(np.minimum(square, 9.0 * robust).mean())
     # MacKay's fixed point of sigma^2 = mean(phi^2 + variance): a few rounds where that takes dozens. `known` is the
     # share of the unknowns that the measurements, not the prior, decide
-    known = max(1.0 - unknown / spread**2, 1e-3)
-    return float(np.clip(np.sqrt(seen / known), spread / _LARGEST_CHANGE, spread * _LARGEST_CHANGE))
+    known = max(1.0 - unknown / sigma**2, 1e-3)
+    return float(np.clip(np.sqrt(seen / known), sigma / _LARGEST_CHANGE, sigma * _LARGEST_CHANGE))
 
 
 class Common(NamedTuple):
@@ -123,33 +123,33 @@ class Common(NamedTuple):
 
 
 def estimated(
-    spreads: Spreads, current: Reconstruction, covariances: NDArray[np.float64], options: BundleOptions,
+    sigmas: PriorSigmas, current: Reconstruction, covariances: NDArray[np.float64], options: BundleOptions,
     layout: Layout, baseline: float, common: Common | None = None,
-) -> Spreads:  # fmt: skip
+) -> PriorSigmas:  # fmt: skip
     """Estimates of the prior standard deviations from a solution; given ones stay."""
     variances = np.diagonal(covariances, axis1=1, axis2=2)
     if not np.isfinite(variances).all():
-        return spreads
+        return sigmas
     own, own_variances = _own_motions(current, covariances[:, 6 : layout.motion, 6 : layout.motion], common)
-    limited = [options.phi_limits.get(name, np.inf) < spreads.phi for name in current.image_names]
+    limited = [options.phi_limits.get(name, np.inf) < sigmas.phi for name in current.image_names]
     own_variances = np.where(np.array(limited)[:, None], 0.0, own_variances)
     ones = np.ones(len(own))
-    phi, velocity, focal, centre = spreads.phi, spreads.velocity, spreads.focal, spreads.centre
-    means = spreads.means
+    phi, velocity, focal, centre = sigmas.phi, sigmas.velocity, sigmas.focal, sigmas.centre
+    means = sigmas.means
     if options.phi_sigma is None and own.shape[1] > 0:
-        phi = _spread(own[:, :3], own_variances[:, :3], ones, spreads.phi) + _MIN_SPREAD
+        phi = _prior_sigma(own[:, :3], own_variances[:, :3], ones, sigmas.phi) + _MIN_SIGMA
     if options.velocity_sigma is None and own.shape[1] > 3:
-        velocity = _spread(own[:, 3:], own_variances[:, 3:], ones, spreads.velocity) + _MIN_SPREAD * current.baseline
+        velocity = _prior_sigma(own[:, 3:], own_variances[:, 3:], ones, sigmas.velocity) + _MIN_SIGMA * current.baseline
     if common is not None:
-        means = _mean_sigmas(common, velocity, spreads.means, current)
+        means = _mean_sigmas(common, velocity, sigmas.means, current)
     if options.varying:
         varied = current.variation
         of_varied = variances[:, layout.motion : layout.variation]
-        focal = _spread(varied[:, :1], of_varied[:, :1], ones, spreads.focal) + _MIN_SPREAD
-        centre = _spread(varied[:, 1:], of_varied[:, 1:], ones, spreads.centre) + _MIN_SPREAD
-    bends, ways = _bend_spreads(spreads, current, variances[:, layout.variation :], layout)
+        focal = _prior_sigma(varied[:, :1], of_varied[:, :1], ones, sigmas.focal) + _MIN_SIGMA
+        centre = _prior_sigma(varied[:, 1:], of_varied[:, 1:], ones, sigmas.centre) + _MIN_SIGMA
+    bends, ways = _bend_sigmas(sigmas, current, variances[:, layout.variation :], layout)
     return _bounded(
-        Spreads(phi, velocity, focal, centre, bends, ways, spreads.field, spreads.path, means), options, baseline
+        PriorSigmas(phi, velocity, focal, centre, bends, ways, sigmas.field, sigmas.path, means), options, baseline
     )
 
 
@@ -209,25 +209,25 @@ def _own_motions(
     return own, np.where(held, 0.0, np.maximum(variances, 1e-300))
 
 
-def _bend_spreads(
-    spreads: Spreads, current: Reconstruction, variances: NDArray[np.float64], layout: Layout
+def _bend_sigmas(
+    sigmas: PriorSigmas, current: Reconstruction, variances: NDArray[np.float64], layout: Layout
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Prior standard deviations of the groups of bends, of rotations and of positions."""
     ones, found = np.ones(current.num_images), layout.coefficients(current)
     turns = 3 * len(layout.group)
 
-    def of(group: int, part: slice, spread: float, least: float) -> float:
+    def of(group: int, part: slice, sigma: float, least: float) -> float:
         mine = np.flatnonzero(np.repeat(np.array(layout.group[: (part.stop - part.start) // 3]) == group, 3))
-        return _spread(found[:, part][:, mine], variances[:, part][:, mine], ones, spread) + least
+        return _prior_sigma(found[:, part][:, mine], variances[:, part][:, mine], ones, sigma) + least
 
     own, ways = slice(0, turns), slice(turns, turns + 3 * layout.ways)
     return (
-        tuple(of(k, own, spread, _MIN_SPREAD) for k, spread in enumerate(spreads.bends)),
-        tuple(of(k, ways, spread, _MIN_SPREAD * current.baseline) for k, spread in enumerate(spreads.ways)),
+        tuple(of(k, own, sigma, _MIN_SIGMA) for k, sigma in enumerate(sigmas.bends)),
+        tuple(of(k, ways, sigma, _MIN_SIGMA * current.baseline) for k, sigma in enumerate(sigmas.ways)),
     )
 
 
-def estimates_spreads(shutter_model: str, options: BundleOptions) -> bool:
+def estimates_sigmas(shutter_model: str, options: BundleOptions) -> bool:
     """Whether a prior standard deviation is estimated."""
     of_turn = shutter_model != "global" and options.phi_sigma is None
     of_way = shutter_model == "constant-motion" and options.velocity_sigma is None
@@ -236,14 +236,14 @@ def estimates_spreads(shutter_model: str, options: BundleOptions) -> bool:
     )
 
 
-def settled(before: Spreads, after: Spreads, tolerance: float) -> bool:
+def settled(before: PriorSigmas, after: PriorSigmas, tolerance: float) -> bool:
     """Whether no prior standard deviation changed by more than a share; negligible ones may keep falling.
 
     On a path, phi and velocity have none of their own.
     """
     of_bends = (_SETTLED_AT,) * len(before.bends), (0.0,) * len(before.ways)
     phi, velocity = (np.inf, np.inf) if before.path else (_SETTLED_AT, 0.0)
-    none = Spreads(
+    none = PriorSigmas(
         phi,
         velocity,
         _SETTLED_AT,
@@ -262,10 +262,10 @@ def settled(before: Spreads, after: Spreads, tolerance: float) -> bool:
     )
 
 
-def starting_spreads(options: BundleOptions, layout: Layout, reconstruction: Reconstruction) -> Spreads:
+def starting_sigmas(options: BundleOptions, layout: Layout, reconstruction: Reconstruction) -> PriorSigmas:
     """Those that are given, or at which the estimation begins."""
     baseline = reconstruction.baseline
-    start = Spreads(
+    start = PriorSigmas(
         options.phi_sigma or options.phi_sigma_start,
         (options.velocity_sigma or options.velocity_sigma_start) * baseline,
         options.focal_sigma_start,
@@ -290,34 +290,34 @@ def has_means(layout: Layout, options: BundleOptions) -> bool:
     return layout.motion > 9 and estimates and options.path is None
 
 
-def _bounded(spreads: Spreads, options: BundleOptions, baseline: float) -> Spreads:
+def _bounded(sigmas: PriorSigmas, options: BundleOptions, baseline: float) -> PriorSigmas:
     """The prior standard deviations within their upper limits."""
     phi = np.inf if options.phi_sigma_most is None else options.phi_sigma_most
     velocity = np.inf if options.velocity_sigma_most is None else options.velocity_sigma_most * baseline
-    return Spreads(
-        min(spreads.phi, phi), min(spreads.velocity, velocity), min(spreads.focal, _MOST_VARIED),
-        min(spreads.centre, _MOST_VARIED), tuple(min(each, phi) for each in spreads.bends), spreads.ways,
-        min(spreads.field, _MOST_PX), spreads.path, spreads.means,
+    return PriorSigmas(
+        min(sigmas.phi, phi), min(sigmas.velocity, velocity), min(sigmas.focal, _MOST_VARIED),
+        min(sigmas.centre, _MOST_VARIED), tuple(min(each, phi) for each in sigmas.bends), sigmas.ways,
+        min(sigmas.field, _MOST_PX), sigmas.path, sigmas.means,
     )  # fmt: skip
 
 
-def field_spread(values: NDArray[np.float64], variances: NDArray[np.float64], spread: float) -> float:
-    """Prior standard deviation in pixels of the unknowns (k, n) of residual fields, as `_spread`."""
-    found = _spread(values, variances, np.ones(len(values)), spread)
-    return min(found + _MIN_SPREAD_PX, _MOST_PX)
+def field_prior_sigma(values: NDArray[np.float64], variances: NDArray[np.float64], sigma: float) -> float:
+    """Prior standard deviation in pixels of the unknowns (k, n) of residual fields, as `_prior_sigma`."""
+    found = _prior_sigma(values, variances, np.ones(len(values)), sigma)
+    return min(found + _MIN_SIGMA_PX, _MOST_PX)
 
 
-def path_spreads(
+def path_prior_sigmas(
     prior: PathPrior, residuals: NDArray[np.float64], variances: NDArray[np.float64], baseline: float
 ) -> tuple[float, ...]:
-    """Prior standard deviations of a path by its residuals (q, 18) and their posterior variances, as `_spread`.
+    """Prior standard deviations of a path by its residuals (q, 18) and their posterior variances, as `_prior_sigma`.
 
     With few frames, which hardly determine them, they are drawn to those of a hand.
     """
     squares, unknown = (prior.unit_squares(each) for each in (residuals**2, variances))
     ones, found = np.ones(len(residuals)), []
     usual = _TURN_START, _TRAVEL_START * baseline
-    for square, variance, spread, start in zip(squares, unknown, prior.spreads, usual, strict=True):
-        seen = _spread(np.sqrt(square), variance, ones, spread) ** 2
+    for square, variance, sigma, start in zip(squares, unknown, prior.sigmas, usual, strict=True):
+        seen = _prior_sigma(np.sqrt(square), variance, ones, sigma) ** 2
         found.append(float(np.sqrt((square.size * seen + _USUAL_WEIGHT * start**2) / (square.size + _USUAL_WEIGHT))))
     return tuple(found)
