@@ -103,7 +103,7 @@ def library_sigmas(result: BundleResult, remedy: Remedy | None, options: BundleO
         first = dict(zip(rec.image_names, row_phi(rec)[:, 0], strict=True))
         held = {name: np.where(np.arange(3) == first[name], sigma, np.inf) for name, sigma in remedy.anchors.items()}
         options = replace(options, known_phi={name: (np.zeros(3), sigma) for name, sigma in held.items()})
-    posterior = Posterior(result, options)
+    posterior = Posterior(result, replace(options, bends=len(result.bend_sigmas)))
     mean = np.zeros((3, m, nb))
     mean[:, :, 6:9] = np.eye(3)[:, None] * rec.frame_span()[:, None] / m
     variance = (mean * posterior.of_photos(mean)).sum((1, 2))
