@@ -255,7 +255,7 @@ class _Fits:
         # start guarantees that a model never ends above the simpler one, which it contains
         cost = [objective(start, model, options) for start in starts]
         result = bundle_adjust(starts[int(np.argmin(cost))], model, options, step)
-        found, sigmas = result.reconstruction, PriorSigmas(result.phi_sigma, result.velocity_rms)
+        found, sigmas = result.reconstruction, PriorSigmas(result.phi_rms, result.velocity_rms)
         errors, rms_px = clipped_errors(found, self.held_out, self._sigma_px)
         smooth = errors_without(warps, found, self.given.observations, self.held_out, self._sigma_px)
         left = max(float(errors.mean() - smooth.mean()), 0.0) if len(errors) else 0.0

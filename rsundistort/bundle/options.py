@@ -318,6 +318,12 @@ class BundleResult:
     common: CommonMotion | None = None
 
     @property
+    def phi_rms(self) -> float:
+        """Root mean square of a component of phi by its prior, mean included, radians per frame."""
+        mean = 0.0 if self.common is None else float(np.mean(self.common.values[:, :3] ** 2))
+        return float(np.sqrt(self.phi_sigma**2 + mean))
+
+    @property
     def velocity_rms(self) -> float:
         """Root mean square of a component of the velocity by its prior, baselines per frame."""
         mean = 0.0 if self.common is None else float(np.mean(self.common.values[:, 3:] ** 2))

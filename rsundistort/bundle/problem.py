@@ -151,14 +151,15 @@ class BundleProblem:
         self._size = reconstruction.size
 
     def _motion_means(self, sigmas: PriorSigmas) -> MotionMeans | None:
-        """How motions depend on their means, if these are solved for."""
+        """How motions depend on their means, if these are solved for and any photo shares them."""
         if not sigmas.means:
             return None
         # what a photo's own limit bounds is no sample of the others, and few photos are none of their camera
         limits, start = self._options.phi_limits, self._start
         limited = [limits.get(name, np.inf) < sigmas.phi for name in start.image_names]
         few = np.bincount(start.camera_idx)[start.camera_idx] < LEAST_PHOTOS
-        return MotionMeans.of(start, sigmas.means, self._free[:, 6:12] & ~(few | limited)[:, None])
+        shares = self._free[:, 6:12] & ~(few | limited)[:, None]
+        return MotionMeans.of(start, sigmas.means, shares) if shares.any() else None
 
     def _motion_sigmas(self, sigmas: PriorSigmas) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Standard deviations (m,) of the priors on phi and velocity, per frame, no wider than a photo's own limit."""

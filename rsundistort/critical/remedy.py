@@ -247,7 +247,7 @@ def _again(result: BundleResult, options: BundleOptions) -> BundleResult:
     rec = result.reconstruction
     again = replace(
         options, outlier_rounds=0, sigma_px=result.sigma_px, bend_sigma_start=result.bend_sigmas or 1e-3,
-        phi_sigma_start=result.phi_sigma, velocity_sigma_start=result.velocity_rms or options.velocity_sigma_start,
+        phi_sigma_start=result.phi_rms, velocity_sigma_start=result.velocity_rms or options.velocity_sigma_start,
     )  # fmt: skip
     return replace(bundle_adjust(rec, rec.shutter_model, again), num_outliers=result.num_outliers)
 

@@ -193,7 +193,7 @@ def run_trial(scene: KnownScene, options: OneOptions, trial: int) -> list[dict[s
         seconds = time.perf_counter() - began
         # the method's own cost of the true parameters, with the prior standard deviations it ended with
         final = replace(
-            chosen, phi_sigma=result.phi_sigma, velocity_sigma=max(result.velocity_rms, 1e-9), spread_rounds=0
+            chosen, phi_sigma=result.phi_rms, velocity_sigma=max(result.velocity_rms, 1e-9), spread_rounds=0
         )  # fmt: skip
         true_cost = objective(truth, model, final)
         lines.append(

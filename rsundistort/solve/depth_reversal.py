@@ -83,7 +83,7 @@ def choose_depths(
         Called with the cost after each step.
     """
     rec = result.reconstruction
-    options = replace(options, phi_sigma_start=result.phi_sigma)
+    options = replace(options, phi_sigma_start=result.phi_rms)
     other = bundle_adjust(with_depths_reversed(rec), rec.shutter_model, options, progress)
     explained, otherwise = num_explained(rec), num_explained(other.reconstruction)
     return DepthChoice(other if otherwise > explained else result, explained, otherwise)

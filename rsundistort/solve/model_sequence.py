@@ -270,7 +270,7 @@ def solve_tracks(
         options = _of_registered(wanted, result.reconstruction)
         strong = strong or _is_strong(result.reconstruction)
         result, tracks, options = _retriangulated(track_source, result, options, log, ends=not auto)
-    options = replace(options, phi_sigma_start=result.phi_sigma)
+    options = replace(options, phi_sigma_start=result.phi_rms)
     choice = None
     if auto:
         choice, result, tracks, options = _chosen(track_source, result, tracks, options, seed, log)
@@ -440,7 +440,7 @@ def _registered_again(
                 log.end(stage, added=(), moved=(), dropped=())
                 break
             options = rough_options(_of_registered(wanted, tracks, says=False))
-            options = replace(options, phi_sigma_start=result.phi_sigma)
+            options = replace(options, phi_sigma_start=result.phi_rms)
             result = bundle_adjust(tracks, rec.shutter_model, options, partial(_tell, log, stage))
         left_out = left_out.union(found.dropped) - {*result.reconstruction.image_names}
         log.end(stage, added=found.added, moved=found.moved, dropped=found.dropped)
@@ -483,7 +483,7 @@ def _retriangulated(
         tracks = firmly_connected(tracks)
         _check_enough(tracks, len(track_source.matched.names))
         options = _of_registered(options, tracks)
-        options = replace(options, phi_sigma_start=result.phi_sigma)
+        options = replace(options, phi_sigma_start=result.phi_rms)
         how = options if ends and aligns else rough_options(options)
         result = bundle_adjust(tracks, shutter_model, how, partial(_tell, log, stage))
         after = result.reconstruction

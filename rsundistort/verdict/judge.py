@@ -315,7 +315,7 @@ def _doubts(
     rec = result.reconstruction
     turn = rec.phi * rec.frame_span()[:, None]
     sigma = np.linalg.norm(result.sigma_phi, axis=1) * rec.frame_span()
-    times = np.abs(turn).max(1) / result.phi_sigma
+    times = np.abs(turn).max(1) / result.phi_rms
     counts = _counts(rec)
     doubts: dict[str, list[str]] = {}
     for i, name in enumerate(rec.image_names):

@@ -59,7 +59,7 @@ def photo_motions(result: BundleResult) -> PhotoMotions:
     """
     rec = result.reconstruction
     nb = 12 if rec.shutter_model == "constant-motion" else 9
-    spread = np.repeat([result.phi_sigma, result.velocity_sigma * rec.baseline], 3)[: nb - 6]
+    spread = np.repeat([result.phi_rms, result.velocity_rms * rec.baseline], 3)[: nb - 6]
     found = np.zeros((4, rec.num_images))
     splits = 3 * rec.num_images
     for i, mine in enumerate(rec.observations.by_photo(rec.num_images)):
