@@ -26,9 +26,17 @@ def main() -> None:
                 sys.exit(f"error: {' '.join(str(error).split())}")
             try:  # of click itself
                 sys.stderr.write(f"error: stdout cannot be written: {error.strerror}\n")
+                sys.stderr.flush()
             except OSError:  # then it was this one: click says there how it was called wrongly
+                _forget_unwritten(2)
                 sys.exit(2)
+            _forget_unwritten(1)
             sys.exit(3)
+
+
+def _forget_unwritten(number: int) -> None:
+    """Let the stream take what it still holds: else Python tries again at its end, and exits with a code of its own."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), number)
 
 
 def _open_streams() -> None:

@@ -22,6 +22,8 @@ from solved_scene import solve_scene
 
 from rsundistort.synthetic import scene
 
+# processes of tests hold back what they write, as the command does where nobody has set this
+os.environ.pop("PYTHONUNBUFFERED", None)
 # the compiler of kernels makes millions of objects that stay: to search them again and again takes a tenth of its time
 gc.set_threshold(200_000, 50, 100)
 hypothesis.settings.register_profile("rsundistort", max_examples=40, deadline=None, derandomize=True, database=None)

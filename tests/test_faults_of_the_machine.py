@@ -321,8 +321,10 @@ def test_streams_that_take_nothing_stop_no_batch(batch, streams, code, said):
         ("rectify --nothing 2> /dev/full", 2, ""),
     ],
 )
-def test_help_and_refusals_that_nobody_gets_keep_their_exit_codes(line, code, said):
-    done = subprocess.run(["bash", "-c", f"{' '.join(COMMAND)} {line}"], capture_output=True, text=True, timeout=60)
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_help_and_refusals_that_nobody_gets_keep_their_exit_codes(line, code, said, unbuffered):
+    line = f"PYTHONUNBUFFERED={unbuffered} {' '.join(COMMAND)} {line}"
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (code, said)
 
 
