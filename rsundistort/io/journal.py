@@ -161,7 +161,7 @@ def entries_of(text: str) -> dict[str, JournalEntry]:
     for line in text.splitlines():
         try:
             entry = _entry(parse_json(line))
-        except (ValueError, TypeError, KeyError, IndexError, AttributeError):
+        except (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError):
             continue
         entries[entry.name] = entry
     return entries
@@ -175,5 +175,7 @@ def _entry(value: dict[str, Any]) -> JournalEntry:
     name, fingerprint, turn, depth = (value[key] for key in ("name", "fingerprint", "turn", "depth"))
     if not (isinstance(name, str) and isinstance(fingerprint, str) and turn in range(1, 9)):
         raise InputError("no entry of a journal")
-    files = {check_photo_name(path): int(size) for path, size in value["files"].items()}
+    files = {check_photo_name(path): size for path, size in value["files"].items()}
+    if not all(type(size) is int and size >= 0 for size in files.values()):
+        raise InputError("no sizes of files")
     return JournalEntry(name, fingerprint, files, turn, depth and (str(depth[0]), float(depth[1]), float(depth[2])))

@@ -53,7 +53,7 @@ def degeneracy_of(solution: Solution) -> CriticalMotion | None:
         values = np.array(said["singular_values"], float).reshape(5)
         null = np.array(said["null_vector"], float).reshape(5)
         spread = float(said["y_axis_spread_deg"])
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         return None
     return CriticalMotion(values, null, spread, sum(image.posed for image in solution.registered))
 

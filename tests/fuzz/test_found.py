@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import struct
 import time
 import zipfile
@@ -211,6 +212,15 @@ def test_a_journal_of_empty_lines_takes_no_time():
     began = time.process_time()
     assert entries_of("\n{" * 25_000) == {}
     assert time.process_time() - began < 2
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"files": {"a.png": math.inf}}, {"files": {"a.png": -1}}, {"depth": ["a", 10**400, 1]}]
+)
+def test_a_journal_with_sizes_that_no_file_has_is_passed_over(wrong):
+    right = {"name": "a.jpg", "fingerprint": "f", "files": {"a.png": 12}, "turn": 1, "depth": ["d", 1.0, 2.0]}
+    assert set(entries_of(json.dumps(right))) == {"a.jpg"}
+    assert entries_of(json.dumps(right | wrong)) == {}
 
 
 def test_a_number_that_no_float_holds_is_named(tmp_path):
