@@ -16,7 +16,7 @@ from .conventions import HALF, poses_of, quiet_pycolmap
 from .file_checks import check_colmap_cameras, check_colmap_files, pycolmap_model
 from .lenses import camera_from_colmap
 
-__all__ = ["checked_name", "read_colmap_cameras", "read_colmap_poses"]
+__all__ = ["checked_name", "image_name", "read_colmap_cameras", "read_colmap_poses"]
 
 
 def read_colmap_cameras(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
@@ -40,7 +40,7 @@ def read_colmap_cameras(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
     cameras = {}
     for camera_id in sorted(model.cameras):
         cameras[str(camera_id)] = camera_from_colmap(model.cameras[camera_id], f"{path}: camera {camera_id}")
-    return cameras, {checked_name(image.name, str(path)): str(image.camera_id) for image in model.images.values()}
+    return cameras, {image_name(image, str(path)): str(image.camera_id) for image in model.images.values()}
 
 
 def checked_name(name: str, where: str) -> str:
@@ -49,6 +49,15 @@ def checked_name(name: str, where: str) -> str:
         return check_photo_name(name)
     except InputError as error:
         raise FormatError(f"{where}: {error}") from error
+
+
+def image_name(image: Any, where: str) -> str:
+    """The name of a `pycolmap.Image` of the model that `where` names."""
+    try:
+        name = image.name
+    except UnicodeDecodeError as error:  # pycolmap reads bytes, and decodes them when they are asked for
+        raise FormatError(f"{where}: the name of image {image.image_id} is not UTF-8: {error.object!r}") from error
+    return checked_name(name, where)
 
 
 def _read_model(path: Path) -> Any:
@@ -116,7 +125,7 @@ def read_colmap_poses(folder: Path, any_lens: bool = False) -> tuple[Any, ...]:
             point.append(number)
     return (
         cameras,
-        [checked_name(image.name, str(folder)) for image in images],
+        [image_name(image, str(folder)) for image in images],
         np.array([ids.index(image.camera_id) for image in images], np.int64),
         R_cw,
         center_w,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..errors import FileError, FormatError
 from ..model import Observations, Reconstruction
 from ..model.reprojection import reprojection_residuals
-from .cameras_and_poses import checked_name
+from .cameras_and_poses import image_name
 from .conventions import HALF, poses_of
 from .file_checks import pycolmap_model
 from .lenses import camera_from_colmap
@@ -185,14 +185,14 @@ def colmap_model_of(model: Any, where: str = "the model") -> ColmapModel:
     place = {key: k for k, key in enumerate(camera_ids)}
     rec = Reconstruction(
         cameras,
-        [checked_name(image.name, where) for image in images],
+        [image_name(image, where) for image in images],
         np.array([place[image.camera_id] for image in images], np.int64),
         R_cw,
         center_w,
         points_w,
         Observations(frame, point, np.concatenate(xy)),
     )
-    unregistered = sorted({image.name for image in model.images.values()} - set(rec.image_names))
+    unregistered = sorted({image_name(image, where) for image in model.images.values()} - set(rec.image_names))
     return ColmapModel(
         rec,
         np.array(camera_ids, np.int64),

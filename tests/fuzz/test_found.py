@@ -9,6 +9,7 @@ import struct
 import time
 import zipfile
 import zlib
+from functools import partial
 
 import cv2
 import numpy as np
@@ -17,10 +18,11 @@ import pytest
 pytest.importorskip("av")
 pytest.importorskip("pillow_heif")
 
-from groups import claimed, npy, packed, recipe, report_arrays, solution
+from groups import claimed, colmap_files, npy, packed, recipe, report_arrays, solution
 from other_groups import CONTROL, SETTINGS, TRIALS, altered, database, kept, lines, opf, raw_photos, scene
 
 from rsundistort import read_solution, rectify_folder, write_solution
+from rsundistort.colmap.cameras_and_poses import read_colmap_cameras, read_colmap_poses
 from rsundistort.errors import FileError, FormatError, InputError
 from rsundistort.experiments.one import check_settings, read_trials
 from rsundistort.experiments.scenes import load_scene
@@ -229,6 +231,18 @@ def test_a_number_that_no_float_holds_is_named(tmp_path):
     (tmp_path / "m.json").write_text(f"{start}{pose}]}}")
     with pytest.raises(FormatError, match=r"extrinsics\[0\]"):
         read_model(tmp_path / "m.json")
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+@pytest.mark.parametrize("read", [read_colmap_cameras, partial(read_colmap_poses, any_lens=True), read_model])
+def test_a_photo_in_a_colmap_model_whose_name_is_no_text_is_named(tmp_path, kind, read):
+    files = colmap_files()[kind]
+    damaged = files | {f"images.{kind}": files[f"images.{kind}"].replace(b".png", b".\xdbng", 1)}
+    assert damaged != files
+    for name, data in damaged.items():
+        (tmp_path / name).write_bytes(data)
+    with pytest.raises(FormatError, match=r"the name of image \d+ is not UTF-8"):
+        read(tmp_path)
 
 
 def test_a_mask_of_one_colour_is_small_and_is_read(tmp_path):
