@@ -76,7 +76,7 @@ def _hear_again(lost: sys.UnraisableHookArgs) -> None:
     """Raise an interruption again that Python dropped, as it does in what native code and the collector call."""
     if isinstance(lost.exc_value, KeyboardInterrupt):
         threading.Thread(target=_interrupt_main, daemon=True).start()
-    else:
+    elif not _state["heard"]:  # else it is of objects that the interruption left half made
         sys.__unraisablehook__(lost)
 
 

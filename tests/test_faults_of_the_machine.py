@@ -265,6 +265,18 @@ def test_sigterm_ends_in_one_line_and_resume_goes_on(batch):
     assert sorted(path.name for path in (out / "images").iterdir()) == NAMES
 
 
+@POSIX
+def test_what_an_interruption_left_half_made_says_nothing():
+    program = (
+        "import os, signal\n"
+        "from rsundistort_cli.stopping import hears_signals\n"
+        "class Half:\n    def __del__(self): raise AttributeError('half made')\n"
+        "with hears_signals():\n    half = Half()\n    os.kill(os.getpid(), signal.SIGTERM)\n    half.wait()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (143, "stopped; nothing was written\n")
+
+
 @pytest.mark.parametrize("is_solved", [True, False])
 def test_a_full_disk_of_a_run_says_how_to_continue(tmp_path, is_solved):
     def fill_the_disk():
