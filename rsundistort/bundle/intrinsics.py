@@ -31,6 +31,10 @@ INTRINSICS: dict[str, int] = {
 _OF_LENS = {"pinhole": ("k1", "k2", "p1", "p2", "k3"), "fisheye": ("k1", "k2", "k3", "k4")}
 
 
+# errors of a calibration that look like a phi3 of all photos, of readout by rows and by columns
+_DECENTRING: tuple[Mapping[str, float], ...] = ({"cx": 3.0, "p2": 1.0}, {"cy": 3.0, "p1": 1.0})
+
+
 @dataclass(frozen=True)
 class GuessedCameras:
     """Prior on the intrinsics that are refined, from what is known of the cameras before the photos.
@@ -45,23 +49,50 @@ class GuessedCameras:
     sigma : mapping of intrinsic to float, or a sequence of them
         Standard deviations, of all cameras or of each: of f (fx, fy) relative, of cx and cy in focal lengths, of the
         lens coefficients. Intrinsics that are not named have no prior.
+    decentring : sequence of (float, float), optional
+        Of each camera, the standard deviations e of an error of (cx, p2) = (3, 1) e and of (cy, p1) = (3, 1) e, which
+        calibrations have beside that (`bundle.calibration_doubt`). It counts for the standard deviations that are
+        reported; the estimate takes it for zero.
     """
 
     cameras: Sequence[Camera]
     sigma: Mapping[str, float] | Sequence[Mapping[str, float]]
+    decentring: Sequence[tuple[float, float]] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.sigma, Mapping) and len(self.sigma) != len(self.cameras):
             raise InputError(f"{len(self.cameras)} guessed cameras and the sigmas of {len(self.sigma)}")
+        if len(self.decentring) not in (0, len(self.cameras)):
+            raise InputError(f"{len(self.cameras)} guessed cameras and the decentring of {len(self.decentring)}")
         stated = [self.sigma] if isinstance(self.sigma, Mapping) else self.sigma
         for name, value in (each for sigma in stated for each in sigma.items()):
             if name not in INTRINSICS or not 0 < value < np.inf:
                 raise InputError(f"guessed {name!r}: sigma {value!r}, expected a positive one of an intrinsic")
+        for value in (each for of_camera in self.decentring for each in of_camera):
+            if not 0 <= value < np.inf:
+                raise InputError(f"guessed decentring: sigma {value!r}, expected zero or a positive number")
 
     @property
     def sigmas(self) -> Sequence[Mapping[str, float]]:
         """The standard deviations of each camera."""
         return [self.sigma] * len(self.cameras) if isinstance(self.sigma, Mapping) else self.sigma
+
+    def pulls_of_decentring(self, cameras: Sequence[Camera], names: Sequence[str], heavy: bool) -> NDArray[np.float64]:
+        """(2, cameras, len(names)) by how much one standard deviation of it changes the prior's gradient at `cameras`.
+
+        `heavy` says whether the prior is that of `prior_weight`, or normal.
+        """
+        pulls = np.zeros((2, len(cameras), len(names)))
+        for k, (of_axes, camera, guess, of) in enumerate(
+            zip(self.decentring, cameras, self.cameras, self.sigmas, strict=False)
+        ):
+            sigma = np.array([of.get(name, np.inf) for name in names])
+            apart, slope = np.array(deviation(camera, guess, names)) / sigma
+            weight = prior_weight(apart**2)[1] if heavy else np.ones(len(names))
+            for axis, (error, terms) in enumerate(zip(of_axes, _DECENTRING, strict=True)):
+                errors = error * np.array([terms.get(name, 0.0) for name in names])
+                pulls[axis, k] = slope * weight * errors / sigma
+        return pulls
 
     def surprises(self, cameras: Sequence[Camera]) -> list[tuple[int, str, float]]:
         """Intrinsics that lie more than three standard deviations off: (camera, name, how many)."""

@@ -58,6 +58,8 @@ class Function:
         Its variance, and the shares of that that are the priors' and the known lengths' doing.
     with_photos, with_photos_of_priors : (m, nb) array
         Its covariance with the photos' unknowns, and the priors' share of that.
+    with_cameras : (k,) array
+        Its covariance with the unknowns of all cameras.
     pulls : (o, 2) array
         How far each residual pulls it.
     """
@@ -67,6 +69,7 @@ class Function:
     of_lengths: float
     with_photos: Array
     with_photos_of_priors: Array
+    with_cameras: Array
     pulls: Array
 
     def inflated(self, own: float, photos: Array) -> tuple[float, Array]:
@@ -394,6 +397,7 @@ class NormalEquations:
             of_lengths=float((np.einsum("qna,na->q", self._lengths, point) ** 2).sum()),
             with_photos=self._seen(frame),
             with_photos_of_priors=self._seen(self.inverse.times(of_frame, of_camera)[0][0]),
+            with_cameras=camera,
             pulls=self._moved(frame, point, camera),
         )
 

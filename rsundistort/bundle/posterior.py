@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from .calibration_doubt import CalibrationDoubt
 from .jackknife import inflation_of
 from .options import BundleOptions, BundleResult
 from .prior_sigmas import PriorSigmas
@@ -50,6 +51,7 @@ class Posterior:
         inflation = np.ones_like(result.inflation) if self._partitions is None else result.inflation
         self._inflation = inflation / self._factor
         self._covariance = self._equations.covariance(self._inflation)
+        self._doubt = CalibrationDoubt.of(self._equations, plain, rec.cameras)
         self._camera_idx = rec.camera_idx
         self._own = self._problem.layout.size - self._problem.layout.motion
         self._shape = rec.num_images, len(self._inflation) - self._own
@@ -58,14 +60,15 @@ class Posterior:
         """Covariance of the photos' unknowns times vectors (k, m, nb), as in `BundleResult.covariances`."""
         whole = self._whole(vectors)
         if self._path is None:
-            return self._covariance(whole)[:, :, : vectors.shape[2]]
+            return (self._covariance(whole) + self._doubt.times(whole)[0])[:, :, : vectors.shape[2]]
         # phi and velocity are pace times rates
         pace, rates = self._path.pace[self._camera_idx][:, None], self._path.rates
         of_pace = np.zeros((len(vectors), self._equations.num_shared))
         columns = (self._camera_idx + 1) * (self._equations.num_shared // self._equations.num_cameras) - 1
         np.add.at(of_pace.T, columns, np.einsum("kma,ma->mk", vectors[:, :, 6:12], rates))
         whole[:, :, 6:12] *= pace
-        moved, shared = self._equations.times(whole, of_pace)
+        parts = self._equations.times(whole, of_pace), self._doubt.times(whole, of_pace)
+        moved, shared = (of_equations + of_doubt for of_equations, of_doubt in zip(*parts, strict=True))
         moved[:, :, 6:12] = pace * moved[:, :, 6:12] + shared[:, columns, None] * rates
         return moved[:, :, : vectors.shape[2]]
 
@@ -81,7 +84,8 @@ class Posterior:
         if self._partitions is not None:
             own = inflation_of(found, self._equations, self._partitions, self._factor)
         variance, with_photos = found.inflated(own / self._factor, self._inflation)
-        return variance, with_photos[:, : self._shape[1]]
+        of_doubt, with_doubt = self._doubt.of_function(found)
+        return variance + of_doubt, (with_photos + with_doubt)[:, : self._shape[1]]
 
     def motions(self) -> tuple[Array, Array]:
         """Motions (m, k) of the photos and their covariances (m, k, k), as far as the model has them.

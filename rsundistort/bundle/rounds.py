@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..model import Reconstruction
 from ..model.reprojection import reprojection_residuals
+from .calibration_doubt import CalibrationDoubt
 from .common_motion import CommonMotion
 from .intrinsics import pixels_of
 from .jackknife import Inflation, inflated, inflation
@@ -160,6 +161,7 @@ class Rounds:
         if state.path is not None:
             self._with_pace = equations.photos_by_shared(1)[:, :, 0]
         self._weighed_noise, self._had_heavy_tails = self._noise, self._heavy_tails
+        self._doubt = CalibrationDoubt.of(equations, options, self._current.cameras, self._heavy_tails)
         per_camera = equations.num_shared // equations.num_cameras
         self._inflation = Inflation(np.ones(len(self._marginals.photos[0])), np.ones(per_camera))
         if asks_residuals:
@@ -255,11 +257,12 @@ class Rounds:
         weighed, sigmas = self._weighed_noise, self._sigmas
         by = self._inflation.photos / weighed, self._inflation.cameras / weighed
         covariances, of_intrinsics = inflated(self._marginals, *by)
+        covariances, of_intrinsics = covariances + self._doubt.of_photos, of_intrinsics + self._doubt.of_cameras
         path = None
         if self._path is not None and options.path is not None:
             pace_sigma = np.sqrt(np.diagonal(of_intrinsics).reshape(len(current.cameras), -1)[:, -1])
             path = path_solution(current, options.path, self._path, pace_sigma)
-            with_pace = self._with_pace * by[0] * by[1][-1]
+            with_pace = self._with_pace * by[0] * by[1][-1] + self._doubt.with_last(current.camera_idx, len(by[1]))
             covariances = of_motions(covariances, with_pace, pace_sigma, self._path, current.camera_idx)
             current = orthogonal(with_path_motions(current, options.path, self._path))
         return BundleResult(

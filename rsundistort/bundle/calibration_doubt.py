@@ -1,0 +1,91 @@
+"""What is added to covariances for errors of a calibration that no residual shows.
+
+A principal point and a tangential distortion that are off together look like a phi3 that all photos share: to second
+order
+
+    (cx, p2) = (3, 1) e:    e (3 x^2 + y^2, 2 x y) - 3 e (x^2, x y) = e (y^2, -x y)
+
+after the rotation that makes up for the principal point. The estimate then goes wrong by H^-1 g, where H is the Hessian
+and g the change of the gradient of the calibration's prior. It is no noise, and the jackknife cannot see it, so the
+covariance of that is added (`GuessedCameras.decentring`). The estimate itself trusts the calibration: a prior that was
+as wide as such errors would lose what exact calibrations know (courtyard: rotations wrong by 0.014 degrees, not 0.008).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model import Camera
+from .normal_equations import Function, NormalEquations
+from .options import BundleOptions
+
+__all__ = ["CalibrationDoubt"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CalibrationDoubt:
+    """How far r errors of calibrations, each of one standard deviation, move the estimate.
+
+    Attributes
+    ----------
+    pulls : (r, k) array
+        The change of the gradient of the priors on the cameras' unknowns.
+    photos : (r, m, nb) array
+        How far the unknowns of the photos move.
+    cameras : (r, k) array
+        The same of all cameras.
+    """
+
+    pulls: Array
+    photos: Array
+    cameras: Array
+
+    @classmethod
+    def of(
+        cls, equations: NormalEquations, options: BundleOptions, cameras: Sequence[Camera], heavy: bool = True
+    ) -> CalibrationDoubt:
+        """At the solution that has these equations; NaN where the system cannot be factored."""
+        c, names = equations.num_cameras, options.refine
+        of_each = np.zeros((2, c, c, equations.num_shared // c))
+        if options.guessed is not None:
+            each = np.arange(c)
+            of_each[:, each, each, : len(names)] = options.guessed.pulls_of_decentring(cameras, names, heavy)
+        pulls = of_each.reshape(2 * c, -1)
+        pulls = pulls[pulls.any(1)]
+        unmoved = np.zeros((len(pulls), equations.num_photos, equations.blocks[1].shape[2]))
+        return cls(pulls, *(equations.times(unmoved, pulls) if len(pulls) else (unmoved, pulls)))
+
+    @property
+    def of_photos(self) -> Array:
+        """(m, nb, nb) covariances of each photo's unknowns."""
+        value: Array = np.einsum("rma,rmb->mab", self.photos, self.photos)
+        return value
+
+    @property
+    def of_cameras(self) -> Array:
+        """(k, k) covariance of the unknowns of all cameras."""
+        return self.cameras.T @ self.cameras
+
+    def with_last(self, camera_idx: NDArray[np.int64], per_camera: int) -> Array:
+        """(m, nb) covariances of photos' unknowns with the last of their camera."""
+        last = self.cameras[:, (camera_idx + 1) * per_camera - 1]
+        value: Array = np.einsum("rma,rm->ma", self.photos, last)
+        return value
+
+    def times(self, photos: Array, cameras: Array | None = None) -> tuple[Array, Array]:
+        """The covariance times stacks of values of photos (n, m, nb) and of cameras (n, k)."""
+        along = np.einsum("rma,nma->nr", self.photos, photos)
+        if cameras is not None:
+            along += cameras @ self.cameras.T
+        return np.einsum("nr,rma->nma", along, self.photos), along @ self.cameras
+
+    def of_function(self, found: Function) -> tuple[float, Array]:
+        """Variance of a function of the points, and its covariance (m, nb) with the photos' unknowns."""
+        moved = self.pulls @ found.with_cameras
+        return float(moved @ moved), np.einsum("r,rma->ma", moved, self.photos)
