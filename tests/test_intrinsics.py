@@ -10,10 +10,7 @@ from bundle_scenes import FISHEYE, LENS, RATIONAL, gradients, make_scene, pertur
 from numpy_reference import Fisheye
 
 from rsundistort import BundleOptions, bundle_adjust
-from rsundistort.bundle import (
-    GuessedCameras,
-    choose_model,
-)
+from rsundistort.bundle import GuessedCameras, Posterior, choose_model
 from rsundistort.bundle.intrinsics import moved_camera
 from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
@@ -189,3 +186,47 @@ def test_a_pinhole_lens_among_fisheyes_stays_what_it_is(rng):
     fisheye = both.camera_idx[both.observations.frame_idx] == 3
     assert np.abs(res[~fisheye]).max() < 1e-9  # px, as above
     assert np.abs(res[fisheye]).max() > 1
+
+
+def decentred(camera, error, axis):
+    names = (("cx", "p2"), ("cy", "p1"))[axis]
+    return moved_camera(camera, names, np.array([3.0, 1.0]) * error)
+
+
+@pytest.mark.parametrize("model", ["rotation", "constant-motion"])
+def test_deviations_allow_for_as_much_as_a_decentred_calibration_moves_the_estimate(model, rng):
+    rec = make_scene(rng, model, num_images=8, num_points=80, noise_px=0.01, dist=LENS)
+    sigma, error = {"f": 1e-3, "cx": 4e-4, "cy": 4e-4, "k1": 3e-3, "p1": 3e-4, "p2": 3e-4}, 1e-4
+    options = BundleOptions(
+        loss="squared", sigma_px=0.3, phi_sigma=0.02, velocity_sigma=0.05, outlier_rounds=0, cost_tolerance=1e-15,
+        step_tolerance=1e-14, refine=tuple(sigma), deviations="model", max_iterations=30,
+    )  # fmt: skip
+
+    def guessed(camera, *decentring):
+        others = rec.cameras[1:]
+        return GuessedCameras([camera, *others], sigma, [*decentring, *[(0.0, 0.0)] * len(others)])
+
+    def adjusted(*guess):
+        return bundle_adjust(rec, model, replace(options, guessed=guessed(*guess)))
+
+    right, errors = rec.cameras[0], (error, 2 * error)
+    given, without = adjusted(right, errors), adjusted(right, (0.0, 0.0))
+    off = [adjusted(decentred(right, size, axis), (0.0, 0.0)) for axis, size in enumerate(errors)]
+    moved = np.array([each.reconstruction.phi - without.reconstruction.phi for each in off])
+    expected = np.einsum("rma,rmb->mab", moved, moved)
+    vectors = np.zeros((3, *without.covariances.shape[:2]))
+    vectors[:, :, 6:9] = np.eye(3)[:, None]
+    both = [Posterior(without, replace(options, guessed=guessed(right, each))) for each in (errors, (0.0, 0.0))]
+    of_sum = np.subtract(*(np.einsum("kma,lma->kl", each.of_photos(vectors), vectors) for each in both))
+    np.testing.assert_allclose(of_sum, np.einsum("ra,rb->ab", moved.sum(1), moved.sum(1)), atol=0.02 * of_sum.max())
+    assert given.reconstruction.phi == pytest.approx(without.reconstruction.phi, abs=1e-12)  # it is no prior
+    added = (given.covariances - without.covariances)[:, 6:9, 6:9]
+    np.testing.assert_allclose(added, expected, atol=0.02 * expected.max())
+
+
+def test_a_decentring_that_is_no_deviation_is_refused(rng):
+    cameras = make_scene(rng, "rotation").cameras
+    with pytest.raises(InputError, match=f"{len(cameras)} guessed cameras and the decentring of 1"):
+        GuessedCameras(cameras, GUESS_SIGMA, [(1e-3, 1e-3)])
+    with pytest.raises(InputError, match="guessed decentring: sigma -1"):
+        GuessedCameras(cameras, GUESS_SIGMA, [(1e-3, -1.0)] * len(cameras))

@@ -65,6 +65,13 @@ def test_a_calibration_is_known_as_well_as_its_file_says_and_others_as_calibrati
     assert known.sigmas[0]["cy"] == photo_cameras.GIVEN_SIGMA["cy"]
 
 
+def test_only_calibrations_of_unknown_accuracy_may_be_decentred(folder):
+    (folder / "camera.json").write_text(with_sigma(camera_of(WIDE), {"f": 1.2, "p1": 1e-4}))
+    cameras = find_cameras(folder, NAMES[:3], SIZES[:3])
+    assert cameras.known_to(loose=False).decentring == [(1e-3, 0.0)]  # p1 goes with cy
+    assert not cameras.known_to(loose=True).decentring
+
+
 def test_the_command_line_knows_better_than_the_file(folder):
     (folder / "camera.json").write_text(with_sigma(camera_of(WIDE), {"f": 1.2, "k1": 0.01}))
     cameras = find_cameras(folder, NAMES[:3], SIZES[:3]).with_sigma({"fx": 0.6, "fy": 0.3})
