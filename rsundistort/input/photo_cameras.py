@@ -27,9 +27,10 @@ from ..sfm import USUAL_FOCAL
 __all__ = ["GIVEN_SIGMA", "GUESS_SIGMA", "PhotoCameras", "camera_file_of", "check_readouts", "find_cameras"]
 
 #: Standard deviations of EXIF's guess (relative f, principal point in focal lengths, lens coefficients): equivalent
-#: focal lengths are rounded to millimetres, focusing and stabilising crop a little, phones hardly distort.
+#: focal lengths are rounded to millimetres, focusing and stabilising crop a little, phones hardly distort, and lenses
+#: are hardly decentred (p1 and p2 trade against cx, cy and a phi3 that all photos share).
 GUESS_SIGMA = {
-    "f": 0.05, "cx": 0.01, "cy": 0.01, "k1": 0.2, "k2": 0.4, "k3": 0.4, "k4": 0.4, "p1": 2e-3, "p2": 2e-3
+    "f": 0.05, "cx": 0.01, "cy": 0.01, "k1": 0.2, "k2": 0.4, "k3": 0.4, "k4": 0.4, "p1": 1e-3, "p2": 1e-3
 }  # fmt: skip
 #: Standard deviations of a calibration: published ones of good cameras were off by half a pixel.
 GIVEN_SIGMA = {
