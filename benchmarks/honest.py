@@ -287,26 +287,20 @@ def calibration(bench: Bench) -> None:
             ran.append(bench.run(warp / "photos"))
             each, true = ran[-1], rs.read_solution(warp / "ground_truth.json")
             rec = each.solved.shared
-            unknown, sigma = np.zeros(3), np.array([np.inf, np.inf, 1e-6])
-            phi3 = {
-                name: rec.frame_span()[k] * true.image(name).motion.phi[2] for k, name in enumerate(rec.image_names)
+            only_phi3, spans = np.array([np.inf, np.inf, 1e-6]), rec.frame_span()
+            known = {
+                name: (span * true.image(name).motion.phi, only_phi3)
+                for name, span in zip(rec.image_names, spans, strict=True)
             }
-            known = {name: (unknown + [0, 0, value], sigma) for name, value in phi3.items()}
-            again = rs.bundle_adjust(
-                rec, rec.shutter_model, replace(each.options, known_phi=known, deviations="model")
-            ).reconstruction.cameras[0]
+            options = replace(each.options, known_phi=known, deviations="model")
+            again = rs.bundle_adjust(rec, rec.shutter_model, options).reconstruction.cameras[0]
             assert each.options.guessed is not None
             (given,) = each.options.guessed.cameras
             found.append([again.K[0, 2] - given.K[0, 2], *(1e3 * again.dist[2:4])])
             apart = dict(zip(("cx_px", "p1_1e-3", "p2_1e-3"), np.round(found[-1], 2).tolist(), strict=True))
             show(f"{name}, seed {seed}", **each.facts, **apart)
-        bench.row(
-            name,
-            ran,
-            dict(zip(("cx px", "p1", "p2 1e-3"), np.median(found, 0).round(2).tolist(), strict=True)),
-            "",
-            None,
-        )
+        medians = np.median(found, axis=0).round(2).tolist()
+        bench.row(name, ran, dict(zip(("cx px", "p1 1e-3", "p2 1e-3"), medians, strict=True)), "", None)
 
 
 def better(bench: Bench) -> None:
