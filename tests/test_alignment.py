@@ -44,12 +44,11 @@ def photo_of(texture, R_cw, center, gain, rng):
     return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
 
 
-@pytest.fixture(scope="module")
-def plane():
+def plane_from(*last):
     """Five photos of a plane, points measured to a pixel in four of them, and where they are really seen."""
     rng = np.random.default_rng(0)
     texture = Texture(rng)
-    centers = np.array([[-0.8, 0.1, -3.0], [-0.3, -0.2, -2.8], [0.1, 0.2, -3.2], [0.5, 0.0, -3.0], [0.9, -0.1, -2.9]])
+    centers = np.array([[-0.8, 0.1, -3.0], [-0.3, -0.2, -2.8], [0.1, 0.2, -3.2], [0.5, 0.0, -3.0], last])
     R_cw = np.array([look_at(center, [0.1, 0.0, 0.0]) for center in centers])
     photos = [
         photo_of(texture, R, c, gain, rng) for R, c, gain in zip(R_cw, centers, rng.uniform(0.6, 1.2, 5), strict=True)
@@ -66,6 +65,11 @@ def plane():
     return rec, photos, truth
 
 
+@pytest.fixture(scope="module")
+def plane():
+    return plane_from(0.9, -0.1, -2.9)
+
+
 def source(photos, masks=None):
     def patches_of(places):
         for frame, each in places.items():
@@ -75,18 +79,22 @@ def source(photos, masks=None):
     return patches_of
 
 
-def test_aligned_measurements_show_the_same_point(plane):
-    rec, photos, _ = plane
-    found = align_tracks(rec, np.ones(5), source(photos))
-    obs = found.observations
-    # which point of the plane each measurement shows, by plain geometry
+def apart(rec):
+    """(o, 2) how far from the other measurements of its point each shows the plane, by plain geometry."""
+    obs = rec.observations
     rays = np.column_stack([(obs.xy_raw - [159.5, 119.5]) / 300, np.ones(len(obs))])
-    rays = np.einsum("nij,ni->nj", found.R_cw[obs.frame_idx], rays)
-    center = found.center_w[obs.frame_idx]
+    rays = np.einsum("nij,ni->nj", rec.R_cw[obs.frame_idx], rays)
+    center = rec.center_w[obs.frame_idx]
     on_plane = center[:, :2] - center[:, 2:] / rays[:, 2:] * rays[:, :2]
     counts = np.bincount(obs.point_idx)
     mean = np.stack([np.bincount(obs.point_idx, on_plane[:, k]) / counts for k in range(2)], 1)
-    apart_px = 100 * (on_plane - mean[obs.point_idx])  # about 100 px to the unit of length
+    return 100 * (on_plane - mean[obs.point_idx])  # about 100 px to the unit of length
+
+
+def test_aligned_measurements_show_the_same_point(plane):
+    rec, photos, _ = plane
+    found = align_tracks(rec, np.ones(5), source(photos))
+    apart_px = apart(found)
     assert np.median(np.linalg.norm(apart_px, axis=1)) < 0.05
     # before: 0.4 px of noise
     assert np.percentile(np.linalg.norm(apart_px, axis=1), 90) < 0.2
@@ -99,6 +107,16 @@ def test_points_are_found_where_no_feature_was(plane):
     new = obs.frame_idx == 4
     assert new.sum() > 100
     assert np.median(np.linalg.norm(obs.xy_raw[new] - truth[4, obs.point_idx[new]], axis=1)) < 0.6
+
+
+def test_features_are_aligned_from_farther_off_than_points_are_searched_for():
+    rec, photos, _ = plane_from(2.4, -0.1, -2.0)  # 50 degrees from the second photo
+    found = align_tracks(rec, np.ones(5), source(photos))
+    aside = found.observations.frame_idx == 4
+    assert set(found.observations.point_idx[aside]) <= set(range(20))
+    aligned = aside & (found.observations.sigma < 1)
+    assert aligned.sum() > 12
+    assert np.median(np.linalg.norm(apart(found)[aligned], axis=1)) < 0.1
 
 
 def test_deviations_are_those_of_the_differences(plane, rng):

@@ -33,8 +33,10 @@ _PER_SIZE = 5.0
 _LEAST_MEASURED, _LEAST_NEW = 0.7, 0.85
 _MOST_SHIFT = 1.5
 # A point without a feature is searched for in a photo that sees it from within this angle of the best view, and from a
-# distance that differs by this factor at most.
+# distance that differs by this factor at most; a feature is aligned from farther off, since its descriptor was alike,
+# and points that only two photos show are searched for as far, since they are lost otherwise.
 _MOST_ANGLE_DEG, _MOST_SCALE = 30.0, 1.7
+_WIDE_ANGLE_DEG, _WIDE_SCALE = 60.0, 2.0
 # Windows with less contrast (standard deviation in grey levels) hold nothing but noise.
 _LEAST_CONTRAST = 3.0
 # No alignment is more exact than this, in pixels of the finer window's level: interpolation, compression.
@@ -268,12 +270,18 @@ def _further(
 
 
 def _looks_alike(rec: Reconstruction, best: _Windows, windows: _Windows) -> NDArray[np.bool_]:
-    """Windows that may be aligned with the best view of their points: seen from a similar direction and distance."""
+    """Windows that may be aligned with the best view of their points: seen from a similar direction and distance.
+
+    The first windows are those of the observations.
+    """
     of = best.select(windows.point)
     cosine = (_directions(rec, windows.frame, windows.point) * _directions(rec, of.frame, of.point)).sum(1)
+    is_measured = np.arange(len(windows.frame)) < len(rec.observations)
+    is_wide = is_measured | (rec.track_lengths(np.ones(len(rec.observations), bool))[windows.point] < 3)
+    angle, scale = np.where(is_wide, _WIDE_ANGLE_DEG, _MOST_ANGLE_DEG), np.where(is_wide, _WIDE_SCALE, _MOST_SCALE)
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = np.abs(np.log(windows.spacing / of.spacing))
-        alike = (cosine > np.cos(np.deg2rad(_MOST_ANGLE_DEG))) & (ratio < np.log(_MOST_SCALE))
+        alike = (cosine > np.cos(np.deg2rad(angle))) & (ratio < np.log(scale))
     finite = np.isfinite(windows.xy).all(1) & np.isfinite(windows.M).all((1, 2)) & np.isfinite(of.M).all((1, 2))
     return np.asarray(alike & finite & (windows.frame != of.frame))
 
