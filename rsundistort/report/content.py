@@ -316,7 +316,7 @@ def _value(name: str, value: float, sigma: float | None, digits: int) -> str:
 
 
 def _address(data: bytes | None) -> str | None:
-    return None if data is None else f"data:image/webp;base64,{base64.b64encode(data).decode()}"
+    return None if data is None else f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
 
 
 def _packed(values: NDArray[np.float64]) -> dict[str, str]:

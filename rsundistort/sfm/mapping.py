@@ -19,11 +19,11 @@ from .database import LOOSE, MatchedPhotos, from_pycolmap, pipeline_options, wri
 __all__ = ["map_photos"]
 
 # Mapping only has to place the photos; the tracks are rebuilt afterwards. All at once this many of the largest
-# keypoints of each do, or all (seconds of processor time with 2048 / all: herz-jesus-8 2.1 / 4.6, a phone's 16 photos
-# 2.0 / 4.4).
+# keypoints of each do, or more, or all (seconds of processor time with 2048 / all: herz-jesus-8 2.1 / 4.6, a phone's 16
+# photos 2.0 / 4.4). More are tried while photos are left out, and all only if twice as many place more of them.
 # It takes others than incremental mapping does where photos hang together weakly: 13 instead of 8 of a drone's 14, 29
 # instead of 27 in lund; so the other way is tried only where it leaves out more than a quarter.
-_PLACING_KEYPOINTS, _ENOUGH_REGISTERED = 2048, 0.75
+_PLACING_KEYPOINTS, _ENOUGH_REGISTERED = (2048, 4096, None), 0.75
 
 # Mapping one after the other only has to place the photos: it gets this many of the largest keypoints of each. All of
 # them come back when the tracks are rebuilt. (herz-jesus-8: 16384 keypoints map in 4.7 s, 4096
@@ -76,12 +76,14 @@ def map_photos(matched: MatchedPhotos, progress: Callable[[int], None] | None = 
         When no two photos could be registered.
     """
     total = len(matched.names)
-    found = None
-    for limit in (_PLACING_KEYPOINTS, None):
+    enough = _ENOUGH_REGISTERED * total
+    found, count = None, 0
+    for limit in _PLACING_KEYPOINTS:
         found = _with_more(found, _mapped_at_once(matched, limit))
-        if found is not None and found.num_images == total:
-            return found
-    if found is None or found.num_images < _ENOUGH_REGISTERED * total:
+        before, count = count, 0 if found is None else found.num_images
+        if count == total or enough <= count == before:
+            break
+    if found is None or count < enough:
         found = _with_more(found, _mapped_one_by_one(matched, progress))
     if found is None:
         raise ReconstructionError(

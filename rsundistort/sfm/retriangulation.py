@@ -104,9 +104,7 @@ def _posed_model(matched: MatchedPhotos, reconstruction: Reconstruction, cameras
             model.add_frame(frame)
             image = db.read_image(index + 1)
             image.frame_id = frame.frame_id
-            image.points2D = pycolmap.Point2DList(
-                [pycolmap.Point2D(xy) for xy in db.read_keypoints(index + 1)[:, :2].astype(np.float64)]
-            )
+            image.points2D = pycolmap.Image(keypoints=db.read_keypoints(index + 1)[:, :2].astype(np.float64)).points2D
             model.add_image(image)
             model.register_frame(frame.frame_id)
     return model
