@@ -77,7 +77,7 @@ def test_pictures_of_both_sides_are_small_and_of_the_photos_shape(solved_courtya
     for view in views[:3]:
         for side in ("before", "after"):
             kind, _, data = view[side].partition(",")
-            assert kind == "data:image/webp;base64"
+            assert kind == "data:image/jpeg;base64"
             pixels = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_UNCHANGED)
             assert pixels.shape[1] / pixels.shape[0] == pytest.approx(view["size"][0] / view["size"][1], rel=0.01)
             raw = SCENES / "courtyard" / "photos" / view["name"] if side == "before" else out / "images" / view["name"]

@@ -22,10 +22,10 @@ __all__ = ["Picture", "PictureJob", "make_pictures"]
 
 # Bytes of all pictures of a report, and of one at least and at most: 100 photos fill half of 15 MB, beside plotly.js.
 _ALL_BYTES = 6_000_000
-_BYTES = (5_000, 160_000)
+_BYTES = (5_500, 160_000)
 # Approximate bytes that JPEG takes for a pixel of a reduced photo. WebP takes two thirds, and forty times as long.
-_BYTES_PER_PIXEL = 0.22
-_QUALITIES = (80, 65, 50, 35, 20)
+_BYTES_PER_PIXEL = 0.17
+_QUALITIES = (80, 70, 55, 40, 25)
 
 
 @dataclass(frozen=True)
