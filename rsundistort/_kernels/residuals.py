@@ -237,12 +237,14 @@ def _lens_jacobian(model, axis, sign, lens, x, y, z, phi, vel, xd, yd, d):
 @parallel_kernel()
 def intrinsic_blocks(
     model, camera_of_frame, axes, signs, intrs, lenses, R_cw, center_w, phi, vel_w, points_w,
-    frame_idx, point_idx, xy_raw, sigma_px, loss_kind, loss_scale, clock, unknowns, J_camera,
+    frame_idx, point_idx, xy_raw, sigma_px, loss_kind, loss_scale, clock, unknowns, variation, J_camera, J_photo,
 ):  # fmt: skip
     """Jacobians (o, 2, nc) by the intrinsics of each observation's camera, weighted as in `residual_blocks`.
 
+    And those (o, 2, 3) by its photo's variation, of log f, cx / f and cy / f, or (o, 2, 0) where these are not wanted.
     `clock` is as there.
     `unknowns` (nc,) are codes: 0 log f (both), 1 log fx, 2 log fy, 3 cx / fx, 4 cy / fy, 5 to 10 k1 k2 p1 p2 k3 k4.
+    `variation` (m, 3) is what photos have of these: shifts are in focal lengths of the camera, and follow its own.
     """
     o = len(frame_idx)
     scale2 = loss_scale * loss_scale
@@ -255,6 +257,7 @@ def intrinsic_blocks(
             c = camera_of_frame[f]
             axis, sign, lens = axes[c], signs[c], lenses[c]
             J_camera[k] = 0.0
+            J_photo[k] = 0.0
             x, y, z = _camera_frame(R_cw[f], center_w[f], vel_w[f], points_w[point_idx[k]], vel_c)
             row = clock[k] if clock[k] == clock[k] else _measured_row(axis, sign, intrs[c], xy_raw[k])
             if not project(model, axis, sign, lens, x, y, z, phi[f], vel_c, row, out, False):
@@ -265,12 +268,21 @@ def intrinsic_blocks(
             _, _, _, m00, m01, m11 = _weights(loss_kind, r0, r1, scale2)
             g0, g1 = intrs[c, 0] / sigma_px[k], intrs[c, 1] / sigma_px[k]
             _lens_jacobian(model, axis, sign, lens, x, y, z, phi[f], vel_c, xd, yd, d)
+            # focal lengths of the camera to one of the photo
+            unit = np.exp(-variation[f, 0])
             for i in range(len(unknowns)):
                 code = unknowns[i]
                 if code >= 5:
                     u, v = d[code - 5, 0], d[code - 5, 1]
+                elif code >= 3:
+                    u, v = (unit, 0.0) if code == 3 else (0.0, unit)
                 else:
-                    u = xd if code < 2 else (1.0 if code == 3 else 0.0)
-                    v = yd if code == 0 or code == 2 else (1.0 if code == 4 else 0.0)
+                    u = xd + unit * variation[f, 1] if code < 2 else 0.0
+                    v = yd + unit * variation[f, 2] if code != 1 else 0.0
                 J_camera[k, 0, i] = m00 * g0 * u + m01 * g1 * v
                 J_camera[k, 1, i] = m01 * g0 * u + m11 * g1 * v
+            if J_photo.shape[2]:
+                for i, m0, m1 in ((0, m00, m01), (1, m01, m11)):
+                    J_photo[k, i, 0] = m0 * g0 * xd + m1 * g1 * yd
+                    J_photo[k, i, 1] = m0 * g0 * unit
+                    J_photo[k, i, 2] = m1 * g1 * unit

@@ -57,8 +57,6 @@ class State:
 # Observations that a thread takes at a time, and whose costs are summed together.
 _CHUNK = 1024
 
-_VARIATION = np.array([INTRINSICS[name] for name in ("f", "cx", "cy")], np.int64)
-
 
 class BundleProblem:
     """Robust reprojection errors and the priors on phi and velocity, with the gauge and the constrained photos held.
@@ -489,30 +487,17 @@ class BundleProblem:
     def _by_lens(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Weighted Jacobians of the intrinsics that are refined (o, 2, nr), and of a photo's variation (o, 2, 3).
 
-        The last is left empty where nobody needs it.
+        The last is left empty (o, 2, 0) where nobody needs it.
         """
         if state is self._lens_of:
             return self._lens
-        num = len(self._refine)
-        varies = self._options.varying or self._fields is not None
-        codes = np.concatenate([self._refine_codes, _VARIATION[: 3 * varies]])
-        both = np.empty((len(self._xy), 2, len(codes)))
-        if len(codes):
-            residuals.intrinsic_blocks(*self._kernel_args(state), self._rows(state), codes, both)
-        J, of_photo = both[:, :, :num], both[:, :, num:]
-        if self._options.varying:
-            own = state.variation[self._structure.frame_idx]
-            # a photo's principal point moves by focal lengths of its camera, not by its own
-            of_photo[:, :, 1:] *= np.exp(-own[:, 0])[:, None, None]
-            for k, name in enumerate(self._refine):
-                if name in ("cx", "cy"):
-                    J[:, :, k] = of_photo[:, :, 1 + (name == "cy")]
-                # shifts are in focal lengths
-                if name in ("f", "fx"):
-                    J[:, :, k] += of_photo[:, :, 1] * own[:, 1, None]
-                if name in ("f", "fy"):
-                    J[:, :, k] += of_photo[:, :, 2] * own[:, 2, None]
-        self._lens_of, self._lens = state, (np.ascontiguousarray(J), of_photo)
+        o, wanted = len(self._xy), self._options.varying or self._fields is not None
+        J, of_photo = np.empty((o, 2, len(self._refine))), np.empty((o, 2, 3 * wanted))
+        if J.size or of_photo.size:
+            residuals.intrinsic_blocks(
+                *self._kernel_args(state), self._rows(state), self._refine_codes, state.variation, J, of_photo
+            )
+        self._lens_of, self._lens = state, (J, of_photo)
         return self._lens
 
     def cost(self, state: State) -> float:

@@ -355,9 +355,8 @@ def _points_of_keypoints(matched: MatchedPhotos, scene: Reconstruction) -> dict[
         xy = matched.features[photo].xy_raw
         place = {tuple(each): k for k, each in enumerate(xy.tolist())}
         point = np.full(len(xy), -1)
-        for row in rows.tolist():
-            keypoint = place.get(tuple(observations.xy_raw[row].tolist()))
-            if keypoint is not None:
-                point[keypoint] = observations.point_idx[row]
+        for each, shown in zip(observations.xy_raw[rows].tolist(), observations.point_idx[rows].tolist(), strict=True):
+            if (keypoint := place.get(tuple(each))) is not None:
+                point[keypoint] = shown
         found[photo] = point
     return found
