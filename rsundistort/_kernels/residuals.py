@@ -9,7 +9,7 @@ import numpy as np
 from ._jit import kernel, parallel_kernel, prange
 from .lens import distort, lens_basis, undistort
 from .motion import cubic, interval, moves, path, rodrigues, rotate
-from .projection import CHUNK, CONSTANT_MOTION, ROTATION, project
+from .projection import CHUNK, CONSTANT_MOTION, GLOBAL, ROTATION, project
 
 # Largest share of the curvature along a residual that a robust loss removes. Removing all of it would send points of
 # two photos whose rays miss each other far off, and damp the step of everything else until it hardly moves; removing
@@ -211,7 +211,9 @@ def _lens_jacobian(model, axis, sign, lens, x, y, z, phi, vel, xd, yd, d):
     last.
     """
     if model < ROTATION:
-        X, Y, _ = undistort(lens, xd, yd)
+        X, Y = x / z, y / z
+        if model != GLOBAL:
+            X, Y, _ = undistort(lens, xd, yd)
         lens_basis(lens, X, Y, d)
         return
     moving = 1.0 if model == CONSTANT_MOTION else 0.0
