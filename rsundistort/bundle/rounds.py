@@ -14,7 +14,7 @@ from ..model.reprojection import reprojection_residuals
 from .calibration_doubt import CalibrationDoubt
 from .common_motion import CommonMotion
 from .intrinsics import pixels_of
-from .jackknife import Inflation, inflated, inflation
+from .jackknife import Inflation, Partition, inflated, inflation
 from .layout import Layout
 from .normal_equations import NormalEquations
 from .options import BundleOptions, BundleResult
@@ -131,6 +131,7 @@ class Rounds:
         self._damping = options.initial_damping
         self._iterations = 0
         self._means: NDArray[np.float64] | None = None
+        self._partitions: tuple[Partition, ...] = ()
 
     def solve(self, cost_tolerance: float, is_judged: bool = False) -> None:
         """Solve once. One that is judged says how uncertain it is by its residuals, if the options ask for that."""
@@ -165,7 +166,9 @@ class Rounds:
         per_camera = equations.num_shared // equations.num_cameras
         self._inflation = Inflation(np.ones(len(self._marginals.photos[0])), np.ones(per_camera))
         if asks_residuals:
-            self._inflation = inflation(equations, problem.partitions(state), self._marginals, self._noise)
+            # the measurements of judged solves are the same, and their points hardly move
+            self._partitions = self._partitions or problem.partitions(state)
+            self._inflation = inflation(equations, self._partitions, self._marginals, self._noise)
             self._noise, self._heavy_tails = self._inflation.noise, True
         self._weighed_sigmas = self._sigmas
         self._sigmas = estimated(
@@ -225,7 +228,7 @@ class Rounds:
         base = self._base
         keep = _believed(base, options, self._sigma_px)
         alive = base.track_lengths(keep) >= 2
-        self._keep = keep[alive[base.observations.point_idx]]
+        self._keep, self._partitions = keep[alive[base.observations.point_idx]], ()
         self._base = base.take_points(alive)
 
     @property
