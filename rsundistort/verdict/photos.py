@@ -58,7 +58,7 @@ def photo_motions(result: BundleResult) -> PhotoMotions:
         The solution, with a shutter model.
     """
     rec = result.reconstruction
-    nb = 12 if rec.shutter_model == "constant-motion" else 9
+    nb = motion_end(rec.shutter_model)
     spread = np.repeat([result.phi_rms, result.velocity_rms * rec.baseline], 3)[: nb - 6]
     found = np.zeros((4, rec.num_images))
     splits = 3 * rec.num_images
