@@ -526,7 +526,7 @@ def test_a_photo_that_stands_twice_in_the_folder_does_not_ruin_the_uncertainty(r
     )  # fmt: skip
     # few steps: depths that nothing holds have not run away yet, where they would not count
     options = replace(options, deviations="model")
-    few = replace(options, max_iterations=1, spread_rounds=0)
+    few = replace(options, max_iterations=1, prior_sigma_rounds=0)
     alone = replace(result.reconstruction, observations=scene.observations)
     found = [bundle_adjust(each, "rotation", few) for each in (alone, twice)]
     sigma, with_copy = (shape_cost(each, options).sigma_log_k for each in found)

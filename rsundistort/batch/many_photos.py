@@ -253,7 +253,7 @@ def _most_bytes(solution: Solution, names: Iterable[str], options: RectifyOption
 
 
 def _entry(done: PhotoDone) -> JournalEntry:
-    return JournalEntry(done.name, done.fingerprint, done.files, done.turn, done.depth)
+    return JournalEntry(done.name, done.fingerprint, done.files, done.orientation, done.depth)
 
 
 class PointColors:

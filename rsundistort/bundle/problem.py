@@ -98,7 +98,7 @@ class BundleProblem:
             photos = range(reconstruction.num_images)
             self._bend_clock = np.array([reconstruction.camera(i).clock_range for i in photos])
         self._path, self._path_start, self._bounded = None, path, True
-        self._turns_only = options.path is not None and options.path.turns_only
+        self._rotation_only = options.path is not None and options.path.rotation_only
         if options.path is not None:
             if shutter_model != "constant-motion":
                 raise InputError(f"frames on a path move by constant-motion, not by {shutter_model}")
@@ -226,7 +226,7 @@ class BundleProblem:
         if self._path is None:
             return free
         free = np.pad(free, ((0, 0), (0, 6)), constant_values=True)
-        if self._turns_only:
+        if self._rotation_only:
             free[:, [3, 4, 5, 9, 10, 11, *range(self.layout.size + 3, self.layout.size + 6)]] = False
         return free
 
@@ -447,7 +447,7 @@ class BundleProblem:
         lengths = self._lengths.residuals(state.points_w), self._lengths.jacobian(state.points_w)
         return NormalEquations(
             self._elimination, total, res, J_frame, prior_diag, prior_gradient, border, lengths, coupling,
-            state.points_w - state.center_w[0] if self._turns_only else None,
+            state.points_w - state.center_w[0] if self._rotation_only else None,
             self._places.on_points(state.points_w), common,
         )  # fmt: skip
 

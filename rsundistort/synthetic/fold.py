@@ -123,8 +123,8 @@ def _line_speed(
     norm = undistort_to_rays(uv, camera)
     known = np.asarray(np.isfinite(norm).all(axis=1))
     rays = np.column_stack([np.where(known[:, None], norm, 0.0), np.ones(len(uv))])
-    turned, gone = motion.at(clock)
-    level = Rotation.from_rotvec(-turned).apply(rays)
+    rotated, gone = motion.at(clock)
+    level = Rotation.from_rotvec(-rotated).apply(rays)
     # small against the distance of what comes towards the camera
     fastest = float(np.abs((motion.at(clock + _STEP)[1] - gone) * inverse_depth[:, None]).max()) / _STEP
     step = _STEP / max(1.0, fastest)
@@ -132,8 +132,8 @@ def _line_speed(
     def position(late: float) -> NDArray[np.float64]:
         """Pixels (n, 2) of what the rays see, `late` after its own moment."""
         # X(t) = Exp(theta(t)) (X(0) - way(t)), so the camera's way is rotated by all of the time gone
-        turn, way = motion.at(clock + late)
-        return distort_rays(Rotation.from_rotvec(turn).apply(level - (way - gone) * inverse_depth[:, None]), camera)
+        rotation, way = motion.at(clock + late)
+        return distort_rays(Rotation.from_rotvec(rotation).apply(level - (way - gone) * inverse_depth[:, None]), camera)
 
     known &= np.linalg.norm(position(0.0) - uv, axis=1) < _LENS_PX
     moved_px = (position(step) - position(-step))[:, axis]

@@ -66,8 +66,8 @@ def project_rows(
     reached = np.zeros(len(points), bool)
     for _ in range(_MAX_STEPS):
         tau = clock_of(camera.readout, seen)
-        turn, way = motion.at(tau)
-        q = Rotation.from_rotvec(turn).apply((points - (center + way)) @ R.T)
+        rotation, way = motion.at(tau)
+        q = Rotation.from_rotvec(rotation).apply((points - (center + way)) @ R.T)
         ahead &= q[:, 2] > 1e-9
         q[~ahead] = (0.0, 0.0, 1.0)
         before, seen = seen, distort_rays(q, camera, np.eye(3))

@@ -49,8 +49,8 @@ def line_poses(camera: Camera, view: View, delay: float = 0.0) -> tuple[NDArray[
     axis, sign = READOUTS[camera.readout]
     lines = np.arange(camera.height if axis == 1 else camera.width)
     tau = sign * (lines - camera.K[axis, 2]) / camera.K[axis, axis] + delay
-    turn, way = view.motion.at(tau)
-    return Rotation.from_rotvec(turn).as_matrix() @ view.R_cw, view.center_w + way
+    rotation, way = view.motion.at(tau)
+    return Rotation.from_rotvec(rotation).as_matrix() @ view.R_cw, view.center_w + way
 
 
 def pixel_rays(camera: Camera, view: View, uv_raw: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -75,8 +75,8 @@ def pixel_rays(camera: Camera, view: View, uv_raw: ArrayLike) -> tuple[NDArray[n
     tau = sign * (uv[:, axis] - camera.K[axis, 2]) / camera.K[axis, axis]
     rays_c = np.column_stack([undistort_to_rays(uv, camera), np.ones(len(uv))])
     tau, line = np.unique(tau, return_inverse=True)  # of whole photos there are few
-    turn, way = view.motion.at(tau)
-    return view.center_w + way[line], Rotation.from_rotvec(-turn)[line].apply(rays_c) @ view.R_cw
+    rotation, way = view.motion.at(tau)
+    return view.center_w + way[line], Rotation.from_rotvec(-rotation)[line].apply(rays_c) @ view.R_cw
 
 
 def _develop(radiance: NDArray[np.float64], exposure: float) -> NDArray[np.uint8]:

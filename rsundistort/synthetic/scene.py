@@ -213,8 +213,8 @@ class Light:
         angle = order * np.pi * (3 - np.sqrt(5))
         spread = np.tan(np.radians(self.sun_radius_deg)) * radius
         local = np.stack([np.ones(num), spread * np.cos(angle), spread * np.sin(angle)], 1)
-        turn = Rotation.from_euler("yz", [-self.sun_elevation_deg, self.sun_azimuth_deg], degrees=True)
-        return np.asarray(turn.apply(local / np.linalg.norm(local, axis=1, keepdims=True)))
+        rotation = Rotation.from_euler("yz", [-self.sun_elevation_deg, self.sun_azimuth_deg], degrees=True)
+        return np.asarray(rotation.apply(local / np.linalg.norm(local, axis=1, keepdims=True)))
 
 
 def _sky_image(light: Light, seed: int) -> NDArray[np.float32]:

@@ -110,9 +110,9 @@ def _lookup(camera: Camera, motion: RowMotion | ArrayLike) -> tuple[NDArray[np.f
     steps = clock[:, 0] if axis == 1 else clock[0]
     R = Rotation.from_rotvec(-motion.at(steps)[0]).as_matrix()
     rays = np.dstack([ideal, np.ones((h, w))])
-    turned = np.einsum("vij,vuj->vui" if axis == 1 else "uij,vuj->vui", R, rays)
-    source = distort_rays(turned, camera).reshape(h, w, 2)
-    ahead = turned[..., 2] > 0  # not where the lens sees nothing
+    rotated = np.einsum("vij,vuj->vui" if axis == 1 else "uij,vuj->vui", R, rays)
+    source = distort_rays(rotated, camera).reshape(h, w, 2)
+    ahead = rotated[..., 2] > 0  # not where the lens sees nothing
     inside = ahead & (source >= 0).all(-1) & (source[..., 0] <= w - 1) & (source[..., 1] <= h - 1)
     return np.where(ahead[..., None], source, -1e6).astype(np.float32), inside
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from ..bundle import BundleResult
+from ..bundle.layout import motion_end
 from ..model import Reconstruction
 from ..model.projection import clock_of, project_points_with_jacobians, unproject_points
 
@@ -96,7 +97,7 @@ class _Photo:
     frame: Array
     size: Array
     along: int
-    turn: Array
+    rotation: Array
 
     @classmethod
     def of(cls, rec: Reconstruction, i: int, mine: NDArray[np.int64], sigma_px: float) -> _Photo:
@@ -144,9 +145,9 @@ class _Photo:
 
     def spread_px(self, covariance: Array) -> float:
         """Largest standard deviation of a displacement by the motion of this covariance, velocities in the world."""
-        turn = np.eye(len(self.motion))
-        turn[3:, 3:] = self.turn[: len(turn) - 3, : len(turn) - 3]
-        covariance = turn @ covariance @ turn.T
+        rotation = np.eye(len(self.motion))
+        rotation[3:, 3:] = self.rotation[: len(rotation) - 3, : len(rotation) - 3]
+        covariance = rotation @ covariance @ rotation.T
         variance = np.einsum("fia,ab,fib->f", self.frame, covariance, self.frame).max(initial=0.0)
         return float(np.sqrt(variance * self._noise(self.residuals, self.J.shape[2])))
 
