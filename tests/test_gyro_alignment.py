@@ -232,5 +232,5 @@ def test_too_little():
         align_gyro(gyroscope(), times, pairs, turns[:5])
     with pytest.raises(InputError, match="pairs"):
         align_gyro(gyroscope(), times, pairs.astype(float), turns)
-    with pytest.raises(InputError, match="join frames"):
+    with pytest.raises(InputError, match="connect frames"):
         align_gyro(gyroscope(), times[:100], pairs, turns)

@@ -47,11 +47,11 @@ def _noise_px(reconstruction: Reconstruction, shutter_model: str, floor: float) 
     if not valid.any():
         return max(1.0, floor)
     # median of |x| of a normal variable is 0.6745 sigma; residuals of a fit are shorter than the noise
-    spread = float(np.median(np.abs(res / reconstruction.observations.sigma[:, None])[valid])) / 0.6745
+    sigma = float(np.median(np.abs(res / reconstruction.observations.sigma[:, None])[valid])) / 0.6745
     bends = max(reconstruction.bend.shape[1] - 2, 0)
     unknowns = (9 + 3 * bends) * reconstruction.num_images + 3 * reconstruction.num_points
     shrink = np.sqrt(max(1.0 - unknowns / (2.0 * len(res)), 0.1))
-    return max(spread / shrink, floor)
+    return max(sigma / shrink, floor)
 
 
 def _believed(reconstruction: Reconstruction, options: BundleOptions, sigma: float) -> NDArray[np.bool_]:

@@ -200,19 +200,19 @@ def align_gyro(
 
 def check_pairs(pairs: ArrayLike, rotations: ArrayLike) -> tuple[NDArray[np.int64], _Array]:
     """Pairs of frames (n, 2) and the rotations (n, 3) between them; other shapes and types are refused."""
-    joined = np.asarray(pairs)
-    if joined.ndim != 2 or joined.shape[1] != 2 or not np.issubdtype(joined.dtype, np.integer):
-        raise InputError(f"pairs.shape={joined.shape} of {joined.dtype}, expected (n, 2) of int")
-    return joined, check_array(rotations, (len(joined), 3), "rotations")
+    between = np.asarray(pairs)
+    if between.ndim != 2 or between.shape[1] != 2 or not np.issubdtype(between.dtype, np.integer):
+        raise InputError(f"pairs.shape={between.shape} of {between.dtype}, expected (n, 2) of int")
+    return between, check_array(rotations, (len(between), 3), "rotations")
 
 
 def _rates(frame_time_s: ArrayLike, pairs: ArrayLike, rotations: ArrayLike) -> tuple[_Array, _Array, _Array]:
     """Start and end (n,) of intervals between frames, and the rates (n, 3) in them; without false ones."""
     times = check_finite(frame_time_s, (None,), "frame_time_s")
-    joined, vectors = check_pairs(pairs, rotations)
-    if len(joined) and (joined.min() < 0 or joined.max() >= len(times)):
-        raise InputError(f"pairs join frames {joined.min()} to {joined.max()} of {len(times)}")
-    start, end = times[joined[:, 0]], times[joined[:, 1]]
+    between, vectors = check_pairs(pairs, rotations)
+    if len(between) and (between.min() < 0 or between.max() >= len(times)):
+        raise InputError(f"pairs connect frames {between.min()} to {between.max()} of {len(times)}")
+    start, end = times[between[:, 0]], times[between[:, 1]]
     good = np.isfinite(vectors).all(axis=1) & (end > start)
     return start[good], end[good], -vectors[good] / (end - start)[good, None]
 

@@ -60,16 +60,16 @@ def photo_motions(result: BundleResult) -> PhotoMotions:
     """
     rec = result.reconstruction
     nb = motion_end(rec.shutter_model)
-    spread = np.repeat([result.phi_rms, result.velocity_rms * rec.baseline], 3)[: nb - 6]
+    sigmas = np.repeat([result.phi_rms, result.velocity_rms * rec.baseline], 3)[: nb - 6]
     found = np.zeros((4, rec.num_images))
     splits = 3 * rec.num_images
     for i, mine in enumerate(rec.observations.by_photo(rec.num_images)):
         if len(mine):
-            prior = np.concatenate([np.zeros(6), (rec.frame_span()[i] / np.maximum(spread, 1e-12)) ** 2])
+            prior = np.concatenate([np.zeros(6), (rec.frame_span()[i] / np.maximum(sigmas, 1e-12)) ** 2])
             photo = _Photo.of(rec, i, mine, result.sigma_px)
             found[:, i] = (
                 photo.shift_px(photo.motion[None])[0] + _bent_px(rec, i),
-                photo.spread_px(result.covariances[i, 6:, 6:]),
+                photo.motion_sigma_px(result.covariances[i, 6:, 6:]),
                 photo.difference_px(prior, _CHANCE / splits),
                 photo.covered,
             )
@@ -143,7 +143,7 @@ class _Photo:
         shift = np.linalg.norm(np.einsum("fia,ka->kfi", self.frame, motions), axis=2)
         return np.asarray(shift.max(axis=1, initial=0.0))
 
-    def spread_px(self, covariance: Array) -> float:
+    def motion_sigma_px(self, covariance: Array) -> float:
         """Largest standard deviation of a displacement by the motion of this covariance, velocities in the world."""
         rotation = np.eye(len(self.motion))
         rotation[3:, 3:] = self.rotation[: len(rotation) - 3, : len(rotation) - 3]
