@@ -12,6 +12,7 @@ from scipy.special import fdtrc
 from ..bundle import BundleResult
 from ..bundle.layout import motion_end
 from ..model import Reconstruction
+from ..model.path import cross_matrices
 from ..model.projection import clock_of, project_points_with_jacobians, unproject_points
 
 __all__ = ["PhotoMotions", "photo_motions"]
@@ -107,9 +108,9 @@ class _Photo:
         moving = rec.shutter_model == "constant-motion"
         xy, valid, J = project_points_with_jacobians(points_c, camera, motion, rec.shutter_model)
         mine, points_c = mine[valid], points_c[valid]
-        blocks = [-J.point[valid] @ _cross(points_c), -J.point[valid], J.phi[valid]]
+        blocks = [-J.point[valid] @ cross_matrices(points_c), -J.point[valid], J.phi[valid]]
         if moving:
-            blocks[0] = blocks[0] - J.velocity[valid] @ _cross(motion.velocity[None])
+            blocks[0] = blocks[0] - J.velocity[valid] @ cross_matrices(motion.velocity[None])
             blocks.append(J.velocity[valid])
         precision = 1.0 / (sigma_px * obs.sigma[mine])
         depth = float(np.median(points_c[:, 2])) if len(points_c) else 1.0
@@ -193,10 +194,3 @@ class _Photo:
         if fdtrc(len(difference), max(self.residuals.size - 2 * nb, 1), unlike) > chance:
             return 0.0
         return float(self.shift_px(difference[None])[0])
-
-
-def _cross(vectors: Array) -> Array:
-    """(n, 3, 3) matrices that take x to vector cross x."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
