@@ -32,7 +32,7 @@ def close(solution: Solution, out: Path, warned: Said, talk: Talk) -> None:
 
 
 def summary(solution: Solution, out: Path, warned: Sequence[str]) -> dict[str, Any]:
-    """What was found, for other programs; all of it is in solution.json."""
+    """Summary of the result for other programs; all of it is in solution.json."""
     shifts = sorted(image.rs_shift_px or 0.0 for image in solution.registered)
     critical = solution.critical_motion
     return {
@@ -59,7 +59,7 @@ def summary(solution: Solution, out: Path, warned: Sequence[str]) -> dict[str, A
 
 
 def closing_table(solution: Solution, out: Path) -> str:
-    """What was found, one line per photo, in 80 columns."""
+    """Table of the result with one line per photo, in 80 columns."""
     from rsundistort.report import verdict_of
 
     rows = [("photo", "measurements", "rms px", "deg/frame", "shift px")]

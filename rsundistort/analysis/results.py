@@ -85,7 +85,7 @@ class Evaluation(_FormerlyDict):
     psnr_before_db: PsnrSummary | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """What `rsundistort evaluate --json` prints: without what is None."""
+        """The JSON object of `rsundistort evaluate --json`, without fields that are None."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
@@ -120,7 +120,7 @@ class PoseAnalysis(_FormerlyDict):
         return self.degeneracy
 
     def to_json(self) -> dict[str, Any]:
-        """What `rsundistort analyze --json` prints."""
+        """The JSON object of `rsundistort analyze --json`."""
         return {
             "photos": self.photos,
             "readout": list(self.readout),

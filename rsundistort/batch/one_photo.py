@@ -101,7 +101,7 @@ class PhotoJob:
         return [self.image, self.mask, *(each.target for each in self.also), *maps]
 
     def fingerprint(self) -> str:
-        """What the outputs depend on, as a number: if it is another one, they are stale.
+        """Digest of all that the outputs depend on: they are stale if it changes.
 
         Files count with size and time of change, all else with its value; a missing photo has no fingerprint ("").
         """
@@ -151,7 +151,7 @@ def feed(digest: Any, value: Any) -> None:
 
 @dataclass(frozen=True)
 class PhotoDone:
-    """What came of one photo.
+    """Outcome of one photo.
 
     Attributes
     ----------
@@ -212,7 +212,7 @@ def rectify_photo(job: PhotoJob) -> PhotoDone:
 
 
 def _rectify_in(work: Path, job: PhotoJob) -> PhotoDone:
-    """The same by way of a folder that is here; without the fingerprint."""
+    """Rectify a photo by way of a local folder; the result has no fingerprint."""
     try:
         source = fetched(job.source, work / "photo")
         own_mask = None if job.own_mask is None else fetched(job.own_mask, work / "masks")
@@ -231,7 +231,7 @@ def _rectify_in(work: Path, job: PhotoJob) -> PhotoDone:
 
 
 def _rectify(job: PhotoJob, source: Path, own_mask: Path | None, out: Path) -> PhotoDone:
-    """The same with local files; without the fingerprint."""
+    """Rectify a photo in local files; the result has no fingerprint."""
     options, geometry = job.options, job.geometry
     files: dict[str, int] = {}
     writing = False

@@ -27,7 +27,7 @@ _UNSETTLED_PATH = 1e-4
 
 
 def objective(reconstruction: Reconstruction, shutter_model: str, options: BundleOptions) -> float:
-    """What `bundle_adjust` lowers in its first solve, at a reconstruction's values.
+    """The cost that `bundle_adjust` minimises in its first solve, at the values of a reconstruction.
 
     Half the robust sum of squares in units of the noise (`options.sigma_px`, which must be given), and the priors.
     Motion that the model lacks, or that is held, counts as zero.

@@ -55,7 +55,7 @@ class Layout:
 
     @classmethod
     def of(cls, shutter_model: str, options: BundleOptions) -> Layout:
-        """That of a model."""
+        """The layout of a shutter model."""
         motion = motion_end(shutter_model)
         exact = SHUTTER_MODELS[shutter_model] >= SHUTTER_MODELS["rotation"]
         functions, group = bend_functions(options.bends) if exact and options.bends else (np.zeros((0, 0)), ())

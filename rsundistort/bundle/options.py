@@ -332,7 +332,7 @@ class BundleResult:
         return float(np.sqrt(self.velocity_sigma**2 + mean))
 
     def of_photos(self, keep: NDArray[np.bool_]) -> BundleResult:
-        """The same for some photos (m,) only, with the points that two of them show."""
+        """The result of some photos (m,) only, with the points that two of them show."""
         return replace(self, reconstruction=self.reconstruction.take_photos(keep), covariances=self.covariances[keep])
 
     @property

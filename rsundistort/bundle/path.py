@@ -43,7 +43,7 @@ _FRAMES_BEFORE = 100.0
 
 @dataclass(frozen=True)
 class PathStart:
-    """What an adjustment found of a path, for the next one to begin with.
+    """Path that an adjustment found, with which the next one begins.
 
     Attributes
     ----------
@@ -360,7 +360,7 @@ def path_bends(reconstruction: Reconstruction, path: FramePath, state: PathState
 
 @dataclass(frozen=True)
 class PathSolution:
-    """What was found of a path.
+    """Solution of a path.
 
     Attributes
     ----------

@@ -268,7 +268,7 @@ def settled(before: PriorSigmas, after: PriorSigmas, tolerance: float) -> bool:
 
 
 def starting_sigmas(options: BundleOptions, layout: Layout, reconstruction: Reconstruction) -> PriorSigmas:
-    """Those that are given, or at which the estimation begins."""
+    """Standard deviations that are given, or at which the estimation begins."""
     baseline = reconstruction.baseline
     start = PriorSigmas(
         options.phi_sigma or options.phi_sigma_start,

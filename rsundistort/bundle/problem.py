@@ -35,7 +35,7 @@ __all__ = ["BundleProblem", "State"]
 
 @dataclass(frozen=True)
 class State:
-    """What a step changes: cameras, poses, shutter motion, variation and points, as in `Reconstruction`.
+    """Unknowns that a step changes: cameras, poses, shutter motion, variation and points, as in `Reconstruction`.
 
     Of the bends (m, 3 k) coefficients along `Layout.functions`, of the rotation, then of the position, three by three.
     Of frames on a path, phi and velocity are those of its rates. Means (cameras, 6) of the motions are in the frame of
@@ -254,7 +254,7 @@ class BundleProblem:
         )  # fmt: skip
 
     def with_squares(self) -> BundleProblem:
-        """The same without a robust loss, and without the bound of the readout time, for covariances.
+        """The problem without a robust loss and without the bound of the readout time, for covariances.
 
         The curvature of a robust loss is not the inverse of a covariance: of normal noise it would be too small by a
         quarter. That of squares is right for normal noise, and to the safe side for noise with heavy tails.
@@ -310,7 +310,7 @@ class BundleProblem:
         return self._model, *self._args, LOSSES[self._options.loss], self._options.loss_scale
 
     def _arrays(self, state: State) -> tuple[NDArray[Any], ...]:
-        """What the kernels take of cameras, photos, points and measurements."""
+        """Arguments of the kernels: cameras, photos, points and measurements."""
         s = self._structure
         phi = state.phi
         if self.layout.bent:

@@ -182,7 +182,7 @@ class Rounds:
         self._new_points = self._current if self._rotation_only else retriangulated(self._current, self._model)
 
     def _common(self, equations: NormalEquations) -> Common | None:
-        """What the last solve found of the means of the motions."""
+        """Means of the motions that the last solve found."""
         state, current = self._solved.state, self._current
         if not state.means.size:
             return None
@@ -251,7 +251,7 @@ class Rounds:
         self._base = replace(self._new_points, observations=self._base.observations)
 
     def result(self) -> BundleResult:
-        """What the last solve found."""
+        """Result of the last solve."""
         current, options, layout, state = self._current, self._options, self._layout, self._solved.state
         res, valid = reprojection_residuals(current)
         weighed, sigmas = self._weighed_noise, self._sigmas

@@ -65,7 +65,7 @@ class CriticalMotion:
 
     @property
     def meaning(self) -> str:
-        """What is confounded, in words."""
+        """Unknowns that are confounded, in words."""
         if self.num_photos < 3:
             return "too few photos: two never separate the shutter from the shape of the scene"
         if not self.is_low:

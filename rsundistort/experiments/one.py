@@ -215,7 +215,7 @@ def run_trial(scene: KnownScene, options: OneOptions, trial: int) -> list[dict[s
 
 
 def _settings(options: OneOptions) -> dict[str, Any]:
-    """What a trial's result depends on."""
+    """Settings that the result of a trial depends on."""
     return {k: v for k, v in asdict(options).items() if k not in ("jobs", "trials", "methods")}
 
 

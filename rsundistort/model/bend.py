@@ -117,7 +117,7 @@ def splines_at(num_sites: int, place: Array) -> Array:
 
 
 def parts_of(clock: Array, readings: Array, sites: int) -> tuple[Array, Array, Array]:
-    """Of readings (k, c), at ascending times of the clock (k,): bends (sites, c), constants and rates (c,)."""
+    """Parts of readings (k, c) at ascending times of the clock (k,): bends (sites, c), constants and rates (c,)."""
     from scipy.interpolate import CubicSpline
 
     values = CubicSpline(clock, readings)(np.linspace(clock[0], clock[-1], sites))

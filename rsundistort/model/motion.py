@@ -34,7 +34,7 @@ def check_shutter_model(name: str) -> int:
 def steady_parts(
     clock: NDArray[np.float64], moved: NDArray[np.float64], sites: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """What `RowMotion.of` says of one frame, of k frames at once.
+    """`RowMotion.of` for k frames at once.
 
     Parameters
     ----------

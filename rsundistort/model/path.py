@@ -100,7 +100,7 @@ class CameraPath:
             object.__setattr__(self, name, frozen(value))
 
     def moved(self, R: Array, origin: Array, scale: float) -> CameraPath:
-        """The same in a world where x is scale R (x - origin)."""
+        """The path in a world where x is scale R (x - origin)."""
         return replace(
             self,
             R_cw=self.R_cw @ R.T,
@@ -119,7 +119,7 @@ class CameraPath:
         return rotation[0], way[0]
 
     def _around(self, moments: Index, offset: Array) -> tuple[Array, Array]:
-        """As `near`, (k, n, 3) of k moments."""
+        """`near` for k moments: (k, n, 3)."""
         rotation, way = (
             offset[:, None] * slope[moments, None] + 0.5 * offset[:, None] ** 2 * bend[moments, None]
             for slope, bend in ((self.rate, self.rate_change), (self.velocity, self.acceleration))
@@ -133,7 +133,7 @@ class CameraPath:
         return rotation, way
 
     def _towards(self, moments: Index, others: Index, offset: Array) -> tuple[Array, Array]:
-        """As `_around`, on the side of one neighbour of each."""
+        """`_around` on the side of one neighbour of each moment."""
         dt = self.time_s[others] - self.time_s[moments]
         xi = Rotation.from_matrix(self.R_cw[others] @ self.R_cw[moments].transpose(0, 2, 1)).as_rotvec()
         J = inverse_left_jacobians(xi)

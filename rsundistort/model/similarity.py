@@ -54,7 +54,7 @@ class Similarity:
         return reconstruction.moved(self.R, -self.R.T @ self.shift / self.scale, self.scale)
 
     def after(self, other: Similarity) -> Similarity:
-        """Both, the other first."""
+        """The composition of both, the other one applied first."""
         return Similarity(self.scale * other.scale, self.R @ other.R, self.of(other.shift[None])[0])
 
     @property

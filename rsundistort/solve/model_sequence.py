@@ -67,7 +67,7 @@ _LOOKED_AT = 5
 
 @dataclass(frozen=True)
 class TrackSource:
-    """What new tracks are made from.
+    """Source of new tracks.
 
     Attributes
     ----------

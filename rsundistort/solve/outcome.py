@@ -90,7 +90,7 @@ class Solved:
 
     @property
     def reconstruction(self) -> Reconstruction:
-        """The same with a camera for each photo if they vary."""
+        """The reconstruction with a camera for each photo, if they vary."""
         return self.shared.with_own_cameras()
 
     @property

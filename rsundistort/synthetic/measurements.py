@@ -106,7 +106,7 @@ def measure(
     noise_px: float = 0.0,
     seed: int = 0,
 ) -> Measured:
-    """What photos measure of points that they are known to see.
+    """Measurements of points that photos are known to see.
 
     Parameters
     ----------

@@ -326,7 +326,7 @@ class Scene:
 
     @property
     def geometry(self) -> tuple[Any, ...]:
-        """What the kernels need to intersect rays; see `_kernels.raycast`."""
+        """Arguments of the kernels that intersect rays; see `_kernels.raycast`."""
         return self._ordered[1]
 
     @property
@@ -336,7 +336,7 @@ class Scene:
 
     @cached_property
     def look(self) -> tuple[Any, ...]:
-        """What the kernels need to colour a hit: textures, baked light, sky; seconds of work, done once."""
+        """Arguments of the kernels that colour a hit: textures, baked light, sky; seconds of work, done once."""
         patches = self.ordered_patches
         names = sorted(self.textures)
         levels, first_level, texels, start = [], [0], [], 0
