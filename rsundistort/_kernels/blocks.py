@@ -46,10 +46,10 @@ def multiply(row_start, cols, S, x, parts, y):
 
 
 @parallel_kernel(fastmath=SUMS)
-def project_blocks(rotation, free, functions, pair_start, block, left, right, S, E):
+def project_blocks(R, free, functions, pair_start, block, left, right, S, E):
     """E (pairs, q nb, q nb) = Z_c' S Z_d of each pair of clusters, from the entries that belong to it.
 
-    Z is functions[f, k] (m, q) times the unknowns of photo f, of which the first three are rotated by rotation[f]
+    Z is functions[f, k] (m, q) times the unknowns of photo f, of which the first three are rotated by R[f]
     (m, 3, 3) and those that are held (free[f, a] is 0) vanish. Entry s is the part of S between the photos left[s] and
     right[s], block[s] or, below the diagonal, its transpose; entries pair_start[p] to pair_start[p + 1] belong to
     pair p, those of one photo together.
@@ -72,9 +72,7 @@ def project_blocks(rotation, free, functions, pair_start, block, left, right, S,
                         value = S[i, a, b] if f <= g else S[i, b, a]
                         G[a, b] = value * free[f, a] * free[g, b]
                     for b in range(3):
-                        rotated[b] = (
-                            G[a, 0] * rotation[g, 0, b] + G[a, 1] * rotation[g, 1, b] + G[a, 2] * rotation[g, 2, b]
-                        )
+                        rotated[b] = G[a, 0] * R[g, 0, b] + G[a, 1] * R[g, 1, b] + G[a, 2] * R[g, 2, b]
                     for b in range(3):
                         G[a, b] = rotated[b]
                 for k in range(q):
@@ -85,7 +83,7 @@ def project_blocks(rotation, free, functions, pair_start, block, left, right, S,
                 s += 1
             for b in range(q * nb):
                 for a in range(3):
-                    rotated[a] = rotation[f, 0, a] * H[0, b] + rotation[f, 1, a] * H[1, b] + rotation[f, 2, a] * H[2, b]
+                    rotated[a] = R[f, 0, a] * H[0, b] + R[f, 1, a] * H[1, b] + R[f, 2, a] * H[2, b]
                 for a in range(3):
                     H[a, b] = rotated[a]
             for k in range(q):

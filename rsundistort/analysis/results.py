@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from ..critical import CriticalMotion
+from ..model.former_fields import former_fields
 
 __all__ = ["ErrorSummary", "Evaluation", "PhiErrorSummary", "PoseAnalysis", "PsnrSummary"]
 
@@ -89,6 +90,7 @@ class Evaluation(_FormerlyDict):
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
+@former_fields(meter="degeneracy")
 @dataclass(frozen=True)
 class PoseAnalysis(_FormerlyDict):
     """Outcome of `analyze`.
@@ -112,12 +114,6 @@ class PoseAnalysis(_FormerlyDict):
     degeneracy: CriticalMotion
     sentence: str | None = None
     advice: tuple[str, ...] = ()
-
-    @property
-    def meter(self) -> CriticalMotion:
-        """Former name of `degeneracy`, in this version."""
-        warnings.warn("PoseAnalysis.meter is now PoseAnalysis.degeneracy", DeprecationWarning, stacklevel=2)
-        return self.degeneracy
 
     def to_json(self) -> dict[str, Any]:
         """The JSON object of `rsundistort analyze --json`."""

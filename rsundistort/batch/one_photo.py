@@ -28,15 +28,7 @@ from .extras import AlsoImage
 from .geometry import PhotoGeometry
 from .rectify_options import RectifyOptions
 
-__all__ = [
-    "PhotoDone",
-    "PhotoJob",
-    "check_not_rectified",
-    "feed",
-    "orientation_to_apply",
-    "photo_colors",
-    "rectify_photo",
-]
+__all__ = ["PhotoDone", "PhotoJob", "applied_part", "check_not_rectified", "feed", "photo_colors", "rectify_photo"]
 
 # the two files of a photo's grid
 _WAYS = ("forward", "inverse")
@@ -187,7 +179,7 @@ def check_not_rectified(photo: Photo) -> None:
         raise InputError(f"it was rectified already, by rsundistort {by}; --again rectifies it once more")
 
 
-def orientation_to_apply(orientation: int, posed: bool) -> tuple[int, int]:
+def applied_part(orientation: int, posed: bool) -> tuple[int, int]:
     """How a photo's orientation is applied, and what is left of it: mirrors are left where there is a pose."""
     return split_mirror(orientation) if posed else (orientation, 1)
 
@@ -245,7 +237,7 @@ def _rectify(job: PhotoJob, source: Path, own_mask: Path | None, out: Path) -> P
         colors = None if job.sample_xy is None else _colors(photo, job.sample_xy)
         metadata, applied = photo.metadata.marked(_VERSION), 1
         if options.apply_orientation:
-            applied, rest = orientation_to_apply(metadata.orientation, job.posed)
+            applied, rest = applied_part(metadata.orientation, job.posed)
             pixels, mask = orient_pixels(pixels, applied), orient_pixels(mask, applied)
             _warn_of_orientation(job.name, photo, rest)
             metadata = metadata.with_orientation(rest)

@@ -84,12 +84,7 @@ def bundle_adjust(
         rounds.drop_outliers()
     most = options.prior_sigma_rounds + 1
     is_guess = options.path is None or options.path.start is None
-    if (
-        is_guess
-        and not options.outlier_rounds
-        and options.prior_sigma_rounds
-        and estimates_sigmas(shutter_model, options)
-    ):
+    if is_guess and not options.outlier_rounds and most > 1 and estimates_sigmas(shutter_model, options):
         # the first prior standard deviations are a guess: their solution need not be exact
         rounds.solve(options.round_tolerance)
         rounds.begin_next()

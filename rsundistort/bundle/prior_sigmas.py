@@ -229,15 +229,10 @@ def _bend_sigmas(
 
 def estimates_sigmas(shutter_model: str, options: BundleOptions) -> bool:
     """Whether a prior standard deviation is estimated."""
-    of_rotation = shutter_model != "global" and options.phi_sigma is None
+    of_phi = shutter_model != "global" and options.phi_sigma is None
     of_way = shutter_model == "constant-motion" and options.velocity_sigma is None
     return (
-        of_rotation
-        or of_way
-        or options.path is not None
-        or options.varying
-        or options.bends > 0
-        or options.residual_field
+        of_phi or of_way or options.path is not None or options.varying or options.bends > 0 or options.residual_field
     )
 
 

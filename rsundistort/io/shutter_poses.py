@@ -90,9 +90,8 @@ def _motion(solution: Solution, image: SolvedImage) -> RowMotion:
         return motion
     bent = motion.bend is not None and solution.shutter_model == "rotation"
     # it heeds no positions
-    return RowMotion(
-        motion.phi, bend=motion.bend.rotated(np.eye(3), np.zeros((3, 3))) if bent and motion.bend else None
-    )
+    bend = motion.bend.rotated(np.eye(3), np.zeros((3, 3))) if bent and motion.bend else None
+    return RowMotion(motion.phi, bend=bend)
 
 
 def _steady(solution: Solution, image: SolvedImage) -> tuple[RowMotion, Pose]:

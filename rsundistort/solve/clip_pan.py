@@ -58,7 +58,7 @@ def _chained(
             break
         for k in range(a + 1, b + 1):
             mine = (followed.frame == k) & (followed.key == a)
-            rotation = _turn(own[a][followed.place[mine]], rays[mine], _ROOM_PX / float(camera.K[0, 0]))
+            rotation = _agreed_rotation(own[a][followed.place[mine]], rays[mine], _ROOM_PX / float(camera.K[0, 0]))
             if rotation is not None:
                 R_cw[k] = rotation @ R_cw[a]
     left = []
@@ -114,11 +114,9 @@ def _left_by_shutter(before: NDArray[np.float64], after: NDArray[np.float64], ca
         return float("inf")
     (u, v), (x, y) = (each[seen, :2].T / each[seen, 2] for each in (before, after))
     # dx / dt of x = X / Z where X rotates about the three axes
-    by_rotation = np.stack([np.stack([x * y, -(1 + x**2), y], 1), np.stack([1 + y**2, -x * y, -x], 1)], axis=1)
+    by_R = np.stack([np.stack([x * y, -(1 + x**2), y], 1), np.stack([1 + y**2, -x * y, -x], 1)], axis=1)
     r_before, r_after = (u, x) if camera.clock_axis == 0 else (v, y)
-    A = np.concatenate(
-        [by_rotation, r_after[:, None, None] * by_rotation, -r_before[:, None, None] * by_rotation], axis=2
-    )
+    A = np.concatenate([by_R, r_after[:, None, None] * by_R, -r_before[:, None, None] * by_R], axis=2)
     apart, weight = np.stack([x - u, y - v], axis=1), np.ones(len(x))
     size = np.linalg.norm(apart, axis=1)
     for _ in range(10):
@@ -134,11 +132,13 @@ def rotation_between(
 ) -> NDArray[np.float64] | None:
     """The rotation vector from directions of pixels (n, 2) to those in another frame; None if none fits."""
     before, after = _directions(xy_before, camera), _directions(xy_after, camera)
-    rotation = _turn(before, after, _ROOM_PX / float(camera.K[0, 0]))
+    rotation = _agreed_rotation(before, after, _ROOM_PX / float(camera.K[0, 0]))
     return None if rotation is None else np.asarray(Rotation.from_matrix(rotation).as_rotvec())
 
 
-def _turn(before: NDArray[np.float64], after: NDArray[np.float64], within: float) -> NDArray[np.float64] | None:
+def _agreed_rotation(
+    before: NDArray[np.float64], after: NDArray[np.float64], within: float
+) -> NDArray[np.float64] | None:
     """The rotation that takes most directions (n, 3) to those of another frame; None if too few agree on one."""
     seen = np.isfinite(before).all(1) & np.isfinite(after).all(1)
     before, after = before[seen], after[seen]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..batch.clip import rectify_clip
 from ..batch.geometry import DEPTHS, PhotoGeometry, SceneGeometry, ScenePoints, with_depths
 from ..batch.many_photos import PointColors, mask_names, rectify_photos
-from ..batch.one_photo import orientation_to_apply
+from ..batch.one_photo import applied_part
 from ..batch.progress import StageLog
 from ..batch.rectify_options import RectifyOptions
 from ..batch.views import with_view
@@ -182,7 +182,7 @@ class Outputs:
         solution = with_view(solution_of(solved, solving, rectifying), rectifying.view)
         applied: dict[str, int] = {}
         if rectifying.apply_orientation:
-            applied = {name: orientation_to_apply(orientations.get(name, 1), True)[0] for name in rec.image_names}
+            applied = {name: applied_part(orientations.get(name, 1), True)[0] for name in rec.image_names}
         ids = replace(ids or ModelIds.in_order(rec), cameras=solved.camera_ids)
         rec = rec.with_motions([solution.image(name).taken_out or RowMotion() for name in rec.image_names])
         if (options.rs_poses or not {"ncore", "opf"}.isdisjoint(options.exports)) and rec.bends:
