@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..model.bend import Bend
-from ..model.camera import READOUTS, Camera
+from ..model.camera import Camera
 from ..model.motion import RowMotion
 from .lens import distort_rays, undistort_to_rays
 
@@ -74,7 +74,7 @@ def check_no_fold(
     motion = RowMotion(np.asarray(phi, float), np.asarray(np.zeros(3) if velocity is None else velocity, float), bend)
     num = [_GRID, _GRID]
     if bend is not None:
-        num[READOUTS[camera.readout][0]] = max(_GRID, 4 * len(bend.values) - 3)
+        num[camera.clock_axis] = max(_GRID, 4 * len(bend.values) - 3)
     uv = np.stack(np.meshgrid(_stations(camera.width, num[0]), _stations(camera.height, num[1])), -1).reshape(-1, 2)
     speeds = [_line_speed(camera, uv, motion, np.zeros(len(uv)))]
     if depth is not None and motion.moves:
@@ -87,7 +87,7 @@ def check_no_fold(
         raise InputError(f"{name}: the lens model shows nothing at any pixel of the photo")
     worst = int(np.nanargmax(speed))
     if speed[worst] >= 1:
-        axis = READOUTS[camera.readout][0]
+        axis = camera.clock_axis
         line = ("column", "row")[axis]
         raise InputError(
             f"the {line}s of {name} fold over: at pixel ({uv[worst, 0]:.0f}, {uv[worst, 1]:.0f}) the image runs on by "
@@ -118,7 +118,7 @@ def _line_speed(
 ) -> NDArray[np.float64]:
     """Lines (n,) by which the image of what pixels (n, 2) see runs on while one line is read; NaN beyond the lens."""
     K = camera.K
-    axis, sign = READOUTS[camera.readout]
+    axis, sign = camera.clock_axis, camera.clock_sign
     clock = sign * (uv[:, axis] - K[axis, 2]) / K[axis, axis]
     norm = undistort_to_rays(uv, camera)
     known = np.asarray(np.isfinite(norm).all(axis=1))

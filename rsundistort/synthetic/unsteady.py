@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import FormatError, InputError, RsUndistortWarning
 from ..io.gyro import GyroLog
 from ..io.tables import read_table
-from ..model import READOUTS, Camera, RowMotion
+from ..model import Camera, RowMotion
 from ..model.checks import check_array, check_finite, frozen
 
 __all__ = [
@@ -127,7 +127,7 @@ class RowTable:
     def path(self, camera: Camera) -> Poses:
         """The pose as a function of the clock of a camera, which must not show more than the table has."""
         assert self.position is not None
-        axis, sign = READOUTS[camera.readout]
+        axis, sign = camera.clock_axis, camera.clock_sign
         last, f, c = (camera.width, camera.height)[axis] - 1, camera.K[axis, axis], camera.K[axis, 2]
         need = sorted(sign * (np.array([0, last]) - c) / f) if self.by_clock else [0.0, float(last)]
         slack = 1e-6 * (need[1] - need[0])

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
-from ..model import READOUTS, Camera, RowMotion
+from ..model import Camera, RowMotion
 from .lens import distort_rays, undistort_to_rays
 
 __all__ = ["crop_camera", "largest_rectangle", "random_phi", "warp_mask", "warp_photo"]
@@ -99,7 +99,7 @@ def _lookup(camera: Camera, motion: RowMotion | ArrayLike) -> tuple[NDArray[np.f
     motion = motion if isinstance(motion, RowMotion) else RowMotion(np.asarray(motion, np.float64))
     w, h = camera.width, camera.height
     K = camera.K
-    axis, sign = READOUTS[camera.readout]
+    axis, sign = camera.clock_axis, camera.clock_sign
     u, v = np.arange(w, dtype=float), np.arange(h, dtype=float)
     if axis == 1:
         clock = np.repeat((sign * (v - K[1, 2]) / K[1, 1])[:, None], w, axis=1)
