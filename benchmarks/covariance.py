@@ -56,7 +56,7 @@ def ratios(model: str, trials: int) -> dict[str, NDArray[np.float64]]:
     exact = courtyard(model)
     # priors that weigh nothing: with them the standard deviation of the estimates is not the posterior's
     options = BundleOptions(
-        loss="squared", outlier_rounds=0, spread_rounds=0, sigma_px=NOISE_PX, phi_sigma=1e3, velocity_sigma=1e3
+        loss="squared", outlier_rounds=0, prior_sigma_rounds=0, sigma_px=NOISE_PX, phi_sigma=1e3, velocity_sigma=1e3
     )  # fmt: skip
     rng = np.random.default_rng(0)
     phi, centers, predicted = [], [], []

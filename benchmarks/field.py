@@ -37,11 +37,11 @@ ROOT = Path(__file__).resolve().parent.parent
 SETS = ("drone", "phone", "dslr", "lund", "iphone6", "herz-jesus-8")
 TIME = {"phone": 0.4, "dslr": 0.4, "herz-jesus-8": 0.6}
 # at least of the peer's, and at most: features of its, re-triangulation of our run
-LEAST = {"joined": 1.0, "measurements": 1.0}
+LEAST = {"registered": 1.0, "measurements": 1.0}
 MOST = {"features": 0.15, "re-triangulation": 0.15}
 COLUMNS = (
-    "set", "photos", "joined", "measurements", "px", "seconds", "features s", "re-triangulation", "peak MB", "shift px",
-    "model",
+    "set", "photos", "registered", "measurements", "px", "seconds", "features s", "re-triangulation", "peak MB",
+    "shift px", "model",
 )  # fmt: skip
 
 # both write into the folder of work, their last argument, what they reached and how much memory it took
@@ -81,7 +81,7 @@ number, largest = max(models.items(), key=lambda item: item[1].num_reg_images())
 timed("undistortion", pycolmap.undistort_images, work / "undistorted", work / str(number), photos)
 pairs = sqlite3.connect(database).execute("SELECT rows FROM two_view_geometries WHERE rows > 0").fetchall()
 (work / "figures.json").write_text(json.dumps({
-    "photos": len(names), "joined": largest.num_reg_images(), "models": len(models),
+    "photos": len(names), "registered": largest.num_reg_images(), "models": len(models),
     "measurements": round(largest.compute_num_observations() / largest.num_reg_images(), 1),
     "pair_inliers": statistics.median(rows for rows, in pairs),
     "error_px": round(largest.compute_mean_reprojection_error(), 3), "seconds": seconds,
@@ -128,8 +128,8 @@ def ours(photos: Path, *options: str) -> dict[str, Any]:
 def of_solution(path: Path, found: dict[str, Any]) -> dict[str, Any]:
     """The figures of a solution with its seconds by stage; `other` is the start and the report."""
     solution = json.loads(path.read_text())
-    joined = [image for image in solution["images"] if image["registered"]]
-    shifts = [image["rs_shift_px"] or 0.0 for image in joined]
+    registered = [image for image in solution["images"] if image["registered"]]
+    shifts = [image["rs_shift_px"] or 0.0 for image in registered]
     kinds = ("features", "matching", "mapping", "re-triangulation", "adjustment", "rectifying", "writing")
     seconds = dict.fromkeys(kinds, 0.0)
     for stage in solution["stages"]:
@@ -138,10 +138,12 @@ def of_solution(path: Path, found: dict[str, Any]) -> dict[str, Any]:
     seconds["other"] = found["total_s"] - sum(seconds.values())
     return {
         "photos": len(solution["images"]),
-        "joined": len(joined),
-        "not_joined": {image["name"]: image.get("reason") for image in solution["images"] if not image["registered"]},
+        "registered": len(registered),
+        "not_registered": {
+            image["name"]: image.get("reason") for image in solution["images"] if not image["registered"]
+        },
         "shutter_model": solution["shutter_model"],
-        "measurements": round(solution["quality"]["num_observations"] / len(joined), 1),
+        "measurements": round(solution["quality"]["num_observations"] / len(registered), 1),
         "rms_px": round(solution["quality"]["rms_px"], 3),
         "shift_px_median": round(statistics.median(shifts), 2),
         "shift_px_max": round(max(shifts), 2),
@@ -205,8 +207,8 @@ def row_of(name: str, a: dict[str, Any], b: dict[str, Any]) -> list[str]:
             a["shutter_model"],
         ]
     number = str(a.get("photos", b.get("photos", "-")))
-    return [name, number, both("joined"), both("measurements"), both("rms_px", "error_px"), both("total_s"), features,
-            rest[0], both("peak_mb"), *rest[1:]]  # fmt: skip
+    return [name, number, both("registered"), both("measurements"), both("rms_px", "error_px"), both("total_s"),
+            features, rest[0], both("peak_mb"), *rest[1:]]  # fmt: skip
 
 
 def memory(photos: Path) -> list[str]:
@@ -327,8 +329,8 @@ def warped(photos: Path) -> None:
             show(
                 f"{photos.name} warped by {sigma:g}, {how}",
                 shutter_model=solution.shutter_model,
-                joined=f"{len(solution.registered)}/{len(solution.images)}",
-                reference_joined=len(reference.registered),
+                registered=f"{len(solution.registered)}/{len(solution.images)}",
+                reference_registered=len(reference.registered),
                 rotation_deg={"median": round(float(np.median(error)), 4), "worst": round(float(error.max()), 4)},
                 rotation_deg_but_for_a_common_turn=common_turn_off(solution, reference),
                 focal_px=[round(float(each.K[0, 0]), 1) for each in cameras],

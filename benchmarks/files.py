@@ -26,7 +26,7 @@ from rsundistort import Camera, RowMotion, Solution, SolvedImage, rectify_folder
 from rsundistort.errors import FileError
 from rsundistort.evaluation import psnr
 from rsundistort.io import list_photos, output_name, read_photo, write_image
-from rsundistort.model.orientation import MATRICES, turn_pixels
+from rsundistort.model.orientation import MATRICES, orient_pixels
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -74,7 +74,7 @@ def orientation(photos: Path, scratch: Path) -> tuple[dict[str, Any], bool]:
         kept += tags(photos / name)[tag] == tags(scratch / "stored" / "images" / name)[tag]
         worst = min(worst, psnr(after.pixels, before.pixels))
         right = min(right, psnr(shown.pixels, reference) if shown.metadata.orientation == 1 else 0.0)
-        others = [turn_pixels(shown.pixels, o) for o in MATRICES if o != 1]
+        others = [orient_pixels(shown.pixels, o) for o in MATRICES if o != 1]
         wrong = max(wrong, *(psnr(other, reference) for other in others if other.shape == reference.shape))
     return {
         "in": len(names),

@@ -107,8 +107,13 @@ class Ran:
     @property
     def facts(self) -> dict[str, Any]:
         """What every line has."""
-        joined = f"{len(self.solution.registered)}/{len(self.solution.images)}"
-        return {"model": self.solution.shutter_model, "joined": joined, "verdict": self.verdict, "said": self.said}
+        registered = f"{len(self.solution.registered)}/{len(self.solution.images)}"
+        return {
+            "model": self.solution.shutter_model,
+            "registered": registered,
+            "verdict": self.verdict,
+            "said": self.said,
+        }
 
     @property
     def evidence(self) -> dict[str, Any]:

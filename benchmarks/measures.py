@@ -53,13 +53,13 @@ def normalised_errors(
     log_k : float, optional
         Its error.
     """
-    joined = solution.registered
-    span = np.array([[solution.cameras[image.camera_id].frame_span] for image in joined])
-    own = [image.sigma_phi for image in joined]
+    registered = solution.registered
+    span = np.array([[solution.cameras[image.camera_id].frame_span] for image in registered])
+    own = [image.sigma_phi for image in registered]
     known: dict[str, Any] = {"phi": None if any(each is None for each in own) else span * np.array(own)}
     known |= {"log_k": (solution.critical_motion or {}).get("sigma_log_k"), **(sigmas or {})}
     phi = motion_errors(solution, truth).phi_rad_per_frame
-    centers, true = (np.array([each.image(image.name).center_w for image in joined]) for each in (solution, truth))
+    centers, true = (np.array([each.image(image.name).center_w for image in registered]) for each in (solution, truth))
     scale, R, shift = align_points(true, centers)
     errors = {"phi": phi, "mean_phi": phi.mean(0), "log_k": log_k, "center": centers - scale * true @ R.T - shift}
     return {

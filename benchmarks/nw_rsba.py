@@ -1,10 +1,10 @@
 """An outsider's bundle-adjustment problems: prints one JSON object {class: {"points", "rotation_deg", "centres"}}.
 
-    python benchmarks/nw_rsba.py DIR [--spread FACTOR]
+    python benchmarks/nw_rsba.py DIR [--prior-sigmas FACTOR]
 
 DIR holds general.npz, near-parallel.npz, parallel.npz of twenty problems each. Default options, no knowledge of the
 true motion. Medians; points: rms after the similarity that best aligns the points, in scene units; rotation (mean
-angle) and centres (rms) after the similarity that best aligns the centres. `--spread` multiplies the standard
+angle) and centres (rms) after the similarity that best aligns the centres. `--prior-sigmas` multiplies the standard
 deviations that the estimate of the priors starts from.
 """
 
@@ -54,12 +54,12 @@ def main() -> None:
     """Solve all problems."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("dir", type=Path)
-    parser.add_argument("--spread", type=float, default=1.0)
+    parser.add_argument("--prior-sigmas", type=float, default=1.0)
     args = parser.parse_args()
     default = BundleOptions()
     options = BundleOptions(
-        phi_sigma_start=args.spread * default.phi_sigma_start,
-        velocity_sigma_start=args.spread * default.velocity_sigma_start,
+        phi_sigma_start=args.prior_sigmas * default.phi_sigma_start,
+        velocity_sigma_start=args.prior_sigmas * default.velocity_sigma_start,
     )
     summary = {}
     for name in CLASSES:

@@ -43,7 +43,7 @@ def rotations_by_gyro(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The same by a gyroscope in the camera's axes and clock."""
     inside = np.clip(time_s, log.time_s[0], log.time_s[-1])
-    turns = Rotation.from_rotvec(log.turns(inside)).as_matrix()
+    turns = Rotation.from_rotvec(log.rotations(inside)).as_matrix()
     start, end = (np.clip(time_s + side * readout_s / 2, log.time_s[0], log.time_s[-1]) for side in (-1, 1))
     return turns, np.nan_to_num(-log.mean(start, end)) * readout_s
 

@@ -57,7 +57,7 @@ from rsundistort.simulate import WarpOptions, simulate_warp
 
 ROOT = Path(__file__).resolve().parent.parent
 PARTS, SETS, RADIANS = ("sets", "pairs", "limit", "fountain"), ("herz-jesus-8", "dslr"), (0.10, 0.15, 0.20, 0.30)
-COLUMNS = ("set", "rad", "seed", "joined", "right", "wrong", "deg", "worst", "dB", "least", "before", "s")
+COLUMNS = ("set", "rad", "seed", "registered", "right", "wrong", "deg", "worst", "dB", "least", "before", "s")
 WRONG_DEG, AUC_DEG, LEAST_MATCHES = 1.0, 5.0, 30
 
 
@@ -142,7 +142,7 @@ class Bench:
         wrong = sorted(photo for photo, error in errors.items() if error > WRONG_DEG)
         right, values = len(errors) - len(wrong), [*errors.values()]
         show(
-            f"{name} by {radians}, seed {seed}", joined=len(solution.registered), photos=len(solution.images),
+            f"{name} by {radians}, seed {seed}", registered=len(solution.registered), photos=len(solution.images),
             of_still=len(still.registered), right=right, wrong={photo: round(errors[photo], 2) for photo in wrong},
             wrong_and_not_named=sorted({*wrong} - named), median_deg=round(float(np.median(values)), 4),
             max_deg=round(max(values), 4), dB=round(found.psnr_db.median, 2), least_dB=round(found.psnr_db.min, 2),
@@ -341,7 +341,7 @@ def fountain(bench: Bench, times: float = 3.0) -> None:
     )
     found = rs.evaluate(out / "run", out / "truth.json", twins=source / "gs", raw=out / "photos")
     show(
-        f"fountain-small, its velocity times {times}", joined=len(solution.registered), photos=len(images),
+        f"fountain-small, its velocity times {times}", registered=len(solution.registered), photos=len(images),
         model=solution.quality["held_out_chosen"], verdict=[solution.verdict["shutter"], solution.verdict["shape"]],
         dB=round(found.psnr_db.median, 2), least_dB=round(found.psnr_db.min, 2),
         before_dB=round(found.psnr_before_db.median, 2), deg=round(found.rotation_deg.mean, 4),

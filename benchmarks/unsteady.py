@@ -116,7 +116,7 @@ class Bench:
         quality = solution.quality
         value = {
             "model": quality["held_out_chosen"], "verdict": [solution.verdict["shutter"], solution.verdict["shape"]],
-            "joined": len(solution.registered), "dB": round(found.psnr_db.median, 2),
+            "registered": len(solution.registered), "dB": round(found.psnr_db.median, 2),
             "worst": round(min(after.values()), 2), "before": round(found.psnr_before_db.median, 2),
             "deg": round(found.rotation_deg.mean, 4),
             "phi_mrad": np.round(found.phi_mrad_per_frame.mean_per_component, 2).tolist(),
@@ -203,7 +203,7 @@ def harm(bench: Bench, seeds: Sequence[int], references: Path) -> None:
             name = f"harm by {sigma}, {change}, {shake}"
             found = bench.measure(name, seed, folder, references, bench.still, own_lens=True, quality=100)
             if found is not None:
-                photos += found["joined"]
+                photos += found["registered"]
                 worse = {f"{folder.name}/{k}": v for k, v in found["worse"].items() if k not in found["doubtful"]}
                 silent |= worse
     show("harm", photos=photos, worse_and_not_named=silent)

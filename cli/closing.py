@@ -32,7 +32,7 @@ def close(solution: Solution, out: Path, warned: Said, talk: Talk) -> None:
 
 
 def summary(solution: Solution, out: Path, warned: Sequence[str]) -> dict[str, Any]:
-    """What was found, for other programs; all of it is in solution.json."""
+    """Summary of the result for other programs; all of it is in solution.json."""
     shifts = sorted(image.rs_shift_px or 0.0 for image in solution.registered)
     critical = solution.critical_motion
     return {
@@ -59,7 +59,7 @@ def summary(solution: Solution, out: Path, warned: Sequence[str]) -> dict[str, A
 
 
 def closing_table(solution: Solution, out: Path) -> str:
-    """What was found, one line per photo, in 80 columns."""
+    """Table of the result with one line per photo, in 80 columns."""
     from rsundistort.report import verdict_of
 
     rows = [("photo", "measurements", "rms px", "deg/frame", "shift px")]
@@ -69,13 +69,13 @@ def closing_table(solution: Solution, out: Path) -> str:
             rows.append((name, "-", "-", "-", "not registered"))
             continue
         span = solution.cameras[image.camera_id].frame_span
-        turn = float((image.motion.phi**2).sum() ** 0.5) * span * 57.29577951308232
+        rotation = float((image.motion.phi**2).sum() ** 0.5) * span * 57.29577951308232
         rows.append(
             (
                 name,
                 str(image.num_observations),
                 f"{image.rms_px:.2f}",
-                f"{turn:.2f}",
+                f"{rotation:.2f}",
                 f"{image.rs_shift_px:.1f}",
             )
         )
@@ -221,8 +221,8 @@ def _video(solution: Solution) -> list[str]:
     video = solution.options.get("video")
     if not video:
         return []
-    turned = {3: 180, 6: 90, 8: 270}.get(video["orientation"])
-    said = f", players rotate them by {turned} degrees clockwise, the files do not" if turned else ""
+    rotated = {3: 180, 6: 90, 8: 270}.get(video["orientation"])
+    said = f", players rotate them by {rotated} degrees clockwise, the files do not" if rotated else ""
     what = "key frames of" if "key_frames" in video else "of"
     return [f"video              {len(solution.images)} {what} {video['frames']} frames{said}"]
 

@@ -181,7 +181,7 @@ def say_json(value: Any) -> None:
 
 
 def list_failed(failed: Mapping[str, str], talk: Talk) -> None:
-    """What failed and why, and the exit code that says so; nothing if nothing did."""
+    """List what failed and why, and return the exit code that says so; nothing if nothing did."""
     if failed:
         lines = ["", "failed:", *(f"  {name}: {why}" for name, why in failed.items())]
         (tell if talk.to_people else say)("\n".join(lines))

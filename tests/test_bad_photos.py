@@ -96,9 +96,9 @@ def test_of_two_scenes_the_larger_is_solved_and_the_other_named(photos):
         # upside down and inside out, no feature is one of the others'
         save_png(photos / f"other-{path.name}", 255 - cv2.imread(str(path))[:, ::-1])
     solution, _ = tried(photos.parent, "--camera", str(whole.parent / "camera.json"), "--model", "rotation")
-    joined = {image.name for image in solution.registered}
-    assert joined == set(COURTYARD_NAMES[:6])
-    assert all("shares too little" in image.reason for image in solution.images if image.name not in joined)
+    registered = {image.name for image in solution.registered}
+    assert registered == set(COURTYARD_NAMES[:6])
+    assert all("shares too little" in image.reason for image in solution.images if image.name not in registered)
 
 
 def test_three_photos(photos):

@@ -215,7 +215,7 @@ def test_spreads_of_the_priors_do_not_depend_on_their_start(rng):
 def test_estimated_spread_is_the_mean_square_of_what_is_found_and_what_is_left_open(rng):
     truth = make_scene(rng, "rotation", num_images=8, num_points=60, noise_px=0.5)
     # of one noise for all: else the last step is weighed by another than the prior standard deviation was
-    options = BundleOptions(spread_tolerance=1e-6, spread_rounds=40, deviations="model")
+    options = BundleOptions(prior_sigma_tolerance=1e-6, prior_sigma_rounds=40, deviations="model")
     result = bundle_adjust(perturbed(truth, rng), "rotation", options)
     square = (result.reconstruction.phi**2 + result.sigma_phi**2) * truth.frame_span()[:, None] ** 2
     assert np.abs(result.reconstruction.phi).max() < 3 * np.sqrt(np.median(square) / 0.455)  # none is cut
@@ -302,7 +302,7 @@ def test_rays_that_miss_each_other_do_not_hold_up_the_rest(rng):
     gross = (rng.random(len(obs)) < 0.1)[:, None]
     spoiled = replace(obs, xy_raw=obs.xy_raw + gross * rng.uniform(5, 60, (len(obs), 2)))
     start = replace(perturbed(truth, rng), observations=spoiled)
-    options = BundleOptions(spread_rounds=0, sigma_px=0.5, phi_sigma=0.03, deviations="model")
+    options = BundleOptions(prior_sigma_rounds=0, sigma_px=0.5, phi_sigma=0.03, deviations="model")
     result = bundle_adjust(start, "rotation", options)
     assert result.converged
     # over four solves: points that are sent far off damp the step of all others, and it takes 80 to 120
@@ -404,7 +404,7 @@ def test_order_of_the_measurements_does_not_matter(rng):
 
 def test_cost_falls_with_each_accepted_step_and_the_reason_is_said(rng):
     start = perturbed(make_scene(rng, "rotation", noise_px=0.5), rng)
-    once = BundleOptions(outlier_rounds=0, spread_rounds=0)
+    once = BundleOptions(outlier_rounds=0, prior_sigma_rounds=0)
     result = bundle_adjust(start, "rotation", once)
     assert result.stop_reason == "cost"
     assert result.converged
@@ -492,7 +492,7 @@ def test_the_axis_of_the_readout_is_found_whatever_was_guessed(wrong, rng):
         cameras[k] = replace(cameras[k], readout=other)
     guessed = replace(perturbed(rec, rng), cameras=cameras, shutter_model="global")
     choice = choose_readouts(guessed, range(4))
-    assert choice.turned == wrong
+    assert choice.changed == wrong
     for found, true in zip(choice.reconstruction.cameras, rec.cameras, strict=True):
         assert READOUTS[found.readout][0] == READOUTS[true.readout][0]
 
@@ -500,7 +500,7 @@ def test_the_axis_of_the_readout_is_found_whatever_was_guessed(wrong, rng):
 def test_without_motion_the_guess_of_the_readout_stays(rng):
     rec = make_scene(rng, "global", num_images=12, num_points=100, noise_px=0.3)
     choice = choose_readouts(perturbed(rec, rng), range(4))
-    assert choice.turned == ()
+    assert choice.changed == ()
     assert choice.reconstruction.cameras == rec.cameras
 
 

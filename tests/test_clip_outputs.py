@@ -37,7 +37,7 @@ from rsundistort.io import write_path
 from rsundistort.io.video import VideoReader, frame_name
 from rsundistort.io.video_like import pixels_of
 from rsundistort.io.video_writer import write_video
-from rsundistort.model.orientation import turn_path
+from rsundistort.model.orientation import orient_path
 from rsundistort.model.path import CameraPath
 from rsundistort.report.readout import readout_facts
 from rsundistort.solve import MeasuredReadout, measure_readout
@@ -305,7 +305,7 @@ COLUMNS = ["tx ty tz", "qx qy qz qw", "vx vy vz", "wx wy wz"]
 
 def test_the_path_of_rotated_frames_is_that_of_a_rotated_camera(tmp_path):
     path = path_of(HandHeld(4), np.arange(8) / 30)
-    turned = turn_path(path, 6)
+    turned = orient_path(path, 6)
     # shown clockwise, what points right is what pointed up
     np.testing.assert_allclose(turned.R_cw[:, 0], -path.R_cw[:, 1])
     np.testing.assert_allclose(turned.R_cw[:, 1], path.R_cw[:, 0])

@@ -11,16 +11,16 @@ from rsundistort.bundle import BundleOptions
 from rsundistort.bundle.own_motions import own_motions
 from rsundistort.input.stabilisation import calmer_than_felt, judge_stabilisation
 from rsundistort.io import GyroLog
-from rsundistort.solve.clip_gyroscope import turns_between
+from rsundistort.solve.clip_gyroscope import rotations_between
 
 FRAME_S = 1 / 30
 
 
 def said(found, time_s, frame_span):
-    pairs, turns = turns_between(np.zeros(len(time_s), np.int64), found.R_cw)
-    sigma = np.linalg.norm(found.sigma_turn[pairs], axis=1)
+    pairs, turns = rotations_between(np.zeros(len(time_s), np.int64), found.R_cw)
+    sigma = np.linalg.norm(found.sigma_rotation[pairs], axis=1)
     phi, of_phi = found.phi * frame_span, found.sigma_phi * frame_span
-    return judge_stabilisation(time_s, pairs, turns, phi, of_phi, turn_sigma=sigma)
+    return judge_stabilisation(time_s, pairs, turns, phi, of_phi, rotation_sigma=sigma)
 
 
 @pytest.mark.parametrize("seed", [11, 12])
@@ -32,7 +32,7 @@ def test_frames_that_were_rotated_back_are_named_and_others_are_not(seed):
     found = own_motions(start)
     assert said(found, time_s, span).verdict == "none"
     # rotated back as a whole, the frames look on without rotating, and their lines show the shaking all the same
-    still = type(found)(np.tile(found.R_cw[:1], (40, 1, 1)), found.phi, found.sigma_turn, found.sigma_phi)
+    still = type(found)(np.tile(found.R_cw[:1], (40, 1, 1)), found.phi, found.sigma_rotation, found.sigma_phi)
     assert said(still, time_s, span).verdict == "stabilised"
 
 

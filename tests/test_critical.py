@@ -82,7 +82,7 @@ def adjusted(scene, rng, still=None, model="rotation", options=None):
 
 
 @pytest.mark.parametrize("name", HIDDEN)
-def test_meter_is_zero_where_the_shape_is_hidden_and_only_there(name):
+def test_degeneracy_measure_is_zero_where_the_shape_is_hidden_and_only_there(name):
     degeneracy = degeneracy_of(named_scene(name))
     values = degeneracy.singular_values
     assert values.shape == (5,)
@@ -162,7 +162,7 @@ def test_meter_does_not_change_with_the_world_or_the_order_of_the_photos(rng):
 
 
 @pytest.mark.parametrize("name", HIDDEN)
-def test_hessian_without_a_gauge_has_as_many_zeros_as_the_meter_says(name):
+def test_hessian_without_a_gauge_has_as_many_zeros_as_the_measure_says(name):
     scene = named_scene(name, num_points=80)
     scene = with_measurements(scene, np.zeros((scene.num_images, 3)), "two-step")
     options = BundleOptions(loss="squared", outlier_rounds=0)
@@ -526,7 +526,7 @@ def test_a_photo_that_stands_twice_in_the_folder_does_not_ruin_the_uncertainty(r
     )  # fmt: skip
     # few steps: depths that nothing holds have not run away yet, where they would not count
     options = replace(options, deviations="model")
-    few = replace(options, max_iterations=1, spread_rounds=0)
+    few = replace(options, max_iterations=1, prior_sigma_rounds=0)
     alone = replace(result.reconstruction, observations=scene.observations)
     found = [bundle_adjust(each, "rotation", few) for each in (alone, twice)]
     sigma, with_copy = (shape_cost(each, options).sigma_log_k for each in found)

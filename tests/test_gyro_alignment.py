@@ -123,7 +123,7 @@ def test_false_rotations_and_missing_ones_do_no_harm():
     found = align_gyro(gyroscope(camera_from_gyro=parse_axes("yxz"), offset_s=0.5), times, pairs, turns)
     assert found.axes == "yxz"
     assert found.offset_s == pytest.approx(0.5, abs=0.001)
-    assert found.num_turns == len(turns) - 10
+    assert found.num_rotations == len(turns) - 10
     assert found.num_inliers == pytest.approx(len(turns) - 35, abs=6)
 
 
@@ -232,5 +232,5 @@ def test_too_little():
         align_gyro(gyroscope(), times, pairs, turns[:5])
     with pytest.raises(InputError, match="pairs"):
         align_gyro(gyroscope(), times, pairs.astype(float), turns)
-    with pytest.raises(InputError, match="join frames"):
+    with pytest.raises(InputError, match="connect frames"):
         align_gyro(gyroscope(), times[:100], pairs, turns)

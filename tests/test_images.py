@@ -17,7 +17,7 @@ from refusals import one_line
 from rsundistort import Camera, rectify
 from rsundistort.errors import FileError, FileKindWarning, InputError, MetadataWarning
 from rsundistort.io import Metadata, list_photos, output_name, read_photo, write_image
-from rsundistort.model.orientation import turn_pixels
+from rsundistort.model.orientation import orient_pixels
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
@@ -62,7 +62,7 @@ def test_orientation_is_carried_and_not_applied(tmp_path):
     assert photo.metadata.orientation == 6
     assert photo.pixels.shape == (48, 64, 3)
     turned = cv2.imread(str(tmp_path / "turned.jpg"), cv2.IMREAD_COLOR)
-    np.testing.assert_array_equal(turned, turn_pixels(photo.pixels, 6))  # the tag is really there: OpenCV follows it
+    np.testing.assert_array_equal(turned, orient_pixels(photo.pixels, 6))  # the tag is really there: OpenCV follows it
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

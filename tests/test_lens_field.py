@@ -33,7 +33,7 @@ from rsundistort.errors import FormatError, InputError
 from rsundistort.io import read_solution, write_solution
 from rsundistort.io.cameras import camera_from_json, camera_to_json
 from rsundistort.model.field import field_basis, field_over_frame, field_slope, lens_pixels, raw_pixels, steepest
-from rsundistort.model.orientation import MATRICES, turn_camera, turn_points
+from rsundistort.model.orientation import MATRICES, orient_camera, orient_points
 from rsundistort.model.projection import project_points, project_points_with_jacobians, unproject_points
 from rsundistort.model.reprojection import reprojection_residuals
 from rsundistort.rectify import rectify
@@ -153,9 +153,9 @@ def test_maps_and_rectified_photos_are_without_it(rng):
 def test_rotated_photos_have_a_rotated_field(orientation, rng):
     camera = camera_with_field(rng)
     xy = pixels(rng, camera)
-    turned = turn_camera(camera, orientation)
-    expected = turn_points(lens_pixels(camera, xy), camera.width, camera.height, orientation)
-    found = lens_pixels(turned, turn_points(xy, camera.width, camera.height, orientation))
+    turned = orient_camera(camera, orientation)
+    expected = orient_points(lens_pixels(camera, xy), camera.width, camera.height, orientation)
+    found = lens_pixels(turned, orient_points(xy, camera.width, camera.height, orientation))
     np.testing.assert_allclose(found, expected, atol=1e-9)
 
 

@@ -20,7 +20,7 @@ from PIL import Image, ImageCms
 from rsundistort.errors import MetadataWarning
 from rsundistort.io import Metadata, read_photo, write_image
 from rsundistort.io.photos.exif import corrected_exif, exif_of_tiff
-from rsundistort.model.orientation import turn_pixels
+from rsundistort.model.orientation import orient_pixels
 
 SUFFIXES = (".jpg", ".png", ".webp", ".tif")
 ICC = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
@@ -91,7 +91,7 @@ def test_opencv_and_pillow_follow_what_is_written(tmp_path, suffix):
         assert b"x-default" in image.info["xmp"]
         pixels = np.asarray(image)[..., ::-1]
         if suffix == ".tif":  # Pillow rotates a TIFF
-            np.testing.assert_array_equal(pixels, turn_pixels(photo.pixels, 6))
+            np.testing.assert_array_equal(pixels, orient_pixels(photo.pixels, 6))
         elif suffix != ".webp":  # no halved colour to be drawn by other means
             np.testing.assert_array_equal(pixels, photo.pixels)
 

@@ -27,12 +27,12 @@ from rsundistort.model.orientation import (
     INVERSE,
     compose_orientations,
     in_stored_frame,
+    orient_camera,
+    orient_pixels,
+    orient_points,
+    orient_reconstruction,
+    orient_solution,
     split_mirror,
-    turn_camera,
-    turn_pixels,
-    turn_points,
-    turn_reconstruction,
-    turn_solution,
 )
 
 DIST = [-0.1, 0.02, 0.003, -0.002, 0.01, 0.02, -0.01, 0.003, 0.002, -0.001, 0.004, 0.0005]
@@ -84,35 +84,35 @@ def test_pixels_are_rotated_as_opencv_rotates_them(tmp_path):
         tagged = data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:]
         shown = cv2.imdecode(np.frombuffer(tagged, np.uint8), cv2.IMREAD_COLOR)
         plain = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        np.testing.assert_array_equal(turn_pixels(plain, o), shown)
-        np.testing.assert_array_equal(turn_pixels(turn_pixels(plain, o), INVERSE[o]), plain)
+        np.testing.assert_array_equal(orient_pixels(plain, o), shown)
+        np.testing.assert_array_equal(orient_pixels(orient_pixels(plain, o), INVERSE[o]), plain)
 
 
 def test_points_go_where_their_pixels_go():
     pixels = np.arange(35, dtype=np.uint16).reshape(5, 7)
     xy = np.array([[x, y] for y in range(5) for x in range(7)], float)
     for o in range(1, 9):
-        x, y = turn_points(xy, 7, 5, o).astype(int).T
-        np.testing.assert_array_equal(turn_pixels(pixels, o)[y, x], pixels.ravel())
+        x, y = orient_points(xy, 7, 5, o).astype(int).T
+        np.testing.assert_array_equal(orient_pixels(pixels, o)[y, x], pixels.ravel())
 
 
 def test_orientations_compose_like_the_pixels():
     pixels = np.arange(35).reshape(5, 7)
     for first in range(1, 9):
         for then in range(1, 9):
-            both = turn_pixels(turn_pixels(pixels, first), then)
-            np.testing.assert_array_equal(turn_pixels(pixels, compose_orientations(first, then)), both)
+            both = orient_pixels(orient_pixels(pixels, first), then)
+            np.testing.assert_array_equal(orient_pixels(pixels, compose_orientations(first, then)), both)
         turn, rest = split_mirror(first)
         assert turn in TURNS
         assert rest in (1, 2)
-        np.testing.assert_array_equal(turn_pixels(turn_pixels(pixels, turn), rest), turn_pixels(pixels, first))
+        np.testing.assert_array_equal(orient_pixels(orient_pixels(pixels, turn), rest), orient_pixels(pixels, first))
 
 
 @pytest.mark.parametrize("model", ["global", "two-step", "linearized", "rotation", "constant-motion"])
 @pytest.mark.parametrize("readout", READOUTS)
 def test_rotated_solution_sees_the_points_at_the_rotated_pixels(rng, readout, model):
     before = solution(rng, readout, model, [str(o) for o in TURNS])
-    after = turn_solution(before, {str(o): o for o in TURNS})
+    after = orient_solution(before, {str(o): o for o in TURNS})
     for o in TURNS:
         old, new = before.image(str(o)), after.image(str(o))
         points_w = points_before(rng, old.R_cw, old.center_w)
@@ -120,11 +120,11 @@ def test_rotated_solution_sees_the_points_at_the_rotated_pixels(rng, readout, mo
         xy2, valid2 = project(points_w, after, new, model)
         assert valid.all()
         assert valid2.all()
-        np.testing.assert_allclose(xy2, turn_points(xy, 640, 480, o), atol=1e-9)
+        np.testing.assert_allclose(xy2, orient_points(xy, 640, 480, o), atol=1e-9)
         # rectified photos: a pinhole at the same pose
         plain = project(points_w, before, old, None)[0]
-        np.testing.assert_allclose(project(points_w, after, new, None)[0], turn_points(plain, 640, 480, o), atol=1e-9)
-        assert new.turned == o
+        np.testing.assert_allclose(project(points_w, after, new, None)[0], orient_points(plain, 640, 480, o), atol=1e-9)
+        assert new.applied_orientation == o
 
 
 @pytest.mark.parametrize("readout", READOUTS)
@@ -135,19 +135,19 @@ def test_mirrored_motion_sees_mirrored_points(rng, readout, orientation):
     before = Solution(
         "rotation", {"1": camera(readout)}, {"1": camera().pinhole()}, (SolvedImage("a", "1", motion=motion),)
     )
-    after = turn_solution(before, {"a": orientation})
+    after = orient_solution(before, {"a": orientation})
     new = after.image("a")
     points_c = points_before(rng, np.eye(3), np.zeros(3))
-    mirrored = np.column_stack([turn_points(points_c[:, :2], 1, 1, orientation), points_c[:, 2]])
+    mirrored = np.column_stack([orient_points(points_c[:, :2], 1, 1, orientation), points_c[:, 2]])
     xy, _ = project_points(points_c, camera(readout), motion)
     xy2, _ = project_points(mirrored, after.cameras[new.camera_id], new.motion)
-    np.testing.assert_allclose(xy2, turn_points(xy, 640, 480, orientation), atol=1e-9)
+    np.testing.assert_allclose(xy2, orient_points(xy, 640, 480, orientation), atol=1e-9)
 
 
 def test_a_posed_photo_is_not_mirrored(rng):
     for o in MIRRORS:
         with pytest.raises(InputError, match="mirror"):
-            turn_solution(solution(rng), {"a": o})
+            orient_solution(solution(rng), {"a": o})
 
 
 def test_rotating_a_photo_and_rectifying_it_commute(rng):
@@ -156,21 +156,21 @@ def test_rotating_a_photo_and_rectifying_it_commute(rng):
     plain, mask = rectify(photo, camera(), image.motion)
     for o in range(2, 9):
         before = Solution("rotation", {"1": camera()}, {"1": camera().pinhole()}, (replace(image, R_cw=None),))
-        after = turn_solution(before, {"a": o})
+        after = orient_solution(before, {"a": o})
         new = after.image("a")
         other, other_mask = rectify(
-            turn_pixels(photo, o), after.cameras[new.camera_id], new.motion,
+            orient_pixels(photo, o), after.cameras[new.camera_id], new.motion,
             new_camera=after.rectified_cameras[new.camera_id],
         )  # fmt: skip
         # the grid is float32: a sample may round to the next 1/32 pixel
-        both = (turn_pixels(mask, o) > 0) & (other_mask > 0)
-        assert (turn_pixels(mask, o) != other_mask).mean() < 1e-4
-        assert np.abs(turn_pixels(plain, o).astype(int) - other)[both].max() <= 2
+        both = (orient_pixels(mask, o) > 0) & (other_mask > 0)
+        assert (orient_pixels(mask, o) != other_mask).mean() < 1e-4
+        assert np.abs(orient_pixels(plain, o).astype(int) - other)[both].max() <= 2
 
 
 def test_cameras_are_shared_by_photos_of_one_orientation(rng):
     before = solution(rng)
-    after = turn_solution(before, {"a": 6, "c": 6})
+    after = orient_solution(before, {"a": 6, "c": 6})
     assert after.image("a").camera_id == after.image("c").camera_id != "1" == after.image("b").camera_id
     assert set(after.cameras) == set(after.rectified_cameras) == {"1", "2"}
     assert after.cameras["1"] == before.cameras["1"]
@@ -180,14 +180,14 @@ def test_cameras_are_shared_by_photos_of_one_orientation(rng):
 
 def test_a_rotated_solution_is_written_read_and_rotated_back(tmp_path, rng):
     before = solution(rng)
-    after = turn_solution(before, {"a": 6, "c": 3})
+    after = orient_solution(before, {"a": 6, "c": 3})
     write_solution(tmp_path / "s.json", after)
     back = in_stored_frame(read_solution(tmp_path / "s.json"))
     for old, new in zip(before.images, back.images, strict=True):
         np.testing.assert_allclose(new.R_cw, old.R_cw, atol=1e-12)
         np.testing.assert_allclose(new.motion.phi, old.motion.phi)
         np.testing.assert_allclose(new.sigma_phi, old.sigma_phi)
-        assert new.turned == 1
+        assert new.applied_orientation == 1
         np.testing.assert_allclose(back.cameras[new.camera_id].K, before.cameras["1"].K)
         np.testing.assert_allclose(back.cameras[new.camera_id].dist, before.cameras["1"].dist)
         assert back.cameras[new.camera_id].readout == before.cameras["1"].readout
@@ -204,21 +204,21 @@ def test_a_rotated_reconstruction_has_the_same_residuals_and_cameras(rng):
         shutter_model="rotation",
     )  # fmt: skip
     turns = {"a": 8, "b": 6, "c": 8}
-    after, turned = turn_solution(before, turns), turn_reconstruction(rec, turns)
+    after, turned = orient_solution(before, turns), orient_reconstruction(rec, turns)
     assert list(turned.cameras) == list(after.cameras.values())
     for i, image in enumerate(after.images):
         assert turned.camera(i) == after.cameras[image.camera_id]
         np.testing.assert_allclose(turned.R_cw[i], image.R_cw)
         np.testing.assert_allclose(turned.phi[i], image.motion.phi)
         seen = rec.observations.frame_idx == i
-        expected = turn_points(rec.observations.xy_raw[seen], 640, 480, turns[image.name])
+        expected = orient_points(rec.observations.xy_raw[seen], 640, 480, turns[image.name])
         np.testing.assert_allclose(turned.observations.xy_raw[seen], expected)
     with pytest.raises(InputError):
-        turn_reconstruction(rec, {"a": 2})
+        orient_reconstruction(rec, {"a": 2})
 
 
 def test_a_garbled_rotation_is_refused(tmp_path, rng):
-    write_solution(tmp_path / "s.json", turn_solution(solution(rng), {"a": 6}))
+    write_solution(tmp_path / "s.json", orient_solution(solution(rng), {"a": 6}))
     text = (tmp_path / "s.json").read_text()
     (tmp_path / "s.json").write_text(text.replace('"turned": 6', '"turned": 9'))
     with pytest.raises(InputError, match="1 to 8"):
@@ -230,4 +230,4 @@ def test_fisheye_distortion_does_not_rotate():
     if "lens" not in fields:
         pytest.skip("no fisheye lens yet")
     fisheye = Camera(640, 480, K, [0.1, 0.02, 0.003, 0.004], lens="fisheye")
-    np.testing.assert_array_equal(turn_camera(fisheye, 6).dist, fisheye.dist)
+    np.testing.assert_array_equal(orient_camera(fisheye, 6).dist, fisheye.dist)

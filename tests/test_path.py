@@ -233,7 +233,7 @@ def test_a_camera_that_only_rotates_tells_the_readout_time() -> None:
     truth, times = filmed(HandHeld(9, walks=False), 24)
     directions = truth.points_w / np.linalg.norm(truth.points_w, axis=1)[:, None]
     start = replace(truth, points_w=directions)
-    result = bundle_adjust(start, "constant-motion", BundleOptions(path=FramePath(times, FRAME_S, turns_only=True)))
+    result = bundle_adjust(start, "constant-motion", BundleOptions(path=FramePath(times, FRAME_S, rotation_only=True)))
     assert result.path is not None
     assert abs(result.path.readout_s[0] / FRAME_S - 0.6) < 3 * result.path.sigma_readout_s[0] / FRAME_S
     assert result.path.sigma_readout_s[0] / FRAME_S < 0.02
@@ -263,7 +263,7 @@ def test_each_frame_says_its_own_rotation_and_pose() -> None:
     # the path knows them far better than a frame alone
     assert 0.7 < np.sqrt(np.mean(error**2)) < 1.4
     turn = Rotation.from_matrix(found.R_cw @ result.reconstruction.R_cw.transpose(0, 2, 1)).as_rotvec()
-    assert 0.7 < np.sqrt(np.mean((turn / found.sigma_turn) ** 2)) < 1.4
+    assert 0.7 < np.sqrt(np.mean((turn / found.sigma_rotation) ** 2)) < 1.4
 
 
 def test_frames_say_their_rotations_from_a_start_that_knows_none() -> None:
@@ -323,7 +323,7 @@ def test_a_readout_longer_than_the_time_between_frames_is_bounded_and_not_determ
     obs = truth.observations
     # lines that are shifted as if the camera panned ten times as fast, or the other way, while it is read
     skewed = obs.xy_raw + sign * 0.012 * (obs.xy_raw[:, 1:] - 240) * [1.0, 0.0]
-    path = FramePath(times, FRAME_S, turns_only=True)
+    path = FramePath(times, FRAME_S, rotation_only=True)
     found = bundle_adjust(
         replace(start, observations=replace(obs, xy_raw=skewed)), "constant-motion", BundleOptions(path=path)
     )

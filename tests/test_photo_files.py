@@ -30,7 +30,7 @@ from rsundistort import (
 )
 from rsundistort.errors import FileKindWarning, InputError, MetadataWarning, SkippedPhotoWarning
 from rsundistort.io import Metadata, read_photo, write_image
-from rsundistort.model.orientation import INVERSE, turn_pixels
+from rsundistort.model.orientation import INVERSE, orient_pixels
 
 MOTION = RowMotion([0.05, -0.03, 0.04])
 
@@ -78,12 +78,12 @@ def test_applied_orientation_rotates_the_finished_output(tmp_path):
     for o, name in enumerate(names):
         for folder in ("images", "masks"):
             plain, out = (read_photo(tmp_path / run / folder / name) for run in ("plain", "out"))
-            np.testing.assert_array_equal(out.pixels, turn_pixels(plain.pixels, o or 1))
+            np.testing.assert_array_equal(out.pixels, orient_pixels(plain.pixels, o or 1))
             assert out.metadata.orientation == 1
         image = turned.image(name)
         rectified = turned.rectified_cameras[image.camera_id]
         assert out.pixels.shape[:2] == (rectified.height, rectified.width)
-        assert image.turned == (o or 1)
+        assert image.applied_orientation == (o or 1)
         shown = cv2.imread(str(tmp_path / "out" / "images" / name))  # nothing left to apply
         np.testing.assert_array_equal(shown, read_photo(tmp_path / "out" / "images" / name).pixels)
 
@@ -108,11 +108,11 @@ def test_mirrored_photos_lose_their_pose(tmp_path):
     first = read_photo(tmp_path / "out" / "images" / "6.png").pixels
     for name, o in zip(names, (2, 6, 7), strict=True):
         out = read_photo(tmp_path / "out" / "images" / name).pixels
-        np.testing.assert_array_equal(turn_pixels(out, INVERSE[o]), turn_pixels(first, INVERSE[6]))
+        np.testing.assert_array_equal(orient_pixels(out, INVERSE[o]), orient_pixels(first, INVERSE[6]))
 
 
 @pytest.fixture(scope="module")
-def turned_run(tmp_path_factory):
+def rotated_run(tmp_path_factory):
     """The courtyard, its photos stored under several orientations, which are applied; and rectified without."""
     folder = tmp_path_factory.mktemp("turned")
     photos = half_courtyard(folder)
@@ -131,23 +131,23 @@ def turned_run(tmp_path_factory):
     return folder, orientations, solution, plain, [str(w.message) for w in caught]
 
 
-def test_a_run_rotates_photos_and_masks(turned_run):
-    folder, orientations, solution, plain, said = turned_run
+def test_a_run_rotates_photos_and_masks(rotated_run):
+    folder, orientations, solution, plain, said = rotated_run
     assert len(said) == 1
     assert said[0].startswith("0006.png: mirrored by its EXIF orientation 5, it was rotated")
     for name, o in orientations.items():
         turn = {5: 6}.get(o, o)
         for kind in ("images", "masks"):
             before, after = (read_photo(folder / out / kind / name) for out in ("plain", "out"))
-            np.testing.assert_array_equal(after.pixels, turn_pixels(before.pixels, turn))
+            np.testing.assert_array_equal(after.pixels, orient_pixels(before.pixels, turn))
         assert read_photo(folder / "out" / "images" / name).metadata.orientation == (2 if o == 5 else 1)
-        assert solution.image(name).turned == turn
-        assert plain.image(name).turned == 1
+        assert solution.image(name).applied_orientation == turn
+        assert plain.image(name).applied_orientation == 1
 
 
-def test_the_colmap_model_of_a_rotated_run_fits_its_photos(turned_run):
+def test_the_colmap_model_of_a_rotated_run_fits_its_photos(rotated_run):
     """Judged by pycolmap: points project to the keypoints as well as they do in the stored frame."""
-    folder, orientations, solution, plain, _ = turned_run
+    folder, orientations, solution, plain, _ = rotated_run
     model = pycolmap.Reconstruction(folder / "out" / "sparse")
     assert model.compute_mean_reprojection_error() < 1.5 * solution.quality["rms_px"]
     assert len(model.cameras) == 4  # one an orientation, none without photos
@@ -165,8 +165,8 @@ def test_the_colmap_model_of_a_rotated_run_fits_its_photos(turned_run):
         assert (frame["h"], frame["w"]) == read_photo(folder / "out" / "images" / name).pixels.shape[:2]
 
 
-def test_a_rotated_run_is_evaluated_like_any_other(turned_run):
-    folder, _, _, _, _ = turned_run
+def test_a_rotated_run_is_evaluated_like_any_other(rotated_run):
+    folder, _, _, _, _ = rotated_run
     plain, turned = (
         evaluate(folder / out, folder / "ground_truth.json", twins=folder / "photos") for out in ("plain", "out")
     )

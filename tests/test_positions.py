@@ -254,7 +254,7 @@ def test_velocities_and_rotations_are_rotated_to_the_north_of_the_grid(crs):
     R_cw, velocity = Rotation.from_rotvec([0.3, 2.0, -1.0]).as_matrix(), np.array([7.0, -4.0, 0.5])
     fact = ExifFacts(fix=GpsFix(*origin, velocity_m_s=tuple(velocity), R_cw=tuple(map(tuple, R_cw.tolist()))))
     frame = frame_at(crs, np.array([origin]))
-    turned = frame.turned(positions_of(["a.jpg"], [fact]))
+    turned = frame.rotated(positions_of(["a.jpg"], [fact]))
     begin, end = frame.of_geodetic(geodetic_of(np.stack([0 * velocity, velocity]), origin))
     np.testing.assert_allclose(turned.velocity_m_s[0], end - begin, rtol=4e-3)  # a projection's metres
     np.testing.assert_allclose(turned.R_cw[0] @ turned.velocity_m_s[0], R_cw @ velocity, atol=1e-12)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import json
+import pickle
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -175,3 +178,25 @@ def test_entries_of_the_former_dicts_answer_with_a_warning():
         assert EVALUATION["center"]["median"] == EVALUATION.center.median
     with pytest.warns(DeprecationWarning, match="Evaluation is no dict"):
         assert "rotation_deg" not in EVALUATION
+
+
+def test_former_fields_answer_with_a_warning():
+    with pytest.warns(DeprecationWarning, match="BundleOptions.spread_rounds is now BundleOptions.prior_sigma_rounds"):
+        options = rs.BundleOptions(spread_rounds=3)
+    assert options == rs.BundleOptions(prior_sigma_rounds=3)
+    with pytest.warns(DeprecationWarning, match="spread_tolerance is now BundleOptions.prior_sigma_tolerance"):
+        assert replace(options, spread_tolerance=0.1) == replace(options, prior_sigma_tolerance=0.1)
+    with pytest.warns(DeprecationWarning, match="BundleOptions.spread_rounds is now"):
+        assert options.spread_rounds == 3
+    with pytest.warns(DeprecationWarning, match="SolvedImage.turned is now SolvedImage.applied_orientation"):
+        image = rs.SolvedImage("a.jpg", "0", turned=6)
+    assert image.applied_orientation == 6
+    assert pickle.loads(pickle.dumps(options)) == options  # as workers get them
+
+
+def test_former_fields_leave_errors_and_signatures_as_they_are():
+    with pytest.raises(InputError, match="prior_sigma_tolerance=0, expected a positive number"):
+        rs.BundleOptions(prior_sigma_tolerance=0)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'spread'"):
+        rs.BundleOptions(spread=3)
+    assert "prior_sigma_rounds" in inspect.signature(rs.BundleOptions).parameters

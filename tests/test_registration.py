@@ -26,7 +26,7 @@ def look_at(center, target):
     return np.array([x, np.cross(z, x), z])
 
 
-def turned_deg(R_a, R_b):
+def rotated_deg(R_a, R_b):
     return np.degrees(Rotation.from_matrix(R_a @ R_b.T).magnitude())
 
 
@@ -90,7 +90,7 @@ def test_a_photo_is_placed_with_its_motion(scene, rng, share_wrong):
         wrong = rng.uniform(size=len(xy)) < share_wrong
         xy[wrong] = rng.uniform([0, 0], [1200, 900], (wrong.sum(), 2))
         placed = place_photo(points_w, xy, CAMERA)
-        assert turned_deg(placed.R_cw, scene.R_cw[photo]) < 0.05
+        assert rotated_deg(placed.R_cw, scene.R_cw[photo]) < 0.05
         assert np.linalg.norm(placed.center_w - scene.center_w[photo]) < 0.01
         np.testing.assert_allclose(placed.phi, scene.phi[photo], atol=3e-3)
         assert placed.fits[~wrong].mean() > 0.99
@@ -118,7 +118,7 @@ def test_left_out_photos_are_added_and_wrong_places_mended(scene, matched):
     assert (found.added, found.moved, found.dropped) == (("5.jpg",), ("4.jpg",), ())
     assert found.reconstruction.image_names == tuple(NAMES)
     for photo in (4, 5):
-        assert turned_deg(found.reconstruction.R_cw[photo], scene.R_cw[photo]) < 0.05
+        assert rotated_deg(found.reconstruction.R_cw[photo], scene.R_cw[photo]) < 0.05
         np.testing.assert_allclose(found.reconstruction.phi[photo], scene.phi[photo], atol=3e-3)
     np.testing.assert_array_equal(found.reconstruction.R_cw[:4], scene.R_cw[:4])
     only_new = register_photos(matched, read_num_verified(matched), wrong, registered_too=False)

@@ -19,7 +19,7 @@ CAMERAS = {
 R_21, T_21 = Rotation.from_euler("xyz", [3, -8, 2], degrees=True).as_matrix(), np.array([-0.96, 0.05, 0.28])
 
 
-def turned_deg(R_a, R_b):
+def rotated_deg(R_a, R_b):
     return np.degrees(Rotation.from_matrix(R_a @ R_b.T).magnitude())
 
 
@@ -102,7 +102,7 @@ def test_a_strong_shutter_is_found_with_the_pose(rng, share_wrong):
         pair = pair_of(xy, camera)
         for sigma, found in ((0.1, errors), (1e-4, without)):
             pose = find_relative_pose(pair, sigma)
-            found.append(max(turned_deg(pose.R_21, R_21), between_deg(pose.t_21, T_21)))
+            found.append(max(rotated_deg(pose.R_21, R_21), between_deg(pose.t_21, T_21)))
     assert np.median(errors) < 0.5 * np.median(without)
 
 
@@ -112,7 +112,7 @@ def test_photos_without_a_shutter_get_none(rng):
     poses, spread = relative_poses(pairs)
     assert spread < 5e-3
     for pose in poses:
-        assert turned_deg(pose.R_21, R_21) < 0.2
+        assert rotated_deg(pose.R_21, R_21) < 0.2
         assert between_deg(pose.t_21, T_21) < 1.0
 
 

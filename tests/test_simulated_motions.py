@@ -187,7 +187,7 @@ def test_rotations_of_a_log_compose_as_rotations_do(rng):
     for step in np.linspace(0.1, 0.9, 20_001)[:-1] + 2e-5:  # ten times as fine, one after the other
         rate = [np.interp(step, time_s, log.omega_c[:, k]) for k in range(3)]
         R = Rotation.from_rotvec(-4e-5 * np.array(rate)) * R
-    assert (Rotation.from_rotvec(log.turns(at)[-1]) * R.inv()).magnitude() < 1e-5
+    assert (Rotation.from_rotvec(log.rotations(at)[-1]) * R.inv()).magnitude() < 1e-5
 
 
 def test_logs_that_are_too_short_or_of_unknown_readout_are_refused():

@@ -320,9 +320,9 @@ def turned_model(scene, orientation_of):
     """The same model of photos that were rotated by their EXIF orientation before COLMAP looked at them."""
     given = colmap_model_of(scene.model)
     from rsundistort.colmap.rectified_model import ModelIds
-    from rsundistort.model.orientation import turn_reconstruction
+    from rsundistort.model.orientation import orient_reconstruction
 
-    rec = turn_reconstruction(given.reconstruction, orientation_of)
+    rec = orient_reconstruction(given.reconstruction, orientation_of)
     ids = ModelIds(range(1, 1 + len(rec.cameras)), given.image_ids.tolist(), given.point_ids.tolist())
     model = pycolmap.Reconstruction()
     for key, camera in zip(ids.cameras, rec.cameras, strict=True):

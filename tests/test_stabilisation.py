@@ -51,7 +51,7 @@ def clip(seed, frames, lines, true_s, *, scale=1.0, phi_sigma=PHI_SIGMA, **optio
     pairs = np.column_stack([np.arange(NUM_FRAMES - 1), np.arange(1, NUM_FRAMES)])
     turns = -scale * frames.angle(times[:-1], times[1:]) + rng.normal(0, TURN_SIGMA, (NUM_FRAMES - 1, 3))
     phi = -lines.angle(times - true_s / 2, times + true_s / 2) + rng.normal(0, phi_sigma, (NUM_FRAMES, 3))
-    return judge_stabilisation(times, pairs, turns, phi, phi_sigma, turn_sigma=TURN_SIGMA, **options)
+    return judge_stabilisation(times, pairs, turns, phi, phi_sigma, rotation_sigma=TURN_SIGMA, **options)
 
 
 def log_of(what):

@@ -11,7 +11,7 @@ from rsundistort import Camera, DepthMap, Plane, RowMotion, Solution, SolvedImag
 from rsundistort import undistort_points as undistort
 from rsundistort.batch.views import with_view
 from rsundistort.errors import InputError
-from rsundistort.model.orientation import in_stored_frame, turn_pixels, turn_solution
+from rsundistort.model.orientation import in_stored_frame, orient_pixels, orient_solution
 from rsundistort.rectify import ViewOptions, init_rectify_map, rectified_roi, rectified_view
 from rsundistort.rectify.maps import EDGE_PX
 
@@ -203,12 +203,12 @@ def test_view_that_no_camera_has_is_refused_with_the_camera():
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_roi_rotates_with_the_photo(orientation):
     solution = with_view(solution_of(), ViewOptions())
-    turned = turn_solution(solution, {image.name: orientation for image in solution.images})
+    turned = orient_solution(solution, {image.name: orientation for image in solution.images})
     for before, after in zip(solution.registered, turned.registered, strict=True):
         marked = np.zeros((H, W), np.uint8)
         x, y, w, h = before.roi
         marked[y : y + h, x : x + w] = 1
-        shown = turn_pixels(marked, orientation)
+        shown = orient_pixels(marked, orientation)
         x, y, w, h = after.roi
         assert shown[y : y + h, x : x + w].all()
         assert shown.sum() == w * h

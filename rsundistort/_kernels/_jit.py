@@ -89,7 +89,7 @@ class _SelfContained(JITCodeLibrary):
 
 @contextmanager
 def _self_contained() -> Iterator[None]:
-    """What is compiled meanwhile is self-contained; numba's lock of its compiler is held."""
+    """Kernels that are compiled in this block are self-contained; numba's lock of its compiler is held."""
     codegen = cpu_target.target_context.codegen()
     before = codegen._library_class
     codegen._library_class = _SelfContained
@@ -133,12 +133,12 @@ _MOST_UNROLLED = 18
 
 
 def unknowns_of(nb: int) -> tuple[float, ...] | int:
-    """What kernels take for the number of columns of a block: a tuple whose length they are compiled for, or it."""
+    """Argument of kernels for the columns of a block: a tuple whose length they are compiled for, or the number."""
     return (0.0,) * nb if nb <= _MOST_UNROLLED else nb
 
 
 def columns(unknowns: tuple[float, ...] | int) -> int:
-    """That number, in a kernel."""
+    """The number of columns, in a kernel."""
     return unknowns if isinstance(unknowns, int) else len(unknowns)
 
 

@@ -46,13 +46,13 @@ def multiply(row_start, cols, S, x, parts, y):
 
 
 @parallel_kernel(fastmath=SUMS)
-def project_blocks(turn, free, functions, pair_start, block, left, right, S, E):
+def project_blocks(R, free, functions, pair_start, block, left, right, S, E):
     """E (pairs, q nb, q nb) = Z_c' S Z_d of each pair of clusters, from the entries that belong to it.
 
-    Z is functions[f, k] (m, q) times the unknowns of photo f, of which the first three are rotated by turn[f] (m, 3, 3)
-    and those that are held (free[f, a] is 0) vanish. Entry s is the part of S between the photos left[s] and right[s],
-    block[s] or, below the diagonal, its transpose; entries pair_start[p] to pair_start[p + 1] belong to pair p, those
-    of one photo together.
+    Z is functions[f, k] (m, q) times the unknowns of photo f, of which the first three are rotated by R[f]
+    (m, 3, 3) and those that are held (free[f, a] is 0) vanish. Entry s is the part of S between the photos left[s] and
+    right[s], block[s] or, below the diagonal, its transpose; entries pair_start[p] to pair_start[p + 1] belong to
+    pair p, those of one photo together.
     """
     nb = S.shape[1]
     q = functions.shape[1]
@@ -60,7 +60,7 @@ def project_blocks(turn, free, functions, pair_start, block, left, right, S, E):
         E[pair] = 0.0
         G = np.empty((nb, nb))
         H = np.empty((nb, q * nb))  # a photo against the cluster of the right
-        turned = np.empty(3)
+        rotated = np.empty(3)
         s = pair_start[pair]
         while s < pair_start[pair + 1]:
             f = left[s]
@@ -72,9 +72,9 @@ def project_blocks(turn, free, functions, pair_start, block, left, right, S, E):
                         value = S[i, a, b] if f <= g else S[i, b, a]
                         G[a, b] = value * free[f, a] * free[g, b]
                     for b in range(3):
-                        turned[b] = G[a, 0] * turn[g, 0, b] + G[a, 1] * turn[g, 1, b] + G[a, 2] * turn[g, 2, b]
+                        rotated[b] = G[a, 0] * R[g, 0, b] + G[a, 1] * R[g, 1, b] + G[a, 2] * R[g, 2, b]
                     for b in range(3):
-                        G[a, b] = turned[b]
+                        G[a, b] = rotated[b]
                 for k in range(q):
                     scale = functions[g, k]
                     for a in range(nb):
@@ -83,9 +83,9 @@ def project_blocks(turn, free, functions, pair_start, block, left, right, S, E):
                 s += 1
             for b in range(q * nb):
                 for a in range(3):
-                    turned[a] = turn[f, 0, a] * H[0, b] + turn[f, 1, a] * H[1, b] + turn[f, 2, a] * H[2, b]
+                    rotated[a] = R[f, 0, a] * H[0, b] + R[f, 1, a] * H[1, b] + R[f, 2, a] * H[2, b]
                 for a in range(3):
-                    H[a, b] = turned[a]
+                    H[a, b] = rotated[a]
             for k in range(q):
                 scale = functions[f, k]
                 for a in range(nb):

@@ -130,14 +130,14 @@ def residual_costs(
 def _by_bends(bends, ways, table, R, t, u, v, v0, v1, v2, out, J):
     """The last columns J of `residual_blocks`."""
     at, s, beyond = interval(len(bends) // 4, (t - table[0, 3]) / table[0, 4])
-    turns = bends.shape[1]
-    first = len(J) - 3 * (turns + ways)
-    for j in range(turns):
+    rotations = bends.shape[1]
+    first = len(J) - 3 * (rotations + ways)
+    for j in range(rotations):
         by, _ = cubic(bends, 4 * at, j, s, beyond)
         for b in range(3):
             J[first + 3 * j + b] = by * (u * out[8 + b] + v * out[11 + b])
             if j < ways:
-                J[first + 3 * (turns + j) + b] = by * (v0 * R[0, b] + v1 * R[1, b] + v2 * R[2, b])
+                J[first + 3 * (rotations + j) + b] = by * (v0 * R[0, b] + v1 * R[1, b] + v2 * R[2, b])
 
 
 @parallel_kernel()

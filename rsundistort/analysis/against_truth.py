@@ -16,7 +16,7 @@ from ..errors import FileError, InputError
 from ..evaluation import motion_errors, pose_errors, psnr
 from ..io import output_name, read_photo, read_solution
 from ..model import RowMotion, Solution, SolvedImage
-from ..model.orientation import INVERSE, in_stored_frame, turn_pixels
+from ..model.orientation import INVERSE, in_stored_frame, orient_pixels
 from ..rectify import rectify
 from .results import ErrorSummary, Evaluation, PhiErrorSummary, PsnrSummary
 
@@ -70,7 +70,7 @@ def evaluate(
     out, truth = Path(out), Path(truth)
     written, true_solution = read_solution(out / "solution.json"), read_solution(truth)
     solution = in_stored_frame(written)
-    turns = {image.name: image.turned for image in written.images}
+    orientations = {image.name: image.applied_orientation for image in written.images}
     rotation = center = after = before = None
     pose_truth = read_solution(Path(poses)) if poses is not None else true_solution
     if any(image.posed for image in pose_truth.images):
@@ -84,7 +84,7 @@ def evaluate(
         if given is not None and not chosen[key].is_dir():
             raise FileError(f"{chosen[key]} is no folder; --{key} takes a folder of photos")
     if chosen["twins"].is_dir():
-        after, before = _image_errors(out, solution, turns, true_solution, chosen, StageLog(progress))
+        after, before = _image_errors(out, solution, orientations, true_solution, chosen, StageLog(progress))
     return Evaluation(
         photos=len(solution.images),
         registered=len(solution.registered),
@@ -128,7 +128,7 @@ def _check_sizes(photo: NDArray[Any], mask: NDArray[Any], shown: NDArray[np.uint
 def _image_errors(
     out: Path,
     solution: Solution,
-    turns: Mapping[str, int],
+    orientations: Mapping[str, int],
     truth: Solution,
     folders: Mapping[str, Path],
     log: StageLog,
@@ -146,7 +146,7 @@ def _image_errors(
     for done, image in enumerate(registered, start=1):
         taken = read_photo(reference_of[image.name]).pixels
         files = out / "images" / output_name(image.name, raw_as), out / "masks" / masks[image.name]
-        photo, mask = (turn_pixels(read_photo(path).pixels, INVERSE[turns[image.name]]) for path in files)
+        photo, mask = (orient_pixels(read_photo(path).pixels, INVERSE[orientations[image.name]]) for path in files)
         try:
             reference, shown = _without_lens(taken, image, solution, truth)
             _check_sizes(photo, mask, shown)

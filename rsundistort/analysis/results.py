@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from ..critical import CriticalMotion
+from ..model.former_fields import former_fields
 
 __all__ = ["ErrorSummary", "Evaluation", "PhiErrorSummary", "PoseAnalysis", "PsnrSummary"]
 
@@ -85,10 +86,11 @@ class Evaluation(_FormerlyDict):
     psnr_before_db: PsnrSummary | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """What `rsundistort evaluate --json` prints: without what is None."""
+        """The JSON object of `rsundistort evaluate --json`, without fields that are None."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
+@former_fields(meter="degeneracy")
 @dataclass(frozen=True)
 class PoseAnalysis(_FormerlyDict):
     """Outcome of `analyze`.
@@ -113,14 +115,8 @@ class PoseAnalysis(_FormerlyDict):
     sentence: str | None = None
     advice: tuple[str, ...] = ()
 
-    @property
-    def meter(self) -> CriticalMotion:
-        """Former name of `degeneracy`, in this version."""
-        warnings.warn("PoseAnalysis.meter is now PoseAnalysis.degeneracy", DeprecationWarning, stacklevel=2)
-        return self.degeneracy
-
     def to_json(self) -> dict[str, Any]:
-        """What `rsundistort analyze --json` prints."""
+        """The JSON object of `rsundistort analyze --json`."""
         return {
             "photos": self.photos,
             "readout": list(self.readout),

@@ -27,7 +27,7 @@ _BYTES_PER_PIXEL = 40
 
 @dataclass(frozen=True)
 class ClipDone:
-    """What came of the frames of a video.
+    """Outcome of the frames of a video.
 
     Attributes
     ----------

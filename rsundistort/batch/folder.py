@@ -15,7 +15,7 @@ from ..io.places import Place, RemoteFolder, local_place, place_of, write_in
 from ..io.record import Record
 from ..io.solution import solution_to_bytes
 from ..model import Solution
-from ..model.orientation import in_stored_frame, split_mirror, turn_solution
+from ..model.orientation import in_stored_frame, orient_solution, split_mirror
 from .geometry import SceneGeometry, ScenePoints, with_depths
 from .many_photos import rectify_photos
 from .one_photo import PhotoDone
@@ -126,8 +126,8 @@ def _as_rectified(solved: Solution, done: Mapping[str, PhotoDone], options: Rect
     ]
     solved = replace(solved, images=tuple(images), options={**solved.options, "raw_as": options.raw_as})
     if options.apply_orientation:
-        turns = {name: each.turn for name, each in done.items() if not each.problem}
-        solved = turn_solution(_without_mirrored_poses(solved, turns), turns)
+        orientations = {name: each.orientation for name, each in done.items() if not each.problem}
+        solved = orient_solution(_without_mirrored_poses(solved, orientations), orientations)
     return solved
 
 
@@ -158,10 +158,10 @@ def _points_beside(solution: Path, solved: Solution, depth: str | Path) -> Scene
     return None
 
 
-def _without_mirrored_poses(solution: Solution, turns: Mapping[str, int]) -> Solution:
+def _without_mirrored_poses(solution: Solution, orientations: Mapping[str, int]) -> Solution:
     images = []
     for image in solution.images:
-        if image.posed and split_mirror(turns.get(image.name, 1))[1] != 1:
+        if image.posed and split_mirror(orientations.get(image.name, 1))[1] != 1:
             text = (
                 f"{image.name} is mirrored by its EXIF orientation and loses its pose: no camera takes a mirror image"
             )

@@ -192,7 +192,7 @@ def _rectified(
 
 
 class _Jobs:
-    """What is to be done to each photo, by name; made when asked for."""
+    """Jobs of the photos by name, each made when it is asked for."""
 
     def __init__(
         self,
@@ -238,7 +238,7 @@ class _Jobs:
 
 
 def _most_bytes(solution: Solution, names: Iterable[str], options: RectifyOptions) -> float:
-    """What the largest of the photos takes, about."""
+    """Bytes that the largest photo takes, estimated."""
     own_depth = str(options.depth) not in DEPTHS
     besides = _BYTES_OF_GRIDS * bool(options.maps) + _BYTES_OF_DEPTH * own_depth
     besides += _BYTES_PER_PIXEL["PNG"] * bool(options.also)
@@ -253,7 +253,7 @@ def _most_bytes(solution: Solution, names: Iterable[str], options: RectifyOption
 
 
 def _entry(done: PhotoDone) -> JournalEntry:
-    return JournalEntry(done.name, done.fingerprint, done.files, done.turn, done.depth)
+    return JournalEntry(done.name, done.fingerprint, done.files, done.orientation, done.depth)
 
 
 class PointColors:

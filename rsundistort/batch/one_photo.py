@@ -22,13 +22,13 @@ from ..io.outputs import CANNOT_WRITE, held_inside
 from ..io.photos.exif import read_orientation
 from ..io.places import File, Place, RemoteFile, fetched
 from ..model import Depth
-from ..model.orientation import split_mirror, turn_pixels
+from ..model.orientation import orient_pixels, split_mirror
 from ..rectify import MAP_KINDS, RemapGrid, ViewOptions, rectify
 from .extras import AlsoImage
 from .geometry import PhotoGeometry
 from .rectify_options import RectifyOptions
 
-__all__ = ["PhotoDone", "PhotoJob", "check_not_rectified", "feed", "photo_colors", "rectify_photo", "turn_of"]
+__all__ = ["PhotoDone", "PhotoJob", "applied_part", "check_not_rectified", "feed", "photo_colors", "rectify_photo"]
 
 # the two files of a photo's grid
 _WAYS = ("forward", "inverse")
@@ -93,7 +93,7 @@ class PhotoJob:
         return [self.image, self.mask, *(each.target for each in self.also), *maps]
 
     def fingerprint(self) -> str:
-        """What the outputs depend on, as a number: if it is another one, they are stale.
+        """Digest of all that the outputs depend on: they are stale if it changes.
 
         Files count with size and time of change, all else with its value; a missing photo has no fingerprint ("").
         """
@@ -143,7 +143,7 @@ def feed(digest: Any, value: Any) -> None:
 
 @dataclass(frozen=True)
 class PhotoDone:
-    """What came of one photo.
+    """Outcome of one photo.
 
     Attributes
     ----------
@@ -155,7 +155,7 @@ class PhotoDone:
         See `PhotoJob.fingerprint`.
     files : mapping of path in the folder of outputs to int
         What was written, and how many bytes it has.
-    turn : int
+    orientation : int
         EXIF orientation that was applied.
     depth : (kind, shift_px, whole_shift_px) or None
         As in `PhotoDepth`, of a photo whose camera travelled.
@@ -167,7 +167,7 @@ class PhotoDone:
     problem: str = ""
     fingerprint: str = ""
     files: Mapping[str, int] = field(default_factory=dict)
-    turn: int = 1
+    orientation: int = 1
     depth: tuple[str, float, float] | None = None
     colors: NDArray[np.float64] | None = None
 
@@ -179,7 +179,7 @@ def check_not_rectified(photo: Photo) -> None:
         raise InputError(f"it was rectified already, by rsundistort {by}; --again rectifies it once more")
 
 
-def turn_of(orientation: int, posed: bool) -> tuple[int, int]:
+def applied_part(orientation: int, posed: bool) -> tuple[int, int]:
     """How a photo's orientation is applied, and what is left of it: mirrors are left where there is a pose."""
     return split_mirror(orientation) if posed else (orientation, 1)
 
@@ -204,7 +204,7 @@ def rectify_photo(job: PhotoJob) -> PhotoDone:
 
 
 def _rectify_in(work: Path, job: PhotoJob) -> PhotoDone:
-    """The same by way of a folder that is here; without the fingerprint."""
+    """Rectify a photo by way of a local folder; the result has no fingerprint."""
     try:
         source = fetched(job.source, work / "photo")
         own_mask = None if job.own_mask is None else fetched(job.own_mask, work / "masks")
@@ -223,7 +223,7 @@ def _rectify_in(work: Path, job: PhotoJob) -> PhotoDone:
 
 
 def _rectify(job: PhotoJob, source: Path, own_mask: Path | None, out: Path) -> PhotoDone:
-    """The same with local files; without the fingerprint."""
+    """Rectify a photo in local files; the result has no fingerprint."""
     options, geometry = job.options, job.geometry
     files: dict[str, int] = {}
     writing = False
@@ -235,10 +235,10 @@ def _rectify(job: PhotoJob, source: Path, own_mask: Path | None, out: Path) -> P
         found = geometry.find_depth()
         pixels, mask = rectify(photo.pixels, *geometry.grid, options.interpolation, mask=own, depth=found.depth)
         colors = None if job.sample_xy is None else _colors(photo, job.sample_xy)
-        metadata, turn = photo.metadata.marked(_VERSION), 1
+        metadata, applied = photo.metadata.marked(_VERSION), 1
         if options.apply_orientation:
-            turn, rest = turn_of(metadata.orientation, job.posed)
-            pixels, mask = turn_pixels(pixels, turn), turn_pixels(mask, turn)
+            applied, rest = applied_part(metadata.orientation, job.posed)
+            pixels, mask = orient_pixels(pixels, applied), orient_pixels(mask, applied)
             _warn_of_orientation(job.name, photo, rest)
             metadata = metadata.with_orientation(rest)
         del photo, own  # not beside the encoded one
@@ -249,7 +249,7 @@ def _rectify(job: PhotoJob, source: Path, own_mask: Path | None, out: Path) -> P
         with held_inside(out, job.mask) as path:
             write_image(path, mask, flat=True)
             files[job.mask] = path.stat().st_size
-        for name, size in _write_extras(job, out, found.depth, turn):
+        for name, size in _write_extras(job, out, found.depth, applied):
             files[name] = size
     except (FileError, InputError, MemoryError, cv2.error) as error:
         if writing and getattr(error.__cause__, "errno", None) in CANNOT_WRITE:
@@ -258,10 +258,10 @@ def _rectify(job: PhotoJob, source: Path, own_mask: Path | None, out: Path) -> P
             (out / name).unlink(missing_ok=True)
         return PhotoDone(job.name, " ".join(str(error).split()) or "it does not fit into the memory")
     note = None if found.whole_shift_px is None else (found.kind, found.shift_px, found.whole_shift_px)
-    return PhotoDone(job.name, "", "", files, turn, note, colors)
+    return PhotoDone(job.name, "", "", files, applied, note, colors)
 
 
-def _write_extras(job: PhotoJob, out: Path, depth: Depth, turn: int) -> Iterator[tuple[str, int]]:
+def _write_extras(job: PhotoJob, out: Path, depth: Depth, applied: int) -> Iterator[tuple[str, int]]:
     """Write the other images of a photo's frame and its grids; their names and sizes, each when it is there."""
     for each in job.also:
         try:
@@ -270,13 +270,13 @@ def _write_extras(job: PhotoJob, out: Path, depth: Depth, turn: int) -> Iterator
         except (FileError, InputError) as error:
             raise InputError(f"{each.source.parent.name}/{each.source.name}: {error}") from error
         with held_inside(out, each.target) as path:
-            write_image(path, turn_pixels(pixels, turn), image.metadata, job.options.quality)
+            write_image(path, orient_pixels(pixels, applied), image.metadata, job.options.quality)
             size = path.stat().st_size
         yield each.target, size
     if job.maps is not None and job.options.maps is not None:
         grid = RemapGrid.from_camera(*job.geometry.grid, depth)
-        if turn != 1:
-            map_x, map_y = (turn_pixels(m, turn) for m in (grid.map_x, grid.map_y))
+        if applied != 1:
+            map_x, map_y = (orient_pixels(m, applied) for m in (grid.map_x, grid.map_y))
             grid = RemapGrid(map_x, map_y, grid.source_width, grid.source_height)
         for name, each_way in zip(job.targets[-len(_WAYS) :], (grid, grid.inverse()), strict=True):
             with held_inside(out, name) as path:

@@ -1,4 +1,4 @@
-"""What is done to each photo."""
+"""Options of the rectification of each photo."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["RectifyOptions"]
 
 @dataclass(frozen=True)
 class RectifyOptions:
-    """What is done to each photo.
+    """Options of the rectification of each photo.
 
     Parameters
     ----------

@@ -27,7 +27,7 @@ _UNSETTLED_PATH = 1e-4
 
 
 def objective(reconstruction: Reconstruction, shutter_model: str, options: BundleOptions) -> float:
-    """What `bundle_adjust` lowers in its first solve, at a reconstruction's values.
+    """The cost that `bundle_adjust` minimises in its first solve, at the values of a reconstruction.
 
     Half the robust sum of squares in units of the noise (`options.sigma_px`, which must be given), and the priors.
     Motion that the model lacks, or that is held, counts as zero.
@@ -82,9 +82,9 @@ def bundle_adjust(
     for _ in range(options.outlier_rounds):
         rounds.solve(options.round_tolerance)
         rounds.drop_outliers()
-    most = options.spread_rounds + 1
+    most = options.prior_sigma_rounds + 1
     is_guess = options.path is None or options.path.start is None
-    if is_guess and not options.outlier_rounds and options.spread_rounds and estimates_sigmas(shutter_model, options):
+    if is_guess and not options.outlier_rounds and most > 1 and estimates_sigmas(shutter_model, options):
         # the first prior standard deviations are a guess: their solution need not be exact
         rounds.solve(options.round_tolerance)
         rounds.begin_next()
@@ -137,7 +137,7 @@ def adjust_sequence(
     # every model except the last is only a start: what it cannot explain is no outlier, and it need not converge; the
     # lens would absorb a shutter that is not modelled yet, and bend what is known of the scene
     rough = replace(
-        options, outlier_rounds=0, spread_rounds=0, cost_tolerance=options.round_tolerance, refine=(), lengths=(),
+        options, outlier_rounds=0, prior_sigma_rounds=0, cost_tolerance=options.round_tolerance, refine=(), lengths=(),
         places=None, deviations="model", residual_field=False,
     )  # fmt: skip
     results: dict[str, BundleResult] = {}

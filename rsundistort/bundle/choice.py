@@ -231,8 +231,8 @@ class _Fits:
         fitted, held = hold_out(reconstruction, seed=seed)
         # gross outliers were dropped before: squares, and only as exact as the comparison of models requires
         self._rough = replace(
-            options, outlier_rounds=0, spread_rounds=4, spread_tolerance=0.05, loss="squared", sigma_px=sigma_px,
-            cost_tolerance=1e-5, max_iterations=_MOST_STEPS, lengths=(), deviations="model",
+            options, outlier_rounds=0, prior_sigma_rounds=4, prior_sigma_tolerance=0.05, loss="squared",
+            sigma_px=sigma_px, cost_tolerance=1e-5, max_iterations=_MOST_STEPS, lengths=(), deviations="model",
         )  # fmt: skip
         self.given = replace(reconstruction, observations=reconstruction.observations.select(fitted))
         self.held_out = reconstruction.observations.select(held)

@@ -44,7 +44,7 @@ class CoarseSpace:
         Photos in the order of their clusters, and where each begins.
     functions : (m, q) array
         The functions, orthonormal in each cluster.
-    turn : (m, 3, 3) array
+    rotation : (m, 3, 3) array
         World to camera, for the first three unknowns.
     free : (m, nb) bool array
         Unknowns that are not held.
@@ -58,7 +58,7 @@ class CoarseSpace:
     by_cluster: Index
     start: Index
     functions: Array
-    turn: Array
+    rotation: Array
     free: NDArray[np.bool_]
     entries: tuple[Index, Index, Index, Index]
     envelope: Envelope
@@ -82,8 +82,8 @@ class CoarseSpace:
         size = np.add.reduceat((functions**2)[by_cluster, :, None] * moved[by_cluster, None], start)
         of_clusters, entries = _pairs_of_clusters(pattern, cluster)
         envelope = Envelope.smallest(of_clusters, size.reshape(num, _FUNCTIONS * nb) > _RIDGE)
-        turn = np.array(R_cw)  # which can be written, whosever it was: kernels are compiled for either kind
-        return cls(cluster, by_cluster, start, functions, turn, free, entries, envelope)
+        rotation = np.array(R_cw)  # which can be written, whosever it was: kernels are compiled for either kind
+        return cls(cluster, by_cluster, start, functions, rotation, free, entries, envelope)
 
     def project(self, reduced: Reduced) -> Reduced:
         """The system of the clusters; the cameras' unknowns stay."""
@@ -91,7 +91,7 @@ class CoarseSpace:
         E = np.empty((len(self.envelope.pattern.cols), _FUNCTIONS * nb, _FUNCTIONS * nb))
         with numba.parallel_chunksize(1):
             blocks.project_blocks(
-                self.turn, self.free.astype(float), self.functions, *self.entries, reduced.S, E
+                self.rotation, self.free.astype(float), self.functions, *self.entries, reduced.S, E
             )  # fmt: skip
         diagonal = np.einsum("caa->ca", E[self.envelope.pattern.diagonal])
         E[self.envelope.pattern.diagonal] += _RIDGE * diagonal[:, :, None] * np.eye(_FUNCTIONS * nb)
@@ -100,16 +100,16 @@ class CoarseSpace:
 
     def restrict(self, x: Array) -> Array:
         """Z' x (clusters, q nb) of values of the photos (m, nb)."""
-        turned = np.where(self.free, x, 0.0)
-        turned[:, :3] = np.einsum("mba,mb->ma", self.turn, turned[:, :3])
-        spread = self.functions[self.by_cluster, :, None] * turned[self.by_cluster, None]
+        rotated = np.where(self.free, x, 0.0)
+        rotated[:, :3] = np.einsum("mba,mb->ma", self.rotation, rotated[:, :3])
+        spread = self.functions[self.by_cluster, :, None] * rotated[self.by_cluster, None]
         return np.add.reduceat(spread, self.start).reshape(len(self.start), -1)
 
     def prolong(self, u: Array) -> Array:
         """Z u (m, nb) of values of the clusters (clusters, q nb)."""
         values = u.reshape(len(u), _FUNCTIONS, -1)[self.cluster]
         x = np.einsum("mk,mka->ma", self.functions, values)
-        x[:, :3] = np.einsum("mab,mb->ma", self.turn, x[:, :3])
+        x[:, :3] = np.einsum("mab,mb->ma", self.rotation, x[:, :3])
         return np.where(self.free, x, 0.0)
 
 

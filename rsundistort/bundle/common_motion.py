@@ -57,7 +57,7 @@ class MotionMeans:
 
     @classmethod
     def of(cls, reconstruction: Reconstruction, sigmas: tuple[float, ...], shares: NDArray[np.bool_]) -> MotionMeans:
-        """Those of a reconstruction; `shares` (m, 6) says which components of its photos' motions have a mean."""
+        """The means of a reconstruction; `shares` (m, 6) says which components of its photos' motions have a mean."""
         directions = np.zeros((reconstruction.num_images, 6, 6))
         directions[:, :3, :3] = np.eye(3)
         directions[:, 3:, 3:] = reconstruction.R_cw.transpose(0, 2, 1)

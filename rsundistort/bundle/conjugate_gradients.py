@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Iterated:
-    """What conjugate gradients end with.
+    """Result of conjugate gradients.
 
     Attributes
     ----------

@@ -93,10 +93,10 @@ class Coupling:
 
     def add_to(self, S: Array, pattern: BlockPattern, scale: float = 1.0) -> None:
         """Add J'J to the blocks (blocks, nb, nb) of the photos' system, in place."""
-        turned = self.first > self.second  # only blocks above the diagonal are kept
+        below = self.first > self.second  # only blocks above the diagonal are kept
         across = scale * np.einsum("qra,qrb->qab", self.J_first, self.J_second)
         np.add.at(
-            S, pattern.find(self.first, self.second), np.where(turned[:, None, None], across.transpose(0, 2, 1), across)
+            S, pattern.find(self.first, self.second), np.where(below[:, None, None], across.transpose(0, 2, 1), across)
         )
         for photo, J in ((self.first, self.J_first), (self.second, self.J_second)):
             np.add.at(S, pattern.diagonal[photo], scale * np.einsum("qra,qrb->qab", J, J))

@@ -37,7 +37,7 @@ class ReadoutChoice:
     gain: dict[int, float]
 
     @property
-    def turned(self) -> tuple[int, ...]:
+    def changed(self) -> tuple[int, ...]:
         """Cameras whose axis is not the one given."""
         return tuple(camera for camera, gain in self.gain.items() if gain > _MIN_GAIN)
 
@@ -66,8 +66,8 @@ def choose_readouts(
     """
     # constraints are meant for one axis; they do not decide between two
     rough = replace(
-        options or BundleOptions(), outlier_rounds=0, spread_rounds=1, spread_tolerance=0.1, cost_tolerance=1e-3,
-        held_phi={}, known_phi={}, still={}, lengths=(), deviations="model",
+        options or BundleOptions(), outlier_rounds=0, prior_sigma_rounds=1, prior_sigma_tolerance=0.1,
+        cost_tolerance=1e-3, held_phi={}, known_phi={}, still={}, lengths=(), deviations="model",
     )  # fmt: skip
 
     def fit(rec: Reconstruction) -> BundleResult:
@@ -87,7 +87,7 @@ def choose_readouts(
     errors = errors_of(found)
     while undecided:
         # the clearest case first: while one camera is wrong, the others' evidence is drowned in its residuals
-        others = {camera: _turned(best, camera) for camera in undecided}
+        others = {camera: _rotated(best, camera) for camera in undecided}
         other_errors = {camera: errors_of(fit(rec)) for camera, rec in others.items()}
         gains.update({camera: standard_errors(errors - each) for camera, each in other_errors.items()})
         clearest = max(undecided, key=lambda camera: gains[camera])
@@ -98,7 +98,7 @@ def choose_readouts(
     return ReadoutChoice(replace(reconstruction, cameras=best.cameras), gains)
 
 
-def _turned(reconstruction: Reconstruction, camera: int) -> Reconstruction:
+def _rotated(reconstruction: Reconstruction, camera: int) -> Reconstruction:
     """The reconstruction with one camera read out along the other axis."""
     cameras = list(reconstruction.cameras)
     cameras[camera] = replace(cameras[camera], readout=other_axis(cameras[camera].readout))

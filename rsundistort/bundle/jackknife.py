@@ -118,7 +118,7 @@ def _squares(pulls: Array) -> Array:
 
 
 class _Residuals(NamedTuple):
-    """Those at hand (o, 2), independent noise of the size that weighs the measurements, and what a fit leaves of it."""
+    """Residuals (o, 2), independent noise of the size that weighs the measurements, and what a fit leaves of it."""
 
     seen: Array
     drawn: Array

@@ -55,7 +55,7 @@ class Layout:
 
     @classmethod
     def of(cls, shutter_model: str, options: BundleOptions) -> Layout:
-        """That of a model."""
+        """The layout of a shutter model."""
         motion = motion_end(shutter_model)
         exact = SHUTTER_MODELS[shutter_model] >= SHUTTER_MODELS["rotation"]
         functions, group = bend_functions(options.bends) if exact and options.bends else (np.zeros((0, 0)), ())
@@ -93,11 +93,11 @@ class Layout:
 
     def values(self, bend: NDArray[np.float64], names: Sequence[str]) -> NDArray[np.float64]:
         """(m, n, 6) values at the sites of coefficients (m, 3 k) of photos."""
-        turns = len(self.group)
+        rotations = len(self.group)
         value = self._known_values(names)
         coefficients = bend.reshape(len(bend), -1, 3)
-        value[..., :3] += self.functions @ coefficients[:, :turns]
-        value[..., 3:] += self.functions[:, : self.ways] @ coefficients[:, turns:]
+        value[..., :3] += self.functions @ coefficients[:, :rotations]
+        value[..., 3:] += self.functions[:, : self.ways] @ coefficients[:, rotations:]
         return value
 
     def _known_values(self, names: Sequence[str]) -> NDArray[np.float64]:
@@ -109,15 +109,15 @@ class Layout:
 
     def coefficients(self, reconstruction: Reconstruction) -> NDArray[np.float64]:
         """(m, 3 k) coefficients of the bends of a reconstruction, as far as they are along the functions."""
-        m, turns = reconstruction.num_images, len(self.group)
+        m, rotations = reconstruction.num_images, len(self.group)
         found = np.zeros((m, self.num_bends, 3))
-        if reconstruction.bends and turns:
+        if reconstruction.bends and rotations:
             bends = [reconstruction.motion(i).bend for i in range(m)]
             values = np.stack([_at_sites(bend, len(self.functions)) for bend in bends if bend is not None])
             values -= self._known_values(reconstruction.image_names)
             inverse = np.linalg.pinv(self.functions)
-            found[:, :turns] = inverse @ values[..., :3]
-            found[:, turns:] = (inverse @ values[..., 3:])[:, : self.ways]
+            found[:, :rotations] = inverse @ values[..., :3]
+            found[:, rotations:] = (inverse @ values[..., 3:])[:, : self.ways]
         return found.reshape(m, -1)
 
 

@@ -115,6 +115,6 @@ def _basis(camera: Camera, names: Sequence[str], shutter_model: str) -> tuple[Ar
     # the span, whatever the units; polynomials of a lens are nearly one another
     span = np.linalg.qr(changes.reshape(-1, len(moved)))[0]
     basis = np.linalg.svd(span.T @ weights)[2][len(moved) :].T
-    square, turn = np.linalg.eigh(basis.T @ (weights.T @ weights / len(xy)) @ basis)
-    basis = basis @ turn / np.sqrt(square)
+    square, rotation = np.linalg.eigh(basis.T @ (weights.T @ weights / len(xy)) @ basis)
+    basis = basis @ rotation / np.sqrt(square)
     return basis, basis.T @ weights.T / len(xy)

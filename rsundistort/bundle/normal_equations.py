@@ -50,7 +50,7 @@ class Marginals(NamedTuple):
 
 @dataclass(frozen=True)
 class Function:
-    """What is known of a linear function of the points.
+    """Uncertainty of a linear function of the points.
 
     Attributes
     ----------
@@ -290,7 +290,7 @@ class NormalEquations:
         return Marginals(*found, *((a - b) / (2 * _STEP) for a, b in zip(looser, tighter, strict=True)))
 
     def _covariances(self) -> tuple[Array, Array]:
-        """Those of photos (m, nb, nb) and of all cameras (k, k)."""
+        """Covariances of photos (m, nb, nb) and of all cameras (k, k)."""
         if self.inverse is None:
             free = self._elimination.free[:, : self._J.shape[2]]
             return np.where(free[:, :, None] & free[:, None], np.nan, 0.0), np.full((self.num_shared,) * 2, np.nan)
@@ -321,7 +321,7 @@ class NormalEquations:
         return c.res, variances
 
     def _with_priors(self, scale: float) -> NormalEquations:
-        """The same with the priors' precision multiplied; for its inverse only, since gradients are not."""
+        """The equations with the priors' precision multiplied; for their inverse only, since gradients are not."""
         other = copy(self)
         other.__dict__.pop("inverse", None)
         other._prior_diag = scale * self._prior_diag
@@ -384,7 +384,7 @@ class NormalEquations:
         return by_frame, by_camera
 
     def function_of_points(self, weights: Array) -> Function | None:
-        """What is known of sum(weights * points), weights (n, 3); None where the system cannot be factored."""
+        """Uncertainty of sum(weights * points), weights (n, 3); None where the system cannot be factored."""
         zero = np.zeros_like(self._g_frame), np.zeros_like(self._g_camera)
         solved = self._solve(0.0, zero[0], -weights, zero[1], exact=True)
         if solved is None or self.inverse is None:
@@ -510,7 +510,7 @@ class NormalEquations:
     def _solve_without_lengths(
         self, damping: float, g_frame: Array, g_point: Array, g_camera: Array, exact: bool
     ) -> tuple[Array, Array, Array, Array, Array] | None:
-        """As `_solve`, of the measurements and priors alone."""
+        """`_solve` for the measurements and priors alone."""
         reduced, V_inv = self.reduce(damping, g_frame, g_point, g_camera)
         solved = self._elimination.solve(reduced, exact)
         if solved is None:

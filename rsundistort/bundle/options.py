@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from ..model import BEND_GROUPS, Bend, KnownLength, Reconstruction
 from ..model.checks import check_fields
+from ..model.former_fields import former_fields
 from .common_motion import CommonMotion
 from .intrinsics import GuessedCameras, check_refined
 from .lengths import check_lengths
@@ -37,6 +38,7 @@ def _known(name: str, phi: ArrayLike, sigma: ArrayLike) -> tuple[NDArray[np.floa
     return np.where(unknown, 0.0, values), sigmas
 
 
+@former_fields(spread_rounds="prior_sigma_rounds", spread_tolerance="prior_sigma_tolerance")
 @dataclass(frozen=True)
 class BundleOptions:
     """Options of `bundle_adjust`; each says which inequality it controls.
@@ -96,10 +98,10 @@ class BundleOptions:
         effect of the intrinsics, with a zero-mean prior whose standard deviation is estimated.
     field_sigma_start : float
         Start of that estimate, pixels: of each of some twenty orthogonal fields, root mean square over the frame.
-    spread_rounds : int
-        Largest number of further solves until no prior standard deviation changes by more than `spread_tolerance`.
-    spread_tolerance : float
-        Largest relative change, see `spread_rounds`.
+    prior_sigma_rounds : int
+        Largest number of further solves until no prior standard deviation changes by more than `prior_sigma_tolerance`.
+    prior_sigma_tolerance : float
+        Largest relative change, see `prior_sigma_rounds`.
     outlier_rounds : int
         Number of times that observations farther than `outlier_sigma` standard deviations are dropped and all is solved
         again.
@@ -173,8 +175,8 @@ class BundleOptions:
     centre_sigma_start: float = 3e-3
     residual_field: bool = False
     field_sigma_start: float = 0.03
-    spread_rounds: int = 12
-    spread_tolerance: float = 0.01
+    prior_sigma_rounds: int = 12
+    prior_sigma_tolerance: float = 0.01
     outlier_rounds: int = 3
     outlier_sigma: float = 4.5
     min_outlier_px: float = 0.25
@@ -217,7 +219,7 @@ class BundleOptions:
         positive = (
             "cost_tolerance", "round_tolerance", "step_tolerance", "initial_damping", "max_damping", "loss_scale",
             "min_sigma_px", "phi_sigma_start", "velocity_sigma_start", "way_sigma_start", "focal_sigma_start",
-            "centre_sigma_start", "field_sigma_start", "spread_tolerance", "outlier_sigma", "cg_tolerance",
+            "centre_sigma_start", "field_sigma_start", "prior_sigma_tolerance", "outlier_sigma", "cg_tolerance",
         )  # fmt: skip
         for name in positive:
             if not getattr(self, name) > 0:
@@ -237,8 +239,8 @@ class BundleOptions:
             raise InputError("the path of a video is solved for in a frame of its own; it takes no known places")
         if self.path is not None and (self.known_phi or self.still or self.held_phi):
             raise InputError("the path of a video says how its frames move; it takes known rates, but no known motions")
-        if self.max_iterations < 1 or self.outlier_rounds < 0 or self.spread_rounds < 0:
-            raise InputError("max_iterations must be at least 1, outlier_rounds and spread_rounds at least 0")
+        if self.max_iterations < 1 or self.outlier_rounds < 0 or self.prior_sigma_rounds < 0:
+            raise InputError("max_iterations must be at least 1, outlier_rounds and prior_sigma_rounds at least 0")
 
 
 @dataclass(frozen=True)
@@ -330,7 +332,7 @@ class BundleResult:
         return float(np.sqrt(self.velocity_sigma**2 + mean))
 
     def of_photos(self, keep: NDArray[np.bool_]) -> BundleResult:
-        """The same for some photos (m,) only, with the points that two of them show."""
+        """The result of some photos (m,) only, with the points that two of them show."""
         return replace(self, reconstruction=self.reconstruction.take_photos(keep), covariances=self.covariances[keep])
 
     @property

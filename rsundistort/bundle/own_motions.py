@@ -35,17 +35,17 @@ class OwnMotions:
         `x_c = R_cw (X_w - center_w)`.
     phi : (m, 3) array
         Radians per unit of the clock.
-    sigma_turn, sigma_phi : (m, 3) array
+    sigma_rotation, sigma_phi : (m, 3) array
         Standard deviations of both, by the residuals of the fits.
     """
 
     R_cw: Array
     phi: Array
-    sigma_turn: Array
+    sigma_rotation: Array
     sigma_phi: Array
 
 
-def own_motions(reconstruction: Reconstruction, *, turns_only: bool = False) -> OwnMotions:
+def own_motions(reconstruction: Reconstruction, *, rotation_only: bool = False) -> OwnMotions:
     """The rotation of each frame during its readout, and its pose, from points that all frames determine.
 
     Frames are fitted to the points, and the points to the frames, alternately and with a robust loss. Only their points
@@ -56,14 +56,14 @@ def own_motions(reconstruction: Reconstruction, *, turns_only: bool = False) -> 
     ----------
     reconstruction : Reconstruction
         Start; of all frames.
-    turns_only : bool
+    rotation_only : bool
         Whether the centres, and the points, stay where they are.
     """
     options = BundleOptions(loss="cauchy")
     problem = BundleProblem(reconstruction, "constant-motion", options, _NOISE_PX, PriorSigmas(_LOOSE, _LOOSE))
-    own = np.array([0, 1, 2, 6, 7, 8] if turns_only else range(_UNKNOWNS))
+    own = np.array([0, 1, 2, 6, 7, 8] if rotation_only else range(_UNKNOWNS))
     state = problem.initial_state()
-    for last in range(1 if turns_only else _ROUNDS):
+    for last in range(1 if rotation_only else _ROUNDS):
         if last:
             state = problem.settle(state)
         state = _fitted(problem, state, own)

@@ -43,7 +43,7 @@ _FRAMES_BEFORE = 100.0
 
 @dataclass(frozen=True)
 class PathStart:
-    """What an adjustment found of a path, for the next one to begin with.
+    """Path that an adjustment found, with which the next one begins.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class FramePath:
         Parts that a cut separates; all in one when left out.
     rates : mapping of photo name to (rate, sigma), optional
         Rate of rotation by a gyroscope, (3,) radians per second in the camera frame, and its standard deviation.
-    turns_only : bool
+    rotation_only : bool
         Whether the camera stays where it is: centres are held, and points count by their directions.
     start : PathStart, optional
         The path of an adjustment of these frames before, where the next one begins.
@@ -101,7 +101,7 @@ class FramePath:
     readout: tuple[float, float] | None = None
     part: Mapping[str, int] = field(default_factory=dict)
     rates: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
-    turns_only: bool = False
+    rotation_only: bool = False
     start: PathStart | None = None
 
     def __post_init__(self) -> None:
@@ -360,7 +360,7 @@ def path_bends(reconstruction: Reconstruction, path: FramePath, state: PathState
 
 @dataclass(frozen=True)
 class PathSolution:
-    """What was found of a path.
+    """Solution of a path.
 
     Attributes
     ----------

@@ -68,7 +68,7 @@ def point_of(reconstruction: Reconstruction, control: ControlPoint) -> int | Non
 
 
 class PlaceResiduals:
-    """What known places say of a state: residuals of centres and of points in their standard deviations.
+    """Residuals of known places in a state: of centres and of points in their standard deviations.
 
     Parameters
     ----------

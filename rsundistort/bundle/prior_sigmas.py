@@ -44,7 +44,7 @@ _MOST_PX = 1.0
 # shutter would be taken for it.
 _MOST_VARIED = 0.02
 # Of a path's rates from frame to frame: radians, and shares of the mean way between consecutive photos.
-_TURN_START, _TRAVEL_START = 5e-3, 0.2
+_ROTATION_START, _TRAVEL_START = 5e-3, 0.2
 # Residuals of a path that count as if these had been seen before.
 _USUAL_WEIGHT = 2.0
 # Ratio of a prior standard deviation to that of the solve before, or the other way round.
@@ -214,13 +214,13 @@ def _bend_sigmas(
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Prior standard deviations of the groups of bends, of rotations and of positions."""
     ones, found = np.ones(current.num_images), layout.coefficients(current)
-    turns = 3 * len(layout.group)
+    rotations = 3 * len(layout.group)
 
     def of(group: int, part: slice, sigma: float, least: float) -> float:
         mine = np.flatnonzero(np.repeat(np.array(layout.group[: (part.stop - part.start) // 3]) == group, 3))
         return _prior_sigma(found[:, part][:, mine], variances[:, part][:, mine], ones, sigma) + least
 
-    own, ways = slice(0, turns), slice(turns, turns + 3 * layout.ways)
+    own, ways = slice(0, rotations), slice(rotations, rotations + 3 * layout.ways)
     return (
         tuple(of(k, own, sigma, _MIN_SIGMA) for k, sigma in enumerate(sigmas.bends)),
         tuple(of(k, ways, sigma, _MIN_SIGMA * current.baseline) for k, sigma in enumerate(sigmas.ways)),
@@ -229,10 +229,10 @@ def _bend_sigmas(
 
 def estimates_sigmas(shutter_model: str, options: BundleOptions) -> bool:
     """Whether a prior standard deviation is estimated."""
-    of_turn = shutter_model != "global" and options.phi_sigma is None
+    of_phi = shutter_model != "global" and options.phi_sigma is None
     of_way = shutter_model == "constant-motion" and options.velocity_sigma is None
     return (
-        of_turn or of_way or options.path is not None or options.varying or options.bends > 0 or options.residual_field
+        of_phi or of_way or options.path is not None or options.varying or options.bends > 0 or options.residual_field
     )
 
 
@@ -263,7 +263,7 @@ def settled(before: PriorSigmas, after: PriorSigmas, tolerance: float) -> bool:
 
 
 def starting_sigmas(options: BundleOptions, layout: Layout, reconstruction: Reconstruction) -> PriorSigmas:
-    """Those that are given, or at which the estimation begins."""
+    """Standard deviations that are given, or at which the estimation begins."""
     baseline = reconstruction.baseline
     start = PriorSigmas(
         options.phi_sigma or options.phi_sigma_start,
@@ -273,7 +273,7 @@ def starting_sigmas(options: BundleOptions, layout: Layout, reconstruction: Reco
         tuple(np.broadcast_to(options.bend_sigma_start, len(set(layout.group))).tolist()),
         (options.way_sigma_start * baseline,) * len(set(layout.group[: layout.ways])),
         options.field_sigma_start,
-        () if options.path is None else (_TURN_START, _TRAVEL_START * baseline),
+        () if options.path is None else (_ROTATION_START, _TRAVEL_START * baseline),
     )
     if has_means(layout, options):
         way = _MUCH * start.velocity
@@ -316,7 +316,7 @@ def path_prior_sigmas(
     """
     squares, unknown = (prior.unit_squares(each) for each in (residuals**2, variances))
     ones, found = np.ones(len(residuals)), []
-    usual = _TURN_START, _TRAVEL_START * baseline
+    usual = _ROTATION_START, _TRAVEL_START * baseline
     for square, variance, sigma, start in zip(squares, unknown, prior.sigmas, usual, strict=True):
         seen = _prior_sigma(np.sqrt(square), variance, ones, sigma) ** 2
         found.append(float(np.sqrt((square.size * seen + _USUAL_WEIGHT * start**2) / (square.size + _USUAL_WEIGHT))))

@@ -35,7 +35,7 @@ __all__ = ["BundleProblem", "State"]
 
 @dataclass(frozen=True)
 class State:
-    """What a step changes: cameras, poses, shutter motion, variation and points, as in `Reconstruction`.
+    """Unknowns that a step changes: cameras, poses, shutter motion, variation and points, as in `Reconstruction`.
 
     Of the bends (m, 3 k) coefficients along `Layout.functions`, of the rotation, then of the position, three by three.
     Of frames on a path, phi and velocity are those of its rates. Means (cameras, 6) of the motions are in the frame of
@@ -96,7 +96,7 @@ class BundleProblem:
             photos = range(reconstruction.num_images)
             self._bend_clock = np.array([reconstruction.camera(i).clock_range for i in photos])
         self._path, self._path_start, self._bounded = None, path, True
-        self._turns_only = options.path is not None and options.path.turns_only
+        self._rotation_only = options.path is not None and options.path.rotation_only
         if options.path is not None:
             if shutter_model != "constant-motion":
                 raise InputError(f"frames on a path move by constant-motion, not by {shutter_model}")
@@ -224,7 +224,7 @@ class BundleProblem:
         if self._path is None:
             return free
         free = np.pad(free, ((0, 0), (0, 6)), constant_values=True)
-        if self._turns_only:
+        if self._rotation_only:
             free[:, [3, 4, 5, 9, 10, 11, *range(self.layout.size + 3, self.layout.size + 6)]] = False
         return free
 
@@ -252,7 +252,7 @@ class BundleProblem:
         )  # fmt: skip
 
     def with_squares(self) -> BundleProblem:
-        """The same without a robust loss, and without the bound of the readout time, for covariances.
+        """The problem without a robust loss and without the bound of the readout time, for covariances.
 
         The curvature of a robust loss is not the inverse of a covariance: of normal noise it would be too small by a
         quarter. That of squares is right for normal noise, and to the safe side for noise with heavy tails.
@@ -308,7 +308,7 @@ class BundleProblem:
         return self._model, *self._args, LOSSES[self._options.loss], self._options.loss_scale
 
     def _arrays(self, state: State) -> tuple[NDArray[Any], ...]:
-        """What the kernels take of cameras, photos, points and measurements."""
+        """Arguments of the kernels: cameras, photos, points and measurements."""
         s = self._structure
         phi = state.phi
         if self.layout.bent:
@@ -445,7 +445,7 @@ class BundleProblem:
         lengths = self._lengths.residuals(state.points_w), self._lengths.jacobian(state.points_w)
         return NormalEquations(
             self._elimination, total, res, J_frame, prior_diag, prior_gradient, border, lengths, coupling,
-            state.points_w - state.center_w[0] if self._turns_only else None,
+            state.points_w - state.center_w[0] if self._rotation_only else None,
             self._places.on_points(state.points_w), common,
         )  # fmt: skip
 

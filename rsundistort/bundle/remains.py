@@ -28,7 +28,7 @@ _PER_COEFFICIENT = 3
 _RIDGE = 1e-6
 # Standard deviation of the rotations that lines are taken to have beyond a steady motion, radians: of a trembling hand
 # or of a motor's vibration. It keeps finite what a half shows hardly.
-_TURNED = 5e-4
+_ROTATED = 5e-4
 _REWEIGHTED = 4
 
 
@@ -96,7 +96,7 @@ def errors_without(
     return np.asarray(np.minimum(square, 2 * CLIP**2) / 2)
 
 
-def _turned(rec: Reconstruction, measured: Observations) -> NDArray[np.float64]:
+def _rotated(rec: Reconstruction, measured: Observations) -> NDArray[np.float64]:
     """(n, 2, 3) pixels a radian that each measurement moves by if its line rotates about the camera's axes.
 
     Without the lens: what is asked is whether two halves show the same.
@@ -113,7 +113,7 @@ def _curves(
 ) -> NDArray[np.float64]:
     """Coefficients of the columns of A (n, 2, k) behind the first `smooth`, which are free; the rest has a prior."""
     A, rest = A.reshape(-1, A.shape[2]), pixels.ravel()
-    prior = np.diag(np.r_[np.zeros(smooth), np.full(A.shape[1] - smooth, _TURNED**-2.0)])
+    prior = np.diag(np.r_[np.zeros(smooth), np.full(A.shape[1] - smooth, _ROTATED**-2.0)])
     found = np.zeros(A.shape[1])
     for _ in range(_REWEIGHTED):
         square = (((rest - A @ found).reshape(-1, 2) / noise[:, None]) ** 2).sum(1)
@@ -135,7 +135,7 @@ def agreement_of_waves(rec: Reconstruction, sigma_px: float) -> float:
     obs = rec.observations
     res, valid = reprojection_residuals(rec)
     half = half_across_readout(rec)[obs.point_idx]
-    smooth, turned = warps(rec, obs), _turned(rec, obs)
+    smooth, rotated = warps(rec, obs), _rotated(rec, obs)
     lines = _splines_along(rec, obs, WAVES)
     low = np.polynomial.legendre.legvander(np.linspace(-1, 1, WAVES), _DEGREE)
     beyond = np.eye(WAVES) - low @ np.linalg.pinv(low)
@@ -148,9 +148,9 @@ def agreement_of_waves(rec: Reconstruction, sigma_px: float) -> float:
             if 2 * len(mine) < A.shape[2]:
                 continue
             A[:, 0, :width] = A[:, 1, width : 2 * width] = smooth[mine]
-            A[:, :, 2 * width :] = np.einsum("na,nik->niak", lines[mine], turned[mine]).reshape(len(mine), 2, -1)
+            A[:, :, 2 * width :] = np.einsum("na,nik->niak", lines[mine], rotated[mine]).reshape(len(mine), 2, -1)
             found = _curves(res[mine], A, sigma_px * obs.sigma[mine], 2 * width)
             both[side, i] = beyond @ found.reshape(WAVES, 3)
-    one, other = both * np.sqrt((turned**2).mean((0, 1)))
+    one, other = both * np.sqrt((rotated**2).mean((0, 1)))
     scale = float(np.sqrt((one**2).sum() * (other**2).sum()))
     return float((one * other).sum() / scale) if scale > 0 else 0.0

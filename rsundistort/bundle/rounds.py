@@ -47,11 +47,11 @@ def _noise_px(reconstruction: Reconstruction, shutter_model: str, floor: float) 
     if not valid.any():
         return max(1.0, floor)
     # median of |x| of a normal variable is 0.6745 sigma; residuals of a fit are shorter than the noise
-    spread = float(np.median(np.abs(res / reconstruction.observations.sigma[:, None])[valid])) / 0.6745
+    sigma = float(np.median(np.abs(res / reconstruction.observations.sigma[:, None])[valid])) / 0.6745
     bends = max(reconstruction.bend.shape[1] - 2, 0)
     unknowns = (9 + 3 * bends) * reconstruction.num_images + 3 * reconstruction.num_points
     shrink = np.sqrt(max(1.0 - unknowns / (2.0 * len(res)), 0.1))
-    return max(spread / shrink, floor)
+    return max(sigma / shrink, floor)
 
 
 def _believed(reconstruction: Reconstruction, options: BundleOptions, sigma: float) -> NDArray[np.bool_]:
@@ -66,7 +66,7 @@ def _check_solvable(reconstruction: Reconstruction, shutter_model: str, path: Fr
     m = reconstruction.num_images
     if shutter_model != "global" and m < 3 and path is None:
         raise InputError(f"{m} photos cannot separate the shutter from the scene; at least three are needed")
-    if path is not None and path.turns_only:
+    if path is not None and path.rotation_only:
         return
     if m > 1 and not np.linalg.norm(np.ptp(reconstruction.center_w, axis=0)) > 1e-9 * reconstruction.size:
         raise InputError("all photos are taken from one place: without parallax there is no scene to solve for")
@@ -113,8 +113,8 @@ class Rounds:
             self._path = prior.start(base, start)
             base = with_path_motions(base, options.path, self._path)
             self._options = options = replace(options, known_bends=path_bends(base, options.path, self._path))
-        self._turns_only = options.path is not None and options.path.turns_only
-        self._base = base if self._turns_only else retriangulated(base, shutter_model, from_afar=True)
+        self._rotation_only = options.path is not None and options.path.rotation_only
+        self._base = base if self._rotation_only else retriangulated(base, shutter_model, from_afar=True)
         self._keep = np.ones(len(self._base.observations), bool)
         self._sigma_px = options.sigma_px or _noise_px(self._base, shutter_model, options.min_sigma_px)
         self._baseline = reconstruction.baseline
@@ -182,10 +182,10 @@ class Rounds:
             self._sigmas = replace(self._sigmas, field=field)
         if state.path is not None:
             self._follow_path(problem, equations)
-        self._new_points = self._current if self._turns_only else retriangulated(self._current, self._model)
+        self._new_points = self._current if self._rotation_only else retriangulated(self._current, self._model)
 
     def _common(self, equations: NormalEquations) -> Common | None:
-        """What the last solve found of the means of the motions."""
+        """Means of the motions that the last solve found."""
         state, current = self._solved.state, self._current
         if not state.means.size:
             return None
@@ -240,7 +240,7 @@ class Rounds:
         ) and not self._had_heavy_tails
         return (
             self._new_points is self._current
-            and settled(self._weighed_sigmas, self._sigmas, options.spread_tolerance)
+            and settled(self._weighed_sigmas, self._sigmas, options.prior_sigma_tolerance)
             and abs(self._noise - self._weighed_noise) < _SETTLED_NOISE * self._noise
             and not awaits_tails
             and (options.path is None or self._path_moved < _SETTLED_BEND)
@@ -254,7 +254,7 @@ class Rounds:
         self._base = replace(self._new_points, observations=self._base.observations)
 
     def result(self) -> BundleResult:
-        """What the last solve found."""
+        """Result of the last solve."""
         current, options, layout, state = self._current, self._options, self._layout, self._solved.state
         res, valid = reprojection_residuals(current)
         weighed, sigmas = self._weighed_noise, self._sigmas

@@ -25,7 +25,7 @@ class LinearSystem(Protocol):
 
 
 class Problem(Protocol):
-    """What is minimised."""
+    """A problem of least squares."""
 
     def linearize(self, state: Any, spent: Any = None) -> LinearSystem:
         """Normal equations and cost at a state; they may be written over those of `spent`, no longer needed."""

@@ -59,7 +59,7 @@ class SparseBlocks:
 
     @property
     def multiply_adds(self) -> float:
-        """What the factorisation takes."""
+        """Multiply-adds of the factorisation."""
         wide = np.diff(self.filled.row_start).astype(float)
         return float((wide * (wide + 1)).sum() / 2 * self.free.shape[1] ** 3)
 

@@ -23,7 +23,7 @@ _level: dict[str, int] = {"users": 0, "before": 0}
 
 @contextmanager
 def kept_log_level() -> Iterator[None]:
-    """What pycolmap logs is, after the last of these blocks in any thread, what it was before the first."""
+    """Keep the log level of pycolmap: after the last of these blocks in any thread it is that before the first."""
     pycolmap = import_pycolmap()
     with _level_lock:
         if not _level["users"]:

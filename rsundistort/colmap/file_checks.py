@@ -116,7 +116,7 @@ def pycolmap_model(folder: Path) -> Any:
 
 
 def check_colmap_cameras(path: Path) -> None:
-    """The same of a file of cameras alone, whatever its name."""
+    """Check a file of cameras alone, whatever its name."""
     _check(path, _after_camera)
 
 

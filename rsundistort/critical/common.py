@@ -21,7 +21,7 @@ _LOW = 0.15
 # Half a pixel from the first row to the last, root mean square: less needs no remedy.
 _SMALL_PX = 0.5 / np.sqrt(12.0)
 # Of a photo's axes right, down and ahead.
-_TURNS, _WAYS = ("nodding", "panning", "rolling"), ("going sideways", "rising", "going ahead")
+_ROTATIONS, _WAYS = ("nodding", "panning", "rolling"), ("going sideways", "rising", "going ahead")
 # Directions that are searched together; the weakest converges sooner.
 _BLOCK = 4
 _MOST_STEPS = 100
@@ -104,17 +104,17 @@ class CommonMotion:
         if not np.isfinite(self.shift_px):
             return "how the camera moved is not determined: the measurements leave it entirely open"
         amount = np.sqrt(np.mean(self.weakest**2, axis=0))
-        turn = int(np.argmax(self.shares[:3]))
+        rotation = int(np.argmax(self.shares[:3]))
         swap = [1, 0, 2] if self.by_column else [0, 1, 2]
         left = (
-            f"in all photos together phi{turn + 1} is uncertain by +-{1e3 * amount[turn]:.2g} mrad a frame, "
+            f"in all photos together phi{rotation + 1} is uncertain by +-{1e3 * amount[rotation]:.2g} mrad a frame, "
             f"which is {self.shift_px:.2g} px in the rectified photos (one standard deviation)"
         )
         if not self.of_travel:
-            return f"{_TURNS[swap[turn]]} is known worst: {left}"
+            return f"{_ROTATIONS[swap[rotation]]} is known worst: {left}"
         way = int(np.argmax(self.shares[3:]))
         how = "can hardly be distinguished" if self.is_weak else "are distinguished worst"
-        return f"{_TURNS[swap[turn]]} and {_WAYS[swap[way]]} {how}: {left}"
+        return f"{_ROTATIONS[swap[rotation]]} and {_WAYS[swap[way]]} {how}: {left}"
 
 
 def row_phi(reconstruction: Reconstruction) -> NDArray[np.int64]:
@@ -129,17 +129,17 @@ def _row_motion(rec: Reconstruction, nb: int) -> tuple[Array, Array]:
     span, order = rec.frame_span(), row_phi(rec)
     forward, back = np.zeros((m, k, nb)), np.zeros((m, k, k))
     for i in range(m):
-        turn = np.eye(3)[order[i]]
-        forward[i, :3, 6:9] = span[i] * turn
-        back[i, :3, :3] = turn.T / span[i]
+        rotation = np.eye(3)[order[i]]
+        forward[i, :3, 6:9] = span[i] * rotation
+        back[i, :3, :3] = rotation.T / span[i]
         if k > 3:
             # the velocity in the camera: it changes with the pose, too
             v = rec.R_cw[i] @ rec.velocity[i]
             across = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
             scale = span[i] / rec.baseline
-            forward[i, 3:, 9:] = scale * turn @ rec.R_cw[i]
-            forward[i, 3:, :3] = -scale * turn @ across
-            back[i, 3:, 3:] = rec.R_cw[i].T @ turn.T / scale
+            forward[i, 3:, 9:] = scale * rotation @ rec.R_cw[i]
+            forward[i, 3:, :3] = -scale * rotation @ across
+            back[i, 3:, 3:] = rec.R_cw[i].T @ rotation.T / scale
     return forward, back
 
 

@@ -65,7 +65,7 @@ class CriticalMotion:
 
     @property
     def meaning(self) -> str:
-        """What is confounded, in words."""
+        """Unknowns that are confounded, in words."""
         if self.num_photos < 3:
             return "too few photos: two never separate the shutter from the shape of the scene"
         if not self.is_low:
@@ -93,9 +93,9 @@ def _equations(
     """(3 (m - 1), 5) linearised self-calibration with one photo's skew, aspect ratio and plane at infinity unknown."""
     others = np.delete(np.arange(len(R_cw)), reference)
     # every photo as one that was read by rows
-    turn = np.where(by_column[:, None, None], _EXCHANGE, np.eye(3)) @ R_cw
-    R = turn[others] @ turn[reference].T
-    t = np.einsum("mij,mj->mi", turn[others], center_w[reference] - center_w[others])
+    rotation = np.where(by_column[:, None, None], _EXCHANGE, np.eye(3)) @ R_cw
+    R = rotation[others] @ rotation[reference].T
+    t = np.einsum("mij,mj->mi", rotation[others], center_w[reference] - center_w[others])
     changes = np.zeros((5, len(others), 3, 3))
     for k, W in enumerate(([[0, 1, 0], [1, 0, 0], [0, 0, 0]], [[0, 0, 0], [0, 2, 0], [0, 0, 0]])):
         changes[k] = R @ np.array(W, float) @ R.transpose(0, 2, 1)
@@ -136,7 +136,7 @@ def critical_motion(
     """
     centers = check_finite(center_w, (None, 3), "center_w")
     m = len(centers)
-    turn = check_rotations(R_cw, m, "R_cw")
+    rotation = check_rotations(R_cw, m, "R_cw")
     if m < 2:
         raise InputError("the degeneracy measure compares photos; it needs at least two poses")
     if not isinstance(readout, (str, Sequence)):
@@ -149,7 +149,7 @@ def critical_motion(
     values = np.zeros((m, 5))
     vectors = np.zeros((m, 5))
     for reference in range(m):
-        rows = _equations(turn, centers / spread, by_column, reference) / np.sqrt(m - 1)
+        rows = _equations(rotation, centers / spread, by_column, reference) / np.sqrt(m - 1)
         # of the triangle: with all rows it would grow with the cube of the number of photos
         _, found, Vt = np.linalg.svd(np.linalg.qr(rows, mode="r"), full_matrices=True)
         values[reference, : len(found)] = found
@@ -158,7 +158,7 @@ def critical_motion(
     lowest = values[:, -1] <= values[:, -1].min() + 1e-12
     null = vectors[int(np.argmax(lowest))]
     null = null * np.sign(null[np.argmax(np.abs(null))])
-    axes = readout_axes(turn, directions)
+    axes = readout_axes(rotation, directions)
     along = np.linalg.eigvalsh(axes.T @ axes / m)[-1]
     return CriticalMotion(
         singular_values=frozen(np.sqrt(np.mean(values**2, axis=0))),

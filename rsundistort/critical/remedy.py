@@ -171,9 +171,9 @@ def contradictions(result: BundleResult, options: BundleOptions, names: Collecti
     for name in names:
         i = rec.image_names.index(name)
         if probability[i] < _UNLIKELY:
-            turn = np.degrees(np.linalg.norm(motion[i, components[i, 1:]]) * span[i])
+            rotation = np.degrees(np.linalg.norm(motion[i, components[i, 1:]]) * span[i])
             found.append(
-                f"{name} was specified as still, but it rotated by {turn:.2f} degrees about its other axes "
+                f"{name} was specified as still, but it rotated by {rotation:.2f} degrees about its other axes "
                 "during the readout; the scene's height is only as right as that"
             )
     return tuple(found)

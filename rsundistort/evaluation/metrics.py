@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..model import Solution
 from ..model.checks import check_kind, check_whole
+from ..model.similarity import similarity_of
 
 __all__ = ["MotionErrors", "PoseErrors", "align_points", "motion_errors", "pose_errors", "psnr", "rotation_angles_deg"]
 
@@ -68,13 +69,8 @@ def align_points(
     scale, R, shift
         `scale * R @ x + shift`; float, (3, 3), (3,).
     """
-    mean, mean_true = points.mean(0), true_points.mean(0)
-    X, Y = points - mean, true_points - mean_true
-    U, s, Vt = np.linalg.svd(Y.T @ X)
-    flip = np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))])
-    scale = float(np.trace(np.diag(s) @ flip) / max(np.sum(X**2), 1e-300))
-    R = U @ flip @ Vt
-    return scale, R, mean_true - scale * R @ mean
+    found = similarity_of(points, true_points)
+    return found.scale, found.R, found.shift
 
 
 def pose_errors(solution: Solution, truth: Solution) -> PoseErrors:

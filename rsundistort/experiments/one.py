@@ -135,10 +135,10 @@ def draw_trial(scene: KnownScene, options: OneOptions, trial: int) -> tuple[Reco
         np.array([motion.velocity for motion in motions]),
         "constant-motion",
     ).with_points(np.ones(int(valid.sum()), bool))
-    turn = Rotation.from_rotvec(np.radians(options.start_rotation_deg) * rng.normal(size=(scene.num_images, 3)))
+    rotation = Rotation.from_rotvec(np.radians(options.start_rotation_deg) * rng.normal(size=(scene.num_images, 3)))
     start = replace(
         truth,
-        R_cw=turn.as_matrix() @ truth.R_cw,
+        R_cw=rotation.as_matrix() @ truth.R_cw,
         center_w=truth.center_w + options.start_length * rng.normal(size=truth.center_w.shape),
         points_w=truth.points_w + options.start_length * rng.normal(size=truth.points_w.shape),
         phi=np.zeros_like(truth.phi),
@@ -193,7 +193,7 @@ def run_trial(scene: KnownScene, options: OneOptions, trial: int) -> list[dict[s
         seconds = time.perf_counter() - began
         # the method's own cost of the true parameters, with the prior standard deviations it ended with
         final = replace(
-            chosen, phi_sigma=result.phi_rms, velocity_sigma=max(result.velocity_rms, 1e-9), spread_rounds=0
+            chosen, phi_sigma=result.phi_rms, velocity_sigma=max(result.velocity_rms, 1e-9), prior_sigma_rounds=0
         )  # fmt: skip
         true_cost = objective(truth, model, final)
         lines.append(
@@ -215,7 +215,7 @@ def run_trial(scene: KnownScene, options: OneOptions, trial: int) -> list[dict[s
 
 
 def _settings(options: OneOptions) -> dict[str, Any]:
-    """What a trial's result depends on."""
+    """Settings that the result of a trial depends on."""
     return {k: v for k, v in asdict(options).items() if k not in ("jobs", "trials", "methods")}
 
 

@@ -62,7 +62,7 @@ class KnownScene:
 
     @property
     def digest(self) -> str:
-        """The same for the same camera, poses, points and visibility, whatever the name."""
+        """Digest of camera, poses, points and visibility, whatever the name."""
         parts = (self.camera.K, self.R_cw, self.center_w, self.points_w, self.frame_idx, self.point_idx)
         total = hashlib.sha256(f"{self.camera.width} {self.camera.height} {self.camera.readout}".encode())
         for part in parts:

@@ -1,10 +1,10 @@
 """Axes and clock of a gyroscope relative to the camera, from the video alone.
 
-Between two frames a time dt apart the world rotates in the camera frame by `turn` (`Exp(turn) R_cw` is the second
-orientation): the camera's mean rate about its own axes is `-turn / dt`. A gyroscope that is fixed to the camera
-measures `omega` about its axes, with a zero-rate offset (bias), on a clock of its own:
+Between two frames a time dt apart the world rotates in the camera frame by `rotation` (`Exp(rotation) R_cw` is the
+second orientation): the camera's mean rate about its own axes is `-rotation / dt`. A gyroscope that is fixed to the
+camera measures `omega` about its axes, with a zero-rate offset (bias), on a clock of its own:
 
-    -turn / dt = s R (mean of omega over the same time, moved by the offset of the clocks - bias) + noise
+    -rotation / dt = s R (mean of omega over the same time, moved by the offset of the clocks - bias) + noise
 
 R takes the gyroscope's axes to the camera's. s is 1 for the true focal length; rotations from a wrong one are too large
 or too small by its error. The offset is searched for by the correlation that the best R at each offset reaches (a
@@ -77,7 +77,7 @@ class GyroAlignment:
         The same about each axis of the camera; small for an axis about which it hardly rotated.
     rms : float
         Residual, rad/s per component, without wrong rotations.
-    num_inliers, num_turns : int
+    num_inliers, num_rotations : int
         Rotations that fit, of those that the log covers.
     """
 
@@ -94,7 +94,7 @@ class GyroAlignment:
     axis_correlations: _Array
     rms: float
     num_inliers: int
-    num_turns: int
+    num_rotations: int
 
     def in_camera(self, log: GyroLog) -> GyroLog:
         """The log about the camera's axes, without its bias, by its own clock."""
@@ -123,7 +123,7 @@ def align_gyro(
     log: GyroLog,
     frame_time_s: ArrayLike,
     pairs: ArrayLike,
-    turns: ArrayLike,
+    rotations: ArrayLike,
     *,
     largest_s: float = 10.0,
 ) -> GyroAlignment | NoAlignment:
@@ -137,9 +137,9 @@ def align_gyro(
         Times at which the middle lines of the frames were read, on the camera's clock.
     pairs : (n, 2) array of int
         Frames of each rotation, the earlier first. Neighbours are best: motion between distant frames is averaged.
-    turns : (n, 3) array
-        Rotation vectors in radians, about the camera's axes: `Exp(turn)` takes directions in the first frame to those
-        in the second. False ones, and NaN, are left out.
+    rotations : (n, 3) array
+        Rotation vectors in radians, about the camera's axes: `Exp(rotation)` takes directions in the first frame to
+        those in the second. False ones, and NaN, are left out.
     largest_s : float
         Offsets of either sign up to this are tried.
 
@@ -149,7 +149,7 @@ def align_gyro(
         The latter with its reason: too few rotations, a log that does not cover the frames, a camera that stood still
         or rotated too uniformly, a log of another clip, several offsets that fit, a mirror image.
     """
-    start, end, seen = _rates(frame_time_s, pairs, turns)
+    start, end, seen = _rates(frame_time_s, pairs, rotations)
     if len(seen) < _FEWEST:
         return NoAlignment(f"{len(seen)} rotations between frames are too few to find a gyroscope by ({_FEWEST})")
 
@@ -194,25 +194,25 @@ def align_gyro(
         axis_correlations=fit.axis_correlations,
         rms=fit.rms,
         num_inliers=fit.num_inliers,
-        num_turns=fit.num_turns,
+        num_rotations=fit.num_rotations,
     )
 
 
-def check_pairs(pairs: ArrayLike, turns: ArrayLike) -> tuple[NDArray[np.int64], _Array]:
+def check_pairs(pairs: ArrayLike, rotations: ArrayLike) -> tuple[NDArray[np.int64], _Array]:
     """Pairs of frames (n, 2) and the rotations (n, 3) between them; other shapes and types are refused."""
-    joined = np.asarray(pairs)
-    if joined.ndim != 2 or joined.shape[1] != 2 or not np.issubdtype(joined.dtype, np.integer):
-        raise InputError(f"pairs.shape={joined.shape} of {joined.dtype}, expected (n, 2) of int")
-    return joined, check_array(turns, (len(joined), 3), "turns")
+    between = np.asarray(pairs)
+    if between.ndim != 2 or between.shape[1] != 2 or not np.issubdtype(between.dtype, np.integer):
+        raise InputError(f"pairs.shape={between.shape} of {between.dtype}, expected (n, 2) of int")
+    return between, check_array(rotations, (len(between), 3), "rotations")
 
 
-def _rates(frame_time_s: ArrayLike, pairs: ArrayLike, turns: ArrayLike) -> tuple[_Array, _Array, _Array]:
+def _rates(frame_time_s: ArrayLike, pairs: ArrayLike, rotations: ArrayLike) -> tuple[_Array, _Array, _Array]:
     """Start and end (n,) of intervals between frames, and the rates (n, 3) in them; without false ones."""
     times = check_finite(frame_time_s, (None,), "frame_time_s")
-    joined, vectors = check_pairs(pairs, turns)
-    if len(joined) and (joined.min() < 0 or joined.max() >= len(times)):
-        raise InputError(f"pairs join frames {joined.min()} to {joined.max()} of {len(times)}")
-    start, end = times[joined[:, 0]], times[joined[:, 1]]
+    between, vectors = check_pairs(pairs, rotations)
+    if len(between) and (between.min() < 0 or between.max() >= len(times)):
+        raise InputError(f"pairs connect frames {between.min()} to {between.max()} of {len(times)}")
+    start, end = times[between[:, 0]], times[between[:, 1]]
     good = np.isfinite(vectors).all(axis=1) & (end > start)
     return start[good], end[good], -vectors[good] / (end - start)[good, None]
 
@@ -383,7 +383,7 @@ class _Fit:
     axis_correlations: _Array
     rms: float
     num_inliers: int
-    num_turns: int
+    num_rotations: int
 
 
 def _refine(
@@ -405,10 +405,10 @@ def _refine(
         measured = log.mean(a, b)
         h = interval / 8
         slope = (log.mean(a + h, b + h) - log.mean(a - h, b - h)) / (2 * h)
-        turned = measured @ rotation.T
+        rotated = measured @ rotation.T
         if iteration == 0:
-            shift = np.median(y - ratio * turned, axis=0)
-        residuals = y - ratio * turned - shift
+            shift = np.median(y - ratio * rotated, axis=0)
+        residuals = y - ratio * rotated - shift
         sizes = np.linalg.norm(residuals, axis=1)
         # the error of the start grows with the rate, and must not be taken for wrong rotations
         noise = _scale(sizes, ratio * measured, max(_SHARE, 0.4 * 0.6**iteration))
@@ -416,9 +416,9 @@ def _refine(
         inlier = 1 / (1 + (sizes / (3 * noise)) ** 2)
         weights = inlier / np.min(noise) ** 2
         J = np.empty((len(y), 3, 8))
-        J[:, :, _ROTATION] = -ratio * np.cross(turned[:, None, :], eye).transpose(0, 2, 1)
+        J[:, :, _ROTATION] = -ratio * np.cross(rotated[:, None, :], eye).transpose(0, 2, 1)
         J[:, :, _SHIFT] = eye
-        J[:, :, _RATIO] = turned
+        J[:, :, _RATIO] = rotated
         J[:, :, _OFFSET] = ratio * slope @ rotation.T
         H = np.einsum("n,nij,nik->jk", weights, J, J)
         g = np.einsum("n,nij,ni->j", weights, J, residuals)
@@ -437,7 +437,7 @@ def _refine(
     # the variance of the gradients, not the noise: rates are not equally exact, and the focal length is wrong for all
     sigma = np.sqrt(np.diag(inverse @ meat @ inverse))
     fits = sizes < 4 * noise
-    A, B = (x - np.average(x, axis=0, weights=inlier) for x in (y, turned))
+    A, B = (x - np.average(x, axis=0, weights=inlier) for x in (y, rotated))
     with np.errstate(invalid="ignore", divide="ignore"):
         products, squares = inlier @ (A * B), (inlier @ A**2, inlier @ B**2)
         axis_correlations = products / np.sqrt(squares[0] * squares[1])

@@ -53,7 +53,7 @@ def capture_sequences(
 
 
 def _natural(name: str) -> tuple[tuple[int, str], ...]:
-    """What sorts 9.jpg before 10.jpg."""
+    """Key that sorts 9.jpg before 10.jpg."""
     parts = re.split(r"([0-9]+)", name)
     return (*((int(part), "") if k % 2 else (-1, part) for k, part in enumerate(parts)), (-1, name))
 

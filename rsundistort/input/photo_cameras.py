@@ -115,7 +115,7 @@ class PhotoCameras:
         return GuessedCameras(self.cameras, sigmas, decentring if default is GIVEN_SIGMA else ())
 
     def with_sigma(self, sigma: Mapping[str, float]) -> PhotoCameras:
-        """The same, all cameras known to these standard deviations, in pixels or of the coefficients."""
+        """The cameras, all known to these standard deviations, in pixels or of the coefficients."""
         specified = self.sigma or [{}] * len(self.cameras)
         return replace(
             self, sigma=[{**old, **_relative(sigma, c)} for old, c in zip(specified, self.cameras, strict=True)]

@@ -111,7 +111,7 @@ class MapFrame:
         east, north, up = (np.asarray(place_m, np.float64) - self.origin).tolist()
         return east, north, up
 
-    def turned(self, positions: PhotoPositions) -> PhotoPositions:
+    def rotated(self, positions: PhotoPositions) -> PhotoPositions:
         """Positions whose velocities and rotations are along the axes of the frame."""
         c, s = np.cos(self.convergence_rad), np.sin(self.convergence_rad)
         from_enu = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -38,7 +38,7 @@ _SHOWN = 9.0
 # Times the median: rates of a hand are not farther out.
 _FARTHEST = 12.0
 # Frames rotate as the gyroscope says except for the focal length, which may be wrong by a fifth.
-_TURN_SHARE = 0.75
+_ROTATION_SHARE = 0.75
 _FEWEST = 10
 # Half a period of a hand's shaking.
 _CHANGE_S = 0.1
@@ -117,11 +117,11 @@ class Stabilisation:
 def judge_stabilisation(
     frame_time_s: ArrayLike,
     pairs: ArrayLike,
-    turns: ArrayLike,
+    rotations: ArrayLike,
     phi_frame: ArrayLike,
     phi_sigma: ArrayLike,
     *,
-    turn_sigma: ArrayLike = 0.0,
+    rotation_sigma: ArrayLike = 0.0,
     readout_s: float | None = None,
     log: GyroLog | None = None,
     offset_s: float = 0.0,
@@ -134,14 +134,14 @@ def judge_stabilisation(
         When the middle lines of the frames were read.
     pairs : (n, 2) array of int
         Neighbouring frames of each rotation, the earlier first.
-    turns : (n, 3) array
+    rotations : (n, 3) array
         Rotation vectors of the world in the camera, radians; NaN where unknown.
     phi_frame, phi_sigma : (m, 3) array
         Rotations of the world in the camera during the readout of each frame, in radians per frame, found without any
-        knowledge of `turns`; NaN where unknown. Their standard deviations, or one for all; too small by a factor of
+        knowledge of `rotations`; NaN where unknown. Their standard deviations, or one for all; too small by a factor of
         1.4, they do no harm.
-    turn_sigma : float or (n, 3) array
-        Standard deviation of `turns` in radians.
+    rotation_sigma : float or (n, 3) array
+        Standard deviation of `rotations` in radians.
     readout_s : float, optional
         Readout time, if it is known.
     log : GyroLog, optional
@@ -161,16 +161,16 @@ def judge_stabilisation(
         Shapes that do not fit, or a readout that is not positive.
     """
     times = check_finite(frame_time_s, (None,), "frame_time_s")
-    joined, vectors = check_pairs(pairs, turns)
+    joined, vectors = check_pairs(pairs, rotations)
     phi = check_array(phi_frame, (len(times), 3), "phi_frame")
     phi_noise = _noise(phi_sigma, phi, "phi_sigma")
-    turn_noise = _noise(turn_sigma, vectors, "turn_sigma")
+    rotation_noise = _noise(rotation_sigma, vectors, "rotation_sigma")
     if readout_s is not None and not (np.isfinite(readout_s) and readout_s > 0):
         raise InputError(f"the time of the readout is {readout_s!r} s, expected a positive number")
     start, end = times[joined[:, 0]], times[joined[:, 1]]
     span = np.where(end > start, end - start, np.nan)
     interval = float(np.nanmedian(span)) if np.isfinite(span).any() else np.nan
-    rate, rate_noise = vectors / span[:, None], turn_noise / span[:, None]
+    rate, rate_noise = vectors / span[:, None], rotation_noise / span[:, None]
     at_frames = _rate_at_frames(rate, joined, len(times))
     levels = _regress(phi, at_frames, phi_noise, together=_TOGETHER)
     changes, beyond = _of_changes(phi, at_frames, phi_noise, interval)
@@ -205,7 +205,7 @@ def _of_changes(phi: _Array, rate: _Array, noise: _Array, interval: float) -> tu
 
 
 def calmer_than_felt(
-    frame_time_s: ArrayLike, pairs: ArrayLike, turns: ArrayLike, turn_sigma: ArrayLike, log: GyroLog
+    frame_time_s: ArrayLike, pairs: ArrayLike, rotations: ArrayLike, rotation_sigma: ArrayLike, log: GyroLog
 ) -> str:
     """Why frames of a video are stabilised, by a gyroscope with unknown axes and clock; empty if not.
 
@@ -214,15 +214,15 @@ def calmer_than_felt(
 
     Parameters
     ----------
-    frame_time_s, pairs, turns, turn_sigma
+    frame_time_s, pairs, rotations, rotation_sigma
         As in `judge_stabilisation`.
     log : GyroLog
         Of this clip beyond doubt, by a clock that is right to some frames: telemetry of the video itself.
     """
     times, joined = np.asarray(frame_time_s, np.float64), np.asarray(pairs)
     span = (times[joined[:, 1]] - times[joined[:, 0]])[:, None]
-    seen, felt = np.asarray(turns) / span, log.mean(times[joined[:, 0]], times[joined[:, 1]])
-    noise = _noise(turn_sigma, seen, "turn_sigma") / span
+    seen, felt = np.asarray(rotations) / span, log.mean(times[joined[:, 0]], times[joined[:, 1]])
+    noise = _noise(rotation_sigma, seen, "rotation_sigma") / span
     follows = joined[1:, 0] == joined[:-1, 1]
     by_frames, by_gyro = (np.linalg.norm(np.diff(each, axis=0)[follows], axis=1) for each in (seen, felt))
     known = np.isfinite(by_frames) & np.isfinite(by_gyro)
@@ -324,14 +324,14 @@ def _judge(
     low, high = (shutter.slope + side * _SIGMAS * shutter.sigma for side in (-1, 1))
     unexplained = beyond and changes.unexplained > max(_UNEXPLAINED * changes.signal, _SHOWN)
     if frames_by_gyro is not None:
-        turns = frames_by_gyro
+        rotations = frames_by_gyro
         if (
-            _SIGMAS * max(turns.reach, turns.sigma) < 1 - _TURN_SHARE
-            and turns.slope + _SIGMAS * turns.sigma < _TURN_SHARE
+            _SIGMAS * max(rotations.reach, rotations.sigma) < 1 - _ROTATION_SHARE
+            and rotations.slope + _SIGMAS * rotations.sigma < _ROTATION_SHARE
         ):
             line = (
-                f"stabilised in the camera: the frames rotate by {turns.slope:.2f} +- {turns.sigma:.2f} of what the "
-                "gyroscope felt"
+                f"stabilised in the camera: the frames rotate by {rotations.slope:.2f} +- {rotations.sigma:.2f} of "
+                "what the gyroscope felt"
             )
             if shutter_by_gyro is not None and shutter_by_gyro.slope > _SIGMAS * shutter_by_gyro.sigma:
                 line += f", their lines as it says ({1e3 * shutter_by_gyro.slope:.1f} ms)"

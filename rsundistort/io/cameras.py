@@ -93,7 +93,7 @@ def camera_to_json(camera: Camera) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class CameraFile:
-    """What a file or a folder of cameras holds.
+    """Content of a file or a folder of cameras.
 
     Attributes
     ----------

@@ -91,9 +91,9 @@ def _places(camera: Camera) -> NDArray[np.float64]:
 
 def rotation_left_px(camera: Camera, motion: RowMotion) -> float:
     """How far the worst pixel of a photo is off where a format has no room for its rotation during the readout."""
-    turning = RowMotion(motion.phi)
+    rotating = RowMotion(motion.phi)
     (with_it, seen), (without, _) = (
-        unproject_points(_places(camera), camera, each, "rotation") for each in (turning, RowMotion())
+        unproject_points(_places(camera), camera, each, "rotation") for each in (rotating, RowMotion())
     )
     off = (with_it - without)[seen] * camera.K[[0, 1], [0, 1]]
     return float(np.linalg.norm(off, axis=1).max(initial=0.0))

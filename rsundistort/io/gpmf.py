@@ -75,7 +75,7 @@ class _Item:
 
 @dataclass(frozen=True)
 class GyroPayload:
-    """What one payload holds of the camera's gyroscope.
+    """Readings of the camera's gyroscope in one payload.
 
     Attributes
     ----------
@@ -293,7 +293,7 @@ def _stamps(payloads: list[GyroPayload], start_s: NDArray[np.float64]) -> NDArra
 
 
 def parse_payload(data: bytes) -> GyroPayload:
-    """What a payload holds of the gyroscope of the first device that has one.
+    """Readings of the gyroscope of the first device in a payload that has one.
 
     Unknown keys are passed over. What is damaged is named in `problems`; nothing is raised.
     """

@@ -74,8 +74,8 @@ def guess_readouts(
     tagged = {group for fact, group in zip(facts, groups, strict=True) if fact.orientation not in (None, 1)}
     readouts = {}
     for fact, (width, height), group in zip(facts, sizes, groups, strict=True):
-        turned = height > width and group not in tagged and (_body(fact), height, width) in frames
-        readouts[group] = across if turned else readout
+        rotated = height > width and group not in tagged and (_body(fact), height, width) in frames
+        readouts[group] = across if rotated else readout
     count = sum(readouts[group] == across for group in groups)
     if not count:
         return readouts, []

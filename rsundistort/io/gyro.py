@@ -91,20 +91,20 @@ class GyroLog:
         rate = (self._angle(end_s) - self._angle(start_s)) / (end_s - start_s)[..., None]
         return np.where(self._covers(start_s, end_s)[..., None], rate, np.nan)
 
-    def turns(self, at_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def rotations(self, at_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """(k, 3) rotation vectors of the world in the camera at times (k,), against the first of them.
 
-        `Exp(turn) R_cw` is the orientation then, R_cw that at the first time. Between neighbouring times the axis of
-        the rotation is held; what that leaves falls with the square of the steps.
+        `Exp(rotation) R_cw` is the orientation then, R_cw that at the first time. Between neighbouring times the axis
+        of the rotation is held; what that leaves falls with the square of the steps.
         """
         from scipy.spatial.transform import Rotation
 
-        turns = Rotation.from_rotvec(-np.diff(self._angle(at_s), axis=0, prepend=self._angle(at_s[:1])))
+        rotations = Rotation.from_rotvec(-np.diff(self._angle(at_s), axis=0, prepend=self._angle(at_s[:1])))
         step = 1
         while step < len(at_s):  # products of all before, by doubling
-            turns = Rotation.concatenate([turns[:step], turns[step:] * turns[:-step]])
+            rotations = Rotation.concatenate([rotations[:step], rotations[step:] * rotations[:-step]])
             step *= 2
-        return np.asarray(turns.as_rotvec(), np.float64)
+        return np.asarray(rotations.as_rotvec(), np.float64)
 
     @cached_property
     def _angle_before(self) -> NDArray[np.float64]:
@@ -372,7 +372,7 @@ def bends_from_gyro(
         if not log._covers(start, end):
             continue
         clock = np.linspace(*cameras[name].clock_range, _STEPS)
-        motion, _, _ = RowMotion.of(clock, log.turns(np.linspace(start, end, _STEPS)))
+        motion, _, _ = RowMotion.of(clock, log.rotations(np.linspace(start, end, _STEPS)))
         assert motion.bend is not None
         found[name] = motion.phi * (clock[-1] - clock[0]), motion.bend
     return found

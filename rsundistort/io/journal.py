@@ -68,7 +68,7 @@ class Journal:
         self._file: IO[str] | None = None
 
     def read(self) -> dict[str, JournalEntry]:
-        """What was done, by photo; the last word on each counts."""
+        """Entries by photo; the last one of each photo counts."""
         text = self.path.read_text(encoding="utf-8", errors="replace") if self.path.is_file() else ""
         return entries_of(text)
 
@@ -156,7 +156,7 @@ class RemoteJournal(Journal):
 
 
 def entries_of(text: str) -> dict[str, JournalEntry]:
-    """What was done, by photo, by the text of a journal; the last word on each counts."""
+    """Entries by photo of the text of a journal; the last one of each photo counts."""
     entries = {}
     for line in text.splitlines():
         try:

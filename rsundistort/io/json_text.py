@@ -18,7 +18,7 @@ _DEEPEST = 100
 
 
 def parse_json(text: str, pairs: Callable[[list[tuple[str, Any]]], Any] | None = None) -> Any:
-    """What a JSON text says; a ValueError whose words are for people where it is none.
+    """Value of a JSON text; if it is none, a ValueError whose words are for people.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def _deepest(text: str) -> int:
 
 
 def read_json(path: Path | str) -> Any:
-    """What a JSON file says.
+    """Value of a JSON file.
 
     Raises
     ------

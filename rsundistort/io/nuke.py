@@ -40,8 +40,8 @@ def write_nuke(folder: Path, scene: ExportScene) -> str:
         R_cw = np.array([image.R_cw for image in images]).reshape(-1, 3, 3)
         center_w = np.array([image.center_w for image in images]).reshape(-1, 3)
     # camera to world, y up in both; Nuke rotates about z first, then x, then y: R = Ry Rx Rz
-    turned = FLIP @ R_cw.transpose(0, 2, 1) @ FLIP
-    angles = np.unwrap(euler_deg(turned, "zxy")[:, [1, 2, 0]], axis=0, period=360)
+    rotated = FLIP @ R_cw.transpose(0, 2, 1) @ FLIP
+    angles = np.unwrap(euler_deg(rotated, "zxy")[:, [1, 2, 0]], axis=0, period=360)
     centers = center_w @ FLIP
     lens = np.array([_lens(camera) for camera in cameras]).reshape(-1, 6)
     (folder / "camera.nk").write_text(_script(frames, centers, angles, lens, cameras), encoding="utf-8")

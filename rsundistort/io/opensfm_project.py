@@ -127,7 +127,7 @@ def _reference(georeference: Mapping[str, Any] | None) -> dict[str, float] | Non
 
 
 def _on_the_map(gps: Mapping[str, float], reference: Mapping[str, float] | None) -> dict[str, Any]:
-    """What a shot says of its GPS: its place in the frame where that is one of the map."""
+    """GPS entry of a shot: its place in the frame where that is one of the map."""
     if not gps:
         return {"gps_dop": 0.0}
     if reference is None:

@@ -59,7 +59,7 @@ def write_opf(folder: Path, scene: ExportScene) -> str:
         raise InputError("OPF takes photos to be read row by row, and these are by column; take opf-rectified")
     shown = [scene.originals.get(image.name, image.name) for image in images]
     rec = scene.reconstruction
-    if any(image.turned != 1 for image in scene.solution.images):
+    if any(image.applied_orientation != 1 for image in scene.solution.images):
         raise InputError("points and measurements are rotated as the photos are; leave --apply-orientation out")
     left, lens = 0.0, 0.0
     for image in images:
@@ -231,8 +231,8 @@ def _middle(
 
     ends = end_poses(solution, image)
     (R_first, first), (R_last, last) = ends if solution.cameras[image.camera_id].clock_sign > 0 else ends[::-1]
-    turn = Rotation.from_matrix(R_last @ R_first.T).as_rotvec()
-    R_cw = Rotation.from_rotvec(turn / 2).as_matrix() @ R_first
+    rotation = Rotation.from_matrix(R_last @ R_first.T).as_rotvec()
+    R_cw = Rotation.from_rotvec(rotation / 2).as_matrix() @ R_first
     return R_cw, (first + last) / 2, last - first
 
 

@@ -362,7 +362,7 @@ def _check_apart(folder: Place, other: Place, same: bool, among: bool) -> None:
 
 @contextmanager
 def _errors_of(folder: Path, mend: str = "") -> Iterator[None]:
-    """What the system says of a folder that cannot be written, in one line."""
+    """Error messages of a folder that cannot be written, in one line."""
     try:
         yield
     except OSError as error:

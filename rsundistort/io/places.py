@@ -75,7 +75,7 @@ class RemoteFolder:
         return bool(fs == others) and PurePosixPath(inside).is_relative_to(PurePosixPath(root))
 
     def listing(self, within: str = ".") -> dict[str, Mapping[str, Any]] | None:
-        """What is in it or a sub-folder, by its own name, as the file system has it; None if there is no such folder.
+        """Entries of the folder or a sub-folder by name, as the file system has them; None without such a folder.
 
         Stores of objects know no empty folders.
         """

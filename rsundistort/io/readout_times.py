@@ -50,7 +50,7 @@ def readout_time(make: str, model: str, width: int, height: int) -> tuple[float,
 
 
 def _key(make: str, model: str) -> str:
-    """What is left of a camera's name whoever writes it: "NIKON CORPORATION", "NIKON Z 9" -> "nikoncorporationz9"."""
+    """A camera's name in one spelling, whoever writes it: "NIKON CORPORATION", "NIKON Z 9" -> "nikoncorporationz9"."""
     words = [re.sub(r"[^\w+ ]", " ", text.replace("\0", "").casefold()).split() for text in (make, model)]
     brand = words[0][:1]
     return "".join(words[0] + (words[1][1:] if brand and words[1][:1] == brand else words[1]))

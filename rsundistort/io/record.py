@@ -178,7 +178,7 @@ class Record:
 
     @contextmanager
     def _errors(self) -> Iterator[None]:
-        """What the system says of a folder that cannot be written, in one line."""
+        """Error messages of a folder that cannot be written, in one line."""
         try:
             yield
         except FileError:

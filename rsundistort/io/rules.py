@@ -97,7 +97,7 @@ class OneOf:
 
 @dataclass(frozen=True)
 class Maybe:
-    """What a rule says, or null."""
+    """A value that follows a rule, or null."""
 
     rule: Any
 
@@ -124,7 +124,7 @@ def _is(value: Any, kind: type) -> bool:
 
 
 class _Wrong(Exception):
-    """What is wrong with a value, and its place: from within outwards."""
+    """Error in a value, with its place, from within outwards."""
 
     def __init__(self, expected: str, value: Any, lacks: str = "") -> None:
         super().__init__(f"lacks {lacks}" if lacks else f"expected {expected}, got {shown(value)}")

@@ -90,15 +90,16 @@ def _motion(solution: Solution, image: SolvedImage) -> RowMotion:
         return motion
     bent = motion.bend is not None and solution.shutter_model == "rotation"
     # it heeds no positions
-    return RowMotion(motion.phi, bend=motion.bend.turned(np.eye(3), np.zeros((3, 3))) if bent and motion.bend else None)
+    bend = motion.bend.rotated(np.eye(3), np.zeros((3, 3))) if bent and motion.bend else None
+    return RowMotion(motion.phi, bend=bend)
 
 
 def _steady(solution: Solution, image: SolvedImage) -> tuple[RowMotion, Pose]:
     """The steady motion that is nearest, and its pose."""
     assert image.R_cw is not None
     assert image.center_w is not None
-    motion, turn, way = _motion(solution, image).steady(*solution.cameras[image.camera_id].clock_range)
-    return motion, (turn @ image.R_cw, image.center_w + way)
+    motion, rotation, way = _motion(solution, image).steady(*solution.cameras[image.camera_id].clock_range)
+    return motion, (rotation @ image.R_cw, image.center_w + way)
 
 
 def _line(camera: Camera, place: float, border: float = 0.5) -> float:

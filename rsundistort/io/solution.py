@@ -157,8 +157,8 @@ def solution_to_json(solution: Solution) -> dict[str, Any]:
             entry["depth"], entry["translation_shift_px"] = image.depth, image.translation_shift_px
         if image.reason is not None:
             entry["reason"] = image.reason
-        if image.turned != 1:
-            entry["turned"] = image.turned
+        if image.applied_orientation != 1:
+            entry["turned"] = image.applied_orientation
         if image.roi is not None:
             entry["roi"] = image.roi
         images.append(entry)
@@ -274,7 +274,7 @@ def _image_from_json(entry: dict[str, Any], where: str) -> SolvedImage:
             depth=entry.get("depth"),
             translation_shift_px=entry.get("translation_shift_px"),
             reason=entry.get("reason"),
-            turned=entry.get("turned", 1),
+            applied_orientation=entry.get("turned", 1),
             roi=None if roi is None else (roi[0], roi[1], roi[2], roi[3]),
             doubtful=entry.get("doubtful"),
             lens_only=bool(entry.get("lens_only")),

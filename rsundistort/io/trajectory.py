@@ -40,8 +40,8 @@ def _quaternions(R_cw: NDArray[np.float64]) -> NDArray[np.float64]:
     """(m, 4) rotations x, y, z, w of cameras in the world."""
     from scipy.spatial.transform import Rotation
 
-    turned = np.reshape(R_cw, (-1, 3, 3)).transpose(0, 2, 1)
-    return np.asarray(Rotation.from_matrix(turned).as_quat(canonical=True))
+    rotated = np.reshape(R_cw, (-1, 3, 3)).transpose(0, 2, 1)
+    return np.asarray(Rotation.from_matrix(rotated).as_quat(canonical=True))
 
 
 def write_path(path: Path, names: Sequence[str], camera_path: CameraPath) -> None:

@@ -49,7 +49,7 @@ class Pixels:
 
     @property
     def black(self) -> list[int]:
-        """What stands for black."""
+        """Value of black."""
         luma = 0 if self.full_range else 16 << (self.bits - 8)
         return [luma] if self.values.ndim == 2 else [luma, 1 << (self.bits - 1), 1 << (self.bits - 1)]
 

@@ -117,7 +117,7 @@ def splines_at(num_sites: int, place: Array) -> Array:
 
 
 def parts_of(clock: Array, readings: Array, sites: int) -> tuple[Array, Array, Array]:
-    """Of readings (k, c), at ascending times of the clock (k,): bends (sites, c), constants and rates (c,)."""
+    """Parts of readings (k, c) at ascending times of the clock (k,): bends (sites, c), constants and rates (c,)."""
     from scipy.interpolate import CubicSpline
 
     values = CubicSpline(clock, readings)(np.linspace(clock[0], clock[-1], sites))
@@ -188,9 +188,9 @@ class Bend:
         r = check_finite(clock, (None,), "clock")
         if len(r) < 4 or not (np.diff(r) > 0).all():
             raise InputError("the readings of the clock must ascend, and be four or more")
-        turn = check_finite(rotation, (len(r), 3), "rotation")
-        way = np.zeros_like(turn) if position is None else check_finite(position, (len(r), 3), "position")
-        rest, constant, rate = parts_of(r, np.hstack([turn, way]), sites)
+        vectors = check_finite(rotation, (len(r), 3), "rotation")
+        way = np.zeros_like(vectors) if position is None else check_finite(position, (len(r), 3), "position")
+        rest, constant, rate = parts_of(r, np.hstack([vectors, way]), sites)
         return cls(float(r[0]), float(r[-1]), rest[:, :3], rest[:, 3:]), constant.reshape(2, 3), rate.reshape(2, 3)
 
     @property
@@ -221,7 +221,7 @@ class Bend:
         found = _values_at(self.values, place).reshape(*r.shape, 6)
         return found[..., :3], found[..., 3:]
 
-    def turned(self, matrix: ArrayLike, of_position: ArrayLike | None = None) -> Bend:
+    def rotated(self, matrix: ArrayLike, of_position: ArrayLike | None = None) -> Bend:
         """The bend with its rotation vectors, or its positions too, in other axes."""
         assert self.position is not None
         rotation = self.rotation @ np.asarray(matrix, np.float64).T

@@ -34,7 +34,7 @@ def check_shutter_model(name: str) -> int:
 def steady_parts(
     clock: NDArray[np.float64], moved: NDArray[np.float64], sites: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """What `RowMotion.of` says of one frame, of k frames at once.
+    """`RowMotion.of` for k frames at once.
 
     Parameters
     ----------
@@ -49,8 +49,8 @@ def steady_parts(
     -------
     bend : (k, sites, 6) array
         Beside the nearest steady motions.
-    turn, way : (k, 3, 3), (k, 3) array
-        The poses that go with these have rotations `turn R_cw` and centres `center_w + way`.
+    correction, way : (k, 3, 3), (k, 3) array
+        The poses that go with these have rotations `correction R_cw` and centres `center_w + way`.
     rate : (k, 2, 3) array
         Phi and velocity.
     """
@@ -58,17 +58,19 @@ def steady_parts(
 
     k, n = moved.shape[:2]
     readings = Rotation.from_rotvec(moved[..., :3].reshape(-1, 3)).as_matrix().reshape(k, n, 3, 3)
-    turn = readings[:, n // 2]
+    correction = readings[:, n // 2]
     # the constant part goes into the pose; rotations do not commute, so that a share of it is left each time
     for _ in range(10):
-        left = Rotation.from_matrix((readings @ turn[:, None].transpose(0, 1, 3, 2)).reshape(-1, 3, 3)).as_rotvec()
+        left = Rotation.from_matrix(
+            (readings @ correction[:, None].transpose(0, 1, 3, 2)).reshape(-1, 3, 3)
+        ).as_rotvec()
         both = np.concatenate([left.reshape(k, n, 3), moved[..., 3:]], axis=2)
         rest, constant, rate = parts_of(clock, both.transpose(1, 0, 2).reshape(n, -1), sites)
         constant = constant.reshape(k, 2, 3)
-        turn = Rotation.from_rotvec(constant[:, 0]).as_matrix() @ turn
+        correction = Rotation.from_rotvec(constant[:, 0]).as_matrix() @ correction
         if np.abs(constant[:, 0]).max(initial=0.0) < 1e-15:
             break
-    return rest.reshape(sites, k, 6).transpose(1, 0, 2), turn, constant[:, 1], rate.reshape(k, 2, 3)
+    return rest.reshape(sites, k, 6).transpose(1, 0, 2), correction, constant[:, 1], rate.reshape(k, 2, 3)
 
 
 @dataclass(frozen=True)
@@ -130,22 +132,22 @@ class RowMotion:
         -------
         motion : RowMotion
             Its bend is orthogonal to 1 and to the clock.
-        turn : (3, 3) array
-            The pose that goes with it has the rotation `turn R_cw`
+        correction : (3, 3) array
+            The pose that goes with it has the rotation `correction R_cw`
         way : (3,) array
             and the centre `center_w + way`.
         """
         from scipy.spatial.transform import Rotation
 
         readings = Rotation.from_rotvec(np.array(check_finite(rotation, (None, 3), "rotation")))
-        turn = readings[len(readings) // 2]
+        correction = readings[len(readings) // 2]
         # the constant part goes into the pose; rotations do not commute, so that a share of it is left each time
         for _ in range(50):
-            bend, constant, rate = Bend.of(clock, (readings * turn.inv()).as_rotvec(), position, sites)
-            turn = Rotation.from_rotvec(constant[0]) * turn
+            bend, constant, rate = Bend.of(clock, (readings * correction.inv()).as_rotvec(), position, sites)
+            correction = Rotation.from_rotvec(constant[0]) * correction
             if np.abs(constant[0]).max() < 1e-15:
                 break
-        return cls(rate[0], rate[1], bend), turn.as_matrix(), constant[1]
+        return cls(rate[0], rate[1], bend), correction.as_matrix(), constant[1]
 
     def steady(self, start: float, end: float) -> tuple[RowMotion, NDArray[np.float64], NDArray[np.float64]]:
         """The nearest steady motion while the clock runs from start to end, and the pose it belongs to.
@@ -155,14 +157,14 @@ class RowMotion:
         if self.bend is None:
             return self, np.eye(3), np.zeros(3)
         clock = np.linspace(start, end, 1025)
-        near, turn, way = RowMotion.of(clock, *self.at(clock), sites=len(self.bend.values))
-        return replace(near, bend=None, frame=self.frame), turn, way
+        near, correction, way = RowMotion.of(clock, *self.at(clock), sites=len(self.bend.values))
+        return replace(near, bend=None, frame=self.frame), correction, way
 
     def in_camera(self, R_cw: NDArray[np.float64]) -> RowMotion:
         """The motion with its velocity in the camera frame at the reference row, as projection takes it."""
         self._check_frame("world")
         R = check_rotation(R_cw, "R_cw")
-        bend = None if self.bend is None else self.bend.turned(np.eye(3), R)
+        bend = None if self.bend is None else self.bend.rotated(np.eye(3), R)
         return replace(self, velocity=R @ self.velocity, bend=bend, frame="camera")
 
     def as_in(self, frame: str) -> RowMotion:
@@ -201,11 +203,11 @@ class RowMotion:
         """Rotation vector and position (..., 3) relative to the pose at the clock r (...), for exact models."""
         r = check_numbers(clock, "clock")
         with np.errstate(invalid="ignore"):  # at no moment: NaN
-            turn, way = r[..., None] * self.phi, r[..., None] * self.velocity
+            rotation, way = r[..., None] * self.phi, r[..., None] * self.velocity
         if self.bend is not None:
             bent, moved = self.bend.at(r)
-            turn, way = turn + bent, way + moved
-        return turn, way
+            rotation, way = rotation + bent, way + moved
+        return rotation, way
 
     def pose_at(
         self, clock: float, R_cw: NDArray[np.float64], center_w: NDArray[np.float64]
@@ -227,9 +229,9 @@ class RowMotion:
         from scipy.spatial.transform import Rotation
 
         self._check_frame("world")
-        turn, way = self.at(check_number(clock, "clock"))
+        rotation, way = self.at(check_number(clock, "clock"))
         R, center = check_rotation(R_cw, "R_cw"), check_finite(center_w, (3,), "center_w")
-        return Rotation.from_rotvec(turn).as_matrix() @ R, center + way
+        return Rotation.from_rotvec(rotation).as_matrix() @ R, center + way
 
     def imaginary_camera(self, readout: str = "top-to-bottom") -> tuple[float, float]:
         """Aspect ratio and skew, in the readout direction, of the imaginary camera of the paper."""

@@ -27,14 +27,14 @@ __all__ = [
     "MATRICES",
     "compose_orientations",
     "in_stored_frame",
+    "orient_camera",
+    "orient_image",
+    "orient_path",
+    "orient_pixels",
+    "orient_points",
+    "orient_reconstruction",
+    "orient_solution",
     "split_mirror",
-    "turn_camera",
-    "turn_image",
-    "turn_path",
-    "turn_pixels",
-    "turn_points",
-    "turn_reconstruction",
-    "turn_solution",
 ]
 
 #: Of each EXIF orientation, the (2, 2) matrix that takes x right, y down of the stored frame to those of the shown one.
@@ -70,7 +70,7 @@ def _swaps(orientation: int) -> bool:
     return bool(MATRICES[orientation][0, 0] == 0)
 
 
-def turn_pixels(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
+def orient_pixels(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
     """(h, w[, channels]) stored pixels as the orientation shows them; 5 to 8 exchange the sides."""
     if _swaps(orientation):
         pixels = np.swapaxes(pixels, 0, 1)
@@ -78,7 +78,7 @@ def turn_pixels(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
     return np.ascontiguousarray(pixels[:: int(down), :: int(across)])
 
 
-def turn_points(xy: ArrayLike, width: int, height: int, orientation: int) -> NDArray[np.float64]:
+def orient_points(xy: ArrayLike, width: int, height: int, orientation: int) -> NDArray[np.float64]:
     """(n, 2) pixels of a stored photo of that size where the orientation shows them; integer centres in both."""
     xy = check_finite(xy, (None, 2), "xy")
     matrix = MATRICES[orientation]
@@ -87,23 +87,23 @@ def turn_points(xy: ArrayLike, width: int, height: int, orientation: int) -> NDA
     return xy @ matrix.T + (matrix < 0) @ last
 
 
-def turn_rectangle(
+def orient_rectangle(
     rectangle: tuple[int, int, int, int], width: int, height: int, orientation: int
 ) -> tuple[int, int, int, int]:
     """Pixels (x, y, width, height) of a stored photo of that size where the orientation shows them."""
     x, y, w, h = rectangle
-    corners = turn_points([[x, y], [x + w - 1, y + h - 1]], width, height, orientation)
+    corners = orient_points([[x, y], [x + w - 1, y + h - 1]], width, height, orientation)
     (left, top), (right, bottom) = corners.min(0), corners.max(0)
     return int(left), int(top), int(right - left) + 1, int(bottom - top) + 1
 
 
-def turn_camera(camera: Camera, orientation: int) -> Camera:
+def orient_camera(camera: Camera, orientation: int) -> Camera:
     """The camera whose photos are those of `camera`, shown by the orientation; exact, also for mirrored ones."""
     matrix, swaps = MATRICES[orientation], _swaps(orientation)
     width, height = (camera.height, camera.width) if swaps else (camera.width, camera.height)
     K = np.eye(3)
     K[[0, 1], [0, 1]] = np.abs(matrix) @ np.diag(camera.K)[:2]
-    K[:2, 2] = turn_points(camera.K[None, :2, 2], camera.width, camera.height, orientation)[0]
+    K[:2, 2] = orient_points(camera.K[None, :2, 2], camera.width, camera.height, orientation)[0]
     clock = camera.clock_sign * matrix[:, camera.clock_axis]
     along = int(np.flatnonzero(clock)[0])
     readout = next(name for name, way in READOUTS.items() if way == (along, float(clock[along])))
@@ -114,11 +114,11 @@ def turn_camera(camera: Camera, orientation: int) -> Camera:
         if len(dist) == 12:
             dist[[8, 10]], dist[[9, 11]] = matrix @ dist[[8, 10]], matrix @ dist[[9, 11]]
     return replace(
-        camera, width=width, height=height, K=K, dist=dist, readout=readout, field=_turned_field(camera, matrix)
+        camera, width=width, height=height, K=K, dist=dist, readout=readout, field=_oriented_field(camera, matrix)
     )
 
 
-def _turned_field(camera: Camera, matrix: NDArray[np.int64]) -> NDArray[np.float64]:
+def _oriented_field(camera: Camera, matrix: NDArray[np.int64]) -> NDArray[np.float64]:
     """The field (rows, cols, 2) of a camera whose axes a signed permutation rotates."""
     field = camera.field @ matrix.T
     if matrix[0, 0] == 0:
@@ -126,7 +126,7 @@ def _turned_field(camera: Camera, matrix: NDArray[np.int64]) -> NDArray[np.float
     return field[:: int(matrix[1].sum()), :: int(matrix[0].sum())]
 
 
-def turn_image(image: SolvedImage, orientation: int, camera_id: str) -> SolvedImage:
+def orient_image(image: SolvedImage, orientation: int, camera_id: str) -> SolvedImage:
     """A photo of a solution with the pose and motion of its shown frame; world and velocity stay.
 
     Raises
@@ -142,7 +142,7 @@ def turn_image(image: SolvedImage, orientation: int, camera_id: str) -> SolvedIm
     motion = image.motion
     if motion is not None:
         # phi is an axial vector: a mirror reverses it
-        bend = None if motion.bend is None else motion.bend.turned(hand * matrix)
+        bend = None if motion.bend is None else motion.bend.rotated(hand * matrix)
         motion = replace(motion, phi=hand * matrix @ motion.phi, bend=bend)
     return replace(
         image,
@@ -150,11 +150,11 @@ def turn_image(image: SolvedImage, orientation: int, camera_id: str) -> SolvedIm
         R_cw=None if image.R_cw is None else matrix @ image.R_cw,
         motion=motion,
         sigma_phi=None if image.sigma_phi is None else np.abs(matrix) @ image.sigma_phi,
-        turned=compose_orientations(image.turned, orientation),
+        applied_orientation=compose_orientations(image.applied_orientation, orientation),
     )
 
 
-def turn_path(path: CameraPath, orientation: int) -> CameraPath:
+def orient_path(path: CameraPath, orientation: int) -> CameraPath:
     """The path of the camera whose frames the orientation shows; one that mirrors is refused, no camera takes these."""
     matrix = np.eye(3)
     matrix[:2, :2] = MATRICES[orientation]
@@ -163,11 +163,11 @@ def turn_path(path: CameraPath, orientation: int) -> CameraPath:
 
 def _new_places(pairs: set[tuple[int, int]], count: int) -> dict[tuple[int, int], int]:
     """Place of each (camera, orientation): the camera's own when it is not rotated, else one after all cameras."""
-    turned = sorted(pair for pair in pairs if pair[1] != 1)
-    return {pair: pair[0] for pair in pairs} | {pair: count + k for k, pair in enumerate(turned)}
+    others = sorted(pair for pair in pairs if pair[1] != 1)
+    return {pair: pair[0] for pair in pairs} | {pair: count + k for k, pair in enumerate(others)}
 
 
-def turn_solution(solution: Solution, orientations: Mapping[str, int]) -> Solution:
+def orient_solution(solution: Solution, orientations: Mapping[str, int]) -> Solution:
     """A solution of photos that were rotated after they were rectified.
 
     Parameters
@@ -181,7 +181,7 @@ def turn_solution(solution: Solution, orientations: Mapping[str, int]) -> Soluti
     -------
     Solution
         Raw and rectified cameras, poses and motions in the frames of the rotated photos. Each camera and orientation
-        that occur together get a camera of their own; `SolvedImage.turned` says how the frame was rotated.
+        that occur together get a camera of their own; `SolvedImage.applied_orientation` says how the frame was rotated.
 
     Raises
     ------
@@ -196,24 +196,24 @@ def turn_solution(solution: Solution, orientations: Mapping[str, int]) -> Soluti
     cameras, rectified = dict(solution.cameras), dict(solution.rectified_cameras)
     for (old, orientation), new in sorted(place.items(), key=lambda item: item[1]):
         if orientation != 1:
-            cameras[ids[new]] = turn_camera(solution.cameras[ids[old]], orientation)
-            rectified[ids[new]] = turn_camera(solution.rectified_cameras[ids[old]], orientation)
+            cameras[ids[new]] = orient_camera(solution.cameras[ids[old]], orientation)
+            rectified[ids[new]] = orient_camera(solution.rectified_cameras[ids[old]], orientation)
     images = []
     for image in solution.images:
         old, orientation = pairs[image.name]
         if image.roi is not None:
             target = solution.rectified_cameras[ids[old]]
-            image = replace(image, roi=turn_rectangle(image.roi, target.width, target.height, orientation))
-        images.append(turn_image(image, orientation, ids[place[old, orientation]]))
+            image = replace(image, roi=orient_rectangle(image.roi, target.width, target.height, orientation))
+        images.append(orient_image(image, orientation, ids[place[old, orientation]]))
     return replace(solution, cameras=cameras, rectified_cameras=rectified, images=tuple(images))
 
 
 def in_stored_frame(solution: Solution) -> Solution:
     """The solution of the photos as the sensor stored them, of one whose photos may have been rotated."""
-    return turn_solution(solution, {image.name: INVERSE[image.turned] for image in solution.images})
+    return orient_solution(solution, {image.name: INVERSE[image.applied_orientation] for image in solution.images})
 
 
-def turn_reconstruction(reconstruction: Reconstruction, orientations: Mapping[str, int]) -> Reconstruction:
+def orient_reconstruction(reconstruction: Reconstruction, orientations: Mapping[str, int]) -> Reconstruction:
     """A reconstruction from rotated photos: cameras, poses, motions and measurements; the scene stays.
 
     Parameters
@@ -221,25 +221,25 @@ def turn_reconstruction(reconstruction: Reconstruction, orientations: Mapping[st
     reconstruction : Reconstruction
         From the photos as they were.
     orientations : mapping of photo name to int
-        As in `turn_solution`, whose cameras come in the same order. None may mirror.
+        As in `orient_solution`, whose cameras come in the same order. None may mirror.
     """
     rec = reconstruction
-    turns = [orientations.get(name, 1) for name in rec.image_names]
-    pairs = [(int(k), o) for k, o in zip(rec.camera_idx, turns, strict=True)]
+    applied = [orientations.get(name, 1) for name in rec.image_names]
+    pairs = [(int(k), o) for k, o in zip(rec.camera_idx, applied, strict=True)]
     place = _new_places(set(pairs), len(rec.cameras))
     new = sorted((k, pair) for pair, k in place.items() if pair[1] != 1)
     matrix = np.tile(np.eye(3), (rec.num_images, 1, 1))
-    matrix[:, :2, :2] = [MATRICES[o] for o in turns]
+    matrix[:, :2, :2] = [MATRICES[o] for o in applied]
     if (np.linalg.det(matrix) < 0).any():
         raise InputError("a reconstruction cannot be mirrored")
     obs = rec.observations
     xy = np.array(obs.xy_raw)
-    for i, (orientation, of_photo) in enumerate(zip(turns, obs.by_photo(rec.num_images), strict=True)):
+    for i, (orientation, of_photo) in enumerate(zip(applied, obs.by_photo(rec.num_images), strict=True)):
         camera = rec.camera(i)
-        xy[of_photo] = turn_points(xy[of_photo], camera.width, camera.height, orientation)
+        xy[of_photo] = orient_points(xy[of_photo], camera.width, camera.height, orientation)
     return replace(
         rec,
-        cameras=(*rec.cameras, *(turn_camera(rec.cameras[old], o) for _, (old, o) in new)),
+        cameras=(*rec.cameras, *(orient_camera(rec.cameras[old], o) for _, (old, o) in new)),
         camera_idx=np.array([place[pair] for pair in pairs], np.int64),
         R_cw=matrix @ rec.R_cw,
         phi=np.einsum("mij,mj->mi", matrix, rec.phi),

@@ -100,7 +100,7 @@ class CameraPath:
             object.__setattr__(self, name, frozen(value))
 
     def moved(self, R: Array, origin: Array, scale: float) -> CameraPath:
-        """The same in a world where x is scale R (x - origin)."""
+        """The path in a world where x is scale R (x - origin)."""
         return replace(
             self,
             R_cw=self.R_cw @ R.T,
@@ -115,12 +115,12 @@ class CameraPath:
         `Exp(rotation) R_cw` and `center_w + position`. Up to the neighbouring moments these lie on the path; beyond
         them, and where there is none, they go on as the path does there.
         """
-        turn, way = self._around(np.array([moment]), np.atleast_1d(np.asarray(offset_s, np.float64)))
-        return turn[0], way[0]
+        rotation, way = self._around(np.array([moment]), np.atleast_1d(np.asarray(offset_s, np.float64)))
+        return rotation[0], way[0]
 
     def _around(self, moments: Index, offset: Array) -> tuple[Array, Array]:
-        """As `near`, (k, n, 3) of k moments."""
-        turn, way = (
+        """`near` for k moments: (k, n, 3)."""
+        rotation, way = (
             offset[:, None] * slope[moments, None] + 0.5 * offset[:, None] ** 2 * bend[moments, None]
             for slope, bend in ((self.rate, self.rate_change), (self.velocity, self.acceleration))
         )
@@ -129,11 +129,11 @@ class CameraPath:
             joined = (other != moments) & (self.part[other] == self.part[moments])
             if joined.any() and on_this_side.any():
                 there = np.ix_(joined, on_this_side)
-                turn[there], way[there] = self._towards(moments[joined], other[joined], offset[on_this_side])
-        return turn, way
+                rotation[there], way[there] = self._towards(moments[joined], other[joined], offset[on_this_side])
+        return rotation, way
 
     def _towards(self, moments: Index, others: Index, offset: Array) -> tuple[Array, Array]:
-        """As `_around`, on the side of one neighbour of each."""
+        """`_around` on the side of one neighbour of each moment."""
         dt = self.time_s[others] - self.time_s[moments]
         xi = Rotation.from_matrix(self.R_cw[others] @ self.R_cw[moments].transpose(0, 2, 1)).as_rotvec()
         J = inverse_left_jacobians(xi)
@@ -181,7 +181,9 @@ class CameraPath:
         """
         chosen = np.asarray(moments, np.int64)
         clock = np.linspace(*clock_range, _SITES)
-        turn, way = self._around(chosen, clock * clock_s)
+        rotation, way = self._around(chosen, clock * clock_s)
         phi, velocity = clock_s * self.rate[chosen], clock_s * self.velocity[chosen]
-        bend = np.concatenate([turn - clock[:, None] * phi[:, None], way - clock[:, None] * velocity[:, None]], axis=2)
+        bend = np.concatenate(
+            [rotation - clock[:, None] * phi[:, None], way - clock[:, None] * velocity[:, None]], axis=2
+        )
         return phi, velocity, bend

@@ -163,7 +163,7 @@ class Reconstruction:
         return bool(self.variation.any())
 
     def with_own_cameras(self) -> Reconstruction:
-        """The same with a camera for each photo, if they vary."""
+        """The reconstruction with a camera for each photo, if they vary."""
         if not self.varies:
             return self
         own = tuple(self.camera(i) for i in range(self.num_images))
@@ -178,7 +178,7 @@ class Reconstruction:
         return RowMotion(self.phi[image], self.velocity[image], bend, "world")
 
     def with_motions(self, motions: Sequence[RowMotion]) -> Reconstruction:
-        """The same with other motions of its photos, bends of as many readings or none."""
+        """The reconstruction with other motions of its photos, bends of as many readings or none."""
         bends = [each.bend for each in motions if each.bend is not None]
         values, clock = np.zeros((len(motions), len(bends[0].values) if bends else 0, 6)), np.zeros((len(motions), 2))
         for i, bend in enumerate(each.bend for each in motions):
@@ -218,14 +218,14 @@ class Reconstruction:
         return float(np.median(np.abs((points - self.center_w[image]) @ self.R_cw[image, 2])))
 
     def normalized(self) -> Reconstruction:
-        """The same in a frame of its own: the first photo at the origin, consecutive centres 1 apart in the mean.
+        """The reconstruction in its own frame: the first photo at the origin, consecutive centres 1 apart in the mean.
 
         Which similarity a mapping ends in is chance; results of two runs must compare without aligning them.
         """
         return self.moved(self.R_cw[0], self.center_w[0], 1.0 / self.baseline)
 
     def moved(self, R: NDArray[np.float64], origin: NDArray[np.float64], scale: float) -> Reconstruction:
-        """The same in a world where x is scale R (x - origin)."""
+        """The reconstruction in a world where x is scale R (x - origin)."""
         return replace(
             self,
             R_cw=self.R_cw @ R.T,

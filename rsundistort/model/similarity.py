@@ -54,7 +54,7 @@ class Similarity:
         return reconstruction.moved(self.R, -self.R.T @ self.shift / self.scale, self.scale)
 
     def after(self, other: Similarity) -> Similarity:
-        """Both, the other first."""
+        """The composition of both, the other one applied first."""
         return Similarity(self.scale * other.scale, self.R @ other.R, self.of(other.shift[None])[0])
 
     @property
@@ -98,8 +98,8 @@ class FittedSimilarity:
     def variance_at(self, points: Array) -> Array:
         """Variances (n, 3) that it gives to places (n, 3), as if its parts were independent."""
         arm = np.asarray(points, np.float64) - self.middle
-        turn = np.cross(np.eye(3), arm[:, None]) * self.sigma_rad[:, None]
-        value: Array = self.sigma_m**2 + (turn**2).sum(1) + (self.sigma_scale * arm) ** 2
+        tilt = np.cross(np.eye(3), arm[:, None]) * self.sigma_rad[:, None]
+        value: Array = self.sigma_m**2 + (tilt**2).sum(1) + (self.sigma_scale * arm) ** 2
         return value
 
 

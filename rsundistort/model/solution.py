@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from .camera import Camera
 from .checks import check_array, check_fields, check_finite, check_photo_name, check_rotation, frozen
+from .former_fields import former_fields
 from .motion import RowMotion, check_shutter_model
 
 __all__ = ["Solution", "SolvedImage"]
 
 
+@former_fields(turned="applied_orientation")
 @dataclass(frozen=True)
 class SolvedImage:
     """One photo of a solution.
@@ -44,7 +46,7 @@ class SolvedImage:
         Largest displacement that the translation alone caused, by that depth.
     reason : str or None
         Why the photo did not register; of one that did, why it could not be rectified.
-    turned : int
+    applied_orientation : int
         EXIF orientation by which the photo was rotated after it was rectified: pose, motion and cameras are those of
         the rotated frame. 1 in the stored frame.
     roi : (x, y, width, height) or None
@@ -68,7 +70,7 @@ class SolvedImage:
     depth: str | None = None
     translation_shift_px: float | None = None
     reason: str | None = None
-    turned: int = 1
+    applied_orientation: int = 1
     roi: tuple[int, int, int, int] | None = None
     doubtful: str | None = None
     lens_only: bool = False

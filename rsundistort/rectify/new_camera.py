@@ -21,7 +21,7 @@ _MOST_SCALE = 1e4
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """What rectified photos show, and how large they are.
+    """View and size of rectified photos.
 
     Parameters
     ----------

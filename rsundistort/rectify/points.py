@@ -244,7 +244,7 @@ def bend_px(camera: Camera, motion: RowMotion, depth: float = np.inf) -> float:
     """
     if motion.bend is None:
         return 0.0
-    near, turn, way = motion.steady(*camera.clock_range)
+    near, rotation, way = motion.steady(*camera.clock_range)
     # along the readout four for each reading of the bend
     num = [33, 33]
     num[camera.clock_axis] = max(33, 4 * len(motion.bend.values))
@@ -256,8 +256,8 @@ def bend_px(camera: Camera, motion: RowMotion, depth: float = np.inf) -> float:
     if np.isfinite(depth):
         points = depth * points + motion.at(clock_of(camera, raw[valid]))[1] - way
     # the camera of the bent motion is the world here
-    near = replace(near, frame="world").in_camera(turn)
-    moved, seen = project_points(points @ turn.T, camera, near, model)
+    near = replace(near, frame="world").in_camera(rotation)
+    moved, seen = project_points(points @ rotation.T, camera, near, model)
     return float(np.linalg.norm(moved - raw[valid], axis=1)[seen].max(initial=0.0))
 
 

@@ -14,7 +14,7 @@ from ..critical.degeneracy import readout_axes
 from ..io import output_name
 from ..model import SHUTTER_MODELS, Camera, Solution, SolvedImage
 from ..model.field import field_over_frame
-from ..model.orientation import MATRICES, in_stored_frame, split_mirror, turn_points
+from ..model.orientation import MATRICES, in_stored_frame, orient_points, split_mirror
 from .diagnostics import Diagnostics
 from .displacement import displacement_field
 from .pictures import Picture
@@ -66,7 +66,7 @@ def photos(source: Source) -> list[dict[str, Any]]:
                 "camera": image.camera_id,
                 "phi": None if phi is None else phi.tolist(),
                 "sigma": None if image.sigma_phi is None else (image.sigma_phi * span).tolist(),
-                "turn": None if phi is None else float(np.linalg.norm(phi)),
+                "rotation": None if phi is None else float(np.linalg.norm(phi)),
                 "shift": image.rs_shift_px,
                 "measurements": image.num_observations,
                 "rms_before": None if i is None or stored is None else float(stored.rms_px[0, i]),
@@ -90,9 +90,9 @@ def motions(solution: Solution) -> list[dict[str, Any]]:
             continue
         camera = solution.cameras[image.camera_id]
         clock = np.linspace(*camera.clock_range, _CURVE_PLACES)
-        turn = np.degrees(image.motion.at(clock)[0])
+        rotation = np.degrees(image.motion.at(clock)[0])
         steady = np.degrees(clock[[0, -1], None] * image.motion.phi)
-        low, high = min(turn.min(), steady.min()), max(turn.max(), steady.max())
+        low, high = min(rotation.min(), steady.min()), max(rotation.max(), steady.max())
         room = max(float(high - low), 1e-9)
 
         def paths(values: NDArray[np.float64], high: float = high, room: float = room) -> list[str]:
@@ -103,12 +103,12 @@ def motions(solution: Solution) -> list[dict[str, Any]]:
             {
                 "number": number,
                 "name": image.name,
-                "curves": paths(turn),
+                "curves": paths(rotation),
                 "steady": paths(steady),
                 "low": float(low),
                 "high": float(high),
                 "zero": round(4 + (height - 8) * float(high) / room, 1) if low < 0 < high else None,
-                "most": float(np.linalg.norm(turn - np.degrees(clock[:, None] * image.motion.phi), axis=1).max()),
+                "most": float(np.linalg.norm(rotation - np.degrees(clock[:, None] * image.motion.phi), axis=1).max()),
                 "lines": ("columns", "rows")[camera.clock_axis],
             }
         )
@@ -158,7 +158,7 @@ def arrows_of(
     ))  # fmt: skip
     camera = stored.cameras[stored.images[0].camera_id]
     ends = displacement_field(stored, stored.images[0], depth, _ACROSS)
-    raw, still = (turn_points(each, camera.width, camera.height, orientation) for each in ends)
+    raw, still = (orient_points(each, camera.width, camera.height, orientation) for each in ends)
     swaps = MATRICES[orientation][0, 0] == 0
     return raw, still, (camera.height, camera.width) if swaps else (camera.width, camera.height)
 
@@ -173,10 +173,10 @@ def scene(source: Source, upright: Mapping[str, int]) -> dict[str, Any] | None:
     R = np.array([image.R_cw for image in images])
     centers = np.array([image.center_w for image in images])
     lenses = [solution.cameras[image.camera_id] for image in images]
-    turn = np.tile(np.eye(3), (len(images), 1, 1))
-    turn[:, :2, :2] = [MATRICES[split_mirror(upright.get(image.name, 1))[0]] for image in images]
+    rotation = np.tile(np.eye(3), (len(images), 1, 1))
+    rotation[:, :2, :2] = [MATRICES[split_mirror(upright.get(image.name, 1))[0]] for image in images]
     # on the map z is up, whatever the cameras look at
-    V = view_frame(turn @ R) if solution.georeference is None else np.eye(3)
+    V = view_frame(rotation @ R) if solution.georeference is None else np.eye(3)
     points = np.zeros((0, 3)) if stored is None else stored.points_w
     reach = _size(centers, points)
     side = min(0.5 * _spacing(centers), 0.12 * reach) or 0.12 * reach

@@ -115,7 +115,7 @@ class Diagnostics:
 
     @classmethod
     def of_results(cls, result: BundleResult, global_result: BundleResult, camera_ids: ArrayLike) -> Diagnostics:
-        """Those of an adjustment and its global-shutter counterpart, whose cameras are called so in the solution."""
+        """Diagnostics of an adjustment and its global-shutter counterpart, with the ids of cameras in the solution."""
         rec, plain = result.reconstruction, _aligned(global_result.reconstruction, result.reconstruction)
         both = [_Residuals.of(each) for each in (plain, rec)]
         chosen, of_plain = (_some(each.num_points) for each in (rec, plain))
@@ -140,7 +140,7 @@ class Diagnostics:
         )
 
     def with_colors(self, rgb: NDArray[np.uint8] | None) -> Diagnostics:
-        """The same with the colours (n, 3) of all points, if they are known."""
+        """The diagnostics with the colours (n, 3) of all points, if they are known."""
         return self if rgb is None else replace(self, rgb=rgb[self.point_idx])
 
 

@@ -141,7 +141,7 @@ def _displacement(figure: Figure, source: Source) -> bool:
     across = min(3, len(moved))
     down = -(-len(moved) // across)
     figure.set_size_inches(2.3 * across, 1.8 * down)
-    fields = [arrows_of(solution, image, depths.get(image.name), image.turned) for image in moved]
+    fields = [arrows_of(solution, image, depths.get(image.name), image.applied_orientation) for image in moved]
     lengths = [np.linalg.norm(still - raw, axis=1).max(initial=0.0) / size[0] for raw, still, size in fields]
     times = longer(lengths)
     for number, (image, (raw, still, (width, height))) in enumerate(zip(moved, fields, strict=True), 1):
@@ -202,13 +202,13 @@ def _sphere(figure: Figure, source: Source) -> bool:
         return False
     figure.set_size_inches(3.0, 3.0)
     axes = figure.add_subplot(projection="3d")
-    turn = np.linspace(0, 2 * np.pi, 73)
+    angle = np.linspace(0, 2 * np.pi, 73)
     for k in range(-2, 3):
         z, r = np.sin(k * np.pi / 6), np.cos(k * np.pi / 6)
-        axes.plot(r * np.cos(turn), r * np.sin(turn), np.full_like(turn, z), color="#dddddd", lw=0.5)
+        axes.plot(r * np.cos(angle), r * np.sin(angle), np.full_like(angle, z), color="#dddddd", lw=0.5)
     for k in range(6):
-        r, a = np.cos(turn), k * np.pi / 6
-        axes.plot(r * np.cos(a), r * np.sin(a), np.sin(turn), color="#dddddd", lw=0.5)
+        r, a = np.cos(angle), k * np.pi / 6
+        axes.plot(r * np.cos(a), r * np.sin(a), np.sin(angle), color="#dddddd", lw=0.5)
     for axis in axes_w:
         axes.plot(*np.stack([axis, -axis]).T, "o-", color=_OURS, ms=2.5, lw=0.7)
     axes.set_box_aspect((1, 1, 1), zoom=1.45)

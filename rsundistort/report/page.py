@@ -85,7 +85,7 @@ def _pictures(
     for image in source.solution.registered:
         before, after = source.before(image.name), source.after(image.name)
         if before is not None or after is not None:
-            jobs[image.name] = PictureJob(before, after, image.turned)
+            jobs[image.name] = PictureJob(before, after, image.applied_orientation)
     tell = None if progress is None else lambda done: progress("report", done, len(jobs))
     return dict(zip(jobs, make_pictures(list(jobs.values()), threads, tell), strict=True))
 

@@ -16,7 +16,7 @@ from ..errors import FileError, InputError
 from ..io import read_exif, read_photo
 from ..io.photos.images import read_plain, stored_size
 from ..io.photos.kinds import kind_of_content
-from ..model.orientation import compose_orientations, turn_pixels
+from ..model.orientation import compose_orientations, orient_pixels
 
 __all__ = ["Picture", "PictureJob", "make_pictures"]
 
@@ -36,13 +36,13 @@ class PictureJob:
     ----------
     before, after : Path or None
         Raw and rectified photo, None where there is none.
-    turned : int
+    applied_orientation : int
         EXIF orientation that was applied to the rectified one.
     """
 
     before: Path | None
     after: Path | None
-    turned: int = 1
+    applied_orientation: int = 1
 
 
 @dataclass(frozen=True)
@@ -78,12 +78,12 @@ def _bytes_of_each(count: int) -> int:
 
 def _picture(job: PictureJob, num_bytes: int) -> Picture:
     shown = 1  # what players do to the rectified photo
-    for path, done in ((job.after, 1), (job.before, job.turned)):
+    for path, done in ((job.after, 1), (job.before, job.applied_orientation)):
         if path is not None and path.is_file():
             stored = read_exif(path).orientation or 1
             shown = stored if done == 1 else 1
             break
-    upright = compose_orientations(job.turned, shown)
+    upright = compose_orientations(job.applied_orientation, shown)
     return Picture(_small(job.before, num_bytes, upright), _small(job.after, num_bytes, shown), upright)
 
 
@@ -99,7 +99,7 @@ def _small(path: Path | None, num_bytes: int, orientation: int) -> bytes | None:
     scale = min(1.0, side / max(pixels.shape[:2]))
     if scale < 1:
         pixels = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    pixels = turn_pixels(pixels, orientation)
+    pixels = orient_pixels(pixels, orientation)
     data = b""
     for quality in _QUALITIES:
         data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()

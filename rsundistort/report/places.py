@@ -48,9 +48,9 @@ def _frame(georeference: Mapping[str, Any]) -> str:
     }.get(crs, f"{crs}, less {origin[0]:.0f}, {origin[1]:.0f} m")
     if "sigma" not in georeference:
         return f"{where}, as in the model"
-    place, turn = georeference["sigma"]["place_m"], georeference["sigma"]["rotation_deg"]
+    place, rotation = georeference["sigma"]["place_m"], georeference["sigma"]["rotation_deg"]
     return (
-        f"{where}; known to {max(place[:2]):.2g} m across, {place[2]:.2g} m in height, {max(turn):.2g} deg, scale "
+        f"{where}; known to {max(place[:2]):.2g} m across, {place[2]:.2g} m in height, {max(rotation):.2g} deg, scale "
         f"{100 * georeference['sigma']['scale']:.2g} %"
     )
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..model import Camera, Reconstruction, RowMotion
+from ..model.path import cross_matrices
 from ..model.projection import clock_of, project_points, project_points_with_jacobians, unproject_points
 from .database import MatchedPhotos
 from .epipolar import TIGHT_PX, Matches, agreeing_photos, read_matches
@@ -168,7 +169,7 @@ def _adjusted(
         # a sum of squares in pixels, as far as these are small; the noise is about one
         cost = float(width**2 * (square / (1.0 + square)).sum() + prior * phi @ phi)
         # Exp(w) R (X - center - R' d): a point moves by w x x_c - d
-        moves = np.concatenate([-_cross(x_c), np.broadcast_to(-np.eye(3), (len(x_c), 3, 3))], axis=2)
+        moves = np.concatenate([-cross_matrices(x_c), np.broadcast_to(-np.eye(3), (len(x_c), 3, 3))], axis=2)
         J = np.where(valid[:, None, None], np.concatenate([slopes.point @ moves, slopes.phi], axis=2), 0.0)
         return _Pose(R_cw, center_w, phi, cost), (J, apart, np.where(valid, 1.0 / (1.0 + square) ** 2, 0.0))
 
@@ -191,13 +192,6 @@ def _adjusted(
         if settled:
             break
     return now
-
-
-def _cross(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 3, 3) matrices of the vector product with rows of x."""
-    zero = np.zeros(len(x))
-    a, b, c = x.T
-    return np.array([[zero, -c, b], [c, zero, -a], [-b, a, zero]]).transpose(2, 0, 1)
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ NO_SHUTTER = 1e-4
 
 @dataclass(frozen=True)
 class View:
-    """What one photo shows of a list of matches.
+    """One photo's side of a list of matches.
 
     Attributes
     ----------

@@ -27,9 +27,9 @@ from ..model import Reconstruction
 from ..sfm import MatchedPhotos, retriangulate
 from ..verdict.clip import ReadoutTime, judge_clip, unfollowed_px
 from ..verdict.speeds import readouts_by_speed
-from .clip_gyroscope import Felt, felt_gyroscope, own_gyroscope, readout_of, turns_between
+from .clip_gyroscope import Felt, felt_gyroscope, own_gyroscope, readout_of, rotations_between
 from .clip_pair import two_frames
-from .clip_pan import turning_only
+from .clip_pan import rotating_only
 from .clip_tracks import follow_points, with_all_frames
 from .model_sequence import rough_options
 from .outcome import Solved
@@ -45,7 +45,7 @@ _LEAST_HALF = 4
 _FLOW_PX, _OUTLIERS = 0.25, 0.2
 # Solves that estimate the prior standard deviations of a path, and the share by which these may still change: with
 # hundreds of frames few are enough.
-_SPREADS, _SETTLED = 4, 0.05
+_SIGMA_ROUNDS, _SETTLED = 4, 0.05
 # Relative fall of the cost that ends an adjustment of a path that another one follows.
 _ROUGH_COST = 1e-4
 # Readout time that counts as none, as a share of the time between frames.
@@ -123,7 +123,7 @@ def solve_clip(
         options = replace(options, path=replace(path, rates=felt.rates(result), start=_start_of(result)))
         result = bundle_adjust(
             result.reconstruction, "constant-motion",
-            replace(options, outlier_rounds=0, spread_rounds=_SPREADS, spread_tolerance=_SETTLED),
+            replace(options, outlier_rounds=0, prior_sigma_rounds=_SIGMA_ROUNDS, prior_sigma_tolerance=_SETTLED),
             partial(_tell, log, "gyroscope"),
         )  # fmt: skip
     log.end("gyroscope", offset_s=None if felt is None else felt.alignment.offset_s)
@@ -136,16 +136,16 @@ def _turned(
 ) -> _Found | None:  # fmt: skip
     """The path of a camera that only rotates; None if rotations do not explain the frames."""
     log.begin("rotations")
-    start, found = turning_only(clip, keys), None
+    start, found = rotating_only(clip, keys), None
     if start is not None:
-        options = replace(options_of(start), path=replace(path, turns_only=True))
+        options = replace(options_of(start), path=replace(path, rotation_only=True))
         result = bundle_adjust(start, "constant-motion", _at_first(options), partial(_tell, log, "rotations"))
         if result.sigma_px < _FLOW_PX and result.num_outliers < _OUTLIERS * len(start.observations):
             result = bundle_adjust(
                 result.reconstruction, "constant-motion",
                 replace(
-                    options, outlier_rounds=1, spread_rounds=_SPREADS, spread_tolerance=_SETTLED,
-                    path=replace(path, turns_only=True, start=_start_of(result)),
+                    options, outlier_rounds=1, prior_sigma_rounds=_SIGMA_ROUNDS, prior_sigma_tolerance=_SETTLED,
+                    path=replace(path, rotation_only=True, start=_start_of(result)),
                 ),
                 partial(_tell, log, "rotations"),
             )  # fmt: skip
@@ -182,7 +182,7 @@ def _travelled(
         how = (
             _at_first(options)
             if result is None
-            else replace(options, outlier_rounds=1, spread_rounds=_SPREADS, spread_tolerance=_SETTLED)
+            else replace(options, outlier_rounds=1, prior_sigma_rounds=_SIGMA_ROUNDS, prior_sigma_tolerance=_SETTLED)
         )
         is_first = result is None
         result = bundle_adjust(whole, "constant-motion", how, partial(_tell, log, stage))
@@ -225,8 +225,8 @@ def _against_telemetry(
     if filmed.verdict == "none":
         return filmed
     place = _places(clip, rec)
-    pairs, turns = turns_between(clip.part[place], R_cw)
-    reason = calmer_than_felt(clip.time_s[place], pairs, turns, _turn_sigma(own, pairs), telemetry)
+    pairs, turns = rotations_between(clip.part[place], R_cw)
+    reason = calmer_than_felt(clip.time_s[place], pairs, turns, _rotation_sigma(own, pairs), telemetry)
     return replace(filmed, verdict="stabilised", reason=reason) if reason else filmed
 
 
@@ -251,7 +251,7 @@ def _was_stabilised(filmed: Stabilisation | None) -> bool:
 def _at_first(options: BundleOptions) -> BundleOptions:
     """Options of an adjustment of a path that is followed by another one."""
     return replace(
-        rough_options(options), outlier_rounds=2, spread_rounds=1, cost_tolerance=_ROUGH_COST, deviations="model"
+        rough_options(options), outlier_rounds=2, prior_sigma_rounds=1, cost_tolerance=_ROUGH_COST, deviations="model"
     )
 
 
@@ -262,7 +262,7 @@ def _judged(
     """The verdict on a path, and the motions of its key frames."""
     assert options.path is not None
     remedy = None
-    if not options.path.turns_only:  # else there is no shape
+    if not options.path.rotation_only:  # else there is no shape
         log.begin("critical motion")
         result, remedy = heal(result, options)
         log.end("critical motion", sigma_log_k=remedy.after.sigma_log_k)
@@ -272,7 +272,7 @@ def _judged(
     log.begin("stabilisation")
     stabilisation, vibration_px, speeds = filmed, 0.0, None
     if stabilisation is None or not _was_stabilised(filmed):
-        own = own_motions(result.reconstruction, turns_only=options.path.turns_only)
+        own = own_motions(result.reconstruction, rotation_only=options.path.rotation_only)
         vibration_px = unfollowed_px(result.reconstruction, own)
         speeds = _by_speed(clip, result, own)
         stabilisation = _stabilisation(clip, result.reconstruction, own, felt)
@@ -285,7 +285,7 @@ def _judged(
     at_once = replace(_at_once(options.path), start=_start_of(result, at_once=True))
     global_result = bundle_adjust(
         of_keys.reconstruction, "constant-motion",
-        replace(rough_options(options), path=at_once, outlier_rounds=0, spread_rounds=0, deviations="model"),
+        replace(rough_options(options), path=at_once, outlier_rounds=0, prior_sigma_rounds=0, deviations="model"),
     )  # fmt: skip
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
     against = stabilisation.reason if stabilisation.verdict == "stabilised" else ""
@@ -358,7 +358,7 @@ def readouts_of_halves(result: BundleResult, options: BundleOptions) -> tuple[Re
     # poses are those of the whole, as good as; a tolerance this small lets each half find its own readout time
     pictures = replace(options.path, rates={}, start=_start_of(result))
     how = replace(
-        rough_options(options), path=pictures, outlier_rounds=0, spread_rounds=1, cost_tolerance=1e-6, refine=()
+        rough_options(options), path=pictures, outlier_rounds=0, prior_sigma_rounds=1, cost_tolerance=1e-6, refine=()
     )
     parts = [rec.take_photos(keep) for keep in (~late, late)]
     if any(part.num_images < _LEAST_HALF or part.num_points < _LEAST_MEASUREMENTS for part in parts):
@@ -370,12 +370,12 @@ def readouts_of_halves(result: BundleResult, options: BundleOptions) -> tuple[Re
 def _stabilisation(clip: Clip, rec: Reconstruction, found: OwnMotions, felt: Felt | None = None) -> Stabilisation:
     """Whether the lines of the frames move as the frames do, each frame having its own motion."""
     place = _places(clip, rec)
-    pairs, turns = turns_between(clip.part[place], found.R_cw)
+    pairs, turns = rotations_between(clip.part[place], found.R_cw)
     span = rec.frame_span()[:, None]
     log, offset_s = (None, 0.0) if felt is None else (felt.log, felt.alignment.offset_s)
     return judge_stabilisation(
         clip.time_s[place], pairs, turns, found.phi * span, found.sigma_phi * span, log=log, offset_s=offset_s,
-        turn_sigma=_turn_sigma(found, pairs),
+        rotation_sigma=_rotation_sigma(found, pairs),
     )  # fmt: skip
 
 
@@ -384,8 +384,8 @@ def _by_speed(clip: Clip, result: BundleResult, found: OwnMotions) -> tuple[Read
     rec = result.reconstruction
     place, span = _places(clip, rec), rec.frame_span()[:, None]
     return readouts_by_speed(
-        clip.time_s[place], clip.part[place], found.R_cw, found.sigma_turn, found.phi * span, found.sigma_phi * span,
-        readout_of(result).seconds,
+        clip.time_s[place], clip.part[place], found.R_cw, found.sigma_rotation, found.phi * span,
+        found.sigma_phi * span, readout_of(result).seconds,
     )  # fmt: skip
 
 
@@ -395,9 +395,9 @@ def _places(clip: Clip, rec: Reconstruction) -> NDArray[np.int64]:
     return np.array([number[name] for name in rec.image_names], np.int64)
 
 
-def _turn_sigma(found: OwnMotions, pairs: NDArray[np.int64]) -> NDArray[np.float64]:
+def _rotation_sigma(found: OwnMotions, pairs: NDArray[np.int64]) -> NDArray[np.float64]:
     """(n, 3) standard deviations of the rotations between pairs of frames."""
-    sigma: NDArray[np.float64] = np.linalg.norm(found.sigma_turn[pairs], axis=1)
+    sigma: NDArray[np.float64] = np.linalg.norm(found.sigma_rotation[pairs], axis=1)
     return sigma
 
 

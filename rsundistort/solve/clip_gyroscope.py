@@ -19,7 +19,7 @@ from ..io.gpmf import has_telemetry
 from ..io.gyro import GyroLog, read_gyro
 from ..verdict.clip import ReadoutTime
 
-__all__ = ["Felt", "felt_gyroscope", "own_gyroscope", "readout_of", "turns_between"]
+__all__ = ["Felt", "felt_gyroscope", "own_gyroscope", "readout_of", "rotations_between"]
 
 
 @dataclass(frozen=True)
@@ -92,22 +92,24 @@ def felt_gyroscope(result: BundleResult, log: GyroLog | None) -> Felt | None:
         return None
     assert result.path is not None
     path = result.path.path
-    found = align_gyro(log, path.time_s, *turns_between(path.part, path.R_cw))
+    found = align_gyro(log, path.time_s, *rotations_between(path.part, path.R_cw))
     if isinstance(found, NoAlignment):
         warnings.warn(f"without the gyroscope: {found.reason}", RsUndistortWarning, stacklevel=5)
         return None
     return Felt(found, found.in_camera(log))
 
 
-def turns_between(part: NDArray[np.int64], R_cw: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def rotations_between(
+    part: NDArray[np.int64], R_cw: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Neighbouring frames (n, 2) of a part, and the rotations (n, 3) from one to the other; NaN of unknown ones."""
     first = np.flatnonzero(part[1:] == part[:-1])
-    turns = np.full((len(first), 3), np.nan)
+    rotations = np.full((len(first), 3), np.nan)
     between = R_cw[first + 1] @ R_cw[first].transpose(0, 2, 1)
     known = np.isfinite(between).all(axis=(1, 2))
     if known.any():
-        turns[known] = Rotation.from_matrix(between[known]).as_rotvec()
-    return np.stack([first, first + 1], axis=1), turns
+        rotations[known] = Rotation.from_matrix(between[known]).as_rotvec()
+    return np.stack([first, first + 1], axis=1), rotations
 
 
 def readout_of(result: BundleResult) -> ReadoutTime:

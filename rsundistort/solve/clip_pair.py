@@ -11,7 +11,7 @@ from ..input.clip import Clip
 from ..input.load import LoadedPhotos
 from ..model import Observations, Reconstruction, RowMotion
 from ..model.projection import unproject_points
-from .clip_pan import turn_between
+from .clip_pan import rotation_between
 from .clip_tracks import follow
 
 __all__ = ["two_frames"]
@@ -41,12 +41,12 @@ def two_frames(clip: Clip, keys: LoadedPhotos) -> Reconstruction:
     first, second = (shown[k][followed.chosen[k]] for k in (0, 1))
     starts = np.concatenate([first[followed.place[forward]], second[followed.place[~forward]]])
     xy = np.stack([np.where((forward == (k == 0))[:, None], starts, followed.xy_raw) for k in (0, 1)])
-    turn = turn_between(xy[0], xy[1], camera)
-    if turn is None:
+    rotation = rotation_between(xy[0], xy[1], camera)
+    if rotation is None:
         raise ReconstructionError(f"the two frames of {clip.video.name} share too little of the scene")
     best: tuple[int, NDArray[np.float64], NDArray[np.float64], RowMotion, NDArray[np.bool_]] | None = None
     for share in _SHARES:
-        motion = RowMotion(share * turn / camera.frame_span)
+        motion = RowMotion(share * rotation / camera.frame_span)
         (a, seen_a), (b, seen_b) = (unproject_points(each, camera, motion, "rotation") for each in xy)
         seen = seen_a & seen_b
         E, _ = cv2.findEssentialMat(a[seen], b[seen], np.eye(3), cv2.RANSAC, 0.9999, _WITHIN_PX / float(camera.K[0, 0]))

@@ -14,7 +14,7 @@ from ..model import Camera, Observations, Reconstruction, RowMotion
 from ..model.projection import unproject_points
 from .clip_tracks import Followed, follow
 
-__all__ = ["turn_between", "turning_only"]
+__all__ = ["rotating_only", "rotation_between"]
 
 # Tolerance for the shutter where frames are rotated onto each other, pixels; and median that may be left when rotations
 # of the lines of both frames are removed, too: the content moves by fifty from key to key, and translation leaves a
@@ -26,7 +26,7 @@ _FIRST = 8
 _TRIALS = 20
 
 
-def turning_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
+def rotating_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
     """All frames of a clip, chained by the rotations between them, with directions as points.
 
     The centres are all at the origin, the points at a distance of 1. None if most frames are not connected, or differ
@@ -58,9 +58,9 @@ def _chained(
             break
         for k in range(a + 1, b + 1):
             mine = (followed.frame == k) & (followed.key == a)
-            turn = _turn(own[a][followed.place[mine]], rays[mine], _ROOM_PX / float(camera.K[0, 0]))
-            if turn is not None:
-                R_cw[k] = turn @ R_cw[a]
+            rotation = _agreed_rotation(own[a][followed.place[mine]], rays[mine], _ROOM_PX / float(camera.K[0, 0]))
+            if rotation is not None:
+                R_cw[k] = rotation @ R_cw[a]
     left = []
     for a, b in pairwise(order):
         if a in R_cw and b in R_cw:
@@ -114,9 +114,9 @@ def _left_by_shutter(before: NDArray[np.float64], after: NDArray[np.float64], ca
         return float("inf")
     (u, v), (x, y) = (each[seen, :2].T / each[seen, 2] for each in (before, after))
     # dx / dt of x = X / Z where X rotates about the three axes
-    by_turn = np.stack([np.stack([x * y, -(1 + x**2), y], 1), np.stack([1 + y**2, -x * y, -x], 1)], axis=1)
+    by_R = np.stack([np.stack([x * y, -(1 + x**2), y], 1), np.stack([1 + y**2, -x * y, -x], 1)], axis=1)
     r_before, r_after = (u, x) if camera.clock_axis == 0 else (v, y)
-    A = np.concatenate([by_turn, r_after[:, None, None] * by_turn, -r_before[:, None, None] * by_turn], axis=2)
+    A = np.concatenate([by_R, r_after[:, None, None] * by_R, -r_before[:, None, None] * by_R], axis=2)
     apart, weight = np.stack([x - u, y - v], axis=1), np.ones(len(x))
     size = np.linalg.norm(apart, axis=1)
     for _ in range(10):
@@ -127,16 +127,18 @@ def _left_by_shutter(before: NDArray[np.float64], after: NDArray[np.float64], ca
     return float(np.median(size))
 
 
-def turn_between(
+def rotation_between(
     xy_before: NDArray[np.float64], xy_after: NDArray[np.float64], camera: Camera
 ) -> NDArray[np.float64] | None:
     """The rotation vector from directions of pixels (n, 2) to those in another frame; None if none fits."""
     before, after = _directions(xy_before, camera), _directions(xy_after, camera)
-    turn = _turn(before, after, _ROOM_PX / float(camera.K[0, 0]))
-    return None if turn is None else np.asarray(Rotation.from_matrix(turn).as_rotvec())
+    rotation = _agreed_rotation(before, after, _ROOM_PX / float(camera.K[0, 0]))
+    return None if rotation is None else np.asarray(Rotation.from_matrix(rotation).as_rotvec())
 
 
-def _turn(before: NDArray[np.float64], after: NDArray[np.float64], within: float) -> NDArray[np.float64] | None:
+def _agreed_rotation(
+    before: NDArray[np.float64], after: NDArray[np.float64], within: float
+) -> NDArray[np.float64] | None:
     """The rotation that takes most directions (n, 3) to those of another frame; None if too few agree on one."""
     seen = np.isfinite(before).all(1) & np.isfinite(after).all(1)
     before, after = before[seen], after[seen]
@@ -146,8 +148,8 @@ def _turn(before: NDArray[np.float64], after: NDArray[np.float64], within: float
     best, most = None, 0
     for _ in range(_TRIALS):
         pair = rng.choice(len(before), 2, replace=False)
-        turn = _aligned(before[pair], after[pair])
-        agree = np.linalg.norm(before @ turn.T - after, axis=1) < within
+        rotation = _aligned(before[pair], after[pair])
+        agree = np.linalg.norm(before @ rotation.T - after, axis=1) < within
         if agree.sum() > most:
             best, most = agree, int(agree.sum())
     if best is None or most < _LEAST_AGREEING:

@@ -141,8 +141,8 @@ class CameraPoses:
             return R_a, c_a
         time = self._clip.time_s
         share = (time[frame] - time[a]) / (time[b] - time[a])
-        turn = Rotation.from_rotvec(share * Rotation.from_matrix(R_b @ R_a.T).as_rotvec())
-        return turn.as_matrix() @ R_a, c_a + share * (c_b - c_a)
+        rotation = Rotation.from_rotvec(share * Rotation.from_matrix(R_b @ R_a.T).as_rotvec())
+        return rotation.as_matrix() @ R_a, c_a + share * (c_b - c_a)
 
 
 def with_all_frames(

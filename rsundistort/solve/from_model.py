@@ -28,7 +28,7 @@ from ..io.photos.images import stored_size
 from ..io.places import local_place
 from ..io.record import Record
 from ..model import Reconstruction, Solution
-from ..model.orientation import INVERSE, turn_reconstruction
+from ..model.orientation import INVERSE, orient_reconstruction
 from ..sfm import matched_of_database
 from .from_poses import measured, posed_photos, shutter_terms
 from .going_on import RunFolder, key_of, run_folder
@@ -300,7 +300,7 @@ def _in_stored_frame(
     Some programs rotate photos by their EXIF orientation before they measure them: the sizes show it.
     """
     rec = given.reconstruction
-    turns: dict[str, int] = {}
+    applied: dict[str, int] = {}
     unsure = []
     for i, name in enumerate(rec.image_names):
         size, facts = photos.get(name, (None, ExifFacts()))
@@ -311,7 +311,7 @@ def _in_stored_frame(
             if orientation in (2, 3, 4) or (orientation > 4 and camera.width == camera.height):
                 unsure.append(name)
         elif (camera.height, camera.width) == size and orientation > 4:
-            turns[name] = INVERSE[orientation]
+            applied[name] = INVERSE[orientation]
         else:
             raise InputError(
                 f"{name} has {size[0]}x{size[1]} pixels, its camera in the model {camera.width}x{camera.height}; "
@@ -322,14 +322,14 @@ def _in_stored_frame(
             f"{len(unsure)} photos, such as {unsure[0]}, have an EXIF orientation that keeps their size: the model is "
             "taken to show them as they are stored", RsUndistortWarning, stacklevel=4,
         )  # fmt: skip
-    if not turns:
+    if not applied:
         return given, "stored" if photos else "not looked at"
-    said = f"rotated by the EXIF orientation in {len(turns)} of {rec.num_images} photos"
-    turned = turn_reconstruction(rec, turns)
+    said = f"rotated by the EXIF orientation in {len(applied)} of {rec.num_images} photos"
+    stored = orient_reconstruction(rec, applied)
     ids = list(given.camera_ids)
-    free = (k for k in range(1, 2 + max(ids) + len(turned.cameras)) if k not in ids)
-    ids += [next(free) for _ in range(len(turned.cameras) - len(ids))]
-    return replace(given, reconstruction=turned, camera_ids=np.array(ids, np.int64)), said
+    free = (k for k in range(1, 2 + max(ids) + len(stored.cameras)) if k not in ids)
+    ids += [next(free) for _ in range(len(stored.cameras) - len(ids))]
+    return replace(given, reconstruction=stored, camera_ids=np.array(ids, np.int64)), said
 
 
 def _photo_cameras(

@@ -67,7 +67,7 @@ _LOOKED_AT = 5
 
 @dataclass(frozen=True)
 class TrackSource:
-    """What new tracks are made from.
+    """Source of new tracks.
 
     Attributes
     ----------
@@ -398,7 +398,7 @@ def _lens_only(verdict: Verdict) -> str:
 
 def rough_options(options: BundleOptions) -> BundleOptions:
     """Options of an adjustment that another one follows."""
-    return replace(options, cost_tolerance=1e-5, spread_rounds=3, spread_tolerance=0.05)
+    return replace(options, cost_tolerance=1e-5, prior_sigma_rounds=3, prior_sigma_tolerance=0.05)
 
 
 def _is_strong(rec: Reconstruction) -> bool:

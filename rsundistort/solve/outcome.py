@@ -90,7 +90,7 @@ class Solved:
 
     @property
     def reconstruction(self) -> Reconstruction:
-        """The same with a camera for each photo if they vary."""
+        """The reconstruction with a camera for each photo, if they vary."""
         return self.shared.with_own_cameras()
 
     @property
@@ -114,12 +114,12 @@ def _readouts(rec: Reconstruction, cameras: PhotoCameras) -> str | dict[str, str
 def _guesses(solved: Solved) -> list[str]:
     """Guesses of the cameras, and the result of the measurements, for people."""
     choice, cameras = solved.directions, solved.cameras
-    if choice is None or not choice.turned:
+    if choice is None or not choice.changed:
         return list(cameras.notes)
     return [
         f"{cameras.labels[k]} fits better as read out {choice.reconstruction.cameras[k].readout} "
         f"(by {choice.gain[k]:.0f} standard errors); --readout settles it"
-        for k in choice.turned
+        for k in choice.changed
     ]
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..batch.clip import rectify_clip
 from ..batch.geometry import DEPTHS, PhotoGeometry, SceneGeometry, ScenePoints, with_depths
 from ..batch.many_photos import PointColors, mask_names, rectify_photos
-from ..batch.one_photo import turn_of
+from ..batch.one_photo import applied_part
 from ..batch.progress import StageLog
 from ..batch.rectify_options import RectifyOptions
 from ..batch.views import with_view
@@ -48,7 +48,7 @@ from ..io.record import Record
 from ..io.usd import write_usd_camera
 from ..io.video import FRAME_TABLE
 from ..model import Camera, Reconstruction, RowMotion, Solution, SolvedImage
-from ..model.orientation import turn_path, turn_reconstruction, turn_solution
+from ..model.orientation import orient_path, orient_reconstruction, orient_solution
 from ..rectify import bend_px
 from ..report import Diagnostics, relative_folder, write_diagnostics, write_report
 from .outcome import Solved, solution_of
@@ -141,7 +141,7 @@ class Outputs:
         What is written besides.
     ids : ModelIds
         Ids of the COLMAP model.
-    turns : mapping of name to int
+    applied : mapping of name to int
         EXIF orientations that are applied.
     rgb : PointRgb or None
         Colours of points; None if all come from the photos.
@@ -158,7 +158,7 @@ class Outputs:
     rectifying: RectifyOptions
     options: OutputOptions
     ids: ModelIds
-    turns: Mapping[str, int]
+    applied: Mapping[str, int]
     rgb: PointRgb | None = None
     with_photos: bool = True
     times: Mapping[str, float] = field(default_factory=dict)
@@ -180,14 +180,14 @@ class Outputs:
         """Outputs of a solution, whose photos have these EXIF orientations."""
         rec = solved.reconstruction
         solution = with_view(solution_of(solved, solving, rectifying), rectifying.view)
-        turns: dict[str, int] = {}
+        applied: dict[str, int] = {}
         if rectifying.apply_orientation:
-            turns = {name: turn_of(orientations.get(name, 1), True)[0] for name in rec.image_names}
+            applied = {name: applied_part(orientations.get(name, 1), True)[0] for name in rec.image_names}
         ids = replace(ids or ModelIds.in_order(rec), cameras=solved.camera_ids)
         rec = rec.with_motions([solution.image(name).taken_out or RowMotion() for name in rec.image_names])
         if (options.rs_poses or not {"ncore", "opf"}.isdisjoint(options.exports)) and rec.bends:
             solution = replace(solution, quality={**solution.quality, "rs_poses_px": _left_by_two_poses(rec)})
-        return cls(solution, rec, rectifying, options, ids, turns, rgb, with_photos, times or {}, solved)
+        return cls(solution, rec, rectifying, options, ids, applied, rgb, with_photos, times or {}, solved)
 
     def begin(self, folder: Path, log: StageLog) -> Solution:
         """Write all except the photos and the colours of points, so that the rest can be resumed."""
@@ -196,10 +196,10 @@ class Outputs:
                 (folder / name).mkdir()
             Journal(folder).write(())
         rgb = None if self.rgb is None else self.rgb.values
-        turned = replace(self._models(folder, self.solution, {}, rgb, None), stages=tuple(log.stages))
-        write_solution(folder / "solution.json", turned)
+        written = replace(self._models(folder, self.solution, {}, rgb, None), stages=tuple(log.stages))
+        write_solution(folder / "solution.json", written)
         self._tell_report(folder, rgb)
-        return turned
+        return written
 
     def report(self, out: Path, jobs: int, log: StageLog, photos: Path | None = None) -> None:
         """Write the report of `out`, if it is wanted; a failure only causes a warning."""
@@ -236,11 +236,11 @@ class Outputs:
         solution = with_depths(replace(solution, images=tuple(images)), found)
         with output_folder(out, overwrite=True) as scratch:
             rgb = self._rgb(colors)
-            turned = self._models(scratch, solution, left_out, rgb, relative_to(photos, out / "rs-poses"), photos)
+            written = self._models(scratch, solution, left_out, rgb, relative_to(photos, out / "rs-poses"), photos)
             self._tell_report(scratch, rgb, relative_folder(photos, out))
             log.end("writing")
-            turned = replace(turned, stages=tuple(log.stages))
-            write_solution(scratch / "solution.json", turned)
+            written = replace(written, stages=tuple(log.stages))
+            write_solution(scratch / "solution.json", written)
         if any((out / "stereo").rglob("*.bin")):
             warnings.warn(
                 f"{out / 'stereo'} holds maps that COLMAP made of an earlier result, and would take for those of this "
@@ -249,7 +249,7 @@ class Outputs:
         self.report(out, workers.jobs, log, photos)
         if not left_out:
             journal.path.unlink()  # nothing to resume
-        return turned
+        return written
 
     @cached_property
     def _diagnostics(self) -> Diagnostics | None:
@@ -305,8 +305,8 @@ class Outputs:
             problem = write_shutter_poses(folder / "rs-poses", solution, originals, "../points.ply")
             if problem and last:
                 warnings.warn(f"rs-poses is without transforms.json: {problem}", RsUndistortWarning, stacklevel=3)
-        if self.turns:
-            solution, rec = turn_solution(solution, self.turns), turn_reconstruction(rec, self.turns)
+        if self.applied:
+            solution, rec = orient_solution(solution, self.applied), orient_reconstruction(rec, self.applied)
             # rotated cameras are further ones, in the same order in both
             ids = replace(ids, cameras=[int(key) for key in solution.cameras])
         new_cameras = [solution.rectified_cameras[str(key)] for key in ids.cameras]
@@ -322,7 +322,7 @@ class Outputs:
         files = {name: (f"images/{new}", f"masks/{masks[name]}") for name, new in written.items()}
         write_transforms(folder / "transforms.json", solution, files, "points.ply")
         path = None if self.solved is None or self.solved.result.path is None else self.solved.result.path.path
-        path = path and turn_path(path, next(iter(self.turns.values()), 1))
+        path = path and orient_path(path, next(iter(self.applied.values()), 1))
         self._export(folder, ExportScene(solution, rec, written, rgb, stored, source, originals, path), last)
         return solution
 
@@ -342,7 +342,7 @@ class Outputs:
         found = None if self.solved is None else self.solved.result.path
         if found is None:
             return
-        path = turn_path(found.path, next(iter(self.turns.values()), 1))
+        path = orient_path(found.path, next(iter(self.applied.values()), 1))
         write_path(folder / "path.csv", found.names, path)
         write_trajectory(folder / "path.txt", path.time_s, path.R_cw, path.center_w)
         if self.options.usd:

@@ -365,7 +365,7 @@ def survey_of(
             raise InputError(f"control point {each.name!r} lies far from the photos' GPS; is it in {crs}, E before N?")
     places = dict(zip(positions.names, zip(placed, positions.sigma_m, strict=True), strict=True))
     notes = [*positions.notes, *([frame.note] * bool(frame.note))]
-    return Survey(frame, frame.turned(positions), places, in_frame, clock_s=clock_s or {}, notes=notes)
+    return Survey(frame, frame.rotated(positions), places, in_frame, clock_s=clock_s or {}, notes=notes)
 
 
 def _check_seen(control: Sequence[ControlPoint], sizes: Mapping[str, tuple[int, int]]) -> None:

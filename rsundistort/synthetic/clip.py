@@ -113,14 +113,14 @@ class CameraPath:
             target = np.column_stack([target[:, :2], center[:, 2]])
         looks = zip(center, target, self.roll_deg(time_s), strict=True)
         R_cw = np.array([look_at(*each) for each in looks]).reshape(-1, 3, 3)
-        turn, way = self.tremor.at(time_s)
+        rotation, way = self.tremor.at(time_s)
         if self.level:
-            turn = turn * [0.0, 1.0, 0.0]
+            rotation = rotation * [0.0, 1.0, 0.0]
         step = 2 * np.pi * self.steps_hz * time_s
         side = R_cw[:, 2, [1, 0, 2]] * [1.0, -1.0, 0.0]  # horizontal, to the right
         side = side / np.linalg.norm(side, axis=1, keepdims=True)
         way = way + self.bob * np.outer(np.sin(step), [0.0, 0.0, 1.0]) + self.sway * np.sin(step / 2)[:, None] * side
-        return Rotation.from_rotvec(turn).as_matrix() @ R_cw, center + way
+        return Rotation.from_rotvec(rotation).as_matrix() @ R_cw, center + way
 
 
 @dataclass(frozen=True)
@@ -175,8 +175,8 @@ class Clip:
         late = self.readout_s / camera.frame_span * clock
         R_cw, center_w = self.path.at(self.time_s[number] + np.append(0.0, late))
         rotation = Rotation.from_matrix(R_cw[1:] @ R_cw[0].T).as_rotvec()
-        motion, turn, way = RowMotion.of(clock, rotation, center_w[1:] - center_w[0], sites)
-        return turn @ R_cw[0], center_w[0] + way, motion
+        motion, correction, way = RowMotion.of(clock, rotation, center_w[1:] - center_w[0], sites)
+        return correction @ R_cw[0], center_w[0] + way, motion
 
 
 def is_clip(entry: Any) -> bool:

@@ -100,8 +100,8 @@ def _orbit(entry: dict[str, Any], camera: str) -> list[Pose]:
     radius, arc = number(entry["radius_m"], "path: radius_m"), number(entry.get("arc_deg", 360.0), "path: arc_deg")
     num = count(entry["num"], "path: num")
     # a whole round does not take its first photo twice
-    turns = np.linspace(0.0, arc, num, endpoint=abs(arc) < 360.0)
-    angle = np.radians(number(entry.get("start_deg", 0.0), "path: start_deg") + turns)
+    arcs = np.linspace(0.0, arc, num, endpoint=abs(arc) < 360.0)
+    angle = np.radians(number(entry.get("start_deg", 0.0), "path: start_deg") + arcs)
     centers = middle + radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(num)], 1)
     roll = number(entry.get("roll_deg", 0.0), "path: roll_deg")
     headings = np.sign(arc or 1.0) * np.stack([-np.sin(angle), np.cos(angle), np.zeros(num)], 1)
@@ -186,11 +186,11 @@ def motions_of(entry: Any, poses: list[Pose], frame_spans: list[float], seed: in
         return [RowMotion(p, v) for p, v in zip(phi / spans, velocity / spans, strict=True)]
     if kind == "rotation":
         take(entry, "motion", ("kind", "sigma_rad_per_frame"), ("still",))
-        turn, shift, drift = number(entry["sigma_rad_per_frame"], "motion: sigma_rad_per_frame"), 0.0, 0.0
+        rotation, shift, drift = number(entry["sigma_rad_per_frame"], "motion: sigma_rad_per_frame"), 0.0, 0.0
     else:
         optional = ("rotation_rad_per_frame", "translation_m_per_frame", "drift_m_per_frame")
         take(entry, "motion", ("kind",), (*optional, "still"))
-        turn, shift, drift = (number(entry.get(key, 0.0), f"motion: {key}") for key in optional)
+        rotation, shift, drift = (number(entry.get(key, 0.0), f"motion: {key}") for key in optional)
     still = entry.get("still", [])
     if any(isinstance(k, bool) or not isinstance(k, int) or not 0 <= k < num for k in still):
         raise FormatError(f"motion: still={still!r}, expected numbers of photos, 0 to {num - 1}")
@@ -198,7 +198,7 @@ def motions_of(entry: Any, poses: list[Pose], frame_spans: list[float], seed: in
     motions = []
     for k, pose in enumerate(poses):
         axis = rng.normal(size=3)
-        phi = turn * rng.normal() / frame_spans[k] * axis / np.linalg.norm(axis)
+        phi = rotation * rng.normal() / frame_spans[k] * axis / np.linalg.norm(axis)
         velocity = shift * shift_rng.normal() / frame_spans[k] * _directions(shift_rng, 1)[0]
         velocity = velocity + drift / frame_spans[k] * pose.heading_w
         motions.append(RowMotion() if k in still else RowMotion(phi, velocity))
@@ -249,8 +249,8 @@ def poses_and_motions(
         vibration = Vibration(travel=options.pop("travel_m", 0.0), **options)
     still = {names[k] for k in entry.get("still", [])}
     found = unsteady_motions({name: start[name] for name in names}, cameras, share, vibration, seed, still)
-    turned = [
-        replace(pose, R_cw=turn @ pose.R_cw, center_w=pose.center_w + way)
-        for pose, (_, turn, way) in zip(poses, found.values(), strict=True)
+    rotated = [
+        replace(pose, R_cw=rotation @ pose.R_cw, center_w=pose.center_w + way)
+        for pose, (_, rotation, way) in zip(poses, found.values(), strict=True)
     ]
-    return turned, [motion for motion, _, _ in found.values()]
+    return rotated, [motion for motion, _, _ in found.values()]

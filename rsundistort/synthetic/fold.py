@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..model.bend import Bend
-from ..model.camera import READOUTS, Camera
+from ..model.camera import Camera
 from ..model.motion import RowMotion
 from .lens import distort_rays, undistort_to_rays
 
@@ -74,7 +74,7 @@ def check_no_fold(
     motion = RowMotion(np.asarray(phi, float), np.asarray(np.zeros(3) if velocity is None else velocity, float), bend)
     num = [_GRID, _GRID]
     if bend is not None:
-        num[READOUTS[camera.readout][0]] = max(_GRID, 4 * len(bend.values) - 3)
+        num[camera.clock_axis] = max(_GRID, 4 * len(bend.values) - 3)
     uv = np.stack(np.meshgrid(_stations(camera.width, num[0]), _stations(camera.height, num[1])), -1).reshape(-1, 2)
     speeds = [_line_speed(camera, uv, motion, np.zeros(len(uv)))]
     if depth is not None and motion.moves:
@@ -87,7 +87,7 @@ def check_no_fold(
         raise InputError(f"{name}: the lens model shows nothing at any pixel of the photo")
     worst = int(np.nanargmax(speed))
     if speed[worst] >= 1:
-        axis = READOUTS[camera.readout][0]
+        axis = camera.clock_axis
         line = ("column", "row")[axis]
         raise InputError(
             f"the {line}s of {name} fold over: at pixel ({uv[worst, 0]:.0f}, {uv[worst, 1]:.0f}) the image runs on by "
@@ -118,13 +118,13 @@ def _line_speed(
 ) -> NDArray[np.float64]:
     """Lines (n,) by which the image of what pixels (n, 2) see runs on while one line is read; NaN beyond the lens."""
     K = camera.K
-    axis, sign = READOUTS[camera.readout]
+    axis, sign = camera.clock_axis, camera.clock_sign
     clock = sign * (uv[:, axis] - K[axis, 2]) / K[axis, axis]
     norm = undistort_to_rays(uv, camera)
     known = np.asarray(np.isfinite(norm).all(axis=1))
     rays = np.column_stack([np.where(known[:, None], norm, 0.0), np.ones(len(uv))])
-    turned, gone = motion.at(clock)
-    level = Rotation.from_rotvec(-turned).apply(rays)
+    rotated, gone = motion.at(clock)
+    level = Rotation.from_rotvec(-rotated).apply(rays)
     # small against the distance of what comes towards the camera
     fastest = float(np.abs((motion.at(clock + _STEP)[1] - gone) * inverse_depth[:, None]).max()) / _STEP
     step = _STEP / max(1.0, fastest)
@@ -132,8 +132,8 @@ def _line_speed(
     def position(late: float) -> NDArray[np.float64]:
         """Pixels (n, 2) of what the rays see, `late` after its own moment."""
         # X(t) = Exp(theta(t)) (X(0) - way(t)), so the camera's way is rotated by all of the time gone
-        turn, way = motion.at(clock + late)
-        return distort_rays(Rotation.from_rotvec(turn).apply(level - (way - gone) * inverse_depth[:, None]), camera)
+        rotation, way = motion.at(clock + late)
+        return distort_rays(Rotation.from_rotvec(rotation).apply(level - (way - gone) * inverse_depth[:, None]), camera)
 
     known &= np.linalg.norm(position(0.0) - uv, axis=1) < _LENS_PX
     moved_px = (position(step) - position(-step))[:, axis]

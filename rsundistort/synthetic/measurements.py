@@ -66,8 +66,8 @@ def project_rows(
     reached = np.zeros(len(points), bool)
     for _ in range(_MAX_STEPS):
         tau = clock_of(camera.readout, seen)
-        turn, way = motion.at(tau)
-        q = Rotation.from_rotvec(turn).apply((points - (center + way)) @ R.T)
+        rotation, way = motion.at(tau)
+        q = Rotation.from_rotvec(rotation).apply((points - (center + way)) @ R.T)
         ahead &= q[:, 2] > 1e-9
         q[~ahead] = (0.0, 0.0, 1.0)
         before, seen = seen, distort_rays(q, camera, np.eye(3))
@@ -106,7 +106,7 @@ def measure(
     noise_px: float = 0.0,
     seed: int = 0,
 ) -> Measured:
-    """What photos measure of points that they are known to see.
+    """Measurements of points that photos are known to see.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from .._kernels import raycast
 from ..errors import InputError
-from ..model.camera import READOUTS, Camera
+from ..model.camera import Camera
 from ..model.checks import check_finite
 from .lens import distort_rays, undistort_to_rays
 from .recipe import Noise, View
@@ -46,11 +46,11 @@ def line_poses(camera: Camera, view: View, delay: float = 0.0) -> tuple[NDArray[
     center_w : (lines, 3) array
         view.center_w + tau*velocity, and what the bend adds.
     """
-    axis, sign = READOUTS[camera.readout]
+    axis, sign = camera.clock_axis, camera.clock_sign
     lines = np.arange(camera.height if axis == 1 else camera.width)
     tau = sign * (lines - camera.K[axis, 2]) / camera.K[axis, axis] + delay
-    turn, way = view.motion.at(tau)
-    return Rotation.from_rotvec(turn).as_matrix() @ view.R_cw, view.center_w + way
+    rotation, way = view.motion.at(tau)
+    return Rotation.from_rotvec(rotation).as_matrix() @ view.R_cw, view.center_w + way
 
 
 def pixel_rays(camera: Camera, view: View, uv_raw: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -71,12 +71,12 @@ def pixel_rays(camera: Camera, view: View, uv_raw: ArrayLike) -> tuple[NDArray[n
         World frame; the directions have depth 1 in the camera.
     """
     uv = check_finite(uv_raw, (None, 2), "uv_raw")
-    axis, sign = READOUTS[camera.readout]
+    axis, sign = camera.clock_axis, camera.clock_sign
     tau = sign * (uv[:, axis] - camera.K[axis, 2]) / camera.K[axis, axis]
     rays_c = np.column_stack([undistort_to_rays(uv, camera), np.ones(len(uv))])
     tau, line = np.unique(tau, return_inverse=True)  # of whole photos there are few
-    turn, way = view.motion.at(tau)
-    return view.center_w + way[line], Rotation.from_rotvec(-turn)[line].apply(rays_c) @ view.R_cw
+    rotation, way = view.motion.at(tau)
+    return view.center_w + way[line], Rotation.from_rotvec(-rotation)[line].apply(rays_c) @ view.R_cw
 
 
 def _develop(radiance: NDArray[np.float64], exposure: float) -> NDArray[np.uint8]:
@@ -136,7 +136,7 @@ def render_view(
     moments = [((k * 7 + 3) % samples + 0.5) / samples - 0.5 for k in range(samples)] if view.exposure else [0.0]
     poses = [line_poses(camera, view, moment * view.exposure) for moment in moments]
     R_cw, center_w = (np.ascontiguousarray(np.stack(each, axis=1)) for each in zip(*poses, strict=True))
-    by_column = READOUTS[camera.readout][0] == 0
+    by_column = camera.clock_axis == 0
     suns = scene.light.sun_directions(samples)
     image = np.empty((camera.height, camera.width, 3))
     for row in range(0, camera.height, _STRIP_ROWS):

@@ -213,8 +213,8 @@ class Light:
         angle = order * np.pi * (3 - np.sqrt(5))
         spread = np.tan(np.radians(self.sun_radius_deg)) * radius
         local = np.stack([np.ones(num), spread * np.cos(angle), spread * np.sin(angle)], 1)
-        turn = Rotation.from_euler("yz", [-self.sun_elevation_deg, self.sun_azimuth_deg], degrees=True)
-        return np.asarray(turn.apply(local / np.linalg.norm(local, axis=1, keepdims=True)))
+        rotation = Rotation.from_euler("yz", [-self.sun_elevation_deg, self.sun_azimuth_deg], degrees=True)
+        return np.asarray(rotation.apply(local / np.linalg.norm(local, axis=1, keepdims=True)))
 
 
 def _sky_image(light: Light, seed: int) -> NDArray[np.float32]:
@@ -326,7 +326,7 @@ class Scene:
 
     @property
     def geometry(self) -> tuple[Any, ...]:
-        """What the kernels need to intersect rays; see `_kernels.raycast`."""
+        """Arguments of the kernels that intersect rays; see `_kernels.raycast`."""
         return self._ordered[1]
 
     @property
@@ -336,7 +336,7 @@ class Scene:
 
     @cached_property
     def look(self) -> tuple[Any, ...]:
-        """What the kernels need to colour a hit: textures, baked light, sky; seconds of work, done once."""
+        """Arguments of the kernels that colour a hit: textures, baked light, sky; seconds of work, done once."""
         patches = self.ordered_patches
         names = sorted(self.textures)
         levels, first_level, texels, start = [], [0], [], 0

@@ -180,12 +180,12 @@ def _mesh(entry: Any, where: str, textures: dict[str, Texture], folder: Path) ->
     uv_m = None
     if uv is not None and len(uv) == len(vertices) and texture is not None:
         uv_m = np.asarray(uv, float) * texture.size_m
-    turn = Rotation.from_euler("z", number(entry.get("yaw_deg", 0.0), f"{where}: yaw_deg"), degrees=True)
+    rotation = Rotation.from_euler("z", number(entry.get("yaw_deg", 0.0), f"{where}: yaw_deg"), degrees=True)
     scale = number(entry.get("scale", 1.0), f"{where}: scale")
     if scale <= 0:
         raise FormatError(f"{where}: scale={scale:g}, expected a positive number")
     origin = check_finite(entry.get("origin_w", (0.0, 0.0, 0.0)), (3,), f"{where}: origin_w")
-    patches = mesh(turn.apply(scale * vertices) + origin, faces, entry["texture"], uv_m)
+    patches = mesh(rotation.apply(scale * vertices) + origin, faces, entry["texture"], uv_m)
     if not patches:
         raise FormatError(f"{where}: every triangle of {path} is without area")
     return patches

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import FormatError, InputError, RsUndistortWarning
 from ..io.gyro import GyroLog
 from ..io.tables import read_table
-from ..model import READOUTS, Camera, RowMotion
+from ..model import Camera, RowMotion
 from ..model.checks import check_array, check_finite, frozen
 
 __all__ = [
@@ -127,7 +127,7 @@ class RowTable:
     def path(self, camera: Camera) -> Poses:
         """The pose as a function of the clock of a camera, which must not show more than the table has."""
         assert self.position is not None
-        axis, sign = READOUTS[camera.readout]
+        axis, sign = camera.clock_axis, camera.clock_sign
         last, f, c = (camera.width, camera.height)[axis] - 1, camera.K[axis, axis], camera.K[axis, 2]
         need = sorted(sign * (np.array([0, last]) - c) / f) if self.by_clock else [0.0, float(last)]
         slack = 1e-6 * (need[1] - need[0])
@@ -170,7 +170,7 @@ def unsteady(
 
     Returns
     -------
-    motion, turn, way
+    motion, correction, way
         As `RowMotion.of`. A spline that deviates from the motion by more than 0.02 px causes a warning.
     """
     start, end = camera.clock_range
@@ -185,12 +185,12 @@ def unsteady(
         rotation = rotation + np.outer((clock - middle) ** 2 / (2 * half), path.phi * np.asarray(share, np.float64))
     sites, readings = _SITES, Rotation.from_rotvec(rotation)
     if shake is not None:
-        turned, moved = shake(clock)
-        readings, position = Rotation.from_rotvec(turned) * readings, position + moved
+        rotated, moved = shake(clock)
+        readings, position = Rotation.from_rotvec(rotated) * readings, position + moved
     while True:
-        motion, turn, way = RowMotion.of(clock, readings.as_rotvec(), position, sites)
+        motion, correction, way = RowMotion.of(clock, readings.as_rotvec(), position, sites)
         found, gone = motion.at(clock)
-        missed = (Rotation.from_rotvec(found) * Rotation.from_matrix(turn) * readings.inv()).magnitude().max()
+        missed = (Rotation.from_rotvec(found) * Rotation.from_matrix(correction) * readings.inv()).magnitude().max()
         missed_px = float(
             np.diag(camera.K)[:2].max() * max(missed, np.linalg.norm(gone + way - position, axis=1).max())
         )
@@ -203,7 +203,7 @@ def unsteady(
             RsUndistortWarning,
             stacklevel=2,
         )
-    return motion, turn, way
+    return motion, correction, way
 
 
 def unsteady_motions(
@@ -251,10 +251,10 @@ def _shake(camera: Camera, vibration: Vibration, rng: np.random.Generator) -> Po
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     if vibration.axis != "random":
         axes[0] = np.eye(3)["xyz".index(vibration.axis)]
-    turn, move = vibration.amplitude_rad * axes[0], vibration.travel * axes[1]
+    swing, move = vibration.amplitude_rad * axes[0], vibration.travel * axes[1]
     rate = 2 * np.pi * rng.uniform(*vibration.periods) / camera.frame_span
     phase, late = rng.uniform(0, 2 * np.pi, 2)
-    return lambda clock: (np.outer(np.sin(rate * clock + phase), turn), np.outer(np.sin(rate * clock + late), move))
+    return lambda clock: (np.outer(np.sin(rate * clock + phase), swing), np.outer(np.sin(rate * clock + late), move))
 
 
 def tracks(log: GyroLog, cameras: list[Camera], readout_s: float | None, seed: int) -> list[Poses]:
@@ -274,7 +274,7 @@ def tracks(log: GyroLog, cameras: list[Camera], readout_s: float | None, seed: i
         first, span = camera.clock_range[0], camera.frame_span
 
         def path(clock: Array) -> tuple[Array, Array]:
-            rotation = log.turns(start_s + readout_s * np.clip((clock - first) / span, 0, 1))
+            rotation = log.rotations(start_s + readout_s * np.clip((clock - first) / span, 0, 1))
             return rotation, np.zeros_like(rotation)
 
         return path

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
-from ..model import READOUTS, Camera, RowMotion
+from ..model import Camera, RowMotion
 from .lens import distort_rays, undistort_to_rays
 
 __all__ = ["crop_camera", "largest_rectangle", "random_phi", "warp_mask", "warp_photo"]
@@ -99,7 +99,7 @@ def _lookup(camera: Camera, motion: RowMotion | ArrayLike) -> tuple[NDArray[np.f
     motion = motion if isinstance(motion, RowMotion) else RowMotion(np.asarray(motion, np.float64))
     w, h = camera.width, camera.height
     K = camera.K
-    axis, sign = READOUTS[camera.readout]
+    axis, sign = camera.clock_axis, camera.clock_sign
     u, v = np.arange(w, dtype=float), np.arange(h, dtype=float)
     if axis == 1:
         clock = np.repeat((sign * (v - K[1, 2]) / K[1, 1])[:, None], w, axis=1)
@@ -110,9 +110,9 @@ def _lookup(camera: Camera, motion: RowMotion | ArrayLike) -> tuple[NDArray[np.f
     steps = clock[:, 0] if axis == 1 else clock[0]
     R = Rotation.from_rotvec(-motion.at(steps)[0]).as_matrix()
     rays = np.dstack([ideal, np.ones((h, w))])
-    turned = np.einsum("vij,vuj->vui" if axis == 1 else "uij,vuj->vui", R, rays)
-    source = distort_rays(turned, camera).reshape(h, w, 2)
-    ahead = turned[..., 2] > 0  # not where the lens sees nothing
+    rotated = np.einsum("vij,vuj->vui" if axis == 1 else "uij,vuj->vui", R, rays)
+    source = distort_rays(rotated, camera).reshape(h, w, 2)
+    ahead = rotated[..., 2] > 0  # not where the lens sees nothing
     inside = ahead & (source >= 0).all(-1) & (source[..., 0] <= w - 1) & (source[..., 1] <= h - 1)
     return np.where(ahead[..., None], source, -1e6).astype(np.float32), inside
 

@@ -263,10 +263,10 @@ def _of_motions(
             "motions may be an error of the lens."
         )
     if (axis := _repeated(rec)) is not None and not {*known}.issuperset(rec.image_names):
-        turn = np.degrees(np.mean(rec.phi[:, axis] * rec.frame_span()))
+        rotation = np.degrees(np.mean(rec.phi[:, axis] * rec.frame_span()))
         reasons.append(
-            f"All photos appear to have rotated alike, by {abs(turn):.2f} degrees about {'xyz'[axis]}: an error of the "
-            "lens looks like that, and no hand moves so."
+            f"All photos appear to have rotated alike, by {abs(rotation):.2f} degrees about {'xyz'[axis]}: an error of "
+            "the lens looks like that, and no hand moves so."
         )
     if 2 * torn.sum() > rec.num_images:
         reasons.append("In most photos halves of the measurements do not agree on the motion found.")
@@ -313,9 +313,9 @@ def _doubts(
 ) -> dict[str, list[str]]:
     """Reasons against each photo."""
     rec = result.reconstruction
-    turn = rec.phi * rec.frame_span()[:, None]
+    rotation = rec.phi * rec.frame_span()[:, None]
     sigma = np.linalg.norm(result.sigma_phi, axis=1) * rec.frame_span()
-    times = np.abs(turn).max(1) / result.phi_rms
+    times = np.abs(rotation).max(1) / result.phi_rms
     counts = _counts(rec)
     doubts: dict[str, list[str]] = {}
     for i, name in enumerate(rec.image_names):
@@ -332,9 +332,9 @@ def _doubts(
             said.append(f"its motion is only known to +-{motions.sigma_px[i]:.1f} px")
         if times[i] > _FAR and motions.shift_px[i] > _UNSEEN_PX:
             said.append(f"it moved {times[i]:.0f} times as much as the other photos do")
-        if np.linalg.norm(turn[i]) - 2 * sigma[i] > most_phi.get(name, np.inf):
+        if np.linalg.norm(rotation[i]) - 2 * sigma[i] > most_phi.get(name, np.inf):
             said.append(
-                f"it appears to have rotated by {np.degrees(np.linalg.norm(turn[i])):.2f} degrees, but would be "
+                f"it appears to have rotated by {np.degrees(np.linalg.norm(rotation[i])):.2f} degrees, but would be "
                 f"blurred by more than {np.degrees(most_phi[name]):.2f}"
             )
     return doubts

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from ..bundle import BundleResult
+from ..bundle.layout import motion_end
 from ..model import Reconstruction
+from ..model.path import cross_matrices
 from ..model.projection import clock_of, project_points_with_jacobians, unproject_points
 
 __all__ = ["PhotoMotions", "photo_motions"]
@@ -58,17 +60,17 @@ def photo_motions(result: BundleResult) -> PhotoMotions:
         The solution, with a shutter model.
     """
     rec = result.reconstruction
-    nb = 12 if rec.shutter_model == "constant-motion" else 9
-    spread = np.repeat([result.phi_rms, result.velocity_rms * rec.baseline], 3)[: nb - 6]
+    nb = motion_end(rec.shutter_model)
+    sigmas = np.repeat([result.phi_rms, result.velocity_rms * rec.baseline], 3)[: nb - 6]
     found = np.zeros((4, rec.num_images))
     splits = 3 * rec.num_images
     for i, mine in enumerate(rec.observations.by_photo(rec.num_images)):
         if len(mine):
-            prior = np.concatenate([np.zeros(6), (rec.frame_span()[i] / np.maximum(spread, 1e-12)) ** 2])
+            prior = np.concatenate([np.zeros(6), (rec.frame_span()[i] / np.maximum(sigmas, 1e-12)) ** 2])
             photo = _Photo.of(rec, i, mine, result.sigma_px)
             found[:, i] = (
                 photo.shift_px(photo.motion[None])[0] + _bent_px(rec, i),
-                photo.spread_px(result.covariances[i, 6:, 6:]),
+                photo.motion_sigma_px(result.covariances[i, 6:, 6:]),
                 photo.difference_px(prior, _CHANCE / splits),
                 photo.covered,
             )
@@ -96,7 +98,7 @@ class _Photo:
     frame: Array
     size: Array
     along: int
-    turn: Array
+    rotation: Array
 
     @classmethod
     def of(cls, rec: Reconstruction, i: int, mine: NDArray[np.int64], sigma_px: float) -> _Photo:
@@ -106,9 +108,9 @@ class _Photo:
         moving = rec.shutter_model == "constant-motion"
         xy, valid, J = project_points_with_jacobians(points_c, camera, motion, rec.shutter_model)
         mine, points_c = mine[valid], points_c[valid]
-        blocks = [-J.point[valid] @ _cross(points_c), -J.point[valid], J.phi[valid]]
+        blocks = [-J.point[valid] @ cross_matrices(points_c), -J.point[valid], J.phi[valid]]
         if moving:
-            blocks[0] = blocks[0] - J.velocity[valid] @ _cross(motion.velocity[None])
+            blocks[0] = blocks[0] - J.velocity[valid] @ cross_matrices(motion.velocity[None])
             blocks.append(J.velocity[valid])
         precision = 1.0 / (sigma_px * obs.sigma[mine])
         depth = float(np.median(points_c[:, 2])) if len(points_c) else 1.0
@@ -142,11 +144,11 @@ class _Photo:
         shift = np.linalg.norm(np.einsum("fia,ka->kfi", self.frame, motions), axis=2)
         return np.asarray(shift.max(axis=1, initial=0.0))
 
-    def spread_px(self, covariance: Array) -> float:
+    def motion_sigma_px(self, covariance: Array) -> float:
         """Largest standard deviation of a displacement by the motion of this covariance, velocities in the world."""
-        turn = np.eye(len(self.motion))
-        turn[3:, 3:] = self.turn[: len(turn) - 3, : len(turn) - 3]
-        covariance = turn @ covariance @ turn.T
+        rotation = np.eye(len(self.motion))
+        rotation[3:, 3:] = self.rotation[: len(rotation) - 3, : len(rotation) - 3]
+        covariance = rotation @ covariance @ rotation.T
         variance = np.einsum("fia,ab,fib->f", self.frame, covariance, self.frame).max(initial=0.0)
         return float(np.sqrt(variance * self._noise(self.residuals, self.J.shape[2])))
 
@@ -192,10 +194,3 @@ class _Photo:
         if fdtrc(len(difference), max(self.residuals.size - 2 * nb, 1), unlike) > chance:
             return 0.0
         return float(self.shift_px(difference[None])[0])
-
-
-def _cross(vectors: Array) -> Array:
-    """(n, 3, 3) matrices that take x to vector cross x."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)

@@ -28,7 +28,7 @@ class ReadoutTime(NamedTuple):
 
 
 def readouts_by_speed(
-    time_s: Array, part: NDArray[np.int64], R_cw: Array, turn_sigma: Array, phi: Array, phi_sigma: Array,
+    time_s: Array, part: NDArray[np.int64], R_cw: Array, rotation_sigma: Array, phi: Array, phi_sigma: Array,
     readout_s: float,
 ) -> tuple[ReadoutTime, ReadoutTime] | None:  # fmt: skip
     """The readout time by rotations slower and faster than a quarter of the frame rate.
@@ -42,7 +42,7 @@ def readouts_by_speed(
     ----------
     time_s, part : (m,) array
         When the middle lines of the frames were read, and the parts that cuts separate.
-    R_cw, turn_sigma : (m, 3, 3), (m, 3) array
+    R_cw, rotation_sigma : (m, 3, 3), (m, 3) array
         Rotations of the frames, each found from its own measurements, and their standard deviations; NaN where unknown.
     phi, phi_sigma : (m, 3) array
         Likewise rotations during the readout, radians per frame.
@@ -55,7 +55,7 @@ def readouts_by_speed(
         By slow and by fast rotations; None if there are too few frames, or a kind of rotation is lost in the noise.
     """
     spectra = [
-        _spectra(time_s[mine], R_cw[mine], turn_sigma[mine], phi[mine], phi_sigma[mine], readout_s)
+        _spectra(time_s[mine], R_cw[mine], rotation_sigma[mine], phi[mine], phi_sigma[mine], readout_s)
         for each in np.unique(part)
         if len(mine := np.flatnonzero(part == each)) >= _FEWEST
     ]
@@ -68,7 +68,7 @@ def readouts_by_speed(
 
 
 def _spectra(
-    time_s: Array, R_cw: Array, turn_sigma: Array, phi: Array, phi_sigma: Array, readout_s: float
+    time_s: Array, R_cw: Array, rotation_sigma: Array, phi: Array, phi_sigma: Array, readout_s: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.complex128], NDArray[np.complex128], Array, Array]:
     """Whether frequencies (n,) are fast; spectra (n, 3) of phi and of the rates; and power (n, 3) of their noise."""
     known = np.isfinite(R_cw).all(axis=(1, 2)) & np.isfinite(phi).all(1) & np.isfinite(phi_sigma).all(1)
@@ -77,22 +77,22 @@ def _spectra(
         return np.zeros(0, bool), none.astype(complex), none.astype(complex), none, none
     time, R, lines = time_s[known], R_cw[known], phi[known]
     steps = Rotation.from_matrix(R[1:] @ R[:-1].transpose(0, 2, 1)).as_rotvec()
-    turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    rotated = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     step_s = float(np.median(np.diff(time)))
     length = time[-1] - time[0] + step_s
     # the rate of a path under a window: that of both, less the window's own
     phase = 2 * np.pi * (time - time[0] + 0.5 * step_s) / length
     window, slope = 0.5 * (1 - np.cos(phase)), np.pi / length * np.sin(phase)
-    turned -= np.average(turned, axis=0, weights=window)
+    rotated -= np.average(rotated, axis=0, weights=window)
     frequency = np.arange(_LEAST_PERIODS, int(0.5 * length / step_s)) / length
     waves = np.exp(-2j * np.pi * frequency[:, None] * time)
     circular = 2j * np.pi * frequency[:, None]
     # a steady motion that is fitted to a period shows less of it, in its rate and in its pose
     z = np.maximum(np.pi * frequency * abs(readout_s), 1e-3)
     shown = 3 * (np.sin(z) - z * np.cos(z)) / z**2 / np.sin(z)
-    rates = (circular * (waves @ (window[:, None] * turned)) - waves @ (slope[:, None] * turned)) * shown[:, None]
-    of_turns, of_lines = turn_sigma[known] ** 2, phi_sigma[known] ** 2
-    rate_noise = np.abs(circular) ** 2 * (window**2 @ of_turns) + slope**2 @ of_turns
+    rates = (circular * (waves @ (window[:, None] * rotated)) - waves @ (slope[:, None] * rotated)) * shown[:, None]
+    of_rotations, of_lines = rotation_sigma[known] ** 2, phi_sigma[known] ** 2
+    rate_noise = np.abs(circular) ** 2 * (window**2 @ of_rotations) + slope**2 @ of_rotations
     line_noise = np.broadcast_to(window**2 @ of_lines, rate_noise.shape)
     fast = frequency > 0.25 / step_s
     return fast, waves @ (window[:, None] * lines), rates, line_noise, rate_noise * shown[:, None] ** 2

@@ -120,7 +120,7 @@ def facts_of_exif(block: bytes, xmp: bytes = b"") -> ExifFacts:
 
 
 def _facts(tags: dict[int, bytes | float | None]) -> ExifFacts:
-    """What the tags of the main and of the EXIF directory say."""
+    """Facts in the tags of the main and of the EXIF directory."""
 
     def text(tag: int) -> str | None:
         return _text(tags.get(tag))

@@ -238,8 +238,8 @@ def _rotation(stated: Mapping[str, float]) -> tuple[tuple[float, float, float], 
             yaw, pitch, roll = (stated[name] for name in names)
             if any((yaw, pitch, roll)) and abs(yaw) <= 360 and abs(pitch) <= 180 and abs(roll) <= 180:
                 axes = np.stack([right, down, np.cross(right, down)])
-                turned = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True).as_matrix()
-                north, east, down_w = (turned @ axes.T).tolist()
+                rotated = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True).as_matrix()
+                north, east, down_w = (rotated @ axes.T).tolist()
                 return tuple(zip(east, north, np.negative(down_w).tolist(), strict=True))
     return None
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import FileError
-from ...model.orientation import INVERSE, compose_orientations, turn_pixels
+from ...model.orientation import INVERSE, compose_orientations, orient_pixels
 from .boxes import primary_properties
 from .metadata import Metadata
 
@@ -72,7 +72,7 @@ def read_heif(data: bytes, name: str) -> tuple[NDArray[np.uint16], Metadata]:
         raise _cannot_be_decoded(name, error) from error
     if pixels.dtype == np.uint8:
         pixels = pixels.astype(np.uint16) * 257
-    return turn_pixels(pixels, INVERSE[_orientation(data)]), metadata
+    return orient_pixels(pixels, INVERSE[_orientation(data)]), metadata
 
 
 def _cannot_be_decoded(name: str, error: Exception) -> FileError:

@@ -40,24 +40,24 @@ class Metadata:
         return rectified_by(self.xmp)
 
     def with_orientation(self, orientation: int) -> Metadata:
-        """The same with another orientation."""
+        """Metadata with another orientation."""
         exif, _ = corrected_exif(self.exif, orientation=orientation)
         xmp, _ = corrected_xmp(self.xmp, orientation=orientation)
         return replace(self, exif=exif, xmp=xmp)
 
     def without_exposure(self) -> Metadata:
-        """The same without the time of the exposure: the lines of a simulated photo are exposed for none."""
+        """Metadata without the time of the exposure: the lines of a simulated photo are exposed for none."""
         try:
             return replace(self, exif=exif_of_tiff(self.exif, without=EXPOSURE_TAGS))
         except Damaged:
             return self
 
     def marked(self, version: str) -> Metadata:
-        """That of the photo after that version of rsundistort rectified it."""
+        """Metadata of the photo after that version of rsundistort rectified it."""
         return replace(self, xmp=marked_xmp(self.xmp, version))
 
     def only_mark(self) -> Metadata:
-        """The same without the XMP, except for the mark of having been rectified."""
+        """Metadata without the XMP, except for the mark of having been rectified."""
         version = self.rectified_by
         return replace(self, xmp=b"" if version is None else marked_xmp(b"", version))
 
