@@ -20,7 +20,7 @@ import numpy as np
 from rsundistort import BundleOptions, RunOptions, Solution, bundle_adjust, read_solution
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers, use_threads
-from rsundistort.bundle.options import BundleResult
+from rsundistort.bundle.bundle_options import BundleResult
 from rsundistort.input.load import load_photos
 from rsundistort.sfm import map_photos, match_photos, retriangulate
 from rsundistort.simulate import WarpOptions, simulate_warp

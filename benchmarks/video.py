@@ -43,14 +43,14 @@ from rsundistort.batch.geometry import SceneGeometry, ScenePoints
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
 from rsundistort.evaluation import psnr
-from rsundistort.input.clip import read_clip
+from rsundistort.input.key_frames import read_clip
 from rsundistort.input.load import load_photos
 from rsundistort.io.video import VideoReader, frame_name
 from rsundistort.model import RowMotion, SolvedImage
 from rsundistort.model.projection import unproject_points
 from rsundistort.solve import RunOptions, SolveOptions
-from rsundistort.solve.clip import frame_path, solve_clip
 from rsundistort.solve.outcome import Solved
+from rsundistort.solve.video_path import frame_path, solve_clip
 
 WALK = Path(__file__).parents[1] / "sample_scenes" / "walk"
 GOPRO = "592,592,426.5,239.5"

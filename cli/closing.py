@@ -229,7 +229,7 @@ def _video(solution: Solution) -> list[str]:
 
 def _readout_time(solution: Solution) -> list[str]:
     """Lines on the readout time that was measured from a video, and on the evidence."""
-    from rsundistort.report.readout import readout_facts
+    from rsundistort.report.readout_facts import readout_facts
 
     facts = solution.quality.get("readout_time")
     if not facts:

@@ -13,7 +13,7 @@ from make_photos import texture
 from rsundistort_cli.main import cli
 
 from rsundistort.errors import InputError, RsUndistortWarning
-from rsundistort.input.clip import read_clip
+from rsundistort.input.key_frames import read_clip
 from rsundistort.io.video import VideoReader
 
 av = pytest.importorskip("av")

@@ -32,7 +32,7 @@ from rsundistort.model.bend import bend_functions, splines_at
 from rsundistort.model.projection import at_depth, clock_of, project_points_with_jacobians
 from rsundistort.model.reprojection import reprojection_residuals
 from rsundistort.rectify import largest_shift_px
-from rsundistort.rectify.coarse import TOLERANCE_PX, coarse_grid
+from rsundistort.rectify.coarse_grid import TOLERANCE_PX, coarse_grid
 from rsundistort.rectify.maps import rectified_rays
 from rsundistort.verdict import judge
 

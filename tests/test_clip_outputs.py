@@ -28,9 +28,9 @@ from rsundistort import (
     rectify,
     run,
 )
-from rsundistort.batch.clip import rectify_clip
 from rsundistort.batch.geometry import PhotoGeometry
 from rsundistort.batch.progress import StageLog
+from rsundistort.batch.video_frames import rectify_clip
 from rsundistort.batch.workers import Workers
 from rsundistort.errors import FileError, InputError
 from rsundistort.io import write_path
@@ -39,10 +39,10 @@ from rsundistort.io.video_like import pixels_of
 from rsundistort.io.video_writer import write_video
 from rsundistort.model.orientation import orient_path
 from rsundistort.model.path import CameraPath
-from rsundistort.report.readout import readout_facts
+from rsundistort.report.readout_facts import readout_facts
 from rsundistort.solve import MeasuredReadout, measure_readout
 from rsundistort.solve.run_outputs import Outputs
-from rsundistort.verdict.clip import problem_of
+from rsundistort.verdict.judge_path import problem_of
 
 av = pytest.importorskip("av")
 

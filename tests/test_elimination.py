@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from rsundistort import BundleOptions
 from rsundistort._kernels import blocks
 from rsundistort.bundle import envelope
-from rsundistort.bundle.coarse import CoarseSpace
+from rsundistort.bundle.coarse_space import CoarseSpace
 from rsundistort.bundle.conjugate_gradients import solve_iteratively
 from rsundistort.bundle.elimination import Elimination
 from rsundistort.bundle.envelope import Envelope

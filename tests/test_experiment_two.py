@@ -22,7 +22,7 @@ from rsundistort.experiments import (
     experiment_two,
     two,
 )
-from rsundistort.experiments.figures import camera_paths, plan_axes
+from rsundistort.experiments.plots import camera_paths, plan_axes
 from rsundistort.synthetic import look_at
 
 NAMES = [f"{k}.png" for k in range(PHOTOS)]

@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, Observations, Reconstruction, bundle_adjust
 from rsundistort.bundle.own_motions import own_motions
-from rsundistort.bundle.path import FramePath, PathPrior, orthogonal, with_path_motions
-from rsundistort.bundle.path import PathState as State
+from rsundistort.bundle.path_prior import FramePath, PathPrior, orthogonal, with_path_motions
+from rsundistort.bundle.path_prior import PathState as State
 from rsundistort.errors import InputError
 from rsundistort.model.path import CameraPath, inverse_left_jacobians
-from rsundistort.solve.clip import readouts_of_halves
-from rsundistort.verdict.clip import judge_clip, unfollowed_px
+from rsundistort.solve.video_path import readouts_of_halves
+from rsundistort.verdict.judge_path import judge_clip, unfollowed_px
 
 FRAME_S = 1 / 30
 
@@ -134,7 +134,7 @@ def test_the_motion_of_a_frame_is_that_of_the_path_around_it() -> None:
     state = replace(prior.start(truth), pace=prior.pace_prior)
     bent = with_path_motions(truth, path, state)
     stated = orthogonal(bent)
-    from rsundistort.bundle.path import path_solution
+    from rsundistort.bundle.path_prior import path_solution
 
     found = path_solution(truth, path, state, np.zeros(1)).path
     clock_s = 0.02 / truth.cameras[0].frame_span

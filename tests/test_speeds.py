@@ -7,7 +7,7 @@ import pytest
 from clips import HandHeld
 from scipy.spatial.transform import Rotation
 
-from rsundistort.verdict.clip import problem_of
+from rsundistort.verdict.judge_path import problem_of
 from rsundistort.verdict.speeds import readouts_by_speed
 
 FRAME_S = 1 / 30

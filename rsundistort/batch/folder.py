@@ -13,7 +13,7 @@ from ..io import list_photos, read_solution
 from ..io.outputs import batch_folder
 from ..io.places import Place, RemoteFolder, local_place, place_of, write_in
 from ..io.record import Record
-from ..io.solution import solution_to_bytes
+from ..io.solution_json import solution_to_bytes
 from ..model import Solution
 from ..model.orientation import in_stored_frame, orient_solution, split_mirror
 from .geometry import SceneGeometry, ScenePoints, with_depths

@@ -9,8 +9,8 @@ import numpy as np
 
 from ..errors import InputError
 from ..model import Reconstruction, check_shutter_model
+from .bundle_options import BundleOptions, BundleResult
 from .layout import Layout
-from .options import BundleOptions, BundleResult
 from .prior_sigmas import estimates_sigmas, starting_sigmas
 from .problem import BundleProblem
 from .rounds import Rounds

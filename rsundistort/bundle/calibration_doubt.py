@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model import Camera
+from .bundle_options import BundleOptions
 from .normal_equations import Function, NormalEquations
-from .options import BundleOptions
 
 __all__ = ["CalibrationDoubt"]
 

@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..model import SHUTTER_MODELS, Observations, Reconstruction, other_axis
 from ..model.reprojection import reprojection_residuals
 from .adjust import MODEL_SEQUENCE, bundle_adjust, objective
-from .options import BundleOptions
+from .bundle_options import BundleOptions
 from .prior_sigmas import PriorSigmas
 from .remains import CLIP, WAVES, agreement_of_waves, errors_without, half_across_readout, warps, waves
 

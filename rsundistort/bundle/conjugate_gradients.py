@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._kernels import blocks
-from .coarse import CoarseSpace
+from .coarse_space import CoarseSpace
 from .reduced import Factored, Reduced, factor, products
 from .structure import BlockPattern
 

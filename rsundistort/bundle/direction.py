@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ..model import Reconstruction, other_axis
 from .adjust import adjust_sequence
+from .bundle_options import BundleOptions, BundleResult
 from .choice import clipped_errors, standard_errors
-from .options import BundleOptions, BundleResult
 
 __all__ = ["ReadoutChoice", "choose_readouts"]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .coarse import CoarseSpace
+from .coarse_space import CoarseSpace
 from .conjugate_gradients import solve_iteratively
 from .envelope import Envelope
 from .reduced import Factored, Reduced, factor

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..model import BEND_GROUPS, SHUTTER_MODELS, Bend, Reconstruction
 from ..model.bend import bend_functions, bend_pieces, splines_at
-from .options import BundleOptions
+from .bundle_options import BundleOptions
 
 __all__ = ["Layout", "motion_end"]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model import Reconstruction
-from .options import BundleOptions
+from .bundle_options import BundleOptions
 from .prior_sigmas import PriorSigmas
 from .problem import BundleProblem, State
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from .bundle_options import BundleOptions, BundleResult
 from .calibration_doubt import CalibrationDoubt
 from .jackknife import inflation_of
-from .options import BundleOptions, BundleResult
 from .prior_sigmas import PriorSigmas
 from .problem import BundleProblem
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model import Reconstruction
+from .bundle_options import BundleOptions
 from .layout import Layout
-from .options import BundleOptions
-from .path import PathPrior
+from .path_prior import PathPrior
 
 __all__ = [
     "Common",

@@ -15,18 +15,18 @@ from .._kernels import residuals
 from ..errors import InputError
 from ..model import Camera, Reconstruction, check_shutter_model
 from ..model.reprojection import camera_arrays, motion_tables, observed_lens_pixels, plain_arrays
+from .bundle_options import LOSSES, BundleOptions
 from .common_motion import LEAST_PHOTOS, MotionMeans
 from .connections import Border, CommonPrior, Coupling
 from .elimination import Elimination
 from .intrinsics import INTRINSICS, check_lenses, deviation, moved_camera, prior_weight
 from .jackknife import Partition, by_corner, by_place
+from .known_lengths import LengthResiduals
+from .known_positions import KnownPlaces, PlaceResiduals
 from .layout import Layout
-from .lengths import LengthResiduals
 from .lens_field import LensFields
 from .normal_equations import Marginals, NormalEquations, Step
-from .options import LOSSES, BundleOptions
-from .path import PathPrior, PathState
-from .places import KnownPlaces, PlaceResiduals
+from .path_prior import PathPrior, PathState
 from .prior_sigmas import PriorSigmas
 from .structure import Structure
 

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..model import Reconstruction
 from ..model.reprojection import reprojection_residuals
+from .bundle_options import BundleOptions, BundleResult
 from .calibration_doubt import CalibrationDoubt
 from .common_motion import CommonMotion
 from .intrinsics import pixels_of
 from .jackknife import Inflation, Partition, inflated, inflation
 from .layout import Layout
 from .normal_equations import NormalEquations
-from .options import BundleOptions, BundleResult
-from .path import (
+from .path_prior import (
     FramePath,
     PathPrior,
     PathState,

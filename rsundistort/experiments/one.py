@@ -28,7 +28,7 @@ from ..io.rules import Between, check
 from ..model import Observations, Reconstruction, RowMotion
 from ..report.figures import need_matplotlib
 from ..synthetic import project_rows
-from .figures import cumulative_histograms
+from .plots import cumulative_histograms
 from .scenes import KnownScene, load_scene
 
 __all__ = ["METHODS", "OneOptions", "check_settings", "experiment_one", "read_trials", "summarize"]

@@ -22,8 +22,8 @@ from ..report.figures import need_matplotlib
 from ..solve import RunOptions, SolveOptions, run
 from ..solve.run_outputs import files_of_run
 from ..versions import versions
-from .figures import camera_paths
 from .paths import PathComparison, compare_paths
+from .plots import camera_paths
 
 __all__ = ["TwoOptions", "experiment_two"]
 

@@ -9,7 +9,7 @@ from typing import Any
 from ..batch.progress import StageLog
 from ..errors import InputError
 from ..io.video import VideoFrames, extract_frames, is_video
-from .clip import Clip, read_clip
+from .key_frames import Clip, read_clip
 
 __all__ = ["PhotoSource", "find_photos"]
 

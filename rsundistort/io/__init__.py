@@ -18,7 +18,7 @@ from .photos.images import MAX_MEGAPIXELS, RAW_AS, Photo, list_photos, output_na
 from .photos.metadata import Metadata
 from .readout_times import readout_time
 from .shutter_poses import write_shutter_poses
-from .solution import read_solution, write_solution
+from .solution_json import read_solution, write_solution
 from .trajectory import write_path, write_point_cloud, write_trajectory
 from .video import VideoFrames, extract_frames, is_video
 

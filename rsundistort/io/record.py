@@ -13,7 +13,7 @@ from ..model.checks import check_photo_name
 from .journal import Journal, entries_of
 from .json_text import parse_json
 from .places import File, Place, RemoteFolder, delete_in, stamps_of, text_in, write_in
-from .solution import FORMAT
+from .solution_json import FORMAT
 
 __all__ = ["Record", "is_inside"]
 

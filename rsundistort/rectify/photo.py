@@ -18,7 +18,7 @@ from ..model import AtInfinity, Camera, Depth, DepthMap, RowMotion, check_shutte
 from ..model.checks import check_kind, check_one_of, check_whole
 from ..model.depth import check_depth
 from ..model.projection import motion_of
-from .coarse import coarse_grid
+from .coarse_grid import coarse_grid
 from .maps import fill_rows, rectified_rays, seen_by
 from .pixel_depths import DepthRows
 

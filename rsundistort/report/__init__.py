@@ -2,8 +2,8 @@
 
 from .diagnostics import Diagnostics, read_diagnostics, write_diagnostics
 from .figures import write_figures
+from .map_facts import map_facts
 from .page import write_report
-from .places import map_facts
 from .source import relative_folder
 from .verdict import Verdict, verdict_of
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ..errors import FileError, FormatError
 from ..io import output_name, read_solution
-from ..io.solution import BENT_VERSION
+from ..io.solution_json import BENT_VERSION
 from ..model import Solution
 from .diagnostics import Diagnostics, read_diagnostics
 

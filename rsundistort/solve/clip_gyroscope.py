@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from ..bundle import BundleResult
 from ..errors import RsUndistortError, RsUndistortWarning
-from ..input.clip import Clip
 from ..input.gyro_alignment import GyroAlignment, NoAlignment, align_gyro
+from ..input.key_frames import Clip
 from ..input.stabilisation import Regression
 from ..io.gpmf import has_telemetry
 from ..io.gyro import GyroLog, read_gyro
-from ..verdict.clip import ReadoutTime
+from ..verdict.judge_path import ReadoutTime
 
 __all__ = ["Felt", "felt_gyroscope", "own_gyroscope", "readout_of", "rotations_between"]
 

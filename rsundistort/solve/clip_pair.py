@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ReconstructionError
-from ..input.clip import Clip
+from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos
 from ..model import Observations, Reconstruction, RowMotion
 from ..model.projection import unproject_points

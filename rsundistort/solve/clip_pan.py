@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..input.clip import Clip
+from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos
 from ..model import Camera, Observations, Reconstruction, RowMotion
 from ..model.projection import unproject_points

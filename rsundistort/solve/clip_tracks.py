@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..input.clip import Clip, greys_of
+from ..input.key_frames import Clip, greys_of
 from ..model import Camera, Observations, Reconstruction, RowMotion
 from ..model.projection import unproject_points
 from ..sfm.flow import flow_between

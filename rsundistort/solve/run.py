@@ -12,10 +12,10 @@ from ..batch.progress import ProgressCallback, StageLog
 from ..batch.workers import Workers, use_threads
 from ..bundle import BundleOptions
 from ..errors import InputError, RsUndistortWarning
-from ..input.clip import Clip
 from ..input.exposure import bounded_by_exposure
 from ..input.frames import find_photos
 from ..input.gyroscope import GyroOptions, Readouts, gyro_contradiction, gyro_motions, known_readouts
+from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos, load_photos
 from ..input.photo_cameras import camera_file_of
 from ..input.unknown_focal import with_focal_lengths
@@ -28,13 +28,13 @@ from ..io.places import local_place
 from ..io.record import Record
 from ..io.video import VideoFrames
 from ..model import Reconstruction, Solution
-from .clip import frame_path, solve_clip
 from .going_on import RunFolder, key_of, run_folder
 from .model_sequence import solve_photos
 from .outcome import Solved
 from .run_options import RunOptions, SolveOptions
 from .run_outputs import OF_VIDEOS, REPLACED, VIDEO, Outputs, check_usd, files_of_run, inputs_of, photo_times
 from .survey import survey_of
+from .video_path import frame_path, solve_clip
 
 __all__ = ["run", "solve_frames"]
 

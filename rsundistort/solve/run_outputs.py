@@ -16,12 +16,12 @@ from pathlib import Path, PurePath
 import numpy as np
 from numpy.typing import NDArray
 
-from ..batch.clip import rectify_clip
 from ..batch.geometry import DEPTHS, PhotoGeometry, SceneGeometry, ScenePoints, with_depths
 from ..batch.many_photos import PointColors, mask_names, rectify_photos
 from ..batch.one_photo import applied_part
 from ..batch.progress import StageLog
 from ..batch.rectify_options import RectifyOptions
+from ..batch.video_frames import rectify_clip
 from ..batch.views import with_view
 from ..batch.workers import Workers
 from ..colmap.rectified_model import ModelIds

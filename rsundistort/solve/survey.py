@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..bundle import CONTROL_SIGMA_PX, KnownPlaces, place_control, scale_of_lengths, with_control
-from ..bundle.places import point_of
+from ..bundle.known_positions import point_of
 from ..errors import InputError, RsUndistortWarning
 from ..input.positions import MapFrame, PhotoPositions, frame_at, frame_of_control, positions_of
 from ..io import ExifFacts

@@ -3,12 +3,12 @@
 from .flight import look_at
 from .measurements import Measured, measure, project_rows
 from .plausible import check_recipe
-from .points import TruePoints, true_points
 from .recipe import Noise, Recipe, View, load_recipe
 from .render import add_noise, line_poses, pixel_rays, render_depth, render_view, rs_shift_px
 from .scene import Light, Opening, Patch, Scene, box, wall
 from .surfaces import height_field, mesh
 from .textures import Texture
+from .true_points import TruePoints, true_points
 from .unsteady import RowTable, Vibration, read_row_tables
 from .warp import random_phi, warp_photo
 

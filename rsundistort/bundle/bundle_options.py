@@ -14,9 +14,9 @@ from ..model.checks import check_fields
 from ..model.former_fields import former_fields
 from .common_motion import CommonMotion
 from .intrinsics import GuessedCameras, check_refined
-from .lengths import check_lengths
-from .path import FramePath, PathSolution
-from .places import KnownPlaces
+from .known_lengths import check_lengths
+from .known_positions import KnownPlaces
+from .path_prior import FramePath, PathSolution
 
 __all__ = ["DEVIATIONS", "LOSSES", "BundleOptions", "BundleResult"]
 

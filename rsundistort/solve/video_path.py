@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 from ..batch.progress import StageLog
 from ..bundle import BundleOptions, BundleResult, bundle_adjust
 from ..bundle.own_motions import OwnMotions, own_motions
-from ..bundle.path import FramePath, PathStart
+from ..bundle.path_prior import FramePath, PathStart
 from ..critical import heal
 from ..errors import RsUndistortWarning
-from ..input.clip import Clip
+from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos
 from ..input.stabilisation import Stabilisation, calmer_than_felt, judge_stabilisation
 from ..io.gyro import GyroLog
 from ..io.kept import Kept
 from ..model import Reconstruction
 from ..sfm import MatchedPhotos, retriangulate
-from ..verdict.clip import ReadoutTime, judge_clip, unfollowed_px
+from ..verdict.judge_path import ReadoutTime, judge_clip, unfollowed_px
 from ..verdict.speeds import readouts_by_speed
 from .clip_gyroscope import Felt, felt_gyroscope, own_gyroscope, readout_of, rotations_between
 from .clip_pair import two_frames

@@ -17,7 +17,7 @@ from ..input.unknown_focal import with_focal_lengths
 from ..io import is_video
 from ..io.outputs import work_folder
 from ..io.places import local_place
-from ..verdict.clip import problem_of
+from ..verdict.judge_path import problem_of
 from .run import solve_frames
 from .run_options import RunOptions
 

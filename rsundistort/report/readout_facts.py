@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ..verdict.clip import problem_of
+from ..verdict.judge_path import problem_of
 
 __all__ = ["readout_facts"]
 
