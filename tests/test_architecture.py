@@ -58,6 +58,11 @@ def test_files_functions_and_commands_are_short():
                 assert node.end_lineno - first <= 80, f"{path.name}: {node.name}"
 
 
+def test_names_of_modules_occur_once_but_for_kernels_and_commands():
+    names = [path.name for path in (ROOT / "rsundistort").rglob("*.py") if path.parent.name != "_kernels"]
+    assert sorted(name for name in set(names) if names.count(name) > 1) == ["__init__.py"]
+
+
 def test_lines_of_markdown_are_short_but_for_tables():
     for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("sample_scenes/**/*.md")]:
         for line in path.read_text(encoding="utf-8").splitlines():
