@@ -476,6 +476,11 @@ class BundleProblem:
         """Photos (o,), points (o,) as in a state, and noise (o,) in pixels of the equations' measurements."""
         return self._structure.frame_idx, self._structure.point_idx, self._sigma_px
 
+    @property
+    def by_photo(self) -> list[NDArray[np.int64]]:
+        """The equations' measurements of each photo."""
+        return np.split(self._structure.frame_order, self._structure.frame_start[1:-1])
+
     def _camera_jacobians(self, state: State) -> NDArray[np.float64]:
         """Weighted Jacobians (o, 2, nc) of what is solved for of the cameras."""
         J, of_photo = self._by_lens(state)
@@ -512,8 +517,10 @@ class BundleProblem:
                     J[:, :, k] += of_photo[:, :, 1] * own[:, 1, None]
                 if name in ("f", "fy"):
                     J[:, :, k] += of_photo[:, :, 2] * own[:, 2, None]
-        self._lens_of, self._lens = state, (np.ascontiguousarray(J), of_photo)
-        return self._lens
+        found = np.ascontiguousarray(J), of_photo
+        if self._options.varying:  # else nobody asks twice
+            self._lens_of, self._lens = state, found
+        return found
 
     def cost(self, state: State) -> float:
         """Half the robust sum of squares in units of the noise, with the priors."""
