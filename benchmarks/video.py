@@ -15,7 +15,8 @@ Prints one JSON object a line. Clips are rendered into FOLDER once (`clips.py`: 
     gopro    ../shared/video: clock, axes and rotation of its gyroscope, readout by pictures and by the gyroscope
     peer     `run` of videos, each in a process of its own, beside pycolmap's extract, match sequentially, map and
              undistort with default options, on the same key frames and with the same camera: seconds and peaks
-    length   the same `run` of the GoPro's video, played to and fro for so many frames: seconds a frame, and peaks
+    length   the same `run` of the GoPro's video, played to and fro for so many frames: seconds a frame, and peaks;
+             on the way back upside down, so that lines are read from first to last as the camera reads them
 """
 
 from __future__ import annotations
@@ -321,16 +322,24 @@ def peer(args: argparse.Namespace) -> None:
 
 
 def to_and_fro(video: Path, out: Path, num_frames: int) -> None:
-    """A video played forwards and backwards until it has so many frames."""
+    """A video played forwards and, upside down, backwards until it has so many frames.
+
+    Backwards alone it would be that of a shutter that runs from the last line to the first. Turned by 180 degrees, as
+    of a camera held the other way round, the first line is the earliest again. Each turn is a cut.
+    """
     with av.open(str(video)) as container:
-        frames = [frame.to_ndarray(format="yuv420p") for frame in container.decode(video=0)]
-        rate, (height, width) = container.streams.video[0].average_rate, frames[0].shape
+        frames = [frame.reformat(format="yuv420p") for frame in container.decode(video=0)]
+        rate, width, height = container.streams.video[0].average_rate, frames[0].width, frames[0].height
     with av.open(str(out), "w") as container:
         stream = container.add_stream("libx264", rate=rate, options={"crf": "18", "preset": "veryfast"})
-        stream.width, stream.height, stream.pix_fmt = width, height * 2 // 3, "yuv420p"
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         for k in range(num_frames):
-            place = k % (2 * len(frames) - 2)
-            picture = frames[min(place, 2 * len(frames) - 2 - place)]
+            place = k % (2 * len(frames))
+            picture = frames[min(place, 2 * len(frames) - 1 - place)].to_ndarray()
+            if place >= len(frames):  # each of the planes, one after the other
+                sizes = width * height, width * height // 4
+                planes = np.split(picture.ravel(), [sizes[0], sum(sizes)])
+                picture = np.concatenate([plane[::-1] for plane in planes]).reshape(picture.shape)
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="yuv420p")))
         container.mux(stream.encode())
 

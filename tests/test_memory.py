@@ -21,7 +21,7 @@ from rsundistort import (
     write_solution,
 )
 from rsundistort.batch import workers as workers_module
-from rsundistort.batch.memory import free_memory
+from rsundistort.batch.memory import free_memory, return_memory
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
 from rsundistort.errors import SkippedPhotoWarning
@@ -181,3 +181,12 @@ def test_masks_of_shrunk_photos_hide_what_they_did():
     assert len(xy) > 20
     assert xy[:, 0].max() < 300
     assert (truth[:, 0] > 300).any()
+
+
+def test_memory_is_returned_where_the_allocator_can(monkeypatch):
+    called = []
+    monkeypatch.setattr("psutil.heap_trim", lambda: called.append(True), raising=False)
+    return_memory()
+    assert called == [True]
+    monkeypatch.delattr("psutil.heap_trim")
+    return_memory()

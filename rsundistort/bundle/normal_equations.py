@@ -270,7 +270,10 @@ class NormalEquations:
     @cached_property
     def inverse(self) -> Factored | None:
         """The inverse of the whole system, for photos and cameras; None where it cannot be factored."""
-        factored = self._elimination.factored(self._reduced)
+        reduced = self._reduced
+        del self._reduced  # as large as the factor
+        factored = self._elimination.factored(reduced)
+        del reduced
         if factored is None or not len(self._lengths):
             return factored
         frame, _, camera, inner = self._of_lengths(0.0, exact=True)
@@ -283,11 +286,13 @@ class NormalEquations:
         covariances fall as the priors' precision P grows: a difference of two that are a little looser and tighter.
         They are 0 unless asked for (`of_priors`), since they take twice the time of the rest.
         """
-        found = self._covariances()
         if not of_priors:
+            found = self._covariances()
             return Marginals(*found, *(np.zeros_like(each) for each in found))
+        # its own inverse, which is kept, comes last: one factor in memory at a time
         looser, tighter = (self._with_priors(1.0 + by)._covariances() for by in (-_STEP, _STEP))
-        return Marginals(*found, *((a - b) / (2 * _STEP) for a, b in zip(looser, tighter, strict=True)))
+        shares = [(a - b) / (2 * _STEP) for a, b in zip(looser, tighter, strict=True)]
+        return Marginals(*self._covariances(), *shares)
 
     def _covariances(self) -> tuple[Array, Array]:
         """Covariances of photos (m, nb, nb) and of all cameras (k, k)."""
@@ -416,20 +421,20 @@ class NormalEquations:
         assert self.inverse is not None
         g_point, V = np.empty_like(self._g_point), np.empty_like(self._V)
         schur.point_blocks(self._s.track_start, noise, self._J, V, g_point)
-        g_frame = self._wide(self._gradients(noise, self._J)[1])
-        g_frame = g_frame + np.sqrt(self._prior_diag) * self._wide(of_photos)
+        V_inv = np.empty_like(self._V)
+        schur.invert_points(self._V, 0.0, V_inv)
+        by_frame, by_camera = self._without_points(V_inv, noise, np.zeros(len(noise), np.int64), 1)
+        g_frame = self._wide(by_frame[0]) + np.sqrt(self._prior_diag) * self._wide(of_photos)
         if self._coupling is not None:
             drawn = np.random.default_rng(1).normal(size=self._coupling.res.shape)
             g_frame += self._coupling.pull(drawn, len(g_frame))
-        g_camera = self._border.sum_photos(self._gradients(noise, self._border.J)[1])
-        g_camera = g_camera + np.sqrt(self._border.prior_diag.ravel()) * of_cameras
+        g_camera = by_camera[0] + np.sqrt(self._border.prior_diag.ravel()) * of_cameras
         if self._common is not None:
             weight, J = self._common
             by_mean = np.zeros((len(weight), self._border.J.shape[2]))
             by_mean[:, -J.shape[2] :] = np.einsum("mah,ma->mh", J, np.sqrt(weight) * self._wide(of_photos))
             g_camera -= self._border.sum_photos(by_mean)
-        reduced, V_inv = self.reduce(0.0, g_frame, g_point, g_camera)
-        frame, camera = self.inverse.solve(reduced.b, reduced.c)
+        frame, camera = self.inverse.solve(-g_frame, -g_camera)
         point = self._point_steps(V_inv, g_point, frame, camera)
         return noise + self._moved(frame, point, camera)
 
@@ -439,18 +444,22 @@ class NormalEquations:
         That is H^-1 of each group's share of the gradient, points eliminated; group (o,) is the group of each.
         """
         assert self.inverse is not None
-        s, border = self._s, self._border
-        m, nb, nc = len(self._g_frame), self._J.shape[2], border.J.shape[2]
         V_inv = np.empty_like(self._V)
         schur.invert_points(self._V, 0.0, V_inv)
+        of_photos, of_cameras = self._without_points(V_inv, residuals, group, num_groups)
+        frame, camera = self.inverse.times(self._wide(of_photos), of_cameras)
+        return self._seen(frame), camera
+
+    def _without_points(self, V_inv: Array, residuals: Array, group: Index, num_groups: int) -> tuple[Array, Array]:
+        """Shares of groups of residuals in the gradient, points eliminated: (num_groups, m, seen), (num_groups, k)."""
+        s, border = self._s, self._border
+        m, nb, nc = len(self._g_frame), self._J.shape[2], border.J.shape[2]
         g_frame, g_camera = np.empty((m, num_groups, nb)), np.empty((m, num_groups, nc))
         schur.group_gradients(
             s.frame_start, s.frame_order, s.point_idx, s.track_start, residuals, self._J, border.J, V_inv,
             group, g_frame, g_camera,
         )  # fmt: skip
-        of_cameras = border.sum_photos(g_camera.transpose(0, 2, 1)).T
-        frame, camera = self.inverse.times(self._wide(g_frame.transpose(1, 0, 2)), of_cameras)
-        return self._seen(frame), camera
+        return g_frame.transpose(1, 0, 2), border.sum_photos(g_camera.transpose(0, 2, 1)).T
 
     def length_pulls(self) -> tuple[Array, Array]:
         """The same of known lengths (q, m, nb) and (q, k), each wrong by its standard deviation."""

@@ -74,9 +74,8 @@ def own_motions(reconstruction: Reconstruction, *, rotation_only: bool = False) 
     share = max(1.0 - len(own) * m / residuals.size, 0.1)
     noise = max(size * _NOISE_PX / np.sqrt(share), _LEAST_NOISE_PX) / _NOISE_PX
     believed = np.linalg.norm(residuals, axis=1) < 4.5 * noise
-    J = J[:, :, own] * believed[:, None, None]
-    by_frame = _by_frame(frame, m)
-    H = _gradients(by_frame, residuals, J)[0]
+    J *= believed[:, None, None]
+    H = _gradients(problem.by_photo, residuals, J, own)[0]
     sigma = np.full((m, _UNKNOWNS), np.nan)
     scale, scaled = _scaled(H)
     known = np.linalg.cond(scaled) < 1e12
@@ -86,7 +85,7 @@ def own_motions(reconstruction: Reconstruction, *, rotation_only: bool = False) 
     corner = problem.partitions(state)[1].group
     count = int(corner.max(initial=0)) + 1
     pulls = np.zeros((m * count, len(own)))
-    np.add.at(pulls, frame * count + corner, np.einsum("oia,oi->oa", J, residuals))
+    np.add.at(pulls, frame * count + corner, np.einsum("oia,oi->oa", J, residuals)[:, own])
     moved = np.einsum("fab,fcb->fca", inverse, pulls.reshape(m, count, -1)[known])
     together = np.median((moved**2).sum(1) / variance, axis=0) if known.any() else np.ones(len(own))
     sigma[np.ix_(known, own)] = np.sqrt(np.maximum(together, 1.0) * variance)
@@ -101,27 +100,27 @@ def _scaled(H: Array) -> tuple[Array, Array]:
     return scale, scale[:, :, None] * H * scale[:, None]
 
 
-def _by_frame(frame: NDArray[np.int64], num_frames: int) -> list[NDArray[np.int64]]:
-    """Measurements of each frame."""
-    return np.split(np.argsort(frame, kind="stable"), np.cumsum(np.bincount(frame, minlength=num_frames))[:-1])
-
-
-def _gradients(by_frame: list[NDArray[np.int64]], residuals: Array, J: Array) -> tuple[Array, Array]:
-    """J'J (m, n, n) and J'residuals (m, n) of each frame, for Jacobians (o, 2, n)."""
-    n = J.shape[2]
-    rows = [(J[mine].reshape(-1, n), residuals[mine].ravel()) for mine in by_frame]
-    return np.array([A.T @ A for A, _ in rows]), np.array([A.T @ b for A, b in rows])
+def _gradients(
+    by_frame: list[NDArray[np.int64]], residuals: Array, J: Array, own: NDArray[np.int64]
+) -> tuple[Array, Array]:
+    """J'J (m, n, n) and J'residuals (m, n) of each frame, for the unknowns `own` (n,) of Jacobians (o, 2, nb)."""
+    n, m = len(own), len(by_frame)
+    H, g = np.empty((m, n, n)), np.empty((m, n))
+    for f, mine in enumerate(by_frame):
+        A, b = J[mine][:, :, own].reshape(-1, n), residuals[mine].ravel()
+        H[f], g[f] = A.T @ A, A.T @ b
+    return H, g
 
 
 def _fitted(problem: BundleProblem, state: State, own: NDArray[np.int64]) -> State:
     """Some steps of Levenberg and Marquardt of every frame on its own."""
     frame, m = problem.measurements[0], len(state.phi)
-    by_frame = _by_frame(frame, m)
+    by_frame = problem.by_photo
     damping = np.full(m, 1e-3)
     cost = np.bincount(frame, problem.costs(state), m)
     for _ in range(_STEPS):
         residuals, J = problem.blocks(state)
-        H, g = _gradients(by_frame, residuals, J[:, :, own])
+        H, g = _gradients(by_frame, residuals, J, own)
         scale, scaled = _scaled(H)
         scaled += np.maximum(damping, 1e-9)[:, None, None] * np.eye(len(own))
         step = np.zeros((m, problem.layout.size))

@@ -105,14 +105,15 @@ class Posterior:
         As a quadratic form, pixels squared. Where pose and points make up for the change in the photo as it was taken,
         it is the rectified photo that is displaced.
         """
-        frame, _, noise_px = self._problem.measurements
-        J = self._equations.blocks[1]
-        J = J[:, :, 6 : J.shape[2] - self._own] * noise_px[:, None, None]
-        if self._path is not None:  # the Jacobians are by rates
-            J = J / self._path.pace[self._camera_idx[frame], None, None]
-        total = np.zeros((len(self._state.phi), J.shape[2], J.shape[2]))
-        np.add.at(total, frame, np.einsum("oki,okj->oij", J, J))
-        return total / np.maximum(np.bincount(frame, minlength=len(total)), 1)[:, None, None]
+        noise_px, J = self._problem.measurements[2], self._equations.blocks[1]
+        by_frame = self._problem.by_photo
+        squares = []
+        for photo, mine in enumerate(by_frame):
+            A = J[mine, :, 6 : J.shape[2] - self._own] * noise_px[mine, None, None]
+            if self._path is not None:  # the Jacobians are by rates
+                A /= self._path.pace[self._camera_idx[photo]]
+            squares.append(np.einsum("oki,okj->ij", A, A) / max(len(mine), 1))
+        return np.array(squares)
 
     def _whole(self, vectors: Array) -> Array:
         """With zeros for what the photos have of their own beside pose and motion."""

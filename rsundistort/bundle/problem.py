@@ -474,6 +474,11 @@ class BundleProblem:
         """Photos (o,), points (o,) as in a state, and noise (o,) in pixels of the equations' measurements."""
         return self._structure.frame_idx, self._structure.point_idx, self._sigma_px
 
+    @property
+    def by_photo(self) -> list[NDArray[np.int64]]:
+        """The equations' measurements of each photo."""
+        return np.split(self._structure.frame_order, self._structure.frame_start[1:-1])
+
     def _camera_jacobians(self, state: State) -> NDArray[np.float64]:
         """Weighted Jacobians (o, 2, nc) of what is solved for of the cameras."""
         J, of_photo = self._by_lens(state)
@@ -497,8 +502,9 @@ class BundleProblem:
             residuals.intrinsic_blocks(
                 *self._kernel_args(state), self._rows(state), self._refine_codes, state.variation, J, of_photo
             )
-        self._lens_of, self._lens = state, (J, of_photo)
-        return self._lens
+        if self._options.varying:  # else nobody asks twice
+            self._lens_of, self._lens = state, (J, of_photo)
+        return J, of_photo
 
     def cost(self, state: State) -> float:
         """Half the robust sum of squares in units of the noise, with the priors."""

@@ -15,6 +15,9 @@ __all__ = ["Factored", "Reduced", "factor", "products"]
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+# Right-hand sides that are solved together: enough for all threads, and little memory.
+_STACK = 32
+
 
 @dataclass(frozen=True)
 class Reduced:
@@ -84,6 +87,12 @@ class Factored:
 
     def times(self, b: Array, c: Array) -> tuple[Array, Array]:
         """The inverse times stacks of photos' values (n, m, nb) and of cameras' (n, k)."""
+        if len(b) > _STACK:
+            x, y = np.empty_like(b, order="C"), np.empty_like(c, order="C")
+            for start in range(0, len(b), _STACK):
+                some = slice(start, start + _STACK)
+                x[some], y[some] = self.times(b[some], c[some])
+            return x, y
         shares = (products(b, self.frames) + c @ self.cameras.T) @ self.weights
         shape = self.photos.shape
         rows = shape.gather(b)

@@ -143,7 +143,9 @@ def _row_motion(rec: Reconstruction, nb: int) -> tuple[Array, Array]:
     return forward, back
 
 
-def common_motion(result: BundleResult, options: BundleOptions | None = None) -> CommonMotion:
+def common_motion(
+    result: BundleResult, options: BundleOptions | None = None, posterior: Posterior | None = None
+) -> CommonMotion:
     """Uncertainty of the part of the motions that the photos share, from the covariance of a solution.
 
     Parameters
@@ -152,12 +154,14 @@ def common_motion(result: BundleResult, options: BundleOptions | None = None) ->
         Of a model with a shutter.
     options : BundleOptions, optional
         Of the adjustment.
+    posterior : Posterior, optional
+        Of both, where it is at hand.
     """
     rec = result.reconstruction
     m, nb = result.covariances.shape[:2]
     forward, back = _row_motion(rec, nb)
     mean = forward.transpose(1, 0, 2) / m
-    posterior = Posterior(result, options)
+    posterior = posterior or Posterior(result, options)
     covariance = np.einsum("imb,jmb->ij", mean, posterior.of_photos(mean))
     # motions in units of the displacement that they cause: `half` takes them there
     squares = np.einsum("mai,mab,mbj->mij", back, posterior.squared_shifts(), back)

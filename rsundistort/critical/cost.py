@@ -154,5 +154,5 @@ def shape_cost(result: BundleResult, options: BundleOptions | None = None) -> Sh
         weakest_sigma=float(np.sqrt(value)),
         weakest_share=float(min(share, 1.0)),
         degeneracy=critical_motion(rec.R_cw, rec.center_w, readout),
-        common=common_motion(result, options),
+        common=common_motion(result, options, covariance),
     )

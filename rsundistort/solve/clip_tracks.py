@@ -42,12 +42,13 @@ class Followed:
         self.frame = self.key = self.place = np.zeros(0, np.int64)
         self.xy_raw = np.zeros((0, 2))
 
-    def add(self, key: int, frame: NDArray[np.int64], place: NDArray[np.int64], xy_raw: NDArray[np.float64]) -> None:
-        """The places found of a key's points."""
-        self.frame = np.concatenate([self.frame, frame])
-        self.key = np.concatenate([self.key, np.full(len(frame), key)])
-        self.place = np.concatenate([self.place, place])
-        self.xy_raw = np.concatenate([self.xy_raw, xy_raw])
+    def add(self, found: list[tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]) -> None:
+        """The places found of keys' points: key, frames (o,), places (o,) and pixels (o, 2) of each."""
+        if not found:
+            return
+        keys, *parts = zip(*found, strict=True)
+        self.frame, self.place, self.xy_raw = (np.concatenate(part) for part in parts)
+        self.key = np.repeat(np.array(keys, np.int64), [len(frame) for frame in parts[0]])
 
 
 def _spread(xy: NDArray[np.float64], worth: NDArray[np.int64], size: tuple[int, int]) -> NDArray[np.int64]:
@@ -114,12 +115,14 @@ def follow(
     for key, xy in shown.items():
         value = np.arange(len(xy))[::-1] if worth is None else worth[key]
         chosen[key] = _spread(xy, value, size)
-    followed = Followed(chosen)
+    found = []
     for a, b, greys in _between_keys(clip, keys):
         step = np.array(size) / greys[0].shape[::-1]
         starts = [(shown[key][chosen[key]] + 0.5) / step - 0.5 for key in (a, b)]
         for key, tracks in zip((a, b), flow_between(greys, *starts), strict=True):
-            followed.add(key, tracks.frame + a, tracks.point, (tracks.xy + 0.5) * step - 0.5)
+            found.append((key, tracks.frame + a, tracks.point, (tracks.xy + 0.5) * step - 0.5))
+    followed = Followed(chosen)
+    followed.add(found)
     return followed
 
 

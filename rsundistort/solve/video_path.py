@@ -170,11 +170,7 @@ def _travelled(
     rough = rough_options(replace(options_of(mapped), refine=()))
     current = bundle_adjust(mapped, "global", rough).reconstruction
     for stage in ("path", "path again"):
-        log.begin("flow")
-        followed = follow_points(clip, current)
-        before: Reconstruction | None = None if result is None else result.reconstruction
-        whole = with_all_frames(clip, current, followed, before).without_photos(_LEAST_MEASUREMENTS)
-        log.end("flow", frames=whole.num_images, of_frames=len(clip.names), observations=len(followed.frame))
+        whole = _of_all_frames(clip, current, None if result is None else result.reconstruction, log)
         log.begin(stage)
         if result is None:
             path, filmed = _as_filmed(clip, whole, path, telemetry)
@@ -195,6 +191,17 @@ def _travelled(
             current = retriangulate(matched, result.of_photos(_are_keys(result, clip)).reconstruction)
     assert result is not None
     return result, options, filmed
+
+
+def _of_all_frames(
+    clip: Clip, current: Reconstruction, before: Reconstruction | None, log: StageLog
+) -> Reconstruction:  # fmt: skip
+    """A reconstruction of all frames by flow from that of the key frames."""
+    log.begin("flow")
+    followed = follow_points(clip, current)
+    whole = with_all_frames(clip, current, followed, before).without_photos(_LEAST_MEASUREMENTS)
+    log.end("flow", frames=whole.num_images, of_frames=len(clip.names), observations=len(followed.frame))
+    return whole
 
 
 def _as_filmed(
