@@ -27,6 +27,7 @@ from .normal_equations import Marginals, NormalEquations, Step
 from .options import LOSSES, BundleOptions
 from .path import PathPrior, PathState
 from .places import KnownPlaces, PlaceResiduals
+from .point_terms import PointTerms
 from .prior_sigmas import PriorSigmas
 from .structure import Structure
 
@@ -339,8 +340,7 @@ class BundleProblem:
         return np.hstack([state.variation[:, : 3 * self._options.varying], state.bend])
 
     def _prior_cost(self, state: State) -> float:
-        motion = self._motion(state)
-        known = self._known_weight * (motion - self._known) ** 2
+        known = self._known_weight * (self._motion(state) - self._known) ** 2
         lengths = float(np.sum(self._lengths.residuals(state.points_w) ** 2))
         varied = float(np.sum(self._own_weight * self._own(state) ** 2))
         lengths += 2.0 * self._places.cost(state.center_w, state.points_w)
@@ -431,8 +431,7 @@ class BundleProblem:
             common = CommonPrior(np.pad(self._motion_weight, around), np.pad(self._means.directions, (*around, (0, 0))))
         if self._path is not None and state.path is not None:
             moves = self._start.camera_idx[self._structure.frame_idx]
-            own_rates = state.path.rates[self._structure.frame_idx]
-            by_pace = np.einsum("oia,oa->oi", J_frame[:, :, 6:12], own_rates)
+            by_pace = np.einsum("oia,oa->oi", J_frame[:, :, 6:12], state.path.rates[self._structure.frame_idx])
             border = replace(border, J=np.concatenate([border.J, by_pace[:, :, None]], axis=2))
             J_frame[:, :, 6:12] *= state.path.pace[moves, None, None]
             joins, *by_ends = self._path.jacobians(state.R_cw, state.center_w, state.path)
@@ -444,12 +443,15 @@ class BundleProblem:
             prior_diag, prior_gradient = (
                 np.hstack(each) for each in zip((prior_diag, prior_gradient), of_changes, strict=True)
             )
-        lengths = self._lengths.residuals(state.points_w), self._lengths.jacobian(state.points_w)
+        of_points = self._point_terms(state)
         return NormalEquations(
-            self._elimination, total, res, J_frame, prior_diag, prior_gradient, border, lengths, coupling,
-            state.points_w - state.center_w[0] if self._turns_only else None,
-            self._places.on_points(state.points_w), common,
-        )  # fmt: skip
+            self._elimination, total, res, J_frame, prior_diag, prior_gradient, border, of_points, coupling, common
+        )
+
+    def _point_terms(self, state: State) -> PointTerms:
+        x = state.points_w
+        rays = x - state.center_w[0] if self._turns_only else None
+        return PointTerms((self._lengths.residuals(x), self._lengths.jacobian(x)), rays, self._places.on_points(x))
 
     @property
     def shares(self) -> NDArray[np.bool_]:
@@ -532,15 +534,14 @@ class BundleProblem:
 
     def settle(self, state: State) -> State:
         """The state with each point one Gauss-Newton step nearer to its measurements, where that lowers its cost."""
-        moved = replace(state, points_w=state.points_w + self.linearize(state).point_steps())
+        steps = self._point_terms(state).steps(self._structure.track_start, *self.blocks(state))
+        moved = replace(state, points_w=state.points_w + steps)
         better = self._track_costs(moved) < self._track_costs(state)
         return replace(state, points_w=np.where(better[:, None], moved.points_w, state.points_w))
 
     def _track_costs(self, state: State) -> NDArray[np.float64]:
         """(n,) cost of each point's measurements."""
-        total = np.zeros(len(state.points_w))
-        np.add.at(total, self._structure.point_idx, self.costs(state))
-        return total
+        return np.asarray(np.bincount(self._structure.point_idx, self.costs(state), len(state.points_w)), np.float64)
 
     def costs(self, state: State) -> NDArray[np.float64]:
         """(o,) cost of each of the equations' measurements."""
