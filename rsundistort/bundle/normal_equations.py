@@ -151,6 +151,11 @@ class NormalEquations:
         self._common = common
         self._lengths = of_points.lengths[1]
 
+    def spend(self) -> tuple[Array, Array]:
+        """The blocks, for others to be written over them; no more can be asked, and all else as large is given up."""
+        del self._J, self._border
+        return self.blocks
+
     def _wide(self, values: Array) -> Array:
         """Photos' values (..., m, measured) with zeros for the unknowns that no measurement sees."""
         return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, self._num_unseen)])

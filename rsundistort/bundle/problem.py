@@ -381,7 +381,7 @@ class BundleProblem:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
         """Weighted residuals (o, 2), Jacobians of the photos (o, 2, nb), and the cost without priors."""
         o = len(self._xy)
-        res, J_frame = spent.blocks if spent else (np.empty((o, 2)), np.empty((o, 2, self.layout.size)))
+        res, J_frame = spent.spend() if spent else (np.empty((o, 2)), np.empty((o, 2, self.layout.size)))
         cost = np.empty(-(-o // _CHUNK))
         with numba.parallel_chunksize(1):
             residuals.residual_blocks(
@@ -431,8 +431,8 @@ class BundleProblem:
             common = CommonPrior(np.pad(self._motion_weight, around), np.pad(self._means.directions, (*around, (0, 0))))
         if self._path is not None and state.path is not None:
             moves = self._start.camera_idx[self._structure.frame_idx]
-            by_pace = np.einsum("oia,oa->oi", J_frame[:, :, 6:12], state.path.rates[self._structure.frame_idx])
-            border = replace(border, J=np.concatenate([border.J, by_pace[:, :, None]], axis=2))
+            rates = state.path.rates[self._structure.frame_idx]
+            border.J[:, :, -1] = np.einsum("oia,oa->oi", J_frame[:, :, 6:12], rates)
             J_frame[:, :, 6:12] *= state.path.pace[moves, None, None]
             joins, *by_ends = self._path.jacobians(state.R_cw, state.center_w, state.path)
             # the changes of the rates stand behind all that the measurements know
@@ -484,29 +484,28 @@ class BundleProblem:
         return np.split(self._structure.frame_order, self._structure.frame_start[1:-1])
 
     def _camera_jacobians(self, state: State) -> NDArray[np.float64]:
-        """Weighted Jacobians (o, 2, nc) of what is solved for of the cameras."""
+        """Weighted Jacobians (o, 2, nc) of what is solved for of the cameras, with room for the pace of a path."""
         J, of_photo = self._by_lens(state)
         if self._fields is None:
             return J
         # what a shift of the principal point does is what weighs a measurement
         camera = self._start.camera_idx[self._structure.frame_idx]
         weight = of_photo[:, :, 1:] / np.array([np.diag(each.K)[:2] for each in state.cameras])[camera, None]
-        return np.concatenate([J, weight @ self._field_jacobian], axis=2)
+        own = len(self._refine)
+        return np.concatenate([J[:, :, :own], weight @ self._field_jacobian, J[:, :, own:]], axis=2)
 
     def _by_lens(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Weighted Jacobians of the intrinsics that are refined (o, 2, nr), and of a photo's variation (o, 2, 3).
-
-        The last is left empty where nobody needs it.
-        """
+        """The same without fields, and those of a photo's variation (o, 2, 3), left empty where nobody needs them."""
         if state is self._lens_of:
             return self._lens
         num = len(self._refine)
         varies = self._options.varying or self._fields is not None
         codes = np.concatenate([self._refine_codes, _VARIATION[: 3 * varies]])
-        both = np.empty((len(self._xy), 2, len(codes)))
+        room = int(self._path is not None)
+        both = np.empty((len(self._xy), 2, len(codes) + room))
         if len(codes):
             residuals.intrinsic_blocks(*self._kernel_args(state), self._rows(state), codes, both)
-        J, of_photo = both[:, :, :num], both[:, :, num:]
+        J, of_photo = both[:, :, :num], both[:, :, num : len(codes)]
         if self._options.varying:
             own = state.variation[self._structure.frame_idx]
             # a photo's principal point moves by focal lengths of its camera, not by its own
@@ -519,10 +518,10 @@ class BundleProblem:
                     J[:, :, k] += of_photo[:, :, 1] * own[:, 1, None]
                 if name in ("f", "fy"):
                     J[:, :, k] += of_photo[:, :, 2] * own[:, 2, None]
-        found = np.ascontiguousarray(J), of_photo
-        if self._options.varying:  # else nobody asks twice
-            self._lens_of, self._lens = state, found
-        return found
+        if not varies:
+            return both, of_photo
+        self._lens_of, self._lens = state, (np.pad(J, ((0, 0), (0, 0), (0, room))), of_photo)
+        return self._lens
 
     def cost(self, state: State) -> float:
         """Half the robust sum of squares in units of the noise, with the priors."""
