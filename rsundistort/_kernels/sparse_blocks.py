@@ -83,17 +83,28 @@ def fill_blocks(row_start, cols, first, second, S, scale, free, U):
 
 @kernel(fastmath=SUMS)
 def _subtract_product(unknowns, A, B, out):
-    """A' B from out, six rows of both at a time: a row of out is loaded and stored once for all six."""
+    """A' B from out, six of its rows and three rows of both at a time: what is loaded serves several products."""
     nb = columns(unknowns)
     whole = nb // 6 * 6
-    for a in range(nb):
-        for c in range(0, whole, 6):
-            x0, x1, x2 = A[c, a], A[c + 1, a], A[c + 2, a]
-            x3, x4, x5 = A[c + 3, a], A[c + 4, a], A[c + 5, a]
+    for c in range(0, whole, 3):
+        for a in range(0, whole, 6):
+            u0, u1, u2 = A[c, a], A[c + 1, a], A[c + 2, a]
+            v0, v1, v2 = A[c, a + 1], A[c + 1, a + 1], A[c + 2, a + 1]
+            w0, w1, w2 = A[c, a + 2], A[c + 1, a + 2], A[c + 2, a + 2]
+            x0, x1, x2 = A[c, a + 3], A[c + 1, a + 3], A[c + 2, a + 3]
+            y0, y1, y2 = A[c, a + 4], A[c + 1, a + 4], A[c + 2, a + 4]
+            z0, z1, z2 = A[c, a + 5], A[c + 1, a + 5], A[c + 2, a + 5]
             for b in range(nb):
-                first = x0 * B[c, b] + x1 * B[c + 1, b] + x2 * B[c + 2, b]
-                out[a, b] -= first + x3 * B[c + 3, b] + x4 * B[c + 4, b] + x5 * B[c + 5, b]
-        for c in range(whole, nb):
+                b0, b1, b2 = B[c, b], B[c + 1, b], B[c + 2, b]
+                out[a, b] -= u0 * b0 + u1 * b1 + u2 * b2
+                out[a + 1, b] -= v0 * b0 + v1 * b1 + v2 * b2
+                out[a + 2, b] -= w0 * b0 + w1 * b1 + w2 * b2
+                out[a + 3, b] -= x0 * b0 + x1 * b1 + x2 * b2
+                out[a + 4, b] -= y0 * b0 + y1 * b1 + y2 * b2
+                out[a + 5, b] -= z0 * b0 + z1 * b1 + z2 * b2
+    for c in range(nb):
+        # rows of out that are left, and rows of both
+        for a in range(whole if c < whole else 0, nb):
             x0 = A[c, a]
             for b in range(nb):
                 out[a, b] -= x0 * B[c, b]

@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from .memory import return_memory
+
 __all__ = ["ProgressCallback", "StageLog"]
 
 #: Called as (stage, done, total); total is 0 where it is not known.
@@ -41,4 +43,5 @@ class StageLog:
 
     def end(self, stage: str, **counts: Any) -> None:
         """Note what a stage took and counted."""
+        return_memory()
         self.stages.append({"name": stage, "seconds": round(time.perf_counter() - self._began, 3), **counts})

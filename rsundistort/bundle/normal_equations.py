@@ -16,6 +16,7 @@ from .._kernels import schur
 from .._kernels._jit import unknowns_of
 from .connections import Border, CommonPrior, Coupling
 from .elimination import Elimination
+from .point_terms import PointTerms
 from .reduced import Factored, Reduced
 
 __all__ = ["PRIORS_ERROR", "Function", "Marginals", "NormalEquations", "Step"]
@@ -97,15 +98,11 @@ class NormalEquations:
         Diagonal Hessian and gradient of the priors of the photos.
     border : Border
         What the photos share.
-    lengths : tuple of (q,) and (q, n, 3) arrays
-        Residuals on few points and their Jacobian: they connect points, which the elimination takes one by one, so
-        their share of the Hessian is added to its inverse (Woodbury).
+    of_points : PointTerms
+        What is known of the points. Lengths connect them, which the elimination takes one by one, so their share of the
+        Hessian is added to its inverse (Woodbury).
     coupling : Coupling, optional
         Prior that connects pairs of photos; the structure's pattern has their blocks.
-    rays : (n, 3) array, optional
-        Directions along which no point moves, where all photos are taken from one place.
-    points : tuple of (k,), (k, 3) and (k, 3) arrays, optional
-        Points with a prior of their own, its diagonal Hessian and its gradient.
     common : CommonPrior, optional
         Which of the photos' priors have means that are the last unknowns of their cameras. Their weights and gradients
         are in `prior_diag` and `prior_gradient`, and in those of the border.
@@ -125,33 +122,20 @@ class NormalEquations:
         prior_diag: Array,
         prior_gradient: Array,
         border: Border,
-        lengths: tuple[Array, Array],
+        of_points: PointTerms,
         coupling: Coupling | None = None,
-        rays: Array | None = None,
-        points: tuple[Index, Array, Array] | None = None,
         common: CommonPrior | None = None,
     ) -> None:
         self.cost = cost
         self._elimination = elimination
         s = self._s = elimination.structure
         nb = prior_diag.shape[1]
-        n = len(s.points)
         self._J = J_frame
         self.blocks = res, J_frame
         self._num_unseen = nb - J_frame.shape[2]
         self._unknowns = unknowns_of(J_frame.shape[2])
         self._prior_diag = prior_diag
-        self._V = np.empty((n, 3, 3))
-        self._g_point = np.empty((n, 3))
-        schur.point_blocks(s.track_start, res, J_frame, self._V, self._g_point)
-        if rays is not None:
-            # any weight holds what nothing pulls at
-            unit = rays / np.linalg.norm(rays, axis=1)[:, None]
-            weight = np.trace(self._V, axis1=1, axis2=2)[:, None, None]
-            self._V += weight * unit[:, :, None] * unit[:, None]
-        if points is not None:
-            self._V[points[0][:, None], np.arange(3), np.arange(3)] += points[1]
-            self._g_point[points[0]] += points[2]
+        self._V, self._g_point = of_points.blocks(s.track_start, res, J_frame)
         self._diagonal, self._g_frame = (self._wide(each) for each in self._gradients(res, J_frame))
         self._diagonal += prior_diag
         self._g_frame += prior_gradient
@@ -165,8 +149,12 @@ class NormalEquations:
         self._camera_diagonal = border.sum_photos(diagonal)
         self._g_camera = border.sum_photos(g_camera) + border.prior_gradient.ravel()
         self._common = common
-        self._lengths = lengths[1]
-        self._g_point += np.einsum("q,qna->na", *lengths)
+        self._lengths = of_points.lengths[1]
+
+    def spend(self) -> tuple[Array, Array]:
+        """The blocks, for others to be written over them; no more can be asked, and all else as large is given up."""
+        del self._J, self._border
+        return self.blocks
 
     def _wide(self, values: Array) -> Array:
         """Photos' values (..., m, measured) with zeros for the unknowns that no measurement sees."""
@@ -549,9 +537,3 @@ class NormalEquations:
         moved = np.einsum("oij,oj->oi", self._border.J, steps[self._border.camera_of_frame[s.frame_idx]])
         schur.point_blocks(s.track_start, moved, self._J, V, pull)
         return g_point + pull
-
-    def point_steps(self) -> Array:
-        """Gauss-Newton steps (n, 3) of the points alone, the photos being held."""
-        V_inv = np.empty_like(self._V)
-        schur.invert_points(self._V, 0.0, V_inv)
-        return -np.einsum("nij,nj->ni", V_inv, self._g_point)

@@ -27,6 +27,7 @@ from .layout import Layout
 from .lens_field import LensFields
 from .normal_equations import Marginals, NormalEquations, Step
 from .path_prior import PathPrior, PathState
+from .point_terms import PointTerms
 from .prior_sigmas import PriorSigmas
 from .structure import Structure
 
@@ -337,8 +338,7 @@ class BundleProblem:
         return np.hstack([state.variation[:, : 3 * self._options.varying], state.bend])
 
     def _prior_cost(self, state: State) -> float:
-        motion = self._motion(state)
-        known = self._known_weight * (motion - self._known) ** 2
+        known = self._known_weight * (self._motion(state) - self._known) ** 2
         lengths = float(np.sum(self._lengths.residuals(state.points_w) ** 2))
         varied = float(np.sum(self._own_weight * self._own(state) ** 2))
         lengths += 2.0 * self._places.cost(state.center_w, state.points_w)
@@ -379,7 +379,7 @@ class BundleProblem:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
         """Weighted residuals (o, 2), Jacobians of the photos (o, 2, nb), and the cost without priors."""
         o = len(self._xy)
-        res, J_frame = spent.blocks if spent else (np.empty((o, 2)), np.empty((o, 2, self.layout.size)))
+        res, J_frame = spent.spend() if spent else (np.empty((o, 2)), np.empty((o, 2, self.layout.size)))
         cost = np.empty(-(-o // _CHUNK))
         with numba.parallel_chunksize(1):
             residuals.residual_blocks(
@@ -429,9 +429,8 @@ class BundleProblem:
             common = CommonPrior(np.pad(self._motion_weight, around), np.pad(self._means.directions, (*around, (0, 0))))
         if self._path is not None and state.path is not None:
             moves = self._start.camera_idx[self._structure.frame_idx]
-            own_rates = state.path.rates[self._structure.frame_idx]
-            by_pace = np.einsum("oia,oa->oi", J_frame[:, :, 6:12], own_rates)
-            border = replace(border, J=np.concatenate([border.J, by_pace[:, :, None]], axis=2))
+            rates = state.path.rates[self._structure.frame_idx]
+            border.J[:, :, -1] = np.einsum("oia,oa->oi", J_frame[:, :, 6:12], rates)
             J_frame[:, :, 6:12] *= state.path.pace[moves, None, None]
             joins, *by_ends = self._path.jacobians(state.R_cw, state.center_w, state.path)
             # the changes of the rates stand behind all that the measurements know
@@ -442,12 +441,15 @@ class BundleProblem:
             prior_diag, prior_gradient = (
                 np.hstack(each) for each in zip((prior_diag, prior_gradient), of_changes, strict=True)
             )
-        lengths = self._lengths.residuals(state.points_w), self._lengths.jacobian(state.points_w)
+        of_points = self._point_terms(state)
         return NormalEquations(
-            self._elimination, total, res, J_frame, prior_diag, prior_gradient, border, lengths, coupling,
-            state.points_w - state.center_w[0] if self._rotation_only else None,
-            self._places.on_points(state.points_w), common,
-        )  # fmt: skip
+            self._elimination, total, res, J_frame, prior_diag, prior_gradient, border, of_points, coupling, common
+        )
+
+    def _point_terms(self, state: State) -> PointTerms:
+        x = state.points_w
+        rays = x - state.center_w[0] if self._rotation_only else None
+        return PointTerms((self._lengths.residuals(x), self._lengths.jacobian(x)), rays, self._places.on_points(x))
 
     @property
     def shares(self) -> NDArray[np.bool_]:
@@ -480,25 +482,24 @@ class BundleProblem:
         return np.split(self._structure.frame_order, self._structure.frame_start[1:-1])
 
     def _camera_jacobians(self, state: State) -> NDArray[np.float64]:
-        """Weighted Jacobians (o, 2, nc) of what is solved for of the cameras."""
+        """Weighted Jacobians (o, 2, nc) of what is solved for of the cameras, with room for the pace of a path."""
         J, of_photo = self._by_lens(state)
         if self._fields is None:
             return J
         # what a shift of the principal point does is what weighs a measurement
         camera = self._start.camera_idx[self._structure.frame_idx]
         weight = of_photo[:, :, 1:] / np.array([np.diag(each.K)[:2] for each in state.cameras])[camera, None]
-        return np.concatenate([J, weight @ self._field_jacobian], axis=2)
+        own = len(self._refine)
+        return np.concatenate([J[:, :, :own], weight @ self._field_jacobian, J[:, :, own:]], axis=2)
 
     def _by_lens(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Weighted Jacobians of the intrinsics that are refined (o, 2, nr), and of a photo's variation (o, 2, 3).
-
-        The last is left empty (o, 2, 0) where nobody needs it.
-        """
+        """The same without fields, and those of a photo's variation (o, 2, 3), or (o, 2, 0) where nobody needs them."""
         if state is self._lens_of:
             return self._lens
         o, wanted = len(self._xy), self._options.varying or self._fields is not None
-        J, of_photo = np.empty((o, 2, len(self._refine))), np.empty((o, 2, 3 * wanted))
-        if J.size or of_photo.size:
+        J = np.empty((o, 2, len(self._refine) + (self._path is not None)))
+        of_photo = np.empty((o, 2, 3 * wanted))
+        if self._refine or wanted:
             residuals.intrinsic_blocks(
                 *self._kernel_args(state), self._rows(state), self._refine_codes, state.variation, J, of_photo
             )
@@ -516,15 +517,14 @@ class BundleProblem:
 
     def settle(self, state: State) -> State:
         """The state with each point one Gauss-Newton step nearer to its measurements, where that lowers its cost."""
-        moved = replace(state, points_w=state.points_w + self.linearize(state).point_steps())
+        steps = self._point_terms(state).steps(self._structure.track_start, *self.blocks(state))
+        moved = replace(state, points_w=state.points_w + steps)
         better = self._track_costs(moved) < self._track_costs(state)
         return replace(state, points_w=np.where(better[:, None], moved.points_w, state.points_w))
 
     def _track_costs(self, state: State) -> NDArray[np.float64]:
         """(n,) cost of each point's measurements."""
-        total = np.zeros(len(state.points_w))
-        np.add.at(total, self._structure.point_idx, self.costs(state))
-        return total
+        return np.asarray(np.bincount(self._structure.point_idx, self.costs(state), len(state.points_w)), np.float64)
 
     def costs(self, state: State) -> NDArray[np.float64]:
         """(o,) cost of each of the equations' measurements."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from ..batch.memory import return_memory
 from ..batch.progress import StageLog
 from ..colmap.conventions import quiet_pycolmap
 from ..errors import ReconstructionError
@@ -69,7 +68,6 @@ def place_photos(
             counts["spread_rad"] = verify_with_shutter(matched)
         kept.put_file("database", database)
         kept.put("pairs", counts)
-    return_memory()
     log.end("matching", **counts)
     log.begin("mapping", len(photos.names))
     mapped: Reconstruction | None = kept.get("mapped")
@@ -83,7 +81,6 @@ def place_photos(
                 "the photos overlap, but show no parallax: the camera stood still or only rotated; "
                 "use photos from places apart"
             ) from error
-        return_memory()
         kept.put("mapped", mapped)
     log.end("mapping", photos=mapped.num_images, points=mapped.num_points, observations=len(mapped.observations))
     return mapped, matched
