@@ -14,7 +14,8 @@ Prints one JSON object a line. Clips are rendered into FOLDER once (`clips.py`: 
     stabilised  the same, rotated back to smooth paths: which are named; and how many of those that the sensor saw are
     gopro    ../shared/video: clock, axes and rotation of its gyroscope, readout by pictures and by the gyroscope
     peer     `run` of videos, each in a process of its own, beside pycolmap's extract, match sequentially, map and
-             undistort with default options, on the same key frames and with the same camera: seconds and peaks
+             undistort with default options, on the same key frames and with the same camera: seconds and peaks; and
+             the share of its time of what any way from a video to a map takes, and of the path of all frames
     length   the same `run` of the GoPro's video, played to and fro for so many frames: seconds a frame, and peaks;
              on the way back upside down, so that lines are read from first to last as the camera reads them
 """
@@ -55,6 +56,12 @@ from rsundistort.solve.video_path import frame_path, solve_clip
 
 WALK = Path(__file__).parents[1] / "sample_scenes" / "walk"
 GOPRO = "592,592,426.5,239.5"
+# Stages of `run` that make a map of key frames, and those of the path; the rest rectifies, writes and reports.
+MAP = ("frames", "features", "rotations", "matching", "mapping")
+PATH = (
+    "flow", "path", "path again", "gyroscope", "critical motion", "halves", "stabilisation",
+    "comparison with a global shutter",
+)  # fmt: skip
 PARTS = ("walk", "level", "pan", "two", "readout", "stabilised", "gopro", "peer", "length")
 
 
@@ -318,7 +325,10 @@ def peer(args: argparse.Namespace) -> None:
         ours(video, given)  # kernels of whatever models it needs
         found = ours(video, given)
         said = {"clip": video.parent.name, "key_frames": len(clip.keys), "ours": found, "theirs": theirs}
-        print(json.dumps(said | {"time": round(found["total_s"] / theirs["total_s"], 2)}), flush=True)
+        parts = {"time": [found["total_s"]], "of_map": [found["seconds"].get(each, 0.0) for each in MAP]}
+        parts["of_path"] = [found["seconds"].get(each, 0.0) for each in PATH]
+        ratios = {name: round(sum(seconds) / theirs["total_s"], 2) for name, seconds in parts.items()}
+        print(json.dumps(said | ratios), flush=True)
 
 
 def to_and_fro(video: Path, out: Path, num_frames: int) -> None:

@@ -12,14 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions
 from rsundistort._kernels import blocks
-from rsundistort.bundle import envelope
+from rsundistort.bundle import envelope, reduced
 from rsundistort.bundle.coarse_space import CoarseSpace
 from rsundistort.bundle.conjugate_gradients import solve_iteratively
 from rsundistort.bundle.elimination import Elimination
 from rsundistort.bundle.envelope import Envelope
 from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
-from rsundistort.bundle.reduced import Reduced
+from rsundistort.bundle.reduced import Reduced, factor
 from rsundistort.bundle.solver import minimize
 from rsundistort.bundle.sparse_blocks import SparseBlocks
 from rsundistort.bundle.structure import Structure
@@ -250,7 +250,7 @@ def test_inverse_inside_the_envelope_is_that_of_dense_algebra(rng, monkeypatch, 
         np.testing.assert_allclose(blocks[i], own, rtol=1e-9, atol=1e-12 * np.abs(own).max())
 
 
-@pytest.mark.parametrize("nb", [5, 9, 19])  # the last is not unrolled
+@pytest.mark.parametrize("nb", [5, 9, 18, 19])  # the last is not unrolled
 def test_sparse_blocks_solve_and_invert_as_dense_algebra_does(rng, nb):
     grid = Grid(rng, long=7, nb=nb)
     shape = SparseBlocks.of(grid.pattern, grid.free)
@@ -357,3 +357,13 @@ def test_steps_by_conjugate_gradients_end_where_factored_ones_do(monkeypatch):
 def test_large_systems_are_iterated_and_small_ones_factored(photos, iterated, monkeypatch):
     problem = BundleProblem(block(photos, monkeypatch), "rotation", BundleOptions(), 0.5, PriorSigmas(0.03, 0.3))
     assert (problem._elimination.space is not None) == iterated
+
+
+def test_many_right_hand_sides_are_solved_as_each_is(rng, monkeypatch):
+    grid = Grid(rng)
+    factored = factor(grid.reduced, SparseBlocks.of(grid.pattern, grid.free))
+    b, c = rng.normal(size=(7, *grid.free.shape)), rng.normal(size=(7, 2))
+    at_once = factored.times(b, c)
+    monkeypatch.setattr(reduced, "_STACK", 3)
+    for found, expected in zip(factored.times(b, c), at_once, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +15,8 @@ from rsundistort import BundleOptions, Observations, Reconstruction, bundle_adju
 from rsundistort.bundle.own_motions import own_motions
 from rsundistort.bundle.path_prior import FramePath, PathPrior, orthogonal, with_path_motions
 from rsundistort.bundle.path_prior import PathState as State
+from rsundistort.bundle.prior_sigmas import PriorSigmas
+from rsundistort.bundle.problem import BundleProblem
 from rsundistort.errors import InputError
 from rsundistort.model.path import CameraPath, inverse_left_jacobians
 from rsundistort.solve.video_path import readouts_of_halves
@@ -373,3 +376,22 @@ def test_halves_of_a_video_ask_for_their_own_readout_times_though_they_begin_at_
 def test_the_state_of_a_path_gives_the_motions() -> None:
     state = State(np.arange(12.0).reshape(2, 6), np.zeros((2, 6)), np.array([0.5, 2.0]))
     np.testing.assert_array_equal(state.motions(np.array([1, 0])), [np.arange(6) * 2.0, np.arange(6, 12) * 0.5])
+
+
+def test_covariances_of_a_path_hold_one_factor_at_a_time() -> None:
+    """Memory of long clips: the system, a copy with other priors, and a factor with what becomes its inverse."""
+    truth, times = filmed(HandHeld(3), 60)
+    options = BundleOptions(path=FramePath(times, FRAME_S))
+    problem = BundleProblem(truth, "constant-motion", options, 0.2, PriorSigmas(0.03, 0.03, path=(0.02, 0.3)))
+    equations = problem.linearize(problem.initial_state())
+    equations.marginal_covariances()  # compiles
+    equations = problem.linearize(problem.initial_state())
+    system = equations._reduced.S.nbytes
+    tracemalloc.start()
+    before = tracemalloc.get_traced_memory()[0]
+    equations.marginal_covariances()
+    peak = tracemalloc.get_traced_memory()[1] - before
+    tracemalloc.stop()
+    factor = equations.inverse.photos.data.nbytes
+    assert "_reduced" not in vars(equations)
+    assert peak < 1.2 * (system + 2 * factor)
