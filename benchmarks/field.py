@@ -332,14 +332,14 @@ def warped(photos: Path) -> None:
                 registered=f"{len(solution.registered)}/{len(solution.images)}",
                 reference_registered=len(reference.registered),
                 rotation_deg={"median": round(float(np.median(error)), 4), "worst": round(float(error.max()), 4)},
-                rotation_deg_but_for_a_common_turn=common_turn_off(solution, reference),
+                rotation_deg_but_for_a_common_one=without_common_rotation(solution, reference),
                 focal_px=[round(float(each.K[0, 0]), 1) for each in cameras],
                 centre_px=[np.round(each.K[:2, 2], 1).tolist() for each in cameras],
                 target="all, <= 0.05 deg" if how == "auto" else None,
             )
 
 
-def common_turn_off(solution: Any, reference: Any) -> dict[str, float]:
+def without_common_rotation(solution: Any, reference: Any) -> dict[str, float]:
     """Rotation errors in degrees less what all cameras are rotated by in their own frames: another principal point."""
     theirs = {image.name: image.R_cw for image in reference.registered}
     both = [(image.R_cw, theirs[image.name]) for image in solution.registered if image.name in theirs]

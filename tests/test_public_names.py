@@ -20,7 +20,7 @@ from bundle_scenes import make_scene, perturbed
 import rsundistort as rs
 from rsundistort._former import FORMER_NAMES
 from rsundistort.analysis import ErrorSummary, Evaluation, PhiErrorSummary, PoseAnalysis, PsnrSummary
-from rsundistort.bundle import BundleResult, bundle_adjust
+from rsundistort.bundle import BundleResult, ReadoutChoice, bundle_adjust
 from rsundistort.critical import critical_motion
 from rsundistort.errors import InputError
 
@@ -191,6 +191,8 @@ def test_former_fields_answer_with_a_warning():
     with pytest.warns(DeprecationWarning, match="SolvedImage.turned is now SolvedImage.applied_orientation"):
         image = rs.SolvedImage("a.jpg", "0", turned=6)
     assert image.applied_orientation == 6
+    with pytest.warns(DeprecationWarning, match="ReadoutChoice.turned is now ReadoutChoice.changed"):
+        assert ReadoutChoice(None, {0: 9.0, 1: 0.0}).turned == (0,)
     assert pickle.loads(pickle.dumps(options)) == options  # as workers get them
 
 

@@ -42,6 +42,6 @@ class StageLog:
         self.tell(stage, done, total)
 
     def end(self, stage: str, **counts: Any) -> None:
-        """Note what a stage took and counted."""
+        """Note what a stage took and counted, and give back the memory that it freed."""
         return_memory()
         self.stages.append({"name": stage, "seconds": round(time.perf_counter() - self._began, 3), **counts})

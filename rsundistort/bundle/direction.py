@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model import Reconstruction, other_axis
+from ..model.former_fields import former_fields
 from .adjust import adjust_sequence
 from .bundle_options import BundleOptions, BundleResult
 from .choice import clipped_errors, standard_errors
@@ -20,6 +21,7 @@ __all__ = ["ReadoutChoice", "choose_readouts"]
 _MIN_GAIN = 5.0
 
 
+@former_fields(turned="changed")
 @dataclass(frozen=True)
 class ReadoutChoice:
     """Outcome of `choose_readouts`.

@@ -493,7 +493,10 @@ class BundleProblem:
         return np.concatenate([J[:, :, :own], weight @ self._field_jacobian, J[:, :, own:]], axis=2)
 
     def _by_lens(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The same without fields, and those of a photo's variation (o, 2, 3), or (o, 2, 0) where nobody needs them."""
+        """Those by the intrinsics, without fields, and those by a photo's variation (o, 2, 3).
+
+        The last are left empty (o, 2, 0) where nobody needs them.
+        """
         if state is self._lens_of:
             return self._lens
         o, wanted = len(self._xy), self._options.varying or self._fields is not None

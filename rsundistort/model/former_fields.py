@@ -25,14 +25,14 @@ def former_fields(**present: str) -> Callable[[_Class], _Class]:
         text = f"{cls.__name__}.{former} is now {cls.__name__}.{present[former]}"
         warnings.warn(text, DeprecationWarning, stacklevel=3)
 
-    def decorate(cls: _Class) -> _Class:
-        # the class has no type that a checker could look `__init__` up in
-        with_present_names: Any = cls.__init__  # type: ignore[misc]
+    def decorate(cls: Any) -> Any:
+        with_present_names = cls.__init__
 
         @functools.wraps(with_present_names)
         def with_former_names(self: Any, *args: Any, **given: Any) -> None:
             for former in [name for name in given if name in present]:
                 warn(cls, former)
+                # beside it `replace` gives the present one, as it was
                 given[present[former]] = given.pop(former)
             with_present_names(self, *args, **given)
 
@@ -43,7 +43,7 @@ def former_fields(**present: str) -> Callable[[_Class], _Class]:
 
             return property(value, doc=f"Former name of `{present[former]}`.")
 
-        cls.__init__ = with_former_names  # type: ignore[misc]
+        cls.__init__ = with_former_names
         for former in present:
             setattr(cls, former, attribute(former))
         return cls

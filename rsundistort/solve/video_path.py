@@ -232,8 +232,8 @@ def _against_telemetry(
     if filmed.verdict == "none":
         return filmed
     place = _places(clip, rec)
-    pairs, turns = rotations_between(clip.part[place], R_cw)
-    reason = calmer_than_felt(clip.time_s[place], pairs, turns, _rotation_sigma(own, pairs), telemetry)
+    pairs, rotations = rotations_between(clip.part[place], R_cw)
+    reason = calmer_than_felt(clip.time_s[place], pairs, rotations, _rotation_sigma(own, pairs), telemetry)
     return replace(filmed, verdict="stabilised", reason=reason) if reason else filmed
 
 
@@ -377,11 +377,11 @@ def readouts_of_halves(result: BundleResult, options: BundleOptions) -> tuple[Re
 def _stabilisation(clip: Clip, rec: Reconstruction, found: OwnMotions, felt: Felt | None = None) -> Stabilisation:
     """Whether the lines of the frames move as the frames do, each frame having its own motion."""
     place = _places(clip, rec)
-    pairs, turns = rotations_between(clip.part[place], found.R_cw)
+    pairs, rotations = rotations_between(clip.part[place], found.R_cw)
     span = rec.frame_span()[:, None]
     log, offset_s = (None, 0.0) if felt is None else (felt.log, felt.alignment.offset_s)
     return judge_stabilisation(
-        clip.time_s[place], pairs, turns, found.phi * span, found.sigma_phi * span, log=log, offset_s=offset_s,
+        clip.time_s[place], pairs, rotations, found.phi * span, found.sigma_phi * span, log=log, offset_s=offset_s,
         rotation_sigma=_rotation_sigma(found, pairs),
     )  # fmt: skip
 
