@@ -14,7 +14,7 @@ MATCHED = SimpleNamespace(names=[f"{k}.jpg" for k in range(16)])
 
 @pytest.fixture
 def attempts(monkeypatch):
-    """Attempts that were made: keypoints all at once, then "one by one"; `registers` says how many photos each takes."""
+    """Attempts made, by their keypoints or "one by one"; `registers` says how many photos each takes."""
     made, registers = [], {}
 
     def of(attempt):
