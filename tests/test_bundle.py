@@ -135,9 +135,10 @@ def test_a_lens_that_varies_from_photo_to_photo_is_found_and_no_shutter_is(rng):
     assert 0.005 < result.centre_sigma < 0.02
 
 
-def test_a_lens_that_varies_beside_a_shutter_is_no_velocity(rng):
-    scene = make_scene(rng, "rotation", num_images=12, num_points=150, dist=LENS)
-    varied = replace(scene, variation=rng.normal(0, 0.01, (12, 3)))
+def choice_of_varied(rng, num_points, variation, **motions):
+    """What is chosen where photos rotate and their lens varies, relative to f, by this standard deviation."""
+    scene = make_scene(rng, "rotation", num_images=12, num_points=num_points, dist=LENS, **motions)
+    varied = replace(scene, variation=rng.normal(0, variation, (12, 3)))
     predicted, _ = reprojection_residuals(
         replace(varied, observations=replace(scene.observations, xy_raw=0 * scene.observations.xy_raw))
     )
@@ -146,8 +147,18 @@ def test_a_lens_that_varies_beside_a_shutter_is_no_velocity(rng):
     options = BundleOptions(
         refine=("f", "cx", "cy"), guessed=GuessedCameras(start.cameras, {"f": 0.02, "cx": 0.01, "cy": 0.01})
     )
-    choice = choose_model(start, options=options, sigma_px=0.2)
+    return choose_model(start, options=options, sigma_px=0.2)
+
+
+def test_a_lens_that_varies_beside_a_shutter_is_no_velocity(rng):
+    choice = choice_of_varied(rng, 150, 0.01)
     assert (choice.shutter_model, choice.varying, choice.shutter) == ("rotation", True, "found")
+
+
+def test_a_lens_that_varies_a_little_beside_a_strong_shutter_is_no_change_of_the_rate():
+    choice = choice_of_varied(np.random.default_rng(7), 300, 0.006, phi_size=0.03)
+    assert "rotation, accelerating" in choice.kept  # before the lens is allowed to vary
+    assert (choice.shutter_model, choice.varying, choice.bends) == ("rotation", True, 0)
 
 
 def test_the_model_sequence_ends_at_the_truth_and_runs_in_order(rng):

@@ -496,14 +496,19 @@ def _selected(fits: _Fits, models: Sequence[str], refines: bool) -> _Selection:
         if SHUTTER_MODELS[model] >= SHUTTER_MODELS["rotation"]:
             selection.bend(last)
             last = selection.best if selection.best.model == model else last
-    best = selection.best
-    if best.bends:
-        # a later model may explain what bends explained before it
-        steady = fits.fit(best.model, best.varying, [best.reconstruction, given])
-        if not fits.is_better(steady, best):
-            selection.best = steady
-            kept.append(steady.label)
+    steady = _without_bends(fits, selection.best)
+    if steady is not selection.best:
+        selection.best = steady
+        kept.append(steady.label)
     return selection
+
+
+def _without_bends(fits: _Fits, best: _Fit) -> _Fit:
+    """The same with steady motions, if a later model or a lens that varies explains what bends explained before."""
+    if not best.bends:
+        return best
+    steady = fits.fit(best.model, best.varying, [best.reconstruction, fits.given])
+    return best if fits.is_better(steady, best) else steady
 
 
 def _doubts(fits: _Fits, best: _Fit, plain: _Fit, gain: dict[str, float]) -> tuple[list[str], float | None]:
@@ -529,4 +534,4 @@ def _with_shared_lens(fits: _Fits, best: _Fit, gain: dict[str, float]) -> _Fit:
         fits.fit(best.model, each, [best.reconstruction, fits.given], bends=best.bends) for each in (False, True)
     )
     gain[vary.label] = fits.gain(shared, vary)
-    return vary if fits.is_better(shared, vary) else shared
+    return _without_bends(fits, vary) if fits.is_better(shared, vary) else shared
