@@ -229,7 +229,7 @@ def solve_frames(
         raise InputError("frames of a video have no GPS; it takes no --crs and --gcp, say --every N for photos that do")
     if solving.still or solving.known or solving.shutter_model not in ("auto", "constant-motion"):
         raise InputError(
-            "the path of a video says how its frames move: it takes no --still, --motions or --model; "
+            "the path of a video says how its frames move: it takes no --still, --known or --model; "
             "say --every N for photos that do"
         )
     readouts = known_readouts(bodies, cameras.cameras, cameras.camera_idx, solving.readout_s, gyro_log)
