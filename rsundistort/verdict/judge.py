@@ -330,6 +330,11 @@ def _doubts(
             said.append(f"its halves contradict each other by {motions.difference_px[i]:.1f} px")
         if motions.sigma_px[i] > _UNCERTAIN_PX:
             said.append(f"its motion is only known to +-{motions.sigma_px[i]:.1f} px")
+        elif motions.sigma_px[i] > max(_UNSEEN_PX / 2, motions.shift_px[i] / 4):
+            said.append(
+                f"its motion of {motions.shift_px[i]:.1f} px is only known to +-{motions.sigma_px[i]:.1f} px, and may be "
+                "less than its error"
+            )
         if times[i] > _FAR and motions.shift_px[i] > _UNSEEN_PX:
             said.append(f"it moved {times[i]:.0f} times as much as the other photos do")
         if np.linalg.norm(rotation[i]) - 2 * sigma[i] > most_phi.get(name, np.inf):
