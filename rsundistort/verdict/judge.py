@@ -140,6 +140,8 @@ def judge(
     reasons += why
     if not reasons:
         reasons = _of_photos(rec, doubts, motions)
+    for name, said in _faint(rec, motions).items():
+        doubts[name] = doubts[name] or [said]
     lost = torn | (_counts(rec) < _FEW) & (motions.sigma_px >= motions.shift_px)
     # motions that cannot be seen do no harm
     lost &= motions.shift_px >= _UNSEEN_PX
@@ -330,11 +332,6 @@ def _doubts(
             said.append(f"its halves contradict each other by {motions.difference_px[i]:.1f} px")
         if motions.sigma_px[i] > _UNCERTAIN_PX:
             said.append(f"its motion is only known to +-{motions.sigma_px[i]:.1f} px")
-        elif motions.sigma_px[i] > max(_UNSEEN_PX / 2, motions.shift_px[i] / 4):
-            said.append(
-                f"its motion of {motions.shift_px[i]:.1f} px is only known to +-{motions.sigma_px[i]:.1f} px, and may be "
-                "less than its error"
-            )
         if times[i] > _FAR and motions.shift_px[i] > _UNSEEN_PX:
             said.append(f"it moved {times[i]:.0f} times as much as the other photos do")
         if np.linalg.norm(rotation[i]) - 2 * sigma[i] > most_phi.get(name, np.inf):
@@ -343,6 +340,20 @@ def _doubts(
                 f"blurred by more than {np.degrees(most_phi[name]):.2f}"
             )
     return doubts
+
+
+def _faint(rec: Reconstruction, motions: PhotoMotions) -> dict[str, str]:
+    """Photos that may come out worse than they went in, which says nothing about the shape of the whole.
+
+    They do if an error of two standard deviations is half of what was found: it is then all that there was.
+    """
+    found, sigma = motions.shift_px, motions.sigma_px
+    faint = (sigma > found / 4) & (sigma > _UNSEEN_PX / 2)
+    return {
+        name: f"its motion of {found[i]:.1f} px is only known to +-{sigma[i]:.1f} px"
+        for i, name in enumerate(rec.image_names)
+        if faint[i]
+    }
 
 
 def _misplaced(result: BundleResult, unexplained: bool) -> dict[str, str]:
