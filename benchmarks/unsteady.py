@@ -1,6 +1,6 @@
 """Motions that are not steady: what is found of them, what the photos are worth, and whether any photo comes out worse.
 
-    python benchmarks/unsteady.py [--photos DIR] [--only PART ...] [--seeds N] [--first-seed K]
+    python benchmarks/unsteady.py [--photos DIR] [--only PART ...] [--kinds KIND ...] [--seeds N] [--first-seed K]
 
 Prints one JSON object a line and at the end a table with targets. Parts, with their own number of seeds:
 
@@ -243,6 +243,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--photos", type=Path, default=ROOT.parent / "shared" / "photos")
     parser.add_argument("--only", nargs="*", choices=PARTS, default=PARTS)
+    parser.add_argument("--kinds", nargs="*", choices=[*MOTIONS], default=[*MOTIONS], help="of anchored and limit")
     parser.add_argument("--seeds", type=int)
     parser.add_argument("--first-seed", type=int, default=0)
     args = parser.parse_args()
@@ -257,10 +258,11 @@ def main() -> int:
         for kind, (sigma, change, shake, _) in MOTIONS.items():
             for seed in seeds(3) if kind in args.only else ():
                 bench.measure(kind, seed, bench.warped(sigma, seed, change, shake), references, bench.still)
-            for seed in seeds(3) if "anchored" in args.only else ():
+            wanted = kind in args.kinds
+            for seed in seeds(3) if wanted and "anchored" in args.only else ():
                 folder = bench.warped(sigma, seed, change, shake, (STOOD,))
                 bench.measure(f"anchored, {kind}", seed, folder, references, bench.still, still={STOOD: 1e-4})
-            for seed in seeds(3) if "limit" in args.only else ():
+            for seed in seeds(3) if wanted and "limit" in args.only else ():
                 limit(bench, kind, seed)
         if "scene" in args.only:
             for seed in seeds(1):
