@@ -4,7 +4,8 @@
 
 Prints one JSON object a line and at the end a table with targets. Parts, with their own number of seeds:
 
-    changing (3)   herz-jesus-8 warped by 0.05 rad a frame, the rate changing by half of itself over half a frame
+    changing (3)   herz-jesus-8 warped by 0.05 rad a frame, the rate changing by half of itself over half a frame;
+                   `dB_without_lens` is against the photos as they are without the lens that was found
     vibrating (3)  herz-jesus-8 warped by 0.02 rad, with 1.5 mrad of vibration at 2 to 5 periods a frame
     anchored (3)   the same two with one photo that stood still, and `--still` says so: what the height of the scene is
                    worth, which level cameras that move so do not determine
@@ -12,7 +13,7 @@ Prints one JSON object a line and at the end a table with targets. Parts, with t
     limit (3)      the bound that the measurements impose on the first two: those of the photos as they are, each moved
                    as the warp moves it, adjusted from the true poses and motions; no match is lost or wrong. Errors of
                    phi (mean over the photos, and about it, mrad a frame) and of log k, the height of the scene, with
-                   their standard deviations. With the noise as it is; with the same residuals in another order, so
+                   their standard deviations; the true mean of phi1, and its standard deviation by the prior. With the noise as it is; with the same residuals in another order, so
                    that neighbours share nothing; and with the lens held at that of the photos as they are
     harm (13)      herz-jesus-8 with motions of all kinds, 0 to 0.1 rad: no photo is to come out more than 0.3 dB below
                    what went in unless it is named as doubtful
@@ -134,6 +135,7 @@ class Bench:
             truth_file = folder / "ground_truth.json"
             truth_file = with_lens_of(out, truth_file) if own_lens else truth_file
             found = rs.evaluate(out, truth_file, poses=poses, twins=references)
+            of_lens = rs.evaluate(out, with_lens_of(out, folder / "ground_truth.json"), twins=references).psnr_db
         except Exception as error:
             show(f"{part}, seed {seed}", crash=f"{type(error).__name__}: {error}")
             self.failed.append(part)
@@ -151,7 +153,8 @@ class Bench:
         value = {
             "model": quality["held_out_chosen"], "verdict": [solution.verdict["shutter"], solution.verdict["shape"]],
             "registered": len(solution.registered), "dB": round(found.psnr_db.median, 2),
-            "worst": round(min(after.values()), 2), "before": round(float(np.median([*before.values()])), 2),
+            "worst": round(min(after.values()), 2), "dB_without_lens": round(of_lens.median, 2),
+            "before": round(float(np.median([*before.values()])), 2),
             "deg": round(found.rotation_deg.mean, 4),
             "phi_mrad": np.round(found.phi_mrad_per_frame.mean_per_component, 2).tolist(),
             "phi_over_sigma": None if phi is None else round(float(np.sqrt(np.mean(phi["phi"] ** 2))), 2),
@@ -192,6 +195,7 @@ def limit(bench: Bench, kind: str, seed: int) -> None:
     rec, options = bench.measured
     options = replace(options, bends=groups)
     obs, warped_by = rec.observations, truth.cameras["1"]
+    span = warped_by.frame_span
     residuals, _ = reprojection_residuals(rec)
     shuffled = np.random.default_rng(seed).permutation(len(obs))
     relative = residuals / obs.sigma[:, None]
@@ -209,8 +213,8 @@ def limit(bench: Bench, kind: str, seed: int) -> None:
         start = replace(rec, observations=replace(obs, xy_raw=moved).select(inside), shutter_model="rotation")
         result = bundle_adjust(start.with_motions(motions), "rotation", how)
         found, cost = result.reconstruction, shape_cost(result, how)
-        off = 1e3 * warped_by.frame_span * (found.phi - np.array([each.phi for each in motions]))
-        sigma = 1e3 * warped_by.frame_span * np.sqrt((result.sigma_phi**2).mean(axis=0))
+        off = 1e3 * span * (found.phi - np.array([each.phi for each in motions]))
+        sigma = 1e3 * span * np.sqrt((result.sigma_phi**2).mean(axis=0))
         degrees = rotations_off(found.R_cw, rec.R_cw)
         dB = [
             psnr_between(read_photo(bench.photos / HERZ / photo).pixels, found.cameras[0], found.motion(i), motions[i])
@@ -219,6 +223,8 @@ def limit(bench: Bench, kind: str, seed: int) -> None:
         show(
             f"limit of {kind}, noise {name}, seed {seed}", measurements=len(start.observations),
             dB=round(float(np.median(dB)), 2), least_dB=round(min(dB), 2), deg=round(float(np.median(degrees)), 4),
+            phi1_mrad=round(1e3 * span * float(np.mean([each.phi[0] for each in motions])), 2),
+            prior_mrad=round(1e3 * result.phi_sigma / len(motions) ** 0.5, 2),
             mean_mrad=off.mean(0).round(2).tolist(), about_it_mrad=off.std(0).round(2).tolist(),
             sigma_mrad=sigma.round(2).tolist(), log_k=round(log_k_error(found, with_poses(truth, _poses(rec))), 5),
             sigma_log_k=round(cost.sigma_log_k, 5), noise=round(result.noise_factor, 2),
