@@ -13,8 +13,9 @@ Prints one JSON object a line and at the end a table with targets. Parts, with t
     limit (3)      the bound that the measurements impose on the first two: those of the photos as they are, each moved
                    as the warp moves it, adjusted from the true poses and motions; no match is lost or wrong. Errors of
                    phi (mean over the photos, and about it, mrad a frame) and of log k, the height of the scene, with
-                   their standard deviations; the true mean of phi1, and its standard deviation by the prior. With the noise as it is; with the same residuals in another order, so
-                   that neighbours share nothing; and with the lens held at that of the photos as they are
+                   their standard deviations; the true mean of phi1, and its standard deviation by the prior. With the
+                   noise as it is; with the same residuals in another order, so that neighbours share nothing; and with
+                   the lens held at that of the photos as they are
     harm (13)      herz-jesus-8 with motions of all kinds, 0 to 0.1 rad: no photo is to come out more than 0.3 dB below
                    what went in unless it is named as doubtful
     steady (2)     steady motions of 0.02 and 0.05 rad, with these models among the choices and without
