@@ -22,6 +22,8 @@ from rsundistort import (
     SolvedImage,
     SolveOptions,
     init_rectify_map,
+    read_solution,
+    rectify,
     unproject_points,
 )
 from rsundistort.bundle import BundleResult, Posterior, gauge_directions
@@ -30,7 +32,7 @@ from rsundistort.critical import Remedy
 from rsundistort.critical.common import row_phi
 from rsundistort.critical.degeneracy import readout_axes
 from rsundistort.evaluation import align_points, motion_errors, psnr
-from rsundistort.io import read_photo
+from rsundistort.io import read_photo, write_image
 from rsundistort.io.cameras import camera_from_json
 from rsundistort.solve import OutputOptions
 
@@ -136,13 +138,11 @@ def log_k_error(rec: Reconstruction, truth: Solution) -> float:
     under the true poses and motions. Far points hardly count, as in `critical.shape_cost`.
     """
     images = [truth.image(name) for name in rec.image_names]
-    motions = [image.motion or RowMotion() for image in images]
     cameras = [truth.cameras[image.camera_id] for image in images]
     true = replace(
         rec, cameras=cameras, camera_idx=np.arange(len(images)), R_cw=np.array([image.R_cw for image in images]),
-        center_w=np.array([image.center_w for image in images]), phi=np.array([motion.phi for motion in motions]),
-        velocity=np.array([motion.velocity for motion in motions]), shutter_model=truth.shutter_model,
-    )  # fmt: skip
+        center_w=np.array([image.center_w for image in images]), shutter_model=truth.shutter_model,
+    ).with_motions([image.motion or RowMotion() for image in images])  # fmt: skip
     points, meet = _meeting_points(true)
     x, y = points[meet], rec.points_w[meet]
     weight = np.ones(len(x))
@@ -201,6 +201,26 @@ def with_lens_of(out: Path, truth: Path) -> Path:
     path = truth.with_name(f"{truth.stem}-lens-of-{out.name}.json")
     path.write_text(json.dumps(content))
     return path
+
+
+def for_the_lens_only(out: Path, truth: Solution, photos: Path, references: Path) -> dict[str, float]:
+    """PSNR of the photos, by name, that a run would have written had it corrected the lens that it found, and no more.
+
+    Against references without that lens; `truth` has the cameras of the run (`with_lens_of`). The photos are stored
+    with a quality of 100, as the run's must be, so that what encoding and interpolation cost is no difference.
+    """
+    solution, found = read_solution(out / "solution.json"), {}
+    for image in solution.registered:
+        name = image.name
+        taken_by, rectified = truth.cameras[truth.image(name).camera_id], solution.rectified_cameras[image.camera_id]
+        (photo, _), (reference, seen) = (
+            rectify(read_photo(folder / name).pixels, taken_by, RowMotion(), "global", rectified)
+            for folder in (photos, references)
+        )
+        write_image(out / "lens-only.jpg", photo, quality=100)
+        mask = read_photo(out / "masks" / f"{Path(name).stem}.png").pixels
+        found[name] = psnr(read_photo(out / "lens-only.jpg").pixels, reference, np.minimum(mask, seen))
+    return found
 
 
 def fountain_truth(folder: Path) -> Solution:

@@ -178,7 +178,7 @@ class Bench:
         found = bundle_adjust(start, "rotation", free).reconstruction
         errors = rotations_off(found.R_cw, rec.R_cw)
         dB = [
-            _psnr_between(
+            psnr_between(
                 read_photo(self.photos / name / photo).pixels, found.cameras[found.camera_idx[f]],
                 rs.RowMotion(found.phi[f]), rs.RowMotion(phi[f]),
             )
@@ -241,7 +241,7 @@ class Bench:
         self.rows.append(("pairs", str(radians), str(seed), name, *(f"{key} {value}" for key, value in auc.items())))
 
 
-def _psnr_between(pixels: np.ndarray, camera: rs.Camera, found: rs.RowMotion, true: rs.RowMotion) -> float:
+def psnr_between(pixels: np.ndarray, camera: rs.Camera, found: rs.RowMotion, true: rs.RowMotion) -> float:
     """What is left of a photo in dB where a rectification takes one motion for another."""
     step, (height, width) = 16, pixels.shape[:2]
     grid = np.stack(np.meshgrid(np.arange(0, width, step), np.arange(0, height, step)), axis=2).astype(float)

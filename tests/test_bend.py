@@ -26,6 +26,7 @@ from rsundistort.bundle import choose_model
 from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.bundle.remains import agreement_of_waves, half_across_readout
+from rsundistort.critical import still_probability
 from rsundistort.errors import InputError
 from rsundistort.model import BEND_GROUPS, Bend
 from rsundistort.model.bend import bend_functions, splines_at
@@ -205,7 +206,10 @@ def test_bends_that_make_no_sense_are_refused(arguments, said):
 def make_scene(
     rng, model="rotation", groups=GROUPS, turn=6e-4, way=0.0, steady=0.03, num_points=700, noise_px=NOISE_PX
 ):
-    """Six photos from all around, rolled at will, of a cloud; the truth, with its measurements."""
+    """Six photos from all around, rolled at will, of a cloud; the truth, with its measurements.
+
+    Rotations and bends may be of each photo.
+    """
     camera, m = make_camera(), 6
     points_w = rng.uniform(-1, 1, (num_points, 3))
     center_w = rng.normal(size=(m, 3))
@@ -217,10 +221,10 @@ def make_scene(
     moves = model == "constant-motion"
     motions = [
         RowMotion(
-            rng.normal(0, steady, 3), rng.normal(0, 0.1, 3) * moves,
-            random_bend(rng, camera, groups, turn, way) if groups else None,
+            rng.normal(0, rotates, 3), rng.normal(0, 0.1, 3) * moves,
+            random_bend(rng, camera, groups, trembles, way) if groups else None,
         )
-        for _ in range(m)
+        for rotates, trembles in zip(np.broadcast_to(steady, m), np.broadcast_to(turn, m), strict=True)
     ]  # fmt: skip
     found = []
     for i, (R, center, motion) in enumerate(zip(R_cw, center_w, motions, strict=True)):
@@ -295,6 +299,14 @@ def test_a_known_bend_is_taken_and_the_rest_is_found(rng):
     half = dict(list(known.items())[:3])
     rest = bundle_adjust(still(truth), "rotation", BundleOptions(known_bends=half, bends=2))
     assert rest.rms_px < 1.1 * NOISE_PX
+
+
+def test_a_photo_that_trembles_did_not_stand_still(rng):
+    truth = make_scene(rng, groups=1, steady=[0.03, 0.03, 0.03, 0.03, 0.0, 0.0], turn=[2e-3] * 5 + [0.0])
+    options = BundleOptions(bends=1)
+    probability = still_probability(bundle_adjust(still(truth), "rotation", options), options)
+    assert probability[5] > 0.9
+    assert probability[:5].max() < 0.1
 
 
 @pytest.mark.parametrize(

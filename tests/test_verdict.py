@@ -284,6 +284,18 @@ def test_a_motion_that_nothing_supports_is_not_taken_out(rng):
     assert "only known to" in weak.doubtful["2.jpg"]
 
 
+def test_a_motion_that_may_be_all_error_is_named_and_says_nothing_about_the_shape(rng):
+    result = bundle_adjust(measured(rng, swung(rng, 0.01)), "rotation")
+    choice = choice_of("rotation", gain=9.0)
+    found, sigma = photo_motions(result).shift_px, photo_motions(result).sigma_px
+    # of the photo that moved least, an error of two standard deviations then is half, and of the others less
+    least = int(np.argmin(found))
+    times = (found.min() / 3.9 / sigma[least]) ** 2
+    verdict = judge(replace(result, covariances=np.array(result.covariances) * times), None, choice)
+    assert verdict.doubtful[result.reconstruction.image_names[least]].startswith(f"its motion of {found.min():.1f} px")
+    assert verdict.shape == judge(result, None, choice).shape == "trusted"
+
+
 def test_places_that_only_the_solution_tells_are_named_where_it_does_not_tell_them(rng):
     result, choice = bundle_adjust(measured(rng, swung(rng)), "rotation"), choice_of("rotation", gain=9.0)
     assert not judge(result, None, choice, strong=True).doubtful

@@ -32,7 +32,7 @@ class Posterior:
     def __init__(self, result: BundleResult, options: BundleOptions | None = None) -> None:
         rec = result.reconstruction
         per_unit = np.repeat([1.0, rec.baseline], 3)
-        sigmas = PriorSigmas(
+        sigmas = self._sigmas = PriorSigmas(
             result.phi_sigma, max(result.velocity_sigma * rec.baseline, 1e-300),
             max(result.focal_sigma, 1e-300), max(result.centre_sigma, 1e-300), result.bend_sigmas,
             tuple(each * rec.baseline for each in result.way_sigmas), result.field_sigma_px, result.path_sigmas,
@@ -90,14 +90,21 @@ class Posterior:
     def motions(self) -> tuple[Array, Array]:
         """Motions (m, k) of the photos and their covariances (m, k, k), as far as the model has them.
 
-        One Gauss-Newton step from the result, which matters where the options free what was held in it.
+        Phi, velocity, and the coefficients of the bends, each a root mean square over the frame. One Gauss-Newton step
+        from the result, which matters where the options free what was held in it.
         """
+        layout, state = self._problem.layout, self._state
         covariances = self._equations.marginal_covariances(of_priors=False).photos
         solved = self._equations.solve(0.0)
         step = np.full(covariances.shape[:2], np.nan) if solved is None else solved[0][0]
-        last = covariances.shape[1] - self._own
-        motion = np.hstack([self._state.phi, self._state.velocity])[:, : last - 6] + step[:, 6:last]
-        return motion, covariances[:, 6:last, 6:last]
+        own = np.r_[6 : layout.motion, layout.variation : layout.size]
+        motion = np.hstack([np.hstack([state.phi, state.velocity])[:, : layout.motion - 6], state.bend])
+        return motion + step[:, own], covariances[:, own[:, None], own]
+
+    @property
+    def bend_sigmas(self) -> Array:
+        """(k,) prior standard deviations of the coefficients of the bends: radians, then world units."""
+        return self._problem.layout.per_bend(self._sigmas.bends, self._sigmas.ways)
 
     def squared_shifts(self) -> Array:
         """(m, k, k) mean over a photo's measurements of the squared displacement that a change of its motion causes.

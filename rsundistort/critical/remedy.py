@@ -27,8 +27,8 @@ _SHARE = 0.1
 _NONE = 10.0
 # A still photo is contradicted if its stillness is less likely than this.
 _UNLIKELY = 0.01
-# One from the first row to the last, root mean square.
-_PIXEL = 1.0 / np.sqrt(12.0)
+# Root mean square over the frame of what grows by one from the first row to the last.
+_RMS = 1.0 / np.sqrt(12.0)
 
 
 @dataclass(frozen=True)
@@ -85,21 +85,20 @@ def with_remedy(options: BundleOptions, remedy: str) -> BundleOptions:
     return replace(options, phi_sigma=_NONE) if remedy == "none" else options
 
 
-def _freed(
-    result: BundleResult, options: BundleOptions | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
-    """Motions (m, k) and their covariances if no photo is taken as still."""
-    free = replace(options or BundleOptions(), still={}, held_phi={})
-    return Posterior(result, free).motions()
+def _freed(result: BundleResult, options: BundleOptions | None) -> Posterior:
+    """The solution's covariances if no photo is taken as still."""
+    given = options or BundleOptions()
+    return Posterior(result, replace(given, still={}, held_phi={}, bends=len(result.bend_sigmas)))
 
 
 def still_probability(result: BundleResult, options: BundleOptions | None = None) -> NDArray[np.float64]:
     """(m,) probability that each photo did not move, from what all others leave undetermined of its motion.
 
     Either the photo was still (zero motion, up to 1 mrad per frame and the translation that displaces as much), as one
-    in ten is, or it moved like the rest (zero mean; the robust standard deviation of phi2 and phi3, and the prior one
-    of the velocity). Each is a prior on its motion in place of the one it was adjusted with; the likelier one is that
-    under which the measurements are likelier. No other photo is taken as still, whatever the options say.
+    in ten is, or it moved like the rest (zero mean; the robust standard deviation of phi2 and phi3, and the prior ones
+    of the velocity and of the bends). Each is a prior on its motion in place of the one it was adjusted with; the
+    likelier one is that under which the measurements are likelier. No other photo is taken as still, whatever the
+    options say.
 
     Parameters
     ----------
@@ -110,7 +109,8 @@ def still_probability(result: BundleResult, options: BundleOptions | None = None
     """
     rec = result.reconstruction
     m = rec.num_images
-    motion, covariance = _freed(result, options)
+    freed = _freed(result, options)
+    motion, covariance = freed.motions()
     if not np.isfinite(covariance).all():
         return np.zeros(m)
     span, depth = rec.frame_span(), np.array([rec.median_depth(i) for i in range(m)])
@@ -119,17 +119,22 @@ def still_probability(result: BundleResult, options: BundleOptions | None = None
     phi = max(float(np.median(pair)) / 0.6745, 2 * _STILL)
     velocity = np.maximum(result.velocity_rms * rec.baseline, 2 * _STILL * depth)
 
-    def precision(of_phi: ArrayLike, of_velocity: ArrayLike) -> NDArray[np.float64]:
+    bends = freed.bend_sigmas
+    steady = motion.shape[1] - len(bends)
+
+    def precision(of_phi: ArrayLike, of_velocity: ArrayLike, of_bends: NDArray[np.float64]) -> NDArray[np.float64]:
         """(m, k, k) of a prior, per unit of the clock."""
         sigma = np.repeat(np.stack(np.broadcast_arrays(of_phi, of_velocity, span)[:2], axis=1), 3, axis=1)
-        value: NDArray[np.float64] = (span[:, None] / sigma[:, : motion.shape[1]])[:, :, None] ** 2
-        return value * np.eye(motion.shape[1])
+        sigma = np.hstack([sigma[:, :steady] / span[:, None], np.broadcast_to(of_bends, (m, len(bends)))])
+        value: NDArray[np.float64] = sigma[:, :, None] ** -2.0 * np.eye(motion.shape[1])
+        return value
 
     # of the motion, all that the prior of its own photo did not say: exp(pull x - x' (inside) x / 2)
     inside = np.linalg.inv(covariance)
     mean, phi_sigma, velocity_sigma = _expected(result)
-    own = precision(phi_sigma, np.maximum(velocity_sigma, 1e-300))
-    pull = np.einsum("mij,mj->mi", inside, motion) - np.einsum("mij,mj->mi", own, mean[:, : motion.shape[1]])
+    mean = np.hstack([mean[:, :steady], np.zeros((m, len(bends)))])
+    own = precision(phi_sigma, np.maximum(velocity_sigma, 1e-300), bends)
+    pull = np.einsum("mij,mj->mi", inside, motion) - np.einsum("mij,mj->mi", own, mean)
     value, vector = np.linalg.eigh(inside - own)  # nothing where nothing else is known
     inside = np.einsum("mij,mj,mkj->mik", vector, np.maximum(value, 0.0), vector)
 
@@ -140,8 +145,9 @@ def still_probability(result: BundleResult, options: BundleOptions | None = None
         value: NDArray[np.float64] = 0.5 * (np.linalg.slogdet(prior)[1] - np.linalg.slogdet(total)[1] + gain)
         return value
 
-    odds = np.log(_SHARE / (1 - _SHARE)) + evidence(precision(_STILL, _STILL * depth))
-    odds -= evidence(precision(phi, velocity))
+    # a camera that is held more firmly trembles less, too
+    odds = np.log(_SHARE / (1 - _SHARE)) + evidence(precision(_STILL, _STILL * depth, bends * (_STILL / phi)))
+    odds -= evidence(precision(phi, velocity, bends))
     probability: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-np.clip(odds, -500, 500)))
     return probability
 
@@ -164,7 +170,7 @@ def contradictions(result: BundleResult, options: BundleOptions, names: Collecti
         return ()
     rec = result.reconstruction
     probability = still_probability(result, options)
-    motion = _freed(result, options)[0]
+    motion = _freed(result, options).motions()[0]
     span = rec.frame_span()
     components = row_phi(rec)
     found = []
@@ -230,16 +236,18 @@ def _anchor_sigma(result: BundleResult, image: int, probability: float) -> float
 
     The estimate should be the mean of both cases, p times that of a still photo and 1 - p times the given one. A
     constraint of variance s on a value known to a variance C draws it by C / (C + s), and by p C / (C + still) if s is
-    still / p + C (1 - p) / p.
+    still / p + C (1 - p) / p. Where only phi1 is open, the photo is as still about that axis as about the other two.
     """
     rec = result.reconstruction
     variance = np.diagonal(result.covariances[image])[6:] * rec.frame_span()[image] ** 2
+    still, p = _STILL**2, probability
     if len(variance) > 3:
         variance = np.concatenate([variance[:3], variance[3:] / rec.median_depth(image) ** 2])
     else:
-        variance = variance[row_phi(rec)[image, :1]]
-    open_, p = float(variance.mean()), probability
-    return float(np.sqrt((_STILL**2 + (1 - p) * open_) / p))
+        phi1, *others = row_phi(rec)[image]
+        square = (rec.phi[image] * rec.frame_span()[image]) ** 2 + variance
+        still, variance = max(still, float(square[others].mean())), variance[[phi1]]
+    return float(np.sqrt((still + (1 - p) * float(variance.mean())) / p))
 
 
 def _again(result: BundleResult, options: BundleOptions) -> BundleResult:
@@ -254,6 +262,6 @@ def _again(result: BundleResult, options: BundleOptions) -> BundleResult:
 
 def _warnings(cost: ShapeCost) -> tuple[str, ...]:
     """Warning of a common motion that displaces the rectified photos by a pixel over the frame."""
-    if not (cost.common.is_weak and cost.common.shift_px > _PIXEL):
+    if not (cost.common.is_weak and cost.common.shift_px > _RMS):
         return ()
     return (f"{cost.common.sentence}; a photo that is known not to have moved (--still) would resolve it",)

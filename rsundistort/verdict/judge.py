@@ -140,6 +140,8 @@ def judge(
     reasons += why
     if not reasons:
         reasons = _of_photos(rec, doubts, motions)
+    for name, said in _faint(rec, motions).items():
+        doubts[name] = doubts[name] or [said]
     lost = torn | (_counts(rec) < _FEW) & (motions.sigma_px >= motions.shift_px)
     # motions that cannot be seen do no harm
     lost &= motions.shift_px >= _UNSEEN_PX
@@ -338,6 +340,20 @@ def _doubts(
                 f"blurred by more than {np.degrees(most_phi[name]):.2f}"
             )
     return doubts
+
+
+def _faint(rec: Reconstruction, motions: PhotoMotions) -> dict[str, str]:
+    """Photos that may come out worse than they went in, which says nothing about the shape of the whole.
+
+    They do if an error of two standard deviations is half of what was found: it is then all that there was.
+    """
+    found, sigma = motions.shift_px, motions.sigma_px
+    faint = (sigma > found / 4) & (sigma > _UNSEEN_PX / 2)
+    return {
+        name: f"its motion of {found[i]:.1f} px is only known to +-{sigma[i]:.1f} px"
+        for i, name in enumerate(rec.image_names)
+        if faint[i]
+    }
 
 
 def _misplaced(result: BundleResult, unexplained: bool) -> dict[str, str]:
