@@ -131,6 +131,24 @@ def test_right_places_stay(scene, matched):
     assert found.reconstruction.image_names == scene.image_names
 
 
+def test_a_set_that_is_turned_as_a_whole_is_placed_by_the_points_of_the_rest(scene, matched):
+    # what it shows of itself says nothing: 3, 4 and 5 agree with each other about copies of the points
+    obs, turn = scene.observations, Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix()
+    turned = np.arange(6) >= 3
+    of_set = turned[obs.frame_idx]
+    split = replace(
+        scene,
+        R_cw=np.where(turned[:, None, None], scene.R_cw @ turn.T, scene.R_cw),
+        center_w=np.where(turned[:, None], scene.center_w @ turn.T, scene.center_w),
+        points_w=np.concatenate([scene.points_w, scene.points_w @ turn.T]),
+        observations=replace(obs, point_idx=obs.point_idx + len(scene.points_w) * of_set),
+    )
+    found = register_photos(matched, read_num_verified(matched), split)
+    assert len(found.moved) == 3
+    between = found.reconstruction.R_cw[0] @ found.reconstruction.R_cw[5].T
+    assert rotated_deg(between, scene.R_cw[0] @ scene.R_cw[5].T) < 0.05
+
+
 def test_a_photo_that_fits_nowhere_loses_its_place(scene, matched, rng):
     # all that the last photo shows is false: its keypoints lie where chance has put them
     features = list(matched.features)

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from ..model import Camera, Reconstruction, RowMotion
 from ..model.path import cross_matrices
 from ..model.projection import clock_of, project_points, project_points_with_jacobians, unproject_points
+from .connected import LEAST_MEASUREMENTS, connected_photos
 from .database import MatchedPhotos
 from .epipolar import TIGHT_PX, Matches, agreeing_photos, read_matches
 
@@ -244,7 +245,10 @@ def register_photos(
         it has. One that fits nowhere and contradicts the others loses its place: a wrong one is worse than none.
     """
     matches = read_matches(matched)
-    shows = _Shown(matched, matches, scene)
+    # what a set that is connected by little shows of itself does not say where it is
+    connected = connected_photos(scene) if registered_too else np.ones(scene.num_images, bool)
+    rest = scene if connected.all() else scene.take_photos(connected)
+    shows_rest = _Shown(matched, matches, rest)
     agreeing = agreeing_photos(matched, matches, num_verified, scene) if registered_too else np.zeros(0, bool)
     index_of = {name: i for i, name in enumerate(scene.image_names)}
     new: dict[int, Placed] = {}
@@ -254,15 +258,15 @@ def register_photos(
         i = index_of.get(name)
         if i is not None and not registered_too:
             continue
-        keypoint, point = shows.by_others(photo)
+        keypoint, point = shows_rest.by_others(photo)
         camera = scene.cameras[matched.camera_idx[photo]] if i is None else scene.camera(i)
-        features, points_w = matched.features[photo], scene.points_w[point]
+        features, points_w = matched.features[photo], rest.points_w[point]
         xy, step_px = features.xy_raw[keypoint], features.step_px
         now, total = 0, len(np.unique(keypoint))
         if i is not None:
             fits = _fits(scene.R_cw[i], scene.center_w[i], scene.motion(i), points_w, xy, camera, step_px)
             now = len(np.unique(keypoint[fits]))
-        enough = max(_LEAST_POINTS, _LEAST_SHARE * total)
+        enough = max(LEAST_MEASUREMENTS if registered_too else _LEAST_POINTS, _LEAST_SHARE * total)
         placed = place_photo(points_w, xy, camera, step_px) if total >= max(enough, _CLEARLY * now) else None
         then = 0 if placed is None else len(np.unique(keypoint[placed.fits]))
         if placed is not None and then >= max(enough, _CLEARLY * now):

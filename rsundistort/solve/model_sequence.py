@@ -430,6 +430,11 @@ def _registered_again(
         stage = f"registration {wave}"
         log.begin(stage)
         scene = firmly_connected(retriangulate(matched, rec))
+        if strong and wave == 1:  # measurements that thresholds without a shutter had cut off
+            options = rough_options(_of_registered(wanted, scene, says=False))
+            options = replace(options, phi_sigma_start=result.phi_rms)
+            result = bundle_adjust(scene, rec.shutter_model, options, partial(_tell, log, stage))
+            scene = firmly_connected(retriangulate(matched, result.reconstruction))
         found = register_photos(matched, num_verified, scene, registered_too=strong)
         changes = found.changes or scene.num_images < rec.num_images
         if changes:
