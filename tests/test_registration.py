@@ -121,7 +121,7 @@ def test_left_out_photos_are_added_and_wrong_places_mended(scene, matched):
         assert rotated_deg(found.reconstruction.R_cw[photo], scene.R_cw[photo]) < 0.05
         np.testing.assert_allclose(found.reconstruction.phi[photo], scene.phi[photo], atol=3e-3)
     np.testing.assert_array_equal(found.reconstruction.R_cw[:4], scene.R_cw[:4])
-    only_new = register_photos(matched, read_num_verified(matched), wrong, registered_too=False)
+    only_new = register_photos(matched, read_num_verified(matched), wrong, strong=False)
     assert (only_new.added, only_new.moved, only_new.dropped) == (("5.jpg",), (), ())
 
 
