@@ -2,6 +2,7 @@
 
     python benchmarks/strong.py [--photos DIR] [--only PART ...] [--sets SET ...] [--rad R ...] [--seeds N]
                                 [--first-seed K] [--work DIR] [--no-photos]
+                                [--before CHECKOUT]
 
 Prints one JSON object a line and at the end a table. Parts:
 
@@ -19,6 +20,8 @@ Prints one JSON object a line and at the end a table. Parts:
               the true motions, how many photos these connect (`sfm.firmly_connected`), and the adjustment of these
               tracks from the true poses and motions
     fountain  fountain-small with its velocity three times as large
+    weak      processor time of `run` on herz-jesus-8 as it is and warped by 0.02 rad, of this state over that of the
+              checkout --before, by turns, and whether both write the same solution; without --before it is left out
 
 Exits 1 if one crashes, never because a figure misses its target (photos right >= 90 %, none wrong and not named; 0.1
 deg and 38 dB up to 0.20).
@@ -29,6 +32,9 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import os
+import resource
+import subprocess
 import sys
 import tempfile
 import time
@@ -61,7 +67,7 @@ from rsundistort.simulate import WarpOptions, simulate_warp
 from rsundistort.solve.run_outputs import Outputs
 
 ROOT = Path(__file__).resolve().parent.parent
-PARTS, SETS = ("sets", "pairs", "limit", "matches", "fountain"), ("herz-jesus-8", "dslr")
+PARTS, SETS = ("sets", "pairs", "limit", "matches", "fountain", "weak"), ("herz-jesus-8", "dslr")
 RADIANS = (0.10, 0.15, 0.20, 0.30)
 COLUMNS = ("set", "rad", "seed", "registered", "right", "wrong", "deg", "worst", "dB", "least", "before", "s")
 DB = ("dB", "least_dB", "before_dB")
@@ -419,6 +425,35 @@ def fountain(bench: Bench, times: float = 3.0) -> None:
     ))  # fmt: skip
 
 
+def weak(bench: Bench, before: Path, times: int = 2) -> None:
+    """What weak shutters pay for strong ones."""
+    name, states = "herz-jesus-8", {"before": before, "now": ROOT}
+    warped = bench.warped(name, 0.02, 0)
+    assert warped is not None
+    for title, photos in (("as it is", bench.photos / name), ("by 0.02", warped / "photos")):
+        seconds: dict[str, list[float]] = {state: [] for state in states}
+        found = {}
+        for _ in range(times):
+            for state, checkout in states.items():
+                out = bench.work / f"weak-{state}"
+                start = resource.getrusage(resource.RUSAGE_CHILDREN)
+                subprocess.run(
+                    [sys.executable, "-m", "cli", "run", str(photos), "-o", str(out), "--overwrite", "-q"],
+                    check=True, cwd=checkout, env={**os.environ, "PYTHONPATH": str(checkout)},
+                )  # fmt: skip
+                end = resource.getrusage(resource.RUSAGE_CHILDREN)
+                seconds[state].append(end.ru_utime + end.ru_stime - start.ru_utime - start.ru_stime)
+                solution = rs.read_solution(out / "solution.json")
+                found[state] = [
+                    (image.name, image.R_cw.tolist(), image.motion.phi.tolist()) for image in solution.registered
+                ]
+        seconds = {state: [round(each, 1) for each in values] for state, values in seconds.items()}
+        show(
+            f"weak: {name} {title}", processor_s=seconds,
+            ratio=round(min(seconds["now"]) / min(seconds["before"]), 3), same=found["now"] == found["before"],
+        )  # fmt: skip
+
+
 def main() -> int:
     """Run the parts that are asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -428,6 +463,7 @@ def main() -> int:
     parser.add_argument("--rad", nargs="*", type=float, default=RADIANS)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--before", type=Path, help="another checkout of this project, for weak")
     parser.add_argument("--no-photos", action="store_true", help="sets are solved, not rectified: no dB")
     parser.add_argument("--work", type=Path, help="folder that keeps the warped photos for the next time")
     args = parser.parse_args()
@@ -450,6 +486,8 @@ def main() -> int:
                     bench.matches(name, radians, seed)
         if "fountain" in args.only:
             fountain(bench)
+        if "weak" in args.only and args.before is not None:
+            weak(bench, args.before)
     rows = [COLUMNS, *bench.rows]
     widths = [max(len(row[k]) for row in rows if k < len(row)) for k in range(len(COLUMNS))]
     for row in rows:
