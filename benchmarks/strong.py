@@ -1,7 +1,8 @@
 """Strong shutters: which photos are registered and how well, and relative poses of pairs beside those of others.
 
     python benchmarks/strong.py [--photos DIR] [--only PART ...] [--sets SET ...] [--rad R ...] [--seeds N]
-                                [--first-seed K]
+                                [--first-seed K] [--work DIR] [--no-photos]
+                                [--before CHECKOUT]
 
 Prints one JSON object a line and at the end a table. Parts:
 
@@ -15,7 +16,12 @@ Prints one JSON object a line and at the end a table. Parts:
     limit     the bound that the measurements of a set impose: those of the photos as they are, each moved as the warp
               moves it, adjusted from the true poses and motions with the intrinsics in the estimate. No match is lost
               or wrong; rotations and dB as above
+    matches   the bound that the matches of each warp impose: their tracks by the poses of the photos as they are and
+              the true motions, how many photos these connect (`sfm.firmly_connected`), and the adjustment of these
+              tracks from the true poses and motions
     fountain  fountain-small with its velocity three times as large
+    weak      processor time of `run` on herz-jesus-8 as it is and warped by 0.02 rad, of this state over that of the
+              checkout --before, by turns, and whether both write the same solution; without --before it is left out
 
 Exits 1 if one crashes, never because a figure misses its target (photos right >= 90 %, none wrong and not named; 0.1
 deg and 38 dB up to 0.20).
@@ -26,11 +32,15 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import os
+import resource
+import subprocess
 import sys
 import tempfile
 import time
 import warnings
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -48,16 +58,19 @@ from rsundistort.bundle import bundle_adjust
 from rsundistort.colmap.conventions import quiet_pycolmap
 from rsundistort.errors import InputError
 from rsundistort.evaluation import psnr
-from rsundistort.input.load import load_photos
+from rsundistort.input.load import LoadedPhotos, load_photos
 from rsundistort.io import read_photo
-from rsundistort.sfm import match_photos
+from rsundistort.sfm import MatchedPhotos, firmly_connected, match_photos, retriangulate
 from rsundistort.sfm.epipolar import read_matches
 from rsundistort.sfm.relative_pose import Pair, View, relative_poses
 from rsundistort.simulate import WarpOptions, simulate_warp
+from rsundistort.solve.run_outputs import Outputs
 
 ROOT = Path(__file__).resolve().parent.parent
-PARTS, SETS, RADIANS = ("sets", "pairs", "limit", "fountain"), ("herz-jesus-8", "dslr"), (0.10, 0.15, 0.20, 0.30)
+PARTS, SETS = ("sets", "pairs", "limit", "matches", "fountain", "weak"), ("herz-jesus-8", "dslr")
+RADIANS = (0.10, 0.15, 0.20, 0.30)
 COLUMNS = ("set", "rad", "seed", "registered", "right", "wrong", "deg", "worst", "dB", "least", "before", "s")
+DB = ("dB", "least_dB", "before_dB")
 WRONG_DEG, AUC_DEG, LEAST_MATCHES = 1.0, 5.0, 30
 
 
@@ -87,8 +100,8 @@ def rotations_off(R_cw: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> np
 class Bench:
     """Photos, the folder of work, and what came of it."""
 
-    def __init__(self, photos: Path, work: Path) -> None:
-        self.photos, self.work = photos, work
+    def __init__(self, photos: Path, work: Path, *, rectifies: bool = True) -> None:
+        self.photos, self.work, self.rectifies = photos, work, rectifies
         self.rows: list[tuple[str, ...]] = []
         self.failed: list[str] = []
         self._still: dict[str, rs.Solution] = {}
@@ -106,15 +119,16 @@ class Bench:
                 return solved
 
             with mock.patch.object(module, "solve_photos", kept):
-                self._still[name] = rs.run(self.photos / name, out, run_options(shutter_model="global"))
+                options = run_options(shutter_model="global")
+                self._still[name] = rs.run(self.photos / name, out, options, overwrite=True)
         return self._still[name]
 
     def warped(self, name: str, radians: float, seed: int) -> Path | None:
         """Folder of warped photos; None where rows fold over."""
         out = self.work / f"{name}-{radians}-{seed}"
-        if not out.is_dir():
+        if not (out / "ground_truth.json").is_file():
             try:
-                simulate_warp(self.photos / name, out, WarpOptions(sigma_rad=radians, seed=seed))
+                simulate_warp(self.photos / name, out, WarpOptions(sigma_rad=radians, seed=seed, overwrite=True))
             except InputError as error:
                 show(f"{name} by {radians}, seed {seed}", passed_over=str(error))
                 return None
@@ -127,12 +141,10 @@ class Bench:
             return
         still, start = self.still(name), time.perf_counter()
         try:
-            solution = rs.run(folder / "photos", folder / "run", run_options(), overwrite=True)
+            with nullcontext() if self.rectifies else mock.patch.object(Outputs, "rectify", _as_solved):
+                solution = rs.run(folder / "photos", folder / "run", run_options(), overwrite=True)
             seconds = time.perf_counter() - start
-            found = rs.evaluate(
-                folder / "run", with_lens_of(folder / "run", folder / "ground_truth.json"),
-                poses=self.work / f"{name}-still" / "solution.json", twins=self.photos / name,
-            )  # fmt: skip
+            dB = self._of_photos(name, folder) if self.rectifies else {}
         except Exception as error:
             show(f"{name} by {radians}, seed {seed}", crash=f"{type(error).__name__}: {error}")
             self.failed.append(name)
@@ -145,21 +157,29 @@ class Bench:
             f"{name} by {radians}, seed {seed}", registered=len(solution.registered), photos=len(solution.images),
             of_still=len(still.registered), right=right, wrong={photo: round(errors[photo], 2) for photo in wrong},
             wrong_and_not_named=sorted({*wrong} - named), median_deg=round(float(np.median(values)), 4),
-            max_deg=round(max(values), 4), dB=round(found.psnr_db.median, 2), least_dB=round(found.psnr_db.min, 2),
-            before_dB=round(found.psnr_before_db.median, 2), model=solution.quality["held_out_chosen"],
+            max_deg=round(max(values), 4), **dB, model=solution.quality["held_out_chosen"],
             verdict=[solution.verdict["shutter"], solution.verdict["shape"]], seconds=round(seconds, 1),
         )  # fmt: skip
         self.rows.append((
             name, str(radians), str(seed), f"{len(solution.registered)}/{len(solution.images)}",
             f"{right}/{len(still.registered)}", f"{len(wrong)}, {len({*wrong} - named)} not named",
-            f"{np.median(values):.3f}", f"{max(values):.3f}", f"{found.psnr_db.median:.1f}", f"{found.psnr_db.min:.1f}",
-            f"{found.psnr_before_db.median:.1f}", f"{seconds:.0f}",
+            f"{np.median(values):.3f}", f"{max(values):.3f}", *(f"{dB[key]:.1f}" if dB else "" for key in DB),
+            f"{seconds:.0f}",
         ))  # fmt: skip
+
+    def _of_photos(self, name: str, folder: Path) -> dict[str, float]:
+        """Ratios in dB of the rectified photos of a run to the photos as they are, and of the warped ones."""
+        found = rs.evaluate(
+            folder / "run", with_lens_of(folder / "run", folder / "ground_truth.json"),
+            poses=self.work / f"{name}-still" / "solution.json", twins=self.photos / name,
+        )  # fmt: skip
+        values = found.psnr_db.median, found.psnr_db.min, found.psnr_before_db.median
+        return {key: round(value, 2) for key, value in zip(DB, values, strict=True)}
 
     def limit(self, name: str, radians: float, seed: int) -> None:
         """The adjustment of right matches alone."""
         self.still(name)
-        rec, options = self._measured[name]
+        rec = self._measured[name][0]
         phi, xy = np.zeros((len(rec.image_names), 3)), rec.observations.xy_raw.copy()
         rng, camera_of = np.random.default_rng(seed), [rec.cameras[k] for k in rec.camera_idx]
         for f, mine in enumerate(rec.observations.by_photo(len(phi))):
@@ -172,26 +192,61 @@ class Bench:
         sizes = np.array([(camera.width, camera.height) for camera in camera_of])[rec.observations.frame_idx]
         inside = ((xy > -0.5) & (xy < sizes - 0.5)).all(axis=1)
         observations = replace(rec.observations, xy_raw=xy).select(inside)
-        start = replace(rec, observations=observations, phi=phi, shutter_model="rotation")
+        self._show_limit(f"limit of {name}", name, replace(rec, observations=observations), phi, radians, seed)
+
+    def matches(self, name: str, radians: float, seed: int) -> None:
+        """The adjustment of what the matches of one warp connect by true poses and motions."""
+        folder = self.warped(name, radians, seed)
+        if folder is None:
+            return
+        self.still(name)
+        rec = self._measured[name][0]
+        truth = rs.read_solution(folder / "ground_truth.json")
+        phi_of, of_warp = {image.name: image.motion.phi for image in truth.images}, next(iter(truth.cameras.values()))
+        with tempfile.TemporaryDirectory() as work:
+            loaded, matched = _load_and_match(folder / "photos", Path(work))
+            # each keypoint where the photo as it was showed it
+            still = [
+                _moved(found.xy_raw, of_warp, rs.RowMotion(phi_of[photo]), rs.RowMotion())
+                for photo, found in zip(loaded.names, loaded.features, strict=True)
+            ]
+            features = [replace(found, xy_raw=xy) for found, xy in zip(loaded.features, still, strict=True)]
+            tracks = retriangulate(replace(matched, features=features, cameras=rec.cameras), rec)
+        tracks = firmly_connected(tracks)
+        obs, phi = tracks.observations, np.array([phi_of[photo] for photo in tracks.image_names])
+        xy = obs.xy_raw.copy()
+        for f, mine in enumerate(obs.by_photo(len(phi))):
+            xy[mine] = _moved(xy[mine], rec.cameras[tracks.camera_idx[f]], rs.RowMotion(), rs.RowMotion(phi[f]))
+        tracks = replace(tracks, observations=replace(obs, xy_raw=xy))
+        self._show_limit(f"right matches of {name}", name, tracks, phi, radians, seed)
+
+    def _show_limit(
+        self, title: str, name: str, tracks: rs.Reconstruction, phi: np.ndarray, radians: float, seed: int
+    ) -> None:
+        """The adjustment of measurements from true poses and motions phi (m, 3)."""
+        rec, options = self._measured[name]
+        start = replace(tracks, phi=phi, shutter_model="rotation")
         # the exposure of the photos as they are does not bound what moves them here
         free = replace(options, phi_limits={}, phi_sigma_most=None, velocity_sigma_most=None)
         found = bundle_adjust(start, "rotation", free).reconstruction
-        errors = rotations_off(found.R_cw, rec.R_cw)
+        R_cw = dict(zip(rec.image_names, rec.R_cw, strict=True))
+        errors = rotations_off(found.R_cw, [R_cw[photo] for photo in found.image_names])
         dB = [
             psnr_between(
                 read_photo(self.photos / name / photo).pixels, found.cameras[found.camera_idx[f]],
                 rs.RowMotion(found.phi[f]), rs.RowMotion(phi[f]),
             )
-            for f, photo in enumerate(rec.image_names)
+            for f, photo in enumerate(found.image_names)
         ]  # fmt: skip
+        wrong = int((errors > WRONG_DEG).sum())
         show(
-            f"limit of {name} by {radians}, seed {seed}", photos=len(phi), measurements=len(observations),
-            median_deg=round(float(np.median(errors)), 4), max_deg=round(float(errors.max()), 4),
-            dB=round(float(np.median(dB)), 2), least_dB=round(min(dB), 2),
+            f"{title} by {radians}, seed {seed}", photos=len(phi), of_still=rec.num_images,
+            measurements=len(tracks.observations), wrong=wrong, median_deg=round(float(np.median(errors)), 4),
+            max_deg=round(float(errors.max()), 4), dB=round(float(np.median(dB)), 2), least_dB=round(min(dB), 2),
         )  # fmt: skip
         self.rows.append((
-            f"limit, {name}", str(radians), str(seed), f"{len(phi)}", "", "", f"{np.median(errors):.3f}",
-            f"{errors.max():.3f}", f"{np.median(dB):.1f}", f"{min(dB):.1f}",
+            title, str(radians), str(seed), f"{len(phi)}/{rec.num_images}", "", f"{wrong}",
+            f"{np.median(errors):.3f}", f"{errors.max():.3f}", f"{np.median(dB):.1f}", f"{min(dB):.1f}",
         ))  # fmt: skip
 
     def pairs(self, name: str, radians: float, seed: int) -> None:
@@ -200,16 +255,10 @@ class Bench:
         if folder is None:
             return
         still = {image.name: image for image in self.still(name).registered}
-        loaded = load_photos(
-            folder if radians == 0 else folder / "photos", None, None, 8192, Workers(2), StageLog(lambda *_: None)
-        )  # fmt: skip
-        cameras = loaded.cameras
         with tempfile.TemporaryDirectory() as work:
-            matched = match_photos(
-                Path(work) / "database.db", loaded.names, loaded.features, cameras.cameras, cameras.camera_idx,
-                calibrated=cameras.calibrated,
-            )  # fmt: skip
+            loaded, matched = _load_and_match(folder if radians == 0 else folder / "photos", Path(work))
             matches = read_matches(matched)
+        cameras = loaded.cameras
         pairs, truth = [], []
         for (first, second), found in matches.items():
             names = loaded.names[first], loaded.names[second]
@@ -239,6 +288,29 @@ class Bench:
             seconds_a_pair=round(seconds / len(pairs), 3),
         )  # fmt: skip
         self.rows.append(("pairs", str(radians), str(seed), name, *(f"{key} {value}" for key, value in auc.items())))
+
+
+def _as_solved(outputs: Outputs, *_: Any) -> rs.Solution:
+    """Instead of `Outputs.rectify`."""
+    return outputs.solution
+
+
+def _load_and_match(photos: Path, work: Path) -> tuple[LoadedPhotos, MatchedPhotos]:
+    """Features and matches of a folder."""
+    loaded = load_photos(photos, None, None, 8192, Workers(2), StageLog(lambda *_: None))
+    cameras = loaded.cameras
+    matched = match_photos(
+        work / "database.db", loaded.names, loaded.features, cameras.cameras, cameras.camera_idx,
+        calibrated=cameras.calibrated,
+    )  # fmt: skip
+    return loaded, matched
+
+
+def _moved(xy: np.ndarray, camera: rs.Camera, motion: rs.RowMotion, to: rs.RowMotion) -> np.ndarray:
+    """Pixels (n, 2) of a photo with a motion where a photo with another shows the same; far outside if nowhere."""
+    ideal = rs.undistort_points(xy, camera, motion, P=camera.K)
+    moved = rs.distort_points(ideal, camera, to, P=camera.K)
+    return np.where(np.isfinite(moved), moved, -1e4)
 
 
 def psnr_between(pixels: np.ndarray, camera: rs.Camera, found: rs.RowMotion, true: rs.RowMotion) -> float:
@@ -353,6 +425,35 @@ def fountain(bench: Bench, times: float = 3.0) -> None:
     ))  # fmt: skip
 
 
+def weak(bench: Bench, before: Path, times: int = 2) -> None:
+    """What weak shutters pay for strong ones."""
+    name, states = "herz-jesus-8", {"before": before, "now": ROOT}
+    warped = bench.warped(name, 0.02, 0)
+    assert warped is not None
+    for title, photos in (("as it is", bench.photos / name), ("by 0.02", warped / "photos")):
+        seconds: dict[str, list[float]] = {state: [] for state in states}
+        found = {}
+        for _ in range(times):
+            for state, checkout in states.items():
+                out = bench.work / f"weak-{state}"
+                start = resource.getrusage(resource.RUSAGE_CHILDREN)
+                subprocess.run(
+                    [sys.executable, "-m", "cli", "run", str(photos), "-o", str(out), "--overwrite", "-q"],
+                    check=True, cwd=checkout, env={**os.environ, "PYTHONPATH": str(checkout)},
+                )  # fmt: skip
+                end = resource.getrusage(resource.RUSAGE_CHILDREN)
+                seconds[state].append(end.ru_utime + end.ru_stime - start.ru_utime - start.ru_stime)
+                solution = rs.read_solution(out / "solution.json")
+                found[state] = [
+                    (image.name, image.R_cw.tolist(), image.motion.phi.tolist()) for image in solution.registered
+                ]
+        seconds = {state: [round(each, 1) for each in values] for state, values in seconds.items()}
+        show(
+            f"weak: {name} {title}", processor_s=seconds,
+            ratio=round(min(seconds["now"]) / min(seconds["before"]), 3), same=found["now"] == found["before"],
+        )  # fmt: skip
+
+
 def main() -> int:
     """Run the parts that are asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -362,10 +463,13 @@ def main() -> int:
     parser.add_argument("--rad", nargs="*", type=float, default=RADIANS)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--before", type=Path, help="another checkout of this project, for weak")
+    parser.add_argument("--no-photos", action="store_true", help="sets are solved, not rectified: no dB")
+    parser.add_argument("--work", type=Path, help="folder that keeps the warped photos for the next time")
     args = parser.parse_args()
     warnings.simplefilter("ignore")
-    with tempfile.TemporaryDirectory() as work:
-        bench = Bench(args.photos, Path(work))
+    with tempfile.TemporaryDirectory() if args.work is None else nullcontext(args.work) as work:
+        bench = Bench(args.photos, Path(work), rectifies=not args.no_photos)
         seeds = range(args.first_seed, args.first_seed + args.seeds)
         for name in args.sets:
             for radians in args.rad if "sets" in args.only else ():
@@ -377,8 +481,13 @@ def main() -> int:
             for radians in (0.02, *args.rad) if "limit" in args.only else ():
                 for seed in seeds:
                     bench.limit(name, radians, seed)
+            for radians in args.rad if "matches" in args.only else ():
+                for seed in seeds:
+                    bench.matches(name, radians, seed)
         if "fountain" in args.only:
             fountain(bench)
+        if "weak" in args.only and args.before is not None:
+            weak(bench, args.before)
     rows = [COLUMNS, *bench.rows]
     widths = [max(len(row[k]) for row in rows if k < len(row)) for k in range(len(COLUMNS))]
     for row in rows:

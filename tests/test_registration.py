@@ -121,7 +121,7 @@ def test_left_out_photos_are_added_and_wrong_places_mended(scene, matched):
         assert rotated_deg(found.reconstruction.R_cw[photo], scene.R_cw[photo]) < 0.05
         np.testing.assert_allclose(found.reconstruction.phi[photo], scene.phi[photo], atol=3e-3)
     np.testing.assert_array_equal(found.reconstruction.R_cw[:4], scene.R_cw[:4])
-    only_new = register_photos(matched, read_num_verified(matched), wrong, registered_too=False)
+    only_new = register_photos(matched, read_num_verified(matched), wrong, strong=False)
     assert (only_new.added, only_new.moved, only_new.dropped) == (("5.jpg",), (), ())
 
 
@@ -129,6 +129,24 @@ def test_right_places_stay(scene, matched):
     found = register_photos(matched, read_num_verified(matched), scene)
     assert not found.changes
     assert found.reconstruction.image_names == scene.image_names
+
+
+def test_a_set_that_is_turned_as_a_whole_is_placed_by_the_points_of_the_rest(scene, matched):
+    # what it shows of itself says nothing: 3, 4 and 5 agree with each other about copies of the points
+    obs, turn = scene.observations, Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix()
+    turned = np.arange(6) >= 3
+    of_set = turned[obs.frame_idx]
+    split = replace(
+        scene,
+        R_cw=np.where(turned[:, None, None], scene.R_cw @ turn.T, scene.R_cw),
+        center_w=np.where(turned[:, None], scene.center_w @ turn.T, scene.center_w),
+        points_w=np.concatenate([scene.points_w, scene.points_w @ turn.T]),
+        observations=replace(obs, point_idx=obs.point_idx + len(scene.points_w) * of_set),
+    )
+    found = register_photos(matched, read_num_verified(matched), split)
+    assert len(found.moved) == 3
+    between = found.reconstruction.R_cw[0] @ found.reconstruction.R_cw[5].T
+    assert rotated_deg(between, scene.R_cw[0] @ scene.R_cw[5].T) < 0.05
 
 
 def test_a_photo_that_fits_nowhere_loses_its_place(scene, matched, rng):

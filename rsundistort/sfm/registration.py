@@ -19,12 +19,14 @@ from scipy.spatial.transform import Rotation
 from ..model import Camera, Reconstruction, RowMotion
 from ..model.path import cross_matrices
 from ..model.projection import clock_of, project_points, project_points_with_jacobians, unproject_points
+from .connected import LEAST_MEASUREMENTS, connected_photos
 from .database import MatchedPhotos
 from .epipolar import TIGHT_PX, Matches, agreeing_photos, read_matches
 
 __all__ = ["Placed", "Registration", "place_photo", "register_photos"]
 
-# COLMAP's own demands on the pose of a photo: so many points that fit, and this share of all.
+# COLMAP's own demands on the pose of a photo: so many points that fit, and this share of all. Features that a strong
+# shutter sheared hardly match: then as many points do as a photo needs to stay (`LEAST_MEASUREMENTS`).
 _LEAST_POINTS, _LEAST_SHARE = 30, 0.25
 # Another place is the right one if so many times as many measurements fit it.
 _CLEARLY = 1.25
@@ -222,7 +224,7 @@ def register_photos(
     num_verified: Mapping[tuple[int, int], int],
     scene: Reconstruction,
     *,
-    registered_too: bool = True,
+    strong: bool = True,
 ) -> Registration:
     """Register photos by what the others show of the scene, each with a motion of its own, where that explains more.
 
@@ -234,8 +236,9 @@ def register_photos(
         As `read_num_verified` returns them.
     scene : Reconstruction
         Poses, motions, points; its measurements are keypoints of `matched`.
-    registered_too : bool
-        Whether photos that have a place are held against it; else only the others are placed.
+    strong : bool
+        Whether the shutter is so strong that photos may have wrong places: they are then held against these, and those
+        of a set that is connected by little against the points of the rest alone. Else only the others are placed.
 
     Returns
     -------
@@ -244,25 +247,28 @@ def register_photos(
         it has. One that fits nowhere and contradicts the others loses its place: a wrong one is worse than none.
     """
     matches = read_matches(matched)
-    shows = _Shown(matched, matches, scene)
-    agreeing = agreeing_photos(matched, matches, num_verified, scene) if registered_too else np.zeros(0, bool)
+    # such a set agrees with itself wherever it is
+    connected = connected_photos(scene) if strong else np.ones(scene.num_images, bool)
+    rest = scene if connected.all() else scene.take_photos(connected)
+    shows, least = _Shown(matched, matches, rest), LEAST_MEASUREMENTS if strong else _LEAST_POINTS
+    agreeing = agreeing_photos(matched, matches, num_verified, scene) if strong else np.zeros(0, bool)
     index_of = {name: i for i, name in enumerate(scene.image_names)}
     new: dict[int, Placed] = {}
     elsewhere: dict[int, Placed] = {}
     dropped = []
     for photo, name in enumerate(matched.names):
         i = index_of.get(name)
-        if i is not None and not registered_too:
+        if i is not None and not strong:
             continue
         keypoint, point = shows.by_others(photo)
         camera = scene.cameras[matched.camera_idx[photo]] if i is None else scene.camera(i)
-        features, points_w = matched.features[photo], scene.points_w[point]
+        features, points_w = matched.features[photo], rest.points_w[point]
         xy, step_px = features.xy_raw[keypoint], features.step_px
         now, total = 0, len(np.unique(keypoint))
         if i is not None:
             fits = _fits(scene.R_cw[i], scene.center_w[i], scene.motion(i), points_w, xy, camera, step_px)
             now = len(np.unique(keypoint[fits]))
-        enough = max(_LEAST_POINTS, _LEAST_SHARE * total)
+        enough = max(least, _LEAST_SHARE * total)
         placed = place_photo(points_w, xy, camera, step_px) if total >= max(enough, _CLEARLY * now) else None
         then = 0 if placed is None else len(np.unique(keypoint[placed.fits]))
         if placed is not None and then >= max(enough, _CLEARLY * now):

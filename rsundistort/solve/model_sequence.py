@@ -430,7 +430,11 @@ def _registered_again(
         stage = f"registration {wave}"
         log.begin(stage)
         scene = firmly_connected(retriangulate(matched, rec))
-        found = register_photos(matched, num_verified, scene, registered_too=strong)
+        if strong and wave == 1 and scene.num_images >= _LEAST_PHOTOS:
+            # thresholds without a shutter had cut off most measurements: no photo is judged before they are back
+            result = _roughly_adjusted(scene, result, wanted, partial(_tell, log, stage))
+            scene = firmly_connected(retriangulate(matched, result.reconstruction))
+        found = register_photos(matched, num_verified, scene, strong=strong)
         changes = found.changes or scene.num_images < rec.num_images
         if changes:
             tracks = found.reconstruction
@@ -439,9 +443,7 @@ def _registered_again(
             if tracks.num_images < _LEAST_PHOTOS:  # too few are connected to distinguish right from wrong
                 log.end(stage, added=(), moved=(), dropped=())
                 break
-            options = rough_options(_of_registered(wanted, tracks, says=False))
-            options = replace(options, phi_sigma_start=result.phi_rms)
-            result = bundle_adjust(tracks, rec.shutter_model, options, partial(_tell, log, stage))
+            result = _roughly_adjusted(tracks, result, wanted, partial(_tell, log, stage))
         left_out = left_out.union(found.dropped) - {*result.reconstruction.image_names}
         log.end(stage, added=found.added, moved=found.moved, dropped=found.dropped)
         if not changes:
@@ -450,6 +452,15 @@ def _registered_again(
         names = ", ".join(sorted(left_out))
         warnings.warn(f"left out, since they contradict the other photos: {names}", RsUndistortWarning, stacklevel=3)
     return result
+
+
+def _roughly_adjusted(
+    tracks: Reconstruction, result: BundleResult, wanted: BundleOptions, progress: Callable[[float], None]
+) -> BundleResult:
+    """An adjustment of other tracks after one, with its prior of the motions, that another one follows."""
+    options = rough_options(_of_registered(wanted, tracks, says=False))
+    options = replace(options, phi_sigma_start=result.phi_rms)
+    return bundle_adjust(tracks, tracks.shutter_model, options, progress)
 
 
 def _retriangulated(
