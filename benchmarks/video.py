@@ -70,7 +70,15 @@ def solved_clip(video: Path, camera: str, readout_s: float | None = None) -> tup
     began = time.process_time()
     with tempfile.TemporaryDirectory() as scratch:
         clip = read_clip(video, Path(scratch) / "frames")
-        keys = load_photos(Path(scratch) / "frames", camera, None, 8192, Workers(0), StageLog(None), least=2)
+        keys = load_photos(
+            Path(scratch) / "frames",
+            camera,
+            None,
+            RunOptions().most_features(True),
+            Workers(0),
+            StageLog(None),
+            least=2,
+        )
         known = None if readout_s is None else (readout_s, "given")
         options = SolveOptions()
         solved = solve_clip(

@@ -15,7 +15,7 @@ from ..model.projection import unproject_points
 from ..sfm.flow import flow_between
 from ..sfm.resection import resect
 
-__all__ = ["Followed", "follow", "follow_points", "with_all_frames"]
+__all__ = ["Followed", "follow", "follow_points", "followed_again", "with_all_frames"]
 
 # Number of points of a key frame that are followed: those of the most key frames first, from all its cells.
 _POINTS = 120
@@ -41,6 +41,16 @@ class Followed:
         self.chosen = chosen
         self.frame = self.key = self.place = np.zeros(0, np.int64)
         self.xy_raw = np.zeros((0, 2))
+
+    def of(self, chosen: Mapping[int, NDArray[np.int64]]) -> Followed:
+        """The same places, by other indices (n,) of the keys' measurements; without points of which it is negative."""
+        anew = Followed({key: index[index >= 0] for key, index in chosen.items()})
+        place = {key: np.where(index >= 0, np.cumsum(index >= 0) - 1, -1) for key, index in chosen.items()}
+        places = np.array([place[key][k] for key, k in zip(self.key.tolist(), self.place.tolist(), strict=True)], int)
+        there = places >= 0
+        anew.frame, anew.key, anew.place = self.frame[there], self.key[there], places[there]
+        anew.xy_raw = self.xy_raw[there]
+        return anew
 
     def add(self, found: list[tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]) -> None:
         """The places found of keys' points: key, frames (o,), places (o,) and pixels (o, 2) of each."""
@@ -83,13 +93,34 @@ def follow_points(clip: Clip, reconstruction: Reconstruction) -> Followed:
     The chosen values are indices of its measurements.
     """
     rec, obs = reconstruction, reconstruction.observations
-    number = {name: k for k, name in enumerate(clip.names)}
-    mine = {number[name]: each for name, each in zip(rec.image_names, obs.by_photo(rec.num_images), strict=True)}
+    mine = _of_keys(clip, rec)
     worth = np.bincount(obs.point_idx, minlength=rec.num_points)[obs.point_idx]
     shown = {key: obs.xy_raw[each] for key, each in mine.items()}
     followed = follow(clip, shown, rec.cameras[0], {key: worth[each] for key, each in mine.items()})
     followed.chosen = {key: mine[key][chosen] for key, chosen in followed.chosen.items()}
     return followed
+
+
+def followed_again(
+    clip: Clip, followed: Followed, before: Reconstruction, reconstruction: Reconstruction
+) -> Followed:  # fmt: skip
+    """What was followed of a reconstruction's points, of another one's: of features that both measure."""
+    mine, chosen = _of_keys(clip, reconstruction), {}
+    for key, starts in followed.chosen.items():
+        own = mine.get(key, np.zeros(0, np.int64))
+        index_of = dict(zip(map(tuple, reconstruction.observations.xy_raw[own]), own.tolist(), strict=True))
+        found = [index_of.get(xy, -1) for xy in map(tuple, before.observations.xy_raw[starts])]
+        chosen[key] = np.array(found, np.int64)
+    return followed.of(chosen)
+
+
+def _of_keys(clip: Clip, rec: Reconstruction) -> dict[int, NDArray[np.int64]]:
+    """The measurements of each key frame, by its number."""
+    number = {name: k for k, name in enumerate(clip.names)}
+    return {
+        number[name]: each
+        for name, each in zip(rec.image_names, rec.observations.by_photo(rec.num_images), strict=True)
+    }
 
 
 def follow(
