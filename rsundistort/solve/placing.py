@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
+
 from ..batch.progress import StageLog
 from ..colmap.conventions import quiet_pycolmap
 from ..errors import ReconstructionError
@@ -20,9 +22,9 @@ __all__ = ["place_photos"]
 
 # Verified matches of a pair that overlaps, beyond doubt.
 _MANY = 100
-# Largest distance from epipolar lines of matches between key frames of a video. Content moves by little from one to the
-# next, and so does the shutter's distortion: with four times as much, these lines have any direction where there is
-# hardly any parallax, and poses go wrong.
+# Largest distance from epipolar lines of matches between key frames of a video, in the pixels that features are
+# detected in. Content moves by little from one to the next, and so does the shutter's distortion: with four times as
+# much, these lines have any direction where there is hardly any parallax, and poses go wrong.
 _CLOSE_PX = 4.0
 # Largest keypoints of a key frame that place it: neighbours show nearly all of them again.
 _OF_CLIP = (512, 2048, None)
@@ -74,7 +76,9 @@ def place_photos(
     else:
         choose = pairs_of_clip if of_clip else pairs_to_match
         pairs, num_pairs = choose(photos, matching, seed), math.comb(len(photos.names), 2)
-        within_px = _CLOSE_PX if of_clip else LOOSE_PX
+        within_px = LOOSE_PX
+        if of_clip:
+            within_px = _CLOSE_PX * float(np.median([each.step_px for each in photos.features]))
         matched = match_photos(*given, calibrated=cameras.calibrated, seed=seed, pairs=pairs, within_px=within_px)
         counts = {"pairs": num_pairs if pairs is None else len(pairs), "of_pairs": num_pairs}
         if with_shutter:
