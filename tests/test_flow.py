@@ -63,13 +63,13 @@ def test_key_frames_follow_the_motion_of_the_picture() -> None:
 
 def test_corners_of_key_frames_are_found_in_the_next() -> None:
     chooser = KeyFrameChooser()
-    for grey in frames(8.25 * np.arange(14)):
+    for grey in frames(8.0 * np.arange(14)):
         chooser.feed(grey)
     chooser.finish()
     assert [each.keys for each in chooser.flows] == list(pairwise(chooser.keys))
     for each in chooser.flows:
         assert len(each.first_xy) > 20
-        moved = 8.25 * (each.keys[1] - each.keys[0])
+        moved = 8.0 * (each.keys[1] - each.keys[0])
         assert np.abs(np.median(each.first_xy - each.second_xy - [moved, 0], axis=0)).max() < 0.05
 
 
