@@ -113,7 +113,7 @@ def spread_of_halves(photos: Path, draws: int = 16) -> np.ndarray:
     """
     log = StageLog(None)
     with tempfile.TemporaryDirectory() as folder:
-        loaded = load_photos(photos, None, None, RunOptions().max_features, Workers(2), log)
+        loaded = load_photos(photos, None, None, RunOptions().most_features(False), Workers(2), log)
         solved = solve_photos(loaded, "rotation", 0, lambda _: BundleOptions(), Path(folder), log)
     rec, rng = solved.shared, np.random.default_rng(0)
     options = BundleOptions(phi_sigma_start=solved.result.phi_sigma)

@@ -58,7 +58,7 @@ def main() -> None:
             work = Path(folder)
             simulate_warp(photos, work / "warp", WarpOptions(sigma_rad=args.sigma, seed=seed))
             truth = read_solution(work / "warp" / "ground_truth.json")
-            loaded = load_photos(work / "warp" / "photos", None, None, options.max_features, workers, log)
+            loaded = load_photos(work / "warp" / "photos", None, None, options.most_features(False), workers, log)
             cameras = loaded.cameras
             matched = match_photos(
                 work / "database.db", loaded.names, loaded.features, cameras.cameras, cameras.camera_idx

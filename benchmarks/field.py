@@ -44,12 +44,14 @@ COLUMNS = (
     "shift px", "model",
 )  # fmt: skip
 
-# both write into the folder of work, their last argument, what they reached and how much memory it took
+# both write into the folder of work, their last argument, what they reached, how much memory it took, and the
+# processors' seconds
 PEAK = """
-import atexit, sys
+import atexit, sys, time
 from pathlib import Path
 def note():
     lines = Path("/proc/self/status").read_text().splitlines()
+    Path(sys.argv[-1], "cpu_s").write_text(str(time.process_time()))
     Path(sys.argv[-1], "peak").write_text(next(line.split()[1] for line in lines if line.startswith("VmHWM:")))
 atexit.register(note)
 """
@@ -108,7 +110,8 @@ def in_child(code: str, photos: Path, work: Path, *arguments: str) -> dict[str, 
     if done.returncode:
         said = done.stderr.strip().splitlines()
         return {"crash": said[-1] if said else f"exit code {done.returncode}", "total_s": seconds}
-    return {"total_s": seconds, "peak_mb": round(int((work / "peak").read_text()) / 1024)}
+    cpu_s = round(float((work / "cpu_s").read_text()), 2)
+    return {"total_s": seconds, "cpu_s": cpu_s, "peak_mb": round(int((work / "peak").read_text()) / 1024)}
 
 
 def peer(photos: Path) -> dict[str, Any]:

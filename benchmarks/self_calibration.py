@@ -69,7 +69,7 @@ def solve(photos: Path) -> tuple[BundleResult, BundleOptions]:
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore", RsUndistortWarning)
         workers = Workers(use_threads(0))
-        loaded = load_photos(photos, None, None, options.max_features, workers, log)
+        loaded = load_photos(photos, None, None, options.most_features(False), workers, log)
 
         def of(rec: Reconstruction) -> BundleOptions:
             return options.solve.options_for(loaded.cameras)

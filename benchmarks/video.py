@@ -15,7 +15,9 @@ Prints one JSON object a line. Clips are rendered into FOLDER once (`clips.py`: 
     gopro    ../shared/video: clock, axes and rotation of its gyroscope, readout by pictures and by the gyroscope
     peer     `run` of videos, each in a process of its own, beside pycolmap's extract, match sequentially, map and
              undistort with default options, on the same key frames and with the same camera: seconds and peaks; and
-             the share of its time of what any way from a video to a map takes, and of the path of all frames
+             ratios, of the seconds (`time`) and, as all that follow, of those of the processors, since the machine may
+             be busy (`cpu`); of what any way from a video to a map takes, of the path of all frames, and of the start
+             and the outputs; `least` is all but what comes after the first path: with none of that, a run ends there
     length   the same `run` of the GoPro's video, played to and fro for so many frames: seconds a frame, and peaks;
              on the way back upside down, so that lines are read from first to last as the camera reads them
 """
@@ -62,6 +64,14 @@ PATH = (
     "flow", "path", "path again", "gyroscope", "critical motion", "halves", "stabilisation",
     "comparison with a global shutter",
 )  # fmt: skip
+# Seconds by the clock, and of all processors: on a busy machine only these compare.
+KINDS = {"s": "total", "cpu_s": "cpu"}
+# What makes stages count the processors' seconds.
+BY_PROCESSOR = """
+import types
+from rsundistort.batch import progress
+progress.time = types.SimpleNamespace(perf_counter=time.process_time)
+"""
 PARTS = ("walk", "level", "pan", "two", "readout", "stabilised", "gopro", "peer", "length")
 
 
@@ -70,7 +80,15 @@ def solved_clip(video: Path, camera: str, readout_s: float | None = None) -> tup
     began = time.process_time()
     with tempfile.TemporaryDirectory() as scratch:
         clip = read_clip(video, Path(scratch) / "frames")
-        keys = load_photos(Path(scratch) / "frames", camera, None, 8192, Workers(0), StageLog(None), least=2)
+        keys = load_photos(
+            Path(scratch) / "frames",
+            camera,
+            None,
+            RunOptions().most_features(True),
+            Workers(0),
+            StageLog(None),
+            least=2,
+        )
         known = None if readout_s is None else (readout_s, "given")
         options = SolveOptions()
         solved = solve_clip(
@@ -297,9 +315,9 @@ def gopro(args: argparse.Namespace) -> None:
 
 
 def ours(video: Path, camera: str) -> dict[str, Any]:
-    """Seconds, by stage, and peak of a run of a video in a process of its own."""
+    """Seconds, those of the processors by stage, and peak of a run of a video in a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
-        found = in_child(OURS, video, Path(folder), "--camera", camera)
+        found = in_child(BY_PROCESSOR + OURS, video, Path(folder), "--camera", camera)
         if "crash" not in found:
             solution = json.loads(Path(folder, "out", "solution.json").read_text())
             found["frames"] = solution["quality"]["readout_time"]["frames"]
@@ -325,9 +343,14 @@ def peer(args: argparse.Namespace) -> None:
         ours(video, given)  # kernels of whatever models it needs
         found = ours(video, given)
         said = {"clip": video.parent.name, "key_frames": len(clip.keys), "ours": found, "theirs": theirs}
-        parts = {"time": [found["total_s"]], "of_map": [found["seconds"].get(each, 0.0) for each in MAP]}
-        parts["of_path"] = [found["seconds"].get(each, 0.0) for each in PATH]
-        ratios = {name: round(sum(seconds) / theirs["total_s"], 2) for name, seconds in parts.items()}
+        of_map, of_path = (sum(found["seconds"].get(each, 0.0) for each in part) for part in (MAP, PATH))
+        first = sum(found["seconds"].get(each, 0.0) for each in ("flow", "path"))
+        parts = {
+            "cpu": found["cpu_s"], "of_map": of_map, "of_path": of_path, "of_rest": found["cpu_s"] - of_map - of_path,
+            "least": found["cpu_s"] - of_path + first,
+        }  # fmt: skip
+        ratios = {"time": round(found["total_s"] / theirs["total_s"], 2)}
+        ratios |= {name: round(seconds / theirs["cpu_s"], 2) for name, seconds in parts.items()}
         print(json.dumps(said | ratios), flush=True)
 
 
@@ -361,7 +384,9 @@ def length(args: argparse.Namespace) -> None:
             video = Path(folder) / "clip.mp4"
             to_and_fro(args.shared / "video" / "gopro-hero5-gentle.mp4", video, num_frames)
             found = ours(video, GOPRO)
-        said = {"of_frames": num_frames, "s_per_frame": round(found["total_s"] / num_frames, 3)}
+        said: dict[str, Any] = {"of_frames": num_frames}
+        if "crash" not in found:
+            said |= {f"{name}_per_frame": round(found[f"{kind}_s"] / num_frames, 3) for name, kind in KINDS.items()}
         print(json.dumps(said | found), flush=True)
 
 

@@ -63,8 +63,8 @@ _measure_options = opt.gathered(
     click.option(
         "--max-features",
         type=click.IntRange(min=100),
-        default=8192,
-        help="Largest number of features of a photo.",
+        default=None,
+        help="Largest number of features of a photo. By default 8192, and 2048 for key frames of a video.",
     ),
     click.option(
         "--feature-megapixels",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import pytest
@@ -57,6 +59,18 @@ def test_key_frames_follow_the_motion_of_the_picture() -> None:
     assert np.median(steps) >= 16
     assert chooser.cuts == []
     np.testing.assert_allclose(chooser.steps, 8.0, atol=0.1)
+
+
+def test_corners_of_key_frames_are_found_in_the_next() -> None:
+    chooser = KeyFrameChooser()
+    for grey in frames(8.0 * np.arange(14)):
+        chooser.feed(grey)
+    chooser.finish()
+    assert [each.keys for each in chooser.flows] == list(pairwise(chooser.keys))
+    for each in chooser.flows:
+        assert len(each.first_xy) > 20
+        moved = 8.0 * (each.keys[1] - each.keys[0])
+        assert np.abs(np.median(each.first_xy - each.second_xy - [moved, 0], axis=0)).max() < 0.05
 
 
 def test_the_sharpest_of_the_candidates_is_taken() -> None:

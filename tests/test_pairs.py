@@ -6,6 +6,7 @@ import math
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from large_sets import COMMON, make_street
 from rsundistort import Camera, RunOptions
 from rsundistort.errors import InputError
 from rsundistort.input.load import LoadedPhotos
-from rsundistort.input.pairing import capture_sequences, pairs_to_match, places_of
+from rsundistort.input.pairing import capture_sequences, pairs_of_clip, pairs_to_match, places_of
 from rsundistort.input.photo_cameras import PhotoCameras
 from rsundistort.io import ExifFacts, GpsFix
 from rsundistort.sfm import Features, choose_pairs, global_descriptors, match_photos
@@ -188,6 +189,18 @@ def test_small_sets_are_matched_exhaustively_unless_specified():
     pairs = pairs_to_match(photos_of(70), "auto", 0)
     assert {(1, 2), (9, 10), (69 - 6, 69)} <= as_set(pairs)
     assert len(pairs) <= 70 * (6 + 10)
+
+
+def test_key_frames_are_matched_with_those_in_steps_of_powers_of_two_and_with_what_they_show_again(street):
+    found = as_set(pairs_of_clip(photos_of(20), "auto", 0))
+    assert found == {(i, j) for i in range(20) for j in range(i + 1, 20) if j - i in (1, 2, 4, 8, 16)}
+    assert pairs_of_clip(photos_of(20), "exhaustive", 0) is None
+    again = pairs_of_clip(replace(photos_of(80), features=street.features), "auto", 0)
+    assert as_set(again) > {(i, i + step) for step in (1, 2, 4, 8, 16, 32, 64) for i in range(80 - step)}
+    returns = again[~np.isin(again[:, 1] - again[:, 0], 2 ** np.arange(7))]
+    assert len(returns) <= 3 * 80
+    common = street.common()
+    assert np.mean(common[tuple(returns.T)] > 0) > 0.9
 
 
 def test_options_refuse_unknown_matchings():

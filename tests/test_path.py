@@ -299,6 +299,25 @@ def test_a_vibration_beyond_the_frame_rate_is_distinguished_from_a_hand() -> Non
         assert least <= unfollowed_px(found, own_motions(found)) <= most
 
 
+@dataclass(frozen=True)
+class OnlyShaken(HandHeld):
+    """A camera that does not rotate but by a motor, at more than half of the frame rate."""
+
+    def rotations(self, time_s):
+        angle = 2 * np.pi * 17.0 * np.asarray(time_s)[:, None] + [0.0, 1.0, 2.0]
+        return Rotation.from_rotvec(0.01 * np.sin(angle)).as_matrix()
+
+
+def test_lines_that_rotate_against_their_frames_are_doubted() -> None:
+    for hand, readout in ((OnlyShaken(1), 0.6), (HandHeld(0), -0.6)):
+        found = adjusted(*filmed(hand, 30, readout))
+        assert found.path is not None
+        assert found.path.readout_s[0] < 0
+        verdict = judge_clip(found, found, None, FRAME_S)
+        assert verdict.shape == "doubtful"
+        assert any("the last line is read first" in reason for reason in verdict.reasons)
+
+
 def test_frames_are_not_bent_by_a_readout_that_cannot_be() -> None:
     truth, times = filmed(HandHeld(0), 20)
     found = adjusted(truth, times)  # of 20 ms

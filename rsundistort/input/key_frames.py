@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, RsUndistortWarning
 from ..io.video import FrameWriter, VideoFrames, VideoReader, frame_name, sharpness_of
-from ..sfm.flow import KeyFrameChooser, flow_size
+from ..sfm.flow import KeyFlow, KeyFrameChooser, flow_size
 
 __all__ = ["Clip", "greys_of", "read_clip"]
 
@@ -56,6 +57,8 @@ class Clip:
         Median motion of the content to the next frame; NaN over a cut.
     frames : VideoFrames
         Further facts about them, and about the camera.
+    flows : tuple of KeyFlow
+        Corners of key frames in the next one, in pixels of the flow.
     """
 
     video: Path
@@ -68,6 +71,7 @@ class Clip:
     keys: NDArray[np.int64]
     moved_px: NDArray[np.float64]
     frames: VideoFrames
+    flows: tuple[KeyFlow, ...] = ()
 
     @property
     def key_names(self) -> tuple[str, ...]:
@@ -121,8 +125,19 @@ def read_clip(video: Path, folder: Path, progress: Callable[[int, int], None] | 
     FileError
         No video, or damaged at its beginning.
     """
+    folder.mkdir(parents=True)
+    try:
+        return _read(video, folder, progress)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+
+
+def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None) -> Clip:
     chooser, numbers, times, sharpness, num_late = KeyFrameChooser(), list[int](), list[float](), list[float](), 0
+    held: dict[int, tuple[int, float, Any]] = {}  # frames that may become the next key
     with VideoReader(video) as reader:
+        writer, num_written = FrameWriter(reader, folder), 0
         for number, time_s, picture in reader:
             if progress is not None:
                 progress(number + 1, reader.num_frames)
@@ -136,15 +151,22 @@ def read_clip(video: Path, folder: Path, progress: Callable[[int, int], None] | 
             grey = _grey(picture)
             if grey.std() < _DARK:
                 continue
+            held[len(numbers)] = number, time_s, picture
             numbers.append(number)
             times.append(time_s)
             sharpness.append(sharpness_of(picture))
             chooser.feed(grey)
+            for k in chooser.keys[num_written:]:
+                writer.add(*held[k], sharpness[k])
+            num_written = len(chooser.keys)
+            held = {k: each for k, each in held.items() if k > chooser.keys[-1]}
         chooser.finish()
+        for k in chooser.keys[num_written:]:
+            writer.add(*held[k], sharpness[k])
         reader.warn()
     if num_late:
         warnings.warn(
-            f"{video.name}: {num_late} frames whose time runs back were left out", RsUndistortWarning, stacklevel=2
+            f"{video.name}: {num_late} frames whose time runs back were left out", RsUndistortWarning, stacklevel=3
         )
     if len(numbers) < 2:
         some = "1 frame that shows" if numbers else "no frame that shows"
@@ -152,22 +174,25 @@ def read_clip(video: Path, folder: Path, progress: Callable[[int, int], None] | 
     time = np.array(times)
     frame_s = float(np.median(np.diff(time)))
     breaks = {*chooser.cuts, *(np.flatnonzero(np.diff(time) > _PAUSE * frame_s) + 1).tolist()}
-    keys = np.array(sorted({*chooser.keys, *_between(len(numbers), len(chooser.keys)), *_ends(breaks)}))
-    frames = _write(video, folder, {numbers[k]: sharpness[k] for k in keys.tolist()})
+    more = {*_between(len(numbers), len(chooser.keys)), *_ends(breaks)} - {*chooser.keys}
+    _add(writer, video, {numbers[k]: sharpness[k] for k in more})
     part = np.cumsum([k in breaks for k in range(len(numbers))])
     names = tuple(frame_name(video, number) for number in numbers)
-    return Clip(video, folder, tuple(numbers), names, time, frame_s, part, keys, np.array(chooser.steps), frames)
+    keys = np.array(sorted({*chooser.keys, *more}))
+    flows = tuple(each for each in chooser.flows if part[each.keys[0]] == part[each.keys[1]])
+    return Clip(
+        video, folder, tuple(numbers), names, time, frame_s, part, keys, np.array(chooser.steps), writer.finish(), flows
+    )
 
 
-def _write(video: Path, folder: Path, sharpness: Mapping[int, float]) -> VideoFrames:
-    """Frames of a video, by their numbers, as PNG files."""
-    folder.mkdir(parents=True)
+def _add(writer: FrameWriter, video: Path, sharpness: Mapping[int, float]) -> None:
+    """Write more frames of a video, by their numbers."""
+    if not sharpness:
+        return
     with VideoReader(video) as reader:
-        writer = FrameWriter(reader, folder)
         for number, time_s, picture in reader:
             if number in sharpness:
                 writer.add(number, time_s, picture, sharpness[number])
-        return writer.finish()
 
 
 def _between(num_frames: int, num_keys: int) -> Iterable[int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 
@@ -12,13 +13,15 @@ from ..io import ExifFacts
 from ..sfm import choose_pairs, global_descriptors
 from .load import LoadedPhotos
 
-__all__ = ["MATCHINGS", "capture_sequences", "pairs_to_match", "places_of"]
+__all__ = ["MATCHINGS", "capture_sequences", "pairs_of_clip", "pairs_to_match", "places_of"]
 
 #: "auto" is "exhaustive" for small sets, and "neighbours" where that saves half of the pairs or more.
 MATCHINGS = ("auto", "exhaustive", "neighbours")
 
 # neighbours are about 25 for each photo
 _EXHAUSTIVE_TO = 60
+# Key frames of a video are matched with the most similar others that are not neighbours, by as many of their features.
+_RETURNS, _SEEN_AGAIN_BY = 3, 256
 _EARTH_RADIUS_M = 6371e3
 
 
@@ -33,6 +36,21 @@ def pairs_to_match(photos: LoadedPhotos, matching: str, seed: int) -> NDArray[np
         places_of(photos.facts),
         global_descriptors([each.descriptors for each in photos.features], seed),
     )
+
+
+def pairs_of_clip(keys: LoadedPhotos, matching: str, seed: int) -> NDArray[np.int64] | None:
+    """Pairs of key frames of a video, in its order; None for all.
+
+    Each is matched with those 1, 2, 4, 8, ... further on, as long as the video: tracks connect what lies between, and
+    far ones have the parallax that neighbours lack. The most similar others find what the camera returns to.
+    """
+    if matching == "exhaustive":
+        return None
+    num = len(keys.names)
+    steps = 2 ** np.arange(math.ceil(math.log2(max(num, 2))))
+    ahead = [np.column_stack([np.arange(num - step), np.arange(step, num)]) for step in steps.tolist()]
+    largest = [each.descriptors[:_SEEN_AGAIN_BY] for each in keys.features]
+    return choose_pairs(num, descriptors=global_descriptors(largest, seed), given=ahead, similar=_RETURNS)
 
 
 def capture_sequences(

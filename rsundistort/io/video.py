@@ -259,9 +259,10 @@ class FrameWriter:
         self._rows.append((name, number, time_s, sharpness))
 
     def finish(self) -> VideoFrames:
-        """Write the table."""
+        """Write the table, in the order of the video."""
         if not self._rows:
             raise FileError(f"{self._reader.video} holds no whole frame; copy it again from the camera")
+        self._rows.sort(key=lambda row: row[1])
         with (self._folder / FRAME_TABLE).open("w", encoding="utf-8", newline="") as file:
             table = csv.writer(file)
             table.writerow(["name", "frame", "time_s", "sharpness"])

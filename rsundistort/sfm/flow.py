@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FlowTracks", "KeyFrameChooser", "flow_between", "flow_size"]
+__all__ = ["FlowTracks", "KeyFlow", "KeyFrameChooser", "flow_between", "flow_size"]
 
 Grey = NDArray[np.uint8]
 
@@ -59,6 +59,34 @@ def _followed(
     return there, (found.ravel() == 1) & (returned.ravel() == 1) & same & inside
 
 
+@dataclass(frozen=True)
+class KeyFlow:
+    """Corners of a key frame, and where they lie in the next one.
+
+    Attributes
+    ----------
+    keys : (int, int)
+        Both frames.
+    first_xy, second_xy : (n, 2) array
+        Pixels of the frames as they are followed.
+    """
+
+    keys: tuple[int, int]
+    first_xy: NDArray[np.float32]
+    second_xy: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class _Since:
+    """A frame since the last key frame: how far the content moved, and where corners of the key are still seen."""
+
+    grey: Grey
+    sharpness: float
+    moved: float
+    xy: NDArray[np.float32]
+    corner: NDArray[np.int64]
+
+
 class KeyFrameChooser:
     """Choose key frames of a video while its frames pass, and find its cuts.
 
@@ -70,13 +98,16 @@ class KeyFrameChooser:
         Frames that do not continue the one before.
     steps : list of float
         Motion of the content from each frame to the next, pixels of the flow; NaN over a cut.
+    flows : list of KeyFlow
+        Corners of key frames in the next one.
     """
 
     def __init__(self) -> None:
         self.keys: list[int] = []
         self.cuts: list[int] = []
         self.steps: list[float] = []
-        self._since: list[tuple[Grey, float, float]] = []  # frames from the last key on: grey, sharpness, moved
+        self.flows: list[KeyFlow] = []
+        self._since: list[_Since] = []  # frames from the last key on
         self._number = -1
 
     def feed(self, grey: Grey) -> None:
@@ -91,45 +122,52 @@ class KeyFrameChooser:
     def finish(self) -> None:
         """The last frame is a key frame, too: nothing is known beyond it."""
         if self.keys and self.keys[-1] != self._number:
+            self._join(len(self._since) - 1)
             self.keys.append(self._number)
 
     def _begin(self, number: int, grey: Grey, sharpness: float) -> None:
         self.keys.append(number)
         found = cv2.goodFeaturesToTrack(grey, _CORNERS, 0.01, 0.02 * math.hypot(*grey.shape))
         self._corners = np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
-        self._xy, self._alive = self._corners.copy(), np.ones(len(self._corners), bool)
-        self._since = [(grey, sharpness, 0.0)]
+        self._since = [_Since(grey, sharpness, 0.0, self._corners, np.arange(len(self._corners)))]
 
     def _step(self, grey: Grey, sharpness: float, counts: bool) -> None:
-        before, alive = self._since[-1][0], np.flatnonzero(self._alive)
-        xy, seen = _followed(before, grey, self._xy[alive])
+        last = self._since[-1]
+        xy, seen = _followed(last.grey, grey, last.xy)
         if counts:
-            moved = np.linalg.norm(xy - self._xy[alive], axis=1)[seen]
+            moved = np.linalg.norm(xy - last.xy, axis=1)[seen]
             self.steps.append(float(np.median(moved)) if seen.any() else np.nan)
-            if len(alive) >= _LEAST_CORNERS and seen.sum() < (1 - _CUT) * len(alive):
+            if len(last.xy) >= _LEAST_CORNERS and seen.sum() < (1 - _CUT) * len(last.xy):
                 self.cuts.append(self._number)
                 if self.keys[-1] != self._number - 1:
                     self.keys.append(self._number - 1)
                 self._begin(self._number, grey, sharpness)
                 return
-        self._xy[alive] = xy
-        self._alive[alive[~seen]] = False
-        apart = np.linalg.norm(self._xy - self._corners, axis=1)[self._alive]
-        moved_by = float(np.median(apart)) / math.hypot(*grey.shape) if self._alive.any() else 1.0
-        self._since.append((grey, sharpness, moved_by))
-        share = float(self._alive.sum()) / max(len(self._corners), 1)
+        xy, corner = xy[seen], last.corner[seen]
+        apart = np.linalg.norm(xy - self._corners[corner], axis=1)
+        moved_by = float(np.median(apart)) / math.hypot(*grey.shape) if len(corner) else 1.0
+        self._since.append(_Since(grey, sharpness, moved_by, xy, corner))
+        share = len(corner) / max(len(self._corners), 1)
         if moved_by > _MOVED or share < _SEEN or len(self._since) > _MOST_GAP:
             self._choose()
 
     def _choose(self) -> None:
         """The sharpest of the frames that moved far enough becomes a key; those behind it are followed again."""
-        last = self._since[-1][2]
-        candidates = [k for k, each in enumerate(self._since) if k > 0 and each[2] >= _CANDIDATE * last]
-        best = max(candidates, key=lambda k: (self._since[k][1], k))
-        rest, number = self._since[best + 1 :], self.keys[-1] + best
-        self._begin(number, *self._since[best][:2])
-        for grey, sharpness, _ in rest:
-            self._step(grey, sharpness, counts=False)
+        last = self._since[-1].moved
+        candidates = [k for k, each in enumerate(self._since) if k > 0 and each.moved >= _CANDIDATE * last]
+        best = max(candidates, key=lambda k: (self._since[k].sharpness, k))
+        self._join(best)
+        chosen, rest = self._since[best], self._since[best + 1 :]
+        self._begin(self.keys[-1] + best, chosen.grey, chosen.sharpness)
+        for each in rest:
+            self._step(each.grey, each.sharpness, counts=False)
+
+    def _join(self, place: int) -> None:
+        """Look for the corners of the last key in a frame that becomes the next, by their windows in the key itself."""
+        key, other = self._since[0], self._since[place]
+        start = self._corners[other.corner]
+        xy, seen = _followed(key.grey, other.grey, start, other.xy)
+        self.flows.append(KeyFlow((self.keys[-1], self.keys[-1] + place), start[seen], xy[seen]))
 
 
 @dataclass(frozen=True)

@@ -16,14 +16,15 @@ from ..model import Reconstruction
 from .connected import LEAST_MEASUREMENTS
 from .database import LOOSE, MatchedPhotos, from_pycolmap, pipeline_options, write_photos
 
-__all__ = ["map_photos"]
+__all__ = ["PLACING_KEYPOINTS", "map_photos"]
 
 # Mapping only has to place the photos; the tracks are rebuilt afterwards. All at once this many of the largest
 # keypoints of each do, or more, or all (seconds of processor time with 2048 / all: herz-jesus-8 2.1 / 4.6, a phone's 16
 # photos 2.0 / 4.4). More are tried while photos are left out, and all only if twice as many place more of them.
 # It takes others than incremental mapping does where photos hang together weakly: 13 instead of 8 of a drone's 14, 29
 # instead of 27 in lund; so the other way is tried only where it leaves out more than a quarter.
-_PLACING_KEYPOINTS, _ENOUGH_REGISTERED = (2048, 4096, None), 0.75
+PLACING_KEYPOINTS: tuple[int | None, ...] = (2048, 4096, None)
+_ENOUGH_REGISTERED = 0.75
 
 # Mapping one after the other only has to place the photos: it gets this many of the largest keypoints of each. All of
 # them come back when the tracks are rebuilt. (herz-jesus-8: 16384 keypoints map in 4.7 s, 4096
@@ -52,7 +53,11 @@ def _mapping_database(matched: MatchedPhotos, folder: Path, limit: int | None) -
     return path
 
 
-def map_photos(matched: MatchedPhotos, progress: Callable[[int], None] | None = None) -> Reconstruction:
+def map_photos(
+    matched: MatchedPhotos,
+    progress: Callable[[int], None] | None = None,
+    keypoints: Sequence[int | None] = PLACING_KEYPOINTS,
+) -> Reconstruction:
     """Global-shutter reconstruction with room for shutter distortion.
 
     All photos are placed at once (pycolmap's global mapper). Where that leaves some out, they are also placed one after
@@ -64,6 +69,8 @@ def map_photos(matched: MatchedPhotos, progress: Callable[[int], None] | None = 
         Photos with their matches.
     progress : callable, optional
         Called with the number of photos registered so far.
+    keypoints : sequence of int or None
+        How many of the largest keypoints of each place it, in attempts one after the other; None for all.
 
     Returns
     -------
@@ -78,7 +85,7 @@ def map_photos(matched: MatchedPhotos, progress: Callable[[int], None] | None = 
     total = len(matched.names)
     enough = _ENOUGH_REGISTERED * total
     found, count = None, 0
-    for limit in _PLACING_KEYPOINTS:
+    for limit in keypoints:
         found = _with_more(found, _mapped_at_once(matched, limit))
         before, count = count, 0 if found is None else found.num_images
         if count == total or enough <= count == before:

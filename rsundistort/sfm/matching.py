@@ -13,7 +13,10 @@ from ..model import Camera
 from .database import LOOSE, MatchedPhotos, verification_options, write_photos
 from .features import Features
 
-__all__ = ["match_photos"]
+__all__ = ["LOOSE_PX", "match_photos"]
+
+#: Largest distance of matches from epipolar lines that leaves room for the shutter: `LOOSE` times that of COLMAP.
+LOOSE_PX = 4.0 * LOOSE
 
 
 def match_photos(
@@ -25,7 +28,7 @@ def match_photos(
     *,
     calibrated: bool = True,
     focal_known: bool = True,
-    within_px: float = 4.0 * LOOSE,
+    within_px: float = LOOSE_PX,
     seed: int = 0,
     pairs: NDArray[np.int64] | None = None,
 ) -> MatchedPhotos:

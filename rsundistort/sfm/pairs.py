@@ -29,6 +29,9 @@ def choose_pairs(
     sequences: Sequence[ArrayLike] = (),
     positions: ArrayLike | None = None,
     descriptors: ArrayLike | None = None,
+    *,
+    given: Sequence[NDArray[np.int64]] = (),
+    similar: int = _SIMILAR,
 ) -> NDArray[np.int64]:
     """Pairs of photos that are neighbours in order of capture, by place, or by appearance.
 
@@ -44,18 +47,22 @@ def choose_pairs(
         Where they were taken, in any unit of length; NaN where that is not known.
     descriptors : (m, D) array, optional
         As `global_descriptors` gives them; photos of which it is 0 look like none.
+    given : sequence of (p, 2) int arrays
+        Pairs that are chosen already.
+    similar : int
+        Partners of a photo by appearance.
 
     Returns
     -------
     (p, 2) int64 array
         Pairs i < j in ascending order, each once.
     """
-    pairs = [np.zeros((0, 2), np.int64), *(_next_in(np.asarray(order, np.int64)) for order in sequences)]
+    pairs = [np.zeros((0, 2), np.int64), *given, *(_next_in(np.asarray(order, np.int64)) for order in sequences)]
     if positions is not None:
         pairs.append(_nearest(np.asarray(positions, np.float64)))
     if descriptors is not None:
         # the most similar ones are often chosen already: they would leave no room for a return
-        pairs.append(_most_similar(np.asarray(descriptors), np.concatenate(pairs)))
+        pairs.append(_most_similar(np.asarray(descriptors), np.concatenate(pairs), similar))
     chosen = np.sort(np.concatenate(pairs), axis=1)
     chosen = chosen[chosen[:, 0] < chosen[:, 1]]
     return np.column_stack(np.divmod(np.unique(chosen[:, 0] * num_photos + chosen[:, 1]), num_photos))
@@ -81,8 +88,8 @@ def _nearest(positions: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.column_stack([np.repeat(known, found.shape[1]), known[found.ravel()]])
 
 
-def _most_similar(descriptors: NDArray[Any], chosen: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Each photo with the most similar ones that are not chosen already; of equals the first."""
+def _most_similar(descriptors: NDArray[Any], chosen: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Each photo with so many similar ones that are not chosen already; of equals the first."""
     known = np.flatnonzero(descriptors.any(1))
     place = np.full(len(descriptors), -1)
     place[known] = np.arange(len(known))
@@ -95,7 +102,7 @@ def _most_similar(descriptors: NDArray[Any], chosen: NDArray[np.int64]) -> NDArr
         of_block = chosen[(chosen[:, 0] >= first) & (chosen[:, 0] < first + _BLOCK)]
         similarity[of_block[:, 0] - first, of_block[:, 1]] = -np.inf
         similarity[block - first, block] = -np.inf
-        best = np.argsort(-similarity, axis=1, kind="stable")[:, :_SIMILAR]
+        best = np.argsort(-similarity, axis=1, kind="stable")[:, :count]
         row, column = np.nonzero(np.isfinite(np.take_along_axis(similarity, best, axis=1)))
         found.append(np.column_stack([known[block[row]], known[best[row, column]]]))
     return np.concatenate(found)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -12,6 +13,7 @@ from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos
 from ..model import Camera, Observations, Reconstruction, RowMotion
 from ..model.projection import unproject_points
+from ..sfm.flow import flow_size
 from .clip_tracks import Followed, follow
 
 __all__ = ["rotating_only", "rotation_between"]
@@ -21,8 +23,6 @@ __all__ = ["rotating_only", "rotation_between"]
 # part of that.
 _ROOM_PX, _LEFT_PX = 40.0, 0.5
 _LEAST_AGREEING = 12
-# Key frames that are tested first: those of a camera that travels show it there, and the rest need not be followed.
-_FIRST = 8
 _TRIALS = 20
 
 
@@ -33,15 +33,29 @@ def rotating_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
     from rotations by more than a shutter explains.
     """
     camera = keys.cameras.of(0)
+    step = np.array([camera.width, camera.height]) / flow_size(camera.width, camera.height)
+    corners = [(step * (each.first_xy + 0.5) - 0.5, step * (each.second_xy + 0.5) - 0.5) for each in clip.flows]
+    # corners of key frames show it in no time, so that the frames between need not be followed
+    if corners and not _only_rotates([_beyond_rotation(first, second, camera) for first, second in corners], camera):
+        return None
     number = {name: k for k, name in enumerate(clip.names)}
     shown = {number[name]: found.xy_raw for name, found in zip(keys.names, keys.features, strict=True)}
-    first = sorted(shown)[:_FIRST]
-    if len(shown) >= 2 * _FIRST and _chained(clip, camera, {key: shown[key] for key in first}) is None:
-        return None
     chained = _chained(clip, camera, shown)
     if chained is None or 2 * len(chained[2]) < len(clip.names):
         return None
     return _joined(clip, keys, chained[0], shown, *chained[1:])
+
+
+def _only_rotates(left: Sequence[float], camera: Camera) -> bool:
+    """Whether key frames and the next ones differ by rotations of their lines only, up to distances `left`."""
+    return len(left) > 0 and bool(np.median(left) * camera.K[0, 0] < _LEFT_PX)
+
+
+def _beyond_rotation(xy_before: NDArray[np.float64], xy_after: NDArray[np.float64], camera: Camera) -> float:
+    """Median distance of pixels (n, 2) of two frames, as directions, beyond what rotations of their lines explain."""
+    before, after = _directions(xy_before, camera), _directions(xy_after, camera)
+    rotation = _agreed_rotation(before, after, _ROOM_PX / float(camera.K[0, 0]))
+    return float("inf") if rotation is None else _left_by_shutter(before @ rotation.T, after, camera)
 
 
 def _chained(
@@ -67,7 +81,7 @@ def _chained(
             mine = (followed.frame == b) & (followed.key == a)
             before = own[a][followed.place[mine]] @ (R_cw[b] @ R_cw[a].T).T
             left.append(_left_by_shutter(before, rays[mine], camera))
-    if not left or not np.median(left) * camera.K[0, 0] < _LEFT_PX:
+    if not _only_rotates(left, camera):
         return None
     return followed, own, R_cw
 

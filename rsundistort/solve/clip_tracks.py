@@ -15,11 +15,14 @@ from ..model.projection import unproject_points
 from ..sfm.flow import flow_between
 from ..sfm.resection import resect
 
-__all__ = ["Followed", "follow", "follow_points", "with_all_frames"]
+__all__ = ["Followed", "few_returns", "follow", "follow_points", "followed_again", "with_all_frames"]
 
 # Number of points of a key frame that are followed: those of the most key frames first, from all its cells.
 _POINTS = 120
 _CELLS = 6
+# Beyond this many key frames, what the camera returns to after so many others is connected by every eighth of them and
+# the next only: else all are connected with all, and the time that a frame takes grows with their number.
+_FEW, _AWAY, _ANCHORS = 60, 16, 8
 # Tolerance for the shutter where a frame is registered without it, in pixels.
 _ROOM_PX = 12.0
 
@@ -41,6 +44,16 @@ class Followed:
         self.chosen = chosen
         self.frame = self.key = self.place = np.zeros(0, np.int64)
         self.xy_raw = np.zeros((0, 2))
+
+    def of(self, chosen: Mapping[int, NDArray[np.int64]]) -> Followed:
+        """The same places, by other indices (n,) of the keys' measurements; without points of which it is negative."""
+        anew = Followed({key: index[index >= 0] for key, index in chosen.items()})
+        place = {key: np.where(index >= 0, np.cumsum(index >= 0) - 1, -1) for key, index in chosen.items()}
+        places = np.array([place[key][k] for key, k in zip(self.key.tolist(), self.place.tolist(), strict=True)], int)
+        there = places >= 0
+        anew.frame, anew.key, anew.place = self.frame[there], self.key[there], places[there]
+        anew.xy_raw = self.xy_raw[there]
+        return anew
 
     def add(self, found: list[tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]) -> None:
         """The places found of keys' points: key, frames (o,), places (o,) and pixels (o, 2) of each."""
@@ -83,13 +96,34 @@ def follow_points(clip: Clip, reconstruction: Reconstruction) -> Followed:
     The chosen values are indices of its measurements.
     """
     rec, obs = reconstruction, reconstruction.observations
-    number = {name: k for k, name in enumerate(clip.names)}
-    mine = {number[name]: each for name, each in zip(rec.image_names, obs.by_photo(rec.num_images), strict=True)}
+    mine = _of_keys(clip, rec)
     worth = np.bincount(obs.point_idx, minlength=rec.num_points)[obs.point_idx]
     shown = {key: obs.xy_raw[each] for key, each in mine.items()}
     followed = follow(clip, shown, rec.cameras[0], {key: worth[each] for key, each in mine.items()})
     followed.chosen = {key: mine[key][chosen] for key, chosen in followed.chosen.items()}
     return followed
+
+
+def followed_again(
+    clip: Clip, followed: Followed, before: Reconstruction, reconstruction: Reconstruction
+) -> Followed:  # fmt: skip
+    """What was followed of a reconstruction's points, of another one's: of features that both measure."""
+    mine, chosen = _of_keys(clip, reconstruction), {}
+    for key, starts in followed.chosen.items():
+        own = mine.get(key, np.zeros(0, np.int64))
+        index_of = dict(zip(map(tuple, reconstruction.observations.xy_raw[own]), own.tolist(), strict=True))
+        found = [index_of.get(xy, -1) for xy in map(tuple, before.observations.xy_raw[starts])]
+        chosen[key] = np.array(found, np.int64)
+    return followed.of(chosen)
+
+
+def _of_keys(clip: Clip, rec: Reconstruction) -> dict[int, NDArray[np.int64]]:
+    """The measurements of each key frame, by its number."""
+    number = {name: k for k, name in enumerate(clip.names)}
+    return {
+        number[name]: each
+        for name, each in zip(rec.image_names, rec.observations.by_photo(rec.num_images), strict=True)
+    }
 
 
 def follow(
@@ -148,6 +182,43 @@ class CameraPoses:
         return rotation.as_matrix() @ R_a, c_a + share * (c_b - c_a)
 
 
+def few_returns(
+    key: NDArray[np.int64], point: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Tracks that connect few of the key frames to which the camera returns.
+
+    The measurements of each visit become a point of its own, and some of all visits another one, which measures them
+    once more.
+
+    Parameters
+    ----------
+    key, point : (o,) int array
+        Key frame, in the order of time, and point of each measurement.
+
+    Returns
+    -------
+    index, point_idx : (p,) int array
+        Measurements, and the new points that they show.
+    source : (n,) int array
+        The point that each new one was.
+    """
+    order = np.lexsort((key, point))
+    k, p = key[order], point[order]
+    begins = np.diff(p, prepend=-1) != 0
+    begins[1:] |= np.diff(k) > _AWAY
+    visit = np.cumsum(begins) - 1
+    source = p[begins]
+    # what some of the key frames of at least two visits show
+    some = k % _ANCHORS < 2
+    visits = np.bincount(source[np.unique(visit[some])], minlength=int(p.max(initial=-1)) + 1)
+    again = np.flatnonzero(some & (visits[p] > 1))
+    returning, place = np.unique(p[again], return_inverse=True)
+    return (
+        np.concatenate([order, order[again]]), np.concatenate([visit, len(source) + place]),
+        np.concatenate([source, returning]),
+    )  # fmt: skip
+
+
 def with_all_frames(
     clip: Clip, reconstruction: Reconstruction, followed: Followed, placed_before: Reconstruction | None = None
 ) -> Reconstruction:
@@ -155,7 +226,8 @@ def with_all_frames(
 
     Each followed point is a point of its own, at the place of the point in its key frame: the start of the flow counts
     as the measurement of the key frame, so an error there is the same in all frames, and moves the point. Points of the
-    key frames connect these, as before. Frames that were `placed_before` keep their poses.
+    key frames connect these, as before; where there are many, as `few_returns` has them. Frames that were
+    `placed_before` keep their poses.
     """
     rec, obs = reconstruction, reconstruction.observations
     number = {name: k for k, name in enumerate(clip.names)}
@@ -163,10 +235,13 @@ def with_all_frames(
     keys = sorted(followed.chosen)
     start = dict(zip(keys, np.cumsum([0, *(len(followed.chosen[k]) for k in keys)])[:-1].tolist(), strict=True))
     own = np.concatenate([followed.chosen[k] for k in keys])
-    points_w = np.concatenate([rec.points_w, rec.points_w[obs.point_idx[own]]])
-    point = rec.num_points + np.array([start[k] for k in followed.key.tolist()], np.int64) + followed.place
-    at_key = np.concatenate([np.full(len(followed.chosen[k]), k) for k in keys])
     frames = np.array([number[name] for name in rec.image_names])
+    every = np.arange(len(obs)), obs.point_idx, np.arange(rec.num_points)
+    rank = np.argsort(np.argsort(frames))
+    index, of_keys, source = every if len(frames) <= _FEW else few_returns(rank[obs.frame_idx], obs.point_idx)
+    points_w = np.concatenate([rec.points_w[source], rec.points_w[obs.point_idx[own]]])
+    point = len(source) + np.array([start[k] for k in followed.key.tolist()], np.int64) + followed.place
+    at_key = np.concatenate([np.full(len(followed.chosen[k]), k) for k in keys])
     poses = {k: (rec.R_cw[i], rec.center_w[i]) for k, i in image_of.items()}
     if placed_before is not None:
         at = zip(placed_before.image_names, placed_before.R_cw, placed_before.center_w, strict=True)
@@ -180,12 +255,12 @@ def with_all_frames(
         guess = known.near(k)
         poses[k] = resect(rays[mine], points_w[point[mine]], *guess, within) or guess
     placed = np.array(sorted(poses))
-    index = np.full(len(clip.names), -1)
-    index[placed] = np.arange(len(placed))
-    frame = index[np.concatenate([frames[obs.frame_idx], at_key, followed.frame])]
-    of_point = np.concatenate([obs.point_idx, rec.num_points + np.arange(len(own)), point])
-    xy_raw = np.concatenate([obs.xy_raw, obs.xy_raw[own], followed.xy_raw])
-    sigma = np.concatenate([obs.sigma, np.ones(len(own) + len(followed.frame))])
+    image = np.full(len(clip.names), -1)
+    image[placed] = np.arange(len(placed))
+    frame = image[np.concatenate([frames[obs.frame_idx[index]], at_key, followed.frame])]
+    of_point = np.concatenate([of_keys, len(source) + np.arange(len(own)), point])
+    xy_raw = np.concatenate([obs.xy_raw[index], obs.xy_raw[own], followed.xy_raw])
+    sigma = np.concatenate([obs.sigma[index], np.ones(len(own) + len(followed.frame))])
     seen = frame >= 0
     whole = Reconstruction(
         rec.cameras, [clip.names[k] for k in placed.tolist()], np.zeros(len(placed), np.int64),

@@ -5,19 +5,29 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
+
 from ..batch.progress import StageLog
 from ..colmap.conventions import quiet_pycolmap
 from ..errors import ReconstructionError
 from ..input.load import LoadedPhotos
-from ..input.pairing import pairs_to_match
+from ..input.pairing import pairs_of_clip, pairs_to_match
 from ..io.kept import Kept
 from ..model import Reconstruction
 from ..sfm import MatchedPhotos, map_photos, match_photos, verify_with_shutter
+from ..sfm.mapping import PLACING_KEYPOINTS
+from ..sfm.matching import LOOSE_PX
 
 __all__ = ["place_photos"]
 
 # Verified matches of a pair that overlaps, beyond doubt.
 _MANY = 100
+# Largest distance from epipolar lines of matches between key frames of a video, in the pixels that features are
+# detected in. Content moves by little from one to the next, and so does the shutter's distortion: with four times as
+# much, these lines have any direction where there is hardly any parallax, and poses go wrong.
+_CLOSE_PX = 4.0
+# Largest keypoints of a key frame that place it: neighbours show nearly all of them again.
+_OF_CLIP = (512, 2048, None)
 
 
 def _num_verified(matched: MatchedPhotos) -> int:
@@ -36,6 +46,7 @@ def place_photos(
     kept: Kept,
     *,
     with_shutter: bool = False,
+    of_clip: bool = False,
 ) -> tuple[Reconstruction, MatchedPhotos]:
     """Match photos and map them, as of a global shutter; results of an earlier run are not computed again.
 
@@ -53,6 +64,8 @@ def place_photos(
         Takes the results, for resuming.
     with_shutter : bool
         Whether pairs that a shutter hides are verified by relative poses with a shutter.
+    of_clip : bool
+        Whether they are key frames of a video in its order, which differ by little.
     """
     cameras, database = photos.cameras, scratch / "database.db"
     log.begin("matching")
@@ -61,8 +74,12 @@ def place_photos(
     if counts is not None and kept.get_file("database", database):
         matched = MatchedPhotos(*given, calibrated=cameras.calibrated, seed=seed)
     else:
-        pairs, num_pairs = pairs_to_match(photos, matching, seed), math.comb(len(photos.names), 2)
-        matched = match_photos(*given, calibrated=cameras.calibrated, seed=seed, pairs=pairs)
+        choose = pairs_of_clip if of_clip else pairs_to_match
+        pairs, num_pairs = choose(photos, matching, seed), math.comb(len(photos.names), 2)
+        within_px = LOOSE_PX
+        if of_clip:
+            within_px = _CLOSE_PX * float(np.median([each.step_px for each in photos.features]))
+        matched = match_photos(*given, calibrated=cameras.calibrated, seed=seed, pairs=pairs, within_px=within_px)
         counts = {"pairs": num_pairs if pairs is None else len(pairs), "of_pairs": num_pairs}
         if with_shutter:
             counts["spread_rad"] = verify_with_shutter(matched)
@@ -73,7 +90,8 @@ def place_photos(
     mapped: Reconstruction | None = kept.get("mapped")
     if mapped is None:
         try:
-            mapped = map_photos(matched, lambda done: log.tell("mapping", done, len(photos.names)))
+            keypoints = _OF_CLIP if of_clip else PLACING_KEYPOINTS
+            mapped = map_photos(matched, lambda done: log.tell("mapping", done, len(photos.names)), keypoints)
         except ReconstructionError as error:
             if _num_verified(matched) < len(photos.names) - 1:
                 raise

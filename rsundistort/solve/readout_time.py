@@ -99,7 +99,7 @@ def measure_readout(
         assert source.clip is not None
         assert source.frames is not None
         loaded = load_photos(
-            source.folder, source.camera, options.solve.readout, options.max_features, workers, log,
+            source.folder, source.camera, options.solve.readout, options.most_features(True), workers, log,
             megapixels=options.feature_megapixels, again=True, least=2,
         )  # fmt: skip
         loaded = with_focal_lengths(loaded, options.solve.seed, log)

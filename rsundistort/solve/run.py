@@ -138,10 +138,11 @@ def _solved(
     found: Outputs | None = before.outputs(log)
     if found is not None:
         return found
+    is_clip = source.clip is not None
     loaded = load_photos(
-        folder, source.camera, options.solve.readout, options.max_features, workers, log,
+        folder, source.camera, options.solve.readout, options.most_features(is_clip), workers, log,
         megapixels=options.feature_megapixels, masks=rectify.masks, raw_as=rectify.raw_as, again=rectify.again,
-        max_megapixels=rectify.max_megapixels, least=3 if source.clip is None else 2, kept=kept,
+        max_megapixels=rectify.max_megapixels, least=2 if is_clip else 3, kept=kept,
     )  # fmt: skip
     loaded = with_focal_lengths(loaded, options.solve.seed, log, kept)
     _check_anchors(options.solve, loaded.names, photos)
@@ -151,7 +152,7 @@ def _solved(
     else:
         solved, solving = solve_frames(options, source.clip, loaded, bodies, gyro_log, log, kept), options.solve
     facts = {
-        "max_features": options.max_features,
+        "max_features": options.most_features(is_clip),
         "feature_megapixels": options.feature_megapixels,
         "matching": options.matching,
         "video": source.video,

@@ -30,6 +30,9 @@ __all__ = ["OutputOptions", "RunOptions", "SolveOptions"]
 #: Frames of a video that are rectified.
 FRAMES = ("key", "all")
 
+# Largest numbers of features by default.
+_OF_PHOTO, _OF_KEY_FRAME = 8192, 2048
+
 
 class _Part:
     """Options that name the class of an option that was theirs when there was one class."""
@@ -182,8 +185,9 @@ class RunOptions(_Part):
     camera : str, optional
         File or folder of cameras, or numbers, as `io.read_camera_file` takes them; else `camera.json` or `cameras.json`
         in or beside the folder of photos, else EXIF.
-    max_features : int
-        Largest number of features per photo.
+    max_features : int, optional
+        Largest number of features per photo; by default 8192, and 2048 per key frame of a video, whose neighbours show
+        the same.
     feature_megapixels : float
         Larger photos are reduced to this size to detect their features.
     every, sharpest : int, optional
@@ -202,7 +206,7 @@ class RunOptions(_Part):
     rectify: RectifyOptions = field(default_factory=RectifyOptions)
     outputs: OutputOptions = field(default_factory=OutputOptions)
     camera: str | None = None
-    max_features: int = 8192
+    max_features: int | None = None
     feature_megapixels: float = DETECTION_MEGAPIXELS
     every: int | None = None
     sharpest: int | None = None
@@ -210,9 +214,13 @@ class RunOptions(_Part):
     matching: str = "auto"
     gyro: GyroOptions | None = None
 
+    def most_features(self, of_clip: bool) -> int:
+        """Largest number of features of a photo, or of a key frame of a video."""
+        return self.max_features or (_OF_KEY_FRAME if of_clip else _OF_PHOTO)
+
     def __post_init__(self) -> None:
         check_fields(self)
-        if self.max_features < 100:
+        if self.max_features is not None and self.max_features < 100:
             raise InputError(f"max_features={self.max_features!r}, expected at least 100")
         if not 0.05 <= self.feature_megapixels < np.inf:
             raise InputError(f"feature_megapixels={self.feature_megapixels!r}, expected at least 0.05")

@@ -30,7 +30,7 @@ from ..verdict.speeds import readouts_by_speed
 from .clip_gyroscope import Felt, felt_gyroscope, own_gyroscope, readout_of, rotations_between
 from .clip_pair import two_frames
 from .clip_pan import rotating_only
-from .clip_tracks import follow_points, with_all_frames
+from .clip_tracks import follow_points, followed_again, with_all_frames
 from .model_sequence import rough_options
 from .outcome import Solved
 from .placing import place_photos
@@ -110,7 +110,7 @@ def solve_clip(
     elif found is None:
         found = _travelled(
             clip, keys, path, options_of, log, telemetry,
-            lambda: place_photos(keys, scratch, log, seed, matching, kept or Kept()),
+            lambda: place_photos(keys, scratch, log, seed, matching, kept or Kept(), of_clip=True),
         )  # fmt: skip
     result, options, filmed = found
     assert options.path is not None
@@ -169,9 +169,13 @@ def _travelled(
     # the lens would absorb a shutter that is not modelled yet
     rough = rough_options(replace(options_of(mapped), refine=()))
     current = bundle_adjust(mapped, "global", rough).reconstruction
+    log.begin("flow")
+    followed = follow_points(clip, current)
+    log.end("flow", observations=len(followed.frame))
     for stage in ("path", "path again"):
-        whole = _of_all_frames(clip, current, None if result is None else result.reconstruction, log)
         log.begin(stage)
+        on_path = None if result is None else result.reconstruction
+        whole = with_all_frames(clip, current, followed, on_path).without_photos(_LEAST_MEASUREMENTS)
         if result is None:
             path, filmed = _as_filmed(clip, whole, path, telemetry)
         options = replace(options_of(whole), path=path if result is None else replace(path, start=_start_of(result)))
@@ -183,25 +187,16 @@ def _travelled(
         is_first = result is None
         result = bundle_adjust(whole, "constant-motion", how, partial(_tell, log, stage))
         log.end(
-            stage, rms_px=result.rms_px, iterations=result.num_iterations, readout_s=readout_of(result).seconds,
-            stop_reason=result.stop_reason,
+            stage, frames=whole.num_images, of_frames=len(clip.names), rms_px=result.rms_px,
+            iterations=result.num_iterations, readout_s=readout_of(result).seconds, stop_reason=result.stop_reason,
         )  # fmt: skip
         if is_first:
             # key frames without shutter: measurements that it had torn from their tracks return
-            current = retriangulate(matched, result.of_photos(_are_keys(result, clip)).reconstruction)
+            before, of_keys = current, result.of_photos(_are_keys(result, clip)).reconstruction
+            current = retriangulate(matched, of_keys)
+            followed = followed_again(clip, followed, before, current)
     assert result is not None
     return result, options, filmed
-
-
-def _of_all_frames(
-    clip: Clip, current: Reconstruction, before: Reconstruction | None, log: StageLog
-) -> Reconstruction:  # fmt: skip
-    """A reconstruction of all frames by flow from that of the key frames."""
-    log.begin("flow")
-    followed = follow_points(clip, current)
-    whole = with_all_frames(clip, current, followed, before).without_photos(_LEAST_MEASUREMENTS)
-    log.end("flow", frames=whole.num_images, of_frames=len(clip.names), observations=len(followed.frame))
-    return whole
 
 
 def _as_filmed(

@@ -23,6 +23,8 @@ _UNSEEN_PX = 1.0
 SIGMAS, APART = 3.0, 4.0
 # Share of the readout time by slow rotations that fast ones must show: noise in the poses hides some of it.
 _SHOWN_FAST = 0.5
+# A vibration a little faster than half of the frame rate shows in the frames as a slower one that runs the other way.
+_BACKWARDS = "the last line is read first (--readout), or the camera vibrates faster than half of the frame rate"
 
 
 def judge_clip(
@@ -89,18 +91,21 @@ def judge_clip(
             f"The camera moved too little to determine the readout time: {1e3 * time.seconds:.1f} +- "
             f"{1e3 * time.sigma:.1f} ms."
         )
-    reasons += _contradictions(vibration_px, speeds, halves)
+    reasons += _contradictions(time, vibration_px, speeds, halves)
     lens_only = tuple(rec.image_names) if shutter == "not-determined" else ()
     return Verdict(shutter, "doubtful" if reasons else "trusted", tuple(reasons), {}, lens_only)
 
 
 def _contradictions(
+    time: ReadoutTime,
     vibration_px: float,
     speeds: tuple[ReadoutTime, ReadoutTime] | None,
     halves: tuple[ReadoutTime, ReadoutTime] | None,
 ) -> list[str]:
     """Why the readout time may be wrong, whatever its standard deviation."""
     reasons = []
+    if _is_backwards(time):
+        reasons.append(f"The readout time is {1e3 * time.seconds:.1f} +- {1e3 * time.sigma:.1f} ms: {_BACKWARDS}.")
     if vibration_px > _UNSEEN_PX:
         reasons.append(
             f"The frames rotate by {vibration_px:.1f} px more than their path explains: the camera vibrates faster "
@@ -121,6 +126,11 @@ def _contradictions(
                 f"{1e3 * b.seconds:.1f} ms by the second, {apart:.0f} standard deviations apart."
             )
     return reasons
+
+
+def _is_backwards(time: ReadoutTime) -> bool:
+    """Whether lines rotate against the frames, as no camera's do whose readout direction is known."""
+    return time.seconds < -SIGMAS * time.sigma
 
 
 def _runs_the_other_way(slow: ReadoutTime, fast: ReadoutTime) -> bool:
@@ -157,6 +167,8 @@ def problem_of(evidence: Mapping[str, Any]) -> str:
     seconds, sigma = evidence["seconds"], evidence["sigma"]
     if not abs(seconds) > SIGMAS * sigma:
         return f"the camera moved too little: {1e3 * seconds:.1f} +- {1e3 * sigma:.1f} ms"
+    if _is_backwards(ReadoutTime(seconds, sigma)):
+        return f"{1e3 * seconds:.1f} +- {1e3 * sigma:.1f} ms: {_BACKWARDS}"
     if evidence.get("halves"):
         first, second = evidence["halves"]
         apart = abs(first["seconds"] - second["seconds"]) / np.hypot(first["sigma"], second["sigma"])
