@@ -15,14 +15,11 @@ from ..model.projection import unproject_points
 from ..sfm.flow import flow_between
 from ..sfm.resection import resect
 
-__all__ = ["Followed", "few_returns", "follow", "follow_points", "followed_again", "with_all_frames"]
+__all__ = ["Followed", "follow", "follow_points", "followed_again", "with_all_frames"]
 
 # Number of points of a key frame that are followed: those of the most key frames first, from all its cells.
 _POINTS = 120
 _CELLS = 6
-# Beyond this many key frames, what the camera returns to after so many others is connected by every eighth of them and
-# the next only: else all are connected with all, and the time that a frame takes grows with their number.
-_FEW, _AWAY, _ANCHORS = 60, 16, 8
 # Tolerance for the shutter where a frame is registered without it, in pixels.
 _ROOM_PX = 12.0
 
@@ -182,43 +179,6 @@ class CameraPoses:
         return rotation.as_matrix() @ R_a, c_a + share * (c_b - c_a)
 
 
-def few_returns(
-    key: NDArray[np.int64], point: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Tracks that connect few of the key frames to which the camera returns.
-
-    The measurements of each visit become a point of its own, and some of all visits another one, which measures them
-    once more.
-
-    Parameters
-    ----------
-    key, point : (o,) int array
-        Key frame, in the order of time, and point of each measurement.
-
-    Returns
-    -------
-    index, point_idx : (p,) int array
-        Measurements, and the new points that they show.
-    source : (n,) int array
-        The point that each new one was.
-    """
-    order = np.lexsort((key, point))
-    k, p = key[order], point[order]
-    begins = np.diff(p, prepend=-1) != 0
-    begins[1:] |= np.diff(k) > _AWAY
-    visit = np.cumsum(begins) - 1
-    source = p[begins]
-    # what some of the key frames of at least two visits show
-    some = k % _ANCHORS < 2
-    visits = np.bincount(source[np.unique(visit[some])], minlength=int(p.max(initial=-1)) + 1)
-    again = np.flatnonzero(some & (visits[p] > 1))
-    returning, place = np.unique(p[again], return_inverse=True)
-    return (
-        np.concatenate([order, order[again]]), np.concatenate([visit, len(source) + place]),
-        np.concatenate([source, returning]),
-    )  # fmt: skip
-
-
 def with_all_frames(
     clip: Clip, reconstruction: Reconstruction, followed: Followed, placed_before: Reconstruction | None = None
 ) -> Reconstruction:
@@ -226,8 +186,7 @@ def with_all_frames(
 
     Each followed point is a point of its own, at the place of the point in its key frame: the start of the flow counts
     as the measurement of the key frame, so an error there is the same in all frames, and moves the point. Points of the
-    key frames connect these, as before; where there are many, as `few_returns` has them. Frames that were
-    `placed_before` keep their poses.
+    key frames connect these, as before. Frames that were `placed_before` keep their poses.
     """
     rec, obs = reconstruction, reconstruction.observations
     number = {name: k for k, name in enumerate(clip.names)}
@@ -236,11 +195,8 @@ def with_all_frames(
     start = dict(zip(keys, np.cumsum([0, *(len(followed.chosen[k]) for k in keys)])[:-1].tolist(), strict=True))
     own = np.concatenate([followed.chosen[k] for k in keys])
     frames = np.array([number[name] for name in rec.image_names])
-    every = np.arange(len(obs)), obs.point_idx, np.arange(rec.num_points)
-    rank = np.argsort(np.argsort(frames))
-    index, of_keys, source = every if len(frames) <= _FEW else few_returns(rank[obs.frame_idx], obs.point_idx)
-    points_w = np.concatenate([rec.points_w[source], rec.points_w[obs.point_idx[own]]])
-    point = len(source) + np.array([start[k] for k in followed.key.tolist()], np.int64) + followed.place
+    points_w = np.concatenate([rec.points_w, rec.points_w[obs.point_idx[own]]])
+    point = rec.num_points + np.array([start[k] for k in followed.key.tolist()], np.int64) + followed.place
     at_key = np.concatenate([np.full(len(followed.chosen[k]), k) for k in keys])
     poses = {k: (rec.R_cw[i], rec.center_w[i]) for k, i in image_of.items()}
     if placed_before is not None:
@@ -257,10 +213,10 @@ def with_all_frames(
     placed = np.array(sorted(poses))
     image = np.full(len(clip.names), -1)
     image[placed] = np.arange(len(placed))
-    frame = image[np.concatenate([frames[obs.frame_idx[index]], at_key, followed.frame])]
-    of_point = np.concatenate([of_keys, len(source) + np.arange(len(own)), point])
-    xy_raw = np.concatenate([obs.xy_raw[index], obs.xy_raw[own], followed.xy_raw])
-    sigma = np.concatenate([obs.sigma[index], np.ones(len(own) + len(followed.frame))])
+    frame = image[np.concatenate([frames[obs.frame_idx], at_key, followed.frame])]
+    of_point = np.concatenate([obs.point_idx, rec.num_points + np.arange(len(own)), point])
+    xy_raw = np.concatenate([obs.xy_raw, obs.xy_raw[own], followed.xy_raw])
+    sigma = np.concatenate([obs.sigma, np.ones(len(own) + len(followed.frame))])
     seen = frame >= 0
     whole = Reconstruction(
         rec.cameras, [clip.names[k] for k in placed.tolist()], np.zeros(len(placed), np.int64),
