@@ -23,6 +23,7 @@ from bundle_scenes import (
 from numpy_reference import MODELS, Fisheye
 
 from rsundistort import BundleOptions
+from rsundistort._kernels import schur
 from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.model import KnownLength
@@ -230,3 +231,17 @@ def test_known_lengths_join_the_system(damping, refine, rng):
         variance = joined.linearize(state).function_of_points(joined.in_order(weights)).variance
         b = weights[joined._structure.points].ravel()
         assert variance == pytest.approx(b @ whole[points, points] @ b, rel=1e-6)
+
+
+def test_points_without_parallax_keep_what_their_measurements_say_across_them(rng):
+    rays = rng.normal(size=(50, 2, 3))
+    flat = np.einsum("nki,nkj->nij", rays, rays)  # of rank two
+    full = flat + np.eye(3)
+    V = np.concatenate([flat, full, np.zeros((1, 3, 3))])
+    V_inv = np.empty_like(V)
+    schur.invert_points(V, 0.0, V_inv)
+    np.testing.assert_allclose(V @ V_inv @ V, V, atol=1e-9 * np.abs(V).max())
+    np.testing.assert_allclose(V_inv[50:100], np.linalg.inv(full), atol=1e-9)
+    # what elimination takes from a photo that sees the points along these rays is the same for any such inverse
+    kept = np.einsum("nki,nij,nlj->nkl", rays, V_inv[:50], rays)
+    np.testing.assert_allclose(kept, np.broadcast_to(np.eye(2), kept.shape), atol=1e-6)

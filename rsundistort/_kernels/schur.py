@@ -19,6 +19,8 @@ from ._jit import SUMS, columns, kernel, parallel_kernel, prange
 
 # Tracks that a thread takes at a time.
 _CHUNK = 256
+# Pivots of a point's block below this share of its diagonal are what rounding leaves: a parallax of a microradian.
+_FLAT = 1e-12
 
 
 @parallel_kernel()
@@ -69,14 +71,13 @@ def frame_gradients(frame_start, frame_order, res, J, diagonal, g_frame):
 
 @kernel()
 def _invert_spd3(A, damping, B):
-    """B = (A + damping diag(A))^-1 of a symmetric positive 3x3 matrix; zero where it is singular."""
+    """B = (A + damping diag(A))^-1 of a symmetric positive 3x3 matrix; a generalised inverse where it is singular."""
     a, d, f = A[0, 0] * (1.0 + damping), A[1, 1] * (1.0 + damping), A[2, 2] * (1.0 + damping)
     b, c, e = A[0, 1], A[0, 2], A[1, 2]
     c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
     det = a * c00 + b * c01 + c * c02
-    # the determinant cancels to nothing: the point has no parallax and stays where it is
-    if not det > 1e-14 * a * d * f:
-        B[:] = 0.0
+    if not det > _FLAT * a * d * f:
+        _invert_flat3(A, damping, B)
         return
     B[0, 0] = c00 / det
     B[0, 1] = B[1, 0] = c01 / det
@@ -84,6 +85,41 @@ def _invert_spd3(A, damping, B):
     B[1, 1] = (a * f - c * c) / det
     B[1, 2] = B[2, 1] = (b * c - a * e) / det
     B[2, 2] = (a * d - b * b) / det
+
+
+@kernel()
+def _invert_flat3(A, damping, B):
+    """The inverse of as many rows and columns of a 3x3 matrix as determine something, and zero for the others.
+
+    A point without parallax stays where it is along the axis that is determined least; what its measurements say across
+    it is kept. Any B with A B A = A gives the same reduced system, since the rows of the coupling are in A's range.
+    """
+    M = A.copy()
+    for k in range(3):
+        M[k, k] *= 1.0 + damping
+    full = np.array([M[0, 0], M[1, 1], M[2, 2]])
+    open_ = np.ones(3, np.bool_)
+    for _ in range(3):
+        best, share = -1, _FLAT
+        for k in range(3):
+            if open_[k] and M[k, k] > share * full[k]:
+                best, share = k, M[k, k] / full[k]
+        if best < 0:
+            break
+        open_[best] = False
+        pivot = M[best, best]
+        M[best, best] = 1.0
+        for col in range(3):
+            M[best, col] /= pivot
+        for row in range(3):
+            if row != best:
+                factor = M[row, best]
+                M[row, best] = 0.0
+                for col in range(3):
+                    M[row, col] -= factor * M[best, col]
+    for row in range(3):
+        for col in range(3):
+            B[row, col] = 0.0 if open_[row] or open_[col] else M[row, col]
 
 
 @parallel_kernel()
