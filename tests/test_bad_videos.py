@@ -154,3 +154,14 @@ def test_tags_in_another_encoding_are_no_trouble(tmp_path):
     data = (tmp_path / "clip.mp4").read_bytes()
     (tmp_path / "clip.mp4").write_bytes(data.replace(b"AAAAAAAA", b"\xff\xfe\xe4\xf6\xfc\xc3\xc3\xc3"))
     assert len(read_clip(tmp_path / "clip.mp4", tmp_path / "frames").names) == 4
+
+
+def test_key_frames_do_not_depend_on_the_memory_that_pictures_are_held_in(tmp_path, monkeypatch):
+    video = encode(tmp_path / "clip.mp4", [view(k) for k in range(30)])
+    one = read_clip(video, tmp_path / "one")
+    monkeypatch.setattr("rsundistort.input.key_frames._HELD_BYTES", 0.0)
+    other = read_clip(video, tmp_path / "other")
+    assert (one.keys == other.keys).all()
+    assert len(one.keys) >= 2
+    files = [{path.name: path.read_bytes() for path in each.folder.iterdir()} for each in (one, other)]
+    assert files[0] == files[1]

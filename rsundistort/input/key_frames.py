@@ -27,6 +27,9 @@ _INTERLACED = (
     "{0} is interlaced: each frame holds two moments, which are on no path; write it anew first: "
     'ffmpeg -i "{0}" -vf bwdif=mode=send_frame -crf 12 -c:a copy deinterlaced.mp4'
 )
+# Pictures that may become the next key frame are held up to this much memory: a camera that stands still holds none of
+# them back for ever. The oldest go first, and are decoded again if they are chosen.
+_HELD_BYTES = 2e8
 # A recording paused if a step between frames is longer than this many usual ones.
 _PAUSE = 20.0
 
@@ -136,6 +139,7 @@ def read_clip(video: Path, folder: Path, progress: Callable[[int, int], None] | 
 def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None) -> Clip:
     chooser, numbers, times, sharpness, num_late = KeyFrameChooser(), list[int](), list[float](), list[float](), 0
     held: dict[int, tuple[int, float, Any]] = {}  # frames that may become the next key
+    written = set[int]()
     with VideoReader(video) as reader:
         writer, num_written = FrameWriter(reader, folder), 0
         for number, time_s, picture in reader:
@@ -152,17 +156,21 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
             if grey.std() < _DARK:
                 continue
             held[len(numbers)] = number, time_s, picture
+            if len(held) * sum(plane.buffer_size for plane in picture.planes) > _HELD_BYTES:
+                del held[min(held)]
             numbers.append(number)
             times.append(time_s)
             sharpness.append(sharpness_of(picture))
             chooser.feed(grey)
-            for k in chooser.keys[num_written:]:
+            for k in held.keys() & {*chooser.keys[num_written:]}:
                 writer.add(*held[k], sharpness[k])
+                written.add(k)
             num_written = len(chooser.keys)
             held = {k: each for k, each in held.items() if k > chooser.keys[-1]}
         chooser.finish()
-        for k in chooser.keys[num_written:]:
+        for k in held.keys() & {*chooser.keys[num_written:]}:
             writer.add(*held[k], sharpness[k])
+            written.add(k)
         reader.warn()
     if num_late:
         warnings.warn(
@@ -174,11 +182,10 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
     time = np.array(times)
     frame_s = float(np.median(np.diff(time)))
     breaks = {*chooser.cuts, *(np.flatnonzero(np.diff(time) > _PAUSE * frame_s) + 1).tolist()}
-    more = {*_between(len(numbers), len(chooser.keys)), *_ends(breaks)} - {*chooser.keys}
-    _add(writer, video, {numbers[k]: sharpness[k] for k in more})
+    keys = np.array(sorted({*chooser.keys, *_between(len(numbers), len(chooser.keys)), *_ends(breaks)}))
+    _add(writer, video, {numbers[k]: sharpness[k] for k in keys.tolist() if k not in written})
     part = np.cumsum([k in breaks for k in range(len(numbers))])
     names = tuple(frame_name(video, number) for number in numbers)
-    keys = np.array(sorted({*chooser.keys, *more}))
     flows = tuple(each for each in chooser.flows if part[each.keys[0]] == part[each.keys[1]])
     return Clip(
         video, folder, tuple(numbers), names, time, frame_s, part, keys, np.array(chooser.steps), writer.finish(), flows

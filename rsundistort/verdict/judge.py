@@ -345,7 +345,7 @@ def _doubts(
 def _faint(rec: Reconstruction, motions: PhotoMotions) -> dict[str, str]:
     """Photos that may come out worse than they went in, which says nothing about the shape of the whole.
 
-    They do if an error of two standard deviations is half of what was found: it is then all that there was.
+    If an error of two standard deviations is half of what was found, it may be as large as the true motion.
     """
     found, sigma = motions.shift_px, motions.sigma_px
     faint = (sigma > found / 4) & (sigma > _UNSEEN_PX / 2)
