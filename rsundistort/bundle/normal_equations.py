@@ -158,7 +158,11 @@ class NormalEquations:
 
     def _wide(self, values: Array) -> Array:
         """Photos' values (..., m, measured) with zeros for the unknowns that no measurement sees."""
-        return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, self._num_unseen)])
+        if not self._num_unseen:
+            return values
+        wide = np.zeros((*values.shape[:-1], values.shape[-1] + self._num_unseen))
+        wide[..., : values.shape[-1]] = values
+        return wide
 
     def _seen(self, values: Array) -> Array:
         """Photos' values (..., m, nb) of the unknowns that measurements see."""

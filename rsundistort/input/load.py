@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ..batch.one_photo import check_not_rectified
@@ -19,13 +19,17 @@ from ..io.places import local_place
 from ..sfm import DETECTION_MEGAPIXELS, Features, detect_features, detection_bytes, edge_width_px, grey_8_bit
 from .photo_cameras import PhotoCameras, find_cameras
 
-__all__ = ["LONG_EXPOSURE_S", "LoadedPhotos", "load_photos"]
+__all__ = ["LONG_EXPOSURE_S", "LoadedPhotos", "load_photos", "with_finer_features"]
 
 #: Longer exposures bound the motion: a camera that rotated much would have blurred the photo.
 LONG_EXPOSURE_S = 1 / 250
 
 # Bytes per pixel of a decoded photo, at most, except for floats; and the size of one whose header has none.
 _BYTES_PER_PIXEL, _SIZE_OF_OTHERS = 16, (8000, 6000)
+
+# SIFT doubles the sides of what it is given: a quarter of a photo's pixels become the photo's own. A photo that has so
+# many features there needs no more pixels, unless too few of them match those of other photos.
+_COARSE, _MANY_FEATURES = 0.25, 3000
 
 _NUMBERS = {2: "two", 3: "three"}
 
@@ -52,6 +56,8 @@ class LoadedPhotos:
         As in `RectifyOptions`.
     edges_px : sequence of float or None
         Width of the steepest edges of each photo whose exposure was so long that it matters.
+    coarse : frozenset of str
+        Photos whose features were detected in fewer pixels than allowed; see `with_finer_features`.
     """
 
     names: list[str]
@@ -64,6 +70,7 @@ class LoadedPhotos:
     mask_of: Mapping[str, Path]
     max_megapixels: float
     edges_px: Sequence[float | None] = ()
+    coarse: frozenset[str] = frozenset()
 
     def unregistered(self, registered: Sequence[str]) -> dict[str, str]:
         """Photos that are not registered, and why."""
@@ -82,6 +89,7 @@ class _LoadJob:
     megapixels: float
     max_megapixels: float
     again: bool
+    coarse: bool
 
 
 @dataclass(frozen=True)
@@ -95,6 +103,7 @@ class _Loaded:
     facts: ExifFacts = field(default_factory=ExifFacts)
     edge_px: float | None = None
     problem: str = ""
+    coarse: bool = False
 
 
 def _load(job: _LoadJob) -> _Loaded:
@@ -109,12 +118,17 @@ def _load(job: _LoadJob) -> _Loaded:
     height, width = photo.pixels.shape[:2]
     # a mask that cannot be used stops the run: without it, what it excludes would be measured
     mask = None if job.own_mask is None else read_mask(job.own_mask, width, height)
-    features = detect_features(photo.pixels, job.max_features, mask, job.megapixels)
+    few, features = 1e-6 * _COARSE * width * height, None
+    if job.coarse and few < job.megapixels:
+        features = detect_features(photo.pixels, job.max_features, mask, few)
+    is_coarse = features is not None and len(features.xy_raw) >= min(_MANY_FEATURES, job.max_features)
+    if not is_coarse:
+        features = detect_features(photo.pixels, job.max_features, mask, job.megapixels)
     facts = facts_of_exif(photo.metadata.exif, photo.metadata.xmp)
     edge_px = None
     if facts.exposure_s is not None and facts.exposure_s > LONG_EXPOSURE_S:
         edge_px = edge_width_px(grey_8_bit(photo.pixels))
-    return _Loaded(features, width, height, photo.metadata.orientation, facts, edge_px)
+    return _Loaded(features, width, height, photo.metadata.orientation, facts, edge_px, coarse=is_coarse)
 
 
 def _most_bytes(folder: Path, names: Sequence[str], megapixels: float, max_megapixels: float) -> float:
@@ -165,6 +179,7 @@ def load_photos(
     least: int = 3,
     kept: Kept | None = None,
     only: Sequence[str] | None = None,
+    coarse: bool = False,
 ) -> LoadedPhotos:
     """Read every photo of a folder once, for its size and features; unusable ones are skipped with a warning.
 
@@ -190,33 +205,28 @@ def load_photos(
         Photos that are loaded; all that are there when left out.
     kept : Kept, optional
         Results of an earlier run; takes those of this run.
+    coarse : bool
+        Whether fewer pixels are enough for the features of photos that show many there.
     """
     kept = kept or Kept()
     listed = _listed(folder, raw_as, only, least)
     mask_of = {} if masks is None else find_masks(local_place(masks).absolute(), listed)
-    before: dict[str, _Loaded] = {name: old for name in listed if (old := kept.get(f"features of {name}"))}
-    jobs = (
-        _LoadJob(name, folder.absolute() / name, mask_of.get(name), max_features, megapixels, max_megapixels, again)
+    jobs = [
+        _LoadJob(
+            name, folder.absolute() / name, mask_of.get(name), max_features, megapixels, max_megapixels, again, coarse
+        )
         for name in listed
-        if name not in before
-    )
-    log.begin("features", len(listed), len(before))
-    found, skipped = dict[str, _Loaded](), dict[str, str]()
+    ]
     # headers are not read for workers elsewhere, which limit their own memory
     if not workers.scheduler:
         workers = workers.fitting("features", _most_bytes(folder, listed, megapixels, max_megapixels))
-    results = workers.map(_load, jobs, lambda job, why: _Loaded(problem=f"{job.name}: {why}"))
-    with closing(results):
-        for name in listed:
-            each = before[name] if name in before else next(results)
-            if name not in before and each.features is not None:
-                kept.put(f"features of {name}", each)
-            if each.features is None:
-                skipped[name] = each.problem
-                warnings.warn(f"skipped: {each.problem}", SkippedPhotoWarning, stacklevel=2)
-            else:
-                found[name] = each
-            log.tell("features", len(found) + len(skipped), len(listed))
+    found, skipped = dict[str, _Loaded](), dict[str, str]()
+    for name, each in _read(jobs, "features of", workers, log, kept):
+        if each.features is None:
+            skipped[name] = each.problem
+            warnings.warn(f"skipped: {each.problem}", SkippedPhotoWarning, stacklevel=2)
+        else:
+            found[name] = each
     names, loaded = list(found), list(found.values())
     if len(names) < least:
         readable = f"{folder} holds {len(names)} readable photo{'s' * (len(names) != 1)} of {len(listed)}"
@@ -227,5 +237,67 @@ def load_photos(
     orientations = {name: each.orientation for name, each in found.items()}
     return LoadedPhotos(
         names, features, facts, skipped, cameras, orientations, folder.absolute(), mask_of, max_megapixels,
-        [each.edge_px for each in loaded],
+        [each.edge_px for each in loaded], frozenset(name for name, each in found.items() if each.coarse),
     )  # fmt: skip
+
+
+def with_finer_features(
+    photos: LoadedPhotos,
+    max_features: int,
+    workers: Workers,
+    log: StageLog,
+    megapixels: float,
+    kept: Kept | None = None,
+) -> LoadedPhotos:
+    """Photos with features of all pixels that are allowed, where they were loaded with coarse ones.
+
+    Parameters
+    ----------
+    photos : LoadedPhotos
+        Of `load_photos`.
+    max_features, workers, log, megapixels, kept
+        As there.
+    """
+    jobs = [
+        _LoadJob(
+            name,
+            photos.folder / name,
+            photos.mask_of.get(name),
+            max_features,
+            megapixels,
+            photos.max_megapixels,
+            again=True,
+            coarse=False,
+        )  # fmt: skip
+        for name in photos.names
+        if name in photos.coarse
+    ]
+    if jobs and not workers.scheduler:
+        most = _most_bytes(photos.folder, [job.name for job in jobs], megapixels, photos.max_megapixels)
+        workers = workers.fitting("features", most)
+    finer = dict(_read(jobs, "finer features of", workers, log, kept or Kept()))
+    if lost := [each.problem for each in finer.values() if each.features is None]:
+        raise FileError(lost[0])
+    features = [
+        finer[name].features or old if name in finer else old
+        for name, old in zip(photos.names, photos.features, strict=True)
+    ]
+    log.end("features", photos=len(jobs), keypoints=sum(len(each.xy_raw) for each in features))
+    return replace(photos, features=features, coarse=frozenset())
+
+
+def _read(
+    jobs: Sequence[_LoadJob], key: str, workers: Workers, log: StageLog, kept: Kept
+) -> Iterator[tuple[str, _Loaded]]:
+    """Names and contents of photos; those that an earlier run kept are not read again."""
+    before: dict[str, _Loaded] = {job.name: old for job in jobs if (old := kept.get(f"{key} {job.name}"))}
+    log.begin("features", len(jobs), len(before))
+    left = (job for job in jobs if job.name not in before)
+    results = workers.map(_load, left, lambda job, why: _Loaded(problem=f"{job.name}: {why}"))
+    with closing(results):
+        for done, job in enumerate(jobs, 1):
+            each = before[job.name] if job.name in before else next(results)
+            if job.name not in before and each.features is not None:
+                kept.put(f"{key} {job.name}", each)
+            log.tell("features", done, len(jobs))
+            yield job.name, each

@@ -13,7 +13,7 @@ from ..model import Camera
 from .database import LOOSE, MatchedPhotos, verification_options, write_photos
 from .features import Features
 
-__all__ = ["LOOSE_PX", "match_photos"]
+__all__ = ["LOOSE_PX", "match_more", "match_photos"]
 
 #: Largest distance of matches from epipolar lines that leaves room for the shutter: `LOOSE` times that of COLMAP.
 LOOSE_PX = 4.0 * LOOSE
@@ -62,9 +62,24 @@ def match_photos(
         sift = pycolmap.FeatureExtractorType.SIFT
         for index, found in enumerate(features):
             db.write_descriptors(index + 1, pycolmap.FeatureDescriptors(type=sift, data=found.descriptors))
+    match_more(matched, within_px=within_px, pairs=pairs)
+    return matched
+
+
+def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: NDArray[np.int64] | None = None) -> None:
+    """Match and verify further pairs of photos; those that were matched before stay as they are.
+
+    Parameters
+    ----------
+    matched : MatchedPhotos
+        Photos of `match_photos`; gets the matches.
+    within_px, pairs
+        As there.
+    """
+    pycolmap, database = quiet_pycolmap(), matched.database
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
-    verification = verification_options(within_px, seed)
+    verification = verification_options(within_px, matched.seed)
     if pairs is None:
         pycolmap.match_exhaustive(database, matching, verification_options=verification, device=pycolmap.Device.cpu)
     else:
@@ -74,4 +89,3 @@ def match_photos(
         pycolmap.match_image_pairs(
             database, matching, pairing, verification_options=verification, device=pycolmap.Device.cpu
         )
-    return matched

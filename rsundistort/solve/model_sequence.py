@@ -185,6 +185,7 @@ def solve_photos(
     workers: Workers | None = None,
     kept: Kept | None = None,
     survey: Survey | None = None,
+    finer: Callable[[], LoadedPhotos] | None = None,
 ) -> Solved:
     """Match, map and adjust the model sequence; then remove the shutter from keypoints, make new tracks and adjust.
 
@@ -213,9 +214,13 @@ def solve_photos(
         Results of an earlier run; takes those of this run.
     survey : Survey, optional
         Positions of photos and control points: the frame is then that of the map.
+    finer : callable, optional
+        As in `place_photos`.
     """
     cameras = photos.cameras
-    mapped, matched = place_photos(photos, scratch, log, seed, matching, kept or Kept(), with_shutter=True)
+    mapped, matched = place_photos(
+        photos, scratch, log, seed, matching, kept or Kept(), with_shutter=True, finer=finer
+    )  # fmt: skip
     _check_enough(mapped, len(photos.names))
     solved = solve_tracks(
         mapped, cameras, shutter_model, seed, options_of, log, remedy, TrackSource(matched, photos, workers), survey
@@ -263,7 +268,9 @@ def solve_tracks(
     options = _of_registered(wanted, mapped, says=track_source is None)
     auto = shutter_model == "auto"
     shutter_model = "rotation" if auto else shutter_model
-    result = _adjusted_sequence(mapped, shutter_model, options, log)
+    # an adjustment of new tracks follows, where there are any
+    how = options if track_source is None else rough_options(options)
+    result = _adjusted_sequence(mapped, shutter_model, how, log)
     tracks, strong = result.reconstruction, _is_strong(result.reconstruction)
     if track_source is not None:
         result = _registered_again(track_source, result, wanted, log)
@@ -398,7 +405,7 @@ def _lens_only(verdict: Verdict) -> str:
 
 def rough_options(options: BundleOptions) -> BundleOptions:
     """Options of an adjustment that another one follows."""
-    return replace(options, cost_tolerance=1e-5, prior_sigma_rounds=3, prior_sigma_tolerance=0.05)
+    return replace(options, outlier_rounds=2, cost_tolerance=1e-5, prior_sigma_rounds=1, prior_sigma_tolerance=0.05)
 
 
 def _is_strong(rec: Reconstruction) -> bool:

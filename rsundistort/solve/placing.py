@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..batch.progress import StageLog
-from ..colmap.conventions import quiet_pycolmap
 from ..errors import ReconstructionError
 from ..input.load import LoadedPhotos
 from ..input.pairing import pairs_of_clip, pairs_to_match
 from ..io.kept import Kept
 from ..model import Reconstruction
 from ..sfm import MatchedPhotos, map_photos, match_photos, verify_with_shutter
+from ..sfm.epipolar import read_num_verified
 from ..sfm.mapping import PLACING_KEYPOINTS
-from ..sfm.matching import LOOSE_PX
+from ..sfm.matching import LOOSE_PX, match_more
 
 __all__ = ["place_photos"]
 
@@ -26,15 +30,16 @@ _MANY = 100
 # detected in. Content moves by little from one to the next, and so does the shutter's distortion: with four times as
 # much, these lines have any direction where there is hardly any parallax, and poses go wrong.
 _CLOSE_PX = 4.0
+# Verified matches of a pair with which coarse features do. With more photos than `_ASKED`, so many pairs in their order
+# are asked before all are matched, of which most must have that; each photo then has half of it at least.
+_RICH, _ASKED, _MOST_OF_THEM, _AT_LEAST = 800, 16, 0.75, 0.5
 # Largest keypoints of a key frame that place it: neighbours show nearly all of them again.
 _OF_CLIP = (512, 2048, None)
 
 
-def _num_verified(matched: MatchedPhotos) -> int:
+def _num_overlapping(matched: MatchedPhotos) -> int:
     """Pairs of photos that overlap beyond doubt."""
-    with quiet_pycolmap().Database.open(matched.database) as db:
-        _, counts = db.read_two_view_geometry_num_inliers()
-    return sum(count >= _MANY for count in counts)
+    return sum(count >= _MANY for count in read_num_verified(matched).values())
 
 
 def place_photos(
@@ -47,6 +52,7 @@ def place_photos(
     *,
     with_shutter: bool = False,
     of_clip: bool = False,
+    finer: Callable[[], LoadedPhotos] | None = None,
 ) -> tuple[Reconstruction, MatchedPhotos]:
     """Match photos and map them, as of a global shutter; results of an earlier run are not computed again.
 
@@ -66,26 +72,15 @@ def place_photos(
         Whether pairs that a shutter hides are verified by relative poses with a shutter.
     of_clip : bool
         Whether they are key frames of a video in its order, which differ by little.
+    finer : callable, optional
+        Gives the photos with finer features, for those whose coarse ones match too few of others.
     """
-    cameras, database = photos.cameras, scratch / "database.db"
-    log.begin("matching")
-    given = database, photos.names, photos.features, cameras.cameras, cameras.camera_idx
-    counts: dict[str, float] | None = kept.get("pairs")
-    if counts is not None and kept.get_file("database", database):
-        matched = MatchedPhotos(*given, calibrated=cameras.calibrated, seed=seed)
-    else:
-        choose = pairs_of_clip if of_clip else pairs_to_match
-        pairs, num_pairs = choose(photos, matching, seed), math.comb(len(photos.names), 2)
-        within_px = LOOSE_PX
-        if of_clip:
-            within_px = _CLOSE_PX * float(np.median([each.step_px for each in photos.features]))
-        matched = match_photos(*given, calibrated=cameras.calibrated, seed=seed, pairs=pairs, within_px=within_px)
-        counts = {"pairs": num_pairs if pairs is None else len(pairs), "of_pairs": num_pairs}
-        if with_shutter:
-            counts["spread_rad"] = verify_with_shutter(matched)
-        kept.put_file("database", database)
-        kept.put("pairs", counts)
-    log.end("matching", **counts)
+    options = scratch, log, seed, matching, kept
+    matched = _match(photos, *options, with_shutter=with_shutter, of_clip=of_clip)
+    if matched is None:
+        photos = photos if finer is None else finer()
+        matched = _match(replace(photos, coarse=frozenset()), *options, with_shutter=with_shutter, of_clip=of_clip)
+        assert matched is not None
     log.begin("mapping", len(photos.names))
     mapped: Reconstruction | None = kept.get("mapped")
     if mapped is None:
@@ -93,7 +88,7 @@ def place_photos(
             keypoints = _OF_CLIP if of_clip else PLACING_KEYPOINTS
             mapped = map_photos(matched, lambda done: log.tell("mapping", done, len(photos.names)), keypoints)
         except ReconstructionError as error:
-            if _num_verified(matched) < len(photos.names) - 1:
+            if _num_overlapping(matched) < len(photos.names) - 1:
                 raise
             raise ReconstructionError(
                 "the photos overlap, but show no parallax: the camera stood still or only rotated; "
@@ -102,3 +97,68 @@ def place_photos(
         kept.put("mapped", mapped)
     log.end("mapping", photos=mapped.num_images, points=mapped.num_points, observations=len(mapped.observations))
     return mapped, matched
+
+
+def _match(
+    photos: LoadedPhotos,
+    scratch: Path,
+    log: StageLog,
+    seed: int,
+    matching: str,
+    kept: Kept,
+    *,
+    with_shutter: bool,
+    of_clip: bool,
+) -> MatchedPhotos | None:
+    """Photos matched with each other, as in `place_photos`; None if their features are too coarse for that."""
+    detail = " of coarse features" if photos.coarse else ""
+    cameras, database = photos.cameras, scratch / f"database{detail.replace(' ', '-')}.db"
+    log.begin("matching")
+    given = database, photos.names, photos.features, cameras.cameras, cameras.camera_idx
+    counts: dict[str, float] | None = kept.get(f"pairs{detail}")
+    if counts is not None and kept.get_file(f"database{detail}", database):
+        matched = MatchedPhotos(*given, calibrated=cameras.calibrated, seed=seed)
+    else:
+        choose = pairs_of_clip if of_clip else pairs_to_match
+        within_px = LOOSE_PX
+        if of_clip:
+            within_px = _CLOSE_PX * float(np.median([each.step_px for each in photos.features]))
+        start = partial(match_photos, *given, calibrated=cameras.calibrated, seed=seed, within_px=within_px)
+        asks = bool(photos.coarse) and len(photos.names) > _ASKED
+        if asks:
+            matched = start(pairs=_neighbours(len(photos.names)))
+            if not _most_are_rich(matched):
+                log.end("matching", of="coarse features", rich=False)
+                return None
+        pairs, num_pairs = choose(photos, matching, seed), math.comb(len(photos.names), 2)
+        if asks:
+            match_more(matched, within_px=within_px, pairs=pairs)
+        else:
+            matched = start(pairs=pairs)
+        counts = {"pairs": num_pairs if pairs is None else len(pairs), "of_pairs": num_pairs}
+        if with_shutter:
+            counts["spread_rad"] = verify_with_shutter(matched)
+        kept.put_file(f"database{detail}", database)
+        kept.put(f"pairs{detail}", counts)
+    log.end("matching", **counts)
+    return matched if not photos.coarse or _all_are_rich(matched) else None
+
+
+def _neighbours(count: int) -> NDArray[np.int64]:
+    """(p, 2) some of the pairs of photos that follow each other."""
+    first = np.linspace(0, count - 2, _ASKED).astype(np.int64)
+    return np.stack([first, first + 1], axis=1)
+
+
+def _most_are_rich(matched: MatchedPhotos) -> bool:
+    """Whether most of the pairs that were asked share many matches."""
+    return sum(count >= _RICH for count in read_num_verified(matched).values()) >= _MOST_OF_THEM * _ASKED
+
+
+def _all_are_rich(matched: MatchedPhotos) -> bool:
+    """Whether each photo shares matches enough with one of the others."""
+    most = dict.fromkeys(range(len(matched.names)), 0)
+    for pair, count in read_num_verified(matched).items():
+        for photo in pair:
+            most[photo] = max(most[photo], count)
+    return min(most.values()) >= _AT_LEAST * _RICH

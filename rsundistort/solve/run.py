@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from ..input.exposure import bounded_by_exposure
 from ..input.frames import find_photos
 from ..input.gyroscope import GyroOptions, Readouts, gyro_contradiction, gyro_motions, known_readouts
 from ..input.key_frames import Clip
-from ..input.load import LoadedPhotos, load_photos
+from ..input.load import LoadedPhotos, load_photos, with_finer_features
 from ..input.photo_cameras import camera_file_of
 from ..input.unknown_focal import with_focal_lengths
 from ..io import ExifFacts, is_video, list_photos, output_folder, read_solution
@@ -143,6 +144,7 @@ def _solved(
         folder, source.camera, options.solve.readout, options.most_features(is_clip), workers, log,
         megapixels=options.feature_megapixels, masks=rectify.masks, raw_as=rectify.raw_as, again=rectify.again,
         max_megapixels=rectify.max_megapixels, least=2 if is_clip else 3, kept=kept,
+        coarse=not is_clip,
     )  # fmt: skip
     loaded = with_focal_lengths(loaded, options.solve.seed, log, kept)
     _check_anchors(options.solve, loaded.names, photos)
@@ -206,6 +208,9 @@ def _solve(
         solved = solve_photos(
             loaded, solving.shutter_model, solving.seed, options_of,
             work, log, solving.remedy, options.matching, workers, kept, survey,
+            partial(
+                with_finer_features, loaded, options.most_features(False), workers, log, options.feature_megapixels, kept
+            ),
         )  # fmt: skip
     rec = solved.shared
     cameras.check_plausible(rec.cameras)
