@@ -258,17 +258,9 @@ def with_finer_features(
     max_features, workers, log, megapixels, kept
         As there.
     """
+    limits = max_features, megapixels, photos.max_megapixels
     jobs = [
-        _LoadJob(
-            name,
-            photos.folder / name,
-            photos.mask_of.get(name),
-            max_features,
-            megapixels,
-            photos.max_megapixels,
-            again=True,
-            coarse=False,
-        )  # fmt: skip
+        _LoadJob(name, photos.folder / name, photos.mask_of.get(name), *limits, again=True, coarse=False)
         for name in photos.names
         if name in photos.coarse
     ]

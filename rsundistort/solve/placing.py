@@ -17,8 +17,7 @@ from ..input.load import LoadedPhotos
 from ..input.pairing import pairs_of_clip, pairs_to_match
 from ..io.kept import Kept
 from ..model import Reconstruction
-from ..sfm import MatchedPhotos, map_photos, match_photos, verify_with_shutter
-from ..sfm.epipolar import read_num_verified
+from ..sfm import MatchedPhotos, map_photos, match_photos, read_num_verified, verify_with_shutter
 from ..sfm.mapping import PLACING_KEYPOINTS
 from ..sfm.matching import LOOSE_PX, match_more
 

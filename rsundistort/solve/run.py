@@ -203,14 +203,14 @@ def _solve(
     sizes = [(cameras.of(i).width, cameras.of(i).height) for i in range(len(loaded.names))]
     known = {k: seconds for k, seconds in known_s.items() if cameras.readout_specified[k]}
     clock_s = {name: known[k] for name, k in zip(loaded.names, cameras.camera_idx.tolist(), strict=True) if k in known}
+    finer = partial(
+        with_finer_features, loaded, options.most_features(False), workers, log, options.feature_megapixels, kept
+    )
     survey = survey_of(solving.crs, solving.control, loaded.names, loaded.facts, sizes, clock_s)
     with work_folder() as work:
         solved = solve_photos(
             loaded, solving.shutter_model, solving.seed, options_of,
-            work, log, solving.remedy, options.matching, workers, kept, survey,
-            partial(
-                with_finer_features, loaded, options.most_features(False), workers, log, options.feature_megapixels, kept
-            ),
+            work, log, solving.remedy, options.matching, workers, kept, survey, finer,
         )  # fmt: skip
     rec = solved.shared
     cameras.check_plausible(rec.cameras)
