@@ -5,7 +5,8 @@
 4000x3000, three channels, linear interpolation, both on two threads, by turns; medians. `floor_s` is `cv2.remap` alone
 with ready maps of full size, `bytes_moved` what it must read and write at the least. `cpu_ratio` is the ratio of the
 processors' time, which other programs on the machine disturb less: `cv2.undistort` works on one thread (its strips are
-a row or so), so half of it is the ratio of an idle machine. Exits 1 if one crashes, never because a noisy figure misses
+a row or so), so half of it is the ratio of an idle machine. `bent map` is a map of full size of a motion that vibrates,
+against that of a steady one. Exits 1 if one crashes, never because a noisy figure misses
 its target.
 """
 
@@ -24,14 +25,19 @@ import cv2
 import numpy as np
 
 import rsundistort as rs
+from rsundistort.model import Bend
 
 WIDTH, HEIGHT = 4000, 3000
 K = np.array([[3000.0, 0, 1990], [0, 3010, 1510], [0, 0, 1]])
 DIST = np.array([-0.12, 0.03, 0.001, -0.002])
 MOTION = rs.RowMotion([0.03, -0.02, 0.03])
 CAMERA = rs.Camera(WIDTH, HEIGHT, K, DIST)
+# a milliradian of three periods
+TREMOR = 1e-3 * np.sin(np.linspace(0.0, 6 * np.pi, 65)[:, None] + np.arange(3))
+VIBRATING = rs.RowMotion(MOTION.phi, bend=Bend(*CAMERA.clock_range, TREMOR))
 THREADS = 2
 MAX_EXTRA_MB = 32
+AGAINST = {"peer": "cv2.undistort", "rotation": "uint8"}
 
 # The peak of a fresh process less what it held before, less result and mask. Linux resets the peak when asked.
 MEMORY = """
@@ -88,6 +94,8 @@ def main() -> None:
         "two-step": ours("uint8", "two-step"),
         "uint16": ours("uint16"),
         "float32": ours("float32"),
+        "map": lambda: rs.init_rectify_map(CAMERA, MOTION),
+        "bent map": lambda: rs.init_rectify_map(CAMERA, VIBRATING),
     }
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in works}
     for work in works.values():
@@ -105,11 +113,12 @@ def main() -> None:
         ("two-step", "peer", 0.6),
         ("uint16", "rotation", 2.5),
         ("float32", "rotation", 2.5),
+        ("bent map", "map", 1.3),
     ):
         pairs = list(zip(times[name], times[against], strict=True))
         ratio = statistics.median(a[0] / b[0] for a, b in pairs)
         figures = {
-            "name": f"rectify 4000x3000 {name} against {'cv2.undistort' if against == 'peer' else 'uint8'}",
+            "name": f"rectify 4000x3000 {name} against {AGAINST.get(against, against)}",
             "ours_s": round(median(name), 4),
             "peer_s": round(median(against), 4),
             "ratio": round(ratio, 3),
