@@ -56,8 +56,8 @@ def path(phi, vel, moving, t):
         f0, f1, f2 = phi[0], phi[1], phi[2]
         v0, v1, v2 = moving * vel[0], moving * vel[1], moving * vel[2]
         return t * f0, t * f1, t * f2, f0, f1, f2, t * v0, t * v1, t * v2, v0, v1, v2
-    i, u, beyond = interval(phi.shape[0] // 4, (t - phi[0, 3]) / phi[0, 4])
     rate = 1.0 / phi[0, 4]
+    i, u, beyond = interval(phi.shape[0] // 4, (t - phi[0, 3]) * rate)
     i = 1 + 4 * i
     w0, d0 = cubic(phi, i, 0, u, beyond)
     w1, d1 = cubic(phi, i, 1, u, beyond)
@@ -91,9 +91,9 @@ def cubic(table, i, column, u, beyond):
 
 
 @kernel(forceinline=True)
-def moves(w0, w1, w2, f0, f1, f2, phi, a, b, q0, q1, q2):
-    """Derivative by the clock of q = Exp(w) x: that of w is f."""
-    if phi.ndim == 2:
+def moves(w0, w1, w2, f0, f1, f2, phi, exact, a, b, q0, q1, q2):
+    """Derivative by the clock of q = Exp(w) x: that of w is f. If it is not to be exact, w is taken to be along f."""
+    if exact and phi.ndim == 2:
         # of a steady motion w is along f, and L f = f
         c = third_factor(w0 * w0 + w1 * w1 + w2 * w2, a)
         f0, f1, f2 = rotate(w0, w1, w2, b, c, f0, f1, f2)

@@ -15,7 +15,8 @@ GLOBAL, TWO_STEP, LINEARIZED, ROTATION, CONSTANT_MOTION = 0, 1, 2, 3, 4
 # Points that a thread takes at once.
 CHUNK = 512
 # Newton on the row takes its last step from a gap below this (normalised units): the step squares the gap, and the
-# curvature of the gap is of the order of phi, so 1e-17 is left.
+# curvature of the gap is of the order of phi, so 1e-17 is left. Of a motion that is not steady, whose derivative is
+# approximate, a hundredth of the gap is left at the most.
 _LAST_GAP = 1e-8
 # Derivatives are taken at the row itself: they change as the gap does.
 _SAME_ROW = 1e-13
@@ -169,7 +170,8 @@ def project_exact(axis, sign, lens, x, y, z, phi, vel, moving, start, out, jac):
         q0, q1, q2 = rotate(w0, w1, w2, a, b, x - p0, y - p1, z - p2)
         if not q2 > 0.0:
             return False
-        d0, d1, d2 = moves(w0, w1, w2, f0, f1, f2, phi, a, b, q0, q1, q2)
+        # without derivatives, it only has to lead to the row
+        d0, d1, d2 = moves(w0, w1, w2, f0, f1, f2, phi, jac, a, b, q0, q1, q2)
         if moving != 0.0:
             e0, e1, e2 = rotate(w0, w1, w2, a, b, v0, v1, v2)
             d0, d1, d2 = d0 - e0, d1 - e1, d2 - e2

@@ -222,7 +222,7 @@ def _lens_jacobian(model, axis, sign, lens, x, y, z, phi, vel, xd, yd, d):
     a, b = rodrigues(w0 * w0 + w1 * w1 + w2 * w2)
     q0, q1, q2 = rotate(w0, w1, w2, a, b, x - p0, y - p1, z - p2)
     e0, e1, e2 = rotate(w0, w1, w2, a, b, v0, v1, v2)
-    d0, d1, d2 = moves(w0, w1, w2, f0, f1, f2, phi, a, b, q0, q1, q2)
+    d0, d1, d2 = moves(w0, w1, w2, f0, f1, f2, phi, True, a, b, q0, q1, q2)
     d0, d1, d2 = d0 - e0, d1 - e1, d2 - e2
     X, Y = q0 / q2, q1 / q2
     _, _, xx, xy, yx, yy, _ = distort(lens, X, Y)
