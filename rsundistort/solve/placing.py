@@ -74,12 +74,15 @@ def place_photos(
     finer : callable, optional
         Gives the photos with finer features, for those whose coarse ones match too few of others.
     """
-    options = scratch, log, seed, matching, kept
-    matched = _match(photos, *options, with_shutter=with_shutter, of_clip=of_clip)
-    if matched is None:
-        photos = photos if finer is None else finer()
-        matched = _match(replace(photos, coarse=frozenset()), *options, with_shutter=with_shutter, of_clip=of_clip)
-        assert matched is not None
+    match = partial(
+        _match, scratch=scratch, log=log, seed=seed, matching=matching, kept=kept, with_shutter=with_shutter,
+        of_clip=of_clip,
+    )  # fmt: skip
+    # without finer ones, coarse features have to do
+    matched = match(photos if finer is not None else replace(photos, coarse=frozenset()))
+    if matched is None and finer is not None:
+        matched = match(finer())
+    assert matched is not None
     log.begin("mapping", len(photos.names))
     mapped: Reconstruction | None = kept.get("mapped")
     if mapped is None:
