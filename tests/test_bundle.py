@@ -20,7 +20,7 @@ from rsundistort.bundle import (
     choose_readouts,
     objective,
 )
-from rsundistort.bundle.choice import hold_out
+from rsundistort.bundle.choice import enough_points, hold_out
 from rsundistort.bundle.intrinsics import moved_camera
 from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
@@ -519,6 +519,18 @@ def test_a_camera_whose_readout_was_specified_is_left_alone(rng):
     rec = make_scene(rng, "rotation", num_images=8, num_points=100, noise_px=0.3)
     assert list(choose_readouts(rec, [2]).gain) == [2]
     assert choose_readouts(rec, []).gain == {}
+
+
+def test_a_sample_of_points_has_enough_of_each_photo_and_all_of_small_ones(rng):
+    rec = make_scene(rng, "rotation", num_images=4, num_points=300)
+    seen = rng.random(len(rec.observations)) < np.where(rec.observations.frame_idx == 2, 0.1, 1.0)
+    rec = rec.with_points(seen)
+    taken = enough_points(rec, per_photo=60, seed=3)
+    counts, left = (np.bincount(each.observations.frame_idx) for each in (rec, rec.take_points(taken)))
+    assert (left >= np.minimum(counts, 60)).all()
+    assert left[2] == counts[2] < 60
+    assert taken.sum() < 120
+    assert enough_points(rec, per_photo=300).all()
 
 
 def test_held_out_measurements_leave_their_tracks_three(rng):

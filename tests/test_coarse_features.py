@@ -70,8 +70,8 @@ def test_photos_that_show_many_features_in_fewer_pixels_are_detected_there(tmp_p
     folder = write(tmp_path / "in", [*views(texture(0)), texture(1, 25.0)[: SIZE[1], : SIZE[0]]])
     loaded = load(folder, coarse=True)
     assert loaded.coarse == {"0.png", "1.png", "2.png"}
-    # two fifths of the pixels; the last shows too little even in all pixels, and has all that these show
-    assert [each.step_px for each in loaded.features] == pytest.approx([1.58, 1.58, 1.58, 1.0], abs=0.01)
+    # a third of the pixels; the last shows too little even in all pixels, and has all that these show
+    assert [each.step_px for each in loaded.features] == pytest.approx([1.73, 1.73, 1.73, 1.0], abs=0.01)
     assert all(len(each.xy_raw) >= 3000 for each in loaded.features[:3])
 
 
@@ -86,7 +86,7 @@ def test_finer_features_are_those_of_photos_that_were_never_coarse(tmp_path):
 
 def test_coarse_features_do_where_they_match(tmp_path, seen):
     log = place(write(tmp_path / "in", views(texture(0))))
-    assert [each.step_px for each in seen[0].features] == pytest.approx([1.58] * 3, abs=0.01)
+    assert [each.step_px for each in seen[0].features] == pytest.approx([1.73] * 3, abs=0.01)
     assert [stage["name"] for stage in log.stages] == ["matching"]
 
 

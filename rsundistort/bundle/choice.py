@@ -17,7 +17,14 @@ from .bundle_options import BundleOptions
 from .prior_sigmas import PriorSigmas
 from .remains import CLIP, WAVES, agreement_of_waves, errors_without, half_across_readout, warps, waves
 
-__all__ = ["ModelChoice", "choose_model", "clipped_errors", "corners", "hold_out", "improves", "standard_errors"]
+__all__ = [
+    "ModelChoice", "choose_model", "clipped_errors", "corners", "enough_points", "hold_out", "improves",
+    "standard_errors",
+]  # fmt: skip
+
+# Measurements of a photo that models are compared by, where it has more: they find a fall by `_MIN_FALL` with three
+# standard errors, and more would not change what is kept.
+_ENOUGH = 1500
 
 # A track may lose one measurement if this many are left: two determine the point, the third checks them.
 _LEFT_OVER = 3
@@ -107,6 +114,18 @@ class ModelChoice:
     residual_field: bool = False
     bends: int = 0
     restless: bool = False
+
+
+def enough_points(reconstruction: Reconstruction, per_photo: int = _ENOUGH, seed: int = 0) -> NDArray[np.bool_]:
+    """(n,) points of a sample with so many measurements of each photo or more; all of a photo that has fewer."""
+    obs = reconstruction.observations
+    order = np.random.default_rng([seed, 11]).permutation(reconstruction.num_points)[obs.point_idx]
+    by_photo = np.lexsort((order, obs.frame_idx))
+    frames = obs.frame_idx[by_photo]
+    rank = np.arange(len(obs)) - np.searchsorted(frames, frames)
+    taken = np.zeros(reconstruction.num_points, bool)
+    taken[obs.point_idx[by_photo[rank < per_photo]]] = True
+    return taken
 
 
 def hold_out(
@@ -228,6 +247,7 @@ class _Fits:
         seed: int,
         progress: Callable[[str, float], None] | None,
     ) -> None:
+        reconstruction = reconstruction.take_points(enough_points(reconstruction, seed=seed))
         fitted, held = hold_out(reconstruction, seed=seed)
         # gross outliers were dropped before: squares, and only as exact as the comparison of models requires
         self._rough = replace(
@@ -397,6 +417,8 @@ def choose_model(
     progress: Callable[[str, float], None] | None = None,
 ) -> ModelChoice:
     """Fit models to nine tenths of the measurements, and keep those that predict the rest better.
+
+    Where photos have more than 1,500 measurements, a sample of the points is taken that has so many of each.
 
     First a lens that varies from photo to photo is tried, then the shutter models in order, so that these explain what
     no lens does; then unsteady motions, where the lines of the photos would still move. A model is better if the mean

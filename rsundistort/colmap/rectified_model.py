@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -114,19 +115,23 @@ def colmap_model(
             image_id=ids.images[i],
         )
         model.add_image_with_trivial_frame(image, rigid_of(reconstruction.R_cw[i], reconstruction.center_w[i]))
-    order = np.argsort(obs.point_idx, kind="stable")
-    bounds = np.searchsorted(obs.point_idx[order], np.arange(reconstruction.num_points + 1))
-    for p in range(reconstruction.num_points):
+    # what a loop over measurements reads one by one, Python holds in lists
+    order = np.flatnonzero(place >= 0)
+    order = order[np.argsort(obs.point_idx[order], kind="stable")]
+    bounds = np.searchsorted(obs.point_idx[order], np.arange(reconstruction.num_points + 1)).tolist()
+    seen_in, seen_as = np.asarray(ids.images)[obs.frame_idx[order]].tolist(), place[order].tolist()
+    if colors is None:
+        colors = np.zeros((reconstruction.num_points, 3), np.uint8)
+    images = {key: model.image(key) for key in set(seen_in)}
+    for p, (start, end) in enumerate(pairwise(bounds)):
+        if end - start < 2:
+            continue
         track = pycolmap.Track()
-        for k in order[bounds[p] : bounds[p + 1]]:
-            if place[k] >= 0:
-                track.add_element(ids.images[int(obs.frame_idx[k])], int(place[k]))
-        color = np.zeros(3, np.uint8) if colors is None else colors[p]
-        if track.length() >= 2:
-            point = pycolmap.Point3D(xyz=reconstruction.points_w[p], color=color, track=track)
-            model.add_point3D_with_id(ids.points[p], point)
-            for element in track.elements:
-                model.images[element.image_id].set_point3D_for_point2D(element.point2D_idx, ids.points[p])
+        for key, index in zip(seen_in[start:end], seen_as[start:end], strict=True):
+            track.add_element(key, index)
+            images[key].set_point3D_for_point2D(index, ids.points[p])
+        point = pycolmap.Point3D(xyz=reconstruction.points_w[p], color=colors[p], track=track)
+        model.add_point3D_with_id(ids.points[p], point)
     model.update_point_3d_errors()
     return model
 

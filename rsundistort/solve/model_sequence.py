@@ -362,12 +362,16 @@ def _chosen(
         progress=lambda model, _: log.tell(f"choice: {model}", 0),
     )  # fmt: skip
     options = replace(options, varying=choice.varying, bends=choice.bends, residual_field=choice.residual_field)
-    start = replace(tracks, shutter_model=choice.shutter_model)
-    # windows were aligned, and outliers found, with a model that is replaced now
+    # windows were aligned, and outliers found, with a model that may be replaced now
     again = track_source is not None and track_source.workers is not None
     again = again and (choice.shutter_model == "constant-motion" or choice.bends > 0)
-    how = rough_options(options) if again else options
+    start, how, outliers = tracks, rough_options(options), 0
+    if not again:
+        start, outliers = result.reconstruction, result.num_outliers
+        how = replace(options, outlier_rounds=min(options.outlier_rounds, 1))
+    start = replace(start, shutter_model=choice.shutter_model)
     result = bundle_adjust(start, choice.shutter_model, how, partial(_tell, log, "choice"))
+    result = replace(result, num_outliers=result.num_outliers + outliers)
     log.end(
         "choice of the model", chosen=choice.shutter_model, varying_lens=choice.varying, bends=choice.bends,
         residual_field=choice.residual_field, shutter=choice.shutter, agreement=choice.agreement, gain=choice.gain,
@@ -380,6 +384,8 @@ def _chosen(
 
 def _without_shutter(result: BundleResult, options: BundleOptions) -> BundleResult:
     """The same measurements explained by a global shutter, for comparison."""
+    if result.reconstruction.shutter_model == "global":
+        return result
     plain = BundleOptions(
         outlier_rounds=0,
         loss="squared",
@@ -404,8 +410,11 @@ def _lens_only(verdict: Verdict) -> str:
 
 
 def rough_options(options: BundleOptions) -> BundleOptions:
-    """Options of an adjustment that another one follows."""
-    return replace(options, outlier_rounds=2, cost_tolerance=1e-5, prior_sigma_rounds=1, prior_sigma_tolerance=0.05)
+    """Options of an adjustment that another one follows, which asks it for pixels and not for deviations."""
+    return replace(
+        options, outlier_rounds=2, cost_tolerance=1e-5, prior_sigma_rounds=1, prior_sigma_tolerance=0.05,
+        deviations="model",
+    )  # fmt: skip
 
 
 def _is_strong(rec: Reconstruction) -> bool:
@@ -483,21 +492,24 @@ def _retriangulated(
     if not stages:
         stages = [f"re-triangulation {number}" for number in range(1, _MAX_ROUNDS + 1)]
         stages += ["alignment"] * (track_source.workers is not None)
-    settled, aligns, found = False, False, None
+    settled, aligns, found, drawn = False, False, None, None
     for stage in stages:
         aligns = stage.startswith("alignment")
         if settled and not aligns:
             continue
         log.begin(stage)
         before = result.reconstruction
-        tracks = retriangulate(track_source.matched, before, of_two=aligns)
+        # points of two photos are for the alignment, which may find them in others
+        drawn = drawn or retriangulate(track_source.matched, before, of_two=track_source.workers is not None)
         if aligns:
-            tracks = track_source.aligned(tracks, log)
-        elif (changed := _changed(found, tracks)) < _SETTLED_SHARE:
-            log.end(stage, changed=changed)
-            settled = True
-            continue
-        found = tracks
+            tracks = track_source.aligned(drawn, log)
+        else:
+            tracks = drawn.with_points(np.ones(len(drawn.observations), bool), min_track=3)
+            if (changed := _changed(found, tracks)) < _SETTLED_SHARE:
+                log.end(stage, changed=changed)
+                settled = True
+                continue
+        found, drawn = tracks, None
         tracks = firmly_connected(tracks)
         _check_enough(tracks, len(track_source.matched.names))
         options = _of_registered(options, tracks)

@@ -189,8 +189,8 @@ class RunOptions(_Part):
         Largest number of features per photo; by default 8192, and 2048 per key frame of a video, whose neighbours show
         the same.
     feature_megapixels : float
-        Larger photos are reduced to this size to detect their features; all to two fifths of their own pixels
-        where what these show matches well enough.
+        Larger photos are reduced to this size to detect their features; all to a third of their own pixels where what
+        these show matches well enough.
     every, sharpest : int, optional
         For a video: each N-th frame, or the sharpest of each N frames, as in `io.extract_frames`; by default its frames
         share one path, and its key frames are the photos.
