@@ -296,6 +296,19 @@ def test_a_motion_that_may_be_all_error_is_named_and_says_nothing_about_the_shap
     assert verdict.shape == judge(result, None, choice).shape == "trusted"
 
 
+def test_a_motion_about_the_axis_hides_no_error_about_another(rng):
+    """Corners move by far more than that error, at two standard deviations; in the mean over the frame, less."""
+    result = bundle_adjust(measured(rng, swung(rng, 0.002) + [0, 0, 0.086]), "rotation")
+    covariances = np.zeros_like(result.covariances)
+    covariances[:, 6, 6] = 1e-4
+    motions = photo_motions(replace(result, covariances=covariances))
+    covariances *= float((motions.shift_px / motions.sigma_px).min() / 4.1) ** 2
+    motions = photo_motions(replace(result, covariances=covariances))
+    assert (motions.sigma_px < motions.shift_px / 4).all()
+    assert (motions.relative_sigma > 1 / 4).all()
+    assert all(judge(replace(result, covariances=covariances), None, choice_of("rotation", gain=9.0)).doubtful.values())
+
+
 def test_places_that_only_the_solution_tells_are_named_where_it_does_not_tell_them(rng):
     result, choice = bundle_adjust(measured(rng, swung(rng)), "rotation"), choice_of("rotation", gain=9.0)
     assert not judge(result, None, choice, strong=True).doubtful

@@ -345,10 +345,11 @@ def _doubts(
 def _faint(rec: Reconstruction, motions: PhotoMotions) -> dict[str, str]:
     """Photos that may come out worse than they went in, which says nothing about the shape of the whole.
 
-    If an error of two standard deviations is half of what was found, it may be as large as the true motion.
+    If an error of two standard deviations is half of what was found, it may be as large as the true motion; in the mean
+    over the frame, as a photo is judged.
     """
     found, sigma = motions.shift_px, motions.sigma_px
-    faint = (sigma > found / 4) & (sigma > _UNSEEN_PX / 2)
+    faint = (motions.relative_sigma > 1 / 4) & (sigma > _UNSEEN_PX / 2)
     return {
         name: f"its motion of {found[i]:.1f} px is only known to +-{sigma[i]:.1f} px"
         for i, name in enumerate(rec.image_names)

@@ -35,6 +35,8 @@ class PhotoMotions:
         By the motion.
     sigma_px : (m,) array
         Standard deviation of that, with the noise of the photo's own residuals.
+    relative_sigma : (m,) array
+        Root mean square of the standard deviations all over the frame, relative to that of the displacements.
     difference_px : (m,) array
         Between the motions from two halves of the photo's measurements; 0 where that may be noise.
     covered : (m,) array
@@ -43,6 +45,7 @@ class PhotoMotions:
 
     shift_px: Array
     sigma_px: Array
+    relative_sigma: Array
     difference_px: Array
     covered: Array
 
@@ -62,24 +65,32 @@ def photo_motions(result: BundleResult) -> PhotoMotions:
     rec = result.reconstruction
     nb = motion_end(rec.shutter_model)
     sigmas = np.repeat([result.phi_rms, result.velocity_rms * rec.baseline], 3)[: nb - 6]
-    found = np.zeros((4, rec.num_images))
+    found = np.zeros((5, rec.num_images))
     splits = 3 * rec.num_images
     for i, mine in enumerate(rec.observations.by_photo(rec.num_images)):
         if len(mine):
             prior = np.concatenate([np.zeros(6), (rec.frame_span()[i] / np.maximum(sigmas, 1e-12)) ** 2])
             photo = _Photo.of(rec, i, mine, result.sigma_px)
+            sigmas_px = photo.motion_sigmas_px(result.covariances[i, 6:, 6:])
+            shifts_px, bent_px = photo.shifts_px(photo.motion[None])[0], _bent_px(rec, i)
             found[:, i] = (
-                photo.shift_px(photo.motion[None])[0] + _bent_px(rec, i),
-                photo.motion_sigma_px(result.covariances[i, 6:, 6:]),
+                shifts_px.max(initial=0.0) + bent_px.max(initial=0.0),
+                sigmas_px.max(initial=0.0),
+                _rms(sigmas_px) / max(np.hypot(_rms(shifts_px), _rms(bent_px)), 1e-300),
                 photo.difference_px(prior, _CHANCE / splits),
                 photo.covered,
             )
     return PhotoMotions(*found)
 
 
-def _bent_px(rec: Reconstruction, image: int) -> float:
-    """Approximate displacement of pixels by the unsteady part of a photo's rotation."""
-    return float(rec.camera(image).K[0, 0] * np.linalg.norm(np.abs(rec.bend[image, :, :3]).max(0, initial=0.0)))
+def _bent_px(rec: Reconstruction, image: int) -> Array:
+    """(k,) approximate displacements of pixels by the unsteady part of a photo's rotation, along its readout."""
+    return np.asarray(rec.camera(image).K[0, 0] * np.linalg.norm(rec.bend[image, :, :3], axis=1))
+
+
+def _rms(values: Array) -> float:
+    """Root mean square; 0 of none."""
+    return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
 
 
 @dataclass(frozen=True)
@@ -139,18 +150,17 @@ class _Photo:
             return 0.0
         return float(np.prod(np.ptp(np.quantile(self.xy, [0.05, 0.95], axis=0), axis=0) / self.size) / 0.9**2)
 
-    def shift_px(self, motions: Array) -> Array:
-        """(k,) largest displacement by motions (k, nb - 6)."""
-        shift = np.linalg.norm(np.einsum("fia,ka->kfi", self.frame, motions), axis=2)
-        return np.asarray(shift.max(axis=1, initial=0.0))
+    def shifts_px(self, motions: Array) -> Array:
+        """(k, f) displacements all over the frame by motions (k, nb - 6)."""
+        return np.asarray(np.linalg.norm(np.einsum("fia,ka->kfi", self.frame, motions), axis=2))
 
-    def motion_sigma_px(self, covariance: Array) -> float:
-        """Largest standard deviation of a displacement by the motion of this covariance, velocities in the world."""
+    def motion_sigmas_px(self, covariance: Array) -> Array:
+        """(f,) standard deviations of displacements by the motion of this covariance, velocities in the world."""
         rotation = np.eye(len(self.motion))
         rotation[3:, 3:] = self.rotation[: len(rotation) - 3, : len(rotation) - 3]
         covariance = rotation @ covariance @ rotation.T
-        variance = np.einsum("fia,ab,fib->f", self.frame, covariance, self.frame).max(initial=0.0)
-        return float(np.sqrt(variance * self._noise(self.residuals, self.J.shape[2])))
+        variance = np.einsum("fia,ab,fib->f", self.frame, covariance, self.frame)
+        return np.asarray(np.sqrt(variance * self._noise(self.residuals, self.J.shape[2])))
 
     @staticmethod
     def _noise(residuals: Array, unknowns: int) -> float:
@@ -193,4 +203,4 @@ class _Photo:
         # Hotelling's: the noise is estimated from the same residuals
         if fdtrc(len(difference), max(self.residuals.size - 2 * nb, 1), unlike) > chance:
             return 0.0
-        return float(self.shift_px(difference[None])[0])
+        return float(self.shifts_px(difference[None]).max(initial=0.0))
