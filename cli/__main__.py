@@ -22,6 +22,8 @@ _STREAM_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBAD
 def main() -> None:
     """Run the command."""
     _open_streams()
+    # by default all that is loaded is looked through for circles 500 times in a run of eight seconds: 2 % of it
+    gc.set_threshold(20_000, 20, 20)
     with hears_signals():
         from .main import cli
 

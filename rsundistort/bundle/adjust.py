@@ -79,8 +79,9 @@ def bundle_adjust(
         tell = None if progress is None else (lambda _, cost: progress(cost))
         return adjust_sequence(reconstruction, sequence_to(shutter_model), options, tell)[shutter_model]
     rounds = Rounds(reconstruction, shutter_model, options, progress)
-    for _ in range(options.outlier_rounds):
-        rounds.solve(options.round_tolerance)
+    for left in reversed(range(options.outlier_rounds)):
+        # the last one estimates the noise, which weighs what follows
+        rounds.solve(options.round_tolerance, is_judged=left == 0)
         rounds.drop_outliers()
     most = options.prior_sigma_rounds + 1
     is_guess = options.path is None or options.path.start is None

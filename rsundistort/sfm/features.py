@@ -30,6 +30,8 @@ SIFT_PX = 0.12
 # Residuals by size of the feature, in the adjusted herz-jesus-8: 0.117 px below 2.3 px, 0.122 to 3.5, 0.143 to 7,
 # 0.264 above; and large blobs are biased by perspective besides.
 _COARSE_PX = 3.0
+# A photo full of texture shows a feature for about so many pixels (herz-jesus-8: 82 to 97).
+_PIXELS_PER_FEATURE = 80
 # What OpenCV's SIFT holds for each pixel (measured).
 _BYTES_PER_PIXEL = 245
 
@@ -100,14 +102,19 @@ def detect_features(
     shrink = _shrinking(gray.size, megapixels)
     if shrink > 1.0:
         gray, mask = _shrunk(gray, mask, shrink)
-    keypoints = sift.detect(gray, mask)
+    # descriptors that are not kept cost more than a second pyramid, except where few are left out
+    at_once = gray.size < _PIXELS_PER_FEATURE * max_features
+    keypoints, raw = sift.detectAndCompute(gray, mask) if at_once else (sift.detect(gray, mask), None)
     if not keypoints:
         return Features(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.uint8), shrink)
     x, y, size, angle, response = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints]).T
     # ties by strength and place: the result must not depend on the order of OpenCV's threads
     order = np.lexsort((angle, x, y, -response, -size))[:max_features]
-    # twice the pyramid costs less than descriptors of all
-    kept, raw = sift.compute(gray, [keypoints[k] for k in order])
+    kept = [keypoints[k] for k in order]
+    if raw is None:
+        kept, raw = sift.compute(gray, kept)
+    else:
+        raw = raw[order]
     root = np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-12))
     descriptors = np.clip(np.rint(512.0 * root), 0, 255).astype(np.uint8)
     xy, size = np.asarray(cv2.KeyPoint.convert(kept), np.float64), np.array([k.size for k in kept])
