@@ -298,7 +298,7 @@ def test_a_motion_that_may_be_all_error_is_named_and_says_nothing_about_the_shap
 
 def test_a_motion_about_the_axis_hides_no_error_about_another(rng):
     """Corners move by far more than that error, at two standard deviations; in the mean over the frame, less."""
-    result = bundle_adjust(measured(rng, swung(rng, 0.002) + [0, 0, 0.086]), "rotation")
+    result = bundle_adjust(measured(rng, swung(rng, 0.002) + np.array([0, 0, 0.086])), "rotation")
     covariances = np.zeros_like(result.covariances)
     covariances[:, 6, 6] = 1e-4
     motions = photo_motions(replace(result, covariances=covariances))

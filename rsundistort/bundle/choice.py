@@ -416,18 +416,16 @@ def choose_model(
     seed: int = 0,
     progress: Callable[[str, float], None] | None = None,
 ) -> ModelChoice:
-    """Fit models to nine tenths of the measurements, and keep those that predict the rest better.
-
-    Where photos have more than 1,500 measurements, a sample of the points is taken that has so many of each.
+    """Fit models to nine tenths of the measurements (of `enough_points`), and keep those that predict the rest better.
 
     First a lens that varies from photo to photo is tried, then the shutter models in order, so that these explain what
     no lens does; then unsteady motions, where the lines of the photos would still move. A model is better if the mean
-    held-out error falls by more than two standard errors, measurements in the same part of the same photo counted once,
-    and by more than two hundredths. A shutter model must also remove more than a smooth warp of each photo would still
-    remove, and be better than itself read along the other axis (other causes that bend photos fit either axis), and two
-    halves of the scene must show the same motions. A velocity must explain more, beyond rotations, than a lens that
-    varies; neither is kept where they are equally good. Last, where something smooth is left, a residual field of each
-    camera is kept if it is better.
+    held-out error falls by more than two standard errors, measurements in the same part of the same photo counted
+    once, and by more than two hundredths. A shutter model must also remove more than a smooth warp of each photo would
+    still remove, and be better than itself read along the other axis (other causes that bend photos fit either axis),
+    and two halves of the scene must show the same motions. A velocity must explain more, beyond rotations, than a lens
+    that varies; neither is kept where they are equally good. Last, where something smooth is left, a residual field of
+    each camera is kept if it is better.
 
     Parameters
     ----------

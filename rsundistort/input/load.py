@@ -27,9 +27,9 @@ LONG_EXPOSURE_S = 1 / 250
 # Bytes per pixel of a decoded photo, at most, except for floats; and the size of one whose header has none.
 _BYTES_PER_PIXEL, _SIZE_OF_OTHERS = 16, (8000, 6000)
 
-# SIFT doubles the sides of what it is given: a third of a photo's pixels become more than the photo has. A photo that has
-# so many features there needs no more pixels, unless too few of them match those of other photos. (A quarter takes 0.85
-# of the time, and loses 0.8 dB on warped herz-jesus-8.)
+# SIFT doubles the sides of what it is given: a third of a photo's pixels become more than the photo has. A photo that
+# has so many features there needs no more pixels, unless too few of them match those of other photos. (A quarter takes
+# 0.85 of the time, and loses 0.8 dB on warped herz-jesus-8.)
 _COARSE, _MANY_FEATURES = 1 / 3, 3000
 
 _NUMBERS = {2: "two", 3: "three"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -110,7 +111,7 @@ def detect_features(
     x, y, size, angle, response = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints]).T
     # ties by strength and place: the result must not depend on the order of OpenCV's threads
     order = np.lexsort((angle, x, y, -response, -size))[:max_features]
-    kept = [keypoints[k] for k in order]
+    kept: Sequence[cv2.KeyPoint] = [keypoints[k] for k in order]
     if raw is None:
         kept, raw = sift.compute(gray, kept)
     else:
