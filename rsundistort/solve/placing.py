@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -35,16 +32,8 @@ _CLOSE_PX = 4.0
 # Verified matches of a pair with which coarse features do. With more photos than `_ASKED`, so many pairs in their order
 # are asked before all are matched, of which most must have that; each photo then has half of it at least.
 _RICH, _ASKED, _MOST_OF_THEM, _AT_LEAST = 800, 16, 0.75, 0.5
-# What is imported while mapping keeps one core busy: the tests of unsteady motions and the report need it.
-_LATER = ("scipy.interpolate", "jinja2")
 # Largest keypoints of a key frame that place it: neighbours show nearly all of them again.
 _OF_CLIP = (512, 2048, None)
-
-
-def _import_for_later() -> None:
-    for name in _LATER:
-        with suppress(ImportError):  # whoever needs it says so
-            import_module(name)
 
 
 def _num_overlapping(matched: MatchedPhotos) -> int:
@@ -99,7 +88,6 @@ def place_photos(
     if mapped is None:
         try:
             keypoints = _OF_CLIP if of_clip else PLACING_KEYPOINTS
-            threading.Thread(target=_import_for_later, daemon=True).start()
             mapped = map_photos(matched, lambda done: log.tell("mapping", done, len(photos.names)), keypoints)
         except ReconstructionError as error:
             if _num_overlapping(matched) < len(photos.names) - 1:
