@@ -283,16 +283,20 @@ class _Fits:
         return self.done[label]
 
     def along_other_axis(self, fit: _Fit, plain: _Fit) -> _Fit:
-        """The model of a fit read along the other axis, from a fit without a shutter; vibrations on the same terms."""
+        """The model of a fit read along the other axis, from fits without a shutter; vibrations on the same terms.
 
-        def read(start: Reconstruction, bends: int) -> _Fit:
+        One that lets the lens vary is no start where it does not: without what varied, its poses fit nothing.
+        """
+
+        def read(starts: Sequence[Reconstruction], bends: int) -> _Fit:
             label = f"{fit.model}{_BENDS[bends]}{_VARYING * fit.varying}, read along the other axis"
-            return self.fit(fit.model, fit.varying, [start], label, bends)
+            return self.fit(fit.model, fit.varying, starts, label, bends)
 
         smooth = min(fit.bends, _SMOOTH_BENDS)
-        other = read(read_along_other_axis(plain.reconstruction), smooth)
+        still = self.fit(plain.model, False, [self.given])
+        other = read([read_along_other_axis(each.reconstruction) for each in (plain, still)], smooth)
         if fit.bends > smooth and self.waves_agree(other):
-            other = read(other.reconstruction, fit.bends)
+            other = read([other.reconstruction], fit.bends)
         return other
 
     def agreement(self, fit: _Fit) -> float:
