@@ -230,3 +230,16 @@ def test_a_decentring_that_is_no_deviation_is_refused(rng):
         GuessedCameras(cameras, GUESS_SIGMA, [(1e-3, 1e-3)])
     with pytest.raises(InputError, match="guessed decentring: sigma -1"):
         GuessedCameras(cameras, GUESS_SIGMA, [(1e-3, -1.0)] * len(cameras))
+
+
+def test_the_other_axis_does_no_worse_than_the_lens_alone(rng):
+    # a lens that varies imitates part of the shutter: without what varied, its poses would be a bad start
+    scene = make_scene(rng, "rotation", num_images=12, num_points=400, noise_px=0.1, phi_size=0.05)
+    still = replace(scene, phi=np.zeros_like(scene.phi), shutter_model="global")
+    guessed = GuessedCameras(tuple(scene.cameras), {"f": 1e-3, "cx": 1e-3, "cy": 1e-3})
+    options = BundleOptions(refine=("f", "cx", "cy"), guessed=guessed)
+    choice = choose_model(still, options=options, sigma_px=0.1)
+    assert (choice.shutter, choice.label) == ("found", "rotation")
+    assert "global, varying lens" in choice.kept
+    error = choice.held_out_error
+    assert error["rotation, read along the other axis"] <= error["global"]
