@@ -34,8 +34,6 @@ _MAPPING_KEYPOINTS = 4096
 # Beyond this many photos all are adjusted together whenever there are 1.4 times as many, not 1.1 times as pycolmap has
 # it, and less far: the longer a street, the slower that converges, and our own adjustment follows. (250 photos of
 # benchmarks/large_sets.py: 38 s of processor time instead of 96, and smaller errors; lund: 29 photos instead of 27.)
-# The same holds where all are placed at once: with a relative tolerance of 1e-3, not 1e-5, 500 photos of a survey take
-# 19 s instead of 32, and the same photos and points are found, with 1.01 of the residuals.
 _LARGE = 60
 
 
@@ -206,8 +204,6 @@ def _global_options(matched: MatchedPhotos) -> Any:
         each.random_seed = matched.seed
     mapper.bundle_adjustment.refine_focal_length = not matched.calibrated
     mapper.bundle_adjustment.refine_extra_params = not matched.calibrated
-    if len(matched.names) > _LARGE:
-        mapper.bundle_adjustment.ceres.solver_options.function_tolerance = 1e-3
     return options
 
 
