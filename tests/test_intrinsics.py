@@ -249,7 +249,7 @@ def test_a_calibration_that_is_plainly_wrong_may_be_decentred_by_more(rng):
     camera = replace(make_scene(rng, "rotation").cameras[0], dist=np.array([-0.1, 0.05, 0.0, 0.0]))
     sigma = {"f": 1e-3, "cx": 4e-4, "cy": 4e-4, "k1": 3e-3, "p1": 3e-4, "p2": 3e-4}
     guessed, names = GuessedCameras([camera], sigma, [(1e-3, 1e-3)]), tuple(sigma)
-    off = replace(camera, dist=camera.dist + [0.0, 0.0, 0.0, 8 * sigma["p2"]])
+    off = replace(camera, dist=np.array([-0.1, 0.05, 0.0, 8 * sigma["p2"]]))
     as_given, contradicted, before = (
         guessed.pulls_of_decentring([each], names, heavy)[0, 0, names.index("cx")]
         for each, heavy in ((camera, True), (off, True), (off, False))
