@@ -27,11 +27,13 @@ from rsundistort import (
     unproject_points,
 )
 from rsundistort.bundle import BundleResult, Posterior, gauge_directions
+from rsundistort.bundle.intrinsics import DECENTRING, moved_camera
 from rsundistort.bundle.triangulate import _world_rays
 from rsundistort.critical import Remedy
 from rsundistort.critical.common import row_phi
 from rsundistort.critical.degeneracy import readout_axes
 from rsundistort.evaluation import align_points, motion_errors, psnr
+from rsundistort.input.photo_cameras import PhotoCameras
 from rsundistort.io import read_photo, write_image
 from rsundistort.io.cameras import camera_from_json
 from rsundistort.solve import OutputOptions
@@ -238,3 +240,19 @@ def with_poses(truth: Solution, poses: Solution) -> Solution:
     of = {image.name: image for image in poses.images}
     images = [replace(i, R_cw=of[i.name].R_cw, center_w=of[i.name].center_w) for i in truth.images]
     return replace(truth, images=images)
+
+
+def with_drawn_errors(cameras: dict[str, Any], seed: int) -> dict[str, Any]:
+    """A file of exact cameras, each off by errors drawn from the standard deviations of a calibration."""
+    rng, content = np.random.default_rng(seed), json.loads(json.dumps(cameras))
+    for each in content.get("cameras", {"": content}).values():
+        camera = camera_from_json({**each, "dist": [*each["dist"], *[0.0] * 5][:5]}, "drawn")
+        prior = PhotoCameras((camera,), ("",), np.zeros(1, int), True, (True,), "").known_to(loose=False)
+        (sigmas,), (decentring,) = prior.sigmas, prior.decentring
+        names = ("f", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+        off = {name: sigmas[name] * rng.normal() for name in names}
+        for error, terms in zip(decentring * rng.normal(size=2), DECENTRING, strict=True):
+            off |= {name: off[name] + error * times for name, times in terms.items()}
+        given = moved_camera(camera, names, np.array([*off.values()]))
+        each |= {"K": given.K.tolist(), "dist": given.dist.tolist()}
+    return content

@@ -279,11 +279,11 @@ class BundleResult:
         Root mean square of the x and y components of the residuals.
     num_outliers : int
         Observations dropped.
-    inflation : (unknowns of a photo,) array
-        Factor (1 or more) by which the standard deviations of each kind of unknown due to noise are larger than with
+    inflation : float
+        Factor (1 or more) by which the standard deviations of the photos' unknowns due to noise are larger than with
         independent noise (`BundleOptions.deviations`). The covariances include it.
     noise_factor : float
-        One such factor for all: times `sigma_px` it is the noise that weighed the measurements against the priors.
+        The same of the solve before: times `sigma_px` it is the noise that weighed measurements against priors.
     field_sigma_px : float
         Standard deviation of the prior on the unknowns of the cameras' residual fields; 0 if none was estimated.
     sigma_fields_px : tuple of float
@@ -311,7 +311,7 @@ class BundleResult:
     sigma_intrinsics: tuple[dict[str, float], ...]
     rms_px: float
     num_outliers: int
-    inflation: NDArray[np.float64]
+    inflation: float
     noise_factor: float
     field_sigma_px: float = 0.0
     sigma_fields_px: tuple[float, ...] = ()

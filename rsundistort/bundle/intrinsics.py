@@ -12,6 +12,7 @@ from ..errors import InputError
 from ..model import Camera
 
 __all__ = [
+    "DECENTRING",
     "INTRINSICS",
     "GuessedCameras",
     "check_lenses",
@@ -31,8 +32,8 @@ INTRINSICS: dict[str, int] = {
 _OF_LENS = {"pinhole": ("k1", "k2", "p1", "p2", "k3"), "fisheye": ("k1", "k2", "k3", "k4")}
 
 
-# errors of a calibration that look like a phi3 of all photos, of readout by rows and by columns
-_DECENTRING: tuple[Mapping[str, float], ...] = ({"cx": 3.0, "p2": 1.0}, {"cy": 3.0, "p1": 1.0})
+#: Errors of a calibration that look like a phi3 of all photos, of readout by rows and by columns.
+DECENTRING: tuple[Mapping[str, float], ...] = ({"cx": 3.0, "p2": 1.0}, {"cy": 3.0, "p1": 1.0})
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class GuessedCameras:
             apart, slope = np.array(deviation(camera, guess, names)) / sigma
             weight = prior_weight(apart**2)[1] if heavy else np.ones(len(names))
             scale = (_TAIL + (apart**2).sum()) / (_TAIL + np.isfinite(sigma).sum()) if heavy else 1.0
-            for axis, (error, terms) in enumerate(zip(of_axes, _DECENTRING, strict=True)):
+            for axis, (error, terms) in enumerate(zip(of_axes, DECENTRING, strict=True)):
                 errors = error * max(scale, 1.0) ** 0.5 * np.array([terms.get(name, 0.0) for name in names])
                 pulls[axis, k] = slope * weight * errors / sigma
         return pulls

@@ -55,31 +55,24 @@ class Function:
 
     Attributes
     ----------
-    variance, of_priors, of_lengths : float
-        Its variance, and the shares of that that are the priors' and the known lengths' doing.
+    variance, of_priors : float
+        Its variance, and the share of that that is the priors' doing.
     with_photos, with_photos_of_priors : (m, nb) array
         Its covariance with the photos' unknowns, and the priors' share of that.
     with_cameras : (k,) array
         Its covariance with the unknowns of all cameras.
-    pulls : (o, 2) array
-        How far each residual pulls it.
     """
 
     variance: float
     of_priors: float
-    of_lengths: float
     with_photos: Array
     with_photos_of_priors: Array
     with_cameras: Array
-    pulls: Array
 
-    def inflated(self, own: float, photos: Array) -> tuple[float, Array]:
-        """Variance, and covariance with the photos, where the noise's share of the deviations is enlarged.
-
-        Of the function by a factor, of the photos by one for each kind of unknown (nb,).
-        """
-        variance = self.of_priors + own**2 * (self.variance - self.of_priors)
-        return variance, self.with_photos_of_priors + own * photos * (self.with_photos - self.with_photos_of_priors)
+    def inflated(self, by: float) -> tuple[float, Array]:
+        """Variance, and covariance with the photos, where the noise's share of the deviations is so much larger."""
+        variance = self.of_priors + by**2 * (self.variance - self.of_priors)
+        return variance, self.with_photos_of_priors + by**2 * (self.with_photos - self.with_photos_of_priors)
 
 
 class NormalEquations:
@@ -337,10 +330,10 @@ class NormalEquations:
         other._reduced = replace(self._reduced, S=S, border=border, corner=corner)
         return other
 
-    def covariance(self, inflation: Array | float = 1.0) -> Callable[[Array], Array]:
+    def covariance(self, inflation: float = 1.0) -> Callable[[Array], Array]:
         """Covariance of the photos' unknowns, all others being free, as a function of vectors (k, m, nb).
 
-        With `inflation` (nb,) the noise's share of the deviations is so much larger; that of the priors stays.
+        With `inflation` the noise's share of the deviations is so much larger; that of the priors stays.
         """
         inverse = self.inverse
         if inverse is None:
@@ -349,11 +342,10 @@ class NormalEquations:
         def times(vectors: Array) -> Array:
             return self._seen(inverse.times(self._wide(vectors), np.zeros((len(vectors), len(self._g_camera))))[0])
 
-        if np.all(inflation == 1.0):
+        if inflation == 1.0:
             return times
-        return lambda vectors: (
-            self._by_priors(vectors) + inflation * (times(inflation * vectors) - self._by_priors(inflation * vectors))
-        )
+        by = inflation**2
+        return lambda vectors: by * times(vectors) + (1 - by) * self._by_priors(vectors)
 
     def times(self, frame: Array, camera: Array) -> tuple[Array, Array]:
         """H^-1 times stacks of photos' values (k, m, seen) and of cameras' (k, unknowns); NaN without an inverse."""
@@ -391,11 +383,9 @@ class NormalEquations:
         return Function(
             variance=float((weights * point).sum()),
             of_priors=float((of_frame[0] * frame).sum() + (of_camera[0] * camera).sum()),
-            of_lengths=float((np.einsum("qna,na->q", self._lengths, point) ** 2).sum()),
             with_photos=self._seen(frame),
             with_photos_of_priors=self._seen(self.inverse.times(of_frame, of_camera)[0][0]),
             with_cameras=camera,
-            pulls=self._moved(frame, point, camera),
         )
 
     def _moved(self, frame: Array, point: Array, camera: Array) -> Array:

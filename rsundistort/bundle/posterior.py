@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from .bundle_options import BundleOptions, BundleResult
 from .calibration_doubt import CalibrationDoubt
-from .jackknife import inflation_of
 from .prior_sigmas import PriorSigmas
 from .problem import BundleProblem
 
@@ -46,15 +45,12 @@ class Posterior:
         )  # fmt: skip
         self._state = self._problem.initial_state()
         self._equations = self._problem.linearize(self._state)
-        self._factor = result.noise_factor
-        self._partitions = self._problem.partitions(self._state) if plain.deviations == "jackknife" else None
-        inflation = np.ones_like(result.inflation) if self._partitions is None else result.inflation
-        self._inflation = inflation / self._factor
+        self._inflation = (result.inflation if plain.deviations == "jackknife" else 1.0) / result.noise_factor
         self._covariance = self._equations.covariance(self._inflation)
         self._doubt = CalibrationDoubt.of(self._equations, plain, rec.cameras)
         self._camera_idx = rec.camera_idx
         self._own = self._problem.layout.size - self._problem.layout.motion
-        self._shape = rec.num_images, len(self._inflation) - self._own
+        self._shape = rec.num_images, self._equations.blocks[1].shape[2] - self._own
 
     def of_photos(self, vectors: Array) -> Array:
         """Covariance of the photos' unknowns times vectors (k, m, nb), as in `BundleResult.covariances`."""
@@ -80,10 +76,7 @@ class Posterior:
         found = self._equations.function_of_points(self._problem.in_order(weights))
         if found is None:
             return np.nan, np.full(self._shape, np.nan)
-        own = 1.0
-        if self._partitions is not None:
-            own = inflation_of(found, self._equations, self._partitions, self._factor)
-        variance, with_photos = found.inflated(own / self._factor, self._inflation)
+        variance, with_photos = found.inflated(self._inflation)
         of_doubt, with_doubt = self._doubt.of_function(found)
         return variance + of_doubt, (with_photos + with_doubt)[:, : self._shape[1]]
 

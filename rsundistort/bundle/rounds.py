@@ -163,13 +163,15 @@ class Rounds:
             self._with_pace = equations.photos_by_shared(1)[:, :, 0]
         self._weighed_noise, self._had_heavy_tails = self._noise, self._heavy_tails
         self._doubt = CalibrationDoubt.of(equations, options, self._current.cameras, self._heavy_tails)
-        per_camera = equations.num_shared // equations.num_cameras
-        self._inflation = Inflation(np.ones(len(self._marginals.photos[0])), np.ones(per_camera))
+        self._inflation = Inflation()
         if asks_residuals:
             # the measurements of judged solves are the same, and their points hardly move
             self._partitions = self._partitions or problem.partitions(state)
-            self._inflation = inflation(equations, self._partitions, self._marginals, self._noise)
-            self._noise, self._heavy_tails = self._inflation.noise, True
+            with_pace = state.path is not None
+            self._inflation = inflation(equations, self._partitions, self._marginals, self._noise, with_pace)
+            # of all that has a prior of mean zero: what photos have beside their poses, else the lens
+            kind = "photos" if self._marginals.photos.shape[1] > 6 else "cameras"
+            self._noise, self._heavy_tails = getattr(self._inflation, kind), True
         self._weighed_sigmas = self._sigmas
         self._sigmas = estimated(
             self._sigmas, self._current, self._marginals.photos, options, self._layout, self._baseline,
@@ -258,14 +260,15 @@ class Rounds:
         current, options, layout, state = self._current, self._options, self._layout, self._solved.state
         res, valid = reprojection_residuals(current)
         weighed, sigmas = self._weighed_noise, self._sigmas
-        by = self._inflation.photos / weighed, self._inflation.cameras / weighed
-        covariances, of_intrinsics = inflated(self._marginals, *by)
+        by = self._inflation.over(weighed)
+        covariances, of_intrinsics = inflated(self._marginals, by, len(current.cameras))
         covariances, of_intrinsics = covariances + self._doubt.of_photos, of_intrinsics + self._doubt.of_cameras
         path = None
         if self._path is not None and options.path is not None:
             pace_sigma = np.sqrt(np.diagonal(of_intrinsics).reshape(len(current.cameras), -1)[:, -1])
             path = path_solution(current, options.path, self._path, pace_sigma)
-            with_pace = self._with_pace * by[0] * by[1][-1] + self._doubt.with_last(current.camera_idx, len(by[1]))
+            per_camera = len(of_intrinsics) // len(current.cameras)
+            with_pace = by.photos**2 * self._with_pace + self._doubt.with_last(current.camera_idx, per_camera)
             covariances = of_motions(covariances, with_pace, pace_sigma, self._path, current.camera_idx)
             current = orthogonal(with_path_motions(current, options.path, self._path))
         return BundleResult(
