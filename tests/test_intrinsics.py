@@ -245,14 +245,16 @@ def test_the_other_axis_does_no_worse_than_the_lens_alone(rng):
     assert error["rotation, read along the other axis"] <= error["global"]
 
 
-def test_a_calibration_that_is_plainly_wrong_may_be_decentred_by_more(rng):
+def test_a_calibration_whose_tangential_terms_are_plainly_wrong_may_be_decentred_by_more(rng):
     camera = replace(make_scene(rng, "rotation").cameras[0], dist=np.array([-0.1, 0.05, 0.0, 0.0]))
     sigma = {"f": 1e-3, "cx": 4e-4, "cy": 4e-4, "k1": 3e-3, "p1": 3e-4, "p2": 3e-4}
     guessed, names = GuessedCameras([camera], sigma, [(1e-3, 1e-3)]), tuple(sigma)
     off = replace(camera, dist=np.array([-0.1, 0.05, 0.0, 8 * sigma["p2"]]))
-    as_given, contradicted, before = (
+    # as of a camera whose lens nobody gave
+    without = replace(camera, dist=np.array([-0.1 + 80 * sigma["k1"], 0.05, 0.0, 0.0]))
+    as_given, contradicted, before, other = (
         guessed.pulls_of_decentring([each], names, heavy)[0, 0, names.index("cx")]
-        for each, heavy in ((camera, True), (off, True), (off, False))
+        for each, heavy in ((camera, True), (off, True), (off, False), (without, True))
     )
-    assert as_given == before
-    assert contradicted / as_given == pytest.approx(np.sqrt((9 + 8**2) / (9 + len(sigma))))
+    assert as_given == before == other
+    assert contradicted / as_given == pytest.approx(np.sqrt((9 + 8**2) / (9 + 2)))

@@ -81,10 +81,11 @@ class GuessedCameras:
     def pulls_of_decentring(self, cameras: Sequence[Camera], names: Sequence[str], heavy: bool) -> NDArray[np.float64]:
         """(2, cameras, len(names)) by how much one standard deviation of it changes the prior's gradient at `cameras`.
 
-        `heavy` says whether the prior is that of `prior_weight`, or normal. Then a calibration that the photos
-        contradict somewhere is believed less here too: errors of one calibration have a scale in common, as those of a
-        Student's t distribution, and given n of them whose squares sum to d^2 that is (nu + d^2) / (nu + n) in the
-        square (Ding, "On the conditional distribution of the multivariate t distribution", 2016).
+        `heavy` says whether the prior is that of `prior_weight`, or normal. Then a calibration whose tangential terms
+        the photos contradict is believed less here too: errors of how a lens is centred have a scale in common, as
+        those of a Student's t distribution, and given n of them whose squares sum to d^2 that is (nu + d^2) / (nu + n)
+        in the square (Ding, "On the conditional distribution of the multivariate t distribution", 2016). A focal length
+        or a radial term that is missing says nothing of it.
         """
         pulls = np.zeros((2, len(cameras), len(names)))
         for k, (of_axes, camera, guess, of) in enumerate(
@@ -93,7 +94,8 @@ class GuessedCameras:
             sigma = np.array([of.get(name, np.inf) for name in names])
             apart, slope = np.array(deviation(camera, guess, names)) / sigma
             weight = prior_weight(apart**2)[1] if heavy else np.ones(len(names))
-            scale = (_TAIL + (apart**2).sum()) / (_TAIL + np.isfinite(sigma).sum()) if heavy else 1.0
+            tangential = np.isin(names, ("p1", "p2")) & np.isfinite(sigma)
+            scale = (_TAIL + (apart[tangential] ** 2).sum()) / (_TAIL + tangential.sum()) if heavy else 1.0
             for axis, (error, terms) in enumerate(zip(of_axes, DECENTRING, strict=True)):
                 errors = error * max(scale, 1.0) ** 0.5 * np.array([terms.get(name, 0.0) for name in names])
                 pulls[axis, k] = slope * weight * errors / sigma

@@ -223,13 +223,13 @@ class _Shares(NamedTuple):
         return cls((weights[0], weights[1]), (noises[0], noises[1]), (lengths[0], lengths[1]))
 
     def variances(self, equations: NormalEquations, residuals: Array, partition: Partition, most: int) -> Array:
-        """(2,) by residuals (o, 2), over those of independent noise: the mean over the kinds of unknowns."""
+        """(2,) by residuals (o, 2), over those of independent noise: the mean over the kinds, by the noise's share."""
         group, sign, count = partition.sketch(most)
         pulls = equations.group_pulls(sign[:, None] * residuals, group, count)
         found = []
         for pull, weight, noise, of_lengths in zip(pulls, *self, strict=True):
             kinds = (weight * (_squares(pull) + of_lengths).reshape(weight.shape)).sum(0)[noise > 0]
-            found.append(np.mean(kinds / noise[noise > 0]) if len(kinds) else 1.0)
+            found.append(kinds.sum() / noise.sum() if len(kinds) else 1.0)
         return np.array(found)
 
 
