@@ -172,10 +172,7 @@ def judge_stabilisation(
     interval = float(np.nanmedian(span)) if np.isfinite(span).any() else np.nan
     rate, rate_noise = vectors / span[:, None], rotation_noise / span[:, None]
     at_frames = _rate_at_frames(rate, joined, len(times))
-    levels = _regress(phi, at_frames, phi_noise, together=_TOGETHER)
-    changes, beyond = _of_changes(phi, at_frames, phi_noise, interval)
-    # what lens and scene leave in phi is slow: where it is more than noise, changes determine it better than levels
-    shutter = min(levels, changes, key=lambda found: found.sigma)
+    shutter, changes, beyond = _of_lines(phi, at_frames, phi_noise, interval)
     frames_by_gyro = shutter_by_gyro = None
     if log is not None:
         felt = -log.mean(start + offset_s, end + offset_s)
@@ -184,24 +181,27 @@ def judge_stabilisation(
         frames_by_gyro = _regress(rate, felt, noise, steady=True)
         length = readout_s or 0.5 * interval
         within = -log.mean(times + offset_s - length / 2, times + offset_s + length / 2)
-        shutter_by_gyro = _regress(phi, within, phi_noise, together=_TOGETHER)
+        shutter_by_gyro = _of_lines(phi, within, phi_noise, interval)[0]
     verdict, reason = _judge(shutter, changes, beyond, frames_by_gyro, shutter_by_gyro, interval, readout_s)
     return Stabilisation(verdict, reason, shutter, changes, frames_by_gyro, shutter_by_gyro, beyond)
 
 
-def _of_changes(phi: _Array, rate: _Array, noise: _Array, interval: float) -> tuple[Regression, bool]:
-    """Changes of phi (m, 3) by those of the rate, and whether they exceed the rotations of whole frames.
+def _of_lines(
+    phi: _Array, rate: _Array, noise: _Array, interval: float
+) -> tuple[Regression, Regression, bool]:  # fmt: skip
+    """Phi (m, 3) by the rate, its changes by those of the rate, and whether these exceed those of whole frames.
 
-    What is in no rotation shows in them alone: slow rotations of the lines may be what lens and scene leave.
+    What is in no rotation shows in changes alone: what lens and scene leave in phi is slow. Where it is more than
+    noise, changes determine the slope better than levels, and are the first, too.
     """
+    levels = _regress(phi, rate, noise, together=_TOGETHER)
     step = max(1, round(_CHANGE_S / interval)) if np.isfinite(interval) else 1
     lines, frames = (each[step:] - each[:-step] for each in (phi, rate))
-    found = _regress(lines, frames, np.hypot(noise[step:], noise[:-step]), together=_TOGETHER)
+    changes = _regress(lines, frames, np.hypot(noise[step:], noise[:-step]), together=_TOGETHER)
     known = np.isfinite(lines).all(axis=1) & np.isfinite(frames).all(axis=1)
-    if not known.any():
-        return found, False
-    in_lines, in_frames = (float(np.median(np.linalg.norm(each[known], axis=1))) for each in (lines, frames))
-    return found, in_lines > interval * in_frames
+    in_lines, in_frames = (np.linalg.norm(each[known], axis=1) for each in (lines, frames))
+    beyond = bool(known.any()) and float(np.median(in_lines)) > interval * float(np.median(in_frames))
+    return min(levels, changes, key=lambda found: found.sigma), changes, beyond
 
 
 def calmer_than_felt(
