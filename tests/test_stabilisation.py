@@ -80,7 +80,7 @@ def test_a_clip_as_the_sensor_saw_it(seed, share):
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_slow_errors_of_the_lines_are_no_readout_time(seed):
-    """What lens and scene leave in the lines, next to a slow pan: the shaking alone shows the readout, here of 10 ms."""
+    """What lens and scene leave in the lines, next to a slow pan: the shaking shows the readout, here of 10 ms."""
     hand = motion(seed, 0.1, 0.05, 0.3) + motion(seed + 50, 0.1, 1, 5)
     found = clip(seed, hand, hand + motion(seed + 90, 0.3, 0.05, 0.3), 0.01, phi_sigma=1e-4, log=log_of(hand))
     assert found.shutter.slope == pytest.approx(0.01, rel=0.1)
