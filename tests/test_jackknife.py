@@ -65,7 +65,7 @@ def test_residuals_that_a_fit_leaves_are_those_of_the_whole_system(rng):
     noise, of_photos = rng.normal(size=res.shape), rng.normal(size=(m, nb))
     gradient = np.einsum("oij,oi->j", J, noise)
     gradient[: m * nb] += (np.sqrt(np.maximum(prior, 0)) * of_photos * (prior > 1e-6 * prior.max())).ravel()
-    found = problem.linearize(state).residuals_of(noise, of_photos, np.zeros(2 * len(state.cameras)))
+    found = problem.linearize(state).residuals_of(noise, of_photos, np.zeros(2 * len(state.cameras)), rng)
     np.testing.assert_allclose(found, noise - J @ (inverse @ gradient), atol=1e-6)  # of some 1
 
 

@@ -362,21 +362,24 @@ def group_gradients(
             # J_p is minus these: the sign of their product stays
             u0, u1, u2 = _times(J[n, 0, 3], J[n, 0, 4], J[n, 0, 5], V_inv, p)
             w0, w1, w2 = _times(J[n, 1, 3], J[n, 1, 4], J[n, 1, 5], V_inv, p)
+            # what the measurements of one group, which mostly follow each other, leave is summed first
+            g, x, y = group[track_start[p]], 0.0, 0.0
             for k in range(track_start[p], track_start[p + 1]):
+                if group[k] != g:
+                    _add_product_to(g_frame[f, g], x, y, J[n, 0], J[n, 1])
+                    _add_product_to(g_camera[f, g], x, y, J_camera[n, 0], J_camera[n, 1])
+                    g, x, y = group[k], 0.0, 0.0
                 r0, r1 = res[k, 0], res[k, 1]
                 e0 = J[k, 0, 3] * r0 + J[k, 1, 3] * r1
                 e1 = J[k, 0, 4] * r0 + J[k, 1, 4] * r1
                 e2 = J[k, 0, 5] * r0 + J[k, 1, 5] * r1
-                x = -(u0 * e0 + u1 * e1 + u2 * e2)
-                y = -(w0 * e0 + w1 * e1 + w2 * e2)
+                x -= u0 * e0 + u1 * e1 + u2 * e2
+                y -= w0 * e0 + w1 * e1 + w2 * e2
                 if k == n:
                     x += r0
                     y += r1
-                g = group[k]
-                for a in range(nb):
-                    g_frame[f, g, a] += J[n, 0, a] * x + J[n, 1, a] * y
-                for a in range(nc):
-                    g_camera[f, g, a] += J_camera[n, 0, a] * x + J_camera[n, 1, a] * y
+            _add_product_to(g_frame[f, g], x, y, J[n, 0], J[n, 1])
+            _add_product_to(g_camera[f, g], x, y, J_camera[n, 0], J_camera[n, 1])
 
 
 @parallel_kernel(fastmath=SUMS)

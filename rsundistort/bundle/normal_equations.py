@@ -395,10 +395,11 @@ class NormalEquations:
         moved: Array = np.einsum("oia,oa->oi", self._J, self._seen(frame)[f]) + np.einsum("oia,oa->oi", border.J, own)
         return moved - np.einsum("oia,oa->oi", self._J[:, :, 3:6], point[self._s.point_idx])
 
-    def residuals_of(self, noise: Array, of_photos: Array, of_cameras: Array) -> Array:
+    def residuals_of(self, noise: Array, of_photos: Array, of_cameras: Array, rng: np.random.Generator) -> Array:
         """Residuals (o, 2) that a fit would leave of noise (o, 2), the priors' means being off, too.
 
-        These by so many of their standard deviations, of_photos (m, nb) and of_cameras (k,). Known lengths are right.
+        These by so many of their standard deviations, of_photos (m, nb) and of_cameras (k,), and those of a path by what
+        is drawn. Known lengths are right.
         """
         assert self.inverse is not None
         g_point, V = np.empty_like(self._g_point), np.empty_like(self._V)
@@ -408,8 +409,7 @@ class NormalEquations:
         by_frame, by_camera = self._without_points(V_inv, noise, np.zeros(len(noise), np.int64), 1)
         g_frame = self._wide(by_frame[0]) + np.sqrt(self._prior_diag) * self._wide(of_photos)
         if self._coupling is not None:
-            drawn = np.random.default_rng(1).normal(size=self._coupling.res.shape)
-            g_frame += self._coupling.pull(drawn, len(g_frame))
+            g_frame += self._coupling.pull(rng.normal(size=self._coupling.res.shape), len(g_frame))
         g_camera = by_camera[0] + np.sqrt(self._border.prior_diag.ravel()) * of_cameras
         if self._common is not None:
             weight, J = self._common
