@@ -352,7 +352,6 @@ def group_gradients(
 
     A measurement k pulls at its point, and thereby at all photos n of its track: J_n' (1_nk - J_p,n V^-1 J_p,k') r_k.
     """
-    nb, nc = J.shape[2], J_camera.shape[2]
     for f in prange(len(g_frame)):
         g_frame[f] = 0.0
         g_camera[f] = 0.0

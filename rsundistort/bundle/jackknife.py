@@ -179,7 +179,9 @@ def _left_of_noise(equations: NormalEquations, draws: int) -> list[Array]:
     seen, J = equations.blocks
     of_photos, of_cameras = (equations.num_photos, J.shape[2]), equations.num_shared
     return [
-        equations.residuals_of(*(rng.normal(size=size) for size in (seen.shape, of_photos, of_cameras)), rng)
+        equations.residuals_of(
+            rng.normal(size=seen.shape), rng.normal(size=of_photos), rng.normal(size=of_cameras), rng
+        )
         for _ in range(draws)
     ]
 

@@ -398,8 +398,8 @@ class NormalEquations:
     def residuals_of(self, noise: Array, of_photos: Array, of_cameras: Array, rng: np.random.Generator) -> Array:
         """Residuals (o, 2) that a fit would leave of noise (o, 2), the priors' means being off, too.
 
-        These by so many of their standard deviations, of_photos (m, nb) and of_cameras (k,), and those of a path by what
-        is drawn. Known lengths are right.
+        These by so many of their standard deviations, of_photos (m, nb) and of_cameras (k,), and those of a path by
+        what is drawn. Known lengths are right.
         """
         assert self.inverse is not None
         g_point, V = np.empty_like(self._g_point), np.empty_like(self._V)

@@ -243,7 +243,8 @@ def _read_file(path: Path, width: int, height: int) -> CameraFile:
         content = path.read_text(encoding="utf-8-sig").strip()
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "it is no text"
-        raise FileError(f"camera file {path} cannot be read: {reason}") from error
+        mend = "check the path, or give the numbers fx,fy,cx,cy"
+        raise FileError(f"camera file {path} cannot be read: {reason}; {mend}") from error
     if _is_colmap_text(content):
         return CameraFile(*read_colmap_cameras(path), source=f"{path} (COLMAP)")
     K = _nine_numbers(content)

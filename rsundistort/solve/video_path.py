@@ -17,7 +17,7 @@ from ..bundle import BundleOptions, BundleResult, bundle_adjust
 from ..bundle.own_motions import OwnMotions, own_motions
 from ..bundle.path_prior import FramePath, PathStart
 from ..critical import heal
-from ..errors import RsUndistortWarning
+from ..errors import ReconstructionError, RsUndistortWarning
 from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos
 from ..input.stabilisation import Stabilisation, calmer_than_felt, judge_stabilisation
@@ -102,16 +102,24 @@ def solve_clip(
     Solved
         Its result is that of the key frames, `whole` the reconstruction of all frames.
     """
-    found = _turned(clip, keys, path, options_of, log)
+    turned, explained = _turned(clip, keys, path, options_of, log)
     telemetry = own_gyroscope(clip) if gyroscope is None else None
-    if found is None and len(clip.names) == 2:
+    if turned is not None and explained:
+        found = _only_turned(turned)
+    elif len(clip.names) == 2:
         options = replace(options_of(start := two_frames(clip, keys)), path=path)
         found = bundle_adjust(start, "constant-motion", options, partial(_tell, log, "path")), options, None
-    elif found is None:
-        found = _travelled(
-            clip, keys, path, options_of, log, telemetry,
-            lambda: place_photos(keys, scratch, log, seed, matching, kept or Kept(), of_clip=True),
-        )  # fmt: skip
+    else:
+        try:
+            found = _travelled(
+                clip, keys, path, options_of, log, telemetry,
+                lambda: place_photos(keys, scratch, log, seed, matching, kept or Kept(), of_clip=True),
+            )  # fmt: skip
+        except ReconstructionError:
+            # no scene: rotations that explain neighbours are all that there is
+            if turned is None:
+                raise
+            found = _only_turned(turned)
     result, options, filmed = found
     assert options.path is not None
     path = options.path
@@ -133,14 +141,15 @@ def solve_clip(
 def _turned(
     clip: Clip, keys: LoadedPhotos, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions],
     log: StageLog,
-) -> _Found | None:  # fmt: skip
-    """The path of a camera that only rotates; None if rotations do not explain the frames."""
+) -> tuple[_Found | None, bool]:  # fmt: skip
+    """The path of a camera that only rotates, if that explains neighbours; and whether it explains all frames."""
     log.begin("rotations")
-    start, found = rotating_only(clip, keys), None
+    start, found, explained = rotating_only(clip, keys), None, False
     if start is not None:
         options = replace(options_of(start), path=replace(path, rotation_only=True))
         result = bundle_adjust(start, "constant-motion", _at_first(options), partial(_tell, log, "rotations"))
-        if result.sigma_px < _FLOW_PX and result.num_outliers < _OUTLIERS * len(start.observations):
+        # the first one smooths wild rotations, whose flow it leaves an error twice as large as the next one does
+        if result.sigma_px < 2 * _FLOW_PX:
             result = bundle_adjust(
                 result.reconstruction, "constant-motion",
                 replace(
@@ -149,13 +158,19 @@ def _turned(
                 ),
                 partial(_tell, log, "rotations"),
             )  # fmt: skip
-            warnings.warn(
-                "the camera only rotated: without parallax there are directions, but no positions and no scene",
-                RsUndistortWarning, stacklevel=4,
-            )  # fmt: skip
-            found = result, options, None
-    log.end("rotations", explained=found is not None)
-    return found
+            dropped = 1 - len(result.reconstruction.observations) / len(start.observations)
+            found, explained = (result, options, None), result.sigma_px < _FLOW_PX and dropped < _OUTLIERS
+    log.end("rotations", explained=explained)
+    return found, explained
+
+
+def _only_turned(turned: _Found) -> _Found:
+    """The same, said aloud."""
+    warnings.warn(
+        "the camera only rotated: without parallax there are directions, but no positions and no scene",
+        RsUndistortWarning, stacklevel=4,
+    )  # fmt: skip
+    return turned
 
 
 def _travelled(
