@@ -88,7 +88,7 @@ def test_shares_of_the_priors_and_inflated_covariances_are_those_of_the_whole_in
     assert_near(cameras, (of_priors + 9 * (inverse - of_priors))[last, last], 8 * quotient)
     # the last unknown of each camera is one of the motions
     by = np.tile([3.0, 2.0], len(state.cameras))
-    _, cameras = inflated(marginals, Inflation(2.0, 3.0, with_pace=True), len(state.cameras))
+    _, cameras = inflated(marginals, Inflation(2.0, 3.0, has_pace=True), len(state.cameras))
     assert_near(cameras, (of_priors[last, last] + by[:, None] * (inverse - of_priors)[last, last] * by), 8 * quotient)
     for i in range(m):
         own = slice(nb * i, nb * (i + 1))
@@ -269,6 +269,13 @@ def test_an_inflation_needs_a_system_that_can_be_solved(rng):
     marginals = equations.marginal_covariances()
     assert np.isnan(marginals.photos).any()
     assert inflation(equations, problem.partitions(state), marginals) == Inflation(1.0, 1.0)
+
+
+def test_a_lens_that_is_held_inflates_nothing(rng):
+    truth = make_scene(rng, "rotation", num_images=6, num_points=100, noise_px=1.0)
+    found = bundle_adjust(truth, "global", BundleOptions(sigma_px=0.5, outlier_rounds=0, loss="squared"))
+    assert found.noise_factor == 1.0
+    assert found.inflation > 1.2
 
 
 def test_unknown_deviations_are_refused():

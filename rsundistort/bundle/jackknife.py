@@ -127,13 +127,13 @@ class Inflation(NamedTuple):
     ----------
     photos, cameras : float
         Of the unknowns of the photos, by what they have beside their poses if anything, and of the cameras.
-    with_pace : bool
+    has_pace : bool
         Whether the last unknown of a camera is the pace of its path: that is one of the motions.
     """
 
     photos: float = 1.0
     cameras: float = 1.0
-    with_pace: bool = False
+    has_pace: bool = False
 
     def over(self, noise_factor: float) -> Inflation:
         """The factors where the noise that weighs the measurements is larger than independent noise already."""
@@ -145,7 +145,7 @@ def inflation(
     partitions: tuple[Partition, ...],
     marginals: Marginals,
     noise_factor: float = 1.0,
-    with_pace: bool = False,
+    has_pace: bool = False,
 ) -> Inflation:
     """The factors, from the residuals at an optimum and the covariances there.
 
@@ -153,7 +153,7 @@ def inflation(
     """
     if equations.inverse is None:
         return Inflation()
-    shares = _Shares.of(equations, marginals, with_pace)
+    shares = _Shares.of(equations, marginals, has_pace)
     m, seen = equations.num_photos, equations.blocks[0]
     # what a fit leaves is the mean over all photos: of many it takes few families to find, and few draws
     few = int(np.clip(8 * _FAMILIES // m, _FAMILY, _FAMILIES))
@@ -170,7 +170,9 @@ def inflation(
     # estimate)
     excess -= np.divide(doubt, excess, out=np.full(2, np.inf), where=excess > 0)
     factors = np.sqrt(np.maximum(noise_factor**2 * (square + np.maximum(excess, 0.0)), 1.0))
-    return Inflation(float(factors[0]), float(factors[1]), with_pace)
+    # nothing is uncertain by the noise, such as a lens that is held
+    factors[[not noise.any() for noise in shares.noise]] = 1.0
+    return Inflation(float(factors[0]), float(factors[1]), has_pace)
 
 
 def _left_of_noise(equations: NormalEquations, draws: int) -> list[Array]:
@@ -204,7 +206,7 @@ class _Shares(NamedTuple):
     of_lengths: tuple[Array, Array]
 
     @classmethod
-    def of(cls, equations: NormalEquations, marginals: Marginals, with_pace: bool) -> _Shares:
+    def of(cls, equations: NormalEquations, marginals: Marginals, has_pace: bool) -> _Shares:
         """Those of a solution."""
         weights, noises = [], []
         c = equations.num_cameras
@@ -220,7 +222,7 @@ class _Shares(NamedTuple):
             noises.append(noise)
         # motions make good what a lens leaves more than poses do
         noises[0][: 6 if noises[0][6:].any() else 0] = 0.0
-        noises[1][len(noises[1]) - with_pace :] = 0.0
+        noises[1][len(noises[1]) - has_pace :] = 0.0
         lengths = [(each**2).sum(0) for each in equations.length_pulls()]
         return cls((weights[0], weights[1]), (noises[0], noises[1]), (lengths[0], lengths[1]))
 
@@ -239,7 +241,7 @@ def inflated(marginals: Marginals, by: Inflation, num_cameras: int) -> tuple[Arr
     """Covariances of photos (m, nb, nb) and cameras (k, k) with the noise's share of the deviations enlarged."""
     of_photos, of_cameras = (total - prior for total, prior in zip(marginals[:2], marginals[2:], strict=True))
     factors = np.full((num_cameras, len(of_cameras) // num_cameras), by.cameras)
-    factors[:, factors.shape[1] - by.with_pace :] = by.photos
+    factors[:, factors.shape[1] - by.has_pace :] = by.photos
     each = factors.ravel()
     return (
         marginals.photos_of_priors + by.photos**2 * of_photos,

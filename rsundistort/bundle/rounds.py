@@ -167,11 +167,11 @@ class Rounds:
         if asks_residuals:
             # the measurements of judged solves are the same, and their points hardly move
             self._partitions = self._partitions or problem.partitions(state)
-            with_pace = state.path is not None
-            self._inflation = inflation(equations, self._partitions, self._marginals, self._noise, with_pace)
+            has_pace = state.path is not None
+            found = self._inflation = inflation(equations, self._partitions, self._marginals, self._noise, has_pace)
             # of all that has a prior of mean zero: what photos have beside their poses, else the lens
-            kind = "photos" if self._marginals.photos.shape[1] > 6 else "cameras"
-            self._noise, self._heavy_tails = getattr(self._inflation, kind), True
+            self._noise = found.photos if self._marginals.photos.shape[1] > 6 else found.cameras
+            self._heavy_tails = True
         self._weighed_sigmas = self._sigmas
         self._sigmas = estimated(
             self._sigmas, self._current, self._marginals.photos, options, self._layout, self._baseline,
