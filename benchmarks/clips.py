@@ -8,6 +8,9 @@ Renders clips of each kind and prints one JSON object a line: how strong the shu
     level   the same, held level at all times: all y axes are parallel
     pan     from a tripod, so that there is no parallax
     two     two frames while the camera rotates by 2 to 4 degrees a readout
+    street  a walk along a street, of a phone's or an action camera's 854x480; at 1.2 m a second
+    round   the same size, round a thing again and again, as who scans it: once in ten seconds, each time at another
+            height and distance
 """
 
 from __future__ import annotations
@@ -24,11 +27,17 @@ import numpy as np
 from rsundistort import read_solution
 from rsundistort.simulate import SceneOptions, simulate_scene
 
-KINDS = ("walk", "level", "pan", "two")
+KINDS = ("walk", "level", "pan", "two", "street", "round")
 WIDTH, HEIGHT, FOCAL_PX = 640, 360, 500.0
 # 4 samples a pixel: a frame is 41 dB from one of 64, which is less than its noise would be; 16 take three times as long
 SAMPLES = 4
+# Of long videos.
+LONG = 854, 480, 640.0
 _DEPTH_M, _HALF_WIDTH_M = 13.0, 8.0
+# A stretch of the street has textures of its own: these repeat themselves, and a street must not.
+_STRETCH_M, _STREET_M = 12.0, 9.0
+_SPEED = 1.2
+_ROUND_S = 10.0
 
 
 def texture(kind: str, size_m: tuple[float, float], colour: tuple[int, int, int], **options: Any) -> dict[str, Any]:
@@ -76,6 +85,96 @@ def surfaces(rng: np.random.Generator) -> list[dict[str, Any]]:
             "yaw_deg": float(rng.uniform(0, 90)),
         })  # fmt: skip
     return found
+
+
+def yard(rng: np.random.Generator) -> list[dict[str, Any]]:
+    """Ground, four walls, a group of boxes in the middle, and some before the walls: a way leads round the middle."""
+    half = 9.0
+    found: list[dict[str, Any]] = [{
+        "kind": "rectangle", "origin_w": [-half, -half, 0], "edge_a": [2 * half, 0, 0], "edge_b": [0, 2 * half, 0],
+        "texture": "paving",
+    }]  # fmt: skip
+    corners = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]) * half
+    for k, name in enumerate(("plaster", "stone", "brick", "planks")):
+        edge = corners[(k + 1) % 4] - corners[k]
+        found.append({
+            "kind": "rectangle", "origin_w": [*corners[k].tolist(), 0], "edge_a": [*edge.tolist(), 0],
+            "edge_b": [0, 0, 6], "texture": name,
+        })  # fmt: skip
+    for near in (True, False):
+        for turn in np.linspace(0, 2 * np.pi, 6 if near else 14, endpoint=False) + rng.uniform(0, 0.3):
+            away = rng.uniform(0.5, 1.4) if near else rng.uniform(6.5, 7.8)
+            found.append({
+                "kind": "box", "texture": str(rng.choice(["brick", "stone", "planks", "leaves"])),
+                "center_w": [float(away * np.cos(turn)), float(away * np.sin(turn)), 0.0],
+                "size_m": [*rng.uniform(0.4, 1.0, 2).tolist(), float(rng.uniform(0.5, 2.0))],
+                "yaw_deg": float(rng.uniform(0, 90)),
+            })  # fmt: skip
+    return found
+
+
+def street(rng: np.random.Generator, length_m: float) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
+    """Ground, walls on both sides and boxes before them, along y; and their textures."""
+    found, textures = [], {}
+
+    def own(kind: str, k: int, size_m: tuple[float, float]) -> str:
+        name = f"{kind}-{k}"
+        colour = np.clip(np.array(TEXTURES[kind]["colour"]) + rng.integers(-25, 26, 3), 30, 230)
+        textures[name] = {**TEXTURES[kind], "size_m": size_m, "colour": colour.tolist()}
+        return name
+
+    half, high = _STREET_M / 2, 7.0
+    num = int(np.ceil((length_m + 30) / _STRETCH_M))
+    for k in range(num):
+        y = k * _STRETCH_M - 6
+        found.append({
+            "kind": "rectangle", "origin_w": [-half, y, 0], "edge_a": [_STREET_M, 0, 0], "edge_b": [0, _STRETCH_M, 0],
+            "texture": own("paving", k, (_STREET_M, _STRETCH_M)),
+        })  # fmt: skip
+        for side in (-1, 1):
+            kind = str(rng.choice(["plaster", "brick", "stone"]))
+            ends = (y, _STRETCH_M) if side < 0 else (y + _STRETCH_M, -_STRETCH_M)
+            found.append({
+                "kind": "rectangle", "origin_w": [side * half, ends[0], 0], "edge_a": [0, ends[1], 0],
+                "edge_b": [0, 0, high], "texture": own(kind, 2 * k + (side > 0), (_STRETCH_M, high)),
+            })  # fmt: skip
+            for cell in range(0 if k else 2, 3):  # none behind the first frame
+                found.append({
+                    "kind": "box", "texture": str(rng.choice(["brick", "stone", "planks", "leaves"])),
+                    "center_w": [side * float(rng.uniform(1.9, 3.6)), y + 4.0 * cell + float(rng.uniform(1, 3)), 0.0],
+                    "size_m": [*rng.uniform(0.4, 1.2, 2).tolist(), float(rng.uniform(0.5, 2.6))],
+                    "yaw_deg": float(rng.uniform(0, 90)),
+                })  # fmt: skip
+    found.append({
+        "kind": "rectangle", "origin_w": [-half, num * _STRETCH_M - 6, 0], "edge_a": [_STREET_M, 0, 0],
+        "edge_b": [0, 0, high], "texture": own("plaster", 2 * num, (_STREET_M, high)),
+    })  # fmt: skip
+    return found, TEXTURES | textures
+
+
+def long_path(kind: str, rng: np.random.Generator, num_frames: int) -> dict[str, Any]:
+    """The path of a long video: along the street, or round the middle of the yard."""
+    seconds = num_frames / 30
+    num = max(4, round(seconds / 1.5) + 1)
+    if kind == "street":
+        y = np.linspace(0, _SPEED * seconds, num)
+        places = np.column_stack([rng.uniform(-0.6, 0.6, num), y, rng.uniform(1.4, 1.8, num)])
+        yaw, pitch = rng.uniform(-0.7, 0.7, num), rng.uniform(-0.12, 0.08, num)
+        targets = places + 6 * np.column_stack([np.sin(yaw), np.cos(yaw), np.tan(pitch)])
+    else:
+        turn = 2 * np.pi * np.linspace(0, seconds / _ROUND_S, num)
+        away, high = rng.uniform(3.2, 4.4, num), rng.uniform(1.2, 2.2, num)
+        places = np.column_stack([away * np.cos(turn), away * np.sin(turn), high])
+        targets = np.column_stack([rng.uniform(-0.4, 0.4, (num, 2)), rng.uniform(0.4, 1.2, num)])
+    way = [
+        {"center_w": c.tolist(), "look_at_w": t.tolist(), "roll_deg": float(rng.uniform(-2, 2))}
+        for c, t in zip(places, targets, strict=True)
+    ]
+    return {
+        "kind": "walk", "fps": 30, "num_frames": num_frames, "readout": 0.5, "way": way,
+        "tremor": {"rotation_deg": 1.2, "travel_m": 0.005, "hz": [1, 12], "num": 5},
+        "steps": {"hz": 1.9, "up_m": 0.025, "side_m": 0.02},
+    }  # fmt: skip
 
 
 def path(kind: str, rng: np.random.Generator, num_frames: int) -> dict[str, Any]:
@@ -129,14 +228,21 @@ def clip_recipe(kind: str, seed: int, num_frames: int = 60) -> dict[str, Any]:
     Of 40 to 150 frames: the way points are as many, so that shorter ones rotate faster; longer ones leave the yard.
     """
     rng = np.random.default_rng([seed, KINDS.index(kind)])
-    K = [[FOCAL_PX, 0, WIDTH / 2 + 1.5], [0, FOCAL_PX, HEIGHT / 2 - 1.75], [0, 0, 1]]
+    is_long = kind in ("street", "round")
+    width, height, focal_px = LONG if is_long else (WIDTH, HEIGHT, FOCAL_PX)
+    K = [[focal_px, 0, width / 2 + 1.5], [0, focal_px, height / 2 - 1.75], [0, 0, 1]]
+    taken = (long_path if is_long else path)(kind, rng, num_frames)
+    if kind == "street":
+        around, textures = street(rng, _SPEED * num_frames / 30)
+    else:
+        around, textures = yard(rng) if kind == "round" else surfaces(rng), TEXTURES
     return {
         "format": "rsundistort-recipe", "version": 1, "name": f"{kind}-{seed}", "seed": 1000 + seed,
-        "camera": {"width": WIDTH, "height": HEIGHT, "K": K, "dist": [], "readout": "top-to-bottom"},
-        "render": {"samples": SAMPLES, "spread_px": 0.7, "exposure": 2.0, "jpeg_quality": 95},
+        "camera": {"width": width, "height": height, "K": K, "dist": [], "readout": "top-to-bottom"},
+        "render": {"samples": 2 if is_long else SAMPLES, "spread_px": 0.7, "exposure": 2.0, "jpeg_quality": 95},
         "light": {"sun_azimuth_deg": 235, "sun_elevation_deg": 43, "sun": [1.45, 1.28, 1.04]},
-        "points": 300, "path": path(kind, rng, num_frames), "twins": {"every": 1 if kind == "two" else 10},
-        "textures": TEXTURES, "surfaces": surfaces(rng),
+        "points": 300, "path": taken, "twins": {"every": 1 if kind == "two" else 100 if is_long else 10},
+        "textures": textures, "surfaces": around,
     }  # fmt: skip
 
 

@@ -121,7 +121,7 @@ def scaled(step, h):
 
 def dense_system(problem, state):
     """Hessian and gradient of all unknowns, photos, points, cameras, written out; with the mask of the free ones."""
-    res, J_frame, _ = problem._jacobians(state)
+    res, J_frame = problem.blocks(state)
     J_camera = problem._camera_jacobians(state)
     nc = J_camera.shape[2]
     obs = problem._start.observations.select(problem._structure.order)

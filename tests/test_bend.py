@@ -252,13 +252,13 @@ def test_derivatives_of_the_adjustment(rng, model, way):
         truth, model, options, 0.5, PriorSigmas(0.03, 0.1, bends=(1e-3,) * GROUPS, ways=(0.01,) * 2)
     )
     state = problem.initial_state()
-    residuals, J, _ = problem._jacobians(state)
+    residuals, J = problem.blocks(state)
     residuals, J, h = residuals.copy(), J.copy(), 1e-6
     nothing = np.zeros_like(state.points_w), np.zeros((1, 0))
     for column in range(J.shape[2]):
         step = np.zeros((truth.num_images, J.shape[2]))
         step[:, column] = h
-        ahead, behind = (problem._jacobians(problem.retract(state, (s * step, *nothing)))[0].copy() for s in (1, -1))
+        ahead, behind = (problem.blocks(problem.retract(state, (s * step, *nothing)))[0].copy() for s in (1, -1))
         np.testing.assert_allclose(
             J[:, :, column], (ahead - behind) / (2 * h), atol=1e-6 * np.abs(J[:, :, column]).max()
         )

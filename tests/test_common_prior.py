@@ -144,7 +144,7 @@ def test_covariances_with_means_are_those_of_the_whole_inverse(rng):
 
 def measured_rows(problem, state, size, nr):
     """Jacobian (2 o, size) of the measurements alone."""
-    _, J_frame, _ = problem._jacobians(state)
+    _, J_frame = problem.blocks(state)
     J_camera = problem._camera_jacobians(state)
     obs = problem._start.observations.select(problem._structure.order)
     m, nb = problem._free.shape

@@ -168,7 +168,7 @@ def test_hessian_without_a_gauge_has_as_many_zeros_as_the_measure_says(name):
     options = BundleOptions(loss="squared", outlier_rounds=0)
     problem = BundleProblem(scene, "two-step", options, 1.0, PriorSigmas(1e9, 1e9))
     state = problem.initial_state()
-    _, J_frame, _ = problem._jacobians(state)
+    _, J_frame = problem.blocks(state)
     obs = problem._start.observations.select(problem._structure.order)
     m, n, nb = scene.num_images, scene.num_points, 9
     J = np.zeros((len(obs), 2, nb * m + 3 * n))

@@ -19,7 +19,7 @@ from rsundistort.errors import InputError
 
 def whole_jacobian(problem, state):
     """Weighted residuals (o, 2), Jacobian (o, 2, all unknowns), and Hessian and its inverse with 0 where held."""
-    res, J_frame, _ = problem._jacobians(state)
+    res, J_frame = problem.blocks(state)
     J_camera = problem._camera_jacobians(state)
     H, _, free = dense_system(problem, state)
     s, camera_idx = problem._structure, problem._start.camera_idx

@@ -50,7 +50,7 @@ def test_jacobian_equals_central_differences_through_the_step(model, varying, re
     problem, state = noisy_problem(rng, model, refine=refine, dist=dist, varying=varying)
     order = problem._structure.order
     obs = problem._start.observations.select(order)
-    _, J_frame, _ = problem._jacobians(state)
+    _, J_frame = problem.blocks(state)
     jacobians = J_frame, -J_frame[:, :, 3:6], problem._camera_jacobians(state)
     owners_of = obs.frame_idx, obs.point_idx, problem._start.camera_idx[obs.frame_idx]
     h = 1e-6
@@ -245,3 +245,24 @@ def test_points_without_parallax_keep_what_their_measurements_say_across_them(rn
     # what elimination takes from a photo that sees the points along these rays is the same for any such inverse
     kept = np.einsum("nki,nij,nlj->nkl", rays, V_inv[:50], rays)
     np.testing.assert_allclose(kept, np.broadcast_to(np.eye(2), kept.shape), atol=1e-6)
+
+
+def test_a_point_at_the_lens_neither_moves_nor_says_anything(rng):
+    problem, state = noisy_problem(rng, "rotation", refine=("f", "k1"))
+    point, photo = 7, problem._structure.frame_idx[problem._structure.track_start[7]]
+    at_lens = state.points_w.copy()
+    at_lens[point] = state.center_w[photo] + 1e-7 * state.R_cw[photo][2]
+    moved = replace(state, points_w=at_lens)
+    mine = np.arange(*problem._structure.track_start[point : point + 2])
+    singular = mine[problem._structure.frame_idx[mine] == photo]
+    res, J_frame = problem.blocks(moved)
+    assert not res[singular].any()
+    assert not J_frame[singular].any()
+    equations = problem.linearize(moved)
+    assert not equations._border.J[singular].any()
+    photos, cameras, *_ = equations.marginal_covariances()
+    assert np.isfinite(photos).all()
+    # without one of a hundred measurements, at the same state
+    other = problem.linearize(state).marginal_covariances()
+    sigma, before = (np.sqrt(np.einsum("maa->ma", each)) for each in (photos, other.photos))
+    np.testing.assert_allclose(sigma, before, rtol=0.5)

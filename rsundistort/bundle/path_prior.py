@@ -387,9 +387,13 @@ class PathSolution:
 
 
 def path_solution(reconstruction: Reconstruction, path: FramePath, state: PathState, pace_sigma: Array) -> PathSolution:
-    """The path through a reconstruction's poses, and the readout time by pace and standard deviation (cameras,)."""
+    """The path through a reconstruction's poses, and the readout time by pace and standard deviation (cameras,).
+
+    A deviation that could not be computed is the one before the photos.
+    """
     found, frames = camera_path(reconstruction, path, state)
     span = np.array([camera.frame_span for camera in reconstruction.cameras])
+    pace_sigma = np.where(np.isfinite(pace_sigma), pace_sigma, path.readout_prior[1] / span)
     free = free_pace(state.pace, pace_sigma, path.readout_most / span, _EXCESS_SIGMA / span)
     span_s = span * path.frame_s
     names = tuple(reconstruction.image_names[k] for k in frames.tolist())

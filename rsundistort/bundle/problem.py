@@ -57,6 +57,9 @@ class State:
 
 # Observations that a thread takes at a time, and whose costs are summed together.
 _CHUNK = 1024
+# A measurement that changes so many times as much with its point's place as the rest is of a point at the lens, or one
+# that moves along with the line that is read. Its weight would leave rounding of what the others say.
+_SINGULAR = 100.0
 
 
 class BundleProblem:
@@ -376,8 +379,11 @@ class BundleProblem:
 
     def _jacobians(
         self, state: State, spent: NormalEquations | None = None
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-        """Weighted residuals (o, 2), Jacobians of the photos (o, 2, nb), and the cost without priors."""
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, NDArray[np.int64]]:
+        """Weighted residuals (o, 2), Jacobians of the photos (o, 2, nb), the cost without priors, and who is left out.
+
+        These measurements are singular: with zeros for both they stay where they are, and say nothing.
+        """
         o = len(self._xy)
         res, J_frame = spent.spend() if spent else (np.empty((o, 2)), np.empty((o, 2, self.layout.size)))
         cost = np.empty(-(-o // _CHUNK))
@@ -394,7 +400,10 @@ class BundleProblem:
             )
         if self._options.varying:
             J_frame[:, :, self._block : self.layout.variation] = self._by_lens(state)[1]
-        return res, J_frame, float(cost.sum())
+        change = np.abs(J_frame[:, :, 3:6]).max(axis=(1, 2))
+        singular = np.flatnonzero(change > _SINGULAR * np.median(change))
+        res[singular], J_frame[singular] = 0.0, 0.0
+        return res, J_frame, float(cost.sum()), singular
 
     def blocks(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Weighted residuals (o, 2), and Jacobians of the photos (o, 2, nb)."""
@@ -409,7 +418,7 @@ class BundleProblem:
 
     def linearize(self, state: State, spent: NormalEquations | None = None) -> NormalEquations:
         """Normal equations and cost at a state, written over those of `spent`: fresh memory takes time to get."""
-        res, J_frame, cost = self._jacobians(state, spent)
+        res, J_frame, cost, singular = self._jacobians(state, spent)
         prior_diag = np.zeros((len(state.phi), self.layout.size))
         prior_gradient = np.zeros_like(prior_diag)
         motion = self._motion(state)
@@ -422,6 +431,7 @@ class BundleProblem:
         prior_gradient[own] = self._own_weight * self._own(state)
         total = cost + self._prior_cost(state)
         border = Border(self._camera_jacobians(state), self._start.camera_idx, *self._camera_priors(state)[:2])
+        border.J[singular] = 0.0
         coupling = common = None
         if self._means is not None:
             border = replace(border, J=np.pad(border.J, ((0, 0), (0, 0), (0, 6))))

@@ -39,6 +39,9 @@ __all__ = ["Rounds"]
 _SETTLED_NOISE = 0.1
 # The bends of a path have converged if they change by less, radians: a twentieth of a pixel at any focal length in use.
 _SETTLED_BEND = 2e-5
+# Share of the distance of the rest at which nothing is a point of the scene: no lens has it in focus. A match between
+# photos taken from one place ends there, since noise drives a depth that nothing determines.
+_AT_LENS = 1e-2
 
 
 def _noise_px(reconstruction: Reconstruction, shutter_model: str, floor: float) -> float:
@@ -55,10 +58,16 @@ def _noise_px(reconstruction: Reconstruction, shutter_model: str, floor: float) 
 
 
 def _believed(reconstruction: Reconstruction, options: BundleOptions, sigma: float) -> NDArray[np.bool_]:
-    """(o,) measurements that lie as near to their prediction as their noise allows."""
-    res, valid = reprojection_residuals(reconstruction)
-    limit = np.maximum(options.outlier_sigma * sigma * reconstruction.observations.sigma, options.min_outlier_px)
-    return valid & (np.linalg.norm(res, axis=1) <= limit)
+    """(o,) measurements that lie as near to their prediction as their noise allows, and not at the lens."""
+    rec, obs = reconstruction, reconstruction.observations
+    res, believed = reprojection_residuals(rec)
+    limit = np.maximum(options.outlier_sigma * sigma * obs.sigma, options.min_outlier_px)
+    believed &= np.linalg.norm(res, axis=1) <= limit
+    if options.path is None or not options.path.rotation_only:  # else points are directions
+        away = np.linalg.norm(rec.points_w[obs.point_idx] - rec.center_w[obs.frame_idx], axis=1)
+        for mine in obs.by_photo(rec.num_images):
+            believed[mine] &= away[mine] > _AT_LENS * np.median(away[mine]) if len(mine) else True
+    return believed
 
 
 def _check_solvable(reconstruction: Reconstruction, shutter_model: str, path: FramePath | None) -> None:

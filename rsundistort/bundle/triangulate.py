@@ -11,7 +11,7 @@ from ..model import Reconstruction
 from ..model.projection import clock_of, unproject_points
 from ..model.reprojection import reprojection_residuals
 
-__all__ = ["retriangulated"]
+__all__ = ["retriangulated", "triangulated"]
 
 # Rays that do not meet ahead of the cameras are taken to meet this many sizes of the scene away: so near that they pull
 # (at 50 sizes the way back takes five times as many steps).
@@ -38,6 +38,45 @@ def _world_rays(
     return centers, rays / np.linalg.norm(rays, axis=1, keepdims=True), valid
 
 
+def _meeting_points(
+    reconstruction: Reconstruction, lost: NDArray[np.int64], shutter_model: str, size: float
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.float64]]:
+    """Where the rays of some points (k,) come nearest to each other (k, 3), and whether that is ahead of all cameras.
+
+    With places (k, 3) far along the rays, at some sizes of the scene.
+    """
+    obs = reconstruction.observations
+    number = np.full(reconstruction.num_points, -1)
+    number[lost] = np.arange(len(lost))
+    some = np.flatnonzero(number[obs.point_idx] >= 0)
+    centers, rays, valid = _world_rays(reconstruction, some, shutter_model)
+    some, centers, rays = some[valid], centers[valid], rays[valid]
+    of = number[obs.point_idx[some]]
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    A, b, middle, way = (np.zeros((len(lost), *shape)) for shape in ((3, 3), (3,), (3,), (3,)))
+    np.add.at(A, of, across)
+    np.add.at(b, of, np.einsum("kij,kj->ki", across, centers))
+    np.add.at(middle, of, centers)
+    np.add.at(way, of, rays)
+    count = np.maximum(np.bincount(of, minlength=len(lost)), 1)[:, None]
+    middle, way = middle / count, way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
+    # a ridge of 1e-9 leaves parallel rays at a finite place
+    found = np.linalg.solve(A + 1e-9 * np.eye(3), (b + 1e-9 * middle)[..., None])[..., 0]
+    ahead = np.ones(len(lost), bool)
+    np.logical_and.at(ahead, of, ((found[of] - centers) * rays).sum(1) > 1e-6 * size)
+    return found, ahead, middle + _FAR * size * way
+
+
+def triangulated(reconstruction: Reconstruction, shutter_model: str) -> Reconstruction:
+    """The reconstruction with all points where their rays come nearest to each other, if that is ahead of the cameras.
+
+    Poses and motions are those of the photos; the other points are dropped.
+    """
+    every = np.arange(reconstruction.num_points)
+    points_w, ahead, _ = _meeting_points(reconstruction, every, shutter_model, reconstruction.baseline)
+    return replace(reconstruction, points_w=points_w).take_points(ahead)
+
+
 def retriangulated(reconstruction: Reconstruction, shutter_model: str, from_afar: bool = False) -> Reconstruction:
     """The reconstruction with points triangulated anew that no adjustment could bring back.
 
@@ -57,25 +96,8 @@ def retriangulated(reconstruction: Reconstruction, shutter_model: str, from_afar
     lost = np.flatnonzero(unseen | far)
     if not len(lost):
         return reconstruction
-    number = np.full(reconstruction.num_points, -1)
-    number[lost] = np.arange(len(lost))
-    some = np.flatnonzero(number[obs.point_idx] >= 0)
-    centers, rays, valid = _world_rays(reconstruction, some, shutter_model)
-    some, centers, rays = some[valid], centers[valid], rays[valid]
-    of = number[obs.point_idx[some]]
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    A, b, middle, way = (np.zeros((len(lost), *shape)) for shape in ((3, 3), (3,), (3,), (3,)))
-    np.add.at(A, of, across)
-    np.add.at(b, of, np.einsum("kij,kj->ki", across, centers))
-    np.add.at(middle, of, centers)
-    np.add.at(way, of, rays)
-    count = np.maximum(np.bincount(of, minlength=len(lost)), 1)[:, None]
-    middle, way = middle / count, way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
-    # a ridge of 1e-9 leaves parallel rays at a finite place
-    found = np.linalg.solve(A + 1e-9 * np.eye(3), (b + 1e-9 * middle)[..., None])[..., 0]
-    ahead = np.ones(len(lost), bool)
-    np.logical_and.at(ahead, of, ((found[of] - centers) * rays).sum(1) > 1e-6 * size)
-    found = np.where(ahead[:, None], found, middle + _FAR * size * way)
+    found, ahead, way = _meeting_points(reconstruction, lost, shutter_model, size)
+    found = np.where(ahead[:, None], found, way)
     moved = ahead & (np.linalg.norm(found - reconstruction.center_w.mean(0), axis=1) <= _LOST * size)
     moved |= unseen[lost] | from_afar
     if not moved.any():

@@ -2,71 +2,112 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..bundle.triangulate import triangulated
 from ..errors import ReconstructionError
 from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos
-from ..model import Observations, Reconstruction, RowMotion
+from ..model import Camera, Observations, Reconstruction, RowMotion
 from ..model.projection import unproject_points
 from .clip_pan import rotation_between
 from .clip_tracks import follow
 
-__all__ = ["two_frames"]
+__all__ = ["FramePair"]
 
 # Readout times that are tried, as shares of the time between frames: a fifth more or less leaves little of the shutter.
 _SHARES = (0.0, 0.15, 0.3, 0.45, 0.6, 0.75, 0.9)
 # Tolerance of rays that agree on a pose between the frames, in pixels.
 _WITHIN_PX = 1.0
+# Points that are followed from each frame: there are no others that average their errors.
+_POINTS = 1000
 _LEAST_AGREEING = 20
 
 
-def two_frames(clip: Clip, keys: LoadedPhotos) -> Reconstruction:
-    """Both frames of a clip, and their common points, by the essential matrix of rays without shutter.
+@dataclass(frozen=True)
+class FramePair:
+    """What two frames have in common.
 
-    The camera is assumed to rotate steadily from frame to frame, for the share of the time that explains most points.
-
-    Raises
-    ------
-    ReconstructionError
-        When the frames share too little.
+    Attributes
+    ----------
+    camera : Camera
+        Of both.
+    names : tuple of str
+        The frames.
+    xy : (2, n, 2) array
+        Pixels of the points that were followed from either to the other.
     """
-    camera = keys.cameras.of(0)
-    number = {name: k for k, name in enumerate(clip.names)}
-    shown = {number[name]: found.xy_raw for name, found in zip(keys.names, keys.features, strict=True)}
-    followed = follow(clip, shown, camera)
-    forward = followed.key == 0
-    first, second = (shown[k][followed.chosen[k]] for k in (0, 1))
-    starts = np.concatenate([first[followed.place[forward]], second[followed.place[~forward]]])
-    xy = np.stack([np.where((forward == (k == 0))[:, None], starts, followed.xy_raw) for k in (0, 1)])
-    rotation = rotation_between(xy[0], xy[1], camera)
-    if rotation is None:
-        raise ReconstructionError(f"the two frames of {clip.video.name} share too little of the scene")
-    best: tuple[int, NDArray[np.float64], NDArray[np.float64], RowMotion, NDArray[np.bool_]] | None = None
-    for share in _SHARES:
-        motion = RowMotion(share * rotation / camera.frame_span)
-        (a, seen_a), (b, seen_b) = (unproject_points(each, camera, motion, "rotation") for each in xy)
-        seen = seen_a & seen_b
-        E, _ = cv2.findEssentialMat(a[seen], b[seen], np.eye(3), cv2.RANSAC, 0.9999, _WITHIN_PX / float(camera.K[0, 0]))
-        if E is None or E.shape != (3, 3):
-            continue
-        _, R, way, agree = cv2.recoverPose(E, a[seen], b[seen], np.eye(3))
-        mask = np.zeros(len(seen), bool)
-        mask[np.flatnonzero(seen)[agree.ravel() > 0]] = True
-        if best is None or mask.sum() > best[0]:
-            best = int(mask.sum()), R, way.ravel(), motion, mask
-    if best is None or best[0] < _LEAST_AGREEING:
-        raise ReconstructionError(f"the two frames of {clip.video.name} share too little of the scene")
-    _, R, way, motion, mask = best
-    rays = [unproject_points(each[mask], camera, motion, "rotation")[0] for each in xy]
-    local = cv2.triangulatePoints(np.eye(3, 4), np.column_stack([R, way]), rays[0].T, rays[1].T)
-    points_w = (local[:3] / local[3]).T
-    ahead = np.isfinite(points_w).all(1) & (points_w[:, 2] > 0)
-    n = int(ahead.sum())
-    return Reconstruction(
-        [camera], clip.names, np.zeros(2, np.int64), np.stack([np.eye(3), R]), np.stack([np.zeros(3), -R.T @ way]),
-        points_w[ahead],
-        Observations(np.repeat([0, 1], n), np.tile(np.arange(n), 2), xy[:, mask][:, ahead].reshape(-1, 2)),
-    )  # fmt: skip
+
+    camera: Camera
+    names: tuple[str, ...]
+    xy: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, clip: Clip, keys: LoadedPhotos) -> FramePair:
+        """The frames of a clip of two."""
+        camera = keys.cameras.of(0)
+        number = {name: k for k, name in enumerate(clip.names)}
+        shown = {number[name]: found.xy_raw for name, found in zip(keys.names, keys.features, strict=True)}
+        followed = follow(clip, shown, camera, most=_POINTS)
+        forward = followed.key == 0
+        first, second = (shown[k][followed.chosen[k]] for k in (0, 1))
+        starts = np.concatenate([first[followed.place[forward]], second[followed.place[~forward]]])
+        xy = np.stack([np.where((forward == (k == 0))[:, None], starts, followed.xy_raw) for k in (0, 1)])
+        return cls(camera, tuple(clip.names), xy)
+
+    def placed(self, readout_share: float | None = None) -> Reconstruction:
+        """Both frames and their common points, by the essential matrix of rays without shutter.
+
+        The camera is assumed to rotate steadily from frame to frame, for a share of the time: the one that is known,
+        or that explains most points.
+
+        Raises
+        ------
+        ReconstructionError
+            When the frames share too little.
+        """
+        camera, xy = self.camera, self.xy
+        rotation = rotation_between(xy[0], xy[1], camera)
+        best: tuple[int, NDArray[np.float64], NDArray[np.float64], RowMotion, NDArray[np.bool_]] | None = None
+        for share in () if rotation is None else _SHARES if readout_share is None else (readout_share,):
+            motion = RowMotion(share * rotation / camera.frame_span)
+            (a, seen_a), (b, seen_b) = (unproject_points(each, camera, motion, "rotation") for each in xy)
+            seen, within = seen_a & seen_b, _WITHIN_PX / float(camera.K[0, 0])
+            E, _ = cv2.findEssentialMat(a[seen], b[seen], np.eye(3), cv2.RANSAC, 0.9999, within)
+            if E is None or E.shape != (3, 3):
+                continue
+            _, R, way, agree = cv2.recoverPose(E, a[seen], b[seen], np.eye(3))
+            mask = np.zeros(len(seen), bool)
+            mask[np.flatnonzero(seen)[agree.ravel() > 0]] = True
+            if best is None or mask.sum() > best[0]:
+                best = int(mask.sum()), R, way.ravel(), motion, mask
+        if best is None or best[0] < _LEAST_AGREEING:
+            raise ReconstructionError(f"{self.names[0]} and {self.names[1]} share too little of the scene")
+        _, R, way, motion, mask = best
+        rays = [unproject_points(each[mask], camera, motion, "rotation")[0] for each in xy]
+        local = cv2.triangulatePoints(np.eye(3, 4), np.column_stack([R, way]), rays[0].T, rays[1].T)
+        points_w = (local[:3] / local[3]).T
+        ahead = np.isfinite(points_w).all(1) & (points_w[:, 2] > 0)
+        R_cw, center_w = np.stack([np.eye(3), R]), np.stack([np.zeros(3), -R.T @ way])
+        return Reconstruction(
+            [camera], list(self.names), np.zeros(2, np.int64), R_cw, center_w, points_w[ahead],
+            _seen(xy[:, mask][:, ahead]),
+        )  # fmt: skip
+
+    def of_all(self, found: Reconstruction) -> Reconstruction:
+        """All that was followed, seen by the frames as they were found to move.
+
+        The essential matrix takes those for wrong whose rows the steady rotation does not explain.
+        """
+        n = self.xy.shape[1]
+        return triangulated(replace(found, points_w=np.zeros((n, 3)), observations=_seen(self.xy)), "constant-motion")
+
+
+def _seen(xy: NDArray[np.float64]) -> Observations:
+    """The measurements (2, n, 2) of both frames."""
+    n = xy.shape[1]
+    return Observations(np.repeat([0, 1], n), np.tile(np.arange(n), 2), xy.reshape(-1, 2))

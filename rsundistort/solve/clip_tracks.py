@@ -61,14 +61,16 @@ class Followed:
         self.key = np.repeat(np.array(keys, np.int64), [len(frame) for frame in parts[0]])
 
 
-def _spread(xy: NDArray[np.float64], worth: NDArray[np.int64], size: tuple[int, int]) -> NDArray[np.int64]:
+def _spread(
+    xy: NDArray[np.float64], worth: NDArray[np.int64], size: tuple[int, int], most: int
+) -> NDArray[np.int64]:  # fmt: skip
     """Indices of the points (n, 2) that are followed: the best of each cell of the frame, then the next best."""
     cell = np.clip(_CELLS * (xy + 0.5) / size, 0, _CELLS - 1).astype(int) @ [1, _CELLS]
     order = np.lexsort((-worth, cell))
     rank = np.empty(len(xy), np.int64)
     start = np.searchsorted(cell[order], np.arange(_CELLS**2))
     rank[order] = np.arange(len(xy)) - start[cell[order]]
-    return np.sort(np.lexsort((-worth, rank))[:_POINTS])
+    return np.sort(np.lexsort((-worth, rank))[:most])
 
 
 def _between_keys(clip: Clip, keys: list[int]) -> Iterator[tuple[int, int, list[NDArray[np.uint8]]]]:
@@ -125,7 +127,7 @@ def _of_keys(clip: Clip, rec: Reconstruction) -> dict[int, NDArray[np.int64]]:
 
 def follow(
     clip: Clip, shown: Mapping[int, NDArray[np.float64]], camera: Camera,
-    worth: Mapping[int, NDArray[np.int64]] | None = None,
+    worth: Mapping[int, NDArray[np.int64]] | None = None, most: int = _POINTS,
 ) -> Followed:  # fmt: skip
     """Follow points of key frames to the key frames before and after.
 
@@ -139,13 +141,15 @@ def follow(
         Of the frames.
     worth : mapping of frame number to (n,) int array, optional
         Worth of the points: of those in the same part of a frame the best are followed; by default the first.
+    most : int
+        Number of points of each key frame that are followed.
     """
     size = camera.width, camera.height
     keys = sorted(shown)
     chosen = {}
     for key, xy in shown.items():
         value = np.arange(len(xy))[::-1] if worth is None else worth[key]
-        chosen[key] = _spread(xy, value, size)
+        chosen[key] = _spread(xy, value, size, most)
     found = []
     for a, b, greys in _between_keys(clip, keys):
         step = np.array(size) / greys[0].shape[::-1]

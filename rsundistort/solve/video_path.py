@@ -28,7 +28,7 @@ from ..sfm import MatchedPhotos, retriangulate
 from ..verdict.judge_path import ReadoutTime, judge_clip, unfollowed_px
 from ..verdict.speeds import readouts_by_speed
 from .clip_gyroscope import Felt, felt_gyroscope, own_gyroscope, readout_of, rotations_between
-from .clip_pair import two_frames
+from .clip_pair import FramePair
 from .clip_pan import rotating_only
 from .clip_tracks import follow_points, followed_again, with_all_frames
 from .model_sequence import rough_options
@@ -107,8 +107,7 @@ def solve_clip(
     if turned is not None and explained:
         found = _only_turned(turned)
     elif len(clip.names) == 2:
-        options = replace(options_of(start := two_frames(clip, keys)), path=path)
-        found = bundle_adjust(start, "constant-motion", options, partial(_tell, log, "path")), options, None
+        found = _of_two(FramePair.of(clip, keys), path, options_of, log)
     else:
         try:
             found = _travelled(
@@ -171,6 +170,26 @@ def _only_turned(turned: _Found) -> _Found:
         RsUndistortWarning, stacklevel=4,
     )  # fmt: skip
     return turned
+
+
+def _of_two(
+    pair: FramePair, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions], log: StageLog
+) -> _Found:
+    """The path through two frames."""
+    log.begin("path")
+    start = pair.placed(None if path.readout is None else path.readout_prior[0])
+    options = replace(options_of(start), path=path)
+    first = bundle_adjust(
+        start, "constant-motion", replace(_at_first(options), prior_sigma_rounds=0), partial(_tell, log, "path")
+    )  # fmt: skip
+    options = replace(options, path=replace(path, start=_start_of(first)))
+    whole = pair.of_all(first.reconstruction)
+    # one step says nothing of how much steps differ
+    result = bundle_adjust(
+        whole, "constant-motion", replace(options, prior_sigma_rounds=0), partial(_tell, log, "path")
+    )  # fmt: skip
+    log.end("path", points=result.reconstruction.num_points, rms_px=result.rms_px)
+    return result, options, None
 
 
 def _travelled(
