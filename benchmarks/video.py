@@ -1,7 +1,7 @@
 """Videos as one path: readout times, rotations and rectified frames against the truth, and a GoPro's gyroscope.
 
     python benchmarks/video.py [--only PART ...] [--clips FOLDER] [--num 20] [--first-seed 100] [--shared ../shared]
-                               [--frames 300 600 1200 1800]
+                               [--frames 300 600 1200 1800] [--long street round to-and-fro]
 
 Prints one JSON object a line. Clips are rendered into FOLDER once (`clips.py`: 80 s of one core each).
 
@@ -18,8 +18,10 @@ Prints one JSON object a line. Clips are rendered into FOLDER once (`clips.py`: 
              ratios, of the seconds (`time`) and, as all that follow, of those of the processors, since the machine may
              be busy (`cpu`); of what any way from a video to a map takes, of the path of all frames, and of the start
              and the outputs; `least` is all but what comes after the first path: with none of that, a run ends there
-    length   the same `run` of the GoPro's video, played to and fro for so many frames: seconds a frame, and peaks;
-             on the way back upside down, so that lines are read from first to last as the camera reads them
+    length   the same `run` of the first so many frames of long videos of 854x480 (`clips.py`: a walk along a street,
+             which never returns, and rounds about a thing), and of the GoPro's, played to and fro, on the way back
+             upside down, so that lines are read from first to last as the camera reads them: seconds a frame, peaks,
+             and readout times
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ import tempfile
 import time
 import warnings
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +75,7 @@ import types
 from rsundistort.batch import progress
 progress.time = types.SimpleNamespace(perf_counter=time.process_time)
 """
+LONG = ("street", "round", "to-and-fro")
 PARTS = ("walk", "level", "pan", "two", "readout", "stabilised", "gopro", "peer", "length")
 
 
@@ -320,7 +324,9 @@ def ours(video: Path, camera: str) -> dict[str, Any]:
         found = in_child(BY_PROCESSOR + OURS, video, Path(folder), "--camera", camera)
         if "crash" not in found:
             solution = json.loads(Path(folder, "out", "solution.json").read_text())
-            found["frames"] = solution["quality"]["readout_time"]["frames"]
+            readout = solution["quality"]["readout_time"]
+            found["frames"] = readout["frames"]
+            found["readout_ms"] = [round(1e3 * readout[name], 3) for name in ("seconds", "sigma")]
             found["seconds"] = seconds = dict.fromkeys((each["name"] for each in solution["stages"]), 0.0)
             for each in solution["stages"]:  # one comes twice
                 seconds[each["name"]] = round(seconds[each["name"]] + each["seconds"], 1)
@@ -354,6 +360,17 @@ def peer(args: argparse.Namespace) -> None:
         print(json.dumps(said | ratios), flush=True)
 
 
+def first_frames(video: Path, out: Path, num_frames: int) -> None:
+    """The first frames of a video."""
+    with av.open(str(video)) as source, av.open(str(out), "w") as container:
+        of = source.streams.video[0]
+        stream = container.add_stream("libx264", rate=of.average_rate, options={"crf": "16", "preset": "veryfast"})
+        stream.width, stream.height, stream.pix_fmt = of.width, of.height, "yuv420p"
+        for frame in islice(source.decode(video=0), num_frames):
+            container.mux(stream.encode(frame.reformat(format="yuv420p")))
+        container.mux(stream.encode())
+
+
 def to_and_fro(video: Path, out: Path, num_frames: int) -> None:
     """A video played forwards and, upside down, backwards until it has so many frames.
 
@@ -379,15 +396,22 @@ def to_and_fro(video: Path, out: Path, num_frames: int) -> None:
 
 def length(args: argparse.Namespace) -> None:
     """Time and memory of longer videos."""
-    for num_frames in args.frames:
-        with tempfile.TemporaryDirectory() as folder:
-            video = Path(folder) / "clip.mp4"
-            to_and_fro(args.shared / "video" / "gopro-hero5-gentle.mp4", video, num_frames)
-            found = ours(video, GOPRO)
-        said: dict[str, Any] = {"of_frames": num_frames}
-        if "crash" not in found:
-            said |= {f"{name}_per_frame": round(found[f"{kind}_s"] / num_frames, 3) for name, kind in KINDS.items()}
-        print(json.dumps(said | found), flush=True)
+    for kind in args.long:
+        for num_frames in args.frames:
+            said: dict[str, Any] = {"of": kind, "of_frames": num_frames}
+            with tempfile.TemporaryDirectory() as folder:
+                video, camera = Path(folder) / "clip.mp4", GOPRO
+                if kind == "to-and-fro":
+                    to_and_fro(args.shared / "video" / "gopro-hero5-gentle.mp4", video, num_frames)
+                else:
+                    clip = clip_folder(args.clips, kind, 0, max(args.frames))
+                    said["true_ms"] = round(read_solution(clip / "ground_truth.json").options["readout_ms"], 3)
+                    first_frames(clip / "clip.mp4", video, num_frames)
+                    camera = str(clip / "camera.json")
+                found = ours(video, camera)
+            if "crash" not in found:
+                said |= {f"{name}_per_frame": round(found[f"{kind}_s"] / num_frames, 3) for name, kind in KINDS.items()}
+            print(json.dumps(said | found), flush=True)
 
 
 def main() -> None:
@@ -398,6 +422,7 @@ def main() -> None:
     parser.add_argument("--num", type=int, default=20)
     parser.add_argument("--first-seed", type=int, default=100)
     parser.add_argument("--frames", type=int, nargs="+", default=(300, 600, 1200, 1800))
+    parser.add_argument("--long", choices=LONG, nargs="+", default=LONG)
     parser.add_argument("--shared", type=Path, default=Path(__file__).parents[2] / "shared")
     args = parser.parse_args()
     warnings.simplefilter("ignore")

@@ -21,8 +21,8 @@ from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.bundle.reduced import Reduced, factor
 from rsundistort.bundle.solver import minimize
-from rsundistort.bundle.sparse_blocks import SparseBlocks
-from rsundistort.bundle.structure import Structure
+from rsundistort.bundle.sparse_blocks import Chain, SparseBlocks
+from rsundistort.bundle.structure import BlockPattern, Structure
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -250,7 +250,7 @@ def test_inverse_inside_the_envelope_is_that_of_dense_algebra(rng, monkeypatch, 
         np.testing.assert_allclose(blocks[i], own, rtol=1e-9, atol=1e-12 * np.abs(own).max())
 
 
-@pytest.mark.parametrize("nb", [5, 9, 18, 19])  # the last is not unrolled
+@pytest.mark.parametrize("nb", [1, 5, 9, 18, 19])  # kernels take six, three and two at a time
 def test_sparse_blocks_solve_and_invert_as_dense_algebra_does(rng, nb):
     grid = Grid(rng, long=7, nb=nb)
     shape = SparseBlocks.of(grid.pattern, grid.free)
@@ -276,6 +276,33 @@ def test_sparse_blocks_solve_and_invert_as_dense_algebra_does(rng, nb):
         wanted = dense[f, :, g]
         size = np.maximum(np.abs(wanted).max(axis=(1, 2), keepdims=True), 1e-300)  # a photo may be held
         np.testing.assert_allclose(inverse / size, wanted / size, rtol=1e-7, atol=1e-10)
+
+
+@pytest.mark.parametrize("num", [1, 3, 6])
+def test_unknowns_of_a_chain_are_eliminated_apart_with_the_same_result(rng, num):
+    m, nb = 30, 11
+    chain = np.arange(m - 1), np.arange(1, m)
+    keys = np.arange(0, m, 4)
+    far = [(a, b) for a in keys for b in keys if a < b]
+    pairs = np.unique(np.concatenate([np.transpose(chain), np.array(far), [(k, k) for k in range(m)]]), axis=0)
+    pattern = BlockPattern(np.searchsorted(pairs[:, 0], np.arange(m + 1)), pairs[:, 1])
+    S = rng.normal(size=(len(pairs), nb, nb))
+    S[pattern.diagonal] = 40 * np.eye(nb) + S[pattern.diagonal] + S[pattern.diagonal].transpose(0, 2, 1)
+    # only neighbours know of each other's last unknowns
+    alone = pairs[:, 1] - pairs[:, 0] > 1
+    S[alone, nb - num :], S[alone, :, nb - num :] = 0.0, 0.0
+    free = rng.random((m, nb)) > 0.1
+    whole, parted = (SparseBlocks.of(pattern, free, each) for each in (None, Chain(*chain, num)))
+    assert parted.num_values < whole.num_values
+    assert parted.multiply_adds < whole.multiply_adds
+    b = rng.normal(size=(5, m, nb))
+    results = []
+    for shape in (whole, parted):
+        factor, found = shape.factor(S), shape.gather(b)
+        factor.solve(found)
+        results.append((shape.scatter(found), factor.inverse_blocks(), factor.inverse_blocks_of(*chain)))
+    for one, other in zip(*results, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
 def test_sparse_blocks_fill_no_more_than_the_order_of_a_chain_needs(rng):

@@ -1,7 +1,9 @@
 """Factor of a symmetric matrix of blocks, of which most are zero: U' U with U block upper triangular.
 
-Block i (nb x nb) stands in block row k, row_start[k] <= i < row_start[k + 1], and block column cols[i] >= k, ascending
-from the diagonal; with those that the factorisation fills. `unknowns` stands for nb, see `_jit.unknowns_of`.
+Block row k has size[k] rows, which stand one after the other in data[start[k]:start[k + 1]]: the blocks of columns
+cols[i] >= k, row_start[k] <= i < row_start[k + 1], ascending from the diagonal, with those that the factorisation
+fills. Block i begins in column[i] of these rows, so that blocks of neighbouring columns lie side by side, and products
+run along all of them at once.
 """
 
 from __future__ import annotations
@@ -10,27 +12,31 @@ import math
 
 import numpy as np
 
-from ._jit import SUMS, columns, kernel, parallel_kernel, prange
+from ._jit import SUMS, kernel, parallel_kernel, prange
+
+# Columns of a product that are taken together: with three rows of a factor they fit in a processor's cache.
+_TOGETHER = 512
 
 
 @kernel()
-def eliminate(row_start, cols, order, joined):
-    """An order in which block rows fill few blocks, each time the one with the fewest neighbours (minimum degree).
+def eliminate(row_start, cols, weight, order, joined):
+    """An order in which block rows fill few blocks, each time the one with the lightest neighbours (minimum degree).
 
-    joined (m, m) bool, false before, gets the neighbours of each row when it is eliminated, without the diagonal.
+    weight (n,) are the sizes of the block rows; joined (n, n) bool, false before, gets the neighbours of each row when
+    it is eliminated, without the diagonal.
     """
-    m = len(order)
-    for f in range(m):
+    n = len(order)
+    for f in range(n):
         for i in range(row_start[f], row_start[f + 1]):
             if cols[i] != f:
                 joined[f, cols[i]] = joined[cols[i], f] = True
-    degree = np.empty(m, np.int64)
-    for f in range(m):
-        degree[f] = joined[f].sum()
-    left = np.ones(m, np.bool_)
-    for step in range(m):
+    degree = np.empty(n, np.int64)
+    for f in range(n):
+        degree[f] = (joined[f] * weight).sum()
+    left = np.ones(n, np.bool_)
+    for step in range(n):
         best = -1
-        for f in range(m):
+        for f in range(n):
             if left[f] and (best < 0 or degree[f] < degree[best]):
                 best = f
         order[step] = best
@@ -41,12 +47,12 @@ def eliminate(row_start, cols, order, joined):
             for g in around:
                 if f != g:
                     joined[f, g] = True
-            degree[f] = joined[f].sum()
+            degree[f] = (joined[f] * weight).sum()
 
 
 @kernel(forceinline=True)
 def _place(row_start, cols, row, col):
-    """Where a block of the upper triangle stands."""
+    """Where a block of the upper triangle stands; -1 if it is not there."""
     low, high = row_start[row], row_start[row + 1] - 1
     while low < high:
         middle = (low + high) // 2
@@ -54,219 +60,363 @@ def _place(row_start, cols, row, col):
             low = middle + 1
         else:
             high = middle
-    return low
+    return low if cols[low] == col else -1
 
 
-@kernel()
-def fill_blocks(row_start, cols, first, second, S, scale, free, U):
-    """Blocks S (blocks, nb, nb), between rows first[i] and second[i] in either order, into those of U, scaled.
+@parallel_kernel()
+def fill_blocks(row_start, cols, column, start, size, first, second, S, scale, free, rank, begin, data):
+    """Blocks S (blocks, nb, nb) of photos first[i] and second[i] into the data, scaled.
 
-    scale, free (m, nb); rows of held unknowns are those of the identity.
+    A photo's unknowns are those of parts, begin[a] to begin[a + 1], each a block row: rank (m, parts). scale, free
+    (m, nb); rows of held unknowns are those of the identity. Blocks that are not there are zero in S.
     """
-    U[:] = 0.0
-    nb = S.shape[1]
-    for i in range(len(S)):
+    parts = rank.shape[1]
+    data[:] = 0.0
+    for i in prange(len(S)):
         f, g = first[i], second[i]
-        at = _place(row_start, cols, min(f, g), max(f, g))
-        for a in range(nb):
-            for b in range(nb):
-                value = S[i, a, b] * scale[f, a] * scale[g, b] * free[f, a] * free[g, b]
-                if f <= g:
-                    U[at, a, b] = value
-                else:
-                    U[at, b, a] = value
-    for f in range(len(scale)):
-        for a in range(nb):
-            if not free[f, a]:
-                U[row_start[f], a, a] = 1.0
+        for a in range(parts):
+            # of a photo with itself each pair of parts once
+            for b in range(a if f == g else 0, parts):
+                row, col = rank[f, a], rank[g, b]
+                at = _place(row_start, cols, min(row, col), max(row, col))
+                if at < 0:
+                    continue
+                low = min(row, col)
+                wide = (start[low + 1] - start[low]) // size[low]
+                where = start[low] + column[at]
+                for p in range(begin[a], begin[a + 1]):
+                    for q in range(begin[b], begin[b + 1]):
+                        value = S[i, p, q] * scale[f, p] * scale[g, q] * free[f, p] * free[g, q]
+                        if row <= col:
+                            data[where + (p - begin[a]) * wide + q - begin[b]] = value
+                        else:
+                            data[where + (q - begin[b]) * wide + p - begin[a]] = value
+    for f in prange(len(rank)):
+        for a in range(parts):
+            row = rank[f, a]
+            wide = (start[row + 1] - start[row]) // size[row]
+            for p in range(size[row]):
+                if not free[f, begin[a] + p]:
+                    data[start[row] + p * wide + p] = 1.0
 
 
 @kernel(fastmath=SUMS)
-def _subtract_product(unknowns, A, B, out):
-    """A' B from out, six of its rows and three rows of both at a time: what is loaded serves several products."""
-    nb = columns(unknowns)
-    whole = nb // 6 * 6
-    for c in range(0, whole, 3):
-        for a in range(0, whole, 6):
-            u0, u1, u2 = A[c, a], A[c + 1, a], A[c + 2, a]
-            v0, v1, v2 = A[c, a + 1], A[c + 1, a + 1], A[c + 2, a + 1]
-            w0, w1, w2 = A[c, a + 2], A[c + 1, a + 2], A[c + 2, a + 2]
-            x0, x1, x2 = A[c, a + 3], A[c + 1, a + 3], A[c + 2, a + 3]
-            y0, y1, y2 = A[c, a + 4], A[c + 1, a + 4], A[c + 2, a + 4]
-            z0, z1, z2 = A[c, a + 5], A[c + 1, a + 5], A[c + 2, a + 5]
-            for b in range(nb):
-                b0, b1, b2 = B[c, b], B[c + 1, b], B[c + 2, b]
-                out[a, b] -= u0 * b0 + u1 * b1 + u2 * b2
-                out[a + 1, b] -= v0 * b0 + v1 * b1 + v2 * b2
-                out[a + 2, b] -= w0 * b0 + w1 * b1 + w2 * b2
-                out[a + 3, b] -= x0 * b0 + x1 * b1 + x2 * b2
-                out[a + 4, b] -= y0 * b0 + y1 * b1 + y2 * b2
-                out[a + 5, b] -= z0 * b0 + z1 * b1 + z2 * b2
-    for c in range(nb):
-        # rows of out that are left, and rows of both
-        for a in range(whole if c < whole else 0, nb):
-            x0 = A[c, a]
-            for b in range(nb):
-                out[a, b] -= x0 * B[c, b]
+def _subtract_product(A, at, A_wide, h, w, B, begin, B_wide, out, to, wide, n):
+    """A' B from out: h rows of A (w columns from `at`) and of B (n columns from `begin`), w rows of out from `to`.
+
+    All are rows in one-dimensional data, so many values apart. Six rows of out and three of the others are taken at a
+    time: what is loaded serves several products.
+    """
+    whole, three = w // 6 * 6, h // 3 * 3
+    for low in range(0, n, _TOGETHER):
+        m = min(_TOGETHER, n - low)
+        for c in range(0, three, 3):
+            b = begin + c * B_wide + low
+            b0, b1, b2 = B[b : b + m], B[b + B_wide :], B[b + 2 * B_wide :]
+            for a in range(0, whole, 6):
+                s = at + c * A_wide + a
+                u0, u1, u2 = A[s], A[s + A_wide], A[s + 2 * A_wide]
+                v0, v1, v2 = A[s + 1], A[s + A_wide + 1], A[s + 2 * A_wide + 1]
+                w0, w1, w2 = A[s + 2], A[s + A_wide + 2], A[s + 2 * A_wide + 2]
+                x0, x1, x2 = A[s + 3], A[s + A_wide + 3], A[s + 2 * A_wide + 3]
+                y0, y1, y2 = A[s + 4], A[s + A_wide + 4], A[s + 2 * A_wide + 4]
+                z0, z1, z2 = A[s + 5], A[s + A_wide + 5], A[s + 2 * A_wide + 5]
+                t = to + a * wide + low
+                o0, o1, o2 = out[t:], out[t + wide :], out[t + 2 * wide :]
+                o3, o4, o5 = out[t + 3 * wide :], out[t + 4 * wide :], out[t + 5 * wide :]
+                for k in range(m):
+                    p, q, r = b0[k], b1[k], b2[k]
+                    o0[k] -= u0 * p + u1 * q + u2 * r
+                    o1[k] -= v0 * p + v1 * q + v2 * r
+                    o2[k] -= w0 * p + w1 * q + w2 * r
+                    o3[k] -= x0 * p + x1 * q + x2 * r
+                    o4[k] -= y0 * p + y1 * q + y2 * r
+                    o5[k] -= z0 * p + z1 * q + z2 * r
+        for c in range(h):
+            b = begin + c * B_wide + low
+            row = B[b : b + m]
+            # rows of out that are left, and rows of both
+            for a in range(whole if c < three else 0, w):
+                x, o = A[at + c * A_wide + a], out[to + a * wide + low :]
+                for k in range(m):
+                    o[k] -= x * row[k]
+
+
+@kernel(forceinline=True)
+def _run(cols, p, end, at, last):
+    """How many blocks from p and from `at` on are of the same columns, before `end` and `last`."""
+    run = 1
+    while p + run < end and at + run < last and cols[at + run] == cols[p + run]:
+        run += 1
+    return run
+
+
+@kernel(forceinline=True)
+def _together(cols, p, end):
+    """How many blocks from p on are of columns that follow each other."""
+    run = 1
+    while p + run < end and cols[p + run] == cols[p] + run:
+        run += 1
+    return run
 
 
 @parallel_kernel(fastmath=SUMS)
-def factor_blocks(unknowns, row_start, cols, U):
+def factor_blocks(row_start, cols, column, start, size, data):
     """The factor in place of the matrix; False if that is not positive."""
-    nb = columns(unknowns)
-    for k in range(len(row_start) - 1):
-        start, end = row_start[k], row_start[k + 1]
-        D = U[start]
-        for j in range(nb):
-            for i in range(j + 1):
-                v = D[i, j]
-                for c in range(i):
-                    v -= D[c, i] * D[c, j]
-                if i < j:
-                    D[i, j] = v / D[i, i]
-                elif v > 1e-15:  # of a unit diagonal
-                    D[j, j] = math.sqrt(v)
-                else:
-                    return False
-        for p in range(start + 1, end):
-            B = U[p]
-            for i in range(nb):
-                for c in range(i):
-                    x = D[c, i]
-                    for b in range(nb):
-                        B[i, b] -= x * B[c, b]
-                x = 1.0 / D[i, i]
-                for b in range(nb):
-                    B[i, b] *= x
-        for p in prange(start + 1, end):
-            at = row_start[cols[p]]
-            for q in range(p, end):
+    for k in range(len(size)):
+        h, base = size[k], start[k]
+        wide = (start[k + 1] - base) // h
+        for i in range(h):
+            own = data[base + i * wide : base + (i + 1) * wide]
+            if not own[i] > 1e-15:  # of a unit diagonal
+                return False
+            x = 1.0 / math.sqrt(own[i])
+            for b in range(i, wide):
+                own[b] *= x
+            for r in range(i + 1, h):
+                x, row = own[r], data[base + r * wide : base + (r + 1) * wide]
+                for b in range(r, wide):
+                    row[b] -= x * own[b]
+        end = row_start[k + 1]
+        for p in prange(row_start[k] + 1, end):
+            to = cols[p]
+            w, last = size[to], row_start[to + 1]
+            to_wide = (start[to + 1] - start[to]) // w
+            at, q = row_start[to], p
+            while q < end:
                 while cols[at] != cols[q]:
                     at += 1
-                _subtract_product(unknowns, U[p], U[q], U[at])
+                run = _run(cols, q, end, at, last)
+                n = column[q + run - 1] + size[cols[q + run - 1]] - column[q]
+                _subtract_product(
+                    data, base + column[p], wide, h, w, data, base + column[q], wide, data, start[to] + column[at],
+                    to_wide, n,
+                )  # fmt: skip
+                q += run
+                at += run
     return True
 
 
+@kernel(fastmath=SUMS)
+def _take_from(data, at, wide, h, s, n, y, to):
+    """Rows of n values of the data, h of them and six at a time, times s (h, 4), from y (., 4) from `to` on."""
+    six = h // 6 * 6
+    for i in range(0, six, 6):
+        r = at + i * wide
+        u0, u1, u2 = data[r : r + n], data[r + wide :], data[r + 2 * wide :]
+        u3, u4, u5 = data[r + 3 * wide :], data[r + 4 * wide :], data[r + 5 * wide :]
+        a, b, c, d, e, f = s[i], s[i + 1], s[i + 2], s[i + 3], s[i + 4], s[i + 5]
+        a0, b0, c0, d0, e0, f0 = a[0], b[0], c[0], d[0], e[0], f[0]
+        a1, b1, c1, d1, e1, f1 = a[1], b[1], c[1], d[1], e[1], f[1]
+        a2, b2, c2, d2, e2, f2 = a[2], b[2], c[2], d[2], e[2], f[2]
+        a3, b3, c3, d3, e3, f3 = a[3], b[3], c[3], d[3], e[3], f[3]
+        for k in range(n):
+            v0, v1, v2, v3, v4, v5 = u0[k], u1[k], u2[k], u3[k], u4[k], u5[k]
+            o = y[to + k]
+            o[0] -= v0 * a0 + v1 * b0 + v2 * c0 + v3 * d0 + v4 * e0 + v5 * f0
+            o[1] -= v0 * a1 + v1 * b1 + v2 * c1 + v3 * d1 + v4 * e1 + v5 * f1
+            o[2] -= v0 * a2 + v1 * b2 + v2 * c2 + v3 * d2 + v4 * e2 + v5 * f2
+            o[3] -= v0 * a3 + v1 * b3 + v2 * c3 + v3 * d3 + v4 * e3 + v5 * f3
+    for i in range(six, h):
+        u, a0, a1, a2, a3 = data[at + i * wide :], s[i, 0], s[i, 1], s[i, 2], s[i, 3]
+        for k in range(n):
+            v, o = u[k], y[to + k]
+            o[0] -= v * a0
+            o[1] -= v * a1
+            o[2] -= v * a2
+            o[3] -= v * a3
+
+
+@kernel(fastmath=SUMS)
+def _take_sums(data, at, wide, h, s, n, y, to):
+    """Rows of n values of the data, h of them, times y (n, 4), from `to` on, from s (h, 4); three at a time."""
+    three = h // 3 * 3
+    for i in range(0, three, 3):
+        r = at + i * wide
+        u0, u1, u2 = data[r : r + n], data[r + wide :], data[r + 2 * wide :]
+        a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = c0 = c1 = c2 = c3 = 0.0
+        for k in range(n):
+            o, v0, v1, v2 = y[to + k], u0[k], u1[k], u2[k]
+            y0, y1, y2, y3 = o[0], o[1], o[2], o[3]
+            a0 += v0 * y0
+            a1 += v0 * y1
+            a2 += v0 * y2
+            a3 += v0 * y3
+            b0 += v1 * y0
+            b1 += v1 * y1
+            b2 += v1 * y2
+            b3 += v1 * y3
+            c0 += v2 * y0
+            c1 += v2 * y1
+            c2 += v2 * y2
+            c3 += v2 * y3
+        a, b, c = s[i], s[i + 1], s[i + 2]
+        a[0] -= a0
+        a[1] -= a1
+        a[2] -= a2
+        a[3] -= a3
+        b[0] -= b0
+        b[1] -= b1
+        b[2] -= b2
+        b[3] -= b3
+        c[0] -= c0
+        c[1] -= c1
+        c[2] -= c2
+        c[3] -= c3
+    for i in range(three, h):
+        u = data[at + i * wide :]
+        for j in range(4):
+            t = 0.0
+            for k in range(n):
+                t += u[k] * y[to + k, j]
+            s[i, j] -= t
+
+
 @parallel_kernel(fastmath=SUMS)
-def solve_blocks(row_start, cols, U, x):
-    """Right-hand sides x (k, m, nb) become solutions.
+def solve_blocks(row_start, cols, column, start, size, position, data, x):
+    """Right-hand sides x (k, unknowns) become solutions; block row i has the unknowns from position[i] on.
 
     Four are solved at a time, since reading the factor from memory dominates the time of a solution.
     """
-    m, nb = x.shape[1:]
+    rows = len(size)
     for quad in prange((len(x) + 3) // 4):
         first, count = 4 * quad, min(4, len(x) - 4 * quad)
         # those beyond the last are zero
-        y = np.zeros((m, nb, 4))
+        y = np.zeros((x.shape[1], 4))
         for j in range(count):
-            y[:, :, j] = x[first + j]
-        for k in range(m):
-            start = row_start[k]
-            for i in range(nb):
-                scale = 1.0 / U[start, i, i]
+            y[:, j] = x[first + j]
+        for k in range(rows):
+            h = size[k]
+            wide, own = (start[k + 1] - start[k]) // h, position[k]
+            for i in range(h):
+                row = data[start[k] + i * wide :]
+                d = 1.0 / row[i]
                 for j in range(4):
-                    y[k, i, j] *= scale
-                for b in range(i + 1, nb):
+                    y[own + i, j] *= d
+                for b in range(i + 1, h):
                     for j in range(4):
-                        y[k, b, j] -= U[start, i, b] * y[k, i, j]
-            for p in range(start + 1, row_start[k + 1]):
-                for b in range(nb):
-                    t0 = t1 = t2 = t3 = 0.0
-                    for i in range(nb):
-                        u = U[p, i, b]
-                        t0 += u * y[k, i, 0]
-                        t1 += u * y[k, i, 1]
-                        t2 += u * y[k, i, 2]
-                        t3 += u * y[k, i, 3]
-                    y[cols[p], b, 0] -= t0
-                    y[cols[p], b, 1] -= t1
-                    y[cols[p], b, 2] -= t2
-                    y[cols[p], b, 3] -= t3
-        for k in range(m - 1, -1, -1):
-            start = row_start[k]
-            for p in range(start + 1, row_start[k + 1]):
-                for i in range(nb):
-                    t0 = t1 = t2 = t3 = 0.0
-                    for b in range(nb):
-                        u = U[p, i, b]
-                        t0 += u * y[cols[p], b, 0]
-                        t1 += u * y[cols[p], b, 1]
-                        t2 += u * y[cols[p], b, 2]
-                        t3 += u * y[cols[p], b, 3]
-                    y[k, i, 0] -= t0
-                    y[k, i, 1] -= t1
-                    y[k, i, 2] -= t2
-                    y[k, i, 3] -= t3
-            for i in range(nb - 1, -1, -1):
-                for b in range(i + 1, nb):
+                        y[own + b, j] -= row[b] * y[own + i, j]
+            p, end = row_start[k] + 1, row_start[k + 1]
+            while p < end:
+                run = _together(cols, p, end)
+                n = column[p + run - 1] + size[cols[p + run - 1]] - column[p]
+                _take_from(data, start[k] + column[p], wide, h, y[own : own + h], n, y, position[cols[p]])
+                p += run
+        for k in range(rows - 1, -1, -1):
+            h = size[k]
+            wide, own = (start[k + 1] - start[k]) // h, position[k]
+            p, end = row_start[k] + 1, row_start[k + 1]
+            while p < end:
+                run = _together(cols, p, end)
+                n = column[p + run - 1] + size[cols[p + run - 1]] - column[p]
+                _take_sums(data, start[k] + column[p], wide, h, y[own : own + h], n, y, position[cols[p]])
+                p += run
+            for i in range(h - 1, -1, -1):
+                row = data[start[k] + i * wide :]
+                for b in range(i + 1, h):
                     for j in range(4):
-                        y[k, i, j] -= U[start, i, b] * y[k, b, j]
-                scale = 1.0 / U[start, i, i]
+                        y[own + i, j] -= row[b] * y[own + b, j]
+                d = 1.0 / row[i]
                 for j in range(4):
-                    y[k, i, j] *= scale
+                    y[own + i, j] *= d
         for j in range(count):
-            x[first + j] = y[:, :, j]
+            x[first + j] = y[:, j]
+
+
+@kernel(fastmath=SUMS)
+def _subtract_outer(A, at, A_wide, h, B, begin, B_wide, w, out, to, wide, n):
+    """A B' from out: h rows of A and w of B, n columns from `at` and `begin`; two of each at a time."""
+    for i in range(0, h, 2):
+        i2 = min(i + 1, h - 1)
+        a0, a1 = A[at + i * A_wide : at + i * A_wide + n], A[at + i2 * A_wide :]
+        for j in range(0, w, 2):
+            j2 = min(j + 1, w - 1)
+            b0, b1 = B[begin + j * B_wide :], B[begin + j2 * B_wide :]
+            s00 = s01 = s10 = s11 = 0.0
+            for k in range(n):
+                s00 += a0[k] * b0[k]
+                s01 += a0[k] * b1[k]
+                s10 += a1[k] * b0[k]
+                s11 += a1[k] * b1[k]
+            out[to + i * wide + j] -= s00
+            if j2 > j:
+                out[to + i * wide + j2] -= s01
+            if i2 > i:
+                out[to + i2 * wide + j] -= s10
+                if j2 > j:
+                    out[to + i2 * wide + j2] -= s11
 
 
 @parallel_kernel(fastmath=SUMS)
-def invert_blocks(unknowns, row_start, cols, Z):
+def invert_blocks(row_start, cols, column, start, size, parts, data):
     """A factor becomes, in place, the inverse of its matrix where it has blocks itself.
 
     From the last row to the first (Takahashi, Fagan and Chin, "Formation of a sparse bus impedance matrix", 1973): with
     W = D^-1 U the row left of its diagonal block D, the inverse is -W Z on the right and D^-1 D^-T + W Z W' on the
-    diagonal, Z being the inverse of the rows after it.
+    diagonal, Z being the inverse of the rows after it. `parts` of W Z are summed side by side; their number decides the
+    rounding, not that of the threads.
     """
-    nb, m = columns(unknowns), len(row_start) - 1
-    widest = 1
-    for k in range(m):
-        widest = max(widest, row_start[k + 1] - row_start[k])
-    W, flipped = np.empty((widest, nb, nb)), np.empty((widest, nb, nb))
-    D_inv = np.zeros((nb, nb))
-    for k in range(m - 1, -1, -1):
-        start, end = row_start[k], row_start[k + 1]
-        for j in range(nb):
+    rows = len(size)
+    widest, tallest = 1, 1
+    for k in range(rows):
+        tallest = max(tallest, size[k])
+        widest = max(widest, (start[k + 1] - start[k]) // size[k])
+    W, flipped = np.empty(tallest * widest), np.empty(widest * tallest)
+    sums = np.empty((parts, tallest * widest))
+    D_inv = np.zeros((tallest, tallest))
+    for k in range(rows - 1, -1, -1):
+        h, base, begin, end = size[k], start[k], row_start[k], row_start[k + 1]
+        wide = (start[k + 1] - base) // h
+        n = wide - h  # on the right of the diagonal block
+        for j in range(h):
             for i in range(j, -1, -1):
                 v = 1.0 if i == j else 0.0
                 for c in range(i + 1, j + 1):
-                    v -= Z[start, i, c] * D_inv[c, j]
-                D_inv[i, j] = v / Z[start, i, i]
-        for p in range(start + 1, end):
-            for i in range(nb):
-                for b in range(nb):
-                    v = 0.0
-                    for c in range(i, nb):
-                        v += D_inv[i, c] * Z[p, c, b]
-                    W[p - start, i, b] = flipped[p - start, b, i] = v
-        # blocks on the right are read and written here, but never the same
-        for p in prange(start + 1, end):
-            out, other = Z[p], np.empty((nb, nb))
-            out[:] = 0.0
-            col = cols[p]
-            for q in range(start + 1, end):
-                at = _place(row_start, cols, min(col, cols[q]), max(col, cols[q]))
-                if q <= p:
-                    _subtract_product(unknowns, flipped[q - start], Z[at], out)
-                else:
-                    for a in range(nb):
-                        for b in range(nb):
-                            other[a, b] = Z[at, b, a]
-                    _subtract_product(unknowns, flipped[q - start], other, out)
-        D = Z[start]
-        for i in range(nb):
-            for j in range(i, nb):
+                    v -= data[base + i * wide + c] * D_inv[c, j]
+                D_inv[i, j] = v / data[base + i * wide + i]
+        for i in range(h):
+            own = W[i * n : (i + 1) * n]
+            own[:] = 0.0
+            for c in range(i, h):
+                x, row = D_inv[i, c], data[base + c * wide + h : base + (c + 1) * wide]
+                for b in range(n):
+                    own[b] += x * row[b]
+            for b in range(n):
+                flipped[b * h + i] = own[b]
+        used = parts if end - begin > 2 * parts else 1
+        for part in prange(used):
+            out = sums[part]
+            out[: h * n] = 0.0
+            for p in range(begin + 1 + part, end, used):
+                row, a = cols[p], column[p] - h
+                w, last = size[row], row_start[row + 1]
+                row_wide = (start[row + 1] - start[row]) // w
+                at, q = row_start[row], p
+                while q < end:
+                    while cols[at] != cols[q]:
+                        at += 1
+                    run = _run(cols, q, end, at, last)
+                    m = column[q + run - 1] + size[cols[q + run - 1]] - column[q]
+                    Z, b = start[row] + column[at], column[q] - h
+                    _subtract_product(flipped, a * h, h, w, h, data, Z, row_wide, out, b, n, m)
+                    # and what is below the diagonal of Z, which is that row's mirror image
+                    skip = w if q == p else 0
+                    if m > skip:
+                        _subtract_outer(W, b + skip, n, h, data, Z + skip, row_wide, w, out, a, n, m - skip)
+                    q += run
+                    at += run
+        for part in range(1, used):
+            for i in range(h * n):
+                sums[0, i] += sums[part, i]
+        for i in range(h):
+            for b in range(n):
+                data[base + i * wide + h + b] = sums[0, i * n + b]
+        for i in range(h):
+            for j in range(i, h):
                 v = 0.0
-                for c in range(j, nb):
+                for c in range(j, h):
                     v += D_inv[i, c] * D_inv[j, c]
-                D[i, j] = v
-            for j in range(i):
-                D[i, j] = 0.0
-        for p in range(start + 1, end):
-            for i in range(nb):
-                for j in range(i, nb):
-                    v = 0.0
-                    for b in range(nb):
-                        v += W[p - start, i, b] * Z[p, j, b]
-                    D[i, j] -= v
-        for i in range(nb):
-            for j in range(i):
-                D[i, j] = D[j, i]
+                own, other = W[i * n : (i + 1) * n], sums[0, j * n : (j + 1) * n]
+                for b in range(n):
+                    v -= own[b] * other[b]
+                data[base + i * wide + j] = data[base + j * wide + i] = v

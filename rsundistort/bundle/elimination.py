@@ -11,7 +11,7 @@ from .coarse_space import CoarseSpace
 from .conjugate_gradients import solve_iteratively
 from .envelope import Envelope
 from .reduced import Factored, Reduced, factor
-from .sparse_blocks import SparseBlocks
+from .sparse_blocks import Chain, SparseBlocks
 from .structure import Structure
 
 __all__ = ["Elimination"]
@@ -63,16 +63,20 @@ class Elimination:
         poses: tuple[Array, Array],
         factor_limit: float | None,
         cg_tolerance: float,
-        on_path: bool = False,
+        chain: Chain | None = None,
     ) -> Elimination:
         """Choose between factorisation and conjugate gradients, for photos at R_cw (m, 3, 3) and center_w (m, 3).
 
         Conjugate gradients are taken if they are expected to take half the time of the factorisation, or, with a limit,
         if that takes more multiply-adds. In the first case they may take as long as the factorisation, which then
-        solves what they have not. Frames that are on one path share points with few others, key frames with any: their
+        solves what they have not. Frames that a path chains share points with few others, key frames with any: their
         factor is sparse inside its envelope.
         """
-        shape = SparseBlocks.of(structure.pattern, free) if on_path else Envelope.smallest(structure.pattern, free)
+        shape = (
+            Envelope.smallest(structure.pattern, free)
+            if chain is None
+            else SparseBlocks.of(structure.pattern, free, chain)
+        )
         adds = shape.multiply_adds
         products = 2 * _WAIT * 2 * len(structure.pattern.cols) * free.shape[1] ** 2  # of one iteration
         if adds <= (2 * _EXPECTED_CG * products if factor_limit is None else factor_limit):

@@ -29,6 +29,7 @@ from .normal_equations import Marginals, NormalEquations, Step
 from .path_prior import PathPrior, PathState
 from .point_terms import PointTerms
 from .prior_sigmas import PriorSigmas
+from .sparse_blocks import Chain
 from .structure import Structure
 
 __all__ = ["BundleProblem", "State"]
@@ -147,8 +148,9 @@ class BundleProblem:
         self._free = self._free_unknowns()
         self._means, self._means_start = self._motion_means(sigmas), means
         poses = reconstruction.R_cw, reconstruction.center_w
+        chain = None if self._path is None else Chain(self._path.first, self._path.second, 6)
         self._elimination = Elimination.of(
-            self._structure, self._free, poses, options.factor_limit, options.cg_tolerance, self._path is not None
+            self._structure, self._free, poses, options.factor_limit, options.cg_tolerance, chain
         )  # fmt: skip
         self._size = reconstruction.size
 
@@ -400,8 +402,9 @@ class BundleProblem:
             )
         if self._options.varying:
             J_frame[:, :, self._block : self.layout.variation] = self._by_lens(state)[1]
-        change = np.abs(J_frame[:, :, 3:6]).max(axis=(1, 2))
-        singular = np.flatnonzero(change > _SINGULAR * np.median(change))
+        of_place = J_frame[:, :, 3:6]
+        change = np.einsum("oia,oia->o", of_place, of_place)
+        singular = np.flatnonzero(change > _SINGULAR**2 * np.median(change))
         res[singular], J_frame[singular] = 0.0, 0.0
         return res, J_frame, float(cost.sum()), singular
 

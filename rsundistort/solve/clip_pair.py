@@ -73,7 +73,10 @@ class FramePair:
         camera, xy = self.camera, self.xy
         rotation = rotation_between(xy[0], xy[1], camera)
         best: tuple[int, NDArray[np.float64], NDArray[np.float64], RowMotion, NDArray[np.bool_]] | None = None
-        for share in () if rotation is None else _SHARES if readout_share is None else (readout_share,):
+        little = ReconstructionError(f"{self.names[0]} and {self.names[1]} share too little of the scene")
+        if rotation is None:
+            raise little
+        for share in _SHARES if readout_share is None else (readout_share,):
             motion = RowMotion(share * rotation / camera.frame_span)
             (a, seen_a), (b, seen_b) = (unproject_points(each, camera, motion, "rotation") for each in xy)
             seen, within = seen_a & seen_b, _WITHIN_PX / float(camera.K[0, 0])
@@ -86,7 +89,7 @@ class FramePair:
             if best is None or mask.sum() > best[0]:
                 best = int(mask.sum()), R, way.ravel(), motion, mask
         if best is None or best[0] < _LEAST_AGREEING:
-            raise ReconstructionError(f"{self.names[0]} and {self.names[1]} share too little of the scene")
+            raise little
         _, R, way, motion, mask = best
         rays = [unproject_points(each[mask], camera, motion, "rotation")[0] for each in xy]
         local = cv2.triangulatePoints(np.eye(3, 4), np.column_stack([R, way]), rays[0].T, rays[1].T)

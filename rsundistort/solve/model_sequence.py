@@ -46,7 +46,7 @@ from .outcome import Solved
 from .placing import place_photos
 from .survey import Survey
 
-__all__ = ["TrackSource", "rough_options", "solve_photos", "solve_tracks"]
+__all__ = ["TrackSource", "rough_options", "solve_photos", "solve_tracks", "without_shutter"]
 
 # Re-triangulation ends when no rectified pixel of any photo moves by more than this between two rounds, in pixels of
 # the images that the features were detected in; or when less than this share of the measurements changes, so that the
@@ -293,7 +293,7 @@ def solve_tracks(
             advice = advise(result, options)
         log.end("critical motion", remedy=mended.name, sigma_log_k=mended.after.sigma_log_k)
     log.begin("comparison with a global shutter")
-    global_result = _without_shutter(result, options)
+    global_result = without_shutter(result, options)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
     log.begin("verdict")
     measured = mapped if track_source is None else tracks
@@ -382,7 +382,7 @@ def _chosen(
     return choice, result, tracks, options
 
 
-def _without_shutter(result: BundleResult, options: BundleOptions) -> BundleResult:
+def without_shutter(result: BundleResult, options: BundleOptions) -> BundleResult:
     """The same measurements explained by a global shutter, for comparison."""
     if result.reconstruction.shutter_model == "global":
         return result

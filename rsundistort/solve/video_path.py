@@ -31,7 +31,7 @@ from .clip_gyroscope import Felt, felt_gyroscope, own_gyroscope, readout_of, rot
 from .clip_pair import FramePair
 from .clip_pan import rotating_only
 from .clip_tracks import follow_points, followed_again, with_all_frames
-from .model_sequence import rough_options
+from .model_sequence import rough_options, without_shutter
 from .outcome import Solved
 from .placing import place_photos
 
@@ -318,11 +318,12 @@ def _judged(
     log.end("stabilisation", verdict=stabilisation.verdict)
     of_keys = result.of_photos(_are_keys(result, clip))
     log.begin("comparison with a global shutter")
-    at_once = replace(_at_once(options.path), start=_start_of(result, at_once=True))
-    global_result = bundle_adjust(
-        of_keys.reconstruction, "constant-motion",
-        replace(rough_options(options), path=at_once, outlier_rounds=0, prior_sigma_rounds=0, deviations="model"),
-    )  # fmt: skip
+    if options.path.rotation_only:  # there are no positions without a path
+        at_once = replace(_at_once(options.path), start=_start_of(result, at_once=True))
+        rough = replace(rough_options(options), path=at_once, outlier_rounds=0, prior_sigma_rounds=0)
+        global_result = bundle_adjust(of_keys.reconstruction, "constant-motion", rough)
+    else:
+        global_result = without_shutter(of_keys, options)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
     against = stabilisation.reason if stabilisation.verdict == "stabilised" else ""
     verdict = judge_clip(result, of_keys, halves, clip.frame_s, remedy, against, vibration_px, speeds)
