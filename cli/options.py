@@ -230,9 +230,9 @@ PHOTO_OPTIONS: tuple[Decorator, ...] = (
         "--alpha",
         metavar="keep|0..1",
         callback=view_alpha,
-        help="View of the rectified photos. keep: K and size of the raw photos; 0: no photo of a camera has an empty "
-        "pixel; 1: every pixel of all its photos is kept; numbers between are views between these. The default is "
-        "keep, or the view of the solution.",
+        help="View of the rectified photos. keep: K, as it was found, and size of the raw photos; 0: no photo of a "
+        "camera has an empty pixel; 1: every pixel of all its photos is kept; numbers between are views between "
+        "these. The default is the view of the solution, whose pixels stay as near to the raw ones as they can.",
     ),
     click.option(
         "--scale",

@@ -266,3 +266,16 @@ def test_a_point_at_the_lens_neither_moves_nor_says_anything(rng):
     other = problem.linearize(state).marginal_covariances()
     sigma, before = (np.sqrt(np.einsum("maa->ma", each)) for each in (photos, other.photos))
     np.testing.assert_allclose(sigma, before, rtol=0.5)
+
+
+def test_near_points_count_where_most_of_the_scene_is_far(rng):
+    problem, state = noisy_problem(rng, "rotation")
+    given = problem.reconstruction(state)
+    far = given.points_w.copy()
+    far[: int(0.8 * len(far))] *= 1e4
+    mountains = BundleProblem(
+        replace(given, points_w=far), "rotation", BundleOptions(), 0.5, PriorSigmas(0.03, 0.1, 0.02, 0.01)
+    )
+    _, J_frame = mountains.blocks(mountains.initial_state())
+    _, valid = reprojection_residuals(replace(given, points_w=far))
+    assert (J_frame.any(axis=(1, 2)) == valid[mountains._structure.order]).all()

@@ -146,7 +146,8 @@ def test_images_are_what_the_solution_says(courtyard, solved):
     solution, out, _ = solved
     image = solution.registered[2]
     raw = read_photo(courtyard / "photos" / image.name).pixels
-    pixels, mask = rectify(raw, solution.cameras["1"], image.motion, solution.shutter_model)
+    new_camera = solution.rectified_cameras["1"]
+    pixels, mask = rectify(raw, solution.cameras["1"], image.motion, solution.shutter_model, new_camera)
     np.testing.assert_array_equal(read_photo(out / "images" / image.name).pixels, pixels)
     np.testing.assert_array_equal(read_photo(out / "masks" / image.name).pixels, mask)
 

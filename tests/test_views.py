@@ -12,7 +12,7 @@ from rsundistort import undistort_points as undistort
 from rsundistort.batch.views import with_view
 from rsundistort.errors import InputError
 from rsundistort.model.orientation import in_stored_frame, orient_pixels, orient_solution
-from rsundistort.rectify import ViewOptions, init_rectify_map, rectified_roi, rectified_view
+from rsundistort.rectify import ViewOptions, init_rectify_map, rectified_roi, rectified_view, steadiest_pinhole
 from rsundistort.rectify.maps import EDGE_PX
 
 W, H = 320, 240
@@ -46,6 +46,51 @@ def test_one_camera_does_for_all_photos(readout):
         assert kept.min() >= -1e-9  # px; rounding
         assert (kept.max(0) <= np.array([W - 1, H - 1]) + 1e-9).all()
         assert (mask_of(camera, motion, new)[y : y + h, x : x + w] == 255).all()
+
+
+def moved_px(camera, before, new_camera):
+    """How far pixels of the rectified photo lie from where those of the camera before were: root mean square."""
+    raw = np.dstack(np.meshgrid(np.arange(0, W, 4), np.arange(0, H, 4))).reshape(-1, 2).astype(float)
+    now, then = undistort(raw, camera, P=new_camera.K), undistort(raw, before, P=before.K)
+    shown = ((then >= 0) & (then <= [W - 1, H - 1])).all(1)
+    return float(np.sqrt(((now - then)[shown] ** 2).sum(1).mean()))
+
+
+@pytest.mark.parametrize("dist", [[], LENS], ids=["no lens", "lens"])
+def test_a_camera_that_is_confirmed_keeps_its_view(dist):
+    camera = make_camera(dist)
+    np.testing.assert_allclose(steadiest_pinhole(camera, camera).K, K, atol=1e-9)
+
+
+def test_another_focal_length_without_a_lens_zooms_nothing():
+    found = Camera(W, H, K * [[1.03], [1.03], [1.0]] + [[0, 0, -2.0], [0, 0, 1.0], [0, 0, 0]])
+    np.testing.assert_allclose(steadiest_pinhole(found, make_camera([])).K, found.K, atol=1e-9)
+
+
+@pytest.mark.parametrize("dist", [[-0.01, 0.02, 0, 0], [0.02, -0.01, 0.0005, 0]], ids=["barrel", "pincushion"])
+def test_a_lens_that_is_found_moves_the_picture_little_and_leaves_no_wider_border_empty(dist):
+    before, found = make_camera([]), make_camera(dist)
+    new = steadiest_pinhole(found, before)
+    assert moved_px(found, before, new) < 0.8 * moved_px(found, before, found.pinhole())
+    assert new.K[0, 0] / new.K[1, 1] == pytest.approx(K[0, 0] / K[1, 1])
+    # but for the pixels of the border itself
+    empty, empty_before = (mask_of(found, RowMotion(), each)[1:-1, 1:-1] == 0 for each in (new, found.pinhole()))
+    assert empty.sum() <= empty_before.sum()
+
+
+def test_a_wide_lens_that_was_not_known_leaves_no_border_empty():
+    found = make_camera([-0.3, 0.08, 0, 0])
+    new = steadiest_pinhole(found, make_camera([]))
+    assert 0.9 * K[0, 0] < new.K[0, 0] < K[0, 0]
+    assert (mask_of(found, RowMotion(), new)[1:-1, 1:-1] == 255).all()
+
+
+def test_a_fisheye_keeps_its_middle():
+    fisheye = Camera(
+        W, H, K * [[0.45], [0.45], [1.0]] + [[0, 0, 87.0], [0, 0, 66.9], [0, 0, 0]], [0.02, 0, 0, 0], lens="fisheye"
+    )
+    nearly = Camera(W, H, fisheye.K, [0.0205, 0, 0, 0], lens="fisheye")
+    assert steadiest_pinhole(nearly, fisheye).K[0, 0] == pytest.approx(fisheye.K[0, 0], rel=2e-3)
 
 
 @pytest.mark.parametrize("dist", [[-0.12, 0.03, 0, 0], [0.1, 0.02, 0.002, -0.001], [-0.2, 0.05, 0, 0, 0.01]])

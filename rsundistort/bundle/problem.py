@@ -15,6 +15,7 @@ from .._kernels import residuals
 from ..errors import InputError
 from ..model import Camera, Reconstruction, check_shutter_model
 from ..model.reprojection import camera_arrays, motion_tables, observed_lens_pixels, plain_arrays
+from .at_lens import least_distance
 from .bundle_options import LOSSES, BundleOptions
 from .common_motion import LEAST_PHOTOS, MotionMeans
 from .connections import Border, CommonPrior, Coupling
@@ -58,9 +59,6 @@ class State:
 
 # Observations that a thread takes at a time, and whose costs are summed together.
 _CHUNK = 1024
-# A measurement that changes so many times as much with its point's place as the rest is of a point at the lens, or one
-# that moves along with the line that is read. Its weight would leave rounding of what the others say.
-_SINGULAR = 100.0
 
 
 class BundleProblem:
@@ -116,6 +114,9 @@ class BundleProblem:
         self._start = replace(reconstruction, points_w=reconstruction.points_w[structure.points], observations=obs)
         self._xy = obs.xy_raw[structure.order]
         self._sigma_px = sigma_px * obs.sigma[structure.order]
+        focal_px = np.array([camera.K[0, 0] for camera in reconstruction.cameras])[reconstruction.camera_idx]
+        nearest = max(least_distance(reconstruction), 1e-300)
+        self._most_change = 2.0 * (focal_px[structure.frame_idx] / self._sigma_px / nearest) ** 2
         # the rows that the last cost predicted, where the next Jacobians look for them
         self._clock = np.full(len(obs), np.nan)
         self._clock_of: State | None = None
@@ -384,7 +385,8 @@ class BundleProblem:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, NDArray[np.int64]]:
         """Weighted residuals (o, 2), Jacobians of the photos (o, 2, nb), the cost without priors, and who is left out.
 
-        These measurements are singular: with zeros for both they stay where they are, and say nothing.
+        These measurements are singular, of points at the lens or moving along with the line that is read. Their weight
+        would leave rounding of what the others say; with zeros for both they stay where they are, and say nothing.
         """
         o = len(self._xy)
         res, J_frame = spent.spend() if spent else (np.empty((o, 2)), np.empty((o, 2, self.layout.size)))
@@ -403,8 +405,7 @@ class BundleProblem:
         if self._options.varying:
             J_frame[:, :, self._block : self.layout.variation] = self._by_lens(state)[1]
         of_place = J_frame[:, :, 3:6]
-        change = np.einsum("oia,oia->o", of_place, of_place)
-        singular = np.flatnonzero(change > _SINGULAR**2 * np.median(change))
+        singular = np.flatnonzero(np.einsum("oia,oia->o", of_place, of_place) > self._most_change)
         res[singular], J_frame[singular] = 0.0, 0.0
         return res, J_frame, float(cost.sum()), singular
 

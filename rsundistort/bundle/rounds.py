@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..model import Reconstruction
 from ..model.reprojection import reprojection_residuals
+from .at_lens import least_distance
 from .bundle_options import BundleOptions, BundleResult
 from .calibration_doubt import CalibrationDoubt
 from .common_motion import CommonMotion
@@ -39,9 +40,6 @@ __all__ = ["Rounds"]
 _SETTLED_NOISE = 0.1
 # The bends of a path have converged if they change by less, radians: a twentieth of a pixel at any focal length in use.
 _SETTLED_BEND = 2e-5
-# Share of the distance of the rest at which nothing is a point of the scene: no lens has it in focus. A match between
-# photos taken from one place ends there, since noise drives a depth that nothing determines.
-_AT_LENS = 1e-2
 
 
 def _noise_px(reconstruction: Reconstruction, shutter_model: str, floor: float) -> float:
@@ -65,8 +63,7 @@ def _believed(reconstruction: Reconstruction, options: BundleOptions, sigma: flo
     believed &= np.linalg.norm(res, axis=1) <= limit
     if options.path is None or not options.path.rotation_only:  # else points are directions
         away = np.linalg.norm(rec.points_w[obs.point_idx] - rec.center_w[obs.frame_idx], axis=1)
-        for mine in obs.by_photo(rec.num_images):
-            believed[mine] &= away[mine] > _AT_LENS * np.median(away[mine]) if len(mine) else True
+        believed &= away >= least_distance(rec)
     return believed
 
 

@@ -58,11 +58,14 @@ def _meeting_points(
     np.add.at(b, of, np.einsum("kij,kj->ki", across, centers))
     np.add.at(middle, of, centers)
     np.add.at(way, of, rays)
-    count = np.maximum(np.bincount(of, minlength=len(lost)), 1)[:, None]
-    middle, way = middle / count, way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
+    count = np.bincount(of, minlength=len(lost))
+    middle, way = (
+        middle / np.maximum(count, 1)[:, None],
+        way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12),
+    )
     # a ridge of 1e-9 leaves parallel rays at a finite place
     found = np.asarray(np.linalg.solve(A + 1e-9 * np.eye(3), (b + 1e-9 * middle)[..., None])[..., 0], np.float64)
-    ahead = np.ones(len(lost), bool)
+    ahead = count > 0
     np.logical_and.at(ahead, of, ((found[of] - centers) * rays).sum(1) > 1e-6 * size)
     return found, ahead, middle + _FAR * size * way
 

@@ -3,7 +3,7 @@
 from .coarse_grid import TOLERANCE_PX, CoarseGrid, coarse_grid
 from .grid import MAP_KINDS, RemapGrid
 from .maps import init_rectify_map
-from .new_camera import ViewOptions, optimal_new_camera, rectified_roi, rectified_view
+from .new_camera import ViewOptions, optimal_new_camera, rectified_roi, rectified_view, steadiest_pinhole
 from .photo import INTERPOLATIONS, rectify
 from .point_depths import depth_from_points, fit_plane, plane_in_camera, prefers_plane
 from .point_maps import bend_px, distort_points, largest_shift_px, translation_shift_px, undistort_points
@@ -28,6 +28,7 @@ __all__ = [
     "rectified_roi",
     "rectified_view",
     "rectify",
+    "steadiest_pinhole",
     "translation_shift_px",
     "undistort_points",
 ]

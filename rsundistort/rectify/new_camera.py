@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,14 @@ from ..model import Camera, RowMotion
 from ..model.checks import check_fields, check_number, check_size
 from ..model.projection import motion_of, unproject_points
 
-__all__ = ["ViewOptions", "optimal_new_camera", "rectified_roi", "rectified_view"]
+__all__ = ["ViewOptions", "optimal_new_camera", "rectified_roi", "rectified_view", "steadiest_pinhole"]
 
 # Beyond it a photo of a pixel fits into no file.
 _MOST_SCALE = 1e4
+# Points on each side of a frame by which a pinhole camera is fitted; steps from it to the one with the camera's own K.
+_SAMPLES, _SHARES = 33, 65
+# Pixels that an empty border may be wide: the edge of a pixel lies so far from its centre.
+_EMPTY_PX = 0.5
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,50 @@ def rectified_view(
         K[:2, 2] -= 0.5
         return Camera(width, height, K, readout=old.readout)
     return optimal_new_camera(camera, motions, shutter_model, float(view.alpha), (width, height))[0]
+
+
+def steadiest_pinhole(camera: Camera, before: Camera) -> Camera:
+    """The pinhole camera whose picture moves least when a lens that was taken for another one is found.
+
+    Rectified by the camera as it was `before`, photos keep its K. What is found of a lens beside its distortion, or
+    against it, need not zoom them: one factor of the focal lengths and the principal point follow, so that pixels stay
+    where they were in the mean square over the frame, as far as that leaves no borders empty.
+
+    Parameters
+    ----------
+    camera : Camera
+        As it was found.
+    before : Camera
+        As it was given, or guessed.
+    """
+    plain = camera.pinhole()
+    x, y = np.meshgrid(np.linspace(0, camera.width - 1, _SAMPLES), np.linspace(0, camera.height - 1, _SAMPLES))
+    xy = np.column_stack([x.ravel(), y.ravel()])
+    (found, seen), (old, seen_before) = (unproject_points(xy, each, RowMotion(), "global") for each in (camera, before))
+    f, f_before = (np.diag(each.K)[:2] for each in (camera, before))
+    target = f_before * old + before.K[:2, 2]
+    # what the picture shows: a fisheye's border lies far beyond it
+    shown = seen & seen_before & ((target >= 0) & (target <= [camera.width - 1, camera.height - 1])).all(1)
+    if not shown.any():
+        return plain
+    rays, target = f * found[shown], target[shown]
+    middle, middle_before = rays.mean(0), target.mean(0)
+    factor = float(((rays - middle) * (target - middle_before)).sum() / ((rays - middle) ** 2).sum())
+    centre = middle_before - factor * middle
+    outline = _outline(camera, None, "global")
+    K = plain.K.copy()
+    for share in np.linspace(1.0, 0.0, _SHARES):
+        zoom = 1.0 + share * (factor - 1.0)
+        K[[0, 1], [0, 1]], K[:2, 2] = zoom * f, plain.K[:2, 2] + share * (centre - plain.K[:2, 2])
+        if outline is None or _empty(outline, K, camera) <= max(_EMPTY_PX, _empty(outline, plain.K, camera)):
+            break
+    return replace(plain, K=K)
+
+
+def _empty(outline: _Outline, K: NDArray[np.float64], camera: Camera) -> float:
+    """How wide the widest empty border of a rectified photo is, in pixels."""
+    f, c, last = np.diag(K)[:2], K[:2, 2], np.array([camera.width - 1, camera.height - 1])
+    return float(max((f * outline.inner_lo + c).max(), (last - f * outline.inner_hi - c).max()))
 
 
 @dataclass(frozen=True)

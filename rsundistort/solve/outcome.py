@@ -16,7 +16,7 @@ from ..input.photo_cameras import PhotoCameras
 from ..model import BEND_GROUPS, Reconstruction, Solution, SolvedImage
 from ..model.field import field_over_frame
 from ..model.reprojection import reprojection_residuals
-from ..rectify import largest_shift_px
+from ..rectify import largest_shift_px, steadiest_pinhole
 from ..verdict import Verdict
 from ..versions import versions
 from .run_options import SolveOptions
@@ -171,8 +171,10 @@ def solution_of(solved: Solved, options: SolveOptions, rectify: RectifyOptions) 
     return Solution(
         shutter_model=rec.shutter_model,
         cameras=dict(zip(map(str, solved.camera_ids), rec.cameras, strict=True)),
-        # same size and K, so that raw and rectified compare pixel by pixel
-        rectified_cameras=solved.by_camera([camera.pinhole() for camera in shared.cameras]),
+        # same size, and all but the same K, so that raw and rectified compare pixel by pixel
+        rectified_cameras=solved.by_camera(
+            [steadiest_pinhole(*each) for each in zip(shared.cameras, solved.cameras.cameras, strict=True)]
+        ),
         images=tuple(_images(solved)),
         quality=_quality(solved),
         critical_motion=None if solved.remedy is None else _critical(solved),

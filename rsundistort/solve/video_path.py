@@ -178,16 +178,13 @@ def _of_two(
     """The path through two frames."""
     log.begin("path")
     start = pair.placed(None if path.readout is None else path.readout_prior[0])
-    options = replace(options_of(start), path=path)
-    first = bundle_adjust(
-        start, "constant-motion", replace(_at_first(options), prior_sigma_rounds=0), partial(_tell, log, "path")
-    )  # fmt: skip
+    # one step determines no spread of steps, and estimates of it would not settle
+    options = replace(options_of(start), path=path, prior_sigma_rounds=0)
+    rough = replace(_at_first(options), prior_sigma_rounds=0)
+    first = bundle_adjust(start, "constant-motion", rough, partial(_tell, log, "path"))
     options = replace(options, path=replace(path, start=_start_of(first)))
     whole = pair.of_all(first.reconstruction)
-    # one step says nothing of how much steps differ
-    result = bundle_adjust(
-        whole, "constant-motion", replace(options, prior_sigma_rounds=0), partial(_tell, log, "path")
-    )  # fmt: skip
+    result = bundle_adjust(whole, "constant-motion", options, partial(_tell, log, "path"))
     log.end("path", points=result.reconstruction.num_points, rms_px=result.rms_px)
     return result, options, None
 
