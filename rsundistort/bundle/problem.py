@@ -115,7 +115,7 @@ class BundleProblem:
         self._xy = obs.xy_raw[structure.order]
         self._sigma_px = sigma_px * obs.sigma[structure.order]
         focal_px = np.array([camera.K[0, 0] for camera in reconstruction.cameras])[reconstruction.camera_idx]
-        nearest = max(least_distance(reconstruction), 1e-300)
+        nearest = least_distance(reconstruction) or np.nan  # then no change is too large
         self._most_change = 2.0 * (focal_px[structure.frame_idx] / self._sigma_px / nearest) ** 2
         # the rows that the last cost predicted, where the next Jacobians look for them
         self._clock = np.full(len(obs), np.nan)
