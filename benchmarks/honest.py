@@ -282,10 +282,10 @@ def suppressed(bench: Bench) -> None:
                 found.append([np.mean(figures["phi_mrad_per_frame"]), *decibels, *turned.values()])
             medians = np.median(found, axis=0).round(2).tolist()
             said = dict(zip(("phi mrad", "dB", BY_LENS, "turned dB", "left px"), medians, strict=True))
-            given = said["turned dB"] if which == "given" else given
+            given = said["dB"] if which == "given" else given
             target, met = ("found", all(each.said[0] == "found" for each in ran)) if sigma >= 0.01 else ("", None)
             if sigma == 0.01 and which == "guessed":
-                target, met = f"found, turned dB >= {given - 2:.2f}", bool(met) and said["turned dB"] >= given - 2
+                target, met = f"found, dB >= {given - 2:.2f}", bool(met) and said["dB"] >= given - 2
             bench.row(name, ran, said, target, met)
 
 
