@@ -212,7 +212,7 @@ class Rounds:
         state, options = self._solved.state, self._options
         assert options.path is not None
         residuals, variances = equations.coupling_variances()
-        if np.isfinite(variances).all():
+        if options.prior_sigma_rounds and np.isfinite(variances).all():
             self._sigmas = replace(
                 self._sigmas, path=path_prior_sigmas(problem.path, residuals, variances, self._baseline)
             )
