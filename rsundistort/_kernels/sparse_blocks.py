@@ -143,21 +143,26 @@ def _subtract_product(A, at, A_wide, h, w, B, begin, B_wide, out, to, wide, n):
 
 
 @kernel(forceinline=True)
-def _run(cols, p, end, at, last):
-    """How many blocks from p and from `at` on are of the same columns, before `end` and `last`."""
+def _run(cols, column, size, q, end, at, last):
+    """Blocks from q on, before `end`, that lie side by side in another row, too, from `at` or later, before `last`.
+
+    Where they begin there, how many they are, and how many columns they have.
+    """
+    while cols[at] != cols[q]:
+        at += 1
     run = 1
-    while p + run < end and at + run < last and cols[at + run] == cols[p + run]:
+    while q + run < end and at + run < last and cols[at + run] == cols[q + run]:
         run += 1
-    return run
+    return at, run, column[q + run - 1] + size[cols[q + run - 1]] - column[q]
 
 
 @kernel(forceinline=True)
-def _together(cols, p, end):
-    """How many blocks from p on are of columns that follow each other."""
+def _together(cols, column, size, p, end):
+    """Blocks from p on, before `end`, of columns that follow each other: how many, and how many columns they have."""
     run = 1
     while p + run < end and cols[p + run] == cols[p] + run:
         run += 1
-    return run
+    return run, column[p + run - 1] + size[cols[p + run - 1]] - column[p]
 
 
 @parallel_kernel(fastmath=SUMS)
@@ -184,10 +189,7 @@ def factor_blocks(row_start, cols, column, start, size, data):
             to_wide = (start[to + 1] - start[to]) // w
             at, q = row_start[to], p
             while q < end:
-                while cols[at] != cols[q]:
-                    at += 1
-                run = _run(cols, q, end, at, last)
-                n = column[q + run - 1] + size[cols[q + run - 1]] - column[q]
+                at, run, n = _run(cols, column, size, q, end, at, last)
                 _subtract_product(
                     data, base + column[p], wide, h, w, data, base + column[q], wide, data, start[to] + column[at],
                     to_wide, n,
@@ -298,8 +300,7 @@ def solve_blocks(row_start, cols, column, start, size, position, data, x):
                         y[own + b, j] -= row[b] * y[own + i, j]
             p, end = row_start[k] + 1, row_start[k + 1]
             while p < end:
-                run = _together(cols, p, end)
-                n = column[p + run - 1] + size[cols[p + run - 1]] - column[p]
+                run, n = _together(cols, column, size, p, end)
                 _take_from(data, start[k] + column[p], wide, h, y[own : own + h], n, y, position[cols[p]])
                 p += run
         for k in range(rows - 1, -1, -1):
@@ -307,8 +308,7 @@ def solve_blocks(row_start, cols, column, start, size, position, data, x):
             wide, own = (start[k + 1] - start[k]) // h, position[k]
             p, end = row_start[k] + 1, row_start[k + 1]
             while p < end:
-                run = _together(cols, p, end)
-                n = column[p + run - 1] + size[cols[p + run - 1]] - column[p]
+                run, n = _together(cols, column, size, p, end)
                 _take_sums(data, start[k] + column[p], wide, h, y[own : own + h], n, y, position[cols[p]])
                 p += run
             for i in range(h - 1, -1, -1):
@@ -393,10 +393,7 @@ def invert_blocks(row_start, cols, column, start, size, parts, data):
                 row_wide = (start[row + 1] - start[row]) // w
                 at, q = row_start[row], p
                 while q < end:
-                    while cols[at] != cols[q]:
-                        at += 1
-                    run = _run(cols, q, end, at, last)
-                    m = column[q + run - 1] + size[cols[q + run - 1]] - column[q]
+                    at, run, m = _run(cols, column, size, q, end, at, last)
                     Z, b = start[row] + column[at], column[q] - h
                     _subtract_product(flipped, a * h, h, w, h, data, Z, row_wide, out, b, n, m)
                     # and what is below the diagonal of Z, which is that row's mirror image
