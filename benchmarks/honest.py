@@ -9,7 +9,8 @@ Prints one JSON object a line and at the end a table with targets. Parts, with t
     coverage (10)     errors in units of the standard deviations that are reported: their root mean square is to be 1;
                       sample scenes (6) are rendered again, with other motions, their cameras given as "exact", as
                       "drawn", as "wrong", and without a word on how exact they are
-    calibration (2)   cx and p of herz-jesus-8 with phi3 given, from the calibration's
+    calibration (2)   cx and p of herz-jesus-8 with phi3 given, from the calibration's; and what its photos are worth
+                      by true motions and the lens that they say they have where they are as they were taken
     better (5)        dB and degrees, of photos of a camera that rotated, and of one that rotated and travelled
     directions        what is said of the axis of the readout where nobody specifies it
     strong (3)        herz-jesus-8 warped by 0.2 and 0.3 rad: no photo a degree wrong in a scene that is to be trusted
@@ -40,6 +41,7 @@ from unittest import mock
 import numpy as np
 from measures import (
     against_references,
+    by_true_motions,
     fountain_truth,
     library_sigmas,
     log_k_error,
@@ -356,6 +358,22 @@ def calibration(bench: Bench) -> None:
             show(f"{name}, seed {seed}", **each.facts, **apart)
         medians = np.median(found, axis=0).round(2).tolist()
         bench.row(name, ran, dict(zip(("cx px", "p1 1e-3", "p2 1e-3"), medians, strict=True)), "", None)
+    # without any error of motions: what is lost is the lens that photos without a shutter say they were taken through
+    for which in CAMERAS:
+        name, dB = f"calibration: {HERZ} by 0.01 and true motions, {which}", list[list[float]]()
+        with bench.case(name):
+            still = bench.run(bench.photos / HERZ, **bench.camera(which, bench.photos / HERZ / "camera.json"))
+            (camera,) = still.solution.cameras.values()
+            for seed in bench.numbers(2):
+                warp = bench.warped(0.01, seed)
+                true = rs.read_solution(warp / "ground_truth.json")
+                view = [
+                    by_true_motions(camera, true, warp / "photos", bench.photos / HERZ, each) for each in (False, True)
+                ]
+                dB.append(view)
+                show(f"{name}, seed {seed}", **still.facts, psnr_db=dict(zip(("view", "rotated"), view, strict=True)))
+            medians = np.median(dB, axis=0).round(2).tolist()
+            bench.row(name, [still], dict(zip(("dB", "dB in a rotated view"), medians, strict=True)), "", None)
 
 
 def better(bench: Bench) -> None:

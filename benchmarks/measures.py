@@ -10,10 +10,12 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from rsundistort import (
     BundleOptions,
+    Camera,
     Reconstruction,
     RectifyOptions,
     RowMotion,
@@ -36,6 +38,7 @@ from rsundistort.evaluation import align_points, motion_errors, psnr
 from rsundistort.input.photo_cameras import PhotoCameras
 from rsundistort.io import read_photo, write_image
 from rsundistort.io.cameras import camera_from_json
+from rsundistort.rectify import steadiest_pinhole
 from rsundistort.solve import OutputOptions
 
 Array = np.ndarray
@@ -223,6 +226,44 @@ def for_the_lens_only(out: Path, truth: Solution, photos: Path, references: Path
         mask = read_photo(out / "masks" / f"{Path(name).stem}.png").pixels
         found[name] = psnr(read_photo(out / "lens-only.jpg").pixels, reference, np.minimum(mask, seen))
     return found
+
+
+def steadiest_rotated_view(camera: Camera, before: Camera) -> tuple[Array, Array]:
+    """K and the rotation of the pinhole camera whose picture moves least when one lens is taken for another.
+
+    Unlike `rectify.steadiest_pinhole` it may look another way than the camera does, which takes back what a principal
+    point that is found elsewhere does to perspective; it keeps the principal point.
+    """
+    x, y = np.meshgrid(np.linspace(0, camera.width - 1, 33), np.linspace(0, camera.height - 1, 33))
+    xy = np.column_stack([x.ravel(), y.ravel()])
+    found, old = (unproject_points(xy, each, RowMotion(), "global")[0] for each in (camera, before))
+    rays, f, f_before = np.insert(found, 2, 1, 1), np.diag(camera.K)[:2], np.diag(before.K)[:2]
+
+    def apart(unknowns: Array) -> Array:
+        seen = Rotation.from_rotvec(unknowns[:3]).apply(rays)
+        residuals: Array = (1.0 + unknowns[3]) * f * seen[:, :2] / seen[:, 2:] - f_before * old
+        return residuals.ravel()
+
+    rotvec, zoom = np.split(least_squares(apart, np.zeros(4), x_scale="jac").x, [3])
+    K = np.array(before.K)
+    K[[0, 1], [0, 1]] = (1.0 + zoom) * f
+    return K, Rotation.from_rotvec(rotvec).as_matrix()
+
+
+def by_true_motions(camera: Camera, truth: Solution, photos: Path, references: Path, rotated: bool) -> float:
+    """Median PSNR over the photos that a run would have written had it found this camera and the true motions.
+
+    Against references as they are, in the view that a run has by default, or in the one that is rotated as well.
+    """
+    decibels = []
+    for image in truth.images:
+        before = truth.cameras[image.camera_id]
+        K, R = steadiest_rotated_view(camera, before) if rotated else (steadiest_pinhole(camera, before).K, np.eye(3))
+        x, y = init_rectify_map(camera, image.motion, truth.shutter_model, R, K)
+        photo, reference = (read_photo(folder / image.name).pixels for folder in (photos, references))
+        mask = ((x >= 0) & (x <= camera.width - 1) & (y >= 0) & (y <= camera.height - 1)).astype(np.uint8) * 255
+        decibels.append(psnr(cv2.remap(photo, x, y, cv2.INTER_LANCZOS4), reference, mask))
+    return round(float(np.median(decibels)), 2)
 
 
 def fountain_truth(folder: Path) -> Solution:
