@@ -232,7 +232,7 @@ def steadiest_rotated_view(camera: Camera, before: Camera) -> tuple[Array, Array
     """K and the rotation of the pinhole camera whose picture moves least when one lens is taken for another.
 
     Unlike `rectify.steadiest_pinhole` it may look another way than the camera does, which takes back what a principal
-    point that is found elsewhere does to perspective; it keeps the principal point.
+    point that is found elsewhere does to perspective.
     """
     x, y = np.meshgrid(np.linspace(0, camera.width - 1, 33), np.linspace(0, camera.height - 1, 33))
     xy = np.column_stack([x.ravel(), y.ravel()])
@@ -240,13 +240,16 @@ def steadiest_rotated_view(camera: Camera, before: Camera) -> tuple[Array, Array
     rays, f, f_before = np.insert(found, 2, 1, 1), np.diag(camera.K)[:2], np.diag(before.K)[:2]
 
     def apart(unknowns: Array) -> Array:
+        """Rotation, relative change of the focal lengths, shift of the principal point in focal lengths."""
         seen = Rotation.from_rotvec(unknowns[:3]).apply(rays)
-        residuals: Array = (1.0 + unknowns[3]) * f * seen[:, :2] / seen[:, 2:] - f_before * old
+        ideal = (1.0 + unknowns[3]) * seen[:, :2] / seen[:, 2:] + unknowns[4:]
+        residuals: Array = f * ideal - f_before * old
         return residuals.ravel()
 
-    rotvec, zoom = np.split(least_squares(apart, np.zeros(4), x_scale="jac").x, [3])
+    rotvec, zoom, shift = np.split(least_squares(apart, np.zeros(6), x_scale="jac").x, [3, 4])
     K = np.array(before.K)
     K[[0, 1], [0, 1]] = (1.0 + zoom) * f
+    K[:2, 2] += shift * f
     return K, Rotation.from_rotvec(rotvec).as_matrix()
 
 
@@ -262,7 +265,7 @@ def by_true_motions(camera: Camera, truth: Solution, photos: Path, references: P
         x, y = init_rectify_map(camera, image.motion, truth.shutter_model, R, K)
         photo, reference = (read_photo(folder / image.name).pixels for folder in (photos, references))
         mask = ((x >= 0) & (x <= camera.width - 1) & (y >= 0) & (y <= camera.height - 1)).astype(np.uint8) * 255
-        decibels.append(psnr(cv2.remap(photo, x, y, cv2.INTER_LANCZOS4), reference, mask))
+        decibels.append(psnr(cv2.remap(photo, x, y, cv2.INTER_CUBIC), reference, mask))
     return round(float(np.median(decibels)), 2)
 
 
