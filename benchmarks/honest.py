@@ -41,6 +41,7 @@ from unittest import mock
 import numpy as np
 from measures import (
     against_references,
+    alike,
     by_true_motions,
     fountain_truth,
     library_sigmas,
@@ -317,8 +318,9 @@ def coverage(bench: Bench) -> None:
                 sigmas, rec = library_sigmas(each.solved.result, each.solved.remedy, each.options), each.solved.shared
                 errors.append(normalised_errors(each.solution, truth, sigmas, log_k_error(rec, truth)))
             show(
-                name, **ran[0].facts, runs=len(ran), rms=pooled(errors), by_component=pooled(errors, by_component=True)
-            )
+                name, **ran[0].facts, runs=len(ran), rms=pooled(errors), by_component=pooled(errors, by_component=True),
+                alike=alike(errors),
+            )  # fmt: skip
             covered(bench, name, ran, errors)
             _, _, which = label.partition(", ")
             for of_all, some in zip(together.setdefault(which, ([], [])), (ran, errors), strict=True):

@@ -88,6 +88,21 @@ def pooled(errors: Sequence[Mapping[str, Array | None]], by_component: bool = Fa
     return found
 
 
+def alike(errors: Sequence[Mapping[str, Array | None]]) -> dict[str, float]:
+    """Mean correlation of the errors of two solutions, by quantity: 1 if several sets of photos err as one does.
+
+    Sets that were warped from the same photos share what their keypoints and their calibration have wrong. Quantities
+    that one of them lacks, or whose photos are not those of the others, are left out.
+    """
+    found = {}
+    for key in ("phi", "center"):
+        values = [np.ravel(value) for each in errors if (value := each[key]) is not None]
+        if len(values) == len(errors) > 1 and len({len(value) for value in values}) == 1:
+            apart = np.triu_indices(len(values), 1)
+            found[key] = round(float(np.corrcoef(values)[apart].mean()), 2)
+    return found
+
+
 def run_options(**given: Any) -> RunOptions:
     """Options of a run without a report, of the fields of all its parts."""
     parts = {

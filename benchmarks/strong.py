@@ -60,7 +60,14 @@ from rsundistort.errors import InputError
 from rsundistort.evaluation import psnr
 from rsundistort.input.load import LoadedPhotos, load_photos
 from rsundistort.io import read_photo
-from rsundistort.sfm import MatchedPhotos, firmly_connected, match_photos, retriangulate
+from rsundistort.sfm import (
+    MatchedPhotos,
+    firmly_connected,
+    map_photos,
+    match_photos,
+    retriangulate,
+    verify_with_shutter,
+)
 from rsundistort.sfm.epipolar import read_matches
 from rsundistort.sfm.relative_pose import Pair, View, relative_poses
 from rsundistort.simulate import WarpOptions, simulate_warp
@@ -212,6 +219,8 @@ class Bench:
             ]
             features = [replace(found, xy_raw=xy) for found, xy in zip(loaded.features, still, strict=True)]
             tracks = retriangulate(replace(matched, features=features, cameras=rec.cameras), rec)
+            verify_with_shutter(matched)
+            self._show_mapped(name, map_photos(replace(matched, features=features)), radians, seed)
         tracks = firmly_connected(tracks)
         obs, phi = tracks.observations, np.array([phi_of[photo] for photo in tracks.image_names])
         xy = obs.xy_raw.copy()
@@ -219,6 +228,16 @@ class Bench:
             xy[mine] = _moved(xy[mine], rec.cameras[tracks.camera_idx[f]], rs.RowMotion(), rs.RowMotion(phi[f]))
         tracks = replace(tracks, observations=replace(obs, xy_raw=xy))
         self._show_limit(f"right matches of {name}", name, tracks, phi, radians, seed)
+
+    def _show_mapped(self, name: str, mapped: rs.Reconstruction, radians: float, seed: int) -> None:
+        """What mapping makes of the matches of one warp, had it known the motions."""
+        still = {image.name: image.R_cw for image in self.still(name).registered}
+        found = {photo: R for photo, R in zip(mapped.image_names, mapped.R_cw, strict=True) if photo in still}
+        errors = rotations_off([*found.values()], [still[photo] for photo in found])
+        show(
+            f"mapping of {name} by {radians}, seed {seed}, motions known", registered=len(found), of_still=len(still),
+            wrong=int((errors > WRONG_DEG).sum()), max_deg=round(float(errors.max()), 2),
+        )  # fmt: skip
 
     def _show_limit(
         self, title: str, name: str, tracks: rs.Reconstruction, phi: np.ndarray, radians: float, seed: int
