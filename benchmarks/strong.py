@@ -218,9 +218,9 @@ class Bench:
                 for photo, found in zip(loaded.names, loaded.features, strict=True)
             ]
             features = [replace(found, xy_raw=xy) for found, xy in zip(loaded.features, still, strict=True)]
-            tracks = retriangulate(replace(matched, features=features, cameras=rec.cameras), rec)
             verify_with_shutter(matched)
             self._show_mapped(name, map_photos(replace(matched, features=features)), radians, seed)
+            tracks = retriangulate(replace(matched, features=features, cameras=rec.cameras), rec)
         tracks = firmly_connected(tracks)
         obs, phi = tracks.observations, np.array([phi_of[photo] for photo in tracks.image_names])
         xy = obs.xy_raw.copy()
