@@ -257,6 +257,12 @@ PHOTO_OPTIONS: tuple[Decorator, ...] = (
 )
 
 
+def check_needed(given: dict[str, Any], option: str, needing: dict[str, str]) -> None:
+    """Refuse options, by their keys, that say nothing without another one which was not given."""
+    if alone := [name for key, name in needing.items() if key in given]:
+        raise click.UsageError(f"{alone[0]} is for {option}; give {option} too, or leave {alone[0]} out")
+
+
 def taken(given: dict[str, Any], kind: type) -> Any:
     """Options of a kind, of its fields among what was given; these are taken out."""
     return kind(**{key: given.pop(key) for key in [*given] if key in kind.__dataclass_fields__})  # type: ignore[attr-defined]

@@ -107,7 +107,10 @@ def command(photos: Path, out: Path, measuring: dict[str, Any], given: dict[str,
         from rsundistort.solve import RunOptions, run
 
         log = {field: measuring.pop(key) for key, field in _GYRO_FIELDS.items() if key in measuring}
-        gyro = GyroOptions(**log) if "file" in log else None
+        if "file" not in log:
+            names = {field: f"--{key.replace('_', '-')}" for key, field in _GYRO_FIELDS.items()}
+            opt.check_needed(log, "--gyro", names)
+        gyro = GyroOptions(**log) if log else None
         solve, rectify, outputs = parts_of(given)
         options = RunOptions(solve=solve, rectify=rectify, outputs=outputs, gyro=gyro, **measuring)
         solution = run(photos, out, options, progress, **given)

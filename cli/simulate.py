@@ -102,6 +102,12 @@ def warp(photos: Path, out: Path, given: dict[str, Any], quiet: bool) -> None:
         from rsundistort.simulate import WarpOptions, read_motion_file, simulate_warp
         from rsundistort.synthetic import Vibration
 
+        if "gyro" not in given:
+            opt.check_needed(given, "--gyro", {"gyro_axes": "--gyro-axes"})
+        if not given.get("vibration"):
+            opt.check_needed(given, "--vibration", {"periods": "--vibration-periods", "axis": "--vibration-axis"})
+        if "motion" in given and "sigma_rad" in given:
+            raise click.UsageError("--motion gives the motions, and --sigma is for random ones; give one of them")
         axes, amplitude = given.pop("gyro_axes", None), given.pop("vibration", None)
         shaking = {key: given.pop(key) for key in ("periods", "axis") if key in given}
         if "motion" in given:

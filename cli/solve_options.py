@@ -183,6 +183,8 @@ def _sigmas(text: str) -> dict[str, float]:
     found: dict[str, float] = {}
     for each in text.split(",") if text else []:
         name, _, number = each.partition("=")
+        if name.strip() in found:
+            raise click.BadParameter(f"{name.strip()} is given twice", param_hint="--camera-sigma")
         try:
             found[name.strip()] = float(number)
         except ValueError:

@@ -81,6 +81,12 @@ def test_info(invoke):
         ["evaluate", "out"],
         ["simulate", "spin"],
         ["simulate", "warp", "photos", "-o", "out", "--sigma", "-0.1"],
+        ["simulate", "warp", "photos", "-o", "out", "--sigma", "0.1", "--motion", "motion.json"],
+        ["simulate", "warp", "photos", "-o", "out", "--vibration-axis", "x"],
+        ["simulate", "warp", "photos", "-o", "out", "--gyro-axes", "xyz"],
+        ["run", "photos", "-o", "out", "--gyro-offset", "1"],
+        ["run", "photos", "-o", "out", "--photo-times", "times.csv"],
+        ["run", "photos", "-o", "out", "--camera-sigma", "f=1,f=2"],
     ],
 )
 def test_wrong_use_is_exit_code_2(invoke, tmp_path, args):

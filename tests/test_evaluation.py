@@ -71,6 +71,11 @@ def test_known_centre_errors_are_recovered_in_steps_of_the_truth():
     assert errors.rotation_deg.max() < 1e-12
 
 
+def test_position_errors_are_undefined_where_all_cameras_are_in_one_place(rng):
+    R, C = draw_poses(rng, 4)
+    assert np.isnan(pose_errors(make_solution(R, C), make_solution(R, np.ones((4, 3)))).center).all()
+
+
 def test_only_photos_with_poses_on_both_sides_count(rng):
     R, C = draw_poses(rng, 6)
     truth, solution = make_solution(R, C), make_solution(R, C)
@@ -91,6 +96,10 @@ def test_motion_errors_are_in_radians_per_frame(readout, span, rng):
     phi, error = rng.normal(size=(4, 3)), rng.normal(size=(4, 3))
     errors = motion_errors(make_solution(R, C, phi + error, camera), make_solution(R, C, phi, camera))
     np.testing.assert_allclose(errors.phi_rad_per_frame, error * span, rtol=0, atol=1e-14)  # rounding
+    # a camera of another focal length has another clock: the same rotation over a frame is no error
+    wider = Camera(640, 480, np.diag([0.5, 0.5, 1]) @ CAMERA.K, readout=readout)
+    none = motion_errors(make_solution(R, C, phi, camera), make_solution(R, C, phi / 2, wider))
+    np.testing.assert_allclose(none.phi_rad_per_frame, 0, atol=1e-14)  # rounding
     with pytest.raises(InputError, match="no photo has a motion"):
         motion_errors(replace(make_solution(R, C), images=[]), make_solution(R, C))
 
@@ -134,6 +143,12 @@ def test_psnr_counts_neither_the_mask_nor_the_margin_around_it():
     corner = np.zeros_like(truth)
     corner[0, 0] = 255
     assert psnr(corner, truth, margin_px=0) == pytest.approx(10 * np.log10(40 * 60), rel=1e-12)
+
+
+@pytest.mark.parametrize("odd", [np.zeros((4, 5), np.int64), np.zeros((4, 5), np.int8), np.full((4, 5), np.inf)])
+def test_images_without_a_known_peak_are_refused(odd):
+    with pytest.raises(InputError, match=r"expected uint8, uint16 or float in 0 to 1|NaN or infinity"):
+        psnr(odd, odd)
 
 
 def test_images_that_do_not_compare_are_refused():

@@ -132,6 +132,8 @@ def test_list_photos_sorts_and_passes_over_other_files(tmp_path):
         (tmp_path / name).write_bytes(b"x")
     (tmp_path / "folder.jpg").mkdir()
     assert list_photos(tmp_path) == ["a.png", "b.JPG", "c.tiff", "d.NEF", "e.webp"]
+    (tmp_path / "f.jpg").symlink_to("nowhere.jpg")  # reading it says that it leads nowhere
+    assert list_photos(tmp_path)[-1] == "f.jpg"
 
 
 @pytest.mark.parametrize("kind", ["empty", "missing", "file", "others"])

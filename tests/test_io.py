@@ -280,6 +280,13 @@ def test_what_is_no_solution_is_refused(tmp_path, content):
     assert "solution.json" in one_line(error)
 
 
+def test_a_solution_is_not_written_into_what_is_no_folder(tmp_path):
+    for path in (tmp_path / "nowhere" / "solution.json", tmp_path):
+        with pytest.raises(FileError, match=r"cannot be written .*give a file in a folder that is there"):
+            write_solution(path, small_solution())
+    assert tree(tmp_path) == {}
+
+
 def test_missing_solution_is_refused(tmp_path):
     for path in (tmp_path / "none.json", tmp_path):
         with pytest.raises(FileError) as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from measures import library_sigmas, log_k_error, normalised_errors, pooled
+from measures import alike, library_sigmas, log_k_error, normalised_errors, pooled
 from solved_scene import SCENES
 
 from rsundistort import BundleOptions, Observations, Reconstruction, Solution, SolvedImage, bundle_adjust, read_solution
@@ -45,3 +45,11 @@ def test_what_has_no_deviation_is_missing():
     truth = read_solution(SCENES / "courtyard" / "ground_truth.json")
     found = normalised_errors(truth, truth, {"mean_phi": np.ones(3)}, log_k=0.0)
     assert pooled([found]) == {"phi": None, "mean_phi": 0.0, "log_k": None, "center": None}
+
+
+def test_sets_that_err_as_one_are_alike(rng):
+    phi, center = rng.normal(size=(2, 5, 3))
+    one = {"phi": phi, "mean_phi": phi.mean(0), "log_k": None, "center": None}
+    assert alike([one, one | {"phi": -2 * phi}]) == {"phi": -1.0}
+    assert alike([one | {"center": center}] * 3) == {"phi": 1.0, "center": 1.0}
+    assert alike([one]) == {}

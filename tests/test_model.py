@@ -100,7 +100,7 @@ def scaled(i, j, value):
         (make_reconstruction, {"camera_idx": [0, 0, 1]}, "camera_idx goes from 0 to 1, expected 0 to 0"),
         (make_reconstruction, {"camera_idx": [0, 0]}, r"camera_idx\.shape=\(2,\), expected \(3,\)"),
         (make_reconstruction, {"R_cw": np.tile(2 * np.eye(3), (3, 1, 1))}, "R_cw holds a matrix that is no rotation"),
-        (make_reconstruction, {"R_cw": np.tile(-np.eye(3), (3, 1, 1))}, "R_cw holds a matrix that is no rotation"),
+        (make_reconstruction, {"R_cw": np.tile(-np.eye(3), (3, 1, 1))}, "R_cw holds a matrix that mirrors"),
         (make_reconstruction, {"R_cw": np.eye(3)}, r"R_cw\.shape=\(3, 3\), expected \(3, 3, 3\)"),
         (make_reconstruction, {"center_w": np.zeros((2, 3))}, r"center_w\.shape=\(2, 3\), expected \(3, 3\)"),
         (make_reconstruction, {"points_w": np.full((2, 3), NAN)}, "points_w holds NaN or infinity"),

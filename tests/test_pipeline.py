@@ -301,8 +301,26 @@ def test_options_are_checked(kind, options, says):
         kind(**options)
 
 
+def test_options_of_another_kind_are_refused(tmp_path):
+    with pytest.raises(InputError, match="options: expected a RunOptions"):
+        run(tmp_path, tmp_path / "out", {"jobs": 1})
+    with pytest.raises(InputError, match="options: expected a RectifyOptions"):
+        rectify_folder(tmp_path, tmp_path / "solution.json", tmp_path / "out", {"quality": 90})
+    for function, given in ((run, (tmp_path, tmp_path / "out")), (rectify_folder, (tmp_path, tmp_path, tmp_path))):
+        with pytest.raises(InputError, match="overwrite begins anew and resume continues"):
+            function(*given, overwrite=True, resume=True)
+    with pytest.raises(InputError, match=r"jobs=1\.5, expected a whole number"):
+        run(tmp_path, tmp_path / "out", jobs=1.5)
+    with pytest.raises(InputError, match="seed=-1, expected a whole number"):
+        SolveOptions(seed=-1)
+    with pytest.raises(InputError, match="max_megapixels=-1, expected a positive number"):
+        RectifyOptions(max_megapixels=-1)
+    with pytest.raises(InputError, match="known motion of 'a': expected phi and sigma of three numbers each"):
+        SolveOptions(known={"a": ([0, 0], [1, 1, 1])})
+
+
 def test_number_of_jobs_is_checked(tmp_path):
-    with pytest.raises(InputError, match="jobs=-1, expected 0 to"):
+    with pytest.raises(InputError, match="jobs=-1, expected a whole number, at least 0"):
         run(tmp_path, tmp_path / "out", jobs=-1)
     assert not (tmp_path / "out").exists()
 

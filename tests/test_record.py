@@ -333,6 +333,34 @@ def test_what_a_killed_process_left_is_no_content(tmp_path):
         pytest.fail("entered")
 
 
+@pytest.mark.parametrize("name", ["maps", "also"])
+def test_a_batch_that_did_nothing_leaves_nothing(tmp_path, name):
+    def stopped():
+        (tmp_path / name / "deep").mkdir(parents=True)
+        (tmp_path / name / "deep" / "half.npz").write_text("ha")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), batch_folder(tmp_path):
+        stopped()
+    with batch_folder(tmp_path, resume=True):
+        pass
+
+
+def test_what_changed_since_a_folder_was_complete_is_named(tmp_path):
+    record = Record(tmp_path)
+    record.check(["a.txt", "b.txt"])
+    with record.writing(["a.txt", "b.txt"]):
+        for name in ("a.txt", "b.txt"):
+            (tmp_path / name).write_text("whole")
+    record.finish("key")
+    assert Record(tmp_path).is_finished("key")
+    assert Record(tmp_path).changed("key") == []
+    assert Record(tmp_path).changed("other") is None
+    (tmp_path / "b.txt").unlink()
+    assert not Record(tmp_path).is_finished("key")
+    assert Record(tmp_path).changed("key") == ["b.txt"]
+
+
 def test_a_killed_process_leaves_a_record_by_which_its_files_are_known(tmp_path):
     record = Record(tmp_path)
     record.check(["a.txt", "b.txt", "c.txt"])

@@ -91,10 +91,10 @@ def _refine(folder):
     return ["--camera", CAMERA, "--refine", "f,zoom"]
 
 
-def _camera_sigma(text):
+def _camera_sigma(text, *others):
     def make(folder):
         save_textures(folder, THREE)
-        return ["--camera", CAMERA, "--camera-sigma", text]
+        return ["--camera", CAMERA, "--camera-sigma", text, *others]
 
     return make
 
@@ -113,6 +113,11 @@ def _still_and_known(folder):
     save_textures(folder, THREE)
     (folder.parent / "gyro.csv").write_text("name,phi1,phi2,phi3,sigma\na.png,0,0,0,0.001\n")
     return ["--camera", CAMERA, "--still", "a.png=1", "--known", "gyro.csv"]
+
+
+def _still_of_global(folder):
+    save_textures(folder, THREE)
+    return ["--camera", CAMERA, "--still", "a.png", "--model", "global"]
 
 
 def _unknown_known(folder):
@@ -176,6 +181,9 @@ OTHER_SIZE = json.dumps({"width": 640, "height": 480, "K": [[600, 0, 320], [0, 6
         (_camera_sigma("zoom=1"), "sigma of 'zoom'"),
         (_camera_sigma("f=1,fx=1"), "give one or the other"),
         (_camera_sigma("k1=nan"), "sigma of k1 is nan"),
+        (_camera_sigma("k4=1"), "camera_sigma: k4 of a pinhole lens"),
+        (_camera_sigma("f=1", "--refine", "none"), "refine none fixes the camera"),
+        (_still_of_global, "a global shutter has no motion"),
     ],
 )
 def test_run_refuses_in_one_line_and_writes_nothing(invoke, tmp_path, make, says):

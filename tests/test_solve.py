@@ -439,6 +439,9 @@ def test_what_does_not_go_together_is_refused(tmp_path, rng):
             rs.solve(model, **options)
     with pytest.raises(InputError, match=r"model is a builtins\.int, expected a folder, a file or a pycolmap"):
         rs.solve(20)
+    for extra in ({"maps": "npz"}, {"also": [(tmp_path, "nearest")]}, {"masks": tmp_path}):
+        with pytest.raises(InputError, match="maps, masks and other images are of rectified photos; give images"):
+            rs.solve(folder, tmp_path / "out", rectify=rs.RectifyOptions(**extra))
     assert not (tmp_path / "out").exists()
 
 

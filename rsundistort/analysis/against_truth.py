@@ -75,7 +75,9 @@ def evaluate(
     pose_truth = read_solution(Path(poses)) if poses is not None else true_solution
     if any(image.posed for image in pose_truth.images):
         errors = pose_errors(solution, pose_truth)
-        rotation, center = _summary(errors.rotation_deg), _summary(errors.center)
+        rotation = _summary(errors.rotation_deg)
+        # none where all cameras are in one place
+        center = _summary(errors.center) if np.isfinite(errors.center).all() else None
     phi = np.abs(motion_errors(solution, true_solution).phi_rad_per_frame) * 1e3
     x, y, z = phi.mean(0).tolist()
     folders = {"twins": (twins, truth.parent / "global"), "raw": (raw, truth.parent / "photos")}

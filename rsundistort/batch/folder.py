@@ -10,11 +10,12 @@ from typing import Any
 
 from ..errors import InputError, MetadataWarning, RsUndistortWarning, SkippedPhotoWarning
 from ..io import list_photos, read_solution
-from ..io.outputs import batch_folder
+from ..io.outputs import batch_folder, check_begins_or_goes_on
 from ..io.places import Place, RemoteFolder, local_place, place_of, write_in
 from ..io.record import Record
 from ..io.solution_json import solution_to_bytes
 from ..model import Solution
+from ..model.checks import check_kind
 from ..model.orientation import in_stored_frame, orient_solution, split_mirror
 from .geometry import SceneGeometry, ScenePoints, with_depths
 from .many_photos import rectify_photos
@@ -76,6 +77,9 @@ def rectify_folder(
     left_out : dict of name to reason
         Photos of the folder that were not rectified; a warning says so, too.
     """
+    if options is not None:
+        check_kind(options, RectifyOptions, "options")
+    check_begins_or_goes_on(overwrite, resume)
     options = replace(options or RectifyOptions(), **named)
     solution = local_place(solution)
     folder, target = place_of(photos), place_of(out)

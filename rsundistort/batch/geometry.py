@@ -236,6 +236,9 @@ class SceneGeometry:
         moving = solution.shutter_model == "constant-motion"
         self._moving = {image.name for image in solution.registered if moving and image.posed}
         own = self._how == "map" and self._moving
+        if self._how == "map" and not self._moving:
+            text = f"{depth} is not used: no camera travelled while it was read, or the shutter model has no velocity"
+            warnings.warn(text, RsUndistortWarning, stacklevel=2)
         self._maps = find_depth_maps(Path(depth).absolute(), sorted(self._moving)) if own else {}
         if self._how in ("plane", "points") and points is None and self._moving:
             raise InputError(f"depth {self._how!r} needs the points of the scene, and there are none")

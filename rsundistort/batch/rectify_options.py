@@ -81,5 +81,7 @@ class RectifyOptions:
             raise InputError(f"maps={self.maps!r}, expected one of {', '.join(MAP_KINDS)}")
         if self.raw_as not in RAW_AS:
             raise InputError(f"raw_as={self.raw_as!r}, expected one of {', '.join(RAW_AS)}")
+        if not self.max_megapixels > 0:
+            raise InputError(f"max_megapixels={self.max_megapixels!r}, expected a positive number")
         if not 1 <= self.quality <= 100:
             raise InputError(f"quality={self.quality!r}, expected 1 to 100")

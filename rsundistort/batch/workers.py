@@ -16,6 +16,7 @@ import cv2
 import numba
 
 from ..errors import InputError, RsUndistortWarning
+from ..model.checks import check_whole
 from .memory import free_memory
 
 __all__ = ["Workers", "use_threads"]
@@ -35,8 +36,7 @@ _RETRIES = 2
 
 def use_threads(jobs: int) -> int:
     """Hold OpenCV and the kernels to a number of threads; 0 for all cores. Returns the number."""
-    if not 0 <= jobs <= _MOST_JOBS:
-        raise InputError(f"jobs={jobs!r}, expected 0 to {_MOST_JOBS}")
+    jobs = check_whole(jobs, "jobs", 0, _MOST_JOBS)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     jobs = jobs or cores
     cv2.setNumThreads(jobs)

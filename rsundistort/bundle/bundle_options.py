@@ -29,7 +29,10 @@ LOSSES: dict[str, int] = {"squared": 0, "huber": 1, "cauchy": 2, "soft-l1": 3}
 
 def _known(name: str, phi: ArrayLike, sigma: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """A known motion, checked."""
-    values, sigmas = (np.array(np.broadcast_to(np.asarray(value, np.float64), 3)) for value in (phi, sigma))
+    try:
+        values, sigmas = (np.array(np.broadcast_to(np.asarray(value, np.float64), 3)) for value in (phi, sigma))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"known motion of {name!r}: expected phi and sigma of three numbers each") from error
     unknown = np.isposinf(sigmas)
     if not (np.isfinite(values) | unknown).all():
         raise InputError(f"known motion of {name!r}: {values.tolist()}, expected finite numbers")

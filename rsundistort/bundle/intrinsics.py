@@ -135,15 +135,13 @@ def check_refined(names: Sequence[str]) -> tuple[str, ...]:
     return names
 
 
-def check_lenses(names: Sequence[str], cameras: Sequence[Camera]) -> None:
+def check_lenses(names: Sequence[str], cameras: Sequence[Camera], what: str = "cannot refine") -> None:
     """Refuse names that are checked, but that the lenses of all cameras lack."""
     lenses = sorted({camera.lens for camera in cameras})
     known = [name for lens in lenses for name in _OF_LENS[lens]]
     for name in names:
         if INTRINSICS[name] >= INTRINSICS["k1"] and name not in known:
-            raise InputError(
-                f"cannot refine {name} of a {' or '.join(lenses)} lens, expected some of {', '.join(known)}"
-            )
+            raise InputError(f"{what} {name} of a {' or '.join(lenses)} lens, expected some of {', '.join(known)}")
 
 
 def moved_camera(camera: Camera, names: Sequence[str], step: NDArray[np.float64]) -> Camera:

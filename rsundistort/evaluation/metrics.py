@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import Solution
-from ..model.checks import check_kind, check_whole
+from ..model.checks import check_finite, check_kind, check_whole
 from ..model.similarity import similarity_of
 
 __all__ = ["MotionErrors", "PoseErrors", "align_points", "motion_errors", "pose_errors", "psnr", "rotation_angles_deg"]
@@ -29,7 +29,7 @@ class PoseErrors:
         Angle left after the common rotation that best aligns all orientations.
     center : (m,) array
         Distance left after the similarity that best aligns the centres, in units of the truth's mean distance
-        between consecutive centres.
+        between consecutive centres; NaN where these are all in one place.
     """
 
     names: tuple[str, ...]
@@ -69,6 +69,10 @@ def align_points(
     scale, R, shift
         `scale * R @ x + shift`; float, (3, 3), (3,).
     """
+    points = check_finite(points, (None, 3), "points")
+    true_points = check_finite(true_points, points.shape, "true_points")
+    if len(points) < 3:
+        raise InputError(f"{len(points)} points; a similarity needs at least three")
     found = similarity_of(points, true_points)
     return found.scale, found.R, found.shift
 
@@ -86,6 +90,8 @@ def pose_errors(solution: Solution, truth: Solution) -> PoseErrors:
     InputError
         When fewer than three photos have poses on both sides.
     """
+    for each, what in ((solution, "solution"), (truth, "truth")):
+        check_kind(each, Solution, what)
     true_of = {image.name: image for image in truth.images if image.posed}
     pairs = [(image, true_of[image.name]) for image in solution.images if image.posed and image.name in true_of]
     if len(pairs) < 3:
@@ -97,10 +103,12 @@ def pose_errors(solution: Solution, truth: Solution) -> PoseErrors:
     # R_true = R A^T for the world rotation A that takes estimated to true coordinates
     A = _best_rotation(np.einsum("mji,mjk->ik", R_true, R))
     rotation = rotation_angles_deg(np.einsum("mij,kj,mlk->mil", R, A, R_true))
+    step = np.linalg.norm(np.diff(C_true, axis=0), axis=1).mean()
+    if not step > 0:
+        return PoseErrors(tuple(a.name for a, _ in pairs), rotation, np.full(len(pairs), np.nan))
     scale, S, shift = align_points(C, C_true)
     left = np.linalg.norm(scale * C @ S.T + shift - C_true, axis=1)
-    step = np.linalg.norm(np.diff(C_true, axis=0), axis=1).mean()
-    return PoseErrors(tuple(a.name for a, _ in pairs), rotation, left / max(step, 1e-300))
+    return PoseErrors(tuple(a.name for a, _ in pairs), rotation, left / step)
 
 
 def motion_errors(solution: Solution, truth: Solution) -> MotionErrors:
@@ -108,6 +116,8 @@ def motion_errors(solution: Solution, truth: Solution) -> MotionErrors:
 
     A readout that is taken to run the other way reverses the sign of phi and is no error.
     """
+    for each, what in ((solution, "solution"), (truth, "truth")):
+        check_kind(each, Solution, what)
     true_of = {image.name: image for image in truth.images if image.motion is not None}
     names, errors = [], []
     for image in solution.images:
@@ -118,7 +128,9 @@ def motion_errors(solution: Solution, truth: Solution) -> MotionErrors:
         camera, true_camera = solution.cameras[image.camera_id], truth.cameras[true_image.camera_id]
         reverse = camera.clock_sign * true_camera.clock_sign
         names.append(image.name)
-        errors.append((image.motion.phi - reverse * true_image.motion.phi) * camera.frame_span)
+        # each by its own camera: with another focal length the same rotation has another phi
+        true_phi = true_image.motion.phi * true_camera.frame_span
+        errors.append(image.motion.phi * camera.frame_span - reverse * true_phi)
     if not names:
         raise InputError("no photo has a motion in both solution and truth")
     return MotionErrors(tuple(names), np.array(errors))
@@ -139,8 +151,13 @@ def psnr(image: NDArray[Any], truth: NDArray[Any], mask: NDArray[np.uint8] | Non
     """
     for each, name in ((image, "image"), (truth, "truth"), *(() if mask is None else ((mask, "mask"),))):
         check_kind(each, np.ndarray, name)
-        if each.dtype.kind not in "uif" or each.ndim not in (2, 3) or not each.size:
-            raise InputError(f"{name} is {each.dtype} {each.shape}, expected numbers (h, w[, channels])")
+        known = each.dtype in (np.uint8, np.uint16) or each.dtype.kind == "f"
+        if not known or each.ndim not in (2, 3) or not each.size:
+            raise InputError(
+                f"{name} is {each.dtype} {each.shape}, expected uint8, uint16 or float in 0 to 1, (h, w[, channels])"
+            )
+        if each.dtype.kind == "f":
+            check_finite(each, each.shape, name)
     if image.shape != truth.shape or image.dtype != truth.dtype:
         raise InputError(f"image {image.shape} {image.dtype} and truth {truth.shape} {truth.dtype} do not compare")
     if mask is not None and (mask.dtype != np.uint8 or mask.shape != image.shape[:2]):

@@ -107,6 +107,10 @@ class _Loaded:
     coarse: bool = False
 
 
+# A descriptor takes 16 pixels, and a camera of a row of pixels is none.
+_LEAST_SIDE = 16
+
+
 def _load(job: _LoadJob) -> _Loaded:
     try:
         photo = read_photo(job.source, job.max_megapixels)
@@ -117,6 +121,8 @@ def _load(job: _LoadJob) -> _Loaded:
     except InputError as error:
         return _Loaded(problem=f"{job.name}: {error}")
     height, width = photo.pixels.shape[:2]
+    if min(width, height) < _LEAST_SIDE:
+        return _Loaded(problem=f"{job.name} has {width}x{height} pixels, too few to show anything")
     # a mask that cannot be used stops the run: without it, what it excludes would be measured
     mask = None if job.own_mask is None else read_mask(job.own_mask, width, height)
     few, features = 1e-6 * _COARSE * width * height, None

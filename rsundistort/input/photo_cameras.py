@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bundle import BundleOptions, GuessedCameras, deviation, pixels_of
+from ..bundle.intrinsics import check_lenses
 from ..errors import InputError, ReconstructionError
 from ..io import (
     CameraFile,
@@ -116,6 +117,7 @@ class PhotoCameras:
 
     def with_sigma(self, sigma: Mapping[str, float]) -> PhotoCameras:
         """The cameras, all known to these standard deviations, in pixels or of the coefficients."""
+        check_lenses([*sigma], self.cameras, "camera_sigma:")
         specified = self.sigma or [{}] * len(self.cameras)
         return replace(
             self, sigma=[{**old, **_relative(sigma, c)} for old, c in zip(specified, self.cameras, strict=True)]

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import psutil
 
-from ..errors import FileError
+from ..errors import FileError, InputError
 from .aside import is_partial, remove_partial
 from .journal import Journal, RemoteJournal
 from .lock import check_still_there, locked
@@ -23,8 +23,8 @@ from .places import Place, RemoteFolder
 from .record import Record, is_inside
 
 __all__ = [
-    "BATCH_FOLDERS", "CANNOT_WRITE", "batch_folder", "has_content", "held_inside", "make_inside", "only_writer",
-    "output_folder", "work_folder",
+    "BATCH_FOLDERS", "CANNOT_WRITE", "batch_folder", "check_begins_or_goes_on", "has_content", "held_inside",
+    "make_inside", "only_writer", "output_folder", "work_folder",
 ]  # fmt: skip
 
 #: What a batch fills.
@@ -46,6 +46,12 @@ _WORK = _SCRATCH.lstrip(".")
 
 # Where an open folder has a name that no link changes, by its number.
 _OPEN_FOLDERS = Path("/proc/self/fd")
+
+
+def check_begins_or_goes_on(overwrite: bool, resume: bool) -> None:
+    """Refuse to begin anew and to go on at once."""
+    if overwrite and resume:
+        raise InputError("overwrite begins anew and resume continues; give one of them")
 
 
 @contextmanager
@@ -225,7 +231,8 @@ def batch_folder(
                 going_on = journal.path.is_file()
                 if has_content(folder) and not overwrite:
                     _check_goes_on(folder, going_on, resume)
-                new = [path for path in (folder / "images", folder / "masks", journal.path) if not path.exists()]
+                paths = (*(folder / name for name in BATCH_FOLDERS), journal.path)
+                new = [path for path in paths if not path.exists()]
                 # a last line cut short must not run into the next; and what is there without it cannot be gone on with
                 journal.write(journal.read().values())
                 for name in ("images", "masks"):

@@ -207,8 +207,16 @@ def local_place(place: Path | str) -> Path:
     return local
 
 
+def _leads_nowhere(path: Path) -> bool:
+    """Whether a link has lost what it led to."""
+    return path.is_symlink() and not path.exists()
+
+
 def files_in(place: Place, within: str = ".") -> dict[str, File] | None:
-    """Files in a folder or a sub-folder of it by their own names, sorted; None if there is no such folder."""
+    """Files in a folder or a sub-folder of it by their own names, sorted; None if there is no such folder.
+
+    Links that lead nowhere are among them: reading one says so, and nothing is left out in silence.
+    """
     if isinstance(place, RemoteFolder):
         listing = place.listing(within)
         if listing is None:
@@ -220,7 +228,9 @@ def files_in(place: Place, within: str = ".") -> dict[str, File] | None:
             if entry["type"] == "file"
         }
     folder = place / within
-    return {path.name: path for path in sorted(folder.iterdir()) if path.is_file()} if folder.is_dir() else None
+    if not folder.is_dir():
+        return None
+    return {path.name: path for path in sorted(folder.iterdir()) if path.is_file() or _leads_nowhere(path)}
 
 
 def files_of(place: Place, paths: Sequence[str]) -> dict[str, File]:

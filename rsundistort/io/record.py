@@ -157,10 +157,14 @@ class Record:
 
     def is_finished(self, key: str) -> bool:
         """Whether all is there as it was when that was noted."""
+        return self.changed(key) == []
+
+    def changed(self, key: str) -> list[str] | None:
+        """What is gone or changed since it was noted that all is there; None if that was not noted of `key`."""
         if text_in(self._place, self.NAME).splitlines()[-1:] != [_line("", key).strip()]:
-            return False
+            return None
         known = {path for path in self._own() if not _is_own(path)}  # the journal goes at the end
-        return self.ours({path.split("/")[0] for path in known}) >= known
+        return sorted(known - set(self.ours({path.split("/")[0] for path in known})))
 
     def _append(self, entries: Iterable[tuple[str, str | None]]) -> None:
         lines = [_line(path, stamp) for path, stamp in entries]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import FormatError, InputError
+from ..errors import FileError, FormatError, InputError
 from ..model import Bend, Camera, RowMotion, Solution, SolvedImage
 from .aside import write_aside
 from .cameras import camera_from_json, camera_to_json
@@ -185,8 +185,13 @@ def solution_to_json(solution: Solution) -> dict[str, Any]:
 
 
 def write_solution(path: Path, solution: Solution) -> None:
-    """Write `solution.json`, whole or not at all."""
-    write_aside(Path(path), solution_to_bytes(solution))
+    """Write `solution.json`, whole or not at all; a `FileError` if it cannot be written there."""
+    path = Path(path)
+    try:
+        write_aside(path, solution_to_bytes(solution))
+    except OSError as error:
+        mend = "give a file in a folder that is there"
+        raise FileError(f"{path} cannot be written ({error.strerror}); {mend}") from error
 
 
 def solution_to_bytes(solution: Solution) -> bytes:

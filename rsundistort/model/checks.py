@@ -100,7 +100,7 @@ def check_number(value: Any, name: str, low: float = -np.inf, high: float = np.i
 def check_whole(value: Any, name: str, low: int, high: int = 2**31 - 1) -> int:
     """A whole number between two, which belong to it."""
     if not _is_number(value) or not low <= value <= high or int(value) != value:
-        most = "" if high == 2**31 - 1 else f" up to {high}"
+        most = "" if high == 2**31 - 1 else f" and at most {high}"
         least = "a positive whole number" if low == 1 else f"a whole number, at least {low}"
         raise InputError(f"{name}={_short(value)}, expected {least}{most}")
     return int(value)
@@ -210,8 +210,10 @@ def check_rotations(value: ArrayLike, length: int, name: str) -> NDArray[np.floa
     array = check_finite(value, (length, 3, 3), name)
     if length:
         off = np.abs(array @ array.transpose(0, 2, 1) - np.eye(3)).max()
-        if off > 1e-6 or (np.linalg.det(array) < 0).any():
+        if off > 1e-6:
             raise InputError(f"{name} holds a matrix that is no rotation (off by {off:.2g})")
+        if (np.linalg.det(array) < 0).any():
+            raise InputError(f"{name} holds a matrix that mirrors (determinant -1); a rotation has +1")
     return array
 
 

@@ -225,6 +225,8 @@ def optimal_new_camera(
         Rectangle without empty pixels in any of the rectified photos.
     """
     alpha = check_number(alpha, "alpha", 0.0, 1.0)
+    if isinstance(motion, Sequence) and not motion:
+        raise InputError("motion holds none; give those of the photos, or None for a camera that stood still")
     motions = [motion_of(camera, each) for each in (motion if isinstance(motion, Sequence) else [motion])]
     width, height = check_size((camera.width, camera.height) if size is None else size, least=2)
     outlines = [_outline(camera, each, shutter_model) for each in motions]

@@ -145,6 +145,8 @@ def solve(
         workers, outputs = Workers(use_threads(jobs), scheduler), outputs or OutputOptions()
         check_usd(outputs, is_clip=False)
         folder = None if images is None else local_place(images)
+        if folder is None and (rectify.maps is not None or rectify.also or rectify.masks is not None):
+            raise InputError("solve: maps, masks and other images are of rectified photos; give images, too")
         job = _Job(local_place(model), local_place(out), folder, database, options, rectify, outputs, workers)
         return _solve_files(job, overwrite, resume, progress)
     if not hasattr(model, "reg_image_ids"):

@@ -13,7 +13,7 @@ from ..batch.one_photo import feed
 from ..batch.progress import StageLog
 from ..errors import FileError
 from ..io.kept import Kept
-from ..io.outputs import has_content, only_writer
+from ..io.outputs import check_begins_or_goes_on, has_content, only_writer
 from ..io.record import Record
 from ..versions import versions
 
@@ -88,9 +88,15 @@ def run_folder(
     FileError
         There are outputs, but no run that `resume` could continue.
     """
+    check_begins_or_goes_on(overwrite, resume)
     with only_writer(out):
         run = RunFolder(out, key, resume)
-        if resume and not overwrite and not (run.finished or run.goes_on) and has_content(out):
+        if resume and not (run.finished or run.goes_on) and has_content(out):
+            if changed := Record(out).changed(key):
+                raise FileError(
+                    f"{out} holds this run, complete, but {len(changed)} of its files changed since or are gone, such "
+                    f"as {changed[0]}; give another folder, or --overwrite to make all again"
+                )
             raise FileError(
                 f"{out} is not empty, and holds no run with these photos and options that --resume could continue; "
                 "give another folder, or --overwrite to replace its outputs"

@@ -427,7 +427,7 @@ def _check_enough(registered: Reconstruction, total: int) -> None:
     if registered.num_images < _LEAST_PHOTOS:
         raise ReconstructionError(
             f"only {registered.num_images} of {total} photos could be registered, the shutter needs three; "
-            "use photos that share more of the scene"
+            "use photos that share more of the scene, or check the camera's focal length"
         )
 
 

@@ -12,6 +12,7 @@ from typing import Any
 from ..batch.progress import ProgressCallback, StageLog
 from ..batch.workers import Workers, use_threads
 from ..bundle import BundleOptions
+from ..bundle.intrinsics import check_lenses
 from ..errors import InputError, RsUndistortWarning
 from ..input.exposure import bounded_by_exposure
 from ..input.frames import find_photos
@@ -29,6 +30,7 @@ from ..io.places import local_place
 from ..io.record import Record
 from ..io.video import VideoFrames
 from ..model import Reconstruction, Solution
+from ..model.checks import check_kind
 from .going_on import RunFolder, key_of, run_folder
 from .model_sequence import solve_photos
 from .outcome import Solved
@@ -77,7 +79,8 @@ def run(
     Solution
         As written to `out/solution.json`; photos that did not register are in it, with the reason.
     """
-    options = options or RunOptions()
+    options = RunOptions() if options is None else options
+    check_kind(options, RunOptions, "options")
     rectify = options.rectify
     photos, out = local_place(photos), local_place(out)
     log = StageLog(progress)
@@ -148,6 +151,7 @@ def _solved(
     )  # fmt: skip
     loaded = with_focal_lengths(loaded, options.solve.seed, log, kept)
     _check_anchors(options.solve, loaded.names, photos)
+    check_lenses([*options.solve.camera_sigma], loaded.cameras.cameras, "camera_sigma:")
     bodies = loaded.facts if source.frames is None else [source.frames] * len(loaded.names)
     if source.clip is None:
         solved, solving = _solve(options, loaded, bodies, gyro_log, workers, log, kept)

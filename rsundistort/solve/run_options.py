@@ -21,7 +21,7 @@ from ..input.positions import check_crs
 from ..io.cameras import check_sigma
 from ..io.exports import check_exports
 from ..model import Bend, ControlPoint, KnownLength, check_shutter_model
-from ..model.checks import check_fields
+from ..model.checks import check_fields, check_whole
 from ..sfm import DETECTION_MEGAPIXELS
 
 __all__ = ["OutputOptions", "RunOptions", "SolveOptions"]
@@ -109,6 +109,11 @@ class SolveOptions(_Part):
             check_shutter_model(self.shutter_model)
         check_readouts(self.readout)
         check_sigma(self.camera_sigma, "camera_sigma")
+        check_whole(self.seed, "seed", 0)
+        if self.refine == () and self.camera_sigma:
+            raise InputError("refine none fixes the camera, camera_sigma says how far it may be off; give one of them")
+        if self.shutter_model == "global" and (self.still or self.known or self.known_bends):
+            raise InputError("a global shutter has no motion; leave out still and known, or give another shutter model")
         check_crs(self.crs)
         with_remedy(self.bundle_options(), self.remedy)
         if self.readout_s is not None and not 0 < self.readout_s < np.inf:
