@@ -22,7 +22,7 @@ def attempts(monkeypatch):
         count = registers.get(attempt, 0)
         return SimpleNamespace(num_images=count, by=attempt) if count else None
 
-    monkeypatch.setattr(mapping, "_mapped_at_once", lambda _, limit: of(limit))
+    monkeypatch.setattr(mapping, "_mapped_at_once", lambda _, limit, *__: of(limit))
     monkeypatch.setattr(mapping, "_mapped_one_by_one", lambda *_: of("one by one"))
     return made, registers
 

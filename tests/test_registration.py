@@ -10,10 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, Observations, Reconstruction, RowMotion, project_points
 from rsundistort.colmap.conventions import quiet_pycolmap
-from rsundistort.sfm import Features, MatchedPhotos, read_num_verified, register_photos
+from rsundistort.sfm import Features, MatchedPhotos, map_photos, map_without_motions, read_num_verified, register_photos
 from rsundistort.sfm.database import write_photos
 from rsundistort.sfm.epipolar import agreeing_photos, read_matches
+from rsundistort.sfm.motion_averaging import averaged_motions
 from rsundistort.sfm.registration import place_photo
+from rsundistort.sfm.relative_pose import Pair
+from rsundistort.sfm.verification import pair_of
 
 CAMERA = Camera(1200, 900, [[1000, 0, 600], [0, 1000, 450], [0, 0, 1]])
 NAMES = [f"{k}.jpg" for k in range(6)]
@@ -170,3 +173,41 @@ def test_photos_that_the_poses_do_not_explain_are_distinguished(scene, matched):
     R_cw[:2] = Rotation.from_rotvec([0.2, 0.3, 0.1]).as_matrix() @ R_cw[:2]
     agreeing = agreeing_photos(matched, read_matches(matched), read_num_verified(matched), replace(scene, R_cw=R_cw))
     np.testing.assert_array_equal(agreeing, np.arange(6) >= 2)
+
+
+def pairs_of(matched):
+    return {key: pair_of(matched, key, found) for key, found in read_matches(matched).items()}
+
+
+def test_photos_without_a_pair_have_no_motion(matched):
+    pairs = {key: pair for key, pair in pairs_of(matched).items() if 4 not in key}
+    phi = averaged_motions(6, pairs)
+    assert (phi[4] == 0).all()
+    assert (phi[[0, 1, 2, 3, 5]] != 0).all()
+    assert (averaged_motions(6, {}) == 0).all()
+
+
+def test_a_false_pair_is_outvoted(matched, rng):
+    pairs = pairs_of(matched)
+    before = averaged_motions(6, pairs)
+    other = pairs[0, 3]
+    pairs[0, 3] = Pair(other.first, other.second.take(rng.permutation(len(other.second.clock))))
+    assert np.abs(averaged_motions(6, pairs) - before).max() < 0.05
+
+
+def apart_deg(mapped, scene):
+    """Rotations against the true ones, by the rotation that most of them have in common."""
+    of = [NAMES.index(name) for name in mapped.image_names]
+    steps = Rotation.from_matrix(np.einsum("mji,mjk->mik", scene.R_cw[of], mapped.R_cw))
+    return np.degrees((steps * steps.mean().inv()).magnitude())
+
+
+def test_photos_are_mapped_right_without_their_motions(scene, matched):
+    mapped, plain = map_without_motions(matched), map_photos(matched)
+    assert mapped.num_images >= 5
+    assert apart_deg(mapped, scene).max() < 3.0
+    assert apart_deg(plain, scene).max() > 10.0
+    # the measurements are those of the photos as they are
+    shown = {tuple(xy) for found in matched.features for xy in found.xy_raw.tolist()}
+    assert {tuple(xy) for xy in mapped.observations.xy_raw.tolist()} <= shown
+    assert mapped.shutter_model == "global"

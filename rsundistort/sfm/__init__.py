@@ -9,6 +9,7 @@ from .focal_length import USUAL_FOCAL, estimate_focal_length
 from .imported import matched_of_database
 from .mapping import map_photos
 from .matching import match_photos
+from .motion_averaging import map_without_motions
 from .pairs import choose_pairs, global_descriptors
 from .registration import register_photos
 from .retriangulation import retriangulate
@@ -37,6 +38,7 @@ __all__ = [
     "global_descriptors",
     "grey_8_bit",
     "map_photos",
+    "map_without_motions",
     "match_photos",
     "matched_of_database",
     "read_num_verified",

@@ -57,6 +57,7 @@ def map_photos(
     matched: MatchedPhotos,
     progress: Callable[[int], None] | None = None,
     keypoints: Sequence[int | None] = PLACING_KEYPOINTS,
+    shown: MatchedPhotos | None = None,
 ) -> Reconstruction:
     """Global-shutter reconstruction with room for shutter distortion.
 
@@ -71,6 +72,8 @@ def map_photos(
         Called with the number of photos registered so far.
     keypoints : sequence of int or None
         How many of the largest keypoints of each place it, in attempts one after the other; None for all.
+    shown : MatchedPhotos, optional
+        The photos as they are, where the keypoints of `matched` are not: their pixels are the measurements.
 
     Returns
     -------
@@ -86,12 +89,12 @@ def map_photos(
     enough = _ENOUGH_REGISTERED * total
     found, count = None, 0
     for limit in keypoints:
-        found = _with_more(found, _mapped_at_once(matched, limit))
+        found = _with_more(found, _mapped_at_once(matched, limit, shown))
         before, count = count, 0 if found is None else found.num_images
         if count == total or enough <= count == before:
             break
     if found is None or count < enough:
-        found = _with_more(found, _mapped_one_by_one(matched, progress))
+        found = _with_more(found, _mapped_one_by_one(matched, progress, shown))
     if found is None:
         raise ReconstructionError(
             f"none of the {len(matched.names)} photos overlap enough to be registered; "
@@ -107,16 +110,18 @@ def _with_more(best: Reconstruction | None, other: Reconstruction | None) -> Rec
     return other if other.num_images > best.num_images else best
 
 
-def _mapped_at_once(matched: MatchedPhotos, limit: int | None) -> Reconstruction | None:
+def _mapped_at_once(matched: MatchedPhotos, limit: int | None, shown: MatchedPhotos | None) -> Reconstruction | None:
     """What the global mapper registers by the largest keypoints, without photos that hang on by few measurements."""
     work = matched.database.parent / f"mapping-global-{limit}"
     work.mkdir()
     options = _global_options(matched)
     models = quiet_pycolmap().global_mapping(_mapping_database(matched, work, limit), work, work, options)
-    return _firmly_connected(_largest(models.values()), matched)
+    return _firmly_connected(_largest(models.values()), shown or matched)
 
 
-def _mapped_one_by_one(matched: MatchedPhotos, progress: Callable[[int], None] | None) -> Reconstruction | None:
+def _mapped_one_by_one(
+    matched: MatchedPhotos, progress: Callable[[int], None] | None, shown: MatchedPhotos | None
+) -> Reconstruction | None:
     """What incremental mapping registers.
 
     With the largest keypoints first, then with all, then with less loose thresholds, until all photos are in one model
@@ -130,7 +135,7 @@ def _mapped_one_by_one(matched: MatchedPhotos, progress: Callable[[int], None] |
             matched = _refined(matched, refined)
         matched = replace(matched, calibrated=True)
     attempts = [(_MAPPING_KEYPOINTS, LOOSE), (None, LOOSE), (None, 2.0), (None, 1.0)]
-    return _firmly_connected(_best_model(matched, attempts, progress), matched)
+    return _firmly_connected(_best_model(matched, attempts, progress), shown or matched)
 
 
 def _firmly_connected(model: Any, matched: MatchedPhotos) -> Reconstruction | None:

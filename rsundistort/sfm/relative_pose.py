@@ -16,7 +16,16 @@ from .._kernels import epipolar as kernels
 from ..model import Camera
 from ..model.projection import clock_of, unproject_points
 
-__all__ = ["INLIER_PX", "NO_SHUTTER", "Pair", "RelativePose", "View", "find_relative_pose", "relative_poses"]
+__all__ = [
+    "INLIER_PX",
+    "NO_SHUTTER",
+    "Pair",
+    "RelativePose",
+    "View",
+    "find_relative_pose",
+    "phi_information",
+    "relative_poses",
+]
 
 # Five points suggest a pose with thresholds of these pixels: what fits a narrow one is a part of the photos that the
 # shutter hardly bends, what fits the wide one most of them.
@@ -239,6 +248,20 @@ def _adjusted(start: RelativePose, pair: Pair, phi_sigma: float, width: float) -
             break
     covariance = np.linalg.inv(A + 1e-9 * np.diag(np.diag(A)) + 1e-12 * np.eye(11))
     return replace(now, phi_sigma=np.sqrt(np.maximum(np.diag(covariance)[5:], 0.0)).reshape(2, 3))
+
+
+def phi_information(pose: RelativePose, pair: Pair) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Inverse covariance (6, 6) of both phi by the matches alone, whatever the pose, and the gradient (6,) there.
+
+    For noise of one pixel. The gradient is what the prior of an estimate holds against.
+    """
+    H, g = np.empty((11, 11)), np.empty(11)
+    kernels.pair_system(
+        *pair.arrays, pose.R_21, pose.t_21, _across(pose.t_21), *pose.phi, _WIDTHS_PX[1], H, g
+    )  # fmt: skip
+    H += 1e-9 * np.diag(np.diag(H)) + 1e-12 * np.eye(11)
+    of_pose = np.linalg.solve(H[:5, :5], np.column_stack([H[:5, 5:], g[:5]]))
+    return H[5:, 5:] - H[5:, :5] @ of_pose[:, :6], g[5:] - H[5:, :5] @ of_pose[:, 6]
 
 
 def _across(t: NDArray[np.float64]) -> NDArray[np.float64]:

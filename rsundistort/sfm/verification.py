@@ -13,7 +13,7 @@ from .database import MatchedPhotos
 from .epipolar import MIN_EXPLAINED, Matches, read_matches
 from .relative_pose import INLIER_PX, NO_SHUTTER, Pair, RelativePose, View, find_relative_pose, relative_poses
 
-__all__ = ["verify_with_shutter"]
+__all__ = ["pair_of", "verify_with_shutter"]
 
 # So many pairs of the most matches, and so many matches of each, show how strong the shutter is.
 _ASKED, _MATCHES = 6, 300
@@ -43,7 +43,7 @@ def verify_with_shutter(matched: MatchedPhotos) -> float:
     if not most:
         return 0.0
     step_px = float(np.median([each.step_px for each in matched.features]))
-    pairs = [_pair(matched, pair, matches[pair][:_MATCHES]) for pair in most]
+    pairs = [pair_of(matched, pair, matches[pair][:_MATCHES]) for pair in most]
     poses, spread = relative_poses(pairs)
     if spread >= _STRONG_RAD:
         without = [find_relative_pose(pair, NO_SHUTTER) for pair in pairs]
@@ -62,7 +62,7 @@ def _num_explained(poses: Sequence[RelativePose | None], pairs: Sequence[Pair], 
     return int(sum(found))
 
 
-def _pair(matched: MatchedPhotos, pair: tuple[int, int], matches: NDArray[np.int64]) -> Pair:
+def pair_of(matched: MatchedPhotos, pair: tuple[int, int], matches: NDArray[np.int64]) -> Pair:
     """The matches of two photos, as each shows them."""
     first, second = (
         View.of(matched.features[photo].xy_raw[matches[:, side]], matched.cameras[matched.camera_idx[photo]])
@@ -77,7 +77,7 @@ def _add_explained(matched: MatchedPhotos, matches: Matches, spread: float) -> N
     with pycolmap.Database.open(matched.database) as db:
         verified = set(db.read_two_view_geometry_num_inliers()[0])
         for (first, second), found in matches.items():
-            views = _pair(matched, (first, second), found)
+            views = pair_of(matched, (first, second), found)
             pose = find_relative_pose(views, spread)
             if pose is None:
                 continue

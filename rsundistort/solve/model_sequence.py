@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -36,12 +37,13 @@ from ..sfm import (
     MatchedPhotos,
     align_tracks,
     firmly_connected,
+    map_without_motions,
     read_num_verified,
     register_photos,
     retriangulate,
 )
 from ..verdict import Verdict, judge
-from .depth_reversal import choose_depths
+from .depth_reversal import choose_depths, num_explained
 from .outcome import Solved
 from .placing import place_photos
 from .survey import Survey
@@ -274,8 +276,10 @@ def solve_tracks(
     tracks, strong = result.reconstruction, _is_strong(result.reconstruction)
     if track_source is not None:
         result = _registered_again(track_source, result, wanted, log)
-        options = _of_registered(wanted, result.reconstruction)
         strong = strong or _is_strong(result.reconstruction)
+        if strong and survey is None:
+            result = _mapped_again(track_source, result, wanted, log)
+        options = _of_registered(wanted, result.reconstruction)
         result, tracks, options = _retriangulated(track_source, result, options, log, ends=not auto)
     options = replace(options, phi_sigma_start=result.phi_rms)
     choice = None
@@ -468,6 +472,31 @@ def _registered_again(
         names = ", ".join(sorted(left_out))
         warnings.warn(f"left out, since they contradict the other photos: {names}", RsUndistortWarning, stacklevel=3)
     return result
+
+
+def _mapped_again(
+    track_source: TrackSource, result: BundleResult, wanted: BundleOptions, log: StageLog
+) -> BundleResult:
+    """The solution, or that of a mapping of keypoints without rough motions if it has more photos and explains more.
+
+    A side of a scene that mapping rotated as a whole has no photo that fits elsewhere.
+    """
+    rec, matched = result.reconstruction, track_source.matched
+    if rec.num_images == len(matched.names) or rec.shutter_model not in ("rotation", "constant-motion"):
+        return result
+    stage, mapped = "mapping without motions", None
+    log.begin(stage)
+    with suppress(ReconstructionError):
+        mapped = map_without_motions(replace(matched, cameras=rec.cameras))
+    log.end(stage, photos=0 if mapped is None else mapped.num_images)
+    if mapped is None or mapped.num_images < _LEAST_PHOTOS:
+        return result
+    options = rough_options(_of_registered(wanted, mapped, says=False))
+    other = _adjusted_sequence(mapped, rec.shutter_model, options, log)
+    other = _registered_again(track_source, other, wanted, log)
+    # another place for the same photos is no reason: few of them may be explained better by wrong poses
+    more = other.reconstruction.num_images > rec.num_images
+    return other if more and num_explained(other.reconstruction) > num_explained(rec) else result
 
 
 def _roughly_adjusted(

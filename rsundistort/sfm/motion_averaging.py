@@ -1,0 +1,119 @@
+"""The rotation of each photo during its readout, from what all pairs of photos show of it together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..colmap.conventions import HALF, quiet_pycolmap
+from ..model import Reconstruction, RowMotion
+from .database import MatchedPhotos, ideal_keypoints, verification_options, write_photos
+from .epipolar import MIN_EXPLAINED, Matches, read_matches
+from .mapping import map_photos
+from .matching import LOOSE_PX
+from .relative_pose import Pair, phi_information, relative_poses
+from .verification import pair_of
+
+__all__ = ["averaged_motions", "map_without_motions"]
+
+# Rounds of the weights of pairs, and how many times the usual deviation of a pair halves its weight twice.
+_ROUNDS, _TAIL = 30, 4.0
+
+
+def averaged_motions(num_photos: int, pairs: Mapping[tuple[int, int], Pair]) -> NDArray[np.float64]:
+    """Rotations phi (m, 3) of photos, radians per unit of the clock, that agree best with the relative poses of pairs.
+
+    A pair alone hardly tells the motion of one photo from that of the other. Each pair is a normal distribution of
+    both motions, whatever its pose; their product, under the prior, is what all say. False pairs are outvoted: a pair
+    weighs less the farther it lies from the rest, in units of what pairs usually deviate by.
+
+    Parameters
+    ----------
+    num_photos : int
+        Number of photos m.
+    pairs : mapping of (first, second) to Pair
+        Matches of pairs of photos.
+    """
+    poses, phi_sigma = relative_poses([*pairs.values()])
+    found = {key: pose for key, pose in zip(pairs, poses, strict=True) if pose is not None}
+    known = {key: (*phi_information(pose, pairs[key]), pose.phi.ravel()) for key, pose in found.items()}
+    prior = np.zeros((num_photos, 3))
+    for first, second in found:
+        prior[[first, second]] = (pairs[first, second].frame_spans / phi_sigma).reshape(2, 3) ** 2
+    phi, weights, usual = np.zeros(3 * num_photos), dict.fromkeys(found, 1.0), 1.0
+    for _ in range(_ROUNDS if found else 0):
+        # a photo without a pair has no motion
+        A, b = np.diag(np.where(prior > 0, prior, 1.0).ravel()), np.zeros(3 * num_photos)
+        for key, (information, gradient, mean) in known.items():
+            at = _components(*key)
+            A[np.ix_(at, at)] += weights[key] / usual * information
+            b[at] += weights[key] / usual * (information @ mean - gradient)
+        phi = np.linalg.solve(A, b)
+        apart = {key: _apart(phi[_components(*key)] - mean, each) for key, (each, _, mean) in known.items()}
+        usual = max(float(np.median([*apart.values()])), 1e-9)
+        weights = {key: (1.0 + each / (_TAIL * usual)) ** -2 for key, each in apart.items()}
+    return phi.reshape(num_photos, 3)
+
+
+def _components(first: int, second: int) -> NDArray[np.int64]:
+    """Places of two photos' motions among those of all."""
+    return np.concatenate([np.arange(3 * first, 3 * first + 3), np.arange(3 * second, 3 * second + 3)])
+
+
+def _apart(step: NDArray[np.float64], information: NDArray[np.float64]) -> float:
+    """Mean square of six deviations in units of their standard deviations."""
+    return float(step @ information @ step) / len(step)
+
+
+def map_without_motions(matched: MatchedPhotos) -> Reconstruction:
+    """What `map_photos` makes of the photos if their motions, averaged over pairs, are taken out of their keypoints.
+
+    Pairs are verified anew: matches that a shutter hid are right then, and poses by which it explained false ones are
+    not. The motions are rough, so the result is only another place to start from.
+
+    Parameters
+    ----------
+    matched : MatchedPhotos
+        Photos and their matches; the cameras are taken as known. Its database stays as it is.
+
+    Returns
+    -------
+    Reconstruction
+        With the raw pixels as measurements, and without motions.
+
+    Raises
+    ------
+    ReconstructionError
+        When no two photos could be registered.
+    """
+    matched = replace(matched, calibrated=True)
+    matches = {key: found for key, found in read_matches(matched).items() if len(found) >= MIN_EXPLAINED}
+    pairs = {key: pair_of(matched, key, found) for key, found in matches.items()}
+    phi = averaged_motions(len(matched.names), pairs)
+    cameras = [matched.cameras[k] for k in matched.camera_idx]
+    features = [
+        replace(found, xy_raw=ideal_keypoints(found, camera, RowMotion(each), "rotation").astype(np.float64) - HALF)
+        for found, camera, each in zip(matched.features, cameras, phi, strict=True)
+    ]
+    # what a fisheye shows has no place in a pinhole photo
+    ideal = [camera.without_field() if camera.lens == "fisheye" else camera.pinhole() for camera in matched.cameras]
+    folder = matched.database.parent / "without-motions"
+    folder.mkdir()
+    moved = replace(matched, database=folder / "database.db", features=features, cameras=ideal)
+    _verify(moved, matches)
+    return map_photos(moved, shown=matched)
+
+
+def _verify(matched: MatchedPhotos, matches: Matches) -> None:
+    """Make the database of photos, and verify their matches by the keypoints."""
+    pycolmap = quiet_pycolmap()
+    with pycolmap.Database.open(matched.database) as db:
+        write_photos(db, matched)
+        for (first, second), found in matches.items():
+            db.write_matches(first + 1, second + 1, found.astype(np.uint32))
+    listed = matched.database.with_name("pairs.txt")
+    np.savetxt(listed, np.array([*matches]) + 1, fmt="%d")
+    pycolmap.verify_matches(matched.database, listed, verification_options(LOOSE_PX, matched.seed))
