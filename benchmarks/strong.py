@@ -18,7 +18,8 @@ Prints one JSON object a line and at the end a table. Parts:
               or wrong; rotations and dB as above
     matches   the bound that the matches of each warp impose: their tracks by the poses of the photos as they are and
               the true motions, how many photos these connect (`sfm.firmly_connected`), and the adjustment of these
-              tracks from the true poses and motions
+              tracks from the true poses and motions; and what mapping registers with the pairs as they were verified
+              and the true motions taken out of the keypoints
     fountain  fountain-small with its velocity three times as large
     weak      processor time of `run` on herz-jesus-8 as it is and warped by 0.02 rad, of this state over that of the
               checkout --before, by turns, and whether both write the same solution; without --before it is left out
