@@ -17,6 +17,7 @@ from rsundistort.sfm.motion_averaging import averaged_motions
 from rsundistort.sfm.registration import place_photo
 from rsundistort.sfm.relative_pose import Pair
 from rsundistort.sfm.verification import pair_of
+from rsundistort.solve.model_sequence import _agree
 
 CAMERA = Camera(1200, 900, [[1000, 0, 600], [0, 1000, 450], [0, 0, 1]])
 NAMES = [f"{k}.jpg" for k in range(6)]
@@ -211,3 +212,14 @@ def test_photos_are_mapped_right_without_their_motions(scene, matched):
     shown = {tuple(xy) for found in matched.features for xy in found.xy_raw.tolist()}
     assert {tuple(xy) for xy in mapped.observations.xy_raw.tolist()} <= shown
     assert mapped.shutter_model == "global"
+
+
+def test_solutions_agree_in_any_frame_and_on_the_photos_of_both(scene):
+    frame = Rotation.from_rotvec([0.4, -1.0, 2.0]).as_matrix()
+    assert _agree(scene, replace(scene, R_cw=scene.R_cw @ frame))
+    off = scene.R_cw.copy()
+    off[2] = Rotation.from_rotvec([0, np.radians(5), 0]).as_matrix() @ off[2]
+    assert not _agree(scene, replace(scene, R_cw=off))
+    assert not _agree(scene, replace(scene, image_names=[f"other-{name}" for name in NAMES]))
+    names = [*NAMES[:2], "other.jpg", *NAMES[3:]]
+    assert _agree(scene, replace(scene, R_cw=off, image_names=names))

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..batch.progress import StageLog
 from ..batch.workers import Workers
@@ -61,6 +62,8 @@ _MAX_ROUNDS = 4
 _STRONG_RAD = 0.1
 # Photos that a shutter needs at least.
 _LEAST_PHOTOS = 3
+# Two solutions agree on a photo if its rotations are closer, in radians: a right one is right to a degree.
+_AGREE_RAD = np.radians(2.0)
 # Rounds of registration: photos that are registered make others possible.
 _MOST_WAVES = 4
 # Places along each side of a photo where that is measured.
@@ -477,9 +480,10 @@ def _registered_again(
 def _mapped_again(
     track_source: TrackSource, result: BundleResult, wanted: BundleOptions, log: StageLog
 ) -> BundleResult:
-    """The solution, or that of a mapping of keypoints without rough motions if it has more photos and explains more.
+    """The solution, or that of a mapping of keypoints without rough motions if that has more photos.
 
-    A side of a scene that mapping rotated as a whole has no photo that fits elsewhere.
+    A side of a scene that mapping rotated as a whole has no photo that fits elsewhere. The other solution must agree
+    with the first one on the photos of both, and explain more measurements.
     """
     rec, matched = result.reconstruction, track_source.matched
     if rec.num_images == len(matched.names) or rec.shutter_model not in ("rotation", "constant-motion"):
@@ -494,9 +498,17 @@ def _mapped_again(
     options = rough_options(_of_registered(wanted, mapped, says=False))
     other = _adjusted_sequence(mapped, rec.shutter_model, options, log)
     other = _registered_again(track_source, other, wanted, log)
-    # another place for the same photos is no reason: few of them may be explained better by wrong poses
-    more = other.reconstruction.num_images > rec.num_images
-    return other if more and num_explained(other.reconstruction) > num_explained(rec) else result
+    new = other.reconstruction
+    more = new.num_images > rec.num_images and num_explained(new) > num_explained(rec)
+    return other if more and _agree(rec, new) else result
+
+
+def _agree(rec: Reconstruction, other: Reconstruction) -> bool:
+    """Whether the photos of two solutions look the same ways; where they do not, nobody knows which solution is wrong."""
+    both = [name for name in rec.image_names if name in other.image_names]
+    of_rec, of_other = (each.R_cw[[each.image_names.index(name) for name in both]] for each in (rec, other))
+    steps = Rotation.from_matrix(np.einsum("mji,mjk->mik", of_rec, of_other))
+    return len(both) > 0 and bool((steps * steps.mean().inv()).magnitude().max() < _AGREE_RAD)
 
 
 def _roughly_adjusted(
