@@ -504,7 +504,7 @@ def _mapped_again(
 
 
 def _agree(rec: Reconstruction, other: Reconstruction) -> bool:
-    """Whether the photos of two solutions look the same ways; where they do not, nobody knows which solution is wrong."""
+    """Whether the photos of two solutions look the same ways; where they do not, nobody knows which one is wrong."""
     both = [name for name in rec.image_names if name in other.image_names]
     of_rec, of_other = (each.R_cw[[each.image_names.index(name) for name in both]] for each in (rec, other))
     steps = Rotation.from_matrix(np.einsum("mji,mjk->mik", of_rec, of_other))
