@@ -278,10 +278,15 @@ def solve_tracks(
     result = _adjusted_sequence(mapped, shutter_model, how, log)
     tracks, strong = result.reconstruction, _is_strong(result.reconstruction)
     if track_source is not None:
-        result = _registered_again(track_source, result, wanted, log)
+        result, left_out = _registered_again(track_source, result, wanted, log)
         strong = strong or _is_strong(result.reconstruction)
         if strong and survey is None:
-            result = _mapped_again(track_source, result, wanted, log)
+            result, left_out = _mapped_again(track_source, result, left_out, wanted, log)
+        if left_out:
+            names = ", ".join(sorted(left_out))
+            warnings.warn(
+                f"left out, since they contradict the other photos: {names}", RsUndistortWarning, stacklevel=3
+            )
         options = _of_registered(wanted, result.reconstruction)
         result, tracks, options = _retriangulated(track_source, result, options, log, ends=not auto)
     options = replace(options, phi_sigma_start=result.phi_rms)
@@ -440,10 +445,13 @@ def _check_enough(registered: Reconstruction, total: int) -> None:
 
 def _registered_again(
     track_source: TrackSource, result: BundleResult, wanted: BundleOptions, log: StageLog
-) -> BundleResult:
-    """Register photos that mapping left out, or gave a wrong pose without a shutter, with the points of the others."""
+) -> tuple[BundleResult, set[str]]:
+    """Register photos that mapping left out, or gave a wrong pose without a shutter, with the points of the others.
+
+    With it come those that lost their poses, since they contradict the others.
+    """
     if result.reconstruction.shutter_model not in ("rotation", "constant-motion"):
-        return result
+        return result, set()
     matched, num_verified, left_out = track_source.matched, read_num_verified(track_source.matched), set[str]()
     for wave in range(1, _MOST_WAVES + 1):
         rec = result.reconstruction
@@ -471,36 +479,34 @@ def _registered_again(
         log.end(stage, added=found.added, moved=found.moved, dropped=found.dropped)
         if not changes:
             break
-    if left_out:
-        names = ", ".join(sorted(left_out))
-        warnings.warn(f"left out, since they contradict the other photos: {names}", RsUndistortWarning, stacklevel=3)
-    return result
+    return result, left_out
 
 
 def _mapped_again(
-    track_source: TrackSource, result: BundleResult, wanted: BundleOptions, log: StageLog
-) -> BundleResult:
+    track_source: TrackSource, result: BundleResult, left_out: set[str], wanted: BundleOptions, log: StageLog
+) -> tuple[BundleResult, set[str]]:
     """The solution, or that of a mapping of keypoints without rough motions if that has more photos.
 
     A side of a scene that mapping rotated as a whole has no photo that fits elsewhere. The other solution must agree
-    with the first one on the photos of both, and explain more measurements.
+    with the first one on the photos of both, and explain more measurements. With it come the photos that it left out,
+    as of `_registered_again`.
     """
     rec, matched = result.reconstruction, track_source.matched
     if rec.num_images == len(matched.names) or rec.shutter_model not in ("rotation", "constant-motion"):
-        return result
+        return result, left_out
     stage, mapped = "mapping without motions", None
     log.begin(stage)
     with suppress(ReconstructionError):
         mapped = map_without_motions(replace(matched, cameras=rec.cameras))
     log.end(stage, photos=0 if mapped is None else mapped.num_images)
     if mapped is None or mapped.num_images < _LEAST_PHOTOS:
-        return result
+        return result, left_out
     options = rough_options(_of_registered(wanted, mapped, says=False))
     other = _adjusted_sequence(mapped, rec.shutter_model, options, log)
-    other = _registered_again(track_source, other, wanted, log)
+    other, other_left_out = _registered_again(track_source, other, wanted, log)
     new = other.reconstruction
     more = new.num_images > rec.num_images and num_explained(new) > num_explained(rec)
-    return other if more and _agree(rec, new) else result
+    return (other, other_left_out) if more and _agree(rec, new) else (result, left_out)
 
 
 def _agree(rec: Reconstruction, other: Reconstruction) -> bool:
