@@ -82,11 +82,15 @@ class TrackSource:
         The photos themselves.
     workers : Workers or None
         Workers that read them again to align the tracks at full size; None if that is not wanted.
+    mapped_here : bool
+        Whether the photos were mapped by us, in an arbitrary frame, so that they may be mapped once more. The frame of a
+        model that somebody gave is kept.
     """
 
     matched: MatchedPhotos
     photos: LoadedPhotos | None = None
     workers: Workers | None = None
+    mapped_here: bool = False
 
     @property
     def step_px(self) -> float:
@@ -228,7 +232,15 @@ def solve_photos(
     )  # fmt: skip
     _check_enough(mapped, len(photos.names))
     solved = solve_tracks(
-        mapped, cameras, shutter_model, seed, options_of, log, remedy, TrackSource(matched, photos, workers), survey
+        mapped,
+        cameras,
+        shutter_model,
+        seed,
+        options_of,
+        log,
+        remedy,
+        TrackSource(matched, photos, workers, mapped_here=True),
+        survey,
     )
     if solved.survey is not None:
         return solved
@@ -280,7 +292,7 @@ def solve_tracks(
     if track_source is not None:
         result, left_out = _registered_again(track_source, result, wanted, log)
         strong = strong or _is_strong(result.reconstruction)
-        if strong and survey is None:
+        if strong and survey is None and track_source.mapped_here:
             result, left_out = _mapped_again(track_source, result, left_out, wanted, log)
         if left_out:
             names = ", ".join(sorted(left_out))
