@@ -83,8 +83,8 @@ class TrackSource:
     workers : Workers or None
         Workers that read them again to align the tracks at full size; None if that is not wanted.
     mapped_here : bool
-        Whether the photos were mapped by us, in an arbitrary frame, so that they may be mapped once more. The frame of a
-        model that somebody gave is kept.
+        Whether the photos were mapped by us, in an arbitrary frame, so that they may be mapped once more. The frame of
+        a model that somebody gave is kept.
     """
 
     matched: MatchedPhotos
@@ -290,15 +290,8 @@ def solve_tracks(
     result = _adjusted_sequence(mapped, shutter_model, how, log)
     tracks, strong = result.reconstruction, _is_strong(result.reconstruction)
     if track_source is not None:
-        result, left_out = _registered_again(track_source, result, wanted, log)
+        result = _all_registered(track_source, result, wanted, log, again=survey is None)
         strong = strong or _is_strong(result.reconstruction)
-        if strong and survey is None and track_source.mapped_here:
-            result, left_out = _mapped_again(track_source, result, left_out, wanted, log)
-        if left_out:
-            names = ", ".join(sorted(left_out))
-            warnings.warn(
-                f"left out, since they contradict the other photos: {names}", RsUndistortWarning, stacklevel=3
-            )
         options = _of_registered(wanted, result.reconstruction)
         result, tracks, options = _retriangulated(track_source, result, options, log, ends=not auto)
     options = replace(options, phi_sigma_start=result.phi_rms)
@@ -453,6 +446,24 @@ def _check_enough(registered: Reconstruction, total: int) -> None:
             f"only {registered.num_images} of {total} photos could be registered, the shutter needs three; "
             "use photos that share more of the scene, or check the camera's focal length"
         )
+
+
+def _all_registered(
+    track_source: TrackSource, result: BundleResult, wanted: BundleOptions, log: StageLog, *, again: bool
+) -> BundleResult:
+    """The solution with as many photos as can be registered; `again` by a second mapping, too, whose frame is another.
+
+    A shutter that was strong before photos lost their poses is enough for that.
+    """
+    strong = _is_strong(result.reconstruction)
+    result, left_out = _registered_again(track_source, result, wanted, log)
+    strong = strong or _is_strong(result.reconstruction)
+    if strong and again and track_source.mapped_here:
+        result, left_out = _mapped_again(track_source, result, left_out, wanted, log)
+    if left_out:
+        names = ", ".join(sorted(left_out))
+        warnings.warn(f"left out, since they contradict the other photos: {names}", RsUndistortWarning, stacklevel=4)
+    return result
 
 
 def _registered_again(
