@@ -17,6 +17,7 @@ from refusals import one_line
 from rsundistort import Camera, rectify
 from rsundistort.errors import FileError, FileKindWarning, InputError, MetadataWarning
 from rsundistort.io import Metadata, list_photos, output_name, read_photo, write_image
+from rsundistort.io.photos.images import unread_pictures
 from rsundistort.model.orientation import orient_pixels
 
 
@@ -125,6 +126,13 @@ def test_write_image_replaces_a_file(tmp_path):
     write_image(tmp_path / "a.png", texture(8, 8, 1))
     write_image(tmp_path / "a.png", texture(8, 8, 2))
     np.testing.assert_array_equal(read_photo(tmp_path / "a.png").pixels, texture(8, 8, 2))
+
+
+def test_pictures_that_are_not_read_are_known(tmp_path):
+    for name in ("a.png", "b.bmp", "c.JP2", ".d.gif", "e.txt"):
+        (tmp_path / name).touch()
+    assert unread_pictures(tmp_path) == ["b.bmp", "c.JP2"]
+    assert list_photos(tmp_path) == ["a.png"]
 
 
 def test_list_photos_sorts_and_passes_over_other_files(tmp_path):

@@ -138,6 +138,18 @@ def _one_length(folder):
     return ["--camera", CAMERA, "--lengths", "l.csv"]
 
 
+def _tiny_scale(folder):
+    save_textures(folder, THREE)
+    return ["--camera", CAMERA, "--scale", "0.001"]
+
+
+def _two_camera_files(folder):
+    save_textures(folder, THREE)
+    for name in ("camera.json", "cameras.json"):
+        (folder / name).write_text(OTHER_SIZE)
+    return []
+
+
 def _still(folder):
     save_textures(folder, THREE)
     return ["--camera", CAMERA, "--still", "nobody.png"]
@@ -169,6 +181,8 @@ OTHER_SIZE = json.dumps({"width": 640, "height": 480, "K": [[600, 0, 320], [0, 6
         (_apart, "share more of the scene"),
         (_flat, "share more of the scene"),
         (_still, "nobody.png"),
+        (_tiny_scale, "scale=0.001 leaves 0x0 pixels"),
+        (_two_camera_files, "holds camera.json and cameras.json; remove one"),
         (_contradicting, "named twice"),
         (_no_sigma, "must be positive"),
         (_still_and_known, "give one of them"),

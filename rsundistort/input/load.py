@@ -14,7 +14,7 @@ from ..batch.workers import Workers
 from ..errors import FileError, InputError, SkippedPhotoWarning
 from ..io import MAX_MEGAPIXELS, ExifFacts, facts_of_exif, find_masks, list_photos, read_mask, read_photo
 from ..io.kept import Kept
-from ..io.photos.images import stored_size
+from ..io.photos.images import stored_size, unread_pictures
 from ..io.places import local_place
 from ..sfm import DETECTION_MEGAPIXELS, Features, detect_features, detection_bytes, edge_width_px, grey_8_bit
 from .photo_cameras import PhotoCameras, find_cameras
@@ -161,6 +161,14 @@ def _is_text(name: str) -> bool:
 def _listed(folder: Path, raw_as: str, only: Sequence[str] | None, least: int) -> list[str]:
     """The photos that are to be loaded; refused where they are too few, or no model can hold a name."""
     listed = list_photos(folder, raw_as) if only is None else list(only)
+    if only is None and (unread := unread_pictures(folder)):
+        more = f" and {len(unread) - 1} more" if len(unread) > 1 else ""
+        warnings.warn(
+            f"{folder}: {unread[0]}{more} passed over, since pictures of such kinds are not read; "
+            "convert them to PNG or TIFF",
+            SkippedPhotoWarning,
+            stacklevel=3,
+        )
     if len(listed) < least:
         raise InputError(
             f"{folder} holds {len(listed)} photo{'s' * (len(listed) > 1)}; the shutter needs at least {_NUMBERS[least]}"

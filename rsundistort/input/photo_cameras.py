@@ -168,11 +168,22 @@ def check_readouts(readout: str | Mapping[str, str] | None) -> dict[str, str]:
 
 
 def camera_file_of(folder: Path, camera: str | None) -> Path | None:
-    """The file or folder of the cameras of a folder's photos; None if numbers or EXIF give them."""
+    """The file or folder of the cameras of a folder's photos; None if numbers or EXIF give them.
+
+    Raises
+    ------
+    InputError
+        Both files that a folder may hold are there.
+    """
     if camera is not None:
         return Path(camera) if os.path.exists(camera) else None
-    beside = (parent / name for parent in (folder, folder.parent) for name in _BESIDE)
-    return next((path for path in beside if path.is_file()), None)
+    for parent in (folder, folder.parent):
+        beside = [parent / name for name in _BESIDE if (parent / name).is_file()]
+        if len(beside) > 1:
+            raise InputError(f"{parent} holds {' and '.join(_BESIDE)}; remove one, or say --camera which to use")
+        if beside:
+            return beside[0]
+    return None
 
 
 def find_cameras(

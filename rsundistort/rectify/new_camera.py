@@ -54,6 +54,15 @@ class ViewOptions:
         if self.max_size is not None and self.max_size < 2:
             raise InputError(f"max_size={self.max_size}, expected at least 2 pixels")
 
+    def scale_for(self, width: int, height: int) -> tuple[float, int, int]:
+        """Scale, width and height of the rectified photos of raw ones of such a size; refused where nothing is left."""
+        scale = self.scale if self.max_size is None else min(self.scale, self.max_size / max(width, height))
+        # cut off, so that no pixel's centre lies beyond the last of the old ones
+        across, down = (int(scale * side + 1e-9) for side in (width, height))
+        if min(across, down) < 2:
+            raise InputError(f"scale={scale:g} leaves {across}x{down} pixels of {width}x{height}")
+        return scale, across, down
+
 
 def rectified_view(
     camera: Camera, motions: Sequence[RowMotion], shutter_model: str, view: ViewOptions, as_it_was: Camera
@@ -74,13 +83,7 @@ def rectified_view(
         The rectified camera where `view.alpha` is None.
     """
     old = as_it_was if view.alpha is None else camera.pinhole()
-    scale = view.scale
-    if view.max_size is not None:
-        scale = min(scale, view.max_size / max(old.width, old.height))
-    # cut off, so that no pixel's centre lies beyond the last of the old ones
-    width, height = (int(scale * side + 1e-9) for side in (old.width, old.height))
-    if min(width, height) < 2:
-        raise InputError(f"scale={scale:g} leaves {width}x{height} pixels of {old.width}x{old.height}")
+    scale, width, height = view.scale_for(old.width, old.height)
     if view.alpha is None or view.alpha == "keep" or not motions:
         if scale == 1.0:
             return old

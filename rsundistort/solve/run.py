@@ -151,6 +151,8 @@ def _solved(
     )  # fmt: skip
     loaded = with_focal_lengths(loaded, options.solve.seed, log, kept)
     _check_anchors(options.solve, loaded.names, photos)
+    for each in loaded.cameras.cameras:
+        rectify.view.scale_for(each.width, each.height)
     check_lenses([*options.solve.camera_sigma], loaded.cameras.cameras, "camera_sigma:")
     bodies = loaded.facts if source.frames is None else [source.frames] * len(loaded.names)
     if source.clip is None:

@@ -49,8 +49,12 @@ __all__ = [
     "read_photo",
     "read_plain",
     "stored_size",
+    "unread_pictures",
     "write_image",
 ]
+
+# Pictures that are not read: a folder that holds some was meant to have more photos.
+_UNREAD = (".avif", ".bmp", ".exr", ".gif", ".hdr", ".jp2", ".jxl", ".pgm", ".ppm", ".tga")
 
 #: Photos of more pixels are refused, unless specified otherwise: a small file can claim to be a huge picture.
 MAX_MEGAPIXELS = 250.0
@@ -103,8 +107,15 @@ def list_photos(folder: Place | str, raw_as: str = "tif", sub_folders: Collectio
             )
     if not names:
         kinds = ", ".join(s[1:] for s in PHOTO_SUFFIXES) + ", heic and RAW"
-        raise FileError(f"no photos in {folder}; it should hold files of the kinds {kinds}")
+        raise FileError(
+            f"no photos in {folder}; it should hold files of the kinds {kinds}, and sub-folders are not searched"
+        )
     return names
+
+
+def unread_pictures(folder: Path) -> list[str]:
+    """Names of pictures in a folder that `list_photos` passes over, since their kinds are not read."""
+    return [name for name in files_in(folder) or () if name.lower().endswith(_UNREAD) and not name.startswith(".")]
 
 
 def output_name(name: str, raw_as: str = "tif") -> str:
