@@ -162,11 +162,14 @@ def judged(folder: Path, solved: Solved, cpu_s: float) -> dict[str, Any]:
 
 
 def positions(folder: Path, solved: Solved) -> dict[str, float]:
-    """How far pixels of frames are off, as they were read and as they are corrected: the largest over a lattice."""
+    """How far pixels of frames are off, as they were read and as they are corrected: the largest over a lattice.
+
+    And the largest standard deviation of a corrected one by the covariances of phi.
+    """
     truth = read_solution(folder / "ground_truth.json")
-    rec = solved.whole
+    rec, covariances = solved.whole, solved.result.covariances
     assert rec is not None
-    before, after = [], []
+    before, after, sigma = [], [], []
     for image in truth.images:
         if image.name not in rec.image_names or image.motion is None:
             continue
@@ -183,7 +186,14 @@ def positions(folder: Path, solved: Solved) -> dict[str, float]:
         focal_px = float(camera.K[0, 0])
         before.append(focal_px * np.linalg.norm(plain - wanted, axis=1).max())
         after.append(focal_px * np.linalg.norm(found - wanted, axis=1).max())
-    return {"as_read_px": round(float(np.max(before)), 2), "corrected_px": round(float(np.max(after)), 2)}
+        if covariances is not None:
+            steps = [RowMotion(rec.phi[i] + step) for step in 1e-5 * np.eye(3)]
+            J = np.array([unproject_points(xy, camera, each, "rotation")[0] - found for each in steps]) / 1e-5
+            sigma.append(focal_px * np.sqrt(np.einsum("anj,ab,bnj->n", J, covariances[i, 6:9, 6:9], J)).max())
+    return {
+        "as_read_px": round(float(np.max(before)), 2), "corrected_px": round(float(np.max(after)), 2),
+        "sigma_px": round(float(np.max(sigma, initial=0.0)), 2),
+    }  # fmt: skip
 
 
 def height_error_percent(folder: Path, solved: Solved) -> float:

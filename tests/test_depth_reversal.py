@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from rsundistort import BundleOptions, Camera, Observations, Reconstruction, RowMotion, bundle_adjust, project_points
-from rsundistort.solve.depth_reversal import choose_depths, num_explained, with_depths_reversed
+from rsundistort.solve.depth_reversal import choose_depths, with_depths_reversed
+from rsundistort.solve.solutions import num_explained
 
 # 34 degrees across
 CAMERA = Camera(1200, 800, [[2000, 0, 600], [0, 2000, 400], [0, 0, 1]])

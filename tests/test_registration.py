@@ -17,7 +17,7 @@ from rsundistort.sfm.motion_averaging import averaged_motions
 from rsundistort.sfm.registration import place_photo
 from rsundistort.sfm.relative_pose import Pair
 from rsundistort.sfm.verification import pair_of
-from rsundistort.solve.model_sequence import _agree
+from rsundistort.solve.solutions import agree
 
 CAMERA = Camera(1200, 900, [[1000, 0, 600], [0, 1000, 450], [0, 0, 1]])
 NAMES = [f"{k}.jpg" for k in range(6)]
@@ -182,18 +182,18 @@ def pairs_of(matched):
 
 def test_photos_without_a_pair_have_no_motion(matched):
     pairs = {key: pair for key, pair in pairs_of(matched).items() if 4 not in key}
-    phi = averaged_motions(6, pairs)
+    phi = averaged_motions(6, pairs, 0.25)
     assert (phi[4] == 0).all()
     assert (phi[[0, 1, 2, 3, 5]] != 0).all()
-    assert (averaged_motions(6, {}) == 0).all()
+    assert (averaged_motions(6, {}, 0.25) == 0).all()
 
 
 def test_a_false_pair_is_outvoted(matched, rng):
     pairs = pairs_of(matched)
-    before = averaged_motions(6, pairs)
+    before = averaged_motions(6, pairs, 0.25)
     other = pairs[0, 3]
     pairs[0, 3] = Pair(other.first, other.second.take(rng.permutation(len(other.second.clock))))
-    assert np.abs(averaged_motions(6, pairs) - before).max() < 0.05
+    assert np.abs(averaged_motions(6, pairs, 0.25) - before).max() < 0.05
 
 
 def apart_deg(mapped, scene):
@@ -204,7 +204,7 @@ def apart_deg(mapped, scene):
 
 
 def test_photos_are_mapped_right_without_their_motions(scene, matched):
-    mapped, plain = map_without_motions(matched), map_photos(matched)
+    mapped, plain = map_without_motions(matched, 0.25), map_photos(matched)
     assert mapped.num_images >= 5
     assert apart_deg(mapped, scene).max() < 3.0
     assert apart_deg(plain, scene).max() > 10.0
@@ -216,10 +216,10 @@ def test_photos_are_mapped_right_without_their_motions(scene, matched):
 
 def test_solutions_agree_in_any_frame_and_on_the_photos_of_both(scene):
     frame = Rotation.from_rotvec([0.4, -1.0, 2.0]).as_matrix()
-    assert _agree(scene, replace(scene, R_cw=scene.R_cw @ frame))
+    assert agree(scene, replace(scene, R_cw=scene.R_cw @ frame))
     off = scene.R_cw.copy()
     off[2] = Rotation.from_rotvec([0, np.radians(5), 0]).as_matrix() @ off[2]
-    assert not _agree(scene, replace(scene, R_cw=off))
-    assert not _agree(scene, replace(scene, image_names=[f"other-{name}" for name in NAMES]))
+    assert not agree(scene, replace(scene, R_cw=off))
+    assert not agree(scene, replace(scene, image_names=[f"other-{name}" for name in NAMES]))
     names = [*NAMES[:2], "other.jpg", *NAMES[3:]]
-    assert _agree(scene, replace(scene, R_cw=off, image_names=names))
+    assert agree(scene, replace(scene, R_cw=off, image_names=names))

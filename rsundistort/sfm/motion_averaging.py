@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +16,7 @@ from .database import MatchedPhotos, ideal_keypoints, verification_options, writ
 from .epipolar import MIN_EXPLAINED, Matches, read_matches
 from .mapping import map_photos
 from .matching import LOOSE_PX
-from .relative_pose import Pair, phi_information, relative_poses
+from .relative_pose import Pair, find_relative_pose, phi_information
 from .verification import pair_of
 
 __all__ = ["averaged_motions", "map_without_motions"]
@@ -23,7 +25,9 @@ __all__ = ["averaged_motions", "map_without_motions"]
 _ROUNDS, _TAIL = 30, 4.0
 
 
-def averaged_motions(num_photos: int, pairs: Mapping[tuple[int, int], Pair]) -> NDArray[np.float64]:
+def averaged_motions(
+    num_photos: int, pairs: Mapping[tuple[int, int], Pair], phi_sigma: float
+) -> NDArray[np.float64]:
     """Rotations phi (m, 3) of photos, radians per unit of the clock, that agree best with the relative poses of pairs.
 
     A pair alone hardly tells the motion of one photo from that of the other. Each pair is a normal distribution of
@@ -36,9 +40,11 @@ def averaged_motions(num_photos: int, pairs: Mapping[tuple[int, int], Pair]) -> 
         Number of photos m.
     pairs : mapping of (first, second) to Pair
         Matches of pairs of photos.
+    phi_sigma : float
+        Prior standard deviation of the components of phi, radians a frame.
     """
-    poses, phi_sigma = relative_poses([*pairs.values()])
-    found = {key: pose for key, pose in zip(pairs, poses, strict=True) if pose is not None}
+    poses = {key: find_relative_pose(pair, phi_sigma) for key, pair in pairs.items()}
+    found = {key: pose for key, pose in poses.items() if pose is not None}
     known = {key: (*phi_information(pose, pairs[key]), pose.phi.ravel()) for key, pose in found.items()}
     prior = np.zeros((num_photos, 3))
     for first, second in found:
@@ -68,7 +74,7 @@ def _apart(step: NDArray[np.float64], information: NDArray[np.float64]) -> float
     return float(step @ information @ step) / len(step)
 
 
-def map_without_motions(matched: MatchedPhotos) -> Reconstruction:
+def map_without_motions(matched: MatchedPhotos, phi_sigma: float) -> Reconstruction:
     """What `map_photos` makes of the photos if their motions, averaged over pairs, are taken out of their keypoints.
 
     Pairs are verified anew: matches that a shutter hid are right then, and poses by which it explained false ones are
@@ -77,7 +83,9 @@ def map_without_motions(matched: MatchedPhotos) -> Reconstruction:
     Parameters
     ----------
     matched : MatchedPhotos
-        Photos and their matches; the cameras are taken as known. Its database stays as it is.
+        Photos and their matches; cameras that are guesses are refined by mapping. Its database stays as it is.
+    phi_sigma : float
+        As in `averaged_motions`.
 
     Returns
     -------
@@ -89,10 +97,9 @@ def map_without_motions(matched: MatchedPhotos) -> Reconstruction:
     ReconstructionError
         When no two photos could be registered.
     """
-    matched = replace(matched, calibrated=True)
     matches = {key: found for key, found in read_matches(matched).items() if len(found) >= MIN_EXPLAINED}
     pairs = {key: pair_of(matched, key, found) for key, found in matches.items()}
-    phi = averaged_motions(len(matched.names), pairs)
+    phi = averaged_motions(len(matched.names), pairs, phi_sigma)
     cameras = [matched.cameras[k] for k in matched.camera_idx]
     features = [
         replace(found, xy_raw=ideal_keypoints(found, camera, RowMotion(each), "rotation").astype(np.float64) - HALF)
@@ -100,8 +107,7 @@ def map_without_motions(matched: MatchedPhotos) -> Reconstruction:
     ]
     # what a fisheye shows has no place in a pinhole photo
     ideal = [camera.without_field() if camera.lens == "fisheye" else camera.pinhole() for camera in matched.cameras]
-    folder = matched.database.parent / "without-motions"
-    folder.mkdir()
+    folder = Path(tempfile.mkdtemp(prefix="without-motions-", dir=matched.database.parent))
     moved = replace(matched, database=folder / "database.db", features=features, cameras=ideal)
     _verify(moved, matches)
     return map_photos(moved, shown=matched)

@@ -14,13 +14,9 @@ import numpy as np
 
 from ..bundle import BundleOptions, BundleResult, bundle_adjust
 from ..model import Reconstruction
-from ..model.reprojection import reprojection_residuals
-from ..sfm import SIFT_PX
+from .solutions import num_explained
 
-__all__ = ["DepthChoice", "choose_depths", "num_explained", "with_depths_reversed"]
-
-# Of the noise of features: farther from its prediction no measurement is explained.
-_MOST_SIGMAS = 3.0
+__all__ = ["DepthChoice", "choose_depths", "with_depths_reversed"]
 
 
 def with_depths_reversed(reconstruction: Reconstruction) -> Reconstruction:
@@ -37,13 +33,6 @@ def with_depths_reversed(reconstruction: Reconstruction) -> Reconstruction:
     middle_c = np.einsum("mij,mj->mi", rec.R_cw, middle - rec.center_w)
     center_w = middle - np.einsum("mji,mj->mi", R_cw, middle_c)
     return replace(rec, R_cw=R_cw, center_w=center_w, points_w=middle + (rec.points_w - middle) @ mirror)
-
-
-def num_explained(reconstruction: Reconstruction) -> int:
-    """How many measurements lie as near to their predictions as the noise of features lets them."""
-    residuals, valid = reprojection_residuals(reconstruction)
-    within = _MOST_SIGMAS * SIFT_PX * reconstruction.observations.sigma
-    return int((valid & (np.linalg.norm(residuals, axis=1) <= within)).sum())
 
 
 @dataclass(frozen=True)

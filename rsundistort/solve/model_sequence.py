@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..batch.progress import StageLog
 from ..batch.workers import Workers
@@ -44,9 +43,10 @@ from ..sfm import (
     retriangulate,
 )
 from ..verdict import Verdict, judge
-from .depth_reversal import choose_depths, num_explained
+from .depth_reversal import choose_depths
 from .outcome import Solved
 from .placing import place_photos
+from .solutions import agree, num_explained
 from .survey import Survey
 
 __all__ = ["TrackSource", "rough_options", "solve_photos", "solve_tracks", "without_shutter"]
@@ -62,8 +62,6 @@ _MAX_ROUNDS = 4
 _STRONG_RAD = 0.1
 # Photos that a shutter needs at least.
 _LEAST_PHOTOS = 3
-# Two solutions agree on a photo if its rotations are closer, in radians: a right one is right to a degree.
-_AGREE_RAD = np.radians(2.0)
 # Rounds of registration: photos that are registered make others possible.
 _MOST_WAVES = 4
 # Places along each side of a photo where that is measured.
@@ -510,34 +508,32 @@ def _mapped_again(
 ) -> tuple[BundleResult, set[str]]:
     """The solution, or that of a mapping of keypoints without rough motions if that has more photos.
 
-    A side of a scene that mapping rotated as a whole has no photo that fits elsewhere. The other solution must agree
-    with the first one on the photos of both, and explain more measurements. With it come the photos that it left out,
-    as of `_registered_again`.
+    A side of a scene that mapping rotated as a whole has no photo that fits elsewhere. The cameras as they came and as
+    they were found give two places to start from. The other solution must agree with the first one on the photos of
+    both, and explain more measurements. With it come the photos that it left out, as of `_registered_again`.
     """
     rec, matched = result.reconstruction, track_source.matched
-    if rec.num_images == len(matched.names) or rec.shutter_model not in ("rotation", "constant-motion"):
+    if rec.shutter_model not in ("rotation", "constant-motion"):
         return result, left_out
-    stage, mapped = "mapping without motions", None
-    log.begin(stage)
-    with suppress(ReconstructionError):
-        mapped = map_without_motions(replace(matched, cameras=rec.cameras))
-    log.end(stage, photos=0 if mapped is None else mapped.num_images)
-    if mapped is None or mapped.num_images < _LEAST_PHOTOS:
-        return result, left_out
-    options = rough_options(_of_registered(wanted, mapped, says=False))
-    other = _adjusted_sequence(mapped, rec.shutter_model, options, log)
-    other, other_left_out = _registered_again(track_source, other, wanted, log)
-    new = other.reconstruction
-    more = new.num_images > rec.num_images and num_explained(new) > num_explained(rec)
-    return (other, other_left_out) if more and _agree(rec, new) else (result, left_out)
-
-
-def _agree(rec: Reconstruction, other: Reconstruction) -> bool:
-    """Whether the photos of two solutions look the same ways; where they do not, nobody knows which one is wrong."""
-    both = [name for name in rec.image_names if name in other.image_names]
-    of_rec, of_other = (each.R_cw[[each.image_names.index(name) for name in both]] for each in (rec, other))
-    steps = Rotation.from_matrix(np.einsum("mji,mjk->mik", of_rec, of_other))
-    return len(both) > 0 and bool((steps * steps.mean().inv()).magnitude().max() < _AGREE_RAD)
+    best, best_left_out, stage = result, left_out, "mapping without motions"
+    for start in (matched, replace(matched, cameras=rec.cameras, calibrated=True)):
+        if best.reconstruction.num_images == len(matched.names):
+            break
+        log.begin(stage)
+        mapped = None
+        with suppress(ReconstructionError):
+            mapped = map_without_motions(start, result.phi_rms)
+        log.end(stage, photos=0 if mapped is None else mapped.num_images)
+        if mapped is None or mapped.num_images < _LEAST_PHOTOS:
+            continue
+        options = rough_options(_of_registered(wanted, mapped, says=False))
+        other = _adjusted_sequence(mapped, rec.shutter_model, options, log)
+        other, other_left_out = _registered_again(track_source, other, wanted, log)
+        new, old = other.reconstruction, best.reconstruction
+        more = new.num_images > rec.num_images and num_explained(new) > num_explained(old)
+        if more and agree(rec, new):
+            best, best_left_out = other, other_left_out
+    return best, best_left_out
 
 
 def _roughly_adjusted(

@@ -1,0 +1,32 @@
+"""Solutions of the same photos beside each other: which one explains more, and whether they agree."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..model import Reconstruction
+from ..model.reprojection import reprojection_residuals
+from ..sfm import SIFT_PX
+
+__all__ = ["agree", "num_explained"]
+
+# Of the noise of features: farther from its prediction no measurement is explained.
+_MOST_SIGMAS = 3.0
+# Two solutions agree on a photo if its rotations are closer, in radians: a right one is right to a degree.
+_AGREE_RAD = np.radians(2.0)
+
+
+def num_explained(reconstruction: Reconstruction) -> int:
+    """How many measurements lie as near to their predictions as the noise of features lets them."""
+    residuals, valid = reprojection_residuals(reconstruction)
+    within = _MOST_SIGMAS * SIFT_PX * reconstruction.observations.sigma
+    return int((valid & (np.linalg.norm(residuals, axis=1) <= within)).sum())
+
+
+def agree(rec: Reconstruction, other: Reconstruction) -> bool:
+    """Whether the photos of two solutions look the same ways; where they do not, nobody knows which one is wrong."""
+    both = [name for name in rec.image_names if name in other.image_names]
+    of_rec, of_other = (each.R_cw[[each.image_names.index(name) for name in both]] for each in (rec, other))
+    steps = Rotation.from_matrix(np.einsum("mji,mjk->mik", of_rec, of_other))
+    return len(both) > 0 and bool((steps * steps.mean().inv()).magnitude().max() < _AGREE_RAD)
