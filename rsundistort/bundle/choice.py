@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import SHUTTER_MODELS, Observations, Reconstruction, other_axis
-from ..model.reprojection import reprojection_residuals
+from ..model.reprojection import reprojection_residuals, shutter_displacements
 from .adjust import MODEL_SEQUENCE, bundle_adjust, objective
 from .bundle_options import BundleOptions
 from .prior_sigmas import PriorSigmas
@@ -97,6 +97,9 @@ class ModelChoice:
     restless : bool
         Whether the lines of the photos move faster than any of these models follows; not tested if a shutter is not
         determined.
+    rival : float
+        Of rotations: by how much a velocity that predicts the held-out measurements as well displaces the photos
+        otherwise, in the median, over what the rotations displace them by. 0 where no velocity does as well.
     """
 
     shutter_model: str
@@ -114,6 +117,7 @@ class ModelChoice:
     residual_field: bool = False
     bends: int = 0
     restless: bool = False
+    rival: float = 0.0
 
 
 def enough_points(reconstruction: Reconstruction, per_photo: int = _ENOUGH, seed: int = 0) -> NDArray[np.bool_]:
@@ -368,6 +372,8 @@ class _Selection:
     def consider(self, fit: _Fit) -> None:
         """Keep a fit that is better, if it removes more than a smooth warp of each photo would still remove."""
         fits, best = self._fits, self.best
+        if fit is best:
+            return
         self.gain[fit.label] = fits.gain(best, fit)
         # where both are equally good, the exact rotation is taken, not its approximation
         steady = fit.model == "rotation" and not fit.bends
@@ -396,6 +402,21 @@ class _Selection:
             self.best = vary
             self.kept.append(vary.label)
         return not fits.is_better(vary, fit)
+
+    def weigh_velocity(self, fit: _Fit, steady: _Fit) -> None:
+        """Keep a velocity in place of unsteady rotations, if it predicts better what `steady` ones leave.
+
+        Both give each photo three numbers more. Cameras that travel are more common than those whose rotation changes,
+        and over a flat scene the one looks like the other.
+        """
+        fits, best = self._fits, self.best
+        if best.model != "rotation" or not best.bends:
+            return
+        self.gain[fit.label] = fits.gain(best, fit)
+        ahead = float(fit.errors.mean()) < float(best.errors.mean())
+        if ahead and fits.is_better(steady, fit) and not self._could_be_lens(steady, fit):
+            self.best = fit
+            self.kept.append(fit.label)
 
     def bend(self, fit: _Fit) -> None:
         """Try unsteady motions after a fit, where something smooth is left, or lines would still move."""
@@ -491,7 +512,21 @@ def choose_model(
         best.residual_field,
         best.bends,
         shutter != "not-determined" and fits.waves(best, _RESTLESS, _UNSEEN_PX / 2),
+        _rival(fits, best),
     )
+
+
+def _rival(fits: _Fits, best: _Fit) -> float:
+    """`ModelChoice.rival`, the most of the velocities that were tried."""
+    if best.model != "rotation":
+        return 0.0
+    shares, (own, seen) = [0.0], shutter_displacements(best.reconstruction)
+    for fit in fits.done.values():
+        if fit.model == "constant-motion" and not fits.is_better(fit, best):
+            other, valid = shutter_displacements(fit.reconstruction)
+            apart, size = (np.median(np.linalg.norm(each[seen & valid], axis=1)) for each in (other - own, own))
+            shares.append(float(apart / max(size, 1e-9)))
+    return max(shares)
 
 
 def _selected(fits: _Fits, models: Sequence[str], refines: bool) -> _Selection:
@@ -513,10 +548,13 @@ def _selected(fits: _Fits, models: Sequence[str], refines: bool) -> _Selection:
         last = last if varying else first
     selection = _Selection(fits, plain, kept, gain, refines)
     for model in models[1:]:
+        if model == "constant-motion":
+            selection.weigh_velocity(fits.fit(model, varying, [last.reconstruction, given]), before)
         if selection.best.bends and selection.best.is_explained:
             break
         last = fits.fit(model, varying, [last.reconstruction, given], bends=selection.best.bends)
         selection.consider(last)
+        before = last
         if SHUTTER_MODELS[model] >= SHUTTER_MODELS["rotation"]:
             selection.bend(last)
             last = selection.best if selection.best.model == model else last

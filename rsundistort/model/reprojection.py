@@ -15,7 +15,14 @@ from .field import lens_pixels
 from .motion import check_shutter_model
 from .reconstruction import Reconstruction
 
-__all__ = ["camera_arrays", "motion_tables", "observed_lens_pixels", "plain_arrays", "reprojection_residuals"]
+__all__ = [
+    "camera_arrays",
+    "motion_tables",
+    "observed_lens_pixels",
+    "plain_arrays",
+    "reprojection_residuals",
+    "shutter_displacements",
+]
 
 
 def camera_arrays(
@@ -90,3 +97,10 @@ def reprojection_residuals(
     )  # fmt: skip
     residuals.residuals(model, *arrays, res, valid)
     return res, valid
+
+
+def shutter_displacements(reconstruction: Reconstruction) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """By how much the motions displace the measurements, pixels (o, 2), and which of them could be projected."""
+    moving, valid = reprojection_residuals(reconstruction)
+    still, valid_still = reprojection_residuals(reconstruction, "global")
+    return moving - still, valid & valid_still

@@ -37,6 +37,8 @@ _LEFT_PX = 0.1
 _FIELD_PX = 0.5
 # Largest error of held-out measurements beyond their noise.
 _HELD_OUT_PX = 0.5
+# Photos are displaced this much otherwise by a velocity that explains them as well, as a share of what is corrected.
+_RIVAL = 1 / 3
 # Fewer held-out measurements are not conclusive.
 _LEAST_HELD_OUT = 30
 # A photo is doubtful if its motion is this many times the prior standard deviation, if it has this few measurements, if
@@ -135,6 +137,7 @@ def judge(
     # the fixed scene draws both halves to the motion that it was solved with: their difference is less than the error
     torn = (motions.difference_px > np.maximum(_UNSEEN_PX, motions.shift_px / 2)) | (outliers > 0.5)
     shutter, why = _of_motions(result, global_result, choice, motions, torn, known)
+    reasons += _rival_reasons(choice)
     for name, said in _misplaced(result, bool(unexplained + why)).items() if strong else ():
         doubts[name].append(said)
     reasons += why
@@ -228,6 +231,17 @@ def unexplained_reasons(result: BundleResult, choice: ModelChoice | None) -> lis
         if error > 2.0 and beyond_px > _HELD_OUT_PX:
             reasons.append(f"Held-out measurements are off by {beyond_px:.1f} px more than their noise explains.")
     return reasons
+
+
+def _rival_reasons(choice: ModelChoice | None) -> list[str]:
+    """Whether the photos may have been displaced by a velocity, and not by the rotations that were found."""
+    if choice is None or choice.rival < _RIVAL:
+        return []
+    return [
+        "A camera that travels explains the photos as well as one that rotates, and would displace pixels elsewhere, by "
+        f"{choice.rival:.1f} times of what is corrected: give --model constant-motion if it travelled, or --model "
+        "rotation if it did not."
+    ]
 
 
 def _of_global(choice: ModelChoice | None) -> tuple[str, list[str]]:
