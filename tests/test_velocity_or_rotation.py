@@ -38,8 +38,8 @@ def flight(rng, count, drift, rotation=0.003):
         velocity.append(R.T @ travel)
     observed = Observations(np.concatenate(frames), np.concatenate(points), np.concatenate(xy))
     rec = Reconstruction(
-        [CAMERA], [f"{i}.jpg" for i in range(count)], np.zeros(count, int), np.array(R_cw), np.array(center_w), points_w,
-        observed, np.array(phi), np.array(velocity), shutter_model="constant-motion",
+        [CAMERA], [f"{i}.jpg" for i in range(count)], np.zeros(count, int), np.array(R_cw), np.array(center_w),
+        points_w, observed, np.array(phi), np.array(velocity), shutter_model="constant-motion",
     )  # fmt: skip
     return rec.with_points(np.ones(len(observed), bool), min_track=3)
 

@@ -471,9 +471,8 @@ def choose_model(
     fits = _Fits(reconstruction, options, sigma_px, seed, progress)
     selection = _selected(fits, models, bool(options.refine))
     plain, best, kept, gain = selection.plain, selection.best, selection.kept, selection.gain
-    against, agreement = selection.against, None
+    against, agreement = selection.against if best is plain else [], None
     if best is not plain:
-        against = []
         if np.median(moved_px(best.reconstruction)) < _UNSEEN_PX:
             best = plain
         else:
@@ -546,22 +545,22 @@ def _selected(fits: _Fits, models: Sequence[str], refines: bool) -> _Selection:
         alone = fits.fit("rotation", False, [first.reconstruction, given])
         varying = not float(alone.errors.mean()) < _MOST_OF_IT * float(plain.errors.mean())
         last = last if varying else first
-    selection = _Selection(fits, plain, kept, gain, refines)
+    selection, steady = _Selection(fits, plain, kept, gain, refines), last
     for model in models[1:]:
         if model == "constant-motion":
-            selection.weigh_velocity(fits.fit(model, varying, [last.reconstruction, given]), before)
+            selection.weigh_velocity(fits.fit(model, varying, [last.reconstruction, given]), steady)
         if selection.best.bends and selection.best.is_explained:
             break
         last = fits.fit(model, varying, [last.reconstruction, given], bends=selection.best.bends)
         selection.consider(last)
-        before = last
+        steady = last
         if SHUTTER_MODELS[model] >= SHUTTER_MODELS["rotation"]:
             selection.bend(last)
             last = selection.best if selection.best.model == model else last
-    steady = _without_bends(fits, selection.best)
-    if steady is not selection.best:
-        selection.best = steady
-        kept.append(steady.label)
+    plainer = _without_bends(fits, selection.best)
+    if plainer is not selection.best:
+        selection.best = plainer
+        kept.append(plainer.label)
     return selection
 
 

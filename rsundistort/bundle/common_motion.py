@@ -13,8 +13,8 @@ __all__ = ["LEAST_PHOTOS", "CommonMotion", "MotionMeans"]
 
 Array = NDArray[np.float64]
 
-#: Photos whose motions have a mean: with fewer it is theirs. (Drones' photos over flat ground, three to five: 2.6 to 5.3
-#: dB more with one than without, where they drift; photos whose motions have none lose 0.7 dB at most.)
+#: Photos whose motions have a mean: with fewer it is theirs. (Three to five photos of a drone that drifts over flat
+#: ground: 2.6 to 5.3 dB more with one than without; photos whose motions have none lose 0.7 dB at most.)
 LEAST_PHOTOS = 3
 
 

@@ -25,9 +25,7 @@ __all__ = ["averaged_motions", "map_without_motions"]
 _ROUNDS, _TAIL = 30, 4.0
 
 
-def averaged_motions(
-    num_photos: int, pairs: Mapping[tuple[int, int], Pair], phi_sigma: float
-) -> NDArray[np.float64]:
+def averaged_motions(num_photos: int, pairs: Mapping[tuple[int, int], Pair], phi_sigma: float) -> NDArray[np.float64]:
     """Rotations phi (m, 3) of photos, radians per unit of the clock, that agree best with the relative poses of pairs.
 
     A pair alone hardly tells the motion of one photo from that of the other. Each pair is a normal distribution of

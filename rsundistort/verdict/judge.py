@@ -238,8 +238,8 @@ def _rival_reasons(choice: ModelChoice | None) -> list[str]:
     if choice is None or choice.rival < _RIVAL:
         return []
     return [
-        "A camera that travels explains the photos as well as one that rotates, and would displace pixels elsewhere, by "
-        f"{choice.rival:.1f} times of what is corrected: give --model constant-motion if it travelled, or --model "
+        "A camera that travels explains the photos as well as one that rotates, and would displace pixels elsewhere, "
+        f"by {choice.rival:.1f} times of what is corrected: give --model constant-motion if it travelled, or --model "
         "rotation if it did not."
     ]
 
