@@ -75,7 +75,7 @@ def test_rotations_of_a_camera_that_stays_have_no_rival(rng):
     assert not _rival_reasons(choice)
 
 
-def test_a_rival_makes_the_shape_doubtful(rng):
+def test_a_rival_is_a_reason_that_says_what_to_give(rng):
     choice = replace(choose(flight(rng, 5, drift=0.0, rotation=0.03)), rival=1.9)
     (said,) = _rival_reasons(choice)
     assert "1.9 times" in said

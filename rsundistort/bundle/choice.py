@@ -406,14 +406,14 @@ class _Selection:
     def weigh_velocity(self, fit: _Fit, steady: _Fit) -> None:
         """Keep a velocity in place of unsteady rotations, if it predicts better what `steady` ones leave.
 
-        Both give each photo three numbers more. Cameras that travel are more common than those whose rotation changes,
-        and over a flat scene the one looks like the other.
+        Both give each photo three numbers more; over a flat scene the one looks like the other, and travel is usual.
         """
         fits, best = self._fits, self.best
         if best.model != "rotation" or not best.bends:
             return
         self.gain[fit.label] = fits.gain(best, fit)
         ahead = float(fit.errors.mean()) < float(best.errors.mean())
+        ahead = ahead and float((steady.errors - fit.errors).mean()) > fit.left
         if ahead and fits.is_better(steady, fit) and not self._could_be_lens(steady, fit):
             self.best = fit
             self.kept.append(fit.label)

@@ -13,8 +13,8 @@ __all__ = ["LEAST_PHOTOS", "CommonMotion", "MotionMeans"]
 
 Array = NDArray[np.float64]
 
-#: Photos whose motions have a mean: with fewer it is theirs. (Three to five photos of a drone that drifts over flat
-#: ground gain up to 5.7 dB by it: `benchmarks/honest.py --only flights`.)
+#: Photos whose motions have a mean. It has a prior of its own, so they need not be as many as its unknowns; with two it
+#: would be as much each one's own. (`benchmarks/honest.py --only flights`: three to five photos.)
 LEAST_PHOTOS = 3
 
 
