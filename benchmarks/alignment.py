@@ -24,7 +24,7 @@ from rsundistort.bundle.bundle_options import BundleResult
 from rsundistort.input.load import load_photos
 from rsundistort.sfm import map_photos, match_photos, retriangulate
 from rsundistort.simulate import WarpOptions, simulate_warp
-from rsundistort.solve.model_sequence import TrackSource
+from rsundistort.solve.tracks import TrackSource
 
 ROOT = Path(__file__).resolve().parent.parent
 

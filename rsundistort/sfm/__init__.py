@@ -2,6 +2,7 @@
 
 from .alignment import PatchPlaces, PatchSource, align_tracks, allowed_patches, cut_patches
 from .connected import LEAST_MEASUREMENTS, connected_photos, firmly_connected
+from .contradiction import contradicting_photos
 from .database import MatchedPhotos
 from .epipolar import read_num_verified
 from .features import DETECTION_MEGAPIXELS, SIFT_PX, Features, detect_features, detection_bytes, grey_8_bit
@@ -29,6 +30,7 @@ __all__ = [
     "allowed_patches",
     "choose_pairs",
     "connected_photos",
+    "contradicting_photos",
     "cut_patches",
     "detect_features",
     "detection_bytes",

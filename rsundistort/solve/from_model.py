@@ -32,11 +32,12 @@ from ..model.orientation import INVERSE, orient_reconstruction
 from ..sfm import matched_of_database
 from .from_poses import measured, posed_photos, shutter_terms
 from .going_on import RunFolder, key_of, run_folder
-from .model_sequence import TrackSource, solve_tracks
+from .model_sequence import solve_tracks
 from .outcome import Solved
 from .run_options import OutputOptions, SolveOptions
 from .run_outputs import REPLACED, Outputs, PointRgb, check_usd, files_of_run, inputs_of, photo_times
 from .survey import survey_of
+from .tracks import TrackSource
 
 if TYPE_CHECKING:
     import pycolmap

@@ -21,7 +21,7 @@ from ..io.cameras import camera_to_json
 from ..io.metashape import PosedPhotos, named, read_metashape
 from ..model import Observations, Reconstruction
 from ..sfm import LEAST_MEASUREMENTS, match_photos, retriangulate
-from .model_sequence import TrackSource
+from .tracks import TrackSource
 
 __all__ = ["measured", "posed_photos", "shutter_terms"]
 

@@ -31,9 +31,10 @@ from .clip_gyroscope import Felt, felt_gyroscope, own_gyroscope, readout_of, rot
 from .clip_pair import FramePair
 from .clip_pan import rotating_only
 from .clip_tracks import follow_points, followed_again, with_all_frames
-from .model_sequence import rough_options, without_shutter
+from .model_sequence import without_shutter
 from .outcome import Solved
 from .placing import place_photos
+from .tracks import rough_options
 
 __all__ = ["frame_path", "readouts_of_halves", "solve_clip"]
 

@@ -1,0 +1,121 @@
+"""Parts of a reconstruction whose places contradict the matches between them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from heapq import heapify, heappop, heappush
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..colmap.conventions import quiet_pycolmap
+from ..model import Reconstruction
+from .database import MatchedPhotos
+from .epipolar import FreedMatches
+
+__all__ = ["contradicting_photos", "parts_that_agree"]
+
+Pair = tuple[int, int]
+
+# Of what a free epipolar geometry fits, poses fit about as much in all pairs that are right: all of it where matches
+# are good, three quarters where many are false. A pair supports its poses if they fit these shares of what is usual in
+# the set: one to take a place away, one to ask for another. (Right pairs of real photos, warped or not, fit 0.78 to
+# 1.00 of their matches together, those between a side in a wrong place and the rest 0.41 to 0.72.)
+_WRONG, _SUSPECT = 0.7, 0.8
+# Fewer matches may fit an epipolar geometry by chance, most of them.
+_LEAST_MATCHES = 30
+
+
+def contradicting_photos(
+    matched: MatchedPhotos, num_verified: Mapping[Pair, int], reconstruction: Reconstruction, *, suspects: bool = False
+) -> NDArray[np.bool_]:
+    """Photos in parts of a reconstruction that more matches with the largest part contradict than support.
+
+    Mapping may give a whole side of a scene a wrong place, in which its photos agree with each other, and some matches
+    with the rest fit by chance or because they lie near the axis that it was rotated about. Each photo has its points
+    there, so that residuals do not show it; the matches that were left out do.
+
+    Parameters
+    ----------
+    matched, num_verified
+        Photos, and how many matches of each pair one loose epipolar geometry fits (`read_num_verified`, before new
+        tracks overwrite it).
+    reconstruction : Reconstruction
+        Poses and motions.
+    suspects : bool
+        Whether photos whose place is less certain to be wrong are among them.
+
+    Returns
+    -------
+    (m,) bool array
+        By photo of the reconstruction.
+    """
+    m, support = len(matched.names), _support(matched, num_verified, reconstruction, _SUSPECT if suspects else _WRONG)
+    part = parts_that_agree(support, m)
+    posed = np.isin(matched.names, reconstruction.image_names)
+    sizes = np.bincount(part[posed], minlength=m)
+    largest = int(np.argmax(sizes))
+    with_largest = np.zeros(m)
+    for (first, second), weight in support.items():
+        if largest in (part[first], part[second]) and part[first] != part[second]:
+            with_largest[part[second] if part[first] == largest else part[first]] += weight
+    contradicts = dict(zip(matched.names, with_largest[part] < 0, strict=True))
+    return np.array([contradicts[name] for name in reconstruction.image_names], bool)
+
+
+def _support(
+    matched: MatchedPhotos, num_verified: Mapping[Pair, int], reconstruction: Reconstruction, share_of_usual: float
+) -> dict[Pair, float]:
+    """Matches of each pair that fit its poses, less those that would have to."""
+    freed, pairs, fits, counts = FreedMatches(matched, reconstruction), list[Pair](), list[float](), list[int]()
+    with quiet_pycolmap().Database.open(matched.database) as db:
+        for pair, count in num_verified.items():
+            if count < _LEAST_MATCHES or (freed.posed[list(pair)] < 0).any():
+                continue
+            matches = np.asarray(db.read_matches(pair[0] + 1, pair[1] + 1), np.int64).reshape(-1, 2)
+            # a database of another program may hold what was verified alone
+            if len(matches) >= count:
+                pairs.append(pair)
+                counts.append(count)
+                fits.append(float(freed.explained(*pair, matches).sum()))
+    if not pairs:
+        return {}
+    share = np.array(fits) / counts
+    order = np.argsort(share)
+    half = np.searchsorted(np.cumsum(np.array(counts)[order]), sum(counts) / 2)
+    least = share_of_usual * share[order[half]]
+    return {pair: fit - least * count for pair, fit, count in zip(pairs, fits, counts, strict=True)}
+
+
+def parts_that_agree(support: Mapping[Pair, float], num: int) -> NDArray[np.int64]:
+    """Partition of so many photos into parts within which pairs support each other, (num,) label of each.
+
+    Parts are joined in the order of the support between them, and pairs that contradict count against it: greedy
+    additive edge contraction (Keuper et al., ICCV 2015).
+    """
+    between: list[dict[int, float]] = [{} for _ in range(num)]
+    for (first, second), weight in support.items():
+        between[first][second] = between[second][first] = weight
+    heap = [(-weight, *pair) for pair, weight in support.items() if weight > 0]
+    heapify(heap)
+    label = np.arange(num)
+    while heap:
+        weight, kept, gone = heappop(heap)
+        if between[kept].get(gone) != -weight:
+            continue  # one of them has been joined with another part since
+        del between[kept][gone], between[gone][kept]
+        label[label == gone] = kept
+        for other, more in _emptied(between, gone):
+            total = between[kept].get(other, 0.0) + more
+            between[kept][other] = between[other][kept] = total
+            if total > 0:
+                heappush(heap, (-total, kept, other))
+    return label
+
+
+def _emptied(between: list[dict[int, float]], part: int) -> Iterable[tuple[int, float]]:
+    """What a part shares with others, which it does not from now on."""
+    shared, between[part] = between[part], {}
+    for other in shared:
+        del between[other][part]
+    return shared.items()

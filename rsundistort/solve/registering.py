@@ -1,0 +1,163 @@
+"""Photos that mapping left out or gave a wrong pose, registered once their motions are known."""
+
+from __future__ import annotations
+
+import warnings
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..batch.progress import StageLog
+from ..bundle import BundleOptions, BundleResult
+from ..errors import ReconstructionError, RsUndistortWarning
+from ..model import Reconstruction
+from ..sfm import (
+    contradicting_photos,
+    firmly_connected,
+    map_without_motions,
+    read_num_verified,
+    register_photos,
+    retriangulate,
+)
+from .solutions import agree, num_explained
+from .tracks import (
+    LEAST_PHOTOS,
+    TrackSource,
+    adjusted_sequence,
+    is_strong,
+    of_registered,
+    rough_options,
+    roughly_adjusted,
+    tell,
+)
+
+__all__ = ["all_registered"]
+
+# Rounds of registration: photos that are registered make others possible.
+_MOST_WAVES = 4
+# Models with motions that poses without a shutter may be wrong by.
+_MODELS = "rotation", "constant-motion"
+
+
+def all_registered(
+    track_source: TrackSource, result: BundleResult, wanted: BundleOptions, log: StageLog, *, again: bool
+) -> BundleResult:
+    """The solution with as many photos as can be registered; `again` by a second mapping, too, whose frame is another.
+
+    That takes a shutter that is strong, or was before photos lost their poses, or photos that may have a wrong place.
+    """
+    if result.reconstruction.shutter_model not in _MODELS:
+        return result
+    strong = is_strong(result.reconstruction)
+    registrar = _Registrar(track_source, wanted, log)
+    result, left_out = registrar.registered(result)
+    strong = strong or is_strong(result.reconstruction)
+    if again and track_source.mapped_here and (strong or left_out or registrar.suspects(result.reconstruction).any()):
+        result, left_out = registrar.mapped_again(result, left_out)
+    if left_out:
+        names = ", ".join(sorted(left_out))
+        warnings.warn(f"left out, since they contradict the other photos: {names}", RsUndistortWarning, stacklevel=4)
+    return result
+
+
+@dataclass(frozen=True)
+class _Registrar:
+    """Registers the photos of a source of tracks; a solution comes with the names of those that it left out."""
+
+    track_source: TrackSource
+    wanted: BundleOptions
+    log: StageLog
+    # read at once: new tracks overwrite how many matches a free geometry fits
+    num_verified: dict[tuple[int, int], int] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "num_verified", read_num_verified(self.track_source.matched))
+
+    def registered(self, result: BundleResult) -> tuple[BundleResult, set[str]]:
+        """Register photos that mapping left out, or gave a wrong pose without a shutter, with the points of the others.
+
+        With it come those that lost their poses, since they contradict the others.
+        """
+        matched, left_out = self.track_source.matched, set[str]()
+        for wave in range(1, _MOST_WAVES + 1):
+            rec = result.reconstruction
+            strong = is_strong(rec)
+            if not strong and rec.num_images == len(matched.names) and not self._contradicting(rec).any():
+                break
+            stage = f"registration {wave}"
+            self.log.begin(stage)
+            scene = self._new_tracks(rec)
+            if strong and wave == 1 and scene.num_images >= LEAST_PHOTOS:
+                # thresholds without a shutter had cut off most measurements: no photo is judged before they are back
+                result = self._adjusted(scene, result, stage)
+                scene = self._new_tracks(result.reconstruction)
+            if (wrong := self._contradicting(scene)).any():
+                left_out.update(name for name, each in zip(scene.image_names, wrong, strict=True) if each)
+                scene = firmly_connected(scene.take_photos(~wrong))
+            found = register_photos(matched, self.num_verified, scene, strong=strong)
+            changes = found.changes or scene.num_images < rec.num_images
+            if changes:
+                tracks = found.reconstruction
+                if tracks.num_images >= LEAST_PHOTOS:
+                    tracks = self._new_tracks(tracks)
+                if tracks.num_images < LEAST_PHOTOS:  # too few are connected to distinguish right from wrong
+                    self.log.end(stage, added=(), moved=(), dropped=())
+                    break
+                result = self._adjusted(tracks, result, stage)
+            left_out = left_out.union(found.dropped) - {*result.reconstruction.image_names}
+            self.log.end(stage, added=found.added, moved=found.moved, dropped=found.dropped)
+            if not changes:
+                break
+        return result, left_out
+
+    def mapped_again(self, result: BundleResult, left_out: set[str]) -> tuple[BundleResult, set[str]]:
+        """The solution, or that of a mapping of keypoints without rough motions if that has more photos in their place.
+
+        A side of a scene that mapping rotated as a whole has no photo that fits elsewhere. The cameras as they came and
+        as they were found give two places to start from. The other solution must agree with the first one on the photos
+        of both, except suspects, and explain more measurements.
+        """
+        rec, matched = result.reconstruction, self.track_source.matched
+        firm = rec.take_photos(~self.suspects(rec))
+        best, best_left_out, stage = result, left_out, "mapping without motions"
+        for start in (matched, replace(matched, cameras=rec.cameras, calibrated=True)):
+            of_best = best.reconstruction
+            if of_best.num_images == len(matched.names) and not self.suspects(of_best).any():
+                break
+            self.log.begin(stage)
+            mapped = None
+            with suppress(ReconstructionError):
+                mapped = map_without_motions(start, result.phi_rms)
+            self.log.end(stage, photos=0 if mapped is None else mapped.num_images)
+            if mapped is None or mapped.num_images < LEAST_PHOTOS:
+                continue
+            options = rough_options(of_registered(self.wanted, mapped, says=False))
+            other, other_left_out = self.registered(adjusted_sequence(mapped, rec.shutter_model, options, self.log))
+            new = other.reconstruction
+            if (
+                new.num_images > firm.num_images
+                and self._explained(new) > self._explained(of_best)
+                and agree(firm, new)
+            ):
+                best, best_left_out = other, other_left_out
+        return best, best_left_out
+
+    def suspects(self, reconstruction: Reconstruction) -> NDArray[np.bool_]:
+        """(m,) photos that may have a wrong place."""
+        return contradicting_photos(self.track_source.matched, self.num_verified, reconstruction, suspects=True)
+
+    def _contradicting(self, reconstruction: Reconstruction) -> NDArray[np.bool_]:
+        return contradicting_photos(self.track_source.matched, self.num_verified, reconstruction)
+
+    def _new_tracks(self, reconstruction: Reconstruction) -> Reconstruction:
+        return firmly_connected(retriangulate(self.track_source.matched, reconstruction))
+
+    def _explained(self, reconstruction: Reconstruction) -> int:
+        """Measurements by new tracks: those of a mapping are fewer than those that follow it."""
+        return num_explained(self._new_tracks(reconstruction))
+
+    def _adjusted(self, tracks: Reconstruction, result: BundleResult, stage: str) -> BundleResult:
+        return roughly_adjusted(tracks, result, self.wanted, partial(tell, self.log, stage))
