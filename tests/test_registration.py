@@ -9,15 +9,20 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, Observations, Reconstruction, RowMotion, project_points
+from rsundistort.batch.progress import StageLog
+from rsundistort.bundle import BundleOptions, bundle_adjust
 from rsundistort.colmap.conventions import quiet_pycolmap
 from rsundistort.sfm import Features, MatchedPhotos, map_photos, map_without_motions, read_num_verified, register_photos
+from rsundistort.sfm.contradiction import contradicting_photos, parts_that_agree
 from rsundistort.sfm.database import write_photos
 from rsundistort.sfm.epipolar import agreeing_photos, read_matches
 from rsundistort.sfm.motion_averaging import averaged_motions
 from rsundistort.sfm.registration import place_photo
 from rsundistort.sfm.relative_pose import Pair
 from rsundistort.sfm.verification import pair_of
+from rsundistort.solve.registering import all_registered
 from rsundistort.solve.solutions import agree
+from rsundistort.solve.tracks import TrackSource, rough_options
 
 CAMERA = Camera(1200, 900, [[1000, 0, 600], [0, 1000, 450], [0, 0, 1]])
 NAMES = [f"{k}.jpg" for k in range(6)]
@@ -35,12 +40,18 @@ def rotated_deg(R_a, R_b):
 
 
 @pytest.fixture
-def scene(rng):
-    """Points, poses and motions of a quarter of a radian a frame, and what the photos show of them with noise."""
+def rad():
+    """Of the motions, a frame."""
+    return 0.25
+
+
+@pytest.fixture
+def scene(rng, rad):
+    """Points, poses and motions, and what the photos show of them with noise."""
     points_w = rng.uniform([-3, -2, 5], [3, 2, 9], (500, 3))
     centers = np.column_stack([np.linspace(-2, 2, 6), rng.normal(0, 0.3, 6), rng.normal(0, 0.3, 6)])
     R_cw = np.array([look_at(center, np.array([0, 0, 7.0])) for center in centers])
-    phi = rng.normal(0, 0.25, (6, 3)) / CAMERA.frame_span
+    phi = rng.normal(0, rad, (6, 3)) / CAMERA.frame_span
     frame, point, xy = [], [], []
     for i in range(6):
         uv, valid = project_points((points_w - centers[i]) @ R_cw[i].T, CAMERA, RowMotion(phi[i]))
@@ -135,19 +146,22 @@ def test_right_places_stay(scene, matched):
     assert found.reconstruction.image_names == scene.image_names
 
 
-def test_a_set_that_is_turned_as_a_whole_is_placed_by_the_points_of_the_rest(scene, matched):
-    # what it shows of itself says nothing: 3, 4 and 5 agree with each other about copies of the points
+def with_a_side_turned(scene, first):
+    """The photos from one on agree with each other, about copies of the points, and with no other."""
     obs, turn = scene.observations, Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix()
-    turned = np.arange(6) >= 3
-    of_set = turned[obs.frame_idx]
-    split = replace(
+    turned = np.arange(6) >= first
+    return replace(
         scene,
         R_cw=np.where(turned[:, None, None], scene.R_cw @ turn.T, scene.R_cw),
         center_w=np.where(turned[:, None], scene.center_w @ turn.T, scene.center_w),
         points_w=np.concatenate([scene.points_w, scene.points_w @ turn.T]),
-        observations=replace(obs, point_idx=obs.point_idx + len(scene.points_w) * of_set),
+        observations=replace(obs, point_idx=obs.point_idx + len(scene.points_w) * turned[obs.frame_idx]),
     )
-    found = register_photos(matched, read_num_verified(matched), split)
+
+
+def test_a_set_that_is_turned_as_a_whole_is_placed_by_the_points_of_the_rest(scene, matched):
+    # what it shows of itself says nothing
+    found = register_photos(matched, read_num_verified(matched), with_a_side_turned(scene, 3))
     assert len(found.moved) == 3
     between = found.reconstruction.R_cw[0] @ found.reconstruction.R_cw[5].T
     assert rotated_deg(between, scene.R_cw[0] @ scene.R_cw[5].T) < 0.05
@@ -174,6 +188,36 @@ def test_photos_that_the_poses_do_not_explain_are_distinguished(scene, matched):
     R_cw[:2] = Rotation.from_rotvec([0.2, 0.3, 0.1]).as_matrix() @ R_cw[:2]
     agreeing = agreeing_photos(matched, read_matches(matched), read_num_verified(matched), replace(scene, R_cw=R_cw))
     np.testing.assert_array_equal(agreeing, np.arange(6) >= 2)
+
+
+@pytest.mark.parametrize("suspects", [False, True])
+def test_a_side_that_is_turned_as_a_whole_contradicts_the_rest(scene, matched, suspects):
+    verified = read_num_verified(matched)
+    assert not contradicting_photos(matched, verified, scene, suspects=suspects).any()
+    turned = contradicting_photos(matched, verified, with_a_side_turned(scene, 4), suspects=suspects)
+    np.testing.assert_array_equal(turned, np.arange(6) >= 4)
+    few = dict.fromkeys(verified, 29)
+    assert not contradicting_photos(matched, few, with_a_side_turned(scene, 4), suspects=suspects).any()
+
+
+def test_parts_are_joined_by_all_that_is_between_them():
+    # 3 is tied to 2, but more to what contradicts 1
+    support = {(0, 1): 5.0, (1, 2): 5.0, (2, 3): 1.0, (1, 3): -4.0, (3, 4): 3.0}
+    part = parts_that_agree(support, 6)
+    assert part[0] == part[1] == part[2]
+    assert part[3] == part[4]
+    assert len(set(part.tolist())) == 3
+
+
+@pytest.mark.parametrize("rad", [0.02])
+def test_a_side_in_a_wrong_place_is_registered_again_with_a_weak_shutter(scene, matched):
+    wrong = with_a_side_turned(scene, 4)
+    tracks = TrackSource(matched, mapped_here=True)
+    start = bundle_adjust(wrong, "rotation", rough_options(BundleOptions()))
+    found = all_registered(tracks, start, BundleOptions(), StageLog(lambda *_: None), again=True).reconstruction
+    assert found.image_names == tuple(NAMES)
+    assert apart_deg(found, scene).max() < 0.1
+    assert apart_deg(start.reconstruction, scene).max() > 10.0
 
 
 def pairs_of(matched):

@@ -84,13 +84,13 @@ class _Registrar:
         matched, left_out = self.track_source.matched, set[str]()
         for wave in range(1, _MOST_WAVES + 1):
             rec = result.reconstruction
-            strong = is_strong(rec)
-            if not strong and rec.num_images == len(matched.names) and not self._contradicting(rec).any():
+            strong, stage = is_strong(rec), f"registration {wave}"
+            suspect = self.suspects(rec).any()
+            if not strong and rec.num_images == len(matched.names) and not suspect:
                 break
-            stage = f"registration {wave}"
             self.log.begin(stage)
             scene = self._new_tracks(rec)
-            if strong and wave == 1 and scene.num_images >= LEAST_PHOTOS:
+            if (strong or suspect) and wave == 1 and scene.num_images >= LEAST_PHOTOS:
                 # thresholds without a shutter had cut off most measurements: no photo is judged before they are back
                 result = self._adjusted(scene, result, stage)
                 scene = self._new_tracks(result.reconstruction)
