@@ -20,7 +20,7 @@ from rsundistort.sfm.motion_averaging import averaged_motions
 from rsundistort.sfm.registration import place_photo
 from rsundistort.sfm.relative_pose import Pair
 from rsundistort.sfm.verification import pair_of
-from rsundistort.solve.registering import all_registered
+from rsundistort.solve.registering import Registrar
 from rsundistort.solve.solutions import agree
 from rsundistort.solve.tracks import TrackSource, rough_options
 
@@ -212,9 +212,11 @@ def test_parts_are_joined_by_all_that_is_between_them():
 @pytest.mark.parametrize("rad", [0.02])
 def test_a_side_in_a_wrong_place_is_registered_again_with_a_weak_shutter(scene, matched):
     wrong = with_a_side_turned(scene, 4)
-    tracks = TrackSource(matched, mapped_here=True)
+    registrar = Registrar(TrackSource(matched, mapped_here=True), BundleOptions(), StageLog(lambda *_: None))
     start = bundle_adjust(wrong, "rotation", rough_options(BundleOptions()))
-    found = all_registered(tracks, start, BundleOptions(), StageLog(lambda *_: None), again=True).reconstruction
+    assert registrar.suspects(start.reconstruction) == ["4.jpg", "5.jpg"]
+    found = registrar.all_registered(start, again=True).reconstruction
+    assert registrar.suspects(found) == []
     assert found.image_names == tuple(NAMES)
     assert apart_deg(found, scene).max() < 0.1
     assert apart_deg(start.reconstruction, scene).max() > 10.0

@@ -31,7 +31,7 @@ from ..model import Reconstruction
 from ..verdict import Verdict, judge
 from .outcome import Solved
 from .placing import place_photos
-from .registering import all_registered
+from .registering import Registrar
 from .survey import Survey
 from .tracks import (
     TrackSource,
@@ -171,8 +171,9 @@ def solve_tracks(
     how = options if track_source is None else rough_options(options)
     result = adjusted_sequence(mapped, shutter_model, how, log)
     tracks, strong = result.reconstruction, is_strong(result.reconstruction)
-    if track_source is not None:
-        result = all_registered(track_source, result, wanted, log, again=survey is None)
+    registrar = None if track_source is None else Registrar(track_source, wanted, log)
+    if track_source is not None and registrar is not None:
+        result = registrar.all_registered(result, again=survey is None)
         strong = strong or is_strong(result.reconstruction)
         options = of_registered(wanted, result.reconstruction)
         result, tracks, options = retriangulated(track_source, result, options, log, ends=not auto)
@@ -199,7 +200,8 @@ def solve_tracks(
     known = {*options.known_phi, *options.held_phi, *options.still}
     # two standard deviations of the priors by exposure times
     most_phi = {name: 2.0 * limit for name, limit in options.phi_limits.items()}
-    verdict = judge(result, global_result, choice, mended, measured, known, most_phi, strong)
+    suspects = [] if registrar is None else registrar.suspects(result.reconstruction)
+    verdict = judge(result, global_result, choice, mended, measured, known, most_phi, strong, suspects)
     if verdict.lens_only:
         warnings.warn(_lens_only(verdict), RsUndistortWarning, stacklevel=3)
     log.end("verdict", shutter=verdict.shutter, shape=verdict.shape)

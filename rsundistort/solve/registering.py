@@ -34,7 +34,7 @@ from .tracks import (
     tell,
 )
 
-__all__ = ["all_registered"]
+__all__ = ["Registrar"]
 
 # Rounds of registration: photos that are registered make others possible.
 _MOST_WAVES = 4
@@ -42,62 +42,85 @@ _MOST_WAVES = 4
 _MODELS = "rotation", "constant-motion"
 
 
-def all_registered(
-    track_source: TrackSource, result: BundleResult, wanted: BundleOptions, log: StageLog, *, again: bool
-) -> BundleResult:
-    """The solution with as many photos as can be registered; `again` by a second mapping, too, whose frame is another.
-
-    That takes a shutter that is strong, or was before photos lost their poses, or photos that may have a wrong place.
-    """
-    if result.reconstruction.shutter_model not in _MODELS:
-        return result
-    strong = is_strong(result.reconstruction)
-    registrar = _Registrar(track_source, wanted, log)
-    result, left_out = registrar.registered(result)
-    strong = strong or is_strong(result.reconstruction)
-    if again and track_source.mapped_here and (strong or left_out or registrar.suspects(result.reconstruction).any()):
-        result, left_out = registrar.mapped_again(result, left_out)
-    if left_out:
-        names = ", ".join(sorted(left_out))
-        warnings.warn(f"left out, since they contradict the other photos: {names}", RsUndistortWarning, stacklevel=4)
-    return result
-
-
 @dataclass(frozen=True)
-class _Registrar:
-    """Registers the photos of a source of tracks; a solution comes with the names of those that it left out."""
+class Registrar:
+    """Registers the photos of a source of tracks.
+
+    Attributes
+    ----------
+    track_source : TrackSource
+        Matches, as mapping used them: new tracks overwrite how many of them a free geometry fits.
+    wanted : BundleOptions
+        Of the adjustments, with the constraints of all photos.
+    log : StageLog
+        Gets the progress.
+    """
 
     track_source: TrackSource
     wanted: BundleOptions
     log: StageLog
-    # read at once: new tracks overwrite how many matches a free geometry fits
-    num_verified: dict[tuple[int, int], int] = field(init=False)
+    _num_verified: dict[tuple[int, int], int] = field(init=False)
+    # photos that points of others place where they are, whatever the matches say
+    _confirmed: set[str] = field(init=False, default_factory=set)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "num_verified", read_num_verified(self.track_source.matched))
+        object.__setattr__(self, "_num_verified", read_num_verified(self.track_source.matched))
 
-    def registered(self, result: BundleResult) -> tuple[BundleResult, set[str]]:
+    def all_registered(self, result: BundleResult, *, again: bool) -> BundleResult:
+        """The solution with as many photos as can be registered; `again` by a second mapping, whose frame is another.
+
+        That takes a shutter that is strong, or was before photos lost their poses, or photos that may have a wrong
+        place.
+        """
+        if result.reconstruction.shutter_model not in _MODELS:
+            return result
+        strong = is_strong(result.reconstruction)
+        result, left_out = self._registered(result)
+        strong = strong or is_strong(result.reconstruction)
+        again = again and self.track_source.mapped_here
+        if again and (strong or left_out or self._suspects(result.reconstruction).any()):
+            result, left_out = self._mapped_again(result, left_out)
+        if left_out:
+            names = ", ".join(sorted(left_out))
+            warnings.warn(
+                f"left out, since they contradict the other photos: {names}", RsUndistortWarning, stacklevel=4
+            )
+        return result
+
+    def suspects(self, reconstruction: Reconstruction) -> list[str]:
+        """Photos that may have a wrong place, since matches with the others contradict it."""
+        return [reconstruction.image_names[i] for i in np.flatnonzero(self._suspects(reconstruction)).tolist()]
+
+    def _registered(self, result: BundleResult) -> tuple[BundleResult, set[str]]:
         """Register photos that mapping left out, or gave a wrong pose without a shutter, with the points of the others.
 
         With it come those that lost their poses, since they contradict the others.
         """
         matched, left_out = self.track_source.matched, set[str]()
         for wave in range(1, _MOST_WAVES + 1):
-            rec = result.reconstruction
-            strong, stage = is_strong(rec), f"registration {wave}"
-            suspect = self.suspects(rec).any()
-            if not strong and rec.num_images == len(matched.names) and not suspect:
+            before, rec = result, result.reconstruction
+            strong, all_placed = is_strong(rec), rec.num_images == len(matched.names)
+            suspect = self._suspects(rec).any()
+            if not strong and all_placed and not suspect:
                 break
+            stage = f"registration {wave}"
             self.log.begin(stage)
             scene = self._new_tracks(rec)
             if (strong or suspect) and wave == 1 and scene.num_images >= LEAST_PHOTOS:
                 # thresholds without a shutter had cut off most measurements: no photo is judged before they are back
                 result = self._adjusted(scene, result, stage)
                 scene = self._new_tracks(result.reconstruction)
-            if (wrong := self._contradicting(scene)).any():
-                left_out.update(name for name, each in zip(scene.image_names, wrong, strict=True) if each)
+            if self._confirms(scene, strong) and not strong:
+                # a lens that moves contradicts as a wrong place does
+                result, scene = before, self._new_tracks(before.reconstruction)
+                if all_placed:
+                    self.log.end(stage, added=(), moved=(), dropped=())
+                    break
+            wrong = self._contradicting(scene)
+            taken = [scene.image_names[i] for i in np.flatnonzero(wrong).tolist()]
+            if taken:
                 scene = firmly_connected(scene.take_photos(~wrong))
-            found = register_photos(matched, self.num_verified, scene, strong=strong)
+            found = register_photos(matched, self._num_verified, scene, strong=strong)
             changes = found.changes or scene.num_images < rec.num_images
             if changes:
                 tracks = found.reconstruction
@@ -107,13 +130,13 @@ class _Registrar:
                     self.log.end(stage, added=(), moved=(), dropped=())
                     break
                 result = self._adjusted(tracks, result, stage)
-            left_out = left_out.union(found.dropped) - {*result.reconstruction.image_names}
-            self.log.end(stage, added=found.added, moved=found.moved, dropped=found.dropped)
+            left_out = left_out.union(found.dropped, taken) - {*result.reconstruction.image_names}
+            self.log.end(stage, added=found.added, moved=found.moved, dropped=(*taken, *found.dropped))
             if not changes:
                 break
         return result, left_out
 
-    def mapped_again(self, result: BundleResult, left_out: set[str]) -> tuple[BundleResult, set[str]]:
+    def _mapped_again(self, result: BundleResult, left_out: set[str]) -> tuple[BundleResult, set[str]]:
         """The solution, or that of a mapping of keypoints without rough motions if that has more photos in their place.
 
         A side of a scene that mapping rotated as a whole has no photo that fits elsewhere. The cameras as they came and
@@ -121,11 +144,11 @@ class _Registrar:
         of both, except suspects, and explain more measurements.
         """
         rec, matched = result.reconstruction, self.track_source.matched
-        firm = rec.take_photos(~self.suspects(rec))
+        firm = rec.take_photos(~self._suspects(rec))
         best, best_left_out, stage = result, left_out, "mapping without motions"
         for start in (matched, replace(matched, cameras=rec.cameras, calibrated=True)):
             of_best = best.reconstruction
-            if of_best.num_images == len(matched.names) and not self.suspects(of_best).any():
+            if of_best.num_images == len(matched.names) and not self._suspects(of_best).any():
                 break
             self.log.begin(stage)
             mapped = None
@@ -135,7 +158,7 @@ class _Registrar:
             if mapped is None or mapped.num_images < LEAST_PHOTOS:
                 continue
             options = rough_options(of_registered(self.wanted, mapped, says=False))
-            other, other_left_out = self.registered(adjusted_sequence(mapped, rec.shutter_model, options, self.log))
+            other, other_left_out = self._registered(adjusted_sequence(mapped, rec.shutter_model, options, self.log))
             new = other.reconstruction
             if (
                 new.num_images > firm.num_images
@@ -145,12 +168,27 @@ class _Registrar:
                 best, best_left_out = other, other_left_out
         return best, best_left_out
 
-    def suspects(self, reconstruction: Reconstruction) -> NDArray[np.bool_]:
-        """(m,) photos that may have a wrong place."""
-        return contradicting_photos(self.track_source.matched, self.num_verified, reconstruction, suspects=True)
+    def _confirms(self, scene: Reconstruction, strong: bool) -> bool:
+        """Whether suspects, registered again by the points of the others alone, come back to where they are."""
+        suspects = self._suspects(scene)
+        if not suspects.any() or (~suspects).sum() < LEAST_PHOTOS:
+            return False
+        rest = scene.take_photos(~suspects)
+        found = register_photos(self.track_source.matched, self._num_verified, rest, strong=strong)
+        names = [scene.image_names[i] for i in np.flatnonzero(suspects).tolist()]
+        again = [name for name in found.added if name in names]
+        confirmed = bool(again) and agree(scene, found.reconstruction)
+        if confirmed:
+            self._confirmed.update(names)
+        return confirmed
 
-    def _contradicting(self, reconstruction: Reconstruction) -> NDArray[np.bool_]:
-        return contradicting_photos(self.track_source.matched, self.num_verified, reconstruction)
+    def _suspects(self, reconstruction: Reconstruction) -> NDArray[np.bool_]:
+        return self._contradicting(reconstruction, suspects=True)
+
+    def _contradicting(self, reconstruction: Reconstruction, *, suspects: bool = False) -> NDArray[np.bool_]:
+        matched = self.track_source.matched
+        found = contradicting_photos(matched, self._num_verified, reconstruction, suspects=suspects)
+        return found & ~np.isin(reconstruction.image_names, [*self._confirmed])
 
     def _new_tracks(self, reconstruction: Reconstruction) -> Reconstruction:
         return firmly_connected(retriangulate(self.track_source.matched, reconstruction))

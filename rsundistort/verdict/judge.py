@@ -52,6 +52,7 @@ _OUTLIERS = 1 / 3
 _REPEATED, _LEAST_PHOTOS, _CHANCE = 2.0, 5, 0.001
 # Largest standard deviation of the direction of a photo whose pose counts as known, degrees.
 _LOST_DEG = 1.0
+_SUSPECT = "its matches with the other photos contradict its place"
 # Cosine between axes of rotation that count as the same.
 _SAME_WAY = 0.9
 
@@ -96,6 +97,7 @@ def judge(
     known: Collection[str] = (),
     most_phi: Mapping[str, float] | None = None,
     strong: bool = False,
+    suspects: Collection[str] = (),
 ) -> Verdict:
     """Judge a solution.
 
@@ -118,6 +120,8 @@ def judge(
     strong : bool
         Whether photos rotated so much during the readout that mapping, which knows no shutter, may have given them
         wrong poses: only the solution then determines these.
+    suspects : collection of photo names
+        Photos whose place their matches with the others contradict.
 
     Returns
     -------
@@ -130,7 +134,7 @@ def judge(
     if rec.shutter_model == "global":
         shutter, why = _of_global(choice)
         misplaced = _misplaced(result, bool(unexplained) or shutter != "not-found") if strong else {}
-        return _verdict(shutter, reasons + why, misplaced)
+        return _verdict(shutter, reasons + why, dict.fromkeys(suspects, _SUSPECT) | misplaced)
     motions = photo_motions(result)
     outliers = _outliers(rec, tracks)
     doubts = _doubts(result, motions, outliers, most_phi or {})
@@ -140,6 +144,8 @@ def judge(
     reasons += _rival_reasons(choice)
     for name, said in _misplaced(result, bool(unexplained + why)).items() if strong else ():
         doubts[name].append(said)
+    for name in suspects:
+        doubts[name].append(_SUSPECT)
     reasons += why
     if not reasons:
         reasons = _of_photos(rec, doubts, motions)
