@@ -321,6 +321,15 @@ def test_places_that_only_the_solution_tells_are_named_where_it_does_not_tell_th
     assert judge(loose, None, choice, strong=True).doubtful == {"3.jpg": "its direction is only known to +-5.7 degrees"}
 
 
+@pytest.mark.parametrize("shutter_model", ["global", "rotation"])
+def test_photos_in_a_place_that_matches_contradict_are_named(rng, shutter_model):
+    result, choice = bundle_adjust(measured(rng, swung(rng)), shutter_model), choice_of(shutter_model, gain=9.0)
+    said = judge(result, None, choice, suspects=["2.jpg"])
+    assert said.shape == "doubtful"
+    assert any("(2.jpg)" in reason for reason in said.reasons)
+    assert "contradict its place" in said.doubtful["2.jpg"]
+
+
 def test_all_places_are_named_where_a_strong_shutter_was_not_found(rng):
     rec = measured(rng, swung(rng))
     against = choice_of(against=("the motions of two halves do not agree",))

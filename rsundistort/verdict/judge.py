@@ -131,6 +131,8 @@ def judge(
     rec = result.reconstruction
     unexplained = unexplained_reasons(result, choice)
     reasons = loose_reasons(result) + height_reasons(remedy) + unexplained
+    if suspects:
+        reasons.append(f"{len(suspects)} of {rec.num_images} photos may have a wrong place ({', '.join(suspects)}).")
     if rec.shutter_model == "global":
         shutter, why = _of_global(choice)
         misplaced = _misplaced(result, bool(unexplained) or shutter != "not-found") if strong else {}
