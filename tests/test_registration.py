@@ -20,6 +20,7 @@ from rsundistort.sfm.motion_averaging import averaged_motions
 from rsundistort.sfm.registration import place_photo
 from rsundistort.sfm.relative_pose import Pair
 from rsundistort.sfm.verification import pair_of
+from rsundistort.solve import registering
 from rsundistort.solve.registering import Registrar
 from rsundistort.solve.solutions import agree
 from rsundistort.solve.tracks import TrackSource, rough_options
@@ -220,6 +221,22 @@ def test_a_side_in_a_wrong_place_is_registered_again_with_a_weak_shutter(scene, 
     assert found.image_names == tuple(NAMES)
     assert apart_deg(found, scene).max() < 0.1
     assert apart_deg(start.reconstruction, scene).max() > 10.0
+
+
+@pytest.mark.parametrize("rad", [0.02])
+def test_what_a_rejected_mapping_confirms_says_nothing_of_the_solution(scene, matched, monkeypatch):
+    registrar = Registrar(TrackSource(matched, mapped_here=True), BundleOptions(), StageLog(lambda *_: None))
+    start = bundle_adjust(with_a_side_turned(scene, 4), "rotation", rough_options(BundleOptions()))
+
+    def confirming(self, result):
+        self._confirmed.add("4.jpg")
+        return result, set()
+
+    monkeypatch.setattr(Registrar, "_registered", confirming)
+    monkeypatch.setattr(registering, "map_without_motions", lambda *_: scene)
+    monkeypatch.setattr(registering, "agree", lambda *_: False)
+    assert registrar._mapped_again(start, set())[0] is start
+    assert registrar.suspects(start.reconstruction) == ["4.jpg", "5.jpg"]
 
 
 def pairs_of(matched):

@@ -60,7 +60,7 @@ class Registrar:
     wanted: BundleOptions
     log: StageLog
     _num_verified: dict[tuple[int, int], int] = field(init=False)
-    # photos that points of others place where they are, whatever the matches say
+    # photos of the solution at hand that points of the others place where they are, whatever the matches say
     _confirmed: set[str] = field(init=False, default_factory=set)
 
     def __post_init__(self) -> None:
@@ -146,6 +146,7 @@ class Registrar:
         rec, matched = result.reconstruction, self.track_source.matched
         firm = rec.take_photos(~self._suspects(rec))
         best, best_left_out, stage = result, left_out, "mapping without motions"
+        confirmed = {*self._confirmed}
         for start in (matched, replace(matched, cameras=rec.cameras, calibrated=True)):
             of_best = best.reconstruction
             if of_best.num_images == len(matched.names) and not self._suspects(of_best).any():
@@ -158,14 +159,14 @@ class Registrar:
             if mapped is None or mapped.num_images < LEAST_PHOTOS:
                 continue
             options = rough_options(of_registered(self.wanted, mapped, says=False))
+            self._confirmed.clear()  # where photos are in one solution says nothing of the other
             other, other_left_out = self._registered(adjusted_sequence(mapped, rec.shutter_model, options, self.log))
             new = other.reconstruction
-            if (
-                new.num_images > firm.num_images
-                and self._explained(new) > self._explained(of_best)
-                and agree(firm, new)
-            ):
-                best, best_left_out = other, other_left_out
+            more = new.num_images > firm.num_images and self._explained(new) > self._explained(of_best)
+            if more and agree(firm, new):
+                best, best_left_out, confirmed = other, other_left_out, {*self._confirmed}
+            self._confirmed.clear()
+            self._confirmed.update(confirmed)
         return best, best_left_out
 
     def _confirms(self, scene: Reconstruction, strong: bool) -> bool:

@@ -52,6 +52,7 @@ _OUTLIERS = 1 / 3
 _REPEATED, _LEAST_PHOTOS, _CHANCE = 2.0, 5, 0.001
 # Largest standard deviation of the direction of a photo whose pose counts as known, degrees.
 _LOST_DEG = 1.0
+# Said of a photo that may have a wrong place.
 _SUSPECT = "its matches with the other photos contradict its place"
 # Cosine between axes of rotation that count as the same.
 _SAME_WAY = 0.9
