@@ -159,6 +159,10 @@ def test_motions_that_repeat_themselves_are_no_hands(rng):
     )
     assert _repeated(order) is None
     assert _repeated(replace(order, R_cw=order.R_cw[::-1])) == 2
+    # photos that came out wrong do not hide it
+    phi = np.array(order.phi)
+    phi[2] *= -40.0
+    assert _repeated(replace(order, R_cw=order.R_cw[::-1], phi=phi)) == 2
     # a gyroscope may say so, too
     result = bundle_adjust(rec, "rotation")
     assert judge(result, None, choice_of("rotation", gain=9.0)).lens_only == tuple(rec.image_names)
@@ -328,6 +332,8 @@ def test_photos_in_a_place_that_matches_contradict_are_named(rng, shutter_model)
     assert said.shape == "doubtful"
     assert any("(2.jpg)" in reason for reason in said.reasons)
     assert "contradict its place" in said.doubtful["2.jpg"]
+    # its motion came from the same estimate as its pose
+    assert said.lens_only == (("2.jpg",) if shutter_model == "rotation" else ())
 
 
 def test_all_places_are_named_where_a_strong_shutter_was_not_found(rng):

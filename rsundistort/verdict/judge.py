@@ -154,7 +154,9 @@ def judge(
         reasons = _of_photos(rec, doubts, motions)
     for name, said in _faint(rec, motions).items():
         doubts[name] = doubts[name] or [said]
-    lost = torn | (_counts(rec) < _FEW) & (motions.sigma_px >= motions.shift_px)
+    # pose and motion are one estimate: what contradicts the one does not support the other
+    lost = torn | np.isin(rec.image_names, [*suspects])
+    lost |= (_counts(rec) < _FEW) & (motions.sigma_px >= motions.shift_px)
     # motions that cannot be seen do no harm
     lost &= motions.shift_px >= _UNSEEN_PX
     # a model that the user named is applied
@@ -323,14 +325,31 @@ def _repeated(rec: Reconstruction) -> int | None:
     if m < _LEAST_PHOTOS:
         return None
     phi = rec.phi * rec.frame_span()[:, None]
-    mean, spread = phi.mean(0), phi.std(0, ddof=1)
-    chance = 2.0 * stdtr(m - 1, -np.abs(mean) / np.maximum(spread, 1e-12) * np.sqrt(m))
     half_px = float(np.median([rec.camera(i).K[0, 0] for i in range(m)])) / 2
     between = Rotation.from_matrix(rec.R_cw[1:] @ rec.R_cw[:-1].transpose(0, 2, 1)).as_rotvec().mean(0)
-    if between @ mean > _SAME_WAY * np.linalg.norm(between) * np.linalg.norm(mean):
-        return None
-    alike = (np.abs(mean) > _REPEATED * spread) & (3 * chance < _CHANCE) & (np.abs(mean) * half_px > _UNSEEN_PX)
-    return int(np.argmax(np.where(alike, np.abs(mean), 0.0))) if alike.any() else None
+    # of all photos; and without the largest and smallest fifth, since photos that came out wrong hide what the others
+    # have in common
+    for trimmed in (0, m // 5):
+        mean, spread, freedom = _trimmed_mean(phi, trimmed)
+        if between @ mean > _SAME_WAY * np.linalg.norm(between) * np.linalg.norm(mean):
+            continue
+        chance = 2.0 * stdtr(freedom, -np.abs(mean) / np.maximum(spread, 1e-12) * np.sqrt(m))
+        alike = (np.abs(mean) > _REPEATED * spread) & (3 * chance < _CHANCE) & (np.abs(mean) * half_px > _UNSEEN_PX)
+        if alike.any():
+            return int(np.argmax(np.where(alike, np.abs(mean), 0.0)))
+    return None
+
+
+def _trimmed_mean(values: NDArray[np.float64], trimmed: int) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+    """Mean of columns (m, k) without so many values at either end, its standard deviation times sqrt(m), its freedom.
+
+    The deviation is Tukey and McLaughlin's, from the Winsorised variance.
+    """
+    m = len(values)
+    ordered = np.sort(values, axis=0)
+    kept = ordered[trimmed : m - trimmed]
+    winsorised = np.clip(ordered, kept[0], kept[-1])
+    return kept.mean(0), winsorised.std(0, ddof=1) * m / len(kept), len(kept) - 1
 
 
 def _doubts(
