@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import sys
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -456,6 +457,47 @@ def test_run_of_a_video_writes_all_its_frames_and_its_path(cut, tmp_path):
     assert np.loadtxt(out / "nuke" / "camera.chan")[:, 0].tolist() == list(range(1, 21))
     (camera,) = solution.rectified_cameras.values()
     check_usd(out / "camera.usda", rows[9], 9, camera)
+
+
+@pytest.fixture(scope="module")
+def at_once(tmp_path_factory):
+    """Two thirds of a second of the walk, filmed with a global shutter."""
+    folder = tmp_path_factory.mktemp("at-once")
+    recipe = json.loads((WALK / "recipe.json").read_text())
+    recipe["path"] |= {"readout": 0.001, "num_frames": 20}
+    recipe["render"]["samples"], recipe["twins"] = 2, {"every": 20}
+    (folder / "recipe.json").write_text(json.dumps(recipe))
+    asked = ["simulate", "scene", str(folder / "recipe.json"), "-o", str(folder / "clip")]
+    CliRunner().invoke(cli, asked, catch_exceptions=False)
+    return folder / "clip" / "clip.mp4"
+
+
+@pytest.mark.slow
+def test_a_video_of_a_global_shutter_needs_no_correction_if_the_user_says_what_it_is(at_once, tmp_path):
+    how = RunOptions(max_features=1000)
+    with pytest.warns(RsUndistortWarning, match="if the camera has a global shutter, run it with --model global"):
+        unsaid = run(at_once, tmp_path / "unsaid", how)
+    assert unsaid.verdict["shutter"] == "not-determined"
+    said = run(at_once, tmp_path / "said", replace(how, solve=SolveOptions(shutter_model="global")))
+    assert said.verdict == {"shutter": "not-found", "shape": "trusted", "reasons": []}
+    assert said.shutter_model == "global"
+    assert not any(image.lens_only or image.doubtful for image in said.images)
+    assert "were read at once" in (tmp_path / "said" / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_a_rolling_shutter_that_is_said_to_be_a_global_one_is_doubted(cut, tmp_path):
+    how = RunOptions(max_features=1000, solve=SolveOptions(shutter_model="global"))
+    with pytest.warns(RsUndistortWarning, match="The camera has a rolling shutter, which was not removed, as you"):
+        found = run(cut, tmp_path / "out", how)
+    assert (found.verdict["shutter"], found.verdict["shape"]) == ("not-determined", "doubtful")
+    assert all(image.lens_only for image in found.registered)
+
+
+def test_a_global_shutter_has_no_readout_time(cut, tmp_path):
+    how = RunOptions(max_features=200, solve=SolveOptions(shutter_model="global", readout_s=0.02))
+    with pytest.raises(InputError, match="have no readout time; leave out --readout-ms or --model global"):
+        run(cut, tmp_path / "out", how)
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ that stabilises rotates each frame as a whole against its shaking, and may remov
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -93,6 +93,9 @@ class Stabilisation:
     beyond_frames : bool
         Whether the lines change their rotation by more than the frames do in all of the time from one to the next: no
         readout takes longer, and false poses only make the frames seem to rotate by more.
+    read_at_once : bool
+        Whether the frames rotate and their lines show less of it than the fastest rolling shutter does: that of a
+        global shutter, or of a camera that took its shutter out.
     frames_by_gyro, shutter_by_gyro : Regression or None
         Rates between frames, and rotations during the readout, by the gyroscope's rates.
     """
@@ -104,6 +107,7 @@ class Stabilisation:
     frames_by_gyro: Regression | None = None
     shutter_by_gyro: Regression | None = None
     beyond_frames: bool = False
+    read_at_once: bool = False
 
     @property
     def shows_shaking(self) -> bool:
@@ -183,7 +187,10 @@ def judge_stabilisation(
         within = -log.mean(times + offset_s - length / 2, times + offset_s + length / 2)
         shutter_by_gyro = _of_lines(phi, within, phi_noise, interval)[0]
     verdict, reason = _judge(shutter, changes, beyond, frames_by_gyro, shutter_by_gyro, interval, readout_s)
-    return Stabilisation(verdict, reason, shutter, changes, frames_by_gyro, shutter_by_gyro, beyond)
+    fastest = _FASTEST * interval
+    at_once = _SIGMAS * shutter.reach < fastest and abs(shutter.slope) + _SIGMAS * shutter.sigma < fastest
+    found = Stabilisation(verdict, reason, shutter, changes, frames_by_gyro, shutter_by_gyro, beyond)
+    return replace(found, read_at_once=at_once and not found.shows_shaking)
 
 
 def _of_lines(
@@ -346,7 +353,7 @@ def _judge(
     if detectable and high < least:
         return "stabilised", (
             f"stabilised in the camera: rotation between the frames without its shutter (readout {found}, expected "
-            f"{wanted})"
+            f"{wanted}; if the camera has a global shutter, run it with --model global)"
         )
     if detectable and low > most:
         return "stabilised", (

@@ -92,7 +92,16 @@ def _photos(solution: Solution) -> str:
 
 
 def _not_asked(solution: Solution) -> bool:
-    return solution.shutter_model == "global" and solution.options.get("shutter_model") == "global"
+    """Whether no shutter was looked for: in a video the lines of the frames are, whatever was asked."""
+    return (
+        not _is_video(solution)
+        and solution.shutter_model == "global"
+        and solution.options.get("shutter_model") == "global"
+    )
+
+
+def _is_video(solution: Solution) -> bool:
+    return "readout_time" in solution.quality
 
 
 def _strength(solution: Solution, shifts: list[float]) -> str:
@@ -103,6 +112,8 @@ def _strength(solution: Solution, shifts: list[float]) -> str:
     if _not_asked(solution):
         return "The shutter was not modelled, as you asked (--model global)."
     if solution.shutter_model == "global":
+        if _is_video(solution):
+            return "The lines of the frames do not rotate as the frames do: they were read at once."
         return "No rolling-shutter model predicted measurements better than a global shutter."
     largest, median = max(shifts), float(np.median(shifts))
     said = f"The rolling shutter displaced pixels by up to {_px(largest)}"
@@ -175,7 +186,7 @@ def _height(solution: Solution) -> tuple[str, str]:
 def _unneeded(solution: Solution, largest: float | None) -> str:
     """Why no correction is needed; empty if it is needed."""
     if solution.shutter_model == "global":
-        return "a global shutter explains the photos as well"
+        return f"a global shutter explains the {'frames' if _is_video(solution) else 'photos'} as well"
     if largest is not None and largest < _UNSEEN_PX:
         return "the shutter displaced no pixel by as much as one"
     held_out = solution.quality.get("held_out_rms_px") or {}

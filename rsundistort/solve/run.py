@@ -239,16 +239,21 @@ def solve_frames(
     solving, cameras = options.solve, keys.cameras
     if solving.control or solving.crs not in (None, "none"):
         raise InputError("frames of a video have no GPS; it takes no --crs and --gcp, say --every N for photos that do")
-    if solving.still or solving.known or solving.shutter_model not in ("auto", "constant-motion"):
+    if solving.still or solving.known or solving.shutter_model not in ("auto", "constant-motion", "global"):
         raise InputError(
-            "the path of a video says how its frames move: it takes no --still, --known or --model; "
+            "the path of a video says how its frames move: it takes no --still, --known or --model but global; "
             "say --every N for photos that do"
         )
-    readouts = known_readouts(bodies, cameras.cameras, cameras.camera_idx, solving.readout_s, gyro_log)
+    at_once = solving.shutter_model == "global"
+    if at_once and solving.readout_s is not None:
+        raise InputError("frames of a global shutter have no readout time; leave out --readout-ms or --model global")
+    readouts = {} if at_once else known_readouts(
+        bodies, cameras.cameras, cameras.camera_idx, solving.readout_s, gyro_log
+    )  # fmt: skip
     with work_folder() as work:
         solved = solve_clip(
             clip, keys, frame_path(clip, readouts.get(0)), lambda _: solving.options_for(cameras), work, log,
-            seed=solving.seed, matching=options.matching, gyroscope=gyro_log, kept=kept,
+            seed=solving.seed, matching=options.matching, gyroscope=gyro_log, kept=kept, at_once=at_once,
         )  # fmt: skip
     cameras.check_plausible(solved.shared.cameras)
     return replace(solved, unregistered=keys.unregistered(solved.shared.image_names), readouts=readouts)

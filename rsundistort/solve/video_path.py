@@ -56,6 +56,7 @@ _GIVEN_SIGMA, _TABLE_SIGMA = 0.02, 0.1
 # A readout time is measured if its standard deviation falls to this share of the one before.
 _MEASURED = 0.7
 _OF_STABILISED = "what is taken for frames that were stabilised"
+_OF_GLOBAL = "what was given: a global shutter"
 
 # Result, its options, and whether the frames are as the sensor read them, if that was tested.
 _Found = tuple[BundleResult, BundleOptions, Stabilisation | None]
@@ -73,6 +74,7 @@ def solve_clip(
     matching: str = "auto",
     gyroscope: GyroLog | None = None,
     kept: Kept | None = None,
+    at_once: bool = False,
 ) -> Solved:
     """Map the key frames, register all others with their points, and adjust all as moments of one path.
 
@@ -97,12 +99,15 @@ def solve_clip(
         are found.
     kept : Kept, optional
         Results of an earlier run; takes those of this run.
+    at_once : bool
+        Whether the frames were read at once, by a global shutter, or have lost their shutter since.
 
     Returns
     -------
     Solved
         Its result is that of the key frames, `whole` the reconstruction of all frames.
     """
+    path = _at_once(path) if at_once else path
     turned, explained = _turned(clip, keys, path, options_of, log)
     telemetry = own_gyroscope(clip) if gyroscope is None else None
     if turned is not None and explained:
@@ -135,7 +140,7 @@ def solve_clip(
             partial(_tell, log, "gyroscope"),
         )  # fmt: skip
     log.end("gyroscope", offset_s=None if felt is None else felt.alignment.offset_s)
-    return _judged(clip, keys, result, options, alone, felt, filmed, telemetry, log)
+    return _judged(clip, keys, result, options, alone, felt, filmed, telemetry, log, at_once)
 
 
 def _turned(
@@ -278,6 +283,12 @@ def _at_once(path: FramePath) -> FramePath:
     return replace(path, readout=(0.0, _NO_READOUT * path.frame_s))
 
 
+def _standing(rec: Reconstruction) -> Reconstruction:
+    """The same frames as those of a global shutter."""
+    none = {key: np.zeros_like(getattr(rec, key)) for key in ("phi", "velocity", "bend")}
+    return replace(rec, shutter_model="global", **none)
+
+
 def _was_stabilised(filmed: Stabilisation | None) -> bool:
     return filmed is not None and filmed.verdict == "stabilised"
 
@@ -291,24 +302,26 @@ def _at_first(options: BundleOptions) -> BundleOptions:
 
 def _judged(
     clip: Clip, keys: LoadedPhotos, result: BundleResult, options: BundleOptions, alone: ReadoutTime,
-    felt: Felt | None, filmed: Stabilisation | None, telemetry: GyroLog | None, log: StageLog,
+    felt: Felt | None, filmed: Stabilisation | None, telemetry: GyroLog | None, log: StageLog, at_once: bool,
 ) -> Solved:  # fmt: skip
     """The verdict on a path, and the motions of its key frames."""
     assert options.path is not None
     remedy = None
-    if not options.path.rotation_only:  # else there is no shape
+    if not (options.path.rotation_only or at_once):  # there is no shape, or no shutter that could bend it
         log.begin("critical motion")
         result, remedy = heal(result, options)
         log.end("critical motion", sigma_log_k=remedy.after.sigma_log_k)
     log.begin("halves")
-    halves = None if _was_stabilised(filmed) else readouts_of_halves(result, options)
+    without_readout = at_once or _was_stabilised(filmed)
+    halves = None if without_readout else readouts_of_halves(result, options)
     log.end("halves", readout_s=None if halves is None else [each.seconds for each in halves])
     log.begin("stabilisation")
     stabilisation, vibration_px, speeds = filmed, 0.0, None
-    if stabilisation is None or not _was_stabilised(filmed):
+    if stabilisation is None or not without_readout:
         own = own_motions(result.reconstruction, rotation_only=options.path.rotation_only)
-        vibration_px = unfollowed_px(result.reconstruction, own)
-        speeds = _by_speed(clip, result, own)
+        if not at_once:
+            vibration_px = unfollowed_px(result.reconstruction, own)
+            speeds = _by_speed(clip, result, own)
         stabilisation = _stabilisation(clip, result.reconstruction, own, felt)
         if felt is None and telemetry is not None:
             on_path = result.reconstruction
@@ -317,29 +330,37 @@ def _judged(
     of_keys = result.of_photos(_are_keys(result, clip))
     log.begin("comparison with a global shutter")
     if options.path.rotation_only:  # there are no positions without a path
-        at_once = replace(_at_once(options.path), start=_start_of(result, at_once=True))
-        rough = replace(rough_options(options), path=at_once, outlier_rounds=0, prior_sigma_rounds=0)
+        path_at_once = replace(_at_once(options.path), start=_start_of(result, at_once=True))
+        rough = replace(rough_options(options), path=path_at_once, outlier_rounds=0, prior_sigma_rounds=0)
         global_result = bundle_adjust(of_keys.reconstruction, "constant-motion", rough)
     else:
         global_result = without_shutter(of_keys, options)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
     against = stabilisation.reason if stabilisation.verdict == "stabilised" else ""
+    if at_once:
+        against = _against_global(stabilisation)
     verdict = judge_clip(result, of_keys, halves, clip.frame_s, remedy, against, vibration_px, speeds)
     if verdict.lens_only:
         warnings.warn(
             f"the frames are corrected for the lens only: {verdict.reasons[0]}", RsUndistortWarning, stacklevel=4
         )
     # the frame of a mapping is arbitrary
-    rec, found = of_keys.reconstruction, result.path
+    rec, whole, found = of_keys.reconstruction, result.reconstruction, result.path
     assert found is not None
     world = rec.R_cw[0], rec.center_w[0], 1.0 / rec.baseline
     path = replace(found, path=found.path.moved(*world))
+    if at_once:
+        rec, whole = _standing(rec), _standing(whole)
     of_keys = replace(of_keys, reconstruction=rec.moved(*world), path=path)
-    time = readout_of(result)
+    time = ReadoutTime(0.0, 0.0) if at_once else readout_of(result)
     evidence: dict[str, Any] = {
         "seconds": time.seconds,
         "sigma": time.sigma,
-        "source": _OF_STABILISED if _was_stabilised(filmed) else _source(options, time, felt),
+        "source": _OF_GLOBAL
+        if at_once
+        else _OF_STABILISED
+        if _was_stabilised(filmed)
+        else _source(options, time, felt),
         "of_frame": time.seconds / clip.frame_s,
         "unbounded_seconds": float(found.unbounded_s[0]),
         "frames": len(path.names),
@@ -355,8 +376,21 @@ def _judged(
             evidence["by_gyroscope"] = felt.readout(by_gyro)._asdict()
     return Solved(
         of_keys, global_result, keys.cameras, remedy=remedy, verdict=verdict,
-        whole=result.reconstruction.moved(*world), evidence=evidence,
+        whole=whole.moved(*world), evidence=evidence,
     )  # fmt: skip
+
+
+def _against_global(found: Stabilisation) -> str:
+    """Why frames may not have been read at once, as the user says they were; empty if their lines show that."""
+    if found.read_at_once:
+        return ""
+    if found.verdict == "none":
+        return f"The camera has a rolling shutter, which was not removed, as you asked (--model global): {found.reason}"
+    if found.verdict == "unknown":
+        return (
+            "The camera rotated too little to show whether its frames were read at once, as you asked (--model global)"
+        )
+    return found.reason
 
 
 def _source(options: BundleOptions, time: ReadoutTime, felt: Felt | None) -> str:

@@ -200,7 +200,8 @@ class Light:
     def __post_init__(self) -> None:
         check_fields(self)
         for name in ("sun", "sky", "bounce"):
-            check_finite(getattr(self, name), (3,), f"light: {name}")
+            colour = check_finite(getattr(self, name), (3,), f"light: {name}")
+            object.__setattr__(self, name, tuple(colour.tolist()))  # a light is a key
         for name in ("sun_azimuth_deg", "sun_elevation_deg", "sun_radius_deg", "clouds"):
             check_number(getattr(self, name), f"light: {name}")
 
