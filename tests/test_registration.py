@@ -19,6 +19,7 @@ from rsundistort.sfm.epipolar import agreeing_photos, read_matches
 from rsundistort.sfm.motion_averaging import averaged_motions
 from rsundistort.sfm.registration import place_photo
 from rsundistort.sfm.relative_pose import Pair
+from rsundistort.sfm.sides import carried_along
 from rsundistort.sfm.verification import pair_of
 from rsundistort.solve import registering
 from rsundistort.solve.registering import Registrar
@@ -147,15 +148,15 @@ def test_right_places_stay(scene, matched):
     assert found.reconstruction.image_names == scene.image_names
 
 
-def with_a_side_turned(scene, first):
+def with_a_side_turned(scene, first, scale=1.0):
     """The photos from one on agree with each other, about copies of the points, and with no other."""
     obs, turn = scene.observations, Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix()
     turned = np.arange(6) >= first
     return replace(
         scene,
         R_cw=np.where(turned[:, None, None], scene.R_cw @ turn.T, scene.R_cw),
-        center_w=np.where(turned[:, None], scene.center_w @ turn.T, scene.center_w),
-        points_w=np.concatenate([scene.points_w, scene.points_w @ turn.T]),
+        center_w=np.where(turned[:, None], scale * scene.center_w @ turn.T, scene.center_w),
+        points_w=np.concatenate([scene.points_w, scale * scene.points_w @ turn.T]),
         observations=replace(obs, point_idx=obs.point_idx + len(scene.points_w) * turned[obs.frame_idx]),
     )
 
@@ -237,6 +238,49 @@ def test_what_a_rejected_mapping_confirms_says_nothing_of_the_solution(scene, ma
     monkeypatch.setattr(registering, "agree", lambda *_: False)
     assert registrar._mapped_again(start, set())[0] is start
     assert registrar.suspects(start.reconstruction) == ["4.jpg", "5.jpg"]
+
+
+def test_a_side_is_carried_along_by_a_photo_that_was_placed_again(scene):
+    former, placed = with_a_side_turned(scene, 3, scale=1.7), scene.take_photos(np.arange(6) <= 3)
+    found = carried_along(placed, former, NAMES[3:])
+    assert found.image_names == tuple(NAMES)
+    np.testing.assert_allclose(found.R_cw, scene.R_cw, atol=1e-9)
+    np.testing.assert_allclose(found.center_w, scene.center_w, atol=1e-9)
+    np.testing.assert_array_equal(found.phi, scene.phi)
+
+
+def test_a_side_without_a_photo_in_the_scene_or_a_scale_stays_out(scene):
+    former = with_a_side_turned(scene, 3)
+    rest = scene.take_photos(np.arange(6) <= 2)
+    assert carried_along(rest, former, NAMES[3:]) is rest
+    assert carried_along(rest, former, ()) is rest
+    # of the photo that is placed again, the scene shows four points
+    placed = scene.take_photos(np.arange(6) <= 3)
+    rows = placed.observations.by_photo(4)[3]
+    few = np.setdiff1d(np.arange(len(placed.observations)), rows[4:])
+    placed = replace(placed, observations=placed.observations.select(few))
+    assert carried_along(placed, former, NAMES[3:]) is placed
+
+
+@pytest.mark.parametrize("rad", [0.02])
+def test_a_side_of_which_one_photo_alone_can_be_registered_follows_it(scene, matched, monkeypatch):
+    def but_for_the_last(matched, num_verified, scene, *, strong):
+        found = register_photos(matched, num_verified, scene, strong=strong)
+        new = np.isin(found.reconstruction.image_names, scene.image_names)
+        new |= np.array(found.reconstruction.image_names) != "5.jpg"
+        return replace(
+            found,
+            reconstruction=found.reconstruction.take_photos(new),
+            added=tuple(name for name in found.added if name != "5.jpg"),
+        )
+
+    registrar = Registrar(TrackSource(matched, mapped_here=False), BundleOptions(), StageLog(lambda *_: None))
+    start = bundle_adjust(with_a_side_turned(scene, 4), "rotation", rough_options(BundleOptions()))
+    monkeypatch.setattr(registering, "register_photos", but_for_the_last)
+    found = registrar.all_registered(start, again=False).reconstruction
+    assert sorted(found.image_names) == NAMES
+    order = np.argsort(found.image_names)
+    assert apart_deg(replace(found, image_names=NAMES, R_cw=found.R_cw[order]), scene).max() < 0.1
 
 
 def pairs_of(matched):

@@ -15,6 +15,7 @@ from .pairs import choose_pairs, global_descriptors
 from .registration import register_photos
 from .retriangulation import retriangulate
 from .sharpness import edge_width_px
+from .sides import carried_along
 from .verification import verify_with_shutter
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "PatchSource",
     "align_tracks",
     "allowed_patches",
+    "carried_along",
     "choose_pairs",
     "connected_photos",
     "contradicting_photos",

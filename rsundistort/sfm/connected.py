@@ -7,14 +7,13 @@ from numpy.typing import NDArray
 
 from ..model import Reconstruction
 
-__all__ = ["LEAST_MEASUREMENTS", "connected_photos", "firmly_connected"]
+__all__ = ["LEAST_MEASUREMENTS", "LEAST_TIES", "connected_photos", "firmly_connected"]
 
 #: A photo with fewer measurements is not registered: a wrong place is worse than none.
 LEAST_MEASUREMENTS = 20
-
-# A point of a known place gives two equations, and a photo with its rotation during the readout has nine unknowns: with
-# fewer points it is anywhere.
-_LEAST_TIES = 5
+#: A point of a known place gives two equations, and a photo with its rotation during the readout has nine unknowns:
+#: with fewer points it is anywhere.
+LEAST_TIES = 5
 # A point is known, depth and all, as soon as so many photos show it.
 _LEAST_PHOTOS = 2
 
@@ -22,10 +21,10 @@ _LEAST_PHOTOS = 2
 def firmly_connected(reconstruction: Reconstruction) -> Reconstruction:
     """The largest part of a reconstruction whose poses are determined by equations, and what its photos show."""
     rec = reconstruction.without_photos(LEAST_MEASUREMENTS)
-    connected = connected_photos(rec, _LEAST_TIES)
+    connected = connected_photos(rec, LEAST_TIES)
     while not connected.all():
         rec = rec.take_photos(connected).without_photos(LEAST_MEASUREMENTS)
-        connected = connected_photos(rec, _LEAST_TIES)
+        connected = connected_photos(rec, LEAST_TIES)
     return rec
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -15,6 +16,7 @@ from ..bundle import BundleOptions, BundleResult
 from ..errors import ReconstructionError, RsUndistortWarning
 from ..model import Reconstruction
 from ..sfm import (
+    carried_along,
     contradicting_photos,
     firmly_connected,
     map_without_motions,
@@ -22,6 +24,7 @@ from ..sfm import (
     register_photos,
     retriangulate,
 )
+from ..sfm.registration import Registration
 from .solutions import agree, num_explained
 from .tracks import (
     LEAST_PHOTOS,
@@ -40,6 +43,30 @@ __all__ = ["Registrar"]
 _MOST_WAVES = 4
 # Models with motions that poses without a shutter may be wrong by.
 _MODELS = "rotation", "constant-motion"
+
+
+@dataclass
+class _LostPlaces:
+    """Photos that lost their places, and the reconstruction that they were in before."""
+
+    former: Reconstruction | None = None
+    names: set[str] = field(default_factory=set)
+
+    def note(self, former: Reconstruction, names: Collection[str]) -> None:
+        """Add some, which were in this reconstruction if they are the first."""
+        self.former = self.former or former
+        self.names.update(names)
+
+    def carried_along(self, found: Registration) -> Registration:
+        """With those that photos of their side, which were placed again, carry along.
+
+        Once: if they contradict the others again, they stay left out.
+        """
+        if self.former is None:
+            return found
+        scene, former, self.former = found.reconstruction, self.former, None
+        more = carried_along(scene, former, self.names)
+        return replace(found, reconstruction=more, added=tuple(more.image_names[scene.num_images :]))
 
 
 @dataclass(frozen=True)
@@ -96,7 +123,7 @@ class Registrar:
 
         With it come those that lost their poses, since they contradict the others.
         """
-        matched, left_out = self.track_source.matched, set[str]()
+        matched, left_out, lost = self.track_source.matched, set[str](), _LostPlaces()
         for wave in range(1, _MOST_WAVES + 1):
             before, rec = result, result.reconstruction
             strong, all_placed = is_strong(rec), rec.num_images == len(matched.names)
@@ -118,9 +145,14 @@ class Registrar:
                     break
             wrong = self._contradicting(scene)
             taken = [scene.image_names[i] for i in np.flatnonzero(wrong).tolist()]
+            whole = scene
             if taken:
                 scene = firmly_connected(scene.take_photos(~wrong))
             found = register_photos(matched, self._num_verified, scene, strong=strong)
+            if gone := {*rec.image_names}.difference(scene.image_names).union(found.dropped):
+                lost.note(whole if whole.num_images == rec.num_images else rec, gone)
+            elif not found.changes and wave < _MOST_WAVES:  # the next one judges them
+                found = lost.carried_along(found)
             changes = found.changes or scene.num_images < rec.num_images
             if changes:
                 tracks = found.reconstruction
