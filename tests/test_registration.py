@@ -202,13 +202,23 @@ def test_a_side_that_is_turned_as_a_whole_contradicts_the_rest(scene, matched, s
     assert not contradicting_photos(matched, few, with_a_side_turned(scene, 4), suspects=suspects).any()
 
 
-def test_parts_are_joined_by_all_that_is_between_them():
+def test_parts_are_joined_by_what_is_between_them():
     # 3 is tied to 2, but more to what contradicts 1
-    support = {(0, 1): 5.0, (1, 2): 5.0, (2, 3): 1.0, (1, 3): -4.0, (3, 4): 3.0}
-    part = parts_that_agree(support, 6)
+    weight = {(0, 1): 5.0, (1, 2): 5.0, (2, 3): 1.0, (1, 3): -4.0, (3, 4): 3.0}
+    part = parts_that_agree({pair: (30, each) for pair, each in weight.items()}, 6)
     assert part[0] == part[1] == part[2]
     assert part[3] == part[4]
     assert len(set(part.tolist())) == 3
+
+
+def test_neighbours_decide_and_not_what_looks_alike():
+    """Two sides of four photos, joined at a corner; most photos of one side look like those of the other."""
+    sides = {(i, j): (500, 100.0) for side in (range(4), range(4, 8)) for i in side for j in side if i < j}
+    alike = {(i, j): (60, -45.0) for i in range(4) for j in range(4, 8)}
+    corner = {(3, 4): (300, 50.0), (2, 4): (200, 30.0)}
+    assert len(set(parts_that_agree(sides | alike | corner, 8).tolist())) == 1
+    turned = {pair: (count, -0.2 * count) for pair, (count, _) in corner.items()}
+    assert len(set(parts_that_agree(sides | alike | turned, 8).tolist())) == 2
 
 
 @pytest.mark.parametrize("rad", [0.02])

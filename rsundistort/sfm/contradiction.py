@@ -16,6 +16,8 @@ from .epipolar import FreedMatches
 __all__ = ["contradicting_photos", "parts_that_agree"]
 
 Pair = tuple[int, int]
+# Evidence of pairs: the number of matches, and how many more of them fit than would have to.
+Votes = list[tuple[int, float]]
 
 # Of what a free epipolar geometry fits, poses fit about as much in all pairs that are right: all of it where matches
 # are good, three quarters where many are false. A pair supports its poses if they fit these shares of what is usual in
@@ -24,6 +26,9 @@ Pair = tuple[int, int]
 _WRONG, _SUSPECT = 0.7, 0.8
 # Fewer matches may fit an epipolar geometry by chance, most of them.
 _LEAST_MATCHES = 30
+# So many pairs decide on two parts, those with the most matches: they are neighbours. In a scene that repeats itself
+# many more pairs only look alike, and contradict poses that are right.
+_DECIDING = 3
 
 
 def contradicting_photos(
@@ -55,18 +60,19 @@ def contradicting_photos(
     posed = np.isin(matched.names, reconstruction.image_names)
     sizes = np.bincount(part[posed], minlength=m)
     largest = int(np.argmax(sizes))
-    with_largest = np.zeros(m)
-    for (first, second), weight in support.items():
+    with_largest: dict[int, Votes] = {}
+    for (first, second), votes in support.items():
         if largest in (part[first], part[second]) and part[first] != part[second]:
-            with_largest[part[second] if part[first] == largest else part[first]] += weight
-    contradicts = dict(zip(matched.names, with_largest[part] < 0, strict=True))
+            with_largest.setdefault(int(part[second] if part[first] == largest else part[first]), []).append(votes)
+    wrong = [other for other, votes in with_largest.items() if _balance(_deciding(votes)) < 0]
+    contradicts = dict(zip(matched.names, np.isin(part, wrong), strict=True))
     return np.array([contradicts[name] for name in reconstruction.image_names], bool)
 
 
 def _support(
     matched: MatchedPhotos, num_verified: Mapping[Pair, int], reconstruction: Reconstruction, share_of_usual: float
-) -> dict[Pair, float]:
-    """Matches of each pair that fit its poses, less those that would have to."""
+) -> dict[Pair, tuple[int, float]]:
+    """Matches of each pair, and how many of them fit its poses, less those that would have to."""
     freed, pairs, fits, counts = FreedMatches(matched, reconstruction), list[Pair](), list[float](), list[int]()
     with quiet_pycolmap().Database.open(matched.database) as db:
         for pair, count in num_verified.items():
@@ -82,38 +88,55 @@ def _support(
         return {}
     share = np.array(fits) / counts
     order = np.argsort(share)
-    half = np.searchsorted(np.cumsum(np.array(counts)[order]), sum(counts) / 2)
+    # of the matches that fit: pairs of wrong places have few of them, however many pairs they are
+    half = np.searchsorted(np.cumsum(np.array(fits)[order]), sum(fits) / 2)
     least = share_of_usual * share[order[half]]
-    return {pair: fit - least * count for pair, fit, count in zip(pairs, fits, counts, strict=True)}
+    return {pair: (count, fit - least * count) for pair, fit, count in zip(pairs, fits, counts, strict=True)}
 
 
-def parts_that_agree(support: Mapping[Pair, float], num: int) -> NDArray[np.int64]:
+def parts_that_agree(support: Mapping[Pair, tuple[int, float]], num: int) -> NDArray[np.int64]:
     """Partition of so many photos into parts within which pairs support each other, (num,) label of each.
 
     Parts are joined in the order of the support between them, and pairs that contradict count against it: greedy
-    additive edge contraction (Keuper et al., ICCV 2015).
+    additive edge contraction (Keuper et al., ICCV 2015), in which the pairs with the most matches decide.
+
+    Parameters
+    ----------
+    support : mapping of pair to (int, float)
+        Number of matches of each pair, and how many more of them fit than would have to.
+    num : int
+        Photos.
     """
-    between: list[dict[int, float]] = [{} for _ in range(num)]
-    for (first, second), weight in support.items():
-        between[first][second] = between[second][first] = weight
-    heap = [(-weight, *pair) for pair, weight in support.items() if weight > 0]
+    between: list[dict[int, Votes]] = [{} for _ in range(num)]
+    for (first, second), votes in support.items():
+        between[first][second] = between[second][first] = [votes]
+    heap = [(-weight, *pair) for pair, (_, weight) in support.items() if weight > 0]
     heapify(heap)
     label = np.arange(num)
     while heap:
         weight, kept, gone = heappop(heap)
-        if between[kept].get(gone) != -weight:
+        if _balance(between[kept].get(gone, [])) != -weight:
             continue  # one of them has been joined with another part since
         del between[kept][gone], between[gone][kept]
         label[label == gone] = kept
         for other, more in _emptied(between, gone):
-            total = between[kept].get(other, 0.0) + more
-            between[kept][other] = between[other][kept] = total
-            if total > 0:
+            decide = _deciding([*between[kept].get(other, []), *more])
+            between[kept][other] = between[other][kept] = decide
+            if (total := _balance(decide)) > 0:
                 heappush(heap, (-total, kept, other))
     return label
 
 
-def _emptied(between: list[dict[int, float]], part: int) -> Iterable[tuple[int, float]]:
+def _deciding(votes: Votes) -> Votes:
+    """Those of the pairs with the most matches."""
+    return sorted(votes, reverse=True)[:_DECIDING]
+
+
+def _balance(votes: Votes) -> float:
+    return sum(weight for _, weight in votes)
+
+
+def _emptied(between: list[dict[int, Votes]], part: int) -> Iterable[tuple[int, Votes]]:
     """What a part shares with others, which it does not from now on."""
     shared, between[part] = between[part], {}
     for other in shared:
