@@ -101,8 +101,10 @@ class Registrar:
         """
         if result.reconstruction.shutter_model not in _MODELS:
             return result
-        strong = is_strong(result.reconstruction)
+        strong, before = is_strong(result.reconstruction), result
         result, left_out = self._registered(result)
+        if self._is_worse(result.reconstruction, before.reconstruction):
+            result, left_out = before, set()
         strong = strong or is_strong(result.reconstruction)
         again = again and self.track_source.mapped_here
         if again and (strong or left_out or self._suspects(result.reconstruction).any()):
@@ -113,6 +115,12 @@ class Registrar:
                 f"left out, since they contradict the other photos: {names}", RsUndistortWarning, stacklevel=4
             )
         return result
+
+    def _is_worse(self, new: Reconstruction, old: Reconstruction) -> bool:
+        """Whether the same photos explain fewer measurements in new places: then these are wrong, and not the old."""
+        if {*new.image_names} != {*old.image_names} or new is old:
+            return False
+        return self._explained(new) < self._explained(old)
 
     def suspects(self, reconstruction: Reconstruction) -> list[str]:
         """Photos that may have a wrong place, since matches with the others contradict it."""
