@@ -22,6 +22,8 @@ Prints one JSON object a line. Clips are rendered into FOLDER once (`clips.py`: 
              which never returns, and rounds about a thing), and of the GoPro's, played to and fro, on the way back
              upside down, so that lines are read from first to last as the camera reads them: seconds a frame, peaks,
              and readout times
+    unordered  every fourth frame of two rounds and two streets as photos that know nothing of each other, of scenes
+             that repeat themselves, so that many pairs look alike which are none: poses against the truth
 """
 
 from __future__ import annotations
@@ -76,7 +78,7 @@ from rsundistort.batch import progress
 progress.time = types.SimpleNamespace(perf_counter=time.process_time)
 """
 LONG = ("street", "round", "to-and-fro")
-PARTS = ("walk", "level", "pan", "two", "readout", "stabilised", "gopro", "peer", "length")
+PARTS = ("walk", "level", "pan", "two", "readout", "stabilised", "gopro", "peer", "length", "unordered")
 
 
 def solved_clip(video: Path, camera: str, readout_s: float | None = None) -> tuple[Solved, float]:
@@ -424,6 +426,25 @@ def length(args: argparse.Namespace) -> None:
             print(json.dumps(said | found), flush=True)
 
 
+def unordered(args: argparse.Namespace) -> None:
+    """Frames of long videos as photos."""
+    for kind in sorted({*args.long} - {"to-and-fro"}):
+        for seed in range(min(args.num, 2)):
+            clip = clip_folder(args.clips, kind, seed, 300)
+            with tempfile.TemporaryDirectory() as folder:
+                photos, out = Path(folder) / "photos", Path(folder) / "out"
+                photos.mkdir()
+                with av.open(str(clip / "clip.mp4")) as container:
+                    for k, frame in enumerate(container.decode(video=0)):
+                        if k % 4 == 0:
+                            cv2.imwrite(str(photos / frame_name(Path("clip.mp4"), k)), frame.to_ndarray(format="bgr24"))
+                solution = run(photos, out, RunOptions(report=False))
+                found = evaluate(out, clip / "ground_truth.json").to_json()
+            said: dict[str, Any] = {"clip": clip.name, "photos": len(solution.images)}
+            said |= {"registered": len(solution.registered), "verdict": solution.verdict}
+            print(json.dumps(said | {key: found[key] for key in found if key.startswith(("rot", "pos"))}), flush=True)
+
+
 def main() -> None:
     """Run the parts that are asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -442,7 +463,7 @@ def main() -> None:
         else:
             {
                 "walk": walk, "readout": readout, "stabilised": stabilised, "gopro": gopro, "peer": peer,
-                "length": length,
+                "length": length, "unordered": unordered,
             }[part](args)  # fmt: skip
 
 
