@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..model import Reconstruction
 
-__all__ = ["LEAST_MEASUREMENTS", "LEAST_TIES", "connected_photos", "firmly_connected"]
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+__all__ = ["LEAST_MEASUREMENTS", "LEAST_TIES", "common_points", "connected_photos", "firmly_connected"]
 
 #: A photo with fewer measurements is not registered: a wrong place is worse than none.
 LEAST_MEASUREMENTS = 20
@@ -28,6 +33,22 @@ def firmly_connected(reconstruction: Reconstruction) -> Reconstruction:
     return rec
 
 
+def common_points(reconstruction: Reconstruction) -> NDArray[np.float64]:
+    """(m, m) number of points that two photos show."""
+    shows = _shown(reconstruction, np.ones(len(reconstruction.observations), bool))
+    return np.asarray((shows @ shows.T).toarray())
+
+
+def _shown(rec: Reconstruction, keep_obs: NDArray[np.bool_]) -> csr_matrix:
+    """(m, n) 1 where a photo shows a point, by some observations; what it shows twice counts once."""
+    from scipy.sparse import csr_matrix  # late: few runs need it
+
+    where = rec.observations.frame_idx[keep_obs], rec.observations.point_idx[keep_obs]
+    shows = csr_matrix((np.ones(keep_obs.sum()), where), (rec.num_images, rec.num_points))
+    shows.data[:] = 1.0
+    return shows
+
+
 def connected_photos(reconstruction: Reconstruction, least: int = LEAST_MEASUREMENTS) -> NDArray[np.bool_]:
     """(m,) the largest set of photos of which each shows `least` points whose place the others determine.
 
@@ -35,14 +56,10 @@ def connected_photos(reconstruction: Reconstruction, least: int = LEAST_MEASUREM
     photo in common are one, since that determines how they were rotated. What two sets show of each other by less can
     be rotated and moved against each other: residuals are small wherever they are.
     """
-    from scipy.sparse import csr_matrix  # late: few runs need it
-
     obs, m = reconstruction.observations, reconstruction.num_images
     # what two photos alone show ties no third to them
     ties = (reconstruction.track_lengths(np.ones(len(obs), bool)) > _LEAST_PHOTOS)[obs.point_idx]
-    where = obs.frame_idx[ties], obs.point_idx[ties]
-    shows = csr_matrix((np.ones(ties.sum()), where), (m, reconstruction.num_points))
-    shows.data[:] = 1.0  # what a photo shows twice counts once
+    shows = _shown(reconstruction, ties)
 
     def grown(connected: NDArray[np.bool_]) -> NDArray[np.bool_]:
         new, count = connected, np.zeros(reconstruction.num_points)

@@ -10,14 +10,16 @@ from numpy.typing import NDArray
 
 from ..colmap.conventions import quiet_pycolmap
 from ..model import Reconstruction
+from .connected import common_points
 from .database import MatchedPhotos
 from .epipolar import FreedMatches
 
 __all__ = ["contradicting_photos", "parts_that_agree"]
 
 Pair = tuple[int, int]
-# Evidence of pairs: the number of matches, and how many more of them fit than would have to.
-Votes = list[tuple[int, float]]
+# Evidence of pairs: the number of matches, and how many more of them fit than would have to; both infinite for a proof.
+Vote = tuple[float, float]
+Votes = list[Vote]
 
 # Of what a free epipolar geometry fits, poses fit about as much in all pairs that are right: all of it where matches
 # are good, three quarters where many are false. A pair supports its poses if they fit these shares of what is usual in
@@ -29,6 +31,9 @@ _LEAST_MATCHES = 30
 # So many pairs decide on two parts, those with the most matches: they are neighbours. In a scene that repeats itself
 # many more pairs only look alike, and contradict poses that are right.
 _DECIDING = 3
+# A pair proves that its photos have the right places if so many matches fit, or points are common, and this share of
+# what is usual. In wrong places fewer than 50 matches had it, by chance, and points are common by matches that fit.
+_PROOF_MATCHES, _PROOF = 100, 0.9
 
 
 def contradicting_photos(
@@ -71,9 +76,9 @@ def contradicting_photos(
 
 def _support(
     matched: MatchedPhotos, num_verified: Mapping[Pair, int], reconstruction: Reconstruction, share_of_usual: float
-) -> dict[Pair, tuple[int, float]]:
+) -> dict[Pair, Vote]:
     """Matches of each pair, and how many of them fit its poses, less those that would have to."""
-    freed, pairs, fits, counts = FreedMatches(matched, reconstruction), list[Pair](), list[float](), list[int]()
+    freed, pairs, fits, counts = FreedMatches(matched, reconstruction), list[Pair](), list[int](), list[int]()
     with quiet_pycolmap().Database.open(matched.database) as db:
         for pair, count in num_verified.items():
             if count < _LEAST_MATCHES or (freed.posed[list(pair)] < 0).any():
@@ -83,18 +88,22 @@ def _support(
             if len(matches) >= count:
                 pairs.append(pair)
                 counts.append(count)
-                fits.append(float(freed.explained(*pair, matches).sum()))
+                fits.append(int(freed.explained(*pair, matches).sum()))
     if not pairs:
         return {}
-    share = np.array(fits) / counts
-    order = np.argsort(share)
+    fit, of = np.array(fits), np.array(counts)
+    order = np.argsort(fit / of)
     # of the matches that fit: pairs of wrong places have few of them, however many pairs they are
-    half = np.searchsorted(np.cumsum(np.array(fits)[order]), sum(fits) / 2)
-    least = share_of_usual * share[order[half]]
-    return {pair: (count, fit - least * count) for pair, fit, count in zip(pairs, fits, counts, strict=True)}
+    half = order[np.searchsorted(np.cumsum(fit[order]), fit.sum() / 2)]
+    usual = fit[half] / of[half]
+    first, second = freed.posed[np.array(pairs)].T
+    shown = np.maximum(fit, common_points(reconstruction)[first, second])
+    proves = shown >= np.maximum(_PROOF_MATCHES, _PROOF * usual * of)
+    votes = np.where(proves, np.inf, [of, fit - share_of_usual * usual * of])
+    return dict(zip(pairs, zip(*votes.tolist(), strict=True), strict=True))
 
 
-def parts_that_agree(support: Mapping[Pair, tuple[int, float]], num: int) -> NDArray[np.int64]:
+def parts_that_agree(support: Mapping[Pair, Vote], num: int) -> NDArray[np.int64]:
     """Partition of so many photos into parts within which pairs support each other, (num,) label of each.
 
     Parts are joined in the order of the support between them, and pairs that contradict count against it: greedy
@@ -102,8 +111,9 @@ def parts_that_agree(support: Mapping[Pair, tuple[int, float]], num: int) -> NDA
 
     Parameters
     ----------
-    support : mapping of pair to (int, float)
-        Number of matches of each pair, and how many more of them fit than would have to.
+    support : mapping of pair to (float, float)
+        Number of matches of each pair, and how many more of them fit than would have to; both infinite if the pair
+        proves that its photos have the right places.
     num : int
         Photos.
     """

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model import Reconstruction
-from .connected import LEAST_MEASUREMENTS, LEAST_TIES
+from .connected import LEAST_MEASUREMENTS, LEAST_TIES, common_points
 
 __all__ = ["carried_along"]
 
@@ -59,14 +59,10 @@ def carried_along(scene: Reconstruction, former: Reconstruction, taken: Collecti
 
 def _sides(former: Reconstruction, taken: Collection[str]) -> Iterator[Reconstruction]:
     """The photos that lost their places, by what they show together."""
-    from scipy.sparse import csr_matrix  # late: few runs need it
-    from scipy.sparse.csgraph import connected_components
+    from scipy.sparse.csgraph import connected_components  # late: few runs need it
 
     rec = former.take_photos(np.isin(former.image_names, [*taken]))
-    obs = rec.observations
-    shows = csr_matrix((np.ones(len(obs)), (obs.frame_idx, obs.point_idx)), (rec.num_images, rec.num_points))
-    shows.data[:] = 1.0  # what a photo shows twice counts once
-    side = connected_components((shows @ shows.T).toarray() >= LEAST_MEASUREMENTS)[1]
+    side = connected_components(common_points(rec) >= LEAST_MEASUREMENTS)[1]
     for k in range(side.max(initial=-1) + 1):
         yield rec.take_photos(side == k)
 
