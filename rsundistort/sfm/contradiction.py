@@ -17,8 +17,8 @@ from .epipolar import FreedMatches
 __all__ = ["contradicting_photos", "parts_that_agree"]
 
 Pair = tuple[int, int]
-# Evidence of pairs: the number of matches, and how many more of them fit than would have to; both infinite for a proof.
-Vote = tuple[float, float]
+# Evidence of a pair: the number of matches, and how many more of them fit than would have to.
+Vote = tuple[int, float]
 Votes = list[Vote]
 
 # Of what a free epipolar geometry fits, poses fit about as much in all pairs that are right: all of it where matches
@@ -31,9 +31,6 @@ _LEAST_MATCHES = 30
 # So many pairs decide on two parts, those with the most matches: they are neighbours. In a scene that repeats itself
 # many more pairs only look alike, and contradict poses that are right.
 _DECIDING = 3
-# A pair proves that its photos have the right places if so many matches fit, or points are common, and this share of
-# what is usual. In wrong places fewer than 50 matches had it, by chance, and points are common by matches that fit.
-_PROOF_MATCHES, _PROOF = 100, 0.9
 
 
 def contradicting_photos(
@@ -91,16 +88,15 @@ def _support(
                 fits.append(int(freed.explained(*pair, matches).sum()))
     if not pairs:
         return {}
-    fit, of = np.array(fits), np.array(counts)
+    fit, of = np.array(fits, float), np.array(counts)
     order = np.argsort(fit / of)
     # of the matches that fit: pairs of wrong places have few of them, however many pairs they are
     half = order[np.searchsorted(np.cumsum(fit[order]), fit.sum() / 2)]
-    usual = fit[half] / of[half]
+    least = share_of_usual * fit[half] / of[half]
+    # where textures repeat themselves, many verified matches of right pairs are false; their common points are not
     first, second = freed.posed[np.array(pairs)].T
-    shown = np.maximum(fit, common_points(reconstruction)[first, second])
-    proves = shown >= np.maximum(_PROOF_MATCHES, _PROOF * usual * of)
-    votes = np.where(proves, np.inf, [of, fit - share_of_usual * usual * of])
-    return dict(zip(pairs, zip(*votes.tolist(), strict=True), strict=True))
+    fit = np.maximum(fit, np.minimum(common_points(reconstruction)[first, second], of))
+    return dict(zip(pairs, zip(counts, (fit - least * of).tolist(), strict=True), strict=True))
 
 
 def parts_that_agree(support: Mapping[Pair, Vote], num: int) -> NDArray[np.int64]:
@@ -111,9 +107,8 @@ def parts_that_agree(support: Mapping[Pair, Vote], num: int) -> NDArray[np.int64
 
     Parameters
     ----------
-    support : mapping of pair to (float, float)
-        Number of matches of each pair, and how many more of them fit than would have to; both infinite if the pair
-        proves that its photos have the right places.
+    support : mapping of pair to (int, float)
+        Number of matches of each pair, and how many more of them fit than would have to.
     num : int
         Photos.
     """
