@@ -438,7 +438,7 @@ def unordered(args: argparse.Namespace) -> None:
                     for k, frame in enumerate(container.decode(video=0)):
                         if k % 4 == 0:
                             cv2.imwrite(str(photos / frame_name(Path("clip.mp4"), k)), frame.to_ndarray(format="bgr24"))
-                solution = run(photos, out, RunOptions(report=False))
+                solution = run(photos, out)
                 found = evaluate(out, clip / "ground_truth.json").to_json()
             said: dict[str, Any] = {"clip": clip.name, "photos": len(solution.images)}
             said |= {"registered": len(solution.registered), "verdict": solution.verdict}
