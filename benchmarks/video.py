@@ -442,7 +442,7 @@ def unordered(args: argparse.Namespace) -> None:
                 found = evaluate(out, clip / "ground_truth.json").to_json()
             said: dict[str, Any] = {"clip": clip.name, "photos": len(solution.images)}
             said |= {"registered": len(solution.registered), "verdict": solution.verdict}
-            print(json.dumps(said | {key: found[key] for key in found if key.startswith(("rot", "pos"))}), flush=True)
+            print(json.dumps(said | {key: found[key] for key in found if key in ("rotation_deg", "center")}), flush=True)
 
 
 def main() -> None:
