@@ -442,7 +442,8 @@ def unordered(args: argparse.Namespace) -> None:
                 found = evaluate(out, clip / "ground_truth.json").to_json()
             said: dict[str, Any] = {"clip": clip.name, "photos": len(solution.images)}
             said |= {"registered": len(solution.registered), "verdict": solution.verdict}
-            print(json.dumps(said | {key: found[key] for key in found if key in ("rotation_deg", "center")}), flush=True)
+            said |= {key: found[key] for key in ("rotation_deg", "center") if key in found}
+            print(json.dumps(said), flush=True)
 
 
 def main() -> None:
