@@ -63,9 +63,9 @@ def contradicting_photos(
     sizes = np.bincount(part[posed], minlength=m)
     largest = int(np.argmax(sizes))
     with_largest: dict[int, Votes] = {}
-    for (first, second), votes in support.items():
+    for (first, second), vote in support.items():
         if largest in (part[first], part[second]) and part[first] != part[second]:
-            with_largest.setdefault(int(part[second] if part[first] == largest else part[first]), []).append(votes)
+            with_largest.setdefault(int(part[second] if part[first] == largest else part[first]), []).append(vote)
     wrong = [other for other, votes in with_largest.items() if _balance(_deciding(votes)) < 0]
     contradicts = dict(zip(matched.names, np.isin(part, wrong), strict=True))
     return np.array([contradicts[name] for name in reconstruction.image_names], bool)
@@ -113,8 +113,8 @@ def parts_that_agree(support: Mapping[Pair, Vote], num: int) -> NDArray[np.int64
         Photos.
     """
     between: list[dict[int, Votes]] = [{} for _ in range(num)]
-    for (first, second), votes in support.items():
-        between[first][second] = between[second][first] = [votes]
+    for (first, second), vote in support.items():
+        between[first][second] = between[second][first] = [vote]
     heap = [(-weight, *pair) for pair, (_, weight) in support.items() if weight > 0]
     heapify(heap)
     label = np.arange(num)

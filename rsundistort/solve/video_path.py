@@ -130,8 +130,8 @@ def solve_clip(
     path = options.path
     alone = readout_of(result)
     log.begin("gyroscope")
-    # the telemetry of frames that were rotated since says nothing
-    felt = None if _was_stabilised(filmed) else felt_gyroscope(result, gyroscope or telemetry)
+    # the telemetry of frames that were rotated since says nothing; those of a global shutter only look like them
+    felt = None if _was_stabilised(filmed) and not at_once else felt_gyroscope(result, gyroscope or telemetry)
     if felt is not None:
         options = replace(options, path=replace(path, rates=felt.rates(result), start=_start_of(result)))
         result = bundle_adjust(
@@ -356,11 +356,7 @@ def _judged(
     evidence: dict[str, Any] = {
         "seconds": time.seconds,
         "sigma": time.sigma,
-        "source": _OF_GLOBAL
-        if at_once
-        else _OF_STABILISED
-        if _was_stabilised(filmed)
-        else _source(options, time, felt),
+        "source": _OF_GLOBAL if at_once else _source(options, time, felt, filmed),
         "of_frame": time.seconds / clip.frame_s,
         "unbounded_seconds": float(found.unbounded_s[0]),
         "frames": len(path.names),
@@ -393,9 +389,11 @@ def _against_global(found: Stabilisation) -> str:
     return found.reason
 
 
-def _source(options: BundleOptions, time: ReadoutTime, felt: Felt | None) -> str:
+def _source(options: BundleOptions, time: ReadoutTime, felt: Felt | None, filmed: Stabilisation | None) -> str:
     """The evidence for the readout time."""
     assert options.path is not None
+    if _was_stabilised(filmed):
+        return _OF_STABILISED
     measured = "the video" if felt is None else "the video and its gyroscope"
     if options.path.readout is None or time.sigma < _MEASURED * options.path.readout[1]:
         return measured
