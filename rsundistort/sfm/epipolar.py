@@ -18,6 +18,7 @@ __all__ = [
     "FreedMatches",
     "Matches",
     "agreeing_photos",
+    "distance_from_planes",
     "read_matches",
     "read_num_verified",
     "read_verified",
@@ -172,7 +173,13 @@ def sampson_distance(
     if length == 0.0:
         return np.full(len(x_1), np.inf)
     x, y, z = t_21 / length
-    E = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R_21
+    return distance_from_planes(x_1, x_2, np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R_21)
+
+
+def distance_from_planes(
+    x_1: NDArray[np.float64], x_2: NDArray[np.float64], E: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Distance of matches from the epipolar planes of an essential matrix, as in `sampson_distance`."""
     line_2, line_1 = x_1 @ E.T, x_2 @ E
     slope = np.sqrt((line_1[:, :2] ** 2).sum(1) + (line_2[:, :2] ** 2).sum(1))
     return np.asarray(np.abs((line_2 * x_2).sum(1)) / np.maximum(slope, 1e-300))

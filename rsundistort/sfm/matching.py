@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +12,20 @@ from numpy.typing import NDArray
 from ..colmap.conventions import quiet_pycolmap
 from ..model import Camera
 from .database import LOOSE, MatchedPhotos, verification_options, write_photos
+from .epipolar import MIN_EXPLAINED, distance_from_planes
 from .features import Features
 
-__all__ = ["LOOSE_PX", "match_more", "match_photos"]
+__all__ = ["CLOSE_PX", "LOOSE_PX", "match_more", "match_photos", "verify_matches"]
 
-#: Largest distance of matches from epipolar lines that leaves room for the shutter: `LOOSE` times that of COLMAP.
-LOOSE_PX = 4.0 * LOOSE
+Pair = tuple[int, int]
+
+#: Largest distance of matches from epipolar lines, in the pixels that features were detected in: COLMAP's own, and in
+#: those of the photo, with room for the shutter.
+CLOSE_PX, LOOSE_PX = 4.0, 4.0 * LOOSE
+# A pair has room for the shutter if the close geometry keeps a smaller share of the matches that lie within the wide
+# distance. Wide epipolar lines have any direction where there is hardly any parallax: photos that follow each other
+# along a street come out in a wrong place by them, with the same matches.
+_KEPT = 0.95
 
 
 def match_photos(
@@ -45,7 +54,8 @@ def match_photos(
     focal_known : bool
         Whether their focal lengths are, at least roughly; else pairs are verified without these.
     within_px : float
-        Largest distance of verified matches from their epipolar lines.
+        Largest distance of verified matches from their epipolar lines, in the pixels of the photos. Pairs that lose
+        few matches by that get the geometry of `CLOSE_PX`.
     seed : int
         Seed of the verification.
     pairs : (p, 2) int array, optional
@@ -79,13 +89,77 @@ def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: ND
     pycolmap, database = quiet_pycolmap(), matched.database
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
-    verification = verification_options(within_px, matched.seed)
+    verification = verification_options(_close_px(matched, within_px), matched.seed)
+    before = _matched_pairs(matched)
     if pairs is None:
         pycolmap.match_exhaustive(database, matching, verification_options=verification, device=pycolmap.Device.cpu)
     else:
         pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = database.with_name("pairs.txt")
-        np.savetxt(pairing.match_list_path, np.asarray(pairs) + 1, fmt="%d")
+        pairing.match_list_path = _listed(matched, pairs)
         pycolmap.match_image_pairs(
             database, matching, pairing, verification_options=verification, device=pycolmap.Device.cpu
         )
+    _verify_loosely(matched, sorted(_matched_pairs(matched) - before), within_px)
+
+
+def verify_matches(matched: MatchedPhotos, *, within_px: float = LOOSE_PX) -> None:
+    """Verify the matches of all pairs by the keypoints of the database, as `match_more` does."""
+    pairs = sorted(_matched_pairs(matched))
+    if pairs:
+        _verify(matched, pairs, _close_px(matched, within_px))
+        _verify_loosely(matched, pairs, within_px)
+
+
+def _close_px(matched: MatchedPhotos, within_px: float) -> float:
+    """Largest distance from epipolar lines where neither lens nor shutter displaces anything."""
+    return min(within_px, CLOSE_PX * float(np.median([each.step_px for each in matched.features])))
+
+
+def _verify_loosely(matched: MatchedPhotos, pairs: Sequence[Pair], within_px: float) -> None:
+    """Verify pairs again with room for the shutter where the geometry without it loses matches."""
+    close_px = _close_px(matched, within_px)
+    if close_px == within_px:
+        return
+    pycolmap = quiet_pycolmap()
+    with pycolmap.Database.open(matched.database) as db:
+        lossy = [pair for pair in pairs if _loses_matches(db, *pair, close_px, within_px)]
+        for first, second in lossy:
+            db.delete_two_view_geometry(first + 1, second + 1)
+    if lossy:
+        _verify(matched, lossy, within_px)
+
+
+def _loses_matches(db: Any, first: int, second: int, close_px: float, within_px: float) -> bool:
+    """Whether clearly more matches lie within the wide distance of the epipolar lines than within the close one."""
+    geometry = db.read_two_view_geometry(first + 1, second + 1)
+    if geometry.E is None or len(geometry.inlier_matches) < MIN_EXPLAINED:
+        return True
+    matches = np.asarray(db.read_matches(first + 1, second + 1), np.int64)
+    rays, focal_px = [], []
+    for photo, keypoint in zip((first, second), matches.T, strict=True):
+        camera = db.read_camera(db.read_image(photo + 1).camera_id)
+        xy = db.read_keypoints(photo + 1)[keypoint, :2].astype(np.float64)
+        rays.append(np.column_stack([camera.cam_from_img(xy), np.ones(len(xy))]))
+        focal_px.append(camera.mean_focal_length())
+    distance_px = distance_from_planes(rays[0], rays[1], geometry.E) * float(np.mean(focal_px))
+    return bool((distance_px <= close_px).sum() < _KEPT * (distance_px <= within_px).sum())
+
+
+def _verify(matched: MatchedPhotos, pairs: Sequence[Pair], within_px: float) -> None:
+    options = verification_options(within_px, matched.seed)
+    quiet_pycolmap().verify_matches(matched.database, _listed(matched, np.array(pairs)), options)
+
+
+def _listed(matched: MatchedPhotos, pairs: NDArray[np.int64]) -> Path:
+    """A file of pairs."""
+    path = matched.database.with_name("pairs.txt")
+    np.savetxt(path, np.asarray(pairs) + 1, fmt="%d")
+    return path
+
+
+def _matched_pairs(matched: MatchedPhotos) -> set[Pair]:
+    """Pairs that have matches, or were found to have none."""
+    pycolmap = quiet_pycolmap()
+    with pycolmap.Database.open(matched.database) as db:
+        ids = (pycolmap.pair_id_to_image_pair(pair_id) for pair_id in db.read_all_matches()[0])
+        return {(first - 1, second - 1) for first, second in ids}

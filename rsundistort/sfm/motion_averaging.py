@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from ..colmap.conventions import HALF, quiet_pycolmap
 from ..model import Reconstruction, RowMotion
-from .database import MatchedPhotos, ideal_keypoints, verification_options, write_photos
-from .epipolar import MIN_EXPLAINED, Matches, read_matches
+from .database import MatchedPhotos, ideal_keypoints, write_photos
+from .epipolar import MIN_EXPLAINED, read_matches
 from .mapping import map_photos
-from .matching import LOOSE_PX
+from .matching import verify_matches
 from .relative_pose import Pair, find_relative_pose, phi_information
 from .verification import pair_of
 
@@ -107,17 +107,9 @@ def map_without_motions(matched: MatchedPhotos, phi_sigma: float) -> Reconstruct
     ideal = [camera.without_field() if camera.lens == "fisheye" else camera.pinhole() for camera in matched.cameras]
     folder = Path(tempfile.mkdtemp(prefix="without-motions-", dir=matched.database.parent))
     moved = replace(matched, database=folder / "database.db", features=features, cameras=ideal)
-    _verify(moved, matches)
-    return map_photos(moved, shown=matched)
-
-
-def _verify(matched: MatchedPhotos, matches: Matches) -> None:
-    """Make the database of photos, and verify their matches by the keypoints."""
-    pycolmap = quiet_pycolmap()
-    with pycolmap.Database.open(matched.database) as db:
-        write_photos(db, matched)
+    with quiet_pycolmap().Database.open(moved.database) as db:
+        write_photos(db, moved)
         for (first, second), found in matches.items():
             db.write_matches(first + 1, second + 1, found.astype(np.uint32))
-    listed = matched.database.with_name("pairs.txt")
-    np.savetxt(listed, np.array([*matches]) + 1, fmt="%d")
-    pycolmap.verify_matches(matched.database, listed, verification_options(LOOSE_PX, matched.seed))
+    verify_matches(moved)
+    return map_photos(moved, shown=matched)

@@ -19,16 +19,12 @@ from ..io.kept import Kept
 from ..model import Reconstruction
 from ..sfm import MatchedPhotos, map_photos, match_photos, read_num_verified, verify_with_shutter
 from ..sfm.mapping import PLACING_KEYPOINTS
-from ..sfm.matching import LOOSE_PX, match_more
+from ..sfm.matching import CLOSE_PX, LOOSE_PX, match_more
 
 __all__ = ["place_photos"]
 
 # Verified matches of a pair that overlaps, beyond doubt.
 _MANY = 100
-# Largest distance from epipolar lines of matches between key frames of a video, in the pixels that features are
-# detected in. Content moves by little from one to the next, and so does the shutter's distortion: with four times as
-# much, these lines have any direction where there is hardly any parallax, and poses go wrong.
-_CLOSE_PX = 4.0
 # Verified matches of a pair with which coarse features do. With more photos than `_ASKED`, so many pairs in their order
 # are asked before all are matched, of which most must have that; each photo then has half of it at least.
 _RICH, _ASKED, _MOST_OF_THEM, _AT_LEAST = 800, 16, 0.75, 0.5
@@ -124,7 +120,8 @@ def _match(
         choose = pairs_of_clip if of_clip else pairs_to_match
         within_px = LOOSE_PX
         if of_clip:
-            within_px = _CLOSE_PX * float(np.median([each.step_px for each in photos.features]))
+            # content moves by little from one to the next, and so does the distortion of the shutter
+            within_px = CLOSE_PX * float(np.median([each.step_px for each in photos.features]))
         start = partial(match_photos, *given, calibrated=cameras.calibrated, seed=seed, within_px=within_px)
         asks = bool(photos.coarse) and len(photos.names) > _ASKED
         if asks:
