@@ -1,7 +1,7 @@
 """Structure from motion around pycolmap: features, pairs, matching, mapping, re-triangulation."""
 
 from .alignment import PatchPlaces, PatchSource, align_tracks, allowed_patches, cut_patches
-from .connected import LEAST_MEASUREMENTS, connected_photos, firmly_connected
+from .connected import LEAST_MEASUREMENTS, LEAST_TIES, connected_photos, firmly_connected
 from .contradiction import contradicting_photos
 from .database import MatchedPhotos
 from .epipolar import read_num_verified
@@ -14,6 +14,7 @@ from .motion_averaging import map_without_motions
 from .pairs import choose_pairs, global_descriptors
 from .registration import register_photos
 from .retriangulation import retriangulate
+from .scale_breaks import photos_beside_breaks
 from .sharpness import edge_width_px
 from .sides import carried_along
 from .verification import verify_with_shutter
@@ -21,6 +22,7 @@ from .verification import verify_with_shutter
 __all__ = [
     "DETECTION_MEGAPIXELS",
     "LEAST_MEASUREMENTS",
+    "LEAST_TIES",
     "SIFT_PX",
     "USUAL_FOCAL",
     "Features",
@@ -45,6 +47,7 @@ __all__ = [
     "map_without_motions",
     "match_photos",
     "matched_of_database",
+    "photos_beside_breaks",
     "read_num_verified",
     "register_photos",
     "retriangulate",

@@ -12,7 +12,14 @@ from ..model import Reconstruction
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-__all__ = ["LEAST_MEASUREMENTS", "LEAST_TIES", "common_points", "connected_photos", "firmly_connected"]
+__all__ = [
+    "LEAST_MEASUREMENTS",
+    "LEAST_TIES",
+    "common_points",
+    "connected_parts",
+    "connected_photos",
+    "firmly_connected",
+]
 
 #: A photo with fewer measurements is not registered: a wrong place is worse than none.
 LEAST_MEASUREMENTS = 20
@@ -39,6 +46,13 @@ def common_points(reconstruction: Reconstruction) -> NDArray[np.float64]:
     return np.asarray((shows @ shows.T).toarray())
 
 
+def connected_parts(reconstruction: Reconstruction) -> NDArray[np.int64]:
+    """(m,) label of the part that each photo is in, by what photos show together."""
+    from scipy.sparse.csgraph import connected_components  # late: few runs need it
+
+    return np.asarray(connected_components(common_points(reconstruction) >= LEAST_MEASUREMENTS)[1], np.int64)
+
+
 def _shown(rec: Reconstruction, keep_obs: NDArray[np.bool_]) -> csr_matrix:
     """(m, n) 1 where a photo shows a point, by some observations; what it shows twice counts once."""
     from scipy.sparse import csr_matrix  # late: few runs need it
@@ -49,12 +63,14 @@ def _shown(rec: Reconstruction, keep_obs: NDArray[np.bool_]) -> csr_matrix:
     return shows
 
 
-def connected_photos(reconstruction: Reconstruction, least: int = LEAST_MEASUREMENTS) -> NDArray[np.bool_]:
+def connected_photos(
+    reconstruction: Reconstruction, least: int = LEAST_MEASUREMENTS, *, in_common: int = 1
+) -> NDArray[np.bool_]:
     """(m,) the largest set of photos of which each shows `least` points whose place the others determine.
 
-    A set grows from a pair: a photo is added if it shows so many points that two of the set show. Sets that have a
-    photo in common are one, since that determines how they were rotated. What two sets show of each other by less can
-    be rotated and moved against each other: residuals are small wherever they are.
+    A set grows from a pair: a photo is added if it shows so many points that two of the set show. Sets that have
+    photos in common are one: one photo determines how they were rotated, two determine their scale, too. What two sets
+    show of each other by less can be rotated and moved against each other: residuals are small wherever they are.
     """
     obs, m = reconstruction.observations, reconstruction.num_images
     # what two photos alone show ties no third to them
@@ -77,7 +93,7 @@ def connected_photos(reconstruction: Reconstruction, least: int = LEAST_MEASUREM
         connected = np.arange(m) == first
         if common.max() >= least:
             connected = grown(connected | (np.arange(m) == np.argmax(common)))
-        while any(touching := [(each & connected).any() for each in sets]):
+        while any(touching := [(each & connected).sum() >= in_common for each in sets]):
             both = np.any([connected, *(each for each, near in zip(sets, touching, strict=True) if near)], axis=0)
             sets = [each for each, near in zip(sets, touching, strict=True) if not near]
             connected = grown(both)

@@ -15,7 +15,7 @@ from .database import LOOSE, MatchedPhotos, verification_options, write_photos
 from .epipolar import MIN_EXPLAINED, distance_from_planes
 from .features import Features
 
-__all__ = ["CLOSE_PX", "LOOSE_PX", "match_more", "match_photos", "verify_matches"]
+__all__ = ["CLOSE_PX", "LOOSE_PX", "match_more", "match_photos", "verify_loosely"]
 
 Pair = tuple[int, int]
 
@@ -99,15 +99,14 @@ def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: ND
         pycolmap.match_image_pairs(
             database, matching, pairing, verification_options=verification, device=pycolmap.Device.cpu
         )
-    _verify_loosely(matched, sorted(_matched_pairs(matched) - before), within_px)
+    _verify_lossy(matched, sorted(_matched_pairs(matched) - before), within_px)
 
 
-def verify_matches(matched: MatchedPhotos, *, within_px: float = LOOSE_PX) -> None:
-    """Verify the matches of all pairs by the keypoints of the database, as `match_more` does."""
+def verify_loosely(matched: MatchedPhotos) -> None:
+    """Verify all matches, by the keypoints of the database, with room for a shutter that is strong."""
     pairs = sorted(_matched_pairs(matched))
-    if pairs:
-        _verify(matched, pairs, _close_px(matched, within_px))
-        _verify_loosely(matched, pairs, within_px)
+    _forget(matched, pairs)
+    _verify(matched, pairs, LOOSE_PX)
 
 
 def _close_px(matched: MatchedPhotos, within_px: float) -> float:
@@ -115,17 +114,13 @@ def _close_px(matched: MatchedPhotos, within_px: float) -> float:
     return min(within_px, CLOSE_PX * float(np.median([each.step_px for each in matched.features])))
 
 
-def _verify_loosely(matched: MatchedPhotos, pairs: Sequence[Pair], within_px: float) -> None:
+def _verify_lossy(matched: MatchedPhotos, pairs: Sequence[Pair], within_px: float) -> None:
     """Verify pairs again with room for the shutter where the geometry without it loses matches."""
     close_px = _close_px(matched, within_px)
-    if close_px == within_px:
-        return
-    pycolmap = quiet_pycolmap()
-    with pycolmap.Database.open(matched.database) as db:
-        lossy = [pair for pair in pairs if _loses_matches(db, *pair, close_px, within_px)]
-        for first, second in lossy:
-            db.delete_two_view_geometry(first + 1, second + 1)
-    if lossy:
+    if close_px < within_px:
+        with quiet_pycolmap().Database.open(matched.database) as db:
+            lossy = [pair for pair in pairs if _loses_matches(db, *pair, close_px, within_px)]
+        _forget(matched, lossy)
         _verify(matched, lossy, within_px)
 
 
@@ -146,8 +141,17 @@ def _loses_matches(db: Any, first: int, second: int, close_px: float, within_px:
 
 
 def _verify(matched: MatchedPhotos, pairs: Sequence[Pair], within_px: float) -> None:
-    options = verification_options(within_px, matched.seed)
-    quiet_pycolmap().verify_matches(matched.database, _listed(matched, np.array(pairs)), options)
+    """Verify pairs that have matches but no geometry."""
+    if pairs:
+        options = verification_options(within_px, matched.seed)
+        quiet_pycolmap().verify_matches(matched.database, _listed(matched, np.array(pairs)), options)
+
+
+def _forget(matched: MatchedPhotos, pairs: Sequence[Pair]) -> None:
+    """Remove the geometries of pairs."""
+    with quiet_pycolmap().Database.open(matched.database) as db:
+        for first, second in pairs:
+            db.delete_two_view_geometry(first + 1, second + 1)
 
 
 def _listed(matched: MatchedPhotos, pairs: NDArray[np.int64]) -> Path:

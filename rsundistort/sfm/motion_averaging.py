@@ -15,7 +15,7 @@ from ..model import Reconstruction, RowMotion
 from .database import MatchedPhotos, ideal_keypoints, write_photos
 from .epipolar import MIN_EXPLAINED, read_matches
 from .mapping import map_photos
-from .matching import verify_matches
+from .matching import verify_loosely
 from .relative_pose import Pair, find_relative_pose, phi_information
 from .verification import pair_of
 
@@ -111,5 +111,5 @@ def map_without_motions(matched: MatchedPhotos, phi_sigma: float) -> Reconstruct
         write_photos(db, moved)
         for (first, second), found in matches.items():
             db.write_matches(first + 1, second + 1, found.astype(np.uint32))
-    verify_matches(moved)
+    verify_loosely(moved)
     return map_photos(moved, shown=matched)

@@ -23,7 +23,7 @@ from .connected import LEAST_MEASUREMENTS, connected_photos
 from .database import MatchedPhotos
 from .epipolar import TIGHT_PX, Matches, agreeing_photos, read_matches
 
-__all__ = ["Placed", "Registration", "place_photo", "register_photos"]
+__all__ = ["Placed", "Registration", "place_photo", "points_of_keypoints", "register_photos"]
 
 # COLMAP's own demands on the pose of a photo: so many points that fit, and this share of all. Features that a strong
 # shutter sheared hardly match: then as many points do as a photo needs to stay (`LEAST_MEASUREMENTS`).
@@ -312,7 +312,7 @@ class _Shown:
     """Which points of a scene the keypoints of photos show, by their matches with others."""
 
     def __init__(self, matched: MatchedPhotos, matches: Matches, scene: Reconstruction) -> None:
-        self._point_of = _points_of_keypoints(matched, scene)
+        self._point_of = points_of_keypoints(matched, scene)
         # by photo: the partner, and the keypoints of the photo and of the partner that match
         self._partners: dict[int, list[tuple[int, NDArray[np.int64]]]] = {}
         for (first, second), found in matches.items():
@@ -346,7 +346,7 @@ def _fits(
     return valid & (np.linalg.norm(np.where(valid[:, None], xy - xy_raw, 0.0), axis=1) <= _FIT * TIGHT_PX * step_px)
 
 
-def _points_of_keypoints(matched: MatchedPhotos, scene: Reconstruction) -> dict[int, NDArray[np.int64]]:
+def points_of_keypoints(matched: MatchedPhotos, scene: Reconstruction) -> dict[int, NDArray[np.int64]]:
     """For each photo of a scene the point that each of its keypoints shows, or -1."""
     observations, found = scene.observations, {}
     photo_of = {name: photo for photo, name in enumerate(matched.names)}

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model import Reconstruction
-from .connected import LEAST_MEASUREMENTS, LEAST_TIES, common_points
+from .connected import LEAST_TIES, connected_parts
 
 __all__ = ["carried_along"]
 
@@ -59,10 +59,8 @@ def carried_along(scene: Reconstruction, former: Reconstruction, taken: Collecti
 
 def _sides(former: Reconstruction, taken: Collection[str]) -> Iterator[Reconstruction]:
     """The photos that lost their places, by what they show together."""
-    from scipy.sparse.csgraph import connected_components  # late: few runs need it
-
     rec = former.take_photos(np.isin(former.image_names, [*taken]))
-    side = connected_components(common_points(rec) >= LEAST_MEASUREMENTS)[1]
+    side = connected_parts(rec)
     for k in range(side.max(initial=-1) + 1):
         yield rec.take_photos(side == k)
 

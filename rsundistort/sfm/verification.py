@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..colmap.conventions import quiet_pycolmap
 from .database import MatchedPhotos
 from .epipolar import MIN_EXPLAINED, Matches, read_matches
+from .matching import verify_loosely
 from .relative_pose import INLIER_PX, NO_SHUTTER, Pair, RelativePose, View, find_relative_pose, relative_poses
 
 __all__ = ["pair_of", "verify_with_shutter"]
@@ -48,6 +49,8 @@ def verify_with_shutter(matched: MatchedPhotos) -> float:
     if spread >= _STRONG_RAD:
         without = [find_relative_pose(pair, NO_SHUTTER) for pair in pairs]
         if _num_explained(without, pairs, step_px) < (1.0 - _LOST) * _num_explained(poses, pairs, step_px):
+            # a geometry that few pixels are wide holds for a part of the frame only
+            verify_loosely(matched)
             _add_explained(matched, matches, spread)
     return spread
 

@@ -201,7 +201,9 @@ def solve_tracks(
     # two standard deviations of the priors by exposure times
     most_phi = {name: 2.0 * limit for name, limit in options.phi_limits.items()}
     suspects = [] if registrar is None else registrar.suspects(result.reconstruction)
-    verdict = judge(result, global_result, choice, mended, measured, known, most_phi, strong, suspects)
+    verdict = judge(
+        result, global_result, choice, mended, measured, known, most_phi, strong, suspects, survey is not None
+    )  # fmt: skip
     if verdict.lens_only:
         warnings.warn(_lens_only(verdict), RsUndistortWarning, stacklevel=3)
     log.end("verdict", shutter=verdict.shutter, shape=verdict.shape)

@@ -20,12 +20,13 @@ from ..sfm import (
     contradicting_photos,
     firmly_connected,
     map_without_motions,
+    photos_beside_breaks,
     read_num_verified,
     register_photos,
     retriangulate,
 )
 from ..sfm.registration import Registration
-from .solutions import agree, num_explained
+from .solutions import agree, num_explained, same_places
 from .tracks import (
     LEAST_PHOTOS,
     TrackSource,
@@ -117,14 +118,25 @@ class Registrar:
         return result
 
     def _is_worse(self, new: Reconstruction, old: Reconstruction) -> bool:
-        """Whether the same photos explain fewer measurements in new places: then these are wrong, and not the old."""
+        """Whether the same photos explain fewer measurements in new places: then these are wrong, and not the old.
+
+        Beside a break of the scale each side has points of its own, and these fit better than common ones.
+        """
         if {*new.image_names} != {*old.image_names} or new is old:
             return False
-        return self._explained(new) < self._explained(old)
+        tracks, former = self._new_tracks(new), self._new_tracks(old)
+        if self._breaks(former).any() and not self._breaks(tracks).any():
+            return False
+        return num_explained(tracks) < num_explained(former)
 
     def suspects(self, reconstruction: Reconstruction) -> list[str]:
         """Photos that may have a wrong place, since matches with the others contradict it."""
-        return [reconstruction.image_names[i] for i in np.flatnonzero(self._suspects(reconstruction)).tolist()]
+        # measurements that were aligned are no keypoints any more
+        tracks = self._new_tracks(reconstruction)
+        beside = np.array(tracks.image_names)[self._breaks(tracks)]
+        suspect = np.isin(reconstruction.image_names, [*set(beside.tolist()) - self._confirmed])
+        suspect |= self._suspects(reconstruction)
+        return [reconstruction.image_names[i] for i in np.flatnonzero(suspect).tolist()]
 
     def _registered(self, result: BundleResult) -> tuple[BundleResult, set[str]]:
         """Register photos that mapping left out, or gave a wrong pose without a shutter, with the points of the others.
@@ -218,7 +230,7 @@ class Registrar:
         found = register_photos(self.track_source.matched, self._num_verified, rest, strong=strong)
         names = [scene.image_names[i] for i in np.flatnonzero(suspects).tolist()]
         again = [name for name in found.added if name in names]
-        confirmed = bool(again) and agree(scene, found.reconstruction)
+        confirmed = bool(again) and agree(scene, found.reconstruction) and same_places(scene, found.reconstruction)
         if confirmed:
             self._confirmed.update(names)
         return confirmed
@@ -229,7 +241,11 @@ class Registrar:
     def _contradicting(self, reconstruction: Reconstruction, *, suspects: bool = False) -> NDArray[np.bool_]:
         matched = self.track_source.matched
         found = contradicting_photos(matched, self._num_verified, reconstruction, suspects=suspects)
+        found |= self._breaks(reconstruction)
         return found & ~np.isin(reconstruction.image_names, [*self._confirmed])
+
+    def _breaks(self, tracks: Reconstruction) -> NDArray[np.bool_]:
+        return photos_beside_breaks(self.track_source.matched, tracks)
 
     def _new_tracks(self, reconstruction: Reconstruction) -> Reconstruction:
         return firmly_connected(retriangulate(self.track_source.matched, reconstruction))

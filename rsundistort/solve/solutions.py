@@ -9,11 +9,12 @@ from ..model import Reconstruction
 from ..model.reprojection import reprojection_residuals
 from ..sfm import SIFT_PX
 
-__all__ = ["agree", "num_explained"]
+__all__ = ["agree", "num_explained", "same_places"]
 
 # Of the noise of features: farther from its prediction no measurement is explained.
 _MOST_SIGMAS = 3.0
-# Two solutions agree on a photo if its rotations are closer, in radians: a right one is right to a degree.
+# Two solutions agree on a photo if its rotations are closer, in radians, and its places, seen from the scene: a right
+# one is right to a degree.
 _AGREE_RAD = np.radians(2.0)
 
 
@@ -30,3 +31,18 @@ def agree(rec: Reconstruction, other: Reconstruction) -> bool:
     of_rec, of_other = (each.R_cw[[each.image_names.index(name) for name in both]] for each in (rec, other))
     steps = Rotation.from_matrix(np.einsum("mji,mjk->mik", of_rec, of_other))
     return len(both) > 0 and bool((steps * steps.mean().inv()).magnitude().max() < _AGREE_RAD)
+
+
+def same_places(rec: Reconstruction, other: Reconstruction) -> bool:
+    """Whether the photos of two solutions in one frame are in the same places, as seen from what they show."""
+    index_of = {name: i for i, name in enumerate(other.image_names)}
+    obs, depth = rec.observations, np.zeros(rec.num_images)
+    for i, mine in enumerate(obs.by_photo(rec.num_images)):
+        if len(mine):
+            depth[i] = np.median(np.linalg.norm(rec.points_w[obs.point_idx[mine]] - rec.center_w[i], axis=1))
+    moved = [
+        (np.linalg.norm(other.center_w[index_of[name]] - rec.center_w[i]), depth[i])
+        for i, name in enumerate(rec.image_names)
+        if name in index_of
+    ]
+    return all(way <= _AGREE_RAD * far for way, far in moved)

@@ -17,7 +17,7 @@ from ..bundle.layout import motion_end
 from ..critical import Remedy
 from ..model import Reconstruction
 from ..model.field import field_over_frame
-from ..sfm import LEAST_MEASUREMENTS, connected_photos
+from ..sfm import LEAST_MEASUREMENTS, LEAST_TIES, connected_photos
 from .photos import PhotoMotions, photo_motions
 from .residuals import left_along_readout, left_over_frame
 
@@ -99,6 +99,7 @@ def judge(
     most_phi: Mapping[str, float] | None = None,
     strong: bool = False,
     suspects: Collection[str] = (),
+    scaled: bool = False,
 ) -> Verdict:
     """Judge a solution.
 
@@ -123,6 +124,8 @@ def judge(
         wrong poses: only the solution then determines these.
     suspects : collection of photo names
         Photos whose place their matches with the others contradict.
+    scaled : bool
+        Whether more than points determines the scale of each part of the scene: positions of photos, or a path.
 
     Returns
     -------
@@ -131,7 +134,7 @@ def judge(
     """
     rec = result.reconstruction
     unexplained = unexplained_reasons(result, choice)
-    reasons = loose_reasons(result) + height_reasons(remedy) + unexplained
+    reasons = loose_reasons(result, scaled) + height_reasons(remedy) + unexplained
     if suspects:
         reasons.append(f"{len(suspects)} of {rec.num_images} photos may have a wrong place ({', '.join(suspects)}).")
     if rec.shutter_model == "global":
@@ -186,15 +189,23 @@ def _outliers(rec: Reconstruction, tracks: Reconstruction | None) -> NDArray[np.
     return 1.0 - _counts(rec) / np.maximum([before.get(name, 0) for name in rec.image_names], 1)
 
 
-def loose_reasons(result: BundleResult) -> list[str]:
+def loose_reasons(result: BundleResult, scaled: bool = False) -> list[str]:
     """Parts of the scene without a common scale: the equations then have no single solution."""
-    if np.isfinite(result.covariances).all():
-        return []
     rec = result.reconstruction
-    weakest = rec.image_names[int(np.argmin(_counts(rec)))]
+    more = "take more photos between them"
+    if not np.isfinite(result.covariances).all():
+        weakest = rec.image_names[int(np.argmin(_counts(rec)))]
+        return [
+            "So few measurements connect the photos that parts of the scene could be scaled against each other; "
+            f"{more} ({weakest} has the fewest measurements)."
+        ]
+    loose = ~connected_photos(rec, LEAST_TIES, in_common=2)
+    if scaled or not loose.any():
+        return []
+    names = ", ".join(np.array(rec.image_names)[loose].tolist())
     return [
-        "So few measurements connect the photos that parts of the scene could be scaled against each other; take more "
-        f"photos between them ({weakest} has the fewest measurements)."
+        f"Parts of the scene could be scaled against each other, since {loose.sum()} of {rec.num_images} photos show "
+        f"fewer than {LEAST_TIES} points that two of the others show; {more} and the others ({names})."
     ]
 
 

@@ -67,7 +67,7 @@ def judge_clip(
     assert result.path is not None
     time = ReadoutTime(float(result.path.readout_s[0]), float(result.path.sigma_readout_s[0]))
     beyond = abs(float(result.path.unbounded_s[0])) - SIGMAS * time.sigma
-    reasons = loose_reasons(keys) + height_reasons(remedy) + unexplained_reasons(keys, None)
+    reasons = loose_reasons(keys, scaled=True) + height_reasons(remedy) + unexplained_reasons(keys, None)
     rec = keys.reconstruction
     shift = max(largest_shift_px(rec.camera(i), rec.motion(i), rec.shutter_model) for i in range(rec.num_images))
     most = shift * (abs(time.seconds) + SIGMAS * time.sigma) / max(abs(time.seconds), 1e-9)
