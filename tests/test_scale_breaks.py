@@ -132,3 +132,11 @@ def test_parts_that_share_one_photo_have_no_common_scale(walk):
     assert "scaled against each other, since 5 of 12 photos" in reason or "since 6 of 12" in reason
     assert loose_reasons(covariances, scaled=True) == []
     assert loose_reasons(SimpleNamespace(reconstruction=walk, covariances=covariances.covariances)) == []
+
+
+def test_photos_that_all_contradict_each_other_come_to_an_end(walk, matched, rng):
+    tracks = retriangulate(matched, walk)
+    # what a photo shows is not what it matches
+    point_idx = rng.permutation(tracks.observations.point_idx)
+    mixed = replace(tracks, observations=replace(tracks.observations, point_idx=point_idx))
+    assert photos_beside_breaks(matched, mixed).sum() < COUNT

@@ -53,7 +53,7 @@ def photos_beside_breaks(matched: MatchedPhotos, reconstruction: Reconstruction)
         if common[first].max() >= LEAST_TIES:
             connected, contradicted = due.grown(start | (np.arange(len(left)) == np.argmax(common[first])))
         sets.append((connected, contradicted))
-        left = left & ~connected
+        left = left & ~(connected | start)
     largest, wrong = max(sets, key=lambda each: int(each[0].sum()), default=(left, left))
     for connected, contradicted in sets:
         # the points at a break may be those of one side alone
@@ -108,6 +108,8 @@ class _Due:
             num_shown = np.bincount(self._photo[due & self._shown], minlength=self._num_images)
             agrees = num_shown >= _LEAST_SHOWN * num_due
             new = ~connected & agrees & (num_shown >= LEAST_TIES)
+            # those that are nearest first: what others say of the rest counts, too, before that is added
+            new &= 2 * num_shown >= np.where(new, num_shown, 0).max()
             if not new.any():
                 # one that came in by what the first few said may contradict what more of them say
                 contradicted = ~agrees & (num_due >= _LEAST_DUE)
