@@ -192,20 +192,20 @@ def _outliers(rec: Reconstruction, tracks: Reconstruction | None) -> NDArray[np.
 def loose_reasons(result: BundleResult, scaled: bool = False) -> list[str]:
     """Parts of the scene without a common scale: the equations then have no single solution."""
     rec = result.reconstruction
-    more = "take more photos between them"
-    if not np.isfinite(result.covariances).all():
-        weakest = rec.image_names[int(np.argmin(_counts(rec)))]
-        return [
-            "So few measurements connect the photos that parts of the scene could be scaled against each other; "
-            f"{more} ({weakest} has the fewest measurements)."
-        ]
     loose = ~connected_photos(rec, LEAST_TIES, in_common=2)
-    if scaled or not loose.any():
+    if loose.any() and not scaled:
+        names = ", ".join(np.array(rec.image_names)[loose].tolist())
+        return [
+            f"Parts of the scene could be scaled against each other, since {loose.sum()} of {rec.num_images} photos "
+            f"show fewer than {LEAST_TIES} points that two of the others show; take more photos between the others and "
+            f"these ({names})."
+        ]
+    if np.isfinite(result.covariances).all():
         return []
-    names = ", ".join(np.array(rec.image_names)[loose].tolist())
+    weakest = rec.image_names[int(np.argmin(_counts(rec)))]
     return [
-        f"Parts of the scene could be scaled against each other, since {loose.sum()} of {rec.num_images} photos show "
-        f"fewer than {LEAST_TIES} points that two of the others show; {more} and the others ({names})."
+        "So few measurements connect the photos that parts of the scene could be scaled against each other; take more "
+        f"photos between them ({weakest} has the fewest measurements)."
     ]
 
 
