@@ -6,15 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matched_scene import matched_scene
 from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, Observations, Reconstruction, RowMotion, project_points
 from rsundistort.batch.progress import StageLog
 from rsundistort.bundle import BundleOptions, bundle_adjust
-from rsundistort.colmap.conventions import quiet_pycolmap
-from rsundistort.sfm import Features, MatchedPhotos, map_photos, map_without_motions, read_num_verified, register_photos
+from rsundistort.sfm import map_photos, map_without_motions, read_num_verified, register_photos
 from rsundistort.sfm.contradiction import contradicting_photos, parts_that_agree
-from rsundistort.sfm.database import write_photos
 from rsundistort.sfm.epipolar import agreeing_photos, read_matches
 from rsundistort.sfm.motion_averaging import averaged_motions
 from rsundistort.sfm.registration import place_photo
@@ -70,29 +69,7 @@ def scene(rng, rad):
 @pytest.fixture
 def matched(scene, rng, tmp_path):
     """Its measurements as keypoints, all photos matched with each other, every fifth match wrong."""
-    rows = scene.observations.by_photo(6)
-    features = [
-        Features(scene.observations.xy_raw[each], np.ones(len(each)), np.zeros((len(each), 128), np.uint8))
-        for each in rows
-    ]
-    matched = MatchedPhotos(tmp_path / "database.db", NAMES, features, [CAMERA], np.zeros(6, int), True, 0)
-    pycolmap = quiet_pycolmap()
-    with pycolmap.Database.open(matched.database) as db:
-        write_photos(db, matched)
-        for i in range(6):
-            for j in range(i + 1, 6):
-                points = [scene.observations.point_idx[rows[k]] for k in (i, j)]
-                both = np.intersect1d(*points)
-                first, second = (np.searchsorted(each, both) for each in points)
-                wrong = np.flatnonzero(rng.uniform(size=len(both)) < 0.2)
-                second[wrong] = rng.permutation(second[wrong])
-                pairs = np.column_stack([first, second]).astype(np.uint32)
-                db.write_matches(i + 1, j + 1, pairs)
-                geometry = pycolmap.TwoViewGeometry()
-                geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-                geometry.inlier_matches = pairs[: len(pairs) * 8 // 10]
-                db.write_two_view_geometry(i + 1, j + 1, geometry)
-    return matched
+    return matched_scene(scene, rng, tmp_path / "database.db", share_wrong=0.2)
 
 
 def one_photo(scene, photo):

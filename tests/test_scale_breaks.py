@@ -7,13 +7,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matched_scene import matched_scene
 
 from rsundistort import Camera, Observations, Reconstruction, RowMotion, project_points
 from rsundistort.batch.progress import StageLog
 from rsundistort.bundle import BundleOptions, bundle_adjust
-from rsundistort.colmap.conventions import quiet_pycolmap
-from rsundistort.sfm import Features, MatchedPhotos, firmly_connected, photos_beside_breaks, retriangulate
-from rsundistort.sfm.database import write_photos
+from rsundistort.sfm import firmly_connected, photos_beside_breaks, retriangulate
 from rsundistort.solve.registering import Registrar
 from rsundistort.solve.tracks import TrackSource, rough_options
 from rsundistort.verdict.judge import loose_reasons
@@ -46,33 +45,7 @@ def walk(rng):
 @pytest.fixture
 def matched(walk, rng, tmp_path):
     """Its keypoints; a tenth of all matches is wrong."""
-    rows = walk.observations.by_photo(COUNT)
-    features = [
-        Features(walk.observations.xy_raw[each], np.ones(len(each)), np.zeros((len(each), 128), np.uint8))
-        for each in rows
-    ]
-    matched = MatchedPhotos(
-        tmp_path / "database.db", walk.image_names, features, [CAMERA], np.zeros(COUNT, int), True, 0
-    )
-    pycolmap = quiet_pycolmap()
-    with pycolmap.Database.open(matched.database) as db:
-        write_photos(db, matched)
-        for i in range(COUNT):
-            for j in range(i + 1, COUNT):
-                points = [walk.observations.point_idx[rows[k]] for k in (i, j)]
-                both = np.intersect1d(*points)
-                if len(both) < 30:
-                    continue
-                first, second = (np.searchsorted(each, both) for each in points)
-                wrong = np.flatnonzero(rng.uniform(size=len(both)) < 0.1)
-                second[wrong] = rng.permutation(second[wrong])
-                pairs = np.column_stack([first, second]).astype(np.uint32)
-                db.write_matches(i + 1, j + 1, pairs)
-                geometry = pycolmap.TwoViewGeometry()
-                geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-                geometry.inlier_matches = np.delete(pairs, wrong, axis=0)
-                db.write_two_view_geometry(i + 1, j + 1, geometry)
-    return matched
+    return matched_scene(walk, rng, tmp_path / "database.db", share_wrong=0.1)
 
 
 def broken(walk, first, scale):
@@ -113,25 +86,25 @@ def test_it_is_mended(walk, matched):
     np.testing.assert_allclose(steps / steps.mean(), true / true.mean(), atol=0.03)
 
 
-def test_parts_that_have_no_point_in_common_are_not_known_to_be_beside_a_break(walk, matched):
-    point = walk.observations.point_idx
-    # photos to 5 show other points than those from 5 on
-    left = (walk.observations.frame_idx <= 5) == (point % 2 == 0)
-    left |= walk.observations.frame_idx == 5
-    tracks = walk.with_points(left, min_track=3)
-    assert not photos_beside_breaks(matched, tracks).all()
+def in_two_parts(walk):
+    """Photos to 5 show other points than those from 5 on."""
+    frame, point = walk.observations.frame_idx, walk.observations.point_idx
+    return walk.with_points(np.where(point % 2 == 0, frame <= 5, frame >= 5), min_track=3)
+
+
+def test_parts_that_have_no_point_in_common_are_not_beside_a_break(walk, rng, tmp_path):
+    parts = in_two_parts(walk)
+    matched = matched_scene(parts, rng, tmp_path / "database.db", share_wrong=0.1)
+    assert not photos_beside_breaks(matched, parts).any()
 
 
 def test_parts_that_share_one_photo_have_no_common_scale(walk):
-    frame, point = walk.observations.frame_idx, walk.observations.point_idx
-    kept = np.where(point % 2 == 0, frame <= 5, frame >= 5)
-    covariances = SimpleNamespace(
-        reconstruction=walk.with_points(kept, min_track=3), covariances=np.zeros((COUNT, 12, 12))
-    )
-    (reason,) = loose_reasons(covariances)
-    assert "scaled against each other, since 5 of 12 photos" in reason or "since 6 of 12" in reason
-    assert loose_reasons(covariances, scaled=True) == []
-    assert loose_reasons(SimpleNamespace(reconstruction=walk, covariances=covariances.covariances)) == []
+    covariances = np.zeros((COUNT, 12, 12))
+    parts = SimpleNamespace(reconstruction=in_two_parts(walk), covariances=covariances)
+    (reason,) = loose_reasons(parts)
+    assert "scaled against each other, since 5 of 12 photos" in reason
+    assert loose_reasons(parts, scaled=True) == []
+    assert loose_reasons(SimpleNamespace(reconstruction=walk, covariances=covariances)) == []
 
 
 def test_photos_that_all_contradict_each_other_come_to_an_end(walk, matched, rng):

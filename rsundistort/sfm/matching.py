@@ -15,7 +15,7 @@ from .database import LOOSE, MatchedPhotos, verification_options, write_photos
 from .epipolar import MIN_EXPLAINED, distance_from_planes
 from .features import Features
 
-__all__ = ["CLOSE_PX", "LOOSE_PX", "match_more", "match_photos", "verify_loosely"]
+__all__ = ["LOOSE_PX", "close_px", "match_more", "match_photos", "verify_loosely"]
 
 Pair = tuple[int, int]
 
@@ -89,7 +89,7 @@ def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: ND
     pycolmap, database = quiet_pycolmap(), matched.database
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
-    verification = verification_options(_close_px(matched, within_px), matched.seed)
+    verification = verification_options(min(within_px, close_px(matched.features)), matched.seed)
     before = _matched_pairs(matched)
     if pairs is None:
         pycolmap.match_exhaustive(database, matching, verification_options=verification, device=pycolmap.Device.cpu)
@@ -109,22 +109,22 @@ def verify_loosely(matched: MatchedPhotos) -> None:
     _verify(matched, pairs, LOOSE_PX)
 
 
-def _close_px(matched: MatchedPhotos, within_px: float) -> float:
-    """Largest distance from epipolar lines where neither lens nor shutter displaces anything."""
-    return min(within_px, CLOSE_PX * float(np.median([each.step_px for each in matched.features])))
+def close_px(features: Sequence[Features]) -> float:
+    """Largest distance from epipolar lines where neither lens nor shutter displaces anything, in pixels of photos."""
+    return CLOSE_PX * float(np.median([each.step_px for each in features]))
 
 
 def _verify_lossy(matched: MatchedPhotos, pairs: Sequence[Pair], within_px: float) -> None:
     """Verify pairs again with room for the shutter where the geometry without it loses matches."""
-    close_px = _close_px(matched, within_px)
-    if close_px < within_px:
+    close = close_px(matched.features)
+    if close < within_px:
         with quiet_pycolmap().Database.open(matched.database) as db:
-            lossy = [pair for pair in pairs if _loses_matches(db, *pair, close_px, within_px)]
+            lossy = [pair for pair in pairs if _loses_matches(db, *pair, close, within_px)]
         _forget(matched, lossy)
         _verify(matched, lossy, within_px)
 
 
-def _loses_matches(db: Any, first: int, second: int, close_px: float, within_px: float) -> bool:
+def _loses_matches(db: Any, first: int, second: int, close: float, within_px: float) -> bool:
     """Whether clearly more matches lie within the wide distance of the epipolar lines than within the close one."""
     geometry = db.read_two_view_geometry(first + 1, second + 1)
     if geometry.E is None or len(geometry.inlier_matches) < MIN_EXPLAINED:
@@ -137,7 +137,7 @@ def _loses_matches(db: Any, first: int, second: int, close_px: float, within_px:
         rays.append(np.column_stack([camera.cam_from_img(xy), np.ones(len(xy))]))
         focal_px.append(camera.mean_focal_length())
     distance_px = distance_from_planes(rays[0], rays[1], geometry.E) * float(np.mean(focal_px))
-    return bool((distance_px <= close_px).sum() < _KEPT * (distance_px <= within_px).sum())
+    return bool((distance_px <= close).sum() < _KEPT * (distance_px <= within_px).sum())
 
 
 def _verify(matched: MatchedPhotos, pairs: Sequence[Pair], within_px: float) -> None:

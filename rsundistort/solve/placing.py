@@ -19,7 +19,7 @@ from ..io.kept import Kept
 from ..model import Reconstruction
 from ..sfm import MatchedPhotos, map_photos, match_photos, read_num_verified, verify_with_shutter
 from ..sfm.mapping import PLACING_KEYPOINTS
-from ..sfm.matching import CLOSE_PX, LOOSE_PX, match_more
+from ..sfm.matching import LOOSE_PX, close_px, match_more
 
 __all__ = ["place_photos"]
 
@@ -121,7 +121,7 @@ def _match(
         within_px = LOOSE_PX
         if of_clip:
             # content moves by little from one to the next, and so does the distortion of the shutter
-            within_px = CLOSE_PX * float(np.median([each.step_px for each in photos.features]))
+            within_px = close_px(photos.features)
         start = partial(match_photos, *given, calibrated=cameras.calibrated, seed=seed, within_px=within_px)
         asks = bool(photos.coarse) and len(photos.names) > _ASKED
         if asks:
