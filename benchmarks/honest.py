@@ -16,6 +16,8 @@ Prints one JSON object a line and at the end a table with targets. Parts, with t
     directions        what is said of the axis of the readout where nobody specifies it
     strong (3)        herz-jesus-8 warped by 0.2 and 0.3 rad: no photo a degree wrong in a scene that is to be trusted
     flights (3)       three to five photos of the sample flyover, of a drone that drifts or is blown about
+    uneven (4)        herz-jesus-8 by motions of uneven size, as hands make them: a tripod that was bumped once, half of
+                      the photos from a tripod, and photos of which each moved by a size of its own
 
 Cameras are "given", the camera.json; "guessed", its focal length 5 % off and no lens, refined under the prior of EXIF's
 guesses; "wrong", with cx 5 px and k1 0.005 off, and believed; "exact", with standard deviations of next to nothing;
@@ -411,6 +413,42 @@ def better(bench: Bench) -> None:
         bench.row(name, [moved], {"dB": list(dB.values()), "deg": degrees}, "dB >= 36", dB["median"] >= 36)
 
 
+def uneven_motions(kind: str, num: int, seed: int) -> np.ndarray:
+    """Motions (num, 3), radians per frame."""
+    rng = np.random.default_rng(seed)
+    if kind == "one bumped":
+        phi = rng.normal(0, 3e-4, (num, 3))
+        phi[rng.integers(num)] = rng.normal(0, 0.05, 3)
+        return phi
+    if kind == "half still":
+        return rng.normal(0, 0.03, (num, 3)) * (rng.permutation(num) % 2)[:, None]
+    return rng.normal(0, 0.008, (num, 3)) * np.exp(rng.normal(0, 1, (num, 1)))
+
+
+def uneven(bench: Bench) -> None:
+    """Photos that moved by different amounts."""
+    photos, camera = bench.photos / HERZ, bench.beside(HERZ)
+    names = sorted(path.name for path in photos.glob("*.jpg"))
+    for kind in ("one bumped", "half still", "each its own"):
+        name, ran, off, dB, before = f"uneven: {kind}", list[Ran](), list[float](), list[float](), list[float]()
+        with bench.case(name):
+            for seed in bench.numbers(4):
+                warp = bench.work / f"uneven-{kind.replace(' ', '-')}-{seed}"
+                motion = dict(zip(names, uneven_motions(kind, len(names), seed), strict=True))
+                simulate_warp(photos, warp, WarpOptions(camera, motion=motion))
+                ran.append(bench.run(warp / "photos"))
+                truth, still = warp / "ground_truth.json", bench.still().out / "solution.json"
+                own = with_lens_of(ran[-1].out, truth)
+                found = rs.evaluate(ran[-1].out, own, poses=still, twins=photos)
+                show(f"{name}, seed {seed}", **ran[-1].facts, **brief(found))
+                off.append(float(np.mean(found.phi_mrad_per_frame.mean_per_component)))
+                dB += found.psnr_db.photos.values()
+                before += found.psnr_before_db.photos.values()
+            figures = {"phi mrad": round(float(np.median(off)), 2), BY_LENS: list(summary(dB, min).values())}
+            figures |= {"before": list(summary(before, min).values())}
+            bench.row(name, ran, figures, "found", all(each.said[0] == "found" for each in ran))
+
+
 def directions(bench: Bench) -> None:
     """Axes of the readout where nobody specifies them; the DSLR has none, and the phone's photos are stored upright."""
     value = json.loads((SCENES / "handheld" / "cameras.json").read_text())
@@ -485,7 +523,7 @@ def flights(bench: Bench) -> None:
                 bench.row(name, ran, {"dB before, after": found}, "3 dB better where trusted", harmless)
 
 
-ALL = (nothing_invented, suppressed, coverage, calibration, better, directions, strong, flights)
+ALL = (nothing_invented, suppressed, coverage, calibration, better, directions, strong, flights, uneven)
 PARTS: dict[str, Callable[[Bench], None]] = {part.__name__.replace("_", "-"): part for part in ALL}
 
 

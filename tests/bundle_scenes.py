@@ -119,6 +119,16 @@ def scaled(step, h):
     return tuple(h * part for part in step)
 
 
+def weights_of_motions(problem, own):
+    """Weights (m, k) of the priors of rotations by 0.03 and travels by 0.1 a frame, Student's t with 4 degrees."""
+    weight = np.empty_like(own)
+    for i, span in enumerate(problem._start.frame_span()):
+        for k, sigma in zip(range(0, own.shape[1], 3), (0.03, 0.1), strict=False):
+            square = sum((own[i, k + a] * span / sigma) ** 2 for a in range(3))
+            weight[i, k : k + 3] = 7 / (4 + square) * (span / sigma) ** 2
+    return weight
+
+
 def dense_system(problem, state):
     """Hessian and gradient of all unknowns, photos, points, cameras, written out; with the mask of the free ones."""
     res, J_frame = problem.blocks(state)
@@ -136,13 +146,9 @@ def dense_system(problem, state):
         J[k, :, c : c + nc] = J_camera[k]
     J = J.reshape(-1, J.shape[2])
     H, g = J.T @ J, J.T @ res.ravel()
-    if nb > 6:  # priors: (phi * span / spread)^2 / 2, and the same for the velocity
-        weight = np.zeros((m, nb))
-        weight[:, 6:9] = (problem._start.frame_span() / 0.03)[:, None] ** 2
-        weight[:, 9:] = (problem._start.frame_span() / 0.1)[:, None] ** 2
-        gradient = np.zeros((m, nb))
-        gradient[:, 6:9] = weight[:, 6:9] * state.phi
-        gradient[:, 9:] = weight[:, 9:] * state.velocity[:, : nb - 9]
+    if nb > 6:
+        motion = np.hstack([state.phi, state.velocity[:, : nb - 9]])
+        weight = np.hstack([np.zeros((m, 6)), weights_of_motions(problem, motion)])
         H[: m * nb, : m * nb] += np.diag(weight.ravel())
-        g[: m * nb] += gradient.ravel()
+        g[: m * nb] += (weight * np.hstack([np.zeros((m, 6)), motion])).ravel()
     return H, g, np.concatenate([problem._free.ravel(), np.ones(sum(others), bool)])

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bundle_scenes import dense_system, gradients, make_scene, perturbed, scaled, unit_steps
+from bundle_scenes import dense_system, gradients, make_scene, perturbed, scaled, unit_steps, weights_of_motions
 from numpy_reference import project
 
 from rsundistort import BundleOptions, Camera, Observations, Reconstruction, bundle_adjust
@@ -44,28 +44,27 @@ def whole_system(problem, state):
     first = m * nb + 3 * problem._start.num_points
     place = np.concatenate([np.arange(first), *(first + c * nc + np.arange(nr) for c in range(cameras))])
     J, res = np.zeros((6 * (m + cameras), first + cameras * nc)), np.zeros(6 * (m + cameras))
-    span = problem._start.frame_span()
+    span, motion = problem._start.frame_span(), np.hstack([state.phi, state.velocity])
+    T, own = np.zeros((m, 6, 6)), motion.copy()
+    for i in np.flatnonzero(problem._start.camera_idx == 0):
+        T[i, :3, :3], T[i, 3:, 3:] = np.eye(3) / span[i], problem._start.R_cw[i].T / span[i]
+        own[i] -= T[i] @ state.means[0]
+    sqrt_weight = np.sqrt(weights_of_motions(problem, own))
     for i in range(m):
         rows = slice(6 * i, 6 * i + 6)
-        sqrt_weight = np.repeat(span[i] / np.array([0.03, 0.1]), 3)
-        J[rows, i * nb + 6 : i * nb + 12] = np.diag(sqrt_weight)
-        motion = np.concatenate([state.phi[i], state.velocity[i]])
+        J[rows, i * nb + 6 : i * nb + 12] = np.diag(sqrt_weight[i])
         if problem._start.camera_idx[i] == 0:
-            T = np.zeros((6, 6))
-            T[:3, :3], T[3:, 3:] = np.eye(3) / span[i], problem._start.R_cw[i].T / span[i]
-            J[rows, first + nr : first + nc] = -sqrt_weight[:, None] * T
-            motion = motion - T @ state.means[0]
-        res[rows] = sqrt_weight * motion
+            J[rows, first + nr : first + nc] = -sqrt_weight[i][:, None] * T[i]
+        res[rows] = sqrt_weight[i] * own[i]
     for c in range(cameras):
         rows = slice(6 * (m + c), 6 * (m + c) + 6)
         J[rows, first + c * nc + nr : first + (c + 1) * nc] = np.diag(1 / np.array(MEANS))
         res[rows] = state.means[c] / MEANS
     wide, gradient = J.T @ J, J.T @ res
     # the dense system has the priors of motions without means already
-    weight = np.zeros((m, nb))
-    weight[:, 6:9], weight[:, 9:12] = (span / 0.03)[:, None] ** 2, (span / 0.1)[:, None] ** 2
+    weight = np.hstack([np.zeros((m, 6)), weights_of_motions(problem, motion)])
     H[: m * nb, : m * nb] -= np.diag(weight.ravel())
-    g[: m * nb] -= (weight * np.hstack([np.zeros((m, 6)), state.phi, state.velocity])).ravel()
+    g[: m * nb] -= (weight * np.hstack([np.zeros((m, 6)), motion])).ravel()
     wide[np.ix_(place, place)] += H
     gradient[place] += g
     return wide, gradient, np.concatenate([free[:first], np.ones(cameras * nc, bool)])
@@ -81,7 +80,7 @@ def test_means_join_the_system(damping, factor_limit, refine, rng):
     D = np.zeros(len(H))
     m, nb = problem._free.shape
     first, nc, nr = m * nb + 3 * problem._start.num_points, len(refine) + 6, len(refine)
-    D[:first] = seen[:first]  # means are not damped: their priors hold them
+    D[:first] = np.diag(H)[:first]  # means are not damped: their priors hold them
     for c in range(2):
         D[first + c * nc : first + c * nc + nr] = seen[first + c * nr : first + (c + 1) * nr]
     damped = H + damping * np.diag(D)

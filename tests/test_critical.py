@@ -256,7 +256,7 @@ def test_shape_of_a_global_shutter_is_not_in_question(rng):
 @pytest.mark.parametrize("name", ["parallel", "one portrait, read by columns"])
 def test_auto_finds_the_photo_that_did_not_move(name, rng):
     still = 5  # the portrait photo itself in the second set
-    _, result, options = adjusted(named_scene(name, num_points=300), rng, still, model="two-step")
+    _, result, options = adjusted(named_scene(name, num_points=600), rng, still, model="two-step")
     probability = still_probability(result)
     assert probability[still] > 0.9
     assert np.delete(probability, still).max() < 0.5

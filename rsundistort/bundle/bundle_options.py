@@ -72,9 +72,10 @@ class BundleOptions:
     min_sigma_px : float
         Lower limit of that estimate.
     phi_sigma : float or None
-        Standard deviation of the zero-mean prior on each component of phi, in radians per frame. None: estimated with
-        the solution (empirical Bayes, `sigma^2 <- mean(phi^2 + posterior variance of phi)` after each solve), so that a
-        shutter that is hardly observable is not fitted to noise.
+        Standard deviation of the normal, zero-mean prior on each component of phi, in radians per frame. None: the
+        prior is Student's t with four degrees of freedom (`motion_prior`), and its scale is estimated with the solution
+        (empirical Bayes, the weighted mean of `phi^2 + posterior variance of phi` after each solve), so that a shutter
+        that is hardly observable is not fitted to noise, and that a photo which moved far more does not bend the rest.
     phi_sigma_start : float
         Start of that estimate; about the rotation of a swung hand.
     velocity_sigma, velocity_sigma_start : float or None, float

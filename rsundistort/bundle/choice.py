@@ -42,7 +42,7 @@ _RESTLESS = 49
 # Two halves of a scene must show the same motions: what they have in common exceeds their difference. (Warped photos:
 # 0.98 and more; a camera without rolling shutter: 0.1 to 0.5.)
 _MIN_AGREEMENT = 0.5
-# Motions that displace pixels by less than this, in half of the photos, count as none.
+# Motions that displace pixels by less than this, root mean square over the photos, count as none.
 _UNSEEN_PX = 0.5
 # Share of the limit of a prior standard deviation: an estimate this near would be larger without the limit.
 _AT_LIMIT = 0.99
@@ -99,7 +99,8 @@ class ModelChoice:
         determined.
     rival : float
         Of rotations: by how much a velocity that predicts the held-out measurements as well displaces the photos
-        otherwise, in the median, over what the rotations displace them by. 0 where no velocity does as well.
+        otherwise, in the median, over what the rotations displace them by. 0 where no velocity does as well, and where
+        that is less than half a pixel.
     """
 
     shutter_model: str
@@ -473,7 +474,7 @@ def choose_model(
     plain, best, kept, gain = selection.plain, selection.best, selection.kept, selection.gain
     against, agreement = selection.against if best is plain else [], None
     if best is not plain:
-        if np.median(moved_px(best.reconstruction)) < _UNSEEN_PX:
+        if np.sqrt(np.mean(moved_px(best.reconstruction) ** 2)) < _UNSEEN_PX:
             best = plain
         else:
             against, agreement = _doubts(fits, best, plain, gain)
@@ -524,7 +525,7 @@ def _rival(fits: _Fits, best: _Fit) -> float:
         if fit.model == "constant-motion" and not fits.is_better(fit, best):
             other, valid = shutter_displacements(fit.reconstruction)
             apart, size = (np.median(np.linalg.norm(each[seen & valid], axis=1)) for each in (other - own, own))
-            shares.append(float(apart / max(size, 1e-9)))
+            shares.append(float(apart / max(size, 1e-9)) if apart >= _UNSEEN_PX else 0.0)
     return max(shares)
 
 

@@ -95,6 +95,11 @@ class Posterior:
         return motion + step[:, own], covariances[:, own[:, None], own]
 
     @property
+    def tails(self) -> Array:
+        """By how much the prior draws each photo's rotation and velocity more than a normal one (m, 0 to 2)."""
+        return self._problem.tails(self._state)
+
+    @property
     def bend_sigmas(self) -> Array:
         """(k,) prior standard deviations of the coefficients of the bends: radians, then world units."""
         return self._problem.layout.per_bend(self._sigmas.bends, self._sigmas.ways)

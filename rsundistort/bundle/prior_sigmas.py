@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..model import Reconstruction
 from .bundle_options import BundleOptions
 from .layout import Layout
+from .motion_prior import tail_weight
 from .path_prior import PathPrior
 
 __all__ = [
@@ -109,6 +110,20 @@ def _prior_sigma(
     return float(np.clip(np.sqrt(seen / known), sigma / _LARGEST_CHANGE, sigma * _LARGEST_CHANGE))
 
 
+def _scale(values: NDArray[np.float64], variance: NDArray[np.float64], sigma: float) -> float:
+    """Scale of the prior with heavy tails of motions (m, 3) with posterior variances (m, 3), per frame.
+
+    As `_prior_sigma`, which weighs all photos the same.
+    """
+    free = variance > 0
+    if not free.any():
+        return 0.0
+    weight = tail_weight(np.where(free, values**2 + variance, 0.0).sum(1) / sigma**2, free.sum(1))[:, None]
+    seen, unknown = (float(np.broadcast_to(weight * each, free.shape)[free].mean()) for each in (values**2, variance))
+    known = max(1.0 - unknown / sigma**2, 1e-3)
+    return float(np.clip(np.sqrt(seen / known), sigma / _LARGEST_CHANGE, sigma * _LARGEST_CHANGE))
+
+
 class Common(NamedTuple):
     """Means of the motions of photos (m, 6), their variances, and their covariances with the motions.
 
@@ -137,9 +152,9 @@ def estimated(
     phi, velocity, focal, centre = sigmas.phi, sigmas.velocity, sigmas.focal, sigmas.centre
     means = sigmas.means
     if options.phi_sigma is None and own.shape[1] > 0:
-        phi = _prior_sigma(own[:, :3], own_variances[:, :3], ones, sigmas.phi) + _MIN_SIGMA
+        phi = _scale(own[:, :3], own_variances[:, :3], sigmas.phi) + _MIN_SIGMA
     if options.velocity_sigma is None and own.shape[1] > 3:
-        velocity = _prior_sigma(own[:, 3:], own_variances[:, 3:], ones, sigmas.velocity) + _MIN_SIGMA * current.baseline
+        velocity = _scale(own[:, 3:], own_variances[:, 3:], sigmas.velocity) + _MIN_SIGMA * current.baseline
     if common is not None:
         means = _mean_sigmas(common, velocity, sigmas.means, current)
     if options.varying:

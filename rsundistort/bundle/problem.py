@@ -26,6 +26,7 @@ from .known_lengths import LengthResiduals
 from .known_positions import KnownPlaces, PlaceResiduals
 from .layout import Layout
 from .lens_field import LensFields
+from .motion_prior import MotionPrior
 from .normal_equations import Marginals, NormalEquations, Step
 from .path_prior import PathPrior, PathState
 from .point_terms import PointTerms
@@ -136,10 +137,7 @@ class BundleProblem:
         self._field_weight = sigmas.field**-2.0 if options.residual_field else 0.0
         self._refine_codes = np.array([INTRINSICS[name] for name in options.refine], np.int64)
         span = reconstruction.frame_span()[:, None]
-        weight = [np.repeat((span[:, 0] / s)[:, None] ** 2, 3, axis=1) for s in self._motion_sigmas(sigmas)]
-        self._motion_weight = np.hstack(weight)[:, : self._block - 6]
-        if self._path is not None:  # which says it all
-            self._motion_weight = np.zeros_like(self._motion_weight)
+        self._motion_prior = MotionPrior.of(reconstruction, options, sigmas.phi, sigmas.velocity, self._block - 6)
         varied = np.array([sigmas.focal, sigmas.centre, sigmas.centre])[: 3 * options.varying] ** -2.0
         of_bends = self.layout.per_bend(sigmas.bends, sigmas.ways) ** -2.0
         self._own_weight = np.tile(np.concatenate([varied, of_bends]), (len(span), 1))
@@ -166,18 +164,11 @@ class BundleProblem:
         shares = self._free[:, 6:12] & ~(few | limited)[:, None]
         return MotionMeans.of(start, sigmas.means, shares) if shares.any() else None
 
-    def _motion_sigmas(self, sigmas: PriorSigmas) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Standard deviations (m,) of the priors on phi and velocity, per frame, no wider than a photo's own limit."""
-        limits = self._options.phi_limits
-        most = np.array([limits.get(name, np.inf) for name in self._start.image_names])
-        depths = [self._start.median_depth(i) if np.isfinite(each) else 1.0 for i, each in enumerate(most)]
-        return np.minimum(most, sigmas.phi), np.minimum(most * depths, sigmas.velocity)
-
     def _known_motions(self, span: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Motions (m, nb - 6) known from elsewhere, per unit of the clock, and their weights."""
         if self._options.path is not None:
             return self._options.path.known_rates(self._start.image_names)
-        known, weight = np.zeros((2, *self._motion_weight.shape))
+        known, weight = np.zeros((2, self._start.num_images, self._block - 6))
         for name, (phi, sigma) in self._options.known_phi.items():
             i = self._photo(name)
             if self._block > 6:
@@ -252,7 +243,7 @@ class BundleProblem:
         if self._means is None:
             means = np.zeros((len(cameras), 0))
         elif means is None:
-            means = self._means.most_likely(self._motion_weight, motion, len(cameras))
+            means = self._means.most_likely(self._motion_prior.precision, motion, len(cameras))
         return State(
             cameras, start.R_cw, start.center_w, motion[:, :3], motion[:, 3:], variation, bend, start.points_w, means,
             path,
@@ -339,6 +330,14 @@ class BundleProblem:
         motion = self._motion(state)
         return motion if self._means is None else motion - self._means.at(state.means)
 
+    def _motion_weight(self, state: State) -> NDArray[np.float64]:
+        """(m, nb - 6) weights of the prior on what each photo's motion has of its own."""
+        return self._motion_prior.weight(self._own_motion(state))
+
+    def tails(self, state: State) -> NDArray[np.float64]:
+        """`MotionPrior.tails` of rotations and velocities, (m, 0 to 2)."""
+        return self._motion_prior.tails(self._own_motion(state))
+
     def _own(self, state: State) -> NDArray[np.float64]:
         """(m, k) unknowns behind those: variation and bends."""
         return np.hstack([state.variation[:, : 3 * self._options.varying], state.bend])
@@ -348,7 +347,7 @@ class BundleProblem:
         lengths = float(np.sum(self._lengths.residuals(state.points_w) ** 2))
         varied = float(np.sum(self._own_weight * self._own(state) ** 2))
         lengths += 2.0 * self._places.cost(state.center_w, state.points_w)
-        own = float(np.sum(self._motion_weight * self._own_motion(state) ** 2 + known)) + varied
+        own = 2.0 * self._motion_prior.cost(self._own_motion(state)) + float(known.sum()) + varied
         if self._path is not None and state.path is not None:
             own += 2.0 * self._path.cost(state.R_cw, state.center_w, state.path)
         return 0.5 * (own + lengths) + self._camera_priors(state)[2]
@@ -370,7 +369,7 @@ class BundleProblem:
             total += 0.5 * self._field_weight * float((values**2).sum())
         if self._means is not None:
             weight_of_means = np.broadcast_to(self._means.sigmas**-2.0, state.means.shape)
-            pull = self._means.pull(self._motion_weight, self._motion(state), state.means)
+            pull = self._means.pull(self._motion_weight(state), self._motion(state), state.means)
             diagonal = np.hstack([diagonal, weight_of_means])
             gradient = np.hstack([gradient, weight_of_means * state.means + pull])
             total += 0.5 * float((weight_of_means * state.means**2).sum())
@@ -427,8 +426,9 @@ class BundleProblem:
         prior_gradient = np.zeros_like(prior_diag)
         motion = self._motion(state)
         moving, own = np.s_[:, 6 : self._block], np.s_[:, self._block :]
-        prior_diag[moving] = self._motion_weight + self._known_weight
-        prior_gradient[moving] = self._motion_weight * self._own_motion(state)
+        motion_weight = self._motion_weight(state)
+        prior_diag[moving] = motion_weight + self._known_weight
+        prior_gradient[moving] = motion_weight * self._own_motion(state)
         prior_gradient[moving] += self._known_weight * (motion - self._known)
         prior_diag[:, 3:6], prior_gradient[:, 3:6] = self._places.on_photos(state.center_w)
         prior_diag[own] = self._own_weight
@@ -440,7 +440,7 @@ class BundleProblem:
         if self._means is not None:
             border = replace(border, J=np.pad(border.J, ((0, 0), (0, 0), (0, 6))))
             around = (0, 0), (6, self.layout.size - 12)
-            common = CommonPrior(np.pad(self._motion_weight, around), np.pad(self._means.directions, (*around, (0, 0))))
+            common = CommonPrior(np.pad(motion_weight, around), np.pad(self._means.directions, (*around, (0, 0))))
         if self._path is not None and state.path is not None:
             moves = self._start.camera_idx[self._structure.frame_idx]
             rates = state.path.rates[self._structure.frame_idx]

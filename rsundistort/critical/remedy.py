@@ -133,7 +133,8 @@ def still_probability(result: BundleResult, options: BundleOptions | None = None
     inside = np.linalg.inv(covariance)
     mean, phi_sigma, velocity_sigma = _expected(result)
     mean = np.hstack([mean[:, :steady], np.zeros((m, len(bends)))])
-    own = precision(phi_sigma, np.maximum(velocity_sigma, 1e-300), bends)
+    tails = np.pad(freed.tails, ((0, 0), (0, 2 - freed.tails.shape[1])), constant_values=1.0) ** -0.5
+    own = precision(phi_sigma * tails[:, 0], np.maximum(velocity_sigma * tails[:, 1], 1e-300), bends)
     pull = np.einsum("mij,mj->mi", inside, motion) - np.einsum("mij,mj->mi", own, mean)
     value, vector = np.linalg.eigh(inside - own)  # nothing where nothing else is known
     inside = np.einsum("mij,mj,mkj->mik", vector, np.maximum(value, 0.0), vector)

@@ -1,0 +1,87 @@
+"""The prior of what each photo's motion has of its own: Student's t, since hands hold still, and sometimes jerk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model import Reconstruction
+from .bundle_options import BundleOptions
+
+__all__ = ["MotionPrior", "tail_weight"]
+
+Array = NDArray[np.float64]
+
+# Degrees of freedom. Under a normal prior of an estimated width one photo that jerked draws all others the other way,
+# by what photos hardly show of the motion that they share. Of eight photos, a mean that only the prior decides is wrong
+# by 1.06 times as much as with a normal prior if motions are normal, and by 0.1 to 0.6 times if some moved more.
+_FREEDOM = 4.0
+
+
+def tail_weight(square: Array, num: int | NDArray[np.int64] = 3) -> Array:
+    """Weights of normal priors that pull as Student's t does.
+
+    Parameters
+    ----------
+    square : (...) array
+        Squared deviations in units of the scale, summed over `num` components.
+    """
+    weight: Array = (_FREEDOM + num) / (_FREEDOM + square)
+    return weight
+
+
+@dataclass(frozen=True)
+class MotionPrior:
+    """Priors on rotations, and on velocities, of photos beside the mean; their three components are one deviation.
+
+    Attributes
+    ----------
+    precision : (m, k) array
+        Of the scale, per unit of the clock; k is 0, 3 or 6.
+    has_tails : (m, k / 3) bool array
+        Whether the prior is Student's t; else it is normal.
+    """
+
+    precision: Array
+    has_tails: NDArray[np.bool_]
+
+    @classmethod
+    def of(
+        cls, reconstruction: Reconstruction, options: BundleOptions, phi_sigma: float, velocity_sigma: float, num: int
+    ) -> MotionPrior:
+        """Those of `num` unknowns of a photo, of standard deviations per frame, no wider than a photo's own limit.
+
+        A standard deviation that is given is that of a normal prior, and so is the prior of a photo with a limit.
+        """
+        m = reconstruction.num_images
+        if options.path is not None:  # which says it all
+            return cls(np.zeros((m, num)), np.zeros((m, num // 3), bool))
+        most = np.array([options.phi_limits.get(name, np.inf) for name in reconstruction.image_names])
+        depths = [reconstruction.median_depth(i) if np.isfinite(each) else 1.0 for i, each in enumerate(most)]
+        sigmas = np.minimum(np.stack([most, most * depths], axis=1), [phi_sigma, velocity_sigma])
+        estimated = np.array([options.phi_sigma is None, options.velocity_sigma is None])
+        precision = np.repeat((reconstruction.frame_span()[:, None] / sigmas) ** 2, 3, axis=1)
+        has_tails = estimated & np.isinf(most)[:, None]  # a limit has none beyond it
+        return cls(precision[:, :num], has_tails[:, : num // 3])
+
+    def tails(self, own: Array) -> Array:
+        """(m, k / 3) by which the prior draws deviations (m, k) from the mean more than a normal one of its scale."""
+        return np.where(self.has_tails, tail_weight(self._squares(own)), 1.0)
+
+    def weight(self, own: Array) -> Array:
+        """Weights (m, k) that draw deviations (m, k) from the mean as the prior does."""
+        value: Array = self.precision * np.repeat(self.tails(own), 3, axis=1)
+        return value
+
+    def cost(self, own: Array) -> float:
+        """Minus the log of the density of deviations (m, k), but for a constant."""
+        square = self._squares(own)
+        tails = (_FREEDOM + 3) * np.log1p(square / _FREEDOM)
+        return 0.5 * float(np.where(self.has_tails, tails, square).sum())
+
+    def _squares(self, own: Array) -> Array:
+        """(m, k / 3) in units of the scale."""
+        value: Array = (self.precision * own**2).reshape(len(own), -1, 3).sum(axis=2)
+        return value

@@ -1,0 +1,79 @@
+"""The prior of what each photo's motion has of its own: Student's t, which one photo that jerked does not bend."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bundle_scenes import make_scene
+from critical_scenes import named_scene
+from numpy_reference import project
+from scipy.stats import multivariate_t
+
+from rsundistort import BundleOptions, Observations, bundle_adjust
+from rsundistort.bundle.motion_prior import MotionPrior
+
+# thousands of calls on problems this small wait for threads longer than they compute
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+PHI_SIGMA, VELOCITY_SIGMA = 0.02, 0.1
+
+
+def prior_of(rng, options=None, num=6):
+    scene = make_scene(rng, "constant-motion")
+    return scene, MotionPrior.of(scene, options or BundleOptions(), PHI_SIGMA, VELOCITY_SIGMA, num)
+
+
+def test_cost_is_that_of_students_t_and_the_weights_are_its_slope(rng):
+    scene, prior = prior_of(rng)
+    span = scene.frame_span()[:, None]
+    per_frame = np.repeat([PHI_SIGMA, VELOCITY_SIGMA], 3)
+    one, other = (scale * rng.normal(size=(scene.num_images, 6)) * per_frame / span for scale in (1.0, 5.0))
+    densities = [multivariate_t(np.zeros(3), sigma**2 * np.eye(3), df=4) for sigma in (PHI_SIGMA, VELOCITY_SIGMA)]
+
+    def minus_log(own):
+        return -sum(density.logpdf(span * own[:, 3 * k : 3 * k + 3]).sum() for k, density in enumerate(densities))
+
+    assert prior.cost(other) - prior.cost(one) == pytest.approx(minus_log(other) - minus_log(one), rel=1e-10)
+    slope = prior.weight(other) * other
+    for i, k in ((0, 1), (3, 5)):
+        step = np.zeros_like(other)
+        step[i, k] = 1e-6 * abs(other[i, k])
+        ahead, behind = prior.cost(other + step), prior.cost(other - step)
+        assert slope[i, k] == pytest.approx((ahead - behind) / (2 * step[i, k]), rel=1e-5)
+
+
+def test_what_is_given_or_limited_is_normal(rng):
+    scene, prior = prior_of(rng, BundleOptions(phi_sigma=PHI_SIGMA, phi_limits={"2.jpg": 0.001}))
+    own = rng.normal(size=(scene.num_images, 6))
+    square = (prior.precision[:, :3] * own[:, :3] ** 2).sum()
+    tailless = prior.cost(np.hstack([own[:, :3], np.zeros_like(own[:, :3])]))
+    assert tailless == pytest.approx(0.5 * square, rel=1e-12)
+    np.testing.assert_allclose(prior.weight(own)[:, :3], prior.precision[:, :3], rtol=1e-15)
+    np.testing.assert_allclose(prior.weight(own)[2], prior.precision[2], rtol=1e-15)
+    assert (prior.weight(own)[[0, 1, 3, 4, 5], 3:] < prior.precision[[0, 1, 3, 4, 5], 3:]).all()
+
+
+def test_a_photo_that_jerked_does_not_draw_the_others_the_other_way(rng):
+    # level cameras hardly show a rotation about x that all share, so it is the prior that draws it to zero
+    scene = named_scene("parallel", num_points=200)
+    m, span, obs = scene.num_images, scene.frame_span(), scene.observations
+    phi = rng.normal(0, 3e-4, (m, 3))
+    phi[2] = 0.08, 0.02, -0.03
+    xy = np.empty_like(obs.xy_raw)
+    for i in range(m):
+        mine, camera = obs.frame_idx == i, scene.camera(i)
+        xy[mine] = project(
+            scene.points_w[obs.point_idx[mine]], scene.R_cw[i], scene.center_w[i], phi[i] / span[i], "rotation",
+            camera.readout, camera.K, [], np.zeros(3),
+        )  # fmt: skip
+    xy += rng.normal(0, 0.3, xy.shape)
+    start = replace(scene, observations=Observations(obs.frame_idx, obs.point_idx, xy))
+    found = bundle_adjust(start, "rotation", BundleOptions(loss="squared", outlier_rounds=0, sigma_px=0.3))
+    off = found.reconstruction.phi * span[:, None] - phi
+    assert np.abs(off).max() < 1e-3
+    # with a normal prior all photos take part of the rotation of the one
+    normal = BundleOptions(loss="squared", outlier_rounds=0, sigma_px=0.3, phi_sigma=float(np.sqrt((phi**2).mean())))
+    drawn = bundle_adjust(start, "rotation", normal).reconstruction.phi * span[:, None] - phi
+    assert np.abs(drawn[:, 0].mean()) > 5 * np.abs(off[:, 0].mean())
