@@ -12,6 +12,8 @@ from rsundistort import BundleOptions, Camera, Observations, Reconstruction
 from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
 
+# Of Student's t, four degrees of freedom and three components, by its weights.
+INFORMATION = 7 / 9
 LENS = [-0.12, 0.03, 0.001, -0.002]
 FISHEYE = Fisheye([0.05, -0.02, 0.01, -0.004])
 RATIONAL = [*LENS, 0.01, 0.05, -0.02, 0.01]
@@ -149,6 +151,6 @@ def dense_system(problem, state):
     if nb > 6:
         motion = np.hstack([state.phi, state.velocity[:, : nb - 9]])
         weight = np.hstack([np.zeros((m, 6)), weights_of_motions(problem, motion)])
-        H[: m * nb, : m * nb] += np.diag(weight.ravel())
+        H[: m * nb, : m * nb] += np.diag(INFORMATION * weight.ravel())
         g[: m * nb] += (weight * np.hstack([np.zeros((m, 6)), motion])).ravel()
     return H, g, np.concatenate([problem._free.ravel(), np.ones(sum(others), bool)])

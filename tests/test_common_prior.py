@@ -6,7 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bundle_scenes import dense_system, gradients, make_scene, perturbed, scaled, unit_steps, weights_of_motions
+from bundle_scenes import (
+    INFORMATION,
+    dense_system,
+    gradients,
+    make_scene,
+    perturbed,
+    scaled,
+    unit_steps,
+    weights_of_motions,
+)
 from numpy_reference import project
 
 from rsundistort import BundleOptions, Camera, Observations, Reconstruction, bundle_adjust
@@ -52,10 +61,11 @@ def whole_system(problem, state):
     sqrt_weight = np.sqrt(weights_of_motions(problem, own))
     for i in range(m):
         rows = slice(6 * i, 6 * i + 6)
-        J[rows, i * nb + 6 : i * nb + 12] = np.diag(sqrt_weight[i])
+        root = np.sqrt(INFORMATION) * sqrt_weight[i]
+        J[rows, i * nb + 6 : i * nb + 12] = np.diag(root)
         if problem._start.camera_idx[i] == 0:
-            J[rows, first + nr : first + nc] = -sqrt_weight[i][:, None] * T[i]
-        res[rows] = sqrt_weight[i] * own[i]
+            J[rows, first + nr : first + nc] = -root[:, None] * T[i]
+        res[rows] = sqrt_weight[i] * own[i] / np.sqrt(INFORMATION)  # the gradient's weight is the whole one
     for c in range(cameras):
         rows = slice(6 * (m + c), 6 * (m + c) + 6)
         J[rows, first + c * nc + nr : first + (c + 1) * nc] = np.diag(1 / np.array(MEANS))
@@ -63,7 +73,7 @@ def whole_system(problem, state):
     wide, gradient = J.T @ J, J.T @ res
     # the dense system has the priors of motions without means already
     weight = np.hstack([np.zeros((m, 6)), weights_of_motions(problem, motion)])
-    H[: m * nb, : m * nb] -= np.diag(weight.ravel())
+    H[: m * nb, : m * nb] -= np.diag(INFORMATION * weight.ravel())
     g[: m * nb] -= (weight * np.hstack([np.zeros((m, 6)), motion])).ravel()
     wide[np.ix_(place, place)] += H
     gradient[place] += g

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..model import Reconstruction
 from .bundle_options import BundleOptions
 
-__all__ = ["MotionPrior", "tail_weight"]
+__all__ = ["SIGMA_OF_SCALE", "MotionPrior", "tail_weight"]
 
 Array = NDArray[np.float64]
 
@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 # by what photos hardly show of the motion that they share. Of eight photos, a mean that only the prior decides is wrong
 # by 1.06 times as much as with a normal prior if motions are normal, and by 0.1 to 0.6 times if some moved more.
 _FREEDOM = 4.0
+#: Standard deviation of normal motions of which a scale of 1 is estimated.
+SIGMA_OF_SCALE = 1.15
 
 
 def tail_weight(square: Array, num: int | NDArray[np.int64] = 3) -> Array:
@@ -66,14 +68,20 @@ class MotionPrior:
         has_tails = estimated & np.isinf(most)[:, None]  # a limit has none beyond it
         return cls(precision[:, :num], has_tails[:, : num // 3])
 
-    def tails(self, own: Array) -> Array:
-        """(m, k / 3) by which the prior draws deviations (m, k) from the mean more than a normal one of its scale."""
-        return np.where(self.has_tails, tail_weight(self._squares(own)), 1.0)
-
     def weight(self, own: Array) -> Array:
         """Weights (m, k) that draw deviations (m, k) from the mean as the prior does."""
-        value: Array = self.precision * np.repeat(self.tails(own), 3, axis=1)
+        value: Array = self.precision * np.repeat(self._tails(own), 3, axis=1)
         return value
+
+    def informs(self, own: Array) -> Array:
+        """(m, k / 3) by how much more than a normal prior of its scale this one tells of a motion, or of the mean.
+
+        Student's t tells less than its weights say, by Fisher's information: the weights depend on what they weigh.
+        """
+        return np.where(self.has_tails, (_FREEDOM + 3) / (_FREEDOM + 5), 1.0) * self._tails(own)
+
+    def _tails(self, own: Array) -> Array:
+        return np.where(self.has_tails, tail_weight(self._squares(own)), 1.0)
 
     def cost(self, own: Array) -> float:
         """Minus the log of the density of deviations (m, k), but for a constant."""

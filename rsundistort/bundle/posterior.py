@@ -95,9 +95,9 @@ class Posterior:
         return motion + step[:, own], covariances[:, own[:, None], own]
 
     @property
-    def tails(self) -> Array:
-        """By how much the prior draws each photo's rotation and velocity more than a normal one (m, 0 to 2)."""
-        return self._problem.tails(self._state)
+    def prior_information(self) -> Array:
+        """By how much more than a normal prior that of each photo's rotation and velocity tells of them (m, 0 to 2)."""
+        return self._problem.prior_information(self._state)
 
     @property
     def bend_sigmas(self) -> Array:

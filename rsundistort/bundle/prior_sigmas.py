@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..model import Reconstruction
 from .bundle_options import BundleOptions
 from .layout import Layout
-from .motion_prior import tail_weight
+from .motion_prior import SIGMA_OF_SCALE, tail_weight
 from .path_prior import PathPrior
 
 __all__ = [
@@ -179,7 +179,7 @@ def _mean_sigmas(
     prior; Kass and Wasserman, 1995), and less by the odds that these give against none: what they hardly show is
     halved, what they show stays.
     """
-    velocity, depth = _MUCH * velocity_sigma, _depth(current)
+    velocity, depth = _MUCH * SIGMA_OF_SCALE * velocity_sigma, _depth(current)
     sharing = np.flatnonzero(common.variances.any(1))
     if not len(sharing):
         return (*[velocity / depth] * 3, *[velocity] * 3)

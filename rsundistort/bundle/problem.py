@@ -334,9 +334,9 @@ class BundleProblem:
         """(m, nb - 6) weights of the prior on what each photo's motion has of its own."""
         return self._motion_prior.weight(self._own_motion(state))
 
-    def tails(self, state: State) -> NDArray[np.float64]:
-        """`MotionPrior.tails` of rotations and velocities, (m, 0 to 2)."""
-        return self._motion_prior.tails(self._own_motion(state))
+    def prior_information(self, state: State) -> NDArray[np.float64]:
+        """`MotionPrior.informs` of rotations and velocities, (m, 0 to 2)."""
+        return self._motion_prior.informs(self._own_motion(state))
 
     def _own(self, state: State) -> NDArray[np.float64]:
         """(m, k) unknowns behind those: variation and bends."""
@@ -426,9 +426,9 @@ class BundleProblem:
         prior_gradient = np.zeros_like(prior_diag)
         motion = self._motion(state)
         moving, own = np.s_[:, 6 : self._block], np.s_[:, self._block :]
-        motion_weight = self._motion_weight(state)
-        prior_diag[moving] = motion_weight + self._known_weight
-        prior_gradient[moving] = motion_weight * self._own_motion(state)
+        information = self._motion_prior.precision * np.repeat(self.prior_information(state), 3, axis=1)
+        prior_diag[moving] = information + self._known_weight
+        prior_gradient[moving] = self._motion_weight(state) * self._own_motion(state)
         prior_gradient[moving] += self._known_weight * (motion - self._known)
         prior_diag[:, 3:6], prior_gradient[:, 3:6] = self._places.on_photos(state.center_w)
         prior_diag[own] = self._own_weight
@@ -440,7 +440,7 @@ class BundleProblem:
         if self._means is not None:
             border = replace(border, J=np.pad(border.J, ((0, 0), (0, 0), (0, 6))))
             around = (0, 0), (6, self.layout.size - 12)
-            common = CommonPrior(np.pad(motion_weight, around), np.pad(self._means.directions, (*around, (0, 0))))
+            common = CommonPrior(np.pad(information, around), np.pad(self._means.directions, (*around, (0, 0))))
         if self._path is not None and state.path is not None:
             moves = self._start.camera_idx[self._structure.frame_idx]
             rates = state.path.rates[self._structure.frame_idx]
