@@ -257,7 +257,8 @@ def test_constant_motion_beats_no_shutter_model(four_trials):
         # least squares ends below the truth by half a unit for each unknown, fewer where the prior holds them
         unknowns = 12 * PHOTOS + 3 * POINTS - 7
         assert ours["true_cost"] - unknowns < ours["cost"] < ours["true_cost"]
-        assert 0.01 < ours["phi_sigma"] < 0.06
+        # angles of 0.05 about any axis: most components are far smaller, and the scale of Student's t is theirs
+        assert 0.006 < ours["phi_sigma"] < 0.06
         assert 0.02 < ours["velocity_sigma"] < 0.08
     for metric in ("rotation_deg", "translation", "structure"):
         blind, ours = (summary["tiny"][method][metric]["median"] for method in PAIR)

@@ -44,15 +44,28 @@ def test_cost_is_that_of_students_t_and_the_weights_are_its_slope(rng):
         assert slope[i, k] == pytest.approx((ahead - behind) / (2 * step[i, k]), rel=1e-5)
 
 
-def test_what_is_given_or_limited_is_normal(rng):
-    scene, prior = prior_of(rng, BundleOptions(phi_sigma=PHI_SIGMA, phi_limits={"2.jpg": 0.001}))
+def test_a_deviation_that_is_given_is_that_of_a_normal_prior(rng):
+    scene, prior = prior_of(rng, BundleOptions(phi_sigma=PHI_SIGMA))
     own = rng.normal(size=(scene.num_images, 6))
     square = (prior.precision[:, :3] * own[:, :3] ** 2).sum()
-    tailless = prior.cost(np.hstack([own[:, :3], np.zeros_like(own[:, :3])]))
-    assert tailless == pytest.approx(0.5 * square, rel=1e-12)
-    np.testing.assert_allclose(prior.weight(own)[:, :3], prior.precision[:, :3], rtol=1e-15)
-    np.testing.assert_allclose(prior.weight(own)[2], prior.precision[2], rtol=1e-15)
-    assert (prior.weight(own)[[0, 1, 3, 4, 5], 3:] < prior.precision[[0, 1, 3, 4, 5], 3:]).all()
+    of_phi = prior.cost(np.hstack([own[:, :3], np.zeros_like(own[:, :3])]))
+    assert of_phi == pytest.approx(0.5 * square, rel=1e-12)
+    for found in (prior.weight(own), prior.information(own)):
+        np.testing.assert_allclose(found[:, :3], prior.precision[:, :3], rtol=1e-15)
+        assert (found[:, 3:] < prior.precision[:, 3:]).all()
+
+
+def test_a_limit_has_no_tails(rng):
+    limit = 1e-3
+    scene, prior = prior_of(rng, BundleOptions(phi_limits={"2.jpg": limit}))
+    own = np.zeros((scene.num_images, 6))
+    span = scene.frame_span()[2]
+    own[2, 0], own[2, 4] = 20 * limit / span, 20 * limit * scene.median_depth(2) / span
+    assert prior.cost(own) > 2 * 0.5 * 20**2
+    weight = prior.weight(own)[2] * (limit / span) ** 2
+    assert (weight[:3] >= 1).all() and (weight[3:] * scene.median_depth(2) ** 2 >= 1).all()
+    others = prior.weight(np.zeros_like(own))[[0, 1, 3, 4, 5]]
+    np.testing.assert_allclose(others, 7 / 4 * prior.precision[[0, 1, 3, 4, 5]], rtol=1e-14)
 
 
 def test_a_photo_that_jerked_does_not_draw_the_others_the_other_way(rng):

@@ -42,42 +42,50 @@ class MotionPrior:
     ----------
     precision : (m, k) array
         Of the scale, per unit of the clock; k is 0, 3 or 6.
-    has_tails : (m, k / 3) bool array
+    limit : (m, k) array
+        Precision of what limits a motion besides, a normal density; 0 where nothing does.
+    has_tails : (k / 3,) bool array
         Whether the prior is Student's t; else it is normal.
     """
 
     precision: Array
+    limit: Array
     has_tails: NDArray[np.bool_]
 
     @classmethod
     def of(
         cls, reconstruction: Reconstruction, options: BundleOptions, phi_sigma: float, velocity_sigma: float, num: int
     ) -> MotionPrior:
-        """Those of `num` unknowns of a photo, of standard deviations per frame, no wider than a photo's own limit.
+        """Those of `num` unknowns of a photo, of standard deviations per frame, with the photos' own limits.
 
-        A standard deviation that is given is that of a normal prior, and so is the prior of a photo with a limit.
+        A standard deviation that is given is that of a normal prior.
         """
-        m = reconstruction.num_images
+        m, kinds = reconstruction.num_images, num // 3
         if options.path is not None:  # which says it all
-            return cls(np.zeros((m, num)), np.zeros((m, num // 3), bool))
+            return cls(np.zeros((m, num)), np.zeros((m, num)), np.zeros(kinds, bool))
         most = np.array([options.phi_limits.get(name, np.inf) for name in reconstruction.image_names])
         depths = [reconstruction.median_depth(i) if np.isfinite(each) else 1.0 for i, each in enumerate(most)]
-        sigmas = np.minimum(np.stack([most, most * depths], axis=1), [phi_sigma, velocity_sigma])
+        sigmas = np.full((m, 2), [phi_sigma, velocity_sigma]), np.stack([most, most * depths], axis=1)
+        span = reconstruction.frame_span()[:, None]
+        precision, limit = (np.repeat((span / each) ** 2, 3, axis=1)[:, :num] for each in sigmas)
         estimated = np.array([options.phi_sigma is None, options.velocity_sigma is None])
-        precision = np.repeat((reconstruction.frame_span()[:, None] / sigmas) ** 2, 3, axis=1)
-        has_tails = estimated & np.isinf(most)[:, None]  # a limit has none beyond it
-        return cls(precision[:, :num], has_tails[:, : num // 3])
+        return cls(precision, limit, estimated[:kinds])
 
     def weight(self, own: Array) -> Array:
         """Weights (m, k) that draw deviations (m, k) from the mean as the prior does."""
-        value: Array = self.precision * np.repeat(self._tails(own), 3, axis=1)
+        value: Array = self.precision * np.repeat(self._tails(own), 3, axis=1) + self.limit
         return value
 
-    def informs(self, own: Array) -> Array:
-        """(m, k / 3) by how much more than a normal prior of its scale this one tells of a motion, or of the mean.
+    def information(self, own: Array) -> Array:
+        """(m, k) what the prior tells of motions, or of their mean, at deviations (m, k).
 
         Student's t tells less than its weights say, by Fisher's information: the weights depend on what they weigh.
         """
+        value: Array = self.precision * np.repeat(self.informs(own), 3, axis=1) + self.limit
+        return value
+
+    def informs(self, own: Array) -> Array:
+        """(m, k / 3) information by that of a normal prior of the same scale, without limits."""
         return np.where(self.has_tails, (_FREEDOM + 3) / (_FREEDOM + 5), 1.0) * self._tails(own)
 
     def _tails(self, own: Array) -> Array:
@@ -87,7 +95,7 @@ class MotionPrior:
         """Minus the log of the density of deviations (m, k), but for a constant."""
         square = self._squares(own)
         tails = (_FREEDOM + 3) * np.log1p(square / _FREEDOM)
-        return 0.5 * float(np.where(self.has_tails, tails, square).sum())
+        return 0.5 * float(np.where(self.has_tails, tails, square).sum() + (self.limit * own**2).sum())
 
     def _squares(self, own: Array) -> Array:
         """(m, k / 3) in units of the scale."""

@@ -426,7 +426,7 @@ class BundleProblem:
         prior_gradient = np.zeros_like(prior_diag)
         motion = self._motion(state)
         moving, own = np.s_[:, 6 : self._block], np.s_[:, self._block :]
-        information = self._motion_prior.precision * np.repeat(self.prior_information(state), 3, axis=1)
+        information = self._motion_prior.information(self._own_motion(state))
         prior_diag[moving] = information + self._known_weight
         prior_gradient[moving] = self._motion_weight(state) * self._own_motion(state)
         prior_gradient[moving] += self._known_weight * (motion - self._known)
