@@ -12,6 +12,7 @@ from numpy_reference import project
 from scipy.stats import multivariate_t
 
 from rsundistort import BundleOptions, Observations, bundle_adjust
+from rsundistort.bundle import choose_model
 from rsundistort.bundle.motion_prior import MotionPrior
 
 # thousands of calls on problems this small wait for threads longer than they compute
@@ -63,30 +64,44 @@ def test_a_limit_has_no_tails(rng):
     own[2, 0], own[2, 4] = 20 * limit / span, 20 * limit * scene.median_depth(2) / span
     assert prior.cost(own) > 2 * 0.5 * 20**2
     weight = prior.weight(own)[2] * (limit / span) ** 2
-    assert (weight[:3] >= 1).all() and (weight[3:] * scene.median_depth(2) ** 2 >= 1).all()
+    assert (weight[:3] >= 1).all()
+    assert (weight[3:] * scene.median_depth(2) ** 2 >= 1).all()
     others = prior.weight(np.zeros_like(own))[[0, 1, 3, 4, 5]]
     np.testing.assert_allclose(others, 7 / 4 * prior.precision[[0, 1, 3, 4, 5]], rtol=1e-14)
+
+
+def measured(scene, phi, rng, noise_px=0.3):
+    """The scene as photos show it that rotated by phi (m, 3), radians per frame; without motions or poses known."""
+    obs = scene.observations
+    xy = np.empty_like(obs.xy_raw)
+    for i, span in enumerate(scene.frame_span()):
+        mine, camera = obs.frame_idx == i, scene.camera(i)
+        xy[mine] = project(
+            scene.points_w[obs.point_idx[mine]], scene.R_cw[i], scene.center_w[i], phi[i] / span, "rotation",
+            camera.readout, camera.K, [], np.zeros(3),
+        )  # fmt: skip
+    xy += rng.normal(0, noise_px, xy.shape)
+    return replace(scene, observations=Observations(obs.frame_idx, obs.point_idx, xy))
 
 
 def test_a_photo_that_jerked_does_not_draw_the_others_the_other_way(rng):
     # level cameras hardly show a rotation about x that all share, so it is the prior that draws it to zero
     scene = named_scene("parallel", num_points=200)
-    m, span, obs = scene.num_images, scene.frame_span(), scene.observations
-    phi = rng.normal(0, 3e-4, (m, 3))
+    span, phi = scene.frame_span()[:, None], rng.normal(0, 3e-4, (scene.num_images, 3))
     phi[2] = 0.08, 0.02, -0.03
-    xy = np.empty_like(obs.xy_raw)
-    for i in range(m):
-        mine, camera = obs.frame_idx == i, scene.camera(i)
-        xy[mine] = project(
-            scene.points_w[obs.point_idx[mine]], scene.R_cw[i], scene.center_w[i], phi[i] / span[i], "rotation",
-            camera.readout, camera.K, [], np.zeros(3),
-        )  # fmt: skip
-    xy += rng.normal(0, 0.3, xy.shape)
-    start = replace(scene, observations=Observations(obs.frame_idx, obs.point_idx, xy))
-    found = bundle_adjust(start, "rotation", BundleOptions(loss="squared", outlier_rounds=0, sigma_px=0.3))
-    off = found.reconstruction.phi * span[:, None] - phi
+    start, options = measured(scene, phi, rng), BundleOptions(loss="squared", outlier_rounds=0, sigma_px=0.3)
+    off = bundle_adjust(start, "rotation", options).reconstruction.phi * span - phi
     assert np.abs(off).max() < 1e-3
     # with a normal prior all photos take part of the rotation of the one
-    normal = BundleOptions(loss="squared", outlier_rounds=0, sigma_px=0.3, phi_sigma=float(np.sqrt((phi**2).mean())))
-    drawn = bundle_adjust(start, "rotation", normal).reconstruction.phi * span[:, None] - phi
+    normal = replace(options, phi_sigma=float(np.sqrt((phi**2).mean())))
+    drawn = bundle_adjust(start, "rotation", normal).reconstruction.phi * span - phi
     assert np.abs(drawn[:, 0].mean()) > 5 * np.abs(off[:, 0].mean())
+
+
+def test_a_shutter_that_one_photo_shows_is_found(rng):
+    scene = named_scene("random", num_points=300)
+    phi = rng.normal(0, 3e-4, (scene.num_images, 3))
+    phi[4] = 0.03, -0.04, 0.05
+    choice = choose_model(measured(scene, phi, rng), options=BundleOptions(), sigma_px=0.3)
+    assert (choice.shutter, choice.shutter_model) == ("found", "rotation")
+    assert choice.rival == 0.0

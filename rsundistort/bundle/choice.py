@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import SHUTTER_MODELS, Observations, Reconstruction, other_axis
-from ..model.reprojection import reprojection_residuals, shutter_displacements
+from ..model.reprojection import reprojection_residuals, shutter_displacements, typical_px
 from .adjust import MODEL_SEQUENCE, bundle_adjust, objective
 from .bundle_options import BundleOptions
 from .prior_sigmas import PriorSigmas
@@ -99,8 +99,8 @@ class ModelChoice:
         determined.
     rival : float
         Of rotations: by how much a velocity that predicts the held-out measurements as well displaces the photos
-        otherwise, in the median, over what the rotations displace them by. 0 where no velocity does as well, and where
-        that is less than half a pixel.
+        otherwise (the mean over the photos of their medians) over what the rotations displace them by. 0 where no
+        velocity does as well, and where that is less than half a pixel.
     """
 
     shutter_model: str
@@ -524,7 +524,7 @@ def _rival(fits: _Fits, best: _Fit) -> float:
     for fit in fits.done.values():
         if fit.model == "constant-motion" and not fits.is_better(fit, best):
             other, valid = shutter_displacements(fit.reconstruction)
-            apart, size = (np.median(np.linalg.norm(each[seen & valid], axis=1)) for each in (other - own, own))
+            apart, size = (typical_px(best.reconstruction, each, seen & valid) for each in (other - own, own))
             shares.append(float(apart / max(size, 1e-9)) if apart >= _UNSEEN_PX else 0.0)
     return max(shares)
 

@@ -22,6 +22,7 @@ __all__ = [
     "plain_arrays",
     "reprojection_residuals",
     "shutter_displacements",
+    "typical_px",
 ]
 
 
@@ -104,3 +105,13 @@ def shutter_displacements(reconstruction: Reconstruction) -> tuple[NDArray[np.fl
     moving, valid = reprojection_residuals(reconstruction)
     still, valid_still = reprojection_residuals(reconstruction, "global")
     return moving - still, valid & valid_still
+
+
+def typical_px(reconstruction: Reconstruction, displacements: NDArray[np.float64], valid: NDArray[np.bool_]) -> float:
+    """Mean over the photos of the median length of displacements (o, 2): few photos may be all that moved.
+
+    Only measurements that are `valid` (o,) count.
+    """
+    px = np.linalg.norm(displacements, axis=1)
+    photos = [mine[valid[mine]] for mine in reconstruction.observations.by_photo(reconstruction.num_images)]
+    return float(np.mean([np.median(px[mine]) for mine in photos if len(mine)] or [0.0]))
