@@ -1,4 +1,4 @@
-"""The matches that fit the poses of a reconstruction, and the photos that contradict the others."""
+"""The matches that fit the poses and motions of a reconstruction, and the photos that contradict the others."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..colmap.conventions import quiet_pycolmap
 from ..model import Reconstruction
-from ..model.projection import unproject_points
+from ..model.projection import clock_of, unproject_points
 from .database import MatchedPhotos
 
 __all__ = [
@@ -35,7 +35,7 @@ _LEAST_SHARE = 0.5
 
 
 class FreedMatches:
-    """Matches under a reconstruction: rays without lens and shutter.
+    """Matches under a reconstruction: rays without lens and shutter, from where the camera was when it read them.
 
     Parameters
     ----------
@@ -50,6 +50,7 @@ class FreedMatches:
         self.posed = np.array([index_of.get(name, -1) for name in matched.names])
         self._matched, self._rec = matched, reconstruction
         self._rays: dict[int, NDArray[np.float64]] = {}
+        self._centers: dict[int, NDArray[np.float64]] = {}
 
     def _rays_of(self, photo: int) -> NDArray[np.float64]:
         if photo not in self._rays:
@@ -60,6 +61,20 @@ class FreedMatches:
             self._rays[photo] = np.column_stack([np.where(valid[:, None], xy, np.nan), np.ones(len(xy))])
         return self._rays[photo]
 
+    def _centers_of(self, photo: int) -> NDArray[np.float64]:
+        """(n, 3) where the camera was, or (3,) if it did not travel."""
+        if photo not in self._centers:
+            rec, i = self._rec, int(self.posed[photo])
+            center, motion = rec.center_w[i], rec.motion(i)
+            if rec.shutter_model == "constant-motion" and motion.moves:
+                center = center + motion.at(clock_of(rec.camera(i), self._matched.features[photo].xy_raw))[1]
+            self._centers[photo] = center
+        return self._centers[photo]
+
+    def _centers_at(self, photo: int, keypoints: NDArray[np.integer]) -> NDArray[np.float64]:
+        center = self._centers_of(photo)
+        return center if center.ndim == 1 else center[keypoints]
+
     def explained(self, first: int, second: int, matches: NDArray[np.integer]) -> NDArray[np.bool_]:
         """(n,) whether both rays of a match are within tight thresholds of the other's epipolar plane (Sampson).
 
@@ -69,14 +84,42 @@ class FreedMatches:
         if i < 0 or j < 0:
             return np.zeros(len(matches), bool)
         rec, features = self._rec, self._matched.features
+        centers = [self._centers_at(k, matches[:, side]) for side, k in enumerate((first, second))]
         distance = sampson_distance(
             self._rays_of(first)[matches[:, 0]], self._rays_of(second)[matches[:, 1]], rec.R_cw[j] @ rec.R_cw[i].T,
-            rec.R_cw[j] @ (rec.center_w[i] - rec.center_w[j]),
+            (centers[0] - centers[1]) @ rec.R_cw[j].T,
         )  # fmt: skip
         allowed = [
             TIGHT_PX * features[k].step_px / float(rec.camera(posed).K[0, 0]) for k, posed in ((first, i), (second, j))
         ]
         return distance <= max(allowed)
+
+    def inverse_depths(self, matches: Matches) -> dict[int, NDArray[np.float64]]:
+        """Inverse depths (n,) of the keypoints of photos that travelled while they were read, when their row was.
+
+        Of each, the mean over its matches by the information that these have of it; 0, which is at infinity, where it
+        has none. Photos are counted as in `matched`.
+        """
+        rec, found = self._rec, dict[int, NDArray[np.float64]]()
+        if rec.shutter_model != "constant-motion" or not any(rec.motion(i).moves for i in range(rec.num_images)):
+            return found
+        total = {k: np.zeros((2, len(self._rays_of(k)))) for k in np.flatnonzero(self.posed >= 0).tolist()}
+        for pair, rows in matches.items():
+            # directions in the world, and where they are seen from
+            ray = [self._rays_of(k)[rows[:, side]] @ rec.R_cw[self.posed[k]] for side, k in enumerate(pair)]
+            center = [self._centers_at(k, rows[:, side]) for side, k in enumerate(pair)]
+            normal = np.cross(*ray)
+            for k, keypoint, own, other, base in (
+                (pair[0], rows[:, 0], *ray, center[1] - center[0]),
+                (pair[1], rows[:, 1], *ray[::-1], center[1] - center[0]),
+            ):
+                # where both rays are nearest to each other
+                depth = (np.cross(base, other) * normal).sum(1)
+                weight = np.where(depth > 0, (np.cross(base, own) ** 2).sum(1), 0.0)
+                inverse = (normal**2).sum(1) / np.where(depth > 0, depth, 1.0)
+                np.add.at(total[k][0], keypoint, weight * inverse)
+                np.add.at(total[k][1], keypoint, weight)
+        return {k: sums[0] / np.maximum(sums[1], 1e-300) for k, sums in total.items()}
 
 
 #: Keypoints of two photos that match, by the pair of photos as in `MatchedPhotos`: (n, 2) int arrays.
@@ -161,25 +204,30 @@ def sampson_distance(
     ----------
     x_1, x_2 : (n, 3) arrays
         Normalized coordinates and 1; NaN where there are none.
-    R_21, t_21 : (3, 3) and (3,) arrays
-        From the first camera to the second, `x_2 ~ R_21 X_1 + t_21`.
+    R_21, t_21 : (3, 3) and (3,) or (n, 3) arrays
+        From the first camera to the second, `x_2 ~ R_21 X_1 + t_21`; of each match, if the cameras travelled.
 
     Returns
     -------
     (n,) array
         In normalized coordinates; NaN where these are. Inf for two photos from one place, which have no planes.
     """
-    length = float(np.linalg.norm(t_21))
-    if length == 0.0:
-        return np.full(len(x_1), np.inf)
-    x, y, z = t_21 / length
-    return distance_from_planes(x_1, x_2, np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R_21)
+    length = np.linalg.norm(t_21, axis=-1, keepdims=True)
+    t_21 = t_21 / np.maximum(length, 1e-300)
+    distance = _distance_from_lines(x_2, np.cross(x_2, t_21) @ R_21, np.cross(t_21, x_1 @ R_21.T))
+    return np.where(length[..., 0] > 0, distance, np.inf)
 
 
 def distance_from_planes(
     x_1: NDArray[np.float64], x_2: NDArray[np.float64], E: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Distance of matches from the epipolar planes of an essential matrix, as in `sampson_distance`."""
-    line_2, line_1 = x_1 @ E.T, x_2 @ E
+    return _distance_from_lines(x_2, x_2 @ E, x_1 @ E.T)
+
+
+def _distance_from_lines(
+    x_2: NDArray[np.float64], line_1: NDArray[np.float64], line_2: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Sampson's distance by the epipolar lines (n, 3) in both photos."""
     slope = np.sqrt((line_1[:, :2] ** 2).sum(1) + (line_2[:, :2] ** 2).sum(1))
     return np.asarray(np.abs((line_2 * x_2).sum(1)) / np.maximum(slope, 1e-300))

@@ -11,7 +11,7 @@ from ..colmap.conventions import quiet_pycolmap
 from ..colmap.lenses import camera_to_colmap
 from ..model import Camera, Reconstruction, RowMotion
 from .database import MatchedPhotos, from_pycolmap, ideal_keypoints, pipeline_options
-from .epipolar import MIN_EXPLAINED, TIGHT_PX, FreedMatches
+from .epipolar import MIN_EXPLAINED, TIGHT_PX, FreedMatches, Matches
 
 __all__ = ["retriangulate"]
 
@@ -41,16 +41,19 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction, *, of_
     freed, cameras = FreedMatches(matched, reconstruction), reconstruction.cameras
     tight_px = TIGHT_PX * float(np.median([each.step_px for each in matched.features]))
     with pycolmap.Database.open(matched.database) as db:
+        explained = _explained(db, freed)
+        depths = freed.inverse_depths(explained)
         for index, camera in enumerate(cameras):
             db.update_camera(camera_to_colmap(camera, True, index + 1))
         for index, found in enumerate(matched.features):
             camera = cameras[matched.camera_idx[index]]
             model, motion, own = "global", RowMotion(), camera
             if (i := int(freed.posed[index])) >= 0:
-                model, motion, own = reconstruction.shutter_model, reconstruction.motion(i), reconstruction.camera(i)
-            db.update_keypoints(index + 1, ideal_keypoints(found, camera, motion, model, own))
+                model, own = reconstruction.shutter_model, reconstruction.camera(i)
+                motion = reconstruction.motion(i).in_camera(reconstruction.R_cw[i])
+            db.update_keypoints(index + 1, ideal_keypoints(found, camera, motion, model, own, depths.get(index)))
         db.clear_two_view_geometries()
-        _write_explained(db, freed)
+        _write_explained(db, explained)
     empty = _posed_model(matched, reconstruction, cameras)
     options = pipeline_options(1.0, matched.seed, False, len(matched.names))
     options.mapper.filter_max_reproj_error = tight_px
@@ -65,9 +68,10 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction, *, of_
     return from_pycolmap(model, matched, reconstruction)
 
 
-def _write_explained(db: Any, freed: FreedMatches) -> None:
-    """Write the matches that fit the poses as verified: pairs with known geometry need no search for one."""
+def _explained(db: Any, freed: FreedMatches) -> Matches:
+    """The matches that fit the poses."""
     pycolmap = quiet_pycolmap()
+    found = Matches()
     for pair_id in db.read_all_matches()[0]:
         first, second = (k - 1 for k in pycolmap.pair_id_to_image_pair(pair_id))
         if freed.posed[first] < 0 or freed.posed[second] < 0:
@@ -75,10 +79,18 @@ def _write_explained(db: Any, freed: FreedMatches) -> None:
         matches = np.asarray(db.read_matches(first + 1, second + 1))
         explained = matches[freed.explained(first, second, matches)]
         if len(explained) >= MIN_EXPLAINED:
-            geometry = pycolmap.TwoViewGeometry()
-            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-            geometry.inlier_matches = explained
-            db.write_two_view_geometry(first + 1, second + 1, geometry)
+            found[first, second] = explained
+    return found
+
+
+def _write_explained(db: Any, explained: Matches) -> None:
+    """Write these as verified: pairs with known geometry need no search for one."""
+    pycolmap = quiet_pycolmap()
+    for (first, second), matches in explained.items():
+        geometry = pycolmap.TwoViewGeometry()
+        geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+        geometry.inlier_matches = matches
+        db.write_two_view_geometry(first + 1, second + 1, geometry)
 
 
 def _posed_model(matched: MatchedPhotos, reconstruction: Reconstruction, cameras: Sequence[Camera]) -> Any:
