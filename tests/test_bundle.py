@@ -229,7 +229,7 @@ def test_estimated_scale_is_the_one_that_makes_the_motions_found_likeliest(rng):
     options = BundleOptions(prior_sigma_tolerance=1e-6, prior_sigma_rounds=40, deviations="model")
     result = bundle_adjust(perturbed(truth, rng), "rotation", options)
     square = (result.reconstruction.phi**2 + result.sigma_phi**2) * truth.frame_span()[:, None] ** 2
-    # of three components by Student's t with four degrees of freedom: the mean of these is 1
+    # of Student's t, three components and four degrees of freedom
     weight = 7 / (4 + square.sum(1) / result.phi_sigma**2)
     assert np.mean(weight[:, None] * square) == pytest.approx(result.phi_sigma**2, rel=1e-4)
 

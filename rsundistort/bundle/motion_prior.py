@@ -81,10 +81,10 @@ class MotionPrior:
 
         Student's t tells less than its weights say, by Fisher's information: the weights depend on what they weigh.
         """
-        value: Array = self.precision * np.repeat(self.informs(own), 3, axis=1) + self.limit
+        value: Array = self.precision * np.repeat(self.relative_information(own), 3, axis=1) + self.limit
         return value
 
-    def informs(self, own: Array) -> Array:
+    def relative_information(self, own: Array) -> Array:
         """(m, k / 3) information by that of a normal prior of the same scale, without limits."""
         return np.where(self.has_tails, (_FREEDOM + 3) / (_FREEDOM + 5), 1.0) * self._tails(own)
 

@@ -95,9 +95,9 @@ class Posterior:
         return motion + step[:, own], covariances[:, own[:, None], own]
 
     @property
-    def prior_information(self) -> Array:
+    def relative_information(self) -> Array:
         """By how much more than a normal prior that of each photo's rotation and velocity tells of them (m, 0 to 2)."""
-        return self._problem.prior_information(self._state)
+        return self._problem.relative_information(self._state)
 
     @property
     def bend_sigmas(self) -> Array:

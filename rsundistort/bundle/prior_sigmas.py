@@ -104,10 +104,7 @@ def _prior_sigma(
     square, unknown = values[free] ** 2 * scale, float((variance[free] * scale).mean())
     robust = float(np.median(square + variance[free] * scale)) / 0.455  # median of the square of a normal variable
     seen = float(np.minimum(square, 9.0 * robust).mean())
-    # MacKay's fixed point of sigma^2 = mean(phi^2 + variance): a few rounds where that takes dozens. `known` is the
-    # share of the unknowns that the measurements, not the prior, decide
-    known = max(1.0 - unknown / sigma**2, 1e-3)
-    return float(np.clip(np.sqrt(seen / known), sigma / _LARGEST_CHANGE, sigma * _LARGEST_CHANGE))
+    return _fixed_point(seen, unknown, sigma)
 
 
 def _scale(values: NDArray[np.float64], variance: NDArray[np.float64], sigma: float) -> float:
@@ -120,6 +117,12 @@ def _scale(values: NDArray[np.float64], variance: NDArray[np.float64], sigma: fl
         return 0.0
     weight = tail_weight(np.where(free, values**2 + variance, 0.0).sum(1) / sigma**2, free.sum(1))[:, None]
     seen, unknown = (float(np.broadcast_to(weight * each, free.shape)[free].mean()) for each in (values**2, variance))
+    return _fixed_point(seen, unknown, sigma)
+
+
+def _fixed_point(seen: float, unknown: float, sigma: float) -> float:
+    """MacKay's of sigma^2 = mean square seen + mean variance: a few rounds where that equation takes dozens."""
+    # the share of the unknowns that the measurements, not the prior, decide
     known = max(1.0 - unknown / sigma**2, 1e-3)
     return float(np.clip(np.sqrt(seen / known), sigma / _LARGEST_CHANGE, sigma * _LARGEST_CHANGE))
 

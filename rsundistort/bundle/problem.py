@@ -334,9 +334,9 @@ class BundleProblem:
         """(m, nb - 6) weights of the prior on what each photo's motion has of its own."""
         return self._motion_prior.weight(self._own_motion(state))
 
-    def prior_information(self, state: State) -> NDArray[np.float64]:
-        """`MotionPrior.informs` of rotations and velocities, (m, 0 to 2)."""
-        return self._motion_prior.informs(self._own_motion(state))
+    def relative_information(self, state: State) -> NDArray[np.float64]:
+        """`MotionPrior.relative_information` of rotations and velocities, (m, 0 to 2)."""
+        return self._motion_prior.relative_information(self._own_motion(state))
 
     def _own(self, state: State) -> NDArray[np.float64]:
         """(m, k) unknowns behind those: variation and bends."""

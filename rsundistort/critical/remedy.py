@@ -133,7 +133,7 @@ def still_probability(result: BundleResult, options: BundleOptions | None = None
     inside = np.linalg.inv(covariance)
     mean, phi_sigma, velocity_sigma = _expected(result)
     mean = np.hstack([mean[:, :steady], np.zeros((m, len(bends)))])
-    of_tails = freed.prior_information
+    of_tails = freed.relative_information
     of_tails = np.pad(of_tails, ((0, 0), (0, 2 - of_tails.shape[1])), constant_values=1.0) ** -0.5
     own = precision(phi_sigma * of_tails[:, 0], np.maximum(velocity_sigma * of_tails[:, 1], 1e-300), bends)
     pull = np.einsum("mij,mj->mi", inside, motion) - np.einsum("mij,mj->mi", own, mean)

@@ -20,7 +20,7 @@ from ..colmap.conventions import HALF, poses_of, quiet_pycolmap
 from ..colmap.lenses import camera_to_colmap
 from ..errors import ReconstructionError
 from ..model import Camera, Observations, Reconstruction, RowMotion
-from ..model.projection import clock_of, project_points, unproject_points
+from ..model.projection import at_depth, project_points, unproject_points
 from .features import Features
 
 __all__ = [
@@ -71,18 +71,17 @@ def ideal_keypoints(
     motion: RowMotion,
     model: str,
     own: Camera | None = None,
-    inverse_depth: NDArray[np.float64] | None = None,
+    depth: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float32]:
     """Keypoints without shutter in the camera of the database, COLMAP's centres; where none exists, far outside.
 
-    `own` is the camera at the time of the photo, if it differs; `inverse_depth` (n,) that of the keypoints when their
-    row was read, if the motion, in the camera, travels.
+    `own` is the camera at the time of the photo, if it differs; `depth` (n,) that of the keypoints at the reference
+    row, if the motion, in the camera, travels.
     """
     own = own or camera
     ideal, valid = unproject_points(features.xy_raw, own, motion, model)
-    if inverse_depth is not None:
-        way = motion.as_in("camera").at(clock_of(own, features.xy_raw))[1] * inverse_depth[:, None]
-        ideal = (ideal + way[:, :2]) / (1.0 + way[:, 2:])
+    if depth is not None:
+        ideal = at_depth(ideal, features.xy_raw, own, motion, depth)
     if camera.lens == "fisheye":
         rays = np.column_stack([np.where(valid[:, None], ideal, 0.0), np.ones(len(ideal))])
         xy = project_points(rays, camera.without_field(), None, "global")[0]

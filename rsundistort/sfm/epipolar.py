@@ -94,11 +94,11 @@ class FreedMatches:
         ]
         return distance <= max(allowed)
 
-    def inverse_depths(self, matches: Matches) -> dict[int, NDArray[np.float64]]:
-        """Inverse depths (n,) of the keypoints of photos that travelled while they were read, when their row was.
+    def depths(self, matches: Matches) -> dict[int, NDArray[np.float64]]:
+        """Depths (n,) of keypoints at the reference row, of all photos if any travelled while it was read, else none.
 
-        Of each, the mean over its matches by the information that these have of it; 0, which is at infinity, where it
-        has none. Photos are counted as in `matched`.
+        By the mean of the inverse depths that a keypoint's matches give, by the information that they have of it; inf
+        where it has none. Photos are counted as in `matched`.
         """
         rec, found = self._rec, dict[int, NDArray[np.float64]]()
         if rec.shutter_model != "constant-motion" or not any(rec.motion(i).moves for i in range(rec.num_images)):
@@ -108,18 +108,21 @@ class FreedMatches:
             # directions in the world, and where they are seen from
             ray = [self._rays_of(k)[rows[:, side]] @ rec.R_cw[self.posed[k]] for side, k in enumerate(pair)]
             center = [self._centers_at(k, rows[:, side]) for side, k in enumerate(pair)]
-            normal = np.cross(*ray)
-            for k, keypoint, own, other, base in (
-                (pair[0], rows[:, 0], *ray, center[1] - center[0]),
-                (pair[1], rows[:, 1], *ray[::-1], center[1] - center[0]),
-            ):
+            normal, base = np.cross(*ray), center[1] - center[0]
+            for k, keypoint, own, other in ((pair[0], rows[:, 0], *ray), (pair[1], rows[:, 1], *ray[::-1])):
                 # where both rays are nearest to each other
                 depth = (np.cross(base, other) * normal).sum(1)
                 weight = np.where(depth > 0, (np.cross(base, own) ** 2).sum(1), 0.0)
                 inverse = (normal**2).sum(1) / np.where(depth > 0, depth, 1.0)
                 np.add.at(total[k][0], keypoint, weight * inverse)
                 np.add.at(total[k][1], keypoint, weight)
-        return {k: sums[0] / np.maximum(sums[1], 1e-300) for k, sums in total.items()}
+        for k, (weighted, weights) in total.items():
+            i = int(self.posed[k])
+            along = (self._centers_of(k) - rec.center_w[i]) @ rec.R_cw[i, 2]
+            # what is at the camera, or behind it, is noise
+            known = weighted > 0
+            found[k] = np.where(known, weights / np.where(known, weighted, 1.0) + along, np.inf)
+        return found
 
 
 #: Keypoints of two photos that match, by the pair of photos as in `MatchedPhotos`: (n, 2) int arrays.

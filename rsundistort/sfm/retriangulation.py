@@ -42,7 +42,7 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction, *, of_
     tight_px = TIGHT_PX * float(np.median([each.step_px for each in matched.features]))
     with pycolmap.Database.open(matched.database) as db:
         explained = _explained(db, freed)
-        depths = freed.inverse_depths(explained)
+        depths = freed.depths(explained)
         for index, camera in enumerate(cameras):
             db.update_camera(camera_to_colmap(camera, True, index + 1))
         for index, found in enumerate(matched.features):
