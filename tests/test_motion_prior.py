@@ -13,7 +13,7 @@ from scipy.stats import multivariate_t
 
 from rsundistort import BundleOptions, Observations, bundle_adjust
 from rsundistort.bundle import choose_model
-from rsundistort.bundle.motion_prior import MotionPrior
+from rsundistort.bundle.motion_prior import SIGMA_OF_SCALE, MotionPrior, tail_weight
 
 # thousands of calls on problems this small wait for threads longer than they compute
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -105,3 +105,40 @@ def test_a_shutter_that_one_photo_shows_is_found(rng):
     choice = choose_model(measured(scene, phi, rng), options=BundleOptions(), sigma_px=0.3)
     assert (choice.shutter, choice.shutter_model) == ("found", "rotation")
     assert choice.rival == 0.0
+
+
+def mean_by_the_prior(phi, weights_of):
+    """Length of the mean of motions (m, 3) that nothing but their prior tells, of an estimated scale; it should be 0."""
+    mean, scale = np.zeros(3), 0.02
+    for _ in range(300):
+        own = phi - mean
+        weight = weights_of((own**2).sum(1) / scale**2)[:, None]
+        # not below what no photo shows
+        scale = max(float(np.sqrt((weight * own**2).mean())), 5e-5)
+        mean = (weight * phi).sum(0) / weight.sum()
+    return float(np.linalg.norm(mean))
+
+
+def test_what_heavy_tails_cost_and_what_they_save(rng):
+    bumped = rng.normal(0, 3e-4, (40, 8, 3))
+    bumped[:, 0] = rng.normal(0, 0.05, (40, 3))
+    uneven = rng.normal(0, 0.01, (40, 8, 3)) * np.exp(rng.normal(0, 1, (40, 8, 1)))
+    normal = rng.normal(0, 0.02, (200, 8, 3))
+
+    def ratio(sets):
+        tails, none = (
+            np.sqrt(np.mean([mean_by_the_prior(phi, of) ** 2 for phi in sets])) for of in (tail_weight, np.ones_like)
+        )
+        return tails / none
+
+    assert 1.0 < ratio(normal) < 1.1
+    assert ratio(uneven) < 0.6
+    assert ratio(bumped) < 0.1
+
+
+def test_scale_of_normal_motions(rng):
+    square = (rng.normal(size=(400_000, 3)) ** 2).sum(1)
+    scale = 1.0
+    for _ in range(100):
+        scale = np.sqrt((tail_weight(square / scale**2) * square).mean() / 3)
+    assert 1.0 / scale == pytest.approx(SIGMA_OF_SCALE, abs=0.005)
