@@ -108,7 +108,7 @@ def test_a_shutter_that_one_photo_shows_is_found(rng):
 
 
 def mean_by_the_prior(phi, weights_of):
-    """Length of the mean of motions (m, 3) that nothing but their prior tells, of an estimated scale; it should be 0."""
+    """Length of the mean of motions (m, 3) that their prior alone tells, of an estimated scale; it should be 0."""
     mean, scale = np.zeros(3), 0.02
     for _ in range(300):
         own = phi - mean
