@@ -74,6 +74,10 @@ def test_a_field_is_of_cubic_splines(rng):
     np.testing.assert_allclose(basis @ camera.field.reshape(-1, 2), expected, atol=1e-12)
 
 
+def test_a_camera_whose_photos_were_all_left_out_has_a_field_without_weights(rng):
+    assert field_basis(camera_with_field(rng), (5, 7), np.empty((0, 2))).shape == (0, 35)
+
+
 def test_a_field_ends_at_the_border_of_the_photo(rng):
     camera = camera_with_field(rng)
     inside, beyond = np.array([[100.0, -0.5], [639.5, 200]]), np.array([[100.0, -90.0], [800.0, 200]])

@@ -86,7 +86,7 @@ def field_basis(camera: Camera, shape: tuple[int, int], xy_raw: Array) -> Array:
     down, across = (
         _splines(u, n) @ np.linalg.inv(_splines(np.linspace(0, 1, n), n)) for u, n in zip((y, x), shape, strict=True)
     )
-    return (down[:, :, None] * across[:, None]).reshape(len(xy_raw), -1)
+    return (down[:, :, None] * across[:, None]).reshape(len(xy_raw), shape[0] * shape[1])
 
 
 def field_slope(camera: Camera, xy_raw: Array) -> Array:
