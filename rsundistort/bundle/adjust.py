@@ -94,7 +94,9 @@ def bundle_adjust(
     exact = options.cost_tolerance >= unsettled
     for left in reversed(range(most)):
         exact = exact or left == 0
-        rounds.solve(options.cost_tolerance if exact else unsettled, is_judged=True)
+        # a jackknife takes as long as many steps: once the noise is known only the last solve needs one
+        judged = exact or not rounds.know_their_noise
+        rounds.solve(options.cost_tolerance if exact else unsettled, is_judged=judged)
         if rounds.are_settled and exact:
             break
         exact = exact or rounds.are_settled

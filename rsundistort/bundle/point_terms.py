@@ -8,11 +8,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._kernels import schur
+from .structure import Structure
 
-__all__ = ["PointTerms"]
+__all__ = ["PointTerms", "largest_step", "moved_points", "nearest_photos"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+# A step takes a point to so many times its distance at most: one that asks for more wants it at infinity, or beyond.
+_FURTHEST = 10.0
+
+
+def nearest_photos(points_w: Array, center_w: Array, structure: Structure) -> Index:
+    """(n,) the photo nearest to each point of a structure, of those that measured it."""
+    away = np.linalg.norm(points_w[structure.point_idx] - center_w[structure.frame_idx], axis=1)
+    order = np.lexsort((away, structure.point_idx))
+    nearest: Index = structure.frame_idx[order[structure.track_start[:-1]]]
+    return nearest
+
+
+def moved_points(points_w: Array, steps: Array, center_w: Array) -> Array:
+    """Points (n, 3) after steps, to first order X + step, that change the direction from a centre and inverse distance.
+
+    Rays of little parallax tell inverse depth, and that with normal errors; a step of the depth itself would take such
+    points through the centre, to behind the camera (Civera et al., "Inverse depth parametrization", 2008).
+    """
+    away = points_w - center_w
+    along = np.einsum("na,na->n", steps, away) / np.maximum(np.einsum("na,na->n", away, away), 1e-300)
+    along = along[:, None]
+    moved: Array = center_w + (away + steps - along * away) / np.maximum(1.0 - along, 1.0 / _FURTHEST)
+    return moved
+
+
+def largest_step(points_w: Array, steps: Array, middle_w: Array, size: float) -> float:
+    """Largest step of points (n, 3) in sizes of the scene, or in their own distance from its middle if that is larger.
+
+    A far point moves a lot along its ray without moving in any photo.
+    """
+    far = points_w - middle_w
+    distance = np.maximum(np.sqrt(np.einsum("na,na->n", far, far)), size)
+    return float((np.abs(steps) / distance[:, None]).max(initial=0))
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from .lens_field import LensFields
 from .motion_prior import MotionPrior
 from .normal_equations import Marginals, NormalEquations, Step
 from .path_prior import PathPrior, PathState
-from .point_terms import PointTerms
+from .point_terms import PointTerms, largest_step, moved_points, nearest_photos
 from .prior_sigmas import PriorSigmas
 from .sparse_blocks import Chain
 from .structure import Structure
@@ -113,6 +113,7 @@ class BundleProblem:
         self._given = reconstruction
         obs = replace(obs, point_idx=np.argsort(structure.points)[obs.point_idx])
         self._start = replace(reconstruction, points_w=reconstruction.points_w[structure.points], observations=obs)
+        self._nearest = nearest_photos(self._start.points_w, self._start.center_w, structure)
         self._xy = obs.xy_raw[structure.order]
         self._sigma_px = sigma_px * obs.sigma[structure.order]
         focal_px = np.array([camera.K[0, 0] for camera in reconstruction.cameras])[reconstruction.camera_idx]
@@ -532,16 +533,20 @@ class BundleProblem:
         self._clock_of = state
         return float(cost.sum()) + self._prior_cost(state)
 
-    def settle(self, state: State) -> State:
-        """The state with each point one Gauss-Newton step nearer to its measurements, where that lowers its cost."""
-        steps = self._point_terms(state).steps(self._structure.track_start, *self.blocks(state))
-        moved = replace(state, points_w=state.points_w + steps)
-        better = self._track_costs(moved) < self._track_costs(state)
-        return replace(state, points_w=np.where(better[:, None], moved.points_w, state.points_w))
+    def settle(self, state: State, before: State | None = None) -> State:
+        """The state with each point one Gauss-Newton step nearer to its measurements, where that lowers its cost.
 
-    def _track_costs(self, state: State) -> NDArray[np.float64]:
-        """(n,) cost of each point's measurements."""
-        return np.asarray(np.bincount(self._structure.point_idx, self.costs(state), len(state.points_w)), np.float64)
+        Points that came to lie behind a camera do not see the way back: they may return to where they were before.
+        """
+        state = state if before is None else self._with_better_points(state, before.points_w)
+        steps = self._point_terms(state).steps(self._structure.track_start, *self.blocks(state))
+        return self._with_better_points(state, moved_points(state.points_w, steps, state.center_w[self._nearest]))
+
+    def _with_better_points(self, state: State, points_w: NDArray[np.float64]) -> State:
+        """The state with those of other points (n, 3) whose measurements cost less."""
+        point_idx, other = self._structure.point_idx, replace(state, points_w=points_w)
+        own, others = (np.bincount(point_idx, self.costs(each), len(points_w)) for each in (state, other))
+        return replace(state, points_w=np.where((others < own)[:, None], points_w, state.points_w))
 
     def costs(self, state: State) -> NDArray[np.float64]:
         """(o,) cost of each of the equations' measurements."""
@@ -562,8 +567,7 @@ class BundleProblem:
             cameras = tuple(moved(k, c, s[own:last]) for k, (c, s) in enumerate(zip(cameras, intrinsics, strict=True)))
         phi = state.phi + frame[:, 6:9] if self._block > 6 else state.phi
         velocity = state.velocity + frame[:, 9:12] if self._block > 9 else state.velocity
-        path = state.path
-        if path is not None:
+        if (path := state.path) is not None:
             changes = path.changes + frame[:, self.layout.size :]
             path = PathState(path.rates + frame[:, 6:12], changes, path.pace + intrinsics[:, -1])
             phi, velocity = np.split(path.motions(self._start.camera_idx), 2, axis=1)
@@ -577,7 +581,7 @@ class BundleProblem:
             if self._options.varying
             else state.variation,
             state.bend + frame[:, self.layout.variation : self.layout.size],
-            state.points_w + point,
+            moved_points(state.points_w, point, state.center_w[self._nearest]),
             state.means + intrinsics[:, intrinsics.shape[1] - state.means.shape[1] :],
             path,
         )
@@ -587,13 +591,9 @@ class BundleProblem:
         frame, point, intrinsics = step
         frame = frame[:, : self.layout.size]
         ways = self.layout.size - 3 * self.layout.ways
-        own = range(self._block, ways)
-        angles = np.abs(frame[:, [0, 1, 2, *range(6, min(self._block, 9)), *own]]).max()
-        # a far point moves a lot along its ray without moving in any photo: its depth is its own yardstick
-        far = state.points_w - state.center_w.mean(0)
-        depth = np.maximum(np.sqrt(np.einsum("na,na->n", far, far)), self._size)
+        angles = np.abs(frame[:, [0, 1, 2, *range(6, min(self._block, 9)), *range(self._block, ways)]]).max()
         moved = np.abs(frame[:, [3, 4, 5, *range(9, self._block), *range(ways, frame.shape[1])]]).max() / self._size
-        lengths = max(moved, float((np.abs(point) / depth[:, None]).max(initial=0)))
+        lengths = max(moved, largest_step(state.points_w, point, state.center_w.mean(0), self._size))
         of_lens = np.abs(intrinsics[:, : len(self._refine)]).max(initial=0.0)
         fields = intrinsics[:, len(self._refine) : intrinsics.shape[1] - state.means.shape[1]]
         of_fields = np.abs(fields).max(initial=0.0) / float(self._start.cameras[0].K[0, 0])

@@ -126,7 +126,7 @@ class Rounds:
         self._baseline = reconstruction.baseline
         self._layout = Layout.of(shutter_model, options)
         self._sigmas = starting_sigmas(options, self._layout, self._base)
-        self._noise = 1.0
+        self._noise, self._noise_is_known = 1.0, False
         if start is not None:
             self._sigmas = replace(self._sigmas, path=start.sigmas)
             self._noise = start.noise or 1.0
@@ -177,6 +177,7 @@ class Rounds:
             found = self._inflation = inflation(equations, self._partitions, self._marginals, self._noise, has_pace)
             # of all that has a prior of mean zero: what photos have beside their poses, else the lens
             self._noise = found.photos if self._marginals.photos.shape[1] > 6 else found.cameras
+            self._noise_is_known = self._has_its_noise
             self._heavy_tails = True
         self._weighed_sigmas = self._sigmas
         self._sigmas = estimated(
@@ -237,7 +238,18 @@ class Rounds:
         keep = _believed(base, options, self._sigma_px)
         alive = base.track_lengths(keep) >= 2
         self._keep, self._partitions = keep[alive[base.observations.point_idx]], ()
+        self._noise_is_known = False
         self._base = base.take_points(alive)
+
+    @property
+    def _has_its_noise(self) -> bool:
+        """Whether the noise by the last solve is that which it was weighed with."""
+        return abs(self._noise - self._weighed_noise) < _SETTLED_NOISE * self._noise
+
+    @property
+    def know_their_noise(self) -> bool:
+        """Whether the noise has converged since outliers were dropped."""
+        return self._noise_is_known
 
     @property
     def are_settled(self) -> bool:
@@ -249,7 +261,7 @@ class Rounds:
         return (
             self._new_points is self._current
             and settled(self._weighed_sigmas, self._sigmas, options.prior_sigma_tolerance)
-            and abs(self._noise - self._weighed_noise) < _SETTLED_NOISE * self._noise
+            and self._has_its_noise
             and not awaits_tails
             and (options.path is None or self._path_moved < _SETTLED_BEND)
         )

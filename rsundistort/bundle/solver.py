@@ -36,8 +36,8 @@ class Problem(Protocol):
     def cost(self, state: Any) -> float:
         """The cost of a state."""
 
-    def settle(self, state: Any) -> Any:
-        """A state of lower cost, found in less time than a step takes, for steps that the model predicted badly."""
+    def settle(self, state: Any, before: Any) -> Any:
+        """A state of lower cost, found in less time than the step from `before`, which was predicted badly."""
 
     def step_size(self, state: Any, step: Any) -> float:
         """Largest change of an unknown in natural units (radians, scene sizes)."""
@@ -85,8 +85,9 @@ def minimize(
             step, predicted = solved
             candidate = problem.retract(state, step)
             new_cost = problem.cost(candidate)
-            if predicted > cost_tolerance * cost and not cost - new_cost > _GOOD_STEP * predicted:
-                candidate = problem.settle(candidate)
+            is_good = cost - new_cost > _GOOD_STEP * predicted
+            if not is_good and (predicted > cost_tolerance * cost or new_cost > cost):
+                candidate = problem.settle(candidate, state)
                 new_cost = problem.cost(candidate)
             decrease = cost - new_cost
             small_step = problem.step_size(state, step) < step_tolerance
