@@ -61,3 +61,30 @@ def test_points_that_start_at_a_wrong_distance_come_back(factor, rng):
         )  # fmt: skip
         ends.append(found.cost_history[-1])
     assert ends[1] == pytest.approx(ends[0], rel=1e-6)
+
+
+def test_settling_moves_points_alone_and_never_to_a_higher_cost(rng):
+    truth = make_scene(rng, "rotation", noise_px=0.5)
+    start = replace(truth, points_w=truth.points_w + 0.02 * rng.normal(size=truth.points_w.shape))
+    problem = BundleProblem(start, "rotation", BundleOptions(loss="squared"), 0.5, PriorSigmas(0.03, 0.03))
+    state = problem.initial_state()
+    points, settled = problem.measurements[1], problem.settle(state)
+    assert (np.bincount(points, problem.costs(settled)) <= np.bincount(points, problem.costs(state))).all()
+    # with the true photos one step ends at the noise: half the number of values, less three for each point
+    assert problem.cost(state) > 10 * len(truth.observations)
+    assert problem.cost(settled) == pytest.approx(len(truth.observations) - 1.5 * truth.num_points, rel=0.25)
+    for name in ("R_cw", "center_w", "phi", "velocity"):
+        assert getattr(settled, name) is getattr(state, name)
+
+
+def test_settling_returns_points_from_behind_the_camera(rng):
+    truth = make_scene(rng, "rotation", noise_px=0.5)
+    problem = BundleProblem(truth, "rotation", BundleOptions(loss="squared"), 0.5, PriorSigmas(0.03, 0.03))
+    before = problem.initial_state()
+    points_w = before.points_w.copy()
+    points_w[:3] = 2 * before.center_w.mean(0) - points_w[:3]
+    settled = problem.settle(replace(before, points_w=points_w), before)
+    assert problem.cost(settled) <= problem.cost(before)
+    assert ((settled.points_w[:3] - truth.center_w[0]) @ truth.R_cw[0][2] > 0).all()
+    # a point behind all cameras does not see the way back by itself
+    assert problem.cost(problem.settle(replace(before, points_w=points_w))) > 2 * problem.cost(before)

@@ -95,7 +95,7 @@ def bundle_adjust(
     for left in reversed(range(most)):
         exact = exact or left == 0
         # a jackknife takes as long as many steps: once the noise is known only the last solve needs one
-        judged = exact or not rounds.know_their_noise
+        judged = exact or not rounds.noise_is_known
         rounds.solve(options.cost_tolerance if exact else unsettled, is_judged=judged)
         if rounds.are_settled and exact:
             break

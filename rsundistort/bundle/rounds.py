@@ -126,7 +126,9 @@ class Rounds:
         self._baseline = reconstruction.baseline
         self._layout = Layout.of(shutter_model, options)
         self._sigmas = starting_sigmas(options, self._layout, self._base)
-        self._noise, self._noise_is_known = 1.0, False
+        self._noise = 1.0
+        #: Whether the noise has converged since outliers were dropped.
+        self.noise_is_known = False
         if start is not None:
             self._sigmas = replace(self._sigmas, path=start.sigmas)
             self._noise = start.noise or 1.0
@@ -177,7 +179,7 @@ class Rounds:
             found = self._inflation = inflation(equations, self._partitions, self._marginals, self._noise, has_pace)
             # of all that has a prior of mean zero: what photos have beside their poses, else the lens
             self._noise = found.photos if self._marginals.photos.shape[1] > 6 else found.cameras
-            self._noise_is_known = self._has_its_noise
+            self.noise_is_known = self._has_its_noise
             self._heavy_tails = True
         self._weighed_sigmas = self._sigmas
         self._sigmas = estimated(
@@ -238,18 +240,13 @@ class Rounds:
         keep = _believed(base, options, self._sigma_px)
         alive = base.track_lengths(keep) >= 2
         self._keep, self._partitions = keep[alive[base.observations.point_idx]], ()
-        self._noise_is_known = False
+        self.noise_is_known = False
         self._base = base.take_points(alive)
 
     @property
     def _has_its_noise(self) -> bool:
         """Whether the noise by the last solve is that which it was weighed with."""
         return abs(self._noise - self._weighed_noise) < _SETTLED_NOISE * self._noise
-
-    @property
-    def know_their_noise(self) -> bool:
-        """Whether the noise has converged since outliers were dropped."""
-        return self._noise_is_known
 
     @property
     def are_settled(self) -> bool:
