@@ -10,7 +10,7 @@ import pytest
 from make_photos import texture
 from scipy.spatial.transform import Rotation
 
-from rsundistort.sfm.flow import KeyFrameChooser, flow_between, flow_size
+from rsundistort.sfm.flow import KeyFrameChooser, even_brightness, flow_between, flow_size
 from rsundistort.sfm.resection import resect
 
 WIDTH, HEIGHT = 320, 240
@@ -37,6 +37,35 @@ def test_points_are_followed_to_a_twentieth_of_a_pixel() -> None:
     assert np.median(np.abs(backward.xy - expected)) < 0.05
     assert set(forward.frame) == {1, 2, 3}
     assert set(backward.frame) == {0, 1, 2}
+
+
+def under_lamps(greys: list[np.ndarray]) -> list[np.ndarray]:
+    """The same with bands of lamps that flicker, brighter and darker by a quarter, two in each frame."""
+    y = np.arange(HEIGHT)[:, None]
+    bands = [1 + 0.25 * np.sin(2 * np.pi * (2 * y / HEIGHT + 0.37 * k)) for k in range(len(greys))]
+    return [np.clip(0.8 * band * grey, 0, 255).astype(np.uint8) for band, grey in zip(bands, greys, strict=True)]
+
+
+def test_lamps_that_flicker_are_no_motion_and_no_cut() -> None:
+    shifts = 3.3 * np.arange(12)
+    greys = [even_brightness(grey) for grey in under_lamps(frames(shifts))]
+    chooser = KeyFrameChooser()
+    for grey in greys:
+        chooser.feed(grey)
+    assert chooser.cuts == []
+    np.testing.assert_allclose(chooser.steps, 3.3, atol=0.1)
+    xy = np.random.default_rng(1).uniform([60, 30], [280, 210], (80, 2))
+    forward, _ = flow_between(greys, xy, xy[:0])
+    in_steady_light, _ = flow_between(frames(shifts), xy, xy[:0])
+    assert len(forward.frame) > 0.95 * len(in_steady_light.frame)
+    expected = xy[forward.point] - np.column_stack([shifts[forward.frame], np.zeros(len(forward.frame))])
+    assert np.median(np.abs(forward.xy - expected)) < 0.1
+
+
+def test_noise_in_the_dark_is_no_texture() -> None:
+    dark = np.random.default_rng(0).integers(0, 3, (HEIGHT, WIDTH), np.uint8)
+    assert even_brightness(dark).std() < 5
+    assert even_brightness(np.zeros_like(dark)).max() == 0
 
 
 def test_what_leaves_the_frame_is_not_followed() -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, RsUndistortWarning
 from ..io.video import FrameWriter, VideoFrames, VideoReader, frame_name, sharpness_of
-from ..sfm.flow import KeyFlow, KeyFrameChooser, flow_size
+from ..sfm.flow import KeyFlow, KeyFrameChooser, even_brightness, flow_size
 
 __all__ = ["Clip", "greys_of", "read_clip"]
 
@@ -91,7 +91,7 @@ class Clip:
 
 
 def _grey(picture: Any) -> NDArray[np.uint8]:
-    """A frame for the flow: grey, and reduced if it is large."""
+    """A frame: grey, and reduced for the flow if it is large."""
     width, height = flow_size(picture.width, picture.height)
     if (width, height) == (picture.width, picture.height):
         return np.ascontiguousarray(picture.to_ndarray(format="gray"))
@@ -104,7 +104,7 @@ def greys_of(clip: Clip, wanted: Sequence[int]) -> Iterator[tuple[int, NDArray[n
     with VideoReader(clip.video) as reader:
         for number, _, picture in reader:
             if number in number_of:
-                yield number_of[number], _grey(picture)
+                yield number_of[number], even_brightness(_grey(picture))
                 if number_of[number] == wanted[-1]:
                     return
 
@@ -161,7 +161,7 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
             numbers.append(number)
             times.append(time_s)
             sharpness.append(sharpness_of(picture))
-            chooser.feed(grey)
+            chooser.feed(even_brightness(grey))
             for k in held.keys() & {*chooser.keys[num_written:]}:
                 writer.add(*held[k], sharpness[k])
                 written.add(k)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FlowTracks", "KeyFlow", "KeyFrameChooser", "flow_between", "flow_size"]
+__all__ = ["FlowTracks", "KeyFlow", "KeyFrameChooser", "even_brightness", "flow_between", "flow_size"]
 
 Grey = NDArray[np.uint8]
 
@@ -21,6 +21,9 @@ _LEVELS = 4
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.003)
 # A point that returns elsewhere, followed there and back again, was lost: pixels.
 _BACK_PX = 0.5
+# Area whose mean brightness is divided out, pixels; the least mean, so that noise in the dark is no texture; and what
+# the mean becomes.
+_AREA, _DARK, _MEAN = 31, 16.0, 100.0
 # Corners that measure the motion of the content.
 _CORNERS = 300
 # A key frame is due when the content has moved by this share of its diagonal, or when this few of the corners are still
@@ -37,6 +40,16 @@ def flow_size(width: int, height: int) -> tuple[int, int]:
     """Width and height at which frames of this size are followed."""
     shrink = max(1.0, math.sqrt(width * height / (1e6 * _FLOW_MEGAPIXELS)))
     return max(2, round(width / shrink)), max(2, round(height / shrink))
+
+
+def even_brightness(grey: Grey) -> Grey:
+    """A frame over its mean brightness nearby.
+
+    The flow takes a point to be as bright in all frames. Under lamps that flicker a rolling shutter reads bands of
+    different brightness, which run through the frames, and exposures follow the scene.
+    """
+    mean = cv2.boxFilter(grey, cv2.CV_32F, (_AREA, _AREA))
+    return cv2.divide(grey, np.maximum(mean, _DARK), scale=_MEAN, dtype=cv2.CV_8U)
 
 
 def _followed(
@@ -111,7 +124,7 @@ class KeyFrameChooser:
         self._number = -1
 
     def feed(self, grey: Grey) -> None:
-        """The next frame."""
+        """The next frame, of even brightness."""
         self._number += 1
         sharpness = float(cv2.Laplacian(grey, cv2.CV_32F).var())
         if not self.keys:
@@ -198,7 +211,7 @@ def flow_between(
     Parameters
     ----------
     greys : sequence of (h, w) uint8 array
-        The frames, from the first key to the last, both included.
+        The frames, of even brightness, from the first key to the last, both included.
     first_xy, last_xy : (n, 2), (k, 2) array
         Points of each key.
 
