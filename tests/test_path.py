@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from rsundistort.bundle.problem import BundleProblem
 from rsundistort.errors import InputError
 from rsundistort.model.path import CameraPath, inverse_left_jacobians
 from rsundistort.solve.video_path import readouts_of_halves
-from rsundistort.verdict.judge_path import judge_clip, unfollowed_px
+from rsundistort.verdict.judge_path import ReadoutTime, judge_clip, unfollowed_px
 
 FRAME_S = 1 / 30
 
@@ -203,6 +204,17 @@ def test_a_path_is_not_joined_over_a_cut() -> None:
     np.testing.assert_array_equal(result.path.path.part, [0] * 6 + [1] * 6)
 
 
+def test_a_frame_between_two_cuts_leaves_the_readout_time_to_the_others() -> None:
+    """As of a flash, which no flow follows: nothing connects the frame with a path."""
+    truth, times = filmed(HandHeld(6), 20)
+    part = {name: (k > 8) + (k > 9) for k, name in enumerate(truth.image_names)}
+    result, whole = adjusted(truth, times, part=part), adjusted(truth, times)
+    assert result.path is not None
+    assert whole.path is not None
+    assert abs(result.path.readout_s[0] / FRAME_S - 0.6) < 3 * result.path.sigma_readout_s[0] / FRAME_S
+    assert result.path.sigma_readout_s[0] < 2 * whole.path.sigma_readout_s[0]
+
+
 def test_a_known_readout_time_is_believed() -> None:
     truth, times = filmed(HandHeld(7), 10)
     result = adjusted(truth, times, readout=(0.6 * FRAME_S, 1e-7))
@@ -316,6 +328,22 @@ def test_lines_that_rotate_against_their_frames_are_doubted() -> None:
         verdict = judge_clip(found, found, None, FRAME_S)
         assert verdict.shape == "doubtful"
         assert any("the last line is read first" in reason for reason in verdict.reasons)
+
+
+def test_a_path_is_doubted_that_slow_rotations_or_a_gyroscope_contradict() -> None:
+    found = adjusted(*filmed(HandHeld(0), 20))
+    assert found.path is not None
+    time = ReadoutTime(float(found.path.readout_s[0]), float(found.path.sigma_readout_s[0]))
+
+    def reasons(**evidence: Any) -> tuple[str, ...]:
+        return judge_clip(found, found, None, FRAME_S, **evidence).reasons
+
+    slow = ReadoutTime(time.seconds - 2 * time.sigma, time.sigma)
+    assert reasons() == reasons(speeds=(slow, time)) == reasons(rotation_ratio=0.97)
+    slow = ReadoutTime(time.seconds - 5 * time.sigma, time.sigma)
+    assert any("by slow rotations alone" in reason for reason in reasons(speeds=(slow, time)))
+    f = found.reconstruction.cameras[0].K[0, 0]
+    assert any(f"by it the focal length is {0.92 * f:.0f} px" in reason for reason in reasons(rotation_ratio=0.92))
 
 
 def test_frames_are_not_bent_by_a_readout_that_cannot_be() -> None:

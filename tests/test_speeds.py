@@ -69,6 +69,14 @@ def test_a_vibration_faster_than_half_of_the_frame_rate_runs_the_other_way(rng, 
     assert "vibrates faster" in problem_of(told | {"by_speed": [each._asdict() for each in (slow, fast)]})
 
 
+def test_a_path_that_slow_rotations_contradict_is_no_measurement(rng):
+    slow, fast = by_speed(shaken(1, 9.0, 0.003), rng)
+    speeds = {"by_speed": [each._asdict() for each in (slow, fast)]}
+    told = {"sigma": 0.0003, "of_frame": 0.72, "source": "the video"} | speeds
+    assert problem_of(told | {"seconds": slow.seconds + 0.0002}) == ""
+    assert "slow rotations alone contradict it" in problem_of(told | {"seconds": slow.seconds + 0.004})
+
+
 def test_a_readout_against_its_direction_has_the_same_sign_at_all_speeds(rng):
     hand = shaken(1, 11.0, 0.003)
     time_s = np.arange(60) * FRAME_S

@@ -199,7 +199,7 @@ class PathPrior:
         self._whitening = np.linalg.inv(np.linalg.cholesky(np.array(powers).transpose(2, 0, 1)))
         self.sigmas = sigmas
         # nothing comes before the first frame of a part: its changes are those of a path that began at rest
-        self.begins = np.setdiff1d(self.first, self.second)
+        self.begins = np.setdiff1d(order, self.second)
         self.begins_sigma = np.sqrt(_FRAMES_BEFORE) * np.repeat(sigmas, 3)
         share, sigma = path.readout_prior
         span = np.array([camera.frame_span for camera in reconstruction.cameras])

@@ -339,7 +339,8 @@ def _judged(
     against = stabilisation.reason if stabilisation.verdict == "stabilised" else ""
     if at_once:
         against = _against_global(stabilisation)
-    verdict = judge_clip(result, of_keys, halves, clip.frame_s, remedy, against, vibration_px, speeds)
+    ratio = 1.0 if felt is None else felt.alignment.ratio
+    verdict = judge_clip(result, of_keys, halves, clip.frame_s, remedy, against, vibration_px, speeds, ratio)
     if verdict.lens_only:
         warnings.warn(
             f"the frames are corrected for the lens only: {verdict.reasons[0]}", RsUndistortWarning, stacklevel=4

@@ -23,6 +23,10 @@ _UNSEEN_PX = 1.0
 SIGMAS, APART = 3.0, 4.0
 # Share of the readout time by slow rotations that fast ones must show: noise in the poses hides some of it.
 _SHOWN_FAST = 0.5
+# Relative error that the scale of a gyroscope may have: 3 % by most data sheets, and what the lens adds.
+_GYRO_SCALE = 0.05
+# Where a path misses part of how fast its camera rotates, the readout time comes out longer.
+_TOO_FEW = "the camera shakes too fast for its frame rate, or frames are missing or came twice"
 # A vibration a little faster than half of the frame rate shows in the frames as a slower one that runs the other way.
 _BACKWARDS = "the last line is read first (--readout), or the camera vibrates faster than half of the frame rate"
 
@@ -36,6 +40,7 @@ def judge_clip(
     against: str = "",
     vibration_px: float = 0.0,
     speeds: tuple[ReadoutTime, ReadoutTime] | None = None,
+    rotation_ratio: float = 1.0,
 ) -> Verdict:
     """Judge the path of a video.
 
@@ -57,6 +62,8 @@ def judge_clip(
         What frames rotate beyond their path, as `unfollowed_px` gives it.
     speeds : pair of ReadoutTime, optional
         The readout times by slow and by fast rotations, as `readouts_by_speed` gives them.
+    rotation_ratio : float
+        Rotations of the frames over those of the gyroscope.
 
     Returns
     -------
@@ -92,6 +99,11 @@ def judge_clip(
             f"{1e3 * time.sigma:.1f} ms."
         )
     reasons += _contradictions(time, vibration_px, speeds, halves)
+    if abs(np.log(rotation_ratio)) > _GYRO_SCALE:
+        reasons.append(
+            f"The frames rotate {rotation_ratio:.2f} times as far as the gyroscope: by it the focal length is "
+            f"{rotation_ratio * rec.cameras[0].K[0, 0]:.0f} px, not {rec.cameras[0].K[0, 0]:.0f} px."
+        )
     lens_only = tuple(rec.image_names) if shutter == "not-determined" else ()
     return Verdict(shutter, "doubtful" if reasons else "trusted", tuple(reasons), {}, lens_only)
 
@@ -117,6 +129,11 @@ def _contradictions(
             f"{1e3 * speeds[1].seconds:.1f} +- {1e3 * speeds[1].sigma:.1f} ms: the camera vibrates faster than half of "
             "the frame rate, and the readout time may be wrong."
         )
+    elif speeds is not None and _contradicts(time, speeds[0]):
+        reasons.append(
+            f"The readout time is {1e3 * time.seconds:.1f} +- {1e3 * time.sigma:.1f} ms along the path, and "
+            f"{1e3 * speeds[0].seconds:.1f} +- {1e3 * speeds[0].sigma:.1f} ms by slow rotations alone: {_TOO_FEW}."
+        )
     if halves is not None:
         a, b = halves
         apart = abs(a.seconds - b.seconds) / float(np.hypot(a.sigma, b.sigma))
@@ -138,6 +155,11 @@ def _runs_the_other_way(slow: ReadoutTime, fast: ReadoutTime) -> bool:
     sign = np.sign(slow.seconds)
     missing = sign * (_SHOWN_FAST * slow.seconds - fast.seconds)
     return bool(missing > APART * np.hypot(fast.sigma, _SHOWN_FAST * slow.sigma))
+
+
+def _contradicts(time: ReadoutTime, slow: ReadoutTime) -> bool:
+    """Whether the readout time along the path is not that of slow rotations, which any path follows."""
+    return bool(abs(time.seconds - slow.seconds) > SIGMAS * np.hypot(time.sigma, slow.sigma))
 
 
 def unfollowed_px(reconstruction: Reconstruction, own: OwnMotions) -> float:
@@ -180,6 +202,8 @@ def problem_of(evidence: Mapping[str, Any]) -> str:
             return (
                 "the camera vibrates faster than half of the frame rate: slow and fast rotations contradict each other"
             )
+        if _contradicts(ReadoutTime(seconds, sigma), slow):
+            return f"slow rotations alone contradict it: {_TOO_FEW}"
     frame_s = abs(seconds / evidence["of_frame"]) if evidence.get("of_frame") else np.inf
     if abs(evidence.get("unbounded_seconds", seconds)) - SIGMAS * sigma > frame_s:
         return "it would be longer than the time from frame to frame: something else bends the frames"
