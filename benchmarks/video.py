@@ -2,6 +2,7 @@
 
     python benchmarks/video.py [--only PART ...] [--clips FOLDER] [--num 20] [--first-seed 100] [--shared ../shared]
                                [--frames 300 600 1200 1800] [--long street round to-and-fro]
+                               [--edit NAME ...]
 
 Prints one JSON object a line. Clips are rendered into FOLDER once (`clips.py`: 80 s of one core each).
 
@@ -12,6 +13,8 @@ Prints one JSON object a line. Clips are rendered into FOLDER once (`clips.py`: 
     two      two frames whose readout time is known: how far off the corrected positions are
     readout  random walks, gentle to wild: errors of the readout time, and these over their standard deviations
     stabilised  the same, rotated back to smooth paths: which are named; and how many of those that the sensor saw are
+    edited   random walks as programs, lamps and passers-by leave them (`edited.py`): readout times, by the path and by
+             slow rotations alone, and verdicts; only some edits with `--edit`
     gopro    ../shared/video: clock, axes and rotation of its gyroscope, readout by pictures and by the gyroscope
     peer     `run` of videos, each in a process of its own, beside pycolmap's extract, match sequentially, map and
              undistort with default options, on the same key frames and with the same camera: seconds and peaks; and
@@ -42,6 +45,7 @@ import av
 import cv2
 import numpy as np
 from clips import clip_folder
+from edited import EDITS, edited
 from field import OURS, PEER, in_child
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -78,7 +82,7 @@ from rsundistort.batch import progress
 progress.time = types.SimpleNamespace(perf_counter=time.process_time)
 """
 LONG = ("street", "round", "to-and-fro")
-PARTS = ("walk", "level", "pan", "two", "readout", "stabilised", "gopro", "peer", "length", "unordered")
+PARTS = ("walk", "level", "pan", "two", "readout", "stabilised", "edited", "gopro", "peer", "length", "unordered")
 
 
 def solved_clip(video: Path, camera: str, readout_s: float | None = None) -> tuple[Solved, float]:
@@ -323,6 +327,31 @@ def stabilised(args: argparse.Namespace) -> None:
         print(json.dumps(found), flush=True)
 
 
+def edits(args: argparse.Namespace) -> None:
+    """Walks that were changed after they were filmed."""
+    for name in args.edit:
+        change, slower = EDITS[name]
+        for seed in range(args.first_seed, args.first_seed + args.num):
+            folder = clip_folder(args.clips, "walk", seed)
+            true_s = slower * read_solution(folder / "ground_truth.json").options["readout_ms"] / 1e3
+            said: dict[str, Any] = {"edit": name, "clip": folder.name}
+            with tempfile.TemporaryDirectory() as scratch:
+                edited(folder / "clip.mp4", Path(scratch) / "clip.mp4", change)
+                try:
+                    solved, _ = solved_clip(Path(scratch) / "clip.mp4", str(folder / "camera.json"))
+                except Exception as error:  # counted, as what a user would see
+                    print(json.dumps(said | {"error": str(error)}), flush=True)
+                    continue
+            found, verdict = solved.evidence, solved.verdict
+            assert verdict is not None
+            of = {"path": found, **({"slow": found["by_speed"][0]} if found["by_speed"] else {})}
+            for key, time in of.items():
+                said[f"{key}_error_percent"] = round(100 * (time["seconds"] / true_s - 1), 2)
+                said[f"{key}_error_over_sigma"] = round((time["seconds"] - true_s) / time["sigma"], 2)
+            said |= {"verdict": [verdict.shutter, verdict.shape], "reasons": verdict.reasons}
+            print(json.dumps(said), flush=True)
+
+
 def gopro(args: argparse.Namespace) -> None:
     """A GoPro with its gyroscope."""
     video = args.shared / "video" / "gopro-hero5-gentle.mp4"
@@ -455,6 +484,7 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=100)
     parser.add_argument("--frames", type=int, nargs="+", default=(300, 600, 1200, 1800))
     parser.add_argument("--long", choices=LONG, nargs="+", default=LONG)
+    parser.add_argument("--edit", choices=EDITS, nargs="+", default=EDITS)
     parser.add_argument("--shared", type=Path, default=Path(__file__).parents[2] / "shared")
     args = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -464,7 +494,7 @@ def main() -> None:
         else:
             {
                 "walk": walk, "readout": readout, "stabilised": stabilised, "gopro": gopro, "peer": peer,
-                "length": length, "unordered": unordered,
+                "length": length, "unordered": unordered, "edited": edits,
             }[part](args)  # fmt: skip
 
 

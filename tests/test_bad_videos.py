@@ -113,6 +113,51 @@ def test_frames_whose_time_runs_back_are_left_out(tmp_path):
     assert len(clip.names) >= 20
 
 
+@pytest.mark.parametrize("rate", [24, 25, 20, 15, 12])
+def test_frames_of_a_converted_video_have_the_times_of_their_own_rate(tmp_path, rate):
+    shown = [k * rate // 30 for k in range(50)]
+    video = encode(tmp_path / "clip.mp4", [view(k) for k in shown])
+    with pytest.warns(RsUndistortWarning, match=rf"{1e3 / rate:.1f} ms apart"):
+        clip = read_clip(video, tmp_path / "frames")
+    assert len(clip.numbers) == shown[-1] + 1
+    np.testing.assert_allclose(np.diff(clip.time_s), 1 / rate)
+    assert clip.frame_s == pytest.approx(1 / rate)
+
+
+def test_frames_that_come_twice_are_left_out(tmp_path):
+    """Of 25 frames a second, converted to 30: each fifth frame comes twice."""
+    shown = [k - k // 6 for k in range(42)]
+    video = encode(tmp_path / "clip.mp4", [view(k) for k in shown])
+    with pytest.warns(
+        RsUndistortWarning, match=r"clip\.mp4: 6 of 42 frames show the same as the one before.* 40\.0 ms apart"
+    ):
+        clip = read_clip(video, tmp_path / "frames")
+    assert clip.repeated == (6, 12, 18, 24, 30, 36)
+    assert clip.numbers == tuple(k for k in range(42) if k not in clip.repeated)
+    np.testing.assert_allclose(np.diff(clip.time_s), 1 / 25)
+    assert not clip.part.any()
+
+
+def test_a_picture_that_freezes_is_a_pause(tmp_path):
+    shown = [*range(15), *[14] * 30, *range(15, 30)]
+    video = encode(tmp_path / "clip.mp4", [view(k) for k in shown])
+    with pytest.warns(RsUndistortWarning, match="30 of 60 frames show the same") as said:
+        clip = read_clip(video, tmp_path / "frames")
+    assert "apart" not in str(said[0].message)
+    assert np.diff(clip.time_s).max() == pytest.approx(31 / 30)
+    assert clip.part.tolist() == [0] * 15 + [1] * 15
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_calm_scene_after_a_cut_or_a_flash_is_not_taken_for_frames_that_come_twice(tmp_path):
+    """Where the step before was a large one, all that follow are small beside it."""
+    blurred = cv2.GaussianBlur(SCENE, (0, 0), 6.0)
+    other = [np.ascontiguousarray(blurred[::-1, k : k + WIDTH]) for k in range(20)]
+    flash = np.clip(other[9].astype(int) + 100, 0, 255).astype(np.uint8)
+    frames = [*(view(3 * k) for k in range(10)), *other[:9], flash, *other[10:]]
+    assert read_clip(encode(tmp_path / "clip.mp4", frames), tmp_path / "frames").repeated == ()
+
+
 def test_dark_frames_are_left_out(tmp_path):
     frames = [view(k) for k in range(10)]
     frames[4] = frames[5] = BLACK

@@ -7,6 +7,7 @@ import json
 import sys
 from dataclasses import replace
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -516,6 +517,22 @@ def test_a_run_that_is_interrupted_behind_its_video_keeps_the_video_and_its_stag
     assert (out / "video.mp4").stat().st_mtime_ns == before
     assert names.count("video") == 1
     assert names[names.index("video") + 1] == "rectifying"
+
+
+@pytest.mark.slow
+def test_frames_that_come_twice_are_corrected_as_the_one_before(cut, tmp_path):
+    shown = [frame.to_ndarray(format="bgr24") for frame in frames_of(cut)]
+    twice = tmp_path / "twice.mp4"
+    write_video(twice, [shown[k * 5 // 6] for k in range(24)], Fraction(30))
+    (tmp_path / "camera.json").write_bytes((cut.parent / "camera.json").read_bytes())
+    with pytest.warns(RsUndistortWarning, match="4 of 24 frames show the same as the one before.* 40.0 ms apart"):
+        solution = run(twice, tmp_path / "out", RunOptions(frames="all", max_features=1000))
+    assert len(rows_of(tmp_path / "out" / "path.csv")) == 20
+    assert solution.options["video"]["repeated"] == [1, 7, 13, 19]
+    after = [frame.to_ndarray(format="gray").astype(float) for frame in frames_of(tmp_path / "out" / "video.mp4")]
+    steps = np.array([np.abs(second - first).mean() for first, second in pairwise(after)])
+    again = np.isin(np.arange(1, 24), solution.options["video"]["repeated"])
+    assert steps[again].max() < 0.2 * steps[~again].min()
 
 
 def check_usd(path, row, code, camera):

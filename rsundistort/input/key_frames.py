@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import shutil
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,6 +33,15 @@ _INTERLACED = (
 # Pictures that may become the next key frame are held up to this much memory: a camera that stands still holds none of
 # them back for ever. The oldest go first, and are decoded again if they are chosen.
 _HELD_BYTES = 2e8
+# A frame is the one before once more if its grey levels differ by less than this share of what they differed by in each
+# of so many steps before: other frames of rendered and real videos do by a quarter at least, repeated ones by a
+# thousandth. A flash is two large steps. Where there was none, it is taken to be of one grey level.
+_SAME, _STEPS, _FIRST_STEP = 0.1, 3, 1.0
+# A conversion repeats frames at least so often, and divides rates whose ratio has no larger denominator: 30 and 23.976
+# have 5, 60 and 25 have 12.
+_LEAST_REPEATS, _LARGEST_RATE = 4, 32
+# It rounds times to frames, and where it begins, one comes earlier or later.
+_ROUNDED = 1.25
 # A recording paused if a step between frames is longer than this many usual ones.
 _PAUSE = 20.0
 
@@ -45,11 +57,13 @@ class Clip:
     folder : Path
         Where its key frames lie, as PNG files.
     numbers : tuple of int, length n
-        Indices of the frames among those that could be decoded; frames that show nothing are left out.
+        Indices of the frames among those that could be decoded; frames that show nothing, or the same as the one
+        before, are left out.
     names : tuple of str, length n
         Of all frames, also of those that were not written.
     time_s : (n,) array
-        Time of each, by the container's time stamps; seconds since the first.
+        Time of each, by the container's time stamps; seconds since the first. Evenly spaced where frames come twice
+        regularly.
     frame_s : float
         The usual time from one frame to the next.
     part : (n,) int array
@@ -62,6 +76,8 @@ class Clip:
         Further facts about them, and about the camera.
     flows : tuple of KeyFlow
         Corners of key frames in the next one, in pixels of the flow.
+    repeated : tuple of int
+        Indices of frames that show the same as the one before.
     """
 
     video: Path
@@ -75,6 +91,7 @@ class Clip:
     moved_px: NDArray[np.float64]
     frames: VideoFrames
     flows: tuple[KeyFlow, ...] = ()
+    repeated: tuple[int, ...] = ()
 
     @property
     def key_names(self) -> tuple[str, ...]:
@@ -87,6 +104,7 @@ class Clip:
             "key_frames": len(self.keys),
             "frame_s": self.frame_s,
             "cuts_s": self.time_s[np.flatnonzero(np.diff(self.part)) + 1].tolist(),
+            "repeated": [*self.repeated],
         }
 
 
@@ -139,7 +157,7 @@ def read_clip(video: Path, folder: Path, progress: Callable[[int, int], None] | 
 def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None) -> Clip:
     chooser, numbers, times, sharpness, num_late = KeyFrameChooser(), list[int](), list[float](), list[float](), 0
     held: dict[int, tuple[int, float, Any]] = {}  # frames that may become the next key
-    written = set[int]()
+    written, repeated, step = set[int](), list[int](), _Step()
     with VideoReader(video) as reader:
         writer, num_written = FrameWriter(reader, folder), 0
         for number, time_s, picture in reader:
@@ -155,6 +173,9 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
             grey = _grey(picture)
             if grey.std() < _DARK:
                 continue
+            if step.is_none(grey):
+                repeated.append(number)
+                continue
             held[len(numbers)] = number, time_s, picture
             if len(held) * sum(plane.buffer_size for plane in picture.planes) > _HELD_BYTES:
                 del held[min(held)]
@@ -162,6 +183,8 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
             times.append(time_s)
             sharpness.append(sharpness_of(picture))
             chooser.feed(even_brightness(grey))
+            if [len(numbers) - 1] == chooser.cuts[-1:]:
+                step.forget()
             for k in held.keys() & {*chooser.keys[num_written:]}:
                 writer.add(*held[k], sharpness[k])
                 written.add(k)
@@ -180,6 +203,15 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
         some = "1 frame that shows" if numbers else "no frame that shows"
         raise InputError(f"{video.name} has {some} anything; a path needs two")
     time = np.array(times)
+    if repeated:
+        step_s = _even_step(np.array(numbers), time)
+        time = time if step_s is None else time[0] + step_s * np.arange(len(time))
+        others = "" if step_s is None else f"; the others are taken to be {1e3 * step_s:.1f} ms apart"
+        warnings.warn(
+            f"{video.name}: {len(repeated)} of {len(repeated) + len(numbers)} frames show the same as the one before, "
+            f"as if the video was converted to another frame rate; they are corrected as that one{others}",
+            RsUndistortWarning, stacklevel=3,
+        )  # fmt: skip
     frame_s = float(np.median(np.diff(time)))
     breaks = {*chooser.cuts, *(np.flatnonzero(np.diff(time) > _PAUSE * frame_s) + 1).tolist()}
     keys = np.array(sorted({*chooser.keys, *_between(len(numbers), len(chooser.keys)), *_ends(breaks)}))
@@ -187,9 +219,48 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
     part = np.cumsum([k in breaks for k in range(len(numbers))])
     names = tuple(frame_name(video, number) for number in numbers)
     flows = tuple(each for each in chooser.flows if part[each.keys[0]] == part[each.keys[1]])
+    moved_px, frames = np.array(chooser.steps), writer.finish()
     return Clip(
-        video, folder, tuple(numbers), names, time, frame_s, part, keys, np.array(chooser.steps), writer.finish(), flows
+        video, folder, tuple(numbers), names, time, frame_s, part, keys, moved_px, frames, flows, tuple(repeated)
     )
+
+
+class _Step:
+    """By how much frames differ from the one before."""
+
+    def __init__(self) -> None:
+        self._before: NDArray[np.uint8] | None = None
+        self._sizes = deque[float](maxlen=_STEPS)
+
+    def is_none(self, grey: NDArray[np.uint8]) -> bool:
+        """Whether the next frame shows the same as the one before, while the content moves."""
+        if self._before is not None:
+            size = float(cv2.norm(grey, self._before, cv2.NORM_L1)) / grey.size
+            if size < _SAME * min(self._sizes, default=_FIRST_STEP):
+                return True
+            self._sizes.append(size)
+        self._before = grey
+        return False
+
+    def forget(self) -> None:
+        """A new scene begins with this frame."""
+        self._sizes.clear()
+
+
+def _even_step(numbers: NDArray[np.int64], time_s: NDArray[np.float64]) -> float | None:
+    """Time from frame to frame before a conversion to a higher frame rate repeated some; None if it was none.
+
+    Indices of the others (n,) after a conversion are the multiples of the ratio of both rates, rounded.
+    """
+    if (np.diff(numbers) > 1).sum() < _LEAST_REPEATS:
+        return None
+    place = np.arange(len(numbers))
+    slope = float(np.polyfit(place, numbers, 1)[0])
+    for largest in range(1, _LARGEST_RATE):
+        ratio = float(Fraction(slope).limit_denominator(largest))
+        if np.ptp(numbers - ratio * place) < _ROUNDED:
+            return ratio * float(np.median(np.diff(time_s) / np.diff(numbers)))
+    return None
 
 
 def _add(writer: FrameWriter, video: Path, sharpness: Mapping[int, float]) -> None:

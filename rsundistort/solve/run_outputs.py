@@ -46,7 +46,7 @@ from ..io.outputs import batch_folder
 from ..io.places import local_place
 from ..io.record import Record
 from ..io.usd import write_usd_camera
-from ..io.video import FRAME_TABLE
+from ..io.video import FRAME_TABLE, frame_name
 from ..model import Camera, Reconstruction, RowMotion, Solution, SolvedImage
 from ..model.orientation import orient_path, orient_reconstruction, orient_solution
 from ..rectify import bend_px
@@ -366,12 +366,15 @@ class Outputs:
         # depth maps are those of the key frames: with them, and without them in between, things would jump
         depth = self.rectifying.depth if str(self.rectifying.depth) in DEPTHS else "auto"
         scene = SceneGeometry(every, depth, ScenePoints.of_reconstruction(whole))
-        placed = {*whole.image_names}
+        placed, repeated = {*whole.image_names}, solution.options["video"]["repeated"]
+        before = {frame_name(video, k): frame_name(video, k - 1) for k in repeated}
         still = PhotoGeometry(video.name, self.solved.shared.cameras[0], new_camera, RowMotion(), "global")
 
         def geometry_of(name: str) -> PhotoGeometry | None:
             if lens_only:
                 return still
+            while name in before:
+                name = before[name]
             return scene.of(name) if name in placed else None
 
         with Record(out).writing([VIDEO]):
