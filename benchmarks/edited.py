@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 
@@ -35,9 +35,9 @@ def _flash(frames: Frames) -> Frames:
     return [_scaled(frame, 1, 120 * (k % 31 == 20)) for k, frame in enumerate(frames)]
 
 
-def _converted(frames: Frames) -> Frames:
-    """To a frame rate that is higher by a fifth."""
-    return [frames[k * 5 // 6] for k in range(len(frames) * 6 // 5)]
+def _at_rate(frames: Frames, ratio: float) -> Frames:
+    """At another frame rate, so many times the present one: those that are nearest in time."""
+    return [frames[int(k / ratio + 0.5 - 1e-9)] for k in range(int((len(frames) - 1) * ratio))]
 
 
 def _frozen(frames: Frames) -> Frames:
@@ -72,15 +72,16 @@ def _noise(frames: Frames) -> Frames:
     return [_scaled(frame, 0.35, rng.normal(0, 8, frame.shape)) for frame in frames]
 
 
-#: What becomes of the frames, by name, and by how much the readout takes longer by the clock of the file.
+#: What becomes of the frames, by name, and the frame rate that they are then said to have, by the present one.
 EDITS: dict[str, tuple[Callable[[Frames], Frames], float]] = {
     "lamps": (_lamps, 1.0),
     "exposure": (_exposure, 1.0),
     "flash": (_flash, 1.0),
-    "converted": (_converted, 1.2),
+    "higher rate": (lambda frames: _at_rate(frames, 1.25), 1.25),
+    "lower rate": (lambda frames: _at_rate(frames, 5 / 6), 5 / 6),
+    "half the rate": (lambda frames: frames[::2], 0.5),
     "frozen": (_frozen, 1.0),
-    "one in seven missing": (lambda frames: [frame for k, frame in enumerate(frames) if k % 7 != 3], 1.0),
-    "every second": (lambda frames: frames[::2], 0.5),
+    "dropped": (lambda frames: [each for k, each in enumerate(frames) if k % 31 not in (4, 11, 20, 21)], 1.0),
     "passers-by": (_passers_by, 1.0),
     "captions": (_captions, 1.0),
     "blur": (lambda frames: [cv2.GaussianBlur(frame, (0, 0), 2.0) for frame in frames], 1.0),
@@ -88,9 +89,10 @@ EDITS: dict[str, tuple[Callable[[Frames], Frames], float]] = {
 }
 
 
-def edited(video: Path, out: Path, change: Callable[[Sequence[np.ndarray]], Frames]) -> None:
-    """Write a video anew, changed, at its frame rate."""
+def edited(video: Path, out: Path, edit: str) -> None:
+    """Write a video anew, changed."""
+    change, faster = EDITS[edit]
     with av.open(str(video)) as container:
         rate = Fraction(container.streams.video[0].average_rate)
         frames = [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
-    write_video(out, change(frames), rate)
+    write_video(out, change(frames), rate * Fraction(faster).limit_denominator(100))

@@ -330,13 +330,12 @@ def stabilised(args: argparse.Namespace) -> None:
 def edits(args: argparse.Namespace) -> None:
     """Walks that were changed after they were filmed."""
     for name in args.edit:
-        change, slower = EDITS[name]
         for seed in range(args.first_seed, args.first_seed + args.num):
             folder = clip_folder(args.clips, "walk", seed)
-            true_s = slower * read_solution(folder / "ground_truth.json").options["readout_ms"] / 1e3
+            true_s = read_solution(folder / "ground_truth.json").options["readout_ms"] / 1e3
             said: dict[str, Any] = {"edit": name, "clip": folder.name}
             with tempfile.TemporaryDirectory() as scratch:
-                edited(folder / "clip.mp4", Path(scratch) / "clip.mp4", change)
+                edited(folder / "clip.mp4", Path(scratch) / "clip.mp4", name)
                 try:
                     solved, _ = solved_clip(Path(scratch) / "clip.mp4", str(folder / "camera.json"))
                 except Exception as error:  # counted, as what a user would see
@@ -345,9 +344,9 @@ def edits(args: argparse.Namespace) -> None:
             found, verdict = solved.evidence, solved.verdict
             assert verdict is not None
             of = {"path": found, **({"slow": found["by_speed"][0]} if found["by_speed"] else {})}
-            for key, time in of.items():
-                said[f"{key}_error_percent"] = round(100 * (time["seconds"] / true_s - 1), 2)
-                said[f"{key}_error_over_sigma"] = round((time["seconds"] - true_s) / time["sigma"], 2)
+            for key, each in of.items():
+                said[f"{key}_error_percent"] = round(100 * (each["seconds"] / true_s - 1), 2)
+                said[f"{key}_error_over_sigma"] = round((each["seconds"] - true_s) / each["sigma"], 2)
             said |= {"verdict": [verdict.shutter, verdict.shape], "reasons": verdict.reasons}
             print(json.dumps(said), flush=True)
 

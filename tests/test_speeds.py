@@ -27,9 +27,10 @@ def lines_of(rotations_at, time_s, readout_s):
     return np.array(R_cw), np.array(phi)
 
 
-def by_speed(rotations_at, rng, readout_s=0.02, num=60, part=None):
-    """The two readout times of frames with noise."""
-    time_s = np.arange(num) * FRAME_S
+def by_speed(rotations_at, rng, readout_s=0.02, num=60, part=None, without=()):
+    """The two readout times of frames with noise, without some that are missing."""
+    time_s = np.delete(np.arange(num) * FRAME_S, without)
+    num = len(time_s)
     R_cw, phi = lines_of(rotations_at, time_s, readout_s)
     R_cw = Rotation.from_rotvec(rng.normal(0, NOISE, (num, 3))).as_matrix() @ R_cw
     sigma = np.full((num, 3), NOISE)
@@ -94,5 +95,6 @@ def test_a_readout_against_its_direction_has_the_same_sign_at_all_speeds(rng):
 def test_nothing_is_said_of_few_frames_of_gaps_or_of_rotations_lost_in_the_noise(rng):
     assert by_speed(shaken(1, 9.0, 0.003), rng, num=20) is None
     assert by_speed(shaken(1, 9.0, 0.003), rng, num=40, part=np.repeat([0, 1], 20)) is None
+    assert by_speed(shaken(1, 9.0, 0.003), rng, num=46, without=(22, 23)) is None
     still = by_speed(lambda time_s: np.tile(np.eye(3), (len(time_s), 1, 1)), rng)
     assert still is None

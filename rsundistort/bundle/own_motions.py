@@ -31,7 +31,7 @@ class OwnMotions:
 
     Attributes
     ----------
-    R_cw : (m, 3, 3) array
+    R_cw, center_w : (m, 3, 3), (m, 3) array
         `x_c = R_cw (X_w - center_w)`.
     phi : (m, 3) array
         Radians per unit of the clock.
@@ -40,6 +40,7 @@ class OwnMotions:
     """
 
     R_cw: Array
+    center_w: Array
     phi: Array
     sigma_rotation: Array
     sigma_phi: Array
@@ -89,9 +90,10 @@ def own_motions(reconstruction: Reconstruction, *, rotation_only: bool = False) 
     moved = np.einsum("fab,fcb->fca", inverse, pulls.reshape(m, count, -1)[known])
     together = np.median((moved**2).sum(1) / variance, axis=0) if known.any() else np.ones(len(own))
     sigma[np.ix_(known, own)] = np.sqrt(np.maximum(together, 1.0) * variance)
-    R_cw, phi = state.R_cw.copy(), state.phi.copy()
-    R_cw[~known], phi[~known] = np.nan, np.nan
-    return OwnMotions(R_cw, phi, sigma[:, :3], sigma[:, 6:])
+    found = state.R_cw.copy(), state.center_w.copy(), state.phi.copy()
+    for each in found:
+        each[~known] = np.nan
+    return OwnMotions(*found, sigma[:, :3], sigma[:, 6:])
 
 
 def _scaled(H: Array) -> tuple[Array, Array]:

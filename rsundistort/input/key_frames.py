@@ -6,7 +6,7 @@ import shutil
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -97,6 +97,13 @@ class Clip:
     def key_names(self) -> tuple[str, ...]:
         """Names of the key frames."""
         return tuple(self.names[k] for k in self.keys.tolist())
+
+    def with_gaps(self, missing: NDArray[np.int64], frame_s: float) -> Clip:
+        """The same frames where so many (n - 1,) are missing between them, and those of a part `frame_s` apart."""
+        step_s = np.diff(self.time_s)
+        step_s = np.where(np.diff(self.part) == 0, frame_s * (step_s / self.frame_s + missing), step_s)
+        time_s = np.concatenate([[0.0], np.cumsum(step_s)]) + self.time_s[0]
+        return replace(self, time_s=time_s, frame_s=frame_s)
 
     def facts(self) -> dict[str, Any]:
         """Its content of `solution.json`."""

@@ -31,6 +31,7 @@ from .clip_gyroscope import Felt, felt_gyroscope, own_gyroscope, readout_of, rot
 from .clip_pair import FramePair
 from .clip_pan import rotating_only
 from .clip_tracks import follow_points, followed_again, with_all_frames
+from .missing_frames import frames_missing, regular_gaps
 from .model_sequence import without_shutter
 from .outcome import Solved
 from .placing import place_photos
@@ -58,8 +59,9 @@ _MEASURED = 0.7
 _OF_STABILISED = "what is taken for frames that were stabilised"
 _OF_GLOBAL = "what was given: a global shutter"
 
-# Result, its options, and whether the frames are as the sensor read them, if that was tested.
-_Found = tuple[BundleResult, BundleOptions, Stabilisation | None]
+# Result, its options, whether the frames are as the sensor read them, if that was tested, and the clip with the times
+# that the path has.
+_Found = tuple[BundleResult, BundleOptions, Stabilisation | None, Clip]
 
 
 def solve_clip(
@@ -113,7 +115,7 @@ def solve_clip(
     if turned is not None and explained:
         found = _only_turned(turned)
     elif len(clip.names) == 2:
-        found = _of_two(FramePair.of(clip, keys), path, options_of, log)
+        found = _of_two(clip, keys, path, options_of, log)
     else:
         try:
             found = _travelled(
@@ -125,7 +127,7 @@ def solve_clip(
             if turned is None:
                 raise
             found = _only_turned(turned)
-    result, options, filmed = found
+    result, options, filmed, clip = found
     assert options.path is not None
     path = options.path
     alone = readout_of(result)
@@ -164,7 +166,7 @@ def _turned(
                 partial(_tell, log, "rotations"),
             )  # fmt: skip
             dropped = 1 - len(result.reconstruction.observations) / len(start.observations)
-            found, explained = (result, options, None), result.sigma_px < _FLOW_PX and dropped < _OUTLIERS
+            found, explained = (result, options, None, clip), result.sigma_px < _FLOW_PX and dropped < _OUTLIERS
     log.end("rotations", explained=explained)
     return found, explained
 
@@ -179,10 +181,12 @@ def _only_turned(turned: _Found) -> _Found:
 
 
 def _of_two(
-    pair: FramePair, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions], log: StageLog
-) -> _Found:
+    clip: Clip, keys: LoadedPhotos, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions],
+    log: StageLog,
+) -> _Found:  # fmt: skip
     """The path through two frames."""
     log.begin("path")
+    pair = FramePair.of(clip, keys)
     start = pair.placed(None if path.readout is None else path.readout_prior[0])
     # one step determines no spread of steps, and estimates of it would not settle
     options = replace(options_of(start), path=path, prior_sigma_rounds=0)
@@ -192,7 +196,7 @@ def _of_two(
     whole = pair.of_all(first.reconstruction)
     result = bundle_adjust(whole, "constant-motion", options, partial(_tell, log, "path"))
     log.end("path", points=result.reconstruction.num_points, rms_px=result.rms_px)
-    return result, options, None
+    return result, options, None, clip
 
 
 def _travelled(
@@ -214,7 +218,9 @@ def _travelled(
         on_path = None if result is None else result.reconstruction
         whole = with_all_frames(clip, current, followed, on_path).without_photos(_LEAST_MEASUREMENTS)
         if result is None:
-            path, filmed = _as_filmed(clip, whole, path, telemetry)
+            own = own_motions(whole)
+            clip, path = _with_gaps(clip, path, whole, own)
+            path, filmed = _as_filmed(clip, whole, path, telemetry, own)
         options = replace(options_of(whole), path=path if result is None else replace(path, start=_start_of(result)))
         how = (
             _at_first(options)
@@ -233,18 +239,40 @@ def _travelled(
             current = retriangulate(matched, of_keys)
             followed = followed_again(clip, followed, before, current)
     assert result is not None
-    return result, options, filmed
+    return result, options, filmed, clip
+
+
+def _with_gaps(clip: Clip, path: FramePath, start: Reconstruction, own: OwnMotions) -> tuple[Clip, FramePath]:
+    """The times of frames where others are missing between them, though the times of the file do not show it."""
+    place = _places(clip, start)
+    steps = np.diff(clip.time_s[place]) / clip.frame_s
+    missing = frames_missing(own.R_cw, own.center_w, steps, np.diff(clip.part[place]) == 0)
+    if not missing.any():
+        return clip, path
+    of_all = np.zeros(len(clip.names) - 1, np.int64)
+    of_all[place[:-1]] = missing
+    regular, frame_s = regular_gaps(of_all), clip.frame_s
+    if regular is not None:  # the video lasts as long as before
+        of_all, frame_s = regular[0], clip.frame_s / regular[1]
+    first = clip.names[int(np.flatnonzero(of_all)[0])]
+    how = "" if regular is None else f", as if it was converted from {1 / frame_s:.3g} frames a second"
+    warnings.warn(
+        f"{of_all.sum()} frames are missing between those of {clip.video.name}, the first after {first}{how}: the "
+        "camera moves farther there than before and after; the times were corrected",
+        RsUndistortWarning, stacklevel=5,
+    )  # fmt: skip
+    clip = clip.with_gaps(of_all, frame_s)
+    return clip, replace(path, time_s=dict(zip(clip.names, clip.time_s.tolist(), strict=True)), frame_s=frame_s)
 
 
 def _as_filmed(
-    clip: Clip, start: Reconstruction, path: FramePath, telemetry: GyroLog | None
+    clip: Clip, start: Reconstruction, path: FramePath, telemetry: GyroLog | None, found: OwnMotions
 ) -> tuple[FramePath, Stabilisation]:
     """Whether frames are as the sensor read them, and the path of those that can share one.
 
     The shutter of frames that were rotated since is not that of their path, and any readout time would be wrong. The
     telemetry is the video's own.
     """
-    found = own_motions(start)
     filmed = _stabilisation(clip, start, found)
     if not filmed.shows_shaking:  # poses without a path say little else
         filmed = replace(filmed, verdict="unknown" if filmed.verdict == "stabilised" else filmed.verdict)

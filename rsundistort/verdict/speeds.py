@@ -12,8 +12,8 @@ __all__ = ["ReadoutTime", "readouts_by_speed"]
 
 Array = NDArray[np.float64]
 
-# Fewer frames than this of one part have no spectrum to speak of.
-_FEWEST = 24
+# Fewer frames than this, evenly spaced, have no spectrum to speak of; where one is missing, others begin.
+_FEWEST, _GAP = 24, 1.5
 # Periods in a part that a rotation has at least: slower ones are what lens and scene leave, and the window's edge.
 _LEAST_PERIODS = 2
 # A Hann window spreads each rotation over three frequencies: what is left of neighbours goes together.
@@ -54,10 +54,18 @@ def readouts_by_speed(
     pair of ReadoutTime or None
         By slow and by fast rotations; None if there are too few frames, or a kind of rotation is lost in the noise.
     """
+    known = np.isfinite(np.hstack([R_cw.reshape(-1, 9), phi, phi_sigma])).all(axis=1)
+    part = part[known]
+    time_s, R_cw, rotation_sigma, phi, phi_sigma = (
+        each[known] for each in (time_s, R_cw, rotation_sigma, phi, phi_sigma)
+    )
+    apart = np.diff(time_s)
+    ends = (np.diff(part) != 0) | (apart > _GAP * np.median(apart)) if len(apart) else np.zeros(0, bool)
+    run = np.concatenate([[0], np.cumsum(ends)])
     spectra = [
         _spectra(time_s[mine], R_cw[mine], rotation_sigma[mine], phi[mine], phi_sigma[mine], readout_s)
-        for each in np.unique(part)
-        if len(mine := np.flatnonzero(part == each)) >= _FEWEST
+        for each in np.unique(run)
+        if len(mine := np.flatnonzero(run == each)) >= _FEWEST
     ]
     if not spectra:
         return None
@@ -71,31 +79,26 @@ def _spectra(
     time_s: Array, R_cw: Array, rotation_sigma: Array, phi: Array, phi_sigma: Array, readout_s: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.complex128], NDArray[np.complex128], Array, Array]:
     """Whether frequencies (n,) are fast; spectra (n, 3) of phi and of the rates; and power (n, 3) of their noise."""
-    known = np.isfinite(R_cw).all(axis=(1, 2)) & np.isfinite(phi).all(1) & np.isfinite(phi_sigma).all(1)
-    if known.sum() < _FEWEST:
-        none = np.zeros((0, 3))
-        return np.zeros(0, bool), none.astype(complex), none.astype(complex), none, none
-    time, R, lines = time_s[known], R_cw[known], phi[known]
-    steps = Rotation.from_matrix(R[1:] @ R[:-1].transpose(0, 2, 1)).as_rotvec()
+    steps = Rotation.from_matrix(R_cw[1:] @ R_cw[:-1].transpose(0, 2, 1)).as_rotvec()
     rotated = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    step_s = float(np.median(np.diff(time)))
-    length = time[-1] - time[0] + step_s
+    step_s = float(np.median(np.diff(time_s)))
+    length = time_s[-1] - time_s[0] + step_s
     # the rate of a path under a window: that of both, less the window's own
-    phase = 2 * np.pi * (time - time[0] + 0.5 * step_s) / length
+    phase = 2 * np.pi * (time_s - time_s[0] + 0.5 * step_s) / length
     window, slope = 0.5 * (1 - np.cos(phase)), np.pi / length * np.sin(phase)
     rotated -= np.average(rotated, axis=0, weights=window)
     frequency = np.arange(_LEAST_PERIODS, int(0.5 * length / step_s)) / length
-    waves = np.exp(-2j * np.pi * frequency[:, None] * time)
+    waves = np.exp(-2j * np.pi * frequency[:, None] * time_s)
     circular = 2j * np.pi * frequency[:, None]
     # a steady motion that is fitted to a period shows less of it, in its rate and in its pose
     z = np.maximum(np.pi * frequency * abs(readout_s), 1e-3)
     shown = 3 * (np.sin(z) - z * np.cos(z)) / z**2 / np.sin(z)
     rates = (circular * (waves @ (window[:, None] * rotated)) - waves @ (slope[:, None] * rotated)) * shown[:, None]
-    of_rotations, of_lines = rotation_sigma[known] ** 2, phi_sigma[known] ** 2
+    of_rotations, of_lines = rotation_sigma**2, phi_sigma**2
     rate_noise = np.abs(circular) ** 2 * (window**2 @ of_rotations) + slope**2 @ of_rotations
     line_noise = np.broadcast_to(window**2 @ of_lines, rate_noise.shape)
     fast = frequency > 0.25 / step_s
-    return fast, waves @ (window[:, None] * lines), rates, line_noise, rate_noise * shown[:, None] ** 2
+    return fast, waves @ (window[:, None] * phi), rates, line_noise, rate_noise * shown[:, None] ** 2
 
 
 def _slope(

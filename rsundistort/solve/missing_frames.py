@@ -1,0 +1,111 @@
+"""Frames that are missing between others of a video, by how far its camera moves there."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+__all__ = ["frames_missing", "regular_gaps"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+# Frames that may be missing between two others; intervals that say what is usual.
+_MOST, _FEWEST = 3, 12
+# How much likelier, as a logarithm, missing frames must be than a jerk of the hand, beyond all intervals there are;
+# where at least two are, frames are missing, and that others are is as likely as they are frequent.
+_CLEAR, _LIKELY = 7.0, 1.5
+# Squares of normal residuals beyond the number of them: rarer is something else.
+_FITS = 12.0
+# Rounds in which half of the changes may be of missing frames, and of their neighbours, and those in which few are.
+_FIRST, _ROUNDS = 8, 12
+# Quantiles of squares of normal variables.
+_QUARTER, _MEDIAN = 0.1015, 0.455
+# A conversion divides frame rates whose ratio has no larger denominator; the share of its gaps that must be seen, and
+# of those that are seen which it explains.
+_LARGEST, _SEEN, _EXPLAINED = 24, 0.5, 0.85
+
+
+def frames_missing(R_cw: Array, center_w: Array, steps: Array, joined: NDArray[np.bool_]) -> Index:
+    """Number of frames that are missing in each interval between consecutive ones, beyond what their times say.
+
+    Where frames are missing but their times do not show it, the camera moves by a multiple of what it does before and
+    after, in all directions alike. A jerk of the hand moves it elsewhere. Each hypothesis is weighed by the usual
+    changes from interval to interval.
+
+    Parameters
+    ----------
+    R_cw, center_w : (m, 3, 3), (m, 3) array
+        Poses, each of its own measurements; NaN where unknown.
+    steps : (m - 1,) array
+        Times between them by the file, in times between frames.
+    joined : (m - 1,) bool array
+        Whether both are of one part.
+
+    Returns
+    -------
+    (m - 1,) int array
+        All 0 if fewer than two intervals are clear.
+    """
+    m = len(R_cw)
+    found = np.zeros(max(m - 1, 0), np.int64)
+    known = np.asarray(np.isfinite(np.hstack([R_cw.reshape(m, 9), center_w])).all(axis=1))
+    valid = np.flatnonzero(joined & known[1:] & known[:-1])
+    way = np.full((m - 1, 6), np.nan)
+    between = R_cw[valid + 1] @ R_cw[valid].transpose(0, 2, 1)
+    way[valid] = np.hstack([Rotation.from_matrix(between).as_rotvec(), np.diff(center_w, axis=0)[valid]])
+    way = way[:, np.nansum(np.abs(way), axis=0) > 0]  # a camera on a tripod does not travel
+    if len(valid) < _FEWEST or not way.size:
+        return found
+    clear = np.log(len(valid)) + _CLEAR
+    for k in range(_ROUNDS):
+        rate = np.pad(way / (steps + found)[:, None], ((1, 1), (0, 0)), constant_values=np.nan)
+        beside = np.isfinite(rate[:-2, :1]) + 1.0 * np.isfinite(rate[2:, :1])
+        usual = (np.nan_to_num(rate[:-2]) + np.nan_to_num(rate[2:])) / np.where(beside > 0, beside, np.nan)
+        rate = rate[1:-1]
+        squares = (rate - usual) ** 2
+        quantile, normal = (0.25, _QUARTER) if k < _FIRST else (0.5, _MEDIAN)
+        variance = np.maximum(np.nanquantile(squares, quantile, axis=0) / normal, 1e-18)
+
+        def cost(missing: int, usual: Array = usual, variance: Array = variance) -> tuple[Array, float]:
+            """Half the squares of what is left, and how much more it varies: neighbours count as often."""
+            more = (1 + 0.5 * (1 + missing) ** 2) / 1.5
+            return 0.5 * ((way - (steps + missing)[:, None] * usual) ** 2 / variance).sum(1) / more, more
+
+        best, gain, none = np.zeros(m - 1, np.int64), np.zeros(m - 1), cost(0)[0]
+        for missing in range(1, _MOST + 1):
+            left, more = cost(missing)
+            better = none - left - 0.5 * way.shape[1] * np.log(more)
+            take = (2 * left < way.shape[1] + _FITS) & (better > gain)
+            best[take], gain[take] = missing, better[take]
+        certain = int((gain > clear).sum())
+        share = min(certain / len(valid), 0.5)
+        least = clear if certain < 2 else np.log((1 - share) / share) + _LIKELY
+        found = np.where(gain > least, best, 0)
+    return found if (found > 0).sum() > 1 else np.zeros_like(found)
+
+
+def regular_gaps(missing: Index) -> tuple[Index, float] | None:
+    """All gaps of a conversion to a lower frame rate, and the ratio of both rates; None if it was none.
+
+    `missing` (n,) is of all intervals of a video. Of a conversion, frames are those nearest to multiples of the ratio.
+    """
+    seen = np.flatnonzero(missing == 1)
+    n = len(missing)
+    usual = (n + missing.sum()) / n
+    best: tuple[int, Index, float] | None = None
+    for largest in range(2, _LARGEST + 1):
+        for share in {Fraction(part, largest) for part in range(1, largest)}:
+            # as many gaps as are seen, or up to twice as many
+            if share.denominator != largest or not 0.9 * (usual - 1) < share < (usual - 1) / _SEEN:
+                continue
+            for phase in range(largest):
+                gaps = np.diff(np.floor((np.arange(n + 1) * share.numerator + phase) / largest)).astype(np.int64)
+                hits = int(gaps[seen].sum())
+                fits = hits >= _EXPLAINED * (missing > 0).sum() and hits >= _SEEN * gaps.sum()
+                if fits and (best is None or hits - gaps.sum() > best[0]):
+                    best = hits - int(gaps.sum()), gaps, 1 + float(share)
+    return None if best is None else best[1:]
