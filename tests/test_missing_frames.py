@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 from clips import HandHeld
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from rsundistort.solve.missing_frames import frames_missing, regular_gaps
-
 
 FRAME_S = 1 / 30
 
@@ -17,11 +15,9 @@ FRAME_S = 1 / 30
 def missing(hand: HandHeld, kept: NDArray[np.int64], joined: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
     """What is found of frames that are said to follow each other."""
     rng = np.random.default_rng(hand.seed)
-    noise = Rotation.from_rotvec(rng.normal(0, 1e-4, (len(kept), 3))).as_matrix()
-    R_cw, center_w = noise @ hand.rotations(kept * FRAME_S), hand.centers(kept * FRAME_S)
-    center_w = center_w + rng.normal(0, 2e-4, center_w.shape)
+    center_w = hand.centers(kept * FRAME_S) + rng.normal(0, 1e-3, (len(kept), 3))
     steps = np.ones(len(kept) - 1)
-    return frames_missing(R_cw, center_w, steps, steps > 0 if joined is None else joined)
+    return frames_missing(center_w, steps, steps > 0 if joined is None else joined)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -54,18 +50,16 @@ def test_gaps_without_an_order_are_of_no_conversion() -> None:
     assert regular_gaps(gaps) is None
 
 
-def test_a_camera_that_stands_or_only_rotates_misses_none() -> None:
+def test_a_camera_that_stands_misses_none() -> None:
     assert not missing(HandHeld(1, walks=False), np.arange(60)).any()
-    still = np.tile(np.eye(3), (60, 1, 1)), np.zeros((60, 3))
-    assert not frames_missing(*still, np.ones(59), np.ones(59, bool)).any()
+    assert not frames_missing(np.zeros((60, 3)), np.ones(59), np.ones(59, bool)).any()
 
 
 def test_a_jerk_is_no_missing_frame() -> None:
-    kept, hand = np.arange(90), HandHeld(2)
-    R_cw, center_w = hand.rotations(kept * FRAME_S), hand.centers(kept * FRAME_S)
-    for at, push in ((30, [0.03, 0.0, 0.0]), (61, [0.0, 0.05, 0.02])):
-        R_cw[at:] = Rotation.from_rotvec(push).as_matrix() @ R_cw[at:]
-    assert not frames_missing(R_cw, center_w, np.ones(89), np.ones(89, bool)).any()
+    center_w = HandHeld(2).centers(np.arange(90) * FRAME_S)
+    for at, push in ((30, [0.0, 0.05, 0.0]), (61, [0.03, 0.05, 0.02])):
+        center_w[at:] += push
+    assert not frames_missing(center_w, np.ones(89), np.ones(89, bool)).any()
 
 
 def test_a_cut_is_no_gap() -> None:

@@ -1,4 +1,4 @@
-"""Frames that are missing between others of a video, by how far its camera moves there."""
+"""Frames that are missing between others of a video, by how far its camera travels there."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 __all__ = ["frames_missing", "regular_gaps"]
 
@@ -23,23 +22,23 @@ _FITS = 12.0
 # Rounds in which half of the changes may be of missing frames, and of their neighbours, and those in which few are.
 _FIRST, _ROUNDS = 8, 12
 # Quantiles of squares of normal variables.
-_QUARTER, _MEDIAN = 0.1015, 0.455
+_TENTH, _MEDIAN = 0.0158, 0.455
 # A conversion divides frame rates whose ratio has no larger denominator; the share of its gaps that must be seen, and
 # of those that are seen which it explains.
 _LARGEST, _SEEN, _EXPLAINED = 24, 0.5, 0.85
 
 
-def frames_missing(R_cw: Array, center_w: Array, steps: Array, joined: NDArray[np.bool_]) -> Index:
+def frames_missing(center_w: Array, steps: Array, joined: NDArray[np.bool_]) -> Index:
     """Number of frames that are missing in each interval between consecutive ones, beyond what their times say.
 
-    Where frames are missing but their times do not show it, the camera moves by a multiple of what it does before and
-    after, in all directions alike. A jerk of the hand moves it elsewhere. Each hypothesis is weighed by the usual
-    changes from interval to interval.
+    Where frames are missing but their times do not show it, the camera travels a multiple of what it does before and
+    after. A jerk of the hand moves it elsewhere. Each hypothesis is weighed by the usual changes from interval to
+    interval. Rotations do not count: hands tremble too fast.
 
     Parameters
     ----------
-    R_cw, center_w : (m, 3, 3), (m, 3) array
-        Poses, each of its own measurements; NaN where unknown.
+    center_w : (m, 3) array
+        Positions, each of its own measurements; NaN where unknown.
     steps : (m - 1,) array
         Times between them by the file, in times between frames.
     joined : (m - 1,) bool array
@@ -50,14 +49,11 @@ def frames_missing(R_cw: Array, center_w: Array, steps: Array, joined: NDArray[n
     (m - 1,) int array
         All 0 if fewer than two intervals are clear.
     """
-    m = len(R_cw)
+    m = len(center_w)
     found = np.zeros(max(m - 1, 0), np.int64)
-    known = np.asarray(np.isfinite(np.hstack([R_cw.reshape(m, 9), center_w])).all(axis=1))
-    valid = np.flatnonzero(joined & known[1:] & known[:-1])
-    way = np.full((m - 1, 6), np.nan)
-    between = R_cw[valid + 1] @ R_cw[valid].transpose(0, 2, 1)
-    way[valid] = np.hstack([Rotation.from_matrix(between).as_rotvec(), np.diff(center_w, axis=0)[valid]])
-    way = way[:, np.nansum(np.abs(way), axis=0) > 0]  # a camera on a tripod does not travel
+    way = np.where(joined[:, None], np.diff(center_w, axis=0), np.nan)
+    valid = np.flatnonzero(np.isfinite(way[:, 0]))
+    way = way[:, np.nansum(np.abs(way), axis=0) > 0]
     if len(valid) < _FEWEST or not way.size:
         return found
     clear = np.log(len(valid)) + _CLEAR
@@ -67,7 +63,7 @@ def frames_missing(R_cw: Array, center_w: Array, steps: Array, joined: NDArray[n
         usual = (np.nan_to_num(rate[:-2]) + np.nan_to_num(rate[2:])) / np.where(beside > 0, beside, np.nan)
         rate = rate[1:-1]
         squares = (rate - usual) ** 2
-        quantile, normal = (0.25, _QUARTER) if k < _FIRST else (0.5, _MEDIAN)
+        quantile, normal = (0.1, _TENTH) if k < _FIRST else (0.5, _MEDIAN)
         variance = np.maximum(np.nanquantile(squares, quantile, axis=0) / normal, 1e-18)
 
         def cost(missing: int, usual: Array = usual, variance: Array = variance) -> tuple[Array, float]:

@@ -246,7 +246,7 @@ def _with_gaps(clip: Clip, path: FramePath, start: Reconstruction, own: OwnMotio
     """The times of frames where others are missing between them, though the times of the file do not show it."""
     place = _places(clip, start)
     steps = np.diff(clip.time_s[place]) / clip.frame_s
-    missing = frames_missing(own.R_cw, own.center_w, steps, np.diff(clip.part[place]) == 0)
+    missing = frames_missing(own.center_w, steps, np.diff(clip.part[place]) == 0)
     if not missing.any():
         return clip, path
     of_all = np.zeros(len(clip.names) - 1, np.int64)
@@ -258,7 +258,7 @@ def _with_gaps(clip: Clip, path: FramePath, start: Reconstruction, own: OwnMotio
     how = "" if regular is None else f", as if it was converted from {1 / frame_s:.3g} frames a second"
     warnings.warn(
         f"{of_all.sum()} frames are missing between those of {clip.video.name}, the first after {first}{how}: the "
-        "camera moves farther there than before and after; the times were corrected",
+        "camera travels farther there than before and after; the times were corrected",
         RsUndistortWarning, stacklevel=5,
     )  # fmt: skip
     clip = clip.with_gaps(of_all, frame_s)
