@@ -25,9 +25,9 @@ def solve(monkeypatch):
         raise ReconstructionError("no scene point could be triangulated")
 
     def solve(turned, explained):
-        found = turned and (turned, BundleOptions(path=PATH), None)
-        monkeypatch.setattr(video_path, "_turned", lambda *_: (found, explained))
         clip = SimpleNamespace(names=["a", "b", "c"])
+        found = turned and (turned, BundleOptions(path=PATH), None, clip)
+        monkeypatch.setattr(video_path, "_turned", lambda *_: (found, explained))
         return video_path.solve_clip(clip, None, PATH, None, None, StageLog(None))
 
     monkeypatch.setattr(video_path, "_travelled", travelled)

@@ -8,13 +8,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from make_photos import save_png, save_textures, texture
+from make_photos import exif_block, save_png, save_textures, texture
 from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, RowMotion, RsUndistortWarning
 from rsundistort.batch import rectify_folder
 from rsundistort.errors import FormatError, InputError
 from rsundistort.io import GyroLog, read_photo, read_solution
+from rsundistort.io.cameras import camera_to_json
+from rsundistort.io.photos.images import write_image
+from rsundistort.io.photos.metadata import Metadata
 from rsundistort.model import READOUTS
 from rsundistort.simulate import WarpOptions, read_motion_file, simulate_warp
 from rsundistort.synthetic import RowTable, Vibration, load_recipe, read_row_tables
@@ -345,3 +348,23 @@ def test_recipe_takes_tables_and_logs_beside_it(tmp_path):
 def test_recipes_that_say_nonsense_are_refused(tmp_path, motion, says):
     with pytest.raises((FormatError, InputError, OSError), match=says):
         recipe_with(tmp_path, **motion)
+
+
+def test_the_camera_of_a_warp_is_known_as_well_as_that_of_its_photos(tmp_path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for k in range(3):
+        write_image(photos / f"{k}.jpg", texture(320, 240, k), Metadata(exif_block(1, 35).tobytes()))
+
+    def sigma(name, camera=None):
+        simulate_warp(photos, tmp_path / name, WarpOptions(camera, sigma_rad=0.01))
+        return json.loads((tmp_path / name / "camera.json").read_text()).get("sigma")
+
+    guessed = sigma("guessed")
+    (camera,) = read_solution(tmp_path / "guessed" / "ground_truth.json").cameras.values()
+    assert guessed["f"] == pytest.approx(0.05 * camera.K[0, 0])
+    assert guessed["k1"] == 0.2
+    assert "k4" not in guessed
+    assert sigma("given", GIVEN) is None
+    (photos / "camera.json").write_text(json.dumps(camera_to_json(CAMERA) | {"sigma": {"f": 2.0}}))
+    assert sigma("said") == {"f": pytest.approx(2.0)}

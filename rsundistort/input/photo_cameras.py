@@ -115,6 +115,13 @@ class PhotoCameras:
             decentring.append((by_rows, by_columns))
         return GuessedCameras(self.cameras, sigmas, decentring if default is GIVEN_SIGMA else ())
 
+    def sigma_of_file(self, k: int) -> dict[str, float]:
+        """Standard deviations of a camera for `camera.json`; {} of a calibration that has the default ones."""
+        camera = self.cameras[k]
+        sigma = {**({} if self.calibrated else GUESS_SIGMA), **(self.sigma[k] if self.sigma else {})}
+        names = [name for name in sigma if name in self.intrinsics]
+        return {name: sigma[name] * float(pixels) for name, pixels in zip(names, pixels_of(camera, names), strict=True)}
+
     def with_sigma(self, sigma: Mapping[str, float]) -> PhotoCameras:
         """The cameras, all known to these standard deviations, in pixels or of the coefficients."""
         check_lenses([*sigma], self.cameras, "camera_sigma:")

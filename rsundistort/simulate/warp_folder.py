@@ -159,7 +159,7 @@ def simulate_warp(
         references = [f"{folder}/{output_name(name)}" for folder in folders if folder != "masks" for name in names]
         made = ["camera.json", "ground_truth.json", *references, *(f"masks/{name}" for name in masks.values())]
         Record(out).check(made, inputs)
-        whole, source = _camera(photos, names[0], options)
+        whole, source, sigma = _camera(photos, names[0], options)
         motions = _motions(photos, names, whole, options)
         for name in names:
             check_no_fold(name, whole, motions[name].phi, bend=motions[name].bend)
@@ -180,13 +180,14 @@ def simulate_warp(
         log.end("warping", photos=len(names))
         camera = whole if crop is None else crop_camera(whole, crop)
         truth = replace(_truth(camera, source, motions, crop, options), stages=tuple(log.stages))
-        (scratch / "camera.json").write_text(json.dumps(camera_to_json(camera)) + "\n", encoding="utf-8")
+        content = camera_to_json(camera) | ({"sigma": sigma} if sigma else {})
+        (scratch / "camera.json").write_text(json.dumps(content) + "\n", encoding="utf-8")
         write_solution(scratch / "ground_truth.json", truth)
     return truth
 
 
-def _camera(photos: Path, name: str, options: WarpOptions) -> tuple[Camera, str]:
-    """The camera of the photos, as the first of them has it, and where it is from."""
+def _camera(photos: Path, name: str, options: WarpOptions) -> tuple[Camera, str, dict[str, float]]:
+    """The camera of the photos, as the first of them has it, where it is from, and what it is known to."""
     first = read_photo(photos / name)
     height, width = first.pixels.shape[:2]
     facts = [facts_of_exif(first.metadata.exif)]
@@ -196,7 +197,7 @@ def _camera(photos: Path, name: str, options: WarpOptions) -> tuple[Camera, str]
             f"{name} has no focal length in its EXIF and there is no camera.json; "
             "give --camera FILE or --camera fx,fy,cx,cy in pixels"
         )
-    return found.of(0), found.source
+    return found.of(0), found.source, found.sigma_of_file(int(found.camera_idx[0]))
 
 
 def _write_photos(
