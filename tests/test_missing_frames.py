@@ -62,6 +62,15 @@ def test_a_jerk_is_no_missing_frame() -> None:
     assert not frames_missing(center_w, np.ones(89), np.ones(89, bool)).any()
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_frames_that_were_placed_wrongly_miss_none(seed: int) -> None:
+    """As among passers-by: places are off by multiples of the way from frame to frame."""
+    rng = np.random.default_rng(seed)
+    center_w = HandHeld(seed).centers(np.arange(90) * FRAME_S)
+    center_w += 0.01 * rng.standard_t(1.5, center_w.shape)
+    assert not frames_missing(center_w, np.ones(89), np.ones(89, bool)).any()
+
+
 def test_a_cut_is_no_gap() -> None:
     kept = np.concatenate([np.arange(40), np.arange(60, 100)])
     assert not missing(HandHeld(3), kept, np.diff(kept) == 1).any()

@@ -16,11 +16,12 @@ Index = NDArray[np.int64]
 _MOST, _FEWEST = 3, 12
 # How much likelier, as a logarithm, missing frames must be than a jerk of the hand, beyond all intervals there are;
 # where at least two are, frames are missing, and that others are is as likely as they are frequent.
-_CLEAR, _LIKELY = 7.0, 1.5
-# Squares of normal residuals beyond the number of them: rarer is something else.
-_FITS = 12.0
-# Rounds in which half of the changes may be of missing frames, and of their neighbours, and those in which few are.
-_FIRST, _ROUNDS = 8, 12
+_CLEAR, _LIKELY = 3.0, 1.5
+# Degrees of freedom of changes from interval to interval (Student's t): hands jerk, and frames are placed wrongly.
+_DEGREES = 4.0
+# Rounds in which most changes may be of missing frames and of their neighbours, so that the smallest tell what is usual
+# and any that may be missing are tried; and all rounds. The last ones, with the usual changes that are left, decide.
+_FIRST, _FIRST_LEAST, _ROUNDS = 8, 3.7, 12
 # Quantiles of squares of normal variables.
 _TENTH, _MEDIAN = 0.0158, 0.455
 # A conversion divides frame rates whose ratio has no larger denominator; the share of its gaps that must be seen, and
@@ -66,20 +67,19 @@ def frames_missing(center_w: Array, steps: Array, joined: NDArray[np.bool_]) -> 
         quantile, normal = (0.1, _TENTH) if k < _FIRST else (0.5, _MEDIAN)
         variance = np.maximum(np.nanquantile(squares, quantile, axis=0) / normal, 1e-18)
 
-        def cost(missing: int, usual: Array = usual, variance: Array = variance) -> tuple[Array, float]:
-            """Half the squares of what is left, and how much more it varies: neighbours count as often."""
+        def cost(missing: int, usual: Array = usual, variance: Array = variance) -> Array:
+            """Minus the log-likelihood (m - 1,); neighbours count as often as frames are missing, and vary, too."""
             more = (1 + 0.5 * (1 + missing) ** 2) / 1.5
-            return 0.5 * ((way - (steps + missing)[:, None] * usual) ** 2 / variance).sum(1) / more, more
+            squares = ((way - (steps + missing)[:, None] * usual) ** 2 / variance).sum(1) / more
+            tails = 0.5 * (_DEGREES + way.shape[1]) * np.log1p(squares / _DEGREES)
+            return np.asarray(tails + 0.5 * way.shape[1] * np.log(more))
 
-        best, gain, none = np.zeros(m - 1, np.int64), np.zeros(m - 1), cost(0)[0]
-        for missing in range(1, _MOST + 1):
-            left, more = cost(missing)
-            better = none - left - 0.5 * way.shape[1] * np.log(more)
-            take = (2 * left < way.shape[1] + _FITS) & (better > gain)
-            best[take], gain[take] = missing, better[take]
+        gains = cost(0) - np.array([cost(missing) for missing in range(1, _MOST + 1)])
+        best, gain = 1 + np.argmax(np.nan_to_num(gains), axis=0), np.nan_to_num(gains.max(0))
         certain = int((gain > clear).sum())
         share = min(certain / len(valid), 0.5)
         least = clear if certain < 2 else np.log((1 - share) / share) + _LIKELY
+        least = _FIRST_LEAST if k < _FIRST else least
         found = np.where(gain > least, best, 0)
     return found if (found > 0).sum() > 1 else np.zeros_like(found)
 
@@ -91,12 +91,12 @@ def regular_gaps(missing: Index) -> tuple[Index, float] | None:
     """
     seen = np.flatnonzero(missing == 1)
     n = len(missing)
-    usual = (n + missing.sum()) / n
+    seen_share = len(seen) / n
     best: tuple[int, Index, float] | None = None
     for largest in range(2, _LARGEST + 1):
         for share in {Fraction(part, largest) for part in range(1, largest)}:
             # as many gaps as are seen, or up to twice as many
-            if share.denominator != largest or not 0.9 * (usual - 1) < share < (usual - 1) / _SEEN:
+            if share.denominator != largest or not 0.9 * seen_share < share < 1.1 * seen_share / _SEEN:
                 continue
             for phase in range(largest):
                 gaps = np.diff(np.floor((np.arange(n + 1) * share.numerator + phase) / largest)).astype(np.int64)
