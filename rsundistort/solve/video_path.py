@@ -454,8 +454,9 @@ def readouts_of_halves(result: BundleResult, options: BundleOptions) -> tuple[Re
     # poses are those of the whole, as good as; a tolerance this small lets each half find its own readout time
     pictures = replace(options.path, rates={}, start=_start_of(result))
     how = replace(
-        rough_options(options), path=pictures, outlier_rounds=0, prior_sigma_rounds=1, cost_tolerance=1e-6, refine=()
-    )
+        rough_options(options), path=pictures, outlier_rounds=0, prior_sigma_rounds=1, cost_tolerance=1e-6, refine=(),
+        deviations="jackknife",
+    )  # fmt: skip
     parts = [rec.take_photos(keep) for keep in (~late, late)]
     if any(part.num_images < _LEAST_HALF or part.num_points < _LEAST_MEASUREMENTS for part in parts):
         return None

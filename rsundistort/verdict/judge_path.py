@@ -15,12 +15,14 @@ from ..rectify import largest_shift_px
 from .judge import Verdict, height_reasons, loose_reasons, unexplained_reasons
 from .speeds import ReadoutTime
 
-__all__ = ["APART", "SIGMAS", "ReadoutTime", "judge_clip", "problem_of", "unfollowed_px"]
+__all__ = ["SIGMAS", "ReadoutTime", "judge_clip", "problem_of", "unfollowed_px"]
 
 # Displacements below this are lost in the interpolation of a photo.
 _UNSEEN_PX = 1.0
-#: Standard deviations by which a readout time differs from none, and two of them from each other.
-SIGMAS, APART = 3.0, 4.0
+#: Standard deviations by which a readout time differs from none, or from another of the same video.
+SIGMAS = 3.0
+# Those by which slow and fast rotations contradict each other, whose spectra leak.
+_APART = 4.0
 # Share of the readout time by slow rotations that fast ones must show: noise in the poses hides some of it.
 _SHOWN_FAST = 0.5
 # Relative error that the scale of a gyroscope may have: 3 % by most data sheets, and what the lens adds.
@@ -137,7 +139,7 @@ def _contradictions(
     if halves is not None:
         a, b = halves
         apart = abs(a.seconds - b.seconds) / float(np.hypot(a.sigma, b.sigma))
-        if apart > APART:
+        if apart > SIGMAS:
             reasons.append(
                 f"The readout time is {1e3 * a.seconds:.1f} ms by the first half of the video and "
                 f"{1e3 * b.seconds:.1f} ms by the second, {apart:.0f} standard deviations apart."
@@ -154,7 +156,7 @@ def _runs_the_other_way(slow: ReadoutTime, fast: ReadoutTime) -> bool:
     """Whether fast rotations are not those of the lines, but show in the frames as others."""
     sign = np.sign(slow.seconds)
     missing = sign * (_SHOWN_FAST * slow.seconds - fast.seconds)
-    return bool(missing > APART * np.hypot(fast.sigma, _SHOWN_FAST * slow.sigma))
+    return bool(missing > _APART * np.hypot(fast.sigma, _SHOWN_FAST * slow.sigma))
 
 
 def _contradicts(time: ReadoutTime, slow: ReadoutTime) -> bool:
@@ -194,7 +196,7 @@ def problem_of(evidence: Mapping[str, Any]) -> str:
     if evidence.get("halves"):
         first, second = evidence["halves"]
         apart = abs(first["seconds"] - second["seconds"]) / np.hypot(first["sigma"], second["sigma"])
-        if apart > APART:
+        if apart > SIGMAS:
             return f"the halves of the video contradict each other, {apart:.0f} standard deviations apart"
     if evidence.get("by_speed"):
         slow, fast = (ReadoutTime(each["seconds"], each["sigma"]) for each in evidence["by_speed"])
