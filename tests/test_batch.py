@@ -522,7 +522,7 @@ def test_features_on_a_cluster_are_those_of_threads(courtyard, cluster, tmp_path
     address, _ = cluster
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Dask's own
-        solution = run(folder / "photos", tmp_path / "out", replace(options, scheduler=address))
+        solution = run(folder / "photos", tmp_path / "out", options, scheduler=address)
     truth = read_solution(folder / "out" / "solution.json")
     assert solution.quality["num_observations"] == truth.quality["num_observations"]
     for image in solution.registered:
