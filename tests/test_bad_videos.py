@@ -148,6 +148,13 @@ def test_a_picture_that_freezes_is_a_pause(tmp_path):
     assert clip.part.tolist() == [0] * 15 + [1] * 15
 
 
+def test_pictures_that_have_nothing_in_common_share_no_path(tmp_path):
+    video = encode(tmp_path / "clip.mp4", [texture(WIDTH, HEIGHT, seed) for seed in range(6)])
+    with pytest.raises(InputError, match=r"no frame of clip\.mp4 goes on from the one before.*--every N"):
+        read_clip(video, tmp_path / "frames")
+    assert not (tmp_path / "frames").exists()
+
+
 @pytest.mark.filterwarnings("error")
 def test_a_calm_scene_after_a_cut_or_a_flash_is_not_taken_for_frames_that_come_twice(tmp_path):
     """Where the step before was a large one, all that follow are small beside it."""

@@ -44,6 +44,10 @@ _LEAST_REPEATS, _LARGEST_RATE = 4, 32
 _ROUNDED = 1.25
 # A recording paused if a step between frames is longer than this many usual ones.
 _PAUSE = 20.0
+_ONLY_CUTS = (
+    "no frame of {} goes on from the one before, so that none share a path; take them as photos with --every N or "
+    "--sharpest N"
+)
 
 
 @dataclass(frozen=True)
@@ -209,21 +213,14 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
     if len(numbers) < 2:
         some = "1 frame that shows" if numbers else "no frame that shows"
         raise InputError(f"{video.name} has {some} anything; a path needs two")
-    time = np.array(times)
-    if repeated:
-        step_s = _even_step(np.array(numbers), time)
-        time = time if step_s is None else time[0] + step_s * np.arange(len(time))
-        others = "" if step_s is None else f"; the others are taken to be {1e3 * step_s:.1f} ms apart"
-        warnings.warn(
-            f"{video.name}: {len(repeated)} of {len(repeated) + len(numbers)} frames show the same as the one before, "
-            f"as if the video was converted to another frame rate; they are corrected as that one{others}",
-            RsUndistortWarning, stacklevel=3,
-        )  # fmt: skip
+    time = _with_repeated(video, np.array(numbers), np.array(times), len(repeated))
     frame_s = float(np.median(np.diff(time)))
     breaks = {*chooser.cuts, *(np.flatnonzero(np.diff(time) > _PAUSE * frame_s) + 1).tolist()}
     keys = np.array(sorted({*chooser.keys, *_between(len(numbers), len(chooser.keys)), *_ends(breaks)}))
     _add(writer, video, {numbers[k]: sharpness[k] for k in keys.tolist() if k not in written})
     part = np.cumsum([k in breaks for k in range(len(numbers))])
+    if part[-1] == len(part) - 1:
+        raise InputError(_ONLY_CUTS.format(video.name))
     names = tuple(frame_name(video, number) for number in numbers)
     flows = tuple(each for each in chooser.flows if part[each.keys[0]] == part[each.keys[1]])
     moved_px, frames = np.array(chooser.steps), writer.finish()
@@ -252,6 +249,22 @@ class _Step:
     def forget(self) -> None:
         """A new scene begins with this frame."""
         self._sizes.clear()
+
+
+def _with_repeated(
+    video: Path, numbers: NDArray[np.int64], time_s: NDArray[np.float64], num_repeated: int
+) -> NDArray[np.float64]:
+    """The times (n,) of frames where so many others showed the same as the one before."""
+    if not num_repeated:
+        return time_s
+    step_s = _even_step(numbers, time_s)
+    others = "" if step_s is None else f"; the others are taken to be {1e3 * step_s:.1f} ms apart"
+    warnings.warn(
+        f"{video.name}: {num_repeated} of {num_repeated + len(numbers)} frames show the same as the one before, as if "
+        f"the video was converted to another frame rate; they are corrected as that one{others}",
+        RsUndistortWarning, stacklevel=4,
+    )  # fmt: skip
+    return time_s if step_s is None else time_s[0] + step_s * np.arange(len(time_s))
 
 
 def _even_step(numbers: NDArray[np.int64], time_s: NDArray[np.float64]) -> float | None:
