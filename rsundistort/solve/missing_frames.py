@@ -59,29 +59,43 @@ def frames_missing(center_w: Array, steps: Array, joined: NDArray[np.bool_]) -> 
         return found
     clear = np.log(len(valid)) + _CLEAR
     for k in range(_ROUNDS):
-        rate = np.pad(way / (steps + found)[:, None], ((1, 1), (0, 0)), constant_values=np.nan)
-        beside = np.isfinite(rate[:-2, :1]) + 1.0 * np.isfinite(rate[2:, :1])
-        usual = (np.nan_to_num(rate[:-2]) + np.nan_to_num(rate[2:])) / np.where(beside > 0, beside, np.nan)
-        rate = rate[1:-1]
-        squares = (rate - usual) ** 2
+        rate = way / (steps + found)[:, None]
+        usual = _of_neighbours(rate)
         quantile, normal = (0.1, _TENTH) if k < _FIRST else (0.5, _MEDIAN)
-        variance = np.maximum(np.nanquantile(squares, quantile, axis=0) / normal, 1e-18)
-
-        def cost(missing: int, usual: Array = usual, variance: Array = variance) -> Array:
-            """Minus the log-likelihood (m - 1,); neighbours count as often as frames are missing, and vary, too."""
-            more = (1 + 0.5 * (1 + missing) ** 2) / 1.5
-            squares = ((way - (steps + missing)[:, None] * usual) ** 2 / variance).sum(1) / more
-            tails = 0.5 * (_DEGREES + way.shape[1]) * np.log1p(squares / _DEGREES)
-            return np.asarray(tails + 0.5 * way.shape[1] * np.log(more))
-
-        gains = cost(0) - np.array([cost(missing) for missing in range(1, _MOST + 1)])
-        best, gain = 1 + np.argmax(np.nan_to_num(gains), axis=0), np.nan_to_num(gains.max(0))
-        certain = int((gain > clear).sum())
-        share = min(certain / len(valid), 0.5)
-        least = clear if certain < 2 else np.log((1 - share) / share) + _LIKELY
-        least = _FIRST_LEAST if k < _FIRST else least
+        variance = np.maximum(np.nanquantile((rate - usual) ** 2, quantile, axis=0) / normal, 1e-18)
+        costs = np.array([
+            _minus_log_likelihood(way - (steps + missing)[:, None] * usual, variance, missing)
+            for missing in range(_MOST + 1)
+        ])  # fmt: skip
+        gains = np.nan_to_num(costs[0] - costs[1:])
+        best, gain = 1 + np.argmax(gains, axis=0), gains.max(axis=0)
+        if k < _FIRST:
+            least = _FIRST_LEAST
+        elif (certain := int((gain > clear).sum())) < 2:
+            least = clear
+        else:
+            share = min(certain / len(valid), 0.5)
+            least = np.log((1 - share) / share) + _LIKELY
         found = np.where(gain > least, best, 0)
     return found if (found > 0).sum() > 1 else np.zeros_like(found)
+
+
+def _of_neighbours(rate: Array) -> Array:
+    """(m - 1, d) mean rates of the intervals before and after; NaN where both are unknown."""
+    padded = np.pad(rate, ((1, 1), (0, 0)), constant_values=np.nan)
+    both = np.stack([padded[:-2], padded[2:]])
+    known = np.isfinite(both).sum(axis=0)
+    mean: Array = np.nan_to_num(both).sum(axis=0) / np.where(known > 0, known, np.nan)
+    return mean
+
+
+def _minus_log_likelihood(left: Array, variance: Array, missing: int) -> Array:
+    """Of what is left (m - 1, d) of a way if frames are missing: the rate of its neighbours counts for each of them."""
+    more = (1 + 0.5 * (1 + missing) ** 2) / 1.5
+    squares = (left**2 / variance).sum(axis=1) / more
+    d = left.shape[1]
+    value: Array = 0.5 * (_DEGREES + d) * np.log1p(squares / _DEGREES) + 0.5 * d * np.log(more)
+    return value
 
 
 def regular_gaps(missing: Index) -> tuple[Index, float] | None:
