@@ -48,6 +48,8 @@ def test_gaps_without_an_order_are_of_no_conversion() -> None:
     gaps = np.zeros(119, int)
     gaps[[10, 31, 60, 85, 88]] = 1
     assert regular_gaps(gaps) is None
+    gaps[[60, 85, 88]] = 0
+    assert regular_gaps(gaps) is None  # two gaps fit some ratio
 
 
 def test_a_camera_that_stands_misses_none() -> None:

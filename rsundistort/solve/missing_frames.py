@@ -24,9 +24,11 @@ _DEGREES = 4.0
 _FIRST, _FIRST_LEAST, _ROUNDS = 8, 3.7, 12
 # Quantiles of squares of normal variables.
 _TENTH, _MEDIAN = 0.0158, 0.455
-# A conversion divides frame rates whose ratio has no larger denominator; the share of its gaps that must be seen, and
-# of those that are seen which it explains.
-_LARGEST, _SEEN, _EXPLAINED = 24, 0.5, 0.85
+# Frame rates that videos are converted between: a few gaps fit some ratio or other.
+_RATES = (15, 24, 25, 30, 48, 50, 60)
+_RATIOS = sorted({Fraction(high, low) for high in _RATES for low in _RATES if low < high < 2 * low})
+# Gaps of a conversion that must be seen, the share of all its gaps, and the share of those seen that it explains.
+_LEAST_SEEN, _SEEN, _EXPLAINED = 3, 0.5, 0.85
 
 
 def frames_missing(center_w: Array, steps: Array, joined: NDArray[np.bool_]) -> Index:
@@ -103,19 +105,15 @@ def regular_gaps(missing: Index) -> tuple[Index, float] | None:
 
     `missing` (n,) is of all intervals of a video. Of a conversion, frames are those nearest to multiples of the ratio.
     """
-    seen = np.flatnonzero(missing == 1)
-    n = len(missing)
-    seen_share = len(seen) / n
+    seen, n = np.flatnonzero(missing == 1), len(missing)
     best: tuple[int, Index, float] | None = None
-    for largest in range(2, _LARGEST + 1):
-        for share in {Fraction(part, largest) for part in range(1, largest)}:
-            # as many gaps as are seen, or up to twice as many
-            if share.denominator != largest or not 0.9 * seen_share < share < 1.1 * seen_share / _SEEN:
-                continue
-            for phase in range(largest):
-                gaps = np.diff(np.floor((np.arange(n + 1) * share.numerator + phase) / largest)).astype(np.int64)
-                hits = int(gaps[seen].sum())
-                fits = hits >= _EXPLAINED * (missing > 0).sum() and hits >= _SEEN * gaps.sum()
-                if fits and (best is None or hits - gaps.sum() > best[0]):
-                    best = hits - int(gaps.sum()), gaps, 1 + float(share)
+    for ratio in _RATIOS:
+        share = ratio - 1
+        for phase in range(share.denominator):
+            place = (np.arange(n + 1) * share.numerator + phase) // share.denominator
+            gaps = np.diff(place).astype(np.int64)
+            hits, total = int(gaps[seen].sum()), int(gaps.sum())
+            enough = max(_LEAST_SEEN, _SEEN * total, _EXPLAINED * (missing > 0).sum())
+            if hits >= enough and (best is None or hits - total > best[0]):
+                best = hits - total, gaps, float(ratio)
     return None if best is None else best[1:]
