@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pytest
 from clips import HandHeld
 from numpy.typing import NDArray
 
-from rsundistort.solve.missing_frames import frames_missing, regular_gaps
+from rsundistort.solve.missing_frames import Gaps, frames_missing, gaps_between
 
 FRAME_S = 1 / 30
 
@@ -18,6 +20,23 @@ def missing(hand: HandHeld, kept: NDArray[np.int64], joined: NDArray[np.bool_] |
     center_w = hand.centers(kept * FRAME_S) + rng.normal(0, 1e-3, (len(kept), 3))
     steps = np.ones(len(kept) - 1)
     return frames_missing(center_w, steps, steps > 0 if joined is None else joined)
+
+
+def converted(num_frames: int, ratio: float, phase: float) -> NDArray[np.int64]:
+    """Which frames a conversion keeps: those nearest to multiples of the ratio."""
+    return np.floor(np.arange(num_frames) * ratio + phase).astype(np.int64)
+
+
+def gaps(
+    seed: int, kept: NDArray[np.int64], rate: float, frame_s: float, shake: float = 1e-3,
+    place: NDArray[np.int64] | None = None,
+) -> Gaps:  # fmt: skip
+    """What is found of evenly spaced frames of a hand that shakes, of which some or all could be placed."""
+    place = np.arange(len(kept)) if place is None else place
+    rng = np.random.default_rng(seed)
+    center_w = HandHeld(seed).centers(kept[place] * frame_s) + rng.normal(0, shake, (len(place), 3))
+    steps = np.diff(place).astype(float)
+    return gaps_between(center_w, place, steps, steps > 0, len(kept), rate)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -34,22 +53,51 @@ def test_frames_that_are_missing_here_and_there_are_found(seed: int) -> None:
     assert (found == true)[true > 0].sum() >= 4
 
 
-@pytest.mark.parametrize("rate", [25, 24])
-@pytest.mark.parametrize("seed", range(3))
-def test_all_gaps_of_a_conversion_are_found_by_most_of_them(seed: int, rate: int) -> None:
-    kept = np.floor(np.arange(80) * 30 / rate + 0.5).astype(int)
-    regular = regular_gaps(missing(HandHeld(seed), kept))
-    assert regular is not None
-    np.testing.assert_array_equal(regular[0], np.diff(kept) - 1)
-    assert regular[1] == pytest.approx(30 / rate)
+# Frame rates of the camera and of the file.
+CONVERTED = [(30, 25), (30, 24), (29.97, 23.976), (25, 24), (30, 20), (60, 25), (60, 24)]
+
+
+@pytest.mark.parametrize(("camera", "rate"), CONVERTED)
+@pytest.mark.parametrize("shake", [1e-3, 4e-3])
+def test_a_conversion_to_a_lower_frame_rate_is_found_however_hands_shake(
+    camera: float, rate: float, shake: float
+) -> None:
+    for seed in range(3):
+        kept = converted(80, camera / rate, seed / 3)
+        found = gaps(seed, kept, rate, 1 / camera, shake)
+        np.testing.assert_array_equal(found.missing, np.diff(kept) - 1)
+        assert found.ratio == pytest.approx(camera / rate, rel=2e-3)
+
+
+@pytest.mark.parametrize("rate", [10, 15, 24, 25, 29.97, 30, 50, 60, 17])
+def test_frames_of_a_hand_that_shakes_are_of_no_conversion(rate: float) -> None:
+    for seed, shake in product(range(6), (1e-3, 5e-3, 0.05)):
+        found = gaps(seed, np.arange(90), rate, 1 / rate, shake)
+        assert found.ratio is None
+        assert not found.missing.any()
 
 
 def test_gaps_without_an_order_are_of_no_conversion() -> None:
-    gaps = np.zeros(119, int)
-    gaps[[10, 31, 60, 85, 88]] = 1
-    assert regular_gaps(gaps) is None
-    gaps[[60, 85, 88]] = 0
-    assert regular_gaps(gaps) is None  # two gaps fit some ratio
+    kept = np.delete(np.arange(120), [10, 31, 60, 85, 88])
+    found = gaps(3, kept, 25, FRAME_S)
+    assert found.ratio is None
+    assert (found.missing == np.diff(kept) - 1).all()
+
+
+def test_a_conversion_is_found_by_the_frames_that_were_placed() -> None:
+    kept = converted(100, 1.2, 0.45)
+    place = np.delete(np.arange(len(kept)), [0, 7, 8, 30, 51])
+    found = gaps(1, kept, 25, FRAME_S, place=place)
+    np.testing.assert_array_equal(found.missing, np.diff(kept) - 1)
+
+
+def test_frames_that_are_unevenly_spaced_are_of_no_conversion() -> None:
+    steps = np.where(np.arange(79) % 5 == 2, 2.0, 1.0)
+    kept = np.concatenate([[0], np.cumsum(steps).astype(int)])
+    center_w = HandHeld(1).centers(kept * FRAME_S)
+    found = gaps_between(center_w, np.arange(80), steps, steps > 0, 80, 25)
+    assert found.ratio is None
+    assert not found.missing.any()
 
 
 def test_a_camera_that_stands_misses_none() -> None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["frames_missing", "regular_gaps"]
+__all__ = ["Gaps", "frames_missing", "gaps_between"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -24,11 +24,128 @@ _DEGREES = 4.0
 _FIRST, _FIRST_LEAST, _ROUNDS = 8, 3.7, 12
 # Quantiles of squares of normal variables.
 _TENTH, _MEDIAN = 0.0158, 0.455
-# Frame rates that videos are converted between: a few gaps fit some ratio or other.
-_RATES = (15, 24, 25, 30, 48, 50, 60)
-_RATIOS = sorted({Fraction(high, low) for high in _RATES for low in _RATES if low < high < 2 * low})
-# Gaps of a conversion that must be seen, the share of all its gaps, and the share of those seen that it explains.
-_LEAST_SEEN, _SEEN, _EXPLAINED = 3, 0.5, 0.85
+# Frame rates that videos are converted between, those of NTSC among them, the share by which files and cameras miss
+# them, the largest ratio of two, and how far from a whole number it is: frames of a whole ratio are evenly spaced, and
+# those of a large one almost.
+_RATES = np.array([10, 12, 12.5, 15, 20, 24, 25, 30, 48, 50, 60, 90, 100, 120, 240])
+_NTSC = np.array([24, 30, 48, 60, 120, 240]) * (1000 / 1001)
+_SAME_RATE, _LARGEST_RATIO, _NOT_WHOLE = 2e-3, 2.9, 0.01
+# Phases of a conversion that are tried, and steps to the usual size of its changes.
+_PHASES, _SCALE_STEPS = 120, 8
+# Intervals of all hypotheses at once, for the memory.
+_AT_ONCE = 200_000
+# Changes that share intervals say partly the same: each interval is the neighbour of two others.
+_COUNTED_ONCE = 0.5
+
+
+class Gaps(NamedTuple):
+    """Frames that are missing.
+
+    Attributes
+    ----------
+    missing : (n - 1,) int array
+        How many between consecutive frames of a video, beyond what their times say.
+    ratio : float or None
+        The frame rate of the camera by that of the video, if that was converted. It lasts as long as before.
+    """
+
+    missing: Index
+    ratio: float | None
+
+
+def gaps_between(
+    center_w: Array, place: Index, steps: Array, joined: NDArray[np.bool_], num_frames: int, rate: float
+) -> Gaps:
+    """Frames that are missing here and there, or regularly since the video was converted from a higher frame rate.
+
+    A conversion is one hypothesis about all intervals, so that it is seen where hands shake too much for single gaps.
+
+    Parameters
+    ----------
+    center_w : (m, 3) array
+        Positions, each of its own measurements; NaN where unknown.
+    place : (m,) int array
+        Which frames of the video these are.
+    steps : (m - 1,) array
+        Times between them by the file, in times between frames.
+    joined : (m - 1,) bool array
+        Whether both are of one part.
+    num_frames : int
+        Number of frames of the video.
+    rate : float
+        Its frame rate, 1/s.
+    """
+    single = frames_missing(center_w, steps, joined)
+    of_all = np.zeros(max(num_frames - 1, 0), np.int64)
+    of_all[place[:-1]] = single
+    way = np.where(joined[:, None], np.diff(center_w, axis=0), np.nan)
+    valid = int(np.isfinite(way).all(axis=1).sum())
+    way = way[:, np.nansum(np.abs(way), axis=0) > 0]
+    between = np.diff(place)
+    if valid < _FEWEST or not way.size or not np.allclose(steps[joined], between[joined], atol=0.05):
+        return Gaps(of_all, None)
+    patterns, ratios, cost_of_conversions = _conversions(num_frames, rate)
+    passed = np.concatenate([np.zeros((len(patterns), 1), np.int64), np.cumsum(patterns, axis=1)], axis=1)
+    of_conversions = passed[:, place[1:]] - passed[:, place[:-1]]
+    hypotheses = between + np.vstack([np.zeros_like(single), single, of_conversions])
+    blocks = np.array_split(hypotheses.astype(np.float64), 1 + hypotheses.size // _AT_ONCE)
+    cost = _COUNTED_ONCE * np.concatenate([_cost_of_all(way, block) for block in blocks])
+    # what it takes to say which intervals have gaps, and which conversion it is
+    share = np.count_nonzero(single) / valid
+    cost[1] += np.log(valid) - (valid * (_plog(share) + _plog(1 - share)) if share else 0.0)
+    cost[2:] += cost_of_conversions
+    best = int(np.argmin(cost))
+    if best < 2:
+        return Gaps(of_all, None)
+    return Gaps(patterns[best - 2], float(ratios[best - 2]))
+
+
+def _plog(share: float) -> float:
+    return share * float(np.log(share)) if share > 0 else 0.0
+
+
+def _conversions(num_frames: int, rate: float) -> tuple[Index, Array, Array]:
+    """(h, n - 1) missing frames of all conversions to a rate, (h,) ratios of the rates, and what each costs.
+
+    The frames of a conversion are those nearest to multiples of the ratio. Those between a rate of NTSC and another
+    one slip by a frame now and then, which takes evidence.
+    """
+    low, ntsc = _RATES[_is_near(_RATES, rate)], _NTSC[_is_near(_NTSC, rate)]
+    even, slipping = np.outer(_RATES, 1 / low), (np.outer(_NTSC, 1 / low), np.outer(_RATES, 1 / ntsc))
+    ratios: Array = np.concatenate([each.ravel() for each in (even, *slipping)])
+    cost = np.where(np.arange(len(ratios)) < even.size, 0.0, _CLEAR)
+    whole = np.abs(ratios - np.round(ratios)) < _NOT_WHOLE
+    possible = np.flatnonzero((ratios > 1) & (ratios < _LARGEST_RATIO) & ~whole)
+    ratios, cost = ratios[possible], cost[possible]
+    phases = (np.arange(_PHASES) + 0.5) / _PHASES
+    place = np.floor(np.arange(num_frames) * ratios[:, None, None] + phases[:, None])
+    missing = np.diff(place, axis=2).astype(np.int64).reshape(-1, num_frames - 1) - 1
+    first = np.sort(np.unique(missing, axis=0, return_index=True)[1])
+    cost = np.repeat(cost, _PHASES)[first] + np.log(max(len(first), 1)) + _CLEAR
+    return missing[first], np.repeat(ratios, _PHASES)[first], cost
+
+
+def _is_near(rates: Array, rate: float) -> NDArray[np.bool_]:
+    near: NDArray[np.bool_] = np.abs(rates / rate - 1) < _SAME_RATE
+    return near
+
+
+def _cost_of_all(way: Array, steps: Array) -> Array:
+    """(h,) minus log likelihoods of all changes under (h, m - 1) numbers of steps, whose usual size each estimates."""
+    rate = way / steps[..., None]
+    left = way - steps[..., None] * _of_neighbours(rate)
+    known = np.isfinite(left).all(axis=2)
+    left, count = np.where(known[..., None], left, 0.0), known.sum(axis=1)
+    more, d = _more(steps), way.shape[1]
+    even = left**2 / more[..., None]
+    variance = np.maximum(even.sum(axis=1) / count[:, None], 1e-18)
+    for _ in range(_SCALE_STEPS):
+        squares = (even / variance[:, None]).sum(axis=2)
+        weight = known * (_DEGREES + d) / (_DEGREES + squares)
+        variance = np.maximum((weight[..., None] * even).sum(axis=1) / count[:, None], 1e-18)
+    squares = (even / variance[:, None]).sum(axis=2)
+    cost: Array = _student(squares, more, d).sum(axis=1, where=known) + 0.5 * count * np.log(variance).sum(axis=1)
+    return cost
 
 
 def frames_missing(center_w: Array, steps: Array, joined: NDArray[np.bool_]) -> Index:
@@ -40,12 +157,8 @@ def frames_missing(center_w: Array, steps: Array, joined: NDArray[np.bool_]) -> 
 
     Parameters
     ----------
-    center_w : (m, 3) array
-        Positions, each of its own measurements; NaN where unknown.
-    steps : (m - 1,) array
-        Times between them by the file, in times between frames.
-    joined : (m - 1,) bool array
-        Whether both are of one part.
+    center_w, steps, joined
+        As for `gaps_between`.
 
     Returns
     -------
@@ -83,9 +196,9 @@ def frames_missing(center_w: Array, steps: Array, joined: NDArray[np.bool_]) -> 
 
 
 def _of_neighbours(rate: Array) -> Array:
-    """(m - 1, d) mean rates of the intervals before and after; NaN where both are unknown."""
-    padded = np.pad(rate, ((1, 1), (0, 0)), constant_values=np.nan)
-    both = np.stack([padded[:-2], padded[2:]])
+    """(..., m - 1, d) mean rates of the intervals before and after; NaN where both are unknown."""
+    padded = np.pad(rate, [(0, 0)] * (rate.ndim - 2) + [(1, 1), (0, 0)], constant_values=np.nan)
+    both = np.stack([padded[..., :-2, :], padded[..., 2:, :]])
     known = np.isfinite(both).sum(axis=0)
     mean: Array = np.nan_to_num(both).sum(axis=0) / np.where(known > 0, known, np.nan)
     return mean
@@ -93,27 +206,17 @@ def _of_neighbours(rate: Array) -> Array:
 
 def _minus_log_likelihood(left: Array, variance: Array, missing: int) -> Array:
     """Of what is left (m - 1, d) of a way if frames are missing: the rate of its neighbours counts for each of them."""
-    more = (1 + 0.5 * (1 + missing) ** 2) / 1.5
-    squares = (left**2 / variance).sum(axis=1) / more
-    d = left.shape[1]
+    more = _more(np.array(1.0 + missing))
+    return _student((left**2 / variance).sum(axis=1) / more, more, left.shape[1])
+
+
+def _more(steps: Array) -> Array:
+    """How much larger the variance of a change is over so many steps: neighbours' rates count for each."""
+    more: Array = (1 + 0.5 * steps**2) / 1.5
+    return more
+
+
+def _student(squares: Array, more: Array, d: int) -> Array:
+    """Minus log likelihood of squares of d deviations whose variances are so much larger (Student's t)."""
     value: Array = 0.5 * (_DEGREES + d) * np.log1p(squares / _DEGREES) + 0.5 * d * np.log(more)
     return value
-
-
-def regular_gaps(missing: Index) -> tuple[Index, float] | None:
-    """All gaps of a conversion to a lower frame rate, and the ratio of both rates; None if it was none.
-
-    `missing` (n,) is of all intervals of a video. Of a conversion, frames are those nearest to multiples of the ratio.
-    """
-    seen, n = np.flatnonzero(missing == 1), len(missing)
-    best: tuple[int, Index, float] | None = None
-    for ratio in _RATIOS:
-        share = ratio - 1
-        for phase in range(share.denominator):
-            place = (np.arange(n + 1) * share.numerator + phase) // share.denominator
-            gaps = np.diff(place).astype(np.int64)
-            hits, total = int(gaps[seen].sum()), int(gaps.sum())
-            enough = max(_LEAST_SEEN, _SEEN * total, _EXPLAINED * (missing > 0).sum())
-            if hits >= enough and (best is None or hits - total > best[0]):
-                best = hits - total, gaps, float(ratio)
-    return None if best is None else best[1:]

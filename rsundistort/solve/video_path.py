@@ -31,7 +31,7 @@ from .clip_gyroscope import Felt, felt_gyroscope, own_gyroscope, readout_of, rot
 from .clip_pair import FramePair
 from .clip_pan import rotating_only
 from .clip_tracks import follow_points, followed_again, with_all_frames
-from .missing_frames import frames_missing, regular_gaps
+from .missing_frames import gaps_between
 from .model_sequence import without_shutter
 from .outcome import Solved
 from .placing import place_photos
@@ -246,16 +246,14 @@ def _with_gaps(clip: Clip, path: FramePath, start: Reconstruction, own: OwnMotio
     """The times of frames where others are missing between them, though the times of the file do not show it."""
     place = _places(clip, start)
     steps = np.diff(clip.time_s[place]) / clip.frame_s
-    missing = frames_missing(own.center_w, steps, np.diff(clip.part[place]) == 0)
-    if not missing.any():
+    joined = np.diff(clip.part[place]) == 0
+    of_all, ratio = gaps_between(own.center_w, place, steps, joined, len(clip.names), 1 / clip.frame_s)
+    if not of_all.any():
         return clip, path
-    of_all = np.zeros(len(clip.names) - 1, np.int64)
-    of_all[place[:-1]] = missing
-    regular, frame_s = regular_gaps(of_all), clip.frame_s
-    if regular is not None:  # the video lasts as long as before
-        of_all, frame_s = regular[0], clip.frame_s / regular[1]
+    # the video lasts as long as before
+    frame_s = clip.frame_s if ratio is None else clip.frame_s / ratio
     first = clip.names[int(np.flatnonzero(of_all)[0])]
-    how = "" if regular is None else f", as if it was converted from {1 / frame_s:.3g} frames a second"
+    how = "" if ratio is None else f", as if it was converted from {1 / frame_s:.3g} frames a second"
     warnings.warn(
         f"{of_all.sum()} frames are missing between those of {clip.video.name}, the first after {first}{how}: the "
         "camera travels farther there than before and after; the times were corrected",
