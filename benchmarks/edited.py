@@ -72,6 +72,30 @@ def _noise(frames: Frames) -> Frames:
     return [_scaled(frame, 0.35, rng.normal(0, 8, frame.shape)) for frame in frames]
 
 
+def _hood(frames: Frames) -> Frames:
+    """A quarter of the frame moves with the camera, as the hood of a car does."""
+    height, width = frames[0].shape[:2]
+    size = width, height // 4
+    hood = cv2.resize(np.random.default_rng(3).integers(20, 120, (30, 60, 3), np.uint8), size, interpolation=2)
+    return [np.vstack([frame[: height - len(hood)], hood]) for frame in frames]
+
+
+def _snow(frames: Frames) -> Frames:
+    """Flakes that fall, 2 to 8 px large."""
+    rng = np.random.default_rng(8)
+    size = np.array(frames[0].shape[1::-1])
+    start, step, radius = (
+        rng.uniform(0, size, (150, 2)),
+        rng.uniform((-3, 6), (3, 14), (150, 2)),
+        rng.integers(1, 5, 150),
+    )
+    found = [frame.copy() for frame in frames]
+    for k, frame in enumerate(found):
+        for place, each in zip((start + k * step) % size, radius, strict=True):
+            cv2.circle(frame, place.astype(int).tolist(), int(each), (240, 240, 240), -1)
+    return found
+
+
 #: What becomes of the frames, by name, and the frame rate that they are then said to have, by the present one.
 EDITS: dict[str, tuple[Callable[[Frames], Frames], float]] = {
     "lamps": (_lamps, 1.0),
@@ -86,6 +110,9 @@ EDITS: dict[str, tuple[Callable[[Frames], Frames], float]] = {
     "captions": (_captions, 1.0),
     "blur": (lambda frames: [cv2.GaussianBlur(frame, (0, 0), 2.0) for frame in frames], 1.0),
     "noise": (_noise, 1.0),
+    "hood": (_hood, 1.0),
+    "snow": (_snow, 1.0),
+    "backwards": (lambda frames: frames[::-1], 1.0),
 }
 
 

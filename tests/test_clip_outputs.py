@@ -351,7 +351,10 @@ def test_the_readout_time_is_reported_with_its_evidence():
             "contradict each other, 14 standard deviations apart",
         ),
         ({"seconds": 0.04, "of_frame": 1.2}, "longer than the time from frame to frame"),
-        ({"seconds": -0.0205, "of_frame": -0.615}, "the last line is read first (--readout), or"),
+        (
+            {"seconds": -0.0205, "of_frame": -0.615},
+            "the last line is read first (--readout), the video runs backwards, or",
+        ),
     ],
 )
 def test_readout_says_whether_the_video_tells(tmp_path, monkeypatch, changed, says):

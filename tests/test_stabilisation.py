@@ -79,6 +79,16 @@ def test_a_clip_as_the_sensor_saw_it(seed, share):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
+def test_a_video_that_runs_backwards_has_both_its_rotation_and_its_shutter(seed):
+    """As one of a camera that reads the last line first: its lines rotate against its frames."""
+    hand = motion(seed, 0.1, 0.05, 0.3) + motion(seed + 50, 0.3, 1, 5)
+    found = clip(seed, hand, hand, -0.02)
+    assert found.verdict == "none"
+    assert "the other way" in found.reason
+    assert not found.read_at_once
+
+
+@pytest.mark.parametrize("seed", SEEDS)
 def test_slow_errors_of_the_lines_are_no_readout_time(seed):
     """What lens and scene leave in the lines, next to a slow pan: the shaking shows the readout, here of 10 ms."""
     hand = motion(seed, 0.1, 0.05, 0.3) + motion(seed + 50, 0.1, 1, 5)

@@ -350,6 +350,9 @@ def _judge(
             f"what the lines show is not in the rotation between the frames (readout {found}); shaking faster than "
             f"{0.5 / interval:.0f} Hz looks the same"
         )
+    if detectable and high < -least and low > -most:
+        # a stabilised video has lost its rotation or its shutter, and here are both
+        return "none", f"not stabilised: the lines rotate as much as the frames, the other way (readout {found})"
     if detectable and high < least:
         return "stabilised", (
             f"stabilised in the camera: rotation between the frames without its shutter (readout {found}, expected "

@@ -134,7 +134,7 @@ def _cost_of_all(way: Array, steps: Array) -> Array:
     """(h,) minus log likelihoods of all changes under (h, m - 1) numbers of steps, whose usual size each estimates."""
     rate = way / steps[..., None]
     left = way - steps[..., None] * _of_neighbours(rate)
-    known = np.isfinite(left).all(axis=2)
+    known = np.isfinite(left[..., 0])
     left, count = np.where(known[..., None], left, 0.0), known.sum(axis=1)
     more, d = _more(steps), way.shape[1]
     even = left**2 / more[..., None]

@@ -30,7 +30,10 @@ _GYRO_SCALE = 0.05
 # Where a path misses part of how fast its camera rotates, the readout time comes out longer.
 _TOO_FEW = "the camera shakes too fast for its frame rate, or frames are missing or came twice"
 # A vibration a little faster than half of the frame rate shows in the frames as a slower one that runs the other way.
-_BACKWARDS = "the last line is read first (--readout), or the camera vibrates faster than half of the frame rate"
+_BACKWARDS = (
+    "the last line is read first (--readout), the video runs backwards, or the camera vibrates faster than half of the "
+    "frame rate"
+)
 
 
 def judge_clip(
