@@ -13,6 +13,8 @@ __all__ = ["LinearSystem", "MinimizeResult", "Problem", "minimize"]
 
 # Steps that achieve less than this share of the predicted decrease have met a bend of the valley.
 _GOOD_STEP = 0.8
+# Damping that is lost in rounding: below it, what is needed after a rejected step would take many more to reach.
+_LEAST_DAMPING = 1e-12
 
 
 class LinearSystem(Protocol):
@@ -94,6 +96,7 @@ def minimize(
             if np.isfinite(new_cost) and decrease > 0 and predicted > 0:
                 accepted = True
                 damping *= max(1.0 / 10.0, 1.0 - (2.0 * decrease / predicted - 1.0) ** 3)
+                damping = max(damping, _LEAST_DAMPING)
                 growth = 2.0
                 state, cost = candidate, new_cost
                 history.append(cost)
