@@ -86,6 +86,9 @@ class FramePath:
     readout : (seconds, sigma), optional
         What is known of the readout time of a frame; without it, that it is about half of `frame_s`, give or take as
         much.
+    held_sigma : float
+        Standard deviation in seconds of a readout time that the path says nothing about, such as one that shakes too
+        fast for its frames; `readout` holds it then.
     part : mapping of photo name to int, optional
         Parts that a cut separates; all in one when left out.
     rates : mapping of photo name to (rate, sigma), optional
@@ -103,6 +106,7 @@ class FramePath:
     rates: Mapping[str, tuple[ArrayLike, ArrayLike]] = field(default_factory=dict)
     rotation_only: bool = False
     start: PathStart | None = None
+    held_sigma: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0 < self.frame_s < np.inf:
@@ -396,6 +400,7 @@ def path_solution(reconstruction: Reconstruction, path: FramePath, state: PathSt
     pace_sigma = np.where(np.isfinite(pace_sigma), pace_sigma, path.readout_prior[1] / span)
     free = free_pace(state.pace, pace_sigma, path.readout_most / span, _EXCESS_SIGMA / span)
     span_s = span * path.frame_s
+    pace_sigma = np.hypot(pace_sigma, path.held_sigma / span_s)
     names = tuple(reconstruction.image_names[k] for k in frames.tolist())
     times = (each * span_s for each in (state.pace, pace_sigma, free))
     return PathSolution(found, state, names, *times)

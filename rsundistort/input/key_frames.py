@@ -109,6 +109,11 @@ class Clip:
         time_s = np.concatenate([[0.0], np.cumsum(step_s)]) + self.time_s[0]
         return replace(self, time_s=time_s, frame_s=frame_s)
 
+    def places(self, names: Sequence[str]) -> NDArray[np.int64]:
+        """(m,) which of its frames have these names."""
+        number = {name: k for k, name in enumerate(self.names)}
+        return np.array([number[name] for name in names], np.int64)
+
     def facts(self) -> dict[str, Any]:
         """Its content of `solution.json`."""
         return {

@@ -26,7 +26,6 @@ from ..io.kept import Kept
 from ..model import Reconstruction
 from ..sfm import MatchedPhotos, retriangulate
 from ..verdict.judge_path import ReadoutTime, judge_clip, unfollowed_px
-from ..verdict.speeds import readouts_by_speed
 from .clip_gyroscope import Felt, felt_gyroscope, own_gyroscope, readout_of, rotations_between
 from .clip_pair import FramePair
 from .clip_pan import rotating_only
@@ -35,6 +34,7 @@ from .missing_frames import gaps_between
 from .model_sequence import without_shutter
 from .outcome import Solved
 from .placing import place_photos
+from .shaking import held_by_slow_rotations, speeds_of, tell_if_held
 from .tracks import rough_options
 
 __all__ = ["frame_path", "readouts_of_halves", "solve_clip"]
@@ -110,6 +110,7 @@ def solve_clip(
         Its result is that of the key frames, `whole` the reconstruction of all frames.
     """
     path = _at_once(path) if at_once else path
+    known = path.readout
     turned, explained = _turned(clip, keys, path, options_of, log)
     telemetry = own_gyroscope(clip) if gyroscope is None else None
     if turned is not None and explained:
@@ -135,7 +136,9 @@ def solve_clip(
     # the telemetry of frames that were rotated since says nothing; those of a global shutter only look like them
     felt = None if _was_stabilised(filmed) and not at_once else felt_gyroscope(result, gyroscope or telemetry)
     if felt is not None:
-        options = replace(options, path=replace(path, rates=felt.rates(result), start=_start_of(result)))
+        # its rates are those of the camera, however fast that shakes
+        path = replace(path, rates=felt.rates(result), start=_start_of(result), readout=known, held_sigma=0.0)
+        options = replace(options, path=path)
         result = bundle_adjust(
             result.reconstruction, "constant-motion",
             replace(options, outlier_rounds=0, prior_sigma_rounds=_SIGMA_ROUNDS, prior_sigma_tolerance=_SETTLED),
@@ -153,15 +156,19 @@ def _turned(
     log.begin("rotations")
     start, found, explained = rotating_only(clip, keys), None, False
     if start is not None:
-        options = replace(options_of(start), path=replace(path, rotation_only=True))
+        path = replace(path, rotation_only=True)
+        options = replace(options_of(start), path=path)
         result = bundle_adjust(start, "constant-motion", _at_first(options), partial(_tell, log, "rotations"))
         # the first one smooths wild rotations, whose flow it leaves an error twice as large as the next one does
         if result.sigma_px < 2 * _FLOW_PX:
+            own = own_motions(result.reconstruction, rotation_only=True)
+            path = held_by_slow_rotations(clip, result.reconstruction, path, own)
+            options = replace(options, path=path)
             result = bundle_adjust(
                 result.reconstruction, "constant-motion",
                 replace(
                     options, outlier_rounds=1, prior_sigma_rounds=_SIGMA_ROUNDS, prior_sigma_tolerance=_SETTLED,
-                    path=replace(path, rotation_only=True, start=_start_of(result)),
+                    path=replace(path, start=_start_of(result)),
                 ),
                 partial(_tell, log, "rotations"),
             )  # fmt: skip
@@ -177,6 +184,9 @@ def _only_turned(turned: _Found) -> _Found:
         "the camera only rotated: without parallax there are directions, but no positions and no scene",
         RsUndistortWarning, stacklevel=4,
     )  # fmt: skip
+    path = turned[1].path
+    assert path is not None
+    tell_if_held(path)
     return turned
 
 
@@ -217,11 +227,14 @@ def _travelled(
         log.begin(stage)
         on_path = None if result is None else result.reconstruction
         whole = with_all_frames(clip, current, followed, on_path).without_photos(_LEAST_MEASUREMENTS)
-        if result is None:
+        if on_path is None:
             own = own_motions(whole)
             clip, path = _with_gaps(clip, path, whole, own)
             path, filmed = _as_filmed(clip, whole, path, telemetry, own)
-        options = replace(options_of(whole), path=path if result is None else replace(path, start=_start_of(result)))
+            held = path if _was_stabilised(filmed) else held_by_slow_rotations(clip, whole, path, own)
+        elif held.held_sigma:  # by what is better known now
+            held = held_by_slow_rotations(clip, on_path, path, own_motions(on_path))
+        options = replace(options_of(whole), path=held if result is None else replace(held, start=_start_of(result)))
         how = (
             _at_first(options)
             if result is None
@@ -239,12 +252,13 @@ def _travelled(
             current = retriangulate(matched, of_keys)
             followed = followed_again(clip, followed, before, current)
     assert result is not None
+    tell_if_held(held)
     return result, options, filmed, clip
 
 
 def _with_gaps(clip: Clip, path: FramePath, start: Reconstruction, own: OwnMotions) -> tuple[Clip, FramePath]:
     """The times of frames where others are missing between them, though the times of the file do not show it."""
-    place = _places(clip, start)
+    place = clip.places(start.image_names)
     steps = np.diff(clip.time_s[place]) / clip.frame_s
     joined = np.diff(clip.part[place]) == 0
     of_all, ratio = gaps_between(own.center_w, place, steps, joined, len(clip.names), 1 / clip.frame_s)
@@ -289,7 +303,7 @@ def _against_telemetry(
     """
     if filmed.verdict == "none":
         return filmed
-    place = _places(clip, rec)
+    place = clip.places(rec.image_names)
     pairs, rotations = rotations_between(clip.part[place], R_cw)
     reason = calmer_than_felt(clip.time_s[place], pairs, rotations, _rotation_sigma(own, pairs), telemetry)
     return replace(filmed, verdict="stabilised", reason=reason) if reason else filmed
@@ -339,7 +353,7 @@ def _judged(
         log.end("critical motion", sigma_log_k=remedy.after.sigma_log_k)
     log.begin("halves")
     without_readout = at_once or _was_stabilised(filmed)
-    halves = None if without_readout else readouts_of_halves(result, options)
+    halves = None if without_readout or options.path.held_sigma else readouts_of_halves(result, options)
     log.end("halves", readout_s=None if halves is None else [each.seconds for each in halves])
     log.begin("stabilisation")
     stabilisation, vibration_px, speeds = filmed, 0.0, None
@@ -347,7 +361,7 @@ def _judged(
         own = own_motions(result.reconstruction, rotation_only=options.path.rotation_only)
         if not at_once:
             vibration_px = unfollowed_px(result.reconstruction, own)
-            speeds = _by_speed(clip, result, own)
+            speeds = speeds_of(clip, result.reconstruction, own, readout_of(result).seconds)
         stabilisation = _stabilisation(clip, result.reconstruction, own, felt)
         if felt is None and telemetry is not None:
             on_path = result.reconstruction
@@ -380,6 +394,7 @@ def _judged(
         rec, whole = _standing(rec), _standing(whole)
     of_keys = replace(of_keys, reconstruction=rec.moved(*world), path=path)
     time = ReadoutTime(0.0, 0.0) if at_once else readout_of(result)
+    by_speed = [] if speeds is None else [each._asdict() for each in (speeds.slow, speeds.fast) if each is not None]
     evidence: dict[str, Any] = {
         "seconds": time.seconds,
         "sigma": time.sigma,
@@ -388,7 +403,7 @@ def _judged(
         "unbounded_seconds": float(found.unbounded_s[0]),
         "frames": len(path.names),
         "halves": [] if halves is None else [each._asdict() for each in halves],
-        "by_speed": [] if speeds is None else [each._asdict() for each in speeds],
+        "by_speed": by_speed if len(by_speed) > 1 else [],
         "stabilisation": {"verdict": stabilisation.verdict, "reason": stabilisation.reason},
     }
     if felt is not None:
@@ -421,6 +436,8 @@ def _source(options: BundleOptions, time: ReadoutTime, felt: Felt | None, filmed
     assert options.path is not None
     if _was_stabilised(filmed):
         return _OF_STABILISED
+    if options.path.held_sigma:
+        return "slow rotations of the video"
     measured = "the video" if felt is None else "the video and its gyroscope"
     if options.path.readout is None or time.sigma < _MEASURED * options.path.readout[1]:
         return measured
@@ -464,7 +481,7 @@ def readouts_of_halves(result: BundleResult, options: BundleOptions) -> tuple[Re
 
 def _stabilisation(clip: Clip, rec: Reconstruction, found: OwnMotions, felt: Felt | None = None) -> Stabilisation:
     """Whether the lines of the frames move as the frames do, each frame having its own motion."""
-    place = _places(clip, rec)
+    place = clip.places(rec.image_names)
     pairs, rotations = rotations_between(clip.part[place], found.R_cw)
     span = rec.frame_span()[:, None]
     log, offset_s = (None, 0.0) if felt is None else (felt.log, felt.alignment.offset_s)
@@ -472,22 +489,6 @@ def _stabilisation(clip: Clip, rec: Reconstruction, found: OwnMotions, felt: Fel
         clip.time_s[place], pairs, rotations, found.phi * span, found.sigma_phi * span, log=log, offset_s=offset_s,
         rotation_sigma=_rotation_sigma(found, pairs),
     )  # fmt: skip
-
-
-def _by_speed(clip: Clip, result: BundleResult, found: OwnMotions) -> tuple[ReadoutTime, ReadoutTime] | None:
-    """The readout time by slow and by fast rotations of the frames."""
-    rec = result.reconstruction
-    place, span = _places(clip, rec), rec.frame_span()[:, None]
-    return readouts_by_speed(
-        clip.time_s[place], clip.part[place], found.R_cw, found.sigma_rotation, found.phi * span,
-        found.sigma_phi * span, readout_of(result).seconds,
-    )  # fmt: skip
-
-
-def _places(clip: Clip, rec: Reconstruction) -> NDArray[np.int64]:
-    """(m,) frames of the clip that the photos of a reconstruction are."""
-    number = {name: k for k, name in enumerate(clip.names)}
-    return np.array([number[name] for name in rec.image_names], np.int64)
 
 
 def _rotation_sigma(found: OwnMotions, pairs: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from ..critical import Remedy
 from ..model import Reconstruction
 from ..rectify import largest_shift_px
 from .judge import Verdict, height_reasons, loose_reasons, unexplained_reasons
-from .speeds import ReadoutTime
+from .speeds import BySpeed, ReadoutTime
 
 __all__ = ["SIGMAS", "ReadoutTime", "judge_clip", "problem_of", "unfollowed_px"]
 
@@ -44,7 +44,7 @@ def judge_clip(
     remedy: Remedy | None = None,
     against: str = "",
     vibration_px: float = 0.0,
-    speeds: tuple[ReadoutTime, ReadoutTime] | None = None,
+    speeds: BySpeed | None = None,
     rotation_ratio: float = 1.0,
 ) -> Verdict:
     """Judge the path of a video.
@@ -65,8 +65,8 @@ def judge_clip(
         The reason why the frames are no longer as they were read, such as stabilisation; empty if there is none.
     vibration_px : float
         What frames rotate beyond their path, as `unfollowed_px` gives it.
-    speeds : pair of ReadoutTime, optional
-        The readout times by slow and by fast rotations, as `readouts_by_speed` gives them.
+    speeds : BySpeed, optional
+        What slow and fast rotations say.
     rotation_ratio : float
         Rotations of the frames over those of the gyroscope.
 
@@ -116,7 +116,7 @@ def judge_clip(
 def _contradictions(
     time: ReadoutTime,
     vibration_px: float,
-    speeds: tuple[ReadoutTime, ReadoutTime] | None,
+    speeds: BySpeed | None,
     halves: tuple[ReadoutTime, ReadoutTime] | None,
 ) -> list[str]:
     """Why the readout time may be wrong, whatever its standard deviation."""
@@ -128,16 +128,17 @@ def _contradictions(
             f"The frames rotate by {vibration_px:.1f} px more than their path explains: the camera vibrates faster "
             "than half of the frame rate, or something else bends the frames."
         )
-    if speeds is not None and _runs_the_other_way(*speeds):
+    slow, fast = (None, None) if speeds is None else speeds[:2]
+    if slow is not None and fast is not None and _runs_the_other_way(slow, fast):
         reasons.append(
-            f"Slow rotations ask for a readout time of {1e3 * speeds[0].seconds:.1f} ms, fast ones for "
-            f"{1e3 * speeds[1].seconds:.1f} +- {1e3 * speeds[1].sigma:.1f} ms: the camera vibrates faster than half of "
-            "the frame rate, and the readout time may be wrong."
+            f"Slow rotations ask for a readout time of {1e3 * slow.seconds:.1f} ms, fast ones for "
+            f"{1e3 * fast.seconds:.1f} +- {1e3 * fast.sigma:.1f} ms: the camera vibrates faster than half of the frame "
+            "rate, and the readout time may be wrong."
         )
-    elif speeds is not None and _contradicts(time, speeds[0]):
+    elif slow is not None and _contradicts(time, slow):
         reasons.append(
             f"The readout time is {1e3 * time.seconds:.1f} +- {1e3 * time.sigma:.1f} ms along the path, and "
-            f"{1e3 * speeds[0].seconds:.1f} +- {1e3 * speeds[0].sigma:.1f} ms by slow rotations alone: {_TOO_FEW}."
+            f"{1e3 * slow.seconds:.1f} +- {1e3 * slow.sigma:.1f} ms by slow rotations alone: {_TOO_FEW}."
         )
     if halves is not None:
         a, b = halves

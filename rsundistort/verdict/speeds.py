@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-__all__ = ["ReadoutTime", "readouts_by_speed"]
+__all__ = ["BySpeed", "ReadoutTime", "readouts_by_speed"]
 
 Array = NDArray[np.float64]
 
@@ -27,10 +27,27 @@ class ReadoutTime(NamedTuple):
     sigma: float
 
 
+class BySpeed(NamedTuple):
+    """What slow and fast rotations of frames and of their lines say.
+
+    Attributes
+    ----------
+    slow, fast : ReadoutTime or None
+        The readout times by them; None if that kind of rotation is lost in the noise.
+    unfollowed : float
+        Share of the power of the lines' rotations that is not in those of the frames at the readout time by slow ones,
+        beyond the noise of both: 0 if they agree, 1 or more if they have nothing to do with each other.
+    """
+
+    slow: ReadoutTime | None
+    fast: ReadoutTime | None
+    unfollowed: float
+
+
 def readouts_by_speed(
     time_s: Array, part: NDArray[np.int64], R_cw: Array, rotation_sigma: Array, phi: Array, phi_sigma: Array,
     readout_s: float,
-) -> tuple[ReadoutTime, ReadoutTime] | None:  # fmt: skip
+) -> BySpeed | None:  # fmt: skip
     """The readout time by rotations slower and faster than a quarter of the frame rate.
 
     The lines of a frame rotate by the readout time times the rate of the frames. A rotation faster than half of the
@@ -51,8 +68,8 @@ def readouts_by_speed(
 
     Returns
     -------
-    pair of ReadoutTime or None
-        By slow and by fast rotations; None if there are too few frames, or a kind of rotation is lost in the noise.
+    BySpeed or None
+        None if there are too few frames.
     """
     known = np.isfinite(np.hstack([R_cw.reshape(-1, 9), phi, phi_sigma])).all(axis=1)
     part = part[known]
@@ -70,9 +87,13 @@ def readouts_by_speed(
     if not spectra:
         return None
     fast, lines, rates, line_noise, rate_noise = (np.concatenate(each) for each in zip(*spectra, strict=True))
-    found = [_slope(lines[mine], rates[mine], line_noise[mine], rate_noise[mine], readout_s) for mine in (~fast, fast)]
-    slow, rest = found
-    return None if slow is None or rest is None else (slow, rest)
+    slow, rest = (
+        _slope(lines[mine], rates[mine], line_noise[mine], rate_noise[mine], readout_s) for mine in (~fast, fast)
+    )
+    by_slow = 0.0 if slow is None else slow.seconds
+    left = float((np.abs(lines - by_slow * rates) ** 2 - by_slow**2 * rate_noise - line_noise).sum())
+    power = float((np.abs(lines) ** 2).sum()) - float(line_noise.sum())
+    return BySpeed(slow, rest, left / power if power > line_noise.sum() else 0.0)
 
 
 def _spectra(
