@@ -94,7 +94,7 @@ def felt_gyroscope(result: BundleResult, log: GyroLog | None) -> Felt | None:
     path = result.path.path
     found = align_gyro(log, path.time_s, *rotations_between(path.part, path.R_cw))
     if isinstance(found, NoAlignment):
-        warnings.warn(f"without the gyroscope: {found.reason}", RsUndistortWarning, stacklevel=5)
+        warnings.warn(f"without the gyroscope: {found.reason}", RsUndistortWarning, stacklevel=6)
         return None
     return Felt(found, found.in_camera(log))
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 import warnings
 from dataclasses import replace
 
+import numpy as np
+
+from ..bundle import BundleResult
 from ..bundle.own_motions import OwnMotions
 from ..bundle.path_prior import FramePath
 from ..errors import RsUndistortWarning
@@ -12,7 +15,7 @@ from ..input.key_frames import Clip
 from ..model import Reconstruction
 from ..verdict.speeds import BySpeed, readouts_by_speed
 
-__all__ = ["held_by_slow_rotations", "speeds_of", "tell_if_held"]
+__all__ = ["held_by_slow_rotations", "speeds_of", "tell_if_held", "with_slow_rotations"]
 
 # Share of what lines show that may not be in the frames: 0.01 at most where a path follows its camera, 0.3 and more
 # where it does not.
@@ -21,6 +24,8 @@ _UNFOLLOWED = 0.1
 _KNOWN = 0.5
 # Standard deviation that holds a readout time, by its own: it must not move where a path pulls it.
 _HELD = 0.02
+# Slow rotations alone count at the end, unless what else was known made the readout time more exact by this.
+_AS_EXACT = 1.5
 
 
 def speeds_of(clip: Clip, rec: Reconstruction, found: OwnMotions, readout_s: float) -> BySpeed | None:
@@ -52,6 +57,18 @@ def held_by_slow_rotations(clip: Clip, rec: Reconstruction, path: FramePath, fou
     if not 0 < sigma < _KNOWN * abs(seconds):
         return path
     return replace(path, readout=(seconds, _HELD * sigma), held_sigma=sigma)
+
+
+def with_slow_rotations(result: BundleResult, path: FramePath, speeds: BySpeed | None) -> BundleResult:
+    """The same with the readout time of slow rotations where the path's was held, as they are known by the path found.
+
+    By how much that is another one than the path was held at counts as a part of its standard deviation.
+    """
+    found, slow = result.path, None if speeds is None else speeds.slow
+    if not path.held_sigma or slow is None or found is None or not slow.sigma < _AS_EXACT * path.held_sigma:
+        return result
+    sigma = np.hypot(slow.sigma, slow.seconds - found.readout_s)
+    return replace(result, path=replace(found, readout_s=np.full_like(sigma, slow.seconds), sigma_readout_s=sigma))
 
 
 def tell_if_held(path: FramePath) -> None:

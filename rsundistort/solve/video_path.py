@@ -25,7 +25,7 @@ from ..io.gyro import GyroLog
 from ..io.kept import Kept
 from ..model import Reconstruction
 from ..sfm import MatchedPhotos, retriangulate
-from ..verdict.judge_path import ReadoutTime, judge_clip, unfollowed_px
+from ..verdict.judge_path import BY_SLOW_ROTATIONS, ReadoutTime, judge_clip, unfollowed_px
 from .clip_gyroscope import Felt, felt_gyroscope, own_gyroscope, readout_of, rotations_between
 from .clip_pair import FramePair
 from .clip_pan import rotating_only
@@ -34,7 +34,7 @@ from .missing_frames import gaps_between
 from .model_sequence import without_shutter
 from .outcome import Solved
 from .placing import place_photos
-from .shaking import held_by_slow_rotations, speeds_of, tell_if_held
+from .shaking import held_by_slow_rotations, speeds_of, tell_if_held, with_slow_rotations
 from .tracks import rough_options
 
 __all__ = ["frame_path", "readouts_of_halves", "solve_clip"]
@@ -129,15 +129,26 @@ def solve_clip(
                 raise
             found = _only_turned(turned)
     result, options, filmed, clip = found
-    assert options.path is not None
-    path = options.path
     alone = readout_of(result)
-    log.begin("gyroscope")
     # the telemetry of frames that were rotated since says nothing; those of a global shutter only look like them
-    felt = None if _was_stabilised(filmed) and not at_once else felt_gyroscope(result, gyroscope or telemetry)
+    of_camera = None if _was_stabilised(filmed) and not at_once else gyroscope or telemetry
+    result, options, felt = _with_gyroscope(result, options, of_camera, known, log)
+    return _judged(clip, keys, result, options, alone, felt, filmed, telemetry, log, at_once)
+
+
+def _with_gyroscope(
+    result: BundleResult, options: BundleOptions, gyroscope: GyroLog | None, known: tuple[float, float] | None,
+    log: StageLog,
+) -> tuple[BundleResult, BundleOptions, Felt | None]:  # fmt: skip
+    """The path by the rates of a gyroscope, too, if it fits; its options, and what the gyroscope felt."""
+    assert options.path is not None
+    log.begin("gyroscope")
+    felt = felt_gyroscope(result, gyroscope)
     if felt is not None:
         # its rates are those of the camera, however fast that shakes
-        path = replace(path, rates=felt.rates(result), start=_start_of(result), readout=known, held_sigma=0.0)
+        path = replace(
+            options.path, rates=felt.rates(result), start=_start_of(result), readout=known, held_sigma=0.0
+        )  # fmt: skip
         options = replace(options, path=path)
         result = bundle_adjust(
             result.reconstruction, "constant-motion",
@@ -145,7 +156,7 @@ def solve_clip(
             partial(_tell, log, "gyroscope"),
         )  # fmt: skip
     log.end("gyroscope", offset_s=None if felt is None else felt.alignment.offset_s)
-    return _judged(clip, keys, result, options, alone, felt, filmed, telemetry, log, at_once)
+    return result, options, felt
 
 
 def _turned(
@@ -362,6 +373,7 @@ def _judged(
         if not at_once:
             vibration_px = unfollowed_px(result.reconstruction, own)
             speeds = speeds_of(clip, result.reconstruction, own, readout_of(result).seconds)
+            result = with_slow_rotations(result, options.path, speeds)
         stabilisation = _stabilisation(clip, result.reconstruction, own, felt)
         if felt is None and telemetry is not None:
             on_path = result.reconstruction
@@ -380,7 +392,9 @@ def _judged(
     if at_once:
         against = _against_global(stabilisation)
     ratio = 1.0 if felt is None else felt.alignment.ratio
-    verdict = judge_clip(result, of_keys, halves, clip.frame_s, remedy, against, vibration_px, speeds, ratio)
+    # where the path follows slow rotations only, others contradict nothing
+    apart = None if options.path.held_sigma else speeds
+    verdict = judge_clip(result, of_keys, halves, clip.frame_s, remedy, against, vibration_px, apart, ratio)
     if verdict.lens_only:
         warnings.warn(
             f"the frames are corrected for the lens only: {verdict.reasons[0]}", RsUndistortWarning, stacklevel=4
@@ -437,7 +451,7 @@ def _source(options: BundleOptions, time: ReadoutTime, felt: Felt | None, filmed
     if _was_stabilised(filmed):
         return _OF_STABILISED
     if options.path.held_sigma:
-        return "slow rotations of the video"
+        return BY_SLOW_ROTATIONS
     measured = "the video" if felt is None else "the video and its gyroscope"
     if options.path.readout is None or time.sigma < _MEASURED * options.path.readout[1]:
         return measured

@@ -19,6 +19,8 @@ __all__ = ["SIGMAS", "ReadoutTime", "judge_clip", "problem_of", "unfollowed_px"]
 
 # Displacements below this are lost in the interpolation of a photo.
 _UNSEEN_PX = 1.0
+#: Source of a readout time that the path says nothing about.
+BY_SLOW_ROTATIONS = "slow rotations of the video"
 #: Standard deviations by which a readout time differs from none, or from another of the same video.
 SIGMAS = 3.0
 # Those by which slow and fast rotations contradict each other, whose spectra leak.
@@ -202,7 +204,7 @@ def problem_of(evidence: Mapping[str, Any]) -> str:
         apart = abs(first["seconds"] - second["seconds"]) / np.hypot(first["sigma"], second["sigma"])
         if apart > SIGMAS:
             return f"the halves of the video contradict each other, {apart:.0f} standard deviations apart"
-    if evidence.get("by_speed"):
+    if evidence.get("by_speed") and evidence["source"] != BY_SLOW_ROTATIONS:
         slow, fast = (ReadoutTime(each["seconds"], each["sigma"]) for each in evidence["by_speed"])
         if _runs_the_other_way(slow, fast):
             return (
