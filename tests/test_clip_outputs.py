@@ -350,6 +350,7 @@ def test_the_readout_time_is_reported_with_its_evidence():
             {"halves": [{"seconds": 0.030, "sigma": 0.0005}, {"seconds": 0.0204, "sigma": 0.0005}]},
             "contradict each other, 14 standard deviations apart",
         ),
+        ({"unfollowed_px": 2.0}, "the frames rotate by 2.0 px more than their path explains"),
         ({"seconds": 0.04, "of_frame": 1.2}, "longer than the time from frame to frame"),
         (
             {"seconds": -0.0205, "of_frame": -0.615},

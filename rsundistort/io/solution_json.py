@@ -68,6 +68,7 @@ _READOUT_TIME = {
     "source": str,
     "of_frame?": float,
     "unbounded_seconds?": float,
+    "unfollowed_px?": float,
     "halves?": Maybe([_TIME]),
     "by_speed?": Maybe([_TIME]),
     "by_pictures?": Maybe(_TIME),

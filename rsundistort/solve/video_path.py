@@ -415,6 +415,7 @@ def _judged(
         "source": _OF_GLOBAL if at_once else _source(options, time, felt, filmed),
         "of_frame": time.seconds / clip.frame_s,
         "unbounded_seconds": float(found.unbounded_s[0]),
+        "unfollowed_px": vibration_px,
         "frames": len(path.names),
         "halves": [] if halves is None else [each._asdict() for each in halves],
         "by_speed": by_speed if len(by_speed) > 1 else [],

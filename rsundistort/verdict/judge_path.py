@@ -31,6 +31,7 @@ _SHOWN_FAST = 0.5
 _GYRO_SCALE = 0.05
 # Where a path misses part of how fast its camera rotates, the readout time comes out longer.
 _TOO_FEW = "the camera shakes too fast for its frame rate, or frames are missing or came twice"
+_VIBRATES = "the camera vibrates faster than half of the frame rate, or something else bends the frames"
 # A vibration a little faster than half of the frame rate shows in the frames as a slower one that runs the other way.
 _BACKWARDS = (
     "the last line is read first (--readout), the video runs backwards, or the camera vibrates faster than half of the "
@@ -126,10 +127,7 @@ def _contradictions(
     if _is_backwards(time):
         reasons.append(f"The readout time is {1e3 * time.seconds:.1f} +- {1e3 * time.sigma:.1f} ms: {_BACKWARDS}.")
     if vibration_px > _UNSEEN_PX:
-        reasons.append(
-            f"The frames rotate by {vibration_px:.1f} px more than their path explains: the camera vibrates faster "
-            "than half of the frame rate, or something else bends the frames."
-        )
+        reasons.append(f"The frames rotate by {vibration_px:.1f} px more than their path explains: {_VIBRATES}.")
     slow, fast = (None, None) if speeds is None else speeds[:2]
     if slow is not None and fast is not None and _runs_the_other_way(slow, fast):
         reasons.append(
@@ -199,6 +197,8 @@ def problem_of(evidence: Mapping[str, Any]) -> str:
         return f"the camera moved too little: {1e3 * seconds:.1f} +- {1e3 * sigma:.1f} ms"
     if _is_backwards(ReadoutTime(seconds, sigma)):
         return f"{1e3 * seconds:.1f} +- {1e3 * sigma:.1f} ms: {_BACKWARDS}"
+    if evidence.get("unfollowed_px", 0.0) > _UNSEEN_PX:
+        return f"the frames rotate by {evidence['unfollowed_px']:.1f} px more than their path explains: {_VIBRATES}"
     if evidence.get("halves"):
         first, second = evidence["halves"]
         apart = abs(first["seconds"] - second["seconds"]) / np.hypot(first["sigma"], second["sigma"])
