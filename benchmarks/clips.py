@@ -10,7 +10,8 @@ Renders clips of each kind and prints one JSON object a line: how strong the shu
     two     two frames while the camera rotates by 2 to 4 degrees a readout
     street  a walk along a street, of a phone's or an action camera's 854x480; at 1.2 m a second
     round   the same size, round a thing again and again, as who scans it: once in ten seconds, each time at another
-            height and distance; at least 300 frames, so that all of the yard is seen. Neither unless asked for
+            height and distance; at least 300 frames, so that all of the yard is seen
+    vibrating  a walk that shakes at up to 24 Hz, with 30 frames a second. The last three only if asked for
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from rsundistort import read_solution
 from rsundistort.simulate import SceneOptions, simulate_scene
 
 SHORT = ("walk", "level", "pan", "two")
-KINDS = (*SHORT, "street", "round")
+KINDS = (*SHORT, "street", "round", "vibrating")
 WIDTH, HEIGHT, FOCAL_PX = 640, 360, 500.0
 # 4 samples a pixel: a frame is 41 dB from one of 64, which is less than its noise would be; 16 take three times as long
 SAMPLES = 4
@@ -215,7 +216,9 @@ def path(kind: str, rng: np.random.Generator, num_frames: int) -> dict[str, Any]
         rng.uniform(0.2, 1.2, 4), rng.uniform(1.4, 1.8, 4),
     ])  # fmt: skip
     way = [{"center_w": c.tolist(), "look_at_w": look(c, y, p)} for c, y, p in zip(places, yaws, pitches, strict=True)]
-    if kind == "walk":
+    if kind == "vibrating":
+        tremor = {"rotation_deg": float(np.exp(rng.uniform(np.log(0.4), np.log(2.0)))), "hz": [1, 24], "num": 5}
+    if kind != "level":
         for point, roll in zip(way, rolls, strict=True):
             point["roll_deg"] = float(np.degrees(roll))
     steps = {"hz": float(rng.uniform(1.6, 2.2)), "up_m": 0.025, "side_m": 0.02}
@@ -229,7 +232,7 @@ def clip_recipe(kind: str, seed: int, num_frames: int = 60) -> dict[str, Any]:
     Of 40 to 150 frames: the way points are as many, so that shorter ones rotate faster; longer ones leave the yard.
     """
     rng = np.random.default_rng([seed, KINDS.index(kind)])
-    is_long = kind not in SHORT
+    is_long = kind in ("street", "round")
     width, height, focal_px = LONG if is_long else (WIDTH, HEIGHT, FOCAL_PX)
     K = [[focal_px, 0, width / 2 + 1.5], [0, focal_px, height / 2 - 1.75], [0, 0, 1]]
     taken = (long_path if is_long else path)(kind, rng, num_frames)

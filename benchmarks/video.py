@@ -12,7 +12,8 @@ Prints one JSON object a line. Clips are rendered into FOLDER once (`clips.py`: 
     pan      random clips from a tripod
     two      two frames whose readout time is known: how far off the corrected positions are
     readout  random walks, gentle to wild: errors of the readout time, and these over their standard deviations
-    stabilised  the same, rotated back to smooth paths: which are named; and how many of those that the sensor saw are
+    vibrating  likewise walks that shake at up to 24 Hz, faster than frames can show
+    stabilised  walks, rotated back to smooth paths: which are named; and how many of those that the sensor saw are
     edited   random walks as programs, lamps and passers-by leave them (`edited.py`): readout times, by the path and by
              slow rotations alone, and verdicts; only some edits with `--edit`
     gopro    ../shared/video: clock, axes and rotation of its gyroscope, readout by pictures and by the gyroscope
@@ -37,6 +38,7 @@ import tempfile
 import time
 import warnings
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -83,7 +85,20 @@ from rsundistort.batch import progress
 progress.time = types.SimpleNamespace(perf_counter=time.process_time)
 """
 LONG = ("street", "round", "to-and-fro")
-PARTS = ("walk", "level", "pan", "two", "readout", "stabilised", "edited", "gopro", "peer", "length", "unordered")
+PARTS = (
+    "walk",
+    "level",
+    "pan",
+    "two",
+    "readout",
+    "vibrating",
+    "stabilised",
+    "edited",
+    "gopro",
+    "peer",
+    "length",
+    "unordered",
+)
 
 
 def solved_clip(video: Path, camera: str, readout_s: float | None = None) -> tuple[Solved, float]:
@@ -281,7 +296,7 @@ def of_kind(kind: str, args: argparse.Namespace) -> list[dict[str, Any]]:
             values.append({"error": str(error)})
             continue
         value = judged(folder, solved, cpu_s)
-        if kind in ("pan", "walk"):
+        if kind in ("pan", "walk", "vibrating"):
             value |= against_references(folder / "clip.mp4", solved)
         if kind == "two":
             value |= positions(folder, solved)
@@ -292,9 +307,9 @@ def of_kind(kind: str, args: argparse.Namespace) -> list[dict[str, Any]]:
     return values
 
 
-def readout(args: argparse.Namespace) -> None:
-    """Errors of the readout time over random walks."""
-    values = [each for each in of_kind("walk", args) if "error" not in each]
+def readout(args: argparse.Namespace, kind: str = "walk") -> None:
+    """Errors of the readout time over random clips of a kind."""
+    values = [each for each in of_kind(kind, args) if "error" not in each]
     percent = np.abs([each["error_percent"] for each in values])
     normalised = np.array([each["error_over_sigma"] for each in values])
     print(
@@ -494,7 +509,7 @@ def main() -> None:
         else:
             {
                 "walk": walk, "readout": readout, "stabilised": stabilised, "gopro": gopro, "peer": peer,
-                "length": length, "unordered": unordered, "edited": edits,
+                "length": length, "unordered": unordered, "edited": edits, "vibrating": partial(readout, kind="vibrating"),
             }[part](args)  # fmt: skip
 
 
