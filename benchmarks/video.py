@@ -509,7 +509,8 @@ def main() -> None:
         else:
             {
                 "walk": walk, "readout": readout, "stabilised": stabilised, "gopro": gopro, "peer": peer,
-                "length": length, "unordered": unordered, "edited": edits, "vibrating": partial(readout, kind="vibrating"),
+                "length": length, "unordered": unordered, "edited": edits,
+                "vibrating": partial(readout, kind="vibrating"),
             }[part](args)  # fmt: skip
 
 
