@@ -20,7 +20,7 @@ def attempts(monkeypatch):
     def of(attempt):
         made.append(attempt)
         count = registers.get(attempt, 0)
-        return SimpleNamespace(num_images=count, by=attempt) if count else None
+        return SimpleNamespace(num_images=count, by=attempt) if attempt in registers else None
 
     monkeypatch.setattr(mapping, "_mapped_at_once", lambda _, limit, *__: of(limit))
     monkeypatch.setattr(mapping, "_mapped_one_by_one", lambda *_: of("one by one"))
@@ -46,7 +46,9 @@ def test_mapping_tries_more_keypoints_while_they_may_place_more_photos(attempts,
     assert attempts[0] == made
 
 
-def test_photos_that_no_attempt_registers_are_refused(attempts):
+@pytest.mark.parametrize("registers", [{}, {2048: 0, "one by one": 0}], ids=["none", "without-a-point"])
+def test_photos_that_no_attempt_registers_are_refused(attempts, registers):
+    attempts[1].update(registers)
     with pytest.raises(ReconstructionError, match="none of the 16 photos overlap enough to be registered"):
         map_photos(MATCHED)
     assert attempts[0] == [2048, 4096, None, "one by one"]

@@ -95,7 +95,7 @@ def map_photos(
             break
     if found is None or count < enough:
         found = _with_more(found, _mapped_one_by_one(matched, progress, shown))
-    if found is None:
+    if found is None or found.num_images < 2:
         raise ReconstructionError(
             f"none of the {len(matched.names)} photos overlap enough to be registered; "
             "use photos that share more of the scene, or check the camera's focal length"

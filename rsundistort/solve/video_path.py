@@ -45,6 +45,8 @@ _LEAST_MEASUREMENTS = 15
 _LEAST_HALF = 4
 # Rotations explain the frames up to this error of the flow in pixels, and this share of outliers.
 _FLOW_PX, _OUTLIERS = 0.25, 0.2
+# Times that error after a first adjustment, which knows neither the rotations' size nor the readout.
+_AT_FIRST = 4.0
 # Solves that estimate the prior standard deviations of a path, and the share by which these may still change: with
 # hundreds of frames few are enough.
 _SIGMA_ROUNDS, _SETTLED = 4, 0.05
@@ -170,8 +172,8 @@ def _turned(
         path = replace(path, rotation_only=True)
         options = replace(options_of(start), path=path)
         result = bundle_adjust(start, "constant-motion", _at_first(options), partial(_tell, log, "rotations"))
-        # the first one smooths wild rotations, whose flow it leaves an error twice as large as the next one does
-        if result.sigma_px < 2 * _FLOW_PX:
+        # the first one smooths wild rotations, which leaves an error several times as large as that of the next one
+        if result.sigma_px < _AT_FIRST * _FLOW_PX:
             own = own_motions(result.reconstruction, rotation_only=True)
             path = held_by_slow_rotations(clip, result.reconstruction, path, own)
             options = replace(options, path=path)
