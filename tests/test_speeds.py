@@ -7,7 +7,7 @@ import pytest
 from clips import HandHeld
 from scipy.spatial.transform import Rotation
 
-from rsundistort.verdict.judge_path import problem_of
+from rsundistort.verdict.judge_path import BY_SLOW_ROTATIONS, problem_of
 from rsundistort.verdict.speeds import readouts_by_speed
 
 FRAME_S = 1 / 30
@@ -69,7 +69,11 @@ def test_a_vibration_faster_than_half_of_the_frame_rate_runs_the_other_way(rng, 
     assert fast.seconds < 0.3 * shown
     told = {"seconds": 0.024, "sigma": 0.0005, "of_frame": 0.72, "source": "the video"}
     assert problem_of(told) == ""
-    assert "vibrates faster" in problem_of(told | {"by_speed": [each._asdict() for each in (slow, fast)]})
+    told["by_speed"] = [each._asdict() for each in (slow, fast)]
+    assert "vibrates faster" in problem_of(told)
+    by_slow = told | {"source": BY_SLOW_ROTATIONS, "seconds": slow.seconds, "sigma": slow.sigma}
+    assert problem_of(by_slow) == ""
+    assert "contradict" in problem_of(by_slow | {"seconds": 1.3 * slow.seconds, "sigma": 1e-4})  # given, and wrong
 
 
 def test_a_path_that_slow_rotations_contradict_is_no_measurement(rng):

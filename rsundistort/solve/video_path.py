@@ -394,8 +394,8 @@ def _judged(
     if at_once:
         against = _against_global(stabilisation)
     ratio = 1.0 if felt is None else felt.alignment.ratio
-    # where the path follows slow rotations only, others contradict nothing
-    apart = None if options.path.held_sigma else speeds
+    # where the path follows slow rotations only, fast ones contradict nothing
+    apart = speeds._replace(fast=None) if speeds is not None and options.path.held_sigma else speeds
     verdict = judge_clip(result, of_keys, halves, clip.frame_s, remedy, against, vibration_px, apart, ratio)
     if verdict.lens_only:
         warnings.warn(

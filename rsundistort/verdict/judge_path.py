@@ -204,9 +204,9 @@ def problem_of(evidence: Mapping[str, Any]) -> str:
         apart = abs(first["seconds"] - second["seconds"]) / np.hypot(first["sigma"], second["sigma"])
         if apart > SIGMAS:
             return f"the halves of the video contradict each other, {apart:.0f} standard deviations apart"
-    if evidence.get("by_speed") and evidence["source"] != BY_SLOW_ROTATIONS:
+    if evidence.get("by_speed"):
         slow, fast = (ReadoutTime(each["seconds"], each["sigma"]) for each in evidence["by_speed"])
-        if _runs_the_other_way(slow, fast):
+        if evidence["source"] != BY_SLOW_ROTATIONS and _runs_the_other_way(slow, fast):
             return (
                 "the camera vibrates faster than half of the frame rate: slow and fast rotations contradict each other"
             )
