@@ -87,8 +87,8 @@ class FramePath:
         What is known of the readout time of a frame; without it, that it is about half of `frame_s`, give or take as
         much.
     held_sigma : float
-        Standard deviation in seconds of a readout time that the path says nothing about, such as one that shakes too
-        fast for its frames; `readout` holds it then.
+        Standard deviation in seconds of a readout time that the path says nothing about, as where the camera shakes
+        too fast for its frames; `readout` then holds it with a small one. 0 if the path may say something.
     part : mapping of photo name to int, optional
         Parts that a cut separates; all in one when left out.
     rates : mapping of photo name to (rate, sigma), optional

@@ -13,7 +13,7 @@ __all__ = ["LinearSystem", "MinimizeResult", "Problem", "minimize"]
 
 # Steps that achieve less than this share of the predicted decrease have met a bend of the valley.
 _GOOD_STEP = 0.8
-# Damping that is lost in rounding: below it, what is needed after a rejected step would take many more to reach.
+# Damping that is lost in rounding. From far below, many steps would be rejected until damping has an effect again.
 _LEAST_DAMPING = 1e-12
 
 

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import entr
 
 __all__ = ["Gaps", "frames_missing", "gaps_between"]
 
@@ -30,6 +31,8 @@ _TENTH, _MEDIAN = 0.0158, 0.455
 _RATES = np.array([10, 12, 12.5, 15, 20, 24, 25, 30, 48, 50, 60, 90, 100, 120, 240])
 _NTSC = np.array([24, 30, 48, 60, 120, 240]) * (1000 / 1001)
 _SAME_RATE, _LARGEST_RATIO, _NOT_WHOLE = 2e-3, 2.9, 0.01
+# Frames of a conversion are evenly spaced in the file, but for its rounding of times: share of a step.
+_ROUNDED = 0.05
 # Phases of a conversion that are tried, and steps to the usual size of its changes.
 _PHASES, _SCALE_STEPS = 120, 8
 # Intervals of all hypotheses at once, for the memory.
@@ -82,7 +85,7 @@ def gaps_between(
     valid = int(np.isfinite(way).all(axis=1).sum())
     way = way[:, np.nansum(np.abs(way), axis=0) > 0]
     between = np.diff(place)
-    if valid < _FEWEST or not way.size or not np.allclose(steps[joined], between[joined], atol=0.05):
+    if valid < _FEWEST or not way.size or not np.allclose(steps[joined], between[joined], atol=_ROUNDED):
         return Gaps(of_all, None)
     patterns, ratios, cost_of_conversions = _conversions(num_frames, rate)
     passed = np.concatenate([np.zeros((len(patterns), 1), np.int64), np.cumsum(patterns, axis=1)], axis=1)
@@ -92,16 +95,12 @@ def gaps_between(
     cost = _COUNTED_ONCE * np.concatenate([_cost_of_all(way, block) for block in blocks])
     # what it takes to say which intervals have gaps, and which conversion it is
     share = np.count_nonzero(single) / valid
-    cost[1] += np.log(valid) - (valid * (_plog(share) + _plog(1 - share)) if share else 0.0)
+    cost[1] += np.log(valid) + valid * (entr(share) + entr(1 - share))
     cost[2:] += cost_of_conversions
     best = int(np.argmin(cost))
     if best < 2:
         return Gaps(of_all, None)
     return Gaps(patterns[best - 2], float(ratios[best - 2]))
-
-
-def _plog(share: float) -> float:
-    return share * float(np.log(share)) if share > 0 else 0.0
 
 
 def _conversions(num_frames: int, rate: float) -> tuple[Index, Array, Array]:

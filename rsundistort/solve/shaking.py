@@ -60,9 +60,10 @@ def held_by_slow_rotations(clip: Clip, rec: Reconstruction, path: FramePath, fou
 
 
 def with_slow_rotations(result: BundleResult, path: FramePath, speeds: BySpeed | None) -> BundleResult:
-    """The same with the readout time of slow rotations where the path's was held, as they are known by the path found.
+    """The readout time of slow rotations in place of the one at which the path was held, if it was.
 
-    By how much that is another one than the path was held at counts as a part of its standard deviation.
+    `speeds` are those about the path that was found, whose bends make them more exact than they were before it. The
+    difference from the time that was held counts as a part of the standard deviation.
     """
     found, slow = result.path, None if speeds is None else speeds.slow
     if not path.held_sigma or slow is None or found is None or not slow.sigma < _AS_EXACT * path.held_sigma:

@@ -15,7 +15,7 @@ from ..rectify import largest_shift_px
 from .judge import Verdict, height_reasons, loose_reasons, unexplained_reasons
 from .speeds import BySpeed, ReadoutTime
 
-__all__ = ["SIGMAS", "ReadoutTime", "judge_clip", "problem_of", "unfollowed_px"]
+__all__ = ["BY_SLOW_ROTATIONS", "SIGMAS", "ReadoutTime", "judge_clip", "problem_of", "unfollowed_px"]
 
 # Displacements below this are lost in the interpolation of a photo.
 _UNSEEN_PX = 1.0
