@@ -268,6 +268,12 @@ def test_run_refuses_in_one_line_and_writes_nothing(invoke, tmp_path, options, s
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
+def test_a_video_that_is_not_there_is_no_folder_of_photos(tmp_path):
+    with pytest.raises(FileError, match=r"none\.MP4 does not exist; give a video, or a folder of photos"):
+        run(tmp_path / "none.MP4", tmp_path / "out", RunOptions(frames="all"))
+    assert not [*tmp_path.iterdir()]
+
+
 @pytest.mark.slow
 def test_a_scene_that_slides_by_determines_no_focal_length_and_that_is_said(invoke, tmp_path):
     encode(tmp_path / "clip.mp4", [view(k) for k in range(8)])

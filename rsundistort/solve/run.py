@@ -13,7 +13,7 @@ from ..batch.progress import ProgressCallback, StageLog
 from ..batch.workers import Workers, use_threads
 from ..bundle import BundleOptions
 from ..bundle.intrinsics import check_lenses
-from ..errors import InputError, RsUndistortWarning
+from ..errors import FileError, InputError, RsUndistortWarning
 from ..input.exposure import bounded_by_exposure
 from ..input.frames import find_photos
 from ..input.gyroscope import GyroOptions, Readouts, gyro_contradiction, gyro_motions, known_readouts
@@ -28,7 +28,7 @@ from ..io.motions import Known
 from ..io.outputs import work_folder
 from ..io.places import local_place
 from ..io.record import Record
-from ..io.video import VideoFrames
+from ..io.video import VIDEO_SUFFIXES, VideoFrames
 from ..model import Reconstruction, Solution
 from ..model.checks import check_kind
 from .going_on import RunFolder, key_of, run_folder
@@ -83,6 +83,8 @@ def run(
     check_kind(options, RunOptions, "options")
     rectify = options.rectify
     photos, out = local_place(photos), local_place(out)
+    if photos.suffix.lower() in VIDEO_SUFFIXES and not photos.exists():
+        raise FileError(f"{photos} does not exist; give a video, or a folder of photos")
     log = StageLog(progress)
     workers = Workers(use_threads(jobs), scheduler)
     gyro_files = () if options.gyro is None else (options.gyro.file, options.gyro.times)
