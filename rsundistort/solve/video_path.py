@@ -30,7 +30,7 @@ from .clip_gyroscope import Felt, felt_gyroscope, own_gyroscope, readout_of, rot
 from .clip_pair import FramePair
 from .clip_pan import rotating_only
 from .clip_tracks import follow_points, followed_again, with_all_frames
-from .missing_frames import gaps_between
+from .missing_frames import tell_of_gaps, with_gaps
 from .model_sequence import without_shutter
 from .outcome import Solved
 from .placing import place_photos
@@ -47,6 +47,8 @@ _LEAST_HALF = 4
 _FLOW_PX, _OUTLIERS = 0.25, 0.2
 # Times that error after a first adjustment, which knows neither the rotations' size nor the readout.
 _AT_FIRST = 4.0
+# Times that frames which only rotate are adjusted again, since some are missing between them.
+_GAP_ROUNDS = 3
 # Solves that estimate the prior standard deviations of a path, and the share by which these may still change: with
 # hundreds of frames few are enough.
 _SIGMA_ROUNDS, _SETTLED = 4, 0.05
@@ -116,7 +118,7 @@ def solve_clip(
     turned, explained = _turned(clip, keys, path, options_of, log)
     telemetry = own_gyroscope(clip) if gyroscope is None else None
     if turned is not None and explained:
-        found = _only_turned(turned)
+        found = _only_turned(turned, clip)
     elif len(clip.names) == 2:
         found = _of_two(clip, keys, path, options_of, log)
     else:
@@ -129,7 +131,7 @@ def solve_clip(
             # no scene: rotations that explain neighbours are all that there is
             if turned is None:
                 raise
-            found = _only_turned(turned)
+            found = _only_turned(turned, clip)
     result, options, filmed, clip = found
     alone = readout_of(result)
     # the telemetry of frames that were rotated since says nothing; those of a global shutter only look like them
@@ -171,10 +173,8 @@ def _turned(
     if start is not None:
         path = replace(path, rotation_only=True)
         options = replace(options_of(start), path=path)
-        result = bundle_adjust(start, "constant-motion", _at_first(options), partial(_tell, log, "rotations"))
-        # the first one smooths wild rotations, which leaves an error several times as large as that of the next one
-        if result.sigma_px < _AT_FIRST * _FLOW_PX:
-            own = own_motions(result.reconstruction, rotation_only=True)
+        result, own, clip, path = _turned_in_time(clip, path, start, options, log)
+        if own is not None:
             path = held_by_slow_rotations(clip, result.reconstruction, path, own)
             options = replace(options, path=path)
             result = bundle_adjust(
@@ -191,8 +191,31 @@ def _turned(
     return found, explained
 
 
-def _only_turned(turned: _Found) -> _Found:
-    """The same, said aloud."""
+def _turned_in_time(
+    clip: Clip, path: FramePath, start: Reconstruction, options: BundleOptions, log: StageLog
+) -> tuple[BundleResult, OwnMotions | None, Clip, FramePath]:
+    """The first adjustment of frames that only rotate, and their own motions; None if rotations do not explain them.
+
+    And the clip and its path, with other times where frames are missing. On a path without the gaps the motions of the
+    frames beside them are off, so that others are seen when some were found.
+    """
+    as_said, rounds = (clip, path), 0
+    while True:
+        how = _at_first(replace(options, path=path))
+        result = bundle_adjust(start, "constant-motion", how, partial(_tell, log, "rotations"))
+        # it smooths wild rotations, which leaves an error several times as large as that of the next one
+        if result.sigma_px >= _AT_FIRST * _FLOW_PX:
+            return result, None, clip, path
+        own = own_motions(result.reconstruction, rotation_only=True)
+        timed = with_gaps(*as_said, result.reconstruction, own)
+        if rounds == _GAP_ROUNDS or np.array_equal(timed[0].time_s, clip.time_s):
+            return result, own, clip, path
+        (clip, path), rounds = timed, rounds + 1
+
+
+def _only_turned(turned: _Found, clip: Clip) -> _Found:
+    """The same, said aloud; the clip as its file says."""
+    tell_of_gaps(clip, turned[3])
     warnings.warn(
         "the camera only rotated: without parallax there are directions, but no positions and no scene",
         RsUndistortWarning, stacklevel=4,
@@ -242,7 +265,8 @@ def _travelled(
         whole = with_all_frames(clip, current, followed, on_path).without_photos(_LEAST_MEASUREMENTS)
         if on_path is None:
             own = own_motions(whole)
-            clip, path = _with_gaps(clip, path, whole, own)
+            filmed_clip, (clip, path) = clip, with_gaps(clip, path, whole, own)
+            tell_of_gaps(filmed_clip, clip)
             path, filmed = _as_filmed(clip, whole, path, telemetry, own)
             held = path if _was_stabilised(filmed) else held_by_slow_rotations(clip, whole, path, own)
         elif held.held_sigma:  # by what is better known now
@@ -267,27 +291,6 @@ def _travelled(
     assert result is not None
     tell_if_held(held)
     return result, options, filmed, clip
-
-
-def _with_gaps(clip: Clip, path: FramePath, start: Reconstruction, own: OwnMotions) -> tuple[Clip, FramePath]:
-    """The times of frames where others are missing between them, though the times of the file do not show it."""
-    place = clip.places(start.image_names)
-    steps = np.diff(clip.time_s[place]) / clip.frame_s
-    joined = np.diff(clip.part[place]) == 0
-    of_all, ratio = gaps_between(own.center_w, place, steps, joined, len(clip.names), 1 / clip.frame_s)
-    if not of_all.any():
-        return clip, path
-    # the video lasts as long as before
-    frame_s = clip.frame_s if ratio is None else clip.frame_s / ratio
-    first = clip.names[int(np.flatnonzero(of_all)[0])]
-    how = "" if ratio is None else f", as if it was converted from {1 / frame_s:.3g} frames a second"
-    warnings.warn(
-        f"{of_all.sum()} frames are missing between those of {clip.video.name}, the first after {first}{how}: the "
-        "camera travels farther there than before and after; the times were corrected",
-        RsUndistortWarning, stacklevel=5,
-    )  # fmt: skip
-    clip = clip.with_gaps(of_all, frame_s)
-    return clip, replace(path, time_s=dict(zip(clip.names, clip.time_s.tolist(), strict=True)), frame_s=frame_s)
 
 
 def _as_filmed(
