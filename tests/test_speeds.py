@@ -101,6 +101,36 @@ def test_a_readout_against_its_direction_has_the_same_sign_at_all_speeds(rng):
 def test_nothing_is_said_of_few_frames_of_gaps_or_of_rotations_lost_in_the_noise(rng):
     assert by_speed(shaken(1, 9.0, 0.003), rng, num=20) is None
     assert by_speed(shaken(1, 9.0, 0.003), rng, num=40, part=np.repeat([0, 1], 20)) is None
-    assert by_speed(shaken(1, 9.0, 0.003), rng, num=46, without=(22, 23)) is None
+    assert by_speed(shaken(1, 9.0, 0.003), rng, num=48, without=range(22, 26)) is None
     still = by_speed(lambda time_s: np.tile(np.eye(3), (len(time_s), 1, 1)), rng)
     assert still == (None, None, 0.0)
+
+
+MISSING = {"here and there": (4, 11, 20, 21, 35, 42, 51, 52), "converted": range(2, 60, 6)}
+
+
+@pytest.mark.parametrize("without", MISSING.values(), ids=MISSING)
+@pytest.mark.parametrize("wrong", [0.9, 1.0, 1.15])
+def test_frames_that_are_missing_are_filled_in(rng, without, wrong):
+    """Also if the readout time that is thought is wrong."""
+    time_s = np.delete(np.arange(60) * FRAME_S, without)
+    R_cw, phi = lines_of(shaken(1, 9.0, 0.003), time_s, 0.02)
+    phi = phi + rng.normal(0, NOISE, phi.shape)
+    part, sigma = np.zeros(len(time_s), int), np.full(phi.shape, NOISE)
+    found = readouts_by_speed(time_s, part, R_cw, sigma, phi, sigma, wrong * 0.02)
+    assert found.unfollowed < 0.02
+    assert abs(found.slow.seconds - 0.02) < 4 * found.slow.sigma + 2e-4
+    assert found.slow.sigma < 1e-3
+    assert readouts_by_speed(time_s, part, R_cw, sigma, phi, sigma, 0.02, fills=False) is None
+
+
+@pytest.mark.parametrize("without", MISSING.values(), ids=MISSING)
+@pytest.mark.parametrize("hz", [17.0, 20.0])
+def test_a_fast_vibration_shows_also_where_frames_are_missing(rng, without, hz):
+    slow, _, unfollowed = by_speed(shaken(1, hz, 0.003), rng, without=without)
+    assert unfollowed > 0.15
+    assert abs(slow.seconds - 0.02) < 4 * slow.sigma
+
+
+def test_frames_of_which_most_are_missing_are_not_filled_in(rng):
+    assert by_speed(shaken(1, 9.0, 0.003), rng, num=90, without=np.flatnonzero(np.arange(90) % 5 > 2)) is None

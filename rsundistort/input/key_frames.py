@@ -109,6 +109,12 @@ class Clip:
         time_s = np.concatenate([[0.0], np.cumsum(step_s)]) + self.time_s[0]
         return replace(self, time_s=time_s, frame_s=frame_s)
 
+    @property
+    def is_even(self) -> bool:
+        """Whether no frame of a part is missing, by their times."""
+        step_s = np.diff(self.time_s)[np.diff(self.part) == 0]
+        return bool((step_s < 1.5 * self.frame_s).all())
+
     def places(self, names: Sequence[str]) -> NDArray[np.int64]:
         """(m,) which of its frames have these names."""
         number = {name: k for k, name in enumerate(self.names)}

@@ -28,24 +28,32 @@ _HELD = 0.02
 _AS_EXACT = 1.5
 
 
-def speeds_of(clip: Clip, rec: Reconstruction, found: OwnMotions, readout_s: float) -> BySpeed | None:
-    """What slow and fast rotations of frames say, each having its own motion; about a readout time."""
+def speeds_of(
+    clip: Clip, rec: Reconstruction, found: OwnMotions, readout_s: float, *, fills: bool = True
+) -> BySpeed | None:
+    """What slow and fast rotations of frames say, each having its own motion; about a readout time.
+
+    Frames that are missing are filled in, if wanted.
+    """
     place, span = clip.places(rec.image_names), rec.frame_span()[:, None]
     return readouts_by_speed(
         clip.time_s[place], clip.part[place], found.R_cw, found.sigma_rotation, found.phi * span,
-        found.sigma_phi * span, readout_s,
+        found.sigma_phi * span, readout_s, fills=fills,
     )  # fmt: skip
 
 
-def held_by_slow_rotations(clip: Clip, rec: Reconstruction, path: FramePath, found: OwnMotions) -> FramePath:
+def held_by_slow_rotations(
+    clip: Clip, rec: Reconstruction, path: FramePath, found: OwnMotions, *, fills: bool = True
+) -> FramePath:
     """The path, its readout time held where the camera shakes faster than its frames show.
 
     A path through such frames is too smooth: lines rotate faster than it does, which looks like a longer readout.
-    Slow rotations are the same in lines and frames, and what is known of the readout counts beside them.
+    Slow rotations are the same in lines and frames, and what is known of the readout counts beside them. Motions that
+    were found before any path are too rough to fill in frames that are missing.
     """
     about = path.readout_prior[0] * path.frame_s
     for _ in range(2):  # lines average over the readout, so that it counts a little
-        speeds = speeds_of(clip, rec, found, about)
+        speeds = speeds_of(clip, rec, found, about, fills=fills)
         if speeds is None or speeds.slow is None or not speeds.unfollowed > _UNFOLLOWED:
             return path
         seconds, sigma = speeds.slow

@@ -268,8 +268,8 @@ def _travelled(
             filmed_clip, (clip, path) = clip, with_gaps(clip, path, whole, own)
             tell_of_gaps(filmed_clip, clip)
             path, filmed = _as_filmed(clip, whole, path, telemetry, own)
-            held = path if _was_stabilised(filmed) else held_by_slow_rotations(clip, whole, path, own)
-        elif held.held_sigma:  # by what is better known now
+            held = path if _was_stabilised(filmed) else held_by_slow_rotations(clip, whole, path, own, fills=False)
+        elif held.held_sigma or not (_was_stabilised(filmed) or clip.is_even):  # by what is better known now
             held = held_by_slow_rotations(clip, on_path, path, own_motions(on_path))
         options = replace(options_of(whole), path=held if result is None else replace(held, start=_start_of(result)))
         how = (

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import KroghInterpolator
 from scipy.spatial.transform import Rotation
 
 __all__ = ["BySpeed", "ReadoutTime", "readouts_by_speed"]
 
 Array = NDArray[np.float64]
 
-# Fewer frames than this, evenly spaced, have no spectrum to speak of; where one is missing, others begin.
-_FEWEST, _GAP = 24, 1.5
+# Fewer frames than this have no spectrum to speak of.
+_FEWEST = 24
+# Frames that may be missing between two for both to be of one run, the share of a run's frames that may be, and how far
+# from a whole number of steps a frame may be.
+_MOST_MISSING, _MOST_FILLED, _UNEVEN = 3, 0.5, 0.25
+# Frames on each side that say where the camera was at one that is missing.
+_BESIDE = 2
+# Another readout time, by the one that is thought, which shows how much what is asked for hangs on it.
+_MORE = 1.1
 # Periods in a part that a rotation has at least: slower ones are what lens and scene leave, and the window's edge.
 _LEAST_PERIODS = 2
 # A Hann window spreads each rotation over three frequencies: what is left of neighbours goes together.
@@ -44,9 +54,19 @@ class BySpeed(NamedTuple):
     unfollowed: float
 
 
+class _Run(NamedTuple):
+    """Frames in a row: times (m,), rotations (m, 3) since the first and during the readout, their standard errors."""
+
+    time_s: Array
+    rotated: Array
+    rotation_sigma: Array
+    phi: Array
+    phi_sigma: Array
+
+
 def readouts_by_speed(
     time_s: Array, part: NDArray[np.int64], R_cw: Array, rotation_sigma: Array, phi: Array, phi_sigma: Array,
-    readout_s: float,
+    readout_s: float, *, fills: bool = True,
 ) -> BySpeed | None:  # fmt: skip
     """The readout time by rotations slower and faster than a quarter of the frame rate.
 
@@ -54,6 +74,9 @@ def readouts_by_speed(
     frame rate F shows in the frames as one of F less its frequency that runs the other way, whose rate has the other
     sign: then fast rotations ask for another readout time than slow ones, most likely for a negative one. Both spectra
     are compared, so that rates need no differences of frames, which would miss fast ones.
+
+    Where frames are missing, those beside them say where the camera was, and how fast it rotated if the readout took as
+    long as is thought. That readout time is the one which all frames then ask for.
 
     Parameters
     ----------
@@ -65,6 +88,8 @@ def readouts_by_speed(
         Likewise rotations during the readout, radians per frame.
     readout_s : float
         The readout time that was found: lines average over it.
+    fills : bool
+        Whether frames that are missing may be filled in; they need rotations that are known to some percent.
 
     Returns
     -------
@@ -72,20 +97,59 @@ def readouts_by_speed(
         None if there are too few frames.
     """
     known = np.isfinite(np.hstack([R_cw.reshape(-1, 9), phi, phi_sigma])).all(axis=1)
-    part = part[known]
-    time_s, R_cw, rotation_sigma, phi, phi_sigma = (
-        each[known] for each in (time_s, R_cw, rotation_sigma, phi, phi_sigma)
-    )
-    apart = np.diff(time_s)
-    ends = (np.diff(part) != 0) | (apart > _GAP * np.median(apart)) if len(apart) else np.zeros(0, bool)
-    run = np.concatenate([[0], np.cumsum(ends)])
-    spectra = [
-        _spectra(time_s[mine], R_cw[mine], rotation_sigma[mine], phi[mine], phi_sigma[mine], readout_s)
-        for each in np.unique(run)
-        if len(mine := np.flatnonzero(run == each)) >= _FEWEST
+    time_s, part, R_cw = time_s[known], part[known], R_cw[known]
+    step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+    runs = [
+        _Run(time_s[mine], _rotated(R_cw[mine]), rotation_sigma[known][mine], phi[known][mine], phi_sigma[known][mine])
+        for mine in _in_a_row(time_s, part, step_s, fills)
     ]
-    if not spectra:
+    if not runs:
         return None
+    found = _compared(runs, readout_s, step_s)
+    if all(_places(run, step_s)[-1] == len(run.time_s) - 1 for run in runs) or found.slow is None:
+        return found
+    # what is asked for grows by a share of what is thought: where both are one, less that share of the evidence counts
+    more = _compared(runs, _MORE * readout_s, step_s)
+    kinds = []
+    for about, further in ((found.slow, more.slow), (found.fast, more.fast)):
+        share = np.inf if about is None or further is None else (further[0] - about[0]) / ((_MORE - 1) * readout_s)
+        at = None if about is None or not share < 1 else (about[0] - share * readout_s) / (1 - share)
+        kinds.append((at, max(share, 0.0)))
+    (slow_s, of_slow), (fast_s, of_fast) = kinds
+    if slow_s is None:
+        return BySpeed(None, None, found.unfollowed)
+    there = _compared(runs, slow_s, step_s)
+    slow, fast = (
+        None if at is None or each is None else ReadoutTime(at, each.sigma / (1 - share))
+        for at, each, share in ((slow_s, there.slow, of_slow), (fast_s, there.fast, of_fast))
+    )
+    return BySpeed(slow, fast, there.unfollowed)
+
+
+def _in_a_row(time_s: Array, part: NDArray[np.int64], step_s: float, fills: bool) -> list[NDArray[np.int64]]:
+    """Which frames are evenly spaced, but for some that are missing if they can be filled in; of runs long enough."""
+    apart = np.diff(time_s) / step_s if step_s > 0 else np.zeros(0)
+    missing = np.rint(apart) - 1
+    parted = (missing > (_MOST_MISSING if fills else 0)) | (np.abs(apart - missing - 1) > _UNEVEN)
+    run = np.concatenate([[0], np.cumsum(parted | (np.diff(part) != 0))]) if len(time_s) else np.zeros(0)
+    rows = [np.flatnonzero(run == each) for each in np.unique(run)]
+    filled = [missing[mine[:-1]].sum() if len(mine) > 1 else 0 for mine in rows]
+    return [
+        mine for mine, count in zip(rows, filled, strict=True)
+        if len(mine) >= _FEWEST and count <= _MOST_FILLED * len(mine)
+    ]  # fmt: skip
+
+
+def _rotated(R_cw: Array) -> Array:
+    """(m, 3) rotations of frames since the first, the sum of those from each to the next."""
+    steps = Rotation.from_matrix(R_cw[1:] @ R_cw[:-1].transpose(0, 2, 1)).as_rotvec()
+    value: Array = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    return value
+
+
+def _compared(runs: Sequence[_Run], readout_s: float, step_s: float) -> BySpeed:
+    """What slow and fast rotations say, about a readout time at which missing frames are filled in."""
+    spectra = [_spectra(_filled(run, readout_s, step_s), readout_s) for run in runs]
     fast, lines, rates, line_noise, rate_noise = (np.concatenate(each) for each in zip(*spectra, strict=True))
     slow, rest = (
         _slope(lines[mine], rates[mine], line_noise[mine], rate_noise[mine], readout_s) for mine in (~fast, fast)
@@ -96,18 +160,51 @@ def readouts_by_speed(
     return BySpeed(slow, rest, left / power if power > line_noise.sum() else 0.0)
 
 
+def _places(run: _Run, step_s: float) -> NDArray[np.int64]:
+    """(m,) number of each frame of a run, those that are missing counted."""
+    return np.rint((run.time_s - run.time_s[0]) / step_s).astype(np.int64)
+
+
+def _filled(run: _Run, readout_s: float, step_s: float) -> _Run:
+    """A run with the frames that are missing: rotations and rates there, by those of the frames beside it."""
+    place = _places(run, step_s)
+    if place[-1] == len(place) - 1 or not readout_s:
+        return run
+    number = np.arange(place[-1] + 1)
+    near = [np.stack([np.interp(number, place, each) for each in sigma.T], axis=1) for sigma in run[2::2]]
+    rotated, phi = np.zeros((2, len(number), 3))
+    rotated[place], phi[place] = run.rotated, run.phi
+    of_step = readout_s / step_s
+    # values and rates, alternately
+    both = np.stack([run.rotated, run.phi / of_step], axis=1)
+    for each in np.setdiff1d(number, place):
+        after = int(np.searchsorted(place, each))
+        beside = slice(max(after - _BESIDE, 0), after + _BESIDE)
+        weights = _weights_between(tuple((place[beside] - each).tolist()))
+        rotated[each], rate = weights @ both[beside].reshape(-1, 3)
+        phi[each] = rate * of_step
+    return _Run(run.time_s[0] + number * step_s, rotated, near[0], phi, near[1])
+
+
+@lru_cache(maxsize=4096)
+def _weights_between(places: tuple[int, ...]) -> Array:
+    """(2, 2 n) weights of values and rates at n places, alternately, in value and rate at 0 (Hermite's polynomial)."""
+    node = np.repeat(np.array(places, np.float64), 2)
+    polynomial = KroghInterpolator(node, np.eye(len(node)))
+    return np.stack([polynomial(0.0), polynomial.derivative(0.0)])
+
+
 def _spectra(
-    time_s: Array, R_cw: Array, rotation_sigma: Array, phi: Array, phi_sigma: Array, readout_s: float
+    run: _Run, readout_s: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.complex128], NDArray[np.complex128], Array, Array]:
     """Whether frequencies (n,) are fast; spectra (n, 3) of phi and of the rates; and power (n, 3) of their noise."""
-    steps = Rotation.from_matrix(R_cw[1:] @ R_cw[:-1].transpose(0, 2, 1)).as_rotvec()
-    rotated = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    time_s, rotated, rotation_sigma, phi, phi_sigma = run
     step_s = float(np.median(np.diff(time_s)))
     length = time_s[-1] - time_s[0] + step_s
     # the rate of a path under a window: that of both, less the window's own
     phase = 2 * np.pi * (time_s - time_s[0] + 0.5 * step_s) / length
     window, slope = 0.5 * (1 - np.cos(phase)), np.pi / length * np.sin(phase)
-    rotated -= np.average(rotated, axis=0, weights=window)
+    rotated = rotated - np.average(rotated, axis=0, weights=window)
     frequency = np.arange(_LEAST_PERIODS, int(0.5 * length / step_s)) / length
     waves = np.exp(-2j * np.pi * frequency[:, None] * time_s)
     circular = 2j * np.pi * frequency[:, None]
