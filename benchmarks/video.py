@@ -2,7 +2,7 @@
 
     python benchmarks/video.py [--only PART ...] [--clips FOLDER] [--num 20] [--first-seed 100] [--shared ../shared]
                                [--frames 300 600 1200 1800] [--long street round to-and-fro]
-                               [--edit NAME ...]
+                               [--edit NAME ...] [--kind walk pan vibrating]
 
 Prints one JSON object a line. Clips are rendered into FOLDER once (`clips.py`: 80 s of one core each).
 
@@ -15,7 +15,7 @@ Prints one JSON object a line. Clips are rendered into FOLDER once (`clips.py`: 
     vibrating  likewise walks that shake at up to 24 Hz, faster than frames can show
     stabilised  walks, rotated back to smooth paths: which are named; and how many of those that the sensor saw are
     edited   random walks as programs, lamps and passers-by leave them (`edited.py`): readout times, by the path and by
-             slow rotations alone, and verdicts; only some edits with `--edit`
+             slow rotations alone, and verdicts; only some edits with `--edit`, and of other clips with `--kind`
     gopro    ../shared/video: clock, axes and rotation of its gyroscope, readout by pictures and by the gyroscope
     peer     `run` of videos, each in a process of its own, beside pycolmap's extract, match sequentially, map and
              undistort with default options, on the same key frames and with the same camera: seconds and peaks; and
@@ -39,7 +39,7 @@ import time
 import warnings
 from dataclasses import replace
 from functools import partial
-from itertools import islice
+from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
@@ -344,10 +344,10 @@ def stabilised(args: argparse.Namespace) -> None:
 
 
 def edits(args: argparse.Namespace) -> None:
-    """Walks that were changed after they were filmed."""
-    for name in args.edit:
+    """Random clips that were changed after they were filmed."""
+    for kind, name in product(args.kind, args.edit):
         for seed in range(args.first_seed, args.first_seed + args.num):
-            folder = clip_folder(args.clips, "walk", seed)
+            folder = clip_folder(args.clips, kind, seed)
             true_s = read_solution(folder / "ground_truth.json").options["readout_ms"] / 1e3
             said: dict[str, Any] = {"edit": name, "clip": folder.name}
             with tempfile.TemporaryDirectory() as scratch:
@@ -500,6 +500,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, nargs="+", default=(300, 600, 1200, 1800))
     parser.add_argument("--long", choices=LONG, nargs="+", default=LONG)
     parser.add_argument("--edit", choices=EDITS, nargs="+", default=EDITS)
+    parser.add_argument("--kind", choices=("walk", "pan", "vibrating"), nargs="+", default=("walk",))
     parser.add_argument("--shared", type=Path, default=Path(__file__).parents[2] / "shared")
     args = parser.parse_args()
     warnings.simplefilter("ignore")

@@ -13,6 +13,7 @@ from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos
 from ..model import Camera, Observations, Reconstruction, RowMotion
 from ..model.projection import unproject_points
+from ..sfm.features import Features
 from ..sfm.flow import flow_size
 from .clip_tracks import Followed, follow
 
@@ -24,6 +25,9 @@ __all__ = ["rotating_only", "rotation_between"]
 _ROOM_PX, _LEFT_PX = 40.0, 0.5
 _LEAST_AGREEING = 12
 _TRIALS = 20
+# Key frames before a cut that one after it may show again, its features that may, and how much nearer than the next one
+# a match is.
+_LAST, _MATCHED, _NEARER = 4, 2048, 0.8
 
 
 def rotating_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
@@ -39,8 +43,9 @@ def rotating_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
     if corners and not _only_rotates([_beyond_rotation(first, second, camera) for first, second in corners], camera):
         return None
     number = {name: k for k, name in enumerate(clip.names)}
-    shown = {number[name]: found.xy_raw for name, found in zip(keys.names, keys.features, strict=True)}
-    chained = _chained(clip, camera, shown)
+    features = {number[name]: found for name, found in zip(keys.names, keys.features, strict=True)}
+    shown = {key: found.xy_raw for key, found in features.items()}
+    chained = _chained(clip, camera, features)
     if chained is None or 2 * len(chained[2]) < len(clip.names):
         return None
     return _joined(clip, keys, chained[0], shown, *chained[1:])
@@ -59,17 +64,25 @@ def _beyond_rotation(xy_before: NDArray[np.float64], xy_after: NDArray[np.float6
 
 
 def _chained(
-    clip: Clip, camera: Camera, shown: dict[int, NDArray[np.float64]]
+    clip: Clip, camera: Camera, features: dict[int, Features]
 ) -> tuple[Followed, dict[int, NDArray[np.float64]], dict[int, NDArray[np.float64]]] | None:
     """Followed points of key frames, their directions, and the frames' rotations; None if they do not only rotate."""
+    shown = {key: found.xy_raw for key, found in features.items()}
     followed = follow(clip, shown, camera)
     rays = _directions(followed.xy_raw, camera)
     own = {key: _directions(shown[key][followed.chosen[key]], camera) for key in followed.chosen}
     order = sorted(followed.chosen)
-    R_cw = {order[0]: np.eye(3)}
+    R_cw, again = {order[0]: np.eye(3)}, []
     for a, b in pairwise(order):
         if a not in R_cw or clip.part[a] != clip.part[b]:
-            break
+            # after a cut, or a flash, what was seen before may be seen again
+            for key in [key for key in order if key in R_cw][: -_LAST - 1 : -1]:
+                seen = _seen_again(features[key], followed.chosen[key], features[b], camera)
+                if seen is not None:
+                    R_cw[b] = seen[0] @ R_cw[key]
+                    again.append((key, b, *seen[1:]))
+                    break
+            continue
         for k in range(a + 1, b + 1):
             mine = (followed.frame == k) & (followed.key == a)
             rotation = _agreed_rotation(own[a][followed.place[mine]], rays[mine], _ROOM_PX / float(camera.K[0, 0]))
@@ -77,13 +90,45 @@ def _chained(
                 R_cw[k] = rotation @ R_cw[a]
     left = []
     for a, b in pairwise(order):
-        if a in R_cw and b in R_cw:
+        if a in R_cw and b in R_cw and clip.part[a] == clip.part[b]:
             mine = (followed.frame == b) & (followed.key == a)
             before = own[a][followed.place[mine]] @ (R_cw[b] @ R_cw[a].T).T
             left.append(_left_by_shutter(before, rays[mine], camera))
     if not _only_rotates(left, camera):
         return None
+    for each in again:
+        followed.add_more(*each)
     return followed, own, R_cw
+
+
+def _seen_again(
+    before: Features, chosen: NDArray[np.int64], after: Features, camera: Camera
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]] | None:
+    """The rotation from a frame to another one that shows features of it, which of the chosen ones, and their pixels.
+
+    None if too few agree on a rotation.
+    """
+    first, second = _matches(before.descriptors[chosen], after.descriptors[:_MATCHED])
+    xy, within = after.xy_raw[second], _ROOM_PX / float(camera.K[0, 0])
+    own, seen = _directions(before.xy_raw[chosen[first]], camera), _directions(xy, camera)
+    rotation = _agreed_rotation(own, seen, within)
+    if rotation is None:
+        return None
+    agree = np.linalg.norm(own @ rotation.T - seen, axis=1) < within
+    return rotation, first[agree], xy[agree]
+
+
+def _matches(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Indices (n,) of descriptors that are each other's nearest, and nearer than the next one (Lowe 2004)."""
+    if len(first) < 2 or len(second) < 2:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    a, b = first.astype(np.float32), second.astype(np.float32)
+    distance = np.sqrt(np.maximum((a**2).sum(1)[:, None] + (b**2).sum(1) - 2 * a @ b.T, 0.0))
+    nearest = np.argmin(distance, axis=1)
+    two = np.partition(distance, 1, axis=1)
+    mutual = np.argmin(distance, axis=0)[nearest] == np.arange(len(first))
+    index = np.flatnonzero(mutual & (two[:, 0] < _NEARER * two[:, 1]))
+    return index, nearest[index]
 
 
 def _joined(

@@ -60,6 +60,13 @@ class Followed:
         self.frame, self.place, self.xy_raw = (np.concatenate(part) for part in parts)
         self.key = np.repeat(np.array(keys, np.int64), [len(frame) for frame in parts[0]])
 
+    def add_more(self, key: int, frame: int, place: NDArray[np.int64], xy_raw: NDArray[np.float64]) -> None:
+        """Places (n,) of a key's points at pixels (n, 2) of one more frame."""
+        self.frame = np.concatenate([self.frame, np.full(len(place), frame)])
+        self.key = np.concatenate([self.key, np.full(len(place), key)])
+        self.place = np.concatenate([self.place, place])
+        self.xy_raw = np.concatenate([self.xy_raw, xy_raw])
+
 
 def _spread(
     xy: NDArray[np.float64], worth: NDArray[np.int64], size: tuple[int, int], most: int
