@@ -46,10 +46,12 @@ import numpy as np
 from measures import (
     against_references,
     alike,
+    apart_and_together,
     by_true_motions,
     fountain_truth,
     library_sigmas,
     log_k_error,
+    log_k_sigmas,
     normalised_errors,
     pooled,
     run_options,
@@ -323,15 +325,21 @@ def coverage(bench: Bench) -> None:
     together: dict[str, tuple[list[Ran], list[dict[str, Any]]]] = {}
     for label in dict.fromkeys(case[0] for case in cases):
         name, ran, errors = f"coverage: {label}", list[Ran](), list[dict[str, Any]]()
+        heights = list[tuple[float, np.ndarray]]()
         with bench.case(name):
             for photos, options, truth in (case[1:] for case in cases if case[0] == label):
                 ran.append(bench.run(photos, **options))
                 each = ran[-1]
                 sigmas, rec = library_sigmas(each.solved.result, each.solved.remedy, each.options), each.solved.shared
-                errors.append(normalised_errors(each.solution, truth, sigmas, log_k_error(rec, truth)))
+                log_k = log_k_error(rec, truth)
+                errors.append(normalised_errors(each.solution, truth, sigmas, log_k))
+                if sigmas:
+                    heights.append((log_k, log_k_sigmas(each.solved.result, each.solved.remedy, each.options)))
+            # scenes are rendered anew, photos are not
+            same = " by " in label and len(heights) > 1
             show(
                 name, **ran[0].facts, runs=len(ran), rms=pooled(errors), by_component=pooled(errors, by_component=True),
-                alike=alike(errors),
+                alike=alike(errors), **({"heights": apart_and_together(*zip(*heights, strict=True))} if same else {}),
             )  # fmt: skip
             covered(bench, name, ran, errors)
             _, _, which = label.partition(", ")

@@ -31,7 +31,7 @@ from rsundistort import (
 from rsundistort.bundle import BundleResult, Posterior, gauge_directions
 from rsundistort.bundle.intrinsics import DECENTRING, moved_camera
 from rsundistort.bundle.triangulate import _world_rays
-from rsundistort.critical import Remedy
+from rsundistort.critical import Remedy, shape_cost
 from rsundistort.critical.common import row_phi
 from rsundistort.critical.degeneracy import readout_axes
 from rsundistort.evaluation import align_points, motion_errors, psnr
@@ -112,6 +112,37 @@ def run_options(**given: Any) -> RunOptions:
     return RunOptions(**parts, outputs=OutputOptions(report=False), **given)
 
 
+def _with_anchors(result: BundleResult, remedy: Remedy | None, options: BundleOptions) -> BundleOptions:
+    """The options of the adjustments, with the constraint of the remedy."""
+    rec = result.reconstruction
+    if remedy is not None and remedy.name == "anchor":
+        first = dict(zip(rec.image_names, row_phi(rec)[:, 0], strict=True))
+        held = {name: np.where(np.arange(3) == first[name], sigma, np.inf) for name, sigma in remedy.anchors.items()}
+        options = replace(options, known_phi={name: (np.zeros(3), sigma) for name, sigma in held.items()})
+    return replace(options, bends=len(result.bend_sigmas))
+
+
+def log_k_sigmas(result: BundleResult, remedy: Remedy | None, options: BundleOptions) -> Array:
+    """(2,) standard deviations of log k: by the measurements, and by priors and calibrations."""
+    how = _with_anchors(result, remedy, options)
+    both, rest = (shape_cost(each, how).sigma_log_k for each in (result, replace(result, inflation=1e-9)))
+    return np.sqrt([max(both**2 - rest**2, 0.0), rest**2])
+
+
+def apart_and_together(errors: Sequence[float], sigmas: Sequence[Array]) -> dict[str, float]:
+    """Of sets (n,) warped from the same photos: what their errors share, and what they do not, by what each should be.
+
+    Their measurements have the same noise, since keypoints, lens and scene are the same: its part of the error is one
+    draw in all sets. Priors and calibrations err anew in each. `shared` is their mean error over the deviation by the
+    measurements, `own` the scatter over the deviation by the rest.
+    """
+    of_noise, of_rest = np.sqrt(np.mean(np.square(sigmas), axis=0))
+    return {
+        "shared": round(float(np.mean(errors) / of_noise), 2),
+        "own": round(float(np.std(errors, ddof=1) / of_rest), 2),
+    }
+
+
 def library_sigmas(result: BundleResult, remedy: Remedy | None, options: BundleOptions) -> dict[str, Any]:
     """Deviations that are not in solution.json, as `normalised_errors` takes them, photos in the order of their names.
 
@@ -121,11 +152,7 @@ def library_sigmas(result: BundleResult, remedy: Remedy | None, options: BundleO
     if rec.shutter_model == "global":
         return {}
     m, nb = result.covariances.shape[:2]
-    if remedy is not None and remedy.name == "anchor":
-        first = dict(zip(rec.image_names, row_phi(rec)[:, 0], strict=True))
-        held = {name: np.where(np.arange(3) == first[name], sigma, np.inf) for name, sigma in remedy.anchors.items()}
-        options = replace(options, known_phi={name: (np.zeros(3), sigma) for name, sigma in held.items()})
-    posterior = Posterior(result, replace(options, bends=len(result.bend_sigmas)))
+    posterior = Posterior(result, _with_anchors(result, remedy, options))
     mean = np.zeros((3, m, nb))
     mean[:, :, 6:9] = np.eye(3)[:, None] * rec.frame_span()[:, None] / m
     variance = (mean * posterior.of_photos(mean)).sum((1, 2))
