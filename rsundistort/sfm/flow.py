@@ -24,8 +24,9 @@ _BACK_PX = 0.5
 # Area whose mean brightness is divided out, pixels; the least mean, so that noise in the dark is no texture; and what
 # the mean becomes.
 _AREA, _DARK, _MEAN = 31, 16.0, 100.0
-# Corners that measure the motion of the content.
-_CORNERS = 300
+# Corners that measure the motion of the content, cells of a side of the frame that share them, how good they are at
+# least by the best, and how far they are apart at least, by the diagonal.
+_CORNERS, _CELLS, _LEAST_CORNER, _CORNERS_APART = 300, 6, 0.001, 0.02
 # A key frame is due when the content has moved by this share of its diagonal, or when this few of the corners are still
 # seen; the sharpest of the frames that moved by `_CANDIDATE` of that is taken.
 _MOVED, _SEEN, _CANDIDATE = 0.06, 0.5, 0.6
@@ -70,6 +71,19 @@ def _followed(
     inside = (there >= 0).all(1) & (there[:, 0] <= width - 1) & (there[:, 1] <= height - 1)
     same = np.linalg.norm(back - xy, axis=1) < _BACK_PX
     return there, (found.ravel() == 1) & (returned.ravel() == 1) & same & inside
+
+
+def _corners(grey: Grey) -> NDArray[np.float32]:
+    """(n, 2) corners of a frame, the best of each of its cells first, so that no thing in it has most of them."""
+    found = cv2.goodFeaturesToTrack(grey, 0, _LEAST_CORNER, _CORNERS_APART * math.hypot(*grey.shape))
+    if found is None:
+        return np.zeros((0, 2), np.float32)
+    xy: NDArray[np.float32] = found.reshape(-1, 2)  # the best first
+    cell = (_CELLS * xy / grey.shape[::-1]).astype(np.int64) @ [1, _CELLS]
+    order = np.argsort(cell, kind="stable")
+    rank = np.empty(len(xy), np.int64)
+    rank[order] = np.arange(len(xy)) - np.searchsorted(cell[order], cell[order])
+    return xy[np.argsort(rank, kind="stable")[:_CORNERS]]
 
 
 @dataclass(frozen=True)
@@ -140,8 +154,7 @@ class KeyFrameChooser:
 
     def _begin(self, number: int, grey: Grey, sharpness: float) -> None:
         self.keys.append(number)
-        found = cv2.goodFeaturesToTrack(grey, _CORNERS, 0.01, 0.02 * math.hypot(*grey.shape))
-        self._corners = np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
+        self._corners = _corners(grey)
         self._since = [_Since(grey, sharpness, 0.0, self._corners, np.arange(len(self._corners)))]
 
     def _step(self, grey: Grey, sharpness: float, counts: bool) -> None:

@@ -25,6 +25,9 @@ __all__ = ["rotating_only", "rotation_between"]
 _ROOM_PX, _LEFT_PX = 40.0, 0.5
 _LEAST_AGREEING = 12
 _TRIALS = 20
+# Samples of so many points that are asked for rotations of the lines, radians by which a camera may rotate, times the
+# median that may be left by which points may differ from them, and times that all points are asked then.
+_SAMPLES, _FEW, _FAST, _AT_FIRST, _FITS = 100, 6, 0.1, 6.0, 10
 # Key frames before a cut that one after it may show again, its features that may, and how much nearer than the next one
 # a match is.
 _LAST, _MATCHED, _NEARER = 4, 2048, 0.8
@@ -171,19 +174,42 @@ def _left_by_shutter(before: NDArray[np.float64], after: NDArray[np.float64], ca
     seen = np.isfinite(before).all(1) & np.isfinite(after).all(1)
     if seen.sum() < _LEAST_AGREEING:
         return float("inf")
-    (u, v), (x, y) = (each[seen, :2].T / each[seen, 2] for each in (before, after))
-    # dx / dt of x = X / Z where X rotates about the three axes
+    before, after = before[seen], after[seen]
+    size = np.full(len(before), np.inf)
+    for _ in range(2):  # what both frames were rotated by at first may be off by as much as some things moved
+        rotation, size = _rotations_of_lines(before, after, camera)
+        before = before @ rotation.T
+    return float(np.median(size))
+
+
+def _rotations_of_lines(
+    before: NDArray[np.float64], after: NDArray[np.float64], camera: Camera
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The rotation from one frame to another, to first order, and how far directions (n, 3) are off nevertheless (n,).
+
+    The lines of both rotate steadily. It begins at what most agree with of all that a few do, then those count less and
+    less that move otherwise, together.
+    """
+    (u, v), (x, y) = (each[:, :2].T / each[:, 2] for each in (before, after))
+    # dx / dt of x = X / Z where X rotates about the three axes, against the clock
     by_R = np.stack([np.stack([x * y, -(1 + x**2), y], 1), np.stack([1 + y**2, -x * y, -x], 1)], axis=1)
     r_before, r_after = (u, x) if camera.clock_axis == 0 else (v, y)
     A = np.concatenate([by_R, r_after[:, None, None] * by_R, -r_before[:, None, None] * by_R], axis=2)
-    apart, weight = np.stack([x - u, y - v], axis=1), np.ones(len(x))
-    size = np.linalg.norm(apart, axis=1)
-    for _ in range(10):
-        root = np.sqrt(weight)[:, None]
-        fit = np.linalg.lstsq((root[:, :, None] * A).reshape(-1, 9), (root * apart).ravel(), rcond=None)[0]
+    apart, least = np.stack([x - u, y - v], axis=1), _LEFT_PX / float(camera.K[0, 0])
+    few = np.array([np.random.default_rng(k).choice(len(x), _FEW, replace=False) for k in range(_SAMPLES)])
+    some, rest = A[few].reshape(_SAMPLES, -1, 9), apart[few].reshape(_SAMPLES, -1, 1)
+    turned = some.transpose(0, 2, 1)
+    fits = np.linalg.solve(turned @ some + (least / _FAST) ** 2 * np.eye(9), turned @ rest)[..., 0]
+    sizes = np.linalg.norm(apart - np.einsum("oij,sj->soi", A, fits), axis=2)
+    within = _AT_FIRST * least
+    best = np.argmin(np.minimum(sizes, within).sum(axis=1))
+    fit, size = fits[best], sizes[best]
+    for _ in range(_FITS):
+        root = 1.0 / (1.0 + (size / within) ** 2)
+        fit = np.linalg.lstsq((root[:, None, None] * A).reshape(-1, 9), (root[:, None] * apart).ravel(), rcond=None)[0]
         size = np.linalg.norm(apart - A @ fit, axis=1)
-        weight = 1.0 / np.maximum(size, 1e-5)
-    return float(np.median(size))
+        within = max(0.7 * within, least)
+    return Rotation.from_rotvec(-fit[:3]).as_matrix(), size
 
 
 def rotation_between(

@@ -25,7 +25,7 @@ from ..io.gyro import GyroLog
 from ..io.kept import Kept
 from ..model import Reconstruction
 from ..sfm import MatchedPhotos, retriangulate
-from ..verdict.judge_path import BY_SLOW_ROTATIONS, ReadoutTime, judge_clip, unfollowed_px
+from ..verdict.judge_path import BY_SLOW_ROTATIONS, SIGMAS, ReadoutTime, judge_clip, unfollowed_px
 from .clip_gyroscope import Felt, felt_gyroscope, own_gyroscope, readout_of, rotations_between
 from .clip_pair import FramePair
 from .clip_pan import rotating_only
@@ -118,7 +118,7 @@ def solve_clip(
     turned, explained = _turned(clip, keys, path, options_of, log)
     telemetry = own_gyroscope(clip) if gyroscope is None else None
     if turned is not None and explained:
-        found = _only_turned(turned, clip)
+        found = _only_turned(turned)
     elif len(clip.names) == 2:
         found = _of_two(clip, keys, path, options_of, log)
     else:
@@ -131,8 +131,14 @@ def solve_clip(
             # no scene: rotations that explain neighbours are all that there is
             if turned is None:
                 raise
-            found = _only_turned(turned, clip)
-    result, options, filmed, clip = found
+            found = _only_turned(turned)
+        else:
+            if turned is not None and _shows_readout(turned) and not _shows_readout(found):
+                found = _only_turned(turned)
+    as_said, (result, options, filmed, clip) = clip, found
+    tell_of_gaps(as_said, clip)
+    if options.path is not None:
+        tell_if_held(options.path)
     alone = readout_of(result)
     # the telemetry of frames that were rotated since says nothing; those of a global shutter only look like them
     of_camera = None if _was_stabilised(filmed) and not at_once else gyroscope or telemetry
@@ -213,16 +219,18 @@ def _turned_in_time(
         (clip, path), rounds = timed, rounds + 1
 
 
-def _only_turned(turned: _Found, clip: Clip) -> _Found:
-    """The same, said aloud; the clip as its file says."""
-    tell_of_gaps(clip, turned[3])
+def _shows_readout(found: _Found) -> bool:
+    """Whether lines rotate as their frames do: a scene that is none, of things that move, shows anything."""
+    time = readout_of(found[0])
+    return not _was_stabilised(found[2]) and bool(abs(time.seconds) > SIGMAS * time.sigma)
+
+
+def _only_turned(turned: _Found) -> _Found:
+    """The same, said aloud."""
     warnings.warn(
         "the camera only rotated: without parallax there are directions, but no positions and no scene",
         RsUndistortWarning, stacklevel=4,
     )  # fmt: skip
-    path = turned[1].path
-    assert path is not None
-    tell_if_held(path)
     return turned
 
 
@@ -265,8 +273,7 @@ def _travelled(
         whole = with_all_frames(clip, current, followed, on_path).without_photos(_LEAST_MEASUREMENTS)
         if on_path is None:
             own = own_motions(whole)
-            filmed_clip, (clip, path) = clip, with_gaps(clip, path, whole, own)
-            tell_of_gaps(filmed_clip, clip)
+            clip, path = with_gaps(clip, path, whole, own)
             path, filmed = _as_filmed(clip, whole, path, telemetry, own)
             held = path if _was_stabilised(filmed) else held_by_slow_rotations(clip, whole, path, own, fills=False)
         elif held.held_sigma or not (_was_stabilised(filmed) or clip.is_even):  # by what is better known now
@@ -289,7 +296,6 @@ def _travelled(
             current = retriangulate(matched, of_keys)
             followed = followed_again(clip, followed, before, current)
     assert result is not None
-    tell_if_held(held)
     return result, options, filmed, clip
 
 
