@@ -10,7 +10,7 @@ import pytest
 from make_photos import texture
 from scipy.spatial.transform import Rotation
 
-from rsundistort.sfm.flow import KeyFrameChooser, even_brightness, flow_between, flow_size
+from rsundistort.sfm.flow import KeyFrameChooser, _corners, even_brightness, flow_between, flow_size
 from rsundistort.sfm.resection import resect
 
 WIDTH, HEIGHT = 320, 240
@@ -145,3 +145,15 @@ def test_a_photo_is_placed_from_a_pose_nearby() -> None:
 def test_too_few_points_place_nothing() -> None:
     points_w = np.random.default_rng(4).uniform([-3, -2, 4], [3, 2, 9], (11, 3))
     assert resect(points_w[:, :2] / points_w[:, 2:], points_w, np.eye(3), np.zeros(3), within=0.01) is None
+
+
+def test_no_thing_in_a_frame_has_most_of_its_corners() -> None:
+    """A quarter of the frame is far richer in contrast than the rest."""
+    grey = (0.2 * frames(np.zeros(1))[0] + 100).astype(np.uint8)
+    rich = np.random.default_rng(0).integers(0, 2, (HEIGHT // 16, WIDTH // 16)) * 255
+    grey[: HEIGHT // 2, : WIDTH // 2] = cv2.resize(rich.astype(np.uint8), (WIDTH // 2, HEIGHT // 2), interpolation=0)
+    found = _corners(grey)
+    inside = (found < [WIDTH / 2, HEIGHT / 2]).all(axis=1)
+    assert len(found) > 100
+    assert 0.15 < inside.mean() < 0.4
+    assert not len(_corners(np.full((HEIGHT, WIDTH), 90, np.uint8)))

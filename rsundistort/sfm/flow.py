@@ -26,7 +26,7 @@ _BACK_PX = 0.5
 _AREA, _DARK, _MEAN = 31, 16.0, 100.0
 # Corners that measure the motion of the content, cells of a side of the frame that share them, how good they are at
 # least by the best, and how far they are apart at least, by the diagonal.
-_CORNERS, _CELLS, _LEAST_CORNER, _CORNERS_APART = 300, 6, 0.001, 0.02
+_CORNERS, _CELLS, _LEAST_CORNER, _CORNERS_APART = 300, 6, 1e-4, 0.02
 # A key frame is due when the content has moved by this share of its diagonal, or when this few of the corners are still
 # seen; the sharpest of the frames that moved by `_CANDIDATE` of that is taken.
 _MOVED, _SEEN, _CANDIDATE = 0.06, 0.5, 0.6

@@ -1,0 +1,97 @@
+"""A camera that only rotates, among things that move otherwise, and over cuts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rsundistort import Camera
+from rsundistort.sfm.features import Features
+from rsundistort.solve.clip_pan import _LEFT_PX, _beyond_rotation, _matches, _seen_again
+
+F = 500.0
+CAMERA = Camera(640, 360, [[F, 0, 320], [0, F, 180], [0, 0, 1]])
+NOISE_PX = 0.15
+
+
+def pixels(rays: NDArray[np.float64], turned: NDArray[np.float64], phi: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixels of directions in a frame that is rotated by `turned`, and by `phi` from the first line to the last."""
+    y = np.zeros(len(rays))
+    for _ in range(30):  # the line that shows a point is that of its own image
+        x = np.einsum("nab,nb->na", Rotation.from_rotvec(turned + y[:, None] * phi * F / 360).as_matrix(), rays)
+        y = x[:, 1] / x[:, 2]
+    return F * x[:, :2] / x[:, 2:] + [320, 180]
+
+
+def two_frames(
+    rng: np.random.Generator, share: float, num: int = 150
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Corners of a scene in two frames of a hand that pans, and of things that move across them (a share)."""
+    xy = rng.uniform([0, 0], [640, 360], (num, 2))
+    rays = np.column_stack([(xy - [320, 180]) / F, np.ones(num)])
+    phi = [rng.normal(0, 0.015, 3) for _ in range(2)]
+    first = pixels(rays, np.zeros(3), phi[0])
+    second = pixels(rays, rng.normal(0, 0.03, 3) + np.array([0, 0.07, 0]), phi[1])
+    moves = rng.random(num) < share
+    step = np.array([[12.0, 1.0], [-25.0, 0.0], [40.0, -2.0]])[rng.integers(3, size=num)]
+    second[moves] = (first + step)[moves]
+    return first + rng.normal(0, NOISE_PX, (num, 2)), second + rng.normal(0, NOISE_PX, (num, 2))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.35])
+@pytest.mark.parametrize("seed", range(6))
+def test_rotations_of_lines_explain_a_pan_among_things_that_move(seed: int, share: float) -> None:
+    first, second = two_frames(np.random.default_rng(seed), share)
+    assert F * _beyond_rotation(first, second, CAMERA) < _LEFT_PX
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_camera_that_travels_does_more_than_rotate(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    xy, depth = rng.uniform([0, 0], [640, 360], (150, 2)), rng.uniform(3, 12, 150)
+    points = np.column_stack([(xy - [320, 180]) / F, np.ones(150)]) * depth[:, None]
+    moved = points - [0.15, 0.01, 0.02]
+    second = F * moved[:, :2] / moved[:, 2:] + [320, 180]
+    assert F * _beyond_rotation(xy, second, CAMERA) > 1.0
+
+
+def seen(xy: NDArray[np.float64], descriptors: NDArray[np.uint8]) -> Features:
+    return Features(xy, np.ones(len(xy)), descriptors)
+
+
+def test_a_frame_after_a_cut_is_rotated_by_the_features_that_it_shows_again() -> None:
+    rng = np.random.default_rng(1)
+    looks = rng.integers(0, 200, (120, 128)).astype(np.uint8)
+    xy = rng.uniform([0, 0], [640, 360], (120, 2))
+    rays = np.column_stack([(xy - [320, 180]) / F, np.ones(120)])
+    turned = np.array([0.02, -0.15, 0.01])
+    before, again = seen(xy, looks), pixels(rays, turned, np.zeros(3))
+    order, new = rng.permutation(120)[:70], rng.integers(0, 200, (50, 128)).astype(np.uint8)
+    after = seen(
+        np.concatenate([again[order], rng.uniform([0, 0], [640, 360], (50, 2))]), np.concatenate([looks[order], new])
+    )
+    chosen = np.arange(0, 120, 2)
+    found = _seen_again(before, chosen, after, CAMERA)
+    assert found is not None
+    rotation, place, pixel = found
+    assert Rotation.from_matrix(rotation @ Rotation.from_rotvec(turned).as_matrix().T).magnitude() < 1e-6
+    assert {*place.tolist()} == {*np.flatnonzero(np.isin(chosen, order)).tolist()}
+    np.testing.assert_allclose(pixel, again[chosen[place]], atol=1e-9)
+    # another scene shows none of them
+    other = replace(after, descriptors=rng.integers(0, 200, (120, 128)).astype(np.uint8))
+    assert _seen_again(before, chosen, other, CAMERA) is None
+
+
+def test_matches_are_mutual_and_clear() -> None:
+    rng = np.random.default_rng(0)
+    first = rng.integers(0, 200, (20, 128)).astype(np.uint8)
+    # the last two look alike
+    first[19] = first[18]
+    a, b = _matches(first, first[::-1].copy())
+    assert a.tolist() == list(range(18))
+    assert (b == 19 - a).all()
+    assert not len(_matches(first[:1], first)[0])
