@@ -106,8 +106,12 @@ def readouts_by_speed(
     if not runs:
         return None
     found = _compared(runs, readout_s, step_s)
-    if all(_places(run, step_s)[-1] == len(run.time_s) - 1 for run in runs) or found.slow is None:
+    num = sum(int(_places(run, step_s)[-1]) + 1 for run in runs)
+    num_filled = num - sum(len(run.time_s) for run in runs)
+    if not num_filled or found.slow is None:
         return found
+    # errors of those that are filled in are in all frequencies, but no more independent than they are themselves
+    wider = max(1.0, np.sqrt(0.5 * num / num_filled))
     # what is asked for grows by a share of what is thought: where both are one, less that share of the evidence counts
     more = _compared(runs, _MORE * readout_s, step_s)
     kinds = []
@@ -120,7 +124,7 @@ def readouts_by_speed(
         return BySpeed(None, None, found.unfollowed)
     there = _compared(runs, slow_s, step_s)
     slow, fast = (
-        None if at is None or each is None else ReadoutTime(at, each.sigma / (1 - share))
+        None if at is None or each is None else ReadoutTime(at, wider * each.sigma / (1 - share))
         for at, each, share in ((slow_s, there.slow, of_slow), (fast_s, there.fast, of_fast))
     )
     return BySpeed(slow, fast, there.unfollowed)
