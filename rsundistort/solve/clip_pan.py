@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import pairwise
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -79,7 +80,7 @@ def _chained(
     for a, b in pairwise(order):
         if a not in R_cw or clip.part[a] != clip.part[b]:
             # after a cut, or a flash, what was seen before may be seen again
-            for key in [key for key in order if key in R_cw][: -_LAST - 1 : -1]:
+            for key in reversed([each for each in order if each in R_cw][-_LAST:]):
                 seen = _seen_again(features[key], followed.chosen[key], features[b], camera)
                 if seen is not None:
                     R_cw[b] = seen[0] @ R_cw[key]
@@ -125,13 +126,15 @@ def _matches(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[NDArr
     """Indices (n,) of descriptors that are each other's nearest, and nearer than the next one (Lowe 2004)."""
     if len(first) < 2 or len(second) < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    a, b = first.astype(np.float32), second.astype(np.float32)
-    distance = np.sqrt(np.maximum((a**2).sum(1)[:, None] + (b**2).sum(1) - 2 * a @ b.T, 0.0))
-    nearest = np.argmin(distance, axis=1)
-    two = np.partition(distance, 1, axis=1)
-    mutual = np.argmin(distance, axis=0)[nearest] == np.arange(len(first))
-    index = np.flatnonzero(mutual & (two[:, 0] < _NEARER * two[:, 1]))
-    return index, nearest[index]
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    back = [each.trainIdx for each in matcher.match(second, first)]
+    clear = [
+        (best.queryIdx, best.trainIdx)
+        for best, next_best in matcher.knnMatch(first, second, k=2)
+        if best.distance < _NEARER * next_best.distance and back[best.trainIdx] == best.queryIdx
+    ]
+    index, nearest = np.array(clear, np.int64).reshape(-1, 2).T
+    return index, nearest
 
 
 def _joined(
