@@ -23,9 +23,16 @@ __all__ = ["averaged_motions", "map_without_motions"]
 
 # Rounds of the weights of pairs, and how many times the usual deviation of a pair halves its weight twice.
 _ROUNDS, _TAIL = 30, 4.0
+# Standard deviation of a component of the motions of a solution, radians a frame.
+_KNOWN_RAD = 0.003
 
 
-def averaged_motions(num_photos: int, pairs: Mapping[tuple[int, int], Pair], phi_sigma: float) -> NDArray[np.float64]:
+def averaged_motions(
+    num_photos: int,
+    pairs: Mapping[tuple[int, int], Pair],
+    phi_sigma: float,
+    known_phi: Mapping[int, NDArray[np.float64]] | None = None,
+) -> NDArray[np.float64]:
     """Rotations phi (m, 3) of photos, radians per unit of the clock, that agree best with the relative poses of pairs.
 
     A pair alone hardly tells the motion of one photo from that of the other. Each pair is a normal distribution of
@@ -40,17 +47,22 @@ def averaged_motions(num_photos: int, pairs: Mapping[tuple[int, int], Pair], phi
         Matches of pairs of photos.
     phi_sigma : float
         Prior standard deviation of the components of phi, radians a frame.
+    known_phi : mapping of int to (3,) array, optional
+        Motions of some photos by a solution: a pair with one of these shows that of the other photo far better.
     """
+    known_phi = known_phi or {}
     poses = {key: find_relative_pose(pair, phi_sigma) for key, pair in pairs.items()}
     found = {key: pose for key, pose in poses.items() if pose is not None}
     known = {key: (*phi_information(pose, pairs[key]), pose.phi.ravel()) for key, pose in found.items()}
-    prior = np.zeros((num_photos, 3))
+    prior, expected = np.zeros((num_photos, 3)), np.zeros((num_photos, 3))
     for first, second in found:
         prior[[first, second]] = (pairs[first, second].frame_spans / phi_sigma).reshape(2, 3) ** 2
-    phi, weights, usual = np.zeros(3 * num_photos), dict.fromkeys(found, 1.0), 1.0
+    for k, each in known_phi.items():
+        prior[k], expected[k] = prior[k] * (phi_sigma / _KNOWN_RAD) ** 2, each
+    phi, weights, usual = expected.ravel(), dict.fromkeys(found, 1.0), 1.0
     for _ in range(_ROUNDS if found else 0):
         # a photo without a pair has no motion
-        A, b = np.diag(np.where(prior > 0, prior, 1.0).ravel()), np.zeros(3 * num_photos)
+        A, b = np.diag(np.where(prior > 0, prior, 1.0).ravel()), (prior * expected).ravel()
         for key, (information, gradient, mean) in known.items():
             at = _components(*key)
             A[np.ix_(at, at)] += weights[key] / usual * information
@@ -72,7 +84,9 @@ def _apart(step: NDArray[np.float64], information: NDArray[np.float64]) -> float
     return float(step @ information @ step) / len(step)
 
 
-def map_without_motions(matched: MatchedPhotos, phi_sigma: float) -> Reconstruction:
+def map_without_motions(
+    matched: MatchedPhotos, phi_sigma: float, known_phi: Mapping[str, NDArray[np.float64]] | None = None
+) -> Reconstruction:
     """What `map_photos` makes of the photos if their motions, averaged over pairs, are taken out of their keypoints.
 
     Pairs are verified anew: matches that a shutter hid are right then, and poses by which it explained false ones are
@@ -84,11 +98,13 @@ def map_without_motions(matched: MatchedPhotos, phi_sigma: float) -> Reconstruct
         Photos and their matches; cameras that are guesses are refined by mapping. Its database stays as it is.
     phi_sigma : float
         As in `averaged_motions`.
+    known_phi : mapping of str to (3,) array, optional
+        As there, by name.
 
     Returns
     -------
     Reconstruction
-        With the raw pixels as measurements, and without motions.
+        With the raw pixels as measurements, and the motions that were taken out of them.
 
     Raises
     ------
@@ -97,7 +113,8 @@ def map_without_motions(matched: MatchedPhotos, phi_sigma: float) -> Reconstruct
     """
     matches = {key: found for key, found in read_matches(matched).items() if len(found) >= MIN_EXPLAINED}
     pairs = {key: pair_of(matched, key, found) for key, found in matches.items()}
-    phi = averaged_motions(len(matched.names), pairs, phi_sigma)
+    known = {matched.names.index(name): each for name, each in (known_phi or {}).items()}
+    phi = averaged_motions(len(matched.names), pairs, phi_sigma, known)
     cameras = [matched.cameras[k] for k in matched.camera_idx]
     features = [
         replace(found, xy_raw=ideal_keypoints(found, camera, RowMotion(each), "rotation").astype(np.float64) - HALF)
@@ -112,4 +129,5 @@ def map_without_motions(matched: MatchedPhotos, phi_sigma: float) -> Reconstruct
         for (first, second), found in matches.items():
             db.write_matches(first + 1, second + 1, found.astype(np.uint32))
     verify_loosely(moved)
-    return map_photos(moved, shown=matched)
+    mapped = map_photos(moved, shown=matched)
+    return replace(mapped, phi=phi[[matched.names.index(name) for name in mapped.image_names]])

@@ -16,6 +16,7 @@ from ..bundle import BundleOptions, BundleResult
 from ..errors import ReconstructionError, RsUndistortWarning
 from ..model import Reconstruction
 from ..sfm import (
+    LEAST_MEASUREMENTS,
     carried_along,
     contradicting_photos,
     firmly_connected,
@@ -154,8 +155,10 @@ class Registrar:
             self.log.begin(stage)
             scene = self._new_tracks(rec)
             if (strong or suspect) and wave == 1 and scene.num_images >= LEAST_PHOTOS:
-                # thresholds without a shutter had cut off most measurements: no photo is judged before they are back
-                result = self._adjusted(scene, result, stage)
+                # thresholds without a shutter had cut off most measurements: no photo is judged before they are back,
+                # nor is what connects it
+                loose = retriangulate(matched, rec).without_photos(LEAST_MEASUREMENTS) if strong else scene
+                result = self._adjusted(loose, result, stage)
                 scene = self._new_tracks(result.reconstruction)
             if self._confirms(scene, strong) and not strong:
                 # a lens that moves contradicts as a wrong place does
@@ -192,27 +195,39 @@ class Registrar:
         """The solution, or that of a mapping of keypoints without rough motions if that has more photos in their place.
 
         A side of a scene that mapping rotated as a whole has no photo that fits elsewhere. The cameras as they came and
-        as they were found give two places to start from. The other solution must agree with the first one on the photos
-        of both, except suspects, and explain more measurements.
+        as they were found give two places to start from, and the motions of the photos that are right a third one,
+        which shows those of the others. The other solution must agree with the first one on the photos of both, except
+        suspects, and explain more measurements.
         """
         rec, matched = result.reconstruction, self.track_source.matched
         firm = rec.take_photos(~self._suspects(rec))
         best, best_left_out, stage = result, left_out, "mapping without motions"
         confirmed = {*self._confirmed}
-        for start in (matched, replace(matched, cameras=rec.cameras, calibrated=True)):
-            of_best = best.reconstruction
-            if of_best.num_images == len(matched.names) and not self._suspects(of_best).any():
+        for cameras_found, motions_known in ((False, False), (True, False), (True, True)):
+            of_best, start, known_phi = best.reconstruction, matched, {}
+            suspects = self._suspects(of_best)
+            if of_best.num_images == len(matched.names) and not suspects.any():
                 break
+            if cameras_found:
+                start = replace(matched, cameras=rec.cameras, calibrated=True)
+            if motions_known:
+                right = of_best.take_photos(~suspects)
+                known_phi = dict(zip(right.image_names, right.phi, strict=True))
+                start = replace(start, cameras=right.cameras)
             self.log.begin(stage)
             mapped = None
             with suppress(ReconstructionError):
-                mapped = map_without_motions(start, result.phi_rms)
+                mapped = map_without_motions(start, result.phi_rms, known_phi)
             self.log.end(stage, photos=0 if mapped is None else mapped.num_images)
             if mapped is None or mapped.num_images < LEAST_PHOTOS:
                 continue
-            options = rough_options(of_registered(self.wanted, mapped, says=False))
+            if motions_known:
+                adjusted = self._adjusted(replace(mapped, shutter_model=rec.shutter_model), best, stage)
+            else:
+                options = rough_options(of_registered(self.wanted, mapped, says=False))
+                adjusted = adjusted_sequence(mapped, rec.shutter_model, options, self.log)
             self._confirmed.clear()  # where photos are in one solution says nothing of the other
-            other, other_left_out = self._registered(adjusted_sequence(mapped, rec.shutter_model, options, self.log))
+            other, other_left_out = self._registered(adjusted)
             new = other.reconstruction
             more = new.num_images > firm.num_images and self._explained(new) > self._explained(of_best)
             if more and agree(firm, new):
