@@ -197,6 +197,8 @@ def _varying(solution: Solution) -> list[str]:
     if not solution.lens_varied:
         return []
     focal, centre = solution.quality["focal_sigma"], solution.quality["centre_sigma_focal_lengths"]
+    if not centre:
+        return [f"varying lens       f by {100 * focal:.2g} % from frame to frame (focusing, zooming)"]
     camera = next(iter(solution.cameras.values()))
     return [
         f"varying lens       f by {100 * focal:.2g} %, principal point by {centre * camera.K[0, 0]:.1f} px from photo "

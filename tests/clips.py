@@ -45,11 +45,12 @@ class HandHeld:
 
 def filmed(
     hand: HandHeld, num_frames: int = 30, readout: float = 0.6, num_points: int = 250, noise_px: float = 0.3,
-    frame_s: float = 1 / 30, every: int = 1,
+    frame_s: float = 1 / 30, every: int = 1, zoom: Array | float = 1.0,
 ) -> tuple[Reconstruction, dict[str, float]]:  # fmt: skip
     """What the camera sees, with its true poses at the moments of the principal row, and the time of each frame.
 
-    `readout` is the share of the time between frames, negative for a shutter that runs from the bottom to the top.
+    `readout` is the share of the time between frames, negative for a shutter that runs from the bottom to the top;
+    `zoom` times 500 px are the focal lengths of the frames. Lines take the same time whatever these are.
     """
     camera = Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]])
     rng = np.random.default_rng(1000 + hand.seed)
@@ -61,15 +62,16 @@ def filmed(
     start, end = camera.clock_range
     seconds = readout * frame_s / (end - start)
     frames, seen, pixels = [], [], []
+    zoom = np.broadcast_to(zoom, time.shape)
     for k, moment in enumerate(time):
-        clock = np.zeros(num_points)
+        clock, units = np.zeros(num_points), zoom[k]
         for _ in range(60):  # the row that shows a point is that of its own image
             at = moment + seconds * clock
             x = np.einsum("nab,nb->na", hand.rotations(at), points - hand.centers(at))
-            before, clock = clock, np.where(x[:, 2] > 0.5, x[:, 1] / np.maximum(x[:, 2], 0.5), 0.0)
+            before, clock = clock, np.where(x[:, 2] > 0.5, units * x[:, 1] / np.maximum(x[:, 2], 0.5), 0.0)
             if np.abs(clock - before).max() < 1e-14:
                 break
-        xy = 500 * x[:, :2] / np.maximum(x[:, 2:], 0.5) + [320, 240]
+        xy = 500 * units * x[:, :2] / np.maximum(x[:, 2:], 0.5) + [320, 240]
         inside = (x[:, 2] > 0.5) & (xy >= 0).all(1) & (xy <= [639, 479]).all(1)
         frames.append(np.full(inside.sum(), k))
         seen.append(np.flatnonzero(inside))
@@ -77,8 +79,9 @@ def filmed(
     observations = Observations(np.concatenate(frames), np.concatenate(seen), np.concatenate(pixels))
     names = [f"{k:06d}.png" for k in range(len(time))]
     truth = Reconstruction(
-        [camera], names, np.zeros(len(time), int), hand.rotations(time), hand.centers(time), points, observations
-    )
+        [camera], names, np.zeros(len(time), int), hand.rotations(time), hand.centers(time), points, observations,
+        variation=np.column_stack([np.log(zoom), np.zeros((len(time), 2))]),
+    )  # fmt: skip
     return truth.with_points(np.ones(len(observations), bool)), dict(zip(names, time.tolist(), strict=True))
 
 

@@ -429,7 +429,8 @@ def test_halves_of_a_video_ask_for_their_own_readout_times_though_they_begin_at_
 
 def test_the_state_of_a_path_gives_the_motions() -> None:
     state = State(np.arange(12.0).reshape(2, 6), np.zeros((2, 6)), np.array([0.5, 2.0]))
-    np.testing.assert_array_equal(state.motions(np.array([1, 0])), [np.arange(6) * 2.0, np.arange(6, 12) * 0.5])
+    cameras, same = np.array([1, 0]), np.zeros((2, 3))
+    np.testing.assert_array_equal(state.motions(cameras, same), [np.arange(6) * 2.0, np.arange(6, 12) * 0.5])
 
 
 def test_covariances_of_a_path_hold_one_factor_at_a_time() -> None:
@@ -449,3 +450,47 @@ def test_covariances_of_a_path_hold_one_factor_at_a_time() -> None:
     factor = equations.inverse.photos.data.nbytes
     assert "_reduced" not in vars(equations)
     assert peak < 1.2 * (system + 2 * factor)
+
+
+@pytest.mark.parametrize("amount", [0.01, 0.1])
+def test_a_lens_that_focuses_or_zooms_is_no_motion(amount: float) -> None:
+    """Lines take the same time whatever the focal length is: the oracle projects each line from its own pose."""
+    zoom = 1.0 + amount * np.sin(np.arange(24) / 4.0)
+    truth, times = filmed(HandHeld(5), 24, 0.6, zoom=zoom)
+    start = replace(truth, variation=np.zeros((24, 3)))
+    options = BundleOptions(path=FramePath(times, FRAME_S), varying=True)
+    result = bundle_adjust(start, "constant-motion", options)
+    assert result.path is not None
+    share, sigma = result.path.readout_s / FRAME_S, result.path.sigma_readout_s / FRAME_S
+    assert abs(share - 0.6) < 3 * sigma
+    assert sigma < 0.02
+    off = result.reconstruction.variation[:, 0] - np.log(zoom)
+    assert np.std(off) < 0.001
+    assert (result.reconstruction.variation[:, 1:] == 0).all()
+    assert abs(result.focal_sigma / np.std(np.log(zoom)) - 1.0) < 0.3
+    assert result.centre_sigma == 0.0
+    assert np.max(rotation_errors_deg(result.path.path.R_cw, truth.R_cw)) < 0.05
+    # each frame by itself says the same
+    own = own_motions(result.reconstruction)
+    turned = own.phi * result.reconstruction.frame_span()[:, None]
+    rates = result.path.state.rates[:, :3] * share
+    assert np.nanmedian(np.abs(turned - rates) / own.sigma_phi / result.reconstruction.frame_span()[:, None]) < 1.5
+
+
+def test_the_jacobians_of_a_lens_that_zooms_are_those_of_differences() -> None:
+    truth, times = filmed(HandHeld(3), 6, 0.6, noise_px=0.0, zoom=np.linspace(0.9, 1.2, 6))
+    options = BundleOptions(path=FramePath(times, FRAME_S), varying=True, loss="squared")
+    problem = BundleProblem(truth, "constant-motion", options, 0.3, PriorSigmas(0.1, 0.1, path=(0.01, 0.1)))
+    state = problem.initial_state()
+    rng, m = np.random.default_rng(1), truth.num_images
+    nothing = np.zeros((m, 19)), np.zeros_like(state.points_w), np.zeros((1, 1))
+    away = rng.normal(0, 1e-3, (m, 19)), rng.normal(0, 0.01, state.points_w.shape), np.array([[1e-3]])
+    state = problem.retract(state, away)
+    gradient = problem.linearize(state)._g_frame
+    for unknown in (0, 4, 7, 10, 12):
+        costs = []
+        for sign in (1.0, -1.0):
+            frame = nothing[0].copy()
+            frame[2, unknown] = sign * 1e-5
+            costs.append(problem.cost(problem.retract(state, (frame, *nothing[1:]))))
+        np.testing.assert_allclose(gradient[2, unknown], (costs[0] - costs[1]) / 2e-5, rtol=2e-3)

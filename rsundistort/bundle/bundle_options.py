@@ -88,7 +88,8 @@ class BundleOptions:
         wider than what displaces their scene, at its median depth, as much. They do not affect the prior of the others.
     varying : bool
         Whether the intrinsics of each photo may differ from its camera's: log f, as a focusing lens changes it, and the
-        principal point, as a stabiliser moves it, each with a zero-mean prior whose standard deviation is estimated.
+        principal point, as a stabiliser moves it, each with a zero-mean prior whose standard deviation is estimated. Of
+        frames on a path log f alone: a shift that lasts from frame to frame is a rotation of the path.
     bends : int
         Number of groups of `model.BEND_GROUPS` in unsteady motions, 0 to 5, for exact models: in their rotation, and
         for constant-motion with the first two groups in their position. Each group has a zero-mean prior whose standard

@@ -64,12 +64,23 @@ class Layout:
             place = np.linspace(0, 1, _KNOWN_SITES)
             functions = splines_at(len(functions), place) @ functions if group else np.zeros((_KNOWN_SITES, 0))
         ways = sum(each < _WAYS for each in group) if motion > 9 else 0
-        return cls(motion, motion + 3 * options.varying, functions, group, ways, known)
+        # a shift of the principal point that lasts from frame to frame is a rotation of their path
+        num_varying = (1 if options.path is not None else 3) if options.varying else 0
+        return cls(motion, motion + num_varying, functions, group, ways, known)
 
     @property
     def bent(self) -> bool:
         """Whether motions are not steady."""
         return len(self.functions) > 0
+
+    @property
+    def num_varying(self) -> int:
+        """How many intrinsics vary: log f alone on a path, else cx / fx and cy / fy, too; 0 if none does."""
+        return self.variation - self.motion
+
+    def varied(self, step: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(m, 3) what steps (m, nb) of the photos change of log f, cx / fx and cy / fy."""
+        return np.pad(step[:, self.motion : self.variation], ((0, 0), (0, 3 - self.num_varying)))
 
     @property
     def num_bends(self) -> int:

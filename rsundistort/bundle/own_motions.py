@@ -52,7 +52,8 @@ def own_motions(reconstruction: Reconstruction, *, rotation_only: bool = False) 
     Frames are fitted to the points, and the points to the frames, alternately and with a robust loss. Only their points
     connect the frames, and no prior constrains their motion, so that frames whose shutters and poses contradict each
     other are fitted as well as any others. The velocities of the reconstruction are fixed, and its bends: frames that
-    turn while they are read would be fitted by another pose, whose error goes with their rotation.
+    turn while they are read would be fitted by another pose, whose error goes with their rotation. So are their focal
+    lengths, where these vary.
 
     Parameters
     ----------
@@ -62,7 +63,10 @@ def own_motions(reconstruction: Reconstruction, *, rotation_only: bool = False) 
         Whether the centres, and the points, stay where they are.
     """
     bends = {name: reconstruction.motion(i).bend for i, name in enumerate(reconstruction.image_names)}
-    options = BundleOptions(loss="cauchy", known_bends={name: bend for name, bend in bends.items() if bend is not None})
+    options = BundleOptions(
+        loss="cauchy", known_bends={name: bend for name, bend in bends.items() if bend is not None},
+        varying=reconstruction.varies,
+    )  # fmt: skip
     problem = BundleProblem(reconstruction, "constant-motion", options, _NOISE_PX, PriorSigmas(_LOOSE, _LOOSE))
     own = np.array([0, 1, 2, 6, 7, 8] if rotation_only else range(_UNKNOWNS))
     state = problem.initial_state()

@@ -167,9 +167,17 @@ class PathState:
     changes: Array
     pace: Array
 
-    def motions(self, camera_idx: Index) -> Array:
+    def paces(self, camera_idx: Index, variation: Array) -> Array:
+        """(m,) time that a unit of each photo's clock takes, by the variation (m, 3) of their intrinsics.
+
+        A line takes the same time whatever the focal length is, and a unit of the clock has as many lines as f pixels.
+        """
+        value: Array = self.pace[camera_idx] * np.exp(variation[:, 0])
+        return value
+
+    def motions(self, camera_idx: Index, variation: Array) -> Array:
         """(m, 6) phi and velocity of the photos."""
-        return self.pace[camera_idx, None] * self.rates
+        return self.paces(camera_idx, variation)[:, None] * self.rates
 
 
 class PathPrior:
@@ -352,7 +360,11 @@ def with_path_motions(reconstruction: Reconstruction, path: FramePath, state: Pa
     for mine, motions in parts:
         for value, each in zip(values, motions, strict=True):
             value[mine] = each
-    return replace(reconstruction, phi=values[0], velocity=values[1], bend=values[2], bend_clock=clock)
+    # units of the camera's clock have become those of each photo's, whose lines are the same
+    units = np.exp(reconstruction.variation[:, :1])
+    return replace(
+        reconstruction, phi=units * values[0], velocity=units * values[1], bend=values[2], bend_clock=clock / units
+    )
 
 
 def path_bends(reconstruction: Reconstruction, path: FramePath, state: PathState) -> dict[str, Bend]:
@@ -406,16 +418,18 @@ def path_solution(reconstruction: Reconstruction, path: FramePath, state: PathSt
     return PathSolution(found, state, names, *times)
 
 
-def of_motions(covariances: Array, with_pace: Array, pace_sigma: Array, state: PathState, camera_idx: Index) -> Array:
+def of_motions(
+    covariances: Array, with_pace: Array, pace_sigma: Array, state: PathState, reconstruction: Reconstruction
+) -> Array:
     """Covariances (m, nb, nb) of poses, phi and velocity by those of poses and rates, and of these with the pace."""
     m, nb = covariances.shape[:2]
     joint = np.zeros((m, nb + 1, nb + 1))
     joint[:, :nb, :nb] = covariances
     joint[:, nb, :nb] = joint[:, :nb, nb] = with_pace
-    joint[:, nb, nb] = pace_sigma[camera_idx] ** 2
+    joint[:, nb, nb] = pace_sigma[reconstruction.camera_idx] ** 2
     T = np.tile(np.eye(nb, nb + 1), (m, 1, 1))
-    T[:, 6:12, 6:12] *= state.pace[camera_idx, None, None]
-    T[:, 6:12, nb] = state.rates
+    T[:, 6:12, 6:12] *= state.paces(reconstruction.camera_idx, reconstruction.variation)[:, None, None]
+    T[:, 6:12, nb] = np.exp(reconstruction.variation[:, :1]) * state.rates
     return T @ joint @ T.transpose(0, 2, 1)
 
 

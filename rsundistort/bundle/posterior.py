@@ -58,7 +58,9 @@ class Posterior:
         if self._path is None:
             return (self._covariance(whole) + self._doubt.times(whole)[0])[:, :, : vectors.shape[2]]
         # phi and velocity are pace times rates
-        pace, rates = self._path.pace[self._camera_idx][:, None], self._path.rates
+        variation = self._state.variation
+        pace = self._path.paces(self._camera_idx, variation)[:, None]
+        rates = np.exp(variation[:, :1]) * self._path.rates
         of_pace = np.zeros((len(vectors), self._equations.num_shared))
         columns = (self._camera_idx + 1) * (self._equations.num_shared // self._equations.num_cameras) - 1
         np.add.at(of_pace.T, columns, np.einsum("kma,ma->mk", vectors[:, :, 6:12], rates))
@@ -116,7 +118,7 @@ class Posterior:
         for photo, mine in enumerate(by_frame):
             A = J[mine, :, 6 : J.shape[2] - self._own] * noise_px[mine, None, None]
             if self._path is not None:  # the Jacobians are by rates
-                A /= self._path.pace[self._camera_idx[photo]]
+                A /= self._path.paces(self._camera_idx, self._state.variation)[photo]
             squares.append(np.einsum("oki,okj->ij", A, A) / max(len(mine), 1))
         return np.array(squares)
 

@@ -44,6 +44,8 @@ _MOST_PX = 1.0
 # No lens varies more than this from photo to photo (of f, and of the principal point in focal lengths). A strong
 # shutter would be taken for it.
 _MOST_VARIED = 0.02
+# A video may zoom, and what its path leaves of a shutter is not taken for that.
+_MOST_ZOOMED = 0.5
 # Of a path's rates from frame to frame: radians, and shares of the mean way between consecutive photos.
 _ROTATION_START, _TRAVEL_START = 5e-3, 0.2
 # Residuals of a path that count as if these had been seen before.
@@ -164,7 +166,8 @@ def estimated(
         varied = current.variation
         of_varied = variances[:, layout.motion : layout.variation]
         focal = _prior_sigma(varied[:, :1], of_varied[:, :1], ones, sigmas.focal) + _MIN_SIGMA
-        centre = _prior_sigma(varied[:, 1:], of_varied[:, 1:], ones, sigmas.centre) + _MIN_SIGMA
+        if layout.num_varying > 1:
+            centre = _prior_sigma(varied[:, 1:], of_varied[:, 1:], ones, sigmas.centre) + _MIN_SIGMA
     bends, ways = _bend_sigmas(sigmas, current, variances[:, layout.variation :], layout)
     return _bounded(
         PriorSigmas(phi, velocity, focal, centre, bends, ways, sigmas.field, sigmas.path, means), options, baseline
@@ -312,8 +315,9 @@ def _bounded(sigmas: PriorSigmas, options: BundleOptions, baseline: float) -> Pr
     """The prior standard deviations within their upper limits."""
     phi = np.inf if options.phi_sigma_most is None else options.phi_sigma_most
     velocity = np.inf if options.velocity_sigma_most is None else options.velocity_sigma_most * baseline
+    focal = _MOST_VARIED if options.path is None else _MOST_ZOOMED
     return PriorSigmas(
-        min(sigmas.phi, phi), min(sigmas.velocity, velocity), min(sigmas.focal, _MOST_VARIED),
+        min(sigmas.phi, phi), min(sigmas.velocity, velocity), min(sigmas.focal, focal),
         min(sigmas.centre, _MOST_VARIED), tuple(min(each, phi) for each in sigmas.bends), sigmas.ways,
         min(sigmas.field, _MOST_PX), sigmas.path, sigmas.means,
     )  # fmt: skip

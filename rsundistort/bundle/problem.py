@@ -97,8 +97,9 @@ class BundleProblem:
         self._block = self.layout.motion
         self._bend_clock = reconstruction.bend_clock
         if not reconstruction.bends:
-            photos = range(reconstruction.num_images)
-            self._bend_clock = np.array([reconstruction.camera(i).clock_range for i in photos])
+            self._bend_clock = np.array(
+                [reconstruction.camera(i).clock_range for i in range(reconstruction.num_images)]
+            )
         self._path, self._path_start, self._bounded = None, path, True
         self._rotation_only = options.path is not None and options.path.rotation_only
         if options.path is not None:
@@ -139,7 +140,7 @@ class BundleProblem:
         self._refine_codes = np.array([INTRINSICS[name] for name in options.refine], np.int64)
         span = reconstruction.frame_span()[:, None]
         self._motion_prior = MotionPrior.of(reconstruction, options, sigmas.phi, sigmas.velocity, self._block - 6)
-        varied = np.array([sigmas.focal, sigmas.centre, sigmas.centre])[: 3 * options.varying] ** -2.0
+        varied = np.array([sigmas.focal, sigmas.centre, sigmas.centre])[: self.layout.num_varying] ** -2.0
         of_bends = self.layout.per_bend(sigmas.bends, sigmas.ways) ** -2.0
         self._own_weight = np.tile(np.concatenate([varied, of_bends]), (len(span), 1))
         self._lengths = LengthResiduals(self._start, options.lengths)
@@ -239,7 +240,7 @@ class BundleProblem:
         path = self._path_start
         if self._path is not None:
             path = path or self._path.start(start)
-            motion = path.motions(start.camera_idx)
+            motion = path.motions(start.camera_idx, variation)
         means = self._means_start
         if self._means is None:
             means = np.zeros((len(cameras), 0))
@@ -257,8 +258,7 @@ class BundleProblem:
         quarter. That of squares is right for normal noise, and to the safe side for noise with heavy tails.
         """
         plain = copy(self)
-        plain._options = replace(self._options, loss="squared")
-        plain._lens_of, plain._bounded = None, False
+        plain._options, plain._lens_of, plain._bounded = replace(self._options, loss="squared"), None, False
         return plain
 
     def covariances(self, state: State) -> Marginals:
@@ -341,13 +341,13 @@ class BundleProblem:
 
     def _own(self, state: State) -> NDArray[np.float64]:
         """(m, k) unknowns behind those: variation and bends."""
-        return np.hstack([state.variation[:, : 3 * self._options.varying], state.bend])
+        return np.hstack([state.variation[:, : self.layout.num_varying], state.bend])
 
     def _prior_cost(self, state: State) -> float:
         known = self._known_weight * (self._motion(state) - self._known) ** 2
-        lengths = float(np.sum(self._lengths.residuals(state.points_w) ** 2))
+        lengths = 2.0 * self._places.cost(state.center_w, state.points_w)
+        lengths += float(np.sum(self._lengths.residuals(state.points_w) ** 2))
         varied = float(np.sum(self._own_weight * self._own(state) ** 2))
-        lengths += 2.0 * self._places.cost(state.center_w, state.points_w)
         own = 2.0 * self._motion_prior.cost(self._own_motion(state)) + float(known.sum()) + varied
         if self._path is not None and state.path is not None:
             own += 2.0 * self._path.cost(state.R_cw, state.center_w, state.path)
@@ -403,7 +403,7 @@ class BundleProblem:
                 cost,
             )
         if self._options.varying:
-            J_frame[:, :, self._block : self.layout.variation] = self._by_lens(state)[1]
+            J_frame[:, :, self._block : self.layout.variation] = self._by_lens(state)[1][..., : self.layout.num_varying]
         of_place = J_frame[:, :, 3:6]
         singular = np.flatnonzero(np.einsum("oia,oia->o", of_place, of_place) > self._most_change)
         res[singular], J_frame[singular] = 0.0, 0.0
@@ -443,10 +443,12 @@ class BundleProblem:
             around = (0, 0), (6, self.layout.size - 12)
             common = CommonPrior(np.pad(information, around), np.pad(self._means.directions, (*around, (0, 0))))
         if self._path is not None and state.path is not None:
-            moves = self._start.camera_idx[self._structure.frame_idx]
-            rates = state.path.rates[self._structure.frame_idx]
-            border.J[:, :, -1] = np.einsum("oia,oa->oi", J_frame[:, :, 6:12], rates)
-            J_frame[:, :, 6:12] *= state.path.pace[moves, None, None]
+            f = self._structure.frame_idx
+            pace, units = state.path.pace[self._start.camera_idx[f], None, None], np.exp(state.variation[f, :1])
+            border.J[:, :, -1] = np.einsum("oia,oa->oi", J_frame[:, :, 6:12], units * state.path.rates[f])
+            # a longer focal length is a slower clock
+            J_frame[:, :, 12 : self.layout.variation] += border.J[:, :, -1:] * pace
+            J_frame[:, :, 6:12] *= pace * units[..., None]
             joins, *by_ends = self._path.jacobians(state.R_cw, state.center_w, state.path)
             # the changes of the rates stand behind all that the measurements know
             of_own = np.zeros((*joins.shape, self.layout.size - 12))
@@ -567,19 +569,18 @@ class BundleProblem:
             cameras = tuple(moved(k, c, s[own:last]) for k, (c, s) in enumerate(zip(cameras, intrinsics, strict=True)))
         phi = state.phi + frame[:, 6:9] if self._block > 6 else state.phi
         velocity = state.velocity + frame[:, 9:12] if self._block > 9 else state.velocity
+        variation = state.variation + self.layout.varied(frame)
         if (path := state.path) is not None:
             changes = path.changes + frame[:, self.layout.size :]
             path = PathState(path.rates + frame[:, 6:12], changes, path.pace + intrinsics[:, -1])
-            phi, velocity = np.split(path.motions(self._start.camera_idx), 2, axis=1)
+            phi, velocity = np.split(path.motions(self._start.camera_idx, variation), 2, axis=1)
         return State(
             cameras,
             Rotation.from_rotvec(frame[:, :3]).as_matrix() @ state.R_cw,
             state.center_w + frame[:, 3:6],
             phi,
             velocity,
-            state.variation + frame[:, self._block : self.layout.variation]
-            if self._options.varying
-            else state.variation,
+            variation,
             state.bend + frame[:, self.layout.variation : self.layout.size],
             moved_points(state.points_w, point, state.center_w[self._nearest]),
             state.means + intrinsics[:, intrinsics.shape[1] - state.means.shape[1] :],
@@ -594,7 +595,6 @@ class BundleProblem:
         angles = np.abs(frame[:, [0, 1, 2, *range(6, min(self._block, 9)), *range(self._block, ways)]]).max()
         moved = np.abs(frame[:, [3, 4, 5, *range(9, self._block), *range(ways, frame.shape[1])]]).max() / self._size
         lengths = max(moved, largest_step(state.points_w, point, state.center_w.mean(0), self._size))
-        of_lens = np.abs(intrinsics[:, : len(self._refine)]).max(initial=0.0)
-        fields = intrinsics[:, len(self._refine) : intrinsics.shape[1] - state.means.shape[1]]
-        of_fields = np.abs(fields).max(initial=0.0) / float(self._start.cameras[0].K[0, 0])
-        return float(max(angles, lengths, of_lens, of_fields))
+        own, last = len(self._refine), intrinsics.shape[1] - state.means.shape[1]
+        of_fields = np.abs(intrinsics[:, own:last]).max(initial=0.0) / float(self._start.cameras[0].K[0, 0])
+        return float(max(angles, lengths, np.abs(intrinsics[:, :own]).max(initial=0.0), of_fields))

@@ -284,7 +284,7 @@ class Rounds:
             path = path_solution(current, options.path, self._path, pace_sigma)
             per_camera = len(of_intrinsics) // len(current.cameras)
             with_pace = by.photos**2 * self._with_pace + self._doubt.with_last(current.camera_idx, per_camera)
-            covariances = of_motions(covariances, with_pace, pace_sigma, self._path, current.camera_idx)
+            covariances = of_motions(covariances, with_pace, pace_sigma, self._path, current)
             current = orthogonal(with_path_motions(current, options.path, self._path))
         return BundleResult(
             current,
@@ -295,7 +295,7 @@ class Rounds:
             sigmas.phi,
             sigmas.velocity / self._baseline,
             sigmas.focal if options.varying else 0.0,
-            sigmas.centre if options.varying else 0.0,
+            sigmas.centre if layout.num_varying > 1 else 0.0,
             sigmas.bends,
             tuple(each / self._baseline for each in sigmas.ways),
             covariances[:, : layout.motion, : layout.motion],

@@ -54,6 +54,9 @@ _GAP_ROUNDS = 3
 _SIGMA_ROUNDS, _SETTLED = 4, 0.05
 # Relative fall of the cost that ends an adjustment of a path that another one follows.
 _ROUGH_COST = 1e-4
+# A focal length changes from frame to frame, by focusing or zooming, if a first adjustment finds it to vary by more: it
+# does not know the path well, and leaves up to half of that of a lens that stays.
+_FOCUSES = 5e-4
 # Readout time that counts as none, as a share of the time between frames.
 _NO_READOUT = 1e-6
 # Relative standard deviation of a readout time that is specified, or from the table.
@@ -182,7 +185,7 @@ def _turned(
         result, own, clip, path = _turned_in_time(clip, path, start, options, log)
         if own is not None:
             path = held_by_slow_rotations(clip, result.reconstruction, path, own)
-            options = replace(options, path=path)
+            options = _if_it_focuses(replace(options, path=path), result)
             result = bundle_adjust(
                 result.reconstruction, "constant-motion",
                 replace(
@@ -244,7 +247,7 @@ def _of_two(
     start = pair.placed(None if path.readout is None else path.readout_prior[0])
     # one step determines no spread of steps, and estimates of it would not settle
     options = replace(options_of(start), path=path, prior_sigma_rounds=0)
-    rough = replace(_at_first(options), prior_sigma_rounds=0)
+    rough = replace(_at_first(options), prior_sigma_rounds=0, varying=False)
     first = bundle_adjust(start, "constant-motion", rough, partial(_tell, log, "path"))
     options = replace(options, path=replace(path, start=_start_of(first)))
     whole = pair.of_all(first.reconstruction)
@@ -271,6 +274,8 @@ def _travelled(
         log.begin(stage)
         on_path = None if result is None else result.reconstruction
         whole = with_all_frames(clip, current, followed, on_path).without_photos(_LEAST_MEASUREMENTS)
+        if on_path is not None:
+            whole = _focused_as(on_path, whole)
         if on_path is None:
             own = own_motions(whole)
             clip, path = with_gaps(clip, path, whole, own)
@@ -278,13 +283,12 @@ def _travelled(
             held = path if _was_stabilised(filmed) else held_by_slow_rotations(clip, whole, path, own, fills=False)
         elif held.held_sigma or not (_was_stabilised(filmed) or clip.is_even):  # by what is better known now
             held = held_by_slow_rotations(clip, on_path, path, own_motions(on_path))
-        options = replace(options_of(whole), path=held if result is None else replace(held, start=_start_of(result)))
-        how = (
-            _at_first(options)
-            if result is None
-            else replace(options, outlier_rounds=1, prior_sigma_rounds=_SIGMA_ROUNDS, prior_sigma_tolerance=_SETTLED)
-        )
-        is_first = result is None
+        options, is_first = replace(options_of(whole), path=held), result is None
+        if result is None:
+            how = _at_first(options)
+        else:
+            options = _if_it_focuses(replace(options, path=replace(held, start=_start_of(result))), result)
+            how = replace(options, outlier_rounds=1, prior_sigma_rounds=_SIGMA_ROUNDS, prior_sigma_tolerance=_SETTLED)
         result = bundle_adjust(whole, "constant-motion", how, partial(_tell, log, stage))
         log.end(
             stage, frames=whole.num_images, of_frames=len(clip.names), rms_px=result.rms_px,
@@ -358,8 +362,23 @@ def _was_stabilised(filmed: Stabilisation | None) -> bool:
 def _at_first(options: BundleOptions) -> BundleOptions:
     """Options of an adjustment of a path that is followed by another one."""
     return replace(
-        rough_options(options), outlier_rounds=2, prior_sigma_rounds=1, cost_tolerance=_ROUGH_COST, deviations="model"
-    )
+        rough_options(options), outlier_rounds=2, prior_sigma_rounds=1, cost_tolerance=_ROUGH_COST, deviations="model",
+        varying=True,
+    )  # fmt: skip
+
+
+def _focused_as(before: Reconstruction, whole: Reconstruction) -> Reconstruction:
+    """A reconstruction with the focal lengths that another one found for the same frames."""
+    of_frame = dict(zip(before.image_names, before.variation, strict=True))
+    none = np.zeros(3)
+    return replace(whole, variation=np.array([of_frame.get(name, none) for name in whole.image_names]))
+
+
+def _if_it_focuses(options: BundleOptions, first: BundleResult) -> BundleOptions:
+    """Options with a focal length that varies from frame to frame, if a first adjustment shows that."""
+    if first.focal_sigma < _FOCUSES:
+        return options
+    return replace(options, varying=True, focal_sigma_start=first.focal_sigma)
 
 
 def _judged(
