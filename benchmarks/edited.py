@@ -96,6 +96,28 @@ def _snow(frames: Frames) -> Frames:
     return found
 
 
+def _magnified(frames: Frames, by: Callable[[float], float]) -> Frames:
+    """Magnified about the middle, by a function of the time from 0 to 1."""
+    size = frames[0].shape[1::-1]
+    middle = (np.array(size) - 1) / 2
+    found = []
+    for time, frame in zip(np.linspace(0, 1, len(frames)), frames, strict=True):
+        warp = by(time) * np.eye(2, 3)
+        warp[:, 2] = middle - warp[:, :2] @ middle
+        found.append(cv2.warpAffine(frame, warp, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+    return found
+
+
+def _focusing(frames: Frames) -> Frames:
+    """A lens that focuses to and fro, which changes its focal length by a hundredth."""
+    return _magnified(frames, lambda time: 1 + 0.01 * np.sin(2.7 * np.pi * time))
+
+
+def _cropped(frames: Frames) -> Frames:
+    """A zoom by cropping, which shortens the readout of what it shows: in the mean by an eighth."""
+    return _magnified(frames, lambda time: 1 + 0.3 * time)
+
+
 #: What becomes of the frames, by name, and the frame rate that they are then said to have, by the present one.
 EDITS: dict[str, tuple[Callable[[Frames], Frames], float]] = {
     "lamps": (_lamps, 1.0),
@@ -112,6 +134,8 @@ EDITS: dict[str, tuple[Callable[[Frames], Frames], float]] = {
     "noise": (_noise, 1.0),
     "hood": (_hood, 1.0),
     "snow": (_snow, 1.0),
+    "focusing": (_focusing, 1.0),
+    "zoom": (_cropped, 1.0),
     "backwards": (lambda frames: frames[::-1], 1.0),
 }
 
