@@ -197,8 +197,9 @@ def _varying(solution: Solution) -> list[str]:
     if not solution.lens_varied:
         return []
     focal, centre = solution.quality["focal_sigma"], solution.quality["centre_sigma_focal_lengths"]
-    if not centre:
-        return [f"varying lens       f by {100 * focal:.2g} % from frame to frame (focusing, zooming)"]
+    if not centre:  # of a video, by a hundredth of a percent at least: a tenth of a pixel
+        line = f"varying lens       f by {100 * focal:.2g} % from frame to frame (focusing, zooming)"
+        return [line] if focal >= 1e-4 else []
     camera = next(iter(solution.cameras.values()))
     return [
         f"varying lens       f by {100 * focal:.2g} %, principal point by {centre * camera.K[0, 0]:.1f} px from photo "

@@ -1,7 +1,7 @@
 """What data looks like between the stages: frozen dataclasses of arrays."""
 
 from .bend import BEND_GROUPS, Bend
-from .camera import READOUTS, Camera, check_readout, other_axis
+from .camera import READOUTS, Camera, check_readout, opposite, other_axis
 from .control_point import ControlPoint
 from .depth import AtInfinity, Depth, DepthMap, Plane
 from .known_length import KnownLength
@@ -28,5 +28,6 @@ __all__ = [
     "SolvedImage",
     "check_readout",
     "check_shutter_model",
+    "opposite",
     "other_axis",
 ]

@@ -13,7 +13,7 @@ from ..errors import InputError
 from .checks import check_finite, check_numbers, check_one_of, check_whole, frozen
 from .field import folds, spline_coefficients
 
-__all__ = ["LENSES", "READOUTS", "Camera", "check_readout", "other_axis"]
+__all__ = ["LENSES", "READOUTS", "Camera", "check_readout", "opposite", "other_axis"]
 
 #: Readout directions, in the stored pixel frame: (axis of the clock, its sign).
 READOUTS: dict[str, tuple[int, float]] = {
@@ -33,6 +33,12 @@ def check_readout(readout: str, name: str = "readout") -> tuple[int, float]:
 def other_axis(readout: str) -> str:
     """A readout direction along the other axis; to reverse one is to negate the motion, and changes nothing else."""
     return ("top-to-bottom", "left-to-right")[READOUTS[readout][0]]
+
+
+def opposite(readout: str) -> str:
+    """The readout direction that runs the other way."""
+    axis, sign = READOUTS[readout]
+    return next(name for name, each in READOUTS.items() if each == (axis, -sign))
 
 
 #: Lens models, and the names of their coefficients in the order of `Camera.dist`.

@@ -5,9 +5,9 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,11 @@ from ..critical import heal
 from ..errors import ReconstructionError, RsUndistortWarning
 from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos
+from ..input.photo_cameras import PhotoCameras
 from ..input.stabilisation import Stabilisation, calmer_than_felt, judge_stabilisation
 from ..io.gyro import GyroLog
 from ..io.kept import Kept
-from ..model import Reconstruction
+from ..model import Reconstruction, opposite, other_axis
 from ..sfm import MatchedPhotos, retriangulate
 from ..verdict.judge_path import BY_SLOW_ROTATIONS, SIGMAS, ReadoutTime, judge_clip, unfollowed_px
 from .clip_gyroscope import Felt, felt_gyroscope, own_gyroscope, readout_of, rotations_between
@@ -57,6 +58,8 @@ _ROUGH_COST = 1e-4
 # A focal length changes from frame to frame, by focusing or zooming, if a first adjustment finds it to vary by more: it
 # does not know the path well, and leaves up to half of that of a lens that stays.
 _FOCUSES = 5e-4
+# Standard deviation of a readout time, as a share of the time between frames, that no false axis of it leaves.
+_CLEAR = 0.01
 # Readout time that counts as none, as a share of the time between frames.
 _NO_READOUT = 1e-6
 # Relative standard deviation of a readout time that is specified, or from the table.
@@ -66,6 +69,7 @@ _MEASURED = 0.7
 _OF_STABILISED = "what is taken for frames that were stabilised"
 _OF_GLOBAL = "what was given: a global shutter"
 
+_WithCameras = TypeVar("_WithCameras", Reconstruction, MatchedPhotos, PhotoCameras)
 # Result, its options, whether the frames are as the sensor read them, if that was tested, and the clip with the times
 # that the path has.
 _Found = tuple[BundleResult, BundleOptions, Stabilisation | None, Clip]
@@ -118,35 +122,82 @@ def solve_clip(
     """
     path = _at_once(path) if at_once else path
     known = path.readout
-    turned, explained = _turned(clip, keys, path, options_of, log)
     telemetry = own_gyroscope(clip) if gyroscope is None else None
-    if turned is not None and explained:
-        found = _only_turned(turned)
-    elif len(clip.names) == 2:
-        found = _of_two(clip, keys, path, options_of, log)
-    else:
-        try:
-            found = _travelled(
-                clip, keys, path, options_of, log, telemetry,
-                lambda: place_photos(keys, scratch, log, seed, matching, kept or Kept(), of_clip=True),
-            )  # fmt: skip
-        except ReconstructionError:
-            # no scene: rotations that explain neighbours are all that there is
-            if turned is None:
-                raise
-            found = _only_turned(turned)
-        else:
-            if turned is not None and _shows_readout(turned) and not _shows_readout(found):
-                found = _only_turned(turned)
+    # the scene of the key frames is that of a global shutter, whatever their lines are
+    placed = cache(lambda: place_photos(keys, scratch, log, seed, matching, kept or Kept(), of_clip=True))
+
+    def along(direction: str) -> tuple[LoadedPhotos, _Found]:
+        read_so = replace(keys, cameras=_read_along(direction, keys.cameras))
+        return read_so, _filmed_by(clip, read_so, path, options_of, log, telemetry, placed)
+
+    directions = (keys.cameras.of(0).readout,) if at_once else _directions(keys.cameras)
+    keys_so, found = along(directions[0])
+    if len(directions) > 1 and not (_shows_readout(found) and readout_of(found[0]).sigma < _CLEAR * clip.frame_s):
+        others = along(directions[1])
+        # lines that are none show something, too, but fit worse
+        if _shows_readout(others[1]) and not (_shows_readout(found) and found[0].sigma_px < others[1][0].sigma_px):
+            keys_so, found = others
+    if len(directions) > 1 and _shows_readout(found) and readout_of(found[0]).seconds < 0:
+        keys_so, found = along(opposite(keys_so.cameras.of(0).readout))
+    keys = keys_so
     as_said, (result, options, filmed, clip) = clip, found
     tell_of_gaps(as_said, clip)
-    if options.path is not None:
-        tell_if_held(options.path)
+    assert options.path is not None
+    if options.path.rotation_only:
+        warnings.warn(
+            "the camera only rotated: without parallax there are directions, but no positions and no scene",
+            RsUndistortWarning, stacklevel=3,
+        )  # fmt: skip
+    tell_if_held(options.path)
     alone = readout_of(result)
     # the telemetry of frames that were rotated since says nothing; those of a global shutter only look like them
     of_camera = None if _was_stabilised(filmed) and not at_once else gyroscope or telemetry
     result, options, felt = _with_gyroscope(result, options, of_camera, known, log)
     return _judged(clip, keys, result, options, alone, felt, filmed, telemetry, log, at_once)
+
+
+def _directions(cameras: PhotoCameras) -> tuple[str, ...]:
+    """Along which to read the frames, the likeliest first.
+
+    Sensors lie on their long side: frames that are stored upright were rotated since, or are a part of others.
+    """
+    camera = cameras.of(0)
+    if cameras.readout_specified[0] or camera.height <= camera.width:
+        return (camera.readout,)
+    return other_axis(camera.readout), camera.readout
+
+
+def _read_along(direction: str, of: _WithCameras) -> _WithCameras:
+    """The same with cameras that are read in another direction."""
+    return replace(of, cameras=tuple(replace(camera, readout=direction) for camera in of.cameras))
+
+
+def _filmed_by(
+    clip: Clip, keys: LoadedPhotos, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions],
+    log: StageLog, telemetry: GyroLog | None, placed: Callable[[], tuple[Reconstruction, MatchedPhotos]],
+) -> _Found:  # fmt: skip
+    """The path of the camera: of one that only rotates, through two frames, or of one that travels."""
+    turned, explained = _turned(clip, keys, path, options_of, log)
+    if turned is not None and explained:
+        return turned
+    if len(clip.names) == 2:
+        return _of_two(clip, keys, path, options_of, log)
+    direction = keys.cameras.of(0).readout
+
+    def read_so() -> tuple[Reconstruction, MatchedPhotos]:
+        mapped, matched = placed()
+        return _read_along(direction, mapped), _read_along(direction, matched)
+
+    try:
+        found = _travelled(clip, path, options_of, log, telemetry, read_so)
+    except ReconstructionError:
+        # no scene: rotations that explain neighbours are all that there is
+        if turned is None:
+            raise
+        return turned
+    if turned is not None and _shows_readout(turned) and not _shows_readout(found):
+        return turned
+    return found
 
 
 def _with_gyroscope(
@@ -228,15 +279,6 @@ def _shows_readout(found: _Found) -> bool:
     return not _was_stabilised(found[2]) and bool(abs(time.seconds) > SIGMAS * time.sigma)
 
 
-def _only_turned(turned: _Found) -> _Found:
-    """The same, said aloud."""
-    warnings.warn(
-        "the camera only rotated: without parallax there are directions, but no positions and no scene",
-        RsUndistortWarning, stacklevel=4,
-    )  # fmt: skip
-    return turned
-
-
 def _of_two(
     clip: Clip, keys: LoadedPhotos, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions],
     log: StageLog,
@@ -257,7 +299,7 @@ def _of_two(
 
 
 def _travelled(
-    clip: Clip, keys: LoadedPhotos, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions],
+    clip: Clip, path: FramePath, options_of: Callable[[Reconstruction], BundleOptions],
     log: StageLog, telemetry: GyroLog | None, placed: Callable[[], tuple[Reconstruction, MatchedPhotos]],
 ) -> _Found:  # fmt: skip
     """The path of a camera that travels, from the scene of its key frames, mapped as of a global shutter."""
