@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from ..input.key_frames import Clip
@@ -20,6 +22,8 @@ from .clip_tracks import Followed, follow
 
 __all__ = ["rotating_only", "rotation_between"]
 
+_Corners = tuple[NDArray[np.float64], NDArray[np.float64]]
+
 # Tolerance for the shutter where frames are rotated onto each other, pixels; and median that may be left when rotations
 # of the lines of both frames are removed, too: the content moves by fifty from key to key, and translation leaves a
 # part of that.
@@ -29,6 +33,8 @@ _TRIALS = 20
 # Samples of so many points that are asked for rotations of the lines, radians by which a camera may rotate, times the
 # median that may be left by which points may differ from them, and times that all points are asked then.
 _SAMPLES, _FEW, _FAST, _AT_FIRST, _FITS = 100, 6, 0.1, 6.0, 10
+# A focal length that nobody knows is off by such a factor at most; how many are tried, and key frames asked.
+_MOST_OFF, _GRID, _ASKED = 2.0, 9, 6
 # Key frames before a cut that one after it may show again, its features that may, and how much nearer than the next one
 # a match is.
 _LAST, _MATCHED, _NEARER = 4, 2048, 0.8
@@ -43,6 +49,8 @@ def rotating_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
     camera = keys.cameras.of(0)
     step = np.array([camera.width, camera.height]) / flow_size(camera.width, camera.height)
     corners = [(step * (each.first_xy + 0.5) - 0.5, step * (each.second_xy + 0.5) - 0.5) for each in clip.flows]
+    if corners and keys.cameras.without_focal:
+        camera = _with_likeliest_focal(corners, camera)
     # corners of key frames show it in no time, so that the frames between need not be followed
     if corners and not _only_rotates([_beyond_rotation(first, second, camera) for first, second in corners], camera):
         return None
@@ -52,7 +60,32 @@ def rotating_only(clip: Clip, keys: LoadedPhotos) -> Reconstruction | None:
     chained = _chained(clip, camera, features)
     if chained is None or 2 * len(chained[2]) < len(clip.names):
         return None
-    return _joined(clip, keys, chained[0], shown, *chained[1:])
+    return _joined(clip, camera, chained[0], shown, *chained[1:])
+
+
+def _with_likeliest_focal(corners: Sequence[_Corners], camera: Camera) -> Camera:
+    """The camera with the focal length by which rotations explain corners of key frames and the next ones best.
+
+    That of a guess, since no parallax says more, may be off by half, and rotations do not explain any frame by it.
+    """
+    some = [corners[k] for k in np.unique(np.linspace(0, len(corners) - 1, _ASKED).astype(int)).tolist()]
+
+    def with_focal(log_ratio: float) -> Camera:
+        ratio = np.exp(log_ratio)
+        return replace(camera, K=camera.K * [[ratio, 1.0, 1.0], [1.0, ratio, 1.0], [1.0, 1.0, 1.0]])
+
+    def left_px(log_ratio: float) -> float:
+        other = with_focal(log_ratio)
+        left = float(np.median([_beyond_rotation(first, second, other) for first, second in some]))
+        return left * float(other.K[0, 0])
+
+    tried = np.linspace(-np.log(_MOST_OFF), np.log(_MOST_OFF), _GRID)
+    values = [left_px(each) for each in tried.tolist()]
+    best = int(np.argmin(values))
+    if not np.isfinite(values[best]):
+        return camera
+    around = tried[max(best - 1, 0)], tried[min(best + 1, _GRID - 1)]
+    return with_focal(float(minimize_scalar(left_px, bounds=around, method="bounded", options={"xatol": 1e-3}).x))
 
 
 def _only_rotates(left: Sequence[float], camera: Camera) -> bool:
@@ -138,7 +171,7 @@ def _matches(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[NDArr
 
 
 def _joined(
-    clip: Clip, keys: LoadedPhotos, followed: Followed, shown: dict[int, NDArray[np.float64]],
+    clip: Clip, camera: Camera, followed: Followed, shown: dict[int, NDArray[np.float64]],
     own: dict[int, NDArray[np.float64]], R_cw: dict[int, NDArray[np.float64]],
 ) -> Reconstruction:  # fmt: skip
     """The frames with known rotations, and their measurements."""
@@ -152,7 +185,7 @@ def _joined(
     num = sum(len(own[key]) for key in order)
     at_key = np.concatenate([np.full(len(own[key]), index[key]) for key in order])
     rec = Reconstruction(
-        [keys.cameras.of(0)], [clip.names[k] for k in placed.tolist()], np.zeros(len(placed), np.int64),
+        [camera], [clip.names[k] for k in placed.tolist()], np.zeros(len(placed), np.int64),
         np.array([R_cw[k] for k in placed.tolist()]), np.zeros((len(placed), 3)),
         np.concatenate([own[key] @ R_cw[key] for key in order]),
         Observations(

@@ -17,7 +17,7 @@ from ..bundle import BundleOptions, BundleResult, bundle_adjust
 from ..bundle.own_motions import OwnMotions, own_motions
 from ..bundle.path_prior import FramePath, PathStart
 from ..critical import heal
-from ..errors import ReconstructionError, RsUndistortWarning
+from ..errors import InputError, ReconstructionError, RsUndistortWarning
 from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos
 from ..input.photo_cameras import PhotoCameras
@@ -131,12 +131,18 @@ def solve_clip(
         return read_so, _filmed_by(clip, read_so, path, options_of, log, telemetry, placed)
 
     directions = (keys.cameras.of(0).readout,) if at_once else _directions(keys.cameras)
-    keys_so, found = along(directions[0])
-    if len(directions) > 1 and not (_shows_readout(found) and readout_of(found[0]).sigma < _CLEAR * clip.frame_s):
-        others = along(directions[1])
-        # lines that are none show something, too, but fit worse
-        if _shows_readout(others[1]) and not (_shows_readout(found) and found[0].sigma_px < others[1][0].sigma_px):
-            keys_so, found = others
+    tried, failed = list[tuple[LoadedPhotos, _Found]](), None
+    for direction in directions:
+        try:
+            tried.append(along(direction))
+        except (InputError, ReconstructionError) as error:
+            failed = failed or error
+        if tried and readout_of(tried[-1][1][0]).sigma < _CLEAR * clip.frame_s and _shows_readout(tried[-1][1]):
+            break
+    if not tried and failed is not None:
+        raise failed
+    # lines that are none show something, too, but fit worse
+    keys_so, found = min(tried, key=lambda each: each[1][0].sigma_px if _shows_readout(each[1]) else np.inf)
     if len(directions) > 1 and _shows_readout(found) and readout_of(found[0]).seconds < 0:
         keys_so, found = along(opposite(keys_so.cameras.of(0).readout))
     keys = keys_so
@@ -261,7 +267,8 @@ def _turned_in_time(
     """
     as_said, rounds = (clip, path), 0
     while True:
-        how = _at_first(replace(options, path=path))
+        # the focal length would absorb wild rotations that the path smooths yet
+        how = _at_first(replace(options, path=path, refine=()))
         result = bundle_adjust(start, "constant-motion", how, partial(_tell, log, "rotations"))
         # it smooths wild rotations, which leaves an error several times as large as that of the next one
         if result.sigma_px >= _AT_FIRST * _FLOW_PX:
