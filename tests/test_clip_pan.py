@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera
 from rsundistort.sfm.features import Features
-from rsundistort.solve.clip_pan import _LEFT_PX, _beyond_rotation, _matches, _seen_again
+from rsundistort.solve.clip_pan import _LEFT_PX, _beyond_rotation, _matches, _seen_again, _with_likeliest_focal
 
 F = 500.0
 CAMERA = Camera(640, 360, [[F, 0, 320], [0, F, 180], [0, 0, 1]])
@@ -95,3 +95,17 @@ def test_matches_are_mutual_and_clear() -> None:
     assert a.tolist() == list(range(18))
     assert (b == 19 - a).all()
     assert not len(_matches(first[:1], first)[0])
+
+
+@pytest.mark.parametrize("guess", [300.0, 480.0, 700.0])
+def test_a_pan_says_the_focal_length_that_nobody_knows(guess: float) -> None:
+    corners = [two_frames(np.random.default_rng(seed), 0.1) for seed in range(12)]
+    found = _with_likeliest_focal(corners, Camera(640, 360, [[guess, 0, 320], [0, guess, 180], [0, 0, 1]]))
+    assert abs(found.K[0, 0] / F - 1.0) < 0.04
+    assert found.K[0, 0] == found.K[1, 1]
+    np.testing.assert_array_equal(found.K[:2, 2], [320, 180])
+
+
+def test_corners_that_fit_no_rotation_leave_the_guess() -> None:
+    nothing = np.zeros((3, 2)), np.zeros((3, 2))
+    assert _with_likeliest_focal([nothing], CAMERA) == CAMERA

@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from rsundistort import BundleOptions
+from rsundistort import BundleOptions, Camera
 from rsundistort.batch.progress import StageLog
 from rsundistort.bundle.path_prior import FramePath
-from rsundistort.errors import ReconstructionError, RsUndistortWarning
+from rsundistort.errors import InputError, ReconstructionError, RsUndistortWarning
+from rsundistort.input.load import LoadedPhotos
+from rsundistort.input.photo_cameras import PhotoCameras
 from rsundistort.solve import video_path
 from rsundistort.verdict.judge_path import ReadoutTime
 
 PATH = FramePath({}, 1 / 30)
 TURNED, TRAVELLED = "the path of a camera that only rotated", "the path through a scene"
 CLIP = SimpleNamespace(names=["a", "b", "c"], time_s=np.arange(3) / 30, frame_s=1 / 30, part=np.zeros(3, int))
+
+
+def keys_of(camera, specified=False):
+    """Key frames of a camera."""
+    cameras = PhotoCameras([camera], ["camera"], np.zeros(3, int), True, (specified,), "here")
+    return LoadedPhotos(["a", "b", "c"], [], [], {}, cameras, {}, Path(), {}, 1.0)
 
 
 @pytest.fixture
@@ -29,10 +39,10 @@ def solve(monkeypatch):
                 raise ReconstructionError("no scene point could be triangulated")
             return scene, BundleOptions(path=PATH), filmed, CLIP
 
-        found = turned and (turned, BundleOptions(path=PATH), None, CLIP)
+        found = turned and (turned, BundleOptions(path=replace(PATH, rotation_only=True)), None, CLIP)
         monkeypatch.setattr(video_path, "_turned", lambda *_: (found, explained))
         monkeypatch.setattr(video_path, "_travelled", travelled)
-        return video_path.solve_clip(CLIP, None, PATH, None, None, StageLog(None))
+        return video_path.solve_clip(CLIP, keys_of(Camera(64, 36, np.eye(3))), PATH, None, None, StageLog(None))
 
     monkeypatch.setattr(video_path, "own_gyroscope", lambda _: None)
     monkeypatch.setattr(video_path, "readout_of", lambda _: ReadoutTime(0.01, 0.001))
@@ -69,3 +79,51 @@ def test_a_scene_that_shows_no_readout_is_none_if_rotations_show_one(solve, monk
 
 def test_a_scene_that_shows_a_readout_stays(solve):
     assert solve(TURNED, False, TRAVELLED) == TRAVELLED
+
+
+ROUGH, EXACT = ReadoutTime(0.02, 3e-3), ReadoutTime(0.01, 1e-4)
+UPRIGHT, LYING = Camera(36, 64, np.eye(3)), Camera(64, 36, np.eye(3))
+NOTHING = ReadoutTime(0.01, 0.01)
+
+
+@pytest.mark.parametrize(
+    ("camera", "specified", "by_direction", "expected"),
+    [
+        # sensors lie on their long side
+        (UPRIGHT, False, {"left-to-right": (EXACT, 0.1)}, "left-to-right"),
+        (UPRIGHT, False, {"left-to-right": (ReadoutTime(-0.02, 1e-4), 0.1), "right-to-left": (NOTHING, 0.1)},
+         "right-to-left"),
+        # a part of a frame that lay
+        (UPRIGHT, False, {"left-to-right": (NOTHING, 0.1), "top-to-bottom": (EXACT, 0.1)}, "top-to-bottom"),
+        (UPRIGHT, False, {"left-to-right": (ROUGH, 0.2), "top-to-bottom": (EXACT, 0.1)}, "top-to-bottom"),
+        (UPRIGHT, False, {"left-to-right": (ROUGH, 0.1), "top-to-bottom": (EXACT, 0.2)}, "left-to-right"),
+        (UPRIGHT, False, {"left-to-right": (NOTHING, 0.1), "top-to-bottom": (NOTHING, 0.1)}, "left-to-right"),
+        (UPRIGHT, False, {"left-to-right": None, "top-to-bottom": (NOTHING, 0.1)}, "top-to-bottom"),
+        # what is specified, and frames that lie, are not asked
+        (UPRIGHT, True, {"top-to-bottom": (NOTHING, 0.1)}, "top-to-bottom"),
+        (LYING, False, {"top-to-bottom": (NOTHING, 0.1)}, "top-to-bottom"),
+    ],
+)  # fmt: skip
+def test_the_lines_of_frames_that_stand_are_those_that_fit(monkeypatch, camera, specified, by_direction, expected):
+    def filmed(clip, keys, *_):
+        found = by_direction[keys.cameras.of(0).readout]
+        if found is None:
+            raise InputError("it does not fit at all")
+        return SimpleNamespace(time=found[0], sigma_px=found[1]), BundleOptions(path=PATH), None, CLIP
+
+    monkeypatch.setattr(video_path, "_filmed_by", filmed)
+    monkeypatch.setattr(video_path, "own_gyroscope", lambda _: None)
+    monkeypatch.setattr(video_path, "readout_of", lambda result: result.time)
+    monkeypatch.setattr(video_path, "_judged", lambda clip, keys, *_: keys.cameras.of(0).readout)
+    found = video_path.solve_clip(CLIP, keys_of(camera, specified), PATH, None, None, StageLog(None))
+    assert found == expected
+
+
+def test_frames_that_fit_along_no_axis_say_why(monkeypatch):
+    def filmed(*_):
+        raise ReconstructionError("no scene point could be triangulated")
+
+    monkeypatch.setattr(video_path, "_filmed_by", filmed)
+    monkeypatch.setattr(video_path, "own_gyroscope", lambda _: None)
+    with pytest.raises(ReconstructionError, match="no scene point"):
+        video_path.solve_clip(CLIP, keys_of(UPRIGHT), PATH, None, None, StageLog(None))

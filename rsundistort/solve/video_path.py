@@ -127,7 +127,8 @@ def solve_clip(
     placed = cache(lambda: place_photos(keys, scratch, log, seed, matching, kept or Kept(), of_clip=True))
 
     def along(direction: str) -> tuple[LoadedPhotos, _Found]:
-        read_so = replace(keys, cameras=_read_along(direction, keys.cameras))
+        as_stored = direction == keys.cameras.of(0).readout
+        read_so = keys if as_stored else replace(keys, cameras=_read_along(direction, keys.cameras))
         return read_so, _filmed_by(clip, read_so, path, options_of, log, telemetry, placed)
 
     directions = (keys.cameras.of(0).readout,) if at_once else _directions(keys.cameras)
@@ -141,8 +142,9 @@ def solve_clip(
             break
     if not tried and failed is not None:
         raise failed
-    # lines that are none show something, too, but fit worse
-    keys_so, found = min(tried, key=lambda each: each[1][0].sigma_px if _shows_readout(each[1]) else np.inf)
+    keys_so, found = tried[0]
+    if len(tried) > 1:  # lines that are none show something, too, but fit worse
+        keys_so, found = min(tried, key=lambda each: each[1][0].sigma_px if _shows_readout(each[1]) else np.inf)
     if len(directions) > 1 and _shows_readout(found) and readout_of(found[0]).seconds < 0:
         keys_so, found = along(opposite(keys_so.cameras.of(0).readout))
     keys = keys_so
