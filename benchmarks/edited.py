@@ -12,7 +12,7 @@ import numpy as np
 
 from rsundistort.io.video_writer import write_video
 
-__all__ = ["EDITS", "edited"]
+__all__ = ["EDITS", "OF_NO_CAMERA", "edited"]
 
 Frames = list[np.ndarray]
 
@@ -136,8 +136,13 @@ EDITS: dict[str, tuple[Callable[[Frames], Frames], float]] = {
     "snow": (_snow, 1.0),
     "focusing": (_focusing, 1.0),
     "zoom": (_cropped, 1.0),
+    "no camera": (lambda frames: frames, 1.0),
+    "upright": (lambda frames: [cv2.rotate(frame, cv2.ROTATE_90_CLOCKWISE) for frame in frames], 1.0),
     "backwards": (lambda frames: frames[::-1], 1.0),
 }
+
+#: Edits after which nobody knows the camera.
+OF_NO_CAMERA = ("no camera", "upright")
 
 
 def edited(video: Path, out: Path, edit: str) -> None:

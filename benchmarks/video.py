@@ -47,7 +47,7 @@ import av
 import cv2
 import numpy as np
 from clips import clip_folder
-from edited import EDITS, edited
+from edited import EDITS, OF_NO_CAMERA, edited
 from field import OURS, PEER, in_child
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -101,7 +101,7 @@ PARTS = (
 )
 
 
-def solved_clip(video: Path, camera: str, readout_s: float | None = None) -> tuple[Solved, float]:
+def solved_clip(video: Path, camera: str | None, readout_s: float | None = None) -> tuple[Solved, float]:
     """A clip solved, and the processor's seconds that it took."""
     began = time.process_time()
     with tempfile.TemporaryDirectory() as scratch:
@@ -350,10 +350,11 @@ def edits(args: argparse.Namespace) -> None:
             folder = clip_folder(args.clips, kind, seed)
             true_s = read_solution(folder / "ground_truth.json").options["readout_ms"] / 1e3
             said: dict[str, Any] = {"edit": name, "clip": folder.name}
+            camera = None if name in OF_NO_CAMERA else str(folder / "camera.json")
             with tempfile.TemporaryDirectory() as scratch:
                 edited(folder / "clip.mp4", Path(scratch) / "clip.mp4", name)
                 try:
-                    solved, _ = solved_clip(Path(scratch) / "clip.mp4", str(folder / "camera.json"))
+                    solved, _ = solved_clip(Path(scratch) / "clip.mp4", camera)
                 except Exception as error:  # counted, as what a user would see
                     print(json.dumps(said | {"error": str(error)}), flush=True)
                     continue
