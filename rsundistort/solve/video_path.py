@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +20,13 @@ from ..critical import heal
 from ..errors import InputError, ReconstructionError, RsUndistortWarning
 from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos
-from ..input.photo_cameras import PhotoCameras
 from ..input.stabilisation import Stabilisation, calmer_than_felt, judge_stabilisation
 from ..io.gyro import GyroLog
 from ..io.kept import Kept
-from ..model import Reconstruction, opposite, other_axis
+from ..model import Reconstruction, opposite
 from ..sfm import MatchedPhotos, retriangulate
 from ..verdict.judge_path import BY_SLOW_ROTATIONS, SIGMAS, ReadoutTime, judge_clip, unfollowed_px
+from .clip_direction import likely_directions, read_along
 from .clip_gyroscope import Felt, felt_gyroscope, own_gyroscope, readout_of, rotations_between
 from .clip_pair import FramePair
 from .clip_pan import rotating_only
@@ -69,7 +69,6 @@ _MEASURED = 0.7
 _OF_STABILISED = "what is taken for frames that were stabilised"
 _OF_GLOBAL = "what was given: a global shutter"
 
-_WithCameras = TypeVar("_WithCameras", Reconstruction, MatchedPhotos, PhotoCameras)
 # Result, its options, whether the frames are as the sensor read them, if that was tested, and the clip with the times
 # that the path has.
 _Found = tuple[BundleResult, BundleOptions, Stabilisation | None, Clip]
@@ -128,26 +127,11 @@ def solve_clip(
 
     def along(direction: str) -> tuple[LoadedPhotos, _Found]:
         as_stored = direction == keys.cameras.of(0).readout
-        read_so = keys if as_stored else replace(keys, cameras=_read_along(direction, keys.cameras))
+        read_so = keys if as_stored else replace(keys, cameras=read_along(direction, keys.cameras))
         return read_so, _filmed_by(clip, read_so, path, options_of, log, telemetry, placed)
 
-    directions = (keys.cameras.of(0).readout,) if at_once else _directions(keys.cameras)
-    tried, failed = list[tuple[LoadedPhotos, _Found]](), None
-    for direction in directions:
-        try:
-            tried.append(along(direction))
-        except (InputError, ReconstructionError) as error:
-            failed = failed or error
-        if tried and readout_of(tried[-1][1][0]).sigma < _CLEAR * clip.frame_s and _shows_readout(tried[-1][1]):
-            break
-    if not tried and failed is not None:
-        raise failed
-    keys_so, found = tried[0]
-    if len(tried) > 1:  # lines that are none show something, too, but fit worse
-        keys_so, found = min(tried, key=lambda each: each[1][0].sigma_px if _shows_readout(each[1]) else np.inf)
-    if len(directions) > 1 and _shows_readout(found) and readout_of(found[0]).seconds < 0:
-        keys_so, found = along(opposite(keys_so.cameras.of(0).readout))
-    keys = keys_so
+    directions = (keys.cameras.of(0).readout,) if at_once else likely_directions(keys.cameras)
+    keys, found = _as_read(directions, along, clip.frame_s)
     as_said, (result, options, filmed, clip) = clip, found
     tell_of_gaps(as_said, clip)
     assert options.path is not None
@@ -164,20 +148,26 @@ def solve_clip(
     return _judged(clip, keys, result, options, alone, felt, filmed, telemetry, log, at_once)
 
 
-def _directions(cameras: PhotoCameras) -> tuple[str, ...]:
-    """Along which to read the frames, the likeliest first.
-
-    Sensors lie on their long side: frames that are stored upright were rotated since, or are a part of others.
-    """
-    camera = cameras.of(0)
-    if cameras.readout_specified[0] or camera.height <= camera.width:
-        return (camera.readout,)
-    return other_axis(camera.readout), camera.readout
-
-
-def _read_along(direction: str, of: _WithCameras) -> _WithCameras:
-    """The same with cameras that are read in another direction."""
-    return replace(of, cameras=tuple(replace(camera, readout=direction) for camera in of.cameras))
+def _as_read(
+    directions: Sequence[str], along: Callable[[str], tuple[LoadedPhotos, _Found]], frame_s: float
+) -> tuple[LoadedPhotos, _Found]:
+    """The key frames and their path, read in the one of these directions that fits; the way round as lines say."""
+    tried, failed = list[tuple[LoadedPhotos, _Found]](), None
+    for direction in directions:
+        try:
+            tried.append(along(direction))
+        except (InputError, ReconstructionError) as error:
+            failed = failed or error
+        if tried and readout_of(tried[-1][1][0]).sigma < _CLEAR * frame_s and _shows_readout(tried[-1][1]):
+            break
+    if not tried and failed is not None:
+        raise failed
+    keys, found = tried[0]
+    if len(tried) > 1:  # lines that are none show something, too, but fit worse
+        keys, found = min(tried, key=lambda each: each[1][0].sigma_px if _shows_readout(each[1]) else np.inf)
+    if len(directions) > 1 and _shows_readout(found) and readout_of(found[0]).seconds < 0:
+        return along(opposite(keys.cameras.of(0).readout))
+    return keys, found
 
 
 def _filmed_by(
@@ -194,7 +184,7 @@ def _filmed_by(
 
     def read_so() -> tuple[Reconstruction, MatchedPhotos]:
         mapped, matched = placed()
-        return _read_along(direction, mapped), _read_along(direction, matched)
+        return read_along(direction, mapped), read_along(direction, matched)
 
     try:
         found = _travelled(clip, path, options_of, log, telemetry, read_so)
