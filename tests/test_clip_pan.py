@@ -106,6 +106,9 @@ def test_a_pan_says_the_focal_length_that_nobody_knows(guess: float) -> None:
     np.testing.assert_array_equal(found.K[:2, 2], [320, 180])
 
 
-def test_corners_that_fit_no_rotation_leave_the_guess() -> None:
+def test_corners_that_say_nothing_of_a_focal_length_leave_the_guess() -> None:
     nothing = np.zeros((3, 2)), np.zeros((3, 2))
     assert _with_likeliest_focal([nothing], CAMERA) == CAMERA
+    xy = np.random.default_rng(0).uniform([0, 0], [640, 360], (150, 2))
+    slides_by = xy, xy + np.array([40.0, 3.0])
+    assert _with_likeliest_focal([slides_by], CAMERA) == CAMERA

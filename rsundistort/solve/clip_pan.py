@@ -82,9 +82,10 @@ def _with_likeliest_focal(corners: Sequence[_Corners], camera: Camera) -> Camera
     tried = np.linspace(-np.log(_MOST_OFF), np.log(_MOST_OFF), _GRID)
     values = [left_px(each) for each in tried.tolist()]
     best = int(np.argmin(values))
-    if not np.isfinite(values[best]):
+    # what slides by without any perspective asks for ever longer ones
+    if best in (0, _GRID - 1) or not np.isfinite(values[best]):
         return camera
-    around = tried[max(best - 1, 0)], tried[min(best + 1, _GRID - 1)]
+    around = tried[best - 1], tried[best + 1]
     return with_focal(float(minimize_scalar(left_px, bounds=around, method="bounded", options={"xatol": 1e-3}).x))
 
 

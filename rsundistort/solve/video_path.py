@@ -231,7 +231,10 @@ def _turned(
     if start is not None:
         path = replace(path, rotation_only=True)
         options = replace(options_of(start), path=path)
-        result, own, clip, path = _turned_in_time(clip, path, start, options, log)
+        # a focal length that the rotations said would absorb wild ones, which the path smooths yet
+        said = start.cameras[0] != keys.cameras.of(0)
+        rough = replace(options, refine=()) if said else options
+        result, own, clip, path = _turned_in_time(clip, path, start, rough, log)
         if own is not None:
             path = held_by_slow_rotations(clip, result.reconstruction, path, own)
             options = _if_it_focuses(replace(options, path=path), result)
@@ -259,8 +262,7 @@ def _turned_in_time(
     """
     as_said, rounds = (clip, path), 0
     while True:
-        # the focal length would absorb wild rotations that the path smooths yet
-        how = _at_first(replace(options, path=path, refine=()))
+        how = _at_first(replace(options, path=path))
         result = bundle_adjust(start, "constant-motion", how, partial(_tell, log, "rotations"))
         # it smooths wild rotations, which leaves an error several times as large as that of the next one
         if result.sigma_px >= _AT_FIRST * _FLOW_PX:
