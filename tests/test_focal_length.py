@@ -20,15 +20,20 @@ from rsundistort.input.unknown_focal import with_focal_lengths
 from rsundistort.sfm import USUAL_FOCAL, estimate_focal_length
 
 SIZE = (1280, 960)
+CAMERA = Camera(*SIZE, np.diag([1.0, 1.0, 1.0]))
 
 
-def shown(rng, focal, points_w, turn=0.25, travel=1.0, noise_px=0.4, wrong=0.1):
-    """Matches of two photos, some of them wrong."""
+def shown(rng, focal, points_w, turn=0.25, travel=1.0, noise_px=0.4, wrong=0.1, phi_rad=0.0):
+    """Matches of two photos, some of them wrong; the camera rotated while they were read."""
     middle = (np.array(SIZE) - 1) / 2
     seen = []
     for _ in range(2):
         R_cw = Rotation.from_rotvec(rng.normal(0, turn, 3)).as_matrix()
-        x_c = (points_w - travel * rng.normal(0, 1.0, 3)) @ R_cw.T
+        still = (points_w - travel * rng.normal(0, 1.0, 3)) @ R_cw.T
+        phi, x_c = rng.normal(0, phi_rad, 3) * focal / SIZE[1], still
+        for _ in range(5):
+            clock = np.clip(x_c[:, 1:2] / x_c[:, 2:], -1.0, 1.0)
+            x_c = Rotation.from_rotvec(clock * phi).apply(still)
         seen.append(x_c)
     ahead = (seen[0][:, 2] > 0.5) & (seen[1][:, 2] > 0.5)
     first, second = (
@@ -45,10 +50,19 @@ def in_a_room(rng):
 
 @pytest.mark.parametrize("focal", [600.0, 1000.0, 2400.0])
 def test_pairs_of_a_scene_tell_the_focal_length_as_well_as_they_say(rng, focal):
-    found = estimate_focal_length([shown(rng, focal, in_a_room(rng)) for _ in range(10)], SIZE)
+    found = estimate_focal_length([shown(rng, focal, in_a_room(rng)) for _ in range(10)], CAMERA)
     assert abs(np.log(found.pixels / focal)) < 2.5 * found.sigma
     assert found.sigma < 0.12
     assert found.num_pairs == 10
+
+
+def test_a_shutter_does_not_pass_for_another_focal_length():
+    errors = []
+    for k in range(4):
+        rng = np.random.default_rng(k)
+        pairs = [shown(rng, 1000.0, in_a_room(rng), turn=0.1, travel=0.4, phi_rad=0.03) for _ in range(10)]
+        errors.append(np.log(estimate_focal_length(pairs, CAMERA).pixels / 1000.0))
+    assert np.sqrt(np.mean(np.square(errors))) < 0.015  # 0.024 by poses without a shutter
 
 
 @pytest.mark.parametrize("of", ["a plane", "a camera that rotated"])
@@ -59,13 +73,13 @@ def test_what_tells_nothing_is_not_believed(rng, of):
         shown(rng, focal, plane) if of == "a plane" else shown(rng, focal, in_a_room(rng), travel=0.0)
         for _ in range(10)
     ]
-    found = estimate_focal_length(pairs, SIZE)
+    found = estimate_focal_length(pairs, CAMERA)
     assert found.sigma > 0.15
     assert abs(np.log(found.pixels / focal)) < 2.5 * found.sigma
 
 
 def test_without_pairs_it_is_what_is_usual():
-    found = estimate_focal_length([], SIZE)
+    found = estimate_focal_length([], CAMERA)
     assert found.num_pairs == 0
     assert (found.pixels, found.sigma) == (pytest.approx(USUAL_FOCAL[0] * SIZE[0]), USUAL_FOCAL[1])
 

@@ -21,7 +21,7 @@ from .pairing import capture_sequences, places_of
 __all__ = ["with_focal_lengths"]
 
 # Number of features of a photo, the largest, and of pairs of each camera that are used.
-_FEATURES, _PAIRS = 4096, 60
+_FEATURES, _PAIRS = 4096, 30
 # Matches of a pair that overlaps.
 _LEAST_MATCHES = 60
 # Threshold of fundamental matrices, in pixels of the image that the features were detected in: a shutter bends by some.
@@ -84,10 +84,9 @@ def _focal_length(photos: LoadedPhotos, camera: int, seed: int) -> FocalLength:
         len(mine), capture_sequences(names, of_one, facts), places_of(facts),
         global_descriptors([each.descriptors for each in features], seed),
     )  # fmt: skip
-    size = cameras.cameras[camera].width, cameras.cameras[camera].height
     step_px = float(np.median([each.step_px for each in features]))
     if not len(pairs):
-        return estimate_focal_length([], size)
+        return estimate_focal_length([], cameras.cameras[camera])
     few = pairs[np.unique(np.linspace(0, len(pairs) - 1, _PAIRS).astype(np.int64))]
     with work_folder() as work:
         matched = match_photos(
@@ -101,4 +100,4 @@ def _focal_length(photos: LoadedPhotos, camera: int, seed: int) -> FocalLength:
         for (i, j), matches in verified.items()
         if len(matches) >= _LEAST_MATCHES
     ]
-    return estimate_focal_length(shown, size, step_px, seed)
+    return estimate_focal_length(shown, cameras.cameras[camera], step_px, seed)

@@ -22,9 +22,11 @@ __all__ = [
     "Pair",
     "RelativePose",
     "View",
+    "adjusted_pose",
     "find_relative_pose",
     "phi_information",
     "relative_poses",
+    "suggested_poses",
 ]
 
 # Five points suggest a pose with thresholds of these pixels: what fits a narrow one is a part of the photos that the
@@ -165,11 +167,11 @@ def find_relative_pose(pair: Pair, phi_sigma: float) -> RelativePose | None:
     RelativePose
         Or None if no five points agree on one.
     """
-    starts = _suggested(pair)
+    starts = suggested_poses(pair)
     if not starts:
         return None
-    found = [_adjusted(start, pair, phi_sigma, _WIDTHS_PX[0]) for start in starts]
-    return _ahead(_adjusted(min(found, key=lambda each: each.cost), pair, phi_sigma, _WIDTHS_PX[1]), pair)
+    found = [adjusted_pose(start, pair, phi_sigma, _WIDTHS_PX[0]) for start in starts]
+    return _ahead(adjusted_pose(min(found, key=lambda each: each.cost), pair, phi_sigma, _WIDTHS_PX[1]), pair)
 
 
 def relative_poses(pairs: Sequence[Pair]) -> tuple[list[RelativePose | None], float]:
@@ -191,13 +193,13 @@ def relative_poses(pairs: Sequence[Pair]) -> tuple[list[RelativePose | None], fl
         # the middle of the pairs: one of false matches moves as it likes
         sigma = max(float(np.sqrt(np.median(squares) / max(np.median(known), 1e-3))), NO_SHUTTER)
         poses = [
-            None if pose is None else _adjusted(pose, pair, sigma, _WIDTHS_PX[1])
+            None if pose is None else adjusted_pose(pose, pair, sigma, _WIDTHS_PX[1])
             for pose, pair in zip(poses, pairs, strict=True)
         ]
     return [None if pose is None else _ahead(pose, pair) for pose, pair in zip(poses, pairs, strict=True)], sigma
 
 
-def _suggested(pair: Pair) -> list[RelativePose]:
+def suggested_poses(pair: Pair) -> list[RelativePose]:
     """Poses by five points each, without a shutter."""
     if len(pair.first.clock) < _LEAST_MATCHES:
         return []
@@ -214,8 +216,11 @@ def _suggested(pair: Pair) -> list[RelativePose]:
     return poses
 
 
-def _adjusted(start: RelativePose, pair: Pair, phi_sigma: float, width: float) -> RelativePose:
-    """Pose and motions by Levenberg and Marquardt's steps under a loss of such a width, in pixels."""
+def adjusted_pose(start: RelativePose, pair: Pair, phi_sigma: float, width: float) -> RelativePose:
+    """Pose and motions by Levenberg and Marquardt's steps under a loss of such a width, in pixels.
+
+    `phi_sigma` is the prior standard deviation of phi, radians a frame.
+    """
     weights = (pair.frame_spans / phi_sigma) ** 2
     H, g = np.empty((11, 11)), np.empty(11)
 
