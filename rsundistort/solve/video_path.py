@@ -328,7 +328,8 @@ def _travelled(
             held = held_by_slow_rotations(clip, on_path, path, own_motions(on_path))
         options, is_first = replace(options_of(whole), path=held), result is None
         if result is None:
-            how = _at_first(options)
+            # a camera that nobody knows would take the lines' rotations for its lens; mapping refined it
+            how = _at_first(options if matched.calibrated else replace(options, refine=()))
         else:
             options = _if_it_focuses(replace(options, path=replace(held, start=_start_of(result))), result)
             how = replace(options, outlier_rounds=1, prior_sigma_rounds=_SIGMA_ROUNDS, prior_sigma_tolerance=_SETTLED)
