@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FormatError, InputError, RsUndistortError, RsUndistortWarning
-from .ffmpeg_reasons import ffmpeg_errors
+from .ffmpeg_reasons import open_video
 from .gyro import CAMERA_FROM_GYROFLOW, GyroLog, parse_axes
 
 __all__ = ["GyroPayload", "has_telemetry", "parse_payload", "read_gpmf"]
@@ -111,7 +111,7 @@ class GyroPayload:
 def has_telemetry(path: Path | str) -> bool:
     """Whether a video has a track of GPMF telemetry; False also where PyAV is missing or the file cannot be read."""
     try:
-        with _open(Path(path)) as container:
+        with open_video(Path(path)) as container:
             return _track(container) is not None
     except RsUndistortError:
         return False
@@ -145,7 +145,7 @@ def read_gpmf(path: Path | str, axes: str | None = None) -> GyroLog:
         PyAV is missing.
     """
     path = Path(path)
-    with _open(path) as container:
+    with open_video(path) as container:
         stream = _track(container)
         if stream is None:
             raise FormatError(f"{path} has no track of GoPro's telemetry; give the gyroscope's log as CSV or .gcsv")
@@ -178,16 +178,6 @@ def read_gpmf(path: Path | str, axes: str | None = None) -> GyroLog:
 
 
 # ---------------------------------------------------------------- the container
-
-
-def _open(path: Path) -> Any:
-    try:
-        import av
-    except ImportError:
-        raise InputError(f'{path.name} is a video, which needs PyAV: pip install "rsundistort[video]"') from None
-    with ffmpeg_errors(f"{path} cannot be read as a video"):
-        # tags in another encoding are nothing to fail at
-        return av.open(f"file:{path}", options={"protocol_whitelist": "file"}, metadata_errors="replace")
 
 
 def _track(container: Any) -> Any:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RsUndistortWarning
-from .ffmpeg_reasons import ffmpeg_errors
+from .ffmpeg_reasons import ffmpeg_errors, open_video
 from .video import VideoReader
 from .video_writer import X264_PARAMS
 
@@ -273,9 +273,7 @@ class _Sound:
     """The sound of a video, copied packet by packet, a little ahead of the pictures."""
 
     def __init__(self, video: Path, container: Any) -> None:
-        import av
-
-        self._source = av.open(f"file:{video}", options={"protocol_whitelist": "file"}, metadata_errors="replace")
+        self._source = open_video(video)
         self._target: dict[int, Any] = {}
         self._lost: list[str] = []
         self._num_spoiled = 0
@@ -305,9 +303,7 @@ class _Sound:
             packet.stream = self._target[packet.stream.index]
             try:
                 self._container.mux(packet)
-            except av.error.InvalidDataError:
-                self._num_spoiled += 1
-            except av.error.ArgumentError:  # its time runs back
+            except (av.error.InvalidDataError, av.error.ArgumentError):  # the latter where its time runs back
                 self._num_spoiled += 1
 
     def _peek(self) -> Any:
