@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import FileError, FormatError, InputError
+from ..errors import FileError, FormatError, format_errors
 from ..model import Camera
 from ..model.checks import check_photo_name
 from .conventions import HALF, poses_of, quiet_pycolmap
@@ -45,10 +45,8 @@ def read_colmap_cameras(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
 
 def checked_name(name: str, where: str) -> str:
     """The name of a photo of the model that `where` names."""
-    try:
+    with format_errors(where):
         return check_photo_name(name)
-    except InputError as error:
-        raise FormatError(f"{where}: {error}") from error
 
 
 def image_name(image: Any, where: str) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError
+from ..errors import FormatError, format_errors
 from ..model import Camera
 from ..model.projection import project_points
 from .conventions import HALF, import_pycolmap
@@ -54,10 +54,8 @@ def camera_from_colmap(found: Any, where: str) -> Camera:
         [0, found.focal_length_y, found.principal_point_y - HALF],
         [0, 0, 1],
     ]
-    try:
+    with format_errors(where, ValueError):
         return Camera(found.width, found.height, np.array(K), dist, lens=lens)
-    except ValueError as error:
-        raise FormatError(f"{where}: {error}") from error
 
 
 def _fitted_camera(found: Any, where: str) -> Camera:

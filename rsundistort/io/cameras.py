@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..colmap import read_colmap_cameras
-from ..errors import FileError, FormatError, InputError
+from ..errors import FileError, FormatError, InputError, file_errors, format_errors
 from ..model import Camera, other_axis
 from .calibrations import camera_from_calibration, is_calibration, parse_xml, parse_yaml
 from .json_text import parse_json
@@ -41,7 +41,7 @@ def camera_from_json(value: Any, where: str) -> Camera:
     if missing or unknown:
         what = f"lacks {', '.join(sorted(missing))}" if missing else f"has unknown {', '.join(sorted(unknown))}"
         raise FormatError(f"{where} {what}; expected width, height, K, dist, readout, lens, field, sigma")
-    try:
+    with format_errors(where, (TypeError, ValueError, OverflowError)):
         return Camera(
             value["width"],
             value["height"],
@@ -51,8 +51,6 @@ def camera_from_json(value: Any, where: str) -> Camera:
             value.get("lens", "pinhole"),
             np.asarray(value.get("field") or [], float),
         )
-    except (TypeError, ValueError, OverflowError) as error:
-        raise FormatError(f"{where}: {error}") from error
 
 
 def sigma_from_json(value: Any, where: str) -> dict[str, float]:
@@ -207,14 +205,12 @@ def _camera_from_numbers(text: str, width: int, height: int) -> Camera:
 
 def _read_folder(folder: Path, width: int, height: int) -> CameraFile:
     """Cameras under the stems of their files."""
-    try:
+    with file_errors(folder):
         files = sorted(
             entry
             for entry in folder.iterdir()
             if entry.suffix.lower() in _SUFFIXES and not entry.name.startswith(".") and entry.is_file()
         )
-    except OSError as error:
-        raise FileError(f"{folder} cannot be read: {error.strerror}") from error
     if not files:
         raise FileError(f"{folder} holds no camera files; expected {_KINDS}")
     file_of: dict[str, Path] = {}
@@ -249,10 +245,8 @@ def _read_file(path: Path, width: int, height: int) -> CameraFile:
         return CameraFile(*read_colmap_cameras(path), source=f"{path} (COLMAP)")
     K = _nine_numbers(content)
     if K is not None:
-        try:
+        with format_errors(path):
             return CameraFile({_ONLY: Camera(width, height, K)}, source=f"{path} (K)")
-        except InputError as error:
-            raise FormatError(f"{path}: {error}") from error
     try:
         tree, kind = _parse(content)
     except (ValueError, RecursionError) as error:

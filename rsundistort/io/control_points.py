@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from ..errors import FormatError, InputError
+from ..errors import FormatError, format_errors
 from ..model import ControlPoint
 from .tables import read_table
 
@@ -77,7 +77,5 @@ def _point(name: str, stated: dict[str, str], seen: dict[str, tuple[float, float
     use = stated.get("use", "").lower()
     if use not in _USES:
         raise FormatError(f"{where}: use={use!r}, expected control or check")
-    try:
+    with format_errors(path):
         return ControlPoint(name, (east, north, up), (sigma, sigma, sigma_up), seen, _USES[use])
-    except InputError as error:
-        raise FormatError(f"{path}: {error}") from None

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError, InputError, RsUndistortError, RsUndistortWarning
+from ..errors import FormatError, RsUndistortError, RsUndistortWarning, format_errors
 from .ffmpeg_reasons import open_video
 from .gyro import CAMERA_FROM_GYROFLOW, GyroLog, parse_axes
 
@@ -159,10 +159,8 @@ def read_gpmf(path: Path | str, axes: str | None = None) -> GyroLog:
         raise FormatError(f"{path}: its telemetry has no gyroscope that can be read ({why})")
     start_s, length_s = (np.array(values) for values in zip(*((t, d) for t, d, _ in with_rates), strict=True))
     payloads = [payload for _, _, payload in with_rates]
-    try:
+    with format_errors(path):
         time_s, jitters = _sample_times(payloads, start_s, length_s)
-    except FormatError as error:
-        raise FormatError(f"{path}: {error}") from None
     if jitters:
         said.append("samples that are not uniform in time")
     if ends_s is not None:
@@ -171,10 +169,8 @@ def read_gpmf(path: Path | str, axes: str | None = None) -> GyroLog:
     rates = np.concatenate([payload.rates for payload in payloads]) @ orientation.T
     if said:
         warnings.warn(f"{path.name}, telemetry: {'; '.join(said[:3])}", RsUndistortWarning, stacklevel=2)
-    try:
+    with format_errors(path):
         return GyroLog(time_s, rates, readout_s if readout_s is not None else _global_readout(path))
-    except InputError as error:
-        raise FormatError(f"{path}: {error}") from None
 
 
 # ---------------------------------------------------------------- the container

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..errors import FormatError, InputError
+from ..errors import FormatError, format_errors
 from ..model import KnownLength
 from .tables import read_table
 
@@ -36,11 +36,9 @@ def read_known_lengths(path: Path | str) -> list[KnownLength]:
     for number, row in enumerate(rows, start=2):
         first = row["photo1"]
         second = row["photo2"] or first
-        try:
+        with format_errors(f"{path}, line {number}", ValueError):
             x1, y1, x2, y2, length, sigma = (float(row[c]) for c in ("x1", "y1", "x2", "y2", "length", "sigma"))
             found.append(KnownLength((first, x1, y1), (second, x2, y2), length, sigma))
-        except (ValueError, InputError) as error:
-            raise FormatError(f"{path}, line {number}: {error}") from None
     if len(found) < 2:
         raise FormatError(f"{path} holds {len(found)} lengths; ratios need two, such as a height and a width")
     return found

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..colmap.lenses import FIT_PX, nearest_camera
-from ..errors import FormatError, InputError, RsUndistortWarning
+from ..errors import FormatError, InputError, RsUndistortWarning, format_errors
 from ..model import Camera, Solution
 from ..model.checks import check_rotations
 from .xml_text import read_xml
@@ -225,10 +225,8 @@ def _to_world(transform: ElementTree.Element | None, where: str) -> tuple[NDArra
 
 
 def _numbers(element: ElementTree.Element, count: int, where: str) -> NDArray[np.float64]:
-    try:
+    with format_errors(where, ValueError):
         found = np.array((element.text or "").split(), np.float64)
-    except ValueError as error:
-        raise FormatError(f"{where}: {error}") from error
     if len(found) != count or not np.isfinite(found).all():
         raise FormatError(f"{where}: expected {count} numbers, got {len(found)}")
     return found

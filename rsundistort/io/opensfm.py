@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from ..colmap.cameras_and_poses import checked_name
 from ..colmap.measured_model import ColmapModel
-from ..errors import FileError, FormatError
+from ..errors import FormatError, file_errors
 from ..model import Camera, Observations, Reconstruction
 from .rules import Numbers, OneOf, check
 
@@ -107,13 +107,10 @@ def _observations(path: Path, names: list[str], tracks: list[str]) -> tuple[Any,
     photo_of = {name: i for i, name in enumerate(names)}
     point_of = {track: k for k, track in enumerate(tracks)}
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        with file_errors(path, mend="; the measurements of reconstruction.json are in it"):
+            lines = path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError as error:
         raise FormatError(f"{path} is no UTF-8 text") from error
-    except OSError as error:
-        raise FileError(
-            f"{path} cannot be read: {error.strerror}; the measurements of reconstruction.json are in it"
-        ) from error
     seen, others = [], set()
     for number, line in enumerate(lines, start=1):
         if not line or (number == 1 and line.startswith("OPENSFM_TRACKS_VERSION")):

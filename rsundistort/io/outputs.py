@@ -14,7 +14,7 @@ from pathlib import Path
 
 import psutil
 
-from ..errors import FileError, InputError
+from ..errors import FileError, InputError, file_errors
 from .aside import is_partial, remove_partial
 from .journal import Journal, RemoteJournal
 from .lock import check_still_there, locked
@@ -324,10 +324,8 @@ def held_inside(folder: Path, name: str) -> Iterator[Path]:
         yield path
         _check_inside(within, within, folder)
         return
-    try:
+    with file_errors(path, "written"):
         held = os.open(within, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError as error:
-        raise FileError(f"{path} cannot be written: {error.strerror}") from error
     through = _OPEN_FOLDERS / str(held)
     try:
         _check_inside(within, through, folder)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import FileError, FormatError, InputError
+from ..errors import FileError, FormatError, InputError, format_errors
 from ..model import Bend, Camera, RowMotion, Solution, SolvedImage
 from .aside import write_aside
 from .cameras import camera_from_json, camera_to_json
@@ -231,11 +231,9 @@ def read_solution(path: Path, newer: bool = False) -> Solution:
             f"{path} has version {version!r} of the format, this program reads {VERSION} and {BENT_VERSION}; "
             "update rsundistort"
         )
-    try:
+    with format_errors(path):
         check(value, _RULES)
         return _solution_from_json(value)
-    except InputError as error:
-        raise FormatError(f"{path}: {error}") from error
 
 
 def _solution_from_json(value: dict[str, Any]) -> Solution:
@@ -262,7 +260,7 @@ def _solution_from_json(value: dict[str, Any]) -> Solution:
 
 def _image_from_json(entry: dict[str, Any], where: str) -> SolvedImage:
     motion = None
-    try:
+    with format_errors(where):
         if entry["registered"] and entry.get("phi") is not None:
             velocity = entry.get("velocity") or [0.0, 0.0, 0.0]
             motion = RowMotion(np.array(entry["phi"], float), np.array(velocity, float), _bend_from_json(entry))
@@ -285,5 +283,3 @@ def _image_from_json(entry: dict[str, Any], where: str) -> SolvedImage:
             doubtful=entry.get("doubtful"),
             lens_only=bool(entry.get("lens_only")),
         )
-    except InputError as error:
-        raise FormatError(f"{where}: {error}") from error

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..bundle import BundleResult
-from ..errors import FormatError
+from ..errors import FormatError, format_errors
 from ..evaluation import align_points
 from ..io.aside import write_aside
 from ..model import Reconstruction
@@ -179,10 +179,8 @@ def read_diagnostics(path: Path) -> Diagnostics:
     for name in ("names", "camera_ids"):
         values[name] = tuple(str(each) for each in values[name])
     values["photos"] = str(values["photos"])
-    try:
+    with format_errors(path):
         return Diagnostics(**values)
-    except FormatError as error:
-        raise FormatError(f"{path}: {error}") from error
 
 
 def _is_float(value: Any) -> bool:
