@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -214,12 +215,7 @@ def _median_depth(rec: Reconstruction) -> NDArray[np.float64]:
     obs = rec.observations
     ahead = rec.R_cw[obs.frame_idx, 2]
     z = ((rec.points_w[obs.point_idx] - rec.center_w[obs.frame_idx]) * ahead).sum(1)
-    of_photo = np.split(z[np.argsort(obs.frame_idx, kind="stable")], np.cumsum(_counts(rec))[:-1])
-    return np.array([np.median(each) if len(each) else np.nan for each in of_photo])
-
-
-def _counts(rec: Reconstruction) -> NDArray[np.int64]:
-    return np.bincount(rec.observations.frame_idx, minlength=rec.num_images)
+    return np.array([np.median(z[each]) if len(each) else np.nan for each in obs.by_photo(rec.num_images)])
 
 
 @dataclass(frozen=True)
@@ -258,19 +254,20 @@ class _Residuals:
 
     def by_photo_and_row(self) -> NDArray[np.float64]:
         """(m, c, 2) mean."""
-        m = self.rec.num_images
         where = self.frame_idx * _ROWS_OF_PHOTO + _bin(self.clock, _ROWS_OF_PHOTO)
-        mean = [_means(where, part, m * _ROWS_OF_PHOTO) for part in self.xy.T]
-        return np.stack(mean, axis=-1).reshape(m, _ROWS_OF_PHOTO, 2)
+        return self._mean_xy(where, self.rec.num_images, _ROWS_OF_PHOTO)
 
     def by_cell(self) -> NDArray[np.float64]:
         """(cameras, down, across, 2) mean."""
         across, down = _CELLS
-        num = len(self.rec.cameras) * down * across
         cell = _bin(self.place[:, 1], down) * across + _bin(self.place[:, 0], across)
         where = self.rec.camera_idx[self.frame_idx] * down * across + cell
-        mean = [_means(where, part, num) for part in self.xy.T]
-        return np.stack(mean, axis=-1).reshape(-1, down, across, 2)
+        return self._mean_xy(where, len(self.rec.cameras), down, across)
+
+    def _mean_xy(self, where: NDArray[np.int64], *shape: int) -> NDArray[np.float64]:
+        """(*shape, 2) mean, by the number of the cell where each residual is."""
+        mean = [_means(where, part, math.prod(shape)) for part in self.xy.T]
+        return np.stack(mean, axis=-1).reshape(*shape, 2)
 
 
 def _bin(place: NDArray[np.float64], num: int) -> NDArray[np.int64]:

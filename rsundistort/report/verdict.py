@@ -64,10 +64,11 @@ def advice_of(solution: Solution) -> list[str]:
     said = (solution.critical_motion or {}).get("advice")
     if said or degeneracy is None or not degeneracy.is_low or degeneracy.num_photos < 2:
         return [str(each) for each in said or ()]
-    images = [image for image in in_stored_frame(solution).registered if image.posed]
+    stored = in_stored_frame(solution)
+    images = [image for image in stored.registered if image.posed]
     R, centers = np.array([image.R_cw for image in images]), np.array([image.center_w for image in images])
-    cameras = in_stored_frame(solution).cameras
-    return [each.sentence for each in advise_poses(R, centers, [cameras[image.camera_id].readout for image in images])]
+    readouts = [stored.cameras[image.camera_id].readout for image in images]
+    return [each.sentence for each in advise_poses(R, centers, readouts)]
 
 
 def verdict_of(solution: Solution) -> Verdict:
