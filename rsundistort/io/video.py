@@ -27,6 +27,7 @@ __all__ = [
     "FrameWriter",
     "VideoFrames",
     "VideoReader",
+    "bits_of",
     "extract_frames",
     "frame_name",
     "is_video",
@@ -329,11 +330,16 @@ def frame_name(video: Path, number: int) -> str:
 
 def _pixels(picture: Any) -> NDArray[Any]:
     """(h, w, 3) BGR, 8 bit, or 16 bit where the video has more than eight."""
-    if max(component.bits for component in picture.format.components) > 8:
+    if bits_of(picture.format) > 8:
         deep: NDArray[Any] = picture.to_ndarray(format="rgb48le")
         return np.ascontiguousarray(deep[..., ::-1])
     pixels: NDArray[Any] = picture.to_ndarray(format="bgr24")
     return pixels
+
+
+def bits_of(form: Any) -> int:
+    """Bits of a number in a format of PyAV."""
+    return int(max(component.bits for component in form.components))
 
 
 def sharpness_of(picture: Any) -> float:
