@@ -142,7 +142,7 @@ def read_camera_file(text: str | Path, width: int, height: int) -> CameraFile:
     path = Path(text)
     if "," in str(text) and not _exists(path):
         return CameraFile({_ONLY: _camera_from_numbers(str(text), width, height)}, source="numbers")
-    if not _is_folder(path):
+    if not (_exists(path) and path.is_dir()):
         return _read_file(path, width, height)
     if (path / "cameras.bin").is_file() or (path / "cameras.txt").is_file():
         return CameraFile(*read_colmap_cameras(path), source=f"{path} (COLMAP)")
@@ -185,10 +185,6 @@ def _exists(path: Path) -> bool:
         return path.exists()
     except (OSError, ValueError):  # a text that is too long for a name, or holds a NUL
         return False
-
-
-def _is_folder(path: Path) -> bool:
-    return _exists(path) and path.is_dir()
 
 
 def _camera_from_numbers(text: str, width: int, height: int) -> Camera:

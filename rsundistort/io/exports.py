@@ -61,17 +61,13 @@ def check_exports(exports: Sequence[str], names: Sequence[str] = ()) -> None:
     for name in exports:
         if name not in EXPORTS:
             raise InputError(f"export={name!r}, expected one of {', '.join(EXPORTS)}")
-        _check_extra(name, EXPORTS[name])
+        if module := EXPORTS[name].module:
+            extra = EXPORTS[name].extra
+            try:
+                import_module(module)  # some libraries are installed without what they need
+            except ImportError as error:
+                raise InputError(
+                    f'--export {name} needs the extra {extra}: pip install "rsundistort[{extra}]" ({error})'
+                ) from error
     if "opensfm" in exports:
         check_opensfm_names(list(names))
-
-
-def _check_extra(name: str, needed: Export) -> None:
-    """Refuse an export whose library is not there, or not whole: some are installed without what they need."""
-    if needed.module:
-        try:
-            import_module(needed.module)
-        except ImportError as error:
-            raise InputError(
-                f'--export {name} needs the extra {needed.extra}: pip install "rsundistort[{needed.extra}]" ({error})'
-            ) from error

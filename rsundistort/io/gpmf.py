@@ -248,9 +248,7 @@ def _sample_times(
     # numbers that run back, or make more than nine of ten samples lost, are not believed
     believed = (np.diff(stated) >= count[:-1]).all() and stated[-1] + count[-1] - stated[0] <= 10 * count.sum()
     first = stated - stated[0] if believed else counted
-    at_s = start_s
-    if (stamps := _stamps(payloads, start_s)) is not None:
-        at_s = stamps
+    at_s = _first_times(payloads, start_s)
     if len(payloads) == 1:
         first, at_s = np.array([0, count[0]]), np.array([at_s[0], at_s[0] + length_s[0]])
     rate, start = np.polyfit(first, at_s, 1)
@@ -265,14 +263,14 @@ def _sample_times(
     return np.interp(index, *knots) - payloads[0].delay_s, True
 
 
-def _stamps(payloads: list[GyroPayload], start_s: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Times of the first samples by the camera's own stamps; None where these are missing or contradict the file's."""
+def _first_times(payloads: list[GyroPayload], start_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Times of the first samples by the camera's own stamps; the file's where these are missing or contradict it."""
     if len(payloads) < 2 or any(payload.stamp_s is None for payload in payloads):
-        return None
+        return start_s
     stamps = np.array([payload.stamp_s for payload in payloads], float)
     frame = payloads[0].frame_stamp_s
     at_s = stamps - frame + start_s[0] if frame is not None else stamps + np.median(start_s - stamps)
-    return at_s if np.abs(at_s - start_s).max() < 1.0 else None
+    return at_s if np.abs(at_s - start_s).max() < 1.0 else start_s
 
 
 # ---------------------------------------------------------------- a payload

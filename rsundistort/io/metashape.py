@@ -212,8 +212,7 @@ def _to_world(transform: ElementTree.Element | None, where: str) -> tuple[NDArra
     matrix, scale = np.eye(4), 1.0
     if transform is None or not len(transform):
         return matrix, scale
-    found = {tag: transform.find(tag) for tag in ("rotation", "translation", "scale")}
-    rotation, translation, factor = found["rotation"], found["translation"], found["scale"]
+    rotation, translation, factor = (transform.find(tag) for tag in ("rotation", "translation", "scale"))
     if rotation is not None:
         matrix[:3, :3] = _numbers(rotation, 9, f"{where}: rotation of the chunk").reshape(3, 3)
     if factor is not None:

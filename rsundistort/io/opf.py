@@ -90,10 +90,9 @@ def write_rectified_opf(folder: Path, scene: ExportScene) -> str:
 
 def _carried(camera: Camera) -> Camera:
     """The camera as the format has it."""
-    lens, f = camera.coefficients, float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
-    K = np.array([[f, 0, camera.K[0, 2]], [0, f, camera.K[1, 2]], [0, 0, 1]])
-    if camera.K[0, 0] == camera.K[1, 1]:
-        K = camera.K.copy()
+    lens, K = camera.coefficients, camera.K.copy()
+    if K[0, 0] != K[1, 1]:
+        K[0, 0] = K[1, 1] = np.sqrt(K[0, 0] * K[1, 1])
     return Camera(camera.width, camera.height, K, np.array([lens.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3")]))
 
 

@@ -142,7 +142,8 @@ def only_writer(folder: Path) -> Iterator[None]:
     try:
         with ExitStack() as stack:
             with _errors_of(folder, "; give another folder"):
-                made = _first_missing(folder)
+                # the topmost folder that has to be made: what a failure removes again
+                made = next((path for path in (*reversed(folder.parents), folder) if not path.exists()), None)
                 if folder.exists() and not folder.is_dir():
                     raise FileError(f"{folder} is a file; give a folder for the outputs")
                 folder.mkdir(parents=True, exist_ok=True)
@@ -375,13 +376,3 @@ def _errors_of(folder: Path, mend: str = "") -> Iterator[None]:
         if isinstance(error, FileError) or (not mend and error.errno not in CANNOT_WRITE):
             raise
         raise FileError(f"{folder} cannot be written: {error.strerror}{mend}") from error
-
-
-def _first_missing(folder: Path) -> Path | None:
-    """The topmost folder that has to be made for `folder` to exist: what a failure removes again."""
-    missing = None
-    for path in (folder, *folder.parents):
-        if path.exists():
-            break
-        missing = path
-    return missing
