@@ -196,20 +196,15 @@ def _payloads(container: Any, stream: Any) -> tuple[list[tuple[float, float, Gyr
                 other.discard = _DISCARD_ALL
     found: list[tuple[float, float, GyroPayload]] = []
     end_s, broken = 0.0, False
-    packets = container.demux(stream)
-    while True:
-        try:
-            packet = next(packets)
-        except StopIteration:
-            break
-        except (OSError, av.error.FFmpegError):
-            broken = True
-            break
-        if packet.stream_index != stream.index or not packet.size or packet.pts is None:
-            continue
-        time_s, length_s = (float((value or 0) * packet.time_base) for value in (packet.pts, packet.duration))
-        end_s = max(end_s, time_s + length_s)
-        found.append((time_s - first_s, length_s, parse_payload(bytes(packet))))
+    try:
+        for packet in container.demux(stream):
+            if packet.stream_index != stream.index or not packet.size or packet.pts is None:
+                continue
+            time_s, length_s = (float((value or 0) * packet.time_base) for value in (packet.pts, packet.duration))
+            end_s = max(end_s, time_s + length_s)
+            found.append((time_s - first_s, length_s, parse_payload(bytes(packet))))
+    except (OSError, av.error.FFmpegError):
+        broken = True
     whole_s = float(stream.duration * stream.time_base) if stream.duration else end_s
     return found, (end_s, whole_s) if broken or end_s < whole_s - 0.5 else None
 

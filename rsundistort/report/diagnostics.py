@@ -147,9 +147,10 @@ class Diagnostics:
 
 def write_diagnostics(path: Path, diagnostics: Diagnostics) -> None:
     """Write `report.npz`, whole or not at all."""
-    values: dict[str, Any] = {each.name: getattr(diagnostics, each.name) for each in fields(diagnostics)}
-    # values for display only need
-    values = {name: v.astype(np.float32) if _is_float(v) else np.array(v) for name, v in values.items()}
+    # values for display need no more than single precision
+    values: dict[str, Any] = {
+        name: v.astype(np.float32) if _is_float(v) else np.array(v) for name, v in vars(diagnostics).items()
+    }
     file = io.BytesIO()
     np.savez_compressed(file, format=np.array(_FORMAT), version=np.array(_VERSION), **values)
     write_aside(Path(path), file.getvalue())
