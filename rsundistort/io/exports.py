@@ -38,16 +38,11 @@ class Export:
     extra: str = ""
 
 
-def _metashape(folder: Path, scene: ExportScene) -> str:
-    write_metashape(folder / "cameras.xml", scene.solution, scene.names)
-    return ""
-
-
 _OPF = ("project.opf", "camera_list.json", "input_cameras.json", "calibration/calibrated_cameras.json")
 
 #: By the name of the option and of the folder in OUT.
 EXPORTS: dict[str, Export] = {
-    "metashape": Export(_metashape, ("cameras.xml",)),
+    "metashape": Export(write_metashape, ("cameras.xml",)),
     "ncore": Export(write_ncore, (), "ncore.data.v4", "ncore"),
     "nuke": Export(write_nuke, ("camera.nk", "camera.chan")),
     "opensfm": Export(write_opensfm, ("reconstruction.json", "camera_models.json", "tracks.csv", "image_list.txt")),
