@@ -15,7 +15,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -296,8 +296,8 @@ def parse_payload(data: bytes) -> GyroPayload:
                     frame_stamp_s = _first(stream.get("STMP"), 1e-6)
                 if "SROT" in stream and readout_s is None:
                     readout_s = _readout(stream["SROT"])
-    facts = {"frame_stamp_s": frame_stamp_s, "readout_s": readout_s, "problems": tuple(dict.fromkeys(problems))}
-    return GyroPayload(**{**vars(found or GyroPayload()), **facts})
+    said = tuple(dict.fromkeys(problems))
+    return replace(found or GyroPayload(), frame_stamp_s=frame_stamp_s, readout_s=readout_s, problems=said)
 
 
 def _items(data: memoryview, problems: list[str]) -> Iterator[_Item]:

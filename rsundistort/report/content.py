@@ -84,7 +84,7 @@ def motions(solution: Solution) -> list[dict[str, Any]]:
     """
     width, height = _CURVE
     found = []
-    for number, image in enumerate(solution.images):
+    for image in solution.images:
         if image.motion is None or image.motion.bend is None:
             continue
         camera = solution.cameras[image.camera_id]
@@ -100,7 +100,6 @@ def motions(solution: Solution) -> list[dict[str, Any]]:
 
         found.append(
             {
-                "number": number,
                 "name": image.name,
                 "curves": paths(rotation),
                 "steady": paths(steady),
@@ -241,7 +240,6 @@ def models(solution: Solution) -> list[dict[str, Any]]:
         {
             "name": name,
             "rms": fits.get(name, {}).get("rms_px"),
-            "iterations": fits.get(name, {}).get("iterations"),
             "held_out": held_out.get(name),
             "error": errors.get(name),
             "gain": gains.get(name),

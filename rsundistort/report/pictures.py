@@ -78,12 +78,9 @@ def _bytes_of_each(count: int) -> int:
 
 
 def _picture(job: PictureJob, num_bytes: int) -> Picture:
-    shown = 1  # what players do to the rectified photo
-    for path, done in ((job.after, 1), (job.before, job.applied_orientation)):
-        if path is not None and path.is_file():
-            stored = read_exif(path).orientation or 1
-            shown = stored if done == 1 else 1
-            break
+    # what players do to the rectified photo, and to the raw one unless that was done for good
+    path = job.after or (job.before if job.applied_orientation == 1 else None)
+    shown = 1 if path is None else read_exif(path).orientation or 1
     upright = compose_orientations(job.applied_orientation, shown)
     return Picture(_small(job.before, num_bytes, upright), _small(job.after, num_bytes, shown), upright)
 
