@@ -70,15 +70,8 @@ def closing_table(solution: Solution, out: Path) -> str:
             continue
         span = solution.cameras[image.camera_id].frame_span
         rotation = float((image.motion.phi**2).sum() ** 0.5) * span * 57.29577951308232
-        rows.append(
-            (
-                name,
-                str(image.num_observations),
-                f"{image.rms_px:.2f}",
-                f"{rotation:.2f}",
-                f"{image.rs_shift_px:.1f}",
-            )
-        )
+        numbers = f"{image.rms_px:.2f}", f"{rotation:.2f}", f"{image.rs_shift_px:.1f}"
+        rows.append((name, str(image.num_observations), *numbers))
     verdict = verdict_of(solution)
     total = sum(stage["seconds"] for stage in solution.stages)
     held_out = _held_out(solution.quality)

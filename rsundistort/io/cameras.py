@@ -41,16 +41,10 @@ def camera_from_json(value: Any, where: str) -> Camera:
     if missing or unknown:
         what = f"lacks {', '.join(sorted(missing))}" if missing else f"has unknown {', '.join(sorted(unknown))}"
         raise FormatError(f"{where} {what}; expected width, height, K, dist, readout, lens, field, sigma")
+    given = {key: each for key, each in value.items() if key != "sigma"}
     with format_errors(where, (TypeError, ValueError, OverflowError)):
-        return Camera(
-            value["width"],
-            value["height"],
-            value["K"],
-            np.asarray(value.get("dist") or [], float),
-            value.get("readout", "top-to-bottom"),
-            value.get("lens", "pinhole"),
-            np.asarray(value.get("field") or [], float),
-        )
+        arrays = {key: np.asarray(value.get(key) or [], float) for key in ("dist", "field")}
+        return Camera(**{**given, **arrays})
 
 
 def sigma_from_json(value: Any, where: str) -> dict[str, float]:
@@ -209,23 +203,19 @@ def _read_folder(folder: Path, width: int, height: int) -> CameraFile:
         )
     if not files:
         raise FileError(f"{folder} holds no camera files; expected {_KINDS}")
-    file_of: dict[str, Path] = {}
-    cameras = {}
-    sigma = {}
-    stated = set()
+    found: dict[str, CameraFile] = {}
     for file in files:
-        other = file_of.setdefault(file.stem, file)
+        other = next(each for each in files if each.stem == file.stem)
         if other != file:
             raise InputError(f"{other} and {file.name} are two cameras with one name, {file.stem}; take one away")
-        found = _read_file(file, width, height)
-        if len(found.cameras) != 1:
-            raise InputError(f"{file} holds {len(found.cameras)} cameras; in a folder each file holds one")
-        (cameras[file.stem],) = found.cameras.values()
-        sigma[file.stem] = next(iter(found.sigma.values()), {})
-        if found.readout_specified:
-            stated.add(file.stem)
+        found[file.stem] = _read_file(file, width, height)
+        if (count := len(found[file.stem].cameras)) != 1:
+            raise InputError(f"{file} holds {count} cameras; in a folder each file holds one")
+    cameras = {stem: next(iter(each.cameras.values())) for stem, each in found.items()}
+    sigma = {stem: next(iter(each.sigma.values()), {}) for stem, each in found.items()}
+    stated = frozenset(stem for stem, each in found.items() if each.readout_specified)
     source = f"{folder} ({len(cameras)} camera file{'s' * (len(cameras) > 1)})"
-    return CameraFile(cameras, source=source, readout_specified=frozenset(stated), sigma=sigma)
+    return CameraFile(cameras, source=source, readout_specified=stated, sigma=sigma)
 
 
 def _read_file(path: Path, width: int, height: int) -> CameraFile:

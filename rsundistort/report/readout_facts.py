@@ -38,11 +38,7 @@ def readout_facts(evidence: Mapping[str, Any]) -> list[tuple[str, str]]:
     gyro = evidence.get("gyroscope")
     if gyro:
         offset, sigma = 1e3 * gyro["offset_s"], 1e3 * gyro["offset_sigma_s"]
-        facts.append(
-            (
-                "gyroscope",
-                f"axes {gyro['axes']}, offset {offset:.1f} +- {sigma:.1f} ms, correlation {gyro['correlation']:.3f}",
-            )
-        )
+        text = f"axes {gyro['axes']}, offset {offset:.1f} +- {sigma:.1f} ms, correlation {gyro['correlation']:.3f}"
+        facts.append(("gyroscope", text))
     facts.append(("stabilisation", (evidence.get("stabilisation") or {}).get("reason") or "not examined"))
     return facts
