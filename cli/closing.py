@@ -74,7 +74,8 @@ def closing_table(solution: Solution, out: Path) -> str:
         rows.append((name, str(image.num_observations), *numbers))
     verdict = verdict_of(solution)
     total = sum(stage["seconds"] for stage in solution.stages)
-    held_out = _held_out(solution.quality)
+    quality, held_out = solution.quality, _held_out(solution.quality)
+    before = f"{quality['global_rms_px']:.2f} px with a global shutter, " if solution.shutter_model != "global" else ""
     facts = [
         ("photos registered", f"{len(solution.registered)} of {len(solution.images)}"),
         ("verdict", verdict.headline),
@@ -83,7 +84,7 @@ def closing_table(solution: Solution, out: Path) -> str:
         *_source(solution),
         *_lens(solution),
         *_shutter(solution),
-        ("rms residual", _residual(solution)),
+        ("rms residual", f"{before}{quality['rms_px']:.2f} px{' now' * bool(before)}"),
         ("outputs", f"{out}  ({total:.0f} s)"),
     ]
     lines = [table(rows), "", *_labelled(facts)]
@@ -214,13 +215,6 @@ def _shutter(solution: Solution) -> Iterator[tuple[str, str]]:
         yield "depth", ", ".join(counts)
     if (left := quality.get("rs_poses_px")) is not None:
         yield "rs-poses", f"motions are not steady: two poses per photo are off by up to {left:.1f} px"
-
-
-def _residual(solution: Solution) -> str:
-    """Residuals, beside those of a global shutter if there is another."""
-    quality = solution.quality
-    before = f"{quality['global_rms_px']:.2f} px with a global shutter, " if solution.shutter_model != "global" else ""
-    return f"{before}{quality['rms_px']:.2f} px{' now' * bool(before)}"
 
 
 def _held_out(quality: Mapping[str, Any]) -> str:

@@ -170,12 +170,14 @@ def _height(solution: Solution) -> tuple[str, str]:
     said, degeneracy = solution.critical_motion or {}, degeneracy_of(solution)
     if degeneracy is None:
         return "", ""
-    percent = _percent(said)
+    sigma = said.get("sigma_log_k")
+    percent = float("inf") if sigma is None else 100 * float(sigma)  # undetermined
     sentence = _sentence(str(said.get("sentence") or ""))
     if degeneracy.is_low and said.get("remedy") == "none":
+        known = f"to +-{percent:.2g} %" if np.isfinite(percent) else "and they leave it undetermined"
         return "doubt", (
             f"Do not trust the height of the scene: {_level(degeneracy)}, so it is undetermined to first order, and "
-            f"with the remedy switched off only the model's second-order terms determine it ({_deviation(percent)})."
+            f"with the remedy switched off only the model's second-order terms determine it ({known})."
         )
     if said.get("flagged") and percent > _LARGE_PERCENT:
         return "doubt", f"Do not trust the height of the scene. {sentence}"
@@ -195,16 +197,6 @@ def _unneeded(solution: Solution, largest: float | None) -> str:
     if plain and ours and ours > (1 - _LEAST_GAIN) * plain:
         return "without the shutter, held-out measurements are predicted as well"
     return ""
-
-
-def _percent(said: Any) -> float:
-    """Standard deviation of the height, per cent; infinite if it is undetermined."""
-    sigma = said.get("sigma_log_k")
-    return float("inf") if sigma is None else 100 * float(sigma)
-
-
-def _deviation(percent: float) -> str:
-    return f"to +-{percent:.2g} %" if np.isfinite(percent) else "and they leave it undetermined"
 
 
 def _level(degeneracy: CriticalMotion) -> str:
