@@ -12,7 +12,7 @@ from .export_scene import ExportScene
 from .metashape import write_metashape
 from .ncore import write_ncore
 from .nuke import write_nuke
-from .opensfm_project import check_opensfm_names, write_opensfm
+from .opensfm import check_opensfm_names, write_opensfm
 from .opf import write_opf, write_rectified_opf
 
 __all__ = ["EXPORTS", "check_exports"]
