@@ -186,8 +186,7 @@ def _lens(solution: Solution) -> Iterator[tuple[str, str]]:
 
 def _shutter(solution: Solution) -> Iterator[tuple[str, str]]:
     """The readout time of a video; the place on the map; how fast the camera rotated, depths, and what poses leave."""
-    from rsundistort.report import map_facts
-    from rsundistort.report.readout_facts import readout_facts
+    from rsundistort.report import map_facts, readout_facts
 
     quality = solution.quality
     if evidence := quality.get("readout_time"):
