@@ -81,22 +81,17 @@ def output_folder(
     """
     folder = Path(folder)
     _prepare(folder, apart_from, replaced)
-    scratch = None
-    with only_writer(folder):
-        try:
-            with _errors_of(folder, "; give another folder"):
-                if has_content(folder) and not overwrite:
-                    raise FileError(
-                        f"{folder} is not empty; give another folder, or --overwrite to replace its outputs"
-                    )
-                scratch = Path(tempfile.mkdtemp(prefix=f"{_SCRATCH}{os.getpid()}-", dir=folder))
-            with _errors_of(folder):
-                yield scratch
-                check_still_there(folder)
-                _move(scratch, folder, apart_from)
-        finally:
-            if scratch is not None:
-                shutil.rmtree(scratch, ignore_errors=True)
+    with only_writer(folder), ExitStack() as stack:
+        with _errors_of(folder, "; give another folder"):
+            if has_content(folder) and not overwrite:
+                raise FileError(f"{folder} is not empty; give another folder, or --overwrite to replace its outputs")
+            prefix = f"{_SCRATCH}{os.getpid()}-"
+            scratch = tempfile.TemporaryDirectory(prefix=prefix, dir=folder, ignore_cleanup_errors=True)
+            stack.enter_context(scratch)
+        with _errors_of(folder):
+            yield Path(scratch.name)
+            check_still_there(folder)
+            _move(Path(scratch.name), folder, apart_from)
 
 
 @contextmanager
