@@ -118,7 +118,7 @@ class Diagnostics:
     def of_results(cls, result: BundleResult, global_result: BundleResult, camera_ids: ArrayLike) -> Diagnostics:
         """Diagnostics of an adjustment and its global-shutter counterpart, with the ids of cameras in the solution."""
         rec, plain = result.reconstruction, _aligned(global_result.reconstruction, result.reconstruction)
-        both = [_Residuals.of(each) for each in (plain, rec)]
+        both = [_Residuals(each) for each in (plain, rec)]
         chosen, of_plain = (_some(each.num_points) for each in (rec, plain))
         reach = max(*(np.quantile(np.abs(each.xy), 0.995) for each in both if each.xy.size), 0.1)
         edges = np.linspace(-reach, reach, _BARS)
@@ -219,31 +219,23 @@ def _median_depth(rec: Reconstruction) -> NDArray[np.float64]:
     return np.array([np.median(z[each]) if len(each) else np.nan for each in obs.by_photo(rec.num_images)])
 
 
-@dataclass(frozen=True)
 class _Residuals:
     """Residuals (o, 2) of a reconstruction that could be projected, and where they are.
 
     `clock` (o,) runs from 0, read first, to 1; `place` (o, 2) from 0 to 1 across and down the photo.
     """
 
-    rec: Reconstruction
-    xy: NDArray[np.float64]
-    frame_idx: NDArray[np.int64]
-    clock: NDArray[np.float64]
-    place: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, rec: Reconstruction) -> _Residuals:
+    def __init__(self, rec: Reconstruction) -> None:
         residuals, valid = reprojection_residuals(rec)
         obs = rec.observations
-        frame = obs.frame_idx[valid]
-        camera = rec.camera_idx[frame]
+        self.rec, self.xy, self.frame_idx = rec, residuals[valid], obs.frame_idx[valid]
+        camera = rec.camera_idx[self.frame_idx]
         sizes = np.array([(each.width, each.height) for each in rec.cameras], float)
-        place = np.clip((obs.xy_raw[valid] + 0.5) / sizes[camera], 0, 1)
+        self.place = np.clip((obs.xy_raw[valid] + 0.5) / sizes[camera], 0, 1)
         axis = np.array([each.clock_axis for each in rec.cameras])[camera]
         sign = np.array([each.clock_sign for each in rec.cameras])[camera]
-        along = place[np.arange(len(place)), axis]
-        return cls(rec, residuals[valid], frame, np.where(sign > 0, along, 1 - along), place)
+        along = self.place[np.arange(len(self.place)), axis]
+        self.clock = np.where(sign > 0, along, 1 - along)
 
     def by_photo(self) -> NDArray[np.float64]:
         """(m,) root mean square."""

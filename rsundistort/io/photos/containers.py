@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from .exif import MAKER_NOTE, Damaged, exif_of_tiff
 from .kinds import jpeg_segments, picture_size
 from .metadata import Metadata
+from .xmp import marked_xmp, rectified_by
 
 __all__ = ["Parts", "metadata_of", "with_metadata"]
 
@@ -65,7 +66,8 @@ def _into_jpeg(encoded: memoryview, metadata: Metadata) -> tuple[Parts, list[str
             lost, exif = ["the EXIF, which is too long for a JPEG"], b""
     if len(xmp) > _SEGMENT - len(_XMP_HEAD):
         lost.append("the XMP, which is too long for a JPEG")
-        xmp = Metadata(xmp=xmp).only_mark().xmp
+        version = rectified_by(xmp)
+        xmp = b"" if version is None else marked_xmp(b"", version)
     step = _SEGMENT - len(_ICC_HEAD) - 2
     chunks = [icc[k : k + step] for k in range(0, len(icc), step)]
     if len(chunks) > 255:
