@@ -37,9 +37,8 @@ def read_colmap_cameras(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
     if path.is_dir():
         path = path / "cameras.bin" if (path / "cameras.bin").is_file() else path / "cameras.txt"
     model = _read_model(path)
-    cameras = {}
-    for camera_id in sorted(model.cameras):
-        cameras[str(camera_id)] = camera_from_colmap(model.cameras[camera_id], f"{path}: camera {camera_id}")
+    found = model.cameras
+    cameras = {str(key): camera_from_colmap(found[key], f"{path}: camera {key}") for key in sorted(found)}
     return cameras, {image_name(image, str(path)): str(image.camera_id) for image in model.images.values()}
 
 

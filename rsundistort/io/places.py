@@ -60,11 +60,6 @@ class RemoteFolder:
         return self.url
 
     @property
-    def name(self) -> str:
-        """Last part of the URL."""
-        return self.url.rpartition("/")[2]
-
-    @property
     def protocol(self) -> str:
         """Such as "s3"."""
         return self.url.partition("://")[0]
