@@ -154,8 +154,9 @@ def write_opensfm(folder: Path, scene: ExportScene) -> str:
     images = scene.images
     check_opensfm_names([scene.names[image.name] for image in images])
     names = {image.name: PurePosixPath(scene.names[image.name]).name for image in images}
-    keys = {image.camera_id: _key(image.camera_id, scene.camera(image)) for image in images}
-    cameras = {keys[image.camera_id]: _written_camera(scene.camera(image)) for image in images}
+    of_id = {image.camera_id: _written_camera(scene.camera(image)) for image in images}
+    keys = {key: _key(key, camera) for key, camera in of_id.items()}
+    cameras = {keys[key]: camera for key, camera in of_id.items()}
     shots, reference = {}, _reference(scene.solution.georeference)
     for image in images:
         assert image.R_cw is not None
@@ -194,9 +195,8 @@ def _write(path: Path, value: Any) -> None:
     path.write_text(json.dumps(value, indent=1), encoding="utf-8")
 
 
-def _key(camera_id: str, camera: Camera) -> str:
-    kind = _written_camera(camera)["projection_type"]
-    return f"v2 rsundistort rectified {camera_id} {camera.width} {camera.height} {kind}"
+def _key(camera_id: str, camera: dict[str, Any]) -> str:
+    return f"v2 rsundistort rectified {camera_id} {camera['width']} {camera['height']} {camera['projection_type']}"
 
 
 def _written_camera(camera: Camera) -> dict[str, Any]:
