@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,8 +17,8 @@ __all__ = ["close", "closing_table", "fitted", "summary"]
 
 
 _COLUMNS = 80
-# where what is said of a label begins
-_LABEL = 19
+# where what is said of a label begins, and the label of what goes on there
+_LABEL, _GOES_ON = 19, " "
 
 
 def close(solution: Solution, out: Path, warned: Said, talk: Talk) -> None:
@@ -70,38 +70,24 @@ def closing_table(solution: Solution, out: Path) -> str:
             continue
         span = solution.cameras[image.camera_id].frame_span
         rotation = float((image.motion.phi**2).sum() ** 0.5) * span * 57.29577951308232
-        rows.append(
-            (
-                name,
-                str(image.num_observations),
-                f"{image.rms_px:.2f}",
-                f"{rotation:.2f}",
-                f"{image.rs_shift_px:.1f}",
-            )
-        )
-    quality, verdict = solution.quality, verdict_of(solution)
+        numbers = f"{image.rms_px:.2f}", f"{rotation:.2f}", f"{image.rs_shift_px:.1f}"
+        rows.append((name, str(image.num_observations), *numbers))
+    verdict = verdict_of(solution)
     total = sum(stage["seconds"] for stage in solution.stages)
-    lines = [
-        table(rows),
-        "",
-        f"photos registered  {len(solution.registered)} of {len(solution.images)}",
-        f"verdict            {verdict.headline}",
-        f"shutter model      {solution.shutter_model}",
-        *_held_out(quality),
-        *_cameras(solution),
-        *_model(solution),
-        *_video(solution),
-        *_intrinsics(solution),
-        *_varying(solution),
-        *_fields(solution),
-        *_readout_time(solution),
-        *_map(solution),
-        *_readout(solution),
-        *_depths(solution),
-        *_two_poses(solution),
-        _residual(solution),
-        f"outputs            {out}  ({total:.0f} s)",
+    quality, held_out = solution.quality, _held_out(solution.quality)
+    before = f"{quality['global_rms_px']:.2f} px with a global shutter, " if solution.shutter_model != "global" else ""
+    facts = [
+        ("photos registered", f"{len(solution.registered)} of {len(solution.images)}"),
+        ("verdict", verdict.headline),
+        ("shutter model", solution.shutter_model),
+        *([("held-out error", held_out)] if held_out else []),
+        *_source(solution),
+        *_lens(solution),
+        *_shutter(solution),
+        ("rms residual", f"{before}{quality['rms_px']:.2f} px{' now' * bool(before)}"),
+        ("outputs", f"{out}  ({total:.0f} s)"),
     ]
+    lines = [table(rows), "", *_labelled(facts)]
     critical, said = solution.critical_motion or {}, [verdict.sentences[2]]
     if critical.get("flagged"):
         # the same but for its capital
@@ -137,50 +123,44 @@ def fitted(text: str) -> list[str]:
     return lines
 
 
-def _map(solution: Solution) -> list[str]:
-    """Where on the map the solution is, and how well GPS and control points agree with it."""
-    from rsundistort.report import map_facts
-
-    facts = map_facts(solution.georeference)
+def _labelled(facts: Iterable[tuple[str, str]]) -> list[str]:
+    """Lines of labels and texts; a text without a label is indented below the line above."""
     return [f"{label:<{_LABEL}}{text}" if label else f"  {text}" for label, text in facts]
 
 
-def _cameras(solution: Solution) -> list[str]:
-    """Where the cameras come from, which way they are read out by group where they differ, and what was guessed."""
-    source, readout = solution.options["camera"], solution.options["readout"]
+def _source(solution: Solution) -> Iterator[tuple[str, str]]:
+    """Where the cameras come from, with their readout and what was guessed; the model that was given, and the video."""
+    options = solution.options
+    source, readout = options["camera"], options["readout"]
     if isinstance(readout, str):
-        lines = [f"camera             {source}, readout {readout}"]
+        yield "camera", f"{source}, readout {readout}"
     else:
-        lines = [f"cameras            {source}", *(f"  {group}: readout {each}" for group, each in readout.items())]
-    guesses = solution.options.get("guesses", ())
-    return lines + [f"  {line}" for text in guesses for line in textwrap.wrap(text, 78)]
+        yield "cameras", source
+        yield from (("", f"{group}: readout {each}") for group, each in readout.items())
+    yield from (("", line) for text in options.get("guesses", ()) for line in textwrap.wrap(text, 78))
+    if model := options.get("model"):
+        yield (
+            "measurements",
+            f"{solution.quality['num_observations']} of {solution.quality['num_points']} points now, "
+            f"{model['observations']} of {model['points']} in the model",
+        )
+        frames = {
+            "stored": "the model shows the photos as they are stored",
+            "not looked at": "taken for the stored one",
+        }
+        yield "pixel frame", frames.get(model["frame"], model["frame"] + ", and rotated back")
+    if video := options.get("video"):
+        rotated = {3: 180, 6: 90, 8: 270}.get(video["orientation"])
+        said = f", players rotate them by {rotated} degrees clockwise, the files do not" if rotated else ""
+        what = "key frames of" if "key_frames" in video else "of"
+        yield "video", f"{len(solution.images)} {what} {video['frames']} frames{said}"
 
 
-def _model(solution: Solution) -> list[str]:
-    """Lines on the model that the measurements come from: how many they were, and in which frame."""
-    model = solution.options.get("model")
-    if not model:
-        return []
-    frames = {"stored": "the model shows the photos as they are stored", "not looked at": "taken for the stored one"}
-    return [
-        f"measurements       {solution.quality['num_observations']} of {solution.quality['num_points']} points now, "
-        f"{model['observations']} of {model['points']} in the model",
-        f"pixel frame        {frames.get(model['frame'], model['frame'] + ', and rotated back')}",
-    ]
-
-
-def _residual(solution: Solution) -> str:
-    """The line on residuals, beside those of a global shutter if there is another."""
+def _lens(solution: Solution) -> Iterator[tuple[str, str]]:
+    """Intrinsics that were solved for, with standard deviations; how the lens varies, and what lens models leave."""
     quality = solution.quality
-    before = f"{quality['global_rms_px']:.2f} px with a global shutter, " if solution.shutter_model != "global" else ""
-    return f"rms residual       {before}{quality['rms_px']:.2f} px{' now' * bool(before)}"
-
-
-def _intrinsics(solution: Solution) -> list[str]:
-    """A line on each camera whose intrinsics were solved for, with standard deviations."""
-    lines = []
     for keys, camera in solution.shared_cameras.items():
-        sigmas = solution.quality["sigma_intrinsics"].get(keys[0], {})
+        sigmas = quality["sigma_intrinsics"].get(keys[0], {})
         (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
         values = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **camera.coefficients}
         found = [
@@ -188,64 +168,33 @@ def _intrinsics(solution: Solution) -> list[str]:
             + (f" +- {sigma:.{4 if name[0] in 'kp' else 1}f}" if sigma is not None and isfinite(sigma) else "")
             for name, sigma in sigmas.items()
         ]
-        lines += [f"{'refined' if i == 0 else '':19}{', '.join(found[i : i + 3])}" for i in range(0, len(found), 3)]
-    return lines
+        for i in range(0, len(found), 3):
+            yield _GOES_ON if i else "refined", ", ".join(found[i : i + 3])
+    if solution.lens_varied:
+        focal, centre = quality["focal_sigma"], quality["centre_sigma_focal_lengths"]
+        if centre:
+            centre_px = centre * next(iter(solution.cameras.values())).K[0, 0]
+            said = f"f by {100 * focal:.2g} %, principal point by {centre_px:.1f} px from photo to photo"
+            yield "varying lens", f"{said} (focusing, a stabiliser)"
+        elif focal >= 1e-4:  # of a video, by a hundredth of a percent at least: a tenth of a pixel
+            yield "varying lens", f"f by {100 * focal:.2g} % from frame to frame (focusing, zooming)"
+    if fields := quality.get("lens_fields"):
+        largest = max(fields.values(), key=lambda each: each["rms_px"])
+        said = f"{largest['rms_px']:.2f} px in the mean, {largest['largest_px']:.2f} at most"
+        yield "more than a lens", f"{said}, beside the lens model (+-{largest['sigma_px']:.2f})"
 
 
-def _varying(solution: Solution) -> list[str]:
-    """A line on how the lens differs from photo to photo, if it does."""
-    if not solution.lens_varied:
-        return []
-    focal, centre = solution.quality["focal_sigma"], solution.quality["centre_sigma_focal_lengths"]
-    if not centre:  # of a video, by a hundredth of a percent at least: a tenth of a pixel
-        line = f"varying lens       f by {100 * focal:.2g} % from frame to frame (focusing, zooming)"
-        return [line] if focal >= 1e-4 else []
-    camera = next(iter(solution.cameras.values()))
-    return [
-        f"varying lens       f by {100 * focal:.2g} %, principal point by {centre * camera.K[0, 0]:.1f} px from photo "
-        "to photo (focusing, a stabiliser)"
-    ]
+def _shutter(solution: Solution) -> Iterator[tuple[str, str]]:
+    """The readout time of a video; the place on the map; how fast the camera rotated, depths, and what poses leave."""
+    from rsundistort.report import map_facts, readout_facts
 
-
-def _fields(solution: Solution) -> list[str]:
-    """A line on what lens models leave, if that was taken out, too."""
-    fields = (solution.quality.get("lens_fields") or {}).values()
-    if not fields:
-        return []
-    largest = max(fields, key=lambda each: each["rms_px"])
-    return [
-        f"more than a lens   {largest['rms_px']:.2f} px in the mean, {largest['largest_px']:.2f} at most, beside the "
-        f"lens model (+-{largest['sigma_px']:.2f})"
-    ]
-
-
-def _video(solution: Solution) -> list[str]:
-    """A line on the video whose frames the photos are."""
-    video = solution.options.get("video")
-    if not video:
-        return []
-    rotated = {3: 180, 6: 90, 8: 270}.get(video["orientation"])
-    said = f", players rotate them by {rotated} degrees clockwise, the files do not" if rotated else ""
-    what = "key frames of" if "key_frames" in video else "of"
-    return [f"video              {len(solution.images)} {what} {video['frames']} frames{said}"]
-
-
-def _readout_time(solution: Solution) -> list[str]:
-    """Lines on the readout time that was measured from a video, and on the evidence."""
-    from rsundistort.report.readout_facts import readout_facts
-
-    facts = solution.quality.get("readout_time")
-    if not facts:
-        return []
-    shown = ["readout time", "gyroscope"]
-    if facts["stabilisation"]["verdict"] == "stabilised":
-        shown.append("stabilisation")
-    return [f"{label:<{_LABEL}}{text}" for label, text in readout_facts(facts) if label in shown]
-
-
-def _readout(solution: Solution) -> list[str]:
-    """Lines on how fast the camera rotated, where the time of the readout is known."""
-    times = solution.quality.get("readout_times") or {}
+    quality = solution.quality
+    if evidence := quality.get("readout_time"):
+        stabilised = evidence["stabilisation"]["verdict"] == "stabilised"
+        shown = ("readout time", "gyroscope", *(("stabilisation",) if stabilised else ()))
+        yield from (fact for fact in readout_facts(evidence) if fact[0] in shown)
+    yield from map_facts(solution.georeference)
+    times = quality.get("readout_times") or {}
     rates = sorted(
         float((image.motion.phi**2).sum() ** 0.5)
         * solution.cameras[image.camera_id].frame_span
@@ -254,33 +203,21 @@ def _readout(solution: Solution) -> list[str]:
         for image in solution.registered
         if image.motion is not None and image.camera_id in times
     )
-    if not rates:
-        return []
-    said = dict.fromkeys(f"{time['ms']:g} ms ({time['source']})" for time in times.values())
-    return [
-        f"rotation rates     median {rates[len(rates) // 2]:.1f}, largest {rates[-1]:.1f} deg/s, by a readout of",
-        *(f"{'':19}{each}" for each in said),
-    ]
-
-
-def _depths(solution: Solution) -> list[str]:
-    """A line on how far away the photos of a camera that travelled were taken to show things."""
+    if rates:
+        middle = rates[len(rates) // 2]
+        yield "rotation rates", f"median {middle:.1f}, largest {rates[-1]:.1f} deg/s, by a readout of"
+        said = dict.fromkeys(f"{time['ms']:g} ms ({time['source']})" for time in times.values())
+        yield from ((_GOES_ON, each) for each in said)
     used = [image.depth for image in solution.images if image.depth is not None]
     kinds = {"points": "as the points", "plane": "on a plane", "map": "by maps", "infinity": "at infinity"}
-    counts = [f"{text} in {used.count(kind)} photos" for kind, text in kinds.items() if kind in used]
-    return [f"depth              {', '.join(counts)}"] if counts else []
+    if counts := [f"{text} in {used.count(kind)} photos" for kind, text in kinds.items() if kind in used]:
+        yield "depth", ", ".join(counts)
+    if (left := quality.get("rs_poses_px")) is not None:
+        yield "rs-poses", f"motions are not steady: two poses per photo are off by up to {left:.1f} px"
 
 
-def _two_poses(solution: Solution) -> list[str]:
-    """A line on what formats with two poses per photo cannot express of motions that are not steady."""
-    left = solution.quality.get("rs_poses_px")
-    if left is None:
-        return []
-    return [f"rs-poses           motions are not steady: two poses per photo are off by up to {left:.1f} px"]
-
-
-def _held_out(quality: Mapping[str, Any]) -> list[str]:
-    """A line on how well each model of the sequence predicts measurements that it was not fitted to."""
+def _held_out(quality: Mapping[str, Any]) -> str:
+    """How well each model of the sequence predicts measurements that it was not fitted to."""
     said, unit = [], " standard errors"
     for model, error in quality["held_out_error"].items():
         gain = quality["held_out_gain"].get(model)
@@ -290,4 +227,4 @@ def _held_out(quality: Mapping[str, Any]) -> list[str]:
         kept = "" if model in quality["held_out_kept"] else ": not kept"
         said.append(f"{model} {error:.3f} ({'better' if gain > 0 else 'worse'} by {abs(gain):.1f}{unit}{kept})")
         unit = ""
-    return [f"held-out error     {', '.join(said)}"] if said else []
+    return ", ".join(said)

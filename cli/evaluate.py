@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -17,33 +17,28 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("out", type=click.Path(path_type=Path))
 @click.option("--truth", type=click.Path(path_type=Path), required=True, help="ground_truth.json of the simulation.")
-@click.option("--poses", type=click.Path(path_type=Path), help="Solution whose poses are used as the true ones.")
-@click.option(
-    "--twins",
-    type=click.Path(path_type=Path),
-    help="Folder of the global-shutter references. By default it is global/ beside the truth.",
-)
-@click.option(
-    "--raw",
-    type=click.Path(path_type=Path),
-    help="Folder of the rolling-shutter photos. By default it is photos/ beside the truth.",
+@opt.gathered(
+    "given",
+    click.option("--poses", type=click.Path(path_type=Path), help="Solution whose poses are used as the true ones."),
+    click.option(
+        "--twins",
+        type=click.Path(path_type=Path),
+        help="Folder of the global-shutter references. By default it is global/ beside the truth.",
+    ),
+    click.option(
+        "--raw",
+        type=click.Path(path_type=Path),
+        help="Folder of the rolling-shutter photos. By default it is photos/ beside the truth.",
+    ),
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 @opt.quiet_option
-def command(
-    out: Path,
-    truth: Path,
-    poses: Path | None,
-    twins: Path | None,
-    raw: Path | None,
-    as_json: bool,
-    quiet: bool,
-) -> None:
+def command(out: Path, truth: Path, given: dict[str, Any], as_json: bool, quiet: bool) -> None:
     """Compare the outputs of a run in OUT with the ground truth of a simulation."""
     with errors_for_people(), progress_bars(Talk(quiet, as_json=as_json)) as progress:
         from rsundistort.analysis import evaluate
 
-        result = evaluate(out, truth, poses=poses, twins=twins, raw=raw, progress=progress)
+        result = evaluate(out, truth, progress=progress, **given)
     if as_json:
         say_json(result.to_json())
     elif not quiet:

@@ -33,11 +33,7 @@ def command(cameras: Path | None, as_json: bool) -> None:
         from rsundistort.batch import use_threads
         from rsundistort.versions import versions
 
-        found: dict[str, object] = {
-            "versions": versions(),
-            "threads": use_threads(0),
-            "extras": _extras(),
-        }
+        found = {"versions": versions(), "threads": use_threads(0), "extras": _extras()}
     tell(json.dumps(found) if as_json else _text(found))
 
 
@@ -58,13 +54,10 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _text(found: dict[str, object]) -> str:
-    versions, extras = found["versions"], found["extras"]
-    assert isinstance(versions, dict)
-    assert isinstance(extras, dict)
-    rows = [*versions.items(), ("threads", str(found["threads"]))]
+def _text(found: dict[str, Any]) -> str:
+    rows = [*found["versions"].items(), ("threads", str(found["threads"]))]
     optional = [("optional part", "")]
-    for extra, packages in sorted(extras.items()):
+    for extra, packages in sorted(found["extras"].items()):
         lost = [name for name, number in packages.items() if number is None]
         has = ", ".join(f"{name} {number}" for name, number in packages.items())
         optional.append((extra, f'no: pip install "rsundistort[{extra}]"' if lost else has))

@@ -129,61 +129,11 @@ verbose_option: Decorator = click.option(
 quality_option: Decorator = click.option(
     "--quality", type=click.IntRange(1, 100), default=98, help="Quality of JPEG and WebP."
 )
-raw_as_option: Decorator = click.option(
-    "--raw-as",
-    type=click.Choice(("tif", "jpg", "png")),
-    default="tif",
-    help="Format in which RAW and HEIC photos are written. jpg has 8 bits, the others have 16.",
-)
-apply_orientation_option: Decorator = click.option(
-    "--apply-orientation",
-    is_flag=True,
-    help="Rotate photos, masks, cameras and poses by the EXIF orientation. By default the tag is copied instead.",
-)
-again_option: Decorator = click.option(
-    "--again", is_flag=True, help="Accept photos that rsundistort has rectified before."
-)
-max_pixels_option: Decorator = click.option(
-    "--max-pixels",
-    "max_megapixels",
-    type=click.FloatRange(min=0, min_open=True),
-    default=250.0,
-    metavar="MILLIONS",
-    help="Leave out photos with more pixels. (A small file can claim to be a huge picture.)",
-)
 gyro_axes_option: Decorator = click.option(
     "--gyro-axes",
     metavar="XYZ",
     help="Axes of the gyroscope that point right, down and ahead in the stored pixels. Small letters stand for "
     "reversed axes.",
-)
-depth_option: Decorator = click.option(
-    "--depth",
-    metavar="auto|infinity|plane|points|DIR",
-    default="auto",
-    help="Depth of the scene. It matters if the camera travelled during the readout. plane: a plane through the scene; "
-    "points: interpolated between the reconstructed points; DIR: depth maps of your own (a.npy, .npz or float .tif for "
-    "a.jpg, see docs/depth.md).",
-)
-maps_option: Decorator = click.option(
-    "--maps",
-    type=click.Choice(MAP_KIND_NAMES),
-    help="Write the map of each photo and its inverse into OUT/maps, as NumPy arrays (npz), as OpenEXR in pixels "
-    "(exr), or as the ST map of compositing programs (stmap). exr and stmap need the extra exr.",
-)
-also_option: Decorator = click.option(
-    "--also",
-    multiple=True,
-    metavar="FOLDER[=INTERPOLATION]",
-    callback=also_folders,
-    help="Rectify other images of the same frames with the same maps (a.png for a.jpg), such as labels, depth or near "
-    "infrared. The default interpolation is nearest, which invents no values. May be repeated.",
-)
-interpolation_option: Decorator = click.option(
-    "--interpolation",
-    type=click.Choice(INTERPOLATION_NAMES),
-    default="cubic",
-    help="Interpolation of the rectified photos.",
 )
 
 
@@ -225,7 +175,14 @@ def gathered(name: str, *options: Decorator) -> Decorator:
 
 #: What is done to each photo; for `rectify_options`.
 PHOTO_OPTIONS: tuple[Decorator, ...] = (
-    depth_option,
+    click.option(
+        "--depth",
+        metavar="auto|infinity|plane|points|DIR",
+        default="auto",
+        help="Depth of the scene. It matters if the camera travelled during the readout. plane: a plane through the "
+        "scene; points: interpolated between the reconstructed points; DIR: depth maps of your own (a.npy, .npz or "
+        "float .tif for a.jpg, see docs/depth.md).",
+    ),
     click.option(
         "--alpha",
         metavar="keep|0..1",
@@ -246,14 +203,47 @@ PHOTO_OPTIONS: tuple[Decorator, ...] = (
         metavar="PIXELS",
         help="Largest width or height of the rectified photos.",
     ),
-    interpolation_option,
+    click.option(
+        "--interpolation",
+        type=click.Choice(INTERPOLATION_NAMES),
+        default="cubic",
+        help="Interpolation of the rectified photos.",
+    ),
     quality_option,
-    raw_as_option,
-    apply_orientation_option,
-    again_option,
-    max_pixels_option,
-    maps_option,
-    also_option,
+    click.option(
+        "--raw-as",
+        type=click.Choice(("tif", "jpg", "png")),
+        default="tif",
+        help="Format in which RAW and HEIC photos are written. jpg has 8 bits, the others have 16.",
+    ),
+    click.option(
+        "--apply-orientation",
+        is_flag=True,
+        help="Rotate photos, masks, cameras and poses by the EXIF orientation. By default the tag is copied instead.",
+    ),
+    click.option("--again", is_flag=True, help="Accept photos that rsundistort has rectified before."),
+    click.option(
+        "--max-pixels",
+        "max_megapixels",
+        type=click.FloatRange(min=0, min_open=True),
+        default=250.0,
+        metavar="MILLIONS",
+        help="Leave out photos with more pixels. (A small file can claim to be a huge picture.)",
+    ),
+    click.option(
+        "--maps",
+        type=click.Choice(MAP_KIND_NAMES),
+        help="Write the map of each photo and its inverse into OUT/maps, as NumPy arrays (npz), as OpenEXR in pixels "
+        "(exr), or as the ST map of compositing programs (stmap). exr and stmap need the extra exr.",
+    ),
+    click.option(
+        "--also",
+        multiple=True,
+        metavar="FOLDER[=INTERPOLATION]",
+        callback=also_folders,
+        help="Rectify other images of the same frames with the same maps (a.png for a.jpg), such as labels, depth or "
+        "near infrared. The default interpolation is nearest, which invents no values. May be repeated.",
+    ),
 )
 
 

@@ -68,7 +68,7 @@ def command(video: Path, given: dict[str, Any], talk: Talk) -> None:
 
 
 def _lines(found: MeasuredReadout) -> list[str]:
-    from rsundistort.report.readout_facts import readout_facts
+    from rsundistort.report import readout_facts
 
     facts = [*readout_facts(found.evidence), ("frames", str(found.evidence["frames"]))]
     if found.problem:

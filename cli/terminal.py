@@ -300,12 +300,9 @@ def progress_bars(talk: Talk) -> Iterator[Callable[[str, int, int], None]]:
 
 def table(rows: Sequence[Sequence[str]]) -> str:
     """Rows as aligned columns: the first to the left, the others to the right."""
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    width, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
     lines = []
-    for row in rows:
-        cells = [
-            row[0].ljust(widths[0]),
-            *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True)),
-        ]
+    for first, *others in rows:
+        cells = [first.ljust(width), *(cell.rjust(w) for cell, w in zip(others, widths, strict=True))]
         lines.append("  ".join(cells).rstrip())
     return "\n".join(lines)

@@ -1,5 +1,8 @@
 """Errors and warnings: one root, each leaf also of the builtin class that a caller expects."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 __all__ = [
     "DamagedPhotoWarning",
     "FileError",
@@ -12,6 +15,8 @@ __all__ = [
     "RsUndistortError",
     "RsUndistortWarning",
     "SkippedPhotoWarning",
+    "file_errors",
+    "format_errors",
     "one_line",
 ]
 
@@ -44,8 +49,28 @@ class FileError(RsUndistortError, OSError):
     """A file or folder is missing, unreadable, unwritable or in the way."""
 
 
+@contextmanager
+def file_errors(what: object, deed: str = "read", mend: str = "") -> Iterator[None]:
+    """What the system says of a file in the block becomes a FileError: `what` cannot be read, or written."""
+    try:
+        yield
+    except FileError:
+        raise
+    except OSError as error:
+        raise FileError(f"{what} cannot be {deed}: {error.strerror}{mend}") from error
+
+
 class FormatError(InputError):
     """A file is not of the format, or of a version of it, that can be read."""
+
+
+@contextmanager
+def format_errors(where: object, kinds: type[Exception] | tuple[type[Exception], ...] = InputError) -> Iterator[None]:
+    """Errors of these kinds in the block become a FormatError, which names the place."""
+    try:
+        yield
+    except kinds as error:
+        raise FormatError(f"{where}: {error}") from error
 
 
 class ReconstructionError(RsUndistortError, RuntimeError):

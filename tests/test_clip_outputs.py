@@ -41,7 +41,7 @@ from rsundistort.io.video_like import pixels_of
 from rsundistort.io.video_writer import write_video
 from rsundistort.model.orientation import orient_path
 from rsundistort.model.path import CameraPath
-from rsundistort.report.readout_facts import readout_facts
+from rsundistort.report.facts import readout_facts
 from rsundistort.solve import MeasuredReadout, measure_readout
 from rsundistort.solve.run_outputs import Outputs
 from rsundistort.verdict.judge_path import problem_of

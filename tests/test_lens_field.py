@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bundle_scenes import make_scene, perturbed
-from rsundistort_cli.closing import _fields
+from rsundistort_cli.closing import _lens
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 from solved_scene import cameras_of
@@ -381,8 +381,7 @@ def test_what_was_found_is_stored_and_read_back(rng, tmp_path):
     # arrows are about as long as their cells; the field is larger between them
     assert 0.5 < row["field"]["times"] * lengths.max() * 13 / 800 < 1.2
     assert len(row["field"]["dots"]) == 13 * 9
-    (line,) = _fields(again)
-    assert f"{stated['rms_px']:.2f} px in the mean" in line
+    assert f"{stated['rms_px']:.2f} px in the mean" in dict(_lens(again))["more than a lens"]
 
 
 def test_without_a_field_nothing_is_said(rng):
@@ -390,4 +389,4 @@ def test_without_a_field_nothing_is_said(rng):
     camera = rec.cameras[0]
     solution = Solution("global", {"1": camera}, {"1": camera.pinhole()}, ())
     assert content.cameras(solution)[0]["field"] is None
-    assert _fields(solution) == []
+    assert not [*_lens(replace(solution, quality={"sigma_intrinsics": {}}))]

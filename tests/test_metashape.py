@@ -17,6 +17,7 @@ from rsundistort import RectifyOptions, read_solution
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
 from rsundistort.errors import FileError, FormatError, InputError, ReconstructionError, RsUndistortWarning
+from rsundistort.io.export_scene import ExportScene
 from rsundistort.io.metashape import named, read_metashape, write_metashape, write_posed_photos
 from rsundistort.model.projection import project_points
 from rsundistort.solve.from_poses import measured, posed_photos, shutter_terms
@@ -261,7 +262,7 @@ def small(tmp_path_factory):
     for name in (names := [image.name for image in truth.images[1:4]]):
         picture = cv2.imread(str(COURTYARD / "global" / name), cv2.IMREAD_GRAYSCALE)
         cv2.imwrite(str(place / "photos" / name), picture)
-    write_metashape(place / "cameras.xml", truth, {name: name for name in names})
+    write_metashape(place, ExportScene(truth, None, {name: name for name in names}, None, truth))
     return place, truth
 
 

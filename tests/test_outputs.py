@@ -568,11 +568,11 @@ def test_steady_motions_are_written_as_ever(tmp_path, rng):
 
 def test_closing_line_says_what_two_poses_leave(rng):
     made, solution = solved(rng, [camera_of(dist=())])
-    assert not any("two poses" in line for line in closing._two_poses(solution))
+    assert "rs-poses" not in dict(closing._shutter(solution))
     bent = bent_solution(rng, camera_of(dist=()))
     rec = made.with_motions([image.motion for image in bent.images])
     left = _left_by_two_poses(rec)
     assert left > 1
-    said = closing._two_poses(replace(solution, quality={"rs_poses_px": left}))
-    assert said == [f"rs-poses           motions are not steady: two poses per photo are off by up to {left:.1f} px"]
+    said = dict(closing._shutter(replace(solution, quality={"rs_poses_px": left})))
+    assert said["rs-poses"] == f"motions are not steady: two poses per photo are off by up to {left:.1f} px"
     assert _left_by_two_poses(made) == 0.0

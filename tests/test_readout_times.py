@@ -63,3 +63,8 @@ def test_every_row_can_be_looked_up_and_has_a_source(row):
     assert seconds == pytest.approx(float(row["readout_ms"]) / 1e3)
     assert 1e-3 < seconds < 0.2
     assert source.startswith(row["source"])
+
+
+def test_no_camera_is_there_twice_with_one_size():
+    keys = [(table._key(row["make"], row["model"]), *sorted((row["width"], row["height"]))) for row in ROWS]
+    assert len(set(keys)) == len(keys)

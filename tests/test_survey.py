@@ -23,7 +23,7 @@ from rsundistort.bundle.problem import BundleProblem
 from rsundistort.errors import InputError, RsUndistortWarning
 from rsundistort.io import ExifFacts, GpsFix, read_solution, write_solution
 from rsundistort.model import ControlPoint
-from rsundistort.report.map_facts import map_facts, map_rows
+from rsundistort.report.facts import map_facts, map_rows
 from rsundistort.solve.outcome import solution_of
 from rsundistort.solve.survey import survey_of
 

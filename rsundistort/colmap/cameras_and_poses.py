@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import FileError, FormatError, InputError
+from ..errors import FileError, FormatError, format_errors
 from ..model import Camera
 from ..model.checks import check_photo_name
 from .conventions import HALF, poses_of, quiet_pycolmap
@@ -37,18 +37,15 @@ def read_colmap_cameras(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
     if path.is_dir():
         path = path / "cameras.bin" if (path / "cameras.bin").is_file() else path / "cameras.txt"
     model = _read_model(path)
-    cameras = {}
-    for camera_id in sorted(model.cameras):
-        cameras[str(camera_id)] = camera_from_colmap(model.cameras[camera_id], f"{path}: camera {camera_id}")
+    found = model.cameras
+    cameras = {str(key): camera_from_colmap(found[key], f"{path}: camera {key}") for key in sorted(found)}
     return cameras, {image_name(image, str(path)): str(image.camera_id) for image in model.images.values()}
 
 
 def checked_name(name: str, where: str) -> str:
     """The name of a photo of the model that `where` names."""
-    try:
+    with format_errors(where):
         return check_photo_name(name)
-    except InputError as error:
-        raise FormatError(f"{where}: {error}") from error
 
 
 def image_name(image: Any, where: str) -> str:

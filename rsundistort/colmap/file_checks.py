@@ -9,7 +9,7 @@ from pathlib import Path
 from struct import Struct
 from typing import Any
 
-from ..errors import FileError, FormatError
+from ..errors import FileError, FormatError, file_errors
 from .conventions import import_pycolmap, quiet_pycolmap
 
 __all__ = ["check_colmap_cameras", "check_colmap_files", "pycolmap_model"]
@@ -122,13 +122,11 @@ def check_colmap_cameras(path: Path) -> None:
 
 def _check(path: Path, after: Callable[[Bytes, int], int]) -> None:
     try:
-        with path.open("rb") as file:
+        with file_errors(path), path.open("rb") as file:
             if not path.stat().st_size:  # which cannot be mapped
                 raise _Cut
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
                 _walk(data, after)
-    except OSError as error:
-        raise FileError(f"{path} cannot be read: {error.strerror}") from error
     except _Cut:
         raise FormatError(f"{path} is cut short: it claims more than it holds; copy it again") from None
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError
+from ..errors import FormatError, format_errors
 from ..model import Camera
 from ..model.projection import project_points
 from .conventions import HALF, import_pycolmap
@@ -54,10 +55,8 @@ def camera_from_colmap(found: Any, where: str) -> Camera:
         [0, found.focal_length_y, found.principal_point_y - HALF],
         [0, 0, 1],
     ]
-    try:
+    with format_errors(where, ValueError):
         return Camera(found.width, found.height, np.array(K), dist, lens=lens)
-    except ValueError as error:
-        raise FormatError(f"{where}: {error}") from error
 
 
 def _fitted_camera(found: Any, where: str) -> Camera:
@@ -108,23 +107,21 @@ def nearest_camera(
     best, miss = None, np.inf
     ahead = np.column_stack([rays, np.ones(len(rays))])
     K0 = [start.K[0, 0], start.K[1, 1], start.K[0, 2], start.K[1, 2]]
+
+    def camera_of(p: NDArray[np.float64], lens: str) -> Camera:
+        K = np.array([[p[0], 0, p[2]], [0, p[1], p[3]], [0, 0, 1]])
+        return Camera(start.width, start.height, K, p[4:], lens=lens)
+
+    def error_px(p: NDArray[np.float64], lens: str) -> NDArray[np.float64]:
+        seen = project_points(ahead, camera_of(p, lens), None, "global")[0]
+        return np.nan_to_num(seen - xy_raw, nan=1e3, posinf=1e3, neginf=-1e3).ravel()
+
     for lens, length in (("fisheye", 4), ("pinhole", 8)):
-
-        def camera_of(p: NDArray[np.float64], lens: str = lens) -> Camera:
-            K = np.array([[p[0], 0, p[2]], [0, p[1], p[3]], [0, 0, 1]])
-            return Camera(start.width, start.height, K, p[4:], lens=lens)
-
-        def error_px(p: NDArray[np.float64], camera_of: Any = camera_of) -> NDArray[np.float64]:
-            seen = project_points(ahead, camera_of(p), None, "global")[0]
-            return np.nan_to_num(seen - xy_raw, nan=1e3, posinf=1e3, neginf=-1e3).ravel()
-
-        try:
-            p = least_squares(error_px, [*K0, *np.zeros(length)], x_scale="jac", max_nfev=200).x
-            now = float(np.abs(error_px(p)).max())
+        with suppress(ValueError):
+            p = least_squares(error_px, [*K0, *np.zeros(length)], x_scale="jac", max_nfev=200, args=(lens,)).x
+            now = float(np.abs(error_px(p, lens)).max())
             if now < miss:
-                best, miss = camera_of(p), now
-        except ValueError:
-            continue
+                best, miss = camera_of(p, lens), now
     return best, miss
 
 

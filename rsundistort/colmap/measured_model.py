@@ -173,15 +173,12 @@ def colmap_model_of(model: Any, where: str = "the model") -> ColmapModel:
     for name, values in (("pose", R_cw), ("pose", center_w), ("point", points_w)):
         if not np.isfinite(values).all():
             raise FormatError(f"{where} holds a {name} that is no number")
-    frame_idx, point_of, keypoint, xy = [], [], [], []
+    tables = []  # photo, keypoint, id of the point, x, y
     for i, image in enumerate(images):
-        seen = [(k, p.point3D_id, *p.xy) for k, p in enumerate(image.points2D) if p.has_point3D()]
-        frame_idx.append(np.full(len(seen), i))
-        table = np.array(seen, np.float64).reshape(-1, 4)
-        keypoint.append(table[:, 0].astype(np.int64))
-        point_of.append(np.searchsorted(point_ids, table[:, 1].astype(np.int64)))
-        xy.append(table[:, 2:] - HALF)
-    frame, point = np.concatenate(frame_idx), np.concatenate(point_of)
+        seen = [(i, k, p.point3D_id, *p.xy) for k, p in enumerate(image.points2D) if p.has_point3D()]
+        tables.append(np.array(seen, np.float64).reshape(-1, 5))
+    table = np.concatenate(tables)
+    frame, keypoint, ids = table[:, :3].T.astype(np.int64)
     place = {key: k for k, key in enumerate(camera_ids)}
     rec = Reconstruction(
         cameras,
@@ -190,7 +187,7 @@ def colmap_model_of(model: Any, where: str = "the model") -> ColmapModel:
         R_cw,
         center_w,
         points_w,
-        Observations(frame, point, np.concatenate(xy)),
+        Observations(frame, np.searchsorted(point_ids, ids), table[:, 3:] - HALF),
     )
     unregistered = sorted({image_name(image, where) for image in model.images.values()} - set(rec.image_names))
     return ColmapModel(
@@ -198,7 +195,7 @@ def colmap_model_of(model: Any, where: str = "the model") -> ColmapModel:
         np.array(camera_ids, np.int64),
         np.array([image.image_id for image in images], np.int64),
         point_ids,
-        np.concatenate(keypoint),
+        keypoint,
         colors,
         tuple(unregistered),
         any(model.cameras[k].model_name != "PINHOLE" for k in camera_ids),

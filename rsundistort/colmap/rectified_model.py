@@ -93,11 +93,8 @@ def colmap_model(
 
     ids = ids or ModelIds.in_order(reconstruction)
     model = pycolmap.Reconstruction()
-    used = set(reconstruction.camera_idx.tolist())
-    for index, camera in enumerate(rectified):
-        if index not in used:
-            continue
-        model.add_camera_with_trivial_rig(pinhole_to_colmap(camera, ids.cameras[index]))
+    for index in np.unique(reconstruction.camera_idx).tolist():
+        model.add_camera_with_trivial_rig(pinhole_to_colmap(rectified[index], ids.cameras[index]))
     obs = reconstruction.observations
     xy = rectified_keypoints(reconstruction, rectified)
     usable = np.asarray(np.isfinite(xy).all(1))

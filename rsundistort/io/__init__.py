@@ -2,12 +2,10 @@
 
 from ..colmap import read_colmap_cameras, read_colmap_poses, write_colmap_model, write_colmap_workspace
 from .cameras import CameraFile, check_camera_fits, read_camera_file
-from .control_points import read_control_points
 from .depth_maps import find_depth_maps, read_depth_map
 from .gpmf import has_telemetry, read_gpmf
 from .groups import group_of, guess_readouts
 from .gyro import GyroLog, bends_from_gyro, gyro_offset, motions_from_gyro, read_gyro, read_photo_times
-from .lengths import read_known_lengths
 from .masks import find_masks, read_mask
 from .motions import read_known_motions
 from .nerfstudio import read_transforms, write_transforms
@@ -19,6 +17,7 @@ from .photos.metadata import Metadata
 from .readout_times import readout_time
 from .shutter_poses import write_shutter_poses
 from .solution_json import read_solution, write_solution
+from .surveyed import read_control_points, read_known_lengths
 from .trajectory import write_path, write_point_cloud, write_trajectory
 from .video import VideoFrames, extract_frames, is_video
 

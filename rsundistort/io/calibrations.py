@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError
+from ..errors import format_errors
 from ..model import Camera
 from .xml_text import parse_xml as parse_elements
 
@@ -111,7 +111,7 @@ def camera_from_calibration(tree: Mapping[str, Any], where: str, width: int, hei
         In pixels with integer centres, as both write them.
     """
     fields = _fields(tree)
-    try:
+    with format_errors(where, (TypeError, ValueError, OverflowError)):
         matrix = _numbers(_first(fields, _MATRIX))
         if len(matrix) != 9:
             raise ValueError(f"its camera matrix has {len(matrix)} numbers, expected 9")
@@ -119,8 +119,6 @@ def camera_from_calibration(tree: Mapping[str, Any], where: str, width: int, hei
         width, height, K = _read_out(fields, width, height, matrix.reshape(3, 3))
         dist, lens = _distortion(fields)
         return Camera(width, height, K, dist, lens=lens)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise FormatError(f"{where}: {error}") from error
 
 
 def _fields(tree: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..colmap import read_colmap_cameras
-from ..errors import FileError, FormatError, InputError
+from ..errors import FileError, FormatError, InputError, file_errors, format_errors
 from ..model import Camera, other_axis
 from .calibrations import camera_from_calibration, is_calibration, parse_xml, parse_yaml
 from .json_text import parse_json
@@ -41,18 +41,10 @@ def camera_from_json(value: Any, where: str) -> Camera:
     if missing or unknown:
         what = f"lacks {', '.join(sorted(missing))}" if missing else f"has unknown {', '.join(sorted(unknown))}"
         raise FormatError(f"{where} {what}; expected width, height, K, dist, readout, lens, field, sigma")
-    try:
-        return Camera(
-            value["width"],
-            value["height"],
-            value["K"],
-            np.asarray(value.get("dist") or [], float),
-            value.get("readout", "top-to-bottom"),
-            value.get("lens", "pinhole"),
-            np.asarray(value.get("field") or [], float),
-        )
-    except (TypeError, ValueError, OverflowError) as error:
-        raise FormatError(f"{where}: {error}") from error
+    given = {key: each for key, each in value.items() if key != "sigma"}
+    with format_errors(where, (TypeError, ValueError, OverflowError)):
+        arrays = {key: np.asarray(value.get(key) or [], float) for key in ("dist", "field")}
+        return Camera(**{**given, **arrays})
 
 
 def sigma_from_json(value: Any, where: str) -> dict[str, float]:
@@ -144,7 +136,7 @@ def read_camera_file(text: str | Path, width: int, height: int) -> CameraFile:
     path = Path(text)
     if "," in str(text) and not _exists(path):
         return CameraFile({_ONLY: _camera_from_numbers(str(text), width, height)}, source="numbers")
-    if not _is_folder(path):
+    if not (_exists(path) and path.is_dir()):
         return _read_file(path, width, height)
     if (path / "cameras.bin").is_file() or (path / "cameras.txt").is_file():
         return CameraFile(*read_colmap_cameras(path), source=f"{path} (COLMAP)")
@@ -189,10 +181,6 @@ def _exists(path: Path) -> bool:
         return False
 
 
-def _is_folder(path: Path) -> bool:
-    return _exists(path) and path.is_dir()
-
-
 def _camera_from_numbers(text: str, width: int, height: int) -> Camera:
     try:
         values = [float(v) for v in text.split(",")]
@@ -207,33 +195,27 @@ def _camera_from_numbers(text: str, width: int, height: int) -> Camera:
 
 def _read_folder(folder: Path, width: int, height: int) -> CameraFile:
     """Cameras under the stems of their files."""
-    try:
+    with file_errors(folder):
         files = sorted(
             entry
             for entry in folder.iterdir()
             if entry.suffix.lower() in _SUFFIXES and not entry.name.startswith(".") and entry.is_file()
         )
-    except OSError as error:
-        raise FileError(f"{folder} cannot be read: {error.strerror}") from error
     if not files:
         raise FileError(f"{folder} holds no camera files; expected {_KINDS}")
-    file_of: dict[str, Path] = {}
-    cameras = {}
-    sigma = {}
-    stated = set()
+    found: dict[str, CameraFile] = {}
     for file in files:
-        other = file_of.setdefault(file.stem, file)
+        other = next(each for each in files if each.stem == file.stem)
         if other != file:
             raise InputError(f"{other} and {file.name} are two cameras with one name, {file.stem}; take one away")
-        found = _read_file(file, width, height)
-        if len(found.cameras) != 1:
-            raise InputError(f"{file} holds {len(found.cameras)} cameras; in a folder each file holds one")
-        (cameras[file.stem],) = found.cameras.values()
-        sigma[file.stem] = next(iter(found.sigma.values()), {})
-        if found.readout_specified:
-            stated.add(file.stem)
+        found[file.stem] = _read_file(file, width, height)
+        if (count := len(found[file.stem].cameras)) != 1:
+            raise InputError(f"{file} holds {count} cameras; in a folder each file holds one")
+    cameras = {stem: next(iter(each.cameras.values())) for stem, each in found.items()}
+    sigma = {stem: next(iter(each.sigma.values()), {}) for stem, each in found.items()}
+    stated = frozenset(stem for stem, each in found.items() if each.readout_specified)
     source = f"{folder} ({len(cameras)} camera file{'s' * (len(cameras) > 1)})"
-    return CameraFile(cameras, source=source, readout_specified=frozenset(stated), sigma=sigma)
+    return CameraFile(cameras, source=source, readout_specified=stated, sigma=sigma)
 
 
 def _read_file(path: Path, width: int, height: int) -> CameraFile:
@@ -249,10 +231,8 @@ def _read_file(path: Path, width: int, height: int) -> CameraFile:
         return CameraFile(*read_colmap_cameras(path), source=f"{path} (COLMAP)")
     K = _nine_numbers(content)
     if K is not None:
-        try:
+        with format_errors(path):
             return CameraFile({_ONLY: Camera(width, height, K)}, source=f"{path} (K)")
-        except InputError as error:
-            raise FormatError(f"{path}: {error}") from error
     try:
         tree, kind = _parse(content)
     except (ValueError, RecursionError) as error:

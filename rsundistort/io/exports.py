@@ -12,7 +12,7 @@ from .export_scene import ExportScene
 from .metashape import write_metashape
 from .ncore import write_ncore
 from .nuke import write_nuke
-from .opensfm_project import check_opensfm_names, write_opensfm
+from .opensfm import check_opensfm_names, write_opensfm
 from .opf import write_opf, write_rectified_opf
 
 __all__ = ["EXPORTS", "check_exports"]
@@ -38,16 +38,11 @@ class Export:
     extra: str = ""
 
 
-def _metashape(folder: Path, scene: ExportScene) -> str:
-    write_metashape(folder / "cameras.xml", scene.solution, scene.names)
-    return ""
-
-
 _OPF = ("project.opf", "camera_list.json", "input_cameras.json", "calibration/calibrated_cameras.json")
 
 #: By the name of the option and of the folder in OUT.
 EXPORTS: dict[str, Export] = {
-    "metashape": Export(_metashape, ("cameras.xml",)),
+    "metashape": Export(write_metashape, ("cameras.xml",)),
     "ncore": Export(write_ncore, (), "ncore.data.v4", "ncore"),
     "nuke": Export(write_nuke, ("camera.nk", "camera.chan")),
     "opensfm": Export(write_opensfm, ("reconstruction.json", "camera_models.json", "tracks.csv", "image_list.txt")),
@@ -61,17 +56,13 @@ def check_exports(exports: Sequence[str], names: Sequence[str] = ()) -> None:
     for name in exports:
         if name not in EXPORTS:
             raise InputError(f"export={name!r}, expected one of {', '.join(EXPORTS)}")
-        _check_extra(name, EXPORTS[name])
+        if module := EXPORTS[name].module:
+            extra = EXPORTS[name].extra
+            try:
+                import_module(module)  # some libraries are installed without what they need
+            except ImportError as error:
+                raise InputError(
+                    f'--export {name} needs the extra {extra}: pip install "rsundistort[{extra}]" ({error})'
+                ) from error
     if "opensfm" in exports:
         check_opensfm_names(list(names))
-
-
-def _check_extra(name: str, needed: Export) -> None:
-    """Refuse an export whose library is not there, or not whole: some are installed without what they need."""
-    if needed.module:
-        try:
-            import_module(needed.module)
-        except ImportError as error:
-            raise InputError(
-                f'--export {name} needs the extra {needed.extra}: pip install "rsundistort[{needed.extra}]" ({error})'
-            ) from error

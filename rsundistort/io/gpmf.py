@@ -15,15 +15,15 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError, InputError, RsUndistortError, RsUndistortWarning
-from .ffmpeg_reasons import ffmpeg_errors
+from ..errors import FormatError, RsUndistortError, RsUndistortWarning, format_errors
+from .ffmpeg_reasons import open_video
 from .gyro import CAMERA_FROM_GYROFLOW, GyroLog, parse_axes
 
 __all__ = ["GyroPayload", "has_telemetry", "parse_payload", "read_gpmf"]
@@ -111,7 +111,7 @@ class GyroPayload:
 def has_telemetry(path: Path | str) -> bool:
     """Whether a video has a track of GPMF telemetry; False also where PyAV is missing or the file cannot be read."""
     try:
-        with _open(Path(path)) as container:
+        with open_video(Path(path)) as container:
             return _track(container) is not None
     except RsUndistortError:
         return False
@@ -145,7 +145,7 @@ def read_gpmf(path: Path | str, axes: str | None = None) -> GyroLog:
         PyAV is missing.
     """
     path = Path(path)
-    with _open(path) as container:
+    with open_video(path) as container:
         stream = _track(container)
         if stream is None:
             raise FormatError(f"{path} has no track of GoPro's telemetry; give the gyroscope's log as CSV or .gcsv")
@@ -159,10 +159,8 @@ def read_gpmf(path: Path | str, axes: str | None = None) -> GyroLog:
         raise FormatError(f"{path}: its telemetry has no gyroscope that can be read ({why})")
     start_s, length_s = (np.array(values) for values in zip(*((t, d) for t, d, _ in with_rates), strict=True))
     payloads = [payload for _, _, payload in with_rates]
-    try:
+    with format_errors(path):
         time_s, jitters = _sample_times(payloads, start_s, length_s)
-    except FormatError as error:
-        raise FormatError(f"{path}: {error}") from None
     if jitters:
         said.append("samples that are not uniform in time")
     if ends_s is not None:
@@ -171,23 +169,11 @@ def read_gpmf(path: Path | str, axes: str | None = None) -> GyroLog:
     rates = np.concatenate([payload.rates for payload in payloads]) @ orientation.T
     if said:
         warnings.warn(f"{path.name}, telemetry: {'; '.join(said[:3])}", RsUndistortWarning, stacklevel=2)
-    try:
+    with format_errors(path):
         return GyroLog(time_s, rates, readout_s if readout_s is not None else _global_readout(path))
-    except InputError as error:
-        raise FormatError(f"{path}: {error}") from None
 
 
 # ---------------------------------------------------------------- the container
-
-
-def _open(path: Path) -> Any:
-    try:
-        import av
-    except ImportError:
-        raise InputError(f'{path.name} is a video, which needs PyAV: pip install "rsundistort[video]"') from None
-    with ffmpeg_errors(f"{path} cannot be read as a video"):
-        # tags in another encoding are nothing to fail at
-        return av.open(f"file:{path}", options={"protocol_whitelist": "file"}, metadata_errors="replace")
 
 
 def _track(container: Any) -> Any:
@@ -210,20 +196,15 @@ def _payloads(container: Any, stream: Any) -> tuple[list[tuple[float, float, Gyr
                 other.discard = _DISCARD_ALL
     found: list[tuple[float, float, GyroPayload]] = []
     end_s, broken = 0.0, False
-    packets = container.demux(stream)
-    while True:
-        try:
-            packet = next(packets)
-        except StopIteration:
-            break
-        except (OSError, av.error.FFmpegError):
-            broken = True
-            break
-        if packet.stream_index != stream.index or not packet.size or packet.pts is None:
-            continue
-        time_s, length_s = (float((value or 0) * packet.time_base) for value in (packet.pts, packet.duration))
-        end_s = max(end_s, time_s + length_s)
-        found.append((time_s - first_s, length_s, parse_payload(bytes(packet))))
+    try:
+        for packet in container.demux(stream):
+            if packet.stream_index != stream.index or not packet.size or packet.pts is None:
+                continue
+            time_s, length_s = (float((value or 0) * packet.time_base) for value in (packet.pts, packet.duration))
+            end_s = max(end_s, time_s + length_s)
+            found.append((time_s - first_s, length_s, parse_payload(bytes(packet))))
+    except (OSError, av.error.FFmpegError):
+        broken = True
     whole_s = float(stream.duration * stream.time_base) if stream.duration else end_s
     return found, (end_s, whole_s) if broken or end_s < whole_s - 0.5 else None
 
@@ -262,9 +243,7 @@ def _sample_times(
     # numbers that run back, or make more than nine of ten samples lost, are not believed
     believed = (np.diff(stated) >= count[:-1]).all() and stated[-1] + count[-1] - stated[0] <= 10 * count.sum()
     first = stated - stated[0] if believed else counted
-    at_s = start_s
-    if (stamps := _stamps(payloads, start_s)) is not None:
-        at_s = stamps
+    at_s = _first_times(payloads, start_s)
     if len(payloads) == 1:
         first, at_s = np.array([0, count[0]]), np.array([at_s[0], at_s[0] + length_s[0]])
     rate, start = np.polyfit(first, at_s, 1)
@@ -279,14 +258,14 @@ def _sample_times(
     return np.interp(index, *knots) - payloads[0].delay_s, True
 
 
-def _stamps(payloads: list[GyroPayload], start_s: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Times of the first samples by the camera's own stamps; None where these are missing or contradict the file's."""
+def _first_times(payloads: list[GyroPayload], start_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Times of the first samples by the camera's own stamps; the file's where these are missing or contradict it."""
     if len(payloads) < 2 or any(payload.stamp_s is None for payload in payloads):
-        return None
+        return start_s
     stamps = np.array([payload.stamp_s for payload in payloads], float)
     frame = payloads[0].frame_stamp_s
     at_s = stamps - frame + start_s[0] if frame is not None else stamps + np.median(start_s - stamps)
-    return at_s if np.abs(at_s - start_s).max() < 1.0 else None
+    return at_s if np.abs(at_s - start_s).max() < 1.0 else start_s
 
 
 # ---------------------------------------------------------------- a payload
@@ -317,8 +296,8 @@ def parse_payload(data: bytes) -> GyroPayload:
                     frame_stamp_s = _first(stream.get("STMP"), 1e-6)
                 if "SROT" in stream and readout_s is None:
                     readout_s = _readout(stream["SROT"])
-    facts = {"frame_stamp_s": frame_stamp_s, "readout_s": readout_s, "problems": tuple(dict.fromkeys(problems))}
-    return GyroPayload(**{**vars(found or GyroPayload()), **facts})
+    said = tuple(dict.fromkeys(problems))
+    return replace(found or GyroPayload(), frame_stamp_s=frame_stamp_s, readout_s=readout_s, problems=said)
 
 
 def _items(data: memoryview, problems: list[str]) -> Iterator[_Item]:

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import FileError, FormatError, InputError, RsUndistortWarning
+from ..errors import FormatError, InputError, RsUndistortWarning, file_errors, format_errors
 from ..model import Bend, Camera, RowMotion
 from ..model.checks import check_array, check_finite, frozen
 from .motions import Known
@@ -178,10 +178,8 @@ def read_gyro(path: Path | str, axes: str | None = None) -> GyroLog:
         from .gpmf import read_gpmf
 
         return read_gpmf(path, axes)
-    try:
+    with file_errors(path):
         lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
-    except OSError as error:
-        raise FileError(f"{path} cannot be read: {error.strerror}") from error
     if lines and lines[0].strip() in _GCSV:
         return _from_gcsv(path, lines, axes)
     columns = [cell.strip() for cell in lines[0].split(",")] if lines else []
@@ -240,10 +238,8 @@ def _log(
     """A log in which samples that were written with one time are one, their mean."""
     times, index, count = np.unique(time_s, return_inverse=True, return_counts=True)
     mean = np.stack([np.bincount(index, omega_c[:, k]) for k in range(3)], axis=1) / count[:, None]
-    try:
+    with format_errors(path):
         return GyroLog(times, mean, readout_s)
-    except InputError as error:
-        raise FormatError(f"{path}: {error}") from None
 
 
 def read_photo_times(path: Path | str) -> dict[str, float]:

@@ -9,7 +9,6 @@ from collections.abc import Iterable, Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any
 
 from ..errors import FileError, InputError
@@ -89,9 +88,7 @@ class Journal:
     def __enter__(self) -> Journal:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
         if self._file is not None:
             self._file.close()
             self._file = None
@@ -143,13 +140,11 @@ class RemoteJournal(Journal):
         self._said = True
         self._folder.delete([self.NAME])
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        super().__exit__(kind, error, trace)
+    def __exit__(self, kind: object, *_: object) -> None:
+        super().__exit__(kind)
         try:
             # what ended the block matters more than that this failed, too
-            with suppress(FileError) if error is not None else nullcontext():
+            with suppress(FileError) if kind is not None else nullcontext():
                 self.settle()
         finally:
             self._work.cleanup()

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import FileError, FormatError
+from ..errors import FormatError, file_errors
 
 __all__ = ["parse_json", "plain", "read_json"]
 
@@ -61,9 +61,9 @@ def read_json(path: Path | str) -> Any:
         When it cannot be read; when it is no JSON, nested without end, or has numbers of thousands of digits.
     """
     try:
-        return parse_json(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise FileError(f"{path} cannot be read: {error.strerror}") from error
+        with file_errors(path):
+            text = Path(path).read_text(encoding="utf-8")
+        return parse_json(text)
     except UnicodeDecodeError as error:
         raise FormatError(f"{path} is no valid JSON: it is no UTF-8 text") from error
     except ValueError as error:

@@ -54,14 +54,13 @@ def locked(folder: Path) -> Iterator[bool]:
     key, me = str(folder.resolve()), threading.get_ident()
     with _guard:
         held = _held.get(key)
-        if held is not None and held.thread == me:
-            held.count += 1
-            first = False
-        else:
-            if held is not None:
-                raise FileError(_taken(folder, "this process"))
+        first = held is None
+        if held is None:
             held = _held[key] = _Held(me, _acquire(folder))
-            first = True
+        elif held.thread == me:
+            held.count += 1
+        else:
+            raise FileError(_taken(folder, "this process"))
     try:
         yield first
     finally:
@@ -75,7 +74,7 @@ def locked(folder: Path) -> Iterator[bool]:
 def check_still_there(folder: Path) -> None:
     """Refuse to go on writing into a folder that is locked, and was moved or removed, or another put in its place."""
     with _guard:
-        held = next((each for key, each in _held.items() if key == str(folder.resolve())), None)
+        held = _held.get(str(folder.resolve()))
     if held is None or not _is_same(folder / LOCK_NAME, held.file):
         raise FileError(f"{folder} was moved, removed or cleared while it was written")
 

@@ -24,9 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..colmap.lenses import FIT_PX, nearest_camera
-from ..errors import FormatError, InputError, RsUndistortWarning
-from ..model import Camera, Solution
+from ..errors import FormatError, InputError, RsUndistortWarning, format_errors
+from ..model import Camera
 from ..model.checks import check_rotations
+from .export_scene import ExportScene
 from .xml_text import read_xml
 
 __all__ = [
@@ -212,8 +213,7 @@ def _to_world(transform: ElementTree.Element | None, where: str) -> tuple[NDArra
     matrix, scale = np.eye(4), 1.0
     if transform is None or not len(transform):
         return matrix, scale
-    found = {tag: transform.find(tag) for tag in ("rotation", "translation", "scale")}
-    rotation, translation, factor = found["rotation"], found["translation"], found["scale"]
+    rotation, translation, factor = (transform.find(tag) for tag in ("rotation", "translation", "scale"))
     if rotation is not None:
         matrix[:3, :3] = _numbers(rotation, 9, f"{where}: rotation of the chunk").reshape(3, 3)
     if factor is not None:
@@ -225,10 +225,8 @@ def _to_world(transform: ElementTree.Element | None, where: str) -> tuple[NDArra
 
 
 def _numbers(element: ElementTree.Element, count: int, where: str) -> NDArray[np.float64]:
-    try:
+    with format_errors(where, ValueError):
         found = np.array((element.text or "").split(), np.float64)
-    except ValueError as error:
-        raise FormatError(f"{where}: {error}") from error
     if len(found) != count or not np.isfinite(found).all():
         raise FormatError(f"{where}: expected {count} numbers, got {len(found)}")
     return found
@@ -314,25 +312,17 @@ def _rays_and_pixels(
     return rays[inside], xy[inside]
 
 
-def write_metashape(path: Path, solution: Solution, names: Mapping[str, str]) -> None:
-    """Write a `cameras.xml` of the rectified photos, which Import Cameras takes into a chunk that holds them.
+def write_metashape(folder: Path, scene: ExportScene) -> str:
+    """Write `cameras.xml` of the rectified photos, which Import Cameras takes into a chunk that holds them.
 
-    Parameters
-    ----------
-    path : Path
-        File to write.
-    solution : Solution
-        Poses and rectified cameras.
-    names : mapping of photo name to file name
-        Of the rectified photos; those without are left out. Metashape knows a photo by its name without the ending.
+    Metashape knows a photo by its name without the ending. Nothing is left over: the text is empty.
     """
-    images = [image for image in solution.registered if image.posed and image.name in names]
+    images = scene.images
     used = list(dict.fromkeys(image.camera_id for image in images))
-    cameras = tuple(solution.rectified_cameras[key] for key in used)
-    stems = [PurePosixPath(names[image.name]).stem for image in images]
-    labels = tuple(
-        stem if stems.count(stem) == 1 else names[image.name] for image, stem in zip(images, stems, strict=True)
-    )
+    cameras = tuple(scene.solution.rectified_cameras[key] for key in used)
+    files = [scene.names[image.name] for image in images]
+    stems = [PurePosixPath(file).stem for file in files]
+    labels = tuple(stem if stems.count(stem) == 1 else file for file, stem in zip(files, stems, strict=True))
     posed = PosedPhotos(
         labels, cameras, tuple(range(1, 1 + len(used))),
         np.array([used.index(image.camera_id) for image in images], np.int64),
@@ -340,7 +330,8 @@ def write_metashape(path: Path, solution: Solution, names: Mapping[str, str]) ->
         np.array([image.center_w for image in images], np.float64).reshape(-1, 3),
         sensors=tuple(map(_rectified_sensor, cameras)),
     )  # fmt: skip
-    write_posed_photos(path, posed, [f"rectified camera {key}" for key in used])
+    write_posed_photos(folder / "cameras.xml", posed, [f"rectified camera {key}" for key in used])
+    return ""
 
 
 def write_posed_photos(path: Path | str, posed: PosedPhotos, sensor_labels: Sequence[str] = ()) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..model import Camera, Solution
+from ..model import Camera
 from .export_scene import ExportScene
 from .shutter_poses import end_poses
 
@@ -48,7 +48,8 @@ def write_ncore(folder: Path, scene: ExportScene) -> str:
     if source is None:
         raise InputError("it holds the photos; say where they are (--images)")
     folder.mkdir(parents=True, exist_ok=True)
-    readout_us = _readouts_us(solution)
+    known = solution.quality.get("readout_times") or {}
+    readout_us = {key: max(1, round(entry["ms"] * 1e3)) for key, entry in known.items()}
     times, poses = [], []
     for k, image in enumerate(images):
         start = k * _STEP_US
@@ -71,11 +72,6 @@ def write_ncore(folder: Path, scene: ExportScene) -> str:
         stores[name].store_frame((source / image.name).read_bytes(), kind, span, {}, {"name": image.name})
     writer.finalize()
     return ""
-
-
-def _readouts_us(solution: Solution) -> dict[str, int]:
-    known = solution.quality.get("readout_times") or {}
-    return {key: max(1, round(entry["ms"] * 1e3)) for key, entry in known.items()}
 
 
 def _world_from_camera(R_cw: NDArray[np.float64], center_w: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -111,11 +111,10 @@ def write_frames(
     value: dict[str, Any] = dict(common or {})
     if points is not None:
         value["ply_file_path"] = points
-    shared = len(set(cameras)) == 1
     if cameras:
         # nerfstudio looks for the model nowhere else
         value["camera_model"] = intrinsics(cameras[0])["camera_model"]
-    if shared:
+    if len(set(cameras)) == 1:
         value |= intrinsics(cameras[0])
         value["frames"] = [dict(frame) for frame in frames]
     else:

@@ -57,8 +57,6 @@ def write_opf(folder: Path, scene: ExportScene) -> str:
         raise InputError("OPF has no fisheye like ours; take opf-rectified")
     if stored.shutter_model != "global" and any(stored.cameras[image.camera_id].clock_axis == 0 for image in images):
         raise InputError("OPF takes photos to be read row by row, and these are by column; take opf-rectified")
-    shown = [scene.originals.get(image.name, image.name) for image in images]
-    rec = scene.reconstruction
     if any(image.applied_orientation != 1 for image in scene.solution.images):
         raise InputError("points and measurements are rotated as the photos are; leave --apply-orientation out")
     left, lens = 0.0, 0.0
@@ -67,7 +65,8 @@ def write_opf(folder: Path, scene: ExportScene) -> str:
         lens = max(lens, lens_left_px(camera, _carried(camera)))
         if image.taken_out is not None and stored.shutter_model != "global":
             left = max(left, rotation_left_px(camera, image.taken_out))
-    _write(folder, stored, stored.cameras, images, shown, rec, rec.observations.xy_raw, scene, rolling=True)
+    shown = [scene.originals.get(image.name, image.name) for image in images]
+    _write(folder, scene, images, shown, rolling=True)
     said = []
     if left > _REPORTED_PX:
         said.append(f"rotations during the readout have no room: the worst pixel is off by {left:.2g} px")
@@ -81,19 +80,16 @@ def write_rectified_opf(folder: Path, scene: ExportScene) -> str:
     images, cameras = scene.images, scene.solution.rectified_cameras
     of = {key: cameras[key] for key in {image.camera_id for image in images}}
     left = max((lens_left_px(camera, _carried(camera)) for camera in of.values()), default=0.0)
-    rec = scene.reconstruction
     shown = [f"../images/{scene.names[image.name]}" for image in images]
-    xy = rectified_keypoints(rec, scene.rectified_cameras)
-    _write(folder, scene.solution, cameras, images, shown, rec, xy, scene, rolling=False)
+    _write(folder, scene, images, shown, rolling=False)
     return f"two focal lengths have no room: the worst pixel is off by {left:.2g} px" if left > _REPORTED_PX else ""
 
 
 def _carried(camera: Camera) -> Camera:
     """The camera as the format has it."""
-    lens, f = camera.coefficients, float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
-    K = np.array([[f, 0, camera.K[0, 2]], [0, f, camera.K[1, 2]], [0, 0, 1]])
-    if camera.K[0, 0] == camera.K[1, 1]:
-        K = camera.K.copy()
+    lens, K = camera.coefficients, camera.K.copy()
+    if K[0, 0] != K[1, 1]:
+        K[0, 0] = K[1, 1] = np.sqrt(K[0, 0] * K[1, 1])
     return Camera(camera.width, camera.height, K, np.array([lens.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3")]))
 
 
@@ -109,23 +105,18 @@ def _internals(camera: Camera) -> Any:
 
 
 def _write(
-    folder: Path,
-    solution: Solution,
-    cameras: Any,
-    images: Sequence[SolvedImage],
-    shown: Sequence[str],
-    rec: Reconstruction,
-    xy: NDArray[np.float64],
-    scene: ExportScene,
-    *,
-    rolling: bool,
+    folder: Path, scene: ExportScene, images: Sequence[SolvedImage], shown: Sequence[str], *, rolling: bool
 ) -> None:
+    """The project of these photos, shown under these paths: `rolling` as they were taken, else rectified."""
     from pyopf import cameras as opf
     from pyopf.io import save
     from pyopf.project import Calibration, CoreProjectItemType, Metadata, ProjectObjects, ProjectSource
     from pyopf.uid64 import Uid64
 
     folder.mkdir(parents=True, exist_ok=True)
+    solution, rec = scene.stored if rolling else scene.solution, scene.reconstruction
+    cameras = solution.cameras if rolling else solution.rectified_cameras
+    xy = rec.observations.xy_raw if rolling else rectified_keypoints(rec, scene.rectified_cameras)
     used = list(dict.fromkeys(image.camera_id for image in images))
     sensor_id = {key: Uid64(int=1 + k) for k, key in enumerate(used)}
     ids = {image.name: Uid64(int=1 + k) for k, image in enumerate(images)}

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import psutil
 
-from ..errors import FileError, InputError
+from ..errors import FileError, InputError, file_errors
 from .aside import is_partial, remove_partial
 from .journal import Journal, RemoteJournal
 from .lock import check_still_there, locked
@@ -81,22 +81,17 @@ def output_folder(
     """
     folder = Path(folder)
     _prepare(folder, apart_from, replaced)
-    scratch = None
-    with only_writer(folder):
-        try:
-            with _errors_of(folder, "; give another folder"):
-                if has_content(folder) and not overwrite:
-                    raise FileError(
-                        f"{folder} is not empty; give another folder, or --overwrite to replace its outputs"
-                    )
-                scratch = Path(tempfile.mkdtemp(prefix=f"{_SCRATCH}{os.getpid()}-", dir=folder))
-            with _errors_of(folder):
-                yield scratch
-                check_still_there(folder)
-                _move(scratch, folder, apart_from)
-        finally:
-            if scratch is not None:
-                shutil.rmtree(scratch, ignore_errors=True)
+    with only_writer(folder), ExitStack() as stack:
+        with _errors_of(folder, "; give another folder"):
+            if has_content(folder) and not overwrite:
+                raise FileError(f"{folder} is not empty; give another folder, or --overwrite to replace its outputs")
+            prefix = f"{_SCRATCH}{os.getpid()}-"
+            scratch = tempfile.TemporaryDirectory(prefix=prefix, dir=folder, ignore_cleanup_errors=True)
+            stack.enter_context(scratch)
+        with _errors_of(folder):
+            yield Path(scratch.name)
+            check_still_there(folder)
+            _move(Path(scratch.name), folder, apart_from)
 
 
 @contextmanager
@@ -142,7 +137,8 @@ def only_writer(folder: Path) -> Iterator[None]:
     try:
         with ExitStack() as stack:
             with _errors_of(folder, "; give another folder"):
-                made = _first_missing(folder)
+                # the topmost folder that has to be made: what a failure removes again
+                made = next((path for path in (*reversed(folder.parents), folder) if not path.exists()), None)
                 if folder.exists() and not folder.is_dir():
                     raise FileError(f"{folder} is a file; give a folder for the outputs")
                 folder.mkdir(parents=True, exist_ok=True)
@@ -324,10 +320,8 @@ def held_inside(folder: Path, name: str) -> Iterator[Path]:
         yield path
         _check_inside(within, within, folder)
         return
-    try:
+    with file_errors(path, "written"):
         held = os.open(within, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError as error:
-        raise FileError(f"{path} cannot be written: {error.strerror}") from error
     through = _OPEN_FOLDERS / str(held)
     try:
         _check_inside(within, through, folder)
@@ -377,13 +371,3 @@ def _errors_of(folder: Path, mend: str = "") -> Iterator[None]:
         if isinstance(error, FileError) or (not mend and error.errno not in CANNOT_WRITE):
             raise
         raise FileError(f"{folder} cannot be written: {error.strerror}{mend}") from error
-
-
-def _first_missing(folder: Path) -> Path | None:
-    """The topmost folder that has to be made for `folder` to exist: what a failure removes again."""
-    missing = None
-    for path in (folder, *folder.parents):
-        if path.exists():
-            break
-        missing = path
-    return missing

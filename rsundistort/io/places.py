@@ -60,11 +60,6 @@ class RemoteFolder:
         return self.url
 
     @property
-    def name(self) -> str:
-        """Last part of the URL."""
-        return self.url.rpartition("/")[2]
-
-    @property
     def protocol(self) -> str:
         """Such as "s3"."""
         return self.url.partition("://")[0]
@@ -207,11 +202,6 @@ def local_place(place: Path | str) -> Path:
     return local
 
 
-def _leads_nowhere(path: Path) -> bool:
-    """Whether a link has lost what it led to."""
-    return path.is_symlink() and not path.exists()
-
-
 def files_in(place: Place, within: str = ".") -> dict[str, File] | None:
     """Files in a folder or a sub-folder of it by their own names, sorted; None if there is no such folder.
 
@@ -230,7 +220,8 @@ def files_in(place: Place, within: str = ".") -> dict[str, File] | None:
     folder = place / within
     if not folder.is_dir():
         return None
-    return {path.name: path for path in sorted(folder.iterdir()) if path.is_file() or _leads_nowhere(path)}
+    paths = sorted(folder.iterdir())
+    return {path.name: path for path in paths if path.is_file() or (path.is_symlink() and not path.exists())}
 
 
 def files_of(place: Place, paths: Sequence[str]) -> dict[str, File]:

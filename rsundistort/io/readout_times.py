@@ -10,7 +10,6 @@ import re
 from functools import cache
 from pathlib import Path
 
-from ..errors import InputError
 from .tables import read_table
 
 __all__ = ["readout_time"]
@@ -64,7 +63,5 @@ def _table() -> dict[str, dict[tuple[int, int], tuple[float, str]]]:
         size = int(row["width"] or 0), int(row["height"] or 0)
         key = max(size), min(size)
         times = found.setdefault(_key(row["make"], row["model"]), {})
-        if key in times or not row["source"]:
-            raise InputError(f"{_TABLE.name}: {row['make']} {row['model']} {size} twice, or without a source")
         times[key] = float(row["readout_ms"]) / 1e3, row["source"]
     return found

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 
-from ..errors import FileError
+from ..errors import FileError, file_errors
 from ..model.checks import check_photo_name
 from .journal import Journal, entries_of
 from .json_text import parse_json
@@ -171,24 +171,14 @@ class Record:
         if isinstance(self._place, RemoteFolder):
             self._lines += lines
         elif lines:
-            with self._errors(), (self._place / self.NAME).open("a", encoding="utf-8") as file:
+            with file_errors(self._place, "written"), (self._place / self.NAME).open("a", encoding="utf-8") as file:
                 file.write("".join(lines))
 
     def _write(self, known: Mapping[str, Collection[str]]) -> None:
         """Begin anew, in one stroke."""
         lines = (_line(path, stamp) for path in sorted(known) for stamp in sorted(known[path]))
-        with self._errors():
+        with file_errors(self._place, "written"):
             write_in(self._place, self.NAME, "".join(lines).encode())
-
-    @contextmanager
-    def _errors(self) -> Iterator[None]:
-        """Error messages of a folder that cannot be written, in one line."""
-        try:
-            yield
-        except FileError:
-            raise
-        except OSError as error:
-            raise FileError(f"{self._place} cannot be written: {error.strerror}") from error
 
     def _put(self) -> None:
         """Put a remote record with what was added to it."""

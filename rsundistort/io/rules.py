@@ -33,14 +33,11 @@ _LARGEST = 2**53
 _SHOWN = 60
 
 
-@dataclass(frozen=True, init=False)
 class Numbers:
     """Lists of finite numbers of a shape; None: of any length."""
 
-    shape: tuple[int | None, ...]
-
     def __init__(self, *shape: int | None) -> None:
-        object.__setattr__(self, "shape", shape)
+        self.shape = shape
 
     def __str__(self) -> str:
         if len(self.shape) == 1:
@@ -50,17 +47,13 @@ class Numbers:
 
     def holds(self, value: Any, axis: int = 0) -> bool:
         """Whether the value is of this shape from an axis on."""
-        if axis + 1 == len(self.shape):
-            length = self.shape[axis]
-            fits = type(value) is list and (length is None or len(value) == length)
-            return fits and all(_is(each, float) for each in value)
-        length = self.shape[axis]
-        return (
-            type(value) is list
-            and (length is None or len(value) == length)
-            and all(self.holds(each, axis + 1) for each in value)
-            and (self.shape[axis + 1] is not None or len({len(each) for each in value}) < 2)
-        )
+        length, *inner = self.shape[axis:]
+        if type(value) is not list or (length is not None and len(value) != length):
+            return False
+        if not inner:
+            return all(_is(each, float) for each in value)
+        same = inner[0] is not None
+        return all(self.holds(each, axis + 1) for each in value) and (same or len({len(each) for each in value}) < 2)
 
 
 @dataclass(frozen=True)
@@ -78,14 +71,11 @@ class Between:
         return _is(value, type(self.low)) and self.low <= value <= self.high
 
 
-@dataclass(frozen=True, init=False)
 class OneOf:
     """One of some texts."""
 
-    words: tuple[str, ...]
-
     def __init__(self, *words: str) -> None:
-        object.__setattr__(self, "words", words)
+        self.words = words
 
     def __str__(self) -> str:
         return f"one of {', '.join(self.words)}"

@@ -59,12 +59,11 @@ def write_shutter_poses(folder: Path, solution: Solution, photos: Mapping[str, s
     readout = _readout_time(solution, images)
     frames = []
     for image, camera in zip(images, cameras, strict=True):
-        first, last = (_pose(solution, image, _clock(camera, place)) for place in (-0.5, 0.5))
         frame = {
             "file_path": photos[image.name],
-            "transform_matrix": camera_to_world(*_pose(solution, image, _clock(camera, 0.0))),
-            "transform_matrix_start": camera_to_world(*first),
-            "transform_matrix_end": camera_to_world(*last),
+            "transform_matrix": camera_to_world(*_pose(solution, image, 0.0)),
+            "transform_matrix_start": camera_to_world(*_pose(solution, image, -0.5)),
+            "transform_matrix_end": camera_to_world(*_pose(solution, image, 0.5)),
             "rolling_shutter": _NGP_SHUTTER[camera.readout],
         }
         if readout is not None:
@@ -116,9 +115,10 @@ def _clock(camera: Camera, place: float, border: float = 0.5) -> float:
     return float(clock_of(camera, np.full((1, 2), _line(camera, place, border)))[0])
 
 
-def _pose(solution: Solution, image: SolvedImage, clock: float) -> Pose:
+def _pose(solution: Solution, image: SolvedImage, place: float, border: float = 0.5) -> Pose:
+    """The pose there, of the steady motion that is nearest."""
     motion, pose = _steady(solution, image)
-    return motion.pose_at(clock, *pose)
+    return motion.pose_at(_clock(solution.cameras[image.camera_id], place, border), *pose)
 
 
 def end_poses(solution: Solution, image: SolvedImage) -> tuple[Pose, Pose]:
@@ -126,15 +126,14 @@ def end_poses(solution: Solution, image: SolvedImage) -> tuple[Pose, Pose]:
 
     Of the steady motion that is nearest; `image` is in the stored frame.
     """
-    camera = solution.cameras[image.camera_id]
-    first, last = (_pose(solution, image, _clock(camera, place, border=0.0)) for place in (-0.5, 0.5))
-    return first, last
+    return _pose(solution, image, -0.5, border=0.0), _pose(solution, image, 0.5, border=0.0)
 
 
-def _bent(solution: Solution, image: SolvedImage, clock: float) -> Pose:
-    """The pose that a line has, and not that of the nearest steady motion."""
+def _bent(solution: Solution, image: SolvedImage, place: float) -> Pose:
+    """The pose that the line at a place has, and not that of the nearest steady motion."""
     assert image.R_cw is not None
     assert image.center_w is not None
+    clock = _clock(solution.cameras[image.camera_id], place, border=0.0)
     return _motion(solution, image).pose_at(clock, image.R_cw, image.center_w)
 
 
@@ -155,10 +154,7 @@ def _write_gsplat(path: Path, solution: Solution, images: Sequence[SolvedImage],
         lines = {
             "lines": np.array([[_line(camera, place, border=0.0) for place in places] for camera in cameras]),
             "viewmats_lines": np.array(
-                [
-                    [_viewmat(_bent(solution, image, _clock(camera, place, border=0.0))) for place in places]
-                    for image, camera in zip(images, cameras, strict=True)
-                ]
+                [[_viewmat(_bent(solution, image, place)) for place in places] for image in images]
             ),
         }
     Ks = np.array([camera.K for camera in cameras]).reshape(-1, 3, 3)
@@ -201,7 +197,7 @@ def _readout_time(solution: Solution, images: Sequence[SolvedImage]) -> tuple[fl
 def _velocities(solution: Solution, image: SolvedImage, camera: Camera, time: float) -> dict[str, Any]:
     """Velocities of the camera in its own frame, OpenGL's axes: world units and radians by the unit of time."""
     motion, _ = _steady(solution, image)
-    R_cw, _ = _pose(solution, image, _clock(camera, 0.0))
+    R_cw, _ = _pose(solution, image, 0.0)
     # rows run downwards there; to read them upwards is to move the other way
     rate = camera.clock_sign * camera.frame_span / time
     axes = np.array([1.0, -1.0, -1.0])

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import FileError, FormatError, InputError
+from ..errors import FileError, FormatError, InputError, format_errors
 from ..model import Bend, Camera, RowMotion, Solution, SolvedImage
 from .aside import write_aside
 from .cameras import camera_from_json, camera_to_json
@@ -231,11 +231,9 @@ def read_solution(path: Path, newer: bool = False) -> Solution:
             f"{path} has version {version!r} of the format, this program reads {VERSION} and {BENT_VERSION}; "
             "update rsundistort"
         )
-    try:
+    with format_errors(path):
         check(value, _RULES)
         return _solution_from_json(value)
-    except InputError as error:
-        raise FormatError(f"{path}: {error}") from error
 
 
 def _solution_from_json(value: dict[str, Any]) -> Solution:
@@ -260,30 +258,27 @@ def _solution_from_json(value: dict[str, Any]) -> Solution:
     )
 
 
+# Fields of `SolvedImage` that are the same in the file.
+_AS_THEY_ARE = (
+    "name", "camera_id", "R_cw", "center_w", "rms_px", "rs_shift_px", "depth", "translation_shift_px", "reason",
+    "doubtful",
+)  # fmt: skip
+
+
 def _image_from_json(entry: dict[str, Any], where: str) -> SolvedImage:
     motion = None
-    try:
+    with format_errors(where):
         if entry["registered"] and entry.get("phi") is not None:
             velocity = entry.get("velocity") or [0.0, 0.0, 0.0]
             motion = RowMotion(np.array(entry["phi"], float), np.array(velocity, float), _bend_from_json(entry))
         roi, sigma = entry.get("roi"), entry.get("sigma_phi")
+        same: dict[str, Any] = {name: entry.get(name) for name in _AS_THEY_ARE}
         return SolvedImage(
-            name=entry["name"],
-            camera_id=entry["camera_id"],
-            R_cw=entry.get("R_cw"),
-            center_w=entry.get("center_w"),
             motion=motion,
             sigma_phi=None if sigma is None else np.array(sigma, float),
             num_observations=entry.get("num_observations") or 0,
-            rms_px=entry.get("rms_px"),
-            rs_shift_px=entry.get("rs_shift_px"),
-            depth=entry.get("depth"),
-            translation_shift_px=entry.get("translation_shift_px"),
-            reason=entry.get("reason"),
             applied_orientation=entry.get("turned", 1),
             roi=None if roi is None else (roi[0], roi[1], roi[2], roi[3]),
-            doubtful=entry.get("doubtful"),
             lens_only=bool(entry.get("lens_only")),
+            **same,
         )
-    except InputError as error:
-        raise FormatError(f"{where}: {error}") from error

@@ -70,14 +70,11 @@ def write_path(path: Path, names: Sequence[str], camera_path: CameraPath) -> Non
 
 def write_point_cloud(path: Path, points_w: NDArray[np.float64], rgb: NDArray[np.uint8] | None = None) -> None:
     """Write points (n, 3) and their colours (n, 3), black when left out, as binary PLY."""
-    vertices = np.zeros(
-        len(points_w), [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
-    )
-    for axis, name in enumerate("xyz"):
-        vertices[name] = points_w[:, axis]
-    for channel, name in enumerate(("red", "green", "blue")):
-        vertices[name] = 0 if rgb is None else rgb[:, channel]
-    properties = [f"property float {name}" for name in "xyz"]
-    properties += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    rgb = np.zeros((len(points_w), 3), np.uint8) if rgb is None else rgb
+    columns = dict(zip(("x", "y", "z", "red", "green", "blue"), (*points_w.T, *rgb.T), strict=True))
+    vertices = np.zeros(len(points_w), [(name, "<f4" if name in "xyz" else "u1") for name in columns])
+    for name, values in columns.items():
+        vertices[name] = values
+    properties = [f"property {'float' if name in 'xyz' else 'uchar'} {name}" for name in columns]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}", *properties, "end_header"]
     path.write_bytes("\n".join(header).encode() + b"\n" + vertices.tobytes())

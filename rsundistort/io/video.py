@@ -6,7 +6,6 @@ import csv
 import struct
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, InputError, RsUndistortWarning
-from .ffmpeg_reasons import ffmpeg_errors
+from .ffmpeg_reasons import ffmpeg_errors, open_video
 from .outputs import output_folder
 from .photos.exif import ORIENTATION, pack_ifd
 from .photos.images import MAX_MEGAPIXELS, write_image
@@ -28,6 +27,7 @@ __all__ = [
     "FrameWriter",
     "VideoFrames",
     "VideoReader",
+    "bits_of",
     "extract_frames",
     "frame_name",
     "is_video",
@@ -46,6 +46,7 @@ _MEASURED_PX = 960
 # EXIF orientation that shows a frame as its display matrix asks, by the angle counterclockwise
 _ORIENTATIONS = {0: 1, -90: 6, 90: 8, 180: 3, -180: 3}
 _ATTACHED_PICTURE = 1024  # FFmpeg's AV_DISPOSITION_ATTACHED_PIC
+_MEND = "; if it was cut short while being recorded, repair it or copy it again"
 _MAKE = ("make", "com.apple.quicktime.make", "com.android.manufacturer")
 _MODEL = ("model", "com.apple.quicktime.model", "com.android.model")
 
@@ -78,16 +79,6 @@ class VideoFrames:
     orientation: int
     make: str
     model: str
-
-
-@dataclass(frozen=True)
-class _Frame:
-    """A decoded frame that may become a photo; `picture` is PyAV's."""
-
-    number: int
-    time_s: float
-    sharpness: float
-    picture: Any
 
 
 def is_video(path: Path) -> bool:
@@ -151,18 +142,20 @@ def _extract(
     reader: VideoReader, folder: Path, group: int, *, measure: bool, progress: Callable[[int, int], None] | None
 ) -> VideoFrames:
     writer = FrameWriter(reader, folder)
-    best: _Frame | None = None
+    best: tuple[int, float, Any] | None = None
+    sharpest = 0.0
     for number, time_s, picture in reader:
         if progress is not None:
             progress(number + 1, reader.num_frames)
-        if best is not None and number // group > best.number // group:
-            writer.add(best.number, best.time_s, best.picture, best.sharpness)
+        if best is not None and number // group > best[0] // group:
+            writer.add(*best, sharpest)
             best = None
         if measure or best is None:
-            frame = _Frame(number, time_s, sharpness_of(picture), picture)
-            best = frame if best is None or frame.sharpness > best.sharpness else best
+            sharpness = sharpness_of(picture)
+            if best is None or sharpness > sharpest:
+                best, sharpest = (number, time_s, picture), sharpness
     if best is not None:
-        writer.add(best.number, best.time_s, best.picture, best.sharpness)
+        writer.add(*best, sharpest)
     reader.warn()
     return writer.finish()
 
@@ -171,7 +164,8 @@ class VideoReader:
     """Whole frames of a video in the order of presentation, each as (number, time_s, picture of PyAV).
 
     Used in a `with` statement. Times are those since the first frame; NaN where the video holds none. A frame that
-    cannot be decoded is passed over, and so are those that build on it; behind a change of size the video ends.
+    cannot be decoded is concealed by the decoder, and those that build on it inherit the fault: all up to the next
+    whole key frame are passed over. Behind a change of size the video ends.
 
     Raises
     ------
@@ -183,18 +177,17 @@ class VideoReader:
 
     def __init__(self, video: Path | str) -> None:
         self.video = Path(video)
+        self.num_whole = 0
+        self.num_damaged = 0
+        self._interlaced = False
+        self._timeless = 0
+        self._broken = ""
+        self._end_s = 0.0
+        self._size: tuple[int, int] | None = None
+        self._changes_at_s: float | None = None
 
     def __enter__(self) -> VideoReader:
-        try:
-            import av
-        except ImportError:
-            raise InputError(
-                f'{self.video.name} is a video, which needs PyAV: pip install "rsundistort[video]"'
-            ) from None
-        with self._explained():
-            # a name with a colon is no protocol, and a file that refers to others must not fetch them
-            options = {"protocol_whitelist": "file"}
-            self._container = av.open(f"file:{self.video}", options=options, metadata_errors="replace")
+        self._container = open_video(self.video, _MEND)
         # a cover picture is a video stream, too
         streams = self._container.streams.video
         stream = next((s for s in streams if not int(s.disposition) & _ATTACHED_PICTURE), None)
@@ -206,39 +199,93 @@ class VideoReader:
             self._container.close()
             kind = f"pictures of {size[0]}x{size[1]} pixels" if stream.codec_context is not None else "an unknown codec"
             raise FileError(f"{self.video} cannot be read as a video: it has {kind}; repair it or copy it again")
-        self._stream = stream
+        self.stream = stream  # PyAV's, of the pictures
         self.tags = dict(self._container.metadata)
         tags = {key.lower(): value for key, value in (*self._container.metadata.items(), *stream.metadata.items())}
         self.make, self.model = (
             next((tags[key].strip() for key in keys if tags.get(key)), "") for keys in (_MAKE, _MODEL)
         )
-        self.decoded = _Decoded(stream)
         return self
 
     def __exit__(self, *_: object) -> None:
         self._container.close()
 
     def __iter__(self) -> Iterator[tuple[int, float, Any]]:
-        with self._explained():
-            yield from self.decoded
-
-    def _explained(self) -> AbstractContextManager[None]:
-        mend = "; if it was cut short while being recorded, repair it or copy it again"
-        return ffmpeg_errors(f"{self.video} cannot be read as a video", mend)
+        with ffmpeg_errors(f"{self.video} cannot be read as a video", _MEND):
+            yield from self._whole()
 
     @property
     def num_frames(self) -> int:
         """Frames by the container; 0 where it does not say."""
-        return int(self._stream.frames)
+        return int(self.stream.frames)
 
-    @property
-    def stream(self) -> Any:
-        """PyAV's stream of pictures."""
-        return self._stream
+    def _whole(self) -> Iterator[tuple[int, float, Any]]:
+        first: float | None = None
+        previous = np.nan
+        step = float(1 / self.stream.average_rate) if self.stream.average_rate else np.nan
+        damaged = False
+        for number, picture in enumerate(self._pictures()):
+            damaged = picture is None or picture.is_corrupt or (damaged and not picture.key_frame)
+            if picture is not None and picture.time is not None:
+                first = picture.time if first is None else first
+                time_s = picture.time - first
+            else:
+                time_s = previous + step  # NaN until a frame has a time
+            previous = time_s
+            self._end_s = max(self._end_s, time_s + step) if np.isfinite(time_s + step) else self._end_s
+            if damaged:
+                self.num_damaged += 1
+                continue
+            size = picture.width, picture.height
+            if size != (self._size or size):
+                self._changes_at_s = time_s
+                return
+            self._size = size
+            self.num_whole += 1
+            self._interlaced |= picture.interlaced_frame
+            self._timeless += picture.time is None
+            yield number, time_s, picture
+
+    def _pictures(self) -> Iterator[Any]:
+        """Decoded frames; None for one that could not be."""
+        import av
+
+        self.stream.thread_type = "SLICE"  # threads that take a frame each lose the faults of the last ones
+        packets = self.stream.container.demux(self.stream)
+        while True:
+            try:
+                packet = next(packets)
+            except StopIteration:
+                return
+            except av.error.FFmpegError as error:
+                self._broken = error.strerror
+                packet = None  # what the decoder still holds
+            try:
+                yield from self.stream.codec_context.decode(packet)
+            except av.error.FFmpegError:
+                yield None
+            if packet is None:
+                return
 
     def warn(self) -> None:
         """Say what was wrong with the video."""
-        self.decoded.warn(self.video.name)
+        said = []
+        if self.num_damaged:
+            said.append(f"{self.num_damaged} frames or more are damaged and were left out")
+        length = self.stream.duration and float(self.stream.duration * self.stream.time_base)
+        if length is None and self.stream.container.duration is not None:
+            length = self.stream.container.duration / 1e6
+        if self._changes_at_s is not None:
+            said.append(f"its frames change size at {self._changes_at_s:.1f} s; what follows was left out")
+        # containers round, and count the sound that goes on after the last frame
+        elif self._broken or (length and self._end_s and self._end_s < length - max(0.5, 0.02 * length)):
+            said.append(f"it ends at {self._end_s:.1f} s{f' of {length:.1f} s' if length else ''}")
+        if self._interlaced:
+            said.append("it is interlaced: each frame holds two moments, which no shutter model describes")
+        if self._timeless:
+            said.append(f"{self._timeless} frames have no time of their own")
+        if said:
+            warnings.warn(f"{self.video.name}: {'; '.join(said)}", RsUndistortWarning, stacklevel=3)
 
 
 class FrameWriter:
@@ -270,11 +317,10 @@ class FrameWriter:
                 time = f"{time_s:.6f}" if np.isfinite(time_s) else ""
                 table.writerow([name, number, time, f"{sharpness:.2f}"])
         names, _, times, _ = zip(*self._rows, strict=True)
-        decoded = self._reader.decoded
+        reader = self._reader
         return VideoFrames(
-            names, np.array(times), decoded.num_whole, decoded.num_damaged, self._orientation, self._reader.make,
-            self._reader.model,
-        )  # fmt: skip
+            names, np.array(times), reader.num_whole, reader.num_damaged, self._orientation, reader.make, reader.model
+        )
 
 
 def frame_name(video: Path, number: int) -> str:
@@ -282,100 +328,18 @@ def frame_name(video: Path, number: int) -> str:
     return f"{video.stem}_{number:06d}.png"
 
 
-class _Decoded:
-    """Whole frames of a stream in the order of presentation, each as (number, time_s, picture).
-
-    A frame that cannot be decoded is concealed by the decoder, and those that build on it inherit the fault: all up to
-    the next whole key frame are passed over.
-    """
-
-    def __init__(self, stream: Any) -> None:
-        self._stream = stream
-        self.num_whole = 0
-        self.num_damaged = 0
-        self._interlaced = False
-        self._timeless = 0
-        self._broken = ""
-        self._end_s = 0.0
-        self._size: tuple[int, int] | None = None
-        self._changes_at_s: float | None = None
-
-    def __iter__(self) -> Iterator[tuple[int, float, Any]]:
-        first: float | None = None
-        previous = np.nan
-        step = float(1 / self._stream.average_rate) if self._stream.average_rate else np.nan
-        damaged = False
-        for number, picture in enumerate(self._pictures()):
-            damaged = picture is None or picture.is_corrupt or (damaged and not picture.key_frame)
-            if picture is not None and picture.time is not None:
-                first = picture.time if first is None else first
-                time_s = picture.time - first
-            else:
-                time_s = previous + step  # NaN until a frame has a time
-            previous = time_s
-            self._end_s = max(self._end_s, time_s + step) if np.isfinite(time_s + step) else self._end_s
-            if damaged:
-                self.num_damaged += 1
-                continue
-            size = picture.width, picture.height
-            if size != (self._size or size):
-                self._changes_at_s = time_s
-                return
-            self._size = size
-            self.num_whole += 1
-            self._interlaced |= picture.interlaced_frame
-            self._timeless += picture.time is None
-            yield number, time_s, picture
-
-    def _pictures(self) -> Iterator[Any]:
-        """Decoded frames; None for one that could not be."""
-        import av
-
-        self._stream.thread_type = "SLICE"  # threads that take a frame each lose the faults of the last ones
-        packets = self._stream.container.demux(self._stream)
-        while True:
-            try:
-                packet = next(packets)
-            except StopIteration:
-                return
-            except av.error.FFmpegError as error:
-                self._broken = error.strerror
-                packet = None  # what the decoder still holds
-            try:
-                yield from self._stream.codec_context.decode(packet)
-            except av.error.FFmpegError:
-                yield None
-            if packet is None:
-                return
-
-    def warn(self, name: str) -> None:
-        """Say what was wrong with the video."""
-        said = []
-        if self.num_damaged:
-            said.append(f"{self.num_damaged} frames or more are damaged and were left out")
-        length = self._stream.duration and float(self._stream.duration * self._stream.time_base)
-        if length is None and self._stream.container.duration is not None:
-            length = self._stream.container.duration / 1e6
-        if self._changes_at_s is not None:
-            said.append(f"its frames change size at {self._changes_at_s:.1f} s; what follows was left out")
-        # containers round, and count the sound that goes on after the last frame
-        elif self._broken or (length and self._end_s and self._end_s < length - max(0.5, 0.02 * length)):
-            said.append(f"it ends at {self._end_s:.1f} s{f' of {length:.1f} s' if length else ''}")
-        if self._interlaced:
-            said.append("it is interlaced: each frame holds two moments, which no shutter model describes")
-        if self._timeless:
-            said.append(f"{self._timeless} frames have no time of their own")
-        if said:
-            warnings.warn(f"{name}: {'; '.join(said)}", RsUndistortWarning, stacklevel=4)
-
-
 def _pixels(picture: Any) -> NDArray[Any]:
     """(h, w, 3) BGR, 8 bit, or 16 bit where the video has more than eight."""
-    if max(component.bits for component in picture.format.components) > 8:
+    if bits_of(picture.format) > 8:
         deep: NDArray[Any] = picture.to_ndarray(format="rgb48le")
         return np.ascontiguousarray(deep[..., ::-1])
     pixels: NDArray[Any] = picture.to_ndarray(format="bgr24")
     return pixels
+
+
+def bits_of(form: Any) -> int:
+    """Bits of a number in a format of PyAV."""
+    return int(max(component.bits for component in form.components))
 
 
 def sharpness_of(picture: Any) -> float:

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RsUndistortWarning
-from .ffmpeg_reasons import ffmpeg_errors
-from .video import VideoReader
+from .ffmpeg_reasons import ffmpeg_errors, open_video
+from .video import VideoReader, bits_of
 from .video_writer import X264_PARAMS
 
 __all__ = ["Pixels", "VideoWriter", "black_out", "pixels_of"]
@@ -73,7 +73,7 @@ def _readable(picture: Any) -> Any:
     form = picture.format
     if _own_planes(form):
         return picture
-    deep = max(component.bits for component in form.components) > 8
+    deep = bits_of(form) > 8
     if form.is_rgb or form.has_palette:
         made = picture.reformat(format="yuv444p10le" if deep else "yuv444p", dst_colorspace="ITU709")
         made.colorspace, made.color_range = _BT709, _LIMITED_RANGE
@@ -123,12 +123,11 @@ def _picture_of(pixels: Pixels, form: str) -> Any:
         plane = np.ascontiguousarray(values if values.ndim == 2 else values[..., k])
         if k and size != (width, height):
             plane = cv2.resize(plane, size, interpolation=cv2.INTER_AREA)
-        rows = np.zeros(
-            (picture.planes[k].buffer_size // picture.planes[k].line_size, picture.planes[k].line_size), "u1"
-        )
         coded = np.ascontiguousarray(plane).view("u1").reshape(plane.shape[0], -1)
+        target = picture.planes[k]
+        rows = np.zeros((target.buffer_size // target.line_size, target.line_size), "u1")
         rows[: coded.shape[0], : coded.shape[1]] = coded
-        picture.planes[k].update(rows)
+        target.update(rows)
     return picture
 
 
@@ -241,7 +240,7 @@ class VideoWriter:
             if key not in ("major_brand", "minor_version", "compatible_brands", "encoder"):
                 self._container.metadata[key] = value
         self._stream = stream
-        depth = codec_bits(self.pixel_format)
+        depth = bits_of(av.VideoFormat(self.pixel_format, 16, 16))
         if depth < pixels.bits:
             warnings.warn(
                 f"{self._reader.video.name} has {pixels.bits} bits a colour, and {self.encoder} writes {depth}",
@@ -262,20 +261,11 @@ class VideoWriter:
         return ffmpeg_errors("the rectified video cannot be written", reading=False)
 
 
-def codec_bits(pixel_format: str) -> int:
-    """Bits of a number in a format of FFmpeg."""
-    import av
-
-    return int(max(component.bits for component in av.VideoFormat(pixel_format, 16, 16).components))
-
-
 class _Sound:
     """The sound of a video, copied packet by packet, a little ahead of the pictures."""
 
     def __init__(self, video: Path, container: Any) -> None:
-        import av
-
-        self._source = av.open(f"file:{video}", options={"protocol_whitelist": "file"}, metadata_errors="replace")
+        self._source = open_video(video)
         self._target: dict[int, Any] = {}
         self._lost: list[str] = []
         self._num_spoiled = 0
@@ -305,9 +295,7 @@ class _Sound:
             packet.stream = self._target[packet.stream.index]
             try:
                 self._container.mux(packet)
-            except av.error.InvalidDataError:
-                self._num_spoiled += 1
-            except av.error.ArgumentError:  # its time runs back
+            except (av.error.InvalidDataError, av.error.ArgumentError):  # the latter where its time runs back
                 self._num_spoiled += 1
 
     def _peek(self) -> Any:

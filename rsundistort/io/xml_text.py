@@ -6,7 +6,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 from xml.parsers import expat
 
-from ..errors import FileError, FormatError
+from ..errors import FormatError, file_errors
 
 __all__ = ["parse_xml", "read_xml"]
 
@@ -55,9 +55,9 @@ def read_xml(path: Path | str) -> ElementTree.Element:
     FileError, FormatError
         When it cannot be read; when it is no XML, declares a document type, or is nested without end.
     """
+    with file_errors(path):
+        data = Path(path).read_bytes()
     try:
-        return parse_xml(Path(path).read_bytes())
-    except OSError as error:
-        raise FileError(f"{path} cannot be read: {error.strerror}") from error
+        return parse_xml(data)
     except ValueError as error:
         raise FormatError(f"{path} is no valid XML: {error}") from error

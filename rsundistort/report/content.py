@@ -15,7 +15,6 @@ from ..io import output_name
 from ..model import SHUTTER_MODELS, Camera, Solution, SolvedImage
 from ..model.field import field_over_frame
 from ..model.orientation import MATRICES, in_stored_frame, orient_points, split_mirror
-from .diagnostics import Diagnostics
 from .displacement import displacement_field
 from .pictures import Picture
 from .source import Source, relative_folder
@@ -85,7 +84,7 @@ def motions(solution: Solution) -> list[dict[str, Any]]:
     """
     width, height = _CURVE
     found = []
-    for number, image in enumerate(solution.images):
+    for image in solution.images:
         if image.motion is None or image.motion.bend is None:
             continue
         camera = solution.cameras[image.camera_id]
@@ -101,7 +100,6 @@ def motions(solution: Solution) -> list[dict[str, Any]]:
 
         found.append(
             {
-                "number": number,
                 "name": image.name,
                 "curves": paths(rotation),
                 "steady": paths(steady),
@@ -179,22 +177,25 @@ def scene(source: Source, upright: Mapping[str, int]) -> dict[str, Any] | None:
     V = view_frame(rotation @ R) if solution.georeference is None else np.eye(3)
     points = np.zeros((0, 3)) if stored is None else stored.points_w
     reach = _size(centers, points)
+    near = _is_near(points, centers, reach)
     side = min(0.5 * _spacing(centers), 0.12 * reach) or 0.12 * reach
     value: dict[str, Any] = {
         "names": [image.name for image in images],
-        "centers": _packed((centers) @ V.T),
+        "centers": _packed(centers @ V.T),
         "frusta": _packed(_frusta(R, centers, lenses, side) @ V.T),
         "axes": _packed(readout_axes(R, [lens.readout for lens in lenses]) @ V.T),
-        "box": _box(_near(points, centers, reach) @ V.T, centers @ V.T),
+        "box": _box(points[near] @ V.T, centers @ V.T),
     }
     if stored is not None:
         place = {name: i for i, name in enumerate(stored.names)}
         rows = [place[image.name] for image in images]
-        value["shown"] = int(_is_near(stored.points_w, centers, reach).sum())
-        value["points"] = _packed(_near(stored.points_w, centers, reach) @ V.T)
-        value["colors"] = [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in _near_rgb(stored, centers, reach).tolist()]
+        value["shown"] = int(near.sum())
+        value["points"] = _packed(points[near] @ V.T)
+        rgb = stored.rgb[near] if len(stored.rgb) else stored.rgb
+        value["colors"] = [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in rgb.tolist()]
+        others = stored.global_points_w
         value["global"] = {
-            "points": _packed(_near(stored.global_points_w, centers, reach) @ V.T),
+            "points": _packed(others[_is_near(others, centers, reach)] @ V.T),
             "centers": _packed(stored.global_center_w[rows] @ V.T),
             "frusta": _packed(_frusta(stored.global_R_cw[rows], stored.global_center_w[rows], lenses, side) @ V.T),
         }
@@ -239,7 +240,6 @@ def models(solution: Solution) -> list[dict[str, Any]]:
         {
             "name": name,
             "rms": fits.get(name, {}).get("rms_px"),
-            "iterations": fits.get(name, {}).get("iterations"),
             "held_out": held_out.get(name),
             "error": errors.get(name),
             "gain": gains.get(name),
@@ -368,14 +368,6 @@ def _spacing(centers: NDArray[np.float64]) -> float:
 def _is_near(points: NDArray[np.float64], centers: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
     near: NDArray[np.bool_] = np.linalg.norm(points - np.median(centers, axis=0), axis=1) < 2 * reach
     return near
-
-
-def _near(points: NDArray[np.float64], centers: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
-    return points[_is_near(points, centers, reach)]
-
-
-def _near_rgb(stored: Diagnostics, centers: NDArray[np.float64], reach: float) -> NDArray[np.uint8]:
-    return stored.rgb[_is_near(stored.points_w, centers, reach)] if len(stored.rgb) else stored.rgb
 
 
 def _box(points: NDArray[np.float64], centers: NDArray[np.float64]) -> list[list[float]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..bundle import BundleResult
-from ..errors import FormatError
+from ..errors import FormatError, format_errors
 from ..evaluation import align_points
 from ..io.aside import write_aside
 from ..model import Reconstruction
@@ -117,7 +118,7 @@ class Diagnostics:
     def of_results(cls, result: BundleResult, global_result: BundleResult, camera_ids: ArrayLike) -> Diagnostics:
         """Diagnostics of an adjustment and its global-shutter counterpart, with the ids of cameras in the solution."""
         rec, plain = result.reconstruction, _aligned(global_result.reconstruction, result.reconstruction)
-        both = [_Residuals.of(each) for each in (plain, rec)]
+        both = [_Residuals(each) for each in (plain, rec)]
         chosen, of_plain = (_some(each.num_points) for each in (rec, plain))
         reach = max(*(np.quantile(np.abs(each.xy), 0.995) for each in both if each.xy.size), 0.1)
         edges = np.linspace(-reach, reach, _BARS)
@@ -146,9 +147,10 @@ class Diagnostics:
 
 def write_diagnostics(path: Path, diagnostics: Diagnostics) -> None:
     """Write `report.npz`, whole or not at all."""
-    values: dict[str, Any] = {each.name: getattr(diagnostics, each.name) for each in fields(diagnostics)}
-    # values for display only need
-    values = {name: v.astype(np.float32) if _is_float(v) else np.array(v) for name, v in values.items()}
+    # values for display need no more than single precision
+    values: dict[str, Any] = {
+        name: v.astype(np.float32) if _is_float(v) else np.array(v) for name, v in vars(diagnostics).items()
+    }
     file = io.BytesIO()
     np.savez_compressed(file, format=np.array(_FORMAT), version=np.array(_VERSION), **values)
     write_aside(Path(path), file.getvalue())
@@ -179,10 +181,8 @@ def read_diagnostics(path: Path) -> Diagnostics:
     for name in ("names", "camera_ids"):
         values[name] = tuple(str(each) for each in values[name])
     values["photos"] = str(values["photos"])
-    try:
+    with format_errors(path):
         return Diagnostics(**values)
-    except FormatError as error:
-        raise FormatError(f"{path}: {error}") from error
 
 
 def _is_float(value: Any) -> bool:
@@ -216,39 +216,26 @@ def _median_depth(rec: Reconstruction) -> NDArray[np.float64]:
     obs = rec.observations
     ahead = rec.R_cw[obs.frame_idx, 2]
     z = ((rec.points_w[obs.point_idx] - rec.center_w[obs.frame_idx]) * ahead).sum(1)
-    of_photo = np.split(z[np.argsort(obs.frame_idx, kind="stable")], np.cumsum(_counts(rec))[:-1])
-    return np.array([np.median(each) if len(each) else np.nan for each in of_photo])
+    return np.array([np.median(z[each]) if len(each) else np.nan for each in obs.by_photo(rec.num_images)])
 
 
-def _counts(rec: Reconstruction) -> NDArray[np.int64]:
-    return np.bincount(rec.observations.frame_idx, minlength=rec.num_images)
-
-
-@dataclass(frozen=True)
 class _Residuals:
     """Residuals (o, 2) of a reconstruction that could be projected, and where they are.
 
     `clock` (o,) runs from 0, read first, to 1; `place` (o, 2) from 0 to 1 across and down the photo.
     """
 
-    rec: Reconstruction
-    xy: NDArray[np.float64]
-    frame_idx: NDArray[np.int64]
-    clock: NDArray[np.float64]
-    place: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, rec: Reconstruction) -> _Residuals:
+    def __init__(self, rec: Reconstruction) -> None:
         residuals, valid = reprojection_residuals(rec)
         obs = rec.observations
-        frame = obs.frame_idx[valid]
-        camera = rec.camera_idx[frame]
+        self.rec, self.xy, self.frame_idx = rec, residuals[valid], obs.frame_idx[valid]
+        camera = rec.camera_idx[self.frame_idx]
         sizes = np.array([(each.width, each.height) for each in rec.cameras], float)
-        place = np.clip((obs.xy_raw[valid] + 0.5) / sizes[camera], 0, 1)
+        self.place = np.clip((obs.xy_raw[valid] + 0.5) / sizes[camera], 0, 1)
         axis = np.array([each.clock_axis for each in rec.cameras])[camera]
         sign = np.array([each.clock_sign for each in rec.cameras])[camera]
-        along = place[np.arange(len(place)), axis]
-        return cls(rec, residuals[valid], frame, np.where(sign > 0, along, 1 - along), place)
+        along = self.place[np.arange(len(self.place)), axis]
+        self.clock = np.where(sign > 0, along, 1 - along)
 
     def by_photo(self) -> NDArray[np.float64]:
         """(m,) root mean square."""
@@ -260,19 +247,20 @@ class _Residuals:
 
     def by_photo_and_row(self) -> NDArray[np.float64]:
         """(m, c, 2) mean."""
-        m = self.rec.num_images
         where = self.frame_idx * _ROWS_OF_PHOTO + _bin(self.clock, _ROWS_OF_PHOTO)
-        mean = [_means(where, part, m * _ROWS_OF_PHOTO) for part in self.xy.T]
-        return np.stack(mean, axis=-1).reshape(m, _ROWS_OF_PHOTO, 2)
+        return self._mean_xy(where, self.rec.num_images, _ROWS_OF_PHOTO)
 
     def by_cell(self) -> NDArray[np.float64]:
         """(cameras, down, across, 2) mean."""
         across, down = _CELLS
-        num = len(self.rec.cameras) * down * across
         cell = _bin(self.place[:, 1], down) * across + _bin(self.place[:, 0], across)
         where = self.rec.camera_idx[self.frame_idx] * down * across + cell
-        mean = [_means(where, part, num) for part in self.xy.T]
-        return np.stack(mean, axis=-1).reshape(-1, down, across, 2)
+        return self._mean_xy(where, len(self.rec.cameras), down, across)
+
+    def _mean_xy(self, where: NDArray[np.int64], *shape: int) -> NDArray[np.float64]:
+        """(*shape, 2) mean, by the number of the cell where each residual is."""
+        mean = [_means(where, part, math.prod(shape)) for part in self.xy.T]
+        return np.stack(mean, axis=-1).reshape(*shape, 2)
 
 
 def _bin(place: NDArray[np.float64], num: int) -> NDArray[np.int64]:

@@ -14,9 +14,7 @@ from ..errors import FileError, InputError
 from ..io.aside import written_aside
 from ..io.outputs import only_writer
 from ..io.record import Record
-from ..model import Solution
 from .content import arrows_of, longer, models, view_frame
-from .diagnostics import Diagnostics
 from .source import Source, read_source
 from .verdict import degeneracy_of
 
@@ -117,12 +115,8 @@ def _models(figure: Figure, source: Source) -> bool:
     figure.set_size_inches(3.4, 0.6 + 0.32 * len(rows))
     axes = figure.add_subplot()
     values = [row[key] for row in rows]
-    bars = axes.barh(
-        [row["name"] for row in rows],
-        values,
-        height=0.6,
-        color=[_OURS if row["chosen"] else _GREY for row in rows],
-    )
+    colors = [_OURS if row["chosen"] else _GREY for row in rows]
+    bars = axes.barh([row["name"] for row in rows], values, height=0.6, color=colors)
     axes.bar_label(bars, labels=[f"{value:.3f}" for value in values], padding=3)
     axes.invert_yaxis()
     axes.set_xlim(0, 1.15 * max(values))
@@ -174,7 +168,8 @@ def _paths(figure: Figure, source: Source) -> bool:
     figure.set_size_inches(6.2, 2.8)
     for number, (label, pair) in enumerate((("ahead", (0, 1)), ("up", (0, 2))), 1):
         axes = figure.add_subplot(1, 2, number)
-        _mark(axes, stored, V, pair, centers)
+        if stored is not None and len(stored.points_w):
+            _mark(axes, (stored.points_w @ V.T)[:, pair])
         if plain is not None:
             axes.plot(*(plain @ V.T)[:, pair].T, "o--", color=_GLOBAL, ms=2.5, label="global shutter")
         axes.plot(*(centers @ V.T)[:, pair].T, "o-", color=_OURS, ms=2.5, label="rolling shutter")
@@ -183,23 +178,21 @@ def _paths(figure: Figure, source: Source) -> bool:
     return True
 
 
-def _mark(
-    axes: Any, stored: Diagnostics | None, V: NDArray[np.float64], pair: tuple[int, int], centers: NDArray[np.float64]
-) -> None:
+def _mark(axes: Any, shown: NDArray[np.float64]) -> None:
     """The scene's points, faint, behind the paths."""
-    if stored is None or not len(stored.points_w):
-        return
-    shown = (stored.points_w @ V.T)[:, pair]
     low, high = np.quantile(shown, [0.02, 0.98], axis=0)
     shown = shown[((shown >= low) & (shown <= high)).all(1)]
     axes.plot(*shown.T, ".", color="#c9c9c9", ms=0.6, rasterized=True)
 
 
 def _sphere(figure: Figure, source: Source) -> bool:
-    degeneracy = degeneracy_of(source.solution)
-    axes_w = _readout_axes(source.solution)
-    if not len(axes_w):
+    solution, degeneracy = source.solution, degeneracy_of(source.solution)
+    images = [image for image in solution.registered if image.posed]
+    if not images:
         return False
+    R = np.array([image.R_cw for image in images])
+    # the mean photo's up as z
+    axes_w = readout_axes(R, [solution.cameras[image.camera_id].readout for image in images]) @ view_frame(R).T
     figure.set_size_inches(3.0, 3.0)
     axes = figure.add_subplot(projection="3d")
     angle = np.linspace(0, 2 * np.pi, 73)
@@ -219,12 +212,3 @@ def _sphere(figure: Figure, source: Source) -> bool:
             f"degeneracy {degeneracy.value:.3f}, axes {degeneracy.y_axis_spread_deg:.1f}° apart", fontsize=8
         )
     return True
-
-
-def _readout_axes(solution: Solution) -> NDArray[np.float64]:
-    """(m, 3) directions of readout with the mean photo's up as z."""
-    images = [image for image in solution.registered if image.posed]
-    if not images:
-        return np.zeros((0, 3))
-    R = np.array([image.R_cw for image in images])
-    return readout_axes(R, [solution.cameras[image.camera_id].readout for image in images]) @ view_frame(R).T

@@ -16,9 +16,8 @@ from ..io.aside import write_aside
 from ..io.outputs import only_writer
 from ..io.record import Record
 from . import content
-from .map_facts import map_facts, map_rows
+from .facts import map_facts, map_rows, readout_facts
 from .pictures import Picture, PictureJob, make_pictures
-from .readout_facts import readout_facts
 from .source import Source, read_source
 from .verdict import advice_of, degeneracy_of, verdict_of
 

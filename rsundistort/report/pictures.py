@@ -25,6 +25,7 @@ _ALL_BYTES = 6_000_000
 _BYTES = (5_500, 160_000)
 # Approximate bytes that JPEG takes for a pixel of a reduced photo. WebP takes two thirds, and forty times as long.
 _BYTES_PER_PIXEL = 0.17
+_REDUCED = (8, cv2.IMREAD_REDUCED_COLOR_8), (4, cv2.IMREAD_REDUCED_COLOR_4), (2, cv2.IMREAD_REDUCED_COLOR_2)
 _QUALITIES = (80, 70, 55, 40, 25)
 
 
@@ -77,12 +78,9 @@ def _bytes_of_each(count: int) -> int:
 
 
 def _picture(job: PictureJob, num_bytes: int) -> Picture:
-    shown = 1  # what players do to the rectified photo
-    for path, done in ((job.after, 1), (job.before, job.applied_orientation)):
-        if path is not None and path.is_file():
-            stored = read_exif(path).orientation or 1
-            shown = stored if done == 1 else 1
-            break
+    # what players do to the rectified photo, and to the raw one unless that was done for good
+    path = job.after or (job.before if job.applied_orientation == 1 else None)
+    shown = 1 if path is None else read_exif(path).orientation or 1
     upright = compose_orientations(job.applied_orientation, shown)
     return Picture(_small(job.before, num_bytes, upright), _small(job.after, num_bytes, shown), upright)
 
@@ -114,15 +112,7 @@ def _decoded(path: Path, side: float) -> NDArray[np.uint8]:
     if kind_of_content(data, path.name) != "JPEG":
         return _as_bytes(read_photo(path).pixels)
     size = stored_size(path) or (0, 0)
-    flag = cv2.IMREAD_COLOR
-    for factor, reduced in (
-        (8, cv2.IMREAD_REDUCED_COLOR_8),
-        (4, cv2.IMREAD_REDUCED_COLOR_4),
-        (2, cv2.IMREAD_REDUCED_COLOR_2),
-    ):
-        if max(size) >= factor * side:
-            flag = reduced
-            break
+    flag = next((flag for factor, flag in _REDUCED if max(size) >= factor * side), cv2.IMREAD_COLOR)
     pixels = read_plain(path, "photo", flag | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.asarray(pixels, np.uint8)
 

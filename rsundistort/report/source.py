@@ -96,10 +96,10 @@ def _solution(path: Path) -> tuple[Solution, list[str]]:
             solution = read_solution(path, newer=True)
         except FormatError:
             raise refused from None
-        text = (
+        return solution, [
             f"solution.json is of a newer version of its format than {BENT_VERSION}, which this program reads: what is "
-        )
-        return solution, [f"{text}shown may be incomplete, or mean something else; update rsundistort."]
+            "shown may be incomplete, or mean something else; update rsundistort."
+        ]
 
 
 def _missing(source: Source) -> list[str]:

@@ -64,10 +64,11 @@ def advice_of(solution: Solution) -> list[str]:
     said = (solution.critical_motion or {}).get("advice")
     if said or degeneracy is None or not degeneracy.is_low or degeneracy.num_photos < 2:
         return [str(each) for each in said or ()]
-    images = [image for image in in_stored_frame(solution).registered if image.posed]
+    stored = in_stored_frame(solution)
+    images = [image for image in stored.registered if image.posed]
     R, centers = np.array([image.R_cw for image in images]), np.array([image.center_w for image in images])
-    cameras = in_stored_frame(solution).cameras
-    return [each.sentence for each in advise_poses(R, centers, [cameras[image.camera_id].readout for image in images])]
+    readouts = [stored.cameras[image.camera_id].readout for image in images]
+    return [each.sentence for each in advise_poses(R, centers, readouts)]
 
 
 def verdict_of(solution: Solution) -> Verdict:
@@ -169,12 +170,14 @@ def _height(solution: Solution) -> tuple[str, str]:
     said, degeneracy = solution.critical_motion or {}, degeneracy_of(solution)
     if degeneracy is None:
         return "", ""
-    percent = _percent(said)
+    sigma = said.get("sigma_log_k")
+    percent = float("inf") if sigma is None else 100 * float(sigma)  # undetermined
     sentence = _sentence(str(said.get("sentence") or ""))
     if degeneracy.is_low and said.get("remedy") == "none":
+        known = f"to +-{percent:.2g} %" if np.isfinite(percent) else "and they leave it undetermined"
         return "doubt", (
             f"Do not trust the height of the scene: {_level(degeneracy)}, so it is undetermined to first order, and "
-            f"with the remedy switched off only the model's second-order terms determine it ({_deviation(percent)})."
+            f"with the remedy switched off only the model's second-order terms determine it ({known})."
         )
     if said.get("flagged") and percent > _LARGE_PERCENT:
         return "doubt", f"Do not trust the height of the scene. {sentence}"
@@ -194,16 +197,6 @@ def _unneeded(solution: Solution, largest: float | None) -> str:
     if plain and ours and ours > (1 - _LEAST_GAIN) * plain:
         return "without the shutter, held-out measurements are predicted as well"
     return ""
-
-
-def _percent(said: Any) -> float:
-    """Standard deviation of the height, per cent; infinite if it is undetermined."""
-    sigma = said.get("sigma_log_k")
-    return float("inf") if sigma is None else 100 * float(sigma)
-
-
-def _deviation(percent: float) -> str:
-    return f"to +-{percent:.2g} %" if np.isfinite(percent) else "and they leave it undetermined"
 
 
 def _level(degeneracy: CriticalMotion) -> str:

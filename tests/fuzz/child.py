@@ -23,9 +23,15 @@ from rsundistort.colmap import read_colmap_cameras, read_colmap_poses
 from rsundistort.errors import RsUndistortError
 from rsundistort.experiments.one import METHODS, check_settings, read_trials, summarize
 from rsundistort.experiments.scenes import load_scene
-from rsundistort.io import facts_of_exif, read_known_lengths, read_known_motions, read_photo_times, write_solution
+from rsundistort.io import (
+    facts_of_exif,
+    read_control_points,
+    read_known_lengths,
+    read_known_motions,
+    read_photo_times,
+    write_solution,
+)
 from rsundistort.io.cameras import read_camera_file
-from rsundistort.io.control_points import read_control_points
 from rsundistort.io.depth_maps import read_depth_map
 from rsundistort.io.gpmf import parse_payload, read_gpmf
 from rsundistort.io.gyro import read_gyro

@@ -26,13 +26,12 @@ from rsundistort.colmap.cameras_and_poses import read_colmap_cameras, read_colma
 from rsundistort.errors import FileError, FormatError, InputError
 from rsundistort.experiments.one import check_settings, read_trials
 from rsundistort.experiments.scenes import load_scene
+from rsundistort.io import read_control_points, read_known_lengths
 from rsundistort.io.cameras import read_camera_file
-from rsundistort.io.control_points import read_control_points
 from rsundistort.io.depth_maps import read_depth_map
 from rsundistort.io.gpmf import read_gpmf
 from rsundistort.io.journal import entries_of
 from rsundistort.io.kept import Kept
-from rsundistort.io.lengths import read_known_lengths
 from rsundistort.io.masks import read_mask
 from rsundistort.io.models import read_model
 from rsundistort.io.photos.images import read_photo

@@ -30,7 +30,7 @@ class _Ear:
     """A pipe in the place of stderr, and who listens to it."""
 
     def __init__(self) -> None:
-        self._true = os.dup(2)
+        self.true_stderr = os.dup(2)
         read, write = os.pipe()
         os.dup2(write, 2)
         os.close(write)
@@ -50,16 +50,12 @@ class _Ear:
                     self._lines.append(line.decode(errors="replace").strip())
                 elif not _OF_OPENCV.match(line):
                     with suppress(OSError):
-                        os.write(self._true, line)
+                        os.write(self.true_stderr, line)
 
     def close(self) -> None:
-        os.dup2(self._true, 2)
+        os.dup2(self.true_stderr, 2)
         self._thread.join(timeout=5)
-        os.close(self._true)
-
-    @property
-    def true_stderr(self) -> int:
-        return self._true
+        os.close(self.true_stderr)
 
     def _count(self) -> int:
         """Lines that were written until now."""

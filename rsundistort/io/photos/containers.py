@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 from .exif import MAKER_NOTE, Damaged, exif_of_tiff
 from .kinds import jpeg_segments, picture_size
 from .metadata import Metadata
+from .xmp import marked_xmp, rectified_by
 
 __all__ = ["Parts", "metadata_of", "with_metadata"]
 
@@ -27,38 +28,22 @@ Parts = list[bytes | memoryview]
 
 def metadata_of(data: bytes, kind: str) -> Metadata:
     """EXIF, XMP and ICC of a file of a kind; what is damaged beyond finding is left out."""
-    readers: dict[str, Callable[[bytes], Metadata]] = {
-        "JPEG": _of_jpeg, "PNG": _of_png, "WebP": _of_webp,
-    }  # fmt: skip
-    return readers[kind](data)
+    return {"JPEG": _of_jpeg, "PNG": _of_png, "WebP": _of_webp}[kind](data)
 
 
 def with_metadata(encoded: memoryview, kind: str, metadata: Metadata) -> tuple[Parts, list[str]]:
     """An encoded picture with metadata put in, as the parts of its file, and what could not be kept."""
-    writers: dict[str, Callable[[memoryview, Metadata], tuple[Parts, list[str]]]] = {
-        "JPEG": _into_jpeg, "PNG": _into_png, "WebP": _into_webp,
-    }  # fmt: skip
-    return writers[kind](encoded, metadata)
-
-
-def _bare(exif: bytes) -> bytes:
-    """The TIFF structure of an EXIF block, whether or not it has its JPEG head."""
-    return exif[6:] if exif.startswith(_EXIF_HEAD) else exif
+    return {"JPEG": _into_jpeg, "PNG": _into_png, "WebP": _into_webp}[kind](encoded, metadata)
 
 
 # ---------------------------------------------------------------- JPEG
 
 
-def _segments(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Marker and content of the segments before the pixels."""
-    for marker, begin, end in jpeg_segments(data):
-        yield marker, data[begin:end]
-
-
 def _of_jpeg(data: bytes) -> Metadata:
     exif = xmp = b""
     profile: dict[int, bytes] = {}
-    for marker, content in _segments(data):
+    for marker, begin, end in jpeg_segments(data):
+        content = data[begin:end]
         if marker == 0xE1 and content.startswith(_EXIF_HEAD):
             exif = exif or content[6:]
         elif marker == 0xE1 and content.startswith(_XMP_HEAD):
@@ -81,7 +66,8 @@ def _into_jpeg(encoded: memoryview, metadata: Metadata) -> tuple[Parts, list[str
             lost, exif = ["the EXIF, which is too long for a JPEG"], b""
     if len(xmp) > _SEGMENT - len(_XMP_HEAD):
         lost.append("the XMP, which is too long for a JPEG")
-        xmp = Metadata(xmp=xmp).only_mark().xmp
+        version = rectified_by(xmp)
+        xmp = b"" if version is None else marked_xmp(b"", version)
     step = _SEGMENT - len(_ICC_HEAD) - 2
     chunks = [icc[k : k + step] for k in range(0, len(icc), step)]
     if len(chunks) > 255:
@@ -120,7 +106,7 @@ def _of_png(data: bytes) -> Metadata:
     exif = xmp = icc = b""
     for name, content in _png_chunks(data):
         if name == b"eXIf":
-            exif = _bare(content)
+            exif = content.removeprefix(_EXIF_HEAD)
         elif name == b"iCCP":
             icc = _inflated(content[content.find(b"\0") + 2 :])
         elif name == b"iTXt" and content.startswith(_PNG_XMP_HEAD):
@@ -164,7 +150,8 @@ def _riff_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 def _of_webp(data: bytes) -> Metadata:
     chunks = dict(reversed(list(_riff_chunks(data))))
-    return Metadata(_bare(chunks.get(b"EXIF", b"")), chunks.get(b"XMP ", b""), chunks.get(b"ICCP", b""))
+    exif = chunks.get(b"EXIF", b"").removeprefix(_EXIF_HEAD)
+    return Metadata(exif, chunks.get(b"XMP ", b""), chunks.get(b"ICCP", b""))
 
 
 def _into_webp(picture: memoryview, metadata: Metadata) -> tuple[Parts, list[str]]:

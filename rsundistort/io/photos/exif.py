@@ -343,17 +343,14 @@ def exif_of_tiff(data: bytes, without: frozenset[int] = frozenset()) -> bytes:
     exif = structure.sub(entries, EXIF_IFD, "the Exif IFD")
     gps = structure.sub(entries, GPS_IFD, "the GPS IFD")
     interop = structure.sub(exif, INTEROP_IFD, "the interoperability IFD")
-    pointers = (EXIF_IFD, GPS_IFD, INTEROP_IFD)
+    left_out = {EXIF_IFD, GPS_IFD, INTEROP_IFD, *without}
     note = None if MAKER_NOTE in without else exif.get(MAKER_NOTE)
 
     def values(ifd: dict[int, Entry]) -> list[tuple[int, int, int, bytes | int]]:
         return [
             (entry.tag, entry.kind, entry.count, structure.value(entry))
             for entry in ifd.values()
-            if entry.tag not in pointers
-            and entry.tag not in without
-            and entry is not note
-            and entry.kind <= _LAST_CLASSIC
+            if entry.tag not in left_out and entry is not note and entry.kind <= _LAST_CLASSIC
         ]
 
     main = [entry for entry in values(entries) if entry[0] in _DESCRIBING]

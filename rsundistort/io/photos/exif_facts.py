@@ -28,6 +28,8 @@ _FOCAL_LENGTH_IN35MM_FILM, _BODY_SERIAL_NUMBER, _LENS_MODEL = 0xA405, 0xA431, 0x
 _EXIF_IMAGE_WIDTH, _EXIF_IMAGE_HEIGHT = 0xA002, 0xA003
 _FOCAL_PLANE_X_RESOLUTION, _FOCAL_PLANE_RESOLUTION_UNIT = 0xA20E, 0xA210
 _DATE_TIME_ORIGINAL, _SUB_SEC_TIME_ORIGINAL = 0x9003, 0x9291
+# a block of EXIF that says nothing
+_EMPTY = b"II*\0" + bytes(4)
 # mm per FocalPlaneResolutionUnit: inch, cm, mm, micrometre
 _UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 
@@ -116,7 +118,7 @@ def facts_of_exif(block: bytes, xmp: bytes = b"") -> ExifFacts:
         facts = _facts({tag: structure.first_value(entry) for tag, entry in entries.items()})
         return replace(facts, fix=fix_of(structure, gps, xmp))
     except Damaged:
-        return ExifFacts(fix=fix_of(None, {}, xmp))
+        return ExifFacts(fix=fix_of(TiffStructure(_EMPTY), {}, xmp))
 
 
 def _facts(tags: dict[int, bytes | float | None]) -> ExifFacts:

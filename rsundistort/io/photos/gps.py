@@ -84,24 +84,22 @@ class GpsFix:
         return self.latitude_deg == 0 and self.longitude_deg == 0
 
 
-def fix_of(structure: TiffStructure | None, gps: Mapping[int, Entry], xmp: bytes) -> GpsFix | None:
+def fix_of(structure: TiffStructure, gps: Mapping[int, Entry], xmp: bytes) -> GpsFix | None:
     """The position of a photo; None without one.
 
     EXIF counts where both have a value; nothing that is damaged or out of range does.
     """
     stated = _of_xmp(xmp)
-    place = _place(structure, gps) if structure is not None else None
+    place = _place(structure, gps)
     if place in (None, (0, 0)):
         place = _specified_place(stated) or place
     if place is None:
         return None
-    altitudes: dict[str, float] = {}
-    stored = None if structure is None else _altitude(structure, gps)
-    if stored is not None:
-        altitudes["EXIF"] = stored
+    stored = _altitude(structure, gps)
+    altitudes = {} if stored is None else {"EXIF": stored}
     altitudes |= {name: stated[name] for name in ALTITUDES if name in stated}
     sigma, sigma_from = _sigma(structure, gps, stated)
-    speed = None if structure is None else _speed(structure, gps)
+    speed = _speed(structure, gps)
     if speed is None:
         speed = _specified_speed(stated)
     return GpsFix(
@@ -114,11 +112,11 @@ def _place(structure: TiffStructure, gps: Mapping[int, Entry]) -> tuple[float, f
     """Latitude and longitude of EXIF."""
     degrees = []
     for ref, positive, negative, most in ((_LATITUDE_REF, b"N", b"S", 90), (_LONGITUDE_REF, b"E", b"W", 180)):
-        if ref not in gps or ref + 1 not in gps:
+        if ref + 1 not in gps:
             return None
         parts = structure.fractions(gps[ref + 1])
         value = sum(part / 60**k for k, part in enumerate(parts))
-        letter = structure.value(gps[ref])[:1].upper()
+        letter = _letter(structure, gps, ref)
         if not 1 <= len(parts) <= 3 or letter not in (positive, negative) or not 0 <= value <= most:
             return None
         degrees.append(value if letter == positive else -value)
@@ -130,6 +128,11 @@ def _number(structure: TiffStructure, gps: Mapping[int, Entry], tag: int, low: f
     return value if isinstance(value, float) and low <= value <= high else None
 
 
+def _letter(structure: TiffStructure, gps: Mapping[int, Entry], tag: int) -> bytes:
+    """What a tag of EXIF says another one refers to; empty where it is missing."""
+    return structure.value(gps[tag])[:1].upper() if tag in gps else b""
+
+
 def _altitude(structure: TiffStructure, gps: Mapping[int, Entry]) -> float | None:
     """That of EXIF: 1 and 3 of its reference are below sea level and below the ellipsoid."""
     height = _number(structure, gps, _ALTITUDE, 0, 2e4)
@@ -139,27 +142,24 @@ def _altitude(structure: TiffStructure, gps: Mapping[int, Entry]) -> float | Non
 
 def _speed(structure: TiffStructure, gps: Mapping[int, Entry]) -> float | None:
     speed = _number(structure, gps, _SPEED, 0, 5000)
-    unit = structure.value(gps[_SPEED_REF])[:1].upper() if _SPEED_REF in gps else b"K"
+    unit = _letter(structure, gps, _SPEED_REF) if _SPEED_REF in gps else b"K"
     return None if speed is None or unit not in _SPEEDS_M_S else speed * _SPEEDS_M_S[unit]
 
 
 def _velocity(
-    structure: TiffStructure | None, gps: Mapping[int, Entry], stated: Mapping[str, float]
+    structure: TiffStructure, gps: Mapping[int, Entry], stated: Mapping[str, float]
 ) -> tuple[float, float, float] | None:
     """East, north and up; DJI's axes are north, east and down. A track by the compass is not by the map's north."""
     if {"FlightXSpeed", "FlightYSpeed", "FlightZSpeed"} <= stated.keys():
         return stated["FlightYSpeed"], stated["FlightXSpeed"], -stated["FlightZSpeed"]
-    speed = None if structure is None else _speed(structure, gps)
-    if structure is None or speed is None or _TRACK_REF not in gps:
-        return None
-    track = _number(structure, gps, _TRACK, 0, 360)
-    if track is None or structure.value(gps[_TRACK_REF])[:1].upper() != b"T":
+    speed, track = _speed(structure, gps), _number(structure, gps, _TRACK, 0, 360)
+    if speed is None or track is None or _letter(structure, gps, _TRACK_REF) != b"T":
         return None
     return float(speed * np.sin(np.deg2rad(track))), float(speed * np.cos(np.deg2rad(track))), 0.0
 
 
 def _sigma(
-    structure: TiffStructure | None, gps: Mapping[int, Entry], stated: Mapping[str, float]
+    structure: TiffStructure, gps: Mapping[int, Entry], stated: Mapping[str, float]
 ) -> tuple[tuple[float, float, float], str]:
     """Standard deviations east, north and up, and what says so, the most direct first."""
 
@@ -173,14 +173,11 @@ def _sigma(
     if across > 0:
         up = stated.get("GPSZAccuracy", 0.0)
         return bounded(across, across, up if up > 0 else _VERTICAL * across), "accuracy"
-    if structure is not None:
-        radius = _number(structure, gps, _POSITIONING_ERROR, 1e-3, 1e5)
-        if radius is not None:
-            across = radius / _RADIUS_68
-            return bounded(across, across, _VERTICAL * across), "positioning error"
-        dop = _number(structure, gps, _DOP, 0.1, 100)
-        if dop is not None:
-            return bounded(*(each * dop / _CLEAR_SKY_DOP for each in DEFAULT_SIGMA_M)), "DOP"
+    if (radius := _number(structure, gps, _POSITIONING_ERROR, 1e-3, 1e5)) is not None:
+        across = radius / _RADIUS_68
+        return bounded(across, across, _VERTICAL * across), "positioning error"
+    if (dop := _number(structure, gps, _DOP, 0.1, 100)) is not None:
+        return bounded(*(each * dop / _CLEAR_SKY_DOP for each in DEFAULT_SIGMA_M)), "DOP"
     return DEFAULT_SIGMA_M, "default"
 
 

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import DamagedPhotoWarning, FileError, FileKindWarning, InputError, MetadataWarning
+from ...errors import DamagedPhotoWarning, FileError, FileKindWarning, InputError, MetadataWarning, file_errors
 from ..aside import write_aside
 from ..places import Place, files_in, place_of
 from .codec_lines import with_lines
@@ -133,13 +133,11 @@ def stored_size(path: Path) -> tuple[int, int] | None:
     """
     path = Path(path)
     try:
-        with path.open("rb") as file:
+        with file_errors(path), path.open("rb") as file:
             # only the pages that hold the header are read, wherever they are
             data = cast(bytes, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))  # which is read like bytes
     except ValueError:  # an empty file
         return None
-    except OSError as error:
-        raise FileError(f"{path} cannot be read: {error.strerror}") from error
     return picture_size(data, kind_of_content(data, path.name))
 
 
@@ -163,10 +161,8 @@ def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> Photo:
     """
     path = Path(path)
     stamp = _stamp(path)
-    try:
+    with file_errors(path.name):
         data = path.read_bytes()
-    except OSError as error:
-        raise FileError(f"{path.name} cannot be read: {error.strerror}") from error
     kind = kind_of_content(data, path.name)
     if not data or not is_whole(data):
         raise FileError(f"{path.name} is cut short or empty; copy it again from the camera")
@@ -264,10 +260,8 @@ def read_plain(path: Path, what: str, flags: int) -> NDArray[Any]:
     FileError
         When it cannot be read or decoded, or claims more pixels than it can hold or than any photo has.
     """
-    try:
+    with file_errors(f"{what} {path}"):
         data = path.read_bytes()
-    except OSError as error:
-        raise FileError(f"{what} {path} cannot be read: {error.strerror}") from error
     kind = kind_of_content(data, path.name)
     if not is_whole(data):
         raise FileError(f"{what} {path} cannot be decoded: it is cut short, or damaged")
@@ -332,10 +326,8 @@ def write_image(
     """
     path = Path(path)
     parts = _encode(path, np.asarray(pixels), metadata or Metadata(), quality, flat)
-    try:
+    with file_errors(path, "written"):
         write_aside(path, *parts)
-    except OSError as error:
-        raise FileError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def _encode(path: Path, pixels: NDArray[Any], metadata: Metadata, quality: int, flat: bool) -> Parts:

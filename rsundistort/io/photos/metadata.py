@@ -56,11 +56,6 @@ class Metadata:
         """Metadata of the photo after that version of rsundistort rectified it."""
         return replace(self, xmp=marked_xmp(self.xmp, version))
 
-    def only_mark(self) -> Metadata:
-        """Metadata without the XMP, except for the mark of having been rectified."""
-        version = self.rectified_by
-        return replace(self, xmp=b"" if version is None else marked_xmp(b"", version))
-
     def fitted(self, width: int, height: int, channels: int) -> tuple[Metadata, list[str]]:
         """What is true of pixels of that size and number of channels, and what is damaged or left out."""
         exif, problems = corrected_exif(self.exif, width, height)

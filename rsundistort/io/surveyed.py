@@ -1,18 +1,55 @@
-"""Control points and check points of a survey: CSV files."""
+"""What was measured in the scene: lengths, and control points and check points of a survey, in CSV files."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
-from ..errors import FormatError, InputError
-from ..model import ControlPoint
+from ..errors import FormatError, format_errors
+from ..model import ControlPoint, KnownLength
 from .tables import read_table
 
-__all__ = ["read_control_points"]
+__all__ = ["read_control_points", "read_known_lengths"]
 
-_COLUMNS = ("name", "photo", "x", "y", "E", "N", "U", "sigma")
+_OF_LENGTHS = ("photo1", "x1", "y1", "photo2", "x2", "y2", "length", "sigma")
+_OF_POINTS = ("name", "photo", "x", "y", "E", "N", "U", "sigma")
 _USES = {"": False, "control": False, "check": True}
+
+
+def _check_columns(path: Path, columns: Sequence[str], needed: Sequence[str]) -> None:
+    if missing := [column for column in needed if column not in columns]:
+        raise FormatError(f"{path} has no column {missing[0]!r}; expected {', '.join(needed)}")
+
+
+def read_known_lengths(path: Path | str) -> list[KnownLength]:
+    """Lengths between points of the scene, as `BundleOptions.lengths` takes them.
+
+    Parameters
+    ----------
+    path : path
+        CSV with the header `photo1, x1, y1, photo2, x2, y2, length, sigma`: where the two ends are seen (pixels of the
+        stored photos, integer centres; `photo2` may be empty for the same photo), the length, in any unit, and its
+        standard deviation. Two lines or more.
+
+    Raises
+    ------
+    FileError, FormatError
+        Not readable; missing columns, numbers that are none or not positive.
+    """
+    path = Path(path)
+    columns, rows = read_table(path)
+    _check_columns(path, columns, _OF_LENGTHS)
+    found = []
+    for number, row in enumerate(rows, start=2):
+        first = row["photo1"]
+        second = row["photo2"] or first
+        with format_errors(f"{path}, line {number}", ValueError):
+            x1, y1, x2, y2, length, sigma = (float(row[c]) for c in ("x1", "y1", "x2", "y2", "length", "sigma"))
+            found.append(KnownLength((first, x1, y1), (second, x2, y2), length, sigma))
+    if len(found) < 2:
+        raise FormatError(f"{path} holds {len(found)} lengths; ratios need two, such as a height and a width")
+    return found
 
 
 def read_control_points(path: Path | str) -> list[ControlPoint]:
@@ -36,13 +73,12 @@ def read_control_points(path: Path | str) -> list[ControlPoint]:
     # other tables of ours say the unit: sigma_m is sigma here
     columns = [column.removesuffix("_m") for column in columns]
     rows = [{key.removesuffix("_m"): value for key, value in row.items()} for row in rows]
-    if missing := [column for column in _COLUMNS if column not in columns]:
-        raise FormatError(f"{path} has no column {missing[0]!r}; expected {', '.join(_COLUMNS)}")
-    if twice := [column for column in (*_COLUMNS, "sigma_up", "use") if columns.count(column) > 1]:
+    _check_columns(path, columns, _OF_POINTS)
+    if twice := [column for column in (*_OF_POINTS, "sigma_up", "use") if columns.count(column) > 1]:
         raise FormatError(f"{path} has two columns {twice[0]!r}; remove one")
     facts: dict[str, tuple[str, ...]] = {}
     seen: dict[str, dict[str, tuple[float, float]]] = {}
-    named = (*_COLUMNS[4:], *(each for each in ("sigma_up", "use") if each in columns))
+    named = (*_OF_POINTS[4:], *(each for each in ("sigma_up", "use") if each in columns))
     for number, row in enumerate(rows, start=2):
         name, photo = row["name"], row["photo"]
         where = f"{path}, line {number}"
@@ -72,12 +108,10 @@ def _number(text: str, column: str, where: str) -> float:
 
 def _point(name: str, stated: dict[str, str], seen: dict[str, tuple[float, float]], path: Path) -> ControlPoint:
     where = f"{path}, point {name}"
-    east, north, up, sigma = (_number(stated[column], column, where) for column in _COLUMNS[4:])
+    east, north, up, sigma = (_number(stated[column], column, where) for column in _OF_POINTS[4:])
     sigma_up = _number(stated["sigma_up"], "sigma_up", where) if stated.get("sigma_up") else sigma
     use = stated.get("use", "").lower()
     if use not in _USES:
         raise FormatError(f"{where}: use={use!r}, expected control or check")
-    try:
+    with format_errors(path):
         return ControlPoint(name, (east, north, up), (sigma, sigma, sigma_up), seen, _USES[use])
-    except InputError as error:
-        raise FormatError(f"{path}: {error}") from None
