@@ -136,7 +136,7 @@ def test_covariances_are_those_of_the_whole_inverse(factor_limit, refine, rng):
     assert variance == pytest.approx(b @ whole[start:stop, start:stop] @ b, rel=1e-7)
     reference = (whole[: m * nb, start:stop] @ b).reshape(m, nb)
     np.testing.assert_allclose(with_photos, reference, rtol=0, atol=1e-7 * np.abs(reference).max())
-    photos, cameras, *_ = problem.covariances(state)
+    photos, cameras, *_ = problem.linearize(state).marginal_covariances()
     np.testing.assert_array_less(np.abs(photos - expected), 1e-8 * size + 1e-300)  # as the step
     expected = whole[len(whole) - len(cameras) :, len(whole) - len(cameras) :]
     size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))

@@ -27,7 +27,7 @@ from .known_positions import KnownPlaces, PlaceResiduals
 from .layout import Layout
 from .lens_field import LensFields
 from .motion_prior import MotionPrior
-from .normal_equations import Marginals, NormalEquations, Step
+from .normal_equations import NormalEquations, Step
 from .path_prior import PathPrior, PathState
 from .point_terms import PointTerms, largest_step, moved_points, nearest_photos
 from .prior_sigmas import PriorSigmas
@@ -260,13 +260,6 @@ class BundleProblem:
         plain = copy(self)
         plain._options, plain._lens_of, plain._bounded = replace(self._options, loss="squared"), None, False
         return plain
-
-    def covariances(self, state: State) -> Marginals:
-        """Covariances of each photo's unknowns (m, nb, nb), 0 where held (the gauge), and of all cameras' (k, k).
-
-        All others being free. Order and units as the unknowns above. NaN where the system cannot be factored.
-        """
-        return self.linearize(state).marginal_covariances()
 
     def in_order(self, of_points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Values of the reconstruction's points in the order of the state's."""

@@ -204,11 +204,6 @@ class Bend:
         assert self.position is not None
         return frozen(np.hstack([self.rotation, self.position]))
 
-    @cached_property
-    def table(self) -> Array:
-        """(4 (n - 1), 6) as the kernels take it, behind a row of the steady motion."""
-        return frozen(bend_pieces(len(self.values)) @ self.values)
-
     @property
     def moves(self) -> bool:
         """Whether the position departs, too."""

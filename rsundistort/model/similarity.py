@@ -57,13 +57,6 @@ class Similarity:
         """The composition of both, the other one applied first."""
         return Similarity(self.scale * other.scale, self.R @ other.R, self.of(other.shift[None])[0])
 
-    @property
-    def matrix(self) -> Array:
-        """(4, 4) homogeneous."""
-        value = np.eye(4)
-        value[:3, :3], value[:3, 3] = self.scale * self.R, self.shift
-        return value
-
 
 @dataclass(frozen=True)
 class FittedSimilarity:

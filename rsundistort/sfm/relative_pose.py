@@ -81,10 +81,6 @@ class View:
             _rays(xy_raw, camera), slopes, clock_of(camera, xy_raw), rate, camera.frame_span, float(camera.K[0, 0])
         )
 
-    def take(self, keep: NDArray[np.integer]) -> View:
-        """Some of the matches."""
-        return replace(self, rays=self.rays[keep], slopes=self.slopes[keep], clock=self.clock[keep])
-
     @property
     def arrays(self) -> tuple[NDArray[np.float64], ...]:
         """Arguments of the kernels."""
