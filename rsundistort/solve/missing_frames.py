@@ -23,7 +23,7 @@ from ..errors import RsUndistortWarning
 from ..input.key_frames import Clip
 from ..model import Reconstruction
 
-__all__ = ["Gaps", "frames_missing", "gaps_between", "tell_of_gaps", "with_gaps"]
+__all__ = ["Gaps", "frames_missing", "gaps_between", "tell_of_gaps", "told_by", "with_gaps"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -188,7 +188,7 @@ def _weighted_median(values: Array, weights: Array) -> Array:
     return median
 
 
-def _told(own: OwnMotions, joined: NDArray[np.bool_]) -> list[_Intervals]:
+def told_by(own: OwnMotions, joined: NDArray[np.bool_]) -> list[_Intervals]:
     """All that tells of missing frames."""
     return [each for each in (_travels(own, joined), _rotations(own, joined)) if each is not None]
 
@@ -215,8 +215,8 @@ def gaps_between(
     rate : float
         Its frame rate, 1/s.
     """
-    told = _told(own, joined)
-    single = _frames_missing(told, steps)
+    told = told_by(own, joined)
+    single = frames_missing(told, steps)
     of_all = np.zeros(max(num_frames - 1, 0), np.int64)
     of_all[place[:-1]] = single
     between = np.diff(place)
@@ -278,27 +278,13 @@ def _cost_of_all(intervals: _Intervals, steps: Array) -> Array:
     return cost
 
 
-def frames_missing(own: OwnMotions, steps: Array, joined: NDArray[np.bool_]) -> Index:
-    """Number of frames that are missing in each interval between consecutive ones, beyond what their times say.
+def frames_missing(told: Sequence[_Intervals], steps: Array) -> Index:
+    """(m - 1,) frames that are missing between consecutive ones, beyond what their times say; 0 if one gap at most is.
 
     Where frames are missing but their times do not show it, the camera moves a multiple of what is usual. A jerk of the
-    hand moves it elsewhere. Each hypothesis is weighed by the usual changes from interval to interval.
-
-    Parameters
-    ----------
-    own, steps, joined
-        As for `gaps_between`.
-
-    Returns
-    -------
-    (m - 1,) int array
-        All 0 if fewer than two intervals are clear.
+    hand moves it elsewhere. Each hypothesis is weighed by the usual changes from interval to interval. It is the
+    likeliest set of gaps, the likeliest ones first: each that is explained shows more clearly what is usual.
     """
-    return _frames_missing(_told(own, joined), steps)
-
-
-def _frames_missing(told: Sequence[_Intervals], steps: Array) -> Index:
-    """The likeliest set of gaps, the likeliest ones first: each that is explained shows more clearly what is usual."""
     found = np.zeros(len(steps), np.int64)
     if not told:
         return found
