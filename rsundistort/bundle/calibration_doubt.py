@@ -64,8 +64,7 @@ class CalibrationDoubt:
     @property
     def of_photos(self) -> Array:
         """(m, nb, nb) covariances of each photo's unknowns."""
-        value: Array = np.einsum("rma,rmb->mab", self.photos, self.photos)
-        return value
+        return np.einsum("rma,rmb->mab", self.photos, self.photos)
 
     @property
     def of_cameras(self) -> Array:
@@ -75,8 +74,7 @@ class CalibrationDoubt:
     def with_last(self, camera_idx: NDArray[np.int64], per_camera: int) -> Array:
         """(m, nb) covariances of photos' unknowns with the last of their camera."""
         last = self.cameras[:, (camera_idx + 1) * per_camera - 1]
-        value: Array = np.einsum("rma,rm->ma", self.photos, last)
-        return value
+        return np.einsum("rma,rm->ma", self.photos, last)
 
     def times(self, photos: Array, cameras: Array | None = None) -> tuple[Array, Array]:
         """The covariance times stacks of values of photos (n, m, nb) and of cameras (n, k)."""

@@ -67,8 +67,7 @@ class MotionMeans:
 
     def at(self, means: Array) -> Array:
         """Motions (m, 6) of photos that move as the means (cameras, 6) say."""
-        value: Array = np.einsum("mak,mk->ma", self.directions, means[self.camera_idx])
-        return value
+        return np.einsum("mak,mk->ma", self.directions, means[self.camera_idx])
 
     def pull(self, weight: Array, motion: Array, means: Array) -> Array:
         """Gradient (cameras, 6) of the photos' priors, of weights (m, 6), by the means."""

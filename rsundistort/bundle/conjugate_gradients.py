@@ -81,8 +81,7 @@ def _inverse_blocks(diagonal: Array, free: NDArray[np.bool_]) -> Array | None:
         half = np.linalg.inv(np.linalg.cholesky(scaled))
     except np.linalg.LinAlgError:
         return None
-    inverse: Array = scale[:, :, None] * np.einsum("mba,mbc->mac", half, half) * scale[:, None]
-    return inverse
+    return scale[:, :, None] * np.einsum("mba,mbc->mac", half, half) * scale[:, None]
 
 
 def _two_levels(

@@ -116,8 +116,7 @@ def by_corner(xy_raw: Array, size: Array, camera: Index) -> Partition:
 def _squares(pulls: Array) -> Array:
     """Variances (...) by the pulls (groups, ...) of whole families: products inside a family count twice."""
     families = pulls.reshape(len(pulls) // _FAMILY, _FAMILY, *pulls.shape[1:])
-    value: Array = 2.0 * (families.sum(1) ** 2).sum(0) - (families**2).sum((0, 1))
-    return value
+    return 2.0 * (families.sum(1) ** 2).sum(0) - (families**2).sum((0, 1))
 
 
 class Inflation(NamedTuple):

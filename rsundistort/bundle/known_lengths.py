@@ -80,8 +80,7 @@ class LengthResiduals:
         """(q,) residuals in units of their standard deviations."""
         chord = points_w[self._ends[:, 1]] - points_w[self._ends[:, 0]]
         length = np.maximum(np.linalg.norm(chord, axis=1), 1e-300)
-        value: NDArray[np.float64] = self._whiten @ (np.log(length) - self._target)
-        return value
+        return self._whiten @ (np.log(length) - self._target)
 
     def jacobian(self, points_w: NDArray[np.float64]) -> NDArray[np.float64]:
         """(q, n, 3) derivatives of the residuals by the points."""

@@ -127,12 +127,10 @@ class PlaceResiduals:
         return self._point, self._point_sigma**-2.0, self._of_points(points_w) / self._point_sigma
 
     def _of_photos(self, center_w: Array) -> Array:
-        residual: Array = (center_w[self._photo] - self._center) / self._photo_sigma
-        return residual
+        return (center_w[self._photo] - self._center) / self._photo_sigma
 
     def _of_points(self, points_w: Array) -> Array:
-        residual: Array = (points_w[self._point] - self._place) / self._point_sigma
-        return residual
+        return (points_w[self._point] - self._place) / self._point_sigma
 
 
 def _stacked(pairs: Sequence[tuple[ArrayLike, ArrayLike]]) -> tuple[Array, Array]:

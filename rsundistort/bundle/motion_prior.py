@@ -31,8 +31,7 @@ def tail_weight(square: Array, num: int | NDArray[np.int64] = 3) -> Array:
     square : (...) array
         Squared deviations in units of the scale, summed over `num` components.
     """
-    weight: Array = (_FREEDOM + num) / (_FREEDOM + square)
-    return weight
+    return (_FREEDOM + num) / (_FREEDOM + square)
 
 
 @dataclass(frozen=True)
@@ -74,16 +73,14 @@ class MotionPrior:
 
     def weight(self, own: Array) -> Array:
         """Weights (m, k) that draw deviations (m, k) from the mean as the prior does."""
-        value: Array = self.precision * np.repeat(self._tails(own), 3, axis=1) + self.limit
-        return value
+        return self.precision * np.repeat(self._tails(own), 3, axis=1) + self.limit
 
     def information(self, own: Array) -> Array:
         """(m, k) what the prior tells of motions, or of their mean, at deviations (m, k).
 
         Student's t tells less than its weights say, by Fisher's information: the weights depend on what they weigh.
         """
-        value: Array = self.precision * np.repeat(self.relative_information(own), 3, axis=1) + self.limit
-        return value
+        return self.precision * np.repeat(self.relative_information(own), 3, axis=1) + self.limit
 
     def relative_information(self, own: Array) -> Array:
         """(m, k / 3) information by that of a normal prior of the same scale, without limits."""
@@ -100,5 +97,4 @@ class MotionPrior:
 
     def _squares(self, own: Array) -> Array:
         """(m, k / 3) in units of the scale."""
-        value: Array = (self.precision * own**2).reshape(len(own), -1, 3).sum(axis=2)
-        return value
+        return (self.precision * own**2).reshape(len(own), -1, 3).sum(axis=2)

@@ -172,8 +172,7 @@ class PathState:
 
         A line takes the same time whatever the focal length is, and a unit of the clock has as many lines as f pixels.
         """
-        value: Array = self.pace[camera_idx] * np.exp(variation[:, 0])
-        return value
+        return self.pace[camera_idx] * np.exp(variation[:, 0])
 
     def motions(self, camera_idx: Index, variation: Array) -> Array:
         """(m, 6) phi and velocity of the photos."""
@@ -256,8 +255,7 @@ class PathPrior:
     def _whitened(self, differences: Array) -> Array:
         """(q, 3, 6, ...) divided by their standard deviations."""
         spread = np.repeat(self.sigmas, 3).reshape(6, *(1,) * (differences.ndim - 3))
-        value: Array = np.einsum("qij,qj...->qi...", self._whitening, differences) / spread
-        return value
+        return np.einsum("qij,qj...->qi...", self._whitening, differences) / spread
 
     def cost(self, R_cw: Array, center_w: Array, state: PathState) -> float:
         """Half the sum of squares, with that of the pace."""

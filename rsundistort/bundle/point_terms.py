@@ -23,8 +23,7 @@ def nearest_photos(points_w: Array, center_w: Array, structure: Structure) -> In
     """(n,) the photo nearest to each point of a structure, of those that measured it."""
     away = np.linalg.norm(points_w[structure.point_idx] - center_w[structure.frame_idx], axis=1)
     order = np.lexsort((away, structure.point_idx))
-    nearest: Index = structure.frame_idx[order[structure.track_start[:-1]]]
-    return nearest
+    return structure.frame_idx[order[structure.track_start[:-1]]]
 
 
 def moved_points(points_w: Array, steps: Array, center_w: Array) -> Array:
@@ -36,8 +35,7 @@ def moved_points(points_w: Array, steps: Array, center_w: Array) -> Array:
     away = points_w - center_w
     along = np.einsum("na,na->n", steps, away) / np.maximum(np.einsum("na,na->n", away, away), 1e-300)
     along = along[:, None]
-    moved: Array = center_w + (away + steps - along * away) / np.maximum(1.0 - along, 1.0 / _FURTHEST)
-    return moved
+    return center_w + (away + steps - along * away) / np.maximum(1.0 - along, 1.0 / _FURTHEST)
 
 
 def largest_step(points_w: Array, steps: Array, middle_w: Array, size: float) -> float:

@@ -42,8 +42,7 @@ class Reduced:
 
 def products(A: Array, B: Array) -> Array:
     """(i, j) inner products of stacks of photos' values; not of BLAS, whose waiting threads take our processors."""
-    result: Array = np.einsum("ima,jma->ij", A, B)
-    return result
+    return np.einsum("ima,jma->ij", A, B)
 
 
 def _positive_inverse(A: Array) -> Array | None:
@@ -54,8 +53,7 @@ def _positive_inverse(A: Array) -> Array | None:
     except np.linalg.LinAlgError:
         return None
     half = np.linalg.inv(L) * scale
-    inverse: Array = half.T @ half
-    return inverse
+    return half.T @ half
 
 
 @dataclass(frozen=True)

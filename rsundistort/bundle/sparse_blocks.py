@@ -113,8 +113,7 @@ class SparseBlocks:
         """(m, nb) where each of the photos' unknowns stands in the order of the elimination."""
         part = np.repeat(np.arange(len(self.begin) - 1), np.diff(self.begin))
         own = np.arange(self.begin[-1]) - self.begin[part]
-        unknowns: Index = self.position[self.rank[:, part]] + own
-        return unknowns
+        return self.position[self.rank[:, part]] + own
 
     @property
     def _layout(self) -> tuple[Index, Index, Index, Index, Index]:

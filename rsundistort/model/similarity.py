@@ -92,8 +92,7 @@ class FittedSimilarity:
         """Variances (n, 3) that it gives to places (n, 3), as if its parts were independent."""
         arm = np.asarray(points, np.float64) - self.middle
         tilt = np.cross(np.eye(3), arm[:, None]) * self.sigma_rad[:, None]
-        value: Array = self.sigma_m**2 + (tilt**2).sum(1) + (self.sigma_scale * arm) ** 2
-        return value
+        return self.sigma_m**2 + (tilt**2).sum(1) + (self.sigma_scale * arm) ** 2
 
 
 def similarity_of(points: Array, targets: Array) -> Similarity:
@@ -164,8 +163,7 @@ def _rotation_square(found: Similarity, rotation: tuple[Array, float] | None) ->
 
 def _squares(found: Similarity, points: Array, targets: Array, sigma: Array) -> Array:
     """(m,) squared residuals in units of sigma."""
-    value: Array = (((found.of(points) - targets) / sigma) ** 2).sum(1)
-    return value
+    return (((found.of(points) - targets) / sigma) ** 2).sum(1)
 
 
 def _step(

@@ -163,8 +163,7 @@ def _rotations(own: OwnMotions, joined: NDArray[np.bool_]) -> _Intervals | None:
 
     def usual(steps: Array) -> Array:
         by = _weighted_median(share / steps, square * steps ** (2 - power))
-        value: Array = by[..., None, None] * lines
-        return value
+        return by[..., None, None] * lines
 
     return _Intervals(way, usual, lambda steps: steps**power, 1.0)
 
@@ -184,8 +183,7 @@ def _weighted_median(values: Array, weights: Array) -> Array:
     order = np.argsort(values, axis=-1)
     passed = np.cumsum(np.take_along_axis(weights, order, axis=-1), axis=-1)
     middle = np.argmax(passed >= 0.5 * passed[..., -1:], axis=-1)[..., None]
-    median: Array = np.take_along_axis(values, np.take_along_axis(order, middle, axis=-1), axis=-1)[..., 0]
-    return median
+    return np.take_along_axis(values, np.take_along_axis(order, middle, axis=-1), axis=-1)[..., 0]
 
 
 def told_by(own: OwnMotions, joined: NDArray[np.bool_]) -> list[_Intervals]:
@@ -257,8 +255,7 @@ def _conversions(num_frames: int, rate: float) -> tuple[Index, Array, Array]:
 
 
 def _is_near(rates: Array, rate: float) -> NDArray[np.bool_]:
-    near: NDArray[np.bool_] = np.abs(rates / rate - 1) < _SAME_RATE
-    return near
+    return np.abs(rates / rate - 1) < _SAME_RATE
 
 
 def _cost_of_all(intervals: _Intervals, steps: Array) -> Array:
@@ -274,8 +271,7 @@ def _cost_of_all(intervals: _Intervals, steps: Array) -> Array:
         weight = known * (_DEGREES + d) / (_DEGREES + squares)
         variance = np.maximum((weight[..., None] * even).sum(axis=1) / count[:, None], 1e-18)
     squares = (even / variance[:, None]).sum(axis=2)
-    cost: Array = _student(squares, more, d).sum(axis=1, where=known) + 0.5 * count * np.log(variance).sum(axis=1)
-    return cost
+    return _student(squares, more, d).sum(axis=1, where=known) + 0.5 * count * np.log(variance).sum(axis=1)
 
 
 def frames_missing(told: Sequence[_Intervals], steps: Array) -> Index:
@@ -336,8 +332,7 @@ def _of_neighbours(rate: Array) -> Array:
     padded = np.pad(rate, [(0, 0)] * (rate.ndim - 2) + [(1, 1), (0, 0)], constant_values=np.nan)
     both = np.stack([padded[..., :-2, :], padded[..., 2:, :]])
     known = np.isfinite(both).sum(axis=0)
-    mean: Array = np.nan_to_num(both).sum(axis=0) / np.where(known > 0, known, np.nan)
-    return mean
+    return np.nan_to_num(both).sum(axis=0) / np.where(known > 0, known, np.nan)
 
 
 def _student(squares: Array, more: Array, d: int) -> Array:
@@ -346,5 +341,4 @@ def _student(squares: Array, more: Array, d: int) -> Array:
     Of Student's t, or of a knock, which may be of any size.
     """
     usual = 0.5 * (_DEGREES + d) * np.log1p(squares / _DEGREES) + 0.5 * d * np.log(more)
-    value: Array = -np.log(np.exp(-usual) + np.exp(-_KNOCK))
-    return value
+    return -np.log(np.exp(-usual) + np.exp(-_KNOCK))

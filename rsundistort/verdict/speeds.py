@@ -147,8 +147,7 @@ def _in_a_row(time_s: Array, part: NDArray[np.int64], step_s: float, fills: bool
 def _rotated(R_cw: Array) -> Array:
     """(m, 3) rotations of frames since the first, the sum of those from each to the next."""
     steps = Rotation.from_matrix(R_cw[1:] @ R_cw[:-1].transpose(0, 2, 1)).as_rotvec()
-    value: Array = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    return value
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
 
 def _compared(runs: Sequence[_Run], readout_s: float, step_s: float) -> BySpeed:
