@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..model.array_types import Array, Mask
 from .coarse_space import CoarseSpace
 from .conjugate_gradients import solve_iteratively
 from .envelope import Envelope
@@ -24,8 +24,6 @@ _MAX_CG = 500
 _WAIT = 6.0
 # Photos of a cluster, at least; twice as many, and again, while the coarse system would take longer than the products.
 _CLUSTER = 32
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,7 @@ class Elimination:
     """
 
     structure: Structure
-    free: NDArray[np.bool_]
+    free: Mask
     shape: Envelope | SparseBlocks
     space: CoarseSpace | None
     cg_tolerance: float
@@ -59,7 +57,7 @@ class Elimination:
     def of(
         cls,
         structure: Structure,
-        free: NDArray[np.bool_],
+        free: Mask,
         poses: tuple[Array, Array],
         factor_limit: float | None,
         cg_tolerance: float,

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from .._kernels import envelope as kernels
+from ..model.array_types import Array, Index, Mask
 from .structure import BlockPattern
 
 __all__ = ["CholeskyFactor", "Envelope"]
@@ -20,9 +20,6 @@ _PANEL = 48
 _WORTH_THREADS = 3e8
 # Parts of the inverse's sums that threads share: a number of its own, since it decides the rounding.
 _PARTS = 8
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -54,13 +51,13 @@ class Envelope:
     multiply_adds: float
 
     @classmethod
-    def smallest(cls, pattern: BlockPattern, free: NDArray[np.bool_]) -> Envelope:
+    def smallest(cls, pattern: BlockPattern, free: Mask) -> Envelope:
         """Envelope of the free unknowns (m, nb), in the order as given or reverse Cuthill-McKee: what takes less."""
         orders = np.arange(len(free)), reverse_cuthill_mckee(pattern.graph(), symmetric_mode=True).astype(np.int64)
         return min((cls.of(pattern, free, order) for order in orders), key=lambda envelope: envelope.multiply_adds)
 
     @classmethod
-    def of(cls, pattern: BlockPattern, free: NDArray[np.bool_], order: Index) -> Envelope:
+    def of(cls, pattern: BlockPattern, free: Mask, order: Index) -> Envelope:
         """Envelope of the free unknowns (m, nb) with the block rows in an order."""
         m, nb = free.shape
         size = int(free.sum())

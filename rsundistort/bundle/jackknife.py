@@ -28,14 +28,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..model.array_types import Array, Index
 from .normal_equations import PRIORS_ERROR, Marginals, NormalEquations
 
 __all__ = ["Inflation", "Partition", "by_corner", "by_place", "inflated", "inflation"]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _FAMILY = 4
 # Families of points that a photo sees: with fewer their variance is noise, with more they part what goes together.

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import KnownLength, Reconstruction
+from ..model.array_types import Array
 from ..model.known_length import End
 
 __all__ = ["LengthResiduals", "check_lengths", "scale_of_lengths"]
@@ -76,13 +76,13 @@ class LengthResiduals:
     def __len__(self) -> int:
         return len(self._target)
 
-    def residuals(self, points_w: NDArray[np.float64]) -> NDArray[np.float64]:
+    def residuals(self, points_w: Array) -> Array:
         """(q,) residuals in units of their standard deviations."""
         chord = points_w[self._ends[:, 1]] - points_w[self._ends[:, 0]]
         length = np.maximum(np.linalg.norm(chord, axis=1), 1e-300)
         return self._whiten @ (np.log(length) - self._target)
 
-    def jacobian(self, points_w: NDArray[np.float64]) -> NDArray[np.float64]:
+    def jacobian(self, points_w: Array) -> Array:
         """(q, n, 3) derivatives of the residuals by the points."""
         chord = points_w[self._ends[:, 1]] - points_w[self._ends[:, 0]]
         along = chord / np.maximum((chord**2).sum(1, keepdims=True), 1e-300)

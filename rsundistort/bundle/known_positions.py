@@ -6,16 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import InputError
 from ..model import ControlPoint, Reconstruction
+from ..model.array_types import Array, Index
 from .intrinsics import prior_weight
 
 __all__ = ["KnownPlaces", "PlaceResiduals", "point_of"]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # Photos and points that must have a place for these to hold a frame.
 _LEAST = 3

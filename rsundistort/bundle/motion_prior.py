@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model import Reconstruction
+from ..model.array_types import Array, Index, Mask
 from .bundle_options import BundleOptions
 
 __all__ = ["SIGMA_OF_SCALE", "MotionPrior", "tail_weight"]
 
-Array = NDArray[np.float64]
 
 # Degrees of freedom. Under a normal prior of an estimated width one photo that jerked draws all others the other way,
 # by what photos hardly show of the motion that they share. Of eight photos, a mean that only the prior decides is wrong
@@ -23,7 +22,7 @@ _FREEDOM = 4.0
 SIGMA_OF_SCALE = 1.15
 
 
-def tail_weight(square: Array, num: int | NDArray[np.int64] = 3) -> Array:
+def tail_weight(square: Array, num: int | Index = 3) -> Array:
     """Weights of normal priors that pull as Student's t does.
 
     Parameters
@@ -50,7 +49,7 @@ class MotionPrior:
 
     precision: Array
     limit: Array
-    has_tails: NDArray[np.bool_]
+    has_tails: Mask
 
     @classmethod
     def of(

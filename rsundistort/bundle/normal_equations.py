@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from .._kernels import schur
 from .._kernels._jit import unknowns_of
+from ..model.array_types import Array, Index
 from .connections import Border, CommonPrior, Coupling
 from .elimination import Elimination
 from .point_terms import PointTerms
@@ -21,8 +21,6 @@ from .reduced import Factored, Reduced
 
 __all__ = ["PRIORS_ERROR", "Function", "Marginals", "NormalEquations", "Step"]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 Step = tuple[Array, Array, Array]
 
 # Of the priors' precision, for the derivative by it, which is off by at most the square.

@@ -6,11 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..model import Bend, Reconstruction
+from ..model.array_types import Array, Index
 from ..model.bend import splines_at
 from ..model.motion import steady_parts
 from ..model.path import CameraPath, cross_matrices, inverse_left_jacobians
@@ -28,8 +29,6 @@ __all__ = [
     "with_path_motions",
 ]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # Before anything is known of a readout: it takes about half of the time to the next frame, give or take as much, so
 # that neither a global shutter nor one that runs the other way is excluded.

@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .._kernels import schur
+from ..model.array_types import Array, Index
 from .structure import Structure
 
 __all__ = ["PointTerms", "largest_step", "moved_points", "nearest_photos"]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # A step takes a point to so many times its distance at most: one that asks for more wants it at infinity, or beyond.
 _FURTHEST = 10.0

@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..model.array_types import Array
 from .bundle_options import BundleOptions, BundleResult
 from .calibration_doubt import CalibrationDoubt
 from .prior_sigmas import PriorSigmas
 from .problem import BundleProblem
 
 __all__ = ["Posterior", "gauge_directions"]
-
-Array = NDArray[np.float64]
 
 
 class Posterior:

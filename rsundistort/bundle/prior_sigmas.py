@@ -6,9 +6,9 @@ from dataclasses import astuple, dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model import Reconstruction
+from ..model.array_types import Array
 from .bundle_options import BundleOptions
 from .layout import Layout
 from .motion_prior import SIGMA_OF_SCALE, tail_weight
@@ -90,9 +90,7 @@ class PriorSigmas:
     means: tuple[float, ...] = ()
 
 
-def _prior_sigma(
-    values: NDArray[np.float64], variance: NDArray[np.float64], span: NDArray[np.float64], sigma: float
-) -> float:
+def _prior_sigma(values: Array, variance: Array, span: Array, sigma: float) -> float:
     """Prior standard deviation, per frame, of unknowns (m, 3) per unit of the clock with posterior variances (m, 3).
 
     It is estimated over photos and axes; `sigma` is that under which they were found. Values beyond three robust
@@ -109,7 +107,7 @@ def _prior_sigma(
     return _fixed_point(seen, unknown, sigma)
 
 
-def _scale(values: NDArray[np.float64], variance: NDArray[np.float64], sigma: float) -> float:
+def _scale(values: Array, variance: Array, sigma: float) -> float:
     """Scale of the prior with heavy tails of motions (m, 3) with posterior variances (m, 3), per frame.
 
     As `_prior_sigma`, which weighs all photos the same.
@@ -136,14 +134,14 @@ class Common(NamedTuple):
     those of the cameras and their variances, (cameras, 6).
     """
 
-    values: NDArray[np.float64]
-    variances: NDArray[np.float64]
-    with_motions: NDArray[np.float64]
-    of_cameras: tuple[NDArray[np.float64], NDArray[np.float64]]
+    values: Array
+    variances: Array
+    with_motions: Array
+    of_cameras: tuple[Array, Array]
 
 
 def estimated(
-    sigmas: PriorSigmas, current: Reconstruction, covariances: NDArray[np.float64], options: BundleOptions,
+    sigmas: PriorSigmas, current: Reconstruction, covariances: Array, options: BundleOptions,
     layout: Layout, baseline: float, common: Common | None = None,
 ) -> PriorSigmas:  # fmt: skip
     """Estimates of the prior standard deviations from a solution; given ones stay."""
@@ -207,9 +205,7 @@ def _depth(reconstruction: Reconstruction) -> float:
     return float(np.median([reconstruction.median_depth(i) for i in range(reconstruction.num_images)]))
 
 
-def _own_motions(
-    current: Reconstruction, covariances: NDArray[np.float64], common: Common | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _own_motions(current: Reconstruction, covariances: Array, common: Common | None) -> tuple[Array, Array]:
     """What each photo's motion has of its own (m, k), in the camera's frame and per frame, and its variances.
 
     Variances are 0 where a motion is held.
@@ -231,7 +227,7 @@ def _own_motions(
 
 
 def _bend_sigmas(
-    sigmas: PriorSigmas, current: Reconstruction, variances: NDArray[np.float64], layout: Layout
+    sigmas: PriorSigmas, current: Reconstruction, variances: Array, layout: Layout
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Prior standard deviations of the groups of bends, of rotations and of positions."""
     ones, found = np.ones(current.num_images), layout.coefficients(current)
@@ -323,15 +319,13 @@ def _bounded(sigmas: PriorSigmas, options: BundleOptions, baseline: float) -> Pr
     )  # fmt: skip
 
 
-def field_prior_sigma(values: NDArray[np.float64], variances: NDArray[np.float64], sigma: float) -> float:
+def field_prior_sigma(values: Array, variances: Array, sigma: float) -> float:
     """Prior standard deviation in pixels of the unknowns (k, n) of residual fields, as `_prior_sigma`."""
     found = _prior_sigma(values, variances, np.ones(len(values)), sigma)
     return min(found + _MIN_SIGMA_PX, _MOST_PX)
 
 
-def path_prior_sigmas(
-    prior: PathPrior, residuals: NDArray[np.float64], variances: NDArray[np.float64], baseline: float
-) -> tuple[float, ...]:
+def path_prior_sigmas(prior: PathPrior, residuals: Array, variances: Array, baseline: float) -> tuple[float, ...]:
     """Prior standard deviations of a path by its residuals (q, 18) and their posterior variances, as `_prior_sigma`.
 
     With few frames, which hardly determine them, they are drawn to those of a hand.

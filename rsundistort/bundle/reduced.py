@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..model.array_types import Array, Index
 from .envelope import CholeskyFactor, Envelope
 from .sparse_blocks import BlockFactor, SparseBlocks
 
 __all__ = ["Factored", "Reduced", "factor", "products"]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # Right-hand sides that are solved together: enough for all threads, and little memory.
 _STACK = 32

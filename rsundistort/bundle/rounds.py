@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import Reconstruction
+from ..model.array_types import Array, Mask
 from ..model.reprojection import reprojection_residuals
 from .at_lens import least_distance
 from .bundle_options import BundleOptions, BundleResult
@@ -55,7 +55,7 @@ def _noise_px(reconstruction: Reconstruction, shutter_model: str, floor: float) 
     return max(sigma / shrink, floor)
 
 
-def _believed(reconstruction: Reconstruction, options: BundleOptions, sigma: float) -> NDArray[np.bool_]:
+def _believed(reconstruction: Reconstruction, options: BundleOptions, sigma: float) -> Mask:
     """(o,) measurements that lie as near to their prediction as their noise allows, and not at the lens."""
     rec, obs = reconstruction, reconstruction.observations
     res, believed = reprojection_residuals(rec)
@@ -78,9 +78,7 @@ def _check_solvable(reconstruction: Reconstruction, shutter_model: str, path: Fr
         raise InputError("all photos are taken from one place: without parallax there is no scene to solve for")
 
 
-def _sigma_intrinsics(
-    current: Reconstruction, names: Sequence[str], covariance: NDArray[np.float64]
-) -> tuple[dict[str, float], ...]:
+def _sigma_intrinsics(current: Reconstruction, names: Sequence[str], covariance: Array) -> tuple[dict[str, float], ...]:
     """Standard deviations of each camera's refined intrinsics, in pixels or as coefficients."""
     sigmas = np.sqrt(np.diagonal(covariance)).reshape(len(current.cameras), -1)
     return tuple(
@@ -138,7 +136,7 @@ class Rounds:
         self._heavy_tails = self._had_heavy_tails = start is not None and start.noise is not None
         self._damping = options.initial_damping
         self._iterations = 0
-        self._means: NDArray[np.float64] | None = None
+        self._means: Array | None = None
         self._partitions: tuple[Partition, ...] = ()
 
     def solve(self, cost_tolerance: float, is_judged: bool = False) -> None:

@@ -7,18 +7,15 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .._kernels import sparse_blocks as kernels
+from ..model.array_types import Array, Index, Mask
 from .structure import BlockPattern
 
 __all__ = ["BlockFactor", "Chain", "SparseBlocks"]
 
 # Parts of the inverse's sums that threads share: a number of its own, since it decides the rounding.
 _PARTS = 8
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 class Chain(NamedTuple):
@@ -63,7 +60,7 @@ class SparseBlocks:
     """
 
     pattern: BlockPattern
-    free: NDArray[np.bool_]
+    free: Mask
     rank: Index
     begin: Index
     filled: BlockPattern
@@ -73,7 +70,7 @@ class SparseBlocks:
     start: Index
 
     @classmethod
-    def of(cls, pattern: BlockPattern, free: NDArray[np.bool_], chain: Chain | None = None) -> SparseBlocks:
+    def of(cls, pattern: BlockPattern, free: Mask, chain: Chain | None = None) -> SparseBlocks:
         """The order of minimum degree (Tinney and Walker, "Direct solutions of sparse network equations", 1967)."""
         m, nb = free.shape
         begin = np.array([0, nb] if chain is None else [0, nb - chain.num, nb])

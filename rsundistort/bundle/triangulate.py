@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model import Reconstruction
+from ..model.array_types import Array, Index, Mask
 from ..model.projection import clock_of, unproject_points
 from ..model.reprojection import reprojection_residuals
 
@@ -20,9 +20,7 @@ _FAR = 3.0
 _LOST = 1e4
 
 
-def _world_rays(
-    reconstruction: Reconstruction, some: NDArray[np.int64], shutter_model: str
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+def _world_rays(reconstruction: Reconstruction, some: Index, shutter_model: str) -> tuple[Array, Array, Mask]:
     """Centres and unit directions (k, 3) along which some observations were seen, each at the moment of its line."""
     obs = reconstruction.observations
     centers, rays = np.empty((len(some), 3)), np.empty((len(some), 3))
@@ -39,8 +37,8 @@ def _world_rays(
 
 
 def _meeting_points(
-    reconstruction: Reconstruction, lost: NDArray[np.int64], shutter_model: str, size: float
-) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.float64]]:
+    reconstruction: Reconstruction, lost: Index, shutter_model: str, size: float
+) -> tuple[Array, Mask, Array]:
     """Where the rays of some points (k,) come nearest to each other (k, 3), and whether that is ahead of all cameras.
 
     With places (k, 3) far along the rays, at some sizes of the scene.

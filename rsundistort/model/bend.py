@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import InputError
+from .array_types import Array
 from .checks import check_finite, check_whole, frozen
 
 __all__ = ["BEND_GROUPS", "Bend", "bend_functions", "bend_pieces", "bend_table", "parts_of", "splines_at"]
 
-Array = NDArray[np.float64]
 
 #: Groups of functions, by what they add to those before: a rate that changes steadily, its change changing, and then
 #: splines of ever more intervals. Each with its number of intervals and how many functions there are up to it. The last

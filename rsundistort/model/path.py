@@ -5,16 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
+from .array_types import Array, Index
 from .checks import check_finite, check_index, check_rotations, frozen
 
 __all__ = ["CameraPath", "cross_matrices", "inverse_left_jacobians"]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # Sites of the bend that a frame gets from the path: cubics on both sides of the principal row.
 _SITES = 17
@@ -83,7 +82,7 @@ class CameraPath:
     velocity: Array
     rate_change: Array
     acceleration: Array
-    part: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    part: Index = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __post_init__(self) -> None:
         m = len(self.time_s)

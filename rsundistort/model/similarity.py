@@ -6,15 +6,14 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from .array_types import Array
 from .checks import frozen
 from .reconstruction import Reconstruction
 
 __all__ = ["FittedSimilarity", "Similarity", "fit_similarity", "similarity_of"]
 
-Array = NDArray[np.float64]
 
 # Triples of points that are tried; all of up to 13 points, at random of more.
 _TRIES = 300

@@ -6,10 +6,10 @@ from collections.abc import Iterable, Mapping
 from heapq import heapify, heappop, heappush
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..colmap.conventions import quiet_pycolmap
 from ..model import Reconstruction
+from ..model.array_types import Index, Mask
 from .connected import common_points
 from .database import MatchedPhotos
 from .epipolar import FreedMatches
@@ -35,7 +35,7 @@ _DECIDING = 3
 
 def contradicting_photos(
     matched: MatchedPhotos, num_verified: Mapping[Pair, int], reconstruction: Reconstruction, *, suspects: bool = False
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Photos in parts of a reconstruction that more matches with the largest part contradict than support.
 
     Mapping may give a whole side of a scene a wrong place, in which its photos agree with each other, and some matches
@@ -99,7 +99,7 @@ def _support(
     return dict(zip(pairs, zip(counts, (fit - least * of).tolist(), strict=True), strict=True))
 
 
-def parts_that_agree(support: Mapping[Pair, Vote], num: int) -> NDArray[np.int64]:
+def parts_that_agree(support: Mapping[Pair, Vote], num: int) -> Index:
     """Partition of so many photos into parts within which pairs support each other, (num,) label of each.
 
     Parts are joined in the order of the support between them, and pairs that contradict count against it: greedy

@@ -20,6 +20,7 @@ from ..colmap.conventions import HALF, poses_of, quiet_pycolmap
 from ..colmap.lenses import camera_to_colmap
 from ..errors import ReconstructionError
 from ..model import Camera, Observations, Reconstruction, RowMotion
+from ..model.array_types import Array, Index
 from ..model.projection import at_depth, project_points, unproject_points
 from .features import Features
 
@@ -60,7 +61,7 @@ class MatchedPhotos:
     names: Sequence[str]
     features: Sequence[Features]
     cameras: Sequence[Camera]
-    camera_idx: NDArray[np.int64]
+    camera_idx: Index
     calibrated: bool
     seed: int
 
@@ -71,7 +72,7 @@ def ideal_keypoints(
     motion: RowMotion,
     model: str,
     own: Camera | None = None,
-    depth: NDArray[np.float64] | None = None,
+    depth: Array | None = None,
 ) -> NDArray[np.float32]:
     """Keypoints without shutter in the camera of the database, COLMAP's centres; where none exists, far outside.
 

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..colmap.conventions import quiet_pycolmap
 from ..model import Camera
+from ..model.array_types import Index
 from .database import LOOSE, MatchedPhotos, verification_options, write_photos
 from .epipolar import MIN_EXPLAINED, distance_from_planes
 from .features import Features
@@ -33,13 +33,13 @@ def match_photos(
     names: Sequence[str],
     features: Sequence[Features],
     cameras: Sequence[Camera],
-    camera_idx: NDArray[np.int64],
+    camera_idx: Index,
     *,
     calibrated: bool = True,
     focal_known: bool = True,
     within_px: float = LOOSE_PX,
     seed: int = 0,
-    pairs: NDArray[np.int64] | None = None,
+    pairs: Index | None = None,
 ) -> MatchedPhotos:
     """Match photos with each other and verify the pairs, with room for shutter distortion.
 
@@ -76,7 +76,7 @@ def match_photos(
     return matched
 
 
-def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: NDArray[np.int64] | None = None) -> None:
+def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: Index | None = None) -> None:
     """Match and verify further pairs of photos; those that were matched before stay as they are.
 
     Parameters
@@ -154,7 +154,7 @@ def _forget(matched: MatchedPhotos, pairs: Sequence[Pair]) -> None:
             db.delete_two_view_geometry(first + 1, second + 1)
 
 
-def _listed(matched: MatchedPhotos, pairs: NDArray[np.int64]) -> Path:
+def _listed(matched: MatchedPhotos, pairs: Index) -> Path:
     """A file of pairs."""
     path = matched.database.with_name("pairs.txt")
     np.savetxt(path, np.asarray(pairs) + 1, fmt="%d")

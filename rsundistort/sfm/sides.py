@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model import Reconstruction
+from ..model.array_types import Array
 from .connected import LEAST_TIES, connected_parts
 
 __all__ = ["carried_along"]
@@ -65,7 +65,7 @@ def _sides(former: Reconstruction, taken: Collection[str]) -> Iterator[Reconstru
         yield rec.take_photos(side == k)
 
 
-def _depth_ratios(side: Reconstruction, i: int, scene: Reconstruction, j: int) -> NDArray[np.float64]:
+def _depth_ratios(side: Reconstruction, i: int, scene: Reconstruction, j: int) -> Array:
     """Depths of the points that a photo shows in a scene, over those of the same keypoints in its side."""
     here, there = _depths(side, i), _depths(scene, j)
     return np.array([there[place] / here[place] for place in here.keys() & there.keys()])

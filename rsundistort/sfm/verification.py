@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..colmap.conventions import quiet_pycolmap
+from ..model.array_types import Index
 from .database import MatchedPhotos
 from .epipolar import MIN_EXPLAINED, Matches, read_matches
 from .matching import verify_loosely
@@ -65,7 +65,7 @@ def _num_explained(poses: Sequence[RelativePose | None], pairs: Sequence[Pair], 
     return int(sum(found))
 
 
-def pair_of(matched: MatchedPhotos, pair: tuple[int, int], matches: NDArray[np.int64]) -> Pair:
+def pair_of(matched: MatchedPhotos, pair: tuple[int, int], matches: Index) -> Pair:
     """The matches of two photos, as each shows them."""
     first, second = (
         View.of(matched.features[photo].xy_raw[matches[:, side]], matched.cameras[matched.camera_idx[photo]])

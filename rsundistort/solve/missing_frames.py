@@ -13,7 +13,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import entr
 
@@ -22,11 +21,10 @@ from ..bundle.path_prior import FramePath
 from ..errors import RsUndistortWarning
 from ..input.key_frames import Clip
 from ..model import Reconstruction
+from ..model.array_types import Array, Index, Mask
 
 __all__ = ["Gaps", "frames_missing", "gaps_between", "tell_of_gaps", "told_by", "with_gaps"]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # Frames that may be missing between two others; intervals that say what is usual.
 _MOST, _FEWEST = 3, 12
@@ -132,7 +130,7 @@ class _Intervals(NamedTuple):
         return int(np.isfinite(self.way).all(axis=1).sum())
 
 
-def _travels(own: OwnMotions, joined: NDArray[np.bool_]) -> _Intervals | None:
+def _travels(own: OwnMotions, joined: Mask) -> _Intervals | None:
     """Ways between positions, as those before and after; None if few are known."""
     way = np.where(joined[:, None], np.diff(own.center_w, axis=0), np.nan)
     way = way[:, np.nansum(np.abs(way), axis=0) > 0]
@@ -146,7 +144,7 @@ def _travels(own: OwnMotions, joined: NDArray[np.bool_]) -> _Intervals | None:
     )
 
 
-def _rotations(own: OwnMotions, joined: NDArray[np.bool_]) -> _Intervals | None:
+def _rotations(own: OwnMotions, joined: Mask) -> _Intervals | None:
     """Rotations between frames, as those of the lines of both, times the steps; None if few are known."""
     (way, lines), (two, of_ends) = _rotated(own, 1), _rotated(own, 2)
     way[~joined], two[~(joined[1:] & joined[:-1])] = np.nan, np.nan
@@ -186,14 +184,12 @@ def _weighted_median(values: Array, weights: Array) -> Array:
     return np.take_along_axis(values, np.take_along_axis(order, middle, axis=-1), axis=-1)[..., 0]
 
 
-def told_by(own: OwnMotions, joined: NDArray[np.bool_]) -> list[_Intervals]:
+def told_by(own: OwnMotions, joined: Mask) -> list[_Intervals]:
     """All that tells of missing frames."""
     return [each for each in (_travels(own, joined), _rotations(own, joined)) if each is not None]
 
 
-def gaps_between(
-    own: OwnMotions, place: Index, steps: Array, joined: NDArray[np.bool_], num_frames: int, rate: float
-) -> Gaps:
+def gaps_between(own: OwnMotions, place: Index, steps: Array, joined: Mask, num_frames: int, rate: float) -> Gaps:
     """Frames that are missing here and there, or regularly since the video was converted from a higher frame rate.
 
     A conversion is one hypothesis about all intervals, so that it is seen where hands shake too much for single gaps.
@@ -254,7 +250,7 @@ def _conversions(num_frames: int, rate: float) -> tuple[Index, Array, Array]:
     return missing[first], np.repeat(ratios, _PHASES)[first], cost
 
 
-def _is_near(rates: Array, rate: float) -> NDArray[np.bool_]:
+def _is_near(rates: Array, rate: float) -> Mask:
     return np.abs(rates / rate - 1) < _SAME_RATE
 
 

@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..batch.progress import StageLog
 from ..errors import ReconstructionError
@@ -17,6 +16,7 @@ from ..input.load import LoadedPhotos
 from ..input.pairing import pairs_of_clip, pairs_to_match
 from ..io.kept import Kept
 from ..model import Reconstruction
+from ..model.array_types import Index
 from ..sfm import MatchedPhotos, map_photos, match_photos, read_num_verified, verify_with_shutter
 from ..sfm.mapping import PLACING_KEYPOINTS
 from ..sfm.matching import LOOSE_PX, close_px, match_more
@@ -143,7 +143,7 @@ def _match(
     return matched if not photos.coarse or _all_are_rich(matched) else None
 
 
-def _neighbours(count: int) -> NDArray[np.int64]:
+def _neighbours(count: int) -> Index:
     """(p, 2) some of the pairs of photos that follow each other."""
     first = np.linspace(0, count - 2, _ASKED).astype(np.int64)
     return np.stack([first, first + 1], axis=1)

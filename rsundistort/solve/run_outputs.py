@@ -48,6 +48,7 @@ from ..io.record import Record
 from ..io.usd import write_usd_camera
 from ..io.video import FRAME_TABLE, frame_name
 from ..model import Camera, Reconstruction, RowMotion, Solution, SolvedImage
+from ..model.array_types import Mask
 from ..model.orientation import orient_path, orient_reconstruction, orient_solution
 from ..rectify import bend_px
 from ..report import Diagnostics, relative_folder, write_diagnostics, write_report
@@ -122,7 +123,7 @@ class PointRgb:
     """
 
     values: NDArray[np.uint8]
-    known: NDArray[np.bool_]
+    known: Mask
 
 
 @dataclass(frozen=True)

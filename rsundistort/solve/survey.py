@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..bundle import CONTROL_SIGMA_PX, KnownPlaces, place_control, scale_of_lengths, with_control
@@ -17,11 +16,11 @@ from ..errors import InputError, RsUndistortWarning
 from ..input.positions import MapFrame, PhotoPositions, frame_at, frame_of_control, positions_of
 from ..io import ExifFacts
 from ..model import ControlPoint, KnownLength, Reconstruction
+from ..model.array_types import Array
 from ..model.similarity import FittedSimilarity, Similarity, fit_similarity
 
 __all__ = ["Survey", "survey_of"]
 
-Array = NDArray[np.float64]
 
 _LEAST = 3
 # Places georeference a model if they determine its rotation and scale to this: radians, relative.

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import stdtr
 
@@ -16,6 +15,7 @@ from ..bundle.choice import clipped_errors, corners, improves, standard_errors
 from ..bundle.layout import motion_end
 from ..critical import Remedy
 from ..model import Reconstruction
+from ..model.array_types import Array, Index, Mask
 from ..model.field import field_over_frame
 from ..sfm import LEAST_MEASUREMENTS, LEAST_TIES, connected_photos
 from .photos import PhotoMotions, photo_motions
@@ -177,11 +177,11 @@ def _verdict(
     return Verdict(shutter, "doubtful" if reasons else "trusted", tuple(reasons), doubtful or {}, lens_only)
 
 
-def _counts(rec: Reconstruction) -> NDArray[np.int64]:
+def _counts(rec: Reconstruction) -> Index:
     return np.bincount(rec.observations.frame_idx, minlength=rec.num_images)
 
 
-def _outliers(rec: Reconstruction, tracks: Reconstruction | None) -> NDArray[np.float64]:
+def _outliers(rec: Reconstruction, tracks: Reconstruction | None) -> Array:
     """(m,) share of each photo's measurements that the solution does not explain."""
     if tracks is None:
         return np.zeros(rec.num_images)
@@ -287,7 +287,7 @@ def _of_motions(
     global_result: BundleResult | None,
     choice: ModelChoice | None,
     motions: PhotoMotions,
-    torn: NDArray[np.bool_],
+    torn: Mask,
     known: Collection[str],
 ) -> tuple[str, list[str]]:
     """Whether a shutter was found, and why not."""
@@ -351,7 +351,7 @@ def _repeated(rec: Reconstruction) -> int | None:
     return None
 
 
-def _trimmed_mean(values: NDArray[np.float64], trimmed: int) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+def _trimmed_mean(values: Array, trimmed: int) -> tuple[Array, Array, int]:
     """Mean of columns (m, k) without so many values at either end, its standard deviation times sqrt(m), its freedom.
 
     The deviation is Tukey and McLaughlin's, from the Winsorised variance.
@@ -364,7 +364,7 @@ def _trimmed_mean(values: NDArray[np.float64], trimmed: int) -> tuple[NDArray[np
 
 
 def _doubts(
-    result: BundleResult, motions: PhotoMotions, outliers: NDArray[np.float64], most_phi: Mapping[str, float]
+    result: BundleResult, motions: PhotoMotions, outliers: Array, most_phi: Mapping[str, float]
 ) -> dict[str, list[str]]:
     """Reasons against each photo."""
     rec = result.reconstruction

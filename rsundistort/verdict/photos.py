@@ -6,18 +6,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from ..bundle import BundleResult
 from ..bundle.layout import motion_end
 from ..model import Reconstruction
+from ..model.array_types import Array, Index, Mask
 from ..model.path import cross_matrices
 from ..model.projection import clock_of, project_points_with_jacobians, unproject_points
 
 __all__ = ["PhotoMotions", "photo_motions"]
 
-Array = NDArray[np.float64]
 
 # Cells of the chequerboard, across and down; places across and down at which the frame is sampled.
 _BOARD, _LOOKED_AT = 8, 5
@@ -112,7 +111,7 @@ class _Photo:
     rotation: Array
 
     @classmethod
-    def of(cls, rec: Reconstruction, i: int, mine: NDArray[np.int64], sigma_px: float) -> _Photo:
+    def of(cls, rec: Reconstruction, i: int, mine: Index, sigma_px: float) -> _Photo:
         obs, camera, R = rec.observations, rec.camera(i), rec.R_cw[i]
         points_c = (rec.points_w[obs.point_idx[mine]] - rec.center_w[i]) @ R.T
         motion = rec.motion(i).in_camera(R)
@@ -167,7 +166,7 @@ class _Photo:
         """Variance of residuals relative to their weights; at least 1."""
         return max(1.0, float((residuals**2).sum()) / max(residuals.size - unknowns, 1))
 
-    def _halves(self) -> Iterator[NDArray[np.bool_]]:
+    def _halves(self) -> Iterator[Mask]:
         """Measurements (n,) of one half."""
         for values in (self.xy[:, 1 - self.along], self.clock):
             yield values > np.median(values)
@@ -179,7 +178,7 @@ class _Photo:
             return 0.0
         return max(self._difference_px(half, prior, chance) for half in self._halves())
 
-    def _difference_px(self, half: NDArray[np.bool_], prior: Array, chance: float) -> float:
+    def _difference_px(self, half: Mask, prior: Array, chance: float) -> float:
         nb = self.J.shape[2]
         steps, covariances, noise = [], [], []
         for mine in (half, ~half):
