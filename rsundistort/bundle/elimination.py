@@ -10,7 +10,7 @@ from ..model.array_types import Array, Mask
 from .coarse_space import CoarseSpace
 from .conjugate_gradients import solve_iteratively
 from .envelope import Envelope
-from .reduced import Factored, Reduced, factor
+from .reduced import Reduced, factor
 from .sparse_blocks import Chain, SparseBlocks
 from .structure import Structure
 
@@ -101,12 +101,8 @@ class Elimination:
             found = solve_iteratively(reduced, self.space, self.structure.pattern, self.cg_tolerance, self.max_cg)
             if self.max_cg == _MAX_CG or (found is not None and found.converged):
                 return None if found is None else (found.x, found.y, found.residual, found.camera_residual)
-        factored = self.factored(reduced)
+        factored = factor(reduced, self.shape)
         if factored is None:
             return None
         x, y = factored.solve(reduced.b, reduced.c)
         return x, y, np.zeros_like(x), np.zeros_like(y)
-
-    def factored(self, reduced: Reduced) -> Factored | None:
-        """The system factored; None if it is not positive."""
-        return factor(reduced, self.shape)

@@ -17,7 +17,7 @@ from ..model.array_types import Array, Index
 from .connections import Border, CommonPrior, Coupling
 from .elimination import Elimination
 from .point_terms import PointTerms
-from .reduced import Factored, Reduced
+from .reduced import Factored, Reduced, factor
 
 __all__ = ["PRIORS_ERROR", "Function", "Marginals", "NormalEquations", "Step"]
 
@@ -255,7 +255,7 @@ class NormalEquations:
         """The inverse of the whole system, for photos and cameras; None where it cannot be factored."""
         reduced = self._reduced
         del self._reduced  # as large as the factor
-        factored = self._elimination.factored(reduced)
+        factored = factor(reduced, self._elimination.shape)
         del reduced
         if factored is None or not len(self._lengths):
             return factored
@@ -338,12 +338,14 @@ class NormalEquations:
             return lambda vectors: np.full_like(vectors, np.nan)
 
         def times(vectors: Array) -> Array:
-            return self._seen(inverse.times(self._wide(vectors), np.zeros((len(vectors), len(self._g_camera))))[0])
+            found = inverse.times(self._wide(vectors), np.zeros((len(vectors), len(self._g_camera))))
+            if inflation == 1.0:
+                return self._seen(found[0])
+            # H^-1 P H^-1, P the priors' precision
+            by, by_priors = inflation**2, inverse.times(*self._of_priors(*found))[0]
+            return by * self._seen(found[0]) + (1 - by) * self._seen(by_priors)
 
-        if inflation == 1.0:
-            return times
-        by = inflation**2
-        return lambda vectors: by * times(vectors) + (1 - by) * self._by_priors(vectors)
+        return times
 
     def times(self, frame: Array, camera: Array) -> tuple[Array, Array]:
         """H^-1 times stacks of photos' values (k, m, seen) and of cameras' (k, unknowns); NaN without an inverse."""
@@ -351,12 +353,6 @@ class NormalEquations:
             return np.full_like(frame, np.nan), np.full_like(camera, np.nan)
         found = self.inverse.times(self._wide(frame), camera)
         return self._seen(found[0]), found[1]
-
-    def _by_priors(self, vectors: Array) -> Array:
-        """H^-1 P H^-1 of the photos' unknowns times vectors (k, m, nb), P the priors' precision."""
-        assert self.inverse is not None
-        found = self.inverse.times(self._wide(vectors), np.zeros((len(vectors), len(self._g_camera))))
-        return self._seen(self.inverse.times(*self._of_priors(*found))[0])
 
     def _of_priors(self, frame: Array, camera: Array) -> tuple[Array, Array]:
         """The priors' precision times stacks of photos' values (n, m, nb) and of cameras' (n, k)."""
