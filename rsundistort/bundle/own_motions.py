@@ -88,7 +88,7 @@ def own_motions(reconstruction: Reconstruction, *, rotation_only: bool = False) 
     inverse = scale[known, :, None] * np.linalg.inv(scaled[known]) * scale[known, None]
     variance = noise**2 * np.diagonal(inverse, axis1=1, axis2=2)
     # neighbours in a frame go wrong together, by lens, waves and leaves: one factor for each kind of unknown
-    corner = problem.partitions(state)[1].group
+    corner = problem.partitions(state)[1]
     count = int(corner.max(initial=0)) + 1
     pulls = np.zeros((m * count, len(own)))
     np.add.at(pulls, frame * count + corner, np.einsum("oia,oi->oa", J, residuals)[:, own])

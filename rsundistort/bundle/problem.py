@@ -8,7 +8,6 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from .._kernels import residuals
@@ -22,7 +21,7 @@ from .common_motion import LEAST_PHOTOS, MotionMeans
 from .connections import Border, CommonPrior, Coupling
 from .elimination import Elimination
 from .intrinsics import INTRINSICS, check_lenses, deviation, moved_camera, prior_weight
-from .jackknife import Partition, by_corner, by_place
+from .jackknife import by_corner, by_place
 from .known_lengths import LengthResiduals
 from .known_positions import KnownPlaces, PlaceResiduals
 from .layout import Layout
@@ -266,7 +265,7 @@ class BundleProblem:
         """Values of the reconstruction's points in the order of the state's."""
         return of_points[self._structure.points]
 
-    def partitions(self, state: State) -> tuple[Partition, ...]:
+    def partitions(self, state: State) -> tuple[Index, ...]:
         """Measurements that may go wrong together: of one corner of the scene, and of one corner of a lens."""
         s, start = self._structure, self._start
         camera = start.camera_idx[s.frame_idx]
@@ -296,23 +295,19 @@ class BundleProblem:
         )
 
     def _kernel_args(self, state: State) -> tuple[Any, ...]:
+        """Arguments of the kernels: model, cameras, photos, points, measurements and loss."""
         if state is not self._args_of:
-            self._args_of, self._args = state, plain_arrays(*self._arrays(state))
+            s, phi = self._structure, state.phi
+            if self.layout.bent:
+                values = self.layout.values(state.bend, self._start.image_names)
+                phi = motion_tables(phi, values, self._bend_clock, state.R_cw)
+            xy = observed_lens_pixels(state.cameras, self._start.camera_idx[s.frame_idx], self._xy)
+            self._args_of, self._args = state, plain_arrays(
+                *camera_arrays(self._start.camera_idx, state.cameras, state.variation),
+                state.R_cw, state.center_w, phi, state.velocity, state.points_w,
+                s.frame_idx, s.point_idx, xy, self._sigma_px,
+            )  # fmt: skip
         return self._model, *self._args, LOSSES[self._options.loss], self._options.loss_scale
-
-    def _arrays(self, state: State) -> tuple[NDArray[Any], ...]:
-        """Arguments of the kernels: cameras, photos, points and measurements."""
-        s = self._structure
-        phi = state.phi
-        if self.layout.bent:
-            values = self.layout.values(state.bend, self._start.image_names)
-            phi = motion_tables(phi, values, self._bend_clock, state.R_cw)
-        xy = observed_lens_pixels(state.cameras, self._start.camera_idx[s.frame_idx], self._xy)
-        return (
-            *camera_arrays(self._start.camera_idx, state.cameras, state.variation),
-            state.R_cw, state.center_w, phi, state.velocity, state.points_w,
-            s.frame_idx, s.point_idx, xy, self._sigma_px,
-        )  # fmt: skip
 
     def _motion(self, state: State) -> Array:
         """(m, nb - 6) unknowns of the shutter."""

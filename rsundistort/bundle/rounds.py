@@ -9,14 +9,14 @@ import numpy as np
 
 from ..errors import InputError
 from ..model import Reconstruction
-from ..model.array_types import Array, Mask
+from ..model.array_types import Array, Index, Mask
 from ..model.reprojection import reprojection_residuals
 from .at_lens import least_distance
 from .bundle_options import BundleOptions, BundleResult
 from .calibration_doubt import CalibrationDoubt
 from .common_motion import CommonMotion
 from .intrinsics import pixels_of
-from .jackknife import Inflation, Partition, inflated, inflation
+from .jackknife import Inflation, inflated, inflation
 from .layout import Layout
 from .normal_equations import NormalEquations
 from .path_prior import (
@@ -137,7 +137,7 @@ class Rounds:
         self._damping = options.initial_damping
         self._iterations = 0
         self._means: Array | None = None
-        self._partitions: tuple[Partition, ...] = ()
+        self._partitions: tuple[Index, ...] = ()
 
     def solve(self, cost_tolerance: float, is_judged: bool = False) -> None:
         """Solve once. One that is judged says how uncertain it is by its residuals, if the options ask for that."""
@@ -273,7 +273,9 @@ class Rounds:
         current, options, layout, state = self._current, self._options, self._layout, self._solved.state
         res, valid = reprojection_residuals(current)
         weighed, sigmas = self._weighed_noise, self._sigmas
-        by = self._inflation.over(weighed)
+        # the noise that weighs the measurements is larger than independent noise already
+        found = self._inflation
+        by = found._replace(photos=found.photos / weighed, cameras=found.cameras / weighed)
         covariances, of_intrinsics = inflated(self._marginals, by, len(current.cameras))
         covariances, of_intrinsics = covariances + self._doubt.of_photos, of_intrinsics + self._doubt.of_cameras
         path = None
