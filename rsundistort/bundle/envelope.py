@@ -130,11 +130,6 @@ class CholeskyFactor:
         kernels.solve_envelope(self.shape.first, self.shape.offset, self.data, B)
         B *= self.scale
 
-    def inverse_blocks(self) -> Array:
-        """Diagonal blocks (m, nb, nb) of the inverse; 0 where held."""
-        every = np.arange(len(self.shape.place))
-        return self.inverse_blocks_of(every, every)
-
     @cached_property
     def _inverse(self) -> Array:
         """Entries of the inverse inside the envelope, of the scaled matrix."""
@@ -144,7 +139,7 @@ class CholeskyFactor:
         kernels.invert_envelope(shape.first, shape.offset, parts, inverse)
         return inverse
 
-    def inverse_blocks_of(self, first_row: Index, second_row: Index) -> Array:
+    def inverse_blocks(self, first_row: Index, second_row: Index) -> Array:
         """Blocks (q, nb, nb) of the inverse, of pairs of block rows that the pattern connects; 0 where held."""
         shape = self.shape
         first, offset, inverse = shape.first, shape.offset, self._inverse

@@ -99,12 +99,14 @@ class Factored:
         """Blocks of the inverse of each photo (m, nb, nb), 0 where held, and that of all cameras (k, k)."""
         shared = np.einsum("rma,rs->sma", self.frames, self.weights)
         cameras = self.cameras.T @ self.weights @ self.cameras
-        return self.photos.inverse_blocks() + np.einsum("sma,smb->mab", shared, self.frames), (cameras + cameras.T) / 2
+        every = np.arange(self.frames.shape[1])
+        own = self.photos.inverse_blocks(every, every)
+        return own + np.einsum("sma,smb->mab", shared, self.frames), (cameras + cameras.T) / 2
 
     def pair_blocks(self, first: Index, second: Index) -> Array:
         """Blocks of the inverse of pairs of photos that the pattern connects, (q, nb, nb), 0 where held."""
         shared = np.einsum("rqa,rs->sqa", self.frames[:, first], self.weights)
-        return self.photos.inverse_blocks_of(first, second) + np.einsum("sqa,sqb->qab", shared, self.frames[:, second])
+        return self.photos.inverse_blocks(first, second) + np.einsum("sqa,sqb->qab", shared, self.frames[:, second])
 
     def photos_by_cameras(self) -> Array:
         """Blocks of the inverse between photos and cameras, (m, nb, k)."""

@@ -176,11 +176,6 @@ class BlockFactor:
         kernels.solve_blocks(*self.shape._layout, self.shape.position, self.data, B)
         B *= scale
 
-    def inverse_blocks(self) -> Array:
-        """Diagonal blocks (m, nb, nb) of the inverse; 0 where held."""
-        every = np.arange(len(self.scale))
-        return self.inverse_blocks_of(every, every)
-
     @cached_property
     def _inverse(self) -> Array:
         """The inverse where the factor has blocks, of the scaled matrix."""
@@ -188,7 +183,7 @@ class BlockFactor:
         kernels.invert_blocks(*self.shape._layout, _PARTS, inverse)
         return inverse
 
-    def inverse_blocks_of(self, first_row: Index, second_row: Index) -> Array:
+    def inverse_blocks(self, first_row: Index, second_row: Index) -> Array:
         """Blocks (q, nb, nb) of the inverse, of pairs of photos that the pattern joins; 0 where held.
 
         Of unknowns in a chain, pairs that it joins.
