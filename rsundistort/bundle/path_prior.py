@@ -329,11 +329,6 @@ def _excess(pace: Array, most: Array) -> Array:
     return np.sign(pace) * np.maximum(np.abs(pace) - most, 0.0)
 
 
-def free_pace(pace: Array, sigma: Array, most: Array, excess_sigma: Array) -> Array:
-    """(cameras,) pace without the bound, by a Gauss-Newton step from it; standard deviations are those without."""
-    return pace + _excess(pace, most) * (sigma / excess_sigma) ** 2
-
-
 def camera_path(reconstruction: Reconstruction, path: FramePath, state: PathState) -> tuple[CameraPath, Index]:
     """The path through a reconstruction's poses, and its photos in the order of time."""
     order, time, part = path.order(reconstruction.image_names)
@@ -407,7 +402,8 @@ def path_solution(reconstruction: Reconstruction, path: FramePath, state: PathSt
     found, frames = camera_path(reconstruction, path, state)
     span = np.array([camera.frame_span for camera in reconstruction.cameras])
     pace_sigma = np.where(np.isfinite(pace_sigma), pace_sigma, path.readout_prior[1] / span)
-    free = free_pace(state.pace, pace_sigma, path.readout_most / span, _EXCESS_SIGMA / span)
+    # without the bound, by a Gauss-Newton step from it
+    free = state.pace + _excess(state.pace, path.readout_most / span) * (pace_sigma / (_EXCESS_SIGMA / span)) ** 2
     span_s = span * path.frame_s
     pace_sigma = np.hypot(pace_sigma, path.held_sigma / span_s)
     names = tuple(reconstruction.image_names[k] for k in frames.tolist())

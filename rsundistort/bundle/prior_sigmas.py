@@ -152,24 +152,24 @@ def estimated(
     limited = [options.phi_limits.get(name, np.inf) < sigmas.phi for name in current.image_names]
     own_variances = np.where(np.array(limited)[:, None], 0.0, own_variances)
     ones = np.ones(len(own))
-    phi, velocity, focal, centre = sigmas.phi, sigmas.velocity, sigmas.focal, sigmas.centre
-    means = sigmas.means
+    found = sigmas
     if options.phi_sigma is None and own.shape[1] > 0:
-        phi = _scale(own[:, :3], own_variances[:, :3], sigmas.phi) + _MIN_SIGMA
+        found = replace(found, phi=_scale(own[:, :3], own_variances[:, :3], sigmas.phi) + _MIN_SIGMA)
     if options.velocity_sigma is None and own.shape[1] > 3:
         velocity = _scale(own[:, 3:], own_variances[:, 3:], sigmas.velocity) + _MIN_SIGMA * current.baseline
+        found = replace(found, velocity=velocity)
     if common is not None:
-        means = _mean_sigmas(common, velocity, sigmas.means, current)
+        found = replace(found, means=_mean_sigmas(common, found.velocity, sigmas.means, current))
     if options.varying:
         varied = current.variation
         of_varied = variances[:, layout.motion : layout.variation]
-        focal = _prior_sigma(varied[:, :1], of_varied[:, :1], ones, sigmas.focal) + _MIN_SIGMA
+        focal = _prior_sigma(varied[:, :1], of_varied[:, :1], ones, sigmas.focal)
+        found = replace(found, focal=focal + _MIN_SIGMA)
         if layout.num_varying > 1:
-            centre = _prior_sigma(varied[:, 1:], of_varied[:, 1:], ones, sigmas.centre) + _MIN_SIGMA
+            centre = _prior_sigma(varied[:, 1:], of_varied[:, 1:], ones, sigmas.centre)
+            found = replace(found, centre=centre + _MIN_SIGMA)
     bends, ways = _bend_sigmas(sigmas, current, variances[:, layout.variation :], layout)
-    return _bounded(
-        PriorSigmas(phi, velocity, focal, centre, bends, ways, sigmas.field, sigmas.path, means), options, baseline
-    )
+    return _bounded(replace(found, bends=bends, ways=ways), options, baseline)
 
 
 def _mean_sigmas(
@@ -312,10 +312,10 @@ def _bounded(sigmas: PriorSigmas, options: BundleOptions, baseline: float) -> Pr
     phi = np.inf if options.phi_sigma_most is None else options.phi_sigma_most
     velocity = np.inf if options.velocity_sigma_most is None else options.velocity_sigma_most * baseline
     focal = _MOST_VARIED if options.path is None else _MOST_ZOOMED
-    return PriorSigmas(
-        min(sigmas.phi, phi), min(sigmas.velocity, velocity), min(sigmas.focal, focal),
-        min(sigmas.centre, _MOST_VARIED), tuple(min(each, phi) for each in sigmas.bends), sigmas.ways,
-        min(sigmas.field, _MOST_PX), sigmas.path, sigmas.means,
+    return replace(
+        sigmas, phi=min(sigmas.phi, phi), velocity=min(sigmas.velocity, velocity), focal=min(sigmas.focal, focal),
+        centre=min(sigmas.centre, _MOST_VARIED), bends=tuple(min(each, phi) for each in sigmas.bends),
+        field=min(sigmas.field, _MOST_PX),
     )  # fmt: skip
 
 
