@@ -17,6 +17,9 @@ from .motion import RowMotion, check_shutter_model
 
 __all__ = ["Observations", "Reconstruction"]
 
+# Fields of a reconstruction that have a row for each photo.
+_OF_PHOTOS = ("camera_idx", "R_cw", "center_w", "phi", "velocity", "variation", "bend", "bend_clock")
+
 
 def _or(value: Any, default: NDArray[np.float64], name: str) -> NDArray[np.float64]:
     """The value, or what stands for one that was left out."""
@@ -266,6 +269,10 @@ class Reconstruction:
                 return rec
             rec = rec.take_photos(keep)
 
+    def rows(self, of: Any) -> dict[str, Any]:
+        """The fields that have a row for each photo, with the rows that an index, a mask or a slice takes."""
+        return {name: getattr(self, name)[of] for name in _OF_PHOTOS}
+
     def with_photos(
         self,
         names: Sequence[str],
@@ -275,23 +282,12 @@ class Reconstruction:
         phi: NDArray[np.float64],
     ) -> Reconstruction:
         """The reconstruction with more photos at its end, that rotate steadily and have no measurements yet."""
-        more = len(names)
-
-        def and_zeros(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            return np.concatenate([values, np.zeros((more, *values.shape[1:]))])
-
-        return replace(
-            self,
-            image_names=[*self.image_names, *names],
-            camera_idx=np.concatenate([self.camera_idx, camera_idx]),
-            R_cw=np.concatenate([self.R_cw, R_cw]),
-            center_w=np.concatenate([self.center_w, center_w]),
-            phi=np.concatenate([self.phi, phi]),
-            velocity=and_zeros(self.velocity),
-            variation=and_zeros(self.variation),
-            bend=and_zeros(self.bend),
-            bend_clock=and_zeros(self.bend_clock),
-        )
+        given = {"camera_idx": camera_idx, "R_cw": R_cw, "center_w": center_w, "phi": phi}
+        rows: dict[str, Any] = {
+            name: np.concatenate([own, given.get(name, np.zeros((len(names), *own.shape[1:])))])
+            for name, own in self.rows(slice(None)).items()
+        }
+        return replace(self, image_names=[*self.image_names, *names], **rows)
 
     def take_photos(self, keep: NDArray[np.bool_]) -> Reconstruction:
         """The reconstruction with some photos (m,) only, and the points that two of them show."""
@@ -299,14 +295,7 @@ class Reconstruction:
         taken = replace(
             self,
             image_names=[self.image_names[i] for i in np.flatnonzero(keep).tolist()],
-            camera_idx=self.camera_idx[keep],
-            R_cw=self.R_cw[keep],
-            center_w=self.center_w[keep],
-            phi=self.phi[keep],
-            velocity=self.velocity[keep],
-            variation=self.variation[keep],
-            bend=self.bend[keep],
-            bend_clock=self.bend_clock[keep],
             observations=replace(obs, frame_idx=(np.cumsum(keep) - 1)[obs.frame_idx]),
+            **self.rows(keep),
         )
         return taken.with_points(np.ones(len(obs), bool))

@@ -9,7 +9,7 @@ The measurements of the adjustment remain the raw pixels.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -159,7 +159,7 @@ def from_pycolmap(model: Any, matched: MatchedPhotos, posed: Reconstruction | No
 
     Poses, cameras and motions are `posed`'s when it is given (triangulation leaves them alone), else the model's.
     """
-    ids = sorted(i for i in model.reg_image_ids())
+    ids = sorted(model.reg_image_ids())
     names = [matched.names[i - 1] for i in ids]
     frame_idx, point_idx, keypoint, track_points = [], [], [], []
     frame_of = {image_id: k for k, image_id in enumerate(ids)}
@@ -187,11 +187,7 @@ def from_pycolmap(model: Any, matched: MatchedPhotos, posed: Reconstruction | No
     if posed is not None:
         index_of = {name: i for i, name in enumerate(posed.image_names)}
         of = [index_of[name] for name in names]
-        return Reconstruction(
-            posed.cameras, names, posed.camera_idx[of], posed.R_cw[of], posed.center_w[of], points_w, observations,
-            posed.phi[of], posed.velocity[of], posed.shutter_model, posed.variation[of], posed.bend[of],
-            posed.bend_clock[of],
-        )  # fmt: skip
+        return replace(posed, image_names=names, points_w=points_w, observations=observations, **posed.rows(of))
     R_cw, center_w = poses_of([model.images[i] for i in ids])
     camera_idx = np.array([matched.camera_idx[i - 1] for i in ids])
     return Reconstruction(matched.cameras, names, camera_idx, R_cw, center_w, points_w, observations)
