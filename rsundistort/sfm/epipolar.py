@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ __all__ = [
     "Matches",
     "agreeing_photos",
     "distance_from_planes",
+    "photo_pairs",
     "read_matches",
     "read_num_verified",
     "read_verified",
@@ -130,31 +131,31 @@ class FreedMatches:
 Matches = dict[tuple[int, int], Index]
 
 
+def photo_pairs(ids: Iterable[int]) -> list[tuple[int, int]]:
+    """The pairs of photos, counted as in `MatchedPhotos`, of a database's ids of pairs."""
+    return [(i - 1, j - 1) for i, j in map(quiet_pycolmap().pair_id_to_image_pair, ids)]
+
+
 def read_matches(matched: MatchedPhotos) -> Matches:
     """All matches of a database."""
-    pycolmap = quiet_pycolmap()
-    with pycolmap.Database.open(matched.database) as db:
-        pairs = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id in db.read_all_matches()[0]]
-        return {(i - 1, j - 1): np.asarray(db.read_matches(i, j), np.int64) for i, j in pairs}
+    with quiet_pycolmap().Database.open(matched.database) as db:
+        pairs = photo_pairs(db.read_all_matches()[0])
+        return {(i, j): np.asarray(db.read_matches(i + 1, j + 1), np.int64) for i, j in pairs}
 
 
 def read_verified(matched: MatchedPhotos) -> Matches:
     """Matches of a database that the epipolar geometry of their pair fits."""
-    pycolmap = quiet_pycolmap()
-    with pycolmap.Database.open(matched.database) as db:
-        pair_ids, geometries = db.read_two_view_geometries()
-    pairs = (pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids)
-    found = zip(pairs, (np.asarray(each.inlier_matches, np.int64) for each in geometries), strict=True)
-    return {(i - 1, j - 1): matches.reshape(-1, 2) for (i, j), matches in found}
+    with quiet_pycolmap().Database.open(matched.database) as db:
+        ids, geometries = db.read_two_view_geometries()
+    found = (np.asarray(each.inlier_matches, np.int64).reshape(-1, 2) for each in geometries)
+    return dict(zip(photo_pairs(ids), found, strict=True))
 
 
 def read_num_verified(matched: MatchedPhotos) -> dict[tuple[int, int], int]:
     """Number of matches of each pair that fit one loose epipolar geometry, from the database before new tracks."""
-    pycolmap = quiet_pycolmap()
-    with pycolmap.Database.open(matched.database) as db:
-        pair_ids, counts = db.read_two_view_geometry_num_inliers()
-    pairs = (pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids)
-    return {(i - 1, j - 1): int(count) for (i, j), count in zip(pairs, counts, strict=True)}
+    with quiet_pycolmap().Database.open(matched.database) as db:
+        ids, counts = db.read_two_view_geometry_num_inliers()
+    return dict(zip(photo_pairs(ids), map(int, counts), strict=True))
 
 
 def agreeing_photos(

@@ -12,7 +12,7 @@ from ..colmap.conventions import quiet_pycolmap
 from ..model import Camera
 from ..model.array_types import Index
 from .database import LOOSE, MatchedPhotos, verification_options, write_photos
-from .epipolar import MIN_EXPLAINED, distance_from_planes
+from .epipolar import MIN_EXPLAINED, distance_from_planes, photo_pairs
 from .features import Features
 
 __all__ = ["LOOSE_PX", "close_px", "match_more", "match_photos", "verify_loosely"]
@@ -163,7 +163,5 @@ def _listed(matched: MatchedPhotos, pairs: Index) -> Path:
 
 def _matched_pairs(matched: MatchedPhotos) -> set[Pair]:
     """Pairs that have matches, or were found to have none."""
-    pycolmap = quiet_pycolmap()
-    with pycolmap.Database.open(matched.database) as db:
-        ids = (pycolmap.pair_id_to_image_pair(pair_id) for pair_id in db.read_all_matches()[0])
-        return {(first - 1, second - 1) for first, second in ids}
+    with quiet_pycolmap().Database.open(matched.database) as db:
+        return set(photo_pairs(db.read_all_matches()[0]))

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from ..colmap.conventions import quiet_pycolmap
+from ..colmap.conventions import quiet_pycolmap, rigid_of
 from ..colmap.lenses import camera_to_colmap
 from ..model import Camera, Reconstruction, RowMotion
 from .database import MatchedPhotos, from_pycolmap, ideal_keypoints, pipeline_options
-from .epipolar import MIN_EXPLAINED, TIGHT_PX, FreedMatches, Matches
+from .epipolar import MIN_EXPLAINED, TIGHT_PX, FreedMatches, Matches, photo_pairs
 
 __all__ = ["retriangulate"]
 
@@ -70,10 +70,8 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction, *, of_
 
 def _explained(db: Any, freed: FreedMatches) -> Matches:
     """The matches that fit the poses."""
-    pycolmap = quiet_pycolmap()
     found = Matches()
-    for pair_id in db.read_all_matches()[0]:
-        first, second = (k - 1 for k in pycolmap.pair_id_to_image_pair(pair_id))
+    for first, second in photo_pairs(db.read_all_matches()[0]):
         if freed.posed[first] < 0 or freed.posed[second] < 0:
             continue
         matches = np.asarray(db.read_matches(first + 1, second + 1))
@@ -110,9 +108,7 @@ def _posed_model(matched: MatchedPhotos, reconstruction: Reconstruction, cameras
             if name not in index_of:
                 continue
             i = index_of[name]
-            R = reconstruction.R_cw[i]
-            pose = np.column_stack([R, -R @ reconstruction.center_w[i]])
-            frame.rig_from_world = pycolmap.Rigid3d(pose)
+            frame.rig_from_world = rigid_of(reconstruction.R_cw[i], reconstruction.center_w[i])
             model.add_frame(frame)
             image = db.read_image(index + 1)
             image.frame_id = frame.frame_id
