@@ -102,7 +102,8 @@ def detect_features(
         nfeatures=0, nOctaveLayers=3, contrastThreshold=0.02, edgeThreshold=10, sigma=1.6, enable_precise_upscale=True
     )
     gray = grey_8_bit(photo)
-    shrink = _shrinking(gray.size, megapixels)
+    # the factor by which the sides are divided
+    shrink = math.sqrt(max(1.0, gray.size / (1e6 * megapixels)))
     if shrink > 1.0:
         gray, mask = _shrunk(gray, mask, shrink)
     # descriptors that are not kept cost more than a second pyramid, except where few are left out
@@ -128,11 +129,6 @@ def detect_features(
 def detection_bytes(width: int, height: int, megapixels: float = DETECTION_MEGAPIXELS) -> float:
     """Memory that the detection of features takes for a photo of this size, besides the photo."""
     return float(_BYTES_PER_PIXEL * min(width * height, 1e6 * megapixels))
-
-
-def _shrinking(num_pixels: int, megapixels: float) -> float:
-    """The factor by which the sides of a photo are divided."""
-    return math.sqrt(max(1.0, num_pixels / (1e6 * megapixels)))
 
 
 def _shrunk(

@@ -96,7 +96,8 @@ def place_photo(points_w: Array, xy_raw: Array, camera: Camera, step_px: float =
     """
     if len(points_w) < _LEAST_SUGGESTING:
         return None
-    few = _spread_over(len(points_w), _ENOUGH)
+    every = np.arange(len(points_w))
+    few = every if len(every) <= _ENOUGH else np.linspace(0, len(every) - 1, _ENOUGH).astype(np.int64)
     found = [_Pose(R_cw, center_w) for R_cw, center_w in _suggested(points_w[few], xy_raw[few], camera, step_px)]
     found = [_adjusted(pose, points_w[few], xy_raw[few], camera, _WIDE_PX * step_px) for pose in found]
     found.sort(key=lambda pose: pose.cost)
@@ -119,11 +120,6 @@ class _Pose:
     center_w: Array
     phi: Array = field(default_factory=lambda: np.zeros(3))
     cost: float = np.inf
-
-
-def _spread_over(count: int, most: int) -> Index:
-    """Indices of so many of a list, evenly distributed."""
-    return np.arange(count) if count <= most else np.linspace(0, count - 1, most).astype(np.int64)
 
 
 def _suggested(points_w: Array, xy_raw: Array, camera: Camera, step_px: float) -> Iterator[tuple[Array, Array]]:

@@ -32,11 +32,6 @@ _RICH, _ASKED, _MOST_OF_THEM, _AT_LEAST = 800, 16, 0.75, 0.5
 _OF_CLIP = (512, 2048, None)
 
 
-def _num_overlapping(matched: MatchedPhotos) -> int:
-    """Pairs of photos that overlap beyond doubt."""
-    return sum(count >= _MANY for count in read_num_verified(matched).values())
-
-
 def place_photos(
     photos: LoadedPhotos,
     scratch: Path,
@@ -86,7 +81,8 @@ def place_photos(
             keypoints = _OF_CLIP if of_clip else PLACING_KEYPOINTS
             mapped = map_photos(matched, lambda done: log.tell("mapping", done, len(photos.names)), keypoints)
         except ReconstructionError as error:
-            if _num_overlapping(matched) < len(photos.names) - 1:
+            overlapping = sum(count >= _MANY for count in read_num_verified(matched).values())
+            if overlapping < len(photos.names) - 1:
                 raise
             raise ReconstructionError(
                 "the photos overlap, but show no parallax: the camera stood still or only rotated; "
@@ -126,7 +122,8 @@ def _match(
         asks = bool(photos.coarse) and len(photos.names) > _ASKED
         if asks:
             matched = start(pairs=_neighbours(len(photos.names)))
-            if not _most_are_rich(matched):
+            rich = sum(count >= _RICH for count in read_num_verified(matched).values())
+            if rich < _MOST_OF_THEM * _ASKED:
                 log.end("matching", of="coarse features", rich=False)
                 return None
         pairs, num_pairs = choose(photos, matching, seed), math.comb(len(photos.names), 2)
@@ -147,11 +144,6 @@ def _neighbours(count: int) -> Index:
     """(p, 2) some of the pairs of photos that follow each other."""
     first = np.linspace(0, count - 2, _ASKED).astype(np.int64)
     return np.stack([first, first + 1], axis=1)
-
-
-def _most_are_rich(matched: MatchedPhotos) -> bool:
-    """Whether most of the pairs that were asked share many matches."""
-    return sum(count >= _RICH for count in read_num_verified(matched).values()) >= _MOST_OF_THEM * _ASKED
 
 
 def _all_are_rich(matched: MatchedPhotos) -> bool:

@@ -21,10 +21,10 @@ from ..sfm import LEAST_MEASUREMENTS, LEAST_TIES, connected_photos
 from .photos import PhotoMotions, photo_motions
 from .residuals import left_along_readout, left_over_frame
 
-__all__ = ["Verdict", "height_reasons", "judge", "loose_reasons", "unexplained_reasons"]
+__all__ = ["UNSEEN_PX", "Verdict", "height_reasons", "judge", "loose_reasons", "unexplained_reasons"]
 
-# Displacements below this are lost in the interpolation of a photo.
-_UNSEEN_PX = 1.0
+#: Displacements below this are lost in the interpolation of a photo.
+UNSEEN_PX = 1.0
 # A motion with a larger standard deviation may do as much harm as good.
 _UNCERTAIN_PX = 2.0
 # Of the scene's height: as good as photos measure. No standard deviation includes errors that all photos share
@@ -145,7 +145,7 @@ def judge(
     outliers = _outliers(rec, tracks)
     doubts = _doubts(result, motions, outliers, most_phi or {})
     # the fixed scene draws both halves to the motion that it was solved with: their difference is less than the error
-    torn = (motions.difference_px > np.maximum(_UNSEEN_PX, motions.shift_px / 2)) | (outliers > 0.5)
+    torn = (motions.difference_px > np.maximum(UNSEEN_PX, motions.shift_px / 2)) | (outliers > 0.5)
     shutter, why = _of_motions(result, global_result, choice, motions, torn, known)
     reasons += _rival_reasons(choice)
     for name, said in _misplaced(result, bool(unexplained + why)).items() if strong else ():
@@ -161,7 +161,7 @@ def judge(
     lost = torn | np.isin(rec.image_names, [*suspects])
     lost |= (_counts(rec) < _FEW) & (motions.sigma_px >= motions.shift_px)
     # motions that cannot be seen do no harm
-    lost &= motions.shift_px >= _UNSEEN_PX
+    lost &= motions.shift_px >= UNSEEN_PX
     # a model that the user named is applied
     lost |= shutter == "not-determined" and choice is not None
     lens_only = tuple(name for name, each in zip(rec.image_names, lost, strict=True) if each and name not in known)
@@ -292,7 +292,7 @@ def _of_motions(
 ) -> tuple[str, list[str]]:
     """Whether a shutter was found, and why not."""
     rec = result.reconstruction
-    if not (motions.shift_px >= _UNSEEN_PX).any():
+    if not (motions.shift_px >= UNSEEN_PX).any():
         return "not-found", []
     reasons = []
     if choice is None and not (global_result is not None and _explains(result, global_result)):
@@ -345,7 +345,7 @@ def _repeated(rec: Reconstruction) -> int | None:
         if between @ mean > _SAME_WAY * np.linalg.norm(between) * np.linalg.norm(mean):
             continue
         chance = 2.0 * stdtr(freedom, -np.abs(mean) / np.maximum(spread, 1e-12) * np.sqrt(m))
-        alike = (np.abs(mean) > _REPEATED * spread) & (3 * chance < _CHANCE) & (np.abs(mean) * half_px > _UNSEEN_PX)
+        alike = (np.abs(mean) > _REPEATED * spread) & (3 * chance < _CHANCE) & (np.abs(mean) * half_px > UNSEEN_PX)
         if alike.any():
             return int(np.argmax(np.where(alike, np.abs(mean), 0.0)))
     return None
@@ -381,11 +381,11 @@ def _doubts(
             said.append(f"its measurements lie in {100 * motions.covered[i]:.0f} % of its frame")
         if outliers[i] > _OUTLIERS:
             said.append(f"{100 * outliers[i]:.0f} % of its measurements contradict the others")
-        if motions.difference_px[i] > _UNSEEN_PX:
+        if motions.difference_px[i] > UNSEEN_PX:
             said.append(f"its halves contradict each other by {motions.difference_px[i]:.1f} px")
         if motions.sigma_px[i] > _UNCERTAIN_PX:
             said.append(f"its motion is only known to +-{motions.sigma_px[i]:.1f} px")
-        if times[i] > _FAR and motions.shift_px[i] > _UNSEEN_PX:
+        if times[i] > _FAR and motions.shift_px[i] > UNSEEN_PX:
             said.append(f"it moved {times[i]:.0f} times as much as the other photos do")
         if np.linalg.norm(rotation[i]) - 2 * sigma[i] > most_phi.get(name, np.inf):
             said.append(
@@ -402,7 +402,7 @@ def _faint(rec: Reconstruction, motions: PhotoMotions) -> dict[str, str]:
     over the frame, as a photo is judged.
     """
     found, sigma = motions.shift_px, motions.sigma_px
-    faint = (motions.relative_sigma > 1 / 4) & (sigma > _UNSEEN_PX / 2)
+    faint = (motions.relative_sigma > 1 / 4) & (sigma > UNSEEN_PX / 2)
     return {
         name: f"its motion of {found[i]:.1f} px is only known to +-{sigma[i]:.1f} px"
         for i, name in enumerate(rec.image_names)

@@ -71,7 +71,9 @@ def photo_motions(result: BundleResult) -> PhotoMotions:
             prior = np.concatenate([np.zeros(6), (rec.frame_span()[i] / np.maximum(sigmas, 1e-12)) ** 2])
             photo = _Photo.of(rec, i, mine, result.sigma_px)
             sigmas_px = photo.motion_sigmas_px(result.covariances[i, 6:, 6:])
-            shifts_px, bent_px = photo.shifts_px(photo.motion[None])[0], _bent_px(rec, i)
+            shifts_px = photo.shifts_px(photo.motion[None])[0]
+            # approximately, what is unsteady of the rotation displaces along the readout
+            bent_px = rec.camera(i).K[0, 0] * np.linalg.norm(rec.bend[i, :, :3], axis=1)
             found[:, i] = (
                 shifts_px.max(initial=0.0) + bent_px.max(initial=0.0),
                 sigmas_px.max(initial=0.0),
@@ -80,11 +82,6 @@ def photo_motions(result: BundleResult) -> PhotoMotions:
                 photo.covered,
             )
     return PhotoMotions(*found)
-
-
-def _bent_px(rec: Reconstruction, image: int) -> Array:
-    """(k,) approximate displacements of pixels by the unsteady part of a photo's rotation, along its readout."""
-    return np.asarray(rec.camera(image).K[0, 0] * np.linalg.norm(rec.bend[image, :, :3], axis=1))
 
 
 def _rms(values: Array) -> float:
