@@ -143,30 +143,23 @@ class Survey:
         """The reconstruction with the control points among its points, in the frame that they define."""
         found = place_control(rec, self.holding)
         lost = [each.name for each in self.holding if each not in found.points]
-        notes = [
-            *self.notes,
-            *([f"control points that fewer than two registered photos see: {', '.join(lost)}"] * bool(lost)),
-        ]
+        notes = [*self.notes]
+        if lost:
+            notes.append(f"control points that fewer than two registered photos see: {', '.join(lost)}")
         survey, targets = replace(self, notes=notes), np.array([each.place_m for each in found.points]).reshape(-1, 3)
+        problem = f"{len(found.points)} control points are seen by registered photos, three are needed"
         if len(found.points) >= _LEAST:
             sigma = np.array([each.sigma_m for each in found.points])
             fit = self._fitted(rec, found.points_w, targets, sigma)
             problem = _misfit(fit, "control points", robust=False)
-            if problem and self.fit is None:
-                warnings.warn(
-                    f"not on the map: {problem}; poses are in a frame of their own", RsUndistortWarning, stacklevel=4
-                )
-                return None, rec
             if not problem:
                 rec, survey = fit.similarity.of_reconstruction(rec), replace(survey, fit=fit)
-        elif self.fit is None:
-            warnings.warn(
-                f"not on the map: {len(found.points)} control points are seen by registered photos, three are needed; "
-                "poses are in a frame of their own", RsUndistortWarning, stacklevel=4,
-            )  # fmt: skip
-            return None, rec
-        elif found.points:
+        elif self.fit is not None and found.points:
             rec = Similarity(1.0, np.eye(3), (targets - found.points_w).mean(0)).of_reconstruction(rec)
+        if problem and self.fit is None:
+            said = f"not on the map: {problem}; poses are in a frame of their own"
+            warnings.warn(said, RsUndistortWarning, stacklevel=4)
+            return None, rec
         if self.places and found.points:
             # the common offset of all positions is the receiver's and its datum's, and control points know better
             centers, places, _ = _of_photos(rec, self.places)
