@@ -336,7 +336,7 @@ def _in_stored_frame(
 
 
 def _photo_cameras(
-    given: ColmapModel, source: str, facts: Mapping[str, ExifFacts], options: SolveOptions
+    given: ColmapModel, source: str, exif: Sequence[ExifFacts], sizes: Sequence[tuple[int, int]], options: SolveOptions
 ) -> PhotoCameras:
     """The model's cameras, with the readout directions that were specified or are guessed."""
     rec = given.reconstruction
@@ -346,8 +346,7 @@ def _photo_cameras(
     if unknown:
         raise InputError(f"readout of {unknown[0]!r}: no such camera, there are {', '.join(labels)}")
     of_photo = [labels[k] for k in rec.camera_idx.tolist()]
-    sizes = [(rec.camera(i).width, rec.camera(i).height) for i in range(rec.num_images)]
-    guessed, notes = guess_readouts([facts.get(name, ExifFacts()) for name in rec.image_names], sizes, of_photo)
+    guessed, notes = guess_readouts(exif, sizes, of_photo)
     cameras = []
     for label, camera in zip(labels, rec.cameras, strict=True):
         direction = specified.get(label, specified.get("", guessed.get(label, camera.readout)))
@@ -376,16 +375,17 @@ def _solve(
         raise ReconstructionError(
             f"the model holds {given.reconstruction.num_images} registered photos, the shutter needs three"
         )
-    cameras = _photo_cameras(given, source, facts, options)
-    rec = replace(given.reconstruction, cameras=cameras.cameras)
+    rec = given.reconstruction
+    sizes = [(rec.camera(i).width, rec.camera(i).height) for i in range(rec.num_images)]
+    exif = [facts.get(name, ExifFacts()) for name in rec.image_names]
+    cameras = _photo_cameras(given, source, exif, sizes, options)
+    rec = replace(rec, cameras=cameras.cameras)
     for name in (*options.still, *options.known):
         if name not in rec.image_names:
             raise InputError(f"constraint on {name!r}, which is not among the photos of the model")
 
     survey = None
     if options.crs is not None or options.control:  # else its frame is the model's
-        sizes = [(rec.camera(i).width, rec.camera(i).height) for i in range(rec.num_images)]
-        exif = [facts.get(name, ExifFacts()) for name in rec.image_names]
         survey = survey_of(options.crs, options.control, rec.image_names, exif, sizes)
 
     def options_of(each: Reconstruction) -> BundleOptions:
