@@ -13,7 +13,7 @@ from ..model import ControlPoint, Reconstruction
 from ..model.array_types import Array, Index
 from .intrinsics import prior_weight
 
-__all__ = ["KnownPlaces", "PlaceResiduals", "point_of"]
+__all__ = ["KnownPlaces", "PlaceResiduals", "point_of", "stacked"]
 
 
 # Photos and points that must have a place for these to hold a frame.
@@ -100,9 +100,9 @@ class PlaceResiduals:
             index[name]: each for name, each in known.velocities.items() if name in index and self.holds_frame
         }
         self.moving: Index = np.array(list(velocities), np.int64)
-        self.velocity, self.velocity_sigma = _stacked([*velocities.values()])
-        self._center, self._photo_sigma = _stacked([(place, sigma) for place, sigma in photos.values()])
-        self._place, self._point_sigma = _stacked([(each.place_m, each.sigma_m) for each in points.values()])
+        self.velocity, self.velocity_sigma = stacked([*velocities.values()])
+        self._center, self._photo_sigma = stacked([(place, sigma) for place, sigma in photos.values()])
+        self._place, self._point_sigma = stacked([(each.place_m, each.sigma_m) for each in points.values()])
 
     def __len__(self) -> int:
         return len(self._photo) + len(self._point)
@@ -132,7 +132,7 @@ class PlaceResiduals:
         return (points_w[self._point] - self._place) / self._point_sigma
 
 
-def _stacked(pairs: Sequence[tuple[ArrayLike, ArrayLike]]) -> tuple[Array, Array]:
+def stacked(pairs: Sequence[tuple[ArrayLike, ArrayLike]]) -> tuple[Array, Array]:
     """Values and standard deviations, (k, 3) each."""
     values = np.array([place for place, _ in pairs], np.float64).reshape(-1, 3)
     return values, np.array([sigma for _, sigma in pairs], np.float64).reshape(-1, 3)

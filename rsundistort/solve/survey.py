@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..bundle import CONTROL_SIGMA_PX, KnownPlaces, place_control, scale_of_lengths, with_control
-from ..bundle.known_positions import point_of
+from ..bundle.known_positions import point_of, stacked
 from ..errors import InputError, RsUndistortWarning
 from ..input.positions import MapFrame, PhotoPositions, frame_at, frame_of_control, positions_of
 from ..io import ExifFacts
@@ -146,10 +146,10 @@ class Survey:
         notes = [*self.notes]
         if lost:
             notes.append(f"control points that fewer than two registered photos see: {', '.join(lost)}")
-        survey, targets = replace(self, notes=notes), np.array([each.place_m for each in found.points]).reshape(-1, 3)
+        survey = replace(self, notes=notes)
+        targets, sigma = stacked([(each.place_m, each.sigma_m) for each in found.points])
         problem = f"{len(found.points)} control points are seen by registered photos, three are needed"
         if len(found.points) >= _LEAST:
-            sigma = np.array([each.sigma_m for each in found.points])
             fit = self._fitted(rec, found.points_w, targets, sigma)
             problem = _misfit(fit, "control points", robust=False)
             if not problem:
@@ -173,9 +173,8 @@ class Survey:
         x, y, sigma = _of_photos(rec, self.places)
         indices = {point_of(rec, each): each for each in self.holding}
         points = {k: each for k, each in indices.items() if k is not None}
-        x = np.concatenate([x, rec.points_w[list(points)]])
-        y = np.concatenate([y, np.array([each.place_m for each in points.values()]).reshape(-1, 3)])
-        sigma = np.concatenate([sigma, np.array([each.sigma_m for each in points.values()]).reshape(-1, 3)])
+        of_points = rec.points_w[list(points)], *stacked([(each.place_m, each.sigma_m) for each in points.values()])
+        x, y, sigma = (np.concatenate(each) for each in zip((x, y, sigma), of_points, strict=True))
         fit = self._fitted(rec, x, y, sigma)
         rec = fit.similarity.of_reconstruction(rec)
         survey = replace(self, fit=fit)
@@ -280,12 +279,7 @@ class Survey:
 def _of_photos(rec: Reconstruction, places: Mapping[str, tuple[Array, Array]]) -> tuple[Array, Array, Array]:
     """Centres, places and standard deviations (k, 3) of the photos that have a place."""
     rows = [i for i, name in enumerate(rec.image_names) if name in places]
-    known = [places[rec.image_names[i]] for i in rows]
-    return (
-        rec.center_w[rows],
-        np.array([place for place, _ in known]).reshape(-1, 3),
-        np.array([sigma for _, sigma in known]).reshape(-1, 3),
-    )
+    return rec.center_w[rows], *stacked([places[rec.image_names[i]] for i in rows])
 
 
 def _misfit(fit: FittedSimilarity, what: str, robust: bool = True) -> str:
