@@ -166,9 +166,8 @@ def _squares(found: Similarity, points: Array, targets: Array, sigma: Array) -> 
 
 
 def _step(
-    found: Similarity, points: Array, targets: Array, sigma: Array, weight: Array,
-    rotation: tuple[Array, float] | None,
-) -> tuple[Similarity, float, Array, Array]:  # fmt: skip
+    found: Similarity, points: Array, targets: Array, sigma: Array, weight: Array, rotation: tuple[Array, float] | None
+) -> tuple[Similarity, float, Array, Array]:
     """A Gauss-Newton step: the new similarity, its size, the Hessian of shift, rotation and scale, and the middle.
 
     Rotation and scale are about the middle of the points, and in units that make them as large as shifts.

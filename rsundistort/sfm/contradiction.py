@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from heapq import heapify, heappop, heappush
 
 import numpy as np
@@ -124,7 +124,9 @@ def parts_that_agree(support: Mapping[Pair, Vote], num: int) -> Index:
             continue  # one of them has been joined with another part since
         del between[kept][gone], between[gone][kept]
         label[label == gone] = kept
-        for other, more in _emptied(between, gone):
+        shared, between[gone] = between[gone], {}
+        for other, more in shared.items():
+            del between[other][gone]
             decide = _deciding([*between[kept].get(other, []), *more])
             between[kept][other] = between[other][kept] = decide
             if (total := _balance(decide)) > 0:
@@ -139,11 +141,3 @@ def _deciding(votes: Votes) -> Votes:
 
 def _balance(votes: Votes) -> float:
     return sum(weight for _, weight in votes)
-
-
-def _emptied(between: list[dict[int, Votes]], part: int) -> Iterable[tuple[int, Votes]]:
-    """What a part shares with others, which it does not from now on."""
-    shared, between[part] = between[part], {}
-    for other in shared:
-        del between[other][part]
-    return shared.items()

@@ -161,28 +161,23 @@ def from_pycolmap(model: Any, matched: MatchedPhotos, posed: Reconstruction | No
     """
     ids = sorted(model.reg_image_ids())
     names = [matched.names[i - 1] for i in ids]
-    frame_idx, point_idx, keypoint, track_points = [], [], [], []
+    rows, track_points = [], []
     frame_of = {image_id: k for k, image_id in enumerate(ids)}
     for number, point_id in enumerate(sorted(model.point3D_ids())):
         point = model.points3D[point_id]
         track_points.append(point.xyz)
-        seen = set()
-        for element in sorted((e.image_id, e.point2D_idx) for e in point.track.elements):
-            if element[0] in seen:  # COLMAP tracks can hold a photo twice
-                continue
-            seen.add(element[0])
-            frame_idx.append(frame_of[element[0]])
-            point_idx.append(number)
-            keypoint.append(element[1])
+        # COLMAP tracks can hold a photo twice: the first of its keypoints counts
+        seen = dict(sorted(((each.image_id, each.point2D_idx) for each in point.track.elements), reverse=True))
+        rows += [(frame_of[image_id], number, seen[image_id]) for image_id in sorted(seen)]
     if not track_points:
         raise ReconstructionError("the photos were registered, but no scene point could be triangulated")
-    frame = np.array(frame_idx)
+    frame, point_idx, keypoint = np.array(rows).T
     found = [matched.features[image_id - 1] for image_id in ids]
     start = np.concatenate([[0], np.cumsum([len(each.sigma) for each in found])])
     at = start[frame] + keypoint
     xy_raw = np.concatenate([each.xy_raw for each in found])[at]
     sigma = np.concatenate([each.sigma for each in found])[at]
-    observations = Observations(frame, np.array(point_idx), xy_raw, sigma)
+    observations = Observations(frame, point_idx, xy_raw, sigma)
     points_w = np.array(track_points)
     if posed is not None:
         index_of = {name: i for i, name in enumerate(posed.image_names)}

@@ -327,9 +327,8 @@ class _Shown:
 
 
 def _fits(
-    R_cw: Array, center_w: Array, motion: RowMotion, points_w: Array,
-    xy_raw: Array, camera: Camera, step_px: float,
-) -> Mask:  # fmt: skip
+    R_cw: Array, center_w: Array, motion: RowMotion, points_w: Array, xy_raw: Array, camera: Camera, step_px: float
+) -> Mask:
     """(n,) which measurements lie near the predictions of a pose."""
     xy, valid = project_points((points_w - center_w) @ R_cw.T, camera, motion, "rotation")
     return valid & (np.linalg.norm(np.where(valid[:, None], xy - xy_raw, 0.0), axis=1) <= _FIT * TIGHT_PX * step_px)

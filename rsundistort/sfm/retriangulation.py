@@ -101,8 +101,7 @@ def _posed_model(matched: MatchedPhotos, reconstruction: Reconstruction, cameras
             model.add_camera(db.read_camera(index + 1))
         for rig in db.read_all_rigs():
             model.add_rig(rig)
-        frames = {frame.frame_id: frame for frame in db.read_all_frames()}
-        frame_of_image = {d.id: frame for frame in frames.values() for d in frame.data_ids}
+        frame_of_image = {each.id: frame for frame in db.read_all_frames() for each in frame.data_ids}
         for index, name in enumerate(matched.names):
             frame = frame_of_image[index + 1]
             if name not in index_of:
