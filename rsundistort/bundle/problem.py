@@ -15,7 +15,6 @@ from ..errors import InputError
 from ..model import Camera, Reconstruction, check_shutter_model
 from ..model.array_types import Array, Index, Mask
 from ..model.reprojection import camera_arrays, motion_tables, observed_lens_pixels, plain_arrays
-from .at_lens import least_distance
 from .bundle_options import LOSSES, BundleOptions
 from .common_motion import LEAST_PHOTOS, MotionMeans
 from .connections import Border, CommonPrior, Coupling
@@ -33,6 +32,7 @@ from .point_terms import PointTerms, largest_step, moved_points, nearest_photos
 from .prior_sigmas import PriorSigmas
 from .sparse_blocks import Chain
 from .structure import Structure
+from .triangulate import least_distance
 
 __all__ = ["BundleProblem", "State"]
 

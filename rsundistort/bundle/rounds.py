@@ -11,7 +11,6 @@ from ..errors import InputError
 from ..model import Reconstruction
 from ..model.array_types import Array, Index, Mask
 from ..model.reprojection import reprojection_residuals
-from .at_lens import least_distance
 from .bundle_options import BundleOptions, BundleResult
 from .calibration_doubt import CalibrationDoubt
 from .common_motion import CommonMotion
@@ -32,7 +31,7 @@ from .path_prior import (
 from .prior_sigmas import Common, estimated, field_prior_sigma, path_prior_sigmas, settled, starting_sigmas
 from .problem import BundleProblem
 from .solver import minimize
-from .triangulate import retriangulated
+from .triangulate import least_distance, retriangulated
 
 __all__ = ["Rounds"]
 
