@@ -309,8 +309,8 @@ class _Fits:
         the means over the photos are subtracted, since a lens error can cause them.
         """
         rec = fit.reconstruction
-        options = replace(self._rough, varying=fit.varying, bends=fit.bends, phi_sigma=fit.sigmas.phi)
-        options = replace(options, velocity_sigma=fit.sigmas.velocity or None)
+        phi, velocity = fit.sigmas.phi, fit.sigmas.velocity or None
+        options = replace(self._rough, varying=fit.varying, bends=fit.bends, phi_sigma=phi, velocity_sigma=velocity)
         first = half_across_readout(rec)
         try:
             halves = [bundle_adjust(rec.take_points(half), fit.model, options) for half in (first, ~first)]

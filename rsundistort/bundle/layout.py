@@ -112,11 +112,8 @@ class Layout:
         return value
 
     def _known_values(self, names: Sequence[str]) -> Array:
-        value = np.zeros((len(names), len(self.functions), 6))
-        for i, name in enumerate(names):
-            if name in self.known:
-                value[i] = self.known[name]
-        return value
+        none = np.zeros((len(self.functions), 6))
+        return np.array([self.known.get(name, none) for name in names]).reshape(len(names), *none.shape)
 
     def coefficients(self, reconstruction: Reconstruction) -> Array:
         """(m, 3 k) coefficients of the bends of a reconstruction, as far as they are along the functions."""

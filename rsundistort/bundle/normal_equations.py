@@ -293,7 +293,7 @@ class NormalEquations:
         end = (border.camera_of_frame + 1)[:, None] * border.J.shape[2]
         columns = end + np.arange(-last, 0)
         found = self.inverse.photos_by_cameras()[np.arange(self.num_photos)[:, None], :, columns]
-        return self._seen(found.transpose(0, 2, 1).swapaxes(1, 2)).swapaxes(1, 2)
+        return self._seen(found).swapaxes(1, 2)
 
     def coupling_variances(self) -> tuple[Array, Array]:
         """Residuals (q, r) of the coupling, and their variances, all unknowns being free."""

@@ -218,12 +218,10 @@ class PathPrior:
         self._camera_idx = reconstruction.camera_idx
 
     def start(self, reconstruction: Reconstruction, known: PathStart | None = None) -> PathState:
-        """The state that an adjustment begins with: as far as it is `known`, that one."""
-        differences = self._by_differences(reconstruction)
-        return differences if known is None else known.in_order(reconstruction.image_names, differences)
+        """The state that an adjustment begins with: as far as it is `known`, that one.
 
-    def _by_differences(self, reconstruction: Reconstruction) -> PathState:
-        """Rates by differences of the poses of neighbours, and the pace that is likeliest before the photos."""
+        Else rates by differences of the poses of neighbours, and the pace that is likeliest before the photos.
+        """
         m = reconstruction.num_images
         total, count = np.zeros((m, 6)), np.zeros((m, 1))
         i, j = self.first, self.second
@@ -232,7 +230,8 @@ class PathPrior:
         for end in (i, j):
             np.add.at(total, end, rate)
             np.add.at(count, end, 1.0)
-        return PathState(total / np.maximum(count, 1.0), np.zeros((m, 6)), self.pace_prior.copy())
+        differences = PathState(total / np.maximum(count, 1.0), np.zeros((m, 6)), self.pace_prior.copy())
+        return differences if known is None else known.in_order(reconstruction.image_names, differences)
 
     def residuals(self, R_cw: Array, center_w: Array, state: PathState) -> Array:
         """(q, 18) residuals of unit variance, 6 each of steps, rates and changes."""

@@ -52,7 +52,8 @@ class Posterior:
 
     def of_photos(self, vectors: Array) -> Array:
         """Covariance of the photos' unknowns times vectors (k, m, nb), as in `BundleResult.covariances`."""
-        whole = self._whole(vectors)
+        # with zeros for what the photos have of their own beside pose and motion
+        whole = np.pad(vectors, [(0, 0), (0, 0), (0, self._own)])
         if self._path is None:
             return (self._covariance(whole) + self._doubt.times(whole)[0])[:, :, : vectors.shape[2]]
         # phi and velocity are pace times rates
@@ -119,10 +120,6 @@ class Posterior:
                 A /= self._path.paces(self._camera_idx, self._state.variation)[photo]
             squares.append(np.einsum("oki,okj->ij", A, A) / max(len(mine), 1))
         return np.array(squares)
-
-    def _whole(self, vectors: Array) -> Array:
-        """With zeros for what the photos have of their own beside pose and motion."""
-        return np.pad(vectors, [(0, 0), (0, 0), (0, self._own)])
 
 
 def gauge_directions(result: BundleResult) -> Array:

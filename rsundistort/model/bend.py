@@ -68,8 +68,6 @@ def bend_functions(groups: int) -> tuple[Array, tuple[int, ...]]:
     group : (k,) tuple
         Index of the group of each.
     """
-    if not 1 <= groups <= len(BEND_GROUPS):
-        raise InputError(f"{groups} groups of bends, expected 1 to {len(BEND_GROUPS)}")
     chosen = list(BEND_GROUPS.values())[:groups]
     num = chosen[-1][0] + 1
     gram, place = _gram(num), np.linspace(-1, 1, num)

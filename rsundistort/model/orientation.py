@@ -109,7 +109,7 @@ def orient_camera(camera: Camera, orientation: int) -> Camera:
     along = int(np.flatnonzero(clock)[0])
     readout = next(name for name, way in READOUTS.items() if way == (along, float(clock[along])))
     dist = np.array(camera.dist)
-    if len(dist) >= 4 and getattr(camera, "lens", "pinhole") == "pinhole":
+    if len(dist) >= 4 and camera.lens == "pinhole":
         # decentering shifts by 2 x (p . x) + p r^2 with p = (p2, p1): p rotates with the axes, and so does a thin prism
         dist[[3, 2]] = matrix @ dist[[3, 2]]
         if len(dist) == 12:
