@@ -13,7 +13,6 @@ import numpy as np
 from ..batch.progress import ProgressCallback, StageLog
 from ..batch.rectify_options import RectifyOptions
 from ..batch.workers import Workers, use_threads
-from ..bundle import BundleOptions
 from ..colmap.conventions import kept_log_level
 from ..colmap.measured_model import ColmapModel, colmap_model_of, surviving_points
 from ..colmap.rectified_model import ModelIds, colmap_model
@@ -388,9 +387,7 @@ def _solve(
     if options.crs is not None or options.control:  # else its frame is the model's
         survey = survey_of(options.crs, options.control, rec.image_names, exif, sizes)
 
-    def options_of(each: Reconstruction) -> BundleOptions:
-        return replace(options.options_for(cameras), outlier_sigma=_OUTLIER_SIGMA)
-
+    fitting = replace(options.options_for(cameras), outlier_sigma=_OUTLIER_SIGMA)
     with work_folder() as work:
         if database is not None:
             log.begin("database")
@@ -398,12 +395,13 @@ def _solve(
             log.end("database", keypoints=sum(len(found.xy_raw) for found in matched.features))
             track_source = TrackSource(matched)
         solved = solve_tracks(
-            rec, cameras, options.shutter_model, options.seed, options_of, log, options.remedy, track_source, survey
-        )
+            rec, cameras, options.shutter_model, options.seed, lambda _: fitting, log, options.remedy, track_source,
+            survey,
+        )  # fmt: skip
     if solved.survey is None:  # the model's frame is kept
         solved = replace(solved, georeference=given.georeference)
     after = solved.shared
-    for text in cameras.contradicted(after.cameras, options_of(after)):
+    for text in cameras.contradicted(after.cameras, fitting):
         warnings.warn(text, RsUndistortWarning, stacklevel=4)
     lost = dict.fromkeys(given.unregistered, "it is not registered in the model")
     lost |= dict.fromkeys(set(rec.image_names) - set(after.image_names), "no measurement of it survived")
