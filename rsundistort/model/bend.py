@@ -12,6 +12,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
 
 from ..errors import InputError
 from .array_types import Array
@@ -40,8 +41,6 @@ def bend_pieces(num_sites: int) -> Array:
 
     Times the values at n sites.
     """
-    from scipy.interpolate import CubicSpline
-
     spline = CubicSpline(np.arange(num_sites), np.eye(num_sites))
     return frozen(spline.c[::-1].transpose(1, 0, 2).reshape(-1, num_sites))
 
@@ -116,8 +115,6 @@ def splines_at(num_sites: int, place: Array) -> Array:
 
 def parts_of(clock: Array, readings: Array, sites: int) -> tuple[Array, Array, Array]:
     """Parts of readings (k, c) at ascending times of the clock (k,): bends (sites, c), constants and rates (c,)."""
-    from scipy.interpolate import CubicSpline
-
     values = CubicSpline(clock, readings)(np.linspace(clock[0], clock[-1], sites))
     place, gram = np.linspace(-1, 1, sites), _gram(sites)
     ones = np.ones(sites)

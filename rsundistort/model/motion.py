@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from .array_types import Array
@@ -53,8 +54,6 @@ def steady_parts(clock: Array, moved: Array, sites: int) -> tuple[Array, Array, 
     rate : (k, 2, 3) array
         Phi and velocity.
     """
-    from scipy.spatial.transform import Rotation
-
     k, n = moved.shape[:2]
     readings = Rotation.from_rotvec(moved[..., :3].reshape(-1, 3)).as_matrix().reshape(k, n, 3, 3)
     correction = readings[:, n // 2]
@@ -136,8 +135,6 @@ class RowMotion:
         way : (3,) array
             and the centre `center_w + way`.
         """
-        from scipy.spatial.transform import Rotation
-
         readings = Rotation.from_rotvec(np.array(check_finite(rotation, (None, 3), "rotation")))
         correction = readings[len(readings) // 2]
         # the constant part goes into the pose; rotations do not commute, so that a share of it is left each time
@@ -223,8 +220,6 @@ class RowMotion:
         R_cw, center_w : (3, 3), (3,) array
             Exp(r phi) R_cw, and the centre moved by r velocity, with what the bend adds.
         """
-        from scipy.spatial.transform import Rotation
-
         self._check_frame("world")
         rotation, way = self.at(check_number(clock, "clock"))
         R, center = check_rotation(R_cw, "R_cw"), check_finite(center_w, (3,), "center_w")

@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
 
 from .._kernels.alignment import align
 from ..model import Observations, Reconstruction
@@ -245,8 +246,6 @@ def _best_views(rec: Reconstruction, step: Array, measured: _Windows) -> tuple[I
 
 def _further(rec: Reconstruction, best: _Windows, unit: Array, normal: Array) -> Iterator[_Windows]:
     """Windows of points in photos that may show them, but measured none there; a photo at a time."""
-    from scipy.sparse import coo_array  # late: few need it
-
     obs, m = rec.observations, rec.num_images
     ones = np.ones(len(obs), np.int64)
     seen = coo_array((ones, (obs.frame_idx, obs.point_idx)), shape=(m, rec.num_points)).tocsr()

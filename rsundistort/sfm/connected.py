@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 
 from ..model import Reconstruction
 from ..model.array_types import Array, Index, Mask
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_matrix
 
 __all__ = [
     "LEAST_MEASUREMENTS",
@@ -48,15 +45,11 @@ def common_points(reconstruction: Reconstruction) -> Array:
 
 def connected_parts(reconstruction: Reconstruction) -> Index:
     """(m,) label of the part that each photo is in, by what photos show together."""
-    from scipy.sparse.csgraph import connected_components  # late: few runs need it
-
     return np.asarray(connected_components(common_points(reconstruction) >= LEAST_MEASUREMENTS)[1], np.int64)
 
 
 def _shown(rec: Reconstruction, keep_obs: Mask) -> csr_matrix:
     """(m, n) 1 where a photo shows a point, by some observations; what it shows twice counts once."""
-    from scipy.sparse import csr_matrix  # late: few runs need it
-
     where = rec.observations.frame_idx[keep_obs], rec.observations.point_idx[keep_obs]
     shows = csr_matrix((np.ones(keep_obs.sum()), where), (rec.num_images, rec.num_points))
     shows.data[:] = 1.0

@@ -6,6 +6,8 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from ..colmap.conventions import quiet_pycolmap
 from ..model import Reconstruction
@@ -180,9 +182,6 @@ def agreeing_photos(
     (m,) bool array
         By photo of `matched`. False for the rest, which another pose may fit better, and for photos without a pose.
     """
-    from scipy.sparse import coo_matrix  # late: few runs need it
-    from scipy.sparse.csgraph import connected_components
-
     freed = FreedMatches(matched, reconstruction)
     posed = freed.posed >= 0
     linked = [

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from ..model.array_types import Array, Index
 
@@ -80,8 +81,6 @@ def _next_in(order: Index) -> Index:
 
 def _nearest(positions: Array) -> Index:
     """Each photo with those nearest to it."""
-    from scipy.spatial import cKDTree  # late: ten megabytes that few need
-
     known = np.flatnonzero(np.isfinite(positions).all(1))
     if len(known) < 2:
         return np.zeros((0, 2), np.int64)
