@@ -212,10 +212,9 @@ class BundleProblem:
             free[reference, :6] = False
             free[far, 3 + axis] = False
         for name, components in self._options.held_phi.items():
+            i = self._photo(name)
             if self._block > 6:
-                free[self._photo(name), [6 + c for c in components]] = False
-            else:
-                self._photo(name)
+                free[i, [6 + c for c in components]] = False
         for name, still in self._options.still.items():
             if still == 0:
                 i = self._photo(name)

@@ -113,8 +113,7 @@ def run(
             if stages is None:
                 known = len(log.stages)
                 outputs.rectify_clip(photos, out, workers, log)
-                stages = log.stages[known:]
-                before.kept.put(VIDEO, stages)
+                before.kept.put(VIDEO, log.stages[known:])
             else:
                 log.stages += stages
         return outputs.rectify(out / "frames" if is_video(photos) else photos, out, workers, log, before.begun)
