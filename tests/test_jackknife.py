@@ -96,7 +96,7 @@ def test_shares_of_the_priors_and_inflated_covariances_are_those_of_the_whole_in
         assert_near(photos[i], enlarged[own, own], 3 * quotient)
     vectors = rng.normal(size=(2, m, nb))
     assert_near(
-        equations.covariance(2.0)(vectors).reshape(2, -1), vectors.reshape(2, -1) @ enlarged[: m * nb, : m * nb]
+        equations.covariance(vectors, 2.0).reshape(2, -1), vectors.reshape(2, -1) @ enlarged[: m * nb, : m * nb]
     )
     # a function of the points
     weights = rng.normal(size=state.points_w.shape)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -328,24 +327,19 @@ class NormalEquations:
         other._reduced = replace(self._reduced, S=S, border=border, corner=corner)
         return other
 
-    def covariance(self, inflation: float = 1.0) -> Callable[[Array], Array]:
-        """Covariance of the photos' unknowns, all others being free, as a function of vectors (k, m, nb).
+    def covariance(self, vectors: Array, inflation: float = 1.0) -> Array:
+        """Covariance of the photos' unknowns, all others being free, times vectors (k, m, nb).
 
         With `inflation` the noise's share of the deviations is so much larger; that of the priors stays.
         """
-        inverse = self.inverse
-        if inverse is None:
-            return lambda vectors: np.full_like(vectors, np.nan)
-
-        def times(vectors: Array) -> Array:
-            found = inverse.times(self._wide(vectors), np.zeros((len(vectors), len(self._g_camera))))
-            if inflation == 1.0:
-                return self._seen(found[0])
-            # H^-1 P H^-1, P the priors' precision
-            by, by_priors = inflation**2, inverse.times(*self._of_priors(*found))[0]
-            return by * self._seen(found[0]) + (1 - by) * self._seen(by_priors)
-
-        return times
+        if self.inverse is None:
+            return np.full_like(vectors, np.nan)
+        found = self.inverse.times(self._wide(vectors), np.zeros((len(vectors), len(self._g_camera))))
+        if inflation == 1.0:
+            return self._seen(found[0])
+        # H^-1 P H^-1, P the priors' precision
+        by, by_priors = inflation**2, self.inverse.times(*self._of_priors(*found))[0]
+        return by * self._seen(found[0]) + (1 - by) * self._seen(by_priors)
 
     def times(self, frame: Array, camera: Array) -> tuple[Array, Array]:
         """H^-1 times stacks of photos' values (k, m, seen) and of cameras' (k, unknowns); NaN without an inverse."""
@@ -419,12 +413,9 @@ class NormalEquations:
 
         That is H^-1 of each group's share of the gradient, points eliminated; group (o,) is the group of each.
         """
-        assert self.inverse is not None
         V_inv = np.empty_like(self._V)
         schur.invert_points(self._V, 0.0, V_inv)
-        of_photos, of_cameras = self._without_points(V_inv, residuals, group, num_groups)
-        frame, camera = self.inverse.times(self._wide(of_photos), of_cameras)
-        return self._seen(frame), camera
+        return self.times(*self._without_points(V_inv, residuals, group, num_groups))
 
     def _without_points(self, V_inv: Array, residuals: Array, group: Index, num_groups: int) -> tuple[Array, Array]:
         """Shares of groups of residuals in the gradient, points eliminated: (num_groups, m, seen), (num_groups, k)."""

@@ -44,7 +44,6 @@ class Posterior:
         self._state = self._problem.initial_state()
         self._equations = self._problem.linearize(self._state)
         self._inflation = (result.inflation if plain.deviations == "jackknife" else 1.0) / result.noise_factor
-        self._covariance = self._equations.covariance(self._inflation)
         self._doubt = CalibrationDoubt.of(self._equations, plain, rec.cameras)
         self._camera_idx = rec.camera_idx
         self._own = self._problem.layout.size - self._problem.layout.motion
@@ -55,7 +54,8 @@ class Posterior:
         # with zeros for what the photos have of their own beside pose and motion
         whole = np.pad(vectors, [(0, 0), (0, 0), (0, self._own)])
         if self._path is None:
-            return (self._covariance(whole) + self._doubt.times(whole)[0])[:, :, : vectors.shape[2]]
+            moved = self._equations.covariance(whole, self._inflation) + self._doubt.times(whole)[0]
+            return moved[:, :, : vectors.shape[2]]
         # phi and velocity are pace times rates
         variation = self._state.variation
         pace = self._path.paces(self._camera_idx, variation)[:, None]
