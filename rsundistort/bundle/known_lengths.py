@@ -73,9 +73,6 @@ class LengthResiduals:
         # weighted, and without the part that a change of the world's scale explains
         self._whiten = (np.eye(len(lengths)) - unit @ unit.T) * weight
 
-    def __len__(self) -> int:
-        return len(self._target)
-
     def residuals(self, points_w: Array) -> Array:
         """(q,) residuals in units of their standard deviations."""
         chord = points_w[self._ends[:, 1]] - points_w[self._ends[:, 0]]
@@ -86,7 +83,7 @@ class LengthResiduals:
         """(q, n, 3) derivatives of the residuals by the points."""
         chord = points_w[self._ends[:, 1]] - points_w[self._ends[:, 0]]
         along = chord / np.maximum((chord**2).sum(1, keepdims=True), 1e-300)
-        J = np.zeros((len(self), len(points_w), 3))
+        J = np.zeros((len(self._target), len(points_w), 3))
         for k, (a, b) in enumerate(self._ends):
             J[:, a] -= self._whiten[:, k, None] * along[k]
             J[:, b] += self._whiten[:, k, None] * along[k]

@@ -104,9 +104,6 @@ class PlaceResiduals:
         self._center, self._photo_sigma = stacked([(place, sigma) for place, sigma in photos.values()])
         self._place, self._point_sigma = stacked([(each.place_m, each.sigma_m) for each in points.values()])
 
-    def __len__(self) -> int:
-        return len(self._photo) + len(self._point)
-
     def cost(self, center_w: Array, points_w: Array) -> float:
         """Their cost."""
         costs = prior_weight((self._of_photos(center_w) ** 2).sum(1))[0]
