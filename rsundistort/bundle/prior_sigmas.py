@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -258,25 +258,19 @@ def settled(before: PriorSigmas, after: PriorSigmas, tolerance: float) -> bool:
 
     On a path, phi and velocity have none of their own.
     """
-    of_bends = (_SETTLED_AT,) * len(before.bends), (0.0,) * len(before.ways)
     phi, velocity = (np.inf, np.inf) if before.path else (_SETTLED_AT, 0.0)
-    none = PriorSigmas(
-        phi,
-        velocity,
-        _SETTLED_AT,
-        _SETTLED_AT,
-        *of_bends,
-        _SETTLED_PX,
-        (0.0,) * len(before.path),
-        (np.inf,) * len(before.means),
-    )
+    negligible = {
+        "phi": phi, "velocity": velocity, "focal": _SETTLED_AT, "centre": _SETTLED_AT, "bends": _SETTLED_AT,
+        "ways": 0.0, "field": _SETTLED_PX, "path": 0.0, "means": np.inf,
+    }  # fmt: skip
     for old, new in zip(before.means, after.means, strict=True):
         if abs(new - old) > _SETTLED_MEANS * new and max(old, new) > _SETTLED_AT:
             return False
-    return all(
-        abs(new - old) <= tolerance * new or max(old, new) < least
-        for old, new, least in zip(*(np.hstack(astuple(each)) for each in (before, after, none)), strict=True)
-    )
+    for name, least in negligible.items():
+        old, new = np.array([getattr(before, name), getattr(after, name)])
+        if not ((np.abs(new - old) <= tolerance * new) | (np.maximum(old, new) < least)).all():
+            return False
+    return True
 
 
 def starting_sigmas(options: BundleOptions, layout: Layout, reconstruction: Reconstruction) -> PriorSigmas:
