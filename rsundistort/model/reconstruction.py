@@ -183,13 +183,11 @@ class Reconstruction:
 
     def with_motions(self, motions: Sequence[RowMotion]) -> Reconstruction:
         """The reconstruction with other motions of its photos, bends of as many readings or none."""
-        bends = [each.bend for each in motions if each.bend is not None]
-        values, clock = np.zeros((len(motions), len(bends[0].values) if bends else 0, 6)), np.zeros((len(motions), 2))
-        for i, bend in enumerate(each.bend for each in motions):
-            # where there is none, any range of the clock will do
-            clock[i] = (-1.0, 1.0) if bend is None else (bend.start, bend.end)
-            if bend is not None:
-                values[i] = bend.values
+        bends = [each.bend for each in motions]
+        none = np.zeros((max((len(bend.values) for bend in bends if bend is not None), default=0), 6))
+        values = np.array([none if bend is None else bend.values for bend in bends]).reshape(len(bends), *none.shape)
+        # where there is none, any range of the clock will do
+        clock = np.array([(-1.0, 1.0) if bend is None else (bend.start, bend.end) for bend in bends]).reshape(-1, 2)
         return replace(
             self, phi=np.array([each.phi for each in motions]), velocity=np.array([each.velocity for each in motions]),
             bend=values, bend_clock=clock,
