@@ -205,7 +205,6 @@ class Survey:
         """Its content of `solution.json`; covariances are those of the photos' unknowns."""
         assert self.fit is not None
         residuals = self._residuals(rec)
-        sigma = {name: np.asarray(self.places[name][1]).tolist() for name in residuals}
         off = self.outliers(rec)
         value: dict[str, Any] = {
             "crs": self.frame.crs,
@@ -231,7 +230,7 @@ class Survey:
                 "offset_m": self.gps_offset_m.tolist(),
                 "outliers": sorted(off),
                 "photos": {
-                    name: {"residual_m": residual.tolist(), "sigma_m": sigma[name]}
+                    name: {"residual_m": residual.tolist(), "sigma_m": np.asarray(self.places[name][1]).tolist()}
                     for name, (residual, _) in residuals.items()
                 },
             }
