@@ -65,6 +65,11 @@ class MatchedPhotos:
     calibrated: bool
     seed: int
 
+    @property
+    def step_px(self) -> float:
+        """Pixels of the photos per pixel of the images that the features were detected in."""
+        return float(np.median([each.step_px for each in self.features]))
+
 
 def ideal_keypoints(
     features: Features,

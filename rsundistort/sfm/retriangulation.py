@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from ..colmap.conventions import quiet_pycolmap, rigid_of
 from ..colmap.lenses import camera_to_colmap
-from ..model import Camera, Reconstruction, RowMotion
+from ..model import Reconstruction, RowMotion
 from .database import MatchedPhotos, from_pycolmap, ideal_keypoints, pipeline_options
 from .epipolar import MIN_EXPLAINED, TIGHT_PX, FreedMatches, Matches, photo_pairs
 
@@ -39,7 +38,7 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction, *, of_
     """
     pycolmap = quiet_pycolmap()
     freed, cameras = FreedMatches(matched, reconstruction), reconstruction.cameras
-    tight_px = TIGHT_PX * float(np.median([each.step_px for each in matched.features]))
+    tight_px = TIGHT_PX * matched.step_px
     with pycolmap.Database.open(matched.database) as db:
         explained = _explained(db, freed)
         depths = freed.depths(explained)
@@ -53,8 +52,13 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction, *, of_
                 motion = reconstruction.motion(i).in_camera(reconstruction.R_cw[i])
             db.update_keypoints(index + 1, ideal_keypoints(found, camera, motion, model, own, depths.get(index)))
         db.clear_two_view_geometries()
-        _write_explained(db, explained)
-    empty = _posed_model(matched, reconstruction, cameras)
+        # written as verified: pairs with known geometry need no search for one
+        for (first, second), matches in explained.items():
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            geometry.inlier_matches = matches
+            db.write_two_view_geometry(first + 1, second + 1, geometry)
+    empty = _posed_model(matched, reconstruction)
     options = pipeline_options(1.0, matched.seed, False, len(matched.names))
     options.mapper.filter_max_reproj_error = tight_px
     options.triangulation.merge_max_reproj_error = tight_px
@@ -81,23 +85,13 @@ def _explained(db: Any, freed: FreedMatches) -> Matches:
     return found
 
 
-def _write_explained(db: Any, explained: Matches) -> None:
-    """Write these as verified: pairs with known geometry need no search for one."""
-    pycolmap = quiet_pycolmap()
-    for (first, second), matches in explained.items():
-        geometry = pycolmap.TwoViewGeometry()
-        geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-        geometry.inlier_matches = matches
-        db.write_two_view_geometry(first + 1, second + 1, geometry)
-
-
-def _posed_model(matched: MatchedPhotos, reconstruction: Reconstruction, cameras: Sequence[Camera]) -> Any:
+def _posed_model(matched: MatchedPhotos, reconstruction: Reconstruction) -> Any:
     """A pycolmap model of the database's images with the reconstruction's poses and no points."""
     pycolmap = quiet_pycolmap()
     model = pycolmap.Reconstruction()
     index_of = {name: i for i, name in enumerate(reconstruction.image_names)}
     with pycolmap.Database.open(matched.database) as db:
-        for index in range(len(cameras)):
+        for index in range(len(reconstruction.cameras)):
             model.add_camera(db.read_camera(index + 1))
         for rig in db.read_all_rigs():
             model.add_rig(rig)
