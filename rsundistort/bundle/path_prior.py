@@ -342,20 +342,15 @@ def with_path_motions(reconstruction: Reconstruction, path: FramePath, state: Pa
     """The reconstruction with the motion of each frame as the path has it around its principal row."""
     found, order = camera_path(reconstruction, path, state)
     clock_s, camera_idx = state.pace * path.frame_s, reconstruction.camera_idx[order]
-    m, parts, clock = len(order), [], np.zeros((len(order), 2))
+    clock, parts = np.array([camera.clock_range for camera in reconstruction.cameras])[reconstruction.camera_idx], []
     for k, camera in enumerate(reconstruction.cameras):
         moments = np.flatnonzero(camera_idx == k)
-        parts.append((order[moments], found.row_motions(moments, camera.clock_range, float(clock_s[k]))))
-        clock[order[moments]] = camera.clock_range
-    values = [np.zeros((m, *each.shape[1:])) for each in parts[0][1]]
-    for mine, motions in parts:
-        for value, each in zip(values, motions, strict=True):
-            value[mine] = each
+        parts.append((order[moments], *found.row_motions(moments, camera.clock_range, float(clock_s[k]))))
+    photos, *motions = (np.concatenate(each) for each in zip(*parts, strict=True))
+    phi, velocity, bend = (each[np.argsort(photos)] for each in motions)
     # units of the camera's clock have become those of each photo's, whose lines are the same
     units = np.exp(reconstruction.variation[:, :1])
-    return replace(
-        reconstruction, phi=units * values[0], velocity=units * values[1], bend=values[2], bend_clock=clock / units
-    )
+    return replace(reconstruction, phi=units * phi, velocity=units * velocity, bend=bend, bend_clock=clock / units)
 
 
 def path_bends(reconstruction: Reconstruction, path: FramePath, state: PathState) -> dict[str, Bend]:

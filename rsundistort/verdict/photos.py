@@ -65,7 +65,6 @@ def photo_motions(result: BundleResult) -> PhotoMotions:
     nb = motion_end(rec.shutter_model)
     sigmas = np.repeat([result.phi_rms, result.velocity_rms * rec.baseline], 3)[: nb - 6]
     found = np.zeros((5, rec.num_images))
-    splits = 3 * rec.num_images
     for i, mine in enumerate(rec.observations.by_photo(rec.num_images)):
         if len(mine):
             prior = np.concatenate([np.zeros(6), (rec.frame_span()[i] / np.maximum(sigmas, 1e-12)) ** 2])
@@ -78,7 +77,7 @@ def photo_motions(result: BundleResult) -> PhotoMotions:
                 shifts_px.max(initial=0.0) + bent_px.max(initial=0.0),
                 sigmas_px.max(initial=0.0),
                 _rms(sigmas_px) / max(np.hypot(_rms(shifts_px), _rms(bent_px)), 1e-300),
-                photo.difference_px(prior, _CHANCE / splits),
+                photo.difference_px(prior, _CHANCE / (3 * rec.num_images)),
                 photo.covered,
             )
     return PhotoMotions(*found)
