@@ -32,8 +32,6 @@ class Envelope:
         Where the matrix has blocks.
     place : (m, nb) int array
         Row of the unknowns of each block row; -1 where held.
-    size : int
-        Number of unknowns.
     first, offset : (bands,) int array
         First column of each band of four rows, and where the band begins in the data.
     num_values : int
@@ -44,7 +42,6 @@ class Envelope:
 
     pattern: BlockPattern
     place: Index
-    size: int
     first: Index
     offset: Index
     num_values: int
@@ -75,7 +72,7 @@ class Envelope:
         width = 4 * np.arange(1, bands + 1) - first
         offset = np.concatenate([[0], np.cumsum(4 * width)])
         adds = float((2.0 * width.astype(float) ** 2).sum())
-        return cls(pattern, place, size, first, offset[:-1], int(offset[-1]), adds)
+        return cls(pattern, place, first, offset[:-1], int(offset[-1]), adds)
 
     def factor(self, S: Array) -> CholeskyFactor | None:
         """Factor of a matrix of blocks (blocks, nb, nb); None if it is not positive."""

@@ -101,6 +101,8 @@ class NormalEquations:
     ----------
     blocks : tuple of array
         res and J_frame.
+    num_photos, num_cameras, num_shared : int
+        Number of photos, of cameras, and of unknowns of all cameras.
     """
 
     def __init__(
@@ -140,6 +142,7 @@ class NormalEquations:
         self._g_camera = border.sum_photos(g_camera) + border.prior_gradient.ravel()
         self._common = common
         self._lengths = of_points.lengths[1]
+        self.num_photos, self.num_cameras, self.num_shared = len(prior_diag), border.num_cameras, len(self._g_camera)
 
     def spend(self) -> tuple[Array, Array]:
         """The blocks, for others to be written over them; no more can be asked, and all else as large is given up."""
@@ -213,21 +216,6 @@ class NormalEquations:
         border = np.where(self._elimination.free, self._wide(rows[:, :seen].transpose(2, 0, 1)), 0.0)
         c = -g_camera - self._border.sum_photos(rhs_camera)
         return Reduced(S, -rhs, border, (corner + corner.T) / 2, c), V_inv
-
-    @property
-    def num_cameras(self) -> int:
-        """Number of cameras."""
-        return self._border.num_cameras
-
-    @property
-    def num_photos(self) -> int:
-        """Number of photos."""
-        return len(self._g_frame)
-
-    @property
-    def num_shared(self) -> int:
-        """Number of unknowns of all cameras."""
-        return len(self._g_camera)
 
     @cached_property
     def _common_rows(self) -> Array:
