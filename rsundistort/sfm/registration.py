@@ -98,8 +98,8 @@ def place_photo(points_w: Array, xy_raw: Array, camera: Camera, step_px: float =
         return None
     every = np.arange(len(points_w))
     few = every if len(every) <= _ENOUGH else np.linspace(0, len(every) - 1, _ENOUGH).astype(np.int64)
-    found = [_Pose(R_cw, center_w) for R_cw, center_w in _suggested(points_w[few], xy_raw[few], camera, step_px)]
-    found = [_adjusted(pose, points_w[few], xy_raw[few], camera, _WIDE_PX * step_px) for pose in found]
+    suggested = _suggested(points_w[few], xy_raw[few], camera, step_px)
+    found = [_adjusted(pose, points_w[few], xy_raw[few], camera, _WIDE_PX * step_px) for pose in suggested]
     found.sort(key=lambda pose: pose.cost)
     best: Placed | None = None
     for pose in found[:_TRIED]:
@@ -122,7 +122,7 @@ class _Pose:
     cost: float = np.inf
 
 
-def _suggested(points_w: Array, xy_raw: Array, camera: Camera, step_px: float) -> Iterator[tuple[Array, Array]]:
+def _suggested(points_w: Array, xy_raw: Array, camera: Camera, step_px: float) -> Iterator[_Pose]:
     """Poses by three points each, from the whole frame and from parts along the readout."""
     ideal, valid = unproject_points(xy_raw, camera, None, "global")
     clock = clock_of(camera, xy_raw)
@@ -145,7 +145,7 @@ def _suggested(points_w: Array, xy_raw: Array, camera: Camera, step_px: float) -
             )  # fmt: skip
             if found:
                 R_cw = cv2.Rodrigues(turn)[0]
-                yield R_cw, origin - size * (R_cw.T @ way.ravel())
+                yield _Pose(R_cw, origin - size * (R_cw.T @ way.ravel()))
 
 
 def _adjusted(start: _Pose, points_w: Array, xy_raw: Array, camera: Camera, width: float) -> _Pose:
