@@ -97,7 +97,7 @@ def poses_at(path: CameraPath, time_s: Array) -> tuple[Array, Array]:
     R_cw, center_w = [], []
     for time in time_s:
         moment = int(np.argmin(np.abs(path.time_s - time)))
-        turn, way = path.near(moment, time - path.time_s[moment])
-        R_cw.append(Rotation.from_rotvec(turn[0]).as_matrix() @ path.R_cw[moment])
-        center_w.append(path.center_w[moment] + way[0])
+        turn, way = path.around(np.array([moment]), np.array([time - path.time_s[moment]]))
+        R_cw.append(Rotation.from_rotvec(turn[0, 0]).as_matrix() @ path.R_cw[moment])
+        center_w.append(path.center_w[moment] + way[0, 0])
     return np.array(R_cw), np.array(center_w)

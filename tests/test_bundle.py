@@ -47,13 +47,13 @@ def sigma_of_variation(result, options):
     """(m, 3) standard deviations of f, cx and cy of each photo against their means, which are the camera's."""
     spreads = PriorSigmas(1.0, 1.0, result.focal_sigma, result.centre_sigma)
     problem = BundleProblem(result.reconstruction, result.reconstruction.shutter_model, options, 0.2, spreads)
-    covariance = problem.linearize(problem.initial_state()).covariance()
+    equations = problem.linearize(problem.initial_state())
     m, nb = problem._free.shape
     sigma = np.empty((m, 3))
     for i, k in np.ndindex(m, 3):
         function = np.zeros((1, m, nb))
         function[0, :, nb - 3 + k] = (np.arange(m) == i) - 1 / m
-        sigma[i, k] = np.sqrt(np.sum(function * covariance(function)))
+        sigma[i, k] = np.sqrt(np.sum(function * equations.covariance(function)))
     return sigma
 
 

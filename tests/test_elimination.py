@@ -240,7 +240,7 @@ def test_inverse_inside_the_envelope_is_that_of_dense_algebra(rng, monkeypatch, 
     )
     monkeypatch.setattr(envelope, "_WORTH_THREADS", 0.0)
     monkeypatch.setattr(envelope, "_PARTS", parts)
-    blocks = shape.factor(grid.reduced.S).inverse_blocks()
+    blocks = shape.factor(grid.reduced.S).inverse_blocks(np.arange(m), np.arange(m))
     everything = shape.gather(np.eye(grid.free.size).reshape(-1, *grid.free.shape))
     shape.factor(grid.reduced.S).solve(everything)
     expected = shape.scatter(everything).reshape(*grid.free.shape, *grid.free.shape)
@@ -269,10 +269,9 @@ def test_sparse_blocks_solve_and_invert_as_dense_algebra_does(rng, nb):
     np.testing.assert_allclose(shape.scatter(found), x, rtol=1e-7, atol=1e-9 * np.abs(x).max())
     dense = expected.reshape(*grid.free.shape, *grid.free.shape)
     first, second = grid.pattern.cols, grid.pattern.rows  # also those below the diagonal
-    for inverse, f, g in (
-        (factor.inverse_blocks(), np.arange(len(grid.free)), np.arange(len(grid.free))),
-        (factor.inverse_blocks_of(first, second), first, second),
-    ):
+    own = np.arange(len(grid.free))
+    for f, g in ((own, own), (first, second)):
+        inverse = factor.inverse_blocks(f, g)
         wanted = dense[f, :, g]
         size = np.maximum(np.abs(wanted).max(axis=(1, 2), keepdims=True), 1e-300)  # a photo may be held
         np.testing.assert_allclose(inverse / size, wanted / size, rtol=1e-7, atol=1e-10)
@@ -300,7 +299,8 @@ def test_unknowns_of_a_chain_are_eliminated_apart_with_the_same_result(rng, num)
     for shape in (whole, parted):
         factor, found = shape.factor(S), shape.gather(b)
         factor.solve(found)
-        results.append((shape.scatter(found), factor.inverse_blocks(), factor.inverse_blocks_of(*chain)))
+        own = factor.inverse_blocks(np.arange(m), np.arange(m))
+        results.append((shape.scatter(found), own, factor.inverse_blocks(*chain)))
     for one, other in zip(*results, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
@@ -331,7 +331,7 @@ def test_a_sparse_factor_does_not_depend_on_the_number_of_threads(rng):
     for threads in (1, 2):
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
         factor = shape.factor(grid.reduced.S)
-        found.append((factor.data, factor.inverse_blocks()))
+        found.append((factor.data, factor.inverse_blocks(*[np.arange(len(grid.free))] * 2)))
     np.testing.assert_array_equal(found[0][0], found[1][0])
     np.testing.assert_array_equal(found[0][1], found[1][1])
 

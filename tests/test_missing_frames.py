@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rsundistort.bundle.own_motions import OwnMotions
-from rsundistort.solve.missing_frames import Gaps, frames_missing, gaps_between
+from rsundistort.solve.missing_frames import Gaps, frames_missing, gaps_between, told_by
 
 FRAME_S = 1 / 30
 READOUT_S = 0.6 * FRAME_S
@@ -46,7 +46,7 @@ def missing(hand: HandHeld, kept: NDArray[np.int64], joined: NDArray[np.bool_] |
     rng = np.random.default_rng(hand.seed)
     center_w = hand.centers(kept * FRAME_S) + rng.normal(0, 1e-3, (len(kept), 3))
     steps = np.ones(len(kept) - 1)
-    return frames_missing(travelling(center_w), steps, steps > 0 if joined is None else joined)
+    return frames_missing(told_by(travelling(center_w), steps > 0 if joined is None else joined), steps)
 
 
 def converted(num_frames: int, ratio: float, phase: float) -> NDArray[np.int64]:
@@ -129,14 +129,14 @@ def test_frames_that_are_unevenly_spaced_are_of_no_conversion() -> None:
 
 def test_a_camera_that_stands_misses_none() -> None:
     assert not missing(HandHeld(1, walks=False), np.arange(60)).any()
-    assert not frames_missing(travelling(np.zeros((60, 3))), np.ones(59), np.ones(59, bool)).any()
+    assert not frames_missing(told_by(travelling(np.zeros((60, 3))), np.ones(59, bool)), np.ones(59)).any()
 
 
 def test_a_jerk_is_no_missing_frame() -> None:
     center_w = HandHeld(2).centers(np.arange(90) * FRAME_S)
     for at, push in ((30, [0.0, 0.05, 0.0]), (61, [0.03, 0.05, 0.02])):
         center_w[at:] += push
-    assert not frames_missing(travelling(center_w), np.ones(89), np.ones(89, bool)).any()
+    assert not frames_missing(told_by(travelling(center_w), np.ones(89, bool)), np.ones(89)).any()
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -145,7 +145,7 @@ def test_frames_that_were_placed_wrongly_miss_none(seed: int) -> None:
     rng = np.random.default_rng(seed)
     center_w = HandHeld(seed).centers(np.arange(90) * FRAME_S)
     center_w += 0.01 * rng.standard_t(1.5, center_w.shape)
-    assert not frames_missing(travelling(center_w), np.ones(89), np.ones(89, bool)).any()
+    assert not frames_missing(told_by(travelling(center_w), np.ones(89, bool)), np.ones(89)).any()
 
 
 def test_a_cut_is_no_gap() -> None:
@@ -184,7 +184,7 @@ def test_lines_that_do_not_rotate_as_their_frames_say_nothing(seed: int) -> None
     own, steps = turning(HandHeld(seed), np.arange(90) * FRAME_S), np.ones(89)
     others = turning(HandHeld(100 + seed), np.arange(90) * FRAME_S)
     for phi in (others.phi, np.random.default_rng(seed).normal(0, 1e-4, (90, 3)), np.zeros((90, 3))):
-        assert not frames_missing(replace(own, phi=phi), steps, steps > 0).any()
+        assert not frames_missing(told_by(replace(own, phi=phi), steps > 0), steps).any()
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -195,4 +195,4 @@ def test_a_knock_is_no_missing_frame(seed: int) -> None:
     R_cw = own.R_cw.copy()
     for at in (20, 41, 66):
         R_cw[at:] = Rotation.from_rotvec(rng.normal(0, 0.03, 3)).as_matrix() @ R_cw[at:]
-    assert not frames_missing(replace(own, R_cw=R_cw), steps, steps > 0).any()
+    assert not frames_missing(told_by(replace(own, R_cw=R_cw), steps > 0), steps).any()

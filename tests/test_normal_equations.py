@@ -125,7 +125,7 @@ def test_covariances_are_those_of_the_whole_inverse(factor_limit, refine, rng):
     size = np.sqrt(np.einsum("iaa,ibb->iab", expected, expected))
     # of linear functions: of one photo's unknowns, and of all points (which the problem keeps in another order)
     vector = rng.normal(size=(1, m, nb))
-    found = problem.linearize(state).covariance()(vector)[0]
+    found = problem.linearize(state).covariance(vector)[0]
     reference = (whole[: m * nb, : m * nb] @ vector.ravel()).reshape(m, nb)
     np.testing.assert_allclose(found, reference, rtol=0, atol=1e-8 * np.abs(reference).max())
     weights = rng.normal(size=(problem._start.num_points, 3))
@@ -136,7 +136,7 @@ def test_covariances_are_those_of_the_whole_inverse(factor_limit, refine, rng):
     assert variance == pytest.approx(b @ whole[start:stop, start:stop] @ b, rel=1e-7)
     reference = (whole[: m * nb, start:stop] @ b).reshape(m, nb)
     np.testing.assert_allclose(with_photos, reference, rtol=0, atol=1e-7 * np.abs(reference).max())
-    photos, cameras, *_ = problem.covariances(state)
+    photos, cameras, *_ = problem.linearize(state).marginal_covariances()
     np.testing.assert_array_less(np.abs(photos - expected), 1e-8 * size + 1e-300)  # as the step
     expected = whole[len(whole) - len(cameras) :, len(whole) - len(cameras) :]
     size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
@@ -219,7 +219,7 @@ def test_known_lengths_join_the_system(damping, refine, rng):
         whole[np.ix_(free, free)] = inverse
         vector = rng.normal(size=(1, m, nb))
         reference = (whole[: m * nb, : m * nb] @ vector.ravel()).reshape(m, nb)
-        found = equations.covariance()(vector)[0]
+        found = equations.covariance(vector)[0]
         np.testing.assert_allclose(found, reference, rtol=0, atol=1e-7 * np.abs(reference).max())
         photos, cameras, *_ = equations.marginal_covariances()
         for i in range(m):

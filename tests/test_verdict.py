@@ -36,8 +36,10 @@ from rsundistort.report import verdict_of
 from rsundistort.report.displacement import displacement_field
 from rsundistort.solve import model_sequence
 from rsundistort.synthetic.measurements import measure
-from rsundistort.verdict import Verdict, judge, left_along_readout, left_over_frame, photo_motions
+from rsundistort.verdict import Verdict, judge
 from rsundistort.verdict.judge import _repeated
+from rsundistort.verdict.photos import photo_motions
+from rsundistort.verdict.residuals import left_along_readout, left_over_frame
 
 LENS = (-0.1, 0.03, 0.0, 0.0)
 CAMERA = Camera(800, 600, [[700, 0, 402], [0, 700, 297], [0, 0, 1]], LENS)

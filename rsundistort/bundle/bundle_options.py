@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import InputError
 from ..model import BEND_GROUPS, Bend, KnownLength, Reconstruction
+from ..model.array_types import Array, Mask
 from ..model.checks import check_fields
 from ..model.former_fields import former_fields
 from .common_motion import CommonMotion
@@ -27,7 +28,7 @@ DEVIATIONS = ("jackknife", "model")
 LOSSES: dict[str, int] = {"squared": 0, "huber": 1, "cauchy": 2, "soft-l1": 3}
 
 
-def _known(name: str, phi: ArrayLike, sigma: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _known(name: str, phi: ArrayLike, sigma: ArrayLike) -> tuple[Array, Array]:
     """A known motion, checked."""
     try:
         values, sigmas = (np.array(np.broadcast_to(np.asarray(value, np.float64), 3)) for value in (phi, sigma))
@@ -303,7 +304,7 @@ class BundleResult:
 
     reconstruction: Reconstruction
     stop_reason: str
-    cost_history: NDArray[np.float64]
+    cost_history: Array
     num_iterations: int
     sigma_px: float
     phi_sigma: float
@@ -312,7 +313,7 @@ class BundleResult:
     centre_sigma: float
     bend_sigmas: tuple[float, ...]
     way_sigmas: tuple[float, ...]
-    covariances: NDArray[np.float64]
+    covariances: Array
     sigma_intrinsics: tuple[dict[str, float], ...]
     rms_px: float
     num_outliers: int
@@ -336,21 +337,21 @@ class BundleResult:
         mean = 0.0 if self.common is None else float(np.mean(self.common.values[:, 3:] ** 2))
         return float(np.sqrt(self.velocity_sigma**2 + mean))
 
-    def of_photos(self, keep: NDArray[np.bool_]) -> BundleResult:
+    def of_photos(self, keep: Mask) -> BundleResult:
         """The result of some photos (m,) only, with the points that two of them show."""
         return replace(self, reconstruction=self.reconstruction.take_photos(keep), covariances=self.covariances[keep])
 
     @property
-    def sigma_phi(self) -> NDArray[np.float64]:
+    def sigma_phi(self) -> Array:
         """(m, 3) standard deviations of phi, radians per unit of the clock; 0 where held, and for a global shutter."""
         return self._sigmas(6)
 
     @property
-    def sigma_velocity(self) -> NDArray[np.float64]:
+    def sigma_velocity(self) -> Array:
         """(m, 3) standard deviations of the velocity, world units per unit of the clock; 0 where there is none."""
         return self._sigmas(9)
 
-    def _sigmas(self, first: int) -> NDArray[np.float64]:
+    def _sigmas(self, first: int) -> Array:
         variances = np.diagonal(self.covariances, axis1=1, axis2=2)[:, first : first + 3]
         return np.sqrt(variances) if variances.shape[1] else np.zeros((len(self.covariances), 3))
 

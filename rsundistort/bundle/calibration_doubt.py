@@ -17,15 +17,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model import Camera
+from ..model.array_types import Array, Index
 from .bundle_options import BundleOptions
 from .normal_equations import Function, NormalEquations
 
 __all__ = ["CalibrationDoubt"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -64,19 +62,17 @@ class CalibrationDoubt:
     @property
     def of_photos(self) -> Array:
         """(m, nb, nb) covariances of each photo's unknowns."""
-        value: Array = np.einsum("rma,rmb->mab", self.photos, self.photos)
-        return value
+        return np.einsum("rma,rmb->mab", self.photos, self.photos)
 
     @property
     def of_cameras(self) -> Array:
         """(k, k) covariance of the unknowns of all cameras."""
         return self.cameras.T @ self.cameras
 
-    def with_last(self, camera_idx: NDArray[np.int64], per_camera: int) -> Array:
+    def with_last(self, camera_idx: Index, per_camera: int) -> Array:
         """(m, nb) covariances of photos' unknowns with the last of their camera."""
         last = self.cameras[:, (camera_idx + 1) * per_camera - 1]
-        value: Array = np.einsum("rma,rm->ma", self.photos, last)
-        return value
+        return np.einsum("rma,rm->ma", self.photos, last)
 
     def times(self, photos: Array, cameras: Array | None = None) -> tuple[Array, Array]:
         """The covariance times stacks of values of photos (n, m, nb) and of cameras (n, k)."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import SHUTTER_MODELS, Observations, Reconstruction, other_axis
+from ..model.array_types import Array, Index, Mask
 from ..model.reprojection import reprojection_residuals, shutter_displacements, typical_px
 from .adjust import MODEL_SEQUENCE, bundle_adjust, objective
 from .bundle_options import BundleOptions
@@ -121,7 +121,7 @@ class ModelChoice:
     rival: float = 0.0
 
 
-def enough_points(reconstruction: Reconstruction, per_photo: int = _ENOUGH, seed: int = 0) -> NDArray[np.bool_]:
+def enough_points(reconstruction: Reconstruction, per_photo: int = _ENOUGH, seed: int = 0) -> Mask:
     """(n,) points of a sample with so many measurements of each photo or more; all of a photo that has fewer."""
     obs = reconstruction.observations
     order = np.random.default_rng([seed, 11]).permutation(reconstruction.num_points)[obs.point_idx]
@@ -133,9 +133,7 @@ def enough_points(reconstruction: Reconstruction, per_photo: int = _ENOUGH, seed
     return taken
 
 
-def hold_out(
-    reconstruction: Reconstruction, share: float = 0.1, seed: int = 0
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def hold_out(reconstruction: Reconstruction, share: float = 0.1, seed: int = 0) -> tuple[Mask, Mask]:
     """Masks (o,) of the measurements to fit and of those to hold out.
 
     At most one measurement of a track is held out, and only of tracks of at least four photos; of three where none is
@@ -156,7 +154,7 @@ def hold_out(
     return ~held, held
 
 
-def clipped_errors(rec: Reconstruction, measured: Observations, sigma_px: float) -> tuple[NDArray[np.float64], float]:
+def clipped_errors(rec: Reconstruction, measured: Observations, sigma_px: float) -> tuple[Array, float]:
     """Half the clipped squared residual of each measurement in units of the noise, and their rms in pixels."""
     res, valid = reprojection_residuals(replace(rec, observations=measured))
     noise = sigma_px * measured.sigma
@@ -165,7 +163,7 @@ def clipped_errors(rec: Reconstruction, measured: Observations, sigma_px: float)
     return clipped / 2, float(np.sqrt(np.mean(clipped * noise**2) / 2))
 
 
-def standard_errors(fall: NDArray[np.float64], group: NDArray[np.int64] | None = None) -> float:
+def standard_errors(fall: Array, group: Index | None = None) -> float:
     """Mean fall of errors in units of its standard error; 0 if nothing fell.
 
     Errors of the measurements of a group (n,) are correlated, and count once: what the lens does in a corner of a
@@ -179,7 +177,7 @@ def standard_errors(fall: NDArray[np.float64], group: NDArray[np.int64] | None =
     return float(fall.mean() / spread) if spread > 0 else 0.0
 
 
-def improves(before: NDArray[np.float64], after: NDArray[np.float64], gain: float) -> bool:
+def improves(before: Array, after: Array, gain: float) -> bool:
     """Whether a model that the user named explains its measurements well enough for its motions to be trusted.
 
     Its errors (n,) must fall by two standard errors (`gain`), and by more than their excess over those of noise alone:
@@ -188,7 +186,7 @@ def improves(before: NDArray[np.float64], after: NDArray[np.float64], gain: floa
     return gain > _MIN_GAIN and (before - after).mean() > max(_MIN_FALL * before.mean(), after.mean() - 1.0)
 
 
-def corners(rec: Reconstruction, measured: Observations) -> NDArray[np.int64]:
+def corners(rec: Reconstruction, measured: Observations) -> Index:
     """(n,) groups of measurements: those in one of 4 x 4 parts of one photo."""
     size = np.array([(camera.width, camera.height) for camera in rec.cameras])[rec.camera_idx][measured.frame_idx]
     x, y = np.clip(_PARTS * (measured.xy_raw + 0.5) / size, 0, _PARTS - 1).astype(np.int64).T
@@ -205,7 +203,7 @@ class _Fit:
     bends: int
     residual_field: bool
     reconstruction: Reconstruction
-    errors: NDArray[np.float64]
+    errors: Array
     rms_px: float
     left: float
     sigmas: PriorSigmas
@@ -216,7 +214,7 @@ class _Fit:
         return self.left <= _MIN_FALL * float(self.errors.mean()) if len(self.errors) else True
 
 
-def moved_px(reconstruction: Reconstruction) -> NDArray[np.float64]:
+def moved_px(reconstruction: Reconstruction) -> Array:
     """(m,) approximate displacement of pixels by each photo's motion within half a frame from the principal row."""
     rec = reconstruction
     depth = np.linalg.norm(np.median(rec.points_w, axis=0) - rec.center_w, axis=1)
@@ -234,7 +232,7 @@ def read_along_other_axis(reconstruction: Reconstruction) -> Reconstruction:
     return replace(reconstruction, cameras=cameras, phi=still, velocity=still, bend=np.zeros(0))
 
 
-def _turns(rec: Reconstruction) -> NDArray[np.float64]:
+def _turns(rec: Reconstruction) -> Array:
     """(m, k, 3) rotation vectors of each photo's camera at some lines, radians."""
     motions = [rec.motion(i) for i in range(rec.num_images)]
     ranges = [rec.camera(i).clock_range for i in range(rec.num_images)]
@@ -311,8 +309,8 @@ class _Fits:
         the means over the photos are subtracted, since a lens error can cause them.
         """
         rec = fit.reconstruction
-        options = replace(self._rough, varying=fit.varying, bends=fit.bends, phi_sigma=fit.sigmas.phi)
-        options = replace(options, velocity_sigma=fit.sigmas.velocity or None)
+        phi, velocity = fit.sigmas.phi, fit.sigmas.velocity or None
+        options = replace(self._rough, varying=fit.varying, bends=fit.bends, phi_sigma=phi, velocity_sigma=velocity)
         first = half_across_readout(rec)
         try:
             halves = [bundle_adjust(rec.take_points(half), fit.model, options) for half in (first, ~first)]

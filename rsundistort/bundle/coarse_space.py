@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 import scipy.sparse
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from .._kernels import blocks
+from ..model.array_types import Array, Index, Mask
 from .envelope import Envelope
 from .reduced import Reduced
 from .structure import BlockPattern
@@ -23,9 +23,6 @@ _FUNCTIONS = 6
 # Share of its diagonal that keeps the coarse system positive where held unknowns leave a cluster fewer ways to move
 # than functions.
 _RIDGE = 1e-12
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -59,14 +56,12 @@ class CoarseSpace:
     start: Index
     functions: Array
     rotation: Array
-    free: NDArray[np.bool_]
+    free: Mask
     entries: tuple[Index, Index, Index, Index]
     envelope: Envelope
 
     @classmethod
-    def of(
-        cls, pattern: BlockPattern, free: NDArray[np.bool_], R_cw: Array, center_w: Array, max_photos: int
-    ) -> CoarseSpace:
+    def of(cls, pattern: BlockPattern, free: Mask, R_cw: Array, center_w: Array, max_photos: int) -> CoarseSpace:
         """Coarse space of clusters of at most `max_photos` photos at given poses, which may be rough."""
         nb = free.shape[1]
         cluster = _clusters(pattern.graph(), center_w, max_photos)

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model import Reconstruction
+from ..model.array_types import Array, Index, Mask
 
 __all__ = ["LEAST_PHOTOS", "CommonMotion", "MotionMeans"]
 
-Array = NDArray[np.float64]
 
 #: Photos whose motions have a mean. It has a prior of its own, so they need not be as many as its unknowns; with two it
 #: would be as much each one's own. (`benchmarks/honest.py --only flights`: three to five photos.)
@@ -53,11 +52,11 @@ class MotionMeans:
     """
 
     directions: Array
-    camera_idx: NDArray[np.int64]
+    camera_idx: Index
     sigmas: Array
 
     @classmethod
-    def of(cls, reconstruction: Reconstruction, sigmas: tuple[float, ...], shares: NDArray[np.bool_]) -> MotionMeans:
+    def of(cls, reconstruction: Reconstruction, sigmas: tuple[float, ...], shares: Mask) -> MotionMeans:
         """The means of a reconstruction; `shares` (m, 6) says which components of its photos' motions have a mean."""
         directions = np.zeros((reconstruction.num_images, 6, 6))
         directions[:, :3, :3] = np.eye(3)
@@ -67,8 +66,7 @@ class MotionMeans:
 
     def at(self, means: Array) -> Array:
         """Motions (m, 6) of photos that move as the means (cameras, 6) say."""
-        value: Array = np.einsum("mak,mk->ma", self.directions, means[self.camera_idx])
-        return value
+        return np.einsum("mak,mk->ma", self.directions, means[self.camera_idx])
 
     def pull(self, weight: Array, motion: Array, means: Array) -> Array:
         """Gradient (cameras, 6) of the photos' priors, of weights (m, 6), by the means."""

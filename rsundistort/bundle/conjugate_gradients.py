@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .._kernels import blocks
+from ..model.array_types import Array, Mask
 from .coarse_space import CoarseSpace
 from .reduced import Factored, Reduced, factor, products
 from .structure import BlockPattern
@@ -17,8 +17,6 @@ __all__ = ["Iterated", "solve_iteratively"]
 
 # Ranges of block rows whose products are summed one after the other: more than threads, so that they share them.
 _RANGES = 8
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,7 @@ class Iterated:
 class _Bordered:
     """A reduced system as a product with vectors: photos' unknowns, then the cameras'."""
 
-    def __init__(self, pattern: BlockPattern, free: NDArray[np.bool_], reduced: Reduced) -> None:
+    def __init__(self, pattern: BlockPattern, free: Mask, reduced: Reduced) -> None:
         self._pattern, self._free, self._reduced = pattern, free, reduced
         self._parts = np.empty((_RANGES, *free.shape))
 
@@ -71,7 +69,7 @@ class _Bordered:
         return self.join(Sx + np.tensordot(y, r.border, 1), products(r.border, x[None])[:, 0] + r.corner @ y)
 
 
-def _inverse_blocks(diagonal: Array, free: NDArray[np.bool_]) -> Array | None:
+def _inverse_blocks(diagonal: Array, free: Mask) -> Array | None:
     """Inverses of the diagonal blocks (m, nb, nb), 0 where held; None if one is not positive."""
     size = np.sqrt(np.maximum(np.einsum("maa->ma", diagonal), 1e-300))
     scale = np.where(free, 1.0 / size, 0.0)
@@ -81,8 +79,7 @@ def _inverse_blocks(diagonal: Array, free: NDArray[np.bool_]) -> Array | None:
         half = np.linalg.inv(np.linalg.cholesky(scaled))
     except np.linalg.LinAlgError:
         return None
-    inverse: Array = scale[:, :, None] * np.einsum("mba,mbc->mac", half, half) * scale[:, None]
-    return inverse
+    return scale[:, :, None] * np.einsum("mba,mbc->mac", half, half) * scale[:, None]
 
 
 def _two_levels(

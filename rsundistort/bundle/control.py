@@ -6,16 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..model import ControlPoint, Observations, Reconstruction
+from ..model.array_types import Array, Index
 from ..model.reprojection import reprojection_residuals
 from .triangulate import retriangulated
 
 __all__ = ["CONTROL_SIGMA_PX", "PlacedControl", "place_control", "with_control"]
 
-Array = NDArray[np.float64]
 
 #: How exactly a person points at a target, pixels.
 CONTROL_SIGMA_PX = 0.5
@@ -44,7 +43,7 @@ class PlacedControl:
     points_w: Array
     covariance: Array
     rms_px: Array
-    num_photos: NDArray[np.int64]
+    num_photos: Index
 
 
 def with_control(reconstruction: Reconstruction, points: Sequence[ControlPoint], sigma: float) -> Reconstruction:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..model.array_types import Array, Mask
 from .coarse_space import CoarseSpace
 from .conjugate_gradients import solve_iteratively
 from .envelope import Envelope
-from .reduced import Factored, Reduced, factor
+from .reduced import Reduced, factor
 from .sparse_blocks import Chain, SparseBlocks
 from .structure import Structure
 
@@ -24,8 +24,6 @@ _MAX_CG = 500
 _WAIT = 6.0
 # Photos of a cluster, at least; twice as many, and again, while the coarse system would take longer than the products.
 _CLUSTER = 32
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,7 @@ class Elimination:
     """
 
     structure: Structure
-    free: NDArray[np.bool_]
+    free: Mask
     shape: Envelope | SparseBlocks
     space: CoarseSpace | None
     cg_tolerance: float
@@ -59,7 +57,7 @@ class Elimination:
     def of(
         cls,
         structure: Structure,
-        free: NDArray[np.bool_],
+        free: Mask,
         poses: tuple[Array, Array],
         factor_limit: float | None,
         cg_tolerance: float,
@@ -103,12 +101,8 @@ class Elimination:
             found = solve_iteratively(reduced, self.space, self.structure.pattern, self.cg_tolerance, self.max_cg)
             if self.max_cg == _MAX_CG or (found is not None and found.converged):
                 return None if found is None else (found.x, found.y, found.residual, found.camera_residual)
-        factored = self.factored(reduced)
+        factored = factor(reduced, self.shape)
         if factored is None:
             return None
         x, y = factored.solve(reduced.b, reduced.c)
         return x, y, np.zeros_like(x), np.zeros_like(y)
-
-    def factored(self, reduced: Reduced) -> Factored | None:
-        """The system factored; None if it is not positive."""
-        return factor(reduced, self.shape)

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from .._kernels import envelope as kernels
+from ..model.array_types import Array, Index, Mask
 from .structure import BlockPattern
 
 __all__ = ["CholeskyFactor", "Envelope"]
@@ -20,9 +20,6 @@ _PANEL = 48
 _WORTH_THREADS = 3e8
 # Parts of the inverse's sums that threads share: a number of its own, since it decides the rounding.
 _PARTS = 8
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -35,8 +32,6 @@ class Envelope:
         Where the matrix has blocks.
     place : (m, nb) int array
         Row of the unknowns of each block row; -1 where held.
-    size : int
-        Number of unknowns.
     first, offset : (bands,) int array
         First column of each band of four rows, and where the band begins in the data.
     num_values : int
@@ -47,20 +42,19 @@ class Envelope:
 
     pattern: BlockPattern
     place: Index
-    size: int
     first: Index
     offset: Index
     num_values: int
     multiply_adds: float
 
     @classmethod
-    def smallest(cls, pattern: BlockPattern, free: NDArray[np.bool_]) -> Envelope:
+    def smallest(cls, pattern: BlockPattern, free: Mask) -> Envelope:
         """Envelope of the free unknowns (m, nb), in the order as given or reverse Cuthill-McKee: what takes less."""
         orders = np.arange(len(free)), reverse_cuthill_mckee(pattern.graph(), symmetric_mode=True).astype(np.int64)
         return min((cls.of(pattern, free, order) for order in orders), key=lambda envelope: envelope.multiply_adds)
 
     @classmethod
-    def of(cls, pattern: BlockPattern, free: NDArray[np.bool_], order: Index) -> Envelope:
+    def of(cls, pattern: BlockPattern, free: Mask, order: Index) -> Envelope:
         """Envelope of the free unknowns (m, nb) with the block rows in an order."""
         m, nb = free.shape
         size = int(free.sum())
@@ -78,7 +72,7 @@ class Envelope:
         width = 4 * np.arange(1, bands + 1) - first
         offset = np.concatenate([[0], np.cumsum(4 * width)])
         adds = float((2.0 * width.astype(float) ** 2).sum())
-        return cls(pattern, place, size, first, offset[:-1], int(offset[-1]), adds)
+        return cls(pattern, place, first, offset[:-1], int(offset[-1]), adds)
 
     def factor(self, S: Array) -> CholeskyFactor | None:
         """Factor of a matrix of blocks (blocks, nb, nb); None if it is not positive."""
@@ -133,11 +127,6 @@ class CholeskyFactor:
         kernels.solve_envelope(self.shape.first, self.shape.offset, self.data, B)
         B *= self.scale
 
-    def inverse_blocks(self) -> Array:
-        """Diagonal blocks (m, nb, nb) of the inverse; 0 where held."""
-        every = np.arange(len(self.shape.place))
-        return self.inverse_blocks_of(every, every)
-
     @cached_property
     def _inverse(self) -> Array:
         """Entries of the inverse inside the envelope, of the scaled matrix."""
@@ -147,7 +136,7 @@ class CholeskyFactor:
         kernels.invert_envelope(shape.first, shape.offset, parts, inverse)
         return inverse
 
-    def inverse_blocks_of(self, first_row: Index, second_row: Index) -> Array:
+    def inverse_blocks(self, first_row: Index, second_row: Index) -> Array:
         """Blocks (q, nb, nb) of the inverse, of pairs of block rows that the pattern connects; 0 where held."""
         shape = self.shape
         first, offset, inverse = shape.first, shape.offset, self._inverse

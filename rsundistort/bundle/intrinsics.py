@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import Camera
+from ..model.array_types import Array
 
 __all__ = [
     "DECENTRING",
@@ -78,7 +78,7 @@ class GuessedCameras:
         """The standard deviations of each camera."""
         return [self.sigma] * len(self.cameras) if isinstance(self.sigma, Mapping) else self.sigma
 
-    def pulls_of_decentring(self, cameras: Sequence[Camera], names: Sequence[str], heavy: bool) -> NDArray[np.float64]:
+    def pulls_of_decentring(self, cameras: Sequence[Camera], names: Sequence[str], heavy: bool) -> Array:
         """(2, cameras, len(names)) by how much one standard deviation of it changes the prior's gradient at `cameras`.
 
         `heavy` says whether the prior is that of `prior_weight`, or normal. Then a calibration whose tangential terms
@@ -117,7 +117,7 @@ class GuessedCameras:
 _TAIL = 9.0
 
 
-def prior_weight(square: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def prior_weight(square: Array) -> tuple[Array, Array]:
     """Costs of squared deviations in units of sigma under a prior with heavy tails (Cauchy's loss), and weights."""
     return 0.5 * _TAIL * np.log1p(square / _TAIL), 1.0 / (1.0 + square / _TAIL)
 
@@ -144,7 +144,7 @@ def check_lenses(names: Sequence[str], cameras: Sequence[Camera], what: str = "c
             raise InputError(f"{what} {name} of a {' or '.join(lenses)} lens, expected some of {', '.join(known)}")
 
 
-def moved_camera(camera: Camera, names: Sequence[str], step: NDArray[np.float64]) -> Camera:
+def moved_camera(camera: Camera, names: Sequence[str], step: Array) -> Camera:
     """The camera after a step (len(names),): of log f, of cx / fx and cy / fy, and of the lens coefficients."""
     K, lens = np.array(camera.K), camera.coefficients
     # a step of e^10 is as astray as any
@@ -165,7 +165,7 @@ def moved_camera(camera: Camera, names: Sequence[str], step: NDArray[np.float64]
 
 def deviation(
     camera: Camera, guess: Camera, names: Sequence[str]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+) -> tuple[Array, Array]:  # fmt: skip
     """How far (len(names),) a camera is from a guess, in the units of `GuessedCameras`; derivatives in the unknowns."""
     fx, fy, cx, cy = camera.kernel_args[0]
     gx, gy, gcx, gcy = guess.kernel_args[0]
@@ -178,7 +178,7 @@ def deviation(
     return np.array([apart.get(name, 0.0) for name in names]), np.array([slope.get(name, 1.0) for name in names])
 
 
-def pixels_of(camera: Camera, names: Sequence[str]) -> NDArray[np.float64]:
+def pixels_of(camera: Camera, names: Sequence[str]) -> Array:
     """(len(names),) pixels (or coefficients) that a unit of each unknown stands for."""
     fx, fy = camera.K[0, 0], camera.K[1, 1]
     return np.array([{"f": fx, "fx": fx, "fy": fy, "cx": fx, "cy": fy}.get(name, 1.0) for name in names])

@@ -24,19 +24,18 @@ theirs, and stays.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..model.array_types import Array, Index
 from .normal_equations import PRIORS_ERROR, Marginals, NormalEquations
 
-__all__ = ["Inflation", "Partition", "by_corner", "by_place", "inflated", "inflation"]
+__all__ = ["Inflation", "by_corner", "by_place", "inflated", "inflation", "sketch"]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
+# A partition has the group (o,) of each measurement: those of a group may go wrong together. Groups come in families,
+# 4 f to 4 f + 3 are those of family f.
 _FAMILY = 4
 # Families of points that a photo sees: with fewer their variance is noise, with more they part what goes together.
 # (Warped herz-jesus-8, whose photos see all of the scene: deviations of phi1 grow by 2.0, 2.2, 2.5, 2.7 and 2.8 for
@@ -50,36 +49,19 @@ _LEAST_DRAWS = 4
 _LEAST_SEEN = 0.2
 
 
-@dataclass(frozen=True)
-class Partition:
-    """Groups of measurements that may go wrong together.
+def sketch(partition: Index, most: int) -> tuple[Index, Array, int]:
+    """Fewer groups for the same sums of squares: group and sign of each measurement, and the number of groups.
 
-    Attributes
-    ----------
-    group : (o,) int array
-        Group of each measurement, in families of four: 4 f to 4 f + 3 are those of family f.
+    Families that share their groups do so with signs drawn at random, so that their products with each other have
+    the mean zero. Those that follow each other, as near ones do, are kept apart.
     """
-
-    group: Index
-
-    @property
-    def num_families(self) -> int:
-        """Number of families."""
-        return int(self.group.max(initial=0)) // _FAMILY + 1
-
-    def sketch(self, most: int) -> tuple[Index, Array, int]:
-        """Fewer groups for the same sums of squares: group and sign of each measurement, and the number of groups.
-
-        Families that share their groups do so with signs drawn at random, so that their products with each other have
-        the mean zero. Those that follow each other, as near ones do, are kept apart.
-        """
-        family, own = np.divmod(self.group, _FAMILY)
-        count = self.num_families
-        sign = np.ones(count) if count <= most else np.random.default_rng(0).choice([-1.0, 1.0], count)
-        return family % most * _FAMILY + own, sign[family], min(count, most) * _FAMILY
+    family, own = np.divmod(partition, _FAMILY)
+    count = int(family.max(initial=0)) + 1
+    sign = np.ones(count) if count <= most else np.random.default_rng(0).choice([-1.0, 1.0], count)
+    return family % most * _FAMILY + own, sign[family], min(count, most) * _FAMILY
 
 
-def by_place(points_w: Array, point_idx: Index, num_frames: int) -> Partition:
+def by_place(points_w: Array, point_idx: Index, num_frames: int) -> Index:
     """Whole tracks (o,) of points (n, 3) in neighbouring cells of equal counts, by repeated bisection."""
     n = len(points_w)
     # photos times families, over the photos that share each
@@ -102,22 +84,21 @@ def by_place(points_w: Array, point_idx: Index, num_frames: int) -> Partition:
         place[order] = np.arange(n)
         behind = place - (np.cumsum(count) - count)[cell] >= ((count + 1) // 2)[cell]
         cell = 2 * cell + behind
-    return Partition(cell[point_idx])
+    return cell[point_idx]
 
 
-def by_corner(xy_raw: Array, size: Array, camera: Index) -> Partition:
+def by_corner(xy_raw: Array, size: Array, camera: Index) -> Index:
     """Measurements (o, 2) in the same part of photos of the same camera (o,), whose widths and heights are (o, 2)."""
     sides = 2 * _CORNERS
     x, y = np.clip(sides * (xy_raw + 0.5) / size, 0, sides - 1).astype(np.int64).T
     family = (camera * _CORNERS + y // 2) * _CORNERS + x // 2
-    return Partition(_FAMILY * family + 2 * (y % 2) + x % 2)
+    return _FAMILY * family + 2 * (y % 2) + x % 2
 
 
 def _squares(pulls: Array) -> Array:
     """Variances (...) by the pulls (groups, ...) of whole families: products inside a family count twice."""
     families = pulls.reshape(len(pulls) // _FAMILY, _FAMILY, *pulls.shape[1:])
-    value: Array = 2.0 * (families.sum(1) ** 2).sum(0) - (families**2).sum((0, 1))
-    return value
+    return 2.0 * (families.sum(1) ** 2).sum(0) - (families**2).sum((0, 1))
 
 
 class Inflation(NamedTuple):
@@ -135,14 +116,10 @@ class Inflation(NamedTuple):
     cameras: float = 1.0
     has_pace: bool = False
 
-    def over(self, noise_factor: float) -> Inflation:
-        """The factors where the noise that weighs the measurements is larger than independent noise already."""
-        return self._replace(photos=self.photos / noise_factor, cameras=self.cameras / noise_factor)
-
 
 def inflation(
     equations: NormalEquations,
-    partitions: tuple[Partition, ...],
+    partitions: tuple[Index, ...],
     marginals: Marginals,
     noise_factor: float = 1.0,
     has_pace: bool = False,
@@ -226,9 +203,9 @@ class _Shares(NamedTuple):
         lengths = [(each**2).sum(0) for each in equations.length_pulls()]
         return cls((weights[0], weights[1]), (noises[0], noises[1]), (lengths[0], lengths[1]))
 
-    def variances(self, equations: NormalEquations, residuals: Array, partition: Partition, most: int) -> Array:
+    def variances(self, equations: NormalEquations, residuals: Array, partition: Index, most: int) -> Array:
         """(2,) by residuals (o, 2), over those of independent noise: the mean over the kinds, by the noise's share."""
-        group, sign, count = partition.sketch(most)
+        group, sign, count = sketch(partition, most)
         pulls = equations.group_pulls(sign[:, None] * residuals, group, count)
         found = []
         for pull, weight, noise, of_lengths in zip(pulls, *self, strict=True):

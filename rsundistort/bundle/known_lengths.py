@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import KnownLength, Reconstruction
+from ..model.array_types import Array
 from ..model.known_length import End
 
 __all__ = ["LengthResiduals", "check_lengths", "scale_of_lengths"]
@@ -73,21 +73,17 @@ class LengthResiduals:
         # weighted, and without the part that a change of the world's scale explains
         self._whiten = (np.eye(len(lengths)) - unit @ unit.T) * weight
 
-    def __len__(self) -> int:
-        return len(self._target)
-
-    def residuals(self, points_w: NDArray[np.float64]) -> NDArray[np.float64]:
+    def residuals(self, points_w: Array) -> Array:
         """(q,) residuals in units of their standard deviations."""
         chord = points_w[self._ends[:, 1]] - points_w[self._ends[:, 0]]
         length = np.maximum(np.linalg.norm(chord, axis=1), 1e-300)
-        value: NDArray[np.float64] = self._whiten @ (np.log(length) - self._target)
-        return value
+        return self._whiten @ (np.log(length) - self._target)
 
-    def jacobian(self, points_w: NDArray[np.float64]) -> NDArray[np.float64]:
+    def jacobian(self, points_w: Array) -> Array:
         """(q, n, 3) derivatives of the residuals by the points."""
         chord = points_w[self._ends[:, 1]] - points_w[self._ends[:, 0]]
         along = chord / np.maximum((chord**2).sum(1, keepdims=True), 1e-300)
-        J = np.zeros((len(self), len(points_w), 3))
+        J = np.zeros((len(self._target), len(points_w), 3))
         for k, (a, b) in enumerate(self._ends):
             J[:, a] -= self._whiten[:, k, None] * along[k]
             J[:, b] += self._whiten[:, k, None] * along[k]

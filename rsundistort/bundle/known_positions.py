@@ -6,16 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import InputError
 from ..model import ControlPoint, Reconstruction
+from ..model.array_types import Array, Index
 from .intrinsics import prior_weight
 
-__all__ = ["KnownPlaces", "PlaceResiduals", "point_of"]
+__all__ = ["KnownPlaces", "PlaceResiduals", "point_of", "stacked"]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # Photos and points that must have a place for these to hold a frame.
 _LEAST = 3
@@ -101,12 +100,9 @@ class PlaceResiduals:
             index[name]: each for name, each in known.velocities.items() if name in index and self.holds_frame
         }
         self.moving: Index = np.array(list(velocities), np.int64)
-        self.velocity, self.velocity_sigma = _stacked([*velocities.values()])
-        self._center, self._photo_sigma = _stacked([(place, sigma) for place, sigma in photos.values()])
-        self._place, self._point_sigma = _stacked([(each.place_m, each.sigma_m) for each in points.values()])
-
-    def __len__(self) -> int:
-        return len(self._photo) + len(self._point)
+        self.velocity, self.velocity_sigma = stacked([*velocities.values()])
+        self._center, self._photo_sigma = stacked([(place, sigma) for place, sigma in photos.values()])
+        self._place, self._point_sigma = stacked([(each.place_m, each.sigma_m) for each in points.values()])
 
     def cost(self, center_w: Array, points_w: Array) -> float:
         """Their cost."""
@@ -127,15 +123,13 @@ class PlaceResiduals:
         return self._point, self._point_sigma**-2.0, self._of_points(points_w) / self._point_sigma
 
     def _of_photos(self, center_w: Array) -> Array:
-        residual: Array = (center_w[self._photo] - self._center) / self._photo_sigma
-        return residual
+        return (center_w[self._photo] - self._center) / self._photo_sigma
 
     def _of_points(self, points_w: Array) -> Array:
-        residual: Array = (points_w[self._point] - self._place) / self._point_sigma
-        return residual
+        return (points_w[self._point] - self._place) / self._point_sigma
 
 
-def _stacked(pairs: Sequence[tuple[ArrayLike, ArrayLike]]) -> tuple[Array, Array]:
+def stacked(pairs: Sequence[tuple[ArrayLike, ArrayLike]]) -> tuple[Array, Array]:
     """Values and standard deviations, (k, 3) each."""
     values = np.array([place for place, _ in pairs], np.float64).reshape(-1, 3)
     return values, np.array([sigma for _, sigma in pairs], np.float64).reshape(-1, 3)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model import BEND_GROUPS, SHUTTER_MODELS, Bend, Reconstruction
+from ..model.array_types import Array
 from ..model.bend import bend_functions, bend_pieces, splines_at
 from .bundle_options import BundleOptions
 
@@ -48,10 +48,10 @@ class Layout:
 
     motion: int
     variation: int
-    functions: NDArray[np.float64]
+    functions: Array
     group: tuple[int, ...]
     ways: int
-    known: Mapping[str, NDArray[np.float64]]
+    known: Mapping[str, Array]
 
     @classmethod
     def of(cls, shutter_model: str, options: BundleOptions) -> Layout:
@@ -78,7 +78,7 @@ class Layout:
         """How many intrinsics vary: log f alone on a path, else cx / fx and cy / fy, too; 0 if none does."""
         return self.variation - self.motion
 
-    def varied(self, step: NDArray[np.float64]) -> NDArray[np.float64]:
+    def varied(self, step: Array) -> Array:
         """(m, 3) what steps (m, nb) of the photos change of log f, cx / fx and cy / fy."""
         return np.pad(step[:, self.motion : self.variation], ((0, 0), (0, 3 - self.num_varying)))
 
@@ -93,16 +93,16 @@ class Layout:
         return self.variation + 3 * self.num_bends
 
     @cached_property
-    def pieces(self) -> NDArray[np.float64]:
+    def pieces(self) -> Array:
         """(4 (n - 1), k) the functions as the kernels take them."""
         return bend_pieces(len(self.functions)) @ self.functions if self.group else np.zeros((0, 0))
 
-    def per_bend(self, of_groups: Sequence[float], of_ways: Sequence[float]) -> NDArray[np.float64]:
+    def per_bend(self, of_groups: Sequence[float], of_ways: Sequence[float]) -> Array:
         """(3 k,) numbers of the unknowns of bends, by groups."""
         values = [of_groups[each] for each in self.group] + [of_ways[each] for each in self.group[: self.ways]]
         return np.repeat(np.array(values, np.float64), 3)
 
-    def values(self, bend: NDArray[np.float64], names: Sequence[str]) -> NDArray[np.float64]:
+    def values(self, bend: Array, names: Sequence[str]) -> Array:
         """(m, n, 6) values at the sites of coefficients (m, 3 k) of photos."""
         rotations = len(self.group)
         value = self._known_values(names)
@@ -111,14 +111,11 @@ class Layout:
         value[..., 3:] += self.functions[:, : self.ways] @ coefficients[:, rotations:]
         return value
 
-    def _known_values(self, names: Sequence[str]) -> NDArray[np.float64]:
-        value = np.zeros((len(names), len(self.functions), 6))
-        for i, name in enumerate(names):
-            if name in self.known:
-                value[i] = self.known[name]
-        return value
+    def _known_values(self, names: Sequence[str]) -> Array:
+        none = np.zeros((len(self.functions), 6))
+        return np.array([self.known.get(name, none) for name in names]).reshape(len(names), *none.shape)
 
-    def coefficients(self, reconstruction: Reconstruction) -> NDArray[np.float64]:
+    def coefficients(self, reconstruction: Reconstruction) -> Array:
         """(m, 3 k) coefficients of the bends of a reconstruction, as far as they are along the functions."""
         m, rotations = reconstruction.num_images, len(self.group)
         found = np.zeros((m, self.num_bends, 3))
@@ -132,12 +129,12 @@ class Layout:
         return found.reshape(m, -1)
 
 
-def _at_sites(bend: Bend, num_sites: int) -> NDArray[np.float64]:
+def _at_sites(bend: Bend, num_sites: int) -> Array:
     """(n, 6) values of a bend at as many sites as others have."""
     return np.asarray(_between(len(bend.values), num_sites) @ bend.values)
 
 
 @lru_cache(maxsize=8)
-def _between(num_own: int, num_sites: int) -> NDArray[np.float64]:
+def _between(num_own: int, num_sites: int) -> Array:
     """(n, k) splines through one value each of k sites, at n sites."""
     return splines_at(num_own, np.linspace(0, 1, num_sites))

@@ -6,16 +6,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model import Camera, RowMotion
+from ..model.array_types import Array, Index
 from ..model.field import field_basis, field_over_frame, folds
 from ..model.projection import project_points, unproject_points
 from .intrinsics import moved_camera
 
 __all__ = ["LensFields"]
 
-Array = NDArray[np.float64]
 
 # Places along the longer and the shorter side of a photo: two spans by one.
 _SHAPE = (5, 4)
@@ -77,7 +76,7 @@ class LensFields:
                 return camera
         return replace(camera, field=camera.field + change)
 
-    def jacobian(self, cameras: Sequence[Camera], camera_of_obs: NDArray[np.int64], xy_raw: Array) -> Array:
+    def jacobian(self, cameras: Sequence[Camera], camera_of_obs: Index, xy_raw: Array) -> Array:
         """(o, 2, nz) derivatives of the field at pixels (o, 2)."""
         J = np.empty((len(xy_raw), 2, self.num_unknowns))
         for k, (camera, basis) in enumerate(zip(cameras, self._bases, strict=True)):

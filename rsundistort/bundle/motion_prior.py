@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model import Reconstruction
+from ..model.array_types import Array, Index, Mask
 from .bundle_options import BundleOptions
 
 __all__ = ["SIGMA_OF_SCALE", "MotionPrior", "tail_weight"]
 
-Array = NDArray[np.float64]
 
 # Degrees of freedom. Under a normal prior of an estimated width one photo that jerked draws all others the other way,
 # by what photos hardly show of the motion that they share. Of eight photos, a mean that only the prior decides is wrong
@@ -23,7 +22,7 @@ _FREEDOM = 4.0
 SIGMA_OF_SCALE = 1.15
 
 
-def tail_weight(square: Array, num: int | NDArray[np.int64] = 3) -> Array:
+def tail_weight(square: Array, num: int | Index = 3) -> Array:
     """Weights of normal priors that pull as Student's t does.
 
     Parameters
@@ -31,8 +30,7 @@ def tail_weight(square: Array, num: int | NDArray[np.int64] = 3) -> Array:
     square : (...) array
         Squared deviations in units of the scale, summed over `num` components.
     """
-    weight: Array = (_FREEDOM + num) / (_FREEDOM + square)
-    return weight
+    return (_FREEDOM + num) / (_FREEDOM + square)
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,7 @@ class MotionPrior:
 
     precision: Array
     limit: Array
-    has_tails: NDArray[np.bool_]
+    has_tails: Mask
 
     @classmethod
     def of(
@@ -74,16 +72,14 @@ class MotionPrior:
 
     def weight(self, own: Array) -> Array:
         """Weights (m, k) that draw deviations (m, k) from the mean as the prior does."""
-        value: Array = self.precision * np.repeat(self._tails(own), 3, axis=1) + self.limit
-        return value
+        return self.precision * np.repeat(self._tails(own), 3, axis=1) + self.limit
 
     def information(self, own: Array) -> Array:
         """(m, k) what the prior tells of motions, or of their mean, at deviations (m, k).
 
         Student's t tells less than its weights say, by Fisher's information: the weights depend on what they weigh.
         """
-        value: Array = self.precision * np.repeat(self.relative_information(own), 3, axis=1) + self.limit
-        return value
+        return self.precision * np.repeat(self.relative_information(own), 3, axis=1) + self.limit
 
     def relative_information(self, own: Array) -> Array:
         """(m, k / 3) information by that of a normal prior of the same scale, without limits."""
@@ -100,5 +96,4 @@ class MotionPrior:
 
     def _squares(self, own: Array) -> Array:
         """(m, k / 3) in units of the scale."""
-        value: Array = (self.precision * own**2).reshape(len(own), -1, 3).sum(axis=2)
-        return value
+        return (self.precision * own**2).reshape(len(own), -1, 3).sum(axis=2)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -10,19 +9,17 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from .._kernels import schur
 from .._kernels._jit import unknowns_of
+from ..model.array_types import Array, Index
 from .connections import Border, CommonPrior, Coupling
 from .elimination import Elimination
 from .point_terms import PointTerms
-from .reduced import Factored, Reduced
+from .reduced import Factored, Reduced, factor
 
 __all__ = ["PRIORS_ERROR", "Function", "Marginals", "NormalEquations", "Step"]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 Step = tuple[Array, Array, Array]
 
 # Of the priors' precision, for the derivative by it, which is off by at most the square.
@@ -104,6 +101,8 @@ class NormalEquations:
     ----------
     blocks : tuple of array
         res and J_frame.
+    num_photos, num_cameras, num_shared : int
+        Number of photos, of cameras, and of unknowns of all cameras.
     """
 
     def __init__(
@@ -143,6 +142,7 @@ class NormalEquations:
         self._g_camera = border.sum_photos(g_camera) + border.prior_gradient.ravel()
         self._common = common
         self._lengths = of_points.lengths[1]
+        self.num_photos, self.num_cameras, self.num_shared = len(prior_diag), border.num_cameras, len(self._g_camera)
 
     def spend(self) -> tuple[Array, Array]:
         """The blocks, for others to be written over them; no more can be asked, and all else as large is given up."""
@@ -217,21 +217,6 @@ class NormalEquations:
         c = -g_camera - self._border.sum_photos(rhs_camera)
         return Reduced(S, -rhs, border, (corner + corner.T) / 2, c), V_inv
 
-    @property
-    def num_cameras(self) -> int:
-        """Number of cameras."""
-        return self._border.num_cameras
-
-    @property
-    def num_photos(self) -> int:
-        """Number of photos."""
-        return len(self._g_frame)
-
-    @property
-    def num_shared(self) -> int:
-        """Number of unknowns of all cameras."""
-        return len(self._g_camera)
-
     @cached_property
     def _common_rows(self) -> Array:
         """(m, nb + nc, k) what means of priors add to the Hessian: of photos by all cameras, of cameras by these."""
@@ -257,7 +242,7 @@ class NormalEquations:
         """The inverse of the whole system, for photos and cameras; None where it cannot be factored."""
         reduced = self._reduced
         del self._reduced  # as large as the factor
-        factored = self._elimination.factored(reduced)
+        factored = factor(reduced, self._elimination.shape)
         del reduced
         if factored is None or not len(self._lengths):
             return factored
@@ -295,7 +280,7 @@ class NormalEquations:
         end = (border.camera_of_frame + 1)[:, None] * border.J.shape[2]
         columns = end + np.arange(-last, 0)
         found = self.inverse.photos_by_cameras()[np.arange(self.num_photos)[:, None], :, columns]
-        return self._seen(found.transpose(0, 2, 1).swapaxes(1, 2)).swapaxes(1, 2)
+        return self._seen(found).swapaxes(1, 2)
 
     def coupling_variances(self) -> tuple[Array, Array]:
         """Residuals (q, r) of the coupling, and their variances, all unknowns being free."""
@@ -330,22 +315,19 @@ class NormalEquations:
         other._reduced = replace(self._reduced, S=S, border=border, corner=corner)
         return other
 
-    def covariance(self, inflation: float = 1.0) -> Callable[[Array], Array]:
-        """Covariance of the photos' unknowns, all others being free, as a function of vectors (k, m, nb).
+    def covariance(self, vectors: Array, inflation: float = 1.0) -> Array:
+        """Covariance of the photos' unknowns, all others being free, times vectors (k, m, nb).
 
         With `inflation` the noise's share of the deviations is so much larger; that of the priors stays.
         """
-        inverse = self.inverse
-        if inverse is None:
-            return lambda vectors: np.full_like(vectors, np.nan)
-
-        def times(vectors: Array) -> Array:
-            return self._seen(inverse.times(self._wide(vectors), np.zeros((len(vectors), len(self._g_camera))))[0])
-
+        if self.inverse is None:
+            return np.full_like(vectors, np.nan)
+        found = self.inverse.times(self._wide(vectors), np.zeros((len(vectors), len(self._g_camera))))
         if inflation == 1.0:
-            return times
-        by = inflation**2
-        return lambda vectors: by * times(vectors) + (1 - by) * self._by_priors(vectors)
+            return self._seen(found[0])
+        # H^-1 P H^-1, P the priors' precision
+        by, by_priors = inflation**2, self.inverse.times(*self._of_priors(*found))[0]
+        return by * self._seen(found[0]) + (1 - by) * self._seen(by_priors)
 
     def times(self, frame: Array, camera: Array) -> tuple[Array, Array]:
         """H^-1 times stacks of photos' values (k, m, seen) and of cameras' (k, unknowns); NaN without an inverse."""
@@ -353,12 +335,6 @@ class NormalEquations:
             return np.full_like(frame, np.nan), np.full_like(camera, np.nan)
         found = self.inverse.times(self._wide(frame), camera)
         return self._seen(found[0]), found[1]
-
-    def _by_priors(self, vectors: Array) -> Array:
-        """H^-1 P H^-1 of the photos' unknowns times vectors (k, m, nb), P the priors' precision."""
-        assert self.inverse is not None
-        found = self.inverse.times(self._wide(vectors), np.zeros((len(vectors), len(self._g_camera))))
-        return self._seen(self.inverse.times(*self._of_priors(*found))[0])
 
     def _of_priors(self, frame: Array, camera: Array) -> tuple[Array, Array]:
         """The priors' precision times stacks of photos' values (n, m, nb) and of cameras' (n, k)."""
@@ -425,12 +401,9 @@ class NormalEquations:
 
         That is H^-1 of each group's share of the gradient, points eliminated; group (o,) is the group of each.
         """
-        assert self.inverse is not None
         V_inv = np.empty_like(self._V)
         schur.invert_points(self._V, 0.0, V_inv)
-        of_photos, of_cameras = self._without_points(V_inv, residuals, group, num_groups)
-        frame, camera = self.inverse.times(self._wide(of_photos), of_cameras)
-        return self._seen(frame), camera
+        return self.times(*self._without_points(V_inv, residuals, group, num_groups))
 
     def _without_points(self, V_inv: Array, residuals: Array, group: Index, num_groups: int) -> tuple[Array, Array]:
         """Shares of groups of residuals in the gradient, points eliminated: (num_groups, m, seen), (num_groups, k)."""

@@ -5,16 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model import Reconstruction
+from ..model.array_types import Array, Index
 from .bundle_options import BundleOptions
 from .prior_sigmas import PriorSigmas
 from .problem import BundleProblem, State
 
 __all__ = ["OwnMotions", "own_motions"]
 
-Array = NDArray[np.float64]
 
 # Of a frame: rotation, centre, phi.
 _UNKNOWNS = 9
@@ -89,7 +88,7 @@ def own_motions(reconstruction: Reconstruction, *, rotation_only: bool = False) 
     inverse = scale[known, :, None] * np.linalg.inv(scaled[known]) * scale[known, None]
     variance = noise**2 * np.diagonal(inverse, axis1=1, axis2=2)
     # neighbours in a frame go wrong together, by lens, waves and leaves: one factor for each kind of unknown
-    corner = problem.partitions(state)[1].group
+    corner = problem.partitions(state)[1]
     count = int(corner.max(initial=0)) + 1
     pulls = np.zeros((m * count, len(own)))
     np.add.at(pulls, frame * count + corner, np.einsum("oia,oi->oa", J, residuals)[:, own])
@@ -108,9 +107,7 @@ def _scaled(H: Array) -> tuple[Array, Array]:
     return scale, scale[:, :, None] * H * scale[:, None]
 
 
-def _gradients(
-    by_frame: list[NDArray[np.int64]], residuals: Array, J: Array, own: NDArray[np.int64]
-) -> tuple[Array, Array]:
+def _gradients(by_frame: list[Index], residuals: Array, J: Array, own: Index) -> tuple[Array, Array]:
     """J'J (m, n, n) and J'residuals (m, n) of each frame, for the unknowns `own` (n,) of Jacobians (o, 2, nb)."""
     n, m = len(own), len(by_frame)
     H, g = np.empty((m, n, n)), np.empty((m, n))
@@ -120,7 +117,7 @@ def _gradients(
     return H, g
 
 
-def _fitted(problem: BundleProblem, state: State, own: NDArray[np.int64]) -> State:
+def _fitted(problem: BundleProblem, state: State, own: Index) -> State:
     """Some steps of Levenberg and Marquardt of every frame on its own."""
     frame, m = problem.measurements[0], len(state.phi)
     by_frame = problem.by_photo

@@ -6,11 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..model import Bend, Reconstruction
+from ..model.array_types import Array, Index
 from ..model.bend import splines_at
 from ..model.motion import steady_parts
 from ..model.path import CameraPath, cross_matrices, inverse_left_jacobians
@@ -28,8 +29,6 @@ __all__ = [
     "with_path_motions",
 ]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # Before anything is known of a readout: it takes about half of the time to the next frame, give or take as much, so
 # that neither a global shutter nor one that runs the other way is excluded.
@@ -172,8 +171,7 @@ class PathState:
 
         A line takes the same time whatever the focal length is, and a unit of the clock has as many lines as f pixels.
         """
-        value: Array = self.pace[camera_idx] * np.exp(variation[:, 0])
-        return value
+        return self.pace[camera_idx] * np.exp(variation[:, 0])
 
     def motions(self, camera_idx: Index, variation: Array) -> Array:
         """(m, 6) phi and velocity of the photos."""
@@ -220,12 +218,10 @@ class PathPrior:
         self._camera_idx = reconstruction.camera_idx
 
     def start(self, reconstruction: Reconstruction, known: PathStart | None = None) -> PathState:
-        """The state that an adjustment begins with: as far as it is `known`, that one."""
-        differences = self._by_differences(reconstruction)
-        return differences if known is None else known.in_order(reconstruction.image_names, differences)
+        """The state that an adjustment begins with: as far as it is `known`, that one.
 
-    def _by_differences(self, reconstruction: Reconstruction) -> PathState:
-        """Rates by differences of the poses of neighbours, and the pace that is likeliest before the photos."""
+        Else rates by differences of the poses of neighbours, and the pace that is likeliest before the photos.
+        """
         m = reconstruction.num_images
         total, count = np.zeros((m, 6)), np.zeros((m, 1))
         i, j = self.first, self.second
@@ -234,7 +230,8 @@ class PathPrior:
         for end in (i, j):
             np.add.at(total, end, rate)
             np.add.at(count, end, 1.0)
-        return PathState(total / np.maximum(count, 1.0), np.zeros((m, 6)), self.pace_prior.copy())
+        differences = PathState(total / np.maximum(count, 1.0), np.zeros((m, 6)), self.pace_prior.copy())
+        return differences if known is None else known.in_order(reconstruction.image_names, differences)
 
     def residuals(self, R_cw: Array, center_w: Array, state: PathState) -> Array:
         """(q, 18) residuals of unit variance, 6 each of steps, rates and changes."""
@@ -256,8 +253,7 @@ class PathPrior:
     def _whitened(self, differences: Array) -> Array:
         """(q, 3, 6, ...) divided by their standard deviations."""
         spread = np.repeat(self.sigmas, 3).reshape(6, *(1,) * (differences.ndim - 3))
-        value: Array = np.einsum("qij,qj...->qi...", self._whitening, differences) / spread
-        return value
+        return np.einsum("qij,qj...->qi...", self._whitening, differences) / spread
 
     def cost(self, R_cw: Array, center_w: Array, state: PathState) -> float:
         """Half the sum of squares, with that of the pace."""
@@ -332,11 +328,6 @@ def _excess(pace: Array, most: Array) -> Array:
     return np.sign(pace) * np.maximum(np.abs(pace) - most, 0.0)
 
 
-def free_pace(pace: Array, sigma: Array, most: Array, excess_sigma: Array) -> Array:
-    """(cameras,) pace without the bound, by a Gauss-Newton step from it; standard deviations are those without."""
-    return pace + _excess(pace, most) * (sigma / excess_sigma) ** 2
-
-
 def camera_path(reconstruction: Reconstruction, path: FramePath, state: PathState) -> tuple[CameraPath, Index]:
     """The path through a reconstruction's poses, and its photos in the order of time."""
     order, time, part = path.order(reconstruction.image_names)
@@ -351,20 +342,15 @@ def with_path_motions(reconstruction: Reconstruction, path: FramePath, state: Pa
     """The reconstruction with the motion of each frame as the path has it around its principal row."""
     found, order = camera_path(reconstruction, path, state)
     clock_s, camera_idx = state.pace * path.frame_s, reconstruction.camera_idx[order]
-    m, parts, clock = len(order), [], np.zeros((len(order), 2))
+    clock, parts = np.array([camera.clock_range for camera in reconstruction.cameras])[reconstruction.camera_idx], []
     for k, camera in enumerate(reconstruction.cameras):
         moments = np.flatnonzero(camera_idx == k)
-        parts.append((order[moments], found.row_motions(moments, camera.clock_range, float(clock_s[k]))))
-        clock[order[moments]] = camera.clock_range
-    values = [np.zeros((m, *each.shape[1:])) for each in parts[0][1]]
-    for mine, motions in parts:
-        for value, each in zip(values, motions, strict=True):
-            value[mine] = each
+        parts.append((order[moments], *found.row_motions(moments, camera.clock_range, float(clock_s[k]))))
+    photos, *motions = (np.concatenate(each) for each in zip(*parts, strict=True))
+    phi, velocity, bend = (each[np.argsort(photos)] for each in motions)
     # units of the camera's clock have become those of each photo's, whose lines are the same
     units = np.exp(reconstruction.variation[:, :1])
-    return replace(
-        reconstruction, phi=units * values[0], velocity=units * values[1], bend=values[2], bend_clock=clock / units
-    )
+    return replace(reconstruction, phi=units * phi, velocity=units * velocity, bend=bend, bend_clock=clock / units)
 
 
 def path_bends(reconstruction: Reconstruction, path: FramePath, state: PathState) -> dict[str, Bend]:
@@ -410,7 +396,8 @@ def path_solution(reconstruction: Reconstruction, path: FramePath, state: PathSt
     found, frames = camera_path(reconstruction, path, state)
     span = np.array([camera.frame_span for camera in reconstruction.cameras])
     pace_sigma = np.where(np.isfinite(pace_sigma), pace_sigma, path.readout_prior[1] / span)
-    free = free_pace(state.pace, pace_sigma, path.readout_most / span, _EXCESS_SIGMA / span)
+    # without the bound, by a Gauss-Newton step from it
+    free = state.pace + _excess(state.pace, path.readout_most / span) * (pace_sigma / (_EXCESS_SIGMA / span)) ** 2
     span_s = span * path.frame_s
     pace_sigma = np.hypot(pace_sigma, path.held_sigma / span_s)
     names = tuple(reconstruction.image_names[k] for k in frames.tolist())

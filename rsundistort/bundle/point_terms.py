@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .._kernels import schur
+from ..model.array_types import Array, Index
 from .structure import Structure
 
 __all__ = ["PointTerms", "largest_step", "moved_points", "nearest_photos"]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # A step takes a point to so many times its distance at most: one that asks for more wants it at infinity, or beyond.
 _FURTHEST = 10.0
@@ -23,8 +21,7 @@ def nearest_photos(points_w: Array, center_w: Array, structure: Structure) -> In
     """(n,) the photo nearest to each point of a structure, of those that measured it."""
     away = np.linalg.norm(points_w[structure.point_idx] - center_w[structure.frame_idx], axis=1)
     order = np.lexsort((away, structure.point_idx))
-    nearest: Index = structure.frame_idx[order[structure.track_start[:-1]]]
-    return nearest
+    return structure.frame_idx[order[structure.track_start[:-1]]]
 
 
 def moved_points(points_w: Array, steps: Array, center_w: Array) -> Array:
@@ -36,8 +33,7 @@ def moved_points(points_w: Array, steps: Array, center_w: Array) -> Array:
     away = points_w - center_w
     along = np.einsum("na,na->n", steps, away) / np.maximum(np.einsum("na,na->n", away, away), 1e-300)
     along = along[:, None]
-    moved: Array = center_w + (away + steps - along * away) / np.maximum(1.0 - along, 1.0 / _FURTHEST)
-    return moved
+    return center_w + (away + steps - along * away) / np.maximum(1.0 - along, 1.0 / _FURTHEST)
 
 
 def largest_step(points_w: Array, steps: Array, middle_w: Array, size: float) -> float:

@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..model.array_types import Array
 from .bundle_options import BundleOptions, BundleResult
 from .calibration_doubt import CalibrationDoubt
 from .prior_sigmas import PriorSigmas
 from .problem import BundleProblem
 
 __all__ = ["Posterior", "gauge_directions"]
-
-Array = NDArray[np.float64]
 
 
 class Posterior:
@@ -46,7 +44,6 @@ class Posterior:
         self._state = self._problem.initial_state()
         self._equations = self._problem.linearize(self._state)
         self._inflation = (result.inflation if plain.deviations == "jackknife" else 1.0) / result.noise_factor
-        self._covariance = self._equations.covariance(self._inflation)
         self._doubt = CalibrationDoubt.of(self._equations, plain, rec.cameras)
         self._camera_idx = rec.camera_idx
         self._own = self._problem.layout.size - self._problem.layout.motion
@@ -54,9 +51,11 @@ class Posterior:
 
     def of_photos(self, vectors: Array) -> Array:
         """Covariance of the photos' unknowns times vectors (k, m, nb), as in `BundleResult.covariances`."""
-        whole = self._whole(vectors)
+        # with zeros for what the photos have of their own beside pose and motion
+        whole = np.pad(vectors, [(0, 0), (0, 0), (0, self._own)])
         if self._path is None:
-            return (self._covariance(whole) + self._doubt.times(whole)[0])[:, :, : vectors.shape[2]]
+            moved = self._equations.covariance(whole, self._inflation) + self._doubt.times(whole)[0]
+            return moved[:, :, : vectors.shape[2]]
         # phi and velocity are pace times rates
         variation = self._state.variation
         pace = self._path.paces(self._camera_idx, variation)[:, None]
@@ -121,10 +120,6 @@ class Posterior:
                 A /= self._path.paces(self._camera_idx, self._state.variation)[photo]
             squares.append(np.einsum("oki,okj->ij", A, A) / max(len(mine), 1))
         return np.array(squares)
-
-    def _whole(self, vectors: Array) -> Array:
-        """With zeros for what the photos have of their own beside pose and motion."""
-        return np.pad(vectors, [(0, 0), (0, 0), (0, self._own)])
 
 
 def gauge_directions(result: BundleResult) -> Array:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model import Reconstruction
+from ..model.array_types import Array
 from .bundle_options import BundleOptions
 from .layout import Layout
 from .motion_prior import SIGMA_OF_SCALE, tail_weight
@@ -90,9 +90,7 @@ class PriorSigmas:
     means: tuple[float, ...] = ()
 
 
-def _prior_sigma(
-    values: NDArray[np.float64], variance: NDArray[np.float64], span: NDArray[np.float64], sigma: float
-) -> float:
+def _prior_sigma(values: Array, variance: Array, span: Array, sigma: float) -> float:
     """Prior standard deviation, per frame, of unknowns (m, 3) per unit of the clock with posterior variances (m, 3).
 
     It is estimated over photos and axes; `sigma` is that under which they were found. Values beyond three robust
@@ -109,7 +107,7 @@ def _prior_sigma(
     return _fixed_point(seen, unknown, sigma)
 
 
-def _scale(values: NDArray[np.float64], variance: NDArray[np.float64], sigma: float) -> float:
+def _scale(values: Array, variance: Array, sigma: float) -> float:
     """Scale of the prior with heavy tails of motions (m, 3) with posterior variances (m, 3), per frame.
 
     As `_prior_sigma`, which weighs all photos the same.
@@ -136,14 +134,14 @@ class Common(NamedTuple):
     those of the cameras and their variances, (cameras, 6).
     """
 
-    values: NDArray[np.float64]
-    variances: NDArray[np.float64]
-    with_motions: NDArray[np.float64]
-    of_cameras: tuple[NDArray[np.float64], NDArray[np.float64]]
+    values: Array
+    variances: Array
+    with_motions: Array
+    of_cameras: tuple[Array, Array]
 
 
 def estimated(
-    sigmas: PriorSigmas, current: Reconstruction, covariances: NDArray[np.float64], options: BundleOptions,
+    sigmas: PriorSigmas, current: Reconstruction, covariances: Array, options: BundleOptions,
     layout: Layout, baseline: float, common: Common | None = None,
 ) -> PriorSigmas:  # fmt: skip
     """Estimates of the prior standard deviations from a solution; given ones stay."""
@@ -154,24 +152,24 @@ def estimated(
     limited = [options.phi_limits.get(name, np.inf) < sigmas.phi for name in current.image_names]
     own_variances = np.where(np.array(limited)[:, None], 0.0, own_variances)
     ones = np.ones(len(own))
-    phi, velocity, focal, centre = sigmas.phi, sigmas.velocity, sigmas.focal, sigmas.centre
-    means = sigmas.means
+    found = sigmas
     if options.phi_sigma is None and own.shape[1] > 0:
-        phi = _scale(own[:, :3], own_variances[:, :3], sigmas.phi) + _MIN_SIGMA
+        found = replace(found, phi=_scale(own[:, :3], own_variances[:, :3], sigmas.phi) + _MIN_SIGMA)
     if options.velocity_sigma is None and own.shape[1] > 3:
         velocity = _scale(own[:, 3:], own_variances[:, 3:], sigmas.velocity) + _MIN_SIGMA * current.baseline
+        found = replace(found, velocity=velocity)
     if common is not None:
-        means = _mean_sigmas(common, velocity, sigmas.means, current)
+        found = replace(found, means=_mean_sigmas(common, found.velocity, sigmas.means, current))
     if options.varying:
         varied = current.variation
         of_varied = variances[:, layout.motion : layout.variation]
-        focal = _prior_sigma(varied[:, :1], of_varied[:, :1], ones, sigmas.focal) + _MIN_SIGMA
+        focal = _prior_sigma(varied[:, :1], of_varied[:, :1], ones, sigmas.focal)
+        found = replace(found, focal=focal + _MIN_SIGMA)
         if layout.num_varying > 1:
-            centre = _prior_sigma(varied[:, 1:], of_varied[:, 1:], ones, sigmas.centre) + _MIN_SIGMA
+            centre = _prior_sigma(varied[:, 1:], of_varied[:, 1:], ones, sigmas.centre)
+            found = replace(found, centre=centre + _MIN_SIGMA)
     bends, ways = _bend_sigmas(sigmas, current, variances[:, layout.variation :], layout)
-    return _bounded(
-        PriorSigmas(phi, velocity, focal, centre, bends, ways, sigmas.field, sigmas.path, means), options, baseline
-    )
+    return _bounded(replace(found, bends=bends, ways=ways), options, baseline)
 
 
 def _mean_sigmas(
@@ -207,9 +205,7 @@ def _depth(reconstruction: Reconstruction) -> float:
     return float(np.median([reconstruction.median_depth(i) for i in range(reconstruction.num_images)]))
 
 
-def _own_motions(
-    current: Reconstruction, covariances: NDArray[np.float64], common: Common | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _own_motions(current: Reconstruction, covariances: Array, common: Common | None) -> tuple[Array, Array]:
     """What each photo's motion has of its own (m, k), in the camera's frame and per frame, and its variances.
 
     Variances are 0 where a motion is held.
@@ -231,7 +227,7 @@ def _own_motions(
 
 
 def _bend_sigmas(
-    sigmas: PriorSigmas, current: Reconstruction, variances: NDArray[np.float64], layout: Layout
+    sigmas: PriorSigmas, current: Reconstruction, variances: Array, layout: Layout
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Prior standard deviations of the groups of bends, of rotations and of positions."""
     ones, found = np.ones(current.num_images), layout.coefficients(current)
@@ -262,25 +258,19 @@ def settled(before: PriorSigmas, after: PriorSigmas, tolerance: float) -> bool:
 
     On a path, phi and velocity have none of their own.
     """
-    of_bends = (_SETTLED_AT,) * len(before.bends), (0.0,) * len(before.ways)
     phi, velocity = (np.inf, np.inf) if before.path else (_SETTLED_AT, 0.0)
-    none = PriorSigmas(
-        phi,
-        velocity,
-        _SETTLED_AT,
-        _SETTLED_AT,
-        *of_bends,
-        _SETTLED_PX,
-        (0.0,) * len(before.path),
-        (np.inf,) * len(before.means),
-    )
+    negligible = {
+        "phi": phi, "velocity": velocity, "focal": _SETTLED_AT, "centre": _SETTLED_AT, "bends": _SETTLED_AT,
+        "ways": 0.0, "field": _SETTLED_PX, "path": 0.0, "means": np.inf,
+    }  # fmt: skip
     for old, new in zip(before.means, after.means, strict=True):
         if abs(new - old) > _SETTLED_MEANS * new and max(old, new) > _SETTLED_AT:
             return False
-    return all(
-        abs(new - old) <= tolerance * new or max(old, new) < least
-        for old, new, least in zip(*(np.hstack(astuple(each)) for each in (before, after, none)), strict=True)
-    )
+    for name, least in negligible.items():
+        old, new = np.array([getattr(before, name), getattr(after, name)])
+        if not ((np.abs(new - old) <= tolerance * new) | (np.maximum(old, new) < least)).all():
+            return False
+    return True
 
 
 def starting_sigmas(options: BundleOptions, layout: Layout, reconstruction: Reconstruction) -> PriorSigmas:
@@ -316,22 +306,20 @@ def _bounded(sigmas: PriorSigmas, options: BundleOptions, baseline: float) -> Pr
     phi = np.inf if options.phi_sigma_most is None else options.phi_sigma_most
     velocity = np.inf if options.velocity_sigma_most is None else options.velocity_sigma_most * baseline
     focal = _MOST_VARIED if options.path is None else _MOST_ZOOMED
-    return PriorSigmas(
-        min(sigmas.phi, phi), min(sigmas.velocity, velocity), min(sigmas.focal, focal),
-        min(sigmas.centre, _MOST_VARIED), tuple(min(each, phi) for each in sigmas.bends), sigmas.ways,
-        min(sigmas.field, _MOST_PX), sigmas.path, sigmas.means,
+    return replace(
+        sigmas, phi=min(sigmas.phi, phi), velocity=min(sigmas.velocity, velocity), focal=min(sigmas.focal, focal),
+        centre=min(sigmas.centre, _MOST_VARIED), bends=tuple(min(each, phi) for each in sigmas.bends),
+        field=min(sigmas.field, _MOST_PX),
     )  # fmt: skip
 
 
-def field_prior_sigma(values: NDArray[np.float64], variances: NDArray[np.float64], sigma: float) -> float:
+def field_prior_sigma(values: Array, variances: Array, sigma: float) -> float:
     """Prior standard deviation in pixels of the unknowns (k, n) of residual fields, as `_prior_sigma`."""
     found = _prior_sigma(values, variances, np.ones(len(values)), sigma)
     return min(found + _MIN_SIGMA_PX, _MOST_PX)
 
 
-def path_prior_sigmas(
-    prior: PathPrior, residuals: NDArray[np.float64], variances: NDArray[np.float64], baseline: float
-) -> tuple[float, ...]:
+def path_prior_sigmas(prior: PathPrior, residuals: Array, variances: Array, baseline: float) -> tuple[float, ...]:
     """Prior standard deviations of a path by its residuals (q, 18) and their posterior variances, as `_prior_sigma`.
 
     With few frames, which hardly determine them, they are drawn to those of a hand.

@@ -8,31 +8,31 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from .._kernels import residuals
 from ..errors import InputError
 from ..model import Camera, Reconstruction, check_shutter_model
+from ..model.array_types import Array, Index, Mask
 from ..model.reprojection import camera_arrays, motion_tables, observed_lens_pixels, plain_arrays
-from .at_lens import least_distance
 from .bundle_options import LOSSES, BundleOptions
 from .common_motion import LEAST_PHOTOS, MotionMeans
 from .connections import Border, CommonPrior, Coupling
 from .elimination import Elimination
 from .intrinsics import INTRINSICS, check_lenses, deviation, moved_camera, prior_weight
-from .jackknife import Partition, by_corner, by_place
+from .jackknife import by_corner, by_place
 from .known_lengths import LengthResiduals
 from .known_positions import KnownPlaces, PlaceResiduals
 from .layout import Layout
 from .lens_field import LensFields
 from .motion_prior import MotionPrior
-from .normal_equations import Marginals, NormalEquations, Step
+from .normal_equations import NormalEquations, Step
 from .path_prior import PathPrior, PathState
 from .point_terms import PointTerms, largest_step, moved_points, nearest_photos
 from .prior_sigmas import PriorSigmas
 from .sparse_blocks import Chain
 from .structure import Structure
+from .triangulate import least_distance
 
 __all__ = ["BundleProblem", "State"]
 
@@ -47,14 +47,14 @@ class State:
     """
 
     cameras: tuple[Camera, ...]
-    R_cw: NDArray[np.float64]
-    center_w: NDArray[np.float64]
-    phi: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    variation: NDArray[np.float64]
-    bend: NDArray[np.float64]
-    points_w: NDArray[np.float64]
-    means: NDArray[np.float64]
+    R_cw: Array
+    center_w: Array
+    phi: Array
+    velocity: Array
+    variation: Array
+    bend: Array
+    points_w: Array
+    means: Array
     path: PathState | None = None
 
 
@@ -84,7 +84,7 @@ class BundleProblem:
         sigmas: PriorSigmas,
         heavy_tails: bool = True,
         path: PathState | None = None,
-        means: NDArray[np.float64] | None = None,
+        means: Array | None = None,
     ) -> None:
         self._model = check_shutter_model(shutter_model)
         obs = reconstruction.observations
@@ -166,7 +166,7 @@ class BundleProblem:
         shares = self._free[:, 6:12] & ~(few | limited)[:, None]
         return MotionMeans.of(start, sigmas.means, shares) if shares.any() else None
 
-    def _known_motions(self, span: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _known_motions(self, span: Array) -> tuple[Array, Array]:
         """Motions (m, nb - 6) known from elsewhere, per unit of the clock, and their weights."""
         if self._options.path is not None:
             return self._options.path.known_rates(self._start.image_names)
@@ -201,7 +201,7 @@ class BundleProblem:
             raise InputError(f"anchor {name!r} is not a photo of the reconstruction")
         return self._start.image_names.index(name)
 
-    def _free_unknowns(self) -> NDArray[np.bool_]:
+    def _free_unknowns(self) -> Mask:
         """(m, nb) unknowns that are solved for."""
         rec = self._start
         free = np.ones((rec.num_images, self.layout.size), bool)
@@ -212,10 +212,9 @@ class BundleProblem:
             free[reference, :6] = False
             free[far, 3 + axis] = False
         for name, components in self._options.held_phi.items():
+            i = self._photo(name)
             if self._block > 6:
-                free[self._photo(name), [6 + c for c in components]] = False
-            else:
-                self._photo(name)
+                free[i, [6 + c for c in components]] = False
         for name, still in self._options.still.items():
             if still == 0:
                 i = self._photo(name)
@@ -261,18 +260,11 @@ class BundleProblem:
         plain._options, plain._lens_of, plain._bounded = replace(self._options, loss="squared"), None, False
         return plain
 
-    def covariances(self, state: State) -> Marginals:
-        """Covariances of each photo's unknowns (m, nb, nb), 0 where held (the gauge), and of all cameras' (k, k).
-
-        All others being free. Order and units as the unknowns above. NaN where the system cannot be factored.
-        """
-        return self.linearize(state).marginal_covariances()
-
-    def in_order(self, of_points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def in_order(self, of_points: Array) -> Array:
         """Values of the reconstruction's points in the order of the state's."""
         return of_points[self._structure.points]
 
-    def partitions(self, state: State) -> tuple[Partition, ...]:
+    def partitions(self, state: State) -> tuple[Index, ...]:
         """Measurements that may go wrong together: of one corner of the scene, and of one corner of a lens."""
         s, start = self._structure, self._start
         camera = start.camera_idx[s.frame_idx]
@@ -302,44 +294,40 @@ class BundleProblem:
         )
 
     def _kernel_args(self, state: State) -> tuple[Any, ...]:
+        """Arguments of the kernels: model, cameras, photos, points, measurements and loss."""
         if state is not self._args_of:
-            self._args_of, self._args = state, plain_arrays(*self._arrays(state))
+            s, phi = self._structure, state.phi
+            if self.layout.bent:
+                values = self.layout.values(state.bend, self._start.image_names)
+                phi = motion_tables(phi, values, self._bend_clock, state.R_cw)
+            xy = observed_lens_pixels(state.cameras, self._start.camera_idx[s.frame_idx], self._xy)
+            self._args_of, self._args = state, plain_arrays(
+                *camera_arrays(self._start.camera_idx, state.cameras, state.variation),
+                state.R_cw, state.center_w, phi, state.velocity, state.points_w,
+                s.frame_idx, s.point_idx, xy, self._sigma_px,
+            )  # fmt: skip
         return self._model, *self._args, LOSSES[self._options.loss], self._options.loss_scale
 
-    def _arrays(self, state: State) -> tuple[NDArray[Any], ...]:
-        """Arguments of the kernels: cameras, photos, points and measurements."""
-        s = self._structure
-        phi = state.phi
-        if self.layout.bent:
-            values = self.layout.values(state.bend, self._start.image_names)
-            phi = motion_tables(phi, values, self._bend_clock, state.R_cw)
-        xy = observed_lens_pixels(state.cameras, self._start.camera_idx[s.frame_idx], self._xy)
-        return (
-            *camera_arrays(self._start.camera_idx, state.cameras, state.variation),
-            state.R_cw, state.center_w, phi, state.velocity, state.points_w,
-            s.frame_idx, s.point_idx, xy, self._sigma_px,
-        )  # fmt: skip
-
-    def _motion(self, state: State) -> NDArray[np.float64]:
+    def _motion(self, state: State) -> Array:
         """(m, nb - 6) unknowns of the shutter."""
         if state.path is not None:
             return state.path.rates
         return np.hstack([state.phi, state.velocity])[:, : self._block - 6]
 
-    def _own_motion(self, state: State) -> NDArray[np.float64]:
+    def _own_motion(self, state: State) -> Array:
         """(m, nb - 6) what each photo's motion has of its own, beside the mean."""
         motion = self._motion(state)
         return motion if self._means is None else motion - self._means.at(state.means)
 
-    def _motion_weight(self, state: State) -> NDArray[np.float64]:
+    def _motion_weight(self, state: State) -> Array:
         """(m, nb - 6) weights of the prior on what each photo's motion has of its own."""
         return self._motion_prior.weight(self._own_motion(state))
 
-    def relative_information(self, state: State) -> NDArray[np.float64]:
+    def relative_information(self, state: State) -> Array:
         """`MotionPrior.relative_information` of rotations and velocities, (m, 0 to 2)."""
         return self._motion_prior.relative_information(self._own_motion(state))
 
-    def _own(self, state: State) -> NDArray[np.float64]:
+    def _own(self, state: State) -> Array:
         """(m, k) unknowns behind those: variation and bends."""
         return np.hstack([state.variation[:, : self.layout.num_varying], state.bend])
 
@@ -353,7 +341,7 @@ class BundleProblem:
             own += 2.0 * self._path.cost(state.R_cw, state.center_w, state.path)
         return 0.5 * (own + lengths) + self._camera_priors(state)[2]
 
-    def _camera_priors(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    def _camera_priors(self, state: State) -> tuple[Array, Array, float]:
         """Diagonal Hessian and gradient (cameras, nc) of the priors on the cameras, and their cost."""
         apart, slope = np.zeros((2, len(state.cameras), len(self._refine)))
         guessed = self._options.guessed
@@ -380,9 +368,7 @@ class BundleProblem:
             gradient = np.hstack([gradient, slope_of_pace[:, None]])
         return diagonal, gradient, total
 
-    def _jacobians(
-        self, state: State, spent: NormalEquations | None = None
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, NDArray[np.int64]]:
+    def _jacobians(self, state: State, spent: NormalEquations | None = None) -> tuple[Array, Array, float, Index]:
         """Weighted residuals (o, 2), Jacobians of the photos (o, 2, nb), the cost without priors, and who is left out.
 
         These measurements are singular, of points at the lens or moving along with the line that is read. Their weight
@@ -409,11 +395,11 @@ class BundleProblem:
         res[singular], J_frame[singular] = 0.0, 0.0
         return res, J_frame, float(cost.sum()), singular
 
-    def blocks(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def blocks(self, state: State) -> tuple[Array, Array]:
         """Weighted residuals (o, 2), and Jacobians of the photos (o, 2, nb)."""
         return self._jacobians(state)[:2]
 
-    def _rows(self, state: State) -> NDArray[np.float64]:
+    def _rows(self, state: State) -> Array:
         """(o,) where to look for the rows: as the last cost found them, if it was that of this state; else NaN."""
         if state is not self._clock_of:
             self._clock.fill(np.nan)
@@ -469,7 +455,7 @@ class BundleProblem:
         return PointTerms((self._lengths.residuals(x), self._lengths.jacobian(x)), rays, self._places.on_points(x))
 
     @property
-    def shares(self) -> NDArray[np.bool_]:
+    def shares(self) -> Mask:
         """(m, 6) which components of the photos' motions have a mean."""
         assert self._means is not None
         return np.asarray(self._means.directions.any(axis=2))
@@ -480,7 +466,7 @@ class BundleProblem:
         assert self._path is not None
         return self._path
 
-    def fields(self, state: State, covariance: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def fields(self, state: State, covariance: Array) -> tuple[Array, Array]:
         """Unknowns of the cameras' fields (cameras, nz), and their variances by all cameras' covariance (k, k)."""
         num = len(state.cameras)
         if self._fields is None:
@@ -489,16 +475,16 @@ class BundleProblem:
         return values, np.diagonal(covariance).reshape(num, -1)[:, own : own + values.shape[1]]
 
     @property
-    def measurements(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    def measurements(self) -> tuple[Index, Index, Array]:
         """Photos (o,), points (o,) as in a state, and noise (o,) in pixels of the equations' measurements."""
         return self._structure.frame_idx, self._structure.point_idx, self._sigma_px
 
     @property
-    def by_photo(self) -> list[NDArray[np.int64]]:
+    def by_photo(self) -> list[Index]:
         """The equations' measurements of each photo."""
         return np.split(self._structure.frame_order, self._structure.frame_start[1:-1])
 
-    def _camera_jacobians(self, state: State) -> NDArray[np.float64]:
+    def _camera_jacobians(self, state: State) -> Array:
         """Weighted Jacobians (o, 2, nc) of what is solved for of the cameras, with room for the pace of a path."""
         J, of_photo = self._by_lens(state)
         if self._fields is None:
@@ -509,7 +495,7 @@ class BundleProblem:
         own = len(self._refine)
         return np.concatenate([J[:, :, :own], weight @ self._field_jacobian, J[:, :, own:]], axis=2)
 
-    def _by_lens(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _by_lens(self, state: State) -> tuple[Array, Array]:
         """Those by the intrinsics, without fields, and those by a photo's variation (o, 2, 3).
 
         The last are left empty (o, 2, 0) where nobody needs them.
@@ -544,13 +530,13 @@ class BundleProblem:
         steps = self._point_terms(state).steps(self._structure.track_start, *self.blocks(state))
         return self._with_better_points(state, moved_points(state.points_w, steps, state.center_w[self._nearest]))
 
-    def _with_better_points(self, state: State, points_w: NDArray[np.float64]) -> State:
+    def _with_better_points(self, state: State, points_w: Array) -> State:
         """The state with those of other points (n, 3) whose measurements cost less."""
         point_idx, other = self._structure.point_idx, replace(state, points_w=points_w)
         own, others = (np.bincount(point_idx, self.costs(each), len(points_w)) for each in (state, other))
         return replace(state, points_w=np.where((others < own)[:, None], points_w, state.points_w))
 
-    def costs(self, state: State) -> NDArray[np.float64]:
+    def costs(self, state: State) -> Array:
         """(o,) cost of each of the equations' measurements."""
         cost = np.empty(len(self._xy))
         residuals.residual_costs(*self._kernel_args(state), self._clock, cost)

@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..model.array_types import Array, Index
 from .envelope import CholeskyFactor, Envelope
 from .sparse_blocks import BlockFactor, SparseBlocks
 
 __all__ = ["Factored", "Reduced", "factor", "products"]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # Right-hand sides that are solved together: enough for all threads, and little memory.
 _STACK = 32
@@ -42,8 +40,7 @@ class Reduced:
 
 def products(A: Array, B: Array) -> Array:
     """(i, j) inner products of stacks of photos' values; not of BLAS, whose waiting threads take our processors."""
-    result: Array = np.einsum("ima,jma->ij", A, B)
-    return result
+    return np.einsum("ima,jma->ij", A, B)
 
 
 def _positive_inverse(A: Array) -> Array | None:
@@ -54,8 +51,7 @@ def _positive_inverse(A: Array) -> Array | None:
     except np.linalg.LinAlgError:
         return None
     half = np.linalg.inv(L) * scale
-    inverse: Array = half.T @ half
-    return inverse
+    return half.T @ half
 
 
 @dataclass(frozen=True)
@@ -103,12 +99,14 @@ class Factored:
         """Blocks of the inverse of each photo (m, nb, nb), 0 where held, and that of all cameras (k, k)."""
         shared = np.einsum("rma,rs->sma", self.frames, self.weights)
         cameras = self.cameras.T @ self.weights @ self.cameras
-        return self.photos.inverse_blocks() + np.einsum("sma,smb->mab", shared, self.frames), (cameras + cameras.T) / 2
+        every = np.arange(self.frames.shape[1])
+        own = self.photos.inverse_blocks(every, every)
+        return own + np.einsum("sma,smb->mab", shared, self.frames), (cameras + cameras.T) / 2
 
     def pair_blocks(self, first: Index, second: Index) -> Array:
         """Blocks of the inverse of pairs of photos that the pattern connects, (q, nb, nb), 0 where held."""
         shared = np.einsum("rqa,rs->sqa", self.frames[:, first], self.weights)
-        return self.photos.inverse_blocks_of(first, second) + np.einsum("sqa,sqb->qab", shared, self.frames[:, second])
+        return self.photos.inverse_blocks(first, second) + np.einsum("sqa,sqb->qab", shared, self.frames[:, second])
 
     def photos_by_cameras(self) -> Array:
         """Blocks of the inverse between photos and cameras, (m, nb, k)."""

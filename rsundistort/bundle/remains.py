@@ -6,15 +6,15 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model import Observations, Reconstruction
+from ..model.array_types import Array, Mask
 from ..model.bend import splines_at
 from ..model.reprojection import reprojection_residuals
 
 __all__ = ["CLIP", "WAVES", "agreement_of_waves", "errors_without", "half_across_readout", "warps", "waves"]
 
-Functions = Callable[[Reconstruction, Observations], NDArray[np.float64]]
+Functions = Callable[[Reconstruction, Observations], Array]
 
 # Longer residuals, in standard deviations, count as this: a wrong match says nothing about the shutter.
 CLIP = 5.0
@@ -32,7 +32,7 @@ _ROTATED = 5e-4
 _REWEIGHTED = 4
 
 
-def half_across_readout(reconstruction: Reconstruction) -> NDArray[np.bool_]:
+def half_across_readout(reconstruction: Reconstruction) -> Mask:
     """(n,) points on one side of the photos that show them, sides across the readout; half of all."""
     obs = reconstruction.observations
     of_photo = [reconstruction.camera(i) for i in range(reconstruction.num_images)]
@@ -44,7 +44,7 @@ def half_across_readout(reconstruction: Reconstruction) -> NDArray[np.bool_]:
     return np.asarray(place < np.median(place))
 
 
-def warps(rec: Reconstruction, measured: Observations) -> NDArray[np.float64]:
+def warps(rec: Reconstruction, measured: Observations) -> Array:
     """(n, k) polynomials in the place of each measurement, products of Legendre's of up to `_DEGREE` together."""
     size = np.array([(camera.width, camera.height) for camera in rec.cameras])[rec.camera_idx][measured.frame_idx]
     along = 2 * (measured.xy_raw + 0.5) / size - 1
@@ -52,7 +52,7 @@ def warps(rec: Reconstruction, measured: Observations) -> NDArray[np.float64]:
     return np.stack([x[:, i] * y[:, j] for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)], axis=1)
 
 
-def _splines_along(rec: Reconstruction, measured: Observations, sites: int) -> NDArray[np.float64]:
+def _splines_along(rec: Reconstruction, measured: Observations, sites: int) -> Array:
     """(n, sites) splines along the readout at the place of each measurement."""
     camera = [rec.camera(i) for i in range(rec.num_images)]
     axis = np.array([each.clock_axis for each in camera])[measured.frame_idx]
@@ -61,14 +61,14 @@ def _splines_along(rec: Reconstruction, measured: Observations, sites: int) -> N
     return splines_at(sites, np.clip(place, 0.0, 1.0))
 
 
-def waves(rec: Reconstruction, measured: Observations, sites: int = WAVES) -> NDArray[np.float64]:
+def waves(rec: Reconstruction, measured: Observations, sites: int = WAVES) -> Array:
     """(n, k) the same with splines along the readout, through so many values."""
     return np.hstack([warps(rec, measured), _splines_along(rec, measured, sites)])
 
 
 def errors_without(
     functions: Functions, rec: Reconstruction, fitted: Observations, measured: Observations, sigma_px: float
-) -> NDArray[np.float64]:
+) -> Array:
     """As `clipped_errors`, once a smooth warp of each photo, fitted to other measurements, is taken out.
 
     What it takes away is what the model left, whatever it is: lens, focus, motion. What stays is noise, and matches
@@ -96,7 +96,7 @@ def errors_without(
     return np.asarray(np.minimum(square, 2 * CLIP**2) / 2)
 
 
-def _rotated(rec: Reconstruction, measured: Observations) -> NDArray[np.float64]:
+def _rotated(rec: Reconstruction, measured: Observations) -> Array:
     """(n, 2, 3) pixels a radian that each measurement moves by if its line rotates about the camera's axes.
 
     Without the lens: what is asked is whether two halves show the same.
@@ -108,9 +108,7 @@ def _rotated(rec: Reconstruction, measured: Observations) -> NDArray[np.float64]
     return np.stack([across, np.stack([fy * (1 + y * y), -fy * x * y, -fy * x], axis=1)], axis=1)
 
 
-def _curves(
-    pixels: NDArray[np.float64], A: NDArray[np.float64], noise: NDArray[np.float64], smooth: int
-) -> NDArray[np.float64]:
+def _curves(pixels: Array, A: Array, noise: Array, smooth: int) -> Array:
     """Coefficients of the columns of A (n, 2, k) behind the first `smooth`, which are free; the rest has a prior."""
     A, rest = A.reshape(-1, A.shape[2]), pixels.ravel()
     prior = np.diag(np.r_[np.zeros(smooth), np.full(A.shape[1] - smooth, _ROTATED**-2.0)])

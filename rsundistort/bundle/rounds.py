@@ -6,17 +6,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..model import Reconstruction
+from ..model.array_types import Array, Index, Mask
 from ..model.reprojection import reprojection_residuals
-from .at_lens import least_distance
 from .bundle_options import BundleOptions, BundleResult
 from .calibration_doubt import CalibrationDoubt
 from .common_motion import CommonMotion
 from .intrinsics import pixels_of
-from .jackknife import Inflation, Partition, inflated, inflation
+from .jackknife import Inflation, inflated, inflation
 from .layout import Layout
 from .normal_equations import NormalEquations
 from .path_prior import (
@@ -32,7 +31,7 @@ from .path_prior import (
 from .prior_sigmas import Common, estimated, field_prior_sigma, path_prior_sigmas, settled, starting_sigmas
 from .problem import BundleProblem
 from .solver import minimize
-from .triangulate import retriangulated
+from .triangulate import least_distance, retriangulated
 
 __all__ = ["Rounds"]
 
@@ -55,7 +54,7 @@ def _noise_px(reconstruction: Reconstruction, shutter_model: str, floor: float) 
     return max(sigma / shrink, floor)
 
 
-def _believed(reconstruction: Reconstruction, options: BundleOptions, sigma: float) -> NDArray[np.bool_]:
+def _believed(reconstruction: Reconstruction, options: BundleOptions, sigma: float) -> Mask:
     """(o,) measurements that lie as near to their prediction as their noise allows, and not at the lens."""
     rec, obs = reconstruction, reconstruction.observations
     res, believed = reprojection_residuals(rec)
@@ -78,9 +77,7 @@ def _check_solvable(reconstruction: Reconstruction, shutter_model: str, path: Fr
         raise InputError("all photos are taken from one place: without parallax there is no scene to solve for")
 
 
-def _sigma_intrinsics(
-    current: Reconstruction, names: Sequence[str], covariance: NDArray[np.float64]
-) -> tuple[dict[str, float], ...]:
+def _sigma_intrinsics(current: Reconstruction, names: Sequence[str], covariance: Array) -> tuple[dict[str, float], ...]:
     """Standard deviations of each camera's refined intrinsics, in pixels or as coefficients."""
     sigmas = np.sqrt(np.diagonal(covariance)).reshape(len(current.cameras), -1)
     return tuple(
@@ -138,8 +135,8 @@ class Rounds:
         self._heavy_tails = self._had_heavy_tails = start is not None and start.noise is not None
         self._damping = options.initial_damping
         self._iterations = 0
-        self._means: NDArray[np.float64] | None = None
-        self._partitions: tuple[Partition, ...] = ()
+        self._means: Array | None = None
+        self._partitions: tuple[Index, ...] = ()
 
     def solve(self, cost_tolerance: float, is_judged: bool = False) -> None:
         """Solve once. One that is judged says how uncertain it is by its residuals, if the options ask for that."""
@@ -275,7 +272,9 @@ class Rounds:
         current, options, layout, state = self._current, self._options, self._layout, self._solved.state
         res, valid = reprojection_residuals(current)
         weighed, sigmas = self._weighed_noise, self._sigmas
-        by = self._inflation.over(weighed)
+        # the noise that weighs the measurements is larger than independent noise already
+        found = self._inflation
+        by = found._replace(photos=found.photos / weighed, cameras=found.cameras / weighed)
         covariances, of_intrinsics = inflated(self._marginals, by, len(current.cameras))
         covariances, of_intrinsics = covariances + self._doubt.of_photos, of_intrinsics + self._doubt.of_cameras
         path = None

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+
+from ..model.array_types import Array
 
 __all__ = ["LinearSystem", "MinimizeResult", "Problem", "minimize"]
 
@@ -51,7 +52,7 @@ class MinimizeResult:
 
     state: Any
     stop_reason: str
-    cost_history: NDArray[np.float64]
+    cost_history: Array
     num_iterations: int
     damping: float
 

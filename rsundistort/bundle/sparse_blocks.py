@@ -7,18 +7,15 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .._kernels import sparse_blocks as kernels
+from ..model.array_types import Array, Index, Mask
 from .structure import BlockPattern
 
 __all__ = ["BlockFactor", "Chain", "SparseBlocks"]
 
 # Parts of the inverse's sums that threads share: a number of its own, since it decides the rounding.
 _PARTS = 8
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 class Chain(NamedTuple):
@@ -63,7 +60,7 @@ class SparseBlocks:
     """
 
     pattern: BlockPattern
-    free: NDArray[np.bool_]
+    free: Mask
     rank: Index
     begin: Index
     filled: BlockPattern
@@ -73,7 +70,7 @@ class SparseBlocks:
     start: Index
 
     @classmethod
-    def of(cls, pattern: BlockPattern, free: NDArray[np.bool_], chain: Chain | None = None) -> SparseBlocks:
+    def of(cls, pattern: BlockPattern, free: Mask, chain: Chain | None = None) -> SparseBlocks:
         """The order of minimum degree (Tinney and Walker, "Direct solutions of sparse network equations", 1967)."""
         m, nb = free.shape
         begin = np.array([0, nb] if chain is None else [0, nb - chain.num, nb])
@@ -113,8 +110,7 @@ class SparseBlocks:
         """(m, nb) where each of the photos' unknowns stands in the order of the elimination."""
         part = np.repeat(np.arange(len(self.begin) - 1), np.diff(self.begin))
         own = np.arange(self.begin[-1]) - self.begin[part]
-        unknowns: Index = self.position[self.rank[:, part]] + own
-        return unknowns
+        return self.position[self.rank[:, part]] + own
 
     @property
     def _layout(self) -> tuple[Index, Index, Index, Index, Index]:
@@ -180,11 +176,6 @@ class BlockFactor:
         kernels.solve_blocks(*self.shape._layout, self.shape.position, self.data, B)
         B *= scale
 
-    def inverse_blocks(self) -> Array:
-        """Diagonal blocks (m, nb, nb) of the inverse; 0 where held."""
-        every = np.arange(len(self.scale))
-        return self.inverse_blocks_of(every, every)
-
     @cached_property
     def _inverse(self) -> Array:
         """The inverse where the factor has blocks, of the scaled matrix."""
@@ -192,7 +183,7 @@ class BlockFactor:
         kernels.invert_blocks(*self.shape._layout, _PARTS, inverse)
         return inverse
 
-    def inverse_blocks_of(self, first_row: Index, second_row: Index) -> Array:
+    def inverse_blocks(self, first_row: Index, second_row: Index) -> Array:
         """Blocks (q, nb, nb) of the inverse, of pairs of photos that the pattern joins; 0 where held.
 
         Of unknowns in a chain, pairs that it joins.

@@ -6,13 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse
-from numpy.typing import NDArray
 
 from .._kernels import schur
+from ..model.array_types import Index
 
 __all__ = ["BlockPattern", "Structure"]
-
-Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -1,28 +1,32 @@
-"""New triangulation of points where no photo can see them, or at infinity."""
+"""New triangulation of points where no photo can see them, or at infinity; how near to a camera a point may be."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model import Reconstruction
+from ..model.array_types import Array, Index, Mask
 from ..model.projection import clock_of, unproject_points
 from ..model.reprojection import reprojection_residuals
 
-__all__ = ["retriangulated", "triangulated"]
+__all__ = ["least_distance", "retriangulated", "triangulated"]
 
 # Rays that do not meet ahead of the cameras are taken to meet this many sizes of the scene away: so near that they pull
 # (at 50 sizes the way back takes five times as many steps).
 _FAR = 3.0
 # Points beyond so many sizes of the scene are as good as at infinity: no step brings them back.
 _LOST = 1e4
+# How near to a camera a point of the scene may be, as a share of the extent of the cameras' places, or of the distances
+# at which they see the scene, whichever is smaller. A match between photos that are taken from one place ends nearer,
+# since noise drives a depth that nothing determines.
+_AT_LENS = 1e-2
+# Share of the measurements whose distances count: a scene may be far for the most part.
+_NEAREST = 0.1
 
 
-def _world_rays(
-    reconstruction: Reconstruction, some: NDArray[np.int64], shutter_model: str
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+def _world_rays(reconstruction: Reconstruction, some: Index, shutter_model: str) -> tuple[Array, Array, Mask]:
     """Centres and unit directions (k, 3) along which some observations were seen, each at the moment of its line."""
     obs = reconstruction.observations
     centers, rays = np.empty((len(some), 3)), np.empty((len(some), 3))
@@ -39,8 +43,8 @@ def _world_rays(
 
 
 def _meeting_points(
-    reconstruction: Reconstruction, lost: NDArray[np.int64], shutter_model: str, size: float
-) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.float64]]:
+    reconstruction: Reconstruction, lost: Index, shutter_model: str, size: float
+) -> tuple[Array, Mask, Array]:
     """Where the rays of some points (k,) come nearest to each other (k, 3), and whether that is ahead of all cameras.
 
     With places (k, 3) far along the rays, at some sizes of the scene.
@@ -108,3 +112,13 @@ def retriangulated(reconstruction: Reconstruction, shutter_model: str, from_afar
     points = points.copy()
     points[lost[moved]] = found[moved]
     return replace(reconstruction, points_w=points)
+
+
+def least_distance(reconstruction: Reconstruction) -> float:
+    """Distance from a camera, world units, within which nothing is a point of the scene; 0 where nothing says so."""
+    rec, obs = reconstruction, reconstruction.observations
+    if not len(obs):
+        return 0.0
+    away = np.linalg.norm(rec.points_w[obs.point_idx] - rec.center_w[obs.frame_idx], axis=1)
+    extent = float(np.linalg.norm(np.ptp(rec.center_w, axis=0)))
+    return _AT_LENS * min(extent, float(np.quantile(away, _NEAREST)))

@@ -11,14 +11,15 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
 
 from ..errors import InputError
+from .array_types import Array
 from .checks import check_finite, check_whole, frozen
 
 __all__ = ["BEND_GROUPS", "Bend", "bend_functions", "bend_pieces", "bend_table", "parts_of", "splines_at"]
 
-Array = NDArray[np.float64]
 
 #: Groups of functions, by what they add to those before: a rate that changes steadily, its change changing, and then
 #: splines of ever more intervals. Each with its number of intervals and how many functions there are up to it. The last
@@ -40,8 +41,6 @@ def bend_pieces(num_sites: int) -> Array:
 
     Times the values at n sites.
     """
-    from scipy.interpolate import CubicSpline
-
     spline = CubicSpline(np.arange(num_sites), np.eye(num_sites))
     return frozen(spline.c[::-1].transpose(1, 0, 2).reshape(-1, num_sites))
 
@@ -68,8 +67,6 @@ def bend_functions(groups: int) -> tuple[Array, tuple[int, ...]]:
     group : (k,) tuple
         Index of the group of each.
     """
-    if not 1 <= groups <= len(BEND_GROUPS):
-        raise InputError(f"{groups} groups of bends, expected 1 to {len(BEND_GROUPS)}")
     chosen = list(BEND_GROUPS.values())[:groups]
     num = chosen[-1][0] + 1
     gram, place = _gram(num), np.linspace(-1, 1, num)
@@ -118,8 +115,6 @@ def splines_at(num_sites: int, place: Array) -> Array:
 
 def parts_of(clock: Array, readings: Array, sites: int) -> tuple[Array, Array, Array]:
     """Parts of readings (k, c) at ascending times of the clock (k,): bends (sites, c), constants and rates (c,)."""
-    from scipy.interpolate import CubicSpline
-
     values = CubicSpline(clock, readings)(np.linspace(clock[0], clock[-1], sites))
     place, gram = np.linspace(-1, 1, sites), _gram(sites)
     ones = np.ones(sites)
@@ -203,11 +198,6 @@ class Bend:
         """(n, 6) rotation and position."""
         assert self.position is not None
         return frozen(np.hstack([self.rotation, self.position]))
-
-    @cached_property
-    def table(self) -> Array:
-        """(4 (n - 1), 6) as the kernels take it, behind a row of the steady motion."""
-        return frozen(bend_pieces(len(self.values)) @ self.values)
 
     @property
     def moves(self) -> bool:

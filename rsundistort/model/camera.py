@@ -7,9 +7,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
+from .array_types import Array
 from .checks import check_finite, check_numbers, check_one_of, check_whole, frozen
 from .field import folds, spline_coefficients
 
@@ -65,7 +65,7 @@ def _first_positive(*polynomials: np.polynomial.Polynomial) -> float:
     return float(real.min()) if real.size else np.inf
 
 
-def _fold_radius_squared(lens: str, dist: NDArray[np.float64]) -> float:
+def _fold_radius_squared(lens: str, dist: Array) -> float:
     """Squared undistorted radius up to which the radial part of the lens model is monotonic."""
     k1, k2, _, _, k3, k4, k5, k6 = dist[:8]
     if lens == "fisheye":
@@ -109,11 +109,11 @@ class Camera:
 
     width: int
     height: int
-    K: NDArray[np.float64]
-    dist: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    K: Array
+    dist: Array = field(default_factory=lambda: np.zeros(0))
     readout: str = "top-to-bottom"
     lens: str = "pinhole"
-    field: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, 2)))
+    field: Array = field(default_factory=lambda: np.zeros((0, 0, 2)))
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
@@ -135,7 +135,7 @@ class Camera:
         object.__setattr__(self, "dist", frozen(dist))
         object.__setattr__(self, "field", frozen(self._checked_field()))
 
-    def _checked_field(self) -> NDArray[np.float64]:
+    def _checked_field(self) -> Array:
         """The field, refused if it has not enough values, or folds the photo."""
         if not check_numbers(self.field, "field").size:
             return np.zeros((0, 0, 2))
@@ -219,7 +219,7 @@ class Camera:
         return self.lens == "pinhole" and not self.dist.any() and not self.field.any()
 
     @cached_property
-    def spline(self) -> NDArray[np.float64]:
+    def spline(self) -> Array:
         """(rows, cols, 2) coefficients of the field's B-splines, as the kernels take them."""
         return spline_coefficients(self.field)
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+from .array_types import Array, Index
 
 __all__ = [
     "check_annotated",
@@ -74,7 +75,7 @@ def _short(value: Any) -> str:
     return text if len(text) < 100 else f"{text[:97]}..."
 
 
-def check_finite(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> NDArray[np.float64]:
+def check_finite(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> Array:
     """The value as a float64 array of `shape` without NaN and infinity."""
     array = check_array(value, shape, name)
     if not np.isfinite(array).all():
@@ -181,7 +182,7 @@ def check_one_of(value: Any, words: Iterable[str], name: str) -> None:
         raise InputError(f"{name}={_short(value)}, expected one of {', '.join(words)}")
 
 
-def check_index(value: ArrayLike, length: int, upper: int, name: str) -> NDArray[np.int64]:
+def check_index(value: ArrayLike, length: int, upper: int, name: str) -> Index:
     """Indices of shape (length,) in [0, upper)."""
     array = check_array(value, (length,), name, np.int64)
     if not np.array_equal(array, np.asarray(value)):
@@ -205,7 +206,7 @@ def check_photo_name(value: Any) -> str:
     return str(value)
 
 
-def check_rotations(value: ArrayLike, length: int, name: str) -> NDArray[np.float64]:
+def check_rotations(value: ArrayLike, length: int, name: str) -> Array:
     """Rotation matrices of shape (length, 3, 3), orthonormal to 1e-6 and of determinant +1."""
     array = check_finite(value, (length, 3, 3), name)
     if length:
@@ -217,7 +218,7 @@ def check_rotations(value: ArrayLike, length: int, name: str) -> NDArray[np.floa
     return array
 
 
-def check_rotation(value: ArrayLike, name: str) -> NDArray[np.float64]:
+def check_rotation(value: ArrayLike, name: str) -> Array:
     """One rotation matrix (3, 3)."""
     return np.asarray(check_rotations(check_finite(value, (3, 3), name)[None], 1, name)[0])
 

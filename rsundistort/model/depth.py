@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+from .array_types import Array
 from .checks import check_array, check_finite, check_number, check_numbers, check_size, frozen
 
 __all__ = ["AtInfinity", "Depth", "DepthMap", "Plane", "check_depth"]
@@ -36,7 +37,7 @@ class Plane:
     array([0.025])
     """
 
-    normal: NDArray[np.float64]
+    normal: Array
     distance: float
 
     def __post_init__(self) -> None:
@@ -48,7 +49,7 @@ class Plane:
             raise InputError(f"the plane's distance is {self.distance}, expected a positive number")
         object.__setattr__(self, "normal", frozen(normal / length))
 
-    def inverse_depth(self, rays: ArrayLike) -> NDArray[np.float64]:
+    def inverse_depth(self, rays: ArrayLike) -> Array:
         """1 / s of the points s * ray where rays (..., 3) of the camera frame meet the plane; 0 where they do not."""
         directions = check_numbers(rays, "rays")
         if directions.shape[-1:] != (3,):

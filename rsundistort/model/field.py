@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._kernels import field as kernels
+from .array_types import Array
 
 if TYPE_CHECKING:
     from .camera import Camera
@@ -30,7 +31,6 @@ __all__ = [
     "steepest",
 ]
 
-Array = NDArray[np.float64]
 
 # Places across and down at which slopes are looked at.
 _LOOKED_AT = 33

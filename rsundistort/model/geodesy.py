@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from .array_types import Array
 
 __all__ = ["ecef_from_geodetic", "enu_axes", "enu_from_geodetic"]
 
@@ -12,7 +14,7 @@ _A_M, _F = 6378137.0, 1 / 298.257223563
 _E2 = _F * (2 - _F)
 
 
-def ecef_from_geodetic(geodetic: ArrayLike) -> NDArray[np.float64]:
+def ecef_from_geodetic(geodetic: ArrayLike) -> Array:
     """Metres from the centre of the Earth (..., 3) of latitude and longitude in degrees and height in metres (..., 3).
 
     The height is above the ellipsoid; one above sea level shifts all places of a survey alike, and scales them by a
@@ -25,14 +27,14 @@ def ecef_from_geodetic(geodetic: ArrayLike) -> NDArray[np.float64]:
     return np.stack([out * np.cos(lam), out * np.sin(lam), (normal * (1 - _E2) + height) * np.sin(phi)], axis=-1)
 
 
-def enu_axes(latitude_deg: float, longitude_deg: float) -> NDArray[np.float64]:
+def enu_axes(latitude_deg: float, longitude_deg: float) -> Array:
     """Unit vectors east, north and up at a place, as rows (3, 3) in the axes of `ecef_from_geodetic`."""
     phi, lam = np.deg2rad([latitude_deg, longitude_deg])
     (sp, cp), (sl, cl) = (np.sin(phi), np.cos(phi)), (np.sin(lam), np.cos(lam))
     return np.array([[-sl, cl, 0.0], [-sp * cl, -sp * sl, cp], [cp * cl, cp * sl, sp]])
 
 
-def enu_from_geodetic(geodetic: ArrayLike, origin: ArrayLike) -> NDArray[np.float64]:
+def enu_from_geodetic(geodetic: ArrayLike, origin: ArrayLike) -> Array:
     """Metres east, north and up (..., 3) of an origin, both as `ecef_from_geodetic` takes them."""
     origin = np.asarray(origin, np.float64)
     offset = ecef_from_geodetic(geodetic) - ecef_from_geodetic(origin)

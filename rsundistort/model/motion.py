@@ -6,9 +6,11 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
+from .array_types import Array
 from .bend import Bend, bend_table, parts_of
 from .camera import check_readout
 from .checks import check_finite, check_kind, check_number, check_numbers, check_one_of, check_rotation, frozen
@@ -31,9 +33,7 @@ def check_shutter_model(name: str) -> int:
     return SHUTTER_MODELS[name]
 
 
-def steady_parts(
-    clock: NDArray[np.float64], moved: NDArray[np.float64], sites: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def steady_parts(clock: Array, moved: Array, sites: int) -> tuple[Array, Array, Array, Array]:
     """`RowMotion.of` for k frames at once.
 
     Parameters
@@ -54,8 +54,6 @@ def steady_parts(
     rate : (k, 2, 3) array
         Phi and velocity.
     """
-    from scipy.spatial.transform import Rotation
-
     k, n = moved.shape[:2]
     readings = Rotation.from_rotvec(moved[..., :3].reshape(-1, 3)).as_matrix().reshape(k, n, 3, 3)
     correction = readings[:, n // 2]
@@ -96,8 +94,8 @@ class RowMotion:
     (0.9, 0.02)
     """
 
-    phi: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    phi: Array = field(default_factory=lambda: np.zeros(3))
+    velocity: Array = field(default_factory=lambda: np.zeros(3))
     bend: Bend | None = None
     frame: str | None = None
 
@@ -116,7 +114,7 @@ class RowMotion:
     @classmethod
     def of(
         cls, clock: ArrayLike, rotation: ArrayLike, position: ArrayLike | None = None, sites: int = 65
-    ) -> tuple[RowMotion, NDArray[np.float64], NDArray[np.float64]]:
+    ) -> tuple[RowMotion, Array, Array]:
         """The motion through given poses, and the pose that it belongs to.
 
         Parameters
@@ -137,8 +135,6 @@ class RowMotion:
         way : (3,) array
             and the centre `center_w + way`.
         """
-        from scipy.spatial.transform import Rotation
-
         readings = Rotation.from_rotvec(np.array(check_finite(rotation, (None, 3), "rotation")))
         correction = readings[len(readings) // 2]
         # the constant part goes into the pose; rotations do not commute, so that a share of it is left each time
@@ -149,7 +145,7 @@ class RowMotion:
                 break
         return cls(rate[0], rate[1], bend), correction.as_matrix(), constant[1]
 
-    def steady(self, start: float, end: float) -> tuple[RowMotion, NDArray[np.float64], NDArray[np.float64]]:
+    def steady(self, start: float, end: float) -> tuple[RowMotion, Array, Array]:
         """The nearest steady motion while the clock runs from start to end, and the pose it belongs to.
 
         As `of` returns them, without a bend: of least mean square in rotation and in position.
@@ -160,7 +156,7 @@ class RowMotion:
         near, correction, way = RowMotion.of(clock, *self.at(clock), sites=len(self.bend.values))
         return replace(near, bend=None, frame=self.frame), correction, way
 
-    def in_camera(self, R_cw: NDArray[np.float64]) -> RowMotion:
+    def in_camera(self, R_cw: Array) -> RowMotion:
         """The motion with its velocity in the camera frame at the reference row, as projection takes it."""
         self._check_frame("world")
         R = check_rotation(R_cw, "R_cw")
@@ -179,7 +175,7 @@ class RowMotion:
             raise InputError(f"the motion is in the {self.frame} frame, expected the {frame} frame{mend}")
 
     @property
-    def velocity_in_camera(self) -> NDArray[np.float64]:
+    def velocity_in_camera(self) -> Array:
         """The velocity for the kernels, of a motion that is not declared to be in the world."""
         self._check_frame("camera")
         return self.velocity.copy()
@@ -190,7 +186,7 @@ class RowMotion:
         return bool(self.velocity.any()) or (self.bend is not None and self.bend.moves)
 
     @cached_property
-    def kernel_phi(self) -> NDArray[np.float64]:
+    def kernel_phi(self) -> Array:
         """Phi for the kernels, (3,), or the table of a motion with a bend.
 
         Arrays are writable, as the adjustment's are: kernels are compiled for each kind of array that they meet.
@@ -199,7 +195,7 @@ class RowMotion:
             return self.phi.copy()
         return bend_table(self.phi, self.bend.start, self.bend.end, self.bend.values)
 
-    def at(self, clock: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def at(self, clock: ArrayLike) -> tuple[Array, Array]:
         """Rotation vector and position (..., 3) relative to the pose at the clock r (...), for exact models."""
         r = check_numbers(clock, "clock")
         with np.errstate(invalid="ignore"):  # at no moment: NaN
@@ -209,9 +205,7 @@ class RowMotion:
             rotation, way = rotation + bent, way + moved
         return rotation, way
 
-    def pose_at(
-        self, clock: float, R_cw: NDArray[np.float64], center_w: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def pose_at(self, clock: float, R_cw: Array, center_w: Array) -> tuple[Array, Array]:
         """Pose when the clock shows r, exact for the rotation and constant-motion models (paper Eq. 2).
 
         Parameters
@@ -226,8 +220,6 @@ class RowMotion:
         R_cw, center_w : (3, 3), (3,) array
             Exp(r phi) R_cw, and the centre moved by r velocity, with what the bend adds.
         """
-        from scipy.spatial.transform import Rotation
-
         self._check_frame("world")
         rotation, way = self.at(check_number(clock, "clock"))
         R, center = check_rotation(R_cw, "R_cw"), check_finite(center_w, (3,), "center_w")

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+from .array_types import Array, Index
 from .camera import READOUTS, Camera
 from .checks import check_finite
 from .path import CameraPath
@@ -38,7 +39,7 @@ __all__ = [
 ]
 
 #: Of each EXIF orientation, the (2, 2) matrix that takes x right, y down of the stored frame to those of the shown one.
-MATRICES: dict[int, NDArray[np.int64]] = {
+MATRICES: dict[int, Index] = {
     1: np.array([[1, 0], [0, 1]]),
     2: np.array([[-1, 0], [0, 1]]),
     3: np.array([[-1, 0], [0, -1]]),
@@ -78,7 +79,7 @@ def orient_pixels(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
     return np.ascontiguousarray(pixels[:: int(down), :: int(across)])
 
 
-def orient_points(xy: ArrayLike, width: int, height: int, orientation: int) -> NDArray[np.float64]:
+def orient_points(xy: ArrayLike, width: int, height: int, orientation: int) -> Array:
     """(n, 2) pixels of a stored photo of that size where the orientation shows them; integer centres in both."""
     xy = check_finite(xy, (None, 2), "xy")
     matrix = MATRICES[orientation]
@@ -108,7 +109,7 @@ def orient_camera(camera: Camera, orientation: int) -> Camera:
     along = int(np.flatnonzero(clock)[0])
     readout = next(name for name, way in READOUTS.items() if way == (along, float(clock[along])))
     dist = np.array(camera.dist)
-    if len(dist) >= 4 and getattr(camera, "lens", "pinhole") == "pinhole":
+    if len(dist) >= 4 and camera.lens == "pinhole":
         # decentering shifts by 2 x (p . x) + p r^2 with p = (p2, p1): p rotates with the axes, and so does a thin prism
         dist[[3, 2]] = matrix @ dist[[3, 2]]
         if len(dist) == 12:
@@ -118,7 +119,7 @@ def orient_camera(camera: Camera, orientation: int) -> Camera:
     )
 
 
-def _oriented_field(camera: Camera, matrix: NDArray[np.int64]) -> NDArray[np.float64]:
+def _oriented_field(camera: Camera, matrix: Index) -> Array:
     """The field (rows, cols, 2) of a camera whose axes a signed permutation rotates."""
     field = camera.field @ matrix.T
     if matrix[0, 0] == 0:

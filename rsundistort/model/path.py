@@ -5,16 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
+from .array_types import Array, Index
 from .checks import check_finite, check_index, check_rotations, frozen
 
 __all__ = ["CameraPath", "cross_matrices", "inverse_left_jacobians"]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # Sites of the bend that a frame gets from the path: cubics on both sides of the principal row.
 _SITES = 17
@@ -83,7 +82,7 @@ class CameraPath:
     velocity: Array
     rate_change: Array
     acceleration: Array
-    part: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    part: Index = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __post_init__(self) -> None:
         m = len(self.time_s)
@@ -109,17 +108,12 @@ class CameraPath:
             acceleration=scale * self.acceleration @ R.T,
         )
 
-    def near(self, moment: int, offset_s: ArrayLike) -> tuple[Array, Array]:
-        """Rotation vectors and positions (n, 3) against a moment's pose, so many seconds (n,) after it.
+    def around(self, moments: Index, offset: Array) -> tuple[Array, Array]:
+        """Rotation vectors and positions (k, n, 3) against poses at moments (k,), so many seconds (n,) after each.
 
         `Exp(rotation) R_cw` and `center_w + position`. Up to the neighbouring moments these lie on the path; beyond
         them, and where there is none, they go on as the path does there.
         """
-        rotation, way = self._around(np.array([moment]), np.atleast_1d(np.asarray(offset_s, np.float64)))
-        return rotation[0], way[0]
-
-    def _around(self, moments: Index, offset: Array) -> tuple[Array, Array]:
-        """`near` for k moments: (k, n, 3)."""
         rotation, way = (
             offset[:, None] * slope[moments, None] + 0.5 * offset[:, None] ** 2 * bend[moments, None]
             for slope, bend in ((self.rate, self.rate_change), (self.velocity, self.acceleration))
@@ -133,7 +127,7 @@ class CameraPath:
         return rotation, way
 
     def _towards(self, moments: Index, others: Index, offset: Array) -> tuple[Array, Array]:
-        """`_around` on the side of one neighbour of each moment."""
+        """`around` on the side of one neighbour of each moment."""
         dt = self.time_s[others] - self.time_s[moments]
         xi = Rotation.from_matrix(self.R_cw[others] @ self.R_cw[moments].transpose(0, 2, 1)).as_rotvec()
         J = inverse_left_jacobians(xi)
@@ -181,7 +175,7 @@ class CameraPath:
         """
         chosen = np.asarray(moments, np.int64)
         clock = np.linspace(*clock_range, _SITES)
-        rotation, way = self._around(chosen, clock * clock_s)
+        rotation, way = self.around(chosen, clock * clock_s)
         phi, velocity = clock_s * self.rate[chosen], clock_s * self.velocity[chosen]
         bend = np.concatenate(
             [rotation - clock[:, None] * phi[:, None], way - clock[:, None] * velocity[:, None]], axis=2

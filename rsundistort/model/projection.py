@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from .._kernels import projection as kernels
+from .array_types import Array, Mask
 from .camera import Camera
 from .checks import check_array, check_kind
 from .field import field_slope, lens_pixels, raw_pixels
@@ -31,9 +32,9 @@ class ProjectionJacobians:
     In the camera-frame point, in phi, and in the camera-frame velocity (zero for models without translation).
     """
 
-    point: NDArray[np.float64]
-    phi: NDArray[np.float64]
-    velocity: NDArray[np.float64]
+    point: Array
+    phi: Array
+    velocity: Array
 
 
 def motion_of(camera: Camera, motion: RowMotion | None) -> RowMotion:
@@ -47,7 +48,7 @@ def motion_of(camera: Camera, motion: RowMotion | None) -> RowMotion:
 
 def project_points(
     points_c: ArrayLike, camera: Camera, motion: RowMotion | None = None, shutter_model: str = "rotation"
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+) -> tuple[Array, Mask]:
     """Pixels where a rolling-shutter photo shows points of the camera frame.
 
     Parameters
@@ -87,7 +88,7 @@ def project_points(
 
 def project_points_with_jacobians(
     points_c: ArrayLike, camera: Camera, motion: RowMotion | None = None, shutter_model: str = "rotation"
-) -> tuple[NDArray[np.float64], NDArray[np.bool_], ProjectionJacobians]:
+) -> tuple[Array, Mask, ProjectionJacobians]:
     """As `project_points`, with the exact derivatives of the pixels (the implicit row's included)."""
     points = np.ascontiguousarray(check_array(points_c, (None, 3), "points_c"))
     motion = motion_of(camera, motion)
@@ -108,24 +109,18 @@ def project_points_with_jacobians(
     return xy, valid, ProjectionJacobians(J_point, J_phi, J_velocity)
 
 
-def _velocity(motion: RowMotion, shutter_model: str) -> NDArray[np.float64]:
+def _velocity(motion: RowMotion, shutter_model: str) -> Array:
     """In the camera's frame; models that know no velocity take any."""
     return motion.velocity_in_camera if shutter_model == "constant-motion" else motion.velocity.copy()
 
 
-def clock_of(camera: Camera, xy_raw: NDArray[np.float64]) -> NDArray[np.float64]:
+def clock_of(camera: Camera, xy_raw: Array) -> Array:
     """(n,) clock r at which a camera read raw pixels (n, 2); 0 at the line of the principal point."""
     intr, _, axis, sign = camera.kernel_args
     return np.asarray(sign * (lens_pixels(camera, xy_raw)[:, axis] - intr[2 + axis]) / intr[axis])
 
 
-def at_depth(
-    ideal: NDArray[np.float64],
-    xy_raw: NDArray[np.float64],
-    camera: Camera,
-    motion: RowMotion,
-    depth: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def at_depth(ideal: Array, xy_raw: Array, camera: Camera, motion: RowMotion, depth: Array) -> Array:
     """Ideal coordinates (n, 2) under the constant-motion model, of those that `unproject_points` found at infinity.
 
     Parameters
@@ -144,7 +139,7 @@ def at_depth(
 
 def unproject_points(
     xy_raw: ArrayLike, camera: Camera, motion: RowMotion | None = None, shutter_model: str = "rotation"
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+) -> tuple[Array, Mask]:
     """Ideal normalised coordinates (x', y') at the reference row of pixels of a rolling-shutter photo.
 
     Parameters

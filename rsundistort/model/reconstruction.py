@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from .array_types import Array, Index, Mask
 from .bend import Bend
 from .camera import Camera
 from .checks import check_fields, check_finite, check_index, check_numbers, check_rotations, frozen
@@ -17,8 +18,11 @@ from .motion import RowMotion, check_shutter_model
 
 __all__ = ["Observations", "Reconstruction"]
 
+# Fields of a reconstruction that have a row for each photo.
+_OF_PHOTOS = ("camera_idx", "R_cw", "center_w", "phi", "velocity", "variation", "bend", "bend_clock")
 
-def _or(value: Any, default: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+
+def _or(value: Any, default: Array, name: str) -> Array:
     """The value, or what stands for one that was left out."""
     array = check_numbers(value, name)
     return array if array.size else default
@@ -38,10 +42,10 @@ class Observations:
         Standard deviation of each measurement relative to the best ones; 1 when left out.
     """
 
-    frame_idx: NDArray[np.int64]
-    point_idx: NDArray[np.int64]
-    xy_raw: NDArray[np.float64]
-    sigma: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    frame_idx: Index
+    point_idx: Index
+    xy_raw: Array
+    sigma: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         xy = check_finite(self.xy_raw, (None, 2), "xy_raw")
@@ -57,7 +61,7 @@ class Observations:
     def __len__(self) -> int:
         return len(self.xy_raw)
 
-    def by_photo(self, num_images: int) -> list[NDArray[np.int64]]:
+    def by_photo(self, num_images: int) -> list[Index]:
         """Indices of the measurements of each photo."""
         order = np.argsort(self.frame_idx, kind="stable")
         return np.split(order, np.searchsorted(self.frame_idx[order], np.arange(1, num_images)))
@@ -101,17 +105,17 @@ class Reconstruction:
 
     cameras: Sequence[Camera]
     image_names: Sequence[str]
-    camera_idx: NDArray[np.int64]
-    R_cw: NDArray[np.float64]
-    center_w: NDArray[np.float64]
-    points_w: NDArray[np.float64]
+    camera_idx: Index
+    R_cw: Array
+    center_w: Array
+    points_w: Array
     observations: Observations
-    phi: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    phi: Array = field(default_factory=lambda: np.zeros(0))
+    velocity: Array = field(default_factory=lambda: np.zeros(0))
     shutter_model: str = "global"
-    variation: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    bend: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    bend_clock: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    variation: Array = field(default_factory=lambda: np.zeros(0))
+    bend: Array = field(default_factory=lambda: np.zeros(0))
+    bend_clock: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -179,13 +183,11 @@ class Reconstruction:
 
     def with_motions(self, motions: Sequence[RowMotion]) -> Reconstruction:
         """The reconstruction with other motions of its photos, bends of as many readings or none."""
-        bends = [each.bend for each in motions if each.bend is not None]
-        values, clock = np.zeros((len(motions), len(bends[0].values) if bends else 0, 6)), np.zeros((len(motions), 2))
-        for i, bend in enumerate(each.bend for each in motions):
-            # where there is none, any range of the clock will do
-            clock[i] = (-1.0, 1.0) if bend is None else (bend.start, bend.end)
-            if bend is not None:
-                values[i] = bend.values
+        bends = [each.bend for each in motions]
+        none = np.zeros((max((len(bend.values) for bend in bends if bend is not None), default=0), 6))
+        values = np.array([none if bend is None else bend.values for bend in bends]).reshape(len(bends), *none.shape)
+        # where there is none, any range of the clock will do
+        clock = np.array([(-1.0, 1.0) if bend is None else (bend.start, bend.end) for bend in bends]).reshape(-1, 2)
         return replace(
             self, phi=np.array([each.phi for each in motions]), velocity=np.array([each.velocity for each in motions]),
             bend=values, bend_clock=clock,
@@ -196,7 +198,7 @@ class Reconstruction:
         """Whether motions depart from steady ones."""
         return self.bend.shape[1] > 0
 
-    def frame_span(self) -> NDArray[np.float64]:
+    def frame_span(self) -> Array:
         """(m,) how far each photo's clock runs over its frame: converts phi into radians per frame."""
         return np.array([self.camera(i).frame_span for i in range(self.num_images)])
 
@@ -224,7 +226,7 @@ class Reconstruction:
         """
         return self.moved(self.R_cw[0], self.center_w[0], 1.0 / self.baseline)
 
-    def moved(self, R: NDArray[np.float64], origin: NDArray[np.float64], scale: float) -> Reconstruction:
+    def moved(self, R: Array, origin: Array, scale: float) -> Reconstruction:
         """The reconstruction in a world where x is scale R (x - origin)."""
         return replace(
             self,
@@ -235,7 +237,7 @@ class Reconstruction:
             bend=np.concatenate([self.bend[..., :3], scale * self.bend[..., 3:] @ R.T], axis=2),
         )
 
-    def track_lengths(self, keep_obs: NDArray[np.bool_]) -> NDArray[np.int64]:
+    def track_lengths(self, keep_obs: Mask) -> Index:
         """(n,) number of photos that see each point among some observations; a photo counts once."""
         obs = self.observations
         # np.unique by hashes takes many times as long
@@ -244,7 +246,7 @@ class Reconstruction:
         first[1:] = key[1:] != key[:-1]
         return np.bincount(key[first] // self.num_images, minlength=self.num_points)
 
-    def take_points(self, keep_point: NDArray[np.bool_]) -> Reconstruction:
+    def take_points(self, keep_point: Mask) -> Reconstruction:
         """The reconstruction with some points only, and all their observations."""
         obs = self.observations
         new_idx = np.cumsum(keep_point) - 1
@@ -252,7 +254,7 @@ class Reconstruction:
         kept = replace(kept, point_idx=new_idx[kept.point_idx])
         return replace(self, points_w=self.points_w[keep_point], observations=kept)
 
-    def with_points(self, keep_obs: NDArray[np.bool_], min_track: int = 2) -> Reconstruction:
+    def with_points(self, keep_obs: Mask, min_track: int = 2) -> Reconstruction:
         """The reconstruction with some observations only, without points left with under `min_track` photos."""
         alive = self.track_lengths(keep_obs) >= min_track
         return replace(self, observations=self.observations.select(keep_obs)).take_points(alive)
@@ -266,47 +268,28 @@ class Reconstruction:
                 return rec
             rec = rec.take_photos(keep)
 
+    def rows(self, of: Any) -> dict[str, Any]:
+        """The fields that have a row for each photo, with the rows that an index, a mask or a slice takes."""
+        return {name: getattr(self, name)[of] for name in _OF_PHOTOS}
+
     def with_photos(
-        self,
-        names: Sequence[str],
-        camera_idx: NDArray[np.int64],
-        R_cw: NDArray[np.float64],
-        center_w: NDArray[np.float64],
-        phi: NDArray[np.float64],
+        self, names: Sequence[str], camera_idx: Index, R_cw: Array, center_w: Array, phi: Array
     ) -> Reconstruction:
         """The reconstruction with more photos at its end, that rotate steadily and have no measurements yet."""
-        more = len(names)
+        given = {"camera_idx": camera_idx, "R_cw": R_cw, "center_w": center_w, "phi": phi}
+        rows: dict[str, Any] = {
+            name: np.concatenate([own, given.get(name, np.zeros((len(names), *own.shape[1:])))])
+            for name, own in self.rows(slice(None)).items()
+        }
+        return replace(self, image_names=[*self.image_names, *names], **rows)
 
-        def and_zeros(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            return np.concatenate([values, np.zeros((more, *values.shape[1:]))])
-
-        return replace(
-            self,
-            image_names=[*self.image_names, *names],
-            camera_idx=np.concatenate([self.camera_idx, camera_idx]),
-            R_cw=np.concatenate([self.R_cw, R_cw]),
-            center_w=np.concatenate([self.center_w, center_w]),
-            phi=np.concatenate([self.phi, phi]),
-            velocity=and_zeros(self.velocity),
-            variation=and_zeros(self.variation),
-            bend=and_zeros(self.bend),
-            bend_clock=and_zeros(self.bend_clock),
-        )
-
-    def take_photos(self, keep: NDArray[np.bool_]) -> Reconstruction:
+    def take_photos(self, keep: Mask) -> Reconstruction:
         """The reconstruction with some photos (m,) only, and the points that two of them show."""
         obs = self.observations.select(keep[self.observations.frame_idx])
         taken = replace(
             self,
             image_names=[self.image_names[i] for i in np.flatnonzero(keep).tolist()],
-            camera_idx=self.camera_idx[keep],
-            R_cw=self.R_cw[keep],
-            center_w=self.center_w[keep],
-            phi=self.phi[keep],
-            velocity=self.velocity[keep],
-            variation=self.variation[keep],
-            bend=self.bend[keep],
-            bend_clock=self.bend_clock[keep],
             observations=replace(obs, frame_idx=(np.cumsum(keep) - 1)[obs.frame_idx]),
+            **self.rows(keep),
         )
         return taken.with_points(np.ones(len(obs), bool))

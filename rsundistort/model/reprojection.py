@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._kernels import residuals
+from .array_types import Array, Index, Mask
 from .bend import bend_table
 from .camera import Camera
 from .field import lens_pixels
@@ -26,9 +27,7 @@ __all__ = [
 ]
 
 
-def camera_arrays(
-    camera_idx: NDArray[np.int64], cameras: Sequence[Camera], variation: NDArray[np.float64]
-) -> tuple[NDArray[Any], ...]:
+def camera_arrays(camera_idx: Index, cameras: Sequence[Camera], variation: Array) -> tuple[NDArray[Any], ...]:
     """Photo-to-camera indices, clock axes, signs, intrinsics and lenses as the kernels take them.
 
     Of cameras that vary from photo to photo (m, 3) each photo has its own.
@@ -45,9 +44,7 @@ def camera_arrays(
     return np.arange(len(camera_idx)), axes, signs, intrs, lenses
 
 
-def observed_lens_pixels(
-    cameras: Sequence[Camera], camera_of_obs: NDArray[np.int64], xy_raw: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def observed_lens_pixels(cameras: Sequence[Camera], camera_of_obs: Index, xy_raw: Array) -> Array:
     """Pixels (o, 2) of the lens models, those of the kernels, from measured ones."""
     if not any(camera.field.size for camera in cameras):
         return xy_raw
@@ -63,17 +60,13 @@ def plain_arrays(*arrays: NDArray[Any]) -> tuple[NDArray[Any], ...]:
     return tuple(np.require(each, requirements=("C", "W")) for each in arrays)
 
 
-def motion_tables(
-    phi: NDArray[np.float64], values: NDArray[np.float64], clock: NDArray[np.float64], R_cw: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def motion_tables(phi: Array, values: Array, clock: Array, R_cw: Array) -> Array:
     """Motions of photos with bends as the kernels take them: positions in the cameras' frames."""
     in_camera = np.concatenate([values[..., :3], np.einsum("mij,mnj->mni", R_cw, values[..., 3:])], axis=2)
     return bend_table(phi, clock[:, 0], clock[:, 1], in_camera)
 
 
-def reprojection_residuals(
-    reconstruction: Reconstruction, shutter_model: str | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def reprojection_residuals(reconstruction: Reconstruction, shutter_model: str | None = None) -> tuple[Array, Mask]:
     """Predicted minus measured pixels (o, 2) of the lens models, and which observations could be projected.
 
     Parameters
@@ -100,14 +93,14 @@ def reprojection_residuals(
     return res, valid
 
 
-def shutter_displacements(reconstruction: Reconstruction) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def shutter_displacements(reconstruction: Reconstruction) -> tuple[Array, Mask]:
     """By how much the motions displace the measurements, pixels (o, 2), and which of them could be projected."""
     moving, valid = reprojection_residuals(reconstruction)
     still, valid_still = reprojection_residuals(reconstruction, "global")
     return moving - still, valid & valid_still
 
 
-def typical_px(reconstruction: Reconstruction, displacements: NDArray[np.float64], valid: NDArray[np.bool_]) -> float:
+def typical_px(reconstruction: Reconstruction, displacements: Array, valid: Mask) -> float:
     """Mean over the photos of the median length of displacements (o, 2): few photos may be all that moved.
 
     Only measurements that are `valid` (o,) count.

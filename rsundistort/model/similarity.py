@@ -6,15 +6,14 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from .array_types import Array
 from .checks import frozen
 from .reconstruction import Reconstruction
 
 __all__ = ["FittedSimilarity", "Similarity", "fit_similarity", "similarity_of"]
 
-Array = NDArray[np.float64]
 
 # Triples of points that are tried; all of up to 13 points, at random of more.
 _TRIES = 300
@@ -57,13 +56,6 @@ class Similarity:
         """The composition of both, the other one applied first."""
         return Similarity(self.scale * other.scale, self.R @ other.R, self.of(other.shift[None])[0])
 
-    @property
-    def matrix(self) -> Array:
-        """(4, 4) homogeneous."""
-        value = np.eye(4)
-        value[:3, :3], value[:3, 3] = self.scale * self.R, self.shift
-        return value
-
 
 @dataclass(frozen=True)
 class FittedSimilarity:
@@ -99,8 +91,7 @@ class FittedSimilarity:
         """Variances (n, 3) that it gives to places (n, 3), as if its parts were independent."""
         arm = np.asarray(points, np.float64) - self.middle
         tilt = np.cross(np.eye(3), arm[:, None]) * self.sigma_rad[:, None]
-        value: Array = self.sigma_m**2 + (tilt**2).sum(1) + (self.sigma_scale * arm) ** 2
-        return value
+        return self.sigma_m**2 + (tilt**2).sum(1) + (self.sigma_scale * arm) ** 2
 
 
 def similarity_of(points: Array, targets: Array) -> Similarity:
@@ -171,14 +162,12 @@ def _rotation_square(found: Similarity, rotation: tuple[Array, float] | None) ->
 
 def _squares(found: Similarity, points: Array, targets: Array, sigma: Array) -> Array:
     """(m,) squared residuals in units of sigma."""
-    value: Array = (((found.of(points) - targets) / sigma) ** 2).sum(1)
-    return value
+    return (((found.of(points) - targets) / sigma) ** 2).sum(1)
 
 
 def _step(
-    found: Similarity, points: Array, targets: Array, sigma: Array, weight: Array,
-    rotation: tuple[Array, float] | None,
-) -> tuple[Similarity, float, Array, Array]:  # fmt: skip
+    found: Similarity, points: Array, targets: Array, sigma: Array, weight: Array, rotation: tuple[Array, float] | None
+) -> tuple[Similarity, float, Array, Array]:
     """A Gauss-Newton step: the new similarity, its size, the Hessian of shift, rotation and scale, and the middle.
 
     Rotation and scale are about the middle of the points, and in units that make them as large as shifts.

@@ -8,9 +8,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
+from .array_types import Array
 from .camera import Camera
 from .checks import check_array, check_fields, check_finite, check_photo_name, check_rotation, frozen
 from .former_fields import former_fields
@@ -60,10 +60,10 @@ class SolvedImage:
 
     name: str
     camera_id: str
-    R_cw: NDArray[np.float64] | None = None
-    center_w: NDArray[np.float64] | None = None
+    R_cw: Array | None = None
+    center_w: Array | None = None
     motion: RowMotion | None = None
-    sigma_phi: NDArray[np.float64] | None = None
+    sigma_phi: Array | None = None
     num_observations: int = 0
     rms_px: float | None = None
     rs_shift_px: float | None = None

@@ -15,9 +15,11 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
 
 from .._kernels.alignment import align
 from ..model import Observations, Reconstruction
+from ..model.array_types import Array, Index, Mask
 from ..model.projection import project_points
 from .features import SIFT_PX, size_of_sigma
 
@@ -62,8 +64,8 @@ class PatchPlaces:
         Column and row of their first pixel there.
     """
 
-    level: NDArray[np.int64]
-    corner: NDArray[np.int64]
+    level: Index
+    corner: Index
 
 
 def cut_patches(gray: NDArray[np.uint8], places: PatchPlaces) -> NDArray[np.uint8]:
@@ -85,7 +87,7 @@ def cut_patches(gray: NDArray[np.uint8], places: PatchPlaces) -> NDArray[np.uint
     return out
 
 
-def allowed_patches(mask: NDArray[np.uint8] | None, places: PatchPlaces) -> NDArray[np.bool_]:
+def allowed_patches(mask: NDArray[np.uint8] | None, places: PatchPlaces) -> Mask:
     """(n,) whether nothing of the cut-outs' middle parts, where windows lie, is masked."""
     allowed = np.ones(len(places.level), bool)
     if mask is None:
@@ -102,7 +104,7 @@ def allowed_patches(mask: NDArray[np.uint8] | None, places: PatchPlaces) -> NDAr
 
 
 #: What reads photos: places by photo to (photo, patches, which of them its mask allows).
-PatchSource = Callable[[Mapping[int, PatchPlaces]], Iterable[tuple[int, NDArray[np.uint8], NDArray[np.bool_]]]]
+PatchSource = Callable[[Mapping[int, PatchPlaces]], Iterable[tuple[int, NDArray[np.uint8], Mask]]]
 
 
 @dataclass(frozen=True)
@@ -119,21 +121,21 @@ class _Windows:
         Pixels of the photo to a sample.
     """
 
-    frame: NDArray[np.int64]
-    point: NDArray[np.int64]
-    xy: NDArray[np.float64]
-    M: NDArray[np.float64]
+    frame: Index
+    point: Index
+    xy: Array
+    M: Array
 
     def select(self, keep: NDArray[Any]) -> _Windows:
         return _Windows(self.frame[keep], self.point[keep], self.xy[keep], self.M[keep])
 
     @property
-    def spacing(self) -> NDArray[np.float64]:
+    def spacing(self) -> Array:
         """(n,) pixels from sample to sample."""
         return np.asarray(np.sqrt(np.abs(np.linalg.det(self.M))))
 
     @property
-    def level(self) -> NDArray[np.int64]:
+    def level(self) -> Index:
         """(n,) halvings of the photo after which that is about one."""
         return np.asarray(np.clip(np.floor(np.log2(np.maximum(self.spacing, 1.0)) + 0.5), 0, 6), np.int64)
 
@@ -142,9 +144,9 @@ class _Windows:
 class _Aligned:
     """Results of windows: places, correlations, and deviations in pixels; NaN for failures."""
 
-    xy: NDArray[np.float64]
-    correlation: NDArray[np.float64]
-    sigma_px: NDArray[np.float64]
+    xy: Array
+    correlation: Array
+    sigma_px: Array
 
 
 def align_tracks(reconstruction: Reconstruction, steps_px: Sequence[float], patches_of: PatchSource) -> Reconstruction:
@@ -188,7 +190,7 @@ def _joined(parts: Sequence[_Windows]) -> _Windows:
     return _Windows(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(_Windows)))
 
 
-def _facing(rec: Reconstruction) -> NDArray[np.float64]:
+def _facing(rec: Reconstruction) -> Array:
     """(n, 3) mean direction from which the photos see each point."""
     obs = rec.observations
     back = _directions(rec, obs.frame_idx, obs.point_idx)
@@ -196,15 +198,13 @@ def _facing(rec: Reconstruction) -> NDArray[np.float64]:
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12))
 
 
-def _directions(rec: Reconstruction, frame: NDArray[np.int64], point: NDArray[np.int64]) -> NDArray[np.float64]:
+def _directions(rec: Reconstruction, frame: Index, point: Index) -> Array:
     """(n, 3) unit vectors from photos to points."""
     ahead = rec.points_w[point] - rec.center_w[frame]
     return np.asarray(ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12))
 
 
-def _windows_at(
-    rec: Reconstruction, frame: NDArray[np.int64], point: NDArray[np.int64], normal: NDArray[np.float64]
-) -> _Windows:
+def _windows_at(rec: Reconstruction, frame: Index, point: Index, normal: Array) -> _Windows:
     """Windows of points where the model predicts them, on planes with these normals; a sample is a unit of length."""
     across = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]]))
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
@@ -226,9 +226,7 @@ def _windows_at(
     return _Windows(frame, point, xy, M)
 
 
-def _best_views(
-    rec: Reconstruction, step: NDArray[np.float64], measured: _Windows
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _best_views(rec: Reconstruction, step: Array, measured: _Windows) -> tuple[Index, Array]:
     """(n,) measurement of each point from which the others differ least in direction and scale, and samples' lengths.
 
     A sample is as long as gives the window of that photo the size of the feature.
@@ -246,12 +244,8 @@ def _best_views(
     return of_point, np.maximum(size / _PER_SIZE, 1.0) / measured.spacing[of_point]
 
 
-def _further(
-    rec: Reconstruction, best: _Windows, unit: NDArray[np.float64], normal: NDArray[np.float64]
-) -> Iterator[_Windows]:
+def _further(rec: Reconstruction, best: _Windows, unit: Array, normal: Array) -> Iterator[_Windows]:
     """Windows of points in photos that may show them, but measured none there; a photo at a time."""
-    from scipy.sparse import coo_array  # late: few need it
-
     obs, m = rec.observations, rec.num_images
     ones = np.ones(len(obs), np.int64)
     seen = coo_array((ones, (obs.frame_idx, obs.point_idx)), shape=(m, rec.num_points)).tocsr()
@@ -271,7 +265,7 @@ def _further(
         yield replace(windows, M=windows.M * unit[points, None, None]).select(inside)
 
 
-def _looks_alike(rec: Reconstruction, best: _Windows, windows: _Windows) -> NDArray[np.bool_]:
+def _looks_alike(rec: Reconstruction, best: _Windows, windows: _Windows) -> Mask:
     """Windows that may be aligned with the best view of their points: seen from a similar direction and distance.
 
     The first windows are those of the observations.
@@ -288,9 +282,7 @@ def _looks_alike(rec: Reconstruction, best: _Windows, windows: _Windows) -> NDAr
     return np.asarray(alike & finite & (windows.frame != of.frame))
 
 
-def _align_block(
-    wanted: _Windows, rows: NDArray[np.int64], best: _Windows, patches_of: PatchSource, aligned: _Aligned
-) -> None:
+def _align_block(wanted: _Windows, rows: Index, best: _Windows, patches_of: PatchSource, aligned: _Aligned) -> None:
     """Align these rows of the wanted windows with the best views of their points."""
     points, number = np.unique(wanted.point[rows], return_inverse=True)
     # patches of the best views first, then those of the rows
@@ -324,7 +316,7 @@ def _align_block(
 
 
 def _with_aligned(
-    rec: Reconstruction, step: NDArray[np.float64], of_point: NDArray[np.int64], wanted: _Windows, aligned: _Aligned
+    rec: Reconstruction, step: Array, of_point: Index, wanted: _Windows, aligned: _Aligned
 ) -> Reconstruction:
     """The reconstruction with the accepted alignments."""
     obs = rec.observations

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
-from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 
 from ..model import Reconstruction
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_matrix
+from ..model.array_types import Array, Index, Mask
 
 __all__ = [
     "LEAST_MEASUREMENTS",
@@ -40,32 +37,26 @@ def firmly_connected(reconstruction: Reconstruction) -> Reconstruction:
     return rec
 
 
-def common_points(reconstruction: Reconstruction) -> NDArray[np.float64]:
+def common_points(reconstruction: Reconstruction) -> Array:
     """(m, m) number of points that two photos show."""
     shows = _shown(reconstruction, np.ones(len(reconstruction.observations), bool))
     return np.asarray((shows @ shows.T).toarray())
 
 
-def connected_parts(reconstruction: Reconstruction) -> NDArray[np.int64]:
+def connected_parts(reconstruction: Reconstruction) -> Index:
     """(m,) label of the part that each photo is in, by what photos show together."""
-    from scipy.sparse.csgraph import connected_components  # late: few runs need it
-
     return np.asarray(connected_components(common_points(reconstruction) >= LEAST_MEASUREMENTS)[1], np.int64)
 
 
-def _shown(rec: Reconstruction, keep_obs: NDArray[np.bool_]) -> csr_matrix:
+def _shown(rec: Reconstruction, keep_obs: Mask) -> csr_matrix:
     """(m, n) 1 where a photo shows a point, by some observations; what it shows twice counts once."""
-    from scipy.sparse import csr_matrix  # late: few runs need it
-
     where = rec.observations.frame_idx[keep_obs], rec.observations.point_idx[keep_obs]
     shows = csr_matrix((np.ones(keep_obs.sum()), where), (rec.num_images, rec.num_points))
     shows.data[:] = 1.0
     return shows
 
 
-def connected_photos(
-    reconstruction: Reconstruction, least: int = LEAST_MEASUREMENTS, *, in_common: int = 1
-) -> NDArray[np.bool_]:
+def connected_photos(reconstruction: Reconstruction, least: int = LEAST_MEASUREMENTS, *, in_common: int = 1) -> Mask:
     """(m,) the largest set of photos of which each shows `least` points whose place the others determine.
 
     A set grows from a pair: a photo is added if it shows so many points that two of the set show. Sets that have
@@ -77,7 +68,7 @@ def connected_photos(
     ties = (reconstruction.track_lengths(np.ones(len(obs), bool)) > _LEAST_PHOTOS)[obs.point_idx]
     shows = _shown(reconstruction, ties)
 
-    def grown(connected: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def grown(connected: Mask) -> Mask:
         new, count = connected, np.zeros(reconstruction.num_points)
         while new.any():
             count += shows[new].sum(0).A1
@@ -85,7 +76,7 @@ def connected_photos(
             connected = connected | new
         return connected
 
-    left, sets = np.ones(m, bool), list[NDArray[np.bool_]]()
+    left, sets = np.ones(m, bool), list[Mask]()
     while left.any():
         first = int(np.argmax(np.where(left, shows.sum(1).A1, -1.0)))
         common = (shows @ shows[first].T).toarray().ravel()

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from heapq import heapify, heappop, heappush
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..colmap.conventions import quiet_pycolmap
 from ..model import Reconstruction
+from ..model.array_types import Index, Mask
 from .connected import common_points
 from .database import MatchedPhotos
 from .epipolar import FreedMatches
@@ -35,7 +35,7 @@ _DECIDING = 3
 
 def contradicting_photos(
     matched: MatchedPhotos, num_verified: Mapping[Pair, int], reconstruction: Reconstruction, *, suspects: bool = False
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Photos in parts of a reconstruction that more matches with the largest part contradict than support.
 
     Mapping may give a whole side of a scene a wrong place, in which its photos agree with each other, and some matches
@@ -99,7 +99,7 @@ def _support(
     return dict(zip(pairs, zip(counts, (fit - least * of).tolist(), strict=True), strict=True))
 
 
-def parts_that_agree(support: Mapping[Pair, Vote], num: int) -> NDArray[np.int64]:
+def parts_that_agree(support: Mapping[Pair, Vote], num: int) -> Index:
     """Partition of so many photos into parts within which pairs support each other, (num,) label of each.
 
     Parts are joined in the order of the support between them, and pairs that contradict count against it: greedy
@@ -124,7 +124,9 @@ def parts_that_agree(support: Mapping[Pair, Vote], num: int) -> NDArray[np.int64
             continue  # one of them has been joined with another part since
         del between[kept][gone], between[gone][kept]
         label[label == gone] = kept
-        for other, more in _emptied(between, gone):
+        shared, between[gone] = between[gone], {}
+        for other, more in shared.items():
+            del between[other][gone]
             decide = _deciding([*between[kept].get(other, []), *more])
             between[kept][other] = between[other][kept] = decide
             if (total := _balance(decide)) > 0:
@@ -139,11 +141,3 @@ def _deciding(votes: Votes) -> Votes:
 
 def _balance(votes: Votes) -> float:
     return sum(weight for _, weight in votes)
-
-
-def _emptied(between: list[dict[int, Votes]], part: int) -> Iterable[tuple[int, Votes]]:
-    """What a part shares with others, which it does not from now on."""
-    shared, between[part] = between[part], {}
-    for other in shared:
-        del between[other][part]
-    return shared.items()

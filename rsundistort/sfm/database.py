@@ -9,7 +9,7 @@ The measurements of the adjustment remain the raw pixels.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from ..colmap.conventions import HALF, poses_of, quiet_pycolmap
 from ..colmap.lenses import camera_to_colmap
 from ..errors import ReconstructionError
 from ..model import Camera, Observations, Reconstruction, RowMotion
+from ..model.array_types import Array, Index
 from ..model.projection import at_depth, project_points, unproject_points
 from .features import Features
 
@@ -60,9 +61,14 @@ class MatchedPhotos:
     names: Sequence[str]
     features: Sequence[Features]
     cameras: Sequence[Camera]
-    camera_idx: NDArray[np.int64]
+    camera_idx: Index
     calibrated: bool
     seed: int
+
+    @property
+    def step_px(self) -> float:
+        """Pixels of the photos per pixel of the images that the features were detected in."""
+        return float(np.median([each.step_px for each in self.features]))
 
 
 def ideal_keypoints(
@@ -71,7 +77,7 @@ def ideal_keypoints(
     motion: RowMotion,
     model: str,
     own: Camera | None = None,
-    depth: NDArray[np.float64] | None = None,
+    depth: Array | None = None,
 ) -> NDArray[np.float32]:
     """Keypoints without shutter in the camera of the database, COLMAP's centres; where none exists, far outside.
 
@@ -158,39 +164,30 @@ def from_pycolmap(model: Any, matched: MatchedPhotos, posed: Reconstruction | No
 
     Poses, cameras and motions are `posed`'s when it is given (triangulation leaves them alone), else the model's.
     """
-    ids = sorted(i for i in model.reg_image_ids())
+    ids = sorted(model.reg_image_ids())
     names = [matched.names[i - 1] for i in ids]
-    frame_idx, point_idx, keypoint, track_points = [], [], [], []
+    rows, track_points = [], []
     frame_of = {image_id: k for k, image_id in enumerate(ids)}
     for number, point_id in enumerate(sorted(model.point3D_ids())):
         point = model.points3D[point_id]
         track_points.append(point.xyz)
-        seen = set()
-        for element in sorted((e.image_id, e.point2D_idx) for e in point.track.elements):
-            if element[0] in seen:  # COLMAP tracks can hold a photo twice
-                continue
-            seen.add(element[0])
-            frame_idx.append(frame_of[element[0]])
-            point_idx.append(number)
-            keypoint.append(element[1])
+        # COLMAP tracks can hold a photo twice: the first of its keypoints counts
+        seen = dict(sorted(((each.image_id, each.point2D_idx) for each in point.track.elements), reverse=True))
+        rows += [(frame_of[image_id], number, seen[image_id]) for image_id in sorted(seen)]
     if not track_points:
         raise ReconstructionError("the photos were registered, but no scene point could be triangulated")
-    frame = np.array(frame_idx)
+    frame, point_idx, keypoint = np.array(rows).T
     found = [matched.features[image_id - 1] for image_id in ids]
     start = np.concatenate([[0], np.cumsum([len(each.sigma) for each in found])])
     at = start[frame] + keypoint
     xy_raw = np.concatenate([each.xy_raw for each in found])[at]
     sigma = np.concatenate([each.sigma for each in found])[at]
-    observations = Observations(frame, np.array(point_idx), xy_raw, sigma)
+    observations = Observations(frame, point_idx, xy_raw, sigma)
     points_w = np.array(track_points)
     if posed is not None:
         index_of = {name: i for i, name in enumerate(posed.image_names)}
         of = [index_of[name] for name in names]
-        return Reconstruction(
-            posed.cameras, names, posed.camera_idx[of], posed.R_cw[of], posed.center_w[of], points_w, observations,
-            posed.phi[of], posed.velocity[of], posed.shutter_model, posed.variation[of], posed.bend[of],
-            posed.bend_clock[of],
-        )  # fmt: skip
+        return replace(posed, image_names=names, points_w=points_w, observations=observations, **posed.rows(of))
     R_cw, center_w = poses_of([model.images[i] for i in ids])
     camera_idx = np.array([matched.camera_idx[i - 1] for i in ids])
     return Reconstruction(matched.cameras, names, camera_idx, R_cw, center_w, points_w, observations)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from ..colmap.conventions import quiet_pycolmap
 from ..model import Reconstruction
+from ..model.array_types import Array, Index, Mask
 from ..model.projection import clock_of, unproject_points
 from .database import MatchedPhotos
 
@@ -19,6 +22,7 @@ __all__ = [
     "Matches",
     "agreeing_photos",
     "distance_from_planes",
+    "photo_pairs",
     "read_matches",
     "read_num_verified",
     "read_verified",
@@ -49,10 +53,10 @@ class FreedMatches:
         index_of = {name: i for i, name in enumerate(reconstruction.image_names)}
         self.posed = np.array([index_of.get(name, -1) for name in matched.names])
         self._matched, self._rec = matched, reconstruction
-        self._rays: dict[int, NDArray[np.float64]] = {}
-        self._centers: dict[int, NDArray[np.float64]] = {}
+        self._rays: dict[int, Array] = {}
+        self._centers: dict[int, Array] = {}
 
-    def _rays_of(self, photo: int) -> NDArray[np.float64]:
+    def _rays_of(self, photo: int) -> Array:
         if photo not in self._rays:
             rec, i = self._rec, int(self.posed[photo])
             xy, valid = unproject_points(
@@ -61,7 +65,7 @@ class FreedMatches:
             self._rays[photo] = np.column_stack([np.where(valid[:, None], xy, np.nan), np.ones(len(xy))])
         return self._rays[photo]
 
-    def _centers_of(self, photo: int) -> NDArray[np.float64]:
+    def _centers_of(self, photo: int) -> Array:
         """(n, 3) where the camera was, or (3,) if it did not travel."""
         if photo not in self._centers:
             rec, i = self._rec, int(self.posed[photo])
@@ -71,11 +75,11 @@ class FreedMatches:
             self._centers[photo] = center
         return self._centers[photo]
 
-    def _centers_at(self, photo: int, keypoints: NDArray[np.integer]) -> NDArray[np.float64]:
+    def _centers_at(self, photo: int, keypoints: NDArray[np.integer]) -> Array:
         center = self._centers_of(photo)
         return center if center.ndim == 1 else center[keypoints]
 
-    def explained(self, first: int, second: int, matches: NDArray[np.integer]) -> NDArray[np.bool_]:
+    def explained(self, first: int, second: int, matches: NDArray[np.integer]) -> Mask:
         """(n,) whether both rays of a match are within tight thresholds of the other's epipolar plane (Sampson).
 
         Photos are counted as in `matched`; none is explained where one of them has no pose.
@@ -94,13 +98,13 @@ class FreedMatches:
         ]
         return distance <= max(allowed)
 
-    def depths(self, matches: Matches) -> dict[int, NDArray[np.float64]]:
+    def depths(self, matches: Matches) -> dict[int, Array]:
         """Depths (n,) of keypoints at the reference row, of all photos if any travelled while it was read, else none.
 
         By the mean of the inverse depths that a keypoint's matches give, by the information that they have of it; inf
         where it has none. Photos are counted as in `matched`.
         """
-        rec, found = self._rec, dict[int, NDArray[np.float64]]()
+        rec, found = self._rec, dict[int, Array]()
         if rec.shutter_model != "constant-motion" or not any(rec.motion(i).moves for i in range(rec.num_images)):
             return found
         total = {k: np.zeros((2, len(self._rays_of(k)))) for k in np.flatnonzero(self.posed >= 0).tolist()}
@@ -126,34 +130,34 @@ class FreedMatches:
 
 
 #: Keypoints of two photos that match, by the pair of photos as in `MatchedPhotos`: (n, 2) int arrays.
-Matches = dict[tuple[int, int], NDArray[np.int64]]
+Matches = dict[tuple[int, int], Index]
+
+
+def photo_pairs(ids: Iterable[int]) -> list[tuple[int, int]]:
+    """The pairs of photos, counted as in `MatchedPhotos`, of a database's ids of pairs."""
+    return [(i - 1, j - 1) for i, j in map(quiet_pycolmap().pair_id_to_image_pair, ids)]
 
 
 def read_matches(matched: MatchedPhotos) -> Matches:
     """All matches of a database."""
-    pycolmap = quiet_pycolmap()
-    with pycolmap.Database.open(matched.database) as db:
-        pairs = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id in db.read_all_matches()[0]]
-        return {(i - 1, j - 1): np.asarray(db.read_matches(i, j), np.int64) for i, j in pairs}
+    with quiet_pycolmap().Database.open(matched.database) as db:
+        pairs = photo_pairs(db.read_all_matches()[0])
+        return {(i, j): np.asarray(db.read_matches(i + 1, j + 1), np.int64) for i, j in pairs}
 
 
 def read_verified(matched: MatchedPhotos) -> Matches:
     """Matches of a database that the epipolar geometry of their pair fits."""
-    pycolmap = quiet_pycolmap()
-    with pycolmap.Database.open(matched.database) as db:
-        pair_ids, geometries = db.read_two_view_geometries()
-    pairs = (pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids)
-    found = zip(pairs, (np.asarray(each.inlier_matches, np.int64) for each in geometries), strict=True)
-    return {(i - 1, j - 1): matches.reshape(-1, 2) for (i, j), matches in found}
+    with quiet_pycolmap().Database.open(matched.database) as db:
+        ids, geometries = db.read_two_view_geometries()
+    found = (np.asarray(each.inlier_matches, np.int64).reshape(-1, 2) for each in geometries)
+    return dict(zip(photo_pairs(ids), found, strict=True))
 
 
 def read_num_verified(matched: MatchedPhotos) -> dict[tuple[int, int], int]:
     """Number of matches of each pair that fit one loose epipolar geometry, from the database before new tracks."""
-    pycolmap = quiet_pycolmap()
-    with pycolmap.Database.open(matched.database) as db:
-        pair_ids, counts = db.read_two_view_geometry_num_inliers()
-    pairs = (pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids)
-    return {(i - 1, j - 1): int(count) for (i, j), count in zip(pairs, counts, strict=True)}
+    with quiet_pycolmap().Database.open(matched.database) as db:
+        ids, counts = db.read_two_view_geometry_num_inliers()
+    return dict(zip(photo_pairs(ids), map(int, counts), strict=True))
 
 
 def agreeing_photos(
@@ -161,7 +165,7 @@ def agreeing_photos(
     matches: Matches,
     num_verified: Mapping[tuple[int, int], int],
     reconstruction: Reconstruction,
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Photos of a reconstruction that are connected: the largest set linked by pairs that fit it.
 
     A pair links two photos if their poses explain half of what a loose epipolar geometry does.
@@ -178,9 +182,6 @@ def agreeing_photos(
     (m,) bool array
         By photo of `matched`. False for the rest, which another pose may fit better, and for photos without a pose.
     """
-    from scipy.sparse import coo_matrix  # late: few runs need it
-    from scipy.sparse.csgraph import connected_components
-
     freed = FreedMatches(matched, reconstruction)
     posed = freed.posed >= 0
     linked = [
@@ -198,9 +199,7 @@ def agreeing_photos(
     return np.asarray(posed & (part == np.argmax(sizes)))
 
 
-def sampson_distance(
-    x_1: NDArray[np.float64], x_2: NDArray[np.float64], R_21: NDArray[np.float64], t_21: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def sampson_distance(x_1: Array, x_2: Array, R_21: Array, t_21: Array) -> Array:
     """Distance of matches from a relative pose: to first order, the displacement of both that makes them fit.
 
     Parameters
@@ -221,16 +220,12 @@ def sampson_distance(
     return np.where(length[..., 0] > 0, distance, np.inf)
 
 
-def distance_from_planes(
-    x_1: NDArray[np.float64], x_2: NDArray[np.float64], E: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def distance_from_planes(x_1: Array, x_2: Array, E: Array) -> Array:
     """Distance of matches from the epipolar planes of an essential matrix, as in `sampson_distance`."""
     return _distance_from_lines(x_2, x_2 @ E, x_1 @ E.T)
 
 
-def _distance_from_lines(
-    x_2: NDArray[np.float64], line_1: NDArray[np.float64], line_2: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _distance_from_lines(x_2: Array, line_1: Array, line_2: Array) -> Array:
     """Sampson's distance by the epipolar lines (n, 3) in both photos."""
     slope = np.sqrt((line_1[:, :2] ** 2).sum(1) + (line_2[:, :2] ** 2).sum(1))
     return np.asarray(np.abs((line_2 * x_2).sum(1)) / np.maximum(slope, 1e-300))

@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model.array_types import Array
+
 __all__ = [
     "DETECTION_MEGAPIXELS",
     "SIFT_PX",
@@ -53,8 +55,8 @@ class Features:
         Pixels of the stored photo per pixel of the image that the features were detected in: the unit of their errors.
     """
 
-    xy_raw: NDArray[np.float64]
-    sigma: NDArray[np.float64]
+    xy_raw: Array
+    sigma: Array
     descriptors: NDArray[np.uint8]
     step_px: float = 1.0
 
@@ -63,12 +65,12 @@ class Features:
         return Features(self.xy_raw[:count], self.sigma[:count], self.descriptors[:count], self.step_px)
 
 
-def size_sigma(size: NDArray[np.float64]) -> NDArray[np.float64]:
+def size_sigma(size: Array) -> Array:
     """Standard deviations of the positions of features of these diameters, relative to the finest ones."""
     return np.asarray(np.hypot(1.0, size / _COARSE_PX))
 
 
-def size_of_sigma(sigma: NDArray[np.float64], step_px: NDArray[np.float64]) -> NDArray[np.float64]:
+def size_of_sigma(sigma: Array, step_px: Array) -> Array:
     """Diameters of features in pixels of the photo, from `Features.sigma` and `Features.step_px`."""
     return np.asarray(_COARSE_PX * np.sqrt(np.maximum(sigma**2 - step_px**2, (0.5 * step_px) ** 2)))
 
@@ -100,7 +102,8 @@ def detect_features(
         nfeatures=0, nOctaveLayers=3, contrastThreshold=0.02, edgeThreshold=10, sigma=1.6, enable_precise_upscale=True
     )
     gray = grey_8_bit(photo)
-    shrink = _shrinking(gray.size, megapixels)
+    # the factor by which the sides are divided
+    shrink = math.sqrt(max(1.0, gray.size / (1e6 * megapixels)))
     if shrink > 1.0:
         gray, mask = _shrunk(gray, mask, shrink)
     # descriptors that are not kept cost more than a second pyramid, except where few are left out
@@ -126,11 +129,6 @@ def detect_features(
 def detection_bytes(width: int, height: int, megapixels: float = DETECTION_MEGAPIXELS) -> float:
     """Memory that the detection of features takes for a photo of this size, besides the photo."""
     return float(_BYTES_PER_PIXEL * min(width * height, 1e6 * megapixels))
-
-
-def _shrinking(num_pixels: int, megapixels: float) -> float:
-    """The factor by which the sides of a photo are divided."""
-    return math.sqrt(max(1.0, num_pixels / (1e6 * megapixels)))
 
 
 def _shrunk(

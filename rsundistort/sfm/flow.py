@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model.array_types import Array, Index, Mask
+
 __all__ = ["FlowTracks", "KeyFlow", "KeyFrameChooser", "even_brightness", "flow_between", "flow_size"]
 
 Grey = NDArray[np.uint8]
@@ -55,7 +57,7 @@ def even_brightness(grey: Grey) -> Grey:
 
 def _followed(
     before: Grey, after: Grey, xy: NDArray[np.float32], guess: NDArray[np.float32] | None = None
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float32], Mask]:
     """Where points (n, 2) of a frame lie in another, and which of them (n,) were found there and back again."""
     if not len(xy):
         return xy, np.zeros(0, bool)
@@ -111,7 +113,7 @@ class _Since:
     sharpness: float
     moved: float
     xy: NDArray[np.float32]
-    corner: NDArray[np.int64]
+    corner: Index
 
 
 class KeyFrameChooser:
@@ -208,14 +210,12 @@ class FlowTracks:
         Pixels of the frames as they are followed.
     """
 
-    frame: NDArray[np.int64]
-    point: NDArray[np.int64]
-    xy: NDArray[np.float64]
+    frame: Index
+    point: Index
+    xy: Array
 
 
-def flow_between(
-    greys: Sequence[Grey], first_xy: NDArray[np.float64], last_xy: NDArray[np.float64]
-) -> tuple[FlowTracks, FlowTracks]:
+def flow_between(greys: Sequence[Grey], first_xy: Array, last_xy: Array) -> tuple[FlowTracks, FlowTracks]:
     """Follow points of two key frames to the other one, through all frames between.
 
     Each point is looked for by the window around it in its key frame, so that errors do not add up, from where the
@@ -237,7 +237,7 @@ def flow_between(
     return _through(greys, 0, range(1, last + 1), first_xy), _through(greys, last, range(last - 1, -1, -1), last_xy)
 
 
-def _through(greys: Sequence[Grey], key: int, order: Iterable[int], start: NDArray[np.float64]) -> FlowTracks:
+def _through(greys: Sequence[Grey], key: int, order: Iterable[int], start: Array) -> FlowTracks:
     """Points of a key frame in other frames, in an order in which the content moves on."""
     xy0 = np.asarray(start, np.float32).reshape(-1, 2)
     index, xy = np.arange(len(xy0)), xy0

@@ -57,7 +57,7 @@ def matched_of_database(source: Path, database: Path, reconstruction: Reconstruc
     """
     rec = reconstruction
     with _opened(source, database.parent) as db:
-        _check_tables(db, source)
+        _check_tables(db)
         ids = dict(db.execute("SELECT name, image_id FROM images"))
         lost = [name for name in rec.image_names if name not in ids]
         if lost:
@@ -102,7 +102,7 @@ def _opened(source: Path, work: Path) -> Iterator[sqlite3.Connection]:
         raise FileError(f"{source} cannot be copied to {work}: {error.strerror}") from error
 
 
-def _check_tables(db: sqlite3.Connection, source: Path) -> None:
+def _check_tables(db: sqlite3.Connection) -> None:
     """Refuse tables that are computed as they are read: views, virtual ones, generated columns."""
     for table, needed in _TABLES.items():
         row = db.execute("SELECT type, rootpage FROM sqlite_master WHERE name = ?", (table,)).fetchone()

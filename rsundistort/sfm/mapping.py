@@ -144,8 +144,7 @@ def _firmly_connected(model: Any, matched: MatchedPhotos) -> Reconstruction | No
         return None
     if not matched.calibrated:
         matched = _refined(matched, model)
-    rec = from_pycolmap(model, matched, None)
-    return rec.without_photos(LEAST_MEASUREMENTS)
+    return from_pycolmap(model, matched, None).without_photos(LEAST_MEASUREMENTS)
 
 
 def _refined(matched: MatchedPhotos, model: Any) -> MatchedPhotos:

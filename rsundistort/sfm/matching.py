@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..colmap.conventions import quiet_pycolmap
 from ..model import Camera
+from ..model.array_types import Index
 from .database import LOOSE, MatchedPhotos, verification_options, write_photos
-from .epipolar import MIN_EXPLAINED, distance_from_planes
+from .epipolar import MIN_EXPLAINED, distance_from_planes, photo_pairs
 from .features import Features
 
 __all__ = ["LOOSE_PX", "close_px", "match_more", "match_photos", "verify_loosely"]
@@ -33,13 +33,13 @@ def match_photos(
     names: Sequence[str],
     features: Sequence[Features],
     cameras: Sequence[Camera],
-    camera_idx: NDArray[np.int64],
+    camera_idx: Index,
     *,
     calibrated: bool = True,
     focal_known: bool = True,
     within_px: float = LOOSE_PX,
     seed: int = 0,
-    pairs: NDArray[np.int64] | None = None,
+    pairs: Index | None = None,
 ) -> MatchedPhotos:
     """Match photos with each other and verify the pairs, with room for shutter distortion.
 
@@ -76,7 +76,7 @@ def match_photos(
     return matched
 
 
-def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: NDArray[np.int64] | None = None) -> None:
+def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: Index | None = None) -> None:
     """Match and verify further pairs of photos; those that were matched before stay as they are.
 
     Parameters
@@ -89,7 +89,8 @@ def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: ND
     pycolmap, database = quiet_pycolmap(), matched.database
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
-    verification = verification_options(min(within_px, close_px(matched.features)), matched.seed)
+    close = close_px(matched.features)
+    verification = verification_options(min(within_px, close), matched.seed)
     before = _matched_pairs(matched)
     if pairs is None:
         pycolmap.match_exhaustive(database, matching, verification_options=verification, device=pycolmap.Device.cpu)
@@ -99,29 +100,21 @@ def match_more(matched: MatchedPhotos, *, within_px: float = LOOSE_PX, pairs: ND
         pycolmap.match_image_pairs(
             database, matching, pairing, verification_options=verification, device=pycolmap.Device.cpu
         )
-    _verify_lossy(matched, sorted(_matched_pairs(matched) - before), within_px)
+    if close < within_px:  # with room for the shutter where the geometry without it loses matches
+        new = sorted(_matched_pairs(matched) - before)
+        with pycolmap.Database.open(database) as db:
+            lossy = [pair for pair in new if _loses_matches(db, *pair, close, within_px)]
+        _verify_anew(matched, lossy, within_px)
 
 
 def verify_loosely(matched: MatchedPhotos) -> None:
     """Verify all matches, by the keypoints of the database, with room for a shutter that is strong."""
-    pairs = sorted(_matched_pairs(matched))
-    _forget(matched, pairs)
-    _verify(matched, pairs, LOOSE_PX)
+    _verify_anew(matched, sorted(_matched_pairs(matched)), LOOSE_PX)
 
 
 def close_px(features: Sequence[Features]) -> float:
     """Largest distance from epipolar lines where neither lens nor shutter displaces anything, in pixels of photos."""
     return CLOSE_PX * float(np.median([each.step_px for each in features]))
-
-
-def _verify_lossy(matched: MatchedPhotos, pairs: Sequence[Pair], within_px: float) -> None:
-    """Verify pairs again with room for the shutter where the geometry without it loses matches."""
-    close = close_px(matched.features)
-    if close < within_px:
-        with quiet_pycolmap().Database.open(matched.database) as db:
-            lossy = [pair for pair in pairs if _loses_matches(db, *pair, close, within_px)]
-        _forget(matched, lossy)
-        _verify(matched, lossy, within_px)
 
 
 def _loses_matches(db: Any, first: int, second: int, close: float, within_px: float) -> bool:
@@ -140,21 +133,17 @@ def _loses_matches(db: Any, first: int, second: int, close: float, within_px: fl
     return bool((distance_px <= close).sum() < _KEPT * (distance_px <= within_px).sum())
 
 
-def _verify(matched: MatchedPhotos, pairs: Sequence[Pair], within_px: float) -> None:
-    """Verify pairs that have matches but no geometry."""
+def _verify_anew(matched: MatchedPhotos, pairs: Sequence[Pair], within_px: float) -> None:
+    """Verify pairs that have matches; the geometries that they had are forgotten."""
     if pairs:
+        with quiet_pycolmap().Database.open(matched.database) as db:
+            for first, second in pairs:
+                db.delete_two_view_geometry(first + 1, second + 1)
         options = verification_options(within_px, matched.seed)
         quiet_pycolmap().verify_matches(matched.database, _listed(matched, np.array(pairs)), options)
 
 
-def _forget(matched: MatchedPhotos, pairs: Sequence[Pair]) -> None:
-    """Remove the geometries of pairs."""
-    with quiet_pycolmap().Database.open(matched.database) as db:
-        for first, second in pairs:
-            db.delete_two_view_geometry(first + 1, second + 1)
-
-
-def _listed(matched: MatchedPhotos, pairs: NDArray[np.int64]) -> Path:
+def _listed(matched: MatchedPhotos, pairs: Index) -> Path:
     """A file of pairs."""
     path = matched.database.with_name("pairs.txt")
     np.savetxt(path, np.asarray(pairs) + 1, fmt="%d")
@@ -163,7 +152,5 @@ def _listed(matched: MatchedPhotos, pairs: NDArray[np.int64]) -> Path:
 
 def _matched_pairs(matched: MatchedPhotos) -> set[Pair]:
     """Pairs that have matches, or were found to have none."""
-    pycolmap = quiet_pycolmap()
-    with pycolmap.Database.open(matched.database) as db:
-        ids = (pycolmap.pair_id_to_image_pair(pair_id) for pair_id in db.read_all_matches()[0])
-        return {(first - 1, second - 1) for first, second in ids}
+    with quiet_pycolmap().Database.open(matched.database) as db:
+        return set(photo_pairs(db.read_all_matches()[0]))

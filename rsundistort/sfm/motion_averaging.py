@@ -8,10 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..colmap.conventions import HALF, quiet_pycolmap
 from ..model import Reconstruction, RowMotion
+from ..model.array_types import Array, Index
 from .database import MatchedPhotos, ideal_keypoints, write_photos
 from .epipolar import MIN_EXPLAINED, read_matches
 from .mapping import map_photos
@@ -31,8 +31,8 @@ def averaged_motions(
     num_photos: int,
     pairs: Mapping[tuple[int, int], Pair],
     phi_sigma: float,
-    known_phi: Mapping[int, NDArray[np.float64]] | None = None,
-) -> NDArray[np.float64]:
+    known_phi: Mapping[int, Array] | None = None,
+) -> Array:
     """Rotations phi (m, 3) of photos, radians per unit of the clock, that agree best with the relative poses of pairs.
 
     A pair alone hardly tells the motion of one photo from that of the other. Each pair is a normal distribution of
@@ -74,18 +74,18 @@ def averaged_motions(
     return phi.reshape(num_photos, 3)
 
 
-def _components(first: int, second: int) -> NDArray[np.int64]:
+def _components(first: int, second: int) -> Index:
     """Places of two photos' motions among those of all."""
     return np.concatenate([np.arange(3 * first, 3 * first + 3), np.arange(3 * second, 3 * second + 3)])
 
 
-def _apart(step: NDArray[np.float64], information: NDArray[np.float64]) -> float:
+def _apart(step: Array, information: Array) -> float:
     """Mean square of six deviations in units of their standard deviations."""
     return float(step @ information @ step) / len(step)
 
 
 def map_without_motions(
-    matched: MatchedPhotos, phi_sigma: float, known_phi: Mapping[str, NDArray[np.float64]] | None = None
+    matched: MatchedPhotos, phi_sigma: float, known_phi: Mapping[str, Array] | None = None
 ) -> Reconstruction:
     """What `map_photos` makes of the photos if their motions, averaged over pairs, are taken out of their keypoints.
 

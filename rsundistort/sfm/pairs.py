@@ -11,6 +11,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from ..model.array_types import Array, Index
 
 __all__ = ["choose_pairs", "global_descriptors"]
 
@@ -30,9 +33,9 @@ def choose_pairs(
     positions: ArrayLike | None = None,
     descriptors: ArrayLike | None = None,
     *,
-    given: Sequence[NDArray[np.int64]] = (),
+    given: Sequence[Index] = (),
     similar: int = _SIMILAR,
-) -> NDArray[np.int64]:
+) -> Index:
     """Pairs of photos that are neighbours in order of capture, by place, or by appearance.
 
     Each photo picks a fixed number of partners of each kind, so that the number of pairs is proportional to the photos.
@@ -68,7 +71,7 @@ def choose_pairs(
     return np.column_stack(np.divmod(np.unique(chosen[:, 0] * num_photos + chosen[:, 1]), num_photos))
 
 
-def _next_in(order: NDArray[np.int64]) -> NDArray[np.int64]:
+def _next_in(order: Index) -> Index:
     """Each photo of a sequence with those after it."""
     ahead = range(1, min(_NEXT, len(order) - 1) + 1)
     return np.concatenate(
@@ -76,10 +79,8 @@ def _next_in(order: NDArray[np.int64]) -> NDArray[np.int64]:
     )
 
 
-def _nearest(positions: NDArray[np.float64]) -> NDArray[np.int64]:
+def _nearest(positions: Array) -> Index:
     """Each photo with those nearest to it."""
-    from scipy.spatial import cKDTree  # late: ten megabytes that few need
-
     known = np.flatnonzero(np.isfinite(positions).all(1))
     if len(known) < 2:
         return np.zeros((0, 2), np.int64)
@@ -88,7 +89,7 @@ def _nearest(positions: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.column_stack([np.repeat(known, found.shape[1]), known[found.ravel()]])
 
 
-def _most_similar(descriptors: NDArray[Any], chosen: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+def _most_similar(descriptors: NDArray[Any], chosen: Index, count: int) -> Index:
     """Each photo with so many similar ones that are not chosen already; of equals the first."""
     known = np.flatnonzero(descriptors.any(1))
     place = np.full(len(descriptors), -1)
@@ -163,9 +164,7 @@ def _word_of(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> ND
     return np.argmin((words**2).sum(1) - 2.0 * (descriptors @ words.T), axis=1)
 
 
-def _sums(
-    descriptors: NDArray[np.float32], word: NDArray[np.intp], num_words: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _sums(descriptors: NDArray[np.float32], word: NDArray[np.intp], num_words: int) -> tuple[Array, Index]:
     """Sum of the descriptors of each word, and how many there are."""
     counts = np.bincount(word, minlength=num_words)
     sums = np.zeros((num_words, descriptors.shape[1]))
@@ -185,6 +184,6 @@ def _aggregated(descriptors: NDArray[np.float32], words: NDArray[np.float32]) ->
     return np.rint(_LENGTH * _unit(by_word.reshape(1, -1))[0]).astype(np.int16)
 
 
-def _unit(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+def _unit(rows: Array) -> Array:
     """Rows at length 1; zeros as they are."""
     return np.asarray(rows / np.maximum(np.sqrt((rows**2).sum(1, keepdims=True)), 1e-12))

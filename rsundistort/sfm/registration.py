@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..model import Camera, Reconstruction, RowMotion
+from ..model.array_types import Array, Index, Mask
 from ..model.path import cross_matrices
 from ..model.projection import clock_of, project_points, project_points_with_jacobians, unproject_points
 from .connected import LEAST_MEASUREMENTS, connected_photos
@@ -64,15 +65,13 @@ class Placed:
         Which measurements lie near their predictions.
     """
 
-    R_cw: NDArray[np.float64]
-    center_w: NDArray[np.float64]
-    phi: NDArray[np.float64]
-    fits: NDArray[np.bool_]
+    R_cw: Array
+    center_w: Array
+    phi: Array
+    fits: Mask
 
 
-def place_photo(
-    points_w: NDArray[np.float64], xy_raw: NDArray[np.float64], camera: Camera, step_px: float = 1.0
-) -> Placed | None:
+def place_photo(points_w: Array, xy_raw: Array, camera: Camera, step_px: float = 1.0) -> Placed | None:
     """Pose and motion of a photo from points of the scene, many of which may be the wrong ones.
 
     Three points suggest a pose (RANSAC, over the whole frame and over parts of it, in which the shutter moves little);
@@ -97,9 +96,10 @@ def place_photo(
     """
     if len(points_w) < _LEAST_SUGGESTING:
         return None
-    few = _spread_over(len(points_w), _ENOUGH)
-    found = [_Pose(R_cw, center_w) for R_cw, center_w in _suggested(points_w[few], xy_raw[few], camera, step_px)]
-    found = [_adjusted(pose, points_w[few], xy_raw[few], camera, _WIDE_PX * step_px) for pose in found]
+    every = np.arange(len(points_w))
+    few = every if len(every) <= _ENOUGH else np.linspace(0, len(every) - 1, _ENOUGH).astype(np.int64)
+    suggested = _suggested(points_w[few], xy_raw[few], camera, step_px)
+    found = [_adjusted(pose, points_w[few], xy_raw[few], camera, _WIDE_PX * step_px) for pose in suggested]
     found.sort(key=lambda pose: pose.cost)
     best: Placed | None = None
     for pose in found[:_TRIED]:
@@ -116,20 +116,13 @@ def place_photo(
 class _Pose:
     """A pose with the rotation during the readout, and what it costs."""
 
-    R_cw: NDArray[np.float64]
-    center_w: NDArray[np.float64]
-    phi: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    R_cw: Array
+    center_w: Array
+    phi: Array = field(default_factory=lambda: np.zeros(3))
     cost: float = np.inf
 
 
-def _spread_over(count: int, most: int) -> NDArray[np.int64]:
-    """Indices of so many of a list, evenly distributed."""
-    return np.arange(count) if count <= most else np.linspace(0, count - 1, most).astype(np.int64)
-
-
-def _suggested(
-    points_w: NDArray[np.float64], xy_raw: NDArray[np.float64], camera: Camera, step_px: float
-) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+def _suggested(points_w: Array, xy_raw: Array, camera: Camera, step_px: float) -> Iterator[_Pose]:
     """Poses by three points each, from the whole frame and from parts along the readout."""
     ideal, valid = unproject_points(xy_raw, camera, None, "global")
     clock = clock_of(camera, xy_raw)
@@ -152,18 +145,14 @@ def _suggested(
             )  # fmt: skip
             if found:
                 R_cw = cv2.Rodrigues(turn)[0]
-                yield R_cw, origin - size * (R_cw.T @ way.ravel())
+                yield _Pose(R_cw, origin - size * (R_cw.T @ way.ravel()))
 
 
-def _adjusted(
-    start: _Pose, points_w: NDArray[np.float64], xy_raw: NDArray[np.float64], camera: Camera, width: float
-) -> _Pose:
+def _adjusted(start: _Pose, points_w: Array, xy_raw: Array, camera: Camera, width: float) -> _Pose:
     """Pose and phi by Levenberg and Marquardt's steps under a loss of such a width, in pixels."""
     prior = (camera.frame_span / _PHI_SIGMA) ** 2
 
-    def cost_of(
-        R_cw: NDArray[np.float64], center_w: NDArray[np.float64], phi: NDArray[np.float64]
-    ) -> tuple[_Pose, tuple[NDArray[Any], ...]]:
+    def cost_of(R_cw: Array, center_w: Array, phi: Array) -> tuple[_Pose, tuple[NDArray[Any], ...]]:
         x_c = (points_w - center_w) @ R_cw.T
         xy, valid, slopes = project_points_with_jacobians(x_c, camera, RowMotion(phi), "rotation")
         apart = np.where(valid[:, None], xy - xy_raw, _FAR_PX)
@@ -314,13 +303,13 @@ class _Shown:
     def __init__(self, matched: MatchedPhotos, matches: Matches, scene: Reconstruction) -> None:
         self._point_of = points_of_keypoints(matched, scene)
         # by photo: the partner, and the keypoints of the photo and of the partner that match
-        self._partners: dict[int, list[tuple[int, NDArray[np.int64]]]] = {}
+        self._partners: dict[int, list[tuple[int, Index]]] = {}
         for (first, second), found in matches.items():
             self._partners.setdefault(first, []).append((second, found))
             self._partners.setdefault(second, []).append((first, found[:, ::-1]))
         self._num_photos = scene.track_lengths(np.ones(len(scene.observations), bool))
 
-    def by_others(self, photo: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def by_others(self, photo: int) -> tuple[Index, Index]:
         """Keypoints of a photo and the points that they show by the matches, each pair once; points of two others."""
         pairs = [np.zeros((0, 2), np.int64)]
         for partner, found in self._partners.get(photo, ()):
@@ -338,15 +327,14 @@ class _Shown:
 
 
 def _fits(
-    R_cw: NDArray[np.float64], center_w: NDArray[np.float64], motion: RowMotion, points_w: NDArray[np.float64],
-    xy_raw: NDArray[np.float64], camera: Camera, step_px: float,
-) -> NDArray[np.bool_]:  # fmt: skip
+    R_cw: Array, center_w: Array, motion: RowMotion, points_w: Array, xy_raw: Array, camera: Camera, step_px: float
+) -> Mask:
     """(n,) which measurements lie near the predictions of a pose."""
     xy, valid = project_points((points_w - center_w) @ R_cw.T, camera, motion, "rotation")
     return valid & (np.linalg.norm(np.where(valid[:, None], xy - xy_raw, 0.0), axis=1) <= _FIT * TIGHT_PX * step_px)
 
 
-def points_of_keypoints(matched: MatchedPhotos, scene: Reconstruction) -> dict[int, NDArray[np.int64]]:
+def points_of_keypoints(matched: MatchedPhotos, scene: Reconstruction) -> dict[int, Index]:
     """For each photo of a scene the point that each of its keypoints shows, or -1."""
     observations, found = scene.observations, {}
     photo_of = {name: photo for photo, name in enumerate(matched.names)}

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from .._kernels import epipolar as kernels
 from ..model import Camera
+from ..model.array_types import Array
 from ..model.projection import clock_of, unproject_points
 
 __all__ = [
@@ -64,15 +65,15 @@ class View:
         Focal length in pixels.
     """
 
-    rays: NDArray[np.float64]
-    slopes: NDArray[np.float64]
-    clock: NDArray[np.float64]
-    rate: NDArray[np.float64]
+    rays: Array
+    slopes: Array
+    clock: Array
+    rate: Array
     frame_span: float
     focal_px: float
 
     @classmethod
-    def of(cls, xy_raw: NDArray[np.float64], camera: Camera) -> View:
+    def of(cls, xy_raw: Array, camera: Camera) -> View:
         """Normalised rays of pixels (n, 2)."""
         axis = camera.clock_axis
         rate = np.zeros(2)
@@ -83,17 +84,13 @@ class View:
             _rays(xy_raw, camera), slopes, clock_of(camera, xy_raw), rate, camera.frame_span, float(camera.K[0, 0])
         )
 
-    def take(self, keep: NDArray[np.integer]) -> View:
-        """Some of the matches."""
-        return replace(self, rays=self.rays[keep], slopes=self.slopes[keep], clock=self.clock[keep])
-
     @property
-    def arrays(self) -> tuple[NDArray[np.float64], ...]:
+    def arrays(self) -> tuple[Array, ...]:
         """Arguments of the kernels."""
         return self.rays, self.slopes, self.clock, self.rate
 
 
-def _rays(xy_raw: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+def _rays(xy_raw: Array, camera: Camera) -> Array:
     """(n, 3) unit directions of pixels; ahead where the lens has none."""
     ideal, valid = unproject_points(xy_raw, camera, None, "global")
     rays = np.column_stack([np.where(valid[:, None], ideal, 0.0), np.ones(len(ideal))])
@@ -108,12 +105,12 @@ class Pair:
     second: View
 
     @cached_property
-    def arrays(self) -> tuple[NDArray[np.float64], ...]:
+    def arrays(self) -> tuple[Array, ...]:
         """Arguments of the kernels."""
         return *self.first.arrays, *self.second.arrays
 
     @property
-    def frame_spans(self) -> NDArray[np.float64]:
+    def frame_spans(self) -> Array:
         """(6,) clock over the frame, for each component of phi of both."""
         return np.repeat([self.first.frame_span, self.second.frame_span], 3)
 
@@ -134,13 +131,13 @@ class RelativePose:
         Standard deviations of phi, for noise of one pixel.
     """
 
-    R_21: NDArray[np.float64]
-    t_21: NDArray[np.float64]
-    phi: NDArray[np.float64]
+    R_21: Array
+    t_21: Array
+    phi: Array
     cost: float = np.inf
-    phi_sigma: NDArray[np.float64] | None = None
+    phi_sigma: Array | None = None
 
-    def distances_px(self, pair: Pair) -> NDArray[np.float64]:
+    def distances_px(self, pair: Pair) -> Array:
         """(n,) Sampson distances of the matches in pixels of the photos as they are, shutters included."""
         distance = np.empty(len(pair.first.clock))
         kernels.sampson(*pair.arrays, self.R_21, self.t_21, self.phi[0], self.phi[1], distance)
@@ -224,7 +221,7 @@ def adjusted_pose(start: RelativePose, pair: Pair, phi_sigma: float, width: floa
     weights = (pair.frame_spans / phi_sigma) ** 2
     H, g = np.empty((11, 11)), np.empty(11)
 
-    def system_of(pose: RelativePose) -> tuple[RelativePose, NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
+    def system_of(pose: RelativePose) -> tuple[RelativePose, Array, Array, NDArray[Any]]:
         across = _across(pose.t_21)
         cost = kernels.pair_system(*pair.arrays, pose.R_21, pose.t_21, across, *pose.phi, width, H, g)
         phi = pose.phi.ravel()
@@ -255,7 +252,7 @@ def adjusted_pose(start: RelativePose, pair: Pair, phi_sigma: float, width: floa
     return replace(now, phi_sigma=np.sqrt(np.maximum(np.diag(covariance)[5:], 0.0)).reshape(2, 3))
 
 
-def phi_information(pose: RelativePose, pair: Pair) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def phi_information(pose: RelativePose, pair: Pair) -> tuple[Array, Array]:
     """Inverse covariance (6, 6) of both phi by the matches alone, whatever the pose, and the gradient (6,) there.
 
     For noise of one pixel. The gradient is what the prior of an estimate holds against.
@@ -269,7 +266,7 @@ def phi_information(pose: RelativePose, pair: Pair) -> tuple[NDArray[np.float64]
     return H[5:, 5:] - H[5:, :5] @ of_pose[:, :6], g[5:] - H[5:, :5] @ of_pose[:, 6]
 
 
-def _across(t: NDArray[np.float64]) -> NDArray[np.float64]:
+def _across(t: Array) -> Array:
     """(2, 3) directions at right angles to a unit vector."""
     first = np.cross(t, np.eye(3)[np.argmin(np.abs(t))])
     first /= np.linalg.norm(first)

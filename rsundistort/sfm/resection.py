@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+
+from ..model.array_types import Array
 
 __all__ = ["LEAST_POINTS", "resect"]
 
@@ -14,13 +15,7 @@ LEAST_POINTS = 12
 _NARROWER = (4.0, 2.0, 1.0)
 
 
-def resect(
-    rays: NDArray[np.float64],
-    points_w: NDArray[np.float64],
-    R_cw: NDArray[np.float64],
-    center_w: NDArray[np.float64],
-    within: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+def resect(rays: Array, points_w: Array, R_cw: Array, center_w: Array, within: float) -> tuple[Array, Array] | None:
     """Pose of a photo by points of the scene and where it shows them, as far as these agree, from a pose nearby.
 
     Parameters

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from ..colmap.conventions import quiet_pycolmap
+from ..colmap.conventions import quiet_pycolmap, rigid_of
 from ..colmap.lenses import camera_to_colmap
-from ..model import Camera, Reconstruction, RowMotion
+from ..model import Reconstruction, RowMotion
 from .database import MatchedPhotos, from_pycolmap, ideal_keypoints, pipeline_options
-from .epipolar import MIN_EXPLAINED, TIGHT_PX, FreedMatches, Matches
+from .epipolar import MIN_EXPLAINED, TIGHT_PX, FreedMatches, Matches, photo_pairs
 
 __all__ = ["retriangulate"]
 
@@ -39,7 +38,7 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction, *, of_
     """
     pycolmap = quiet_pycolmap()
     freed, cameras = FreedMatches(matched, reconstruction), reconstruction.cameras
-    tight_px = TIGHT_PX * float(np.median([each.step_px for each in matched.features]))
+    tight_px = TIGHT_PX * matched.step_px
     with pycolmap.Database.open(matched.database) as db:
         explained = _explained(db, freed)
         depths = freed.depths(explained)
@@ -53,8 +52,13 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction, *, of_
                 motion = reconstruction.motion(i).in_camera(reconstruction.R_cw[i])
             db.update_keypoints(index + 1, ideal_keypoints(found, camera, motion, model, own, depths.get(index)))
         db.clear_two_view_geometries()
-        _write_explained(db, explained)
-    empty = _posed_model(matched, reconstruction, cameras)
+        # written as verified: pairs with known geometry need no search for one
+        for (first, second), matches in explained.items():
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            geometry.inlier_matches = matches
+            db.write_two_view_geometry(first + 1, second + 1, geometry)
+    empty = _posed_model(matched, reconstruction)
     options = pipeline_options(1.0, matched.seed, False, len(matched.names))
     options.mapper.filter_max_reproj_error = tight_px
     options.triangulation.merge_max_reproj_error = tight_px
@@ -70,10 +74,8 @@ def retriangulate(matched: MatchedPhotos, reconstruction: Reconstruction, *, of_
 
 def _explained(db: Any, freed: FreedMatches) -> Matches:
     """The matches that fit the poses."""
-    pycolmap = quiet_pycolmap()
     found = Matches()
-    for pair_id in db.read_all_matches()[0]:
-        first, second = (k - 1 for k in pycolmap.pair_id_to_image_pair(pair_id))
+    for first, second in photo_pairs(db.read_all_matches()[0]):
         if freed.posed[first] < 0 or freed.posed[second] < 0:
             continue
         matches = np.asarray(db.read_matches(first + 1, second + 1))
@@ -83,36 +85,23 @@ def _explained(db: Any, freed: FreedMatches) -> Matches:
     return found
 
 
-def _write_explained(db: Any, explained: Matches) -> None:
-    """Write these as verified: pairs with known geometry need no search for one."""
-    pycolmap = quiet_pycolmap()
-    for (first, second), matches in explained.items():
-        geometry = pycolmap.TwoViewGeometry()
-        geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-        geometry.inlier_matches = matches
-        db.write_two_view_geometry(first + 1, second + 1, geometry)
-
-
-def _posed_model(matched: MatchedPhotos, reconstruction: Reconstruction, cameras: Sequence[Camera]) -> Any:
+def _posed_model(matched: MatchedPhotos, reconstruction: Reconstruction) -> Any:
     """A pycolmap model of the database's images with the reconstruction's poses and no points."""
     pycolmap = quiet_pycolmap()
     model = pycolmap.Reconstruction()
     index_of = {name: i for i, name in enumerate(reconstruction.image_names)}
     with pycolmap.Database.open(matched.database) as db:
-        for index in range(len(cameras)):
+        for index in range(len(reconstruction.cameras)):
             model.add_camera(db.read_camera(index + 1))
         for rig in db.read_all_rigs():
             model.add_rig(rig)
-        frames = {frame.frame_id: frame for frame in db.read_all_frames()}
-        frame_of_image = {d.id: frame for frame in frames.values() for d in frame.data_ids}
+        frame_of_image = {each.id: frame for frame in db.read_all_frames() for each in frame.data_ids}
         for index, name in enumerate(matched.names):
             frame = frame_of_image[index + 1]
             if name not in index_of:
                 continue
             i = index_of[name]
-            R = reconstruction.R_cw[i]
-            pose = np.column_stack([R, -R @ reconstruction.center_w[i]])
-            frame.rig_from_world = pycolmap.Rigid3d(pose)
+            frame.rig_from_world = rigid_of(reconstruction.R_cw[i], reconstruction.center_w[i])
             model.add_frame(frame)
             image = db.read_image(index + 1)
             image.frame_id = frame.frame_id

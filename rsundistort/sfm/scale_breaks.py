@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model import Reconstruction
+from ..model.array_types import Mask
 from .connected import LEAST_TIES, common_points, connected_parts
 from .database import MatchedPhotos
 from .epipolar import MIN_EXPLAINED, FreedMatches, read_matches
@@ -21,7 +21,7 @@ _LEAST_DUE, _LEAST_SHOWN = 10, 0.5
 _POINTS, _POINTS_OF_PHOTO = 20_000, 200
 
 
-def photos_beside_breaks(matched: MatchedPhotos, reconstruction: Reconstruction) -> NDArray[np.bool_]:
+def photos_beside_breaks(matched: MatchedPhotos, reconstruction: Reconstruction) -> Mask:
     """Photos in parts of a reconstruction that have another scale than the largest one, as their matches say.
 
     What two photos show of each other says nothing of the distance between them: all matches fit, whatever the scale.
@@ -45,7 +45,7 @@ def photos_beside_breaks(matched: MatchedPhotos, reconstruction: Reconstruction)
     due = _Due(matched, reconstruction)
     common = common_points(reconstruction)
     np.fill_diagonal(common, 0.0)
-    left, sets = np.ones(reconstruction.num_images, bool), list[tuple[NDArray[np.bool_], NDArray[np.bool_]]]()
+    left, sets = np.ones(reconstruction.num_images, bool), list[tuple[Mask, Mask]]()
     while left.any():
         first = int(np.argmax(np.where(left, common.max(1), -1.0)))
         start = np.arange(len(left)) == first
@@ -95,7 +95,7 @@ class _Due:
         self._points_of = [obs.point_idx[mine] for mine in obs.by_photo(m)]
         self._shown = np.isin(pairs, obs.frame_idx * n + obs.point_idx)
 
-    def grown(self, start: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def grown(self, start: Mask) -> tuple[Mask, Mask]:
         """(m,) a set of photos that grew from a pair, and (m,) those whose matches contradict their place in it."""
         connected, new = start, start
         showers, known = np.zeros(len(self._photo), np.int64), np.zeros(self._num_points, np.int64)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model import Reconstruction
+from ..model.array_types import Array
 from .connected import LEAST_TIES, connected_parts
 
 __all__ = ["carried_along"]
@@ -35,7 +35,10 @@ def carried_along(scene: Reconstruction, former: Reconstruction, taken: Collecti
         The scene with more photos, which have no measurements yet; or itself.
     """
     at = {name: i for i, name in enumerate(scene.image_names)}
-    for side in _sides(former, taken):
+    lost = former.take_photos(np.isin(former.image_names, [*taken]))
+    part = connected_parts(lost)
+    for k in range(part.max(initial=-1) + 1):
+        side = lost.take_photos(part == k)
         missing = np.array([name not in at for name in side.image_names])
         ratios = {
             i: _depth_ratios(side, i, scene, at[name]) for i, name in enumerate(side.image_names) if not missing[i]
@@ -57,15 +60,7 @@ def carried_along(scene: Reconstruction, former: Reconstruction, taken: Collecti
     return scene
 
 
-def _sides(former: Reconstruction, taken: Collection[str]) -> Iterator[Reconstruction]:
-    """The photos that lost their places, by what they show together."""
-    rec = former.take_photos(np.isin(former.image_names, [*taken]))
-    side = connected_parts(rec)
-    for k in range(side.max(initial=-1) + 1):
-        yield rec.take_photos(side == k)
-
-
-def _depth_ratios(side: Reconstruction, i: int, scene: Reconstruction, j: int) -> NDArray[np.float64]:
+def _depth_ratios(side: Reconstruction, i: int, scene: Reconstruction, j: int) -> Array:
     """Depths of the points that a photo shows in a scene, over those of the same keypoints in its side."""
     here, there = _depths(side, i), _depths(scene, j)
     return np.array([there[place] / here[place] for place in here.keys() & there.keys()])

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..colmap.conventions import quiet_pycolmap
+from ..model.array_types import Index
 from .database import MatchedPhotos
 from .epipolar import MIN_EXPLAINED, Matches, read_matches
 from .matching import verify_loosely
@@ -43,29 +43,27 @@ def verify_with_shutter(matched: MatchedPhotos) -> float:
     most = sorted(matches, key=lambda pair: (-len(matches[pair]), pair))[:_ASKED]
     if not most:
         return 0.0
-    step_px = float(np.median([each.step_px for each in matched.features]))
     pairs = [pair_of(matched, pair, matches[pair][:_MATCHES]) for pair in most]
     poses, spread = relative_poses(pairs)
     if spread >= _STRONG_RAD:
         without = [find_relative_pose(pair, NO_SHUTTER) for pair in pairs]
-        if _num_explained(without, pairs, step_px) < (1.0 - _LOST) * _num_explained(poses, pairs, step_px):
+        within_px = INLIER_PX * matched.step_px
+        if _num_explained(without, pairs, within_px) < (1.0 - _LOST) * _num_explained(poses, pairs, within_px):
             # a geometry that few pixels are wide holds for a part of the frame only
             verify_loosely(matched)
             _add_explained(matched, matches, spread)
     return spread
 
 
-def _num_explained(poses: Sequence[RelativePose | None], pairs: Sequence[Pair], step_px: float) -> int:
+def _num_explained(poses: Sequence[RelativePose | None], pairs: Sequence[Pair], within_px: float) -> int:
     """Matches that lie near the epipolar planes of poses."""
     found = (
-        (pose.distances_px(pair) < INLIER_PX * step_px).sum()
-        for pose, pair in zip(poses, pairs, strict=True)
-        if pose is not None
+        (pose.distances_px(pair) < within_px).sum() for pose, pair in zip(poses, pairs, strict=True) if pose is not None
     )
     return int(sum(found))
 
 
-def pair_of(matched: MatchedPhotos, pair: tuple[int, int], matches: NDArray[np.int64]) -> Pair:
+def pair_of(matched: MatchedPhotos, pair: tuple[int, int], matches: Index) -> Pair:
     """The matches of two photos, as each shows them."""
     first, second = (
         View.of(matched.features[photo].xy_raw[matches[:, side]], matched.cameras[matched.camera_idx[photo]])

@@ -13,7 +13,6 @@ import numpy as np
 from ..batch.progress import ProgressCallback, StageLog
 from ..batch.rectify_options import RectifyOptions
 from ..batch.workers import Workers, use_threads
-from ..bundle import BundleOptions
 from ..colmap.conventions import kept_log_level
 from ..colmap.measured_model import ColmapModel, colmap_model_of, surviving_points
 from ..colmap.rectified_model import ModelIds, colmap_model
@@ -336,7 +335,7 @@ def _in_stored_frame(
 
 
 def _photo_cameras(
-    given: ColmapModel, source: str, facts: Mapping[str, ExifFacts], options: SolveOptions
+    given: ColmapModel, source: str, exif: Sequence[ExifFacts], sizes: Sequence[tuple[int, int]], options: SolveOptions
 ) -> PhotoCameras:
     """The model's cameras, with the readout directions that were specified or are guessed."""
     rec = given.reconstruction
@@ -346,8 +345,7 @@ def _photo_cameras(
     if unknown:
         raise InputError(f"readout of {unknown[0]!r}: no such camera, there are {', '.join(labels)}")
     of_photo = [labels[k] for k in rec.camera_idx.tolist()]
-    sizes = [(rec.camera(i).width, rec.camera(i).height) for i in range(rec.num_images)]
-    guessed, notes = guess_readouts([facts.get(name, ExifFacts()) for name in rec.image_names], sizes, of_photo)
+    guessed, notes = guess_readouts(exif, sizes, of_photo)
     cameras = []
     for label, camera in zip(labels, rec.cameras, strict=True):
         direction = specified.get(label, specified.get("", guessed.get(label, camera.readout)))
@@ -376,21 +374,20 @@ def _solve(
         raise ReconstructionError(
             f"the model holds {given.reconstruction.num_images} registered photos, the shutter needs three"
         )
-    cameras = _photo_cameras(given, source, facts, options)
-    rec = replace(given.reconstruction, cameras=cameras.cameras)
+    rec = given.reconstruction
+    sizes = [(rec.camera(i).width, rec.camera(i).height) for i in range(rec.num_images)]
+    exif = [facts.get(name, ExifFacts()) for name in rec.image_names]
+    cameras = _photo_cameras(given, source, exif, sizes, options)
+    rec = replace(rec, cameras=cameras.cameras)
     for name in (*options.still, *options.known):
         if name not in rec.image_names:
             raise InputError(f"constraint on {name!r}, which is not among the photos of the model")
 
     survey = None
     if options.crs is not None or options.control:  # else its frame is the model's
-        sizes = [(rec.camera(i).width, rec.camera(i).height) for i in range(rec.num_images)]
-        exif = [facts.get(name, ExifFacts()) for name in rec.image_names]
         survey = survey_of(options.crs, options.control, rec.image_names, exif, sizes)
 
-    def options_of(each: Reconstruction) -> BundleOptions:
-        return replace(options.options_for(cameras), outlier_sigma=_OUTLIER_SIGMA)
-
+    fitting = replace(options.options_for(cameras), outlier_sigma=_OUTLIER_SIGMA)
     with work_folder() as work:
         if database is not None:
             log.begin("database")
@@ -398,12 +395,13 @@ def _solve(
             log.end("database", keypoints=sum(len(found.xy_raw) for found in matched.features))
             track_source = TrackSource(matched)
         solved = solve_tracks(
-            rec, cameras, options.shutter_model, options.seed, options_of, log, options.remedy, track_source, survey
-        )
+            rec, cameras, options.shutter_model, options.seed, lambda _: fitting, log, options.remedy, track_source,
+            survey,
+        )  # fmt: skip
     if solved.survey is None:  # the model's frame is kept
         solved = replace(solved, georeference=given.georeference)
     after = solved.shared
-    for text in cameras.contradicted(after.cameras, options_of(after)):
+    for text in cameras.contradicted(after.cameras, fitting):
         warnings.warn(text, RsUndistortWarning, stacklevel=4)
     lost = dict.fromkeys(given.unregistered, "it is not registered in the model")
     lost |= dict.fromkeys(set(rec.image_names) - set(after.image_names), "no measurement of it survived")

@@ -21,12 +21,10 @@ from ..io.cameras import camera_to_json
 from ..io.metashape import PosedPhotos, named, read_metashape
 from ..model import Observations, Reconstruction
 from ..sfm import LEAST_MEASUREMENTS, match_photos, retriangulate
+from .run_options import RunOptions
 from .tracks import TrackSource
 
 __all__ = ["measured", "posed_photos", "shutter_terms"]
-
-# As `run` measures by default.
-_MAX_FEATURES = 8192
 
 
 def posed_photos(model: Path, folder: Path | None, raw_as: str) -> PosedPhotos:
@@ -75,7 +73,7 @@ def measured(
     of_photo = {name: str(posed.camera_ids[k]) for name, k in zip(names, posed.camera_idx.tolist(), strict=True)}
     (work / "cameras.json").write_text(json.dumps({"cameras": cameras, "images": of_photo}), encoding="utf-8")
     loaded = load_photos(
-        folder, str(work / "cameras.json"), None, _MAX_FEATURES, workers, log, masks=rectify.masks,
+        folder, str(work / "cameras.json"), None, RunOptions().most_features(False), workers, log, masks=rectify.masks,
         raw_as=rectify.raw_as, again=rectify.again, max_megapixels=rectify.max_megapixels, only=names,
     )  # fmt: skip
     place = [names.index(name) for name in loaded.names]

@@ -13,7 +13,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import entr
 
@@ -22,11 +21,10 @@ from ..bundle.path_prior import FramePath
 from ..errors import RsUndistortWarning
 from ..input.key_frames import Clip
 from ..model import Reconstruction
+from ..model.array_types import Array, Index, Mask
 
-__all__ = ["Gaps", "frames_missing", "gaps_between", "tell_of_gaps", "with_gaps"]
+__all__ = ["Gaps", "frames_missing", "gaps_between", "tell_of_gaps", "told_by", "with_gaps"]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # Frames that may be missing between two others; intervals that say what is usual.
 _MOST, _FEWEST = 3, 12
@@ -132,7 +130,7 @@ class _Intervals(NamedTuple):
         return int(np.isfinite(self.way).all(axis=1).sum())
 
 
-def _travels(own: OwnMotions, joined: NDArray[np.bool_]) -> _Intervals | None:
+def _travels(own: OwnMotions, joined: Mask) -> _Intervals | None:
     """Ways between positions, as those before and after; None if few are known."""
     way = np.where(joined[:, None], np.diff(own.center_w, axis=0), np.nan)
     way = way[:, np.nansum(np.abs(way), axis=0) > 0]
@@ -146,7 +144,7 @@ def _travels(own: OwnMotions, joined: NDArray[np.bool_]) -> _Intervals | None:
     )
 
 
-def _rotations(own: OwnMotions, joined: NDArray[np.bool_]) -> _Intervals | None:
+def _rotations(own: OwnMotions, joined: Mask) -> _Intervals | None:
     """Rotations between frames, as those of the lines of both, times the steps; None if few are known."""
     (way, lines), (two, of_ends) = _rotated(own, 1), _rotated(own, 2)
     way[~joined], two[~(joined[1:] & joined[:-1])] = np.nan, np.nan
@@ -163,8 +161,7 @@ def _rotations(own: OwnMotions, joined: NDArray[np.bool_]) -> _Intervals | None:
 
     def usual(steps: Array) -> Array:
         by = _weighted_median(share / steps, square * steps ** (2 - power))
-        value: Array = by[..., None, None] * lines
-        return value
+        return by[..., None, None] * lines
 
     return _Intervals(way, usual, lambda steps: steps**power, 1.0)
 
@@ -184,18 +181,15 @@ def _weighted_median(values: Array, weights: Array) -> Array:
     order = np.argsort(values, axis=-1)
     passed = np.cumsum(np.take_along_axis(weights, order, axis=-1), axis=-1)
     middle = np.argmax(passed >= 0.5 * passed[..., -1:], axis=-1)[..., None]
-    median: Array = np.take_along_axis(values, np.take_along_axis(order, middle, axis=-1), axis=-1)[..., 0]
-    return median
+    return np.take_along_axis(values, np.take_along_axis(order, middle, axis=-1), axis=-1)[..., 0]
 
 
-def _told(own: OwnMotions, joined: NDArray[np.bool_]) -> list[_Intervals]:
+def told_by(own: OwnMotions, joined: Mask) -> list[_Intervals]:
     """All that tells of missing frames."""
     return [each for each in (_travels(own, joined), _rotations(own, joined)) if each is not None]
 
 
-def gaps_between(
-    own: OwnMotions, place: Index, steps: Array, joined: NDArray[np.bool_], num_frames: int, rate: float
-) -> Gaps:
+def gaps_between(own: OwnMotions, place: Index, steps: Array, joined: Mask, num_frames: int, rate: float) -> Gaps:
     """Frames that are missing here and there, or regularly since the video was converted from a higher frame rate.
 
     A conversion is one hypothesis about all intervals, so that it is seen where hands shake too much for single gaps.
@@ -215,8 +209,8 @@ def gaps_between(
     rate : float
         Its frame rate, 1/s.
     """
-    told = _told(own, joined)
-    single = _frames_missing(told, steps)
+    told = told_by(own, joined)
+    single = frames_missing(told, steps)
     of_all = np.zeros(max(num_frames - 1, 0), np.int64)
     of_all[place[:-1]] = single
     between = np.diff(place)
@@ -256,9 +250,8 @@ def _conversions(num_frames: int, rate: float) -> tuple[Index, Array, Array]:
     return missing[first], np.repeat(ratios, _PHASES)[first], cost
 
 
-def _is_near(rates: Array, rate: float) -> NDArray[np.bool_]:
-    near: NDArray[np.bool_] = np.abs(rates / rate - 1) < _SAME_RATE
-    return near
+def _is_near(rates: Array, rate: float) -> Mask:
+    return np.abs(rates / rate - 1) < _SAME_RATE
 
 
 def _cost_of_all(intervals: _Intervals, steps: Array) -> Array:
@@ -274,31 +267,16 @@ def _cost_of_all(intervals: _Intervals, steps: Array) -> Array:
         weight = known * (_DEGREES + d) / (_DEGREES + squares)
         variance = np.maximum((weight[..., None] * even).sum(axis=1) / count[:, None], 1e-18)
     squares = (even / variance[:, None]).sum(axis=2)
-    cost: Array = _student(squares, more, d).sum(axis=1, where=known) + 0.5 * count * np.log(variance).sum(axis=1)
-    return cost
+    return _student(squares, more, d).sum(axis=1, where=known) + 0.5 * count * np.log(variance).sum(axis=1)
 
 
-def frames_missing(own: OwnMotions, steps: Array, joined: NDArray[np.bool_]) -> Index:
-    """Number of frames that are missing in each interval between consecutive ones, beyond what their times say.
+def frames_missing(told: Sequence[_Intervals], steps: Array) -> Index:
+    """(m - 1,) frames that are missing between consecutive ones, beyond what their times say; 0 if one gap at most is.
 
     Where frames are missing but their times do not show it, the camera moves a multiple of what is usual. A jerk of the
-    hand moves it elsewhere. Each hypothesis is weighed by the usual changes from interval to interval.
-
-    Parameters
-    ----------
-    own, steps, joined
-        As for `gaps_between`.
-
-    Returns
-    -------
-    (m - 1,) int array
-        All 0 if fewer than two intervals are clear.
+    hand moves it elsewhere. Each hypothesis is weighed by the usual changes from interval to interval. It is the
+    likeliest set of gaps, the likeliest ones first: each that is explained shows more clearly what is usual.
     """
-    return _frames_missing(_told(own, joined), steps)
-
-
-def _frames_missing(told: Sequence[_Intervals], steps: Array) -> Index:
-    """The likeliest set of gaps, the likeliest ones first: each that is explained shows more clearly what is usual."""
     found = np.zeros(len(steps), np.int64)
     if not told:
         return found
@@ -350,8 +328,7 @@ def _of_neighbours(rate: Array) -> Array:
     padded = np.pad(rate, [(0, 0)] * (rate.ndim - 2) + [(1, 1), (0, 0)], constant_values=np.nan)
     both = np.stack([padded[..., :-2, :], padded[..., 2:, :]])
     known = np.isfinite(both).sum(axis=0)
-    mean: Array = np.nan_to_num(both).sum(axis=0) / np.where(known > 0, known, np.nan)
-    return mean
+    return np.nan_to_num(both).sum(axis=0) / np.where(known > 0, known, np.nan)
 
 
 def _student(squares: Array, more: Array, d: int) -> Array:
@@ -360,5 +337,4 @@ def _student(squares: Array, more: Array, d: int) -> Array:
     Of Student's t, or of a knock, which may be of any size.
     """
     usual = 0.5 * (_DEGREES + d) * np.log1p(squares / _DEGREES) + 0.5 * d * np.log(more)
-    value: Array = -np.log(np.exp(-usual) + np.exp(-_KNOCK))
-    return value
+    return -np.log(np.exp(-usual) + np.exp(-_KNOCK))

@@ -108,22 +108,12 @@ def solve_photos(
     finer : callable, optional
         As in `place_photos`.
     """
-    cameras = photos.cameras
     mapped, matched = place_photos(
         photos, scratch, log, seed, matching, kept or Kept(), with_shutter=True, finer=finer
     )  # fmt: skip
     check_enough(mapped, len(photos.names))
-    solved = solve_tracks(
-        mapped,
-        cameras,
-        shutter_model,
-        seed,
-        options_of,
-        log,
-        remedy,
-        TrackSource(matched, photos, workers, mapped_here=True),
-        survey,
-    )
+    source = TrackSource(matched, photos, workers, mapped_here=True)
+    solved = solve_tracks(mapped, photos.cameras, shutter_model, seed, options_of, log, remedy, source, survey)
     if solved.survey is not None:
         return solved
     # the frame of a mapping is arbitrary

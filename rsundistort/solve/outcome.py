@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..batch.rectify_options import RectifyOptions
 from ..bundle import BundleResult, ModelChoice, ReadoutChoice
 from ..critical import Advice, Remedy
 from ..input.photo_cameras import PhotoCameras
 from ..model import BEND_GROUPS, Reconstruction, Solution, SolvedImage
+from ..model.array_types import Array
 from ..model.field import field_over_frame
 from ..model.reprojection import reprojection_residuals
 from ..rectify import largest_shift_px, steadiest_pinhole
@@ -123,7 +123,7 @@ def _guesses(solved: Solved) -> list[str]:
     ]
 
 
-def _image_rms(rec: Reconstruction) -> NDArray[np.float64]:
+def _image_rms(rec: Reconstruction) -> Array:
     """(m,) root mean square residual of each photo in pixels."""
     res, valid = reprojection_residuals(rec)
     frame = rec.observations.frame_idx[valid]

@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..batch.progress import StageLog
 from ..errors import ReconstructionError
@@ -17,6 +16,7 @@ from ..input.load import LoadedPhotos
 from ..input.pairing import pairs_of_clip, pairs_to_match
 from ..io.kept import Kept
 from ..model import Reconstruction
+from ..model.array_types import Index
 from ..sfm import MatchedPhotos, map_photos, match_photos, read_num_verified, verify_with_shutter
 from ..sfm.mapping import PLACING_KEYPOINTS
 from ..sfm.matching import LOOSE_PX, close_px, match_more
@@ -30,11 +30,6 @@ _MANY = 100
 _RICH, _ASKED, _MOST_OF_THEM, _AT_LEAST = 800, 16, 0.75, 0.5
 # Largest keypoints of a key frame that place it: neighbours show nearly all of them again.
 _OF_CLIP = (512, 2048, None)
-
-
-def _num_overlapping(matched: MatchedPhotos) -> int:
-    """Pairs of photos that overlap beyond doubt."""
-    return sum(count >= _MANY for count in read_num_verified(matched).values())
 
 
 def place_photos(
@@ -86,7 +81,8 @@ def place_photos(
             keypoints = _OF_CLIP if of_clip else PLACING_KEYPOINTS
             mapped = map_photos(matched, lambda done: log.tell("mapping", done, len(photos.names)), keypoints)
         except ReconstructionError as error:
-            if _num_overlapping(matched) < len(photos.names) - 1:
+            overlapping = sum(count >= _MANY for count in read_num_verified(matched).values())
+            if overlapping < len(photos.names) - 1:
                 raise
             raise ReconstructionError(
                 "the photos overlap, but show no parallax: the camera stood still or only rotated; "
@@ -126,7 +122,8 @@ def _match(
         asks = bool(photos.coarse) and len(photos.names) > _ASKED
         if asks:
             matched = start(pairs=_neighbours(len(photos.names)))
-            if not _most_are_rich(matched):
+            rich = sum(count >= _RICH for count in read_num_verified(matched).values())
+            if rich < _MOST_OF_THEM * _ASKED:
                 log.end("matching", of="coarse features", rich=False)
                 return None
         pairs, num_pairs = choose(photos, matching, seed), math.comb(len(photos.names), 2)
@@ -143,15 +140,10 @@ def _match(
     return matched if not photos.coarse or _all_are_rich(matched) else None
 
 
-def _neighbours(count: int) -> NDArray[np.int64]:
+def _neighbours(count: int) -> Index:
     """(p, 2) some of the pairs of photos that follow each other."""
     first = np.linspace(0, count - 2, _ASKED).astype(np.int64)
     return np.stack([first, first + 1], axis=1)
-
-
-def _most_are_rich(matched: MatchedPhotos) -> bool:
-    """Whether most of the pairs that were asked share many matches."""
-    return sum(count >= _RICH for count in read_num_verified(matched).values()) >= _MOST_OF_THEM * _ASKED
 
 
 def _all_are_rich(matched: MatchedPhotos) -> bool:

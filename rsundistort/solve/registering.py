@@ -9,12 +9,12 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..batch.progress import StageLog
 from ..bundle import BundleOptions, BundleResult
 from ..errors import ReconstructionError, RsUndistortWarning
 from ..model import Reconstruction
+from ..model.array_types import Mask
 from ..sfm import (
     LEAST_MEASUREMENTS,
     carried_along,
@@ -250,16 +250,16 @@ class Registrar:
             self._confirmed.update(names)
         return confirmed
 
-    def _suspects(self, reconstruction: Reconstruction) -> NDArray[np.bool_]:
+    def _suspects(self, reconstruction: Reconstruction) -> Mask:
         return self._contradicting(reconstruction, suspects=True)
 
-    def _contradicting(self, reconstruction: Reconstruction, *, suspects: bool = False) -> NDArray[np.bool_]:
+    def _contradicting(self, reconstruction: Reconstruction, *, suspects: bool = False) -> Mask:
         matched = self.track_source.matched
         found = contradicting_photos(matched, self._num_verified, reconstruction, suspects=suspects)
         found |= self._breaks(reconstruction)
         return found & ~np.isin(reconstruction.image_names, [*self._confirmed])
 
-    def _breaks(self, tracks: Reconstruction) -> NDArray[np.bool_]:
+    def _breaks(self, tracks: Reconstruction) -> Mask:
         return photos_beside_breaks(self.track_source.matched, tracks)
 
     def _new_tracks(self, reconstruction: Reconstruction) -> Reconstruction:

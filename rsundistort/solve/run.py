@@ -89,11 +89,11 @@ def run(
     workers = Workers(use_threads(jobs), scheduler)
     gyro_files = () if options.gyro is None else (options.gyro.file, options.gyro.times)
     inputs = inputs_of(rectify, photos, *gyro_files, camera_file_of(photos, options.camera))
-    check_usd(options.outputs, is_video(photos) and options.every is None and options.sharpest is None)
     is_clip = is_video(photos) and options.every is None and options.sharpest is None
+    check_usd(options.outputs, is_clip)
     if options.frames == "all" and not is_clip:
         raise InputError(f"{photos} is no video; --frames all is for one")
-    of_video = [name for name in OF_VIDEOS if _writes(name, options)] if is_clip else []
+    of_video = [name for name in OF_VIDEOS if name != VIDEO or options.frames == "all"] if is_clip else []
     replaced = (*REPLACED, "frames") if is_video(photos) else REPLACED
     with run_folder(out, key_of(inputs, options), log, overwrite=overwrite, resume=resume) as before:
         if before.finished:
@@ -113,8 +113,7 @@ def run(
             if stages is None:
                 known = len(log.stages)
                 outputs.rectify_clip(photos, out, workers, log)
-                stages = log.stages[known:]
-                before.kept.put(VIDEO, stages)
+                before.kept.put(VIDEO, log.stages[known:])
             else:
                 log.stages += stages
         return outputs.rectify(out / "frames" if is_video(photos) else photos, out, workers, log, before.begun)
@@ -173,11 +172,6 @@ def _solved(
     )
     before.solved(outputs, log)
     return outputs
-
-
-def _writes(name: str, options: RunOptions) -> bool:
-    """Whether a file of videos is written."""
-    return name != VIDEO or options.frames == "all"
 
 
 def _check_anchors(options: SolveOptions, names: Sequence[str], photos: Path) -> None:

@@ -48,7 +48,9 @@ from ..io.record import Record
 from ..io.usd import write_usd_camera
 from ..io.video import FRAME_TABLE, frame_name
 from ..model import Camera, Reconstruction, RowMotion, Solution, SolvedImage
+from ..model.array_types import Mask
 from ..model.orientation import orient_path, orient_reconstruction, orient_solution
+from ..model.path import CameraPath
 from ..rectify import bend_px
 from ..report import Diagnostics, relative_folder, write_diagnostics, write_report
 from .outcome import Solved, solution_of
@@ -122,7 +124,7 @@ class PointRgb:
     """
 
     values: NDArray[np.uint8]
-    known: NDArray[np.bool_]
+    known: Mask
 
 
 @dataclass(frozen=True)
@@ -317,12 +319,10 @@ class Outputs:
             write_colmap_workspace(folder, [name for _, name in by_id])
         write_point_cloud(folder / "points.ply", rec.points_w, rgb)
         self._trajectory(folder / "poses.txt", solution)
-        self._path(folder, next(iter(solution.rectified_cameras.values())))
+        path = self._path(folder, next(iter(solution.rectified_cameras.values())))
         masks = mask_names([image.name for image in solution.images])
         files = {name: (f"images/{new}", f"masks/{masks[name]}") for name, new in written.items()}
         write_transforms(folder / "transforms.json", solution, files, "points.ply")
-        path = None if self.solved is None or self.solved.result.path is None else self.solved.result.path.path
-        path = path and orient_path(path, next(iter(self.applied.values()), 1))
         self._export(folder, ExportScene(solution, rec, written, rgb, stored, source, originals, path), last)
         return solution
 
@@ -337,17 +337,18 @@ class Outputs:
             if said and tell:
                 warnings.warn(f"{name}: {said}", RsUndistortWarning, stacklevel=4)
 
-    def _path(self, folder: Path, new_camera: Camera) -> None:
-        """Write the path of the camera of a video; rotated as the key frames are."""
+    def _path(self, folder: Path, new_camera: Camera) -> CameraPath | None:
+        """Write the path of the camera of a video; rotated as the key frames are. None of photos."""
         found = None if self.solved is None else self.solved.result.path
         if found is None:
-            return
+            return None
         path = orient_path(found.path, next(iter(self.applied.values()), 1))
         write_path(folder / "path.csv", found.names, path)
         write_trajectory(folder / "path.txt", path.time_s, path.R_cw, path.center_w)
         if self.options.usd:
             frame_s = float(np.median(np.diff(path.time_s)))
             write_usd_camera(folder / USD, new_camera, path, frame_s, self.reconstruction.points_w)
+        return path
 
     def rectify_clip(self, video: Path, out: Path, workers: Workers, log: StageLog) -> None:
         """Rectify all frames of a video into `out`, which `begin` has filled."""

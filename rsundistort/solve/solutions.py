@@ -36,13 +36,10 @@ def agree(rec: Reconstruction, other: Reconstruction) -> bool:
 def same_places(rec: Reconstruction, other: Reconstruction) -> bool:
     """Whether the photos of two solutions in one frame are in the same places, as seen from what they show."""
     index_of = {name: i for i, name in enumerate(other.image_names)}
-    obs, depth = rec.observations, np.zeros(rec.num_images)
-    for i, mine in enumerate(obs.by_photo(rec.num_images)):
-        if len(mine):
-            depth[i] = np.median(np.linalg.norm(rec.points_w[obs.point_idx[mine]] - rec.center_w[i], axis=1))
-    moved = [
-        (np.linalg.norm(other.center_w[index_of[name]] - rec.center_w[i]), depth[i])
-        for i, name in enumerate(rec.image_names)
-        if name in index_of
-    ]
-    return all(way <= _AGREE_RAD * far for way, far in moved)
+    obs = rec.observations
+    for center, name, mine in zip(rec.center_w, rec.image_names, obs.by_photo(rec.num_images), strict=True):
+        away = np.linalg.norm(rec.points_w[obs.point_idx[mine]] - center, axis=1)
+        depth = np.median(away) if len(mine) else 0.0
+        if name in index_of and not np.linalg.norm(other.center_w[index_of[name]] - center) <= _AGREE_RAD * depth:
+            return False
+    return True

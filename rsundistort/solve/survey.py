@@ -8,20 +8,19 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..bundle import CONTROL_SIGMA_PX, KnownPlaces, place_control, scale_of_lengths, with_control
-from ..bundle.known_positions import point_of
+from ..bundle.known_positions import point_of, stacked
 from ..errors import InputError, RsUndistortWarning
 from ..input.positions import MapFrame, PhotoPositions, frame_at, frame_of_control, positions_of
 from ..io import ExifFacts
 from ..model import ControlPoint, KnownLength, Reconstruction
+from ..model.array_types import Array
 from ..model.similarity import FittedSimilarity, Similarity, fit_similarity
 
 __all__ = ["Survey", "survey_of"]
 
-Array = NDArray[np.float64]
 
 _LEAST = 3
 # Places georeference a model if they determine its rotation and scale to this: radians, relative.
@@ -144,30 +143,23 @@ class Survey:
         """The reconstruction with the control points among its points, in the frame that they define."""
         found = place_control(rec, self.holding)
         lost = [each.name for each in self.holding if each not in found.points]
-        notes = [
-            *self.notes,
-            *([f"control points that fewer than two registered photos see: {', '.join(lost)}"] * bool(lost)),
-        ]
-        survey, targets = replace(self, notes=notes), np.array([each.place_m for each in found.points]).reshape(-1, 3)
+        notes = [*self.notes]
+        if lost:
+            notes.append(f"control points that fewer than two registered photos see: {', '.join(lost)}")
+        survey = replace(self, notes=notes)
+        targets, sigma = stacked([(each.place_m, each.sigma_m) for each in found.points])
+        problem = f"{len(found.points)} control points are seen by registered photos, three are needed"
         if len(found.points) >= _LEAST:
-            sigma = np.array([each.sigma_m for each in found.points])
             fit = self._fitted(rec, found.points_w, targets, sigma)
             problem = _misfit(fit, "control points", robust=False)
-            if problem and self.fit is None:
-                warnings.warn(
-                    f"not on the map: {problem}; poses are in a frame of their own", RsUndistortWarning, stacklevel=4
-                )
-                return None, rec
             if not problem:
                 rec, survey = fit.similarity.of_reconstruction(rec), replace(survey, fit=fit)
-        elif self.fit is None:
-            warnings.warn(
-                f"not on the map: {len(found.points)} control points are seen by registered photos, three are needed; "
-                "poses are in a frame of their own", RsUndistortWarning, stacklevel=4,
-            )  # fmt: skip
-            return None, rec
-        elif found.points:
+        elif self.fit is not None and found.points:
             rec = Similarity(1.0, np.eye(3), (targets - found.points_w).mean(0)).of_reconstruction(rec)
+        if problem and self.fit is None:
+            said = f"not on the map: {problem}; poses are in a frame of their own"
+            warnings.warn(said, RsUndistortWarning, stacklevel=4)
+            return None, rec
         if self.places and found.points:
             # the common offset of all positions is the receiver's and its datum's, and control points know better
             centers, places, _ = _of_photos(rec, self.places)
@@ -181,9 +173,8 @@ class Survey:
         x, y, sigma = _of_photos(rec, self.places)
         indices = {point_of(rec, each): each for each in self.holding}
         points = {k: each for k, each in indices.items() if k is not None}
-        x = np.concatenate([x, rec.points_w[list(points)]])
-        y = np.concatenate([y, np.array([each.place_m for each in points.values()]).reshape(-1, 3)])
-        sigma = np.concatenate([sigma, np.array([each.sigma_m for each in points.values()]).reshape(-1, 3)])
+        of_points = rec.points_w[list(points)], *stacked([(each.place_m, each.sigma_m) for each in points.values()])
+        x, y, sigma = (np.concatenate(each) for each in zip((x, y, sigma), of_points, strict=True))
         fit = self._fitted(rec, x, y, sigma)
         rec = fit.similarity.of_reconstruction(rec)
         survey = replace(self, fit=fit)
@@ -214,7 +205,6 @@ class Survey:
         """Its content of `solution.json`; covariances are those of the photos' unknowns."""
         assert self.fit is not None
         residuals = self._residuals(rec)
-        sigma = {name: np.asarray(self.places[name][1]).tolist() for name in residuals}
         off = self.outliers(rec)
         value: dict[str, Any] = {
             "crs": self.frame.crs,
@@ -240,7 +230,7 @@ class Survey:
                 "offset_m": self.gps_offset_m.tolist(),
                 "outliers": sorted(off),
                 "photos": {
-                    name: {"residual_m": residual.tolist(), "sigma_m": sigma[name]}
+                    name: {"residual_m": residual.tolist(), "sigma_m": np.asarray(self.places[name][1]).tolist()}
                     for name, (residual, _) in residuals.items()
                 },
             }
@@ -288,12 +278,7 @@ class Survey:
 def _of_photos(rec: Reconstruction, places: Mapping[str, tuple[Array, Array]]) -> tuple[Array, Array, Array]:
     """Centres, places and standard deviations (k, 3) of the photos that have a place."""
     rows = [i for i, name in enumerate(rec.image_names) if name in places]
-    known = [places[rec.image_names[i]] for i in rows]
-    return (
-        rec.center_w[rows],
-        np.array([place for place, _ in known]).reshape(-1, 3),
-        np.array([sigma for _, sigma in known]).reshape(-1, 3),
-    )
+    return rec.center_w[rows], *stacked([places[rec.image_names[i]] for i in rows])
 
 
 def _misfit(fit: FittedSimilarity, what: str, robust: bool = True) -> str:

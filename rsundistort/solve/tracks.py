@@ -71,11 +71,6 @@ class TrackSource:
     workers: Workers | None = None
     mapped_here: bool = False
 
-    @property
-    def step_px(self) -> float:
-        """Pixels of the photos per pixel of the images that the features were detected in."""
-        return float(np.median([each.step_px for each in self.matched.features]))
-
     def aligned(self, reconstruction: Reconstruction, log: StageLog) -> Reconstruction:
         """The tracks of a reconstruction, aligned at full size."""
         assert self.photos is not None
@@ -211,7 +206,7 @@ def retriangulated(
             stage, points=after.num_points, observations=len(after.observations), rms_px=result.rms_px,
             iterations=result.num_iterations, stop_reason=result.stop_reason, moved_px=moved,
         )  # fmt: skip
-        settled = moved < _SETTLED_PX * track_source.step_px
+        settled = moved < _SETTLED_PX * track_source.matched.step_px
     if ends and not aligns:
         result = bundle_adjust(tracks, shutter_model, options, partial(tell, log, "re-triangulation"))
     return result, tracks, options

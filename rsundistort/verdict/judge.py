@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import stdtr
 
@@ -16,15 +15,16 @@ from ..bundle.choice import clipped_errors, corners, improves, standard_errors
 from ..bundle.layout import motion_end
 from ..critical import Remedy
 from ..model import Reconstruction
+from ..model.array_types import Array, Index, Mask
 from ..model.field import field_over_frame
 from ..sfm import LEAST_MEASUREMENTS, LEAST_TIES, connected_photos
 from .photos import PhotoMotions, photo_motions
 from .residuals import left_along_readout, left_over_frame
 
-__all__ = ["Verdict", "height_reasons", "judge", "loose_reasons", "unexplained_reasons"]
+__all__ = ["UNSEEN_PX", "Verdict", "height_reasons", "judge", "loose_reasons", "unexplained_reasons"]
 
-# Displacements below this are lost in the interpolation of a photo.
-_UNSEEN_PX = 1.0
+#: Displacements below this are lost in the interpolation of a photo.
+UNSEEN_PX = 1.0
 # A motion with a larger standard deviation may do as much harm as good.
 _UNCERTAIN_PX = 2.0
 # Of the scene's height: as good as photos measure. No standard deviation includes errors that all photos share
@@ -145,7 +145,7 @@ def judge(
     outliers = _outliers(rec, tracks)
     doubts = _doubts(result, motions, outliers, most_phi or {})
     # the fixed scene draws both halves to the motion that it was solved with: their difference is less than the error
-    torn = (motions.difference_px > np.maximum(_UNSEEN_PX, motions.shift_px / 2)) | (outliers > 0.5)
+    torn = (motions.difference_px > np.maximum(UNSEEN_PX, motions.shift_px / 2)) | (outliers > 0.5)
     shutter, why = _of_motions(result, global_result, choice, motions, torn, known)
     reasons += _rival_reasons(choice)
     for name, said in _misplaced(result, bool(unexplained + why)).items() if strong else ():
@@ -161,7 +161,7 @@ def judge(
     lost = torn | np.isin(rec.image_names, [*suspects])
     lost |= (_counts(rec) < _FEW) & (motions.sigma_px >= motions.shift_px)
     # motions that cannot be seen do no harm
-    lost &= motions.shift_px >= _UNSEEN_PX
+    lost &= motions.shift_px >= UNSEEN_PX
     # a model that the user named is applied
     lost |= shutter == "not-determined" and choice is not None
     lens_only = tuple(name for name, each in zip(rec.image_names, lost, strict=True) if each and name not in known)
@@ -177,11 +177,11 @@ def _verdict(
     return Verdict(shutter, "doubtful" if reasons else "trusted", tuple(reasons), doubtful or {}, lens_only)
 
 
-def _counts(rec: Reconstruction) -> NDArray[np.int64]:
+def _counts(rec: Reconstruction) -> Index:
     return np.bincount(rec.observations.frame_idx, minlength=rec.num_images)
 
 
-def _outliers(rec: Reconstruction, tracks: Reconstruction | None) -> NDArray[np.float64]:
+def _outliers(rec: Reconstruction, tracks: Reconstruction | None) -> Array:
     """(m,) share of each photo's measurements that the solution does not explain."""
     if tracks is None:
         return np.zeros(rec.num_images)
@@ -287,12 +287,12 @@ def _of_motions(
     global_result: BundleResult | None,
     choice: ModelChoice | None,
     motions: PhotoMotions,
-    torn: NDArray[np.bool_],
+    torn: Mask,
     known: Collection[str],
 ) -> tuple[str, list[str]]:
     """Whether a shutter was found, and why not."""
     rec = result.reconstruction
-    if not (motions.shift_px >= _UNSEEN_PX).any():
+    if not (motions.shift_px >= UNSEEN_PX).any():
         return "not-found", []
     reasons = []
     if choice is None and not (global_result is not None and _explains(result, global_result)):
@@ -345,13 +345,13 @@ def _repeated(rec: Reconstruction) -> int | None:
         if between @ mean > _SAME_WAY * np.linalg.norm(between) * np.linalg.norm(mean):
             continue
         chance = 2.0 * stdtr(freedom, -np.abs(mean) / np.maximum(spread, 1e-12) * np.sqrt(m))
-        alike = (np.abs(mean) > _REPEATED * spread) & (3 * chance < _CHANCE) & (np.abs(mean) * half_px > _UNSEEN_PX)
+        alike = (np.abs(mean) > _REPEATED * spread) & (3 * chance < _CHANCE) & (np.abs(mean) * half_px > UNSEEN_PX)
         if alike.any():
             return int(np.argmax(np.where(alike, np.abs(mean), 0.0)))
     return None
 
 
-def _trimmed_mean(values: NDArray[np.float64], trimmed: int) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+def _trimmed_mean(values: Array, trimmed: int) -> tuple[Array, Array, int]:
     """Mean of columns (m, k) without so many values at either end, its standard deviation times sqrt(m), its freedom.
 
     The deviation is Tukey and McLaughlin's, from the Winsorised variance.
@@ -364,7 +364,7 @@ def _trimmed_mean(values: NDArray[np.float64], trimmed: int) -> tuple[NDArray[np
 
 
 def _doubts(
-    result: BundleResult, motions: PhotoMotions, outliers: NDArray[np.float64], most_phi: Mapping[str, float]
+    result: BundleResult, motions: PhotoMotions, outliers: Array, most_phi: Mapping[str, float]
 ) -> dict[str, list[str]]:
     """Reasons against each photo."""
     rec = result.reconstruction
@@ -381,11 +381,11 @@ def _doubts(
             said.append(f"its measurements lie in {100 * motions.covered[i]:.0f} % of its frame")
         if outliers[i] > _OUTLIERS:
             said.append(f"{100 * outliers[i]:.0f} % of its measurements contradict the others")
-        if motions.difference_px[i] > _UNSEEN_PX:
+        if motions.difference_px[i] > UNSEEN_PX:
             said.append(f"its halves contradict each other by {motions.difference_px[i]:.1f} px")
         if motions.sigma_px[i] > _UNCERTAIN_PX:
             said.append(f"its motion is only known to +-{motions.sigma_px[i]:.1f} px")
-        if times[i] > _FAR and motions.shift_px[i] > _UNSEEN_PX:
+        if times[i] > _FAR and motions.shift_px[i] > UNSEEN_PX:
             said.append(f"it moved {times[i]:.0f} times as much as the other photos do")
         if np.linalg.norm(rotation[i]) - 2 * sigma[i] > most_phi.get(name, np.inf):
             said.append(
@@ -402,7 +402,7 @@ def _faint(rec: Reconstruction, motions: PhotoMotions) -> dict[str, str]:
     over the frame, as a photo is judged.
     """
     found, sigma = motions.shift_px, motions.sigma_px
-    faint = (motions.relative_sigma > 1 / 4) & (sigma > _UNSEEN_PX / 2)
+    faint = (motions.relative_sigma > 1 / 4) & (sigma > UNSEEN_PX / 2)
     return {
         name: f"its motion of {found[i]:.1f} px is only known to +-{sigma[i]:.1f} px"
         for i, name in enumerate(rec.image_names)

@@ -12,13 +12,11 @@ from ..bundle.own_motions import OwnMotions
 from ..critical import Remedy
 from ..model import Reconstruction
 from ..rectify import largest_shift_px
-from .judge import Verdict, height_reasons, loose_reasons, unexplained_reasons
+from .judge import UNSEEN_PX, Verdict, height_reasons, loose_reasons, unexplained_reasons
 from .speeds import BySpeed, ReadoutTime
 
 __all__ = ["BY_SLOW_ROTATIONS", "SIGMAS", "ReadoutTime", "judge_clip", "problem_of", "unfollowed_px"]
 
-# Displacements below this are lost in the interpolation of a photo.
-_UNSEEN_PX = 1.0
 #: Source of a readout time that the path says nothing about.
 BY_SLOW_ROTATIONS = "slow rotations of the video"
 #: Standard deviations by which a readout time differs from none, or from another of the same video.
@@ -88,7 +86,7 @@ def judge_clip(
     most = shift * (abs(time.seconds) + SIGMAS * time.sigma) / max(abs(time.seconds), 1e-9)
     if against:
         return Verdict("not-determined", "doubtful", (f"{against}.", *reasons), {}, tuple(rec.image_names))
-    if not most > _UNSEEN_PX:
+    if not most > UNSEEN_PX:
         shutter = "not-found"
     elif beyond > frame_s:
         # whatever bends them, corrected as by a shutter they would be bent the more
@@ -126,7 +124,7 @@ def _contradictions(
     reasons = []
     if _is_backwards(time):
         reasons.append(f"The readout time is {1e3 * time.seconds:.1f} +- {1e3 * time.sigma:.1f} ms: {_BACKWARDS}.")
-    if vibration_px > _UNSEEN_PX:
+    if vibration_px > UNSEEN_PX:
         reasons.append(f"The frames rotate by {vibration_px:.1f} px more than their path explains: {_VIBRATES}.")
     slow, fast = (None, None) if speeds is None else speeds[:2]
     if slow is not None and fast is not None and _runs_the_other_way(slow, fast):
@@ -197,7 +195,7 @@ def problem_of(evidence: Mapping[str, Any]) -> str:
         return f"the camera moved too little: {1e3 * seconds:.1f} +- {1e3 * sigma:.1f} ms"
     if _is_backwards(ReadoutTime(seconds, sigma)):
         return f"{1e3 * seconds:.1f} +- {1e3 * sigma:.1f} ms: {_BACKWARDS}"
-    if evidence.get("unfollowed_px", 0.0) > _UNSEEN_PX:
+    if evidence.get("unfollowed_px", 0.0) > UNSEEN_PX:
         return f"the frames rotate by {evidence['unfollowed_px']:.1f} px more than their path explains: {_VIBRATES}"
     if evidence.get("halves"):
         first, second = evidence["halves"]

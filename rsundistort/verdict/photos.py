@@ -6,18 +6,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from ..bundle import BundleResult
 from ..bundle.layout import motion_end
 from ..model import Reconstruction
+from ..model.array_types import Array, Index, Mask
 from ..model.path import cross_matrices
 from ..model.projection import clock_of, project_points_with_jacobians, unproject_points
 
 __all__ = ["PhotoMotions", "photo_motions"]
 
-Array = NDArray[np.float64]
 
 # Cells of the chequerboard, across and down; places across and down at which the frame is sampled.
 _BOARD, _LOOKED_AT = 8, 5
@@ -66,26 +65,22 @@ def photo_motions(result: BundleResult) -> PhotoMotions:
     nb = motion_end(rec.shutter_model)
     sigmas = np.repeat([result.phi_rms, result.velocity_rms * rec.baseline], 3)[: nb - 6]
     found = np.zeros((5, rec.num_images))
-    splits = 3 * rec.num_images
     for i, mine in enumerate(rec.observations.by_photo(rec.num_images)):
         if len(mine):
             prior = np.concatenate([np.zeros(6), (rec.frame_span()[i] / np.maximum(sigmas, 1e-12)) ** 2])
             photo = _Photo.of(rec, i, mine, result.sigma_px)
             sigmas_px = photo.motion_sigmas_px(result.covariances[i, 6:, 6:])
-            shifts_px, bent_px = photo.shifts_px(photo.motion[None])[0], _bent_px(rec, i)
+            shifts_px = photo.shifts_px(photo.motion[None])[0]
+            # approximately, what is unsteady of the rotation displaces along the readout
+            bent_px = rec.camera(i).K[0, 0] * np.linalg.norm(rec.bend[i, :, :3], axis=1)
             found[:, i] = (
                 shifts_px.max(initial=0.0) + bent_px.max(initial=0.0),
                 sigmas_px.max(initial=0.0),
                 _rms(sigmas_px) / max(np.hypot(_rms(shifts_px), _rms(bent_px)), 1e-300),
-                photo.difference_px(prior, _CHANCE / splits),
+                photo.difference_px(prior, _CHANCE / (3 * rec.num_images)),
                 photo.covered,
             )
     return PhotoMotions(*found)
-
-
-def _bent_px(rec: Reconstruction, image: int) -> Array:
-    """(k,) approximate displacements of pixels by the unsteady part of a photo's rotation, along its readout."""
-    return np.asarray(rec.camera(image).K[0, 0] * np.linalg.norm(rec.bend[image, :, :3], axis=1))
 
 
 def _rms(values: Array) -> float:
@@ -112,7 +107,7 @@ class _Photo:
     rotation: Array
 
     @classmethod
-    def of(cls, rec: Reconstruction, i: int, mine: NDArray[np.int64], sigma_px: float) -> _Photo:
+    def of(cls, rec: Reconstruction, i: int, mine: Index, sigma_px: float) -> _Photo:
         obs, camera, R = rec.observations, rec.camera(i), rec.R_cw[i]
         points_c = (rec.points_w[obs.point_idx[mine]] - rec.center_w[i]) @ R.T
         motion = rec.motion(i).in_camera(R)
@@ -167,7 +162,7 @@ class _Photo:
         """Variance of residuals relative to their weights; at least 1."""
         return max(1.0, float((residuals**2).sum()) / max(residuals.size - unknowns, 1))
 
-    def _halves(self) -> Iterator[NDArray[np.bool_]]:
+    def _halves(self) -> Iterator[Mask]:
         """Measurements (n,) of one half."""
         for values in (self.xy[:, 1 - self.along], self.clock):
             yield values > np.median(values)
@@ -179,7 +174,7 @@ class _Photo:
             return 0.0
         return max(self._difference_px(half, prior, chance) for half in self._halves())
 
-    def _difference_px(self, half: NDArray[np.bool_], prior: Array, chance: float) -> float:
+    def _difference_px(self, half: Mask, prior: Array, chance: float) -> float:
         nb = self.J.shape[2]
         steps, covariances, noise = [], [], []
         for mine in (half, ~half):

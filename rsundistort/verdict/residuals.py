@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from ..model import Reconstruction
+from ..model.array_types import Index
 from ..model.projection import clock_of
 from ..model.reprojection import reprojection_residuals
 
@@ -47,7 +47,7 @@ def left_over_frame(reconstruction: Reconstruction) -> float:
     return _systematic(rec, (camera * _CELLS[1] + down) * _CELLS[0] + across)
 
 
-def _systematic(rec: Reconstruction, part: NDArray[np.int64]) -> float:
+def _systematic(rec: Reconstruction, part: Index) -> float:
     """Root mean square of the mean residuals of parts (o,), without noise; 0 if they are no more than noise.
 
     Measurements of a photo in a part are correlated and count once: the cluster-robust variance of a mean. The variance

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import KroghInterpolator
 from scipy.spatial.transform import Rotation
 
+from ..model.array_types import Array, Index, Mask
+
 __all__ = ["BySpeed", "ReadoutTime", "readouts_by_speed"]
 
-Array = NDArray[np.float64]
 
 # Fewer frames than this have no spectrum to speak of.
 _FEWEST = 24
@@ -65,7 +66,7 @@ class _Run(NamedTuple):
 
 
 def readouts_by_speed(
-    time_s: Array, part: NDArray[np.int64], R_cw: Array, rotation_sigma: Array, phi: Array, phi_sigma: Array,
+    time_s: Array, part: Index, R_cw: Array, rotation_sigma: Array, phi: Array, phi_sigma: Array,
     readout_s: float, *, fills: bool = True,
 ) -> BySpeed | None:  # fmt: skip
     """The readout time by rotations slower and faster than a quarter of the frame rate.
@@ -130,7 +131,7 @@ def readouts_by_speed(
     return BySpeed(slow, fast, there.unfollowed)
 
 
-def _in_a_row(time_s: Array, part: NDArray[np.int64], step_s: float, fills: bool) -> list[NDArray[np.int64]]:
+def _in_a_row(time_s: Array, part: Index, step_s: float, fills: bool) -> list[Index]:
     """Which frames are evenly spaced, but for some that are missing if they can be filled in; of runs long enough."""
     apart = np.diff(time_s) / step_s if step_s > 0 else np.zeros(0)
     missing = np.rint(apart) - 1
@@ -147,8 +148,7 @@ def _in_a_row(time_s: Array, part: NDArray[np.int64], step_s: float, fills: bool
 def _rotated(R_cw: Array) -> Array:
     """(m, 3) rotations of frames since the first, the sum of those from each to the next."""
     steps = Rotation.from_matrix(R_cw[1:] @ R_cw[:-1].transpose(0, 2, 1)).as_rotvec()
-    value: Array = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    return value
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
 
 def _compared(runs: Sequence[_Run], readout_s: float, step_s: float) -> BySpeed:
@@ -164,7 +164,7 @@ def _compared(runs: Sequence[_Run], readout_s: float, step_s: float) -> BySpeed:
     return BySpeed(slow, rest, left / power if power > line_noise.sum() else 0.0)
 
 
-def _places(run: _Run, step_s: float) -> NDArray[np.int64]:
+def _places(run: _Run, step_s: float) -> Index:
     """(m,) number of each frame of a run, those that are missing counted."""
     return np.rint((run.time_s - run.time_s[0]) / step_s).astype(np.int64)
 
@@ -198,9 +198,7 @@ def _weights_between(places: tuple[int, ...]) -> Array:
     return np.stack([polynomial(0.0), polynomial.derivative(0.0)])
 
 
-def _spectra(
-    run: _Run, readout_s: float
-) -> tuple[NDArray[np.bool_], NDArray[np.complex128], NDArray[np.complex128], Array, Array]:
+def _spectra(run: _Run, readout_s: float) -> tuple[Mask, NDArray[np.complex128], NDArray[np.complex128], Array, Array]:
     """Whether frequencies (n,) are fast; spectra (n, 3) of phi and of the rates; and power (n, 3) of their noise."""
     time_s, rotated, rotation_sigma, phi, phi_sigma = run
     step_s = float(np.median(np.diff(time_s)))
