@@ -31,7 +31,7 @@ from rsundistort.errors import FileError, InputError
 from rsundistort.io import find_depth_maps, read_depth_map, write_colmap_model
 from rsundistort.model import Observations, Reconstruction
 from rsundistort.rectify import depth_from_points
-from rsundistort.synthetic import measure
+from rsundistort.synthetic.measurements import measure
 
 W, H = 200, 160
 K = np.array([[210.0, 0, 97.3], [0, 205.0, 81.6], [0, 0, 1]])
