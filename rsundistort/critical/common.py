@@ -65,15 +65,13 @@ class CommonMotion:
     @property
     def sigma(self) -> Array:
         """(k,) standard deviations of the mean motion."""
-        value: Array = np.sqrt(np.diagonal(self.covariance))
-        return value
+        return np.sqrt(np.diagonal(self.covariance))
 
     @property
     def correlation(self) -> Array:
         """(k, k) correlations of the mean motion."""
         sigma = np.maximum(self.sigma, 1e-300)
-        value: Array = self.covariance / sigma[:, None] / sigma
-        return value
+        return self.covariance / sigma[:, None] / sigma
 
     def as_json(self) -> dict[str, Any]:
         """Its content of `solution.json`."""
@@ -172,8 +170,7 @@ def common_motion(
     def spread(x: Array) -> Array:
         """Covariance of the displacements times (j, m, k)."""
         moved = posterior.of_photos(np.einsum("jmk,mkb->jmb", x, seen))
-        value: Array = np.einsum("mkb,jmb->jmk", seen, moved)
-        return value
+        return np.einsum("mkb,jmb->jmk", seen, moved)
 
     x = np.random.default_rng(0).normal(size=(_BLOCK, m, nb - 6))
     value = 0.0
