@@ -74,8 +74,6 @@ class Clip:
         Parts of continuous frames: a cut, or a pause of the recording, begins a new part.
     keys : (k,) int array
         The key frames.
-    moved_px : (n - 1,) array
-        Median motion of the content to the next frame; NaN over a cut.
     frames : VideoFrames
         Further facts about them, and about the camera.
     flows : tuple of KeyFlow
@@ -92,7 +90,6 @@ class Clip:
     frame_s: float
     part: NDArray[np.int64]
     keys: NDArray[np.int64]
-    moved_px: NDArray[np.float64]
     frames: VideoFrames
     flows: tuple[KeyFlow, ...] = ()
     repeated: tuple[int, ...] = ()
@@ -234,9 +231,8 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
         raise InputError(_ONLY_CUTS.format(video.name))
     names = tuple(frame_name(video, number) for number in numbers)
     flows = tuple(each for each in chooser.flows if part[each.keys[0]] == part[each.keys[1]])
-    moved_px, frames = np.array(chooser.steps), writer.finish()
     return Clip(
-        video, folder, tuple(numbers), names, time, frame_s, part, keys, moved_px, frames, flows, tuple(repeated)
+        video, folder, tuple(numbers), names, time, frame_s, part, keys, writer.finish(), flows, tuple(repeated)
     )
 
 
