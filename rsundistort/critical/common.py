@@ -87,14 +87,9 @@ class CommonMotion:
         }
 
     @property
-    def is_hidden(self) -> bool:
-        """Whether the photos' clocks hardly differ, so that little else determines a common motion."""
-        return self.of_travel and self.contrast < _LOW
-
-    @property
     def is_weak(self) -> bool:
-        """Whether a common motion is hidden, and its uncertainty matters here."""
-        return self.is_hidden and not self.shift_px <= _SMALL_PX
+        """Whether the photos' clocks hardly differ, so that little tells a common motion, and it matters here."""
+        return self.of_travel and self.contrast < _LOW and not self.shift_px <= _SMALL_PX
 
     @property
     def sentence(self) -> str:
