@@ -262,26 +262,20 @@ class PointColors:
     _FINE = 2**16
 
     def __init__(self, reconstruction: Reconstruction) -> None:
-        obs = reconstruction.observations
-        self._place = {name: i for i, name in enumerate(reconstruction.image_names)}
-        self._order = np.argsort(obs.frame_idx, kind="stable")
-        self._bounds = np.searchsorted(obs.frame_idx[self._order], np.arange(reconstruction.num_images + 1))
-        self._xy, self._point_idx = obs.xy_raw, obs.point_idx
+        self._seen = reconstruction.observations
+        photos = self._seen.by_photo(reconstruction.num_images)
+        self._of = dict(zip(reconstruction.image_names, photos, strict=True))
         # whole numbers of 1 / _FINE, whose sum does not depend on the order of the photos
         self._sum = np.zeros((reconstruction.num_points, 3), np.int64)
         self._count = np.zeros(reconstruction.num_points)
 
-    def _of(self, name: str) -> NDArray[np.int64]:
-        i = self._place[name]
-        return np.asarray(self._order[self._bounds[i] : self._bounds[i + 1]])
-
     def pixels(self, name: str) -> NDArray[np.int64]:
         """(k, 2) raw pixels where a photo shows points."""
-        return np.rint(self._xy[self._of(name)]).astype(np.int64)
+        return np.rint(self._seen.xy_raw[self._of[name]]).astype(np.int64)
 
     def add(self, name: str, colors: NDArray[np.float64]) -> None:
         """Take the (k, 3) colours at those pixels, 0 to 255."""
-        points = self._point_idx[self._of(name)]
+        points = self._seen.point_idx[self._of[name]]
         np.add.at(self._sum, points, np.rint(self._FINE * colors).astype(np.int64))
         np.add.at(self._count, points, 1)
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import FileError, RsUndistortWarning
 from ..io.aside import written_aside
@@ -45,11 +45,9 @@ class ClipDone:
     pixel_format: str
 
 
-@dataclass(frozen=True)
-class _Frame:
+class _Frame(NamedTuple):
     """A decoded frame, and what its grid takes."""
 
-    pts: int
     picture: Any
     geometry: PhotoGeometry
 
@@ -112,7 +110,7 @@ def rectify_clip(
                 continue
             found = geometry_of(frame_name(video, number))
             num_lens_only += found is None
-            yield _Frame(picture.pts, picture, found or otherwise)
+            yield _Frame(picture, found or otherwise)
 
     camera = otherwise.camera
     alone = replace(workers, scheduler=None)
@@ -126,7 +124,7 @@ def rectify_clip(
                 closing(alone.map(work, frames(reader), _lost)) as results,
             ):
                 for frame, pixels in results:
-                    writer.add(frame.pts, frame.picture, pixels)
+                    writer.add(frame.picture.pts, frame.picture, pixels)
                     num_frames += 1
                     log.tell("video", num_frames, max(num_frames, reader.num_frames))
     except FileError as error:
