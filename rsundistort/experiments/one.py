@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..batch.progress import ProgressCallback
+from ..batch.progress import ProgressCallback, StageLog
 from ..bundle import BundleOptions, bundle_adjust, objective
 from ..errors import FormatError, InputError
 from ..evaluation import align_points, rotation_angles_deg
@@ -318,12 +318,10 @@ def experiment_one(
         with record.writing(_FILES):
             text = json.dumps({**settings, "scenes": {**known, **digests}}, indent=1)
             write_aside(out / "settings.json", f"{text}\n".encode())
-            return _experiment_one(loaded, out, options, progress)
+            return _experiment_one(loaded, out, options, StageLog(progress))
 
 
-def _experiment_one(
-    loaded: Sequence[KnownScene], out: Path, options: OneOptions, progress: ProgressCallback | None
-) -> dict[str, Any]:
+def _experiment_one(loaded: Sequence[KnownScene], out: Path, options: OneOptions, log: StageLog) -> dict[str, Any]:
     """The trials that are missing in a folder, and what comes of all of them."""
     trials = out / "trials.jsonl"
     _cut_torn_line(trials)
@@ -345,11 +343,9 @@ def _experiment_one(
                 file.write(json.dumps(entry) + "\n")
             file.flush()
             count += 1
-            if progress is not None:
-                progress("trials", count, total)
+            log.tell("trials", count, total)
 
-        if progress is not None:
-            progress("trials", 0, total)
+        log.tell("trials", 0, total)
         # spawned, not forked: the kernels' threads do not survive a fork
         pool = ProcessPoolExecutor(min(cores, max(total, 1)), get_context("spawn"))
         with _one_thread_each(), pool:
