@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import InputError
 from ..model.camera import Camera
 from ..model.motion import RowMotion
-from .lens import distort_rays, undistort_to_rays
+from .lens import clock_at, distort_rays, undistort_to_rays
 
 __all__ = ["check_no_fold"]
 
@@ -105,7 +105,7 @@ def _line_speed(
     """Lines (n,) by which the image of what pixels (n, 2) see runs on while one line is read; NaN beyond the lens."""
     K = camera.K
     axis, sign = camera.clock_axis, camera.clock_sign
-    clock = sign * (uv[:, axis] - K[axis, 2]) / K[axis, axis]
+    clock = clock_at(camera, uv[:, axis])
     norm = undistort_to_rays(uv, camera)
     known = np.asarray(np.isfinite(norm).all(axis=1))
     rays = np.column_stack([np.where(known[:, None], norm, 0.0), np.ones(len(uv))])
