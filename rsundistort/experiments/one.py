@@ -333,25 +333,18 @@ def _experiment_one(loaded: Sequence[KnownScene], out: Path, options: OneOptions
             if missing:
                 jobs.append((scene, replace(options, methods=tuple(missing)), trial))
     cores = options.jobs or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
-    total, count = len(jobs), 0
     with trials.open("a", encoding="utf-8") as file:
-
-        def keep(lines: list[dict[str, Any]]) -> None:
-            nonlocal count
-            for entry in lines:
-                done[entry["scene"], entry["trial"], entry["method"]] = entry
-                file.write(json.dumps(entry) + "\n")
-            file.flush()
-            count += 1
-            log.tell("trials", count, total)
-
-        log.tell("trials", 0, total)
+        log.tell("trials", 0, len(jobs))
         # spawned, not forked: the kernels' threads do not survive a fork
-        pool = ProcessPoolExecutor(min(cores, max(total, 1)), get_context("spawn"))
+        pool = ProcessPoolExecutor(min(cores, max(len(jobs), 1)), get_context("spawn"))
         with _one_thread_each(), pool:
             try:
-                for future in as_completed([pool.submit(run_trial, *job) for job in jobs]):
-                    keep(future.result())
+                for count, future in enumerate(as_completed([pool.submit(run_trial, *job) for job in jobs]), start=1):
+                    for entry in future.result():
+                        done[entry["scene"], entry["trial"], entry["method"]] = entry
+                        file.write(json.dumps(entry) + "\n")
+                    file.flush()
+                    log.tell("trials", count, len(jobs))
             except BaseException:
                 # leaving the pool waits for it: hours, if what is queued were run
                 pool.shutdown(wait=False, cancel_futures=True)

@@ -100,8 +100,7 @@ def load_scene(path: Path | str) -> KnownScene:
         if len(set(cameras)) != 1:
             raise InputError(f"{path} has {len(cameras)} cameras; the experiment takes scenes of one")
         order = np.argsort(names)
-        rank = np.empty(len(names), np.int64)
-        rank[order] = np.arange(len(names))
+        rank = np.argsort(order)
         scene = KnownScene(path.resolve().name, cameras[0], R[order], center[order], points, rank[frame], point)
     elif path.suffix == ".npz":
         scene = _from_npz(path)
