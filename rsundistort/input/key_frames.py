@@ -178,7 +178,7 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
     held: dict[int, tuple[int, float, Any]] = {}  # frames that may become the next key
     written, repeated, step = set[int](), list[int](), _Step()
     with VideoReader(video) as reader:
-        writer, num_written = FrameWriter(reader, folder), 0
+        writer = FrameWriter(reader, folder)
         for number, time_s, picture in reader:
             if progress is not None:
                 progress(number + 1, reader.num_frames)
@@ -204,13 +204,12 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
             chooser.feed(even_brightness(grey))
             if [len(numbers) - 1] == chooser.cuts[-1:]:
                 step.forget()
-            for k in held.keys() & {*chooser.keys[num_written:]}:
+            for k in held.keys() & {*chooser.keys} - written:
                 writer.add(*held[k], sharpness[k])
                 written.add(k)
-            num_written = len(chooser.keys)
             held = {k: each for k, each in held.items() if k > chooser.keys[-1]}
         chooser.finish()
-        for k in held.keys() & {*chooser.keys[num_written:]}:
+        for k in held.keys() & {*chooser.keys} - written:
             writer.add(*held[k], sharpness[k])
             written.add(k)
         reader.warn()
