@@ -133,11 +133,10 @@ class MapFrame:
         return value
 
 
-def check_crs(crs: str | None) -> str | None:
-    """The CRS, refused if it is none in metres, or if there is no library to read it with."""
+def check_crs(crs: str | None) -> None:
+    """Refuse a CRS that is none in metres, and any if there is no library to read it with."""
     if crs not in (None, "local", "none"):
         _transformer(str(crs))
-    return crs
 
 
 def _transformer(crs: str) -> Any:
