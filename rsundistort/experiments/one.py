@@ -214,11 +214,6 @@ def run_trial(scene: KnownScene, options: OneOptions, trial: int) -> list[dict[s
     return lines
 
 
-def _settings(options: OneOptions) -> dict[str, Any]:
-    """Settings that the result of a trial depends on."""
-    return {k: v for k, v in asdict(options).items() if k not in ("jobs", "trials", "methods")}
-
-
 def read_trials(path: Path) -> dict[tuple[str, int, str], dict[str, Any]]:
     """Lines of an earlier run by scene, trial and method; what is cut short or damaged is left out, to be run again."""
     found = {}
@@ -236,8 +231,7 @@ def read_trials(path: Path) -> dict[tuple[str, int, str], dict[str, Any]]:
 def _cut_torn_line(path: Path) -> None:
     """Cut off what a crash left of a line: the next one must not continue it."""
     if path.is_file():
-        whole = path.read_bytes().rfind(b"\n") + 1
-        os.truncate(path, whole)
+        os.truncate(path, path.read_bytes().rfind(b"\n") + 1)
 
 
 @contextmanager
@@ -309,7 +303,8 @@ def experiment_one(
     need_matplotlib()
     out = Path(out)
     with only_writer(out):
-        settings = _settings(options)
+        # those that the result of a trial depends on
+        settings = {k: v for k, v in asdict(options).items() if k not in ("jobs", "trials", "methods")}
         digests = {scene.name: scene.digest for scene in loaded}
         known = check_settings(out / "settings.json", settings, digests)
         record = Record(out)

@@ -223,7 +223,9 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
     time = _with_repeated(video, np.array(numbers), np.array(times), len(repeated))
     frame_s = float(np.median(np.diff(time)))
     breaks = {*chooser.cuts, *(np.flatnonzero(np.diff(time) > _PAUSE * frame_s) + 1).tolist()}
-    keys = np.array(sorted({*chooser.keys, *_between(len(numbers), len(chooser.keys)), *_ends(breaks)}))
+    # no path leads across a break
+    ends = {k - side for k in breaks for side in (0, 1)}
+    keys = np.array(sorted({*chooser.keys, *_between(len(numbers), len(chooser.keys)), *ends}))
     _add(writer, video, {numbers[k]: sharpness[k] for k in keys.tolist() if k not in written})
     part = np.cumsum([k in breaks for k in range(len(numbers))])
     if part[-1] == len(part) - 1:
@@ -304,8 +306,3 @@ def _between(num_frames: int, num_keys: int) -> Iterable[int]:
     if num_keys >= _LEAST_KEYS:
         return ()
     return np.linspace(0, num_frames - 1, min(_LEAST_KEYS, num_frames)).round().astype(int).tolist()
-
-
-def _ends(breaks: set[int]) -> Iterable[int]:
-    """The frames on both sides of a break: no path leads across it."""
-    return (k - side for k in breaks for side in (0, 1))

@@ -149,11 +149,6 @@ def _bytes_of(job: _LoadJob) -> float:
     return detection_bytes(width, height, job.megapixels) + _BYTES_PER_PIXEL * width * height
 
 
-def _is_text(name: str) -> bool:
-    """Whether a name of a file is text: what is not UTF-8 comes as surrogates."""
-    return not any("\ud800" <= letter <= "\udfff" for letter in name)
-
-
 def _listed(folder: Path, raw_as: str, only: Sequence[str] | None, least: int) -> list[str]:
     """The photos that are to be loaded; refused where they are too few, or no model can hold a name."""
     listed = list_photos(folder, raw_as) if only is None else list(only)
@@ -169,7 +164,8 @@ def _listed(folder: Path, raw_as: str, only: Sequence[str] | None, least: int) -
         raise InputError(
             f"{folder} holds {len(listed)} photo{'s' * (len(listed) > 1)}; the shutter needs at least {_NUMBERS[least]}"
         )
-    if no_text := [name for name in listed if not _is_text(name)]:
+    # what is not UTF-8 comes as surrogates
+    if no_text := [name for name in listed if any("\ud800" <= letter <= "\udfff" for letter in name)]:
         raise InputError(f"{no_text[0]!r} in {folder} is no name in UTF-8, and no model can hold it; rename it")
     return listed
 
