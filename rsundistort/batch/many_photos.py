@@ -33,6 +33,8 @@ __all__ = ["PointColors", "mask_names", "rectify_photos"]
 # which become TIFF, 40); and besides its grids, full maps of depth, and another image of its frame.
 _BYTES_PER_PIXEL = {"JPEG": 10, "WebP": 20, "PNG": 32, "TIFF": 60}
 _BYTES_OF_OTHERS, _BYTES_OF_GRIDS, _BYTES_OF_DEPTH = 40, 40, 32
+# What is said of photos that are done when the others were interrupted.
+_GO_ON = "whole; the same command with --resume continues"
 
 
 def mask_names(names: Sequence[str]) -> dict[str, str]:
@@ -55,7 +57,6 @@ def rectify_photos(
     posed: bool = True,
     resume: bool = False,
     colors: PointColors | None = None,
-    go_on: str = "",
     others: bool = True,
 ) -> dict[str, PhotoDone]:
     """Rectify photos into `out/images` and `out/masks`, each file whole or not at all.
@@ -78,8 +79,6 @@ def rectify_photos(
         Pass over what is whole and current by the journal.
     colors : PointColors, optional
         Takes the colours of the points.
-    go_on : str
-        How to go on after an interruption, for people.
     others : bool
         Whether `resume` leaves what an earlier batch made of other photos.
 
@@ -113,9 +112,9 @@ def rectify_photos(
                 done[result.name] = result
                 log.tell("rectifying", len(done), len(names))
     except FileError as error:
-        raise FileError(f"{error}; {len(done)} of {len(names)} photos are done, {go_on}") from error
+        raise FileError(f"{error}; {len(done)} of {len(names)} photos are done, {_GO_ON}") from error
     except KeyboardInterrupt as stop:
-        raise KeyboardInterrupt(f"{len(done)} of {len(names)} photos are done, {go_on}") from stop
+        raise KeyboardInterrupt(f"{len(done)} of {len(names)} photos are done, {_GO_ON}") from stop
     if made := {name: _entry(each) for name, each in done.items() if not each.problem}:
         others_kept = {name: before[name] for name in before.keys() - done.keys()} if resume and others else {}
         _settle(others_kept | made, earlier, record, journal)
