@@ -205,10 +205,9 @@ def clock_contrast(reconstruction: Reconstruction) -> float:
     rec, obs = reconstruction, reconstruction.observations
     m, shape = rec.num_images, (rec.num_points, rec.num_images)
     clock = np.empty(len(obs))
-    for i in range(m):
-        mine = obs.frame_idx == i
+    for i, mine in enumerate(obs.by_photo(m)):
         clock[mine] = clock_of(rec.camera(i), obs.xy_raw[mine])
-        clock[mine] -= clock[mine].mean() if mine.any() else 0.0
+        clock[mine] -= clock[mine].mean() if len(mine) else 0.0
     clocks, ones = (
         coo_array((x, (obs.point_idx, obs.frame_idx)), shape=shape).tocsr() for x in (clock, np.ones(len(obs)))
     )
