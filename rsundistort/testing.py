@@ -171,8 +171,6 @@ class Golden:
             self._write(name, lambda path: _save(path, values))
             return
         path = self.folder / name
-        if not path.is_file():
-            raise AssertionError(_missing(path))
         target = _read(path)
         kept = self.out / name
         if values.shape != target.shape or values.dtype != target.dtype:
@@ -208,12 +206,6 @@ def _unlike(got: NDArray[Any], expected: NDArray[Any]) -> str:
     return f"got {got.dtype} {got.shape}, expected {expected.dtype} {expected.shape}: these do not compare"
 
 
-def _missing(path: Path) -> str:
-    return (
-        f"golden file {path} is missing; make it with pytest --regolden (fixture `golden`), look at it, and commit it"
-    )
-
-
 def _as_picture(value: ArrayLike, name: str) -> NDArray[Any]:
     """The value as an array (h, w) or (h, w, channels > 1)."""
     array = np.asarray(value)
@@ -231,8 +223,6 @@ def _expected_picture(expected: ArrayLike | str | Path) -> NDArray[Any]:
     if not isinstance(expected, (str, Path)):
         return _as_picture(expected, "expected")
     path = Path(expected)
-    if not path.is_file():
-        raise AssertionError(_missing(path))
     return _as_picture(_read(path), str(path))
 
 
@@ -247,6 +237,13 @@ def _compared(mask: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.bool
 
 
 def _read(path: Path) -> NDArray[Any]:
+    """The picture or the array in a golden file."""
+    __tracebackhide__ = True
+    if not path.is_file():
+        raise AssertionError(
+            f"golden file {path} is missing; make it with pytest --regolden (fixture `golden`), look at it, and commit "
+            "it"
+        )
     if path.suffix.lower() not in _ARRAY_SUFFIXES:
         return read_photo(path).pixels
     try:

@@ -119,3 +119,13 @@ def project(points_w, R_cw, center_w, phi, model, readout, K, dist=(), velocity_
     velocity_c = R_cw @ np.asarray(velocity_w, float)
     normalised = project_normalised((points_w - center_w) @ R_cw.T, phi, model, readout, dist, velocity_c)
     return normalised * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
+
+
+def measure(points_w, R_cw, center_w, motions, cameras, frame_idx, point_idx):
+    """Exact pixels (o, 2) of points (n, 3) that photos are known to see, by the exact model."""
+    exact = np.empty((len(frame_idx), 2))
+    for i, view in enumerate(zip(R_cw, center_w, motions, cameras, strict=True)):
+        mine = np.flatnonzero(frame_idx == i)
+        exact[mine], valid = project_rows(points_w[point_idx[mine]], *view)
+        assert valid.all(), f"photo {i} cannot see all of its points"
+    return exact

@@ -19,8 +19,9 @@ from rsundistort.io import read_photo
 from rsundistort.io.video import extract_frames
 from rsundistort.io.video_writer import write_video
 from rsundistort.simulate import SceneOptions, simulate_scene
-from rsundistort.synthetic import line_poses, load_recipe, pixel_rays, render_depth, render_view
+from rsundistort.synthetic import load_recipe, render_depth, render_view
 from rsundistort.synthetic.clip import Tremor
+from rsundistort.synthetic.render import line_poses, pixel_rays
 
 WALK = Path(__file__).parents[1] / "sample_scenes" / "walk"
 WAY = [

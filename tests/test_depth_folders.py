@@ -31,7 +31,6 @@ from rsundistort.errors import FileError, InputError
 from rsundistort.io import find_depth_maps, read_depth_map, write_colmap_model
 from rsundistort.model import Observations, Reconstruction
 from rsundistort.rectify import depth_from_points
-from rsundistort.synthetic import measure
 
 W, H = 200, 160
 K = np.array([[210.0, 0, 97.3], [0, 205.0, 81.6], [0, 0, 1]])
@@ -49,11 +48,12 @@ def small_scene(rng, velocity=(0.4, 0.2, 0.1), num=400):
     turns = Rotation.from_rotvec(rng.normal(0, 0.05, (4, 3))).as_matrix()
     motions = [RowMotion(rng.normal(0, 0.03, 3), velocity) for _ in range(4)]
     frame, point = np.repeat(np.arange(4), num), np.tile(np.arange(num), 4)
-    seen = measure(points, turns, centers, motions, [camera] * 4, frame, point)
-    inside = ((seen.exact > 0) & (seen.exact < [W - 1, H - 1])).all(1)
+    seen = numpy_reference.measure(points, turns, centers, motions, [camera] * 4, frame, point)
+    inside = ((seen > 0) & (seen < [W - 1, H - 1])).all(1)
     names = [f"{k}.png" for k in range(4)]
     rec = Reconstruction(
-        [camera], names, np.zeros(4, int), turns, centers, points, seen.observations.select(inside),
+        [camera], names, np.zeros(4, int), turns, centers, points,
+        Observations(frame, point, seen).select(inside),
         np.array([m.phi for m in motions]), np.array([m.velocity for m in motions]), MODEL,
     )  # fmt: skip
     images = tuple(SolvedImage(n, "1", turns[k], centers[k], motions[k]) for k, n in enumerate(names))

@@ -16,12 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, RowMotion, Solution, SolvedImage
 from rsundistort.errors import FileError, InputError, ReconstructionError
-from rsundistort.experiments import (
-    TwoOptions,
-    compare_paths,
-    experiment_two,
-    two,
-)
+from rsundistort.experiments import TwoOptions, experiment_two, two
+from rsundistort.experiments.paths import compare_paths
 from rsundistort.experiments.plots import camera_paths, plan_axes
 from rsundistort.synthetic import look_at
 

@@ -17,14 +17,8 @@ from scipy.spatial.transform import Rotation
 from rsundistort import Camera, Reconstruction
 from rsundistort.errors import FileError, FormatError, InputError
 from rsundistort.evaluation import rotation_angles_deg
-from rsundistort.experiments import (
-    METHODS,
-    OneOptions,
-    experiment_one,
-    load_scene,
-    one,
-)
-from rsundistort.experiments.one import draw_motions, draw_trial, errors_of, run_trial
+from rsundistort.experiments import OneOptions, experiment_one, load_scene, one
+from rsundistort.experiments.one import METHODS, draw_motions, draw_trial, errors_of, run_trial
 from rsundistort.io import write_colmap_model
 from rsundistort.model.reprojection import reprojection_residuals
 

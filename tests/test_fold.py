@@ -7,7 +7,7 @@ import pytest
 from numpy_reference import Fisheye, lens_of
 from scipy.spatial.transform import Rotation
 
-from rsundistort import Camera
+from rsundistort import Camera, RowMotion
 from rsundistort.errors import InputError
 from rsundistort.model import READOUTS, Bend
 from rsundistort.synthetic.fold import check_no_fold
@@ -24,9 +24,13 @@ def camera_of(readout="top-to-bottom", dist=()):
     return Camera(640, 480, K, np.array(dist), readout, lens_of(dist))
 
 
+def check(camera, phi, velocity=None, depth=None, bend=None):
+    check_no_fold("b.png", camera, RowMotion(phi, np.zeros(3) if velocity is None else velocity, bend), depth)
+
+
 def folds(*args, **kwargs):
     try:
-        check_no_fold("b.png", *args, **kwargs)
+        check(*args, **kwargs)
     except InputError:
         return True
     return False
@@ -37,9 +41,9 @@ def folds(*args, **kwargs):
 def test_motions_of_a_hand_pass(readout, dist, rng):
     camera = camera_of(readout, dist)
     for _ in range(5):
-        check_no_fold("b.png", camera, rng.normal(size=3) * 0.1)
-    check_no_fold("b.png", camera, np.zeros(3))
-    check_no_fold("b.png", camera, rng.normal(size=3) * 0.1, [0.1, -0.2, 0.1], 3.0)
+        check(camera, rng.normal(size=3) * 0.1)
+    check(camera, np.zeros(3))
+    check(camera, rng.normal(size=3) * 0.1, [0.1, -0.2, 0.1], 3.0)
 
 
 # the axis along the lines pulls the image along the readout, by phi (1 + r^2): by hand, for each direction
@@ -54,12 +58,12 @@ THRESHOLDS = {
 @pytest.mark.parametrize(("readout", "phi"), THRESHOLDS.items())
 def test_rows_fold_at_the_rotation_computed_by_hand(readout, phi):
     camera, phi = camera_of(readout), np.array(phi)
-    check_no_fold("b.png", camera, phi * (1 - 1e-6))
+    check(camera, phi * (1 - 1e-6))
     line = "rows" if READOUTS[readout][0] == 1 else "columns"
     with pytest.raises(InputError, match=re.escape(f"the {line} of b.png fold over: at pixel (0, 0)")):
-        check_no_fold("b.png", camera, phi * (1 + 1e-6))
+        check(camera, phi * (1 + 1e-6))
     # the other way round the image runs against the readout: the rows spread, they do not fold
-    check_no_fold("b.png", camera, -2 * phi)
+    check(camera, -2 * phi)
 
 
 @pytest.mark.parametrize("readout", READOUTS)
@@ -92,7 +96,7 @@ def test_nearest_thing_of_a_depth_map_counts():
     assert not folds(camera_of(), np.zeros(3), velocity, depth)
     depth[100:103, 201:204] = 3.9  # finer than the grid
     with pytest.raises(InputError, match=r"at pixel \((200|180), (90|105)\)"):
-        check_no_fold("b.png", camera_of(), np.zeros(3), velocity, depth)
+        check(camera_of(), np.zeros(3), velocity, depth)
     depth[100:103, 201:204] = 4.1
     assert not folds(camera_of(), np.zeros(3), velocity, depth)
 
@@ -179,7 +183,7 @@ def test_speed_is_taken_through_the_lens():
 )
 def test_bad_arguments_are_refused(phi, velocity, depth, says):
     with pytest.raises(InputError, match=says):
-        check_no_fold("b.png", camera_of(), phi, velocity, depth)
+        check(camera_of(), phi, velocity, depth)
 
 
 def test_bends_count_by_their_own_rate():

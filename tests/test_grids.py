@@ -13,7 +13,7 @@ from scipy.ndimage import map_coordinates
 
 from rsundistort import Camera, Plane, RemapGrid, RowMotion, init_rectify_map, rectify, undistort_points
 from rsundistort.errors import FileError, FormatError, InputError
-from rsundistort.rectify import TOLERANCE_PX, coarse_grid
+from rsundistort.rectify.coarse_grid import TOLERANCE_PX, coarse_grid
 from rsundistort.rectify.maps import EDGE_PX, fill_rows, rectified_rays
 
 W, H = 640, 480

@@ -250,7 +250,7 @@ def test_paths_lead_where_they_say(tmp_path):
 
 
 def test_height_field_has_its_heights_and_its_texture_from_above():
-    from rsundistort.synthetic import height_field
+    from rsundistort.synthetic.surfaces import height_field
 
     heights = np.array([[0.0, 1.0, 0.5], [0.2, 2.0, 0.0], [1.0, 0.0, 0.3]])
     patches = height_field(np.array([10.0, 20, 1]), np.array([4.0, 6.0]), heights, "grey")

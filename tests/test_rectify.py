@@ -24,7 +24,8 @@ from rsundistort import (
 )
 from rsundistort.errors import InputError
 from rsundistort.model import READOUTS, Bend
-from rsundistort.rectify import INTERPOLATIONS, coarse_grid
+from rsundistort.rectify import INTERPOLATIONS
+from rsundistort.rectify.coarse_grid import coarse_grid
 from rsundistort.rectify.maps import rectified_rays
 from rsundistort.synthetic.warp import warp_photo
 

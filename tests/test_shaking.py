@@ -24,7 +24,7 @@ def clip_of(rec: Reconstruction, times: dict[str, float], frame_s: float) -> Cli
     n = len(times)
     return Clip(
         Path("clip.mp4"), Path(), tuple(range(n)), tuple(times), np.array([*times.values()]), frame_s,
-        np.zeros(n, np.int64), np.arange(n), np.ones(n - 1), None,
+        np.zeros(n, np.int64), np.arange(n), None,
     )  # fmt: skip
 
 

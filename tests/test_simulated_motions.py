@@ -20,8 +20,8 @@ from rsundistort.io.photos.images import write_image
 from rsundistort.io.photos.metadata import Metadata
 from rsundistort.model import READOUTS
 from rsundistort.simulate import WarpOptions, read_motion_file, simulate_warp
-from rsundistort.synthetic import RowTable, Vibration, load_recipe, read_row_tables
-from rsundistort.synthetic.unsteady import accelerations, tracks, unsteady, vibrations
+from rsundistort.synthetic import Vibration, load_recipe
+from rsundistort.synthetic.unsteady import RowTable, accelerations, read_row_tables, tracks, unsteady, vibrations
 
 CAMERA = Camera(320, 240, [[300, 0, 161.5], [0, 310, 118.25], [0, 0, 1]], [-0.05, 0.01, 0.001, -0.001])
 GIVEN = "300,310,161.5,118.25,-0.05,0.01,0.001,-0.001"

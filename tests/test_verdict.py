@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from numpy_reference import measure
 from rsundistort_cli.closing import closing_table, summary
 from scipy.spatial.transform import Rotation
 from solved_scene import SCENES, solve_scene
@@ -18,6 +19,7 @@ from solved_scene import SCENES, solve_scene
 from rsundistort import (
     BundleOptions,
     Camera,
+    Observations,
     Reconstruction,
     RowMotion,
     RsUndistortWarning,
@@ -35,7 +37,6 @@ from rsundistort.rectify import largest_shift_px
 from rsundistort.report import verdict_of
 from rsundistort.report.displacement import displacement_field
 from rsundistort.solve import model_sequence
-from rsundistort.synthetic.measurements import measure
 from rsundistort.verdict import Verdict, judge
 from rsundistort.verdict.judge import _repeated
 from rsundistort.verdict.photos import photo_motions
@@ -64,10 +65,9 @@ def measured(rng, phi, *, num_points=250, noise_px=NOISE_PX, velocity=None):
     phi = np.asarray(phi) / CAMERA.frame_span
     motions = [RowMotion(*each) for each in zip(phi, np.zeros((m, 3)) if velocity is None else velocity, strict=True)]
     point_idx, frame_idx = (each.ravel() for each in np.mgrid[:num_points, :m])
-    seen = measure(
-        points_w, R_cw, center_w, motions, [CAMERA] * m, frame_idx, point_idx,
-        noise_px=noise_px, seed=int(rng.integers(1 << 30)),
-    ).observations  # fmt: skip
+    exact = measure(points_w, R_cw, center_w, motions, [CAMERA] * m, frame_idx, point_idx)
+    noise = np.random.default_rng(int(rng.integers(1 << 30))).normal(0.0, noise_px, exact.shape)
+    seen = Observations(frame_idx, point_idx, exact + noise)
     inside = ((seen.xy_raw >= 0) & (seen.xy_raw <= [799, 599])).all(1)
     rec = Reconstruction(
         [CAMERA], [f"{i}.jpg" for i in range(m)], np.zeros(m, int), R_cw, center_w, points_w, seen.select(inside)

@@ -131,50 +131,6 @@ def invert_points(V, damping, V_inv):
             _invert_spd3(V[p], damping, V_inv[p])
 
 
-@kernel()
-def _neighbours(f, frame_start, frame_order, frame_idx, point_idx, track_start, slot, found):
-    """Photos >= f that share a point with f, ascending in found[:count]; slot (m,) is scratch of -1."""
-    count = 0
-    slot[f] = 0
-    found[0] = f
-    count = 1
-    for s in range(frame_start[f], frame_start[f + 1]):
-        p = point_idx[frame_order[s]]
-        for k in range(track_start[p], track_start[p + 1]):
-            g = frame_idx[k]
-            if g > f and slot[g] < 0:
-                slot[g] = 0
-                found[count] = g
-                count += 1
-    found[:count].sort()
-    return count
-
-
-@kernel()
-def covisible_counts(frame_start, frame_order, frame_idx, point_idx, track_start, counts):
-    """Number of photos >= f that each photo f shares points with, itself included."""
-    m = len(counts)
-    slot = np.full(m, -1)
-    found = np.empty(m, np.int64)
-    for f in range(m):
-        counts[f] = _neighbours(f, frame_start, frame_order, frame_idx, point_idx, track_start, slot, found)
-        for i in range(counts[f]):
-            slot[found[i]] = -1
-
-
-@kernel()
-def covisible_columns(frame_start, frame_order, frame_idx, point_idx, track_start, row_start, cols):
-    """Block columns of the upper triangle of the reduced system, ascending in each block row."""
-    m = len(row_start) - 1
-    slot = np.full(m, -1)
-    found = np.empty(m, np.int64)
-    for f in range(m):
-        count = _neighbours(f, frame_start, frame_order, frame_idx, point_idx, track_start, slot, found)
-        for i in range(count):
-            cols[row_start[f] + i] = found[i]
-            slot[found[i]] = -1
-
-
 @intrinsic
 def _add_product(typingctx, unknowns, S, i, J, k, n, m00, m01, m10, m11):
     """S[i] += J[k]' M J[n], rows of blocks as vectors.

@@ -98,7 +98,7 @@ def rectify_folder(
         record.check(["solution.json"], [] if _is_of(solution, target) else [solution], again=resume)
         done = rectify_photos(
             folder, scene, names, target, options, workers, StageLog(progress), journal,
-            posed=False, resume=resume, go_on="whole; the same command with --resume continues",
+            posed=False, resume=resume,
         )  # fmt: skip
         left_out |= {name: each.problem for name, each in done.items() if each.problem}
         if all(each.problem for each in done.values()):

@@ -33,6 +33,8 @@ __all__ = ["PointColors", "mask_names", "rectify_photos"]
 # which become TIFF, 40); and besides its grids, full maps of depth, and another image of its frame.
 _BYTES_PER_PIXEL = {"JPEG": 10, "WebP": 20, "PNG": 32, "TIFF": 60}
 _BYTES_OF_OTHERS, _BYTES_OF_GRIDS, _BYTES_OF_DEPTH = 40, 40, 32
+# What is said of photos that are done when the others were interrupted.
+_GO_ON = "whole; the same command with --resume continues"
 
 
 def mask_names(names: Sequence[str]) -> dict[str, str]:
@@ -55,7 +57,6 @@ def rectify_photos(
     posed: bool = True,
     resume: bool = False,
     colors: PointColors | None = None,
-    go_on: str = "",
     others: bool = True,
 ) -> dict[str, PhotoDone]:
     """Rectify photos into `out/images` and `out/masks`, each file whole or not at all.
@@ -78,8 +79,6 @@ def rectify_photos(
         Pass over what is whole and current by the journal.
     colors : PointColors, optional
         Takes the colours of the points.
-    go_on : str
-        How to go on after an interruption, for people.
     others : bool
         Whether `resume` leaves what an earlier batch made of other photos.
 
@@ -113,9 +112,9 @@ def rectify_photos(
                 done[result.name] = result
                 log.tell("rectifying", len(done), len(names))
     except FileError as error:
-        raise FileError(f"{error}; {len(done)} of {len(names)} photos are done, {go_on}") from error
+        raise FileError(f"{error}; {len(done)} of {len(names)} photos are done, {_GO_ON}") from error
     except KeyboardInterrupt as stop:
-        raise KeyboardInterrupt(f"{len(done)} of {len(names)} photos are done, {go_on}") from stop
+        raise KeyboardInterrupt(f"{len(done)} of {len(names)} photos are done, {_GO_ON}") from stop
     if made := {name: _entry(each) for name, each in done.items() if not each.problem}:
         others_kept = {name: before[name] for name in before.keys() - done.keys()} if resume and others else {}
         _settle(others_kept | made, earlier, record, journal)
@@ -262,26 +261,20 @@ class PointColors:
     _FINE = 2**16
 
     def __init__(self, reconstruction: Reconstruction) -> None:
-        obs = reconstruction.observations
-        self._place = {name: i for i, name in enumerate(reconstruction.image_names)}
-        self._order = np.argsort(obs.frame_idx, kind="stable")
-        self._bounds = np.searchsorted(obs.frame_idx[self._order], np.arange(reconstruction.num_images + 1))
-        self._xy, self._point_idx = obs.xy_raw, obs.point_idx
+        self._seen = reconstruction.observations
+        photos = self._seen.by_photo(reconstruction.num_images)
+        self._of = dict(zip(reconstruction.image_names, photos, strict=True))
         # whole numbers of 1 / _FINE, whose sum does not depend on the order of the photos
         self._sum = np.zeros((reconstruction.num_points, 3), np.int64)
         self._count = np.zeros(reconstruction.num_points)
 
-    def _of(self, name: str) -> NDArray[np.int64]:
-        i = self._place[name]
-        return np.asarray(self._order[self._bounds[i] : self._bounds[i + 1]])
-
     def pixels(self, name: str) -> NDArray[np.int64]:
         """(k, 2) raw pixels where a photo shows points."""
-        return np.rint(self._xy[self._of(name)]).astype(np.int64)
+        return np.rint(self._seen.xy_raw[self._of[name]]).astype(np.int64)
 
     def add(self, name: str, colors: NDArray[np.float64]) -> None:
         """Take the (k, 3) colours at those pixels, 0 to 255."""
-        points = self._point_idx[self._of(name)]
+        points = self._seen.point_idx[self._of[name]]
         np.add.at(self._sum, points, np.rint(self._FINE * colors).astype(np.int64))
         np.add.at(self._count, points, 1)
 

@@ -249,8 +249,7 @@ def _rectify(job: PhotoJob, source: Path, own_mask: Path | None, out: Path) -> P
         with held_inside(out, job.mask) as path:
             write_image(path, mask, flat=True)
             files[job.mask] = path.stat().st_size
-        for name, size in _write_extras(job, out, found.depth, applied):
-            files[name] = size
+        files.update(_write_extras(job, out, found.depth, applied))
     except (FileError, InputError, MemoryError, cv2.error) as error:
         if writing and getattr(error.__cause__, "errno", None) in CANNOT_WRITE:
             raise

@@ -5,9 +5,9 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import FileError, RsUndistortWarning
 from ..io.aside import written_aside
@@ -19,37 +19,15 @@ from .geometry import PhotoGeometry
 from .progress import StageLog
 from .workers import Workers
 
-__all__ = ["ClipDone", "rectify_clip"]
+__all__ = ["rectify_clip"]
 
 # What a frame takes for each pixel from decoding to encoding, 16 bits a colour: three planes, before and after, twice.
 _BYTES_PER_PIXEL = 40
 
 
-@dataclass(frozen=True)
-class ClipDone:
-    """Outcome of the frames of a video.
-
-    Attributes
-    ----------
-    num_frames : int
-        Written.
-    num_lens_only : int
-        Of these, those whose motion nobody knows: the lens was taken out of them, and no motion.
-    encoder, pixel_format : str
-        FFmpeg's names of how they are encoded.
-    """
-
-    num_frames: int
-    num_lens_only: int
-    encoder: str
-    pixel_format: str
-
-
-@dataclass(frozen=True)
-class _Frame:
+class _Frame(NamedTuple):
     """A decoded frame, and what its grid takes."""
 
-    pts: int
     picture: Any
     geometry: PhotoGeometry
 
@@ -67,7 +45,7 @@ def rectify_clip(
     interpolation: str,
     workers: Workers,
     log: StageLog,
-) -> ClipDone:
+) -> None:
     """Rectify every frame of a video, each by its own motion; the result is whole or not there.
 
     Size, rate, time stamps, colours and sound are those of the video; a view of odd sides loses a pixel. A few frames
@@ -112,7 +90,7 @@ def rectify_clip(
                 continue
             found = geometry_of(frame_name(video, number))
             num_lens_only += found is None
-            yield _Frame(picture.pts, picture, found or otherwise)
+            yield _Frame(picture, found or otherwise)
 
     camera = otherwise.camera
     alone = replace(workers, scheduler=None)
@@ -126,7 +104,7 @@ def rectify_clip(
                 closing(alone.map(work, frames(reader), _lost)) as results,
             ):
                 for frame, pixels in results:
-                    writer.add(frame.pts, frame.picture, pixels)
+                    writer.add(frame.picture.pts, frame.picture, pixels)
                     num_frames += 1
                     log.tell("video", num_frames, max(num_frames, reader.num_frames))
     except FileError as error:
@@ -136,7 +114,6 @@ def rectify_clip(
     num_frames -= writer.num_late
     _warn(out.name, num_frames, writer.num_late, num_lens_only)
     log.end("video", frames=num_frames, lens_only=num_lens_only, encoder=writer.encoder)
-    return ClipDone(num_frames, num_lens_only, writer.encoder, writer.pixel_format)
 
 
 def _warn(name: str, num_frames: int, num_late: int, num_lens_only: int) -> None:

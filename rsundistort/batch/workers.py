@@ -10,6 +10,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeVar
 
 import cv2
@@ -158,7 +159,7 @@ def _map_on_cluster(
         raise InputError(f"no Dask scheduler answers at {address}; give it as tcp://host:8786") from error
     with client, client.get_executor(pure=False, retries=_RETRIES) as pool:
         ahead = max(64, 4 * sum(client.nthreads().values()))
-        work = _OnWorker(function)
+        work = partial(_on_worker, function)
         for result, said in _in_order(
             pool, work, items, ahead, (KilledWorker,), lambda item, why: (lost(item, why), [])
         ):
@@ -167,16 +168,11 @@ def _map_on_cluster(
             yield result
 
 
-@dataclass(frozen=True)
-class _OnWorker:
+def _on_worker(function: Callable[[T], R], item: T) -> tuple[R, list[Warning]]:
     """A function as a Dask worker calls it: OpenCV is held to its thread, and warnings come back with the result."""
-
-    function: Callable[[Any], Any]
-
-    def __call__(self, item: Any) -> tuple[Any, list[Warning]]:
-        cv2.setNumThreads(1)
-        with _caught_warnings() as said:
-            return self.function(item), said
+    cv2.setNumThreads(1)
+    with _caught_warnings() as said:
+        return function(item), said
 
 
 _caught = threading.local()

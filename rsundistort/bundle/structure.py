@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse
 
-from .._kernels import schur
 from ..model.array_types import Index
 
 __all__ = ["BlockPattern", "Structure"]
@@ -102,13 +101,13 @@ class Structure:
         track_start = np.searchsorted(point_idx, np.arange(num_points + 1))
         frame_order = np.argsort(frame_idx, kind="stable")
         frame_start = np.concatenate([[0], np.cumsum(np.bincount(frame_idx, minlength=num_frames))])
-        counts = np.empty(num_frames, np.int64)
-        lists = (frame_start, frame_order, frame_idx, point_idx, track_start)
-        schur.covisible_counts(*lists, counts)
-        row_start = np.concatenate([[0], np.cumsum(counts)])
-        cols = np.empty(row_start[-1], np.int64)
-        schur.covisible_columns(*lists, row_start, cols)
-        pattern = BlockPattern(row_start, cols)
+        sees = scipy.sparse.csr_array(
+            (np.ones(len(order)), point_idx[frame_order], frame_start), shape=(num_frames, num_points)
+        )
+        # a photo without measurements has its diagonal block, too
+        shared = scipy.sparse.triu(sees @ sees.T + scipy.sparse.diags_array(np.ones(num_frames)), format="csr")
+        shared.sort_indices()
+        pattern = BlockPattern(shared.indptr.astype(np.int64), shared.indices.astype(np.int64))
         if joined is not None:
             pattern = pattern.with_blocks(*joined)
         return cls(points, order, frame_idx, point_idx, track_start, frame_start, frame_order, pattern)

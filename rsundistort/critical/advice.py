@@ -139,16 +139,9 @@ def _with_view(
     mine = mine[seen]
     name = f"advice {rec.num_images}"
     return replace(
-        rec,
-        image_names=[*rec.image_names, name],
-        camera_idx=np.append(rec.camera_idx, rec.camera_idx[like]),
-        R_cw=np.concatenate([rec.R_cw, R_cw[None]]),
-        center_w=np.concatenate([rec.center_w, center_w[None]]),
-        phi=np.concatenate([rec.phi, np.zeros((1, 3))]),
-        velocity=np.concatenate([rec.velocity, np.zeros((1, 3))]),
-        bend=np.concatenate([rec.bend, np.zeros((1, *rec.bend.shape[1:]))]),
+        rec.with_photos([name], rec.camera_idx[[like]], R_cw[None], center_w[None], np.zeros((1, 3))),
         bend_clock=np.concatenate([rec.bend_clock, rec.bend_clock[-1:]]),
-        variation=np.concatenate([rec.variation, rec.variation[like][None]]),
+        variation=np.concatenate([rec.variation, rec.variation[[like]]]),
         observations=Observations(
             np.concatenate([obs.frame_idx, np.full(len(mine), rec.num_images)]),
             np.concatenate([obs.point_idx, obs.point_idx[mine]]),

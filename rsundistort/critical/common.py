@@ -65,15 +65,13 @@ class CommonMotion:
     @property
     def sigma(self) -> Array:
         """(k,) standard deviations of the mean motion."""
-        value: Array = np.sqrt(np.diagonal(self.covariance))
-        return value
+        return np.sqrt(np.diagonal(self.covariance))
 
     @property
     def correlation(self) -> Array:
         """(k, k) correlations of the mean motion."""
         sigma = np.maximum(self.sigma, 1e-300)
-        value: Array = self.covariance / sigma[:, None] / sigma
-        return value
+        return self.covariance / sigma[:, None] / sigma
 
     def as_json(self) -> dict[str, Any]:
         """Its content of `solution.json`."""
@@ -89,14 +87,9 @@ class CommonMotion:
         }
 
     @property
-    def is_hidden(self) -> bool:
-        """Whether the photos' clocks hardly differ, so that little else determines a common motion."""
-        return self.of_travel and self.contrast < _LOW
-
-    @property
     def is_weak(self) -> bool:
-        """Whether a common motion is hidden, and its uncertainty matters here."""
-        return self.is_hidden and not self.shift_px <= _SMALL_PX
+        """Whether the photos' clocks hardly differ, so that little tells a common motion, and it matters here."""
+        return self.of_travel and self.contrast < _LOW and not self.shift_px <= _SMALL_PX
 
     @property
     def sentence(self) -> str:
@@ -172,8 +165,7 @@ def common_motion(
     def spread(x: Array) -> Array:
         """Covariance of the displacements times (j, m, k)."""
         moved = posterior.of_photos(np.einsum("jmk,mkb->jmb", x, seen))
-        value: Array = np.einsum("mkb,jmb->jmk", seen, moved)
-        return value
+        return np.einsum("mkb,jmb->jmk", seen, moved)
 
     x = np.random.default_rng(0).normal(size=(_BLOCK, m, nb - 6))
     value = 0.0
@@ -213,10 +205,9 @@ def clock_contrast(reconstruction: Reconstruction) -> float:
     rec, obs = reconstruction, reconstruction.observations
     m, shape = rec.num_images, (rec.num_points, rec.num_images)
     clock = np.empty(len(obs))
-    for i in range(m):
-        mine = obs.frame_idx == i
+    for i, mine in enumerate(obs.by_photo(m)):
         clock[mine] = clock_of(rec.camera(i), obs.xy_raw[mine])
-        clock[mine] -= clock[mine].mean() if mine.any() else 0.0
+        clock[mine] -= clock[mine].mean() if len(mine) else 0.0
     clocks, ones = (
         coo_array((x, (obs.point_idx, obs.frame_idx)), shape=shape).tocsr() for x in (clock, np.ones(len(obs)))
     )

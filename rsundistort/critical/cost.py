@@ -106,8 +106,7 @@ def _log_scale(reconstruction: Reconstruction) -> NDArray[np.float64]:
     weight *= np.minimum(1.0, (np.median(uncertainty) / uncertainty) ** 2)
     x = rec.points_w - np.average(rec.points_w, axis=0, weights=weight)
     g = weight[:, None] * x @ np.linalg.pinv((weight[:, None] * x).T @ x)
-    value: NDArray[np.float64] = 1.5 * (g @ vertical)[:, None] * vertical - 0.5 * g
-    return value
+    return 1.5 * (g @ vertical)[:, None] * vertical - 0.5 * g
 
 
 def shape_cost(result: BundleResult, options: BundleOptions | None = None) -> ShapeCost:

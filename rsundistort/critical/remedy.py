@@ -126,8 +126,7 @@ def still_probability(result: BundleResult, options: BundleOptions | None = None
         """(m, k, k) of a prior, per unit of the clock."""
         sigma = np.repeat(np.stack(np.broadcast_arrays(of_phi, of_velocity, span)[:2], axis=1), 3, axis=1)
         sigma = np.hstack([sigma[:, :steady] / span[:, None], np.broadcast_to(of_bends, (m, len(bends)))])
-        value: NDArray[np.float64] = sigma[:, :, None] ** -2.0 * np.eye(motion.shape[1])
-        return value
+        return sigma[:, :, None] ** -2.0 * np.eye(motion.shape[1])
 
     # of the motion, all that the prior of its own photo did not say: exp(pull x - x' (inside) x / 2)
     inside = np.linalg.inv(covariance)
@@ -144,14 +143,12 @@ def still_probability(result: BundleResult, options: BundleOptions | None = None
         """(m,) log likelihoods of a prior, up to a constant."""
         total = inside + prior
         gain = np.einsum("mi,mi->m", pull, np.linalg.solve(total, pull[..., None])[..., 0])
-        value: NDArray[np.float64] = 0.5 * (np.linalg.slogdet(prior)[1] - np.linalg.slogdet(total)[1] + gain)
-        return value
+        return 0.5 * (np.linalg.slogdet(prior)[1] - np.linalg.slogdet(total)[1] + gain)
 
     # a camera that is held more firmly trembles less, too
     odds = np.log(_SHARE / (1 - _SHARE)) + evidence(precision(_STILL, _STILL * depth, bends * (_STILL / phi)))
     odds -= evidence(precision(phi, velocity, bends))
-    probability: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-np.clip(odds, -500, 500)))
-    return probability
+    return 1.0 / (1.0 + np.exp(-np.clip(odds, -500, 500)))
 
 
 def _expected(result: BundleResult) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

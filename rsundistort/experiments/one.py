@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..batch.progress import ProgressCallback
+from ..batch.progress import ProgressCallback, StageLog
 from ..bundle import BundleOptions, bundle_adjust, objective
 from ..errors import FormatError, InputError
 from ..evaluation import align_points, rotation_angles_deg
@@ -214,11 +214,6 @@ def run_trial(scene: KnownScene, options: OneOptions, trial: int) -> list[dict[s
     return lines
 
 
-def _settings(options: OneOptions) -> dict[str, Any]:
-    """Settings that the result of a trial depends on."""
-    return {k: v for k, v in asdict(options).items() if k not in ("jobs", "trials", "methods")}
-
-
 def read_trials(path: Path) -> dict[tuple[str, int, str], dict[str, Any]]:
     """Lines of an earlier run by scene, trial and method; what is cut short or damaged is left out, to be run again."""
     found = {}
@@ -236,8 +231,7 @@ def read_trials(path: Path) -> dict[tuple[str, int, str], dict[str, Any]]:
 def _cut_torn_line(path: Path) -> None:
     """Cut off what a crash left of a line: the next one must not continue it."""
     if path.is_file():
-        whole = path.read_bytes().rfind(b"\n") + 1
-        os.truncate(path, whole)
+        os.truncate(path, path.read_bytes().rfind(b"\n") + 1)
 
 
 @contextmanager
@@ -309,7 +303,8 @@ def experiment_one(
     need_matplotlib()
     out = Path(out)
     with only_writer(out):
-        settings = _settings(options)
+        # those that the result of a trial depends on
+        settings = {k: v for k, v in asdict(options).items() if k not in ("jobs", "trials", "methods")}
         digests = {scene.name: scene.digest for scene in loaded}
         known = check_settings(out / "settings.json", settings, digests)
         record = Record(out)
@@ -318,12 +313,10 @@ def experiment_one(
         with record.writing(_FILES):
             text = json.dumps({**settings, "scenes": {**known, **digests}}, indent=1)
             write_aside(out / "settings.json", f"{text}\n".encode())
-            return _experiment_one(loaded, out, options, progress)
+            return _experiment_one(loaded, out, options, StageLog(progress))
 
 
-def _experiment_one(
-    loaded: Sequence[KnownScene], out: Path, options: OneOptions, progress: ProgressCallback | None
-) -> dict[str, Any]:
+def _experiment_one(loaded: Sequence[KnownScene], out: Path, options: OneOptions, log: StageLog) -> dict[str, Any]:
     """The trials that are missing in a folder, and what comes of all of them."""
     trials = out / "trials.jsonl"
     _cut_torn_line(trials)
@@ -335,27 +328,18 @@ def _experiment_one(
             if missing:
                 jobs.append((scene, replace(options, methods=tuple(missing)), trial))
     cores = options.jobs or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
-    total, count = len(jobs), 0
     with trials.open("a", encoding="utf-8") as file:
-
-        def keep(lines: list[dict[str, Any]]) -> None:
-            nonlocal count
-            for entry in lines:
-                done[entry["scene"], entry["trial"], entry["method"]] = entry
-                file.write(json.dumps(entry) + "\n")
-            file.flush()
-            count += 1
-            if progress is not None:
-                progress("trials", count, total)
-
-        if progress is not None:
-            progress("trials", 0, total)
+        log.tell("trials", 0, len(jobs))
         # spawned, not forked: the kernels' threads do not survive a fork
-        pool = ProcessPoolExecutor(min(cores, max(total, 1)), get_context("spawn"))
+        pool = ProcessPoolExecutor(min(cores, max(len(jobs), 1)), get_context("spawn"))
         with _one_thread_each(), pool:
             try:
-                for future in as_completed([pool.submit(run_trial, *job) for job in jobs]):
-                    keep(future.result())
+                for count, future in enumerate(as_completed([pool.submit(run_trial, *job) for job in jobs]), start=1):
+                    for entry in future.result():
+                        done[entry["scene"], entry["trial"], entry["method"]] = entry
+                        file.write(json.dumps(entry) + "\n")
+                    file.flush()
+                    log.tell("trials", count, len(jobs))
             except BaseException:
                 # leaving the pool waits for it: hours, if what is queued were run
                 pool.shutdown(wait=False, cancel_futures=True)

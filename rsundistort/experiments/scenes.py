@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -80,10 +80,7 @@ def _scaled(scene: KnownScene) -> KnownScene:
     step = float(np.linalg.norm(np.diff(scene.center_w, axis=0), axis=1).mean())
     if not step > 0:
         raise InputError(f"{scene.name}: all photos are taken from one place")
-    return KnownScene(
-        scene.name, scene.camera, scene.R_cw, scene.center_w / step, scene.points_w / step, scene.frame_idx,
-        scene.point_idx,
-    )  # fmt: skip
+    return replace(scene, center_w=scene.center_w / step, points_w=scene.points_w / step)
 
 
 def load_scene(path: Path | str) -> KnownScene:
@@ -103,8 +100,7 @@ def load_scene(path: Path | str) -> KnownScene:
         if len(set(cameras)) != 1:
             raise InputError(f"{path} has {len(cameras)} cameras; the experiment takes scenes of one")
         order = np.argsort(names)
-        rank = np.empty(len(names), np.int64)
-        rank[order] = np.arange(len(names))
+        rank = np.argsort(order)
         scene = KnownScene(path.resolve().name, cameras[0], R[order], center[order], points, rank[frame], point)
     elif path.suffix == ".npz":
         scene = _from_npz(path)
@@ -149,6 +145,4 @@ def _seen_twice(scene: KnownScene) -> KnownScene:
     blind = np.flatnonzero(np.bincount(frame, minlength=scene.num_images) == 0)
     if len(blind):
         raise InputError(f"{scene.name}: photo {blind[0]} shares no point with another photo")
-    return KnownScene(
-        scene.name, scene.camera, scene.R_cw, scene.center_w, scene.points_w[kept], frame, new[point],
-    )  # fmt: skip
+    return replace(scene, points_w=scene.points_w[kept], frame_idx=frame, point_idx=new[point])

@@ -183,23 +183,18 @@ def _write_csv(path: Path, names: Sequence[str], solutions: Mapping[str, Solutio
     place = {name: k for k, name in enumerate(found.names)}
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(
-            [
-                "photo",
-                *(f"registered_{key}" for key in solutions),
-                "position_with",
-                "position_without",
-                "rotation_deg_with",
-                "rotation_deg_without",
-            ]
-        )
+        errors = {
+            f"{what}_{key}": values
+            for what, by_key in (("position", found.position), ("rotation_deg", found.rotation_deg))
+            for key, values in by_key.items()
+        }
+        writer.writerow(["photo", *(f"registered_{key}" for key in solutions), *errors])
         for name in names:
             k = place.get(name)
-            errors = (*found.position.values(), *found.rotation_deg.values())
             writer.writerow(
                 [
                     name,
                     *(int(solution.image(name).registered) for solution in solutions.values()),
-                    *("" if k is None else f"{values[k]:.6g}" for values in errors),
+                    *("" if k is None else f"{values[k]:.6g}" for values in errors.values()),
                 ]
             )

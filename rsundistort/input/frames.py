@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,12 +52,7 @@ def find_photos(
             raise InputError(f"{photos} is no video; --every and --sharpest choose frames of one")
         return PhotoSource(photos, camera)
     log.begin("frames")
-    folder = scratch / "frames"
-
-    def tell(done: int, total: int) -> None:
-        log.tell("frames", done, total)
-
-    clip = None
+    folder, tell, clip = scratch / "frames", partial(log.tell, "frames"), None
     if every is None and sharpest is None:
         clip = read_clip(photos, folder, tell)
         frames = clip.frames

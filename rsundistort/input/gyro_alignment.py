@@ -13,11 +13,12 @@ Procrustes problem, in closed form); all unknowns are then refined together, wit
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..io.gyro import GyroLog
@@ -179,23 +180,10 @@ def align_gyro(
         against = "the camera's rotations repeat: several offsets of the gyroscope's clock fit them"
     if against is not None:
         return NoAlignment(against, proper)
-    tilt = np.arccos(np.clip((np.trace(fit.rotation @ ways[0].T) - 1) / 2, -1, 1))
-    return GyroAlignment(
-        offset_s=fit.offset_s,
-        offset_sigma_s=float(fit.sigma[_OFFSET]),
-        camera_from_gyro=fit.rotation,
-        axes=_letters(ways[0]) if tilt <= _OBLIQUE else None,
-        also=tuple(_letters(way) for way in ways[1:]) if tilt <= _OBLIQUE else (),
-        axes_sigma_deg=np.degrees(fit.sigma[_ROTATION]),
-        bias=-fit.rotation.T @ fit.shift / fit.ratio,
-        ratio=fit.ratio,
-        ratio_sigma=float(fit.sigma[_RATIO]),
-        correlation=fit.correlation,
-        axis_correlations=fit.axis_correlations,
-        rms=fit.rms,
-        num_inliers=fit.num_inliers,
-        num_rotations=fit.num_rotations,
-    )
+    tilt = np.arccos(np.clip((np.trace(fit.camera_from_gyro @ ways[0].T) - 1) / 2, -1, 1))
+    if tilt <= _OBLIQUE:
+        return replace(fit, axes=_letters(ways[0]), also=tuple(_letters(way) for way in ways[1:]))
+    return fit
 
 
 def check_pairs(pairs: ArrayLike, rotations: ArrayLike) -> tuple[NDArray[np.int64], _Array]:
@@ -217,7 +205,7 @@ def _rates(frame_time_s: ArrayLike, pairs: ArrayLike, rotations: ArrayLike) -> t
     return start[good], end[good], -vectors[good] / (end - start)[good, None]
 
 
-def _why_not(fit: _Fit, way: _Array, spread: float, interval_s: float) -> str | None:
+def _why_not(fit: GyroAlignment, way: _Array, spread: float, interval_s: float) -> str | None:
     """Reason against an alignment by the nearest signed permutation, where rates change by `spread`."""
     if fit.correlation < _LEAST_CORRELATION and spread < _STILL:
         return (
@@ -231,7 +219,7 @@ def _why_not(fit: _Fit, way: _Array, spread: float, interval_s: float) -> str | 
             f"the gyroscope's axes are a mirror image of the camera's, as {_letters(way)} takes them, which no sensor "
             "is: the sign of an axis is wrong, or two axes are exchanged"
         )
-    if not fit.sigma[_OFFSET] < interval_s / 2:
+    if not fit.offset_sigma_s < interval_s / 2:
         return "the camera rotated too uniformly to determine the offset of the gyroscope's clock"
     return None
 
@@ -372,24 +360,10 @@ def _scale(sizes: _Array, measured: _Array, share: float = _SHARE) -> _Array:
 _ROTATION, _SHIFT, _RATIO, _OFFSET = slice(0, 3), slice(3, 6), 6, 7
 
 
-@dataclass(frozen=True)
-class _Fit:
-    rotation: _Array
-    shift: _Array
-    ratio: float
-    offset_s: float
-    sigma: _Array
-    correlation: float
-    axis_correlations: _Array
-    rms: float
-    num_inliers: int
-    num_rotations: int
-
-
 def _refine(
     log: GyroLog, start: _Array, end: _Array, seen: _Array, offset_s: float, way: _Array, ratio: float
-) -> _Fit | None:
-    """Gauss-Newton on rotation, bias, ratio and offset, with Cauchy's loss.
+) -> GyroAlignment | None:
+    """Gauss-Newton on rotation, bias, ratio and offset, with Cauchy's loss; the axes are not named.
 
     The rotation has a prior about `way`, which only matters where the motion does not determine it.
     """
@@ -423,11 +397,13 @@ def _refine(
         H = np.einsum("n,nij,nik->jk", weights, J, J)
         g = np.einsum("n,nij,ni->j", weights, J, residuals)
         prior = np.diag([1 / _TILT**2] * 3 + [0.0] * 3 + [1.0, 1e-4 / interval**2])
-        off = np.concatenate([-_rotation_vector(rotation @ way.T), np.zeros(3), [1 - ratio, 0.0]])
+        # both may be mirror images
+        tilt = Rotation.from_matrix(rotation @ way.T).as_rotvec()
+        off = np.concatenate([-tilt, np.zeros(3), [1 - ratio, 0.0]])
         step = np.linalg.solve(H + prior, g + prior @ off)
         pulls = np.einsum("n,nij,ni->nj", weights, J, residuals)
         meat = pulls.T @ pulls + prior
-        rotation = _exp(step[_ROTATION]) @ rotation
+        rotation = Rotation.from_rotvec(step[_ROTATION]).as_matrix() @ rotation
         shift = shift + step[_SHIFT]
         ratio = float(np.clip(ratio + step[_RATIO], 0.1, 10.0))
         offset_s += float(np.clip(step[_OFFSET], -interval, interval))
@@ -443,20 +419,19 @@ def _refine(
         axis_correlations = products / np.sqrt(squares[0] * squares[1])
         correlation = products.sum() / np.sqrt(squares[0].sum() * squares[1].sum())
     rms = float(np.sqrt(np.mean(residuals[fits] ** 2))) if fits.any() else float("inf")
-    return _Fit(
-        rotation, shift, ratio, offset_s, sigma, float(np.nan_to_num(correlation)), np.nan_to_num(axis_correlations),
-        rms, int(fits.sum()), len(y),
-    )  # fmt: skip
-
-
-def _exp(vector: _Array) -> _Array:
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_rotvec(vector).as_matrix(), np.float64)
-
-
-def _rotation_vector(matrix: _Array) -> _Array:
-    """The rotation vector between two matrices, which may both be mirror images."""
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_matrix(matrix).as_rotvec(), np.float64)
+    return GyroAlignment(
+        offset_s=offset_s,
+        offset_sigma_s=float(sigma[_OFFSET]),
+        camera_from_gyro=rotation,
+        axes=None,
+        also=(),
+        axes_sigma_deg=np.degrees(sigma[_ROTATION]),
+        bias=-rotation.T @ shift / ratio,
+        ratio=ratio,
+        ratio_sigma=float(sigma[_RATIO]),
+        correlation=float(np.nan_to_num(correlation)),
+        axis_correlations=np.nan_to_num(axis_correlations),
+        rms=rms,
+        num_inliers=int(fits.sum()),
+        num_rotations=len(y),
+    )

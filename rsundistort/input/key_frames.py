@@ -74,8 +74,6 @@ class Clip:
         Parts of continuous frames: a cut, or a pause of the recording, begins a new part.
     keys : (k,) int array
         The key frames.
-    moved_px : (n - 1,) array
-        Median motion of the content to the next frame; NaN over a cut.
     frames : VideoFrames
         Further facts about them, and about the camera.
     flows : tuple of KeyFlow
@@ -92,7 +90,6 @@ class Clip:
     frame_s: float
     part: NDArray[np.int64]
     keys: NDArray[np.int64]
-    moved_px: NDArray[np.float64]
     frames: VideoFrames
     flows: tuple[KeyFlow, ...] = ()
     repeated: tuple[int, ...] = ()
@@ -181,7 +178,7 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
     held: dict[int, tuple[int, float, Any]] = {}  # frames that may become the next key
     written, repeated, step = set[int](), list[int](), _Step()
     with VideoReader(video) as reader:
-        writer, num_written = FrameWriter(reader, folder), 0
+        writer = FrameWriter(reader, folder)
         for number, time_s, picture in reader:
             if progress is not None:
                 progress(number + 1, reader.num_frames)
@@ -207,13 +204,12 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
             chooser.feed(even_brightness(grey))
             if [len(numbers) - 1] == chooser.cuts[-1:]:
                 step.forget()
-            for k in held.keys() & {*chooser.keys[num_written:]}:
+            for k in held.keys() & {*chooser.keys} - written:
                 writer.add(*held[k], sharpness[k])
                 written.add(k)
-            num_written = len(chooser.keys)
             held = {k: each for k, each in held.items() if k > chooser.keys[-1]}
         chooser.finish()
-        for k in held.keys() & {*chooser.keys[num_written:]}:
+        for k in held.keys() & {*chooser.keys} - written:
             writer.add(*held[k], sharpness[k])
             written.add(k)
         reader.warn()
@@ -227,16 +223,17 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
     time = _with_repeated(video, np.array(numbers), np.array(times), len(repeated))
     frame_s = float(np.median(np.diff(time)))
     breaks = {*chooser.cuts, *(np.flatnonzero(np.diff(time) > _PAUSE * frame_s) + 1).tolist()}
-    keys = np.array(sorted({*chooser.keys, *_between(len(numbers), len(chooser.keys)), *_ends(breaks)}))
+    # no path leads across a break
+    ends = {k - side for k in breaks for side in (0, 1)}
+    keys = np.array(sorted({*chooser.keys, *_between(len(numbers), len(chooser.keys)), *ends}))
     _add(writer, video, {numbers[k]: sharpness[k] for k in keys.tolist() if k not in written})
     part = np.cumsum([k in breaks for k in range(len(numbers))])
     if part[-1] == len(part) - 1:
         raise InputError(_ONLY_CUTS.format(video.name))
     names = tuple(frame_name(video, number) for number in numbers)
     flows = tuple(each for each in chooser.flows if part[each.keys[0]] == part[each.keys[1]])
-    moved_px, frames = np.array(chooser.steps), writer.finish()
     return Clip(
-        video, folder, tuple(numbers), names, time, frame_s, part, keys, moved_px, frames, flows, tuple(repeated)
+        video, folder, tuple(numbers), names, time, frame_s, part, keys, writer.finish(), flows, tuple(repeated)
     )
 
 
@@ -309,8 +306,3 @@ def _between(num_frames: int, num_keys: int) -> Iterable[int]:
     if num_keys >= _LEAST_KEYS:
         return ()
     return np.linspace(0, num_frames - 1, min(_LEAST_KEYS, num_frames)).round().astype(int).tolist()
-
-
-def _ends(breaks: set[int]) -> Iterable[int]:
-    """The frames on both sides of a break: no path leads across it."""
-    return (k - side for k in breaks for side in (0, 1))

@@ -138,24 +138,15 @@ def _load(job: _LoadJob) -> _Loaded:
     return _Loaded(features, width, height, photo.metadata.orientation, facts, edge_px, coarse=is_coarse)
 
 
-def _most_bytes(folder: Path, names: Sequence[str], megapixels: float, max_megapixels: float) -> float:
-    """Approximate bytes of the largest photo that will be read."""
-
-    def bytes_of(name: str) -> float:
-        try:
-            width, height = stored_size(folder / name) or _SIZE_OF_OTHERS
-        except FileError:  # it is reported when it is read
-            return 0.0
-        if width * height > max_megapixels * 1e6:
-            return 0.0
-        return detection_bytes(width, height, megapixels) + _BYTES_PER_PIXEL * width * height
-
-    return max(map(bytes_of, names))
-
-
-def _is_text(name: str) -> bool:
-    """Whether a name of a file is text: what is not UTF-8 comes as surrogates."""
-    return not any("\ud800" <= letter <= "\udfff" for letter in name)
+def _bytes_of(job: _LoadJob) -> float:
+    """Approximate bytes that reading a photo takes; 0 if it will not be decoded."""
+    try:
+        width, height = stored_size(job.source) or _SIZE_OF_OTHERS
+    except FileError:  # it is reported when it is read
+        return 0.0
+    if width * height > job.max_megapixels * 1e6:
+        return 0.0
+    return detection_bytes(width, height, job.megapixels) + _BYTES_PER_PIXEL * width * height
 
 
 def _listed(folder: Path, raw_as: str, only: Sequence[str] | None, least: int) -> list[str]:
@@ -173,7 +164,8 @@ def _listed(folder: Path, raw_as: str, only: Sequence[str] | None, least: int) -
         raise InputError(
             f"{folder} holds {len(listed)} photo{'s' * (len(listed) > 1)}; the shutter needs at least {_NUMBERS[least]}"
         )
-    if no_text := [name for name in listed if not _is_text(name)]:
+    # what is not UTF-8 comes as surrogates
+    if no_text := [name for name in listed if any("\ud800" <= letter <= "\udfff" for letter in name)]:
         raise InputError(f"{no_text[0]!r} in {folder} is no name in UTF-8, and no model can hold it; rename it")
     return listed
 
@@ -232,9 +224,6 @@ def load_photos(
         )
         for name in listed
     ]
-    # headers are not read for workers elsewhere, which limit their own memory
-    if not workers.scheduler:
-        workers = workers.fitting("features", _most_bytes(folder, listed, megapixels, max_megapixels))
     found, skipped = dict[str, _Loaded](), dict[str, str]()
     for name, each in _read(jobs, "features of", workers, log, kept):
         if each.features is None:
@@ -279,9 +268,6 @@ def with_finer_features(
         for name in photos.names
         if name in photos.coarse
     ]
-    if jobs and not workers.scheduler:
-        most = _most_bytes(photos.folder, [job.name for job in jobs], megapixels, photos.max_megapixels)
-        workers = workers.fitting("features", most)
     finer = dict(_read(jobs, "finer features of", workers, log, kept or Kept()))
     if lost := [each.problem for each in finer.values() if each.features is None]:
         raise FileError(lost[0])
@@ -297,6 +283,9 @@ def _read(
     jobs: Sequence[_LoadJob], key: str, workers: Workers, log: StageLog, kept: Kept
 ) -> Iterator[tuple[str, _Loaded]]:
     """Names and contents of photos; those that an earlier run kept are not read again."""
+    # headers are not read for workers elsewhere, which limit their own memory
+    if jobs and not workers.scheduler:
+        workers = workers.fitting("features", max(map(_bytes_of, jobs)))
     before: dict[str, _Loaded] = {job.name: old for job in jobs if (old := kept.get(f"{key} {job.name}"))}
     log.begin("features", len(jobs), len(before))
     left = (job for job in jobs if job.name not in before)

@@ -49,7 +49,7 @@ def patch_source(
 ) -> PatchSource:
     """Function that cuts patches out of these photos; `tell` gets the number of photos read."""
     most = max(camera.width * camera.height for camera in photos.cameras.cameras)
-    fitting = workers if workers.scheduler else workers.fitting("alignment", _BYTES_PER_PIXEL * most)
+    fitting = workers.fitting("alignment", _BYTES_PER_PIXEL * most)
 
     def patches_of(
         places: Mapping[int, PatchPlaces],

@@ -133,11 +133,10 @@ class MapFrame:
         return value
 
 
-def check_crs(crs: str | None) -> str | None:
-    """The CRS, refused if it is none in metres, or if there is no library to read it with."""
+def check_crs(crs: str | None) -> None:
+    """Refuse a CRS that is none in metres, and any if there is no library to read it with."""
     if crs not in (None, "local", "none"):
         _transformer(str(crs))
-    return crs
 
 
 def _transformer(crs: str) -> Any:
@@ -219,16 +218,13 @@ def frame_of_control(crs: str, places_m: Array) -> MapFrame:
 
 def positions_of(names: Sequence[str], facts: Sequence[ExifFacts]) -> PhotoPositions:
     """The photos that have a position, and remarks on that."""
-    there = [fact.fix is not None and not fact.fix.is_nowhere for fact in facts]
-    placed = [
-        (name, fact.fix) for name, fact, is_placed in zip(names, facts, there, strict=True) if is_placed and fact.fix
-    ]
-    upright = [fact.orientation in (None, 1) for fact, is_placed in zip(facts, there, strict=True) if is_placed]
+    fixed = [(name, fact, fact.fix) for name, fact in zip(names, facts, strict=True) if fact.fix is not None]
+    placed = [(name, fact, fix) for name, fact, fix in fixed if not fix.is_nowhere]
     notes = []
-    nowhere = [name for name, fact in zip(names, facts, strict=True) if fact.fix and fact.fix.is_nowhere]
+    nowhere = [name for name, _, fix in fixed if fix.is_nowhere]
     if nowhere:
         notes.append(f"GPS at 0,0 is no position: {_some(nowhere)}")
-    fixes = [fix for _, fix in placed]
+    fixes = [fix for _, _, fix in placed]
     altitudes = np.array([np.nan if fix.altitude_m is None else fix.altitude_m for fix in fixes])
     known = np.isfinite(altitudes)
     middle = float(np.median(altitudes[known])) if known.any() else 0.0
@@ -254,14 +250,14 @@ def positions_of(names: Sequence[str], facts: Sequence[ExifFacts]) -> PhotoPosit
     geodetic = np.array([(fix.latitude_deg, fix.longitude_deg) for fix in fixes]).reshape(-1, 2)
     unknown = np.full((3, 3), np.nan)
     return PhotoPositions(
-        [name for name, _ in placed],
+        [name for name, _, _ in placed],
         np.column_stack([geodetic, np.where(known, altitudes, middle)]),
         sigma,
         np.array([np.nan if fix.speed_m_s is None else fix.speed_m_s for fix in fixes]),
         np.array([fix.velocity_m_s or (np.nan,) * 3 for fix in fixes]).reshape(-1, 3),
         # a photo that is stored rotated does not say about which axes
         np.array(
-            [fix.R_cw if is_upright and fix.R_cw else unknown for fix, is_upright in zip(fixes, upright, strict=True)]
+            [fix.R_cw if fact.orientation in (None, 1) and fix.R_cw else unknown for _, fact, fix in placed]
         ).reshape(-1, 3, 3),
         tuple(sorted({fix.sigma_from for fix in fixes} | ({"height above take-off"} if by_height.any() else set()))),
         tuple(notes),

@@ -186,11 +186,11 @@ def judge_stabilisation(
         length = readout_s or 0.5 * interval
         within = -log.mean(times + offset_s - length / 2, times + offset_s + length / 2)
         shutter_by_gyro = _of_lines(phi, within, phi_noise, interval)[0]
-    verdict, reason = _judge(shutter, changes, beyond, frames_by_gyro, shutter_by_gyro, interval, readout_s)
+    found = Stabilisation("unknown", "", shutter, changes, frames_by_gyro, shutter_by_gyro, beyond)
+    verdict, reason = _judge(found, interval, readout_s)
     fastest = _FASTEST * interval
     at_once = _SIGMAS * shutter.reach < fastest and abs(shutter.slope) + _SIGMAS * shutter.sigma < fastest
-    found = Stabilisation(verdict, reason, shutter, changes, frames_by_gyro, shutter_by_gyro, beyond)
-    return replace(found, read_at_once=at_once and not found.shows_shaking)
+    return replace(found, verdict=verdict, reason=reason, read_at_once=at_once and not found.shows_shaking)
 
 
 def _of_lines(
@@ -300,7 +300,7 @@ def _regress(y: _Array, x: _Array, noise: _Array, *, steady: bool = False, toget
     information = inlier @ np.sum(x * x, 1)
     pull = np.pad(inlier * np.sum(x * left, 1), (0, -len(x) % together)).reshape(-1, together)
     sigma = np.sqrt(max(np.sum(pull**2), np.sum(pull.sum(1) ** 2))) / information
-    norms = (inlier @ np.sum(x * x, 1)) * (inlier @ np.sum(y * y, 1))
+    norms = information * (inlier @ np.sum(y * y, 1))
     power = inlier / inlier.sum() / 3
     return Regression(
         slope=slope,
@@ -313,15 +313,10 @@ def _regress(y: _Array, x: _Array, noise: _Array, *, steady: bool = False, toget
 
 
 def _judge(
-    shutter: Regression,
-    changes: Regression,
-    beyond: bool,
-    frames_by_gyro: Regression | None,
-    shutter_by_gyro: Regression | None,
-    interval: float,
-    readout_s: float | None,
+    evidence: Stabilisation, interval: float, readout_s: float | None
 ) -> tuple[Literal["none", "stabilised", "unknown"], str]:
     """The verdict, and the line that says why."""
+    shutter, changes, rotations = evidence.shutter, evidence.changes, evidence.frames_by_gyro
     if readout_s is None:
         least, most, wanted = _FASTEST * interval, _SLOWEST * interval, f"{1e3 * _FASTEST * interval:.1f} ms or more"
     else:
@@ -330,22 +325,21 @@ def _judge(
     alike = f"correlation {shutter.correlation:.2f}"
     found = f"{1e3 * shutter.slope:.1f} +- {1e3 * shutter.sigma:.1f} ms, {alike}"
     low, high = (shutter.slope + side * _SIGMAS * shutter.sigma for side in (-1, 1))
-    unexplained = beyond and changes.unexplained > max(_UNEXPLAINED * changes.signal, _SHOWN)
-    if frames_by_gyro is not None:
-        rotations = frames_by_gyro
-        if (
-            _SIGMAS * max(rotations.reach, rotations.sigma) < 1 - _ROTATION_SHARE
-            and rotations.slope + _SIGMAS * rotations.sigma < _ROTATION_SHARE
-        ):
-            line = (
-                f"stabilised in the camera: the frames rotate by {rotations.slope:.2f} +- {rotations.sigma:.2f} of "
-                "what the gyroscope felt"
-            )
-            if shutter_by_gyro is not None and shutter_by_gyro.slope > _SIGMAS * shutter_by_gyro.sigma:
-                line += f", their lines as it says ({1e3 * shutter_by_gyro.slope:.1f} ms)"
-            return "stabilised", line
+    if (
+        rotations is not None
+        and _SIGMAS * max(rotations.reach, rotations.sigma) < 1 - _ROTATION_SHARE
+        and rotations.slope + _SIGMAS * rotations.sigma < _ROTATION_SHARE
+    ):
+        line = (
+            f"stabilised in the camera: the frames rotate by {rotations.slope:.2f} +- {rotations.sigma:.2f} of "
+            "what the gyroscope felt"
+        )
+        lines = evidence.shutter_by_gyro
+        if lines is not None and lines.slope > _SIGMAS * lines.sigma:
+            line += f", their lines as it says ({1e3 * lines.slope:.1f} ms)"
+        return "stabilised", line
     detectable = _SIGMAS * shutter.reach < least
-    if unexplained:
+    if evidence.shows_shaking:
         return "stabilised", (
             f"stabilised in the camera: a shutter without its rotation, {changes.unexplained / changes.signal:.0%} of "
             f"what the lines show is not in the rotation between the frames (readout {found}); shaking faster than "

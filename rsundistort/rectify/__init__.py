@@ -1,6 +1,5 @@
 """Rectification: grids, photos and points, both ways."""
 
-from .coarse_grid import TOLERANCE_PX, CoarseGrid, coarse_grid
 from .grid import MAP_KINDS, RemapGrid
 from .maps import init_rectify_map
 from .new_camera import ViewOptions, optimal_new_camera, rectified_roi, rectified_view, steadiest_pinhole
@@ -11,12 +10,9 @@ from .point_maps import bend_px, distort_points, largest_shift_px, translation_s
 __all__ = [
     "INTERPOLATIONS",
     "MAP_KINDS",
-    "TOLERANCE_PX",
-    "CoarseGrid",
     "RemapGrid",
     "ViewOptions",
     "bend_px",
-    "coarse_grid",
     "depth_from_points",
     "distort_points",
     "fit_plane",

@@ -6,7 +6,7 @@ import math
 import secrets
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,8 +153,9 @@ class RemapGrid:
         aside = path.with_name(f".{secrets.token_hex(8)}.partial{path.suffix}")
         try:
             if kind == "npz":
+                source = np.array([self.source_width, self.source_height])
                 with aside.open("wb") as file:
-                    self._write_npz(file)
+                    np.savez(file, map_x=self.map_x, map_y=self.map_y, source_size=source)
             else:
                 self._write_exr(aside, kind)
             aside.replace(path)
@@ -162,10 +163,6 @@ class RemapGrid:
             raise FileError(f"{path} cannot be written: {error.strerror or error}") from error
         finally:
             aside.unlink(missing_ok=True)
-
-    def _write_npz(self, file: BinaryIO) -> None:
-        source = np.array([self.source_width, self.source_height])
-        np.savez(file, map_x=self.map_x, map_y=self.map_y, source_size=source)
 
     def _write_exr(self, path: Path, kind: str) -> None:
         OpenEXR = _openexr()

@@ -162,7 +162,7 @@ def simulate_warp(
         whole, source, sigma = _camera(photos, names[0], options)
         motions = _motions(photos, names, whole, options)
         for name in names:
-            check_no_fold(name, whole, motions[name].phi, bend=motions[name].bend)
+            check_no_fold(name, whole, motions[name])
         crop = _common_rectangle(whole, motions, jobs, log) if options.crop else None
         for folder in folders:
             (scratch / folder).mkdir()
@@ -259,16 +259,15 @@ def _motions(photos: Path, names: Sequence[str], camera: Camera, options: WarpOp
         phi = random_phi(names, [camera.frame_span] * len(names), options.sigma_rad, options.seed, options.still)
         start = {name: RowMotion(phi[name]) for name in names}
     else:
-        start = {name: _given(given.get(name, np.zeros(3))) for name in names}
+        start = {name: RowMotion() for name in names} | {
+            name: each if isinstance(each, RowTable) else RowMotion(np.asarray(each, np.float64))
+            for name, each in given.items()
+        }
     found = unsteady_motions(start, cameras, options.acceleration, options.vibration, options.seed, options.still)
     for name, (motion, _, _) in found.items():
         if motion.moves:
             raise InputError(f"table of {name}: it has positions, but a photo can be warped by rotations only")
     return {name: motion for name, (motion, _, _) in found.items()}
-
-
-def _given(value: ArrayLike | RowTable) -> RowMotion | RowTable:
-    return value if isinstance(value, RowTable) else RowMotion(np.asarray(value, np.float64))
 
 
 def _common_rectangle(camera: Camera, motions: Mapping[str, RowMotion], jobs: int, log: StageLog) -> Rectangle:

@@ -223,11 +223,10 @@ class Outputs:
         solution, rec, options = self.solution, self.reconstruction, self.rectifying
         colors = None if self.rgb is not None and self.rgb.known.all() else PointColors(rec)
         scene = SceneGeometry(solution, options.depth, ScenePoints.of_reconstruction(rec))
-        go_on = "whole; the same command with --resume continues"
         with batch_folder(out, overwrite=True) as journal:
             done = rectify_photos(
                 photos, scene, list(rec.image_names), out, options, workers, log, journal,
-                colors=colors, go_on=go_on, resume=resume, others=False,
+                colors=colors, resume=resume, others=False,
             )  # fmt: skip
         log.begin("writing")
         left_out = {name: each.problem for name, each in done.items() if each.problem}

@@ -248,7 +248,7 @@ def poses_and_motions(
         options = dict(take(entry["vibration"], "motion: vibration", (), keys))
         vibration = Vibration(travel=options.pop("travel_m", 0.0), **options)
     still = {names[k] for k in entry.get("still", [])}
-    found = unsteady_motions({name: start[name] for name in names}, cameras, share, vibration, seed, still)
+    found = unsteady_motions(start, cameras, share, vibration, seed, still)
     rotated = [
         replace(pose, R_cw=rotation @ pose.R_cw, center_w=pose.center_w + way)
         for pose, (_, rotation, way) in zip(poses, found.values(), strict=True)

@@ -11,10 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
-from ..model.bend import Bend
 from ..model.camera import Camera
 from ..model.motion import RowMotion
-from .lens import distort_rays, undistort_to_rays
+from .lens import clock_at, distort_rays, undistort_to_rays
 
 __all__ = ["check_no_fold"]
 
@@ -29,14 +28,7 @@ _STEP = 1e-5
 _LENS_PX = 0.5
 
 
-def check_no_fold(
-    name: str,
-    camera: Camera,
-    phi: ArrayLike,
-    velocity: ArrayLike | None = None,
-    depth: ArrayLike | None = None,
-    bend: Bend | None = None,
-) -> None:
+def check_no_fold(name: str, camera: Camera, motion: RowMotion, depth: ArrayLike | None = None) -> None:
     """Refuse a motion that lets two rows of a photo see the same thing.
 
     A point is seen when the clock reaches its row. Where its image runs along the readout as fast as the clock, the
@@ -54,27 +46,21 @@ def check_no_fold(
         Photo, for the message.
     camera : Camera
         Its size, lens and readout.
-    phi : (3,) array
-        Rotation, radians per unit of the clock.
-    velocity : (3,) array, optional
-        Translation of the camera, world units per unit of the clock, in the camera frame at clock zero; none when left
-        out.
+    motion : RowMotion
+        During the readout, its velocity and the positions of its bend in the camera frame at clock zero.
     depth : float or (h, w) array, optional
         z in the camera of the nearest thing, world units: of the whole photo or of each pixel, at the moment its row is
         read; inf where nothing is. Only infinity when left out. The speed is linear in 1/depth, so what holds at this
         depth and at infinity holds between them.
-    bend : Bend, optional
-        What is not steady in the motion; its positions in the camera frame too.
 
     Raises
     ------
     InputError
         Names the photo, and the pixel where the image runs fastest.
     """
-    motion = RowMotion(np.asarray(phi, float), np.asarray(np.zeros(3) if velocity is None else velocity, float), bend)
     num = [_GRID, _GRID]
-    if bend is not None:
-        num[camera.clock_axis] = max(_GRID, 4 * len(bend.values) - 3)
+    if motion.bend is not None:
+        num[camera.clock_axis] = max(_GRID, 4 * len(motion.bend.values) - 3)
     uv = np.stack(np.meshgrid(_stations(camera.width, num[0]), _stations(camera.height, num[1])), -1).reshape(-1, 2)
     speeds = [_line_speed(camera, uv, motion, np.zeros(len(uv)))]
     if depth is not None and motion.moves:
@@ -119,7 +105,7 @@ def _line_speed(
     """Lines (n,) by which the image of what pixels (n, 2) see runs on while one line is read; NaN beyond the lens."""
     K = camera.K
     axis, sign = camera.clock_axis, camera.clock_sign
-    clock = sign * (uv[:, axis] - K[axis, 2]) / K[axis, axis]
+    clock = clock_at(camera, uv[:, axis])
     norm = undistort_to_rays(uv, camera)
     known = np.asarray(np.isfinite(norm).all(axis=1))
     rays = np.column_stack([np.where(known[:, None], norm, 0.0), np.ones(len(uv))])

@@ -6,6 +6,8 @@ OpenCV's default of five steps back is wrong by whole pixels at the edge of a wi
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -14,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from ..model import Camera
 
-__all__ = ["distort_rays", "undistort_to_rays"]
+__all__ = ["clock_at", "distort_rays", "undistort_to_rays"]
 
 _TIGHT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
 
@@ -49,6 +51,12 @@ def undistort_to_rays(uv_raw: ArrayLike, camera: Camera) -> NDArray[np.float64]:
     else:
         rays = cv2.undistortPoints(flat, K, dist, criteria=_TIGHT)
     return np.asarray(rays, np.float64).reshape(uv.shape)
+
+
+def clock_at(camera: Camera, lines: NDArray[Any]) -> NDArray[np.float64]:
+    """The clock when lines are read, by their places along the readout: rows, or columns, in pixels of any shape."""
+    axis = camera.clock_axis
+    return np.asarray(camera.clock_sign * (lines - camera.K[axis, 2]) / camera.K[axis, axis], np.float64)
 
 
 def _check_lens(camera: Camera) -> None:

@@ -6,17 +6,14 @@ SciPy's, the lens OpenCV's, and the four readout directions are written out.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from ..errors import InputError
-from ..model import Camera, Observations, RowMotion
+from ..model import Camera, RowMotion
 from .lens import distort_rays
 
-__all__ = ["Measured", "clock_of", "measure", "project_rows"]
+__all__ = ["clock_of", "project_rows"]
 
 # the speed of the rotation, |phi| and what a bend adds, contracts the fixed point: 0.2 rad per frame needs some 20
 # steps to rounding
@@ -76,66 +73,3 @@ def project_rows(
             break
     K = camera.K
     return seen * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]], ahead & reached
-
-
-@dataclass(frozen=True)
-class Measured:
-    """Synthetic measurements.
-
-    Attributes
-    ----------
-    observations : Observations
-        Measured pixels, with noise.
-    exact : (o, 2) array
-        The same without.
-    """
-
-    observations: Observations
-    exact: NDArray[np.float64]
-
-
-def measure(
-    points_w: ArrayLike,
-    R_cw: ArrayLike,
-    center_w: ArrayLike,
-    motions: list[RowMotion],
-    cameras: list[Camera],
-    frame_idx: ArrayLike,
-    point_idx: ArrayLike,
-    *,
-    noise_px: float = 0.0,
-    seed: int = 0,
-) -> Measured:
-    """Measurements of points that photos are known to see.
-
-    Parameters
-    ----------
-    points_w : (n, 3) array
-        World points.
-    R_cw, center_w : (m, 3, 3), (m, 3) array
-        Poses.
-    motions, cameras : lists of length m
-        Motion and camera of each photo.
-    frame_idx, point_idx : (o,) array
-        Photo and point of each measurement.
-    noise_px : float
-        Standard deviation of the normal noise on u and v.
-    seed : int
-        Of the noise.
-
-    Raises
-    ------
-    InputError
-        When a photo is said to see a point that lies behind it.
-    """
-    points, frame, point = np.asarray(points_w, np.float64), np.asarray(frame_idx), np.asarray(point_idx)
-    R, center = np.asarray(R_cw, np.float64), np.asarray(center_w, np.float64)
-    exact = np.empty((len(frame), 2))
-    for i in range(len(R)):
-        mine = np.flatnonzero(frame == i)
-        exact[mine], valid = project_rows(points[point[mine]], R[i], center[i], motions[i], cameras[i])
-        if not valid.all():
-            bad = int(point[mine][~valid][0])
-            raise InputError(f"photo {i} cannot see point {bad}: it lies behind the camera, or its rows fold over")
-    noise = np.random.default_rng(seed).normal(0.0, noise_px, exact.shape) if noise_px else 0.0
-    return Measured(Observations(frame, point, exact + noise), exact)

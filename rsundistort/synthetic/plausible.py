@@ -28,8 +28,7 @@ def check_recipe(recipe: Recipe) -> None:
         depth = render_depth(recipe.scene, camera, view)
         if not np.isfinite(depth).any():
             raise InputError(f"photo {view.name} shows nothing but sky; look_at_w is away from every surface")
-        motion = view.motion.in_camera(view.R_cw)
-        check_no_fold(view.name, camera, motion.phi, motion.velocity, depth, motion.bend)
+        check_no_fold(view.name, camera, view.motion.in_camera(view.R_cw), depth)
     _check_in_front(recipe)
 
 

@@ -17,7 +17,7 @@ from .._kernels import raycast
 from ..errors import InputError
 from ..model.camera import Camera
 from ..model.checks import check_finite
-from .lens import distort_rays, undistort_to_rays
+from .lens import clock_at, distort_rays, undistort_to_rays
 from .recipe import Noise, View
 from .scene import Scene
 
@@ -46,10 +46,7 @@ def line_poses(camera: Camera, view: View, delay: float = 0.0) -> tuple[NDArray[
     center_w : (lines, 3) array
         view.center_w + tau*velocity, and what the bend adds.
     """
-    axis, sign = camera.clock_axis, camera.clock_sign
-    lines = np.arange(camera.height if axis == 1 else camera.width)
-    tau = sign * (lines - camera.K[axis, 2]) / camera.K[axis, axis] + delay
-    rotation, way = view.motion.at(tau)
+    rotation, way = view.motion.at(clock_at(camera, np.arange(camera.num_lines)) + delay)
     return Rotation.from_rotvec(rotation).as_matrix() @ view.R_cw, view.center_w + way
 
 
@@ -71,10 +68,9 @@ def pixel_rays(camera: Camera, view: View, uv_raw: ArrayLike) -> tuple[NDArray[n
         World frame; the directions have depth 1 in the camera.
     """
     uv = check_finite(uv_raw, (None, 2), "uv_raw")
-    axis, sign = camera.clock_axis, camera.clock_sign
-    tau = sign * (uv[:, axis] - camera.K[axis, 2]) / camera.K[axis, axis]
     rays_c = np.column_stack([undistort_to_rays(uv, camera), np.ones(len(uv))])
-    tau, line = np.unique(tau, return_inverse=True)  # of whole photos there are few
+    # of whole photos there are few
+    tau, line = np.unique(clock_at(camera, uv[:, camera.clock_axis]), return_inverse=True)
     rotation, way = view.motion.at(tau)
     return view.center_w + way[line], Rotation.from_rotvec(-rotation)[line].apply(rays_c) @ view.R_cw
 

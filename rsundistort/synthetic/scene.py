@@ -245,7 +245,7 @@ def _sky_image(light: Light, seed: int) -> NDArray[np.float32]:
                 plane_xy @ np.float32(2.2 * wave) + np.float32(rng.uniform(0, 2 * np.pi)) + bend
             )
     cover = np.clip((density / density.std() - 1.0 + 2.0 * light.clouds) / 1.6, 0, 1)
-    cover = cover * cover * (3 - 2 * cover) * np.clip(direction[..., 2:3][..., 0] * 7, 0, 1)
+    cover = cover * cover * (3 - 2 * cover) * np.clip(direction[..., 2] * 7, 0, 1)
     white = np.array([1.15, 1.13, 1.10]) * (1 - 0.25 * cover[..., None])
     return np.asarray(image + (white - image) * 0.85 * cover[..., None], np.float32)
 
@@ -363,12 +363,7 @@ class Scene:
         return (
             np.array([names.index(p.texture) for p in patches]),
             np.array([p.offset_m for p in patches]),
-            np.array(
-                [
-                    p.axes_m if p.axes_m is not None else (size[0], 0.0, 0.0, size[1])
-                    for p, size in zip(patches, extent_m, strict=True)
-                ]
-            ),
+            np.array([p.axes_m or (a, 0.0, 0.0, b) for p, (a, b) in zip(patches, extent_m, strict=True)]),
             np.concatenate(texels),
             (np.arange(256) / 255.0) ** 2.2,
             np.array(levels, np.int64),

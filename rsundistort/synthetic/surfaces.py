@@ -142,7 +142,7 @@ def mesh(
     """
     patches = []
     for corner in np.asarray(faces):
-        o, a, b = vertices_w[corner[0]], vertices_w[corner[1]], vertices_w[corner[2]]
+        o, a, b = vertices_w[corner]
         normal = np.cross(a - o, b - o)
         if np.linalg.norm(normal) < 1e-9:
             continue

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .measurements import project_rows
-from .recipe import Recipe
+from .recipe import Recipe, View
 from .render import pixel_rays
 
 __all__ = ["TruePoints", "true_points"]
@@ -39,10 +39,8 @@ class TruePoints:
     xy_global: NDArray[np.float64]
 
 
-def _seen(recipe: Recipe, number: int, points_w: NDArray[np.float64], still: bool) -> NDArray[np.float64]:
-    """Pixels (n, 2) where a photo, or its global-shutter reference, shows points; nan where it does not."""
-    view = recipe.views[number]
-    view = view.at_once() if still else view
+def _seen(recipe: Recipe, view: View, points_w: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixels (n, 2) where a photo shows points; nan where it does not."""
     camera = recipe.camera(view)
     uv, valid = project_rows(points_w, view.R_cw, view.center_w, view.motion, camera)
     valid &= ((uv >= 0) & (uv <= [camera.width - 1, camera.height - 1])).all(1)
@@ -72,10 +70,10 @@ def true_points(recipe: Recipe) -> TruePoints:
         met = np.isfinite(distance)
         drawn.append(origins[met] + distance[met, None] * directions[met])
     points = np.concatenate(drawn) if drawn else np.zeros((0, 3))
-    raw = np.array([_seen(recipe, k, points, False) for k in range(len(recipe.views))])
+    raw = np.array([_seen(recipe, view, points) for view in recipe.views])
     shown = np.isfinite(raw[..., 0])
     kept = shown.sum(0) >= 2
     points, raw, shown = points[kept], raw[:, kept], shown[:, kept]
-    reference = np.array([_seen(recipe, k, points, True) for k in range(len(recipe.views))])
+    reference = np.array([_seen(recipe, view.at_once(), points) for view in recipe.views])
     frame, point = np.nonzero(shown)
     return TruePoints(points, frame, point, raw[frame, point], reference[frame, point])

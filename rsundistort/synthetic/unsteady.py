@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -303,15 +304,15 @@ def read_row_tables(path: Path | str) -> dict[str, RowTable]:
     missing = [column for column in ("name", at, "rx", "ry", "rz", *position) if column not in columns]
     if missing:
         raise FormatError(f"{path} has no column {missing[0]!r}; expected name, row or clock, rx, ry, rz and x, y, z")
-    entries: dict[str, dict[str, list[Any]]] = {}
+    entries: dict[str, dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
     for number, row in enumerate(rows, start=2):
-        entry = entries.setdefault(row["name"], {at: [], "rotation": []} | ({"position": []} if position else {}))
         try:
             numbers = {column: float(row[column]) for column in (at, "rx", "ry", "rz", *position)}
         except ValueError:
             raise FormatError(f"{path}, line {number} ({row['name'] or 'no name'}): expected numbers") from None
         if not np.isfinite(list(numbers.values())).all():
             raise FormatError(f"{path}, line {number} ({row['name'] or 'no name'}): NaN or infinity")
+        entry = entries[row["name"]]
         entry[at].append(numbers[at])
         entry["rotation"].append([numbers[column] for column in ("rx", "ry", "rz")])
         if position:

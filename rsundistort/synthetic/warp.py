@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..model import Camera, RowMotion
-from .lens import distort_rays, undistort_to_rays
+from .lens import clock_at, distort_rays, undistort_to_rays
 
 __all__ = ["crop_camera", "largest_rectangle", "random_phi", "warp_mask", "warp_photo"]
 
@@ -98,19 +98,11 @@ def _lookup(camera: Camera, motion: RowMotion | ArrayLike) -> tuple[NDArray[np.f
     """Pixel (h, w, 2) of the photo without motion whose direction each warped pixel saw, and whether it has it."""
     motion = motion if isinstance(motion, RowMotion) else RowMotion(np.asarray(motion, np.float64))
     w, h = camera.width, camera.height
-    K = camera.K
-    axis, sign = camera.clock_axis, camera.clock_sign
-    u, v = np.arange(w, dtype=float), np.arange(h, dtype=float)
-    if axis == 1:
-        clock = np.repeat((sign * (v - K[1, 2]) / K[1, 1])[:, None], w, axis=1)
-    else:
-        clock = np.repeat((sign * (u - K[0, 2]) / K[0, 0])[None, :], h, axis=0)
-    ideal = undistort_to_rays(np.dstack(np.meshgrid(u, v)), camera)
+    ideal = undistort_to_rays(np.dstack(np.meshgrid(np.arange(w), np.arange(h))), camera)
     # one rotation a row (or column): rotate its rays by it
-    steps = clock[:, 0] if axis == 1 else clock[0]
-    R = Rotation.from_rotvec(-motion.at(steps)[0]).as_matrix()
+    R = Rotation.from_rotvec(-motion.at(clock_at(camera, np.arange(camera.num_lines)))[0]).as_matrix()
     rays = np.dstack([ideal, np.ones((h, w))])
-    rotated = np.einsum("vij,vuj->vui" if axis == 1 else "uij,vuj->vui", R, rays)
+    rotated = np.einsum("vij,vuj->vui" if camera.clock_axis == 1 else "uij,vuj->vui", R, rays)
     source = distort_rays(rotated, camera).reshape(h, w, 2)
     ahead = rotated[..., 2] > 0  # not where the lens sees nothing
     inside = ahead & (source >= 0).all(-1) & (source[..., 0] <= w - 1) & (source[..., 1] <= h - 1)
