@@ -21,6 +21,7 @@ from rsundistort import RsUndistortWarning, SolvedImage, read_solution, write_so
 from rsundistort.errors import FormatError
 from rsundistort.io import Metadata, write_image
 from rsundistort.report import verdict_of, write_figures, write_report
+from rsundistort.report.content import cameras
 from rsundistort.report.pictures import PictureJob, _bytes_of_each, _small, make_pictures
 from rsundistort.solve import run_outputs as outputs
 
@@ -183,6 +184,13 @@ def test_names_are_only_names(tmp_path):
 
 
 # ---------------------------------------------------------------- what is missing
+
+
+def test_every_camera_has_its_standard_deviations():
+    one = hand_made(quality={"sigma_intrinsics": {"1": {"f": 0.5, "cx": 0.2}, "2": {"f": 3.0}}})
+    other = replace(one.cameras["1"], K=one.cameras["1"].K + np.diag([9.0, 9.0, 0.0]))
+    shown = cameras(replace(one, cameras={**one.cameras, "2": other}))
+    assert ["0.5" in str(shown[0]["intrinsics"]), "3.0" in str(shown[1]["intrinsics"])] == [True, True]
 
 
 def test_moved_photos_are_said_and_given_anew(copied, photos):

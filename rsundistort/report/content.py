@@ -261,12 +261,14 @@ def cameras(solution: Solution) -> list[dict[str, Any]]:
         sigma = sigmas.get(keys[0]) or {}
         lens = {name: value for name, value in camera.coefficients.items() if value or name in sigma}
         values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-        sigmas = {name: sigma.get(name, sigma.get("f") if name[0] == "f" else None) for name in values}
         rows.append(
             {
                 "id": keys[0] if len(keys) == 1 else f"{keys[0]} to {keys[-1]}",
                 "size": f"{camera.width} x {camera.height}",
-                "intrinsics": [_value(name, value, sigmas[name], 1) for name, value in values.items()],
+                "intrinsics": [
+                    _value(name, value, sigma.get(name, sigma.get("f") if name[0] == "f" else None), 1)
+                    for name, value in values.items()
+                ],
                 "lens": [_value(name, value, sigma.get(name), 4) for name, value in lens.items()],
                 "model": camera.lens,
                 "readout": camera.readout,

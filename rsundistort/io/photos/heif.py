@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -50,12 +52,22 @@ def _metadata(data: bytes, image: Any) -> Metadata:
     return metadata.with_orientation(_orientation(data))
 
 
+@contextmanager
+def _decoding(name: str) -> Iterator[None]:
+    try:
+        yield
+    except FileError:
+        raise
+    except _BROKEN as error:
+        raise FileError(
+            f"{name} cannot be decoded ({' '.join(str(error).split())}); copy it again from the camera"
+        ) from error
+
+
 def heif_metadata(data: bytes, name: str) -> Metadata:
     """The metadata alone, as `read_heif` gives it."""
-    try:
+    with _decoding(name):
         return _metadata(data, _opened(data, name))
-    except _BROKEN as error:
-        raise _cannot_be_decoded(name, error) from error
 
 
 def read_heif(data: bytes, name: str) -> tuple[NDArray[np.uint16], Metadata]:
@@ -64,16 +76,10 @@ def read_heif(data: bytes, name: str) -> tuple[NDArray[np.uint16], Metadata]:
     libheif rotates the pixels by the file's irot and imir properties, which are what counts in HEIF: that is undone,
     and becomes the EXIF orientation, whatever the EXIF said.
     """
-    try:
+    with _decoding(name):
         image = _opened(data, name)
         pixels = np.array(np.asarray(image))
         metadata = _metadata(data, image)
-    except _BROKEN as error:
-        raise _cannot_be_decoded(name, error) from error
     if pixels.dtype == np.uint8:
         pixels = pixels.astype(np.uint16) * 257
     return orient_pixels(pixels, INVERSE[_orientation(data)]), metadata
-
-
-def _cannot_be_decoded(name: str, error: Exception) -> FileError:
-    return FileError(f"{name} cannot be decoded ({' '.join(str(error).split())}); copy it again from the camera")
