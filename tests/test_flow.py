@@ -10,7 +10,7 @@ import pytest
 from make_photos import texture
 from scipy.spatial.transform import Rotation
 
-from rsundistort.sfm.flow import KeyFrameChooser, _corners, even_brightness, flow_between, flow_size
+from rsundistort.sfm.flow import FlowFrame, KeyFrameChooser, _corners, flow_between, flow_size
 from rsundistort.sfm.resection import resect
 
 WIDTH, HEIGHT = 320, 240
@@ -26,10 +26,14 @@ def frames(shifts_px: np.ndarray, seed: int = 0) -> list[np.ndarray]:
     return found
 
 
+def as_followed(greys: list[np.ndarray]) -> list[FlowFrame]:
+    return [FlowFrame.of(grey) for grey in greys]
+
+
 def test_points_are_followed_to_a_twentieth_of_a_pixel() -> None:
     shifts = np.array([0.0, 3.3, 7.1, 9.9])
     xy = np.random.default_rng(1).uniform([40, 30], [280, 210], (80, 2))
-    forward, backward = flow_between(frames(shifts), xy, xy - [shifts[-1], 0])
+    forward, backward = flow_between(as_followed(frames(shifts)), xy, xy - [shifts[-1], 0])
     assert len(forward.frame) > 200
     expected = xy[forward.point] - np.column_stack([shifts[forward.frame], np.zeros(len(forward.frame))])
     assert np.median(np.abs(forward.xy - expected)) < 0.05
@@ -37,6 +41,30 @@ def test_points_are_followed_to_a_twentieth_of_a_pixel() -> None:
     assert np.median(np.abs(backward.xy - expected)) < 0.05
     assert set(forward.frame) == {1, 2, 3}
     assert set(backward.frame) == {0, 1, 2}
+
+
+def of_all_scales(width: int, height: int) -> np.ndarray:
+    """A picture (grey) with things of all sizes in it, as scenes have them."""
+    rng, total = np.random.default_rng(2), np.zeros((height, width), np.float32)
+    for size in width // np.array([240, 120, 60, 30, 15, 8]):
+        small = rng.normal(0, 1, (height // size + 2, width // size + 2)).astype(np.float32)
+        total += cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC)
+    return np.clip(128 + 30 * total, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("width", "shift"), [(640, 70), (1920, 210)])
+def test_a_fast_pan_is_followed(width: int, shift: int) -> None:
+    height = 9 * width // 16
+    whole = of_all_scales(width + shift, height)
+    first, second = as_followed([np.ascontiguousarray(whole[:, :width]), np.ascontiguousarray(whole[:, shift:])])
+    xy = np.random.default_rng(1).uniform([shift + 30, 30], [width - 30, height - 30], (80, 2))
+    forward, _ = flow_between([first, second], xy, xy[:0])
+    assert (np.linalg.norm(forward.xy - xy[forward.point] + [shift, 0], axis=1) < 0.1).sum() > 70
+    chooser = KeyFrameChooser()
+    chooser.feed(first)
+    chooser.feed(second)
+    assert chooser.cuts == []
+    assert chooser.steps == pytest.approx([shift], abs=0.1)
 
 
 def under_lamps(greys: list[np.ndarray]) -> list[np.ndarray]:
@@ -48,15 +76,15 @@ def under_lamps(greys: list[np.ndarray]) -> list[np.ndarray]:
 
 def test_lamps_that_flicker_are_no_motion_and_no_cut() -> None:
     shifts = 3.3 * np.arange(12)
-    greys = [even_brightness(grey) for grey in under_lamps(frames(shifts))]
+    seen = as_followed(under_lamps(frames(shifts)))
     chooser = KeyFrameChooser()
-    for grey in greys:
-        chooser.feed(grey)
+    for frame in seen:
+        chooser.feed(frame)
     assert chooser.cuts == []
     np.testing.assert_allclose(chooser.steps, 3.3, atol=0.1)
     xy = np.random.default_rng(1).uniform([60, 30], [280, 210], (80, 2))
-    forward, _ = flow_between(greys, xy, xy[:0])
-    in_steady_light, _ = flow_between(frames(shifts), xy, xy[:0])
+    forward, _ = flow_between(seen, xy, xy[:0])
+    in_steady_light, _ = flow_between(as_followed(frames(shifts)), xy, xy[:0])
     assert len(forward.frame) > 0.95 * len(in_steady_light.frame)
     expected = xy[forward.point] - np.column_stack([shifts[forward.frame], np.zeros(len(forward.frame))])
     assert np.median(np.abs(forward.xy - expected)) < 0.1
@@ -64,13 +92,13 @@ def test_lamps_that_flicker_are_no_motion_and_no_cut() -> None:
 
 def test_noise_in_the_dark_is_no_texture() -> None:
     dark = np.random.default_rng(0).integers(0, 3, (HEIGHT, WIDTH), np.uint8)
-    assert even_brightness(dark).std() < 5
-    assert even_brightness(np.zeros_like(dark)).max() == 0
+    assert FlowFrame.of(dark).grey.std() < 5
+    assert FlowFrame.of(np.zeros_like(dark)).grey.max() == 0
 
 
 def test_what_leaves_the_frame_is_not_followed() -> None:
     forward, _ = flow_between(
-        frames(np.array([0.0, 25.0])), np.array([[20.0, 120.0], [200.0, 120.0]]), np.zeros((0, 2))
+        as_followed(frames(np.array([0.0, 25.0]))), np.array([[20.0, 120.0], [200.0, 120.0]]), np.zeros((0, 2))
     )
     assert forward.point.tolist() == [1]
 
@@ -78,7 +106,7 @@ def test_what_leaves_the_frame_is_not_followed() -> None:
 def test_key_frames_follow_the_motion_of_the_picture() -> None:
     chooser = KeyFrameChooser()
     for grey in frames(8.0 * np.arange(20)):
-        chooser.feed(grey)
+        chooser.feed(FlowFrame.of(grey))
     chooser.finish()
     # 0.06 of a diagonal of 400 pixels
     steps = 8.0 * np.diff(chooser.keys)
@@ -93,7 +121,7 @@ def test_key_frames_follow_the_motion_of_the_picture() -> None:
 def test_corners_of_key_frames_are_found_in_the_next() -> None:
     chooser = KeyFrameChooser()
     for grey in frames(8.0 * np.arange(14)):
-        chooser.feed(grey)
+        chooser.feed(FlowFrame.of(grey))
     chooser.finish()
     assert [each.keys for each in chooser.flows] == list(pairwise(chooser.keys))
     for each in chooser.flows:
@@ -107,14 +135,14 @@ def test_the_sharpest_of_the_candidates_is_taken() -> None:
     blurred = [grey if k == 3 else cv2.GaussianBlur(grey, (0, 0), 0.8) for k, grey in enumerate(greys)]
     chooser = KeyFrameChooser()
     for grey in blurred:
-        chooser.feed(grey)
+        chooser.feed(FlowFrame.of(grey))
     assert chooser.keys[1] == 3
 
 
 def test_a_cut_begins_anew() -> None:
     chooser = KeyFrameChooser()
     for grey in frames(1.0 * np.arange(5)) + frames(1.0 * np.arange(5), seed=9):
-        chooser.feed(grey)
+        chooser.feed(FlowFrame.of(grey))
     chooser.finish()
     assert chooser.cuts == [5]
     assert {4, 5} <= {*chooser.keys}

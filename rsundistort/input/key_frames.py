@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, RsUndistortWarning
 from ..io.video import FrameWriter, VideoFrames, VideoReader, frame_name, sharpness_of
-from ..sfm.flow import KeyFlow, KeyFrameChooser, even_brightness, flow_size
+from ..sfm.flow import FlowFrame, KeyFlow, KeyFrameChooser, flow_size
 
-__all__ = ["Clip", "greys_of", "read_clip"]
+__all__ = ["Clip", "flow_frames_of", "read_clip"]
 
 # Smallest number of key frames of a clip, if it has as many frames: content that moved little is still seen from its
 # ends.
@@ -135,13 +135,13 @@ def _grey(picture: Any) -> NDArray[np.uint8]:
     return np.ascontiguousarray(picture.to_ndarray(format="gray", width=width, height=height))
 
 
-def greys_of(clip: Clip, wanted: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+def flow_frames_of(clip: Clip, wanted: Sequence[int]) -> Iterator[tuple[int, FlowFrame]]:
     """Frames of a clip, by index (ascending), for the flow; one in memory at a time."""
     number_of = {clip.numbers[k]: k for k in wanted}
     with VideoReader(clip.video) as reader:
         for number, _, picture in reader:
             if number in number_of:
-                yield number_of[number], even_brightness(_grey(picture))
+                yield number_of[number], FlowFrame.of(_grey(picture))
                 if number_of[number] == wanted[-1]:
                     return
 
@@ -201,7 +201,7 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
             numbers.append(number)
             times.append(time_s)
             sharpness.append(sharpness_of(picture))
-            chooser.feed(even_brightness(grey))
+            chooser.feed(FlowFrame.of(grey))
             if [len(numbers) - 1] == chooser.cuts[-1:]:
                 step.forget()
             for k in held.keys() & {*chooser.keys} - written:

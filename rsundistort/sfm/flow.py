@@ -12,20 +12,21 @@ from numpy.typing import NDArray
 
 from ..model.array_types import Array, Index, Mask
 
-__all__ = ["FlowTracks", "KeyFlow", "KeyFrameChooser", "even_brightness", "flow_between", "flow_size"]
+__all__ = ["FlowFrame", "FlowTracks", "KeyFlow", "KeyFrameChooser", "flow_between", "flow_size"]
 
 Grey = NDArray[np.uint8]
 
 # Larger frames are reduced to this: a twentieth of a pixel there is a tenth in a 4K frame.
 _FLOW_MEGAPIXELS = 2.1
 _WINDOW = (21, 21)
-_LEVELS = 4
+# Levels of the pyramids above frames and above reduced ones, and the longer side of these.
+_LEVELS, _COARSE_LEVELS, _COARSE = 4, 2, 160
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.003)
 # A point that returns elsewhere, followed there and back again, was lost: pixels.
 _BACK_PX = 0.5
-# Area whose mean brightness is divided out, pixels; the least mean, so that noise in the dark is no texture; and what
-# the mean becomes.
-_AREA, _DARK, _MEAN = 31, 16.0, 100.0
+# Area whose mean brightness is divided out, pixels of a frame, and of a reduced one, of which a smaller one would leave
+# nothing; the least mean, so that noise in the dark is no texture; and what the mean becomes.
+_AREA, _COARSE_AREA, _DARK, _MEAN = 31, 63, 16.0, 100.0
 # Corners that measure the motion of the content, cells of a side of the frame that share them, how good they are at
 # least by the best, and how far they are apart at least, by the diagonal.
 _CORNERS, _CELLS, _LEAST_CORNER, _CORNERS_APART = 300, 6, 1e-4, 0.02
@@ -45,34 +46,81 @@ def flow_size(width: int, height: int) -> tuple[int, int]:
     return max(2, round(width / shrink)), max(2, round(height / shrink))
 
 
-def even_brightness(grey: Grey) -> Grey:
-    """A frame over its mean brightness nearby.
+@dataclass(frozen=True)
+class FlowFrame:
+    """A frame as it is followed.
 
-    The flow takes a point to be as bright in all frames. Under lamps that flicker a rolling shutter reads bands of
-    different brightness, which run through the frames, and exposures follow the scene.
+    Attributes
+    ----------
+    grey : (h, w) uint8 array
+        Over its mean brightness nearby. The flow takes a point to be as bright in all frames; under lamps that flicker
+        a rolling shutter reads bands of different brightness, which run through the frames, and exposures follow the
+        scene.
+    coarse : (h', w') uint8 array
+        Reduced, over its mean farther around. Fast pans move the content by a tenth of the frame, and of a frame over
+        its mean nearby the upper levels of a pyramid, which show such motions, are empty.
     """
-    mean = cv2.boxFilter(grey, cv2.CV_32F, (_AREA, _AREA))
-    return cv2.divide(grey, np.maximum(mean, _DARK), scale=_MEAN, dtype=cv2.CV_8U)
+
+    grey: Grey
+    coarse: Grey
+
+    @classmethod
+    def of(cls, grey: Grey) -> FlowFrame:
+        """A frame of grey values."""
+        height, width = grey.shape
+        shrink = max(1.0, max(width, height) / _COARSE)
+        size = max(1, round(width / shrink)), max(1, round(height / shrink))
+        reduced = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        return cls(_even(grey, _AREA), _even(np.asarray(reduced, np.uint8), _COARSE_AREA))
+
+
+def _even(grey: Grey, area: int) -> Grey:
+    """Grey values over their mean in an area."""
+    mean = cv2.boxFilter(grey, cv2.CV_32F, (area, area))
+    return np.asarray(cv2.divide(grey, np.maximum(mean, _DARK), scale=_MEAN, dtype=cv2.CV_8U), np.uint8)
 
 
 def _followed(
-    before: Grey, after: Grey, xy: NDArray[np.float32], guess: NDArray[np.float32] | None = None
+    before: FlowFrame, after: FlowFrame, xy: NDArray[np.float32], guess: NDArray[np.float32] | None = None
 ) -> tuple[NDArray[np.float32], Mask]:
-    """Where points (n, 2) of a frame lie in another, and which of them (n,) were found there and back again."""
+    """Where points (n, 2) of a frame lie in another, and which of them (n,) were found there and back again.
+
+    Those that were not are looked for again from where the reduced frames show them.
+    """
     if not len(xy):
         return xy, np.zeros(0, bool)
-    start = (xy if guess is None else guess).copy()
-    flags = cv2.OPTFLOW_USE_INITIAL_FLOW
-    there, found, _ = cv2.calcOpticalFlowPyrLK(
-        before, after, xy, start, winSize=_WINDOW, maxLevel=_LEVELS, criteria=_CRITERIA, flags=flags
-    )
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(
-        after, before, there, xy.copy(), winSize=_WINDOW, maxLevel=_LEVELS, criteria=_CRITERIA, flags=flags
-    )
+    start = xy if guess is None else guess
+    there, seen = _there_and_back(before.grey, after.grey, xy, start)
+    lost = np.flatnonzero(~seen)
+    if len(lost):
+        step, half = np.float32(after.grey.shape[1] / after.coarse.shape[1]), np.float32(0.5)
+        reduced = [(each[lost] + half) / step - half for each in (xy, start)]
+        near, found = _sought(before.coarse, after.coarse, reduced[0], reduced[1], _COARSE_LEVELS)
+        again, seen_again = _there_and_back(before.grey, after.grey, xy[lost], (near + half) * step - half)
+        there[lost], seen[lost] = again, seen_again & found
+    return there, seen
+
+
+def _there_and_back(
+    before: Grey, after: Grey, xy: NDArray[np.float32], start: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], Mask]:
+    """Where points lie in another frame, and which of them returned."""
+    there, found = _sought(before, after, xy, start, _LEVELS)
+    back, returned = _sought(after, before, there, xy, _LEVELS)
     height, width = after.shape
     inside = (there >= 0).all(1) & (there[:, 0] <= width - 1) & (there[:, 1] <= height - 1)
-    same = np.linalg.norm(back - xy, axis=1) < _BACK_PX
-    return there, (found.ravel() == 1) & (returned.ravel() == 1) & same & inside
+    return there, found & returned & inside & (np.linalg.norm(back - xy, axis=1) < _BACK_PX)
+
+
+def _sought(
+    before: Grey, after: Grey, xy: NDArray[np.float32], start: NDArray[np.float32], levels: int
+) -> tuple[NDArray[np.float32], Mask]:
+    """Where points are found in another picture, looked for from a start (Lucas and Kanade 1981, Bouguet 2000)."""
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        before, after, xy, start.copy(), winSize=_WINDOW, maxLevel=levels, criteria=_CRITERIA,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )  # fmt: skip
+    return np.asarray(there, np.float32), found.ravel() == 1
 
 
 def _corners(grey: Grey) -> NDArray[np.float32]:
@@ -109,7 +157,7 @@ class KeyFlow:
 class _Since:
     """A frame since the last key frame: how far the content moved, and where corners of the key are still seen."""
 
-    grey: Grey
+    frame: FlowFrame
     sharpness: float
     moved: float
     xy: NDArray[np.float32]
@@ -139,14 +187,14 @@ class KeyFrameChooser:
         self._since: list[_Since] = []  # frames from the last key on
         self._number = -1
 
-    def feed(self, grey: Grey) -> None:
-        """The next frame, of even brightness."""
+    def feed(self, frame: FlowFrame) -> None:
+        """The next frame."""
         self._number += 1
-        sharpness = float(cv2.Laplacian(grey, cv2.CV_32F).var())
+        sharpness = float(cv2.Laplacian(frame.grey, cv2.CV_32F).var())
         if not self.keys:
-            self._begin(self._number, grey, sharpness)
+            self._begin(self._number, frame, sharpness)
             return
-        self._step(grey, sharpness, counts=True)
+        self._step(frame, sharpness, counts=True)
 
     def finish(self) -> None:
         """The last frame is a key frame, too: nothing is known beyond it."""
@@ -154,14 +202,14 @@ class KeyFrameChooser:
             self._join(len(self._since) - 1)
             self.keys.append(self._number)
 
-    def _begin(self, number: int, grey: Grey, sharpness: float) -> None:
+    def _begin(self, number: int, frame: FlowFrame, sharpness: float) -> None:
         self.keys.append(number)
-        self._corners = _corners(grey)
-        self._since = [_Since(grey, sharpness, 0.0, self._corners, np.arange(len(self._corners)))]
+        self._corners = _corners(frame.grey)
+        self._since = [_Since(frame, sharpness, 0.0, self._corners, np.arange(len(self._corners)))]
 
-    def _step(self, grey: Grey, sharpness: float, counts: bool) -> None:
+    def _step(self, frame: FlowFrame, sharpness: float, counts: bool) -> None:
         last = self._since[-1]
-        xy, seen = _followed(last.grey, grey, last.xy)
+        xy, seen = _followed(last.frame, frame, last.xy)
         if counts:
             moved = np.linalg.norm(xy - last.xy, axis=1)[seen]
             self.steps.append(float(np.median(moved)) if seen.any() else np.nan)
@@ -169,12 +217,12 @@ class KeyFrameChooser:
                 self.cuts.append(self._number)
                 if self.keys[-1] != self._number - 1:
                     self.keys.append(self._number - 1)
-                self._begin(self._number, grey, sharpness)
+                self._begin(self._number, frame, sharpness)
                 return
         xy, corner = xy[seen], last.corner[seen]
         apart = np.linalg.norm(xy - self._corners[corner], axis=1)
-        moved_by = float(np.median(apart)) / math.hypot(*grey.shape) if len(corner) else 1.0
-        self._since.append(_Since(grey, sharpness, moved_by, xy, corner))
+        moved_by = float(np.median(apart)) / math.hypot(*frame.grey.shape) if len(corner) else 1.0
+        self._since.append(_Since(frame, sharpness, moved_by, xy, corner))
         share = len(corner) / max(len(self._corners), 1)
         if moved_by > _MOVED or share < _SEEN or len(self._since) > _MOST_GAP:
             self._choose()
@@ -186,15 +234,15 @@ class KeyFrameChooser:
         best = max(candidates, key=lambda k: (self._since[k].sharpness, k))
         self._join(best)
         chosen, rest = self._since[best], self._since[best + 1 :]
-        self._begin(self.keys[-1] + best, chosen.grey, chosen.sharpness)
+        self._begin(self.keys[-1] + best, chosen.frame, chosen.sharpness)
         for each in rest:
-            self._step(each.grey, each.sharpness, counts=False)
+            self._step(each.frame, each.sharpness, counts=False)
 
     def _join(self, place: int) -> None:
         """Look for the corners of the last key in a frame that becomes the next, by their windows in the key itself."""
         key, other = self._since[0], self._since[place]
         start = self._corners[other.corner]
-        xy, seen = _followed(key.grey, other.grey, start, other.xy)
+        xy, seen = _followed(key.frame, other.frame, start, other.xy)
         self.flows.append(KeyFlow((self.keys[-1], self.keys[-1] + place), start[seen], xy[seen]))
 
 
@@ -215,7 +263,7 @@ class FlowTracks:
     xy: Array
 
 
-def flow_between(greys: Sequence[Grey], first_xy: Array, last_xy: Array) -> tuple[FlowTracks, FlowTracks]:
+def flow_between(frames: Sequence[FlowFrame], first_xy: Array, last_xy: Array) -> tuple[FlowTracks, FlowTracks]:
     """Follow points of two key frames to the other one, through all frames between.
 
     Each point is looked for by the window around it in its key frame, so that errors do not add up, from where the
@@ -223,8 +271,8 @@ def flow_between(greys: Sequence[Grey], first_xy: Array, last_xy: Array) -> tupl
 
     Parameters
     ----------
-    greys : sequence of (h, w) uint8 array
-        The frames, of even brightness, from the first key to the last, both included.
+    frames : sequence of FlowFrame
+        From the first key to the last, both included.
     first_xy, last_xy : (n, 2), (k, 2) array
         Points of each key.
 
@@ -233,17 +281,17 @@ def flow_between(greys: Sequence[Grey], first_xy: Array, last_xy: Array) -> tupl
     forward, backward : FlowTracks
         Frames count from the first key; that of the points themselves is left out.
     """
-    last = len(greys) - 1
-    return _through(greys, 0, range(1, last + 1), first_xy), _through(greys, last, range(last - 1, -1, -1), last_xy)
+    last = len(frames) - 1
+    return _through(frames, 0, range(1, last + 1), first_xy), _through(frames, last, range(last - 1, -1, -1), last_xy)
 
 
-def _through(greys: Sequence[Grey], key: int, order: Iterable[int], start: Array) -> FlowTracks:
+def _through(frames: Sequence[FlowFrame], key: int, order: Iterable[int], start: Array) -> FlowTracks:
     """Points of a key frame in other frames, in an order in which the content moves on."""
     xy0 = np.asarray(start, np.float32).reshape(-1, 2)
     index, xy = np.arange(len(xy0)), xy0
     found = [(np.zeros(0, np.int64), index[:0], xy[:0])]
     for k in order:
-        xy, seen = _followed(greys[key], greys[k], xy0, xy)
+        xy, seen = _followed(frames[key], frames[k], xy0, xy)
         index, xy0, xy = index[seen], xy0[seen], xy[seen]
         found.append((np.full(len(index), k), index, xy))
     frame, point, places = (np.concatenate(each) for each in zip(*found, strict=True))

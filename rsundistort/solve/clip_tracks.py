@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..input.key_frames import Clip, greys_of
+from ..input.key_frames import Clip, flow_frames_of
 from ..model import Camera, Observations, Reconstruction, RowMotion
 from ..model.projection import unproject_points
-from ..sfm.flow import flow_between
+from ..sfm.flow import FlowFrame, flow_between
 from ..sfm.resection import resect
 
 __all__ = ["Followed", "follow", "follow_points", "followed_again", "with_all_frames"]
@@ -80,14 +80,14 @@ def _spread(
     return np.sort(np.lexsort((-worth, rank))[:most])
 
 
-def _between_keys(clip: Clip, keys: list[int]) -> Iterator[tuple[int, int, list[NDArray[np.uint8]]]]:
+def _between_keys(clip: Clip, keys: list[int]) -> Iterator[tuple[int, int, list[FlowFrame]]]:
     """Neighbouring key frames of one part, with the frames from one to the other."""
     wanted = [k for a, b in pairwise(keys) if clip.part[a] == clip.part[b] for k in range(a, b)]
     wanted = sorted({*wanted, *keys})
-    held: dict[int, NDArray[np.uint8]] = {}
+    held: dict[int, FlowFrame] = {}
     place = 0
-    for number, grey in greys_of(clip, wanted):
-        held[number] = grey
+    for number, frame in flow_frames_of(clip, wanted):
+        held[number] = frame
         while place + 1 < len(keys) and keys[place + 1] <= number:
             a, b = keys[place], keys[place + 1]
             if clip.part[a] == clip.part[b]:
@@ -158,10 +158,10 @@ def follow(
         value = np.arange(len(xy))[::-1] if worth is None else worth[key]
         chosen[key] = _spread(xy, value, size, most)
     found = []
-    for a, b, greys in _between_keys(clip, keys):
-        step = np.array(size) / greys[0].shape[::-1]
+    for a, b, frames in _between_keys(clip, keys):
+        step = np.array(size) / frames[0].grey.shape[::-1]
         starts = [(shown[key][chosen[key]] + 0.5) / step - 0.5 for key in (a, b)]
-        for key, tracks in zip((a, b), flow_between(greys, *starts), strict=True):
+        for key, tracks in zip((a, b), flow_between(frames, *starts), strict=True):
             found.append((key, tracks.frame + a, tracks.point, (tracks.xy + 0.5) * step - 0.5))
     followed = Followed(chosen)
     followed.add(found)
