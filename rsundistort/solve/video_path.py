@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..batch.progress import StageLog
 from ..bundle import BundleOptions, BundleResult, bundle_adjust
 from ..bundle.own_motions import OwnMotions, own_motions
-from ..bundle.path_prior import FramePath, PathStart
+from ..bundle.path_prior import FramePath, PathPrior, PathStart
 from ..critical import heal
 from ..errors import InputError, ReconstructionError, RsUndistortWarning
 from ..input.key_frames import Clip
@@ -53,6 +53,9 @@ _GAP_ROUNDS = 3
 # Solves that estimate the prior standard deviations of a path, and the share by which these may still change: with
 # hundreds of frames few are enough.
 _SIGMA_ROUNDS, _SETTLED = 4, 0.05
+# Prior standard deviations of the path through two frames, which determine none: rotation (rad), and travel (ways from
+# one to the other). The rates of a first frame may change by ten times as much: the velocity by a fifth.
+_OF_TWO = 5e-3, 0.02
 # Relative fall of the cost that ends an adjustment of a path that another one follows.
 _ROUGH_COST = 1e-4
 # A focal length changes from frame to frame, by focusing or zooming, if a first adjustment finds it to vary by more
@@ -288,6 +291,8 @@ def _of_two(
     log.begin("path")
     pair = FramePair.of(clip, keys)
     start = pair.placed(None if path.readout is None else path.readout_prior[0])
+    prior = PathPrior(path, start, _OF_TWO)
+    path = replace(path, start=PathStart(tuple(start.image_names), prior.start(start), _OF_TWO))
     # one step determines no spread of steps, and estimates of it would not settle
     options = replace(options_of(start), path=path, prior_sigma_rounds=0)
     rough = replace(_at_first(options), prior_sigma_rounds=0, varying=False)
