@@ -196,12 +196,12 @@ def test_two_frames_suffice() -> None:
 
 def test_a_path_is_not_joined_over_a_cut() -> None:
     truth, times = filmed(HandHeld(6), 12)
-    part = {name: int(k >= 6) for k, name in enumerate(truth.image_names)}
-    late = {name: time + 100 * part[name] for name, time in times.items()}
+    part = {name: 40 * (k >= 6) for k, name in enumerate(truth.image_names)}  # those between have no frame here
+    late = {name: time + 2.5 * part[name] for name, time in times.items()}
     result = adjusted(truth, late, part=part)
     assert result.path is not None
     assert abs(result.path.readout_s[0] / FRAME_S - 0.6) < 3 * result.path.sigma_readout_s[0] / FRAME_S
-    np.testing.assert_array_equal(result.path.path.part, [0] * 6 + [1] * 6)
+    np.testing.assert_array_equal(result.path.path.part, [0] * 6 + [40] * 6)
 
 
 def test_a_frame_between_two_cuts_leaves_the_readout_time_to_the_others() -> None:

@@ -72,7 +72,8 @@ class CameraPath:
     rate_change, acceleration : (m, 3) array
         How fast rate and velocity change, per second.
     part : (m,) int array, optional
-        Moments of different parts are not connected: between them the video was cut.
+        Moments of different parts are not connected: between them the video was cut. Any numbers, as some parts of a
+        video may have no moment here.
     """
 
     time_s: Array
@@ -93,7 +94,7 @@ class CameraPath:
             "time_s": check_finite(self.time_s, (m,), "time_s"),
             "R_cw": check_rotations(self.R_cw, m, "R_cw"),
             **{name: check_finite(getattr(self, name), (m, 3), name) for name in _VECTORS},
-            "part": check_index(part, m, m, "part"),
+            "part": check_index(part, m, np.iinfo(np.int64).max, "part"),
         }
         for name, value in fields.items():
             object.__setattr__(self, name, frozen(value))
