@@ -85,14 +85,15 @@ def _followed(
 ) -> tuple[NDArray[np.float32], Mask]:
     """Where points (n, 2) of a frame lie in another, and which of them (n,) were found there and back again.
 
-    Those that were not are looked for again from where the reduced frames show them.
+    If most were not, the content moved far, and they are looked for again from where the reduced frames show them. (Of
+    a few, what covers them would be found.)
     """
     if not len(xy):
         return xy, np.zeros(0, bool)
     start = xy if guess is None else guess
     there, seen = _there_and_back(before.grey, after.grey, xy, start)
     lost = np.flatnonzero(~seen)
-    if len(lost):
+    if 2 * len(lost) > len(seen):
         step, half = np.float32(after.grey.shape[1] / after.coarse.shape[1]), np.float32(0.5)
         reduced = [(each[lost] + half) / step - half for each in (xy, start)]
         near, found = _sought(before.coarse, after.coarse, reduced[0], reduced[1], _COARSE_LEVELS)
