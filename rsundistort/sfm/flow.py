@@ -73,6 +73,19 @@ class FlowFrame:
         reduced = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
         return cls(_even(grey, _AREA), _even(np.asarray(reduced, np.uint8), _COARSE_AREA))
 
+    def aligned(self, H: Array) -> FlowFrame:
+        """The frame warped so that what it shows at pixels H x lies at x."""
+
+        def warped(grey: Grey) -> Grey:
+            step = self.grey.shape[1] / grey.shape[1]
+            S = np.array([[step, 0.0, 0.5 * step - 0.5], [0.0, step, 0.5 * step - 0.5], [0.0, 0.0, 1.0]])
+            how = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+            return np.asarray(
+                cv2.warpPerspective(grey, np.linalg.inv(S) @ H @ S, grey.shape[::-1], flags=how), np.uint8
+            )
+
+        return FlowFrame(warped(self.grey), warped(self.coarse))
+
 
 def _even(grey: Grey, area: int) -> Grey:
     """Grey values over their mean in an area."""
@@ -81,8 +94,9 @@ def _even(grey: Grey, area: int) -> Grey:
 
 
 def _followed(
-    before: FlowFrame, after: FlowFrame, xy: NDArray[np.float32], guess: NDArray[np.float32] | None = None
-) -> tuple[NDArray[np.float32], Mask]:
+    before: FlowFrame, after: FlowFrame, xy: NDArray[np.float32], guess: NDArray[np.float32] | None = None,
+    levels: int = _LEVELS,
+) -> tuple[NDArray[np.float32], Mask]:  # fmt: skip
     """Where points (n, 2) of a frame lie in another, and which of them (n,) were found there and back again.
 
     If most were not, the content moved far, and they are looked for again from where the reduced frames show them. (Of
@@ -91,23 +105,23 @@ def _followed(
     if not len(xy):
         return xy, np.zeros(0, bool)
     start = xy if guess is None else guess
-    there, seen = _there_and_back(before.grey, after.grey, xy, start)
+    there, seen = _there_and_back(before.grey, after.grey, xy, start, levels)
     lost = np.flatnonzero(~seen)
     if 2 * len(lost) > len(seen):
         step, half = np.float32(after.grey.shape[1] / after.coarse.shape[1]), np.float32(0.5)
         reduced = [(each[lost] + half) / step - half for each in (xy, start)]
         near, found = _sought(before.coarse, after.coarse, reduced[0], reduced[1], _COARSE_LEVELS)
-        again, seen_again = _there_and_back(before.grey, after.grey, xy[lost], (near + half) * step - half)
+        again, seen_again = _there_and_back(before.grey, after.grey, xy[lost], (near + half) * step - half, levels)
         there[lost], seen[lost] = again, seen_again & found
     return there, seen
 
 
 def _there_and_back(
-    before: Grey, after: Grey, xy: NDArray[np.float32], start: NDArray[np.float32]
+    before: Grey, after: Grey, xy: NDArray[np.float32], start: NDArray[np.float32], levels: int
 ) -> tuple[NDArray[np.float32], Mask]:
     """Where points lie in another frame, and which of them returned."""
-    there, found = _sought(before, after, xy, start, _LEVELS)
-    back, returned = _sought(after, before, there, xy, _LEVELS)
+    there, found = _sought(before, after, xy, start, levels)
+    back, returned = _sought(after, before, there, xy, levels)
     height, width = after.shape
     inside = (there >= 0).all(1) & (there[:, 0] <= width - 1) & (there[:, 1] <= height - 1)
     return there, found & returned & inside & (np.linalg.norm(back - xy, axis=1) < _BACK_PX)
@@ -264,7 +278,9 @@ class FlowTracks:
     xy: Array
 
 
-def flow_between(frames: Sequence[FlowFrame], first_xy: Array, last_xy: Array) -> tuple[FlowTracks, FlowTracks]:
+def flow_between(
+    frames: Sequence[FlowFrame], first_xy: Array, last_xy: Array, *, aligned: bool = False
+) -> tuple[FlowTracks, FlowTracks]:
     """Follow points of two key frames to the other one, through all frames between.
 
     Each point is looked for by the window around it in its key frame, so that errors do not add up, from where the
@@ -276,23 +292,28 @@ def flow_between(frames: Sequence[FlowFrame], first_xy: Array, last_xy: Array) -
         From the first key to the last, both included.
     first_xy, last_xy : (n, 2), (k, 2) array
         Points of each key.
+    aligned : bool
+        Whether the points lie nearly where they are in their key frame. Higher levels of pyramids would lose them.
 
     Returns
     -------
     forward, backward : FlowTracks
         Frames count from the first key; that of the points themselves is left out.
     """
-    last = len(frames) - 1
-    return _through(frames, 0, range(1, last + 1), first_xy), _through(frames, last, range(last - 1, -1, -1), last_xy)
+    last, levels = len(frames) - 1, _COARSE_LEVELS if aligned else _LEVELS
+    return (
+        _through(frames, 0, range(1, last + 1), first_xy, levels),
+        _through(frames, last, range(last - 1, -1, -1), last_xy, levels),
+    )
 
 
-def _through(frames: Sequence[FlowFrame], key: int, order: Iterable[int], start: Array) -> FlowTracks:
+def _through(frames: Sequence[FlowFrame], key: int, order: Iterable[int], start: Array, levels: int) -> FlowTracks:
     """Points of a key frame in other frames, in an order in which the content moves on."""
     xy0 = np.asarray(start, np.float32).reshape(-1, 2)
     index, xy = np.arange(len(xy0)), xy0
     found = [(np.zeros(0, np.int64), index[:0], xy[:0])]
     for k in order:
-        xy, seen = _followed(frames[key], frames[k], xy0, xy)
+        xy, seen = _followed(frames[key], frames[k], xy0, xy, levels)
         index, xy0, xy = index[seen], xy0[seen], xy[seen]
         found.append((np.full(len(index), k), index, xy))
     frame, point, places = (np.concatenate(each) for each in zip(*found, strict=True))

@@ -7,13 +7,15 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ..bundle.triangulate import triangulated
 from ..errors import ReconstructionError
-from ..input.key_frames import Clip
+from ..input.key_frames import Clip, flow_frames_of
 from ..input.load import LoadedPhotos
 from ..model import Camera, Observations, Reconstruction, RowMotion
 from ..model.projection import unproject_points
+from ..sfm.flow import flow_between
 from .clip_pan import rotation_between
 from .clip_tracks import follow
 
@@ -53,10 +55,17 @@ class FramePair:
         number = {name: k for k, name in enumerate(clip.names)}
         shown = {number[name]: found.xy_raw for name, found in zip(keys.names, keys.features, strict=True)}
         followed = follow(clip, shown, camera, most=_POINTS)
-        forward = followed.key == 0
         first, second = (shown[k][followed.chosen[k]] for k in (0, 1))
-        starts = np.concatenate([first[followed.place[forward]], second[followed.place[~forward]]])
-        xy = np.stack([np.where((forward == (k == 0))[:, None], starts, followed.xy_raw) for k in (0, 1)])
+        forward = followed.key == 0
+        xy = _joined(
+            first[followed.place[forward]],
+            followed.xy_raw[forward],
+            followed.xy_raw[~forward],
+            second[followed.place[~forward]],
+        )
+        rotation = rotation_between(xy[0], xy[1], camera)
+        if rotation is not None:
+            xy = _followed_aligned(clip, (first, second), camera, rotation)
         return cls(camera, tuple(clip.names), xy)
 
     def placed(self, readout_share: float | None = None) -> Reconstruction:
@@ -108,6 +117,39 @@ class FramePair:
         """
         n = self.xy.shape[1]
         return triangulated(replace(found, points_w=np.zeros((n, 3)), observations=_seen(self.xy)), "constant-motion")
+
+
+def _joined(*places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(2, n, 2) pixels in both frames: of points of the first one, there and in the other, then of the second one."""
+    return np.stack([np.concatenate(places[::2]), np.concatenate(places[1::2])])
+
+
+def _followed_aligned(
+    clip: Clip, starts: tuple[NDArray[np.float64], NDArray[np.float64]], camera: Camera, rotation: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(2, n, 2) pixels of points of both frames that are followed to the other, rotated as the camera did.
+
+    A window is sought as it is: one that rolled by ten degrees is found beside its place, if at all.
+    """
+    frames = dict(flow_frames_of(clip, [0, 1]))
+    height, width = frames[0].grey.shape
+    step = np.array([camera.width / width, camera.height / height])
+    S = np.array([[step[0], 0.0, 0.5 * step[0] - 0.5], [0.0, step[1], 0.5 * step[1] - 0.5], [0.0, 0.0, 1.0]])
+    to_rays = np.linalg.inv(camera.K) @ S
+    H = np.linalg.inv(to_rays) @ Rotation.from_rotvec(rotation).as_matrix() @ to_rays
+    first, second = ((each + 0.5) / step - 0.5 for each in starts)
+    in_first = _mapped(np.linalg.inv(H), second)
+    forward, backward = flow_between([frames[0], frames[1].aligned(H)], first, in_first, aligned=True)
+    found = _joined(
+        first[forward.point], _mapped(H, forward.xy), backward.xy, second[backward.point]
+    )  # fmt: skip
+    return (found + 0.5) * step - 0.5
+
+
+def _mapped(H: NDArray[np.float64], xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixels (n, 2) under a homography."""
+    x = np.column_stack([xy, np.ones(len(xy))]) @ H.T
+    return np.asarray(x[:, :2] / x[:, 2:])
 
 
 def _seen(xy: NDArray[np.float64]) -> Observations:
