@@ -48,7 +48,7 @@ def figures_of(solution: Solution, reference: float) -> dict[str, object]:
         "f": round(f, 1),
         "ratio": round(f / reference, 4),
         "registered": len(solution.registered),
-        "verdict": solution.quality["verdict"]["shutter"],
+        "verdict": solution.verdict["shutter"] if solution.verdict else None,
     }
 
 
