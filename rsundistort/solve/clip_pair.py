@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from ..input.load import LoadedPhotos
 from ..model import Camera, Observations, Reconstruction, RowMotion
 from ..model.projection import unproject_points
 from ..sfm.flow import flow_between
+from ..sfm.relative_pose import Pair, RelativePose, View, adjusted_pose
 from .clip_pan import rotation_between
 from .clip_tracks import follow
 
@@ -23,8 +25,11 @@ __all__ = ["FramePair"]
 
 # Readout times that are tried, as shares of the time between frames: a fifth more or less leaves little of the shutter.
 _SHARES = (0.0, 0.15, 0.3, 0.45, 0.6, 0.75, 0.9)
-# Tolerance of rays that agree on a pose between the frames, in pixels.
-_WITHIN_PX = 1.0
+# Tolerances of rays that agree on a pose between the frames, in pixels: what rotates steadily fits a narrow one.
+_WITHIN_PX = (1.0, 2.0)
+# Prior standard deviation of both frames' phi, radians a frame, when poses are adjusted to all points; the width of the
+# loss, and the distance of points that agree.
+_PHI_SIGMA, _WIDTH_PX, _AGREES_PX = 0.1, 1.5, 1.0
 # Points that are followed from each frame: there are no others that average their errors.
 _POINTS = 1000
 _LEAST_AGREEING = 20
@@ -69,10 +74,10 @@ class FramePair:
         return cls(camera, tuple(clip.names), xy)
 
     def placed(self, readout_share: float | None = None) -> Reconstruction:
-        """Both frames and their common points, by the essential matrix of rays without shutter.
+        """Both frames and their common points, by the relative pose with a shutter that fits all of them best.
 
-        The camera is assumed to rotate steadily from frame to frame, for a share of the time: the one that is known,
-        or that explains most points.
+        Each begins with an essential matrix of rays of cameras that rotate steadily from frame to frame, for a share of
+        the time: the one that is known, or several.
 
         Raises
         ------
@@ -81,25 +86,31 @@ class FramePair:
         """
         camera, xy = self.camera, self.xy
         rotation = rotation_between(xy[0], xy[1], camera)
-        best: tuple[int, NDArray[np.float64], NDArray[np.float64], RowMotion, NDArray[np.bool_]] | None = None
+        pair = Pair(*(View.of(each, camera) for each in xy))
+        best: tuple[RelativePose, float] | None = None
         little = ReconstructionError(f"{self.names[0]} and {self.names[1]} share too little of the scene")
         if rotation is None:
             raise little
-        for share in _SHARES if readout_share is None else (readout_share,):
+        for share, within_px in product(_SHARES if readout_share is None else (readout_share,), _WITHIN_PX):
             motion = RowMotion(share * rotation / camera.frame_span)
             (a, seen_a), (b, seen_b) = (unproject_points(each, camera, motion, "rotation") for each in xy)
-            seen, within = seen_a & seen_b, _WITHIN_PX / float(camera.K[0, 0])
+            seen, within = seen_a & seen_b, within_px / float(camera.K[0, 0])
             E, _ = cv2.findEssentialMat(a[seen], b[seen], np.eye(3), cv2.RANSAC, 0.9999, within)
             if E is None or E.shape != (3, 3):
                 continue
-            _, R, way, agree = cv2.recoverPose(E, a[seen], b[seen], np.eye(3))
-            mask = np.zeros(len(seen), bool)
-            mask[np.flatnonzero(seen)[agree.ravel() > 0]] = True
-            if best is None or mask.sum() > best[0]:
-                best = int(mask.sum()), R, way.ravel(), motion, mask
-        if best is None or best[0] < _LEAST_AGREEING:
+            num, R, way, _ = cv2.recoverPose(E, a[seen], b[seen], np.eye(3))
+            if num < _LEAST_AGREEING:
+                continue
+            phi = np.stack([motion.phi, motion.phi])
+            fit = adjusted_pose(RelativePose(R, way.ravel(), phi), pair, _PHI_SIGMA, _WIDTH_PX)
+            if best is None or fit.cost < best[0].cost:
+                best = fit, share
+        if best is None:
             raise little
-        _, R, way, motion, mask = best
+        fit, share = best
+        R, way = fit.R_21, fit.t_21
+        motion = RowMotion(share * Rotation.from_matrix(R).as_rotvec() / camera.frame_span)
+        mask = fit.distances_px(pair) < _AGREES_PX
         rays = [unproject_points(each[mask], camera, motion, "rotation")[0] for each in xy]
         local = cv2.triangulatePoints(np.eye(3, 4), np.column_stack([R, way]), rays[0].T, rays[1].T)
         points_w = (local[:3] / local[3]).T
