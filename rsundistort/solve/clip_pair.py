@@ -111,6 +111,8 @@ class FramePair:
         R, way = fit.R_21, fit.t_21
         motion = RowMotion(share * Rotation.from_matrix(R).as_rotvec() / camera.frame_span)
         mask = fit.distances_px(pair) < _AGREES_PX
+        if mask.sum() < _LEAST_AGREEING:
+            raise little
         rays = [unproject_points(each[mask], camera, motion, "rotation")[0] for each in xy]
         local = cv2.triangulatePoints(np.eye(3, 4), np.column_stack([R, way]), rays[0].T, rays[1].T)
         points_w = (local[:3] / local[3]).T
