@@ -33,6 +33,8 @@ _PHI_SIGMA = 0.02
 # Costs that are higher by this share count as equal: a plane, or a camera that hardly travelled, is fitted a little
 # better by shorter focal lengths, whose essential matrices bend more.
 _AS_WELL = 0.05
+# Nor does any difference count that is small for matches as exact as this, pixels of the features' image.
+_EXACT_PX = 0.1
 # Sets of pairs drawn for the standard deviation.
 _DRAWS = 200
 # Effect of an unknown lens on the estimate (logarithm): published focal lengths of photos differ from it by this.
@@ -117,7 +119,8 @@ def estimate_focal_length(
     cost = _costs([_fits(xy, [poses[best]], cameras, begin) for xy, poses in zip(shown, rough, strict=True)])
     found = _lowest(finer, cost.sum(0))
     drawn = [_lowest(finer, cost[rng.integers(0, len(cost), len(cost))].sum(0)) for _ in range(_DRAWS)]
-    variance = np.var(drawn) + _indifference(finer, cost.sum(0)) + _UNMODELLED**2
+    exact = _EXACT_PX**2 * sum(len(first) for first, _ in shown)
+    variance = np.var(drawn) + _indifference(finer, cost.sum(0), exact) + _UNMODELLED**2
     weight = np.array([1.0 / variance, 1.0 / spread**2])
     value = float(weight @ [found, usual] / weight.sum())
     return FocalLength(float(side * np.exp(value)), float(weight.sum() ** -0.5), len(shown))
@@ -158,8 +161,8 @@ def _lowest(log_f: Array, cost: Array) -> float:
     return float(log_f[k] - (slope / (2.0 * square) if square > 0.0 else 0.0))
 
 
-def _indifference(log_f: Array, cost: Array) -> float:
-    """Variance of the logarithms of focal lengths that are about as good as the best."""
+def _indifference(log_f: Array, cost: Array, exact: float) -> float:
+    """Variance of the logarithms of focal lengths that are about as good as the best, which costs `exact` at least."""
     fine = np.linspace(log_f[0], log_f[-1], 50 * len(log_f))
-    as_well = np.interp(fine, log_f, cost) < (1.0 + _AS_WELL) * cost.min()
-    return float(np.var(fine[as_well])) if as_well.any() else 0.0
+    as_well = np.interp(fine, log_f, cost) < cost.min() + _AS_WELL * max(cost.min(), exact)
+    return float(np.var(fine[as_well]))
