@@ -1,10 +1,12 @@
 """Photos that lost their EXIF: the focal length that they show, and what a run makes of it; one JSON object a line.
 
     python benchmarks/unknown_camera.py [--photos DIR] [--names herz-jesus-8 iphone6 phone dslr drone lund]
+                                        [--clips DIR [--kinds walk vibrating] [--seeds 100 101 ...]]
 
 `f_reference` is that of `camera.json`, or what a run finds that has the EXIF. `f_pairs` is what pairs of photos say
 before anything is mapped, with its relative standard deviation, and `f` what the run ends with. `walk` of the sample
-scenes is a video without its camera file: `readout_ms` should be 20.
+scenes is a video without its camera file: `readout_ms` should be 20. With `--clips` only `f_pairs` of random clips
+(`clips.py`) is shown, and at the end the root mean square of its relative errors, and the largest.
 """
 
 from __future__ import annotations
@@ -14,12 +16,19 @@ import json
 import shutil
 import tempfile
 import warnings
+from itertools import product
 from pathlib import Path
 
 import cv2
 import numpy as np
+from clips import clip_folder
 
 from rsundistort import RsUndistortWarning, RunOptions, Solution, run
+from rsundistort.batch.progress import StageLog
+from rsundistort.batch.workers import Workers
+from rsundistort.input.key_frames import read_clip
+from rsundistort.input.load import load_photos
+from rsundistort.input.unknown_focal import with_focal_lengths
 from rsundistort.solve import OutputOptions
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -52,12 +61,43 @@ def figures_of(solution: Solution, reference: float) -> dict[str, object]:
     }
 
 
+def of_clips(folder: Path, kinds: list[str], seeds: list[int]) -> None:
+    """What pairs of key frames say of the focal length of clips."""
+    errors = []
+    for kind, seed in product(kinds, seeds):
+        clip = clip_folder(folder, kind, seed)
+        true = json.loads((clip / "camera.json").read_text())["K"][0][0]
+        with tempfile.TemporaryDirectory() as work, warnings.catch_warnings():
+            warnings.simplefilter("ignore", RsUndistortWarning)
+            frames, log = Path(work) / "frames", StageLog(None)
+            read_clip(clip / "clip.mp4", frames)
+            keys = load_photos(frames, None, None, RunOptions().most_features(True), Workers(0), log, least=2)
+            camera = with_focal_lengths(keys, 0, log).cameras.cameras[0]
+        errors.append(float(np.log(camera.K[0, 0] / true)))
+        print(json.dumps({"clip": clip.name, "f_pairs": round(camera.K[0, 0], 1), "f_true": true}), flush=True)
+    print(
+        json.dumps(
+            {
+                "clips": len(errors),
+                "rms": round(float(np.sqrt(np.mean(np.square(errors)))), 3),
+                "largest": round(float(np.abs(errors).max()), 3),
+            }
+        )
+    )
+
+
 def main() -> None:
     """Measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--photos", type=Path, default=ROOT.parent / "shared" / "photos")
     parser.add_argument("--names", nargs="+", default=["herz-jesus-8", "iphone6", "phone", "dslr", "drone", "lund"])
+    parser.add_argument("--clips", type=Path)
+    parser.add_argument("--kinds", nargs="+", default=["walk", "vibrating"])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[*range(100, 108)])
     args = parser.parse_args()
+    if args.clips is not None:
+        of_clips(args.clips, args.kinds, args.seeds)
+        return
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         clip = work / "walk.mp4"

@@ -60,6 +60,7 @@ from rsundistort.batch.workers import Workers
 from rsundistort.evaluation import psnr
 from rsundistort.input.key_frames import read_clip
 from rsundistort.input.load import load_photos
+from rsundistort.input.unknown_focal import with_focal_lengths
 from rsundistort.io.video import VideoReader, frame_name
 from rsundistort.model import RowMotion, SolvedImage
 from rsundistort.model.projection import unproject_points
@@ -102,7 +103,7 @@ PARTS = (
 
 
 def solved_clip(video: Path, camera: str | None, readout_s: float | None = None) -> tuple[Solved, float]:
-    """A clip solved, and the processor's seconds that it took."""
+    """A clip solved as `run` does, and the processor's seconds that it took."""
     began = time.process_time()
     with tempfile.TemporaryDirectory() as scratch:
         clip = read_clip(video, Path(scratch) / "frames")
@@ -115,6 +116,7 @@ def solved_clip(video: Path, camera: str | None, readout_s: float | None = None)
             StageLog(None),
             least=2,
         )
+        keys = with_focal_lengths(keys, 0, StageLog(None))
         known = None if readout_s is None else (readout_s, "given")
         options = SolveOptions()
         solved = solve_clip(

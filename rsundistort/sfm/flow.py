@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..model.array_types import Array, Index, Mask
 
-__all__ = ["FlowFrame", "FlowTracks", "KeyFlow", "KeyFrameChooser", "flow_between", "flow_size"]
+__all__ = ["FlowFrame", "FlowTracks", "KeyFlow", "KeyFrameChooser", "flow_between", "flow_size", "from_reduced"]
 
 Grey = NDArray[np.uint8]
 
@@ -24,8 +24,8 @@ _LEVELS, _COARSE_LEVELS, _COARSE = 4, 2, 160
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.003)
 # A point that returns elsewhere, followed there and back again, was lost: pixels.
 _BACK_PX = 0.5
-# Area whose mean brightness is divided out, pixels of a frame, and of a reduced one, of which a smaller one would leave
-# nothing; the least mean, so that noise in the dark is no texture; and what the mean becomes.
+# Side of the area whose mean brightness is divided out, pixels of a frame, and of a reduced one, where a smaller area
+# would leave nothing of large things; the least mean, so that noise in the dark is no texture; and what it becomes.
 _AREA, _COARSE_AREA, _DARK, _MEAN = 31, 63, 16.0, 100.0
 # Corners that measure the motion of the content, cells of a side of the frame that share them, how good they are at
 # least by the best, and how far they are apart at least, by the diagonal.
@@ -44,6 +44,12 @@ def flow_size(width: int, height: int) -> tuple[int, int]:
     """Width and height at which frames of this size are followed."""
     shrink = max(1.0, math.sqrt(width * height / (1e6 * _FLOW_MEGAPIXELS)))
     return max(2, round(width / shrink)), max(2, round(height / shrink))
+
+
+def from_reduced(step: Array) -> Array:
+    """(3, 3) from pixels of a reduced frame to those of the frame, `step` (2,) times as large; centres are integers."""
+    (a, b), (x, y) = step, 0.5 * step - 0.5
+    return np.array([[a, 0.0, x], [0.0, b, y], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
@@ -77,8 +83,7 @@ class FlowFrame:
         """The frame warped so that what it shows at pixels H x lies at x."""
 
         def warped(grey: Grey) -> Grey:
-            step = self.grey.shape[1] / grey.shape[1]
-            S = np.array([[step, 0.0, 0.5 * step - 0.5], [0.0, step, 0.5 * step - 0.5], [0.0, 0.0, 1.0]])
+            S = from_reduced(np.divide(self.grey.shape[::-1], grey.shape[::-1]))
             how = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
             return np.asarray(
                 cv2.warpPerspective(grey, np.linalg.inv(S) @ H @ S, grey.shape[::-1], flags=how), np.uint8

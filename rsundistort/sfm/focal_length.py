@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model import Camera
+from ..model.array_types import Array
 from .relative_pose import Pair, RelativePose, View, adjusted_pose, suggested_poses
 
 __all__ = ["USUAL_FOCAL", "FocalLength", "estimate_focal_length"]
-
-Array = NDArray[np.float64]
 
 #: Focal lengths of phones, drones and most other cameras over the longer side of their photos, and the standard
 #: deviation of the logarithm of that.

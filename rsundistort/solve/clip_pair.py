@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from ..input.key_frames import Clip, flow_frames_of
 from ..input.load import LoadedPhotos
 from ..model import Camera, Observations, Reconstruction, RowMotion
 from ..model.projection import unproject_points
-from ..sfm.flow import flow_between
+from ..sfm.flow import flow_between, from_reduced
 from ..sfm.relative_pose import Pair, RelativePose, View, adjusted_pose
 from .clip_pan import rotation_between
 from .clip_tracks import follow
@@ -126,7 +127,7 @@ class FramePair:
     def of_all(self, found: Reconstruction) -> Reconstruction:
         """All that was followed, seen by the frames as they were found to move.
 
-        The essential matrix takes those for wrong whose rows the steady rotation does not explain.
+        The relative pose takes those for wrong that a velocity moves while they are read.
         """
         n = self.xy.shape[1]
         return triangulated(replace(found, points_w=np.zeros((n, 3)), observations=_seen(self.xy)), "constant-motion")
@@ -147,19 +148,16 @@ def _followed_aligned(
     frames = dict(flow_frames_of(clip, [0, 1]))
     height, width = frames[0].grey.shape
     step = np.array([camera.width / width, camera.height / height])
-    S = np.array([[step[0], 0.0, 0.5 * step[0] - 0.5], [0.0, step[1], 0.5 * step[1] - 0.5], [0.0, 0.0, 1.0]])
-    to_rays = np.linalg.inv(camera.K) @ S
+    to_rays = np.linalg.inv(camera.K) @ from_reduced(step)
     H = np.linalg.inv(to_rays) @ Rotation.from_rotvec(rotation).as_matrix() @ to_rays
     first, second = ((each + 0.5) / step - 0.5 for each in starts)
     in_first = _mapped(np.linalg.inv(H), second)
     forward, backward = flow_between([frames[0], frames[1].aligned(H)], first, in_first, aligned=True)
-    found = _joined(
-        first[forward.point], _mapped(H, forward.xy), backward.xy, second[backward.point]
-    )  # fmt: skip
+    found = _joined(first[forward.point], _mapped(H, forward.xy), backward.xy, second[backward.point])
     return (found + 0.5) * step - 0.5
 
 
-def _mapped(H: NDArray[np.float64], xy: NDArray[np.float64]) -> NDArray[np.float64]:
+def _mapped(H: NDArray[np.floating[Any]], xy: NDArray[np.float64]) -> NDArray[np.float64]:
     """Pixels (n, 2) under a homography."""
     x = np.column_stack([xy, np.ones(len(xy))]) @ H.T
     return np.asarray(x[:, :2] / x[:, 2:])
