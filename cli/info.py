@@ -66,8 +66,11 @@ def _text(found: dict[str, Any]) -> str:
 
 def _held(path: Path) -> dict[str, Any]:
     """Cameras, photos and rolling-shutter terms of a `cameras.xml`."""
+    from rsundistort.errors import InputError
     from rsundistort.io.metashape import read_metashape
 
+    if path.suffix.lower() != ".xml":
+        raise InputError(f"{path} is no cameras.xml of Metashape; run and solve say what they know of photos and videos")
     posed = read_metashape(path)
     cameras = zip(posed.camera_ids, posed.cameras, posed.sensors, strict=True)
     return {

@@ -502,10 +502,23 @@ def test_a_rolling_shutter_that_is_said_to_be_a_global_one_is_doubted(cut, tmp_p
     assert all(image.lens_only for image in found.registered)
 
 
-def test_a_global_shutter_has_no_readout_time(cut, tmp_path):
-    how = RunOptions(max_features=200, solve=SolveOptions(shutter_model="global", readout_s=0.02))
-    with pytest.raises(InputError, match="have no readout time; leave out --readout-ms or --model global"):
-        run(cut, tmp_path / "out", how)
+@pytest.mark.parametrize(
+    ("solving", "says"),
+    [
+        (SolveOptions(shutter_model="global", readout_s=0.02), "have no readout time; leave out --readout-ms or --mod"),
+        (SolveOptions(shutter_model="rotation"), "takes no --still, --known or --model but global"),
+        (SolveOptions(still={"walk-0001.png": 1e-4}), "takes no --still, --known or --model but global"),
+        (SolveOptions(crs="local"), "frames of a video have no GPS"),
+    ],
+)
+def test_options_that_a_path_does_not_take_are_refused_before_the_video_is_read(cut, tmp_path, solving, says):
+    stages = []
+    with pytest.raises(InputError, match=says):
+        run(cut, tmp_path / "out", RunOptions(solve=solving), progress=lambda *told: stages.append(told))
+    with pytest.raises(InputError, match=says):
+        measure_readout(cut, RunOptions(solve=solving))
+    assert not stages
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow

@@ -299,6 +299,18 @@ def test_verdict(solution, level, said):
     assert all(sentence.endswith(".") and sentence[0].isupper() for sentence in verdict.sentences)
 
 
+def test_a_video_of_a_camera_that_only_rotated_has_no_shape():
+    said = {"shutter": "found", "shape": "trusted", "reasons": []}
+    solution = hand_made(critical=None, quality={"readout_time": {"seconds": 0.02}, "verdict": said})
+    still = [replace(image, center_w=np.zeros(3)) for image in solution.images]
+    verdict = verdict_of(replace(solution, images=tuple(still)))
+    assert verdict.headline == "The rotations can be trusted"
+    assert verdict.sentences[0] == "All 3 photos were registered by their directions."
+    assert "no positions and no scene" in verdict.sentences[2]
+    travelled = verdict_of(solution)
+    assert travelled.headline == "The shape can be trusted"
+
+
 def test_verdict_counts_photos_and_pixels():
     solution = hand_made(quality={"rms_px": 0.21, "global_rms_px": 2.0})
     lost = SolvedImage("z.jpg", "1", reason="too dark")

@@ -86,10 +86,11 @@ def verdict_of(solution: Solution) -> Verdict:
 
 def _photos(solution: Solution) -> str:
     count, registered = len(solution.images), len(solution.registered)
+    where = "by their directions" if _only_rotated(solution) else "in one scene"
     if registered == count:
-        return f"All {count} photos were registered in one scene." if count > 1 else "The only photo has a motion."
+        return f"All {count} photos were registered {where}." if count > 1 else "The only photo has a motion."
     left = "1 was" if count - registered == 1 else f"{count - registered} were"
-    return f"{registered} of {count} photos were registered in one scene; {left} left out."
+    return f"{registered} of {count} photos were registered {where}; {left} left out."
 
 
 def _not_asked(solution: Solution) -> bool:
@@ -99,6 +100,12 @@ def _not_asked(solution: Solution) -> bool:
         and solution.shutter_model == "global"
         and solution.options.get("shutter_model") == "global"
     )
+
+
+def _only_rotated(solution: Solution) -> bool:
+    """Whether the camera of a video stayed in one place: there are directions, but no positions and no scene."""
+    centers = [image.center_w for image in solution.registered]
+    return _is_video(solution) and len(centers) > 1 and not np.ptp(centers, axis=0).any()
 
 
 def _is_video(solution: Solution) -> bool:
@@ -149,6 +156,11 @@ def _shape(solution: Solution, said: Mapping[str, Any], largest: float | None) -
         text = f"No correction is needed: {reason}, and the shape of the scene is as good as that of a global shutter."
         return "still", "No correction needed", text
     level, sentence = _height(solution)
+    if trusted and _only_rotated(solution):
+        text = (
+            "The camera only rotated: there are directions, but no positions and no scene whose shape could be wrong."
+        )
+        return "trust", "The rotations can be trusted", text
     if trusted:
         degeneracy = degeneracy_of(solution)
         why = "the cameras were rotated enough against each other to separate the shutter from the shape"

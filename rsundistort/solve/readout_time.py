@@ -18,7 +18,7 @@ from ..io import is_video
 from ..io.outputs import work_folder
 from ..io.places import local_place
 from ..verdict.judge_path import problem_of
-from .run import solve_frames
+from .run import check_of_video, solve_frames
 from .run_options import RunOptions
 
 __all__ = ["MeasuredReadout", "measure_readout"]
@@ -90,6 +90,7 @@ def measure_readout(
     video = local_place(video)
     if not is_video(video):
         raise InputError(f"{video} is no video; a readout time is measured from one")
+    check_of_video(options.solve)
     log, workers = StageLog(progress), Workers(use_threads(jobs))
     with work_folder() as work, warnings.catch_warnings():
         # no frame is rectified

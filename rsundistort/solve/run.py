@@ -39,7 +39,7 @@ from .run_outputs import OF_VIDEOS, REPLACED, VIDEO, Outputs, check_usd, files_o
 from .survey import survey_of
 from .video_path import frame_path, solve_clip
 
-__all__ = ["run", "solve_frames"]
+__all__ = ["check_of_video", "run", "solve_frames"]
 
 
 def run(
@@ -93,6 +93,8 @@ def run(
     check_usd(options.outputs, is_clip)
     if options.frames == "all" and not is_clip:
         raise InputError(f"{photos} is no video; --frames all is for one")
+    if is_clip:
+        check_of_video(options.solve)
     of_video = [name for name in OF_VIDEOS if name != VIDEO or options.frames == "all"] if is_clip else []
     replaced = (*REPLACED, "frames") if is_video(photos) else REPLACED
     with run_folder(out, key_of(inputs, options), log, overwrite=overwrite, resume=resume) as before:
@@ -222,6 +224,19 @@ def _solve(
     return replace(solved, unregistered=loaded.unregistered(rec.image_names), readouts=readouts), solving
 
 
+def check_of_video(solving: SolveOptions) -> None:
+    """Refuse options that the path of a video does not take."""
+    if solving.control or solving.crs not in (None, "none"):
+        raise InputError("frames of a video have no GPS; it takes no --crs and --gcp, say --every N for photos that do")
+    if solving.still or solving.known or solving.shutter_model not in ("auto", "constant-motion", "global"):
+        raise InputError(
+            "the path of a video says how its frames move: it takes no --still, --known or --model but global; "
+            "say --every N for photos that do"
+        )
+    if solving.shutter_model == "global" and solving.readout_s is not None:
+        raise InputError("frames of a global shutter have no readout time; leave out --readout-ms or --model global")
+
+
 def solve_frames(
     options: RunOptions,
     clip: Clip,
@@ -233,16 +248,7 @@ def solve_frames(
 ) -> Solved:
     """The result of a video and a gyroscope's log."""
     solving, cameras = options.solve, keys.cameras
-    if solving.control or solving.crs not in (None, "none"):
-        raise InputError("frames of a video have no GPS; it takes no --crs and --gcp, say --every N for photos that do")
-    if solving.still or solving.known or solving.shutter_model not in ("auto", "constant-motion", "global"):
-        raise InputError(
-            "the path of a video says how its frames move: it takes no --still, --known or --model but global; "
-            "say --every N for photos that do"
-        )
     at_once = solving.shutter_model == "global"
-    if at_once and solving.readout_s is not None:
-        raise InputError("frames of a global shutter have no readout time; leave out --readout-ms or --model global")
     readouts = {} if at_once else known_readouts(
         bodies, cameras.cameras, cameras.camera_idx, solving.readout_s, gyro_log
     )  # fmt: skip
