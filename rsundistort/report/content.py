@@ -260,7 +260,8 @@ def cameras(solution: Solution) -> list[dict[str, Any]]:
         K = camera.K
         sigma = sigmas.get(keys[0]) or {}
         lens = {name: value for name, value in camera.coefficients.items() if value or name in sigma}
-        values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+        of_focal = {"f": K[0, 0]} if "f" in sigma and K[0, 0] == K[1, 1] else {"fx": K[0, 0], "fy": K[1, 1]}
+        values = of_focal | {"cx": K[0, 2], "cy": K[1, 2]}
         rows.append(
             {
                 "id": keys[0] if len(keys) == 1 else f"{keys[0]} to {keys[-1]}",
@@ -300,16 +301,19 @@ def _field(camera: Camera, facts: Mapping[str, float]) -> dict[str, Any] | None:
 
 def settings(solution: Solution) -> list[tuple[str, str]]:
     """Options by name; empty where none was given."""
-    said = []
-    for name, value in solution.options.items():
-        if isinstance(value, Mapping):
-            text = ", ".join(f"{k}: {v}" for k, v in value.items())
-        elif isinstance(value, (list, tuple)):
-            text = ", ".join(str(each) for each in value)
-        else:
-            text = "" if value is None else str(value)
-        said.append((name.replace("_", " "), text))
-    return said
+    return [(name.replace("_", " "), _setting(value)) for name, value in solution.options.items()]
+
+
+def _setting(value: Any) -> str:
+    """An option's value, without what is empty in it."""
+    if isinstance(value, Mapping):
+        parts = ((name.replace("_", " "), _setting(each)) for name, each in value.items())
+        return ", ".join(f"{name}: {text}" for name, text in parts if text)
+    if isinstance(value, (list, tuple)):
+        return ", ".join(map(_setting, value))
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return "" if value is None else str(value)
 
 
 def _value(name: str, value: float, sigma: float | None, digits: int) -> str:

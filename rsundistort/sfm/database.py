@@ -175,7 +175,9 @@ def from_pycolmap(model: Any, matched: MatchedPhotos, posed: Reconstruction | No
         seen = dict(sorted(((each.image_id, each.point2D_idx) for each in point.track.elements), reverse=True))
         rows += [(frame_of[image_id], number, seen[image_id]) for image_id in sorted(seen)]
     if not track_points:
-        raise ReconstructionError("the photos were registered, but no scene point could be triangulated")
+        raise ReconstructionError(
+            "the photos were registered, but no scene point could be triangulated; check the camera's focal length"
+        )
     frame, point_idx, keypoint = np.array(rows).T
     found = [matched.features[image_id - 1] for image_id in ids]
     start = np.concatenate([[0], np.cumsum([len(each.sigma) for each in found])])
