@@ -70,7 +70,7 @@ def _held(path: Path) -> dict[str, Any]:
     from rsundistort.io.metashape import read_metashape
 
     if path.suffix.lower() != ".xml":
-        raise InputError(f"{path} is no cameras.xml of Metashape; run and solve say what they know of photos and videos")
+        raise InputError(f"{path} is no cameras.xml of Metashape; run says what is known of photos")
     posed = read_metashape(path)
     cameras = zip(posed.camera_ids, posed.cameras, posed.sensors, strict=True)
     return {

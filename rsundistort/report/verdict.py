@@ -104,7 +104,7 @@ def _not_asked(solution: Solution) -> bool:
 
 def _only_rotated(solution: Solution) -> bool:
     """Whether the camera of a video stayed in one place: there are directions, but no positions and no scene."""
-    centers = [image.center_w for image in solution.registered]
+    centers = [image.center_w for image in solution.registered if image.center_w is not None]
     return _is_video(solution) and len(centers) > 1 and not np.ptp(centers, axis=0).any()
 
 
