@@ -244,3 +244,14 @@ def test_no_pixel_moves_farther_than_the_largest_shift(camera, rotation):
     farthest = np.linalg.norm(still - raw, axis=1).max()
     # found on a grid of its own, which has the border in common with this one
     assert largest_shift_px(camera, motion) == pytest.approx(farthest, rel=0.01, abs=1e-9)
+
+
+@pytest.mark.parametrize("readout", READOUTS)
+def test_a_warp_does_not_depend_on_how_many_rows_are_in_memory(monkeypatch, readout):
+    camera = Camera(120, 90, [[110, 0, 60], [0, 110, 44], [0, 0, 1]], LENSES["pincushion"], readout)
+    photo = np.random.default_rng(3).integers(0, 256, (90, 120, 3), np.uint8)
+    motion = RowMotion(np.array([4e-4, -6e-4, 5e-4]))
+    at_once = warp_photo(photo, camera, motion)
+    monkeypatch.setattr("rsundistort.synthetic.warp._TOGETHER", 7 * 120)
+    for some, whole in zip(warp_photo(photo, camera, motion), at_once, strict=True):
+        np.testing.assert_array_equal(some, whole)
