@@ -192,7 +192,8 @@ class NormalEquations:
                 np.ascontiguousarray(self._seen(g_frame)), np.ascontiguousarray(self._seen(diagonal)), S, rhs,
             )  # fmt: skip
         if self._num_unseen:
-            S = np.pad(S, ((0, 0), (0, self._num_unseen), (0, self._num_unseen)))
+            measured, S = S, np.zeros((len(S), nb, nb))
+            S[:, :seen, :seen] = measured
             own = np.arange(seen, nb)
             S[s.pattern.diagonal[:, None], own, own] = diagonal[:, seen:]
             rhs = np.hstack([rhs, g_frame[:, seen:]])

@@ -425,14 +425,17 @@ def orthogonal(reconstruction: Reconstruction) -> Reconstruction:
     rec, sites = reconstruction, reconstruction.bend.shape[1]
     R_cw, center_w, bend = rec.R_cw.copy(), rec.center_w.copy(), np.empty_like(rec.bend)
     phi, velocity = np.empty((2, rec.num_images, 3))
-    for span in np.unique(rec.bend_clock, axis=0):
-        mine = np.flatnonzero((rec.bend_clock == span).all(1))
-        start, end = span.tolist()
-        clock = np.linspace(start, end, 4 * sites)
+    # each photo's own unit of the clock is its readout, so that those of a camera, whatever their focal length, have
+    # the same clock
+    start, length = rec.bend_clock[:, 0], np.ptp(rec.bend_clock, axis=1)
+    for camera in np.unique(rec.camera_idx):
+        mine = np.flatnonzero(rec.camera_idx == camera)
+        own = length[mine, None]
+        clock = start[mine[0]] / length[mine[0]] + np.linspace(0, 1, 4 * sites)
         moved = splines_at(sites, np.linspace(0, 1, len(clock))) @ rec.bend[mine]
-        moved[..., :3] += clock[:, None] * rec.phi[mine, None]
-        moved[..., 3:] += clock[:, None] * rec.velocity[mine, None]
+        moved[..., :3] += clock[:, None] * (own * rec.phi[mine])[:, None]
+        moved[..., 3:] += clock[:, None] * (own * rec.velocity[mine])[:, None]
         rest, turn, way, rate = steady_parts(clock, moved, sites)
         R_cw[mine], center_w[mine] = turn @ R_cw[mine], center_w[mine] + way
-        phi[mine], velocity[mine], bend[mine] = rate[:, 0], rate[:, 1], rest
+        phi[mine], velocity[mine], bend[mine] = rate[:, 0] / own, rate[:, 1] / own, rest
     return replace(rec, R_cw=R_cw, center_w=center_w, phi=phi, velocity=velocity, bend=bend)
