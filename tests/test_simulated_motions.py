@@ -278,6 +278,14 @@ def test_warps_that_make_no_sense_are_refused(tmp_path, options, says):
     assert not (tmp_path / "out").exists()
 
 
+def test_photos_of_two_sizes_are_not_warped_together(tmp_path):
+    photos = save_textures(tmp_path / "photos", ["a.png"])
+    write_image(photos / "b.png", texture(200, 160, 1))
+    with pytest.raises(InputError, match=r"^b\.png has 200x160 pixels, a\.png \d+x\d+; warp photos of each size"):
+        simulate_warp(photos, tmp_path / "out", WarpOptions(camera=GIVEN))
+    assert not (tmp_path / "out").exists()
+
+
 # ---------------------------------------------------------------- recipes
 
 

@@ -143,8 +143,8 @@ def simulate_warp(
     Raises
     ------
     InputError
-        When a motion is of no photo of the folder, or so fast that the rows of a photo fold over; with `crop`, also
-        when less than a quarter of the frame would be left.
+        When photos differ in size, a motion is of none of them, or so fast that the rows of a photo fold over; with
+        `crop`, also when less than a quarter of the frame would be left.
     """
     options = options or WarpOptions()
     photos, out = Path(photos), Path(out)
@@ -169,6 +169,12 @@ def simulate_warp(
 
         def work(name: str) -> None:
             photo = read_photo(photos / name)
+            height, width = photo.pixels.shape[:2]
+            if (width, height) != (whole.width, whole.height):
+                raise InputError(
+                    f"{name} has {width}x{height} pixels, {names[0]} {whole.width}x{whole.height}; "
+                    "warp photos of each size by themselves"
+                )
             warped, mask = warp_photo(photo.pixels, whole, motions[name])
             write_image(scratch / "masks" / masks[name], _cut(mask, crop))
             _write_photos(scratch, output_name(name), photo, warped, crop, options.quality)
