@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera
 from rsundistort.sfm.features import Features
-from rsundistort.solve.clip_pan import _LEFT_PX, _beyond_rotation, _matches, _seen_again, _with_likeliest_focal
+from rsundistort.solve.clip_pan import _LEFT_PX, _beyond_rotation, _matches, _with_likeliest_focal, seen_again
 
 F = 500.0
 CAMERA = Camera(640, 360, [[F, 0, 320], [0, F, 180], [0, 0, 1]])
@@ -75,7 +75,7 @@ def test_a_frame_after_a_cut_is_rotated_by_the_features_that_it_shows_again() ->
         np.concatenate([again[order], rng.uniform([0, 0], [640, 360], (50, 2))]), np.concatenate([looks[order], new])
     )
     chosen = np.arange(0, 120, 2)
-    found = _seen_again(before, chosen, after, CAMERA)
+    found = seen_again(before, chosen, after, CAMERA)
     assert found is not None
     rotation, place, pixel = found
     assert Rotation.from_matrix(rotation @ Rotation.from_rotvec(turned).as_matrix().T).magnitude() < 1e-6
@@ -83,7 +83,7 @@ def test_a_frame_after_a_cut_is_rotated_by_the_features_that_it_shows_again() ->
     np.testing.assert_allclose(pixel, again[chosen[place]], atol=1e-9)
     # another scene shows none of them
     other = replace(after, descriptors=rng.integers(0, 200, (120, 128)).astype(np.uint8))
-    assert _seen_again(before, chosen, other, CAMERA) is None
+    assert seen_again(before, chosen, other, CAMERA) is None
 
 
 def test_matches_are_mutual_and_clear() -> None:

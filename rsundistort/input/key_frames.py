@@ -228,7 +228,9 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
     keys = np.array(sorted({*chooser.keys, *_between(len(numbers), len(chooser.keys)), *ends}))
     _add(writer, video, {numbers[k]: sharpness[k] for k in keys.tolist() if k not in written})
     part = np.cumsum([k in breaks for k in range(len(numbers))])
-    if part[-1] == len(part) - 1:
+    if len(part) == 2:
+        part[:] = 0  # of two frames features say whether they show the same, where points cannot be followed
+    elif part[-1] == len(part) - 1:
         raise InputError(_ONLY_CUTS.format(video.name))
     names = tuple(frame_name(video, number) for number in numbers)
     flows = tuple(each for each in chooser.flows if part[each.keys[0]] == part[each.keys[1]])

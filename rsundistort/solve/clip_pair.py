@@ -19,7 +19,7 @@ from ..model import Camera, Observations, Reconstruction, RowMotion
 from ..model.projection import unproject_points
 from ..sfm.flow import flow_between, from_reduced
 from ..sfm.relative_pose import Pair, RelativePose, View, adjusted_pose
-from .clip_pan import rotation_between
+from .clip_pan import rotation_between, seen_again
 from .clip_tracks import follow
 
 __all__ = ["FramePair"]
@@ -62,14 +62,19 @@ class FramePair:
         shown = {number[name]: found.xy_raw for name, found in zip(keys.names, keys.features, strict=True)}
         followed = follow(clip, shown, camera, most=_POINTS)
         first, second = (shown[k][followed.chosen[k]] for k in (0, 1))
-        forward = followed.key == 0
-        xy = _joined(
-            first[followed.place[forward]],
-            followed.xy_raw[forward],
-            followed.xy_raw[~forward],
-            second[followed.place[~forward]],
-        )
-        rotation = rotation_between(xy[0], xy[1], camera)
+        if clip.flows:
+            forward = followed.key == 0
+            xy = _joined(
+                first[followed.place[forward]],
+                followed.xy_raw[forward],
+                followed.xy_raw[~forward],
+                second[followed.place[~forward]],
+            )
+            rotation = rotation_between(xy[0], xy[1], camera)
+        else:  # nothing goes on from one to the other: a cut, or a roll, which is no obstacle to features
+            before, after = keys.features
+            seen = seen_again(before, np.arange(len(before.xy_raw)), after, camera)
+            xy, rotation = np.zeros((2, 0, 2)), None if seen is None else Rotation.from_matrix(seen[0]).as_rotvec()
         if rotation is not None:
             xy = _followed_aligned(clip, (first, second), camera, rotation)
         return cls(camera, tuple(clip.names), xy)
@@ -87,11 +92,11 @@ class FramePair:
         """
         camera, xy = self.camera, self.xy
         rotation = rotation_between(xy[0], xy[1], camera)
-        pair = Pair(*(View.of(each, camera) for each in xy))
-        best: tuple[RelativePose, float] | None = None
         little = ReconstructionError(f"{self.names[0]} and {self.names[1]} share too little of the scene")
         if rotation is None:
             raise little
+        pair = Pair(*(View.of(each, camera) for each in xy))
+        best: tuple[RelativePose, float] | None = None
         for share, within_px in product(_SHARES if readout_share is None else (readout_share,), _WITHIN_PX):
             motion = RowMotion(share * rotation / camera.frame_span)
             (a, seen_a), (b, seen_b) = (unproject_points(each, camera, motion, "rotation") for each in xy)

@@ -20,7 +20,7 @@ from ..sfm.features import Features
 from ..sfm.flow import flow_size
 from .clip_tracks import Followed, follow
 
-__all__ = ["rotating_only", "rotation_between"]
+__all__ = ["rotating_only", "rotation_between", "seen_again"]
 
 _Corners = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -115,7 +115,7 @@ def _chained(
         if a not in R_cw or clip.part[a] != clip.part[b]:
             # after a cut, or a flash, what was seen before may be seen again
             for key in reversed([each for each in order if each in R_cw][-_LAST:]):
-                seen = _seen_again(features[key], followed.chosen[key], features[b], camera)
+                seen = seen_again(features[key], followed.chosen[key], features[b], camera)
                 if seen is not None:
                     R_cw[b] = seen[0] @ R_cw[key]
                     again.append((key, b, *seen[1:]))
@@ -139,7 +139,7 @@ def _chained(
     return followed, own, R_cw
 
 
-def _seen_again(
+def seen_again(
     before: Features, chosen: NDArray[np.int64], after: Features, camera: Camera
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]] | None:
     """The rotation from a frame to another one that shows features of it, which of the chosen ones, and their pixels.
