@@ -129,6 +129,22 @@ def log_k_sigmas(result: BundleResult, remedy: Remedy | None, options: BundleOpt
     return np.sqrt([max(both**2 - rest**2, 0.0), rest**2])
 
 
+def from_elsewhere(path: Sequence[Mapping[str, Any]], seed: int) -> list[dict[str, Any]]:
+    """A recipe's path for another visit to the scene: its photos are taken from other places nearby.
+
+    Each camera is moved by up to two fifths of the way to its neighbours, along each axis. It looks at what it did, and
+    as much up or down: cameras that are level stay so.
+    """
+    centers = np.array([each["center_w"] for each in path], float)
+    apart = float(np.median(np.linalg.norm(np.diff(centers, axis=0), axis=1)))
+    moves = np.random.default_rng([seed, 11]).uniform(-0.4 * apart, 0.4 * apart, centers.shape)
+    raised = moves * (0, 0, 1)
+    return [
+        {**each, "center_w": (each["center_w"] + move).tolist(), "look_at_w": (each["look_at_w"] + rise).tolist()}
+        for each, move, rise in zip(path, moves, raised, strict=True)
+    ]
+
+
 def apart_and_together(errors: Sequence[float], sigmas: Sequence[Array]) -> dict[str, float]:
     """Of sets (n,) warped from the same photos: what their errors share, and what they do not, by what each should be.
 

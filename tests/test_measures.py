@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
-from measures import alike, library_sigmas, log_k_error, normalised_errors, pooled
+import pytest
+from measures import alike, from_elsewhere, library_sigmas, log_k_error, normalised_errors, pooled
 from solved_scene import SCENES
 
 from rsundistort import BundleOptions, Observations, Reconstruction, Solution, SolvedImage, bundle_adjust, read_solution
@@ -53,3 +56,21 @@ def test_sets_that_err_as_one_are_alike(rng):
     assert alike([one, one | {"phi": -2 * phi}]) == {"phi": -1.0}
     assert alike([one | {"center": center}] * 3) == {"phi": 1.0, "center": 1.0}
     assert alike([one]) == {}
+
+
+@pytest.mark.parametrize("scene", ["courtyard", "colonnade", "handheld", "flyover"])
+def test_another_visit_sees_the_same_from_elsewhere(scene):
+    path = json.loads((SCENES / scene / "recipe.json").read_text())["path"]
+    one, other = (from_elsewhere(path, seed) for seed in (1, 2))
+    assert one == from_elsewhere(path, 1) != other
+    centers, moved, looks, aims = (
+        np.array([each[key] for each in views]) for key in ("center_w", "look_at_w") for views in (path, one)
+    )
+    apart = np.median(np.linalg.norm(np.diff(centers, axis=0), axis=1))
+    assert 0.2 * apart < np.abs(moved - centers).max() <= 0.4 * apart
+    # it looks at what it did, as much up or down: level cameras stay level
+    np.testing.assert_array_equal(aims[:, :2], looks[:, :2])
+    np.testing.assert_allclose((aims - moved)[:, 2], (looks - centers)[:, 2], atol=1e-12)
+    assert [{**each, "center_w": 0, "look_at_w": 0} for each in one] == [
+        {**each, "center_w": 0, "look_at_w": 0} for each in path
+    ]
