@@ -23,6 +23,7 @@ import numpy as np
 from measures import run_options
 
 from rsundistort import RsUndistortWarning, SolvedImage, run
+from rsundistort.io.cameras import camera_to_json
 from rsundistort.model.array_types import Array
 from rsundistort.simulate import WarpOptions, simulate_warp
 
@@ -52,10 +53,14 @@ def main() -> None:
     for name, seed in product(args.names, args.seeds):
         with tempfile.TemporaryDirectory() as folder:
             work, photos = Path(folder), args.photos / name
-            truth = simulate_warp(photos, work / "warp", WarpOptions(sigma_rad=args.rad, seed=seed))
+            as_taken = run(photos, work / "as-taken", run_options(shutter_model=args.model))
+            # rotated as the camera would show it: by the lens that the photos say, since EXIF may be off by a fifth
+            camera = work / "camera.json"
+            camera.write_text(json.dumps(camera_to_json(next(iter(as_taken.cameras.values())))), encoding="utf-8")
+            options = WarpOptions(str(camera), sigma_rad=args.rad, seed=seed)
+            truth = simulate_warp(photos, work / "warp", options)
             # solved without the camera of the warp beside them, as their owner has them
             moved = run((work / "warp" / "photos").rename(work / "moved"), work / "out", run_options())
-            as_taken = run(photos, work / "as-taken", run_options(shutter_model=args.model))
         spans = {image.name: truth.cameras[image.camera_id].frame_span for image in truth.images}
         true, before, after = ({each.name: each for each in s.registered} for s in (truth, as_taken, moved))
         names = sorted({*true, *spans} & {*before} & {*after})
