@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from .._kernels import epipolar as kernels
+from ..colmap.conventions import quiet_pycolmap
 from ..model import Camera
-from ..model.array_types import Array
+from ..model.array_types import Array, Index
 from ..model.projection import clock_of, unproject_points
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "RelativePose",
     "View",
     "adjusted_pose",
+    "best_relative_pose",
     "find_relative_pose",
     "phi_information",
     "relative_poses",
@@ -34,10 +36,17 @@ __all__ = [
 # shutter hardly bends, what fits the wide one most of them.
 _SEARCH_PX = (4.0, 16.0)
 _SEARCHES, _CONFIDENCE = 2000, 0.999
+# So many matches suggest poses to pycolmap, and to five points with the wide threshold beside it, in so many trials.
+_WIDE_PX, _SUGGESTING, _TRIALS = (16.0,), 500, 500
 # Widths of the loss, in pixels: the inliers grow under the wide one. An inlier of the result lies within the last.
 _WIDTHS_PX = (3.0, 1.5)
 INLIER_PX = 4.0
+# The best pose is adjusted under a loss of so many standard deviations of its inliers, and of no less noise, in pixels.
+# A narrower one wastes matches, a wider one is moved by false ones; 4 to 8 are about as good.
+_WIDTH, _LEAST_NOISE_PX = 7.0, 0.1
 _LEAST_MATCHES = 15
+# Median of the absolute value of a standard normal variable.
+_MEDIAN = 0.6745
 _MAX_STEPS, _CONVERGED, _GIVEN_UP = 40, 1e-5, 1e5
 # Prior standard deviation of phi that its estimation starts from, radians a frame, and its rounds.
 _START_SIGMA, _ROUNDS = 0.1, 6
@@ -89,6 +98,15 @@ class View:
         """Arguments of the kernels."""
         return self.rays, self.slopes, self.clock, self.rate
 
+    @property
+    def normalized(self) -> Array:
+        """(n, 2) rays where they meet z = 1."""
+        return np.asarray(self.rays[:, :2] / self.rays[:, 2:])
+
+    def select(self, chosen: Index) -> View:
+        """Some of the matches."""
+        return replace(self, rays=self.rays[chosen], slopes=self.slopes[chosen], clock=self.clock[chosen])
+
 
 def _rays(xy_raw: Array, camera: Camera) -> Array:
     """(n, 3) unit directions of pixels; ahead where the lens has none."""
@@ -113,6 +131,14 @@ class Pair:
     def frame_spans(self) -> Array:
         """(6,) clock over the frame, for each component of phi of both."""
         return np.repeat([self.first.frame_span, self.second.frame_span], 3)
+
+    def evenly(self, most: int) -> Pair:
+        """At most so many of the matches, evenly spaced in their order."""
+        count = len(self.first.clock)
+        if count <= most:
+            return self
+        chosen = np.linspace(0, count - 1, most).astype(int)
+        return Pair(self.first.select(chosen), self.second.select(chosen))
 
 
 @dataclass(frozen=True)
@@ -171,11 +197,50 @@ def find_relative_pose(pair: Pair, phi_sigma: float) -> RelativePose | None:
     return _ahead(adjusted_pose(min(found, key=lambda each: each.cost), pair, phi_sigma, _WIDTHS_PX[1]), pair)
 
 
+def best_relative_pose(pair: Pair, phi_sigma: float, known: Sequence[RelativePose] = ()) -> RelativePose | None:
+    """Relative pose of two photos, from more starts than `find_relative_pose` has, and by the noise of its matches.
+
+    A long lens has several poses that fit nearly as well, and five points may suggest a wrong one: so pycolmap's pose
+    is a start, too, and each is adjusted to the end before the one that costs least is chosen. That one is adjusted
+    once more under a loss as wide as the noise of the pair's inliers asks for.
+
+    Parameters
+    ----------
+    pair : Pair
+        Matches.
+    phi_sigma : float
+        Prior standard deviation of the components of phi, radians a frame.
+    known : sequence of RelativePose, optional
+        Poses that were adjusted with this prior already.
+
+    Returns
+    -------
+    RelativePose
+        Or None if nothing suggests one.
+    """
+    few, found = pair.evenly(_SUGGESTING), [*known]
+    for start in (*suggested_poses(few, _WIDE_PX), *_poses_for_mapping(few)):
+        grown = adjusted_pose(start, pair, phi_sigma, _WIDTHS_PX[0])
+        found.append(adjusted_pose(grown, pair, phi_sigma, _WIDTHS_PX[1]))
+    if not found:
+        return None
+    best = min(found, key=lambda each: each.cost)
+    return _ahead(adjusted_pose(best, pair, phi_sigma, _WIDTH * _noise_px(best, pair)), pair)
+
+
+def _noise_px(pose: RelativePose, pair: Pair) -> float:
+    """Standard deviation of a pair's inliers in pixels, of normal noise, by their median."""
+    distances = pose.distances_px(pair)
+    near = distances[distances < INLIER_PX]
+    return max(float(np.median(near)) / _MEDIAN, _LEAST_NOISE_PX) if len(near) >= _LEAST_MATCHES else 1.0
+
+
 def relative_poses(pairs: Sequence[Pair]) -> tuple[list[RelativePose | None], float]:
     """Relative poses of many pairs of photos, and the prior standard deviation of phi, radians a frame.
 
     That prior standard deviation is the one that these motions have (empirical Bayes: squares over what
-    the matches, not the prior, determine): photos without a shutter get none, and poses like those of five points.
+    the matches, not the prior, determine): photos without a shutter get none. With it each pair is adjusted from other
+    starts, too (`best_relative_pose`), since the motions that its estimation begins with may lead to a wrong minimum.
     """
     poses = [find_relative_pose(pair, _START_SIGMA) for pair in pairs]
     sigma = _START_SIGMA
@@ -193,16 +258,38 @@ def relative_poses(pairs: Sequence[Pair]) -> tuple[list[RelativePose | None], fl
             None if pose is None else adjusted_pose(pose, pair, sigma, _WIDTHS_PX[1])
             for pose, pair in zip(poses, pairs, strict=True)
         ]
-    return [None if pose is None else _ahead(pose, pair) for pose, pair in zip(poses, pairs, strict=True)], sigma
+    begun: list[list[RelativePose]] = [[] if pose is None else [pose] for pose in poses]
+    return [best_relative_pose(pair, sigma, each) for pair, each in zip(pairs, begun, strict=True)], sigma
 
 
-def suggested_poses(pair: Pair) -> list[RelativePose]:
-    """Poses by five points each, without a shutter."""
+def _poses_for_mapping(pair: Pair) -> list[RelativePose]:
+    """The pose that pycolmap verifies a pair by, from an essential matrix or a plane; none if it finds none."""
     if len(pair.first.clock) < _LEAST_MATCHES:
         return []
-    x_1, x_2 = (view.rays[:, :2] / view.rays[:, 2:] for view in (pair.first, pair.second))
+    pycolmap = quiet_pycolmap()
+    sides = [
+        (pycolmap.Camera(model="PINHOLE", width=1, height=1, params=[view.focal_px, view.focal_px, 0.0, 0.0]),
+         view.normalized * view.focal_px)
+        for view in (pair.first, pair.second)
+    ]  # fmt: skip
+    options = pycolmap.TwoViewGeometryOptions()
+    options.compute_relative_pose, options.ransac.random_seed = True, 0
+    options.ransac.max_num_trials = _TRIALS
+    each = np.repeat(np.arange(len(pair.first.clock), dtype=np.uint32)[:, None], 2, axis=1)
+    pose = pycolmap.estimate_calibrated_two_view_geometry(*sides[0], *sides[1], each, options).cam2_from_cam1
+    length = 0.0 if pose is None else float(np.linalg.norm(pose.translation))
+    if not length > 0.0:
+        return []
+    return [RelativePose(pose.rotation.matrix(), np.asarray(pose.translation) / length, np.zeros((2, 3)))]
+
+
+def suggested_poses(pair: Pair, search_px: Sequence[float] = _SEARCH_PX) -> list[RelativePose]:
+    """Poses by five points each, without a shutter, for each threshold in pixels."""
+    if len(pair.first.clock) < _LEAST_MATCHES:
+        return []
+    x_1, x_2 = pair.first.normalized, pair.second.normalized
     focal_px, poses = 0.5 * (pair.first.focal_px + pair.second.focal_px), []
-    for within in _SEARCH_PX:
+    for within in search_px:
         E, inlier = cv2.findEssentialMat(
             x_1, x_2, np.eye(3), method=cv2.USAC_DEFAULT, prob=_CONFIDENCE, threshold=within / focal_px,
             maxIters=_SEARCHES,

@@ -12,7 +12,16 @@ from ..model.array_types import Index
 from .database import MatchedPhotos
 from .epipolar import MIN_EXPLAINED, Matches, read_matches
 from .matching import verify_loosely
-from .relative_pose import INLIER_PX, NO_SHUTTER, Pair, RelativePose, View, find_relative_pose, relative_poses
+from .relative_pose import (
+    INLIER_PX,
+    NO_SHUTTER,
+    Pair,
+    RelativePose,
+    View,
+    best_relative_pose,
+    find_relative_pose,
+    relative_poses,
+)
 
 __all__ = ["pair_of", "verify_with_shutter"]
 
@@ -46,7 +55,7 @@ def verify_with_shutter(matched: MatchedPhotos) -> float:
     pairs = [pair_of(matched, pair, matches[pair][:_MATCHES]) for pair in most]
     poses, spread = relative_poses(pairs)
     if spread >= _STRONG_RAD:
-        without = [find_relative_pose(pair, NO_SHUTTER) for pair in pairs]
+        without = [best_relative_pose(pair, NO_SHUTTER) for pair in pairs]
         within_px = INLIER_PX * matched.step_px
         if _num_explained(without, pairs, within_px) < (1.0 - _LOST) * _num_explained(poses, pairs, within_px):
             # a geometry that few pixels are wide holds for a part of the frame only
