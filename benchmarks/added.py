@@ -7,6 +7,7 @@ warped. The motions found in both differ by the known ones if both are right, wh
 then what is found in the photos as they are is a shutter, and the deviations are right, too, if the differences over
 them (`over_sigma`, root mean square by component) are about one. One JSON object a line; milliradians a frame.
 
+`own` is nothing where a run takes no motion out of the photos as they are: then it is part of what is left.
 What both have in common, such as an error of the lens, cancels: that is for other benchmarks.
 """
 
@@ -63,7 +64,7 @@ def main() -> None:
             moved = run((work / "warp" / "photos").rename(work / "moved"), work / "out", run_options())
         spans = {image.name: truth.cameras[image.camera_id].frame_span for image in truth.images}
         true, before, after = ({each.name: each for each in s.registered} for s in (truth, as_taken, moved))
-        names = sorted({*true, *spans} & {*before} & {*after})
+        names = sorted({*true} & {*before} & {*after})
         span = np.array([[spans[each]] for each in names])
         (known, _), (own, own_sigma), (found, sigma) = (_per_frame(each, names) for each in (true, before, after))
         left = (found - own - known) * span

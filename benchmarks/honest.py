@@ -11,6 +11,7 @@ Prints one JSON object a line and at the end a table with targets. Parts, with t
                       sample scenes (6) are rendered again, with other motions, and with `--elsewhere` from other
                       places, since what one place makes them err is one draw; their cameras given as "exact", as
                       "drawn", as "wrong", and without a word on how exact they are; `height` is that error of each
+                      set, with its sign
     calibration (2)   cx and p of herz-jesus-8 with phi3 given, from the calibration's; and what its photos are worth
                       by true motions and the lens that they say they have where they are as they were taken
     better (5)        dB and degrees, of photos of a camera that rotated, and of one that rotated and travelled

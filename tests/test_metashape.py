@@ -166,6 +166,9 @@ def test_info_shows_the_terms_and_says_why_they_are_not_used(tmp_path):
     assert re.search(r"photos with rolling_shutter +2\n", shown.output)
     assert "-0.125664 0.48 0.0176" in shown.output
     assert "Not used as motion: Agisoft does not publish" in shown.output
+    refused = CliRunner().invoke(cli, ["info", str(tmp_path / "photo.jpg")])
+    assert refused.exit_code == 1
+    assert "photo.jpg is no cameras.xml of Metashape" in refused.stderr
     held = json.loads(CliRunner().invoke(cli, ["info", str(tmp_path / "c.xml"), "--json"]).output)
     assert held["rolling_shutter"]["DJI_0153"]["translation"] == [0.08, -0.44, 0.0]
     assert held["rolling_shutter"]["DJI_0153"]["angle_deg"] == 0

@@ -301,7 +301,7 @@ def test_verdict(solution, level, said):
 
 def test_a_video_of_a_camera_that_only_rotated_has_no_shape():
     said = {"shutter": "found", "shape": "trusted", "reasons": []}
-    solution = hand_made(critical=None, quality={"readout_time": {"seconds": 0.02}, "verdict": said})
+    solution = hand_made(quality={"readout_time": {"seconds": 0.02}}, verdict=said)
     still = [replace(image, center_w=np.zeros(3)) for image in solution.images]
     verdict = verdict_of(replace(solution, images=tuple(still)))
     assert verdict.headline == "The rotations can be trusted"

@@ -421,7 +421,10 @@ def of_motions(
 
 
 def orthogonal(reconstruction: Reconstruction) -> Reconstruction:
-    """The same motions as the nearest steady ones and bends, and the poses that belong to these."""
+    """The same motions as the nearest steady ones and bends, and the poses that belong to these.
+
+    Motions are those of `with_path_motions`: photos of a camera bend over the same share of their clock.
+    """
     rec, sites = reconstruction, reconstruction.bend.shape[1]
     R_cw, center_w, bend = rec.R_cw.copy(), rec.center_w.copy(), np.empty_like(rec.bend)
     phi, velocity = np.empty((2, rec.num_images, 3))

@@ -20,7 +20,7 @@ from .lens import clock_at, distort_rays, undistort_to_rays
 
 __all__ = ["crop_camera", "largest_rectangle", "random_phi", "warp_mask", "warp_photo"]
 
-# Pixels whose rays are held at a time: of 12 megapixels at once they take 5 GB.
+# Pixels whose rays are held at a time: of 12 megapixels at once they take 7 GB.
 _TOGETHER = 500_000
 
 
