@@ -16,6 +16,7 @@ from rsundistort.errors import InputError, ReconstructionError, RsUndistortWarni
 from rsundistort.input.load import LoadedPhotos
 from rsundistort.input.photo_cameras import PhotoCameras
 from rsundistort.solve import video_path
+from rsundistort.solve.clip_verdict import FoundPath
 from rsundistort.verdict.judge_path import ReadoutTime
 
 PATH = FramePath({}, 1 / 30)
@@ -37,16 +38,16 @@ def solve(monkeypatch):
         def travelled(*_):
             if scene is None:
                 raise ReconstructionError("no scene point could be triangulated")
-            return scene, BundleOptions(path=PATH), filmed, CLIP
+            return FoundPath(CLIP, scene, BundleOptions(path=PATH), filmed)
 
-        found = turned and (turned, BundleOptions(path=replace(PATH, rotation_only=True)), None, CLIP)
+        found = turned and FoundPath(CLIP, turned, BundleOptions(path=replace(PATH, rotation_only=True)))
         monkeypatch.setattr(video_path, "_turned", lambda *_: (found, explained))
         monkeypatch.setattr(video_path, "_travelled", travelled)
         return video_path.solve_clip(CLIP, keys_of(Camera(64, 36, np.eye(3))), PATH, None, None, StageLog(None))
 
     monkeypatch.setattr(video_path, "own_gyroscope", lambda _: None)
     monkeypatch.setattr(video_path, "readout_of", lambda _: ReadoutTime(0.01, 0.001))
-    monkeypatch.setattr(video_path, "_judged", lambda clip, keys, result, *_: result)
+    monkeypatch.setattr(video_path, "judged", lambda found, *_, **__: found.result)
     return solve
 
 
@@ -109,12 +110,12 @@ def test_the_lines_of_frames_that_stand_are_those_that_fit(monkeypatch, camera, 
         found = by_direction[keys.cameras.of(0).readout]
         if found is None:
             raise InputError("it does not fit at all")
-        return SimpleNamespace(time=found[0], sigma_px=found[1]), BundleOptions(path=PATH), None, CLIP
+        return FoundPath(CLIP, SimpleNamespace(time=found[0], sigma_px=found[1]), BundleOptions(path=PATH))
 
     monkeypatch.setattr(video_path, "_filmed_by", filmed)
     monkeypatch.setattr(video_path, "own_gyroscope", lambda _: None)
     monkeypatch.setattr(video_path, "readout_of", lambda result: result.time)
-    monkeypatch.setattr(video_path, "_judged", lambda clip, keys, *_: keys.cameras.of(0).readout)
+    monkeypatch.setattr(video_path, "judged", lambda found, keys, *_, **__: keys.cameras.of(0).readout)
     found = video_path.solve_clip(CLIP, keys_of(camera, specified), PATH, None, None, StageLog(None))
     assert found == expected
 

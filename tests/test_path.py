@@ -20,7 +20,7 @@ from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.errors import InputError
 from rsundistort.model.path import CameraPath, inverse_left_jacobians
-from rsundistort.solve.video_path import readouts_of_halves
+from rsundistort.solve.clip_verdict import readouts_of_halves
 from rsundistort.verdict.judge_path import ReadoutTime, judge_clip, unfollowed_px
 
 FRAME_S = 1 / 30

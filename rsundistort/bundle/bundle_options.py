@@ -17,7 +17,7 @@ from .common_motion import CommonMotion
 from .intrinsics import GuessedCameras, check_refined
 from .known_lengths import check_lengths
 from .known_positions import KnownPlaces
-from .path_prior import FramePath, PathSolution
+from .path_prior import FramePath, PathSolution, PathStart
 
 __all__ = ["DEVIATIONS", "LOSSES", "BundleOptions", "BundleResult"]
 
@@ -340,6 +340,12 @@ class BundleResult:
     def of_photos(self, keep: Mask) -> BundleResult:
         """The result of some photos (m,) only, with the points that two of them show."""
         return replace(self, reconstruction=self.reconstruction.take_photos(keep), covariances=self.covariances[keep])
+
+    def path_start(self) -> PathStart:
+        """What was found of a path, where the next adjustment of these frames begins."""
+        assert self.path is not None
+        noise = self.noise_factor if self.noise_factor != 1.0 else None
+        return PathStart(tuple(self.reconstruction.image_names), self.path.state, self.path_sigmas, noise)
 
     @property
     def sigma_phi(self) -> Array:

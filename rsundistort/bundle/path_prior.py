@@ -36,6 +36,8 @@ _READOUT_SHARE, _READOUT_SIGMA = 0.5, 1.0
 # A readout ends before that of the next frame begins: standard deviation, in times between frames, by which one may
 # exceed that. It stands for times of frames that are not exact, and keeps the cost smooth.
 _EXCESS_SIGMA = 0.02
+# Readout time that counts as none, in times between frames.
+_NO_READOUT = 1e-6
 # Frames that a path is taken to have run at, from rest, before its first one.
 _FRAMES_BEFORE = 100.0
 
@@ -60,6 +62,11 @@ class PathStart:
     state: PathState
     sigmas: tuple[float, ...]
     noise: float | None = None
+
+    @property
+    def at_once(self) -> PathStart:
+        """The same frames, read at once."""
+        return replace(self, state=replace(self.state, pace=np.zeros_like(self.state.pace)))
 
     def in_order(self, names: Sequence[str], otherwise: PathState) -> PathState:
         """The state of other frames; of those without one, another's, whose cameras are the same."""
@@ -124,6 +131,11 @@ class FramePath:
     def readout_most(self) -> float:
         """The longest readout, in times between frames: one, unless a longer one is given."""
         return max(1.0, abs(self.readout_prior[0]))
+
+    @property
+    def at_once(self) -> FramePath:
+        """The same frames, read at once."""
+        return replace(self, readout=(0.0, _NO_READOUT * self.frame_s))
 
     def known_rates(self, names: Sequence[str]) -> tuple[Array, Array]:
         """Rates (m, 6) that are known, and their weights, from one frame to the next; weight 0 where none is."""

@@ -99,6 +99,11 @@ class Clip:
         """Names of the key frames."""
         return tuple(self.names[k] for k in self.keys.tolist())
 
+    def are_keys(self, names: Sequence[str]) -> NDArray[np.bool_]:
+        """(m,) which of these frames are key frames."""
+        keys = {*self.key_names}
+        return np.array([name in keys for name in names], bool)
+
     def with_gaps(self, missing: NDArray[np.int64], frame_s: float) -> Clip:
         """The same frames where so many (n - 1,) are missing between them, and those of a part `frame_s` apart."""
         step_s = np.diff(self.time_s)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -15,7 +16,7 @@ from ..model.projection import unproject_points
 from ..sfm.flow import FlowFrame, flow_between
 from ..sfm.resection import resect
 
-__all__ = ["Followed", "follow", "follow_points", "followed_again", "with_all_frames"]
+__all__ = ["Followed", "focused_as", "follow", "follow_points", "followed_again", "with_all_frames"]
 
 # Number of points of a key frame that are followed: those of the most key frames first, from all its cells.
 _POINTS = 120
@@ -235,3 +236,10 @@ def with_all_frames(
         Observations(frame[seen], of_point[seen], xy_raw[seen], sigma[seen]),
     )  # fmt: skip
     return whole.with_points(np.ones(int(seen.sum()), bool))
+
+
+def focused_as(before: Reconstruction, whole: Reconstruction) -> Reconstruction:
+    """A reconstruction with the focal lengths that another one found for the same frames."""
+    of_frame = dict(zip(before.image_names, before.variation, strict=True))
+    none = np.zeros(3)
+    return replace(whole, variation=np.array([of_frame.get(name, none) for name in whole.image_names]))
