@@ -193,8 +193,6 @@ class KeyFrameChooser:
         Frames chosen so far; the first one is.
     cuts : list of int
         Frames that do not continue the one before.
-    steps : list of float
-        Motion of the content from each frame to the next, pixels of the flow; NaN over a cut.
     flows : list of KeyFlow
         Corners of key frames in the next one.
     """
@@ -202,7 +200,6 @@ class KeyFrameChooser:
     def __init__(self) -> None:
         self.keys: list[int] = []
         self.cuts: list[int] = []
-        self.steps: list[float] = []
         self.flows: list[KeyFlow] = []
         self._since: list[_Since] = []  # frames from the last key on
         self._number = -1
@@ -214,7 +211,7 @@ class KeyFrameChooser:
         if not self.keys:
             self._begin(self._number, frame, sharpness)
             return
-        self._step(frame, sharpness, counts=True)
+        self._step(frame, sharpness, may_cut=True)
 
     def finish(self) -> None:
         """The last frame is a key frame, too: nothing is known beyond it."""
@@ -227,18 +224,15 @@ class KeyFrameChooser:
         self._corners = _corners(frame.grey)
         self._since = [_Since(frame, sharpness, 0.0, self._corners, np.arange(len(self._corners)))]
 
-    def _step(self, frame: FlowFrame, sharpness: float, counts: bool) -> None:
+    def _step(self, frame: FlowFrame, sharpness: float, may_cut: bool) -> None:
         last = self._since[-1]
         xy, seen = _followed(last.frame, frame, last.xy)
-        if counts:
-            moved = np.linalg.norm(xy - last.xy, axis=1)[seen]
-            self.steps.append(float(np.median(moved)) if seen.any() else np.nan)
-            if len(last.xy) >= _LEAST_CORNERS and seen.sum() < (1 - _CUT) * len(last.xy):
-                self.cuts.append(self._number)
-                if self.keys[-1] != self._number - 1:
-                    self.keys.append(self._number - 1)
-                self._begin(self._number, frame, sharpness)
-                return
+        if may_cut and len(last.xy) >= _LEAST_CORNERS and seen.sum() < (1 - _CUT) * len(last.xy):
+            self.cuts.append(self._number)
+            if self.keys[-1] != self._number - 1:
+                self.keys.append(self._number - 1)
+            self._begin(self._number, frame, sharpness)
+            return
         xy, corner = xy[seen], last.corner[seen]
         apart = np.linalg.norm(xy - self._corners[corner], axis=1)
         moved_by = float(np.median(apart)) / math.hypot(*frame.grey.shape) if len(corner) else 1.0
@@ -256,7 +250,7 @@ class KeyFrameChooser:
         chosen, rest = self._since[best], self._since[best + 1 :]
         self._begin(self.keys[-1] + best, chosen.frame, chosen.sharpness)
         for each in rest:
-            self._step(each.frame, each.sharpness, counts=False)
+            self._step(each.frame, each.sharpness, may_cut=False)
 
     def _join(self, place: int) -> None:
         """Look for the corners of the last key in a frame that becomes the next, by their windows in the key itself."""
