@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, RsUndistortWarning
-from ..io.video import FrameWriter, VideoFrames, VideoReader, frame_name, sharpness_of
+from ..io.video import FrameWriter, VideoFrames, VideoReader, converted, frame_name, sharpness_of
 from ..sfm.flow import FlowFrame, KeyFlow, KeyFrameChooser, flow_size
 
 __all__ = ["Clip", "flow_frames_of", "read_clip"]
@@ -134,10 +134,7 @@ class Clip:
 
 def _grey(picture: Any) -> NDArray[np.uint8]:
     """A frame: grey, and reduced for the flow if it is large."""
-    width, height = flow_size(picture.width, picture.height)
-    if (width, height) == (picture.width, picture.height):
-        return np.ascontiguousarray(picture.to_ndarray(format="gray"))
-    return np.ascontiguousarray(picture.to_ndarray(format="gray", width=width, height=height))
+    return np.ascontiguousarray(converted(picture, "gray", flow_size(picture.width, picture.height)))
 
 
 def flow_frames_of(clip: Clip, wanted: Sequence[int]) -> Iterator[tuple[int, FlowFrame]]:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import struct
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ __all__ = [
     "VideoFrames",
     "VideoReader",
     "bits_of",
+    "converted",
     "extract_frames",
     "frame_name",
     "is_video",
@@ -328,13 +331,28 @@ def frame_name(video: Path, number: int) -> str:
     return f"{video.stem}_{number:06d}.png"
 
 
+@lru_cache(maxsize=16)
+def _converter(_form: str, _size: tuple[int, int], _of: tuple[Any, ...], _thread: int) -> Any:
+    """What converts frames of a kind to another, for one thread: making it takes longer than a conversion does."""
+    from av.video.reformatter import VideoReformatter
+
+    return VideoReformatter()
+
+
+def converted(picture: Any, form: str, size: tuple[int, int] | None = None) -> NDArray[Any]:
+    """Pixels of a frame in a format that PyAV names, and scaled to a width and height if wanted."""
+    width, height = size or (picture.width, picture.height)
+    kind = picture.format.name, picture.width, picture.height, picture.colorspace, picture.color_range
+    converter = _converter(form, (width, height), kind, threading.get_ident())
+    pixels: NDArray[Any] = converter.reformat(picture, width, height, form).to_ndarray()
+    return pixels
+
+
 def _pixels(picture: Any) -> NDArray[Any]:
     """(h, w, 3) BGR, 8 bit, or 16 bit where the video has more than eight."""
     if bits_of(picture.format) > 8:
-        deep: NDArray[Any] = picture.to_ndarray(format="rgb48le")
-        return np.ascontiguousarray(deep[..., ::-1])
-    pixels: NDArray[Any] = picture.to_ndarray(format="bgr24")
-    return pixels
+        return np.ascontiguousarray(converted(picture, "rgb48le")[..., ::-1])
+    return converted(picture, "bgr24")
 
 
 def bits_of(form: Any) -> int:
@@ -345,8 +363,7 @@ def bits_of(form: Any) -> int:
 def sharpness_of(picture: Any) -> float:
     """Variance of the Laplacian of the reduced grey frame."""
     scale = min(1.0, _MEASURED_PX / max(picture.width, picture.height))
-    width, height = (max(2, round(scale * side)) for side in (picture.width, picture.height))
-    grey = picture.to_ndarray(format="gray", width=width, height=height)
+    grey = converted(picture, "gray", (max(2, round(scale * picture.width)), max(2, round(scale * picture.height))))
     return float(cv2.Laplacian(grey, cv2.CV_32F).var())
 
 

@@ -24,6 +24,8 @@ _LEVELS, _COARSE_LEVELS, _COARSE = 4, 2, 160
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.003)
 # A point that returns elsewhere, followed there and back again, was lost: pixels.
 _BACK_PX = 0.5
+# Share of the points that return within the finest level, from which on the others are not asked.
+_MOST_RETURN = 0.75
 # Side of the area whose mean brightness is divided out, pixels of a frame, and of a reduced one, where a smaller area
 # would leave nothing of large things; the least mean, so that noise in the dark is no texture; and what it becomes.
 _AREA, _COARSE_AREA, _DARK, _MEAN = 31, 63, 16.0, 100.0
@@ -126,10 +128,16 @@ def _there_and_back(
 ) -> tuple[NDArray[np.float32], Mask]:
     """Where points lie in another frame, and which of them returned."""
     there, found = _sought(before, after, xy, start, levels)
-    back, returned = _sought(after, before, there, xy, levels)
     height, width = after.shape
-    inside = (there >= 0).all(1) & (there[:, 0] <= width - 1) & (there[:, 1] <= height - 1)
-    return there, found & returned & inside & (np.linalg.norm(back - xy, axis=1) < _BACK_PX)
+    found &= (there >= 0).all(1) & (there[:, 0] <= width - 1) & (there[:, 1] <= height - 1)
+
+    def returned(levels: int) -> Mask:
+        back, seen = _sought(after, before, there, xy, levels)
+        return found & seen & (np.linalg.norm(back - xy, axis=1) < _BACK_PX)
+
+    seen = returned(0)
+    # coarser levels add nothing where nearly all return, but say which are wrong where many do not
+    return there, seen if np.count_nonzero(seen) >= _MOST_RETURN * len(seen) else returned(levels)
 
 
 def _sought(
