@@ -74,6 +74,19 @@ def test_a_fast_pan_is_followed(width: int, shift: int) -> None:
     assert steps(chooser) == pytest.approx([shift], abs=0.1)
 
 
+@pytest.mark.parametrize("share", [0.2, 0.5])
+def test_what_is_covered_is_not_followed(share: float) -> None:
+    first, cover = of_all_scales(640, 360), of_all_scales(640, 360)[::-1, ::-1]
+    second, edge = np.roll(first, 5, axis=1), round(640 * (1 - share))
+    second[:, edge:] = cover[:, edge:]
+    xy = np.random.default_rng(1).uniform([30, 30], [610, 330], (400, 2))
+    forward, _ = flow_between(as_followed([first, second]), xy, xy[:0])
+    right = np.linalg.norm(forward.xy - xy[forward.point] - [5, 0], axis=1) < 0.2
+    in_view = (xy[:, 0] + 5 < edge - 15).sum()
+    assert right.sum() > 0.97 * in_view
+    assert (~right).sum() < 0.1 * (len(xy) - in_view)
+
+
 def under_lamps(greys: list[np.ndarray]) -> list[np.ndarray]:
     """The same with bands of lamps that flicker, brighter and darker by a quarter, two in each frame."""
     y = np.arange(HEIGHT)[:, None]

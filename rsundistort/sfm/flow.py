@@ -24,8 +24,10 @@ _LEVELS, _COARSE_LEVELS, _COARSE = 4, 2, 160
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.003)
 # A point that returns elsewhere, followed there and back again, was lost: pixels.
 _BACK_PX = 0.5
-# Share of the points that return within the finest level, from which on the others are not asked.
+# Share of the points that have to return at the finest level, and times the median difference of windows from which on
+# one of them may show another thing all the same.
 _MOST_RETURN = 0.75
+_UNLIKE = 3.0
 # Side of the area whose mean brightness is divided out, pixels of a frame, and of a reduced one, where a smaller area
 # would leave nothing of large things; the least mean, so that noise in the dark is no texture; and what it becomes.
 _AREA, _COARSE_AREA, _DARK, _MEAN = 31, 63, 16.0, 100.0
@@ -117,7 +119,7 @@ def _followed(
     if 2 * len(lost) > len(seen):
         step, half = np.float32(after.grey.shape[1] / after.coarse.shape[1]), np.float32(0.5)
         reduced = [(each[lost] + half) / step - half for each in (xy, start)]
-        near, found = _sought(before.coarse, after.coarse, reduced[0], reduced[1], _COARSE_LEVELS)
+        near, found, _ = _sought(before.coarse, after.coarse, reduced[0], reduced[1], _COARSE_LEVELS)
         again, seen_again = _there_and_back(before.grey, after.grey, xy[lost], (near + half) * step - half, levels)
         there[lost], seen[lost] = again, seen_again & found
     return there, seen
@@ -126,29 +128,44 @@ def _followed(
 def _there_and_back(
     before: Grey, after: Grey, xy: NDArray[np.float32], start: NDArray[np.float32], levels: int
 ) -> tuple[NDArray[np.float32], Mask]:
-    """Where points lie in another frame, and which of them returned."""
-    there, found = _sought(before, after, xy, start, levels)
+    """Where points lie in another frame, and which of them returned.
+
+    What shows the same returns at the finest level from where it was, or not at all; of other things this finds what
+    is alike nearby. So all have to return through the pyramid if many did not without it, and else those whose windows
+    differ by much.
+    """
+    there, found, difference = _sought(before, after, xy, start, levels)
     height, width = after.shape
     found &= (there >= 0).all(1) & (there[:, 0] <= width - 1) & (there[:, 1] <= height - 1)
 
-    def returned(levels: int) -> Mask:
-        back, seen = _sought(after, before, there, xy, levels)
-        return found & seen & (np.linalg.norm(back - xy, axis=1) < _BACK_PX)
+    def returned(asked: Index, levels: int) -> Mask:
+        back, seen, _ = _sought(after, before, there[asked], xy[asked], levels)
+        return seen & (np.linalg.norm(back - xy[asked], axis=1) < _BACK_PX)
 
-    seen = returned(0)
-    # coarser levels add nothing where nearly all return, but say which are wrong where many do not
-    return there, seen if np.count_nonzero(seen) >= _MOST_RETURN * len(seen) else returned(levels)
+    seen = np.flatnonzero(found)
+    near = seen[returned(seen, 0)]
+    if len(near) >= _MOST_RETURN * len(xy):
+        doubtful = difference[near] > _UNLIKE * np.median(difference[near])
+        sure, seen = near[~doubtful], near[doubtful]
+    else:
+        sure = near[:0]
+    return there, np.isin(np.arange(len(xy)), np.concatenate([sure, seen[returned(seen, levels)]]))
 
 
 def _sought(
     before: Grey, after: Grey, xy: NDArray[np.float32], start: NDArray[np.float32], levels: int
-) -> tuple[NDArray[np.float32], Mask]:
-    """Where points are found in another picture, looked for from a start (Lucas and Kanade 1981, Bouguet 2000)."""
-    there, found, _ = cv2.calcOpticalFlowPyrLK(
+) -> tuple[NDArray[np.float32], Mask, NDArray[np.float32]]:
+    """Where points are found in another picture, looked for from a start (Lucas and Kanade 1981, Bouguet 2000).
+
+    And by how much their windows differ, in grey levels.
+    """
+    if not len(xy):
+        return xy, np.zeros(0, bool), np.zeros(0, np.float32)
+    there, found, difference = cv2.calcOpticalFlowPyrLK(
         before, after, xy, start.copy(), winSize=_WINDOW, maxLevel=levels, criteria=_CRITERIA,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
-    return np.asarray(there, np.float32), found.ravel() == 1
+    return np.asarray(there, np.float32), found.ravel() == 1, difference.ravel()
 
 
 def _corners(grey: Grey) -> NDArray[np.float32]:
