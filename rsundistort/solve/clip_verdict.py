@@ -30,8 +30,8 @@ from .tracks import rough_options
 
 __all__ = ["FoundPath", "judged", "readouts_of_halves"]
 
-# Frames that half of a clip needs to determine a readout time, and measurements.
-_LEAST_HALF, _LEAST_MEASUREMENTS = 4, 15
+# Frames that half of a clip needs to determine a readout time, and points.
+_LEAST_HALF, _LEAST_POINTS = 4, 15
 # A readout time is measured if its standard deviation falls to this share of the one before.
 _MEASURED = 0.7
 _OF_STABILISED = "what is taken for frames that were stabilised"
@@ -117,8 +117,9 @@ def judged(
         against = _against_global(stabilisation)
     ratio = 1.0 if found.felt is None else found.felt.alignment.ratio
     # where the path follows slow rotations only, fast ones contradict nothing
-    held = tested.speeds is not None and found.path.held_sigma
-    apart = tested.speeds._replace(fast=None) if tested.speeds is not None and held else tested.speeds
+    apart = tested.speeds
+    if apart is not None and found.path.held_sigma:
+        apart = apart._replace(fast=None)
     verdict = judge_clip(
         result, of_keys, tested.halves, clip.frame_s, remedy, against, tested.vibration_px, apart, ratio
     )
@@ -244,7 +245,7 @@ def readouts_of_halves(result: BundleResult, options: BundleOptions) -> tuple[Re
         deviations="jackknife",
     )  # fmt: skip
     parts = [rec.take_photos(keep) for keep in (~late, late)]
-    if any(part.num_images < _LEAST_HALF or part.num_points < _LEAST_MEASUREMENTS for part in parts):
+    if any(part.num_images < _LEAST_HALF or part.num_points < _LEAST_POINTS for part in parts):
         return None
     first, second = (readout_of(bundle_adjust(part, "constant-motion", how)) for part in parts)
     return first, second
