@@ -379,28 +379,26 @@ class _Selection:
         exact = best.model == "two-step" and steady and not fits.is_better(fit, best)
         if not exact and not fits.is_better(best, fit):
             return
-        if best.model == "rotation" and fit.model == "constant-motion" and self._could_be_lens(best, fit):
-            return
+        if best.model == "rotation" and fit.model == "constant-motion":
+            fit = self._or_varying_lens(best, fit)
         if exact or float((best.errors - fit.errors).mean()) > fit.left:
             self.best = fit
             self.kept.append(fit.label)
         else:
             self.against.append(f"{fit.label} removes less of what bends the photos than it leaves")
 
-    def _could_be_lens(self, best: _Fit, fit: _Fit) -> bool:
-        """Whether a lens that varies explains what a velocity does beyond rotations; it is kept where it does better.
+    def _or_varying_lens(self, steady: _Fit, fit: _Fit) -> _Fit:
+        """A velocity beside steady rotations, or a lens that varies in its place, if that predicts better.
 
         A lens that focuses and a camera that travels both scale and shift what the photo shows.
         """
         fits = self._fits
-        if best.varying or not self._refines:
-            return False
-        vary = fits.fit(best.model, True, [best.reconstruction], bends=best.bends)
-        self.gain[vary.label] = fits.gain(best, vary)
-        if fits.is_better(fit, vary):
-            self.best = vary
-            self.kept.append(vary.label)
-        return not fits.is_better(vary, fit)
+        if steady.varying or not self._refines:
+            return fit
+        vary = fits.fit(steady.model, True, [steady.reconstruction], bends=steady.bends)
+        self.gain[vary.label] = fits.gain(steady, vary)
+        is_ahead = float(vary.errors.mean()) < float(fit.errors.mean())
+        return vary if is_ahead and fits.is_better(steady, vary) else fit
 
     def weigh_velocity(self, fit: _Fit, steady: _Fit) -> None:
         """Keep a velocity in place of unsteady rotations, if it predicts better what `steady` ones leave.
@@ -413,9 +411,9 @@ class _Selection:
         self.gain[fit.label] = fits.gain(best, fit)
         ahead = float(fit.errors.mean()) < float(best.errors.mean())
         ahead = ahead and float((steady.errors - fit.errors).mean()) > fit.left
-        if ahead and fits.is_better(steady, fit) and not self._could_be_lens(steady, fit):
-            self.best = fit
-            self.kept.append(fit.label)
+        if ahead and fits.is_better(steady, fit):
+            self.best = self._or_varying_lens(steady, fit)
+            self.kept.append(self.best.label)
 
     def bend(self, fit: _Fit) -> None:
         """Try unsteady motions after a fit, where something smooth is left, or lines would still move."""
