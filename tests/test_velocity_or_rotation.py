@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, Observations, Reconstruction, RowMotion, project_points
-from rsundistort.bundle import BundleOptions, choose_model
+from rsundistort.bundle import BundleOptions, Posterior, bundle_adjust, choose_model
+from rsundistort.bundle.doubt import steps_to
 from rsundistort.model.reprojection import shutter_displacements
 from rsundistort.verdict.judge import _rival_reasons
 
@@ -80,3 +82,30 @@ def test_a_rival_is_a_reason_that_says_what_to_give(rng):
     (said,) = _rival_reasons(choice)
     assert "1.9 times" in said
     assert "--model constant-motion" in said
+
+
+def test_a_model_that_may_be_right_too_widens_the_deviations(rng):
+    rec = flight(rng, 5, drift=0.0, rotation=0.03)
+    choice = choose(rec)
+    options = BundleOptions(outlier_rounds=0, sigma_px=NOISE_PX, deviations="model")
+    alone = bundle_adjust(at_rest(rec), "rotation", options)
+    both = bundle_adjust(at_rest(rec), "rotation", replace(options, rival=choice.steps))
+    assert_array_equal(both.reconstruction.phi, alone.reconstruction.phi)
+    steps = np.array([choice.steps[name][:9] for name in alone.reconstruction.image_names])
+    assert np.abs(steps[:, 6:]).max() > 0
+    assert_allclose(both.covariances - alone.covariances, np.einsum("ma,mb->mab", steps, steps), atol=1e-12)
+    # of all photos together, too: what the mean rotation may be off by
+    mean = np.zeros((1, 5, 9))
+    mean[:, :, 8] = 0.2
+    with_rival = Posterior(both, replace(options, rival=choice.steps)).of_photos(mean)
+    added = (with_rival - Posterior(alone, options).of_photos(mean))[0]
+    assert_allclose(np.sum(mean[0] * added), steps[:, 8].mean() ** 2, atol=1e-12)
+
+
+def test_steps_from_one_solution_to_another_do_not_depend_on_the_frames(rng):
+    rec = flight(rng, 6, drift=0.5)
+    phi, velocity = (rng.normal(size=(6, 3)) * size for size in (1e-4, 1e-3))
+    other = replace(rec, phi=rec.phi + phi, velocity=rec.velocity + velocity)
+    moved = other.moved(Rotation.from_rotvec([0.3, -0.2, 1.0]).as_matrix(), np.array([3.0, 1.0, -2.0]), 1.7)
+    expected = np.hstack([np.zeros((6, 6)), phi, velocity])
+    assert_allclose(steps_to(moved, rec), expected, atol=1e-9)

@@ -5,12 +5,13 @@ from typing import Any
 
 from .adjust import MODEL_SEQUENCE, adjust_sequence, bundle_adjust, objective, sequence_to
 from .bundle_options import BundleOptions, BundleResult
-from .choice import ModelChoice, choose_model
+from .choice import choose_model
 from .control import CONTROL_SIGMA_PX, PlacedControl, place_control, with_control
 from .direction import ReadoutChoice, choose_readouts
 from .intrinsics import GuessedCameras, deviation, pixels_of
 from .known_lengths import scale_of_lengths
 from .known_positions import KnownPlaces
+from .model_choice import ModelChoice
 from .posterior import Posterior, gauge_directions
 
 __all__ = [

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from scipy.special import ndtr
 
 from ..errors import InputError
 from ..model import SHUTTER_MODELS, Observations, Reconstruction, other_axis
@@ -14,11 +15,13 @@ from ..model.array_types import Array, Index, Mask
 from ..model.reprojection import reprojection_residuals, shutter_displacements, typical_px
 from .adjust import MODEL_SEQUENCE, bundle_adjust, objective
 from .bundle_options import BundleOptions
+from .doubt import steps_to
+from .model_choice import ModelChoice
 from .prior_sigmas import PriorSigmas
 from .remains import CLIP, WAVES, agreement_of_waves, errors_without, half_across_readout, warps, waves
 
 __all__ = [
-    "ModelChoice", "choose_model", "clipped_errors", "corners", "enough_points", "hold_out", "improves",
+    "choose_model", "clipped_errors", "corners", "enough_points", "hold_out", "improves",
     "standard_errors",
 ]  # fmt: skip
 
@@ -55,70 +58,6 @@ _VARYING, _FIELD = ", varying lens", ", residual field"
 _BENDS = {0: "", 1: ", accelerating", 2: ", bent", 5: ", vibrating"}
 # Groups that a smooth warp could imitate; the others displace lines faster.
 _SMOOTH_BENDS = 2
-
-
-@dataclass(frozen=True)
-class ModelChoice:
-    """Outcome of `choose_model`. Keys are models, or say in words how a fit differs from the model alone.
-
-    Attributes
-    ----------
-    shutter_model : str
-        The last model that explained the held-out measurements better than the one kept before it.
-    label : str
-        Its key in what follows.
-    varying : bool
-        Whether the intrinsics vary from photo to photo, as `BundleOptions.varying`.
-    shutter : {"found", "not-found", "not-determined"}
-        Whether there is a rolling shutter: "not-determined" if something bends the photos that a shutter model explains
-        in part, or no better than one that is read along the other axis.
-    held_out_error : dict of str to float
-        Mean over the held-out measurements of half the squared residual in units of the noise, clipped: 1 for noise
-        alone. The choice depends on it.
-    held_out_rms_px : dict of str to float
-        Root mean square of the components of the held-out residuals, long ones clipped.
-    gain : dict of str to float
-        Fall of the held-out error against the one kept before, in units of the standard error of that fall. The first
-        has none.
-    left : dict of str to float
-        Part of the held-out error that a smooth warp of each photo would still remove.
-    kept : tuple of str
-        Models that were kept, in order.
-    agreement : float or None
-        Correlation of the motions that two halves of the scene show, each alone; None if it was not computed.
-    against : tuple of str
-        Reasons against a shutter that explained something and was not kept, for people.
-    num_held_out : int
-        Measurements held out.
-    residual_field : bool
-        Whether cameras have fields beside their lens models, as `BundleOptions.residual_field`.
-    bends : int
-        Groups of bends of the motions, as `BundleOptions.bends`.
-    restless : bool
-        Whether the lines of the photos move faster than any of these models follows; not tested if a shutter is not
-        determined.
-    rival : float
-        Of rotations: by how much a velocity that predicts the held-out measurements as well displaces the photos
-        otherwise (the mean over the photos of their medians) over what the rotations displace them by. 0 where no
-        velocity does as well, and where that is less than half a pixel.
-    """
-
-    shutter_model: str
-    label: str
-    varying: bool
-    shutter: str
-    held_out_error: dict[str, float]
-    held_out_rms_px: dict[str, float]
-    gain: dict[str, float]
-    left: dict[str, float]
-    kept: tuple[str, ...]
-    agreement: float | None
-    against: tuple[str, ...]
-    num_held_out: int
-    residual_field: bool = False
-    bends: int = 0
-    restless: bool = False
-    rival: float = 0.0
 
 
 def enough_points(reconstruction: Reconstruction, per_photo: int = _ENOUGH, seed: int = 0) -> Mask:
@@ -509,7 +448,21 @@ def choose_model(
         best.bends,
         shutter != "not-determined" and fits.waves(best, _RESTLESS, _UNSEEN_PX / 2),
         _rival(fits, best),
+        _steps_of_others(fits, best) if best.model != "global" else {},
     )
+
+
+def _steps_of_others(fits: _Fits, best: _Fit) -> dict[str, Array]:
+    """`ModelChoice.steps`. A model is right with the probability that its held-out error is the smaller one."""
+    rec, most = best.reconstruction, np.zeros((best.reconstruction.num_images, 12))
+    for fit in fits.done.values():
+        same = [each.readout for each in fit.reconstruction.cameras] == [each.readout for each in rec.cameras]
+        if fit is best or not same or SHUTTER_MODELS[fit.model] < SHUTTER_MODELS["rotation"] or not len(fit.errors):
+            continue
+        ahead = float(ndtr(-fits.gain(fit, best)))
+        steps = np.sqrt(ahead / (ahead + 0.5)) * steps_to(fit.reconstruction, rec)
+        most = steps if (steps[:, 6:9] ** 2).sum() > (most[:, 6:9] ** 2).sum() else most
+    return dict(zip(rec.image_names, most, strict=True))
 
 
 def _rival(fits: _Fits, best: _Fit) -> float:

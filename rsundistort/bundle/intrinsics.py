@@ -52,7 +52,7 @@ class GuessedCameras:
         lens coefficients. Intrinsics that are not named have no prior.
     decentring : sequence of (float, float), optional
         Of each camera, the standard deviations e of an error of (cx, p2) = (3, 1) e and of (cy, p1) = (3, 1) e, which
-        calibrations have beside that (`bundle.calibration_doubt`). It counts for the standard deviations that are
+        calibrations have beside that (`bundle.doubt`). It counts for the standard deviations that are
         reported; the estimate takes it for zero.
     """
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..model.array_types import Array
 from .bundle_options import BundleOptions, BundleResult
-from .calibration_doubt import CalibrationDoubt
+from .doubt import Doubt
 from .prior_sigmas import PriorSigmas
 from .problem import BundleProblem
 
@@ -44,7 +44,7 @@ class Posterior:
         self._state = self._problem.initial_state()
         self._equations = self._problem.linearize(self._state)
         self._inflation = (result.inflation if plain.deviations == "jackknife" else 1.0) / result.noise_factor
-        self._doubt = CalibrationDoubt.of(self._equations, plain, rec.cameras)
+        self._doubt = Doubt.of(self._equations, plain, rec)
         self._camera_idx = rec.camera_idx
         self._own = self._problem.layout.size - self._problem.layout.motion
         self._shape = rec.num_images, self._equations.blocks[1].shape[2] - self._own

@@ -12,8 +12,8 @@ from ..model import Reconstruction
 from ..model.array_types import Array, Index, Mask
 from ..model.reprojection import reprojection_residuals
 from .bundle_options import BundleOptions, BundleResult
-from .calibration_doubt import CalibrationDoubt
 from .common_motion import CommonMotion
+from .doubt import Doubt
 from .intrinsics import pixels_of
 from .jackknife import Inflation, inflated, inflation
 from .layout import Layout
@@ -167,7 +167,7 @@ class Rounds:
         if state.path is not None:
             self._with_pace = equations.photos_by_shared(1)[:, :, 0]
         self._weighed_noise, self._had_heavy_tails = self._noise, self._heavy_tails
-        self._doubt = CalibrationDoubt.of(equations, options, self._current.cameras, self._heavy_tails)
+        self._doubt = Doubt.of(equations, options, self._current, self._heavy_tails)
         self._inflation = Inflation()
         if asks_residuals:
             # the measurements of judged solves are the same, and their points hardly move

@@ -232,7 +232,9 @@ def _chosen(
         result.reconstruction, MODEL_SEQUENCE, options, sigma_px=result.sigma_px, seed=seed,
         progress=lambda model, _: log.tell(f"choice: {model}", 0),
     )  # fmt: skip
-    options = replace(options, varying=choice.varying, bends=choice.bends, residual_field=choice.residual_field)
+    options = replace(
+        options, varying=choice.varying, bends=choice.bends, residual_field=choice.residual_field, rival=choice.steps,
+    )  # fmt: skip
     # windows were aligned, and outliers found, with a model that may be replaced now
     again = track_source is not None and track_source.workers is not None
     again = again and (choice.shutter_model == "constant-motion" or choice.bends > 0)

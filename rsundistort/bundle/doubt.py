@@ -1,4 +1,4 @@
-"""What is added to covariances for errors of a calibration that no residual shows.
+"""What is added to covariances for errors that no residual shows: of a calibration, and of the choice of a model.
 
 A principal point and a tangential distortion that are off together look like a phi3 that all photos share: to second
 order
@@ -9,26 +9,33 @@ after the rotation that makes up for the principal point. The estimate then goes
 and g the change of the gradient of the calibration's prior. It is no noise, and the jackknife cannot see it, so the
 covariance of that is added (`GuessedCameras.decentring`). The estimate itself trusts the calibration: a prior that was
 as wide as such errors would lose what exact calibrations know (courtyard: rotations wrong by 0.014 degrees, not 0.008).
+
+A model that predicts held-out measurements about as well as the one that is kept may have other motions: over flat
+ground, a velocity looks like a rotation. If it is right with the probability p, the second moment of the estimate's
+error has p d d' beside the covariances, where d is what the one differs by from the other (averaging over models;
+Hoeting et al., "Bayesian model averaging", 1999).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from ..model import Camera
+from ..model import Reconstruction
 from ..model.array_types import Array, Index
+from ..model.similarity import Similarity
 from .bundle_options import BundleOptions
+from .layout import motion_end
 from .normal_equations import Function, NormalEquations
 
-__all__ = ["CalibrationDoubt"]
+__all__ = ["Doubt", "steps_to"]
 
 
 @dataclass(frozen=True)
-class CalibrationDoubt:
-    """How far r errors of calibrations, each of one standard deviation, move the estimate.
+class Doubt:
+    """How far r errors, each of one standard deviation, move the estimate.
 
     Attributes
     ----------
@@ -45,10 +52,9 @@ class CalibrationDoubt:
     cameras: Array
 
     @classmethod
-    def of(
-        cls, equations: NormalEquations, options: BundleOptions, cameras: Sequence[Camera], heavy: bool = True
-    ) -> CalibrationDoubt:
+    def of(cls, equations: NormalEquations, options: BundleOptions, rec: Reconstruction, heavy: bool = True) -> Doubt:
         """At the solution that has these equations; NaN where the system cannot be factored."""
+        cameras = rec.cameras
         c, names = equations.num_cameras, options.refine
         of_each = np.zeros((2, c, c, equations.num_shared // c))
         if options.guessed is not None:
@@ -57,7 +63,14 @@ class CalibrationDoubt:
         pulls = of_each.reshape(2 * c, -1)
         pulls = pulls[pulls.any(1)]
         unmoved = np.zeros((len(pulls), equations.num_photos, equations.blocks[1].shape[2]))
-        return cls(pulls, *(equations.times(unmoved, pulls) if len(pulls) else (unmoved, pulls)))
+        photos, moved = equations.times(unmoved, pulls) if len(pulls) else (unmoved, pulls)
+        if not options.rival:
+            return cls(pulls, photos, moved)
+        steps, end = np.zeros((1, *photos.shape[1:])), motion_end(rec.shutter_model)
+        for each, name in zip(steps[0], rec.image_names, strict=True):
+            each[:end] = options.rival.get(name, np.zeros(end))[:end]
+        none = np.zeros((1, equations.num_shared))
+        return cls(*(np.concatenate(each) for each in ((pulls, none), (photos, steps), (moved, none))))
 
     @property
     def of_photos(self) -> Array:
@@ -85,3 +98,17 @@ class CalibrationDoubt:
         """Variance of a function of the points, and its covariance (m, nb) with the photos' unknowns."""
         moved = self.pulls @ found.with_cameras
         return float(moved @ moved), np.einsum("r,rma->ma", moved, self.photos)
+
+
+def steps_to(other: Reconstruction, rec: Reconstruction) -> Array:
+    """(m, 12) by how much rotation, centre, phi and velocity of the same photos differ, in the frame of the second."""
+    U, _, Vt = np.linalg.svd(np.einsum("mji,mjk->ik", rec.R_cw, other.R_cw))
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    X, Y = ((each.center_w - each.center_w.mean(0)) for each in (other, rec))
+    scale = float(np.sum(Y * (X @ R.T)) / np.sum(X**2))
+    other = Similarity(scale, R, rec.center_w.mean(0) - scale * R @ other.center_w.mean(0)).of_reconstruction(other)
+    turned = Rotation.from_matrix(other.R_cw @ rec.R_cw.transpose(0, 2, 1)).as_rotvec()
+    # each by its own camera: with another focal length the same motion has other rates
+    pace = (other.frame_span() / rec.frame_span())[:, None]
+    moved = (other.center_w - rec.center_w, pace * other.phi - rec.phi, pace * other.velocity - rec.velocity)
+    return np.hstack([turned, *moved])

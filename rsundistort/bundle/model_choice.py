@@ -1,0 +1,77 @@
+"""Which shutter model was kept, and what spoke for the others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from ..model.array_types import Array
+
+__all__ = ["ModelChoice"]
+
+
+@dataclass(frozen=True)
+class ModelChoice:
+    """Outcome of `choose_model`. Keys are models, or say in words how a fit differs from the model alone.
+
+    Attributes
+    ----------
+    shutter_model : str
+        The last model that explained the held-out measurements better than the one kept before it.
+    label : str
+        Its key in what follows.
+    varying : bool
+        Whether the intrinsics vary from photo to photo, as `BundleOptions.varying`.
+    shutter : {"found", "not-found", "not-determined"}
+        Whether there is a rolling shutter: "not-determined" if something bends the photos that a shutter model explains
+        in part, or no better than one that is read along the other axis.
+    held_out_error : dict of str to float
+        Mean over the held-out measurements of half the squared residual in units of the noise, clipped: 1 for noise
+        alone. The choice depends on it.
+    held_out_rms_px : dict of str to float
+        Root mean square of the components of the held-out residuals, long ones clipped.
+    gain : dict of str to float
+        Fall of the held-out error against the one kept before, in units of the standard error of that fall. The first
+        has none.
+    left : dict of str to float
+        Part of the held-out error that a smooth warp of each photo would still remove.
+    kept : tuple of str
+        Models that were kept, in order.
+    agreement : float or None
+        Correlation of the motions that two halves of the scene show, each alone; None if it was not computed.
+    against : tuple of str
+        Reasons against a shutter that explained something and was not kept, for people.
+    num_held_out : int
+        Measurements held out.
+    residual_field : bool
+        Whether cameras have fields beside their lens models, as `BundleOptions.residual_field`.
+    bends : int
+        Groups of bends of the motions, as `BundleOptions.bends`.
+    restless : bool
+        Whether the lines of the photos move faster than any of these models follows; not tested if a shutter is not
+        determined.
+    rival : float
+        Of rotations: by how much a velocity that predicts the held-out measurements as well displaces the photos
+        otherwise (the mean over the photos of their medians) over what the rotations displace them by. 0 where no
+        velocity does as well, and where that is less than half a pixel.
+    steps : mapping of photo to (12,) array
+        Of a shutter: how far the other model that moves its motions most would move them, as `BundleOptions.rival`.
+    """
+
+    shutter_model: str
+    label: str
+    varying: bool
+    shutter: str
+    held_out_error: dict[str, float]
+    held_out_rms_px: dict[str, float]
+    gain: dict[str, float]
+    left: dict[str, float]
+    kept: tuple[str, ...]
+    agreement: float | None
+    against: tuple[str, ...]
+    num_held_out: int
+    residual_field: bool = False
+    bends: int = 0
+    restless: bool = False
+    rival: float = 0.0
+    steps: Mapping[str, Array] = field(default_factory=dict)
