@@ -150,7 +150,7 @@ class BundleOptions:
         estimates the correlation of residuals in regions of the scene and of the lens. With the latter the covariances
         are larger (never smaller than with "model"), and the measurements weigh less against the priors once outliers
         are dropped: a false motion caused by a lens or a scene yields to a prior of mean zero.
-    rival : mapping of photo to (12,) array
+    rival : mapping of photo to 12 floats
         How far another model that may be right moves rotation, centre, phi and velocity of a photo, times the root of
         its probability: its square is added to the covariances (`bundle.doubt`). The estimate does not depend on it.
     path : FramePath, optional
@@ -200,7 +200,7 @@ class BundleOptions:
     factor_limit: float | None = None
     cg_tolerance: float = 0.01
     deviations: str = "jackknife"
-    rival: Mapping[str, Array] = field(default_factory=dict)
+    rival: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     path: FramePath | None = None
 
     def __post_init__(self) -> None:

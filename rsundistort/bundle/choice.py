@@ -384,9 +384,8 @@ def choose_model(
     held-out error falls by more than two standard errors, measurements in the same part of the same photo counted
     once, and by more than two hundredths. A shutter model must also remove more than a smooth warp of each photo would
     still remove, and be better than itself read along the other axis (other causes that bend photos fit either axis),
-    and two halves of the scene must show the same motions. A velocity must explain more, beyond rotations, than a lens
-    that varies; neither is kept where they are equally good. Last, where something smooth is left, a residual field of
-    each camera is kept if it is better.
+    and two halves of the scene must show the same motions. Beside rotations, the one of a velocity and a lens that
+    varies is kept that predicts better. Last comes a residual field of each camera, where something smooth is left.
 
     Parameters
     ----------
@@ -448,12 +447,14 @@ def choose_model(
         best.bends,
         shutter != "not-determined" and fits.waves(best, _RESTLESS, _UNSEEN_PX / 2),
         _rival(fits, best),
-        _steps_of_others(fits, best) if best.model != "global" else {},
+        _steps_of_others(fits, best),
     )
 
 
-def _steps_of_others(fits: _Fits, best: _Fit) -> dict[str, Array]:
+def _steps_of_others(fits: _Fits, best: _Fit) -> dict[str, tuple[float, ...]]:
     """`ModelChoice.steps`. A model is right with the probability that its held-out error is the smaller one."""
+    if best.model == "global":
+        return {}
     rec, most = best.reconstruction, np.zeros((best.reconstruction.num_images, 12))
     for fit in fits.done.values():
         same = [each.readout for each in fit.reconstruction.cameras] == [each.readout for each in rec.cameras]
@@ -462,7 +463,7 @@ def _steps_of_others(fits: _Fits, best: _Fit) -> dict[str, Array]:
         ahead = float(ndtr(-fits.gain(fit, best)))
         steps = np.sqrt(ahead / (ahead + 0.5)) * steps_to(fit.reconstruction, rec)
         most = steps if (steps[:, 6:9] ** 2).sum() > (most[:, 6:9] ** 2).sum() else most
-    return dict(zip(rec.image_names, most, strict=True))
+    return {name: tuple(each) for name, each in zip(rec.image_names, most.tolist(), strict=True)}
 
 
 def _rival(fits: _Fits, best: _Fit) -> float:

@@ -68,7 +68,7 @@ class Doubt:
             return cls(pulls, photos, moved)
         steps, end = np.zeros((1, *photos.shape[1:])), motion_end(rec.shutter_model)
         for each, name in zip(steps[0], rec.image_names, strict=True):
-            each[:end] = options.rival.get(name, np.zeros(end))[:end]
+            each[:end] = options.rival.get(name, (0.0,) * end)[:end]
         none = np.zeros((1, equations.num_shared))
         return cls(*(np.concatenate(each) for each in ((pulls, none), (photos, steps), (moved, none))))
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from ..model.array_types import Array
-
 __all__ = ["ModelChoice"]
 
 
@@ -54,7 +52,7 @@ class ModelChoice:
         Of rotations: by how much a velocity that predicts the held-out measurements as well displaces the photos
         otherwise (the mean over the photos of their medians) over what the rotations displace them by. 0 where no
         velocity does as well, and where that is less than half a pixel.
-    steps : mapping of photo to (12,) array
+    steps : mapping of photo to 12 floats
         Of a shutter: how far the other model that moves its motions most would move them, as `BundleOptions.rival`.
     """
 
@@ -74,4 +72,4 @@ class ModelChoice:
     bends: int = 0
     restless: bool = False
     rival: float = 0.0
-    steps: Mapping[str, Array] = field(default_factory=dict)
+    steps: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
