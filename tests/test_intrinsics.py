@@ -245,6 +245,18 @@ def test_the_other_axis_does_no_worse_than_the_lens_alone(rng):
     assert error["rotation, read along the other axis"] <= error["global"]
 
 
+def test_a_lens_that_would_vary_as_no_lens_does_is_not_taken_out_where_a_shutter_is_not_determined(rng):
+    scene = make_scene(rng, "rotation", num_images=12, num_points=400, noise_px=0.1, phi_size=0.05)
+    still = replace(scene, phi=np.zeros_like(scene.phi), shutter_model="global")
+    guessed = GuessedCameras(tuple(scene.cameras), {"f": 1e-3, "cx": 1e-3, "cy": 1e-3})
+    options = BundleOptions(refine=("f", "cx", "cy"), guessed=guessed, phi_sigma_most=0.02)
+    choice = choose_model(still, options=options, sigma_px=0.1)
+    assert choice.against == ("the exposure times allow less motion than they would need",)
+    # predicts better, by a principal point that wanders by a fiftieth of the focal length
+    assert choice.held_out_error["global, varying lens"] < choice.held_out_error["global"]
+    assert (choice.shutter, choice.label, choice.varying) == ("not-determined", "global", False)
+
+
 def test_a_calibration_whose_tangential_terms_are_plainly_wrong_may_be_decentred_by_more(rng):
     camera = replace(make_scene(rng, "rotation").cameras[0], dist=np.array([-0.1, 0.05, 0.0, 0.0]))
     sigma = {"f": 1e-3, "cx": 4e-4, "cy": 4e-4, "k1": 3e-3, "p1": 3e-4, "p2": 3e-4}

@@ -17,7 +17,7 @@ from .adjust import MODEL_SEQUENCE, bundle_adjust, objective
 from .bundle_options import BundleOptions
 from .doubt import steps_to
 from .model_choice import ModelChoice
-from .prior_sigmas import PriorSigmas
+from .prior_sigmas import MOST_VARIED, PriorSigmas
 from .remains import CLIP, WAVES, agreement_of_waves, errors_without, half_across_readout, warps, waves
 
 __all__ = [
@@ -217,7 +217,9 @@ class _Fits:
         # start guarantees that a model never ends above the simpler one, which it contains
         cost = [objective(start, model, options) for start in starts]
         result = bundle_adjust(starts[int(np.argmin(cost))], model, options, step)
-        found, sigmas = result.reconstruction, PriorSigmas(result.phi_rms, result.velocity_rms)
+        found, sigmas = result.reconstruction, PriorSigmas(
+            result.phi_rms, result.velocity_rms, result.focal_sigma, result.centre_sigma,
+        )  # fmt: skip
         errors, rms_px = clipped_errors(found, self.held_out, self._sigma_px)
         smooth = errors_without(warps, found, self.given.observations, self.held_out, self._sigma_px)
         left = max(float(errors.mean() - smooth.mean()), 0.0) if len(errors) else 0.0
@@ -285,6 +287,14 @@ class _Fits:
         if fit.model == "constant-motion":
             limits.append((fit.sigmas.velocity, self._rough.velocity_sigma_most))
         return any(most is not None and spread >= _AT_LIMIT * most for spread, most in limits)
+
+    def no_lens(self, fit: _Fit) -> bool:
+        """Whether a lens would have to vary more than lenses do.
+
+        Then it makes up for something else: a camera that travels by 6 px a frame over flat ground can be a principal
+        point that wanders by 13.
+        """
+        return fit.varying and max(fit.sigmas.focal, fit.sigmas.centre) >= _AT_LIMIT * MOST_VARIED
 
     def gain(self, before: _Fit, after: _Fit) -> float:
         """Fall of the held-out error from one fit to another, in standard errors."""
@@ -417,11 +427,10 @@ def choose_model(
             elif plain.varying:
                 best = _with_shared_lens(fits, best, gain)
                 kept += [best.label] * (best.label not in kept)
-    if best is plain:
-        kept = kept[: kept.index(plain.label) + 1]
-    if not len(fits.held_out):
-        against.append("no point is seen by three photos, so no measurement could be held out to judge by")
     shutter = "found" if best is not plain else "not-determined" if against else "not-found"
+    if best is plain:
+        best = fits.fit(models[0], False, [fits.given]) if against and fits.no_lens(plain) else plain
+        kept = kept[: kept.index(best.label) + 1]
     # a warp of each photo alone is fitted to few measurements, and removes less than one that all share
     if options.refine and len(fits.held_out) and best.left > _MOST_OF_IT * _MIN_FALL * float(best.errors.mean()):
         label = f"{best.label}{_FIELD}"
@@ -497,6 +506,8 @@ def _selected(fits: _Fits, models: Sequence[str], refines: bool) -> _Selection:
         varying = not float(alone.errors.mean()) < _MOST_OF_IT * float(plain.errors.mean())
         last = last if varying else first
     selection, steady = _Selection(fits, plain, kept, gain, refines), last
+    if not len(fits.held_out):
+        selection.against.append("no point is seen by three photos, so no measurement could be held out to judge by")
     for model in models[1:]:
         if model == "constant-motion":
             selection.weigh_velocity(fits.fit(model, varying, [last.reconstruction, given]), steady)

@@ -15,6 +15,7 @@ from .motion_prior import SIGMA_OF_SCALE, tail_weight
 from .path_prior import PathPrior
 
 __all__ = [
+    "MOST_VARIED",
     "Common",
     "PriorSigmas",
     "estimated",
@@ -43,7 +44,7 @@ _MOST_PX = 1.0
 
 # No lens varies more than this from photo to photo (of f, and of the principal point in focal lengths). A strong
 # shutter would be taken for it.
-_MOST_VARIED = 0.02
+MOST_VARIED = 0.02
 # A video may zoom, and what its path leaves of a shutter is not taken for that.
 _MOST_ZOOMED = 0.5
 # Of a path's rates from frame to frame: radians, and shares of the mean way between consecutive photos.
@@ -305,10 +306,10 @@ def _bounded(sigmas: PriorSigmas, options: BundleOptions, baseline: float) -> Pr
     """The prior standard deviations within their upper limits."""
     phi = np.inf if options.phi_sigma_most is None else options.phi_sigma_most
     velocity = np.inf if options.velocity_sigma_most is None else options.velocity_sigma_most * baseline
-    focal = _MOST_VARIED if options.path is None else _MOST_ZOOMED
+    focal = MOST_VARIED if options.path is None else _MOST_ZOOMED
     return replace(
         sigmas, phi=min(sigmas.phi, phi), velocity=min(sigmas.velocity, velocity), focal=min(sigmas.focal, focal),
-        centre=min(sigmas.centre, _MOST_VARIED), bends=tuple(min(each, phi) for each in sigmas.bends),
+        centre=min(sigmas.centre, MOST_VARIED), bends=tuple(min(each, phi) for each in sigmas.bends),
         field=min(sigmas.field, _MOST_PX),
     )  # fmt: skip
 
