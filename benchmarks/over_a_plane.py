@@ -2,8 +2,8 @@
 
     python benchmarks/over_a_plane.py [--num 3] [--first-seed 0]
 
-Prints one JSON object a line. Over a plane a velocity looks like a rotation: where it gains too little to be chosen,
-phi has what it looks like, and its deviations do not allow for that.
+Prints one JSON object a line. Over a plane a velocity looks like a rotation, or like a lens that varies: which of them
+is chosen decides what phi is, and its deviations have to allow for the others.
 """
 
 from __future__ import annotations
