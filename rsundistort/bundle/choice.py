@@ -152,6 +152,15 @@ class _Fit:
         """Whether next to nothing is left that another model could explain."""
         return self.left <= _MIN_FALL * float(self.errors.mean()) if len(self.errors) else True
 
+    @property
+    def is_no_lens(self) -> bool:
+        """Whether a lens would have to vary more than lenses do.
+
+        Then it makes up for something else: a camera that travels by 6 px a frame over flat ground can be a principal
+        point that wanders by 13.
+        """
+        return self.varying and max(self.sigmas.focal, self.sigmas.centre) >= _AT_LIMIT * MOST_VARIED
+
 
 def moved_px(reconstruction: Reconstruction) -> Array:
     """(m,) approximate displacement of pixels by each photo's motion within half a frame from the principal row."""
@@ -288,14 +297,6 @@ class _Fits:
             limits.append((fit.sigmas.velocity, self._rough.velocity_sigma_most))
         return any(most is not None and spread >= _AT_LIMIT * most for spread, most in limits)
 
-    def no_lens(self, fit: _Fit) -> bool:
-        """Whether a lens would have to vary more than lenses do.
-
-        Then it makes up for something else: a camera that travels by 6 px a frame over flat ground can be a principal
-        point that wanders by 13.
-        """
-        return fit.varying and max(fit.sigmas.focal, fit.sigmas.centre) >= _AT_LIMIT * MOST_VARIED
-
     def gain(self, before: _Fit, after: _Fit) -> float:
         """Fall of the held-out error from one fit to another, in standard errors."""
         return standard_errors(before.errors - after.errors, self._group)
@@ -429,7 +430,7 @@ def choose_model(
                 kept += [best.label] * (best.label not in kept)
     shutter = "found" if best is not plain else "not-determined" if against else "not-found"
     if best is plain:
-        best = fits.fit(models[0], False, [fits.given]) if against and fits.no_lens(plain) else plain
+        best = fits.fit(models[0], False, [fits.given]) if against and plain.is_no_lens else plain
         kept = kept[: kept.index(best.label) + 1]
     # a warp of each photo alone is fitted to few measurements, and removes less than one that all share
     if options.refine and len(fits.held_out) and best.left > _MOST_OF_IT * _MIN_FALL * float(best.errors.mean()):
