@@ -26,7 +26,7 @@ from rsundistort.batch import use_threads
 from rsundistort.batch.progress import StageLog
 from rsundistort.batch.workers import Workers
 from rsundistort.bundle import BundleResult, Posterior, bundle_adjust
-from rsundistort.bundle.choice import clipped_errors, standard_errors
+from rsundistort.bundle.held_out import clipped_errors, standard_errors
 from rsundistort.critical.common import row_phi
 from rsundistort.input.load import load_photos
 from rsundistort.solve.model_sequence import solve_photos

@@ -306,7 +306,7 @@ def steady(bench: Bench, seeds: Sequence[int], references: Path) -> None:
     for sigma in (0.02, 0.05):
         for seed in seeds:
             folder = bench.warped(sigma, seed)
-            with mock.patch("rsundistort.bundle.choice._BENDS", {0: ""}):
+            with mock.patch("rsundistort.bundle.choice.BENDS", {0: ""}):
                 without = bench.measure(f"steady by {sigma}, without", seed, folder, references, bench.still)
             among = bench.measure(f"steady by {sigma}", seed, folder, references, bench.still)
             if without and among:

@@ -81,6 +81,7 @@ def closing_table(solution: Solution, out: Path) -> str:
         ("verdict", verdict.headline),
         ("shutter model", solution.shutter_model),
         *([("held-out error", held_out)] if held_out else []),
+        *_known_motions(quality),
         *_source(solution),
         *_lens(solution),
         *_shutter(solution),
@@ -214,6 +215,13 @@ def _shutter(solution: Solution) -> Iterator[tuple[str, str]]:
         yield "depth", ", ".join(counts)
     if (left := quality.get("rs_poses_px")) is not None:
         yield "rs-poses", f"motions are not steady: two poses per photo are off by up to {left:.1f} px"
+
+
+def _known_motions(quality: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """What the photos say of motions that are known from elsewhere."""
+    if (gain := quality.get("known_motions_gain")) is not None:
+        than = "better" if gain > 0 else "worse"
+        yield "known motions", f"predict the photos {than} than none, by {abs(gain):.1f} standard errors"
 
 
 def _held_out(quality: Mapping[str, Any]) -> str:

@@ -20,7 +20,7 @@ from rsundistort.bundle import (
     choose_readouts,
     objective,
 )
-from rsundistort.bundle.choice import enough_points, hold_out
+from rsundistort.bundle.held_out import enough_points, hold_out
 from rsundistort.bundle.intrinsics import moved_camera
 from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem

@@ -180,7 +180,12 @@ def test_a_solution_far_from_the_gyroscope_is_reported():
     reversed_ = {name: (-phi, np.full(3, 0.001)) for name, phi in zip(rec.image_names[1:], found[1:], strict=True)}
     # twice the root mean square of nine numbers that sum, squared, to 15e-4
     assert "by 26 times its uncertainty" in (gyro_contradiction(rec, reversed_) or "")
-    assert gyro_contradiction(replace(rec, shutter_model="global"), reversed_) is None
+    still = replace(rec, shutter_model="global")
+    assert gyro_contradiction(still, reversed_) is None
+    assert gyro_contradiction(still, reversed_, 2.5) is None
+    assert "predict them worse than none, by 12 standard errors" in (gyro_contradiction(still, reversed_, -12.3) or "")
+    unsure = {name: (phi, np.full(3, 0.02)) for name, (phi, _) in reversed_.items()}
+    assert gyro_contradiction(still, unsure, -12.3) is None
 
 
 # ---------------------------------------------------------------- what the log covers

@@ -257,6 +257,27 @@ def test_a_lens_that_would_vary_as_no_lens_does_is_not_taken_out_where_a_shutter
     assert (choice.shutter, choice.label, choice.varying) == ("not-determined", "global", False)
 
 
+def choice_with_known_motions(rng, off_by):
+    """What is chosen where exposures forbid a shutter that a gyroscope measured, times this, to a milliradian."""
+    scene = make_scene(rng, "rotation", num_images=12, num_points=400, noise_px=0.1, phi_size=0.05)
+    still = replace(scene, phi=np.zeros_like(scene.phi), shutter_model="global")
+    true = off_by * scene.phi * scene.frame_span()[:, None]
+    known = {name: (each, np.full(3, 1e-3)) for name, each in zip(scene.image_names, true, strict=True)}
+    return choose_model(still, options=BundleOptions(phi_sigma_most=0.02, known_phi=known), sigma_px=0.1)
+
+
+def test_motions_known_from_elsewhere_that_predict_better_than_none_are_a_shutter(rng):
+    choice = choice_with_known_motions(rng, 1.0)
+    assert choice.known_gain > 5
+    assert (choice.shutter, choice.label, choice.against) == ("found", "rotation", ())
+
+
+def test_motions_known_from_elsewhere_that_predict_worse_than_none_are_none(rng):
+    choice = choice_with_known_motions(rng, -1.0)
+    assert choice.known_gain < -2
+    assert choice.shutter != "found"
+
+
 def test_a_calibration_whose_tangential_terms_are_plainly_wrong_may_be_decentred_by_more(rng):
     camera = replace(make_scene(rng, "rotation").cameras[0], dist=np.array([-0.1, 0.05, 0.0, 0.0]))
     sigma = {"f": 1e-3, "cx": 4e-4, "cy": 4e-4, "k1": 3e-3, "p1": 3e-4, "p2": 3e-4}

@@ -13,7 +13,7 @@ from ..model import Reconstruction, other_axis
 from ..model.former_fields import former_fields
 from .adjust import adjust_sequence
 from .bundle_options import BundleOptions, BundleResult
-from .choice import clipped_errors, standard_errors
+from .held_out import clipped_errors, standard_errors
 
 __all__ = ["ReadoutChoice", "choose_readouts"]
 

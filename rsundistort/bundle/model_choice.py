@@ -54,6 +54,9 @@ class ModelChoice:
         velocity does as well, and where that is less than half a pixel.
     steps : mapping of photo to 12 floats
         Of a shutter: how far the other model that moves its motions most would move them, as `BundleOptions.rival`.
+    known_gain : float or None
+        Fall of the held-out error by motions that are known from elsewhere, none of them fitted, against no motions, in
+        standard errors; None if none are known.
     """
 
     shutter_model: str
@@ -73,3 +76,4 @@ class ModelChoice:
     restless: bool = False
     rival: float = 0.0
     steps: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    known_gain: float | None = None

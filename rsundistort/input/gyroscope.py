@@ -119,18 +119,36 @@ def gyro_motions(
     return {name: (found[name][0], sigma) for name, (_, sigma) in known.items()}, {k: v for k, (_, v) in found.items()}
 
 
-def gyro_contradiction(rec: Reconstruction, known: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> str | None:
-    """A warning, if a solution contradicts the known motions."""
+def gyro_contradiction(
+    rec: Reconstruction, known: Mapping[str, tuple[ArrayLike, ArrayLike]], gain: float | None = None
+) -> str | None:
+    """A warning, if a solution contradicts the motions by a gyroscope.
+
+    One with a shutter has motions of its own; of one without, `ModelChoice.known_gain` says whether these motions
+    predict the photos better than none.
+    """
+    if not known:
+        return None
+    check = (
+        "check the offset of its clock (--gyro-offset), its axes (--gyro-axes) and the time of the readout "
+        "(--readout-ms)"
+    )
+    if rec.shutter_model == "global":
+        size = [np.asarray(phi) / np.asarray(sigma) for phi, sigma in known.values()]
+        # what is within its own uncertainty may predict worse than none
+        if gain is None or gain > -_FAR or np.sqrt(np.mean(np.square(size))) <= _FAR:
+            return None
+        return (
+            f"the photos contradict the gyroscope: its motions predict them worse than none, by {-gain:.0f} standard "
+            f"errors, and were not used; {check}, or the camera has no rolling shutter, or stabilises its photos"
+        )
     span = rec.frame_span()
     misses = [
         (rec.phi[i] * span[i] - np.asarray(known[name][0])) / np.asarray(known[name][1])
         for i, name in enumerate(rec.image_names)
         if name in known
     ]
-    far = float(np.sqrt(np.mean(np.square(misses)))) if misses and rec.shutter_model != "global" else 0.0
+    far = float(np.sqrt(np.mean(np.square(misses)))) if misses else 0.0
     if far <= _FAR:
         return None
-    return (
-        f"the photos contradict the gyroscope, by {far:.0f} times its uncertainty; check the offset of its clock "
-        "(--gyro-offset), its axes (--gyro-axes) and the time of the readout (--readout-ms)"
-    )
+    return f"the photos contradict the gyroscope, by {far:.0f} times its uncertainty; {check}"

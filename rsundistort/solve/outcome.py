@@ -295,4 +295,5 @@ def _held_out(choice: ModelChoice | None) -> dict[str, Any]:
         "held_out_chosen": None if choice is None else choice.label,
         "held_out_left": {} if choice is None else choice.left,
         "agreement_of_halves": None if choice is None else choice.agreement,
+        "known_motions_gain": None if choice is None else choice.known_gain,
     }

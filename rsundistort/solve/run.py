@@ -218,7 +218,8 @@ def _solve(
         )  # fmt: skip
     rec = solved.shared
     cameras.check_plausible(rec.cameras)
-    contradictions = [gyro_contradiction(rec, from_gyro), *cameras.contradicted(rec.cameras, options_of(rec))]
+    gain = None if solved.choice is None else solved.choice.known_gain
+    contradictions = [gyro_contradiction(rec, from_gyro, gain), *cameras.contradicted(rec.cameras, options_of(rec))]
     for text in filter(None, contradictions):
         warnings.warn(text, RsUndistortWarning, stacklevel=3)
     return replace(solved, unregistered=loaded.unregistered(rec.image_names), readouts=readouts), solving

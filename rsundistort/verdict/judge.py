@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import stdtr
 
 from ..bundle import BundleResult, ModelChoice
-from ..bundle.choice import clipped_errors, corners, improves, standard_errors
+from ..bundle.held_out import clipped_errors, corners, improves, standard_errors
 from ..bundle.layout import motion_end
 from ..critical import Remedy
 from ..model import Reconstruction
