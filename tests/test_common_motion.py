@@ -341,6 +341,10 @@ def test_auto_finds_the_photo_that_neither_rotated_nor_travelled(rng):
         assert 0.0005 < remedy.anchors["05.jpg"] < 0.01
         assert "holds what the motions of all photos have in common" in remedy.sentence
         assert remedy.after.common.shift_px < remedy.before.common.shift_px
+        # what would come on top of that photo, not in its place
+        further = advise(healed, remedy.added_to(ESTIMATED))
+        assert further
+        assert all(each.shift_px < remedy.after.common.shift_px for each in further)
         errors = [np.linalg.norm((row_motion(r.reconstruction) - row_motion(truth)).mean(0)) for r in (result, healed)]
         better += errors[1] < errors[0]
     assert better >= 3

@@ -55,6 +55,10 @@ class Remedy:
     after: ShapeCost
     warnings: tuple[str, ...] = ()
 
+    def added_to(self, options: BundleOptions) -> BundleOptions:
+        """The options of an adjustment, with the photo that the remedy took as still."""
+        return replace(options, still=self.anchors) if self.name == "anchor" else options
+
     @property
     def sentence(self) -> str:
         """For people: the remedy and its reason, and the remaining uncertainty."""

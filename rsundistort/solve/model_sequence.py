@@ -180,7 +180,7 @@ def solve_tracks(
         for text in mended.warnings:
             warnings.warn(text, RsUndistortWarning, stacklevel=3)
         if mended.after.is_flagged or mended.after.common.is_weak:
-            advice = advise(result, options)
+            advice = advise(result, mended.added_to(options))
         log.end("critical motion", remedy=mended.name, sigma_log_k=mended.after.sigma_log_k)
     log.begin("comparison with a global shutter")
     global_result = without_shutter(result, options)

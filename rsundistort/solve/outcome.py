@@ -268,7 +268,9 @@ def _quality(solved: Solved) -> dict[str, Any]:
         "rms_px": result.rms_px,
         "global_rms_px": solved.global_result.rms_px,
         **_held_out(solved.choice),
-        "sigma_intrinsics": solved.by_camera(result.sigma_intrinsics),
+        "sigma_intrinsics": solved.by_camera(
+            [each if k in shared.camera_idx else {} for k, each in enumerate(result.sigma_intrinsics)]
+        ),
         "focal_sigma": result.focal_sigma,
         "centre_sigma_focal_lengths": result.centre_sigma,
         "lens_fields": solved.by_camera(_fields(solved)) if any(c.field.size for c in shared.cameras) else {},
