@@ -271,8 +271,9 @@ def border_rows(
     """
     nb, nc = J.shape[2], J_camera.shape[2]
     for f in prange(len(B)):
-        r0, r1 = np.empty(nc), np.empty(nc)
-        B[f] = 0.0
+        r0, r1, l0, l1 = np.empty(nc), np.empty(nc), np.empty(nb + nc), np.empty(nb + nc)
+        # long rows in one piece: B transposed, by camera
+        sums = np.zeros((B.shape[2] // nc, nc, nb + nc))
         rhs[f] = 0.0
         for s in range(frame_start[f], frame_start[f + 1]):
             k = frame_order[s]
@@ -282,6 +283,8 @@ def border_rows(
             e0 = u0 * g_point[p, 0] + u1 * g_point[p, 1] + u2 * g_point[p, 2]
             e1 = w0 * g_point[p, 0] + w1 * g_point[p, 1] + w2 * g_point[p, 2]
             _add_product_to(rhs[f], -e0, -e1, J_camera[k, 0], J_camera[k, 1])
+            l0[:nb], l1[:nb] = J[k, 0], J[k, 1]
+            l0[nb:], l1[nb:] = J_camera[k, 0], J_camera[k, 1]
             n, end = track_start[p], track_start[p + 1]
             while n < end:
                 # shares of one camera's photos in a track are summed before they are multiplied with the photo's own
@@ -293,11 +296,10 @@ def border_rows(
                     _add_product_to(r0, m00, m01, J_camera[n, 0], J_camera[n, 1])
                     _add_product_to(r1, m10, m11, J_camera[n, 0], J_camera[n, 1])
                     n += 1
-                mine = slice(camera * nc, camera * nc + nc)
-                for a in range(nb):
-                    _add_product_to(B[f, a, mine], J[k, 0, a], J[k, 1, a], r0, r1)
-                for a in range(nc):
-                    _add_product_to(B[f, nb + a, mine], J_camera[k, 0, a], J_camera[k, 1, a], r0, r1)
+                for b in range(nc):
+                    _add_product_to(sums[camera, b], r0[b], r1[b], l0, l1)
+        for camera in range(len(sums)):
+            B[f, :, camera * nc : camera * nc + nc] = sums[camera].T
 
 
 @parallel_kernel(fastmath=SUMS)
