@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rsundistort import Camera, Observations, Reconstruction
-from rsundistort.sfm import LEAST_MEASUREMENTS, firmly_connected
+from rsundistort.sfm import LEAST_MEASUREMENTS, firmly_connected, other_scenes
 from rsundistort.sfm.connected import connected_photos
 
 CAMERA = Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]])
@@ -61,3 +61,19 @@ def test_parts_with_a_photo_in_common_are_one():
     # 4 knows its place among 0 to 3 by what 2 and 3 show, and 5 and 6 know theirs by 4
     parts = showing(7, ((0, 1, 2, 3), 200), ((4, 5, 6), 300), ((2, 3, 4), LEAST_MEASUREMENTS))
     assert connected_photos(parts).all()
+
+
+@pytest.mark.parametrize(
+    ("pairs", "says"),
+    [
+        ({(4, 5): 80, (5, 6): 80}, [[4, 5, 6]]),
+        ({(4, 5): 80, (5, 6): 80, (3, 6): 29}, [[4, 5, 6]]),  # by chance
+        ({(4, 5): 80, (5, 6): 80, (3, 6): 80}, []),  # a part that could not be registered
+        ({(4, 5): 80}, []),  # two photos are no scene
+        ({}, []),
+    ],
+)
+def test_photos_that_match_each_other_and_none_that_is_registered_are_another_scene(pairs, says):
+    registered = np.arange(8) < 4
+    found = other_scenes({(0, 1): 90, (1, 2): 90, (2, 3): 90, **pairs}, registered)
+    assert [each.tolist() for each in found] == says

@@ -8,6 +8,8 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from ..batch.one_photo import check_not_rectified
 from ..batch.progress import StageLog
 from ..batch.workers import Workers
@@ -16,7 +18,15 @@ from ..io import MAX_MEGAPIXELS, ExifFacts, facts_of_exif, find_masks, list_phot
 from ..io.kept import Kept
 from ..io.photos.images import stored_size, unread_pictures
 from ..io.places import local_place
-from ..sfm import DETECTION_MEGAPIXELS, Features, detect_features, detection_bytes, edge_width_px, grey_8_bit
+from ..sfm import (
+    DETECTION_MEGAPIXELS,
+    Features,
+    detect_features,
+    detection_bytes,
+    edge_width_px,
+    grey_8_bit,
+    other_scenes,
+)
 from .photo_cameras import PhotoCameras, find_cameras
 
 __all__ = ["LONG_EXPOSURE_S", "LoadedPhotos", "load_photos", "with_finer_features"]
@@ -73,10 +83,17 @@ class LoadedPhotos:
     edges_px: Sequence[float | None] = ()
     coarse: frozenset[str] = frozenset()
 
-    def unregistered(self, registered: Sequence[str]) -> dict[str, str]:
-        """Photos that are not registered, and why."""
-        lost = sorted({*self.names} - {*registered})
-        return {**self.skipped, **dict.fromkeys(lost, "shares too little with the other photos")}
+    def unregistered(
+        self, registered: Sequence[str], num_verified: Mapping[tuple[int, int], int] | None = None
+    ) -> dict[str, str]:
+        """Photos that are not registered, and why; with the number of verified matches of each pair, if it is known."""
+        lost = dict.fromkeys(sorted({*self.names} - {*registered}), "shares too little with the other photos")
+        for scene in other_scenes(num_verified or {}, np.isin(self.names, registered)):
+            others = (
+                f"it and {len(scene) - 1} others that match it show another scene; put them in a folder of their own"
+            )
+            lost |= dict.fromkeys((self.names[i] for i in scene), others)
+        return {**self.skipped, **lost}
 
 
 @dataclass(frozen=True)

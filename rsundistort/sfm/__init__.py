@@ -1,7 +1,7 @@
 """Structure from motion around pycolmap: features, pairs, matching, mapping, re-triangulation."""
 
 from .alignment import PatchPlaces, PatchSource, align_tracks, allowed_patches, cut_patches
-from .connected import LEAST_MEASUREMENTS, LEAST_TIES, connected_photos, firmly_connected
+from .connected import LEAST_MEASUREMENTS, LEAST_TIES, connected_photos, firmly_connected, other_scenes
 from .contradiction import contradicting_photos
 from .database import MatchedPhotos
 from .epipolar import read_num_verified
@@ -47,6 +47,7 @@ __all__ = [
     "map_without_motions",
     "match_photos",
     "matched_of_database",
+    "other_scenes",
     "photos_beside_breaks",
     "read_num_verified",
     "register_photos",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
@@ -16,6 +18,7 @@ __all__ = [
     "connected_parts",
     "connected_photos",
     "firmly_connected",
+    "other_scenes",
 ]
 
 #: A photo with fewer measurements is not registered: a wrong place is worse than none.
@@ -23,6 +26,8 @@ LEAST_MEASUREMENTS = 20
 #: A point of a known place gives two equations, and a photo with its rotation during the readout has nine unknowns:
 #: with fewer points it is anywhere.
 LEAST_TIES = 5
+# Verified matches that two photos of one scene have; photos of two have fewer by chance.
+_LEAST_MATCHES = 30
 # A point is known, depth and all, as soon as so many photos show it.
 _LEAST_PHOTOS = 2
 
@@ -35,6 +40,15 @@ def firmly_connected(reconstruction: Reconstruction) -> Reconstruction:
         rec = rec.take_photos(connected).without_photos(LEAST_MEASUREMENTS)
         connected = connected_photos(rec, LEAST_TIES)
     return rec
+
+
+def other_scenes(num_verified: Mapping[tuple[int, int], int], is_registered: Mask) -> list[Index]:
+    """Sets of three photos or more that match each other, of which none is registered or matches one that is."""
+    m = len(is_registered)
+    pairs = np.array([pair for pair, count in num_verified.items() if count >= _LEAST_MATCHES], int).reshape(-1, 2)
+    label = connected_components(csr_matrix((np.ones(len(pairs)), pairs.T), (m, m)), directed=False)[1]
+    sets = (np.flatnonzero(label == each) for each in np.unique(label[~is_registered]))
+    return [photos for photos in sets if len(photos) > _LEAST_PHOTOS and not is_registered[photos].any()]
 
 
 def common_points(reconstruction: Reconstruction) -> Array:

@@ -28,6 +28,7 @@ from ..input.load import LoadedPhotos
 from ..input.photo_cameras import PhotoCameras
 from ..io.kept import Kept
 from ..model import Reconstruction
+from ..sfm import read_num_verified
 from ..verdict import Verdict, judge
 from .outcome import Solved
 from .placing import place_photos
@@ -112,8 +113,10 @@ def solve_photos(
         photos, scratch, log, seed, matching, kept or Kept(), with_shutter=True, finer=finer
     )  # fmt: skip
     check_enough(mapped, len(photos.names))
+    num_verified = read_num_verified(matched)
     source = TrackSource(matched, photos, workers, mapped_here=True)
     solved = solve_tracks(mapped, photos.cameras, shutter_model, seed, options_of, log, remedy, source, survey)
+    solved = replace(solved, unregistered=photos.unregistered(solved.shared.image_names, num_verified))
     if solved.survey is not None:
         return solved
     # the frame of a mapping is arbitrary

@@ -222,7 +222,7 @@ def _solve(
     contradictions = [gyro_contradiction(rec, from_gyro, gain), *cameras.contradicted(rec.cameras, options_of(rec))]
     for text in filter(None, contradictions):
         warnings.warn(text, RsUndistortWarning, stacklevel=3)
-    return replace(solved, unregistered=loaded.unregistered(rec.image_names), readouts=readouts), solving
+    return replace(solved, readouts=readouts), solving
 
 
 def check_of_video(solving: SolveOptions) -> None:
