@@ -526,15 +526,23 @@ class BundleProblem:
 
         Points that came to lie behind a camera do not see the way back: they may return to where they were before.
         """
-        state = state if before is None else self._with_better_points(state, before.points_w)
+        cost = self._costs_of_points(state)
+        if before is not None:
+            state, cost = self._with_better_points(state, cost, before.points_w)
         steps = self._point_terms(state).steps(self._structure.track_start, *self.blocks(state))
-        return self._with_better_points(state, moved_points(state.points_w, steps, state.center_w[self._nearest]))
+        return self._with_better_points(
+            state, cost, moved_points(state.points_w, steps, state.center_w[self._nearest])
+        )[0]
 
-    def _with_better_points(self, state: State, points_w: Array) -> State:
-        """The state with those of other points (n, 3) whose measurements cost less."""
-        point_idx, other = self._structure.point_idx, replace(state, points_w=points_w)
-        own, others = (np.bincount(point_idx, self.costs(each), len(points_w)) for each in (state, other))
-        return replace(state, points_w=np.where((others < own)[:, None], points_w, state.points_w))
+    def _with_better_points(self, state: State, cost: Array, points_w: Array) -> tuple[State, Array]:
+        """The state with those of other points (n, 3) whose measurements cost less, and costs (n,) of its points."""
+        other = self._costs_of_points(replace(state, points_w=points_w))
+        points_w = np.where((other < cost)[:, None], points_w, state.points_w)
+        return replace(state, points_w=points_w), np.minimum(cost, other)
+
+    def _costs_of_points(self, state: State) -> Array:
+        """(n,) cost of the measurements of each point."""
+        return np.asarray(np.bincount(self._structure.point_idx, self.costs(state), len(state.points_w)))
 
     def costs(self, state: State) -> Array:
         """(o,) cost of each of the equations' measurements."""
