@@ -77,3 +77,8 @@ class ModelChoice:
     rival: float = 0.0
     steps: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     known_gain: float | None = None
+
+    @property
+    def shows_known_motions(self) -> bool:
+        """Whether motions that are known from elsewhere predict the photos better than none, by two standard errors."""
+        return self.known_gain is not None and self.known_gain > 2.0
