@@ -8,7 +8,7 @@ Prints one JSON object a line and at the end a table with targets. Parts, with t
     suppressed (2)    herz-jesus-8 warped by 0.003 to 0.05 rad: what is found of it, and what the photos are worth
     coverage (10)     errors in units of the standard deviations that are reported: their root mean square is to be 1;
                       `alike` is how far sets of the same photos err as one (correlation of two sets' errors);
-                      sample scenes (6) are rendered again, with other motions, and with `--elsewhere` from other
+                      sample scenes (6) are rendered again, with other motions, and with `--elsewhere`, alone, from other
                       places, since what one place makes them err is one draw; their cameras given as "exact", as
                       "drawn", as "wrong", and without a word on how exact they are; `height` is that error of each
                       set, with its sign
@@ -316,7 +316,8 @@ def coverage(bench: Bench) -> None:
     """Normalised errors of all whose truth is known."""
     cases: list[tuple[str, Path, dict[str, Any], rs.Solution]] = []
     # one set of motions says little: the errors of its photos hang together
-    for photos, sigma in ((HERZ, 0.02), (HERZ, 0.05), (f"{FOUNTAIN}/gs", 0.03)):
+    taken = () if bench.elsewhere else ((HERZ, 0.02), (HERZ, 0.05), (f"{FOUNTAIN}/gs", 0.03))
+    for photos, sigma in taken:
         for seed in bench.numbers(10):
             warp = bench.warped(sigma, seed, photos)
             truth = with_poses(rs.read_solution(warp / "ground_truth.json"), bench.still(photos).solution)
@@ -326,7 +327,8 @@ def coverage(bench: Bench) -> None:
                 drawn = bench.camera("drawn", warp / "camera.json", seed)
                 cases.append((f"{photos} by {sigma}, drawn", warp / "photos", drawn, truth))
     fountain = bench.photos / FOUNTAIN
-    cases.append((fountain.name, fountain / "rs", {}, fountain_truth(fountain)))
+    if taken:
+        cases.append((fountain.name, fountain / "rs", {}, fountain_truth(fountain)))
     for name in ("courtyard", "colonnade", "handheld", "flyover"):
         for seed in bench.numbers(6):
             scene = bench.visited(name, seed)
@@ -566,7 +568,7 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", default=list(PARTS), choices=PARTS, metavar="PART")
     parser.add_argument("--seeds", type=int, help="of each part, instead of its own number")
     parser.add_argument("--first-seed", type=int, default=0, help="so that seeds can be held back")
-    parser.add_argument("--elsewhere", action="store_true", help="coverage: photos of scenes from other places")
+    parser.add_argument("--elsewhere", action="store_true", help="coverage: of scenes only, from other places")
     args = parser.parse_args()
     warnings.simplefilter("ignore")
     if not args.photos.is_dir():
