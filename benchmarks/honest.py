@@ -8,8 +8,8 @@ Prints one JSON object a line and at the end a table with targets. Parts, with t
     suppressed (2)    herz-jesus-8 warped by 0.003 to 0.05 rad: what is found of it, and what the photos are worth
     coverage (10)     errors in units of the standard deviations that are reported: their root mean square is to be 1;
                       `alike` is how far sets of the same photos err as one (correlation of two sets' errors);
-                      sample scenes (6) are rendered again, with other motions, and with `--elsewhere`, alone, from other
-                      places, since what one place makes them err is one draw; their cameras given as "exact", as
+                      sample scenes (6) are rendered again, with other motions, and with `--elsewhere` (these only) from
+                      other places, since what one place makes them err is one draw; their cameras given as "exact", as
                       "drawn", as "wrong", and without a word on how exact they are; `height` is that error of each
                       set, with its sign
     calibration (2)   cx and p of herz-jesus-8 with phi3 given, from the calibration's; and what its photos are worth
