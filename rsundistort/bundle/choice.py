@@ -149,12 +149,13 @@ def choose_model(
     plain, best, kept, gain = selection.plain, selection.best, selection.kept, selection.gain
     against, agreement = selection.against if best is plain else [], None
     known = fits.by_known_motions(plain)
+    is_known = known is not None and fits.is_better(plain, known)
     if best is not plain:
         if np.sqrt(np.mean(moved_px(best.reconstruction) ** 2)) < _UNSEEN_PX:
             best = plain
         else:
             # what else bends photos knows nothing of motions that were measured elsewhere
-            if known is None or not fits.is_better(plain, known):
+            if not is_known:
                 against, agreement = _doubts(fits, best, plain, gain)
             if against:
                 best = plain
@@ -186,6 +187,7 @@ def choose_model(
         _rival(fits, best),
         _steps_of_others(fits, best),
         None if known is None else fits.gain(plain, known),
+        is_known,
     )
 
 

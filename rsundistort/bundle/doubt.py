@@ -18,6 +18,7 @@ Hoeting et al., "Bayesian model averaging", 1999).
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +31,7 @@ from .bundle_options import BundleOptions
 from .layout import motion_end
 from .normal_equations import Function, NormalEquations
 
-__all__ = ["Doubt", "steps_to"]
+__all__ = ["Doubt", "steps_after", "steps_to"]
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,18 @@ class Doubt:
         """Variance of a function of the points, and its covariance (m, nb) with the photos' unknowns."""
         moved = self.pulls @ found.with_cameras
         return float(moved @ moved), np.einsum("r,rma->ma", moved, self.photos)
+
+
+def steps_after(
+    steps: Mapping[str, Sequence[float]], before: Reconstruction, after: Reconstruction
+) -> dict[str, tuple[float, ...]]:
+    """Steps of photos, as `steps_to` returns them, of a reconstruction that a similarity has moved since."""
+    R, scale = after.R_cw[0].T @ before.R_cw[0], after.baseline / before.baseline
+    moved = {}
+    for name, each in steps.items():
+        rotation, centre, phi, velocity = np.reshape(each, (4, 3))
+        moved[name] = tuple(np.concatenate([rotation, scale * R @ centre, phi, scale * R @ velocity]).tolist())
+    return moved
 
 
 def steps_to(other: Reconstruction, rec: Reconstruction) -> Array:

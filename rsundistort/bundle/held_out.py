@@ -73,7 +73,7 @@ def hold_out(reconstruction: Reconstruction, share: float = 0.1, seed: int = 0) 
     obs = reconstruction.observations
     rng = np.random.default_rng([seed, 7])
     lengths = np.bincount(obs.point_idx, minlength=reconstruction.num_points)
-    spare = np.flatnonzero(lengths > min(_LEFT_OVER, lengths.max(initial=0) - 1))
+    spare = np.flatnonzero(lengths > max(min(_LEFT_OVER, lengths.max(initial=0) - 1), 2))
     wanted = min(round(share * len(obs)), len(spare))
     chosen = rng.permutation(spare)[:wanted]
     # a random measurement of each chosen point: the first of its own in a random order
@@ -248,6 +248,7 @@ class ModelFits:
         # motions known from elsewhere would make both halves agree
         options = replace(
             self._rough, varying=fit.varying, bends=fit.bends, phi_sigma=phi, velocity_sigma=velocity, known_phi={},
+            known_bends={},
         )  # fmt: skip
         first = half_across_readout(rec)
         try:
@@ -270,7 +271,7 @@ class ModelFits:
         held = {name: (np.zeros(3), np.full(3, _HELD)) for name in self.given.image_names}
         for name, (phi, sigma) in known.items():
             held[name] = np.where(np.isfinite(sigma), phi, 0.0), held[name][1]
-        options = replace(self._rough, varying=plain.varying, known_phi=held)
+        options = replace(self._rough, varying=plain.varying, known_phi=held, still={}, held_phi={})
         return self._adjusted("known motions", "rotation", [plain.reconstruction], options)
 
     def waves(self, fit: ModelFit, sites: int = WAVES, least_px: float = 0.0) -> bool:

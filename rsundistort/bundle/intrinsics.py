@@ -144,6 +144,11 @@ def check_lenses(names: Sequence[str], cameras: Sequence[Camera], what: str = "c
             raise InputError(f"{what} {name} of a {' or '.join(lenses)} lens, expected some of {', '.join(known)}")
 
 
+def has_intrinsic(camera: Camera, name: str) -> bool:
+    """Whether the camera's lens model has this one."""
+    return INTRINSICS[name] < INTRINSICS["k1"] or name in _OF_LENS[camera.lens]
+
+
 def moved_camera(camera: Camera, names: Sequence[str], step: Array) -> Camera:
     """The camera after a step (len(names),): of log f, of cx / fx and cy / fy, and of the lens coefficients."""
     K, lens = np.array(camera.K), camera.coefficients

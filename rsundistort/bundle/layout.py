@@ -102,6 +102,14 @@ class Layout:
         values = [of_groups[each] for each in self.group] + [of_ways[each] for each in self.group[: self.ways]]
         return np.repeat(np.array(values, np.float64), 3)
 
+    def still_bends(self, still: float, depth: float) -> Array:
+        """(3 k,) weights of bends of a photo that was still to an angle per frame, or the translation that acts alike.
+
+        A steady motion by the angle displaces by its twelfth root, root mean square over the lines.
+        """
+        sigma = self.per_bend([still] * len(self.group), [still * depth] * len(self.group))
+        return np.asarray(12.0 / sigma**2)
+
     def values(self, bend: Array, names: Sequence[str]) -> Array:
         """(m, n, 6) values at the sites of coefficients (m, 3 k) of photos."""
         rotations = len(self.group)

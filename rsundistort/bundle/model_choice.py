@@ -57,6 +57,8 @@ class ModelChoice:
     known_gain : float or None
         Fall of the held-out error by motions that are known from elsewhere, none of them fitted, against no motions, in
         standard errors; None if none are known.
+    shows_known_motions : bool
+        Whether that fall counts as better.
     """
 
     shutter_model: str
@@ -77,8 +79,4 @@ class ModelChoice:
     rival: float = 0.0
     steps: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     known_gain: float | None = None
-
-    @property
-    def shows_known_motions(self) -> bool:
-        """Whether motions that are known from elsewhere predict the photos better than none, by two standard errors."""
-        return self.known_gain is not None and self.known_gain > 2.0
+    shows_known_motions: bool = False

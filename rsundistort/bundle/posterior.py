@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..model.array_types import Array
+from ..model.array_types import Array, Mask
 from .bundle_options import BundleOptions, BundleResult
 from .doubt import Doubt
 from .prior_sigmas import PriorSigmas
@@ -99,6 +99,11 @@ class Posterior:
     def relative_information(self) -> Array:
         """By how much more than a normal prior that of each photo's rotation and velocity tells of them (m, 0 to 2)."""
         return self._problem.relative_information(self._state)
+
+    @property
+    def shares(self) -> Mask:
+        """(m, 6) which components of the photos' motions have a mean of their camera."""
+        return self._problem.shares
 
     @property
     def bend_sigmas(self) -> Array:

@@ -143,6 +143,8 @@ class BundleProblem:
         varied = np.array([sigmas.focal, sigmas.centre, sigmas.centre])[: self.layout.num_varying] ** -2.0
         of_bends = self.layout.per_bend(sigmas.bends, sigmas.ways) ** -2.0
         self._own_weight = np.tile(np.concatenate([varied, of_bends]), (len(span), 1))
+        for i, still in ((self._photo(name), still) for name, still in options.still.items() if still > 0):
+            self._own_weight[i, len(varied) :] += self.layout.still_bends(still, self._start.median_depth(i))
         self._lengths = LengthResiduals(self._start, options.lengths)
         self._places = PlaceResiduals(self._start, options.places or KnownPlaces({}))
         self._known, self._known_weight = self._known_motions(span)

@@ -14,7 +14,7 @@ from ..model.reprojection import reprojection_residuals
 from .bundle_options import BundleOptions, BundleResult
 from .common_motion import CommonMotion
 from .doubt import Doubt
-from .intrinsics import pixels_of
+from .intrinsics import has_intrinsic, pixels_of
 from .jackknife import Inflation, inflated, inflation
 from .layout import Layout
 from .normal_equations import NormalEquations
@@ -80,10 +80,11 @@ def _check_solvable(reconstruction: Reconstruction, shutter_model: str, path: Fr
 def _sigma_intrinsics(current: Reconstruction, names: Sequence[str], covariance: Array) -> tuple[dict[str, float], ...]:
     """Standard deviations of each camera's refined intrinsics, in pixels or as coefficients."""
     sigmas = np.sqrt(np.diagonal(covariance)).reshape(len(current.cameras), -1)
-    return tuple(
-        dict(zip(names, (sigma[: len(names)] * pixels_of(camera, names)).tolist(), strict=True))
-        for camera, sigma in zip(current.cameras, sigmas, strict=True)
-    )
+    found = []
+    for camera, sigma in zip(current.cameras, sigmas, strict=True):
+        values = (sigma[: len(names)] * pixels_of(camera, names)).tolist()
+        found.append({name: each for name, each in zip(names, values, strict=True) if has_intrinsic(camera, name)})
+    return tuple(found)
 
 
 class Rounds:

@@ -140,7 +140,7 @@ def _with_view(
     name = f"advice {rec.num_images}"
     return replace(
         rec.with_photos([name], rec.camera_idx[[like]], R_cw[None], center_w[None], np.zeros((1, 3))),
-        bend_clock=np.concatenate([rec.bend_clock, rec.bend_clock[-1:]]),
+        bend_clock=np.concatenate([rec.bend_clock, rec.bend_clock[[like]]]),
         variation=np.concatenate([rec.variation, rec.variation[[like]]]),
         observations=Observations(
             np.concatenate([obs.frame_idx, np.full(len(mine), rec.num_images)]),

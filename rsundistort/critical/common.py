@@ -122,7 +122,9 @@ def _row_motion(rec: Reconstruction, nb: int) -> tuple[Array, Array]:
     span, order = rec.frame_span(), row_phi(rec)
     forward, back = np.zeros((m, k, nb)), np.zeros((m, k, k))
     for i in range(m):
-        rotation = np.eye(3)[order[i]]
+        sign = rec.camera(i).clock_sign
+        by_rows = np.diag([1.0, 1.0, sign]) * sign
+        rotation = by_rows if order[i, 0] == 0 else np.array([[0.0, -sign, 0.0], [sign, 0.0, 0.0], [0.0, 0.0, 1.0]])
         forward[i, :3, 6:9] = span[i] * rotation
         back[i, :3, :3] = rotation.T / span[i]
         if k > 3:

@@ -134,7 +134,7 @@ def still_probability(result: BundleResult, options: BundleOptions | None = None
 
     # of the motion, all that the prior of its own photo did not say: exp(pull x - x' (inside) x / 2)
     inside = np.linalg.inv(covariance)
-    mean, phi_sigma, velocity_sigma = _expected(result)
+    mean, phi_sigma, velocity_sigma = _expected(result, freed)
     mean = np.hstack([mean[:, :steady], np.zeros((m, len(bends)))])
     of_tails = freed.relative_information
     of_tails = np.pad(of_tails, ((0, 0), (0, 2 - of_tails.shape[1])), constant_values=1.0) ** -0.5
@@ -155,15 +155,19 @@ def still_probability(result: BundleResult, options: BundleOptions | None = None
     return 1.0 / (1.0 + np.exp(-np.clip(odds, -500, 500)))
 
 
-def _expected(result: BundleResult) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _expected(
+    result: BundleResult, freed: Posterior
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Motions (m, 6) of photos by their prior, and its standard deviations (m,) of phi and velocity, per frame."""
     rec, common = result.reconstruction, result.common
     own = np.array([result.phi_sigma, result.velocity_sigma * rec.baseline])
     if common is None:
         return np.zeros((rec.num_images, 6)), *np.repeat(own[:, None], rec.num_images, axis=1)
     per_unit = np.repeat([1.0, rec.baseline], 3)
-    means = MotionMeans.of(rec, common.sigmas, np.ones((rec.num_images, 6), bool)).at(per_unit * common.values)
-    of_means = np.mean((per_unit * common.deviations).reshape(-1, 2, 3) ** 2, axis=2)[rec.camera_idx]
+    # of a camera with few photos, and of a photo with a limit of its own, the motion is its own
+    means = MotionMeans.of(rec, common.sigmas, freed.shares).at(per_unit * common.values)
+    of_means = (per_unit * common.deviations)[rec.camera_idx] ** 2 * freed.shares
+    of_means = of_means.reshape(-1, 2, 3).mean(axis=2)
     return means, *np.sqrt(own**2 + of_means).T
 
 

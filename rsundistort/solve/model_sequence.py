@@ -22,6 +22,7 @@ from ..bundle import (
     choose_model,
     choose_readouts,
 )
+from ..bundle.doubt import steps_after
 from ..critical import advise, heal, with_remedy
 from ..errors import RsUndistortWarning
 from ..input.load import LoadedPhotos
@@ -220,6 +221,7 @@ def _with_control(
     options = replace(options, places=None if placed is None else placed.known(tracks))
     if placed is not None:
         shutter_model = result.reconstruction.shutter_model
+        options = replace(options, rival=steps_after(options.rival, result.reconstruction, tracks))
         result = bundle_adjust(tracks, shutter_model, options, partial(tell, log, "control points"))
     log.end("control points", points=0 if placed is None else len(placed.holding))
     return placed, result, options

@@ -187,7 +187,7 @@ def solution_of(solved: Solved, options: SolveOptions, rectify: RectifyOptions) 
             "interpolation": rectify.interpolation,
             "quality": rectify.quality,
             "raw_as": rectify.raw_as,
-            "refine": list(solved.result.sigma_intrinsics[0]),
+            "refine": list(dict.fromkeys(name for each in solved.result.sigma_intrinsics for name in each)),
             "still": dict(options.still),
             "known": sorted(options.known),
             "lengths": len(options.lengths),
