@@ -578,3 +578,14 @@ def test_measurements_that_are_no_numbers_are_refused(value, rng):
     xy[3, 1] = value
     with pytest.raises(InputError, match="xy_raw holds NaN or infinity"):
         replace(obs, xy_raw=xy)
+
+
+def test_of_points_that_two_photos_see_nothing_is_held_out(rng):
+    rec = make_scene(rng, "rotation", num_images=5, num_points=600, noise_px=0.1)
+    obs = rec.observations
+    pairs = np.array([(a, b) for a in range(5) for b in range(a)])
+    seen = pairs[rng.integers(0, len(pairs), rec.num_points)]
+    rec = rec.with_points((obs.frame_idx[:, None] == seen[obs.point_idx]).any(1))
+    fitted, held = hold_out(rec)
+    assert fitted.all()
+    assert not held.any()

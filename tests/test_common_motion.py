@@ -17,6 +17,7 @@ from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.critical import advise, clock_contrast, common_motion, heal, shape_cost, still_probability
 from rsundistort.errors import InputError
+from rsundistort.model.orientation import orient_reconstruction
 
 MODEL = "constant-motion"
 NOISE_PX = 0.5
@@ -415,3 +416,27 @@ def test_velocities_without_a_common_direction_have_no_mean(rng):
     truth = flight(rng, np.zeros(3))
     result = bundle_adjust(truth, MODEL)
     assert (np.abs(result.common.values) <= 2.5 * result.common.deviations)[:, 3:].all()
+
+
+@pytest.mark.parametrize("orientation", [3, 6, 8])
+def test_what_is_in_common_does_not_depend_on_how_photos_are_stored(orientation, rng):
+    scene = moving(named_scene("5 degrees", m=8, num_points=150), rng, way=0.0)
+    scene = replace(scene, cameras=[scene.cameras[0]], camera_idx=np.zeros(8, int))
+    scene = replace(measured(scene, rng), shutter_model="rotation")
+    turned = orient_reconstruction(scene, dict.fromkeys(scene.image_names[::2], orientation))
+    sigma, of_turned = (common_motion(bundle_adjust(each, "rotation", KNOWN), KNOWN).sigma for each in (scene, turned))
+    # photos stored otherwise are a camera of their own, with a mean of its own
+    np.testing.assert_allclose(of_turned[:3], sigma[:3], rtol=0.1)
+
+
+def test_a_camera_of_two_photos_says_nothing_of_how_they_move(rng):
+    scene = moving(named_scene("parallel", m=9, num_points=150), rng)
+    travels = scene.velocity + 0.3 * scene.baseline / scene.frame_span()[:, None] * [1.0, 0.0, 0.4]
+    first, other = scene.cameras[0], replace(scene.cameras[0], K=scene.cameras[0].K * [[1.001], [1.001], [1.0]])
+    scene = replace(scene, cameras=[first, other], camera_idx=np.array([0] * 7 + [1] * 2), velocity=travels)
+    truth = measured(scene, rng)
+    result = bundle_adjust(truth, MODEL, ESTIMATED)
+    shares = Posterior(result, ESTIMATED).shares
+    assert shares[:7].all()
+    assert not shares[7:].any()
+    assert still_probability(result, ESTIMATED)[7:].max() < 0.5

@@ -291,3 +291,29 @@ def test_a_calibration_whose_tangential_terms_are_plainly_wrong_may_be_decentred
     )
     assert as_given == before == other
     assert contradicted / as_given == pytest.approx(np.sqrt((9 + 8**2) / (9 + 2)))
+
+
+def test_motions_may_be_known_of_some_photos_and_others_still(rng):
+    scene = make_scene(rng, "rotation", num_images=12, num_points=300, noise_px=0.1, phi_size=0.05)
+    phi = scene.phi * scene.frame_span()[:, None]
+    known = {name: (each, np.full(3, 1e-3)) for name, each in zip(scene.image_names[1:], phi[1:], strict=True)}
+    still = {scene.image_names[0]: 1e-3}
+    rec = replace(scene, phi=np.zeros_like(scene.phi), shutter_model="global")
+    for options in (
+        BundleOptions(known_phi=known, still=still),
+        BundleOptions(known_phi=known, held_phi={"0.jpg": (0,)}),
+    ):
+        choice = choose_model(rec, options=options, sigma_px=0.1)
+        assert choice.shows_known_motions
+        assert choice.shutter == "found"
+
+
+def test_deviations_are_those_of_each_lens(rng):
+    scene = make_scene(rng, "rotation", num_images=8, num_points=100, noise_px=0.3)
+    pinhole = scene.cameras[0]
+    fisheye = replace(pinhole, lens="fisheye", dist=np.zeros(4))
+    both = replace(scene, cameras=[pinhole, fisheye], camera_idx=np.arange(8) % 2)
+    options = BundleOptions(refine=("f", "k1", "k2", "p1", "p2", "k3", "k4"), outlier_rounds=0, loss="squared")
+    of_pinhole, of_fisheye = bundle_adjust(both, "global", options).sigma_intrinsics
+    assert list(of_pinhole) == ["f", "k1", "k2", "p1", "p2", "k3"]
+    assert list(of_fisheye) == ["f", "k1", "k2", "k3", "k4"]

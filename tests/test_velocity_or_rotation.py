@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, Observations, Reconstruction, RowMotion, project_points
 from rsundistort.bundle import BundleOptions, Posterior, bundle_adjust, choose_model
-from rsundistort.bundle.doubt import steps_to
+from rsundistort.bundle.doubt import steps_after, steps_to
 from rsundistort.model.reprojection import shutter_displacements
 from rsundistort.verdict.judge import _rival_reasons
 
@@ -109,3 +109,15 @@ def test_steps_from_one_solution_to_another_do_not_depend_on_the_frames(rng):
     moved = other.moved(Rotation.from_rotvec([0.3, -0.2, 1.0]).as_matrix(), np.array([3.0, 1.0, -2.0]), 1.7)
     expected = np.hstack([np.zeros((6, 6)), phi, velocity])
     assert_allclose(steps_to(moved, rec), expected, atol=1e-9)
+
+
+def test_steps_go_along_with_a_frame_that_moves(rng):
+    rec = flight(rng, 6, drift=0.5)
+    other = replace(
+        rec, center_w=rec.center_w + rng.normal(0, 0.01, (6, 3)), phi=rec.phi + 1e-4,
+        velocity=rec.velocity + rng.normal(0, 1e-3, (6, 3)),
+    )  # fmt: skip
+    steps = dict(zip(rec.image_names, map(tuple, steps_to(other, rec).tolist()), strict=True))
+    moved = rec.moved(Rotation.from_rotvec([0.3, -0.2, 1.0]).as_matrix(), np.array([3.0, 1.0, -2.0]), 1.7)
+    found = steps_after(steps, rec, moved)
+    assert_allclose([found[name] for name in rec.image_names], steps_to(other, moved), atol=1e-9)
