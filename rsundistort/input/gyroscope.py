@@ -124,8 +124,8 @@ def gyro_contradiction(
 ) -> str | None:
     """A warning, if a solution contradicts the motions by a gyroscope.
 
-    One with a shutter has motions of its own; of one without, `ModelChoice.known_gain` says whether these motions
-    predict the photos better than none.
+    `gain` is `ModelChoice.known_gain`: whether these motions predict the photos better than none. Of a solution with a
+    shutter, its own motions are compared with them as well.
     """
     if not known:
         return None
@@ -133,15 +133,15 @@ def gyro_contradiction(
         "check the offset of its clock (--gyro-offset), its axes (--gyro-axes) and the time of the readout "
         "(--readout-ms)"
     )
-    if rec.shutter_model == "global":
-        size = [np.asarray(phi) / np.asarray(sigma) for phi, sigma in known.values()]
-        # what is within its own uncertainty may predict worse than none
-        if gain is None or gain > -_FAR or np.sqrt(np.mean(np.square(size))) <= _FAR:
-            return None
+    size = [np.asarray(phi) / np.asarray(sigma) for phi, sigma in known.values()]
+    # what is within its own uncertainty may predict worse than none
+    if gain is not None and gain <= -_FAR and np.sqrt(np.mean(np.square(size))) > _FAR:
         return (
             f"the photos contradict the gyroscope: its motions predict them worse than none, by {-gain:.0f} standard "
-            f"errors, and were not used; {check}, or the camera has no rolling shutter, or stabilises its photos"
+            f"errors; {check}, or the camera has no rolling shutter, or stabilises its photos"
         )
+    if rec.shutter_model == "global":
+        return None
     span = rec.frame_span()
     misses = [
         (rec.phi[i] * span[i] - np.asarray(known[name][0])) / np.asarray(known[name][1])
