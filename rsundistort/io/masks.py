@@ -77,5 +77,7 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8]:
             f"mask {path} has {pixels.shape[1]}x{pixels.shape[0]} pixels, its photo {width}x{height}; "
             "masks are of the stored photo, not rotated"
         )
+    if pixels.any() and pixels.max() < 128:
+        raise InputError(f"mask {path} holds values up to {pixels.max()}, expected 0 and 255; nothing of it is white")
     # masks kept as JPEG are not quite black and white
     return np.where(pixels >= 128, 255, 0).astype(np.uint8)

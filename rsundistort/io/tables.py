@@ -17,6 +17,14 @@ def read_table(path: Path) -> tuple[list[str], list[dict[str, str]]]:
             reader = csv.DictReader(file, restval="")
             columns = [column.strip() for column in reader.fieldnames or []]
             reader.fieldnames = columns
-            return columns, [{column: row[column].strip() for column in columns} for row in reader]
+            rows = []
+            for row in reader:
+                if None in row:
+                    raise FileError(
+                        f"{path}, line {reader.line_num} has more cells than the {len(columns)} columns of its header; "
+                        "numbers take a decimal point"
+                    )
+                rows.append({column: row[column].strip() for column in columns})
+            return columns, rows
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise FileError(f"{path} is no readable CSV file: {error}") from error

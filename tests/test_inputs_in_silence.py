@@ -1,0 +1,46 @@
+"""Inputs that would be read otherwise than they were meant."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from bundle_scenes import make_scene
+
+from rsundistort.errors import FileError, InputError
+from rsundistort.input.photo_cameras import camera_file_of
+from rsundistort.io import read_known_motions
+from rsundistort.io.masks import read_mask
+
+
+def test_a_decimal_comma_is_no_further_cell(tmp_path):
+    table = tmp_path / "known.csv"
+    table.write_text("name,phi1,phi2,phi3,sigma\na.jpg,0,01,0,02,0,03,0,001\n")
+    with pytest.raises(FileError, match=r"line 2 has more cells than the 5 columns .* decimal point"):
+        read_known_motions(table)
+
+
+def test_a_mask_of_zeros_and_ones_is_not_taken_for_black(tmp_path):
+    file = tmp_path / "mask.png"
+    cv2.imwrite(str(file), np.eye(8, dtype=np.uint8))
+    with pytest.raises(InputError, match="values up to 1, expected 0 and 255"):
+        read_mask(file, 8, 8)
+
+
+def test_a_camera_is_found_beside_the_folder_that_one_is_in(tmp_path, monkeypatch):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "camera.json").write_text("{}")
+    monkeypatch.chdir(tmp_path / "photos")
+    found = camera_file_of(type(tmp_path)("."), None)
+    assert found is not None
+    assert found.samefile(tmp_path / "camera.json")
+
+
+def test_photos_that_come_later_have_motions_where_others_are_unsteady(rng):
+    scene = make_scene(rng, "rotation", num_images=4, num_points=20)
+    bent = replace(scene, bend=np.full((4, 5, 6), 1e-4), bend_clock=np.tile([-0.5, 0.5], (4, 1)))
+    more = bent.with_photos(["late.jpg"], np.zeros(1, int), np.eye(3)[None], np.zeros((1, 3)), np.full((1, 3), 0.01))
+    assert (more.bend_clock[4] == [-1.0, 1.0]).all()
+    np.testing.assert_allclose(more.motion(4).phi, 0.01)
