@@ -205,6 +205,7 @@ class ModelFits:
         return self.done[label]
 
     def _adjusted(self, label: str, model: str, starts: Sequence[Reconstruction], options: BundleOptions) -> ModelFit:
+        """A model adjusted from the cheapest of some starts, and its held-out errors."""
         step = None if self._progress is None else partial(self._progress, label)
         # the given motions belong to the given poses and lens: with those of another model they do not fit. The cheaper
         # start guarantees that a model never ends above the simpler one, which it contains
@@ -261,16 +262,17 @@ class ModelFits:
         return float((one * other).sum() / scale) if scale > 0 else 0.0
 
     def by_known_motions(self, plain: ModelFit) -> ModelFit | None:
-        """The same lens with motions as they are known from elsewhere, as by a gyroscope; None if none are known.
+        """The same lens with motions as they are known from elsewhere, as by a gyroscope.
 
-        No motion is fitted to the photos, and what else bends them knows nothing of these.
+        None if none are known, or nothing is held out to judge by. No motion is fitted to the photos, and what else
+        bends them knows nothing of these.
         """
         known = self._rough.known_phi
-        if not known:
+        if not known or not len(self.held_out):
             return None
-        held = {name: (np.zeros(3), np.full(3, _HELD)) for name in self.given.image_names}
-        for name, (phi, sigma) in known.items():
-            held[name] = np.where(np.isfinite(sigma), phi, 0.0), held[name][1]
+        exactly = np.full(3, _HELD)
+        held = {name: (np.zeros(3), exactly) for name in self.given.image_names}
+        held |= {name: (np.where(np.isfinite(sigma), phi, 0.0), exactly) for name, (phi, sigma) in known.items()}
         options = replace(self._rough, varying=plain.varying, known_phi=held, still={}, held_phi={})
         return self._adjusted("known motions", "rotation", [plain.reconstruction], options)
 

@@ -105,7 +105,7 @@ class Layout:
     def still_bends(self, still: float, depth: float) -> Array:
         """(3 k,) weights of bends of a photo that was still to an angle per frame, or the translation that acts alike.
 
-        A steady motion by the angle displaces by its twelfth root, root mean square over the lines.
+        A steady motion by this angle has a root mean square of angle / sqrt(12) over the lines.
         """
         sigma = self.per_bend([still] * len(self.group), [still * depth] * len(self.group))
         return np.asarray(12.0 / sigma**2)

@@ -89,10 +89,8 @@ class LoadedPhotos:
         """Photos that are not registered, and why; with the number of verified matches of each pair, if it is known."""
         lost = dict.fromkeys(sorted({*self.names} - {*registered}), "shares too little with the other photos")
         for scene in other_scenes(num_verified or {}, np.isin(self.names, registered)):
-            others = (
-                f"it and {len(scene) - 1} others that match it show another scene; put them in a folder of their own"
-            )
-            lost |= dict.fromkeys((self.names[i] for i in scene), others)
+            why = f"shows another scene, with {len(scene) - 1} other photos; put them in a folder of their own"
+            lost |= dict.fromkeys((self.names[i] for i in scene), why)
         return {**self.skipped, **lost}
 
 

@@ -184,8 +184,9 @@ def camera_file_of(folder: Path, camera: str | None) -> Path | None:
     """
     if camera is not None:
         return Path(camera) if os.path.exists(camera) else None
-    whole = Path(os.path.abspath(folder))  # the parent of "." is none
-    for parent in (whole, whole.parent) if folder.name in ("", "..") else (folder, folder.parent):
+    # "." and ".." have no parent of their own
+    around = Path(os.path.abspath(folder)).parent if folder.name in ("", "..") else folder.parent
+    for parent in (folder, around):
         beside = [parent / name for name in _BESIDE if (parent / name).is_file()]
         if len(beside) > 1:
             raise InputError(f"{parent} holds {' and '.join(_BESIDE)}; remove one, or say --camera which to use")

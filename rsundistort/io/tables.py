@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from ..errors import FileError
+from ..errors import FileError, FormatError
 
 __all__ = ["read_table"]
 
@@ -19,8 +19,9 @@ def read_table(path: Path) -> tuple[list[str], list[dict[str, str]]]:
             reader.fieldnames = columns
             rows = []
             for row in reader:
-                if None in row:
-                    raise FileError(
+                # spreadsheets end lines with empty cells
+                if any(row.get(None, ())):
+                    raise FormatError(
                         f"{path}, line {reader.line_num} has more cells than the {len(columns)} columns of its header; "
                         "numbers take a decimal point"
                     )

@@ -276,8 +276,8 @@ class Reconstruction:
         self, names: Sequence[str], camera_idx: Index, R_cw: Array, center_w: Array, phi: Array
     ) -> Reconstruction:
         """The reconstruction with more photos at its end, that rotate steadily and have no measurements yet."""
-        given = {"camera_idx": camera_idx, "R_cw": R_cw, "center_w": center_w, "phi": phi}
-        given["bend_clock"] = np.tile([-1.0, 1.0], (len(names), 1))  # of a bend that is none
+        clock = np.tile([-1.0, 1.0], (len(names), 1))  # of a bend that is none
+        given = {"camera_idx": camera_idx, "R_cw": R_cw, "center_w": center_w, "phi": phi, "bend_clock": clock}
         rows: dict[str, Any] = {
             name: np.concatenate([own, given.get(name, np.zeros((len(names), *own.shape[1:])))])
             for name, own in self.rows(slice(None)).items()

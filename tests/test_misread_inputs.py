@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from bundle_scenes import make_scene
 
-from rsundistort.errors import FileError, InputError
+from rsundistort.errors import FormatError, InputError
 from rsundistort.input.photo_cameras import camera_file_of
 from rsundistort.io import read_known_motions
 from rsundistort.io.masks import read_mask
@@ -18,8 +19,10 @@ from rsundistort.io.masks import read_mask
 def test_a_decimal_comma_is_no_further_cell(tmp_path):
     table = tmp_path / "known.csv"
     table.write_text("name,phi1,phi2,phi3,sigma\na.jpg,0,01,0,02,0,03,0,001\n")
-    with pytest.raises(FileError, match=r"line 2 has more cells than the 5 columns .* decimal point"):
+    with pytest.raises(FormatError, match=r"^.*known\.csv, line 2 has more cells than the 5 columns .* decimal point"):
         read_known_motions(table)
+    table.write_text("name,phi1,phi2,phi3,sigma\na.jpg,0.01,0.02,0.03,0.001,,\n")
+    assert read_known_motions(table)["a.jpg"][0] == pytest.approx([0.01, 0.02, 0.03])
 
 
 def test_a_mask_of_zeros_and_ones_is_not_taken_for_black(tmp_path):
@@ -33,7 +36,7 @@ def test_a_camera_is_found_beside_the_folder_that_one_is_in(tmp_path, monkeypatc
     (tmp_path / "photos").mkdir()
     (tmp_path / "camera.json").write_text("{}")
     monkeypatch.chdir(tmp_path / "photos")
-    found = camera_file_of(type(tmp_path)("."), None)
+    found = camera_file_of(Path("."), None)
     assert found is not None
     assert found.samefile(tmp_path / "camera.json")
 
