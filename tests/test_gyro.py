@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, GyroOptions, RowMotion, RsUndistortWarning
 from rsundistort.errors import FileError, FormatError, InputError
-from rsundistort.input.gyroscope import gyro_contradiction, gyro_motions, known_readouts
+from rsundistort.input.gyroscope import gyro_motions, known_contradiction, known_readouts
 from rsundistort.io import (
     GyroLog,
     VideoFrames,
@@ -170,22 +170,27 @@ def test_mean_of_a_piecewise_linear_rate_is_exact(rng):
     assert uneven.mean(np.array(10.3), np.array(31.7)) == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_solution_far_from_the_gyroscope_is_reported():
+def test_a_solution_far_from_known_motions_is_reported():
     rec = named_scene("random", m=4)
     found = np.array([[0.02, -0.01, 0.03], [0.01, 0.02, 0.0], [-0.02, 0.01, 0.01], [0.0, 0.0, 0.02]])
     rec = replace(rec, shutter_model="rotation", phi=found / rec.frame_span()[:, None])
     near = {name: (phi + 0.001, np.full(3, 0.001)) for name, phi in zip(rec.image_names, found, strict=True)}
-    assert gyro_contradiction(rec, near) is None
-    assert gyro_contradiction(rec, {}) is None
+    assert known_contradiction(rec, near, {}) is None
+    assert known_contradiction(rec, {}, {}) is None
     reversed_ = {name: (-phi, np.full(3, 0.001)) for name, phi in zip(rec.image_names[1:], found[1:], strict=True)}
     # twice the root mean square of nine numbers that sum, squared, to 15e-4
-    assert "by 26 times its uncertainty" in (gyro_contradiction(rec, reversed_) or "")
+    assert "gyroscope, by 26 times the uncertainty" in (known_contradiction(rec, reversed_, {}) or "")
+    assert "(--known), by 26 times the uncertainty" in (known_contradiction(rec, {}, reversed_) or "")
+    one, other = dict(list(reversed_.items())[:1]), dict(list(reversed_.items())[1:])
+    assert "the gyroscope and the known motions (--known), by 26" in (known_contradiction(rec, one, other) or "")
     still = replace(rec, shutter_model="global")
-    assert gyro_contradiction(still, reversed_) is None
-    assert gyro_contradiction(still, reversed_, 2.5) is None
-    assert "predict them worse than none, by 12 standard errors" in (gyro_contradiction(still, reversed_, -12.3) or "")
+    assert known_contradiction(still, reversed_, {}) is None
+    assert known_contradiction(still, reversed_, {}, 2.5) is None
+    assert "predict them worse than none, by 12 standard errors" in (
+        known_contradiction(still, reversed_, {}, -12.3) or ""
+    )
     unsure = {name: (phi, np.full(3, 0.02)) for name, (phi, _) in reversed_.items()}
-    assert gyro_contradiction(still, unsure, -12.3) is None
+    assert known_contradiction(still, unsure, {}, -12.3) is None
 
 
 # ---------------------------------------------------------------- what the log covers

@@ -13,6 +13,7 @@ from bundle_scenes import make_scene
 from rsundistort.errors import FormatError, InputError
 from rsundistort.input.photo_cameras import camera_file_of
 from rsundistort.io import read_known_motions
+from rsundistort.io.gyro import read_gyro
 from rsundistort.io.masks import read_mask
 
 
@@ -23,6 +24,22 @@ def test_a_decimal_comma_is_no_further_cell(tmp_path):
         read_known_motions(table)
     table.write_text("name,phi1,phi2,phi3,sigma\na.jpg,0.01,0.02,0.03,0.001,,\n")
     assert read_known_motions(table)["a.jpg"][0] == pytest.approx([0.01, 0.02, 0.03])
+
+
+@pytest.mark.parametrize(("column", "readout_s"), [("phi", None), ("omega", 0.03)])
+def test_known_motions_in_degrees_are_refused(tmp_path, column, readout_s):
+    table = tmp_path / "known.csv"
+    value = 2.0 if readout_s is None else 2.0 / readout_s
+    table.write_text(f"name,{column}1,{column}2,{column}3,sigma\na.jpg,0,{value},0,0.001\n")
+    with pytest.raises(FormatError, match=rf"line 2 \(a\.jpg\): {column}2=.* which is 2 rad .* degrees"):
+        read_known_motions(table, readout_s)
+
+
+def test_a_gyroscope_in_degrees_is_refused(tmp_path):
+    log = tmp_path / "gyro.csv"
+    log.write_text("time_s,wx,wy,wz\n0,0,-120,0\n0.01,0,30,0\n")
+    with pytest.raises(FormatError, match=r"gyro\.csv has rates up to 120, .* degrees per second"):
+        read_gyro(log)
 
 
 def test_a_mask_of_zeros_and_ones_is_not_taken_for_black(tmp_path):

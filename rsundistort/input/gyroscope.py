@@ -19,7 +19,7 @@ from ..io.video import FRAME_TABLE, VideoFrames
 from ..model import Bend, Camera, Reconstruction
 from ..model.checks import check_fields
 
-__all__ = ["GyroOptions", "Readouts", "gyro_contradiction", "gyro_motions", "known_readouts"]
+__all__ = ["GyroOptions", "Readouts", "gyro_motions", "known_contradiction", "known_readouts"]
 
 #: By camera: readout time of a frame in seconds, and its source.
 Readouts = dict[int, tuple[float, str]]
@@ -119,25 +119,35 @@ def gyro_motions(
     return {name: (found[name][0], sigma) for name, (_, sigma) in known.items()}, {k: v for k, (_, v) in found.items()}
 
 
-def gyro_contradiction(
-    rec: Reconstruction, known: Mapping[str, tuple[ArrayLike, ArrayLike]], gain: float | None = None
+def known_contradiction(
+    rec: Reconstruction,
+    from_gyro: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    specified: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    gain: float | None = None,
 ) -> str | None:
-    """A warning, if a solution contradicts the motions by a gyroscope.
+    """A warning, if a solution contradicts the motions that are known, by a gyroscope or as the user specified them.
 
     `gain` is `ModelChoice.known_gain`: whether these motions predict the photos better than none. Of a solution with a
     shutter, its own motions are compared with them as well.
     """
+    known = {**specified, **from_gyro}
     if not known:
         return None
-    check = (
-        "check the offset of its clock (--gyro-offset), its axes (--gyro-axes) and the time of the readout "
-        "(--readout-ms)"
-    )
+    sources, checks = [], []
+    if from_gyro:
+        sources.append("the gyroscope")
+        checks.append(
+            "the offset of its clock (--gyro-offset), its axes (--gyro-axes) and the time of the readout (--readout-ms)"
+        )
+    if specified:
+        sources.append("the known motions (--known)")
+        checks.append("to which photos they belong, their signs, and their unit, radians")
+    source, check = " and ".join(sources), f"check {', and '.join(checks)}"
     size = [np.asarray(phi) / np.asarray(sigma) for phi, sigma in known.values()]
     # what is within its own uncertainty may predict worse than none
     if gain is not None and gain <= -_FAR and np.sqrt(np.mean(np.square(size))) > _FAR:
         return (
-            f"the photos contradict the gyroscope: its motions predict them worse than none, by {-gain:.0f} standard "
+            f"the photos contradict {source}: such motions predict them worse than none, by {-gain:.0f} standard "
             f"errors; {check}, or the camera has no rolling shutter, or stabilises its photos"
         )
     if rec.shutter_model == "global":
@@ -151,4 +161,4 @@ def gyro_contradiction(
     far = float(np.sqrt(np.mean(np.square(misses)))) if misses else 0.0
     if far <= _FAR:
         return None
-    return f"the photos contradict the gyroscope, by {far:.0f} times its uncertainty; {check}"
+    return f"the photos contradict {source}, by {far:.0f} times the uncertainty of these motions; {check}"

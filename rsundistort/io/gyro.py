@@ -35,6 +35,8 @@ __all__ = [
     "read_photo_times",
 ]
 
+# rad/s. Gyroscopes of cameras and phones measure up to 2,000 degrees per second, the fastest up to 4,000.
+_FASTEST = np.deg2rad(4000.0)
 # rad/s. Zero-rate offset of a gyroscope that was calibrated once: half a degree per second.
 _BIAS = 0.01
 # Of the time of the readout: tables and lines counted by eye are right to a millisecond of thirty.
@@ -238,6 +240,11 @@ def _log(
     """A log in which samples that were written with one time are one, their mean."""
     times, index, count = np.unique(time_s, return_inverse=True, return_counts=True)
     mean = np.stack([np.bincount(index, omega_c[:, k]) for k in range(3)], axis=1) / count[:, None]
+    if (fastest := float(np.abs(mean).max(initial=0.0))) > _FASTEST:
+        raise FormatError(
+            f"{path} has rates up to {fastest:.3g}, which no gyroscope measures in rad/s: are they in degrees "
+            "per second? One is 0.01745 rad/s (in .gcsv: its gscale)"
+        )
     with format_errors(path):
         return GyroLog(times, mean, readout_s)
 

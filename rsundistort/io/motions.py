@@ -14,6 +14,8 @@ __all__ = ["read_known_motions"]
 
 # A standard deviation of so many radians knows nothing.
 _UNKNOWN = 1e6
+# rad per frame. No camera is rotated by more: a quarter of a turn in the 10 to 60 ms of a readout.
+_MOST = np.pi / 2
 
 Known = dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
 
@@ -40,7 +42,8 @@ def read_known_motions(path: Path | str, readout_s: float | None = None) -> Know
     Raises
     ------
     FileError, FormatError
-        Not readable; mixed units, missing columns, numbers that are none, sigmas that are not positive, a name twice.
+        Not readable; mixed units, missing columns, numbers that are none, sigmas that are not positive, motions beyond
+        a quarter of a turn per frame, a name twice.
     """
     path = Path(path)
     columns, rows = read_table(path)
@@ -74,6 +77,11 @@ def read_known_motions(path: Path | str, readout_s: float | None = None) -> Know
                 raise FormatError(
                     f"{where}: {units[0]}{k + 1}={text}, sigma={spread}: sigma must be positive, and an unknown "
                     "component's cell is empty"
+                )
+            if abs(phi[k]) > _MOST:
+                raise FormatError(
+                    f"{where}: {units[0]}{k + 1}={text}, which is {abs(phi[k]):.3g} rad while a frame is read; no "
+                    "camera rotates so fast: is it in degrees? One degree is 0.01745 rad"
                 )
         found[name] = (phi, sigma)
     return found

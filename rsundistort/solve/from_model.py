@@ -17,7 +17,7 @@ from ..colmap.conventions import kept_log_level
 from ..colmap.measured_model import ColmapModel, colmap_model_of, surviving_points
 from ..colmap.rectified_model import ModelIds, colmap_model
 from ..errors import FileError, InputError, ReconstructionError, RsUndistortWarning
-from ..input.gyroscope import known_readouts
+from ..input.gyroscope import known_contradiction, known_readouts
 from ..input.photo_cameras import PhotoCameras, check_readouts
 from ..io import ExifFacts, guess_readouts, list_photos, output_folder, output_name, read_exif, read_solution
 from ..io.metashape import is_metashape
@@ -401,7 +401,12 @@ def _solve(
     if solved.survey is None:  # the model's frame is kept
         solved = replace(solved, georeference=given.georeference)
     after = solved.shared
-    for text in cameras.contradicted(after.cameras, fitting):
+    gain = None if solved.choice is None else solved.choice.known_gain
+    contradictions = [
+        known_contradiction(after, {}, options.known, gain),
+        *cameras.contradicted(after.cameras, fitting),
+    ]
+    for text in filter(None, contradictions):
         warnings.warn(text, RsUndistortWarning, stacklevel=4)
     lost = dict.fromkeys(given.unregistered, "it is not registered in the model")
     lost |= dict.fromkeys(set(rec.image_names) - set(after.image_names), "no measurement of it survived")

@@ -16,7 +16,7 @@ from ..bundle.intrinsics import check_lenses
 from ..errors import FileError, InputError, RsUndistortWarning
 from ..input.exposure import bounded_by_exposure
 from ..input.frames import find_photos
-from ..input.gyroscope import GyroOptions, Readouts, gyro_contradiction, gyro_motions, known_readouts
+from ..input.gyroscope import GyroOptions, Readouts, gyro_motions, known_contradiction, known_readouts
 from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos, load_photos, with_finer_features
 from ..input.photo_cameras import camera_file_of
@@ -219,7 +219,10 @@ def _solve(
     rec = solved.shared
     cameras.check_plausible(rec.cameras)
     gain = None if solved.choice is None else solved.choice.known_gain
-    contradictions = [gyro_contradiction(rec, from_gyro, gain), *cameras.contradicted(rec.cameras, options_of(rec))]
+    contradictions = [
+        known_contradiction(rec, from_gyro, options.solve.known, gain),
+        *cameras.contradicted(rec.cameras, options_of(rec)),
+    ]
     for text in filter(None, contradictions):
         warnings.warn(text, RsUndistortWarning, stacklevel=3)
     return replace(solved, readouts=readouts), solving
