@@ -3,9 +3,9 @@
     python benchmarks/known_motions.py [--photos DIR] [--sets NAME ...] [--rad R] [--sigma S] [--seed K]
 
 Warps photos by motions of R rad a frame (0.001), and solves them without a word on these, with motions that are known
-to S rad (0.0003), and with those of the photo next to each, which it did not make. Prints the verdict on the shutter,
-the error of phi in mrad a frame (root mean square; in brackets that of no motion), and by how many standard errors the
-known motions predict better than none.
+to S rad (0.0003), with these reversed, and with those of the photo next to each, which it did not make. Prints the
+verdict on the shutter, the error of phi in mrad a frame (root mean square; in brackets that of no motion), and by how
+many standard errors the known motions predict better than none; "left out" are those that the photos contradict.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ def solved(photos: Path, truth: rs.Solution, true: dict[str, np.ndarray], known:
     gain = found.quality["known_motions_gain"]
     none = rms_mrad(np.array([true[image.name] for image in found.registered]))
     verdict = (found.verdict or {}).get("shutter")
-    return f"{verdict:>15} {error:6.2f} ({none:.2f}) {'' if gain is None else f'{gain:+.1f}'}"
+    left_out = "left out" if found.quality["known_motions_left_out"] else ""
+    return f"{verdict:>15} {error:6.2f} ({none:.2f}) {'' if gain is None else f'{gain:+.1f}'} {left_out}"
 
 
 def main() -> None:
@@ -65,8 +66,14 @@ def main() -> None:
             rng = np.random.default_rng([args.seed, 1])
             deviation = np.full(3, args.sigma)
             own = {key: (phi + args.sigma * rng.normal(size=3), deviation) for key, phi in true.items()}
+            reversed_ = {key: (-phi, sigma) for key, (phi, sigma) in own.items()}
             others = dict(zip(own, [*list(own.values())[1:], next(iter(own.values()))], strict=True))
-            for says, known in (("nothing known", {}), ("its motions", own), ("those of others", others)):
+            for says, known in (
+                ("nothing known", {}),
+                ("its motions", own),
+                ("reversed", reversed_),
+                ("those of others", others),
+            ):
                 print(f"{name:14}{says:18}{solved(warp / 'photos', truth, true, known)}", flush=True)
 
 

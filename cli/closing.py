@@ -222,6 +222,8 @@ def _known_motions(quality: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     if (gain := quality.get("known_motions_gain")) is not None:
         than = "better" if gain > 0 else "worse"
         yield "known motions", f"predict the photos {than} than none, by {abs(gain):.1f} standard errors"
+        if quality.get("known_motions_left_out"):
+            yield _GOES_ON, "left out, since the photos contradict them"
 
 
 def _held_out(quality: Mapping[str, Any]) -> str:

@@ -10,6 +10,7 @@ from critical_scenes import named_scene
 from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, GyroOptions, RowMotion, RsUndistortWarning
+from rsundistort.bundle import KnownMotions
 from rsundistort.errors import FileError, FormatError, InputError
 from rsundistort.input.gyroscope import gyro_motions, known_contradiction, known_readouts
 from rsundistort.io import (
@@ -185,12 +186,14 @@ def test_a_solution_far_from_known_motions_is_reported():
     assert "the gyroscope and the known motions (--known), by 26" in (known_contradiction(rec, one, other) or "")
     still = replace(rec, shutter_model="global")
     assert known_contradiction(still, reversed_, {}) is None
-    assert known_contradiction(still, reversed_, {}, 2.5) is None
-    assert "predict them worse than none, by 12 standard errors" in (
-        known_contradiction(still, reversed_, {}, -12.3) or ""
-    )
-    unsure = {name: (phi, np.full(3, 0.02)) for name, (phi, _) in reversed_.items()}
-    assert known_contradiction(still, unsure, {}, -12.3) is None
+    worse = KnownMotions(gain=-12.3, is_better=False, free_gain=0.0, miss=0.0, size=20.0)
+    said = known_contradiction(still, reversed_, {}, worse) or ""
+    assert "they predict the photos worse than none (by -12.3 standard errors)" in said
+    # what is within its own uncertainty may predict worse than none
+    assert known_contradiction(still, reversed_, {}, replace(worse, size=2.0)) is None
+    # and the photos of a gyroscope that rests may be bent by their lens
+    assert not replace(worse, gain=0.0, size=2.0, miss=9.0).is_contradicted
+    assert replace(worse, gain=0.0, miss=9.0).is_contradicted
 
 
 # ---------------------------------------------------------------- what the log covers

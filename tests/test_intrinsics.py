@@ -268,13 +268,13 @@ def choice_with_known_motions(rng, off_by):
 
 def test_motions_known_from_elsewhere_that_predict_better_than_none_are_a_shutter(rng):
     choice = choice_with_known_motions(rng, 1.0)
-    assert choice.known_gain > 5
+    assert choice.known_motions.gain > 5
     assert (choice.shutter, choice.label, choice.against) == ("found", "rotation", ())
 
 
 def test_motions_known_from_elsewhere_that_predict_worse_than_none_are_none(rng):
     choice = choice_with_known_motions(rng, -1.0)
-    assert choice.known_gain < -2
+    assert choice.known_motions.gain < -2
     assert choice.shutter != "found"
 
 
@@ -304,7 +304,7 @@ def test_motions_may_be_known_of_some_photos_and_others_still(rng):
         BundleOptions(known_phi=known, held_phi={"0.jpg": (0,)}),
     ):
         choice = choose_model(rec, options=options, sigma_px=0.1)
-        assert choice.shows_known_motions
+        assert choice.known_motions.is_better
         assert choice.shutter == "found"
 
 

@@ -29,7 +29,7 @@ from rsundistort import (
     read_solution,
     rectify_folder,
 )
-from rsundistort.bundle import ModelChoice, choose_model
+from rsundistort.bundle import KnownMotions, ModelChoice, choose_model
 from rsundistort.critical import heal
 from rsundistort.errors import FormatError
 from rsundistort.io import write_solution
@@ -363,7 +363,8 @@ def test_motions_that_most_photos_contradict_are_not_taken_out_if_evidence_chose
     torn = judge(result, None, choice_of("rotation", gain=9.0))
     assert torn.shutter == "not-determined"
     # unless a gyroscope measured them
-    assert judge(result, None, replace(choice_of("rotation", gain=9.0), shows_known_motions=True)).shutter == "found"
+    known = KnownMotions(gain=5.0, is_better=True, free_gain=0.0, miss=1.0, size=20.0)
+    assert judge(result, None, replace(choice_of("rotation", gain=9.0), known_motions=known)).shutter == "found"
     assert "halves of the measurements do not agree" in " ".join(torn.reasons)
     assert torn.lens_only == tuple(rec.image_names)
     # who knows a motion from elsewhere knows better

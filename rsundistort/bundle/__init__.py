@@ -10,6 +10,7 @@ from .control import CONTROL_SIGMA_PX, PlacedControl, place_control, with_contro
 from .direction import ReadoutChoice, choose_readouts
 from .intrinsics import GuessedCameras, deviation, pixels_of
 from .known_lengths import scale_of_lengths
+from .known_motions import KnownMotions, judge_known_motions, misses_of
 from .known_positions import KnownPlaces
 from .model_choice import ModelChoice
 from .posterior import Posterior, gauge_directions
@@ -20,6 +21,7 @@ __all__ = [
     "BundleOptions",
     "BundleResult",
     "GuessedCameras",
+    "KnownMotions",
     "KnownPlaces",
     "ModelChoice",
     "PlacedControl",
@@ -31,6 +33,8 @@ __all__ = [
     "choose_readouts",
     "deviation",
     "gauge_directions",
+    "judge_known_motions",
+    "misses_of",
     "objective",
     "pixels_of",
     "place_control",

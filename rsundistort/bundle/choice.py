@@ -14,6 +14,7 @@ from .adjust import MODEL_SEQUENCE
 from .bundle_options import BundleOptions
 from .doubt import steps_to
 from .held_out import BENDS, MIN_AGREEMENT, MIN_FALL, SMOOTH_BENDS, ModelFit, ModelFits
+from .known_motions import compare_known_motions
 from .model_choice import ModelChoice
 
 __all__ = ["choose_model"]
@@ -148,14 +149,13 @@ def choose_model(
     selection = _selected(fits, models, bool(options.refine))
     plain, best, kept, gain = selection.plain, selection.best, selection.kept, selection.gain
     against, agreement = selection.against if best is plain else [], None
-    known = fits.by_known_motions(plain)
-    is_known = known is not None and fits.is_better(plain, known)
+    known = compare_known_motions(fits, plain, best)
     if best is not plain:
         if np.sqrt(np.mean(moved_px(best.reconstruction) ** 2)) < _UNSEEN_PX:
             best = plain
         else:
             # what else bends photos knows nothing of motions that were measured elsewhere
-            if not is_known:
+            if known is None or not known.is_better:
                 against, agreement = _doubts(fits, best, plain, gain)
             if against:
                 best = plain
@@ -186,8 +186,7 @@ def choose_model(
         shutter != "not-determined" and fits.waves(best, _RESTLESS, _UNSEEN_PX / 2),
         _rival(fits, best),
         _steps_of_others(fits, best),
-        None if known is None else fits.gain(plain, known),
-        is_known,
+        known,
     )
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..errors import InputError
 from ..model import Observations, Reconstruction, other_axis
@@ -275,6 +276,16 @@ class ModelFits:
         held |= {name: (np.where(np.isfinite(sigma), phi, 0.0), exactly) for name, (phi, sigma) in known.items()}
         options = replace(self._rough, varying=plain.varying, known_phi=held, still={}, held_phi={})
         return self._adjusted("known motions", "rotation", [plain.reconstruction], options)
+
+    @property
+    def known_phi(self) -> Mapping[str, tuple[ArrayLike, ArrayLike]]:
+        """Motions that are known from elsewhere, and their standard deviations."""
+        return self._rough.known_phi
+
+    def without_known_motions(self, fit: ModelFit) -> ModelFit:
+        """The model of a fit with the motions that the photos alone show."""
+        options = replace(self._rough, varying=fit.varying, bends=fit.bends, known_phi={}, known_bends={})
+        return self._adjusted("the photos alone", fit.model, [fit.reconstruction, self.given], options)
 
     def waves(self, fit: ModelFit, sites: int = WAVES, least_px: float = 0.0) -> bool:
         """Whether free displacements of each photo's lines would remove significantly more than a smooth warp of it.

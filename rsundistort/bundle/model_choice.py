@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from .known_motions import KnownMotions
+
 __all__ = ["ModelChoice"]
 
 
@@ -54,11 +56,8 @@ class ModelChoice:
         velocity does as well, and where that is less than half a pixel.
     steps : mapping of photo to 12 floats
         Of a shutter: how far the other model that moves its motions most would move them, as `BundleOptions.rival`.
-    known_gain : float or None
-        Fall of the held-out error by motions that are known from elsewhere, none of them fitted, against no motions, in
-        standard errors; None if none are known.
-    shows_known_motions : bool
-        Whether that fall counts as better.
+    known_motions : KnownMotions or None
+        What the photos say of motions that are known from elsewhere; None if none are.
     """
 
     shutter_model: str
@@ -78,5 +77,4 @@ class ModelChoice:
     restless: bool = False
     rival: float = 0.0
     steps: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    known_gain: float | None = None
-    shows_known_motions: bool = False
+    known_motions: KnownMotions | None = None

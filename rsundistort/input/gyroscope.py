@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..bundle import KnownMotions, misses_of
 from ..errors import InputError
 from ..io import ExifFacts
 from ..io.gyro import GyroLog, bends_from_gyro, motions_from_gyro, read_gyro, read_photo_times
@@ -123,15 +124,13 @@ def known_contradiction(
     rec: Reconstruction,
     from_gyro: Mapping[str, tuple[ArrayLike, ArrayLike]],
     specified: Mapping[str, tuple[ArrayLike, ArrayLike]],
-    gain: float | None = None,
+    evidence: KnownMotions | None = None,
 ) -> str | None:
     """A warning, if a solution contradicts the motions that are known, by a gyroscope or as the user specified them.
 
-    `gain` is `ModelChoice.known_gain`: whether these motions predict the photos better than none. Of a solution with a
-    shutter, its own motions are compared with them as well.
+    Motions that `evidence` contradicts were left out of the solution; others are compared with its own motions.
     """
-    known = {**specified, **from_gyro}
-    if not known:
+    if not from_gyro and not specified:
         return None
     sources, checks = [], []
     if from_gyro:
@@ -143,22 +142,15 @@ def known_contradiction(
         sources.append("the known motions (--known)")
         checks.append("to which photos they belong, their signs, and their unit, radians")
     source, check = " and ".join(sources), f"check {', and '.join(checks)}"
-    size = [np.asarray(phi) / np.asarray(sigma) for phi, sigma in known.values()]
-    # what is within its own uncertainty may predict worse than none
-    if gain is not None and gain <= -_FAR and np.sqrt(np.mean(np.square(size))) > _FAR:
+    if evidence is not None and evidence.is_contradicted:
+        than = f"{'worse' if evidence.gain < 0 else 'no better'} than none (by {evidence.gain:+.1f} standard errors)"
         return (
-            f"the photos contradict {source}: such motions predict them worse than none, by {-gain:.0f} standard "
-            f"errors; {check}, or the camera has no rolling shutter, or stabilises its photos"
+            f"the photos contradict {source}, whose motions were left out: they predict the photos {than}; {check}, or "
+            "the camera has no rolling shutter, or stabilises its photos"
         )
     if rec.shutter_model == "global":
         return None
-    span = rec.frame_span()
-    misses = [
-        (rec.phi[i] * span[i] - np.asarray(known[name][0])) / np.asarray(known[name][1])
-        for i, name in enumerate(rec.image_names)
-        if name in known
-    ]
-    far = float(np.sqrt(np.mean(np.square(misses)))) if misses else 0.0
+    far = misses_of(rec, dict(specified) | dict(from_gyro))
     if far <= _FAR:
         return None
     return f"the photos contradict {source}, by {far:.0f} times the uncertainty of these motions; {check}"

@@ -401,9 +401,8 @@ def _solve(
     if solved.survey is None:  # the model's frame is kept
         solved = replace(solved, georeference=given.georeference)
     after = solved.shared
-    gain = None if solved.choice is None else solved.choice.known_gain
     contradictions = [
-        known_contradiction(after, {}, options.known, gain),
+        known_contradiction(after, {}, options.known, solved.known_motions),
         *cameras.contradicted(after.cameras, fitting),
     ]
     for text in filter(None, contradictions):

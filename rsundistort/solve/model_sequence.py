@@ -16,11 +16,13 @@ from ..bundle import (
     MODEL_SEQUENCE,
     BundleOptions,
     BundleResult,
+    KnownMotions,
     ModelChoice,
     ReadoutChoice,
     bundle_adjust,
     choose_model,
     choose_readouts,
+    judge_known_motions,
 )
 from ..bundle.doubt import steps_after
 from ..critical import advise, heal, with_remedy
@@ -150,6 +152,10 @@ def solve_tracks(
     survey : Survey, optional
         As in `solve_photos`.
     """
+    again = partial(
+        solve_tracks, mapped, cameras, shutter_model, seed,
+        log=log, remedy=remedy, track_source=track_source, survey=survey,
+    )  # fmt: skip
     directions = _read_out(mapped, cameras, options_of(mapped), log)
     if directions is not None:
         mapped = directions.reconstruction
@@ -175,6 +181,12 @@ def solve_tracks(
     choice = None
     if auto:
         choice, result, tracks, options = _chosen(track_source, result, tracks, options, seed, log)
+    known_motions = _known_motions(result, shutter_model, options, seed) if choice is None else choice.known_motions
+    if known_motions is not None and known_motions.is_contradicted:
+        log.begin("again without the known motions")
+        log.end("again without the known motions", gain=known_motions.gain, miss=known_motions.miss)
+        solved = again(options_of=lambda rec: replace(options_of(rec), known_phi={}, known_bends={}))
+        return replace(solved, known_motions=known_motions)
     if survey is not None and survey.holding:
         survey, result, options = _with_control(survey, result, options, log)
     mended, advice = None, []
@@ -201,8 +213,17 @@ def solve_tracks(
     if verdict.lens_only:
         warnings.warn(_lens_only(verdict), RsUndistortWarning, stacklevel=3)
     log.end("verdict", shutter=verdict.shutter, shape=verdict.shape)
-    solved = Solved(result, global_result, cameras, choice, mended, advice, directions, verdict)
+    solved = Solved(
+        result, global_result, cameras, choice, mended, advice, directions, verdict, known_motions=known_motions
+    )
     return solved if survey is None else _on_the_map(solved, survey, options)
+
+
+def _known_motions(result: BundleResult, model: str, options: BundleOptions, seed: int) -> KnownMotions | None:
+    """What photos say of motions that are known from elsewhere, if the model of the shutter was specified."""
+    if model == "global" or not options.known_phi:
+        return None
+    return judge_known_motions(result.reconstruction, model, options, sigma_px=result.sigma_px, seed=seed)
 
 
 def _on_the_map(solved: Solved, survey: Survey, options: BundleOptions) -> Solved:

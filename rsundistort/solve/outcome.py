@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..batch.rectify_options import RectifyOptions
-from ..bundle import BundleResult, ModelChoice, ReadoutChoice
+from ..bundle import BundleResult, KnownMotions, ModelChoice, ReadoutChoice
 from ..critical import Advice, Remedy
 from ..input.photo_cameras import PhotoCameras
 from ..model import BEND_GROUPS, Reconstruction, Solution, SolvedImage
@@ -64,6 +64,8 @@ class Solved:
         The georeferencing.
     georeference : mapping or None
         The georeferencing in `solution.json`.
+    known_motions : KnownMotions or None
+        What the photos say of motions that are known from elsewhere; those that they contradict were left out.
     """
 
     result: BundleResult
@@ -82,6 +84,7 @@ class Solved:
     facts: Mapping[str, Any] = field(default_factory=dict)
     survey: Survey | None = None
     georeference: Mapping[str, Any] | None = None
+    known_motions: KnownMotions | None = None
 
     @property
     def shared(self) -> Reconstruction:
@@ -189,7 +192,7 @@ def solution_of(solved: Solved, options: SolveOptions, rectify: RectifyOptions) 
             "raw_as": rectify.raw_as,
             "refine": list(dict.fromkeys(name for each in solved.result.sigma_intrinsics for name in each)),
             "still": dict(options.still),
-            "known": sorted(options.known),
+            "known": [] if _contradicted(solved) else sorted(options.known),
             "lengths": len(options.lengths),
             "remedy": options.remedy,
             "depth": str(rectify.depth),
@@ -268,6 +271,7 @@ def _quality(solved: Solved) -> dict[str, Any]:
         "rms_px": result.rms_px,
         "global_rms_px": solved.global_result.rms_px,
         **_held_out(solved.choice),
+        **_known_motions(solved),
         "sigma_intrinsics": solved.by_camera(
             [each if k in shared.camera_idx else {} for k, each in enumerate(result.sigma_intrinsics)]
         ),
@@ -297,5 +301,18 @@ def _held_out(choice: ModelChoice | None) -> dict[str, Any]:
         "held_out_chosen": None if choice is None else choice.label,
         "held_out_left": {} if choice is None else choice.left,
         "agreement_of_halves": None if choice is None else choice.agreement,
-        "known_motions_gain": None if choice is None else choice.known_gain,
+    }
+
+
+def _contradicted(solved: Solved) -> bool:
+    """Whether the photos contradict motions that are known from elsewhere, so that these were left out."""
+    return solved.known_motions is not None and solved.known_motions.is_contradicted
+
+
+def _known_motions(solved: Solved) -> dict[str, Any]:
+    """What the photos say of motions that are known from elsewhere."""
+    known = solved.known_motions
+    return {
+        "known_motions_gain": None if known is None else known.gain,
+        "known_motions_left_out": _contradicted(solved),
     }

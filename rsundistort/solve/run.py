@@ -218,9 +218,8 @@ def _solve(
         )  # fmt: skip
     rec = solved.shared
     cameras.check_plausible(rec.cameras)
-    gain = None if solved.choice is None else solved.choice.known_gain
     contradictions = [
-        known_contradiction(rec, from_gyro, options.solve.known, gain),
+        known_contradiction(rec, from_gyro, options.solve.known, solved.known_motions),
         *cameras.contradicted(rec.cameras, options_of(rec)),
     ]
     for text in filter(None, contradictions):

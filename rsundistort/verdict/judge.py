@@ -306,7 +306,8 @@ def _of_motions(
             f"All photos appear to have rotated alike, by {abs(rotation):.2f} degrees about {'xyz'[axis]}: an error of "
             "the lens looks like that, and no hand moves so."
         )
-    if 2 * torn.sum() > rec.num_images and not (choice is not None and choice.shows_known_motions):
+    by_known = None if choice is None else choice.known_motions
+    if 2 * torn.sum() > rec.num_images and not (by_known is not None and by_known.is_better):
         reasons.append("In most photos halves of the measurements do not agree on the motion found.")
     return ("not-determined" if reasons else "found"), reasons
 
