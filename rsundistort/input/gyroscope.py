@@ -37,11 +37,12 @@ class GyroOptions:
     file : path
         As `io.read_gyro` takes it.
     offset_s : float
-        Time on the log's clock when the camera's shows zero.
+        Time on the log's clock when the camera's shows zero. For a video with a path it is estimated, within 10 s of
+        this.
     axes : str, optional
         As `io.read_gyro` takes them.
     times : path, optional
-        CSV with `name, time_s`; by default `frames.csv` among the photos.
+        CSV with `name, time_s`; by default `frames.csv` among the photos. A video with a path has times of its own.
     """
 
     file: Path | str
