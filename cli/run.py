@@ -100,8 +100,8 @@ def command(photos: Path, out: Path, measuring: dict[str, Any], given: dict[str,
     writes frames/ (the original key frames) and path.csv (pose, velocity and rotation rate of every frame).
 
     Nothing in OUT changes until the motions are solved. After an interruption, the same command with --resume
-    continues. Exit code 3 means that some photos could not be rectified, or that the report could not be written. They
-    are listed, and everything else is complete.
+    continues. Exit code 3 means that some photos could not be rectified, or that the report or an export could not be
+    written. They are listed, and everything else is complete.
     """
     with errors_for_people(opt.GOES_ON, needed_gb=2.0) as warned, progress_bars(talk) as progress:
         from rsundistort.input import GyroOptions
