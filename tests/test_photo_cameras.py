@@ -124,6 +124,40 @@ def test_a_folder_of_cameras_is_shared_out_by_size_and_by_group(folder, tmp_path
         find_cameras(folder, NAMES, SIZES, str(tmp_path / "cameras"))
 
 
+def test_cameras_of_a_folder_that_say_no_size_have_that_of_their_photos(folder, tmp_path):
+    texts = {name: f"{f} 0 24\n0 {f} 20\n0 0 1\n" for name, f in {"phone": 60, "camera-48x64": 50, "drone": 70}.items()}
+    opencv = "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [{}]\n"
+    cameras = tmp_path / "cameras"
+    cameras.mkdir()
+
+    def find():
+        found = find_cameras(folder, NAMES, SIZES, str(cameras))
+        return [(each.width, each.height, each.K[0, 0]) for each in map(found.of, range(4))]
+
+    (cameras / "phone.txt").write_text(texts["phone"])
+    with pytest.raises(InputError, match=r"for d\.png is for 64x48 pixels but the photos have 48x64"):
+        find()  # one K is of one size
+    (cameras / "camera-48x64.txt").write_text(texts["camera-48x64"])
+    assert find() == [(*WIDE, 60)] * 3 + [(*TALL, 50)]
+    (cameras / "phone.txt").rename(cameras / "camera-64x48.txt")
+    assert find() == [(*WIDE, 60)] * 3 + [(*TALL, 50)]
+    (cameras / "camera-48x64.txt").unlink()
+    (cameras / "camera-48x64.yml").write_text(opencv.format("45, 0, 24, 0, 45, 20, 0, 0, 1"))
+    assert find() == [(*WIDE, 60)] * 3 + [(*TALL, 45)]
+    # what has a size takes the photos of that size, and one camera without a size the others
+    (cameras / "camera-48x64.yml").unlink()
+    (cameras / "camera-64x48.txt").rename(cameras / "phone.txt")
+    (cameras / "upright.json").write_text(json.dumps(camera_to_json(camera_of(TALL))))
+    assert find() == [(*WIDE, 60)] * 3 + [(*TALL, 60)]
+    (cameras / "drone.txt").write_text(texts["drone"])
+    with pytest.raises(InputError, match=r"several cameras of the size of a\.png"):
+        find()
+    (cameras / "phone.txt").unlink()
+    (cameras / "wide.json").write_text(json.dumps(camera_to_json(camera_of(WIDE))))
+    with pytest.raises(InputError, match=r"several cameras of the size of a\.png"):
+        find()
+
+
 def test_one_camera_is_not_stretched_over_photos_of_another_size(folder):
     with pytest.raises(InputError, match=r"d\.png"):
         find_cameras(folder, NAMES, SIZES, "60,60,32,24")
