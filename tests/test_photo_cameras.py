@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,11 +15,13 @@ import pytest
 from make_photos import COURTYARD_NAMES, exif_block, half_courtyard, save_png, texture
 
 from rsundistort import Camera, RectifyOptions, RowMotion, RunOptions, SolveOptions, rectify, rectify_folder, run
-from rsundistort.errors import FileError, FormatError, InputError
+from rsundistort.errors import FileError, FormatError, InputError, SkippedPhotoWarning
 from rsundistort.input import photo_cameras
 from rsundistort.io import Metadata, find_masks, read_exif, read_mask, write_image
 from rsundistort.io.cameras import camera_to_json
+from rsundistort.model import Observations, Reconstruction
 from rsundistort.sfm import detect_features
+from rsundistort.solve.outcome import Solved
 
 HANDHELD = Path(__file__).parent.parent / "sample_scenes" / "handheld"
 WIDE, TALL = (64, 48), (48, 64)
@@ -195,6 +199,40 @@ def test_exif_groups_photos_and_rotated_ones_are_read_out_across(tmp_path):
     assert len(found.notes) == 1
     assert "portrait" in found.notes[0]
     assert found.cameras[0].K[0, 0] == found.cameras[1].K[0, 0]
+
+
+def test_photos_that_are_not_registered_keep_the_camera_that_took_them(tmp_path):
+    photos = half_courtyard(tmp_path, COURTYARD_NAMES[:4])
+    save_png(photos / "other.png", texture(160, 240))
+    (photos / "z.png").write_bytes(b"no photo at all")
+    given = json.loads((tmp_path / "camera.json").read_text())
+    cameras = {"small": camera_to_json(camera_of((160, 240), f=200.0)), "phone": given}
+    (tmp_path / "cameras.json").write_text(json.dumps({"cameras": cameras}))
+    options = RunOptions(
+        max_features=1000, solve=SolveOptions(shutter_model="rotation"), camera=str(tmp_path / "cameras.json")
+    )
+    with pytest.warns(SkippedPhotoWarning, match=r"z\.png"):
+        solution = run(photos, tmp_path / "out", options)
+    first, other = solution.image(COURTYARD_NAMES[0]), solution.image("other.png")
+    assert first.registered
+    assert not other.registered
+    assert solution.cameras[first.camera_id].width == 480
+    assert solution.cameras[other.camera_id].width == 160
+
+
+def test_where_lenses_vary_the_camera_of_a_lost_photo_is_that_of_another_photo_by_it():
+    cameras = [camera_of(WIDE), camera_of(WIDE, f=70.0), camera_of(TALL)]
+    seen = Observations(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
+    rec = Reconstruction(
+        cameras, ["a", "b", "c", "d"], np.array([0, 1, 1, 0]), np.tile(np.eye(3), (4, 1, 1)), np.zeros((4, 3)),
+        np.zeros((0, 3)), seen, variation=np.full((4, 3), 0.01),
+    )  # fmt: skip
+    camera_of_photo = {"lost": 1, "alone": 2}
+    solved = Solved(SimpleNamespace(reconstruction=rec), None, None, camera_of=camera_of_photo)
+    assert [solved.camera_id_of(name) for name in ("lost", "alone", "unread")] == [2, 1, 1]
+    shared = replace(solved, result=SimpleNamespace(reconstruction=replace(rec, variation=np.zeros(0))))
+    assert [shared.camera_id_of(name) for name in ("lost", "alone", "unread")] == [2, 3, 1]
+    assert replace(shared, shared_ids=[4, 7, 9]).camera_id_of("lost") == 7
 
 
 # ---------------------------------------------------------------- masks

@@ -266,7 +266,8 @@ def solve_frames(
             at_once=at_once,
         )  # fmt: skip
     cameras.check_plausible(solved.shared.cameras)
-    return replace(solved, unregistered=keys.unregistered(solved.shared.image_names), readouts=readouts)
+    lost = keys.unregistered(solved.shared.image_names)
+    return replace(solved, unregistered=lost, camera_of=keys.camera_of, readouts=readouts)
 
 
 def _with_gyroscope(
