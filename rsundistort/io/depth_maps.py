@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, FormatError, InputError
 from ..model.arrays import read_arrays
-from .masks import find_masks
+from .masks import check_one_photo_each, find_masks
 from .photos.images import read_plain
 
 __all__ = ["find_depth_maps", "read_depth_map"]
@@ -35,13 +35,7 @@ def find_depth_maps(folder: Path, names: Sequence[str]) -> dict[str, Path]:
         When the folder is missing, no map in it is of one of the photos, a photo has several, or two photos share one.
     """
     found = find_masks(folder, names, "depth map", _SUFFIXES)
-    photo_of: dict[Path, str] = {}
-    for name, path in found.items():
-        if (other := photo_of.setdefault(path, name)) != name:
-            raise InputError(
-                f"depth map {path} would be of {other} and of {name}; call it {PurePosixPath(name).name}{path.suffix} "
-                "if it is of the latter"
-            )
+    check_one_photo_each(found, "depth map")
     return found
 
 

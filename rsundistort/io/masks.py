@@ -14,7 +14,7 @@ from ..errors import FileError, InputError
 from .photos.images import read_plain
 from .places import File, Place, files_in
 
-__all__ = ["find_masks", "read_mask"]
+__all__ = ["check_one_photo_each", "find_masks", "read_mask"]
 
 _SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".webp", ".jpg", ".jpeg")
 
@@ -72,6 +72,17 @@ def find_masks(
         such = PurePosixPath(names[0]).with_suffix(suffixes[0])
         raise InputError(f"{folder} holds no {what} of any photo; it should hold {such} and so on")
     return found
+
+
+def check_one_photo_each(found: Mapping[str, Path], what: str) -> None:
+    """Refuse files that `find_masks` found for two photos of one stem, such as `a.npy` for `a.jpg` and `a.png`."""
+    photo_of: dict[Path, str] = {}
+    for name, path in found.items():
+        if (other := photo_of.setdefault(path, name)) != name:
+            raise InputError(
+                f"{what} {path} would be of {other} and of {name}; call it {PurePosixPath(name).name}{path.suffix} "
+                "if it is of the latter"
+            )
 
 
 def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8]:
