@@ -22,7 +22,7 @@ _LABEL, _GOES_ON = 19, " "
 
 
 def close(solution: Solution, out: Path, warned: Said, talk: Talk) -> None:
-    """Say what was found; exit code 3 if photos with a motion could not be rectified, or the report not be written."""
+    """Say what was found; exit code 3 if photos with a motion could not be rectified, or an output not be written."""
     if talk.as_json:
         say_json(summary(solution, out, warned))
     elif talk.to_people:

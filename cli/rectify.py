@@ -50,11 +50,12 @@ def command(photos: Path | str, solution: Path, out: Path | str, given: dict[str
     opt.check_resume(given)
     with errors_for_people(opt.GOES_ON) as warned, progress_bars(talk) as progress:
         from rsundistort.batch import rectify_folder
-        from rsundistort.io.places import place_of, sizes_under
+        from rsundistort.batch.folder import photos_of
 
         options = opt.rectify_options(given)
         solved, left_out = rectify_folder(photos, solution, out, options, progress=progress, **given)
-        count = len(sizes_under(place_of(out), ["images"]))
+        # others may lie in OUT/images, too
+        count = len({*photos_of(photos, solved, options.raw_as)} - left_out.keys())
     # the solution itself names the photos that it could not register
     known = {image.name for image in solved.images if not image.registered}
     failed = {name: why for name, why in left_out.items() if name not in known}

@@ -50,7 +50,8 @@ _measure_options = opt.gathered(
         type=float,
         default=0.0,
         metavar="S",
-        help="Time in seconds on the gyroscope's clock when the camera's clock shows zero.",
+        help="Time in seconds on the gyroscope's clock when the camera's clock shows zero. For a video without --every "
+        "and --sharpest it is estimated, within 10 s of this.",
     ),
     opt.gyro_axes_option,
     click.option(
@@ -58,7 +59,7 @@ _measure_options = opt.gathered(
         type=click.Path(exists=True, dir_okay=False, path_type=Path),
         metavar="CSV",
         help="Times at which the photos were taken, for --gyro: name, time_s. By default they are read from "
-        "frames.csv among the photos.",
+        "frames.csv among the photos. A video without --every and --sharpest takes none.",
     ),
     click.option(
         "--max-features",
@@ -99,8 +100,8 @@ def command(photos: Path, out: Path, measuring: dict[str, Any], given: dict[str,
     writes frames/ (the original key frames) and path.csv (pose, velocity and rotation rate of every frame).
 
     Nothing in OUT changes until the motions are solved. After an interruption, the same command with --resume
-    continues. Exit code 3 means that some photos could not be rectified, or that the report could not be written. They
-    are listed, and everything else is complete.
+    continues. Exit code 3 means that some photos could not be rectified, or that the report or an export could not be
+    written. They are listed, and everything else is complete.
     """
     with errors_for_people(opt.GOES_ON, needed_gb=2.0) as warned, progress_bars(talk) as progress:
         from rsundistort.input import GyroOptions

@@ -503,20 +503,23 @@ def test_a_rolling_shutter_that_is_said_to_be_a_global_one_is_doubted(cut, tmp_p
 
 
 @pytest.mark.parametrize(
-    ("solving", "says"),
+    ("given", "says"),
     [
-        (SolveOptions(shutter_model="global", readout_s=0.02), "have no readout time; leave out --readout-ms or --mod"),
-        (SolveOptions(shutter_model="rotation"), "takes no --still, --known or --model but global"),
-        (SolveOptions(still={"walk-0001.png": 1e-4}), "takes no --still, --known or --model but global"),
-        (SolveOptions(crs="local"), "frames of a video have no GPS"),
+        ({"shutter_model": "global", "readout_s": 0.02}, "have no readout time; leave out --readout-ms or --mod"),
+        ({"shutter_model": "rotation"}, "takes no --still, --known, --remedy or --model but global"),
+        ({"still": {"walk-0001.png": 1e-4}}, "takes no --still, --known, --remedy or --model but global"),
+        ({"remedy": "none"}, "takes no --still, --known, --remedy or --model but global"),
+        ({"crs": "local"}, "frames of a video have no GPS"),
+        (GyroOptions("log.csv", times="times.csv"), "have times of their own; it takes no --photo-times"),
     ],
 )
-def test_options_that_a_path_does_not_take_are_refused_before_the_video_is_read(cut, tmp_path, solving, says):
-    stages = []
+def test_options_that_a_path_does_not_take_are_refused_before_the_video_is_read(cut, tmp_path, given, says):
+    stages, of_log = [], isinstance(given, GyroOptions)
+    options = RunOptions(gyro=given) if of_log else RunOptions(solve=SolveOptions(**given))
     with pytest.raises(InputError, match=says):
-        run(cut, tmp_path / "out", RunOptions(solve=solving), progress=lambda *told: stages.append(told))
+        run(cut, tmp_path / "out", options, progress=lambda *told: stages.append(told))
     with pytest.raises(InputError, match=says):
-        measure_readout(cut, RunOptions(solve=solving))
+        measure_readout(cut, options)
     assert not stages
     assert not (tmp_path / "out").exists()
 

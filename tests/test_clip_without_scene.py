@@ -9,14 +9,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rsundistort import BundleOptions, Camera
+from rsundistort import BundleOptions, Camera, RunOptions
 from rsundistort.batch.progress import StageLog
 from rsundistort.bundle.path_prior import FramePath
 from rsundistort.errors import InputError, ReconstructionError, RsUndistortWarning
+from rsundistort.input import GyroOptions
 from rsundistort.input.load import LoadedPhotos
 from rsundistort.input.photo_cameras import PhotoCameras
+from rsundistort.io.gyro import GyroLog
 from rsundistort.solve import video_path
 from rsundistort.solve.clip_verdict import FoundPath
+from rsundistort.solve.run import solve_frames
 from rsundistort.verdict.judge_path import ReadoutTime
 
 PATH = FramePath({}, 1 / 30)
@@ -55,6 +58,20 @@ def solve(monkeypatch):
 def test_rotations_stand_in_for_a_scene(solve, explained):
     with pytest.warns(RsUndistortWarning, match="only rotated: without parallax there are directions"):
         assert solve(TURNED, explained) == TURNED
+
+
+def test_the_clock_of_a_log_is_looked_for_around_the_offset_that_is_given(solve, monkeypatch):
+    class Sought(Exception):
+        pass
+
+    def felt(_, log, around_s):
+        raise Sought(f"{log.time_s[0]:g} {around_s:g}")
+
+    assert solve(None, False, TRAVELLED) == TRAVELLED  # what frames say holds for those of the next call, too
+    monkeypatch.setattr(video_path, "felt_gyroscope", felt)
+    options, keys = RunOptions(gyro=GyroOptions("log.csv", 70.0)), keys_of(Camera(64, 36, np.eye(3)))
+    with pytest.raises(Sought, match="71 70"):
+        solve_frames(options, CLIP, keys, [], GyroLog([71.0, 72.0], np.ones((2, 3))), StageLog(None))
 
 
 def test_without_them_the_error_says_what_is_missing(solve):

@@ -178,6 +178,31 @@ def test_own_maps(tmp_path, rng, suffix):
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "out" / "images" / "1.png")), expected)
 
 
+def test_maps_of_photos_in_sub_folders_are_in_sub_folders_of_the_same_names(tmp_path):
+    for name in ("a.npy", "one/a.npy", "two/a.jpg.tif", "two/b.npz", "three.npy"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    found = find_depth_maps(tmp_path, ["one/a.jpg", "one/b.jpg", "two/a.jpg", "two/b.jpg"])
+    assert {name: path.relative_to(tmp_path).as_posix() for name, path in found.items()} == {
+        "one/a.jpg": "one/a.npy",
+        "two/a.jpg": "two/a.jpg.tif",
+        "two/b.jpg": "two/b.npz",
+    }
+    with pytest.raises(InputError, match=r"no depth map of any photo; it should hold two/three\.npy and so on"):
+        find_depth_maps(tmp_path, ["two/three.jpg"])
+
+
+def test_it_is_never_a_guess_whose_map_a_file_is(tmp_path):
+    (tmp_path / "a.npy").write_bytes(b"")
+    with pytest.raises(InputError, match=r"would be of a\.jpg and of a\.png; call it a\.png\.npy"):
+        find_depth_maps(tmp_path, ["a.jpg", "a.png"])
+    (tmp_path / "a.png.npy").write_bytes(b"")
+    assert [path.name for path in find_depth_maps(tmp_path, ["a.jpg", "a.png"]).values()] == ["a.npy", "a.png.npy"]
+    (tmp_path / "a.tif").write_bytes(b"")
+    with pytest.raises(InputError, match=r"a\.jpg has several depth maps: a\.npy, a\.tif; keep one of them"):
+        find_depth_maps(tmp_path, ["a.jpg"])
+
+
 def test_maps_of_another_scale_are_noticed(tmp_path, rng):
     rec, solution = small_scene(rng)
     np.save(tmp_path / "1.npy", np.full((H, W), 700.0))

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
+from rsundistort_cli.main import cli
 from scipy.spatial.transform import Rotation
 
 from rsundistort import (
@@ -24,7 +27,7 @@ from rsundistort import (
 )
 from rsundistort.batch.progress import StageLog
 from rsundistort.colmap.rectified_model import ModelIds
-from rsundistort.errors import FormatError, InputError, RsUndistortWarning
+from rsundistort.errors import FormatError, InputError, MissingOutputWarning
 from rsundistort.io.export_scene import ExportScene
 from rsundistort.io.exports import EXPORTS, check_exports
 from rsundistort.io.metashape import read_metashape
@@ -487,7 +490,7 @@ def test_exports_lie_beside_the_other_outputs_and_one_that_fails_is_said(tmp_pat
     turns = dict.fromkeys(scene.names, 6)
     ids = ModelIds.in_order(scene.reconstruction)
     outputs = Outputs(scene.solution, scene.reconstruction, RectifyOptions(), options, ids, turns, with_photos=False)
-    with pytest.warns(RsUndistortWarning, match="opf: it is not written: .*--apply-orientation"):
+    with pytest.warns(MissingOutputWarning, match="no opf was written: .*--apply-orientation"):
         turned = outputs.begin(tmp_path, StageLog(None))
     assert not (tmp_path / "opf").exists()
     for name in ("metashape", "opensfm", "opf-rectified"):
@@ -496,6 +499,28 @@ def test_exports_lie_beside_the_other_outputs_and_one_that_fails_is_said(tmp_pat
     rec = read_model(tmp_path / "opf-rectified" / "project.opf").reconstruction
     assert (rec.cameras[0].width, rec.cameras[0].height) == (H, W)
     np.testing.assert_allclose(rec.R_cw[0], turned.image(rec.image_names[0]).R_cw, atol=1e-9)
+
+
+def test_a_run_whose_export_could_not_be_written_ends_with_exit_code_3(tmp_path, monkeypatch):
+    scene = made()
+
+    def write(folder, _):
+        folder.mkdir()
+        (folder / "camera.nk").write_text("half")
+        raise InputError("the frames have no order")
+
+    def run(*_, **__):
+        ids, options = ModelIds.in_order(scene.reconstruction), OutputOptions(exports=("nuke", "metashape"))
+        outputs = Outputs(scene.solution, scene.reconstruction, RectifyOptions(), options, ids, {}, with_photos=False)
+        return outputs.begin(tmp_path, StageLog(None))
+
+    monkeypatch.setitem(EXPORTS, "nuke", replace(EXPORTS["nuke"], write=write))
+    monkeypatch.setattr(sys.modules["rsundistort.solve"], "run", run)
+    result = CliRunner().invoke(cli, ["run", str(tmp_path), "-o", str(tmp_path / "out"), "--quiet"])
+    said = "no nuke was written: the frames have no order"
+    assert (result.exit_code, result.stderr) == (3, f"warning: {said}\n\nfailed:\n  nuke/: {said}\n")
+    assert not (tmp_path / "nuke").exists()
+    assert (tmp_path / "metashape" / "cameras.xml").is_file()
 
 
 def test_what_there_is_no_writer_for_is_refused():

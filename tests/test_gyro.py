@@ -260,6 +260,12 @@ def test_csv_with_other_columns_and_a_line_that_was_cut_off(tmp_path):
     assert found.omega_c == pytest.approx(np.array([[1, 2, 3], [4, 5, 6]]))
 
 
+def test_empty_cells_behind_the_columns_of_a_log_are_none(tmp_path):
+    path = tmp_path / "gyro.csv"
+    path.write_text("time_s,wx,wy,wz\n0.0,1,2,3,, \n0.1,4,5,6,\n")
+    assert read_gyro(path).omega_c == pytest.approx(np.array([[1, 2, 3], [4, 5, 6]]))
+
+
 def test_samples_of_one_time_are_one(tmp_path):
     path = write_csv(tmp_path / "g.csv", [0, 0.001, 0.001, 0.002], [[0, 0, 0], [1, 2, 3], [3, 2, 1], [0, 0, 0]])
     assert read_gyro(path).omega_c[1] == pytest.approx([2, 2, 2])
@@ -310,6 +316,13 @@ def test_gcsv_of_another_orientation(tmp_path):
         ("a.csv", "time_s,wx,wy,wz\n0,1,2,3\n1,x,2,3\n2,1,2,3\n", "could not convert"),
         ("a.csv", "time_s,wx,wy,wz\n0,1,2,3\n2,1,2,3\n1,1,2,3\n", "sample 3: the time goes back"),
         ("a.csv", "time_s,wx,wy,wz\n0,1,2,3\n2,1,nan,3\n", "NaN"),
+        ("a.csv", "time_s,wx,wy,wz\n0,1,2,3\n0,01,1,2,3\n1,1,2,3\n", "line 3 has more cells than the 4 columns"),
+        ("a.csv", "time_s,wx,wy,wz,wx\n0,1,2,3,4\n1,1,2,3,4\n", "two columns 'wx'"),
+        (
+            "a.gcsv",
+            GCSV.format(orientation="XYZ") + "3,63,1,2,3,4,5,6,7\n",
+            "line 14 has more cells than the 7 columns",
+        ),
         ("a.gcsv", GCSV.replace("gscale,0.002\n", "").format(orientation="XYZ"), "no gscale"),
         ("a.gcsv", GCSV.replace("tscale,0.001", "tscale,quick").format(orientation="XYZ"), "quick"),
         ("a.gcsv", GCSV.replace("orientation,{orientation}\n", ""), "give --gyro-axes"),
@@ -391,6 +404,11 @@ def test_photos_find_their_times_and_readouts(tmp_path):
     (tmp_path / "times.csv").write_text("name,time_s\nz.jpg,1.0\n")
     with pytest.raises(InputError, match=r"none of the photos, such as a\.jpg"):
         gyro_motions(tmp_path, replace(gyro, times=tmp_path / "times.csv"), gyro.log(), readouts, cameras)
+    (tmp_path / "times.csv").write_text("name,time_s\nb.jpg,1.0\nA.jpg,1.0\n")
+    with pytest.raises(InputError, match=r"times\.csv: 'A\.jpg' is not among the photos"):
+        gyro_motions(tmp_path, replace(gyro, times=tmp_path / "times.csv"), gyro.log(), readouts, cameras)
+    (tmp_path / "A.jpg").write_bytes(b"left out, since it cannot be read")
+    assert list(gyro_motions(tmp_path, replace(gyro, times=tmp_path / "times.csv"), gyro.log(), readouts, cameras)[0])
     with pytest.raises(InputError, match="expected seconds"):
         GyroOptions(gyro.file, offset_s=float("nan"))
 

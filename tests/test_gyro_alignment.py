@@ -90,6 +90,13 @@ def test_axes_offset_and_bias_are_found(axes):
     assert axes in str(found)
 
 
+def test_an_offset_that_is_roughly_known_may_be_any():
+    day = 1.7e9  # seconds since 1970, as phones log
+    found = align_gyro(gyroscope(offset_s=day + 1.234), *frames(), around_s=day + 8)
+    assert isinstance(found, GyroAlignment)
+    assert found.offset_s - day == pytest.approx(1.234, abs=min(0.001, 4 * found.offset_sigma_s))
+
+
 def test_the_log_in_the_camera_is_what_a_run_needs():
     log = gyroscope(camera_from_gyro=parse_axes("yXZ"), bias=(0.05, 0.02, -0.04), offset_s=-0.4, noise=0.001)
     found = align_gyro(log, *frames(noise_rad=1e-5))
@@ -227,7 +234,8 @@ def test_too_little():
     dead = GyroLog(np.arange(0.0, 10.0, 0.01), np.zeros((1000, 3)))
     assert "did not move" in align_gyro(dead, times, pairs, turns).reason
     far = gyroscope(offset_s=1e6)
-    assert "cover the frames" in align_gyro(far, times, pairs, turns).reason
+    assert "no offset up to 10 s" in align_gyro(far, times, pairs, turns).reason
+    assert "no offset within 10 s of 50 s" in align_gyro(far, times, pairs, turns, around_s=50).reason
     with pytest.raises(InputError, match="expected"):
         align_gyro(gyroscope(), times, pairs, turns[:5])
     with pytest.raises(InputError, match="pairs"):

@@ -12,9 +12,10 @@ from bundle_scenes import make_scene
 
 from rsundistort.errors import FormatError, InputError
 from rsundistort.input.photo_cameras import camera_file_of
-from rsundistort.io import read_known_motions
+from rsundistort.io import read_known_motions, read_photo_times
 from rsundistort.io.gyro import read_gyro
 from rsundistort.io.masks import read_mask
+from rsundistort.io.surveyed import read_control_points, read_known_lengths
 
 
 def test_a_decimal_comma_is_no_further_cell(tmp_path):
@@ -40,6 +41,20 @@ def test_a_gyroscope_in_degrees_is_refused(tmp_path):
     log.write_text("time_s,wx,wy,wz\n0,0,-120,0\n0.01,0,30,0\n")
     with pytest.raises(FormatError, match=r"gyro\.csv has rates up to 120, .* degrees per second"):
         read_gyro(log)
+
+
+@pytest.mark.parametrize("read", [read_known_motions, read_known_lengths, read_control_points, read_photo_times])
+def test_of_two_columns_of_one_name_none_is_taken(tmp_path, read):
+    table = tmp_path / "table.csv"
+    table.write_text("name,sigma,name \na.jpg,0.1,b.jpg\n")
+    with pytest.raises(FormatError, match=r"^.*table\.csv has two columns 'name'; remove one"):
+        read(table)
+
+
+def test_columns_without_a_name_may_be_several(tmp_path):
+    table = tmp_path / "times.csv"
+    table.write_text("name,time_s,,\na.jpg,1.5,,\n")
+    assert read_photo_times(table) == {"a.jpg": 1.5}
 
 
 def test_a_mask_of_zeros_and_ones_is_not_taken_for_black(tmp_path):

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,11 +15,13 @@ import pytest
 from make_photos import COURTYARD_NAMES, exif_block, half_courtyard, save_png, texture
 
 from rsundistort import Camera, RectifyOptions, RowMotion, RunOptions, SolveOptions, rectify, rectify_folder, run
-from rsundistort.errors import FileError, FormatError, InputError
+from rsundistort.errors import FileError, FormatError, InputError, SkippedPhotoWarning
 from rsundistort.input import photo_cameras
 from rsundistort.io import Metadata, find_masks, read_exif, read_mask, write_image
 from rsundistort.io.cameras import camera_to_json
+from rsundistort.model import Observations, Reconstruction
 from rsundistort.sfm import detect_features
+from rsundistort.solve.outcome import Solved
 
 HANDHELD = Path(__file__).parent.parent / "sample_scenes" / "handheld"
 WIDE, TALL = (64, 48), (48, 64)
@@ -124,6 +128,40 @@ def test_a_folder_of_cameras_is_shared_out_by_size_and_by_group(folder, tmp_path
         find_cameras(folder, NAMES, SIZES, str(tmp_path / "cameras"))
 
 
+def test_cameras_of_a_folder_that_say_no_size_have_that_of_their_photos(folder, tmp_path):
+    texts = {name: f"{f} 0 24\n0 {f} 20\n0 0 1\n" for name, f in {"phone": 60, "camera-48x64": 50, "drone": 70}.items()}
+    opencv = "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [{}]\n"
+    cameras = tmp_path / "cameras"
+    cameras.mkdir()
+
+    def find():
+        found = find_cameras(folder, NAMES, SIZES, str(cameras))
+        return [(each.width, each.height, each.K[0, 0]) for each in map(found.of, range(4))]
+
+    (cameras / "phone.txt").write_text(texts["phone"])
+    with pytest.raises(InputError, match=r"for d\.png is for 64x48 pixels but the photos have 48x64"):
+        find()  # one K is of one size
+    (cameras / "camera-48x64.txt").write_text(texts["camera-48x64"])
+    assert find() == [(*WIDE, 60)] * 3 + [(*TALL, 50)]
+    (cameras / "phone.txt").rename(cameras / "camera-64x48.txt")
+    assert find() == [(*WIDE, 60)] * 3 + [(*TALL, 50)]
+    (cameras / "camera-48x64.txt").unlink()
+    (cameras / "camera-48x64.yml").write_text(opencv.format("45, 0, 24, 0, 45, 20, 0, 0, 1"))
+    assert find() == [(*WIDE, 60)] * 3 + [(*TALL, 45)]
+    # what has a size takes the photos of that size, and one camera without a size the others
+    (cameras / "camera-48x64.yml").unlink()
+    (cameras / "camera-64x48.txt").rename(cameras / "phone.txt")
+    (cameras / "upright.json").write_text(json.dumps(camera_to_json(camera_of(TALL))))
+    assert find() == [(*WIDE, 60)] * 3 + [(*TALL, 60)]
+    (cameras / "drone.txt").write_text(texts["drone"])
+    with pytest.raises(InputError, match=r"several cameras of the size of a\.png"):
+        find()
+    (cameras / "phone.txt").unlink()
+    (cameras / "wide.json").write_text(json.dumps(camera_to_json(camera_of(WIDE))))
+    with pytest.raises(InputError, match=r"several cameras of the size of a\.png"):
+        find()
+
+
 def test_one_camera_is_not_stretched_over_photos_of_another_size(folder):
     with pytest.raises(InputError, match=r"d\.png"):
         find_cameras(folder, NAMES, SIZES, "60,60,32,24")
@@ -161,6 +199,40 @@ def test_exif_groups_photos_and_rotated_ones_are_read_out_across(tmp_path):
     assert len(found.notes) == 1
     assert "portrait" in found.notes[0]
     assert found.cameras[0].K[0, 0] == found.cameras[1].K[0, 0]
+
+
+def test_photos_that_are_not_registered_keep_the_camera_that_took_them(tmp_path):
+    photos = half_courtyard(tmp_path, COURTYARD_NAMES[:4])
+    save_png(photos / "other.png", texture(160, 240))
+    (photos / "z.png").write_bytes(b"no photo at all")
+    given = json.loads((tmp_path / "camera.json").read_text())
+    cameras = {"small": camera_to_json(camera_of((160, 240), f=200.0)), "phone": given}
+    (tmp_path / "cameras.json").write_text(json.dumps({"cameras": cameras}))
+    options = RunOptions(
+        max_features=1000, solve=SolveOptions(shutter_model="rotation"), camera=str(tmp_path / "cameras.json")
+    )
+    with pytest.warns(SkippedPhotoWarning, match=r"z\.png"):
+        solution = run(photos, tmp_path / "out", options)
+    first, other = solution.image(COURTYARD_NAMES[0]), solution.image("other.png")
+    assert first.registered
+    assert not other.registered
+    assert solution.cameras[first.camera_id].width == 480
+    assert solution.cameras[other.camera_id].width == 160
+
+
+def test_where_lenses_vary_the_camera_of_a_lost_photo_is_that_of_another_photo_by_it():
+    cameras = [camera_of(WIDE), camera_of(WIDE, f=70.0), camera_of(TALL)]
+    seen = Observations(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
+    rec = Reconstruction(
+        cameras, ["a", "b", "c", "d"], np.array([0, 1, 1, 0]), np.tile(np.eye(3), (4, 1, 1)), np.zeros((4, 3)),
+        np.zeros((0, 3)), seen, variation=np.full((4, 3), 0.01),
+    )  # fmt: skip
+    camera_of_photo = {"lost": 1, "alone": 2}
+    solved = Solved(SimpleNamespace(reconstruction=rec), None, None, camera_of=camera_of_photo)
+    assert [solved.camera_id_of(name) for name in ("lost", "alone", "unread")] == [2, 1, 1]
+    shared = replace(solved, result=SimpleNamespace(reconstruction=replace(rec, variation=np.zeros(0))))
+    assert [shared.camera_id_of(name) for name in ("lost", "alone", "unread")] == [2, 3, 1]
+    assert replace(shared, shared_ids=[4, 7, 9]).camera_id_of("lost") == 7
 
 
 # ---------------------------------------------------------------- masks

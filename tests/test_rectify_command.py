@@ -68,6 +68,22 @@ def test_rectify_to_another_view(invoke, tmp_path):
         assert invoke(*args, "bad", "--alpha", alpha).exit_code == 2
 
 
+def test_rectify_counts_the_photos_that_it_rectified(invoke, tmp_path):
+    save_textures(tmp_path / "photos", THREE)
+    save_textures(tmp_path / "photos" / "more", ["d.png"])
+    solution_of(tmp_path / "s.json", [*THREE, "more/d.png", "elsewhere.png"])
+    (tmp_path / "photos" / "b.png").write_bytes(b"no photo")
+    args = ["rectify", "photos", "--solution", "s.json", "-o", "out"]
+    result = invoke(*args)
+    assert (result.exit_code, result.stdout.splitlines()[0]) == (
+        3,
+        "3 photos rectified with the rotation model, 1 left out: out",
+    )
+    (tmp_path / "out" / "images" / "a-painting.png").write_bytes(b"of the user")
+    result = invoke(*args, "--resume", "--json")  # what is whole is not rectified again
+    assert json.loads(result.stdout)["rectified"] == 3
+
+
 def test_rectify_pushes_other_images_through_the_same_grid(invoke, tmp_path):
     save_textures(tmp_path / "photos", THREE)
     solution_of(tmp_path / "s.json", THREE)
@@ -95,6 +111,20 @@ def test_rectify_pushes_other_images_through_the_same_grid(invoke, tmp_path):
     result = invoke(*args, "--overwrite")
     assert result.stderr == "warning: skipped: b.png: labels/b.png: photo has 320x100 pixels, its camera 320x240\n"
     assert sorted(tree(tmp_path / "out" / "images")) == ["a.png", "c.png"]
+
+
+def test_an_image_of_two_photos_of_one_stem_is_refused(invoke, tmp_path):
+    names = ["a.png", "a.jpg"]
+    save_textures(tmp_path / "photos", names)
+    save_textures(tmp_path / "labels", ["a.tif"])
+    solution_of(tmp_path / "s.json", names)
+    args = ["rectify", "photos", "--solution", "s.json", "-o", "out", "--also", "labels"]
+    said = error_line(invoke(*args))
+    assert "a.tif would be of a.jpg and of a.png; call it a.png.tif if it is of the latter" in said
+    assert not (tmp_path / "out").exists()
+    save_textures(tmp_path / "labels", ["a.png.tif"])
+    assert invoke(*args).exit_code == 0
+    assert set(tree(tmp_path / "out" / "also")) == {"labels", "labels/a.tif", "labels/a.png.tif"}
 
 
 def test_rectify_writes_maps_both_ways(invoke, tmp_path):

@@ -193,14 +193,16 @@ def test_a_photo_that_a_track_holds_twice_counts_once(rng):
 
 
 def test_unregistered_photos_are_said_to_be(tmp_path, rng):
-    scene = make_scene(rng)
+    scene = make_scene(rng, ("OPENCV", "OPENCV"))
     lost = NAMES[-1]
     image = next(image for image in scene.model.images.values() if image.name == lost)
     for k, point in enumerate(image.points2D):
         if point.has_point3D():
             scene.model.delete_observation(image.image_id, k)
     scene.model.deregister_frame(image.frame_id)
-    assert "not registered" in rs.solve(scene.model, options=OPTIONS)[1].image(lost).reason
+    image_of_lost = rs.solve(scene.model, options=OPTIONS)[1].image(lost)
+    assert "not registered" in image_of_lost.reason
+    assert image_of_lost.camera_id == "7"
     # the files of a model do not name them, the folder of photos does
     photos = save_photos(tmp_path / "photos")
     (photos / "notes.txt").write_text("no photo")

@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 
 from ..errors import InputError
 from ..io import find_masks, output_name
+from ..io.masks import check_one_photo_each
 
 __all__ = ["AlsoImage", "find_extras"]
 
@@ -40,6 +41,11 @@ def find_extras(also: Sequence[tuple[Path, str]], names: Sequence[str]) -> dict[
         Folders of images of the photos' stems and sizes; they go to `out/also`, into folders of the same names.
     names : sequence of str
         Photos.
+
+    Raises
+    ------
+    FileError, InputError
+        A folder is missing or has the name of another one; a photo has several images in it, or two photos share one.
     """
     found: dict[str, list[AlsoImage]] = {name: [] for name in names}
     folders: set[str] = set()
@@ -48,7 +54,9 @@ def find_extras(also: Sequence[tuple[Path, str]], names: Sequence[str]) -> dict[
         if folder.name in folders:
             raise InputError(f"two folders named {folder.name} would both go to also/{folder.name}; rename one")
         folders.add(folder.name)
-        for name, file in find_masks(folder, names, "image").items():
+        files = find_masks(folder, names, "image")
+        check_one_photo_each(files, "image")  # both would be written to one place
+        for name, file in files.items():
             within = PurePosixPath("also", folder.name) / file.relative_to(folder).parent / output_name(file.name)
             found[name].append(AlsoImage(file, within.as_posix(), interpolation))
     return found

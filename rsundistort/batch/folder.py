@@ -25,7 +25,7 @@ from .rectify_options import RectifyOptions
 from .views import with_view
 from .workers import Workers, use_threads
 
-__all__ = ["rectify_folder"]
+__all__ = ["photos_of", "rectify_folder"]
 
 
 def rectify_folder(
@@ -109,10 +109,16 @@ def rectify_folder(
     return solved, dict(sorted(left_out.items()))
 
 
+def photos_of(folder: Place | str, solution: Solution, raw_as: str = "tif") -> list[str]:
+    """Names of the photos in a folder, and in its sub-folders that the solution has motions of."""
+    within = {PurePosixPath(image.name).parent.as_posix() for image in solution.registered}
+    return list_photos(folder, raw_as, within - {"."})
+
+
 def _with_motion(folder: Place, solved: Solution, solution: Path, raw_as: str) -> tuple[list[str], dict[str, str]]:
     """Photos of a folder that have a motion; and the others, with the reason why they are left out."""
     motions = {image.name for image in solved.registered}
-    listed = list_photos(folder, raw_as, {PurePosixPath(name).parent.as_posix() for name in motions} - {"."})
+    listed = photos_of(folder, solved, raw_as)
     if motions.isdisjoint(listed):
         raise InputError(f"{solution} has no motion for any photo of {folder}, such as {listed[0]}; is it theirs?")
     left_out = {name: f"it has no motion in {solution}" for name in listed if name not in motions}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,8 @@ class ColmapModel:
         Whether the colours are known.
     georeference : mapping or None
         Where on the map the model is, as of `Solution`, where it says so.
+    camera_of : mapping of name to int
+        Place of the camera of photos, also of those without a pose, as far as the model says it.
     """
 
     reconstruction: Reconstruction
@@ -61,6 +63,7 @@ class ColmapModel:
     self_calibrated: bool = False
     has_colors: bool = True
     georeference: Mapping[str, Any] | None = None
+    camera_of: Mapping[str, int] = field(default_factory=dict)
 
     def once_a_photo(self) -> ColmapModel:
         """The model with one measurement of a point in a photo, the nearest, and the points that two photos see."""
@@ -189,7 +192,7 @@ def colmap_model_of(model: Any, where: str = "the model") -> ColmapModel:
         points_w,
         Observations(frame, np.searchsorted(point_ids, ids), table[:, 3:] - HALF),
     )
-    unregistered = sorted({image_name(image, where) for image in model.images.values()} - set(rec.image_names))
+    camera_of = {image_name(image, where): place.get(image.camera_id) for image in model.images.values()}
     return ColmapModel(
         rec,
         np.array(camera_ids, np.int64),
@@ -197,8 +200,9 @@ def colmap_model_of(model: Any, where: str = "the model") -> ColmapModel:
         point_ids,
         keypoint,
         colors,
-        tuple(unregistered),
+        tuple(sorted({*camera_of} - {*rec.image_names})),
         any(model.cameras[k].model_name != "PINHOLE" for k in camera_ids),
+        camera_of={name: k for name, k in camera_of.items() if k is not None},
     ).once_a_photo()
 
 

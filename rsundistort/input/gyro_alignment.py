@@ -127,6 +127,7 @@ def align_gyro(
     rotations: ArrayLike,
     *,
     largest_s: float = 10.0,
+    around_s: float = 0.0,
 ) -> GyroAlignment | NoAlignment:
     """The offset of a log's clock and the axes of its sensor, from rotations between frames.
 
@@ -141,8 +142,8 @@ def align_gyro(
     rotations : (n, 3) array
         Rotation vectors in radians, about the camera's axes: `Exp(rotation)` takes directions in the first frame to
         those in the second. False ones, and NaN, are left out.
-    largest_s : float
-        Offsets of either sign up to this are tried.
+    largest_s, around_s : float
+        Offsets that differ from `around_s` by up to `largest_s` either way are tried.
 
     Returns
     -------
@@ -158,10 +159,10 @@ def align_gyro(
     coarse = _Coarse(log, start, end, _without_jumps(seen, start, log, interval))
     if not min(np.ptp(coarse.seen), np.ptp(log.omega_c)) > 0:
         return NoAlignment("the camera, or its gyroscope, did not move at all")
-    found = coarse.search(largest_s)
+    found = coarse.search(largest_s, around_s)
     if found is None:
         return NoAlignment(
-            f"no offset up to {largest_s:g} s lets the gyroscope's log, from {log.time_s[0]:.2f} to "
+            f"no offset {_up_to(largest_s, around_s)} lets the gyroscope's log, from {log.time_s[0]:.2f} to "
             f"{log.time_s[-1]:.2f} s, cover the frames"
         )
     offset, proper, mirrored, rival = found
@@ -222,6 +223,10 @@ def _why_not(fit: GyroAlignment, way: _Array, spread: float, interval_s: float) 
     if not fit.offset_sigma_s < interval_s / 2:
         return "the camera rotated too uniformly to determine the offset of the gyroscope's clock"
     return None
+
+
+def _up_to(largest_s: float, around_s: float) -> str:
+    return f"within {largest_s:g} s of {around_s:g} s" if around_s else f"up to {largest_s:g} s"
 
 
 def _other_clip(correlation: float) -> str:
@@ -288,13 +293,13 @@ class _Coarse:
         products, ratio = self.products(offset_s)
         return float(np.clip(ratio * np.linalg.svd(products)[1].sum(), 0.5, 2.0))
 
-    def search(self, largest_s: float) -> tuple[float, float, float, float] | None:
+    def search(self, largest_s: float, around_s: float) -> tuple[float, float, float, float] | None:
         """The best offset, what rotation and mirror image reach there, and the best elsewhere; None if none covers."""
         interval = float(np.median(self.end - self.start))
         step = interval / 2
         # only where the log covers anything
-        first = max(-largest_s, self.log.time_s[0] - self.end.max())
-        last = min(largest_s, self.log.time_s[-1] - self.start.min())
+        first = max(around_s - largest_s, self.log.time_s[0] - self.end.max())
+        last = min(around_s + largest_s, self.log.time_s[-1] - self.start.min())
         offsets = np.arange(np.ceil(first / step), np.floor(last / step) + 1) * step
         either = self.correlations(offsets).max(axis=1)
         if not len(either) or not np.isfinite(either.max()):

@@ -38,11 +38,12 @@ class GyroOptions:
     file : path
         As `io.read_gyro` takes it.
     offset_s : float
-        Time on the log's clock when the camera's shows zero.
+        Time on the log's clock when the camera's shows zero. For a video with a path it is estimated, within 10 s of
+        this.
     axes : str, optional
         As `io.read_gyro` takes them.
     times : path, optional
-        CSV with `name, time_s`; by default `frames.csv` among the photos.
+        CSV with `name, time_s`; by default `frames.csv` among the photos. A video with a path has times of its own.
     """
 
     file: Path | str
@@ -101,14 +102,19 @@ def gyro_motions(
 ) -> tuple[Known, dict[str, Bend]]:
     """Motions of the photos that have a time, as `RunOptions.known` and `known_bends` take them.
 
-    `readout_s` and `cameras` are by photo.
+    `readout_s` and `cameras` are by photo. A table of times that was given is refused where it names none.
     """
     table = Path(gyro.times) if gyro.times is not None else folder / FRAME_TABLE
     if gyro.times is None and not table.is_file():
         raise InputError(f"{gyro.file}: when were the photos taken? Give a table of name, time_s with --photo-times")
-    times = {name: time for name, time in read_photo_times(table).items() if name in readout_s}
+    stated = read_photo_times(table)
+    times = {name: time for name, time in stated.items() if name in readout_s}
     if not times:
         raise InputError(f"{table} has the time of none of the photos, such as {next(iter(readout_s))}")
+    # photos that cannot be read are left out; frames of a video may have been deleted
+    others = [name for name in stated if name not in readout_s and not (folder / name).is_file()]
+    if others and gyro.times is not None:
+        raise InputError(f"{table}: {others[0]!r} is not among the photos")
     if unknown := [name for name in times if readout_s[name] is None]:
         raise InputError(
             f"{gyro.file}: how long does the camera of {unknown[0]} take to read a frame? Give --readout-ms"

@@ -83,6 +83,11 @@ class LoadedPhotos:
     edges_px: Sequence[float | None] = ()
     coarse: frozenset[str] = frozenset()
 
+    @property
+    def camera_of(self) -> dict[str, int]:
+        """Index of the camera of each photo."""
+        return dict(zip(self.names, self.cameras.camera_idx.tolist(), strict=True))
+
     def unregistered(
         self, registered: Sequence[str], num_verified: Mapping[tuple[int, int], int] | None = None
     ) -> dict[str, str]:

@@ -226,8 +226,7 @@ def find_cameras(
         camera = str(beside)
     if camera is not None:
         file = read_camera_file(camera, *sizes[0])
-        keys = _keys_in(file, camera, names, sizes, groups)
-        known = dict(file.cameras)
+        known, keys = _keys_in(file, camera, names, sizes, groups)
         calibrated, source, notes, usual = True, file.source, list[str](), set[str]()
         in_file, sigma_of = file.readout_specified, file.sigma
     else:
@@ -264,11 +263,18 @@ def _relative(sigma: Mapping[str, float], camera: Camera) -> dict[str, float]:
 
 def _keys_in(
     file: CameraFile, where: str, names: Sequence[str], sizes: Sequence[tuple[int, int]], groups: Sequence[str]
-) -> list[str]:
-    """Camera of the file for each photo: by its name, else by its group, else the only one of its size."""
-    keys = []
+) -> tuple[dict[str, Camera], list[str]]:
+    """Cameras of the file, those without a size for the photos that they took; and the camera of each photo.
+
+    That is by its name, else by its group, else the only one, else the only one of its size, else the only one that has
+    none, and no group's name.
+    """
+    cameras, keys, open_ = dict(file.cameras), list[str](), {*file.without_size}
+    free = [key for key in cameras if key in open_ and key not in groups]
+    by_size = list[str]()
     for name, size, group in zip(names, sizes, groups, strict=True):
-        fitting = [key for key, each in file.cameras.items() if (each.width, each.height) == size]
+        of_size = [key for key, each in file.cameras.items() if (each.width, each.height) == size]
+        fitting = [key for key in of_size if key not in file.without_size] or free
         if file.camera_of_image:
             if name not in file.camera_of_image:
                 raise InputError(f"{where} says of no camera that it took {name}; name it there, or move it away")
@@ -278,15 +284,24 @@ def _keys_in(
         elif group in file.cameras:
             key = group
         elif len(fitting) == 1:
-            key = fitting[0]
+            (key,) = fitting
+            by_size.append(name)
         else:
-            which = "no camera" if not fitting else "several cameras"
-            raise InputError(
-                f"{where} holds {which} of the size of {name}, {size[0]}x{size[1]}; call its file {group}.json"
-            )
-        check_camera_fits(file.cameras[key], *size, f"{where} for {name}")
+            raise _no_camera_for(name, size, group, where, "no camera" if not fitting else "several cameras")
+        if key in open_:
+            cameras[key] = replace(cameras[key], width=size[0], height=size[1])
+            open_.remove(key)
+        check_camera_fits(cameras[key], *size, f"{where} for {name}")
         keys.append(key)
-    return keys
+    # a camera of no size that took no photo may have taken those
+    if by_size and open_ & {*free}:
+        i = names.index(by_size[0])
+        raise _no_camera_for(names[i], sizes[i], groups[i], where, "several cameras")
+    return cameras, keys
+
+
+def _no_camera_for(name: str, size: tuple[int, int], group: str, where: str, which: str) -> InputError:
+    return InputError(f"{where} holds {which} of the size of {name}, {size[0]}x{size[1]}; call its file {group}.json")
 
 
 def _from_exif(

@@ -121,6 +121,14 @@ def camera_from_calibration(tree: Mapping[str, Any], where: str, width: int, hei
         return Camera(width, height, K, dist, lens=lens)
 
 
+def has_size(tree: Mapping[str, Any]) -> bool:
+    """Whether a calibration that can be read holds the size of its photos."""
+    fields = _fields(tree)
+    roi = _fields(fields["roi"]) if isinstance(fields.get("roi"), Mapping) else {}
+    stated = any(len(_numbers(_first(fields, names))) for names in (_WIDTH, _HEIGHT, _SIZE))
+    return stated or _whole(roi, "width") > 0
+
+
 def _fields(tree: Mapping[str, Any]) -> dict[str, Any]:
     return {_plain(key): value for key, value in tree.items()}
 

@@ -13,7 +13,7 @@ import numpy as np
 from ..colmap import read_colmap_cameras
 from ..errors import FileError, FormatError, InputError, file_errors, format_errors
 from ..model import Camera, other_axis
-from .calibrations import camera_from_calibration, is_calibration, parse_xml, parse_yaml
+from .calibrations import camera_from_calibration, has_size, is_calibration, parse_xml, parse_yaml
 from .json_text import parse_json
 
 __all__ = [
@@ -99,6 +99,8 @@ class CameraFile:
         Cameras whose file says which way they are read out; of the others "top-to-bottom" is but a guess.
     sigma : dict of id to standard deviations
         Where the file says how well a camera is known: by intrinsic, in pixels or of the coefficients.
+    without_size : set of id
+        Cameras whose file does not say for what size they are: they have the one that the reader was called with.
     """
 
     cameras: Mapping[str, Camera]
@@ -106,6 +108,7 @@ class CameraFile:
     source: str = ""
     readout_specified: frozenset[str] = frozenset()
     sigma: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    without_size: frozenset[str] = frozenset()
 
 
 _KINDS = (
@@ -135,7 +138,8 @@ def read_camera_file(text: str | Path, width: int, height: int) -> CameraFile:
     """
     path = Path(text)
     if "," in str(text) and not _exists(path):
-        return CameraFile({_ONLY: _camera_from_numbers(str(text), width, height)}, source="numbers")
+        camera = _camera_from_numbers(str(text), width, height)
+        return CameraFile({_ONLY: camera}, source="numbers", without_size=frozenset({_ONLY}))
     if not (_exists(path) and path.is_dir()):
         return _read_file(path, width, height)
     if (path / "cameras.bin").is_file() or (path / "cameras.txt").is_file():
@@ -215,7 +219,8 @@ def _read_folder(folder: Path, width: int, height: int) -> CameraFile:
     sigma = {stem: next(iter(each.sigma.values()), {}) for stem, each in found.items()}
     stated = frozenset(stem for stem, each in found.items() if each.readout_specified)
     source = f"{folder} ({len(cameras)} camera file{'s' * (len(cameras) > 1)})"
-    return CameraFile(cameras, source=source, readout_specified=stated, sigma=sigma)
+    without_size = frozenset(stem for stem, each in found.items() if each.without_size)
+    return CameraFile(cameras, source=source, readout_specified=stated, sigma=sigma, without_size=without_size)
 
 
 def _read_file(path: Path, width: int, height: int) -> CameraFile:
@@ -232,14 +237,15 @@ def _read_file(path: Path, width: int, height: int) -> CameraFile:
     K = _nine_numbers(content)
     if K is not None:
         with format_errors(path):
-            return CameraFile({_ONLY: Camera(width, height, K)}, source=f"{path} (K)")
+            return CameraFile({_ONLY: Camera(width, height, K)}, source=f"{path} (K)", without_size=frozenset({_ONLY}))
     try:
         tree, kind = _parse(content)
     except (ValueError, RecursionError) as error:
         raise FormatError(f"{path} cannot be understood ({error}); expected {_KINDS}") from error
     source = f"{path} ({kind})"
     if is_calibration(tree) and not (kind == "JSON" and "K" in tree):
-        return CameraFile({_ONLY: camera_from_calibration(tree, str(path), width, height)}, source=source)
+        camera = camera_from_calibration(tree, str(path), width, height)
+        return CameraFile({_ONLY: camera}, source=source, without_size=frozenset(() if has_size(tree) else {_ONLY}))
     if kind != "JSON":
         raise FormatError(f"{path} holds no camera; expected {_KINDS}")
     if "cameras" in tree:

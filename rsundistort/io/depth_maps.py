@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, FormatError, InputError
 from ..model.arrays import read_arrays
+from .masks import check_one_photo_each, find_masks
 from .photos.images import read_plain
 
 __all__ = ["find_depth_maps", "read_depth_map"]
@@ -19,7 +20,7 @@ _SUFFIXES = (".npy", ".npz", ".tif", ".tiff")
 
 
 def find_depth_maps(folder: Path, names: Sequence[str]) -> dict[str, Path]:
-    """Depth maps of photos: files of the same stem (`a.tif` for `a.jpg`), or of the whole name (`a.jpg.npy`).
+    """Depth maps of photos, found as `find_masks` does: `a.tif` or `a.jpg.npy` for `a.jpg`, in the same sub-folder.
 
     Parameters
     ----------
@@ -31,18 +32,11 @@ def find_depth_maps(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     Raises
     ------
     FileError, InputError
-        When the folder is missing, or no map in it is of one of the photos.
+        When the folder is missing, no map in it is of one of the photos, a photo has several, or two photos share one.
     """
-    if not folder.is_dir():
-        raise FileError(f"{folder} is no folder; give the folder that holds the depth maps")
-    by_stem = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in _SUFFIXES}
-    found = {name: by_stem.get(name) or by_stem.get(Path(name).stem) for name in names}
-    maps = {name: path for name, path in found.items() if path is not None}
-    if not maps:
-        raise InputError(
-            f"{folder} holds no depth map of any photo; it should hold {Path(names[0]).stem}.npy and so on"
-        )
-    return maps
+    found = find_masks(folder, names, "depth map", _SUFFIXES)
+    check_one_photo_each(found, "depth map")
+    return found
 
 
 def read_depth_map(path: Path) -> NDArray[np.float32]:

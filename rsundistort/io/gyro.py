@@ -22,7 +22,7 @@ from ..errors import FormatError, InputError, RsUndistortWarning, file_errors, f
 from ..model import Bend, Camera, RowMotion
 from ..model.checks import check_array, check_finite, frozen
 from .motions import Known
-from .tables import read_table
+from .tables import check_cells, check_columns, read_table
 from .video import is_video
 
 __all__ = [
@@ -187,6 +187,7 @@ def read_gyro(path: Path | str, axes: str | None = None) -> GyroLog:
     columns = [cell.strip() for cell in lines[0].split(",")] if lines else []
     if missing := [column for column in _COLUMNS if column not in columns]:
         raise FormatError(f"{path} has no column {missing[0]!r}; expected {', '.join(_COLUMNS)}, or Gyroflow's .gcsv")
+    check_columns(path, columns)
     time_s, rates = _samples(path, lines, 1, [columns.index(column) for column in _COLUMNS])
     return _log(path, time_s, rates @ parse_axes(axes or "XYZ").T)
 
@@ -214,8 +215,12 @@ def _from_gcsv(path: Path, lines: list[str], axes: str | None) -> GyroLog:
 def _samples(
     path: Path, lines: list[str], start: int, columns: list[int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Times (n,) and rates (n, 3) as written, without a last line that was cut off."""
+    """Times (n,) and rates (n, 3) as written, behind the line of the columns, without a last line that was cut off."""
     body = lines[start:]
+    width = lines[start - 1].count(",") + 1
+    for number, line in enumerate(body, start + 1):
+        if line.count(",") >= width:
+            check_cells(path, number, width, line.split(",")[width:])
     if len(body) < 2:
         raise FormatError(f"{path} holds no two samples")
     for last in (len(body), len(body) - 1):

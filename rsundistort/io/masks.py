@@ -14,17 +14,25 @@ from ..errors import FileError, InputError
 from .photos.images import read_plain
 from .places import File, Place, files_in
 
-__all__ = ["find_masks", "read_mask"]
+__all__ = ["check_one_photo_each", "find_masks", "read_mask"]
 
 _SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".webp", ".jpg", ".jpeg")
 
 
 @overload
-def find_masks(folder: Path, names: Sequence[str], what: str = ...) -> dict[str, Path]: ...
+def find_masks(
+    folder: Path, names: Sequence[str], what: str = ..., suffixes: Sequence[str] = ...
+) -> dict[str, Path]: ...
 @overload
-def find_masks(folder: Place, names: Sequence[str], what: str = ...) -> Mapping[str, File]: ...
-def find_masks(folder: Place, names: Sequence[str], what: str = "mask") -> Mapping[str, File]:
+def find_masks(
+    folder: Place, names: Sequence[str], what: str = ..., suffixes: Sequence[str] = ...
+) -> Mapping[str, File]: ...
+def find_masks(
+    folder: Place, names: Sequence[str], what: str = "mask", suffixes: Sequence[str] = _SUFFIXES
+) -> Mapping[str, File]:
     """Masks of photos: files of the same stem (`a.png` for `a.jpg`), or of the whole name, as COLMAP has them.
+
+    Those of photos in sub-folders are in sub-folders of the same names.
 
     Parameters
     ----------
@@ -33,12 +41,14 @@ def find_masks(folder: Place, names: Sequence[str], what: str = "mask") -> Mappi
     names : sequence of str
         Photos.
     what : str
-        What errors call them; other images of the same frames are found alike.
+        What errors call them; other files of the same frames are found alike.
+    suffixes : sequence of str
+        Endings that they have, the most usual first.
 
     Raises
     ------
     FileError, InputError
-        When the folder is missing, or no mask in it is of one of the photos.
+        When the folder is missing, no mask in it is of one of the photos, or a photo has several.
     """
     if files_in(folder) is None:
         raise FileError(f"{folder} is no folder; give the folder that holds the {what}s")
@@ -46,7 +56,7 @@ def find_masks(folder: Place, names: Sequence[str], what: str = "mask") -> Mappi
     for within in sorted({PurePosixPath(name).parent for name in names}):
         for each, file in (files_in(folder, within.as_posix()) or {}).items():
             path = within / each
-            if path.suffix.lower() in _SUFFIXES:
+            if path.suffix.lower() in suffixes:
                 by_stem.setdefault(path.with_suffix(""), []).append(file)
     found: dict[str, File] = {}
     for name in names:
@@ -59,8 +69,20 @@ def find_masks(folder: Place, names: Sequence[str], what: str = "mask") -> Mappi
         if fitting:
             found[name] = fitting[0]
     if not found:
-        raise InputError(f"{folder} holds no {what} of any photo; it should hold {Path(names[0]).stem}.png and so on")
+        such = PurePosixPath(names[0]).with_suffix(suffixes[0])
+        raise InputError(f"{folder} holds no {what} of any photo; it should hold {such} and so on")
     return found
+
+
+def check_one_photo_each(found: Mapping[str, Path], what: str) -> None:
+    """Refuse files that `find_masks` found for two photos of one stem, such as `a.npy` for `a.jpg` and `a.png`."""
+    photo_of: dict[Path, str] = {}
+    for name, path in found.items():
+        if (other := photo_of.setdefault(path, name)) != name:
+            raise InputError(
+                f"{what} {path} would be of {other} and of {name}; call it {PurePosixPath(name).name}{path.suffix} "
+                "if it is of the latter"
+            )
 
 
 def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8]:

@@ -86,13 +86,16 @@ def own_gyroscope(clip: Clip) -> GyroLog | None:
         return None
 
 
-def felt_gyroscope(result: BundleResult, log: GyroLog | None) -> Felt | None:
-    """The gyroscope of a clip, aligned with its frames; None without one, or if it is of another clip."""
+def felt_gyroscope(result: BundleResult, log: GyroLog | None, around_s: float = 0.0) -> Felt | None:
+    """The gyroscope of a clip, aligned with its frames; None without one, or if it is of another clip.
+
+    The offset of its clock is looked for around `around_s`.
+    """
     if log is None:
         return None
     assert result.path is not None
     path = result.path.path
-    found = align_gyro(log, path.time_s, *rotations_between(path.part, path.R_cw))
+    found = align_gyro(log, path.time_s, *rotations_between(path.part, path.R_cw), around_s=around_s)
     if isinstance(found, NoAlignment):
         warnings.warn(f"without the gyroscope: {found.reason}", RsUndistortWarning, stacklevel=6)
         return None

@@ -414,4 +414,6 @@ def _solve(
     ids = given.ids_of(old, after.image_names)
     known = (old >= 0) & given.has_colors
     rgb = PointRgb(np.where(known[:, None], given.colors[old], 0).astype(np.uint8), known)
-    return replace(solved, shared_ids=ids.cameras, unregistered=lost, readouts=readouts), ids, rgb
+    camera_of = {**given.camera_of, **dict(zip(rec.image_names, rec.camera_idx.tolist(), strict=True))}
+    solved = replace(solved, shared_ids=ids.cameras, unregistered=lost, camera_of=camera_of, readouts=readouts)
+    return solved, ids, rgb

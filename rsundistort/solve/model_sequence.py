@@ -119,7 +119,8 @@ def solve_photos(
     num_verified = read_num_verified(matched)
     source = TrackSource(matched, photos, workers, mapped_here=True)
     solved = solve_tracks(mapped, photos.cameras, shutter_model, seed, options_of, log, remedy, source, survey)
-    solved = replace(solved, unregistered=photos.unregistered(solved.shared.image_names, num_verified))
+    lost = photos.unregistered(solved.shared.image_names, num_verified)
+    solved = replace(solved, unregistered=lost, camera_of=photos.camera_of)
     if solved.survey is not None:
         return solved
     # the frame of a mapping is arbitrary

@@ -52,6 +52,8 @@ class Solved:
         numbered.
     unregistered : mapping of name to reason
         Photos that are not in it.
+    camera_of : mapping of name to camera index
+        Cameras of photos, in it or not, as far as they are known.
     readouts : mapping of camera index to (seconds, source)
         Readout times, as far as they are known.
     whole : Reconstruction or None
@@ -78,6 +80,7 @@ class Solved:
     verdict: Verdict | None = None
     shared_ids: Sequence[int] = ()
     unregistered: Mapping[str, str] = field(default_factory=dict)
+    camera_of: Mapping[str, int] = field(default_factory=dict)
     readouts: Mapping[int, tuple[float, str]] = field(default_factory=dict)
     whole: Reconstruction | None = None
     evidence: Mapping[str, Any] = field(default_factory=dict)
@@ -101,6 +104,16 @@ class Solved:
         """Ids of the cameras of `reconstruction`, in all outputs."""
         own = self.shared.varies
         return list((not own and self.shared_ids) or range(1, 1 + len(self.reconstruction.cameras)))
+
+    def camera_id_of(self, name: str) -> int:
+        """Id in all outputs of the camera of a photo that is not in it.
+
+        If cameras vary it is that of the first photo by the same one. Where nothing is known, it is the first.
+        """
+        k = self.camera_of.get(name, 0)
+        if not self.shared.varies:
+            return self.camera_ids[k]
+        return self.camera_ids[int(np.argmax(self.shared.camera_idx == k))]
 
     def by_camera(self, values: Sequence[Any]) -> dict[str, Any]:
         """Values of shared cameras, by the ids of the outputs: those of the photos, if they vary."""
@@ -242,7 +255,7 @@ def _images(solved: Solved) -> Iterator[SolvedImage]:
     places = {name: i for i, name in enumerate(rec.image_names)}
     for name in sorted([*rec.image_names, *solved.unregistered]):
         if name in solved.unregistered:
-            yield SolvedImage(name, keys[0], reason=solved.unregistered[name])
+            yield SolvedImage(name, str(solved.camera_id_of(name)), reason=solved.unregistered[name])
             continue
         i = places[name]
         shift_px = largest_shift_px(rec.camera(i), rec.motion(i), rec.shutter_model) if name not in lens_only else 0.0

@@ -94,7 +94,7 @@ def run(
     if options.frames == "all" and not is_clip:
         raise InputError(f"{photos} is no video; --frames all is for one")
     if is_clip:
-        check_of_video(options.solve)
+        check_of_video(options.solve, options.gyro)
     of_video = [name for name in OF_VIDEOS if name != VIDEO or options.frames == "all"] if is_clip else []
     replaced = (*REPLACED, "frames") if is_video(photos) else REPLACED
     with run_folder(out, key_of(inputs, options), log, overwrite=overwrite, resume=resume) as before:
@@ -227,14 +227,19 @@ def _solve(
     return replace(solved, readouts=readouts), solving
 
 
-def check_of_video(solving: SolveOptions) -> None:
+def check_of_video(solving: SolveOptions, gyro: GyroOptions | None) -> None:
     """Refuse options that the path of a video does not take."""
     if solving.control or solving.crs not in (None, "none"):
         raise InputError("frames of a video have no GPS; it takes no --crs and --gcp, say --every N for photos that do")
-    if solving.still or solving.known or solving.shutter_model not in ("auto", "constant-motion", "global"):
+    of_photos = solving.still or solving.known or solving.known_bends or solving.remedy != "auto"
+    if of_photos or solving.shutter_model not in ("auto", "constant-motion", "global"):
         raise InputError(
-            "the path of a video says how its frames move: it takes no --still, --known or --model but global; "
-            "say --every N for photos that do"
+            "the path of a video says how its frames move: it takes no --still, --known, --remedy or --model but "
+            "global; say --every N for photos that do"
+        )
+    if gyro is not None and gyro.times is not None:
+        raise InputError(
+            "the frames of a video have times of their own; it takes no --photo-times, say --every N for photos that do"
         )
     if solving.shutter_model == "global" and solving.readout_s is not None:
         raise InputError("frames of a global shutter have no readout time; leave out --readout-ms or --model global")
@@ -252,16 +257,19 @@ def solve_frames(
     """The result of a video and a gyroscope's log."""
     solving, cameras = options.solve, keys.cameras
     at_once = solving.shutter_model == "global"
+    around_s = 0.0 if options.gyro is None else options.gyro.offset_s
     readouts = {} if at_once else known_readouts(
         bodies, cameras.cameras, cameras.camera_idx, solving.readout_s, gyro_log
     )  # fmt: skip
     with work_folder() as work:
         solved = solve_clip(
             clip, keys, frame_path(clip, readouts.get(0)), lambda _: solving.options_for(cameras), work, log,
-            seed=solving.seed, matching=options.matching, gyroscope=gyro_log, kept=kept, at_once=at_once,
+            seed=solving.seed, matching=options.matching, gyroscope=gyro_log, gyro_offset_s=around_s, kept=kept,
+            at_once=at_once,
         )  # fmt: skip
     cameras.check_plausible(solved.shared.cameras)
-    return replace(solved, unregistered=keys.unregistered(solved.shared.image_names), readouts=readouts)
+    lost = keys.unregistered(solved.shared.image_names)
+    return replace(solved, unregistered=lost, camera_of=keys.camera_of, readouts=readouts)
 
 
 def _with_gyroscope(

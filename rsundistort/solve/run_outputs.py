@@ -328,13 +328,15 @@ class Outputs:
     def _export(self, folder: Path, scene: ExportScene, tell: bool) -> None:
         """Write the exports; an error of one loses no other."""
         for name in self.options.exports:
+            warning: RsUndistortWarning | None = None
             try:
-                said = EXPORTS[name].write(folder / name, scene)
+                if said := EXPORTS[name].write(folder / name, scene):
+                    warning = RsUndistortWarning(f"{name}: {said}")
             except InputError as error:
-                said = f"it is not written: {error}"
+                warning = MissingOutputWarning(f"no {name} was written: {error}", f"{name}/")
                 shutil.rmtree(folder / name, ignore_errors=True)
-            if said and tell:
-                warnings.warn(f"{name}: {said}", RsUndistortWarning, stacklevel=4)
+            if warning is not None and tell:
+                warnings.warn(warning, stacklevel=4)
 
     def _path(self, folder: Path, new_camera: Camera) -> CameraPath | None:
         """Write the path of the camera of a video; rotated as the key frames are. None of photos."""

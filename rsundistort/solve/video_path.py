@@ -74,6 +74,7 @@ def solve_clip(
     seed: int = 0,
     matching: str = "auto",
     gyroscope: GyroLog | None = None,
+    gyro_offset_s: float = 0.0,
     kept: Kept | None = None,
     at_once: bool = False,
 ) -> Solved:
@@ -98,6 +99,8 @@ def solve_clip(
     gyroscope : GyroLog, optional
         A gyroscope's log; else that of the video's own telemetry, if it has any. Its axes and the offset of its clock
         are found.
+    gyro_offset_s : float
+        Where the offset of that log's clock is looked for, as `align_gyro` does around it.
     kept : Kept, optional
         Results of an earlier run; takes those of this run.
     at_once : bool
@@ -131,7 +134,7 @@ def solve_clip(
     alone = readout_of(found.result)
     # the telemetry of frames that were rotated since says nothing; those of a global shutter only look like them
     of_camera = None if was_stabilised(found.filmed) and not at_once else gyroscope or telemetry
-    found = _with_gyroscope(found, of_camera, known, log)
+    found = _with_gyroscope(found, of_camera, gyro_offset_s, known, log)
     return judged(found, keys, alone, telemetry, log, at_once=at_once)
 
 
@@ -186,11 +189,11 @@ def _filmed_by(
 
 
 def _with_gyroscope(
-    found: FoundPath, gyroscope: GyroLog | None, known: tuple[float, float] | None, log: StageLog
+    found: FoundPath, gyroscope: GyroLog | None, around_s: float, known: tuple[float, float] | None, log: StageLog
 ) -> FoundPath:
     """The path by the rates of a gyroscope, too, if it fits."""
     log.begin("gyroscope")
-    result, options, felt = found.result, found.options, felt_gyroscope(found.result, gyroscope)
+    result, options, felt = found.result, found.options, felt_gyroscope(found.result, gyroscope, around_s)
     if felt is not None:
         # its rates are those of the camera, however fast that shakes
         path = replace(
