@@ -36,7 +36,8 @@ from .kinds import (
 )
 from .metadata import Metadata
 from .raw import read_raw
-from .tiff import as_stored, damaged_strips, encode_tiff, tiff_metadata
+from .tiff import damaged_strips, encode_tiff, tiff_metadata
+from .tiff_pixels import misread_as_plain, read_tiff
 
 __all__ = [
     "LARGEST_SIDE",
@@ -200,7 +201,11 @@ def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> Photo:
         pixels, metadata = read_heif(data, path.name)
     else:
         pixels, said = with_lines(
-            lambda: _decode(as_stored(data), path.name) if kind == "TIFF" else _decode_file(path, stamp, data)
+            lambda: (
+                read_tiff(data, path.name, lambda stored: _decode(stored, path.name))
+                if kind == "TIFF"
+                else _decode_file(path, stamp, data)
+            )
         )
         if kind == "TIFF" and (count := damaged_strips(data)):
             said = [f"the checksum of {count} of its strips is wrong"]
@@ -242,7 +247,7 @@ def _decode_file(path: Path, stamp: tuple[int, int] | None, data: bytes) -> NDAr
     return _decode(data, path.name)
 
 
-def _decode(data: bytes, name: str) -> NDArray[Any]:
+def _decode(data: bytes | bytearray, name: str) -> NDArray[Any]:
     try:
         pixels: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -268,6 +273,8 @@ def read_plain(path: Path, what: str, flags: int) -> NDArray[Any]:
     size = picture_size(data, kind)
     if size is not None and (size[0] * size[1] > MAX_MEGAPIXELS * 1e6 or not can_hold(data, kind, size)):
         raise FileError(f"{what} {path} has {size[0]}x{size[1]} pixels by its header, more than it can hold")
+    if kind == "TIFF" and (misread := misread_as_plain(data)):
+        raise FileError(f"{what} {path} is {misread}, which is not read; save it as PNG, or as a plain TIFF")
     try:
         decoded = with_lines(lambda: cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None)
     except cv2.error as error:
