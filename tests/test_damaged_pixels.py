@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import cv2
 import numpy as np
 import pytest
+import tifffile
 from make_photos import save_png, texture
 
 from rsundistort.errors import DamagedPhotoWarning, FileError
@@ -37,6 +38,13 @@ def test_a_whole_tiff_is_read_without_a_word(tmp_path, recwarn):
     path = tmp_path / "a.tif"
     path.write_bytes(bytes(cv2.imencode(".tif", texture(320, 240), [cv2.IMWRITE_TIFF_COMPRESSION, DEFLATE])[1]))
     assert np.array_equal(read_photo(path).pixels, texture(320, 240))
+    assert not recwarn
+
+
+def test_a_tag_that_libtiff_has_no_name_for_is_no_damage(tmp_path, recwarn):
+    tifffile.imwrite(tmp_path / "a.tif", texture(64, 48), photometric="rgb", extratags=[(65001, 3, 1, 7, True)])
+    with heard():
+        read_photo(tmp_path / "a.tif")
     assert not recwarn
 
 

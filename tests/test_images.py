@@ -129,10 +129,37 @@ def test_write_image_replaces_a_file(tmp_path):
 
 
 def test_pictures_that_are_not_read_are_known(tmp_path):
-    for name in ("a.png", "b.bmp", "c.JP2", ".d.gif", "e.txt"):
+    for name in ("a.png", "b.bmp", "c.JP2", ".d.gif", "e.txt", "f.GPR", "g.mpo"):
         (tmp_path / name).touch()
-    assert unread_pictures(tmp_path) == ["b.bmp", "c.JP2"]
+    assert unread_pictures(tmp_path) == ["b.bmp", "c.JP2", "f.GPR", "g.mpo"]
     assert list_photos(tmp_path) == ["a.png"]
+    (tmp_path / "a.png").unlink()
+    with pytest.raises(FileError, match=r"no photos in .* \(b\.bmp is of no such kind; convert it to PNG or TIFF"):
+        list_photos(tmp_path)
+
+
+@pytest.mark.parametrize("suffix", [".jpe", ".JFIF", ".jif", ".jfi", ".pjpeg", ".pjp"])
+def test_a_jpeg_under_another_ending_is_read_and_written(tmp_path, suffix):
+    pixels = texture(64, 48)
+    write_image(tmp_path / f"a{suffix}", pixels, Metadata(camera_exif("<", 6)), quality=97)
+    write_image(tmp_path / "b.jpg", pixels, Metadata(camera_exif("<", 6)), quality=97)
+    assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / "b.jpg").read_bytes()
+    assert list_photos(tmp_path) == [f"a{suffix}", "b.jpg"]
+    assert output_name(f"a{suffix}") == f"a{suffix}"
+    photo = read_photo(tmp_path / f"a{suffix}")
+    np.testing.assert_array_equal(photo.pixels, read_photo(tmp_path / "b.jpg").pixels)
+    assert photo.metadata.orientation == 6
+
+
+@pytest.mark.parametrize("suffix", [".nrw", ".NRW", ".rwl", ".3fr", ".fff"])
+def test_raw_of_other_makers_is_developed(tmp_path, suffix):
+    """A DNG under their endings: LibRaw goes by the content."""
+    (tmp_path / f"a{suffix}").write_bytes(small_dng(6))
+    assert list_photos(tmp_path) == [f"a{suffix}"]
+    assert output_name(f"a{suffix}") == "a.tif"
+    photo = read_photo(tmp_path / f"a{suffix}")
+    assert photo.pixels.dtype == np.uint16
+    assert photo.metadata.orientation == 6
 
 
 def test_list_photos_sorts_and_passes_over_other_files(tmp_path):

@@ -262,3 +262,22 @@ def test_a_png_under_the_name_of_a_jpeg_is_written_as_its_name_says(tmp_path):
     with pytest.warns(FileKindWarning, match=r"a\.jpg is PNG by its content, not JPEG"):
         rectify_folder(tmp_path / "in", save_solution(tmp_path / "s.json", ["a.jpg"]), tmp_path / "out")
     assert (tmp_path / "out" / "images" / "a.jpg").read_bytes()[:3] == b"\xff\xd8\xff"
+
+
+def test_photos_keep_their_endings_and_those_not_read_are_named(tmp_path):
+    (tmp_path / "in").mkdir()
+    for name in ("a.jfif", "b.JPE", "c.png"):
+        write_image(tmp_path / "in" / name, texture(64, 48))
+    (tmp_path / "in" / "d.nrw").write_bytes(small_dng())
+    for name in ("e.gpr", "f.mpo", "g.bmp", "h.psd"):
+        (tmp_path / "in" / name).write_bytes(b"x")
+    names = ["a.jfif", "b.JPE", "c.png", "d.nrw"]
+    solution = save_solution(tmp_path / "s.json", names)
+    _, left_out = rectify_folder(tmp_path / "in", solution, tmp_path / "out")
+    assert not left_out
+    for name in ("a.jfif", "b.JPE", "c.png", "d.tif"):
+        assert read_photo(tmp_path / "out" / "images" / name).pixels.shape == (48, 64, 3)
+    done = CliRunner().invoke(cli, ["run", str(tmp_path / "in"), "-o", str(tmp_path / "run")])
+    line = next(line for line in done.output.splitlines() if "passed over" in line)
+    assert "e.gpr, f.mpo, g.bmp and 1 more passed over" in line
+    assert "RAW to DNG" in line

@@ -22,6 +22,7 @@ from ..io.outputs import CANNOT_WRITE, held_inside
 from ..io.photos.exif import read_orientation
 from ..io.places import File, Place, RemoteFile, fetched
 from ..model import Depth
+from ..model.brightness import white_level
 from ..model.orientation import orient_pixels, split_mirror
 from ..rectify import MAP_KINDS, RemapGrid, ViewOptions, rectify
 from .extras import AlsoImage
@@ -310,5 +311,4 @@ def _colors(photo: Photo, xy: NDArray[np.int64]) -> NDArray[np.float64]:
     values = photo.pixels[np.clip(xy[:, 1], 0, h - 1), np.clip(xy[:, 0], 0, w - 1)].astype(float)
     if values.ndim == 1:
         values = np.repeat(values[:, None], 3, axis=1)
-    scale = 255.0 / np.iinfo(photo.pixels.dtype).max if photo.pixels.dtype.kind == "u" else 255.0
-    return np.asarray(scale * values[:, 2::-1], np.float64)
+    return np.minimum(255.0 / white_level(photo.pixels) * values[:, 2::-1], 255.0)

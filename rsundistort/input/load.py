@@ -173,10 +173,10 @@ def _listed(folder: Path, raw_as: str, only: Sequence[str] | None, least: int) -
     """The photos that are to be loaded; refused where they are too few, or no model can hold a name."""
     listed = list_photos(folder, raw_as) if only is None else list(only)
     if only is None and (unread := unread_pictures(folder)):
-        more = f" and {len(unread) - 1} more" if len(unread) > 1 else ""
+        more = f" and {len(unread) - 3} more" if len(unread) > 3 else ""
         warnings.warn(
-            f"{folder}: {unread[0]}{more} passed over, since pictures of such kinds are not read; "
-            "convert them to PNG or TIFF",
+            f"{folder}: {', '.join(unread[:3])}{more} passed over, since pictures of such kinds are not read; "
+            "convert them to PNG or TIFF, and RAW to DNG",
             SkippedPhotoWarning,
             stacklevel=3,
         )

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, InputError
 from .photos.images import read_plain
+from .photos.kinds import PHOTO_SUFFIXES
 from .places import File, Place, files_in
 
 __all__ = ["check_one_photo_each", "find_masks", "read_mask"]
 
-_SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".webp", ".jpg", ".jpeg")
+_SUFFIXES = (*PHOTO_SUFFIXES, ".bmp")
 
 
 @overload

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..model import Camera
 from .export_scene import ExportScene
+from .photos.kinds import kind_of_name
 from .shutter_poses import end_poses
 
 __all__ = ["write_ncore"]
@@ -22,7 +23,7 @@ __all__ = ["write_ncore"]
 #: Microseconds from photo to photo, and of a readout whose time is not known.
 _STEP_US, _READOUT_US = 1_000_000, 20_000
 _SEQUENCE = "rsundistort"
-_FORMATS = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png"}
+_FORMATS = {"JPEG": "jpeg", "PNG": "png"}
 
 
 def write_ncore(folder: Path, scene: ExportScene) -> str:
@@ -42,7 +43,7 @@ def write_ncore(folder: Path, scene: ExportScene) -> str:
 
     solution, source = scene.stored, scene.source
     images = sorted((solution.image(image.name) for image in scene.images), key=lambda image: image.name)
-    others = [image.name for image in images if Path(image.name).suffix.lower() not in _FORMATS]
+    others = [image.name for image in images if kind_of_name(image.name) not in _FORMATS]
     if others:
         raise InputError(f"{others[0]} is no JPEG or PNG, which alone NCore holds")
     if source is None:
@@ -67,7 +68,7 @@ def write_ncore(folder: Path, scene: ExportScene) -> str:
             table.store_static_pose(name, "rig", np.eye(4))
             lenses.store_camera_intrinsics(name, _parameters(solution.cameras[image.camera_id]))
             stores[name] = writer.register_component_writer(CameraSensorComponent.Writer, name, group_name=name)
-        kind = _FORMATS[Path(image.name).suffix.lower()]
+        kind = _FORMATS[kind_of_name(image.name)]
         span = np.array(times[2 * k : 2 * k + 2], np.uint64)
         stores[name].store_frame((source / image.name).read_bytes(), kind, span, {}, {"name": image.name})
     writer.finalize()

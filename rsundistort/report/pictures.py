@@ -16,6 +16,7 @@ from ..errors import FileError, InputError
 from ..io import read_exif, read_photo
 from ..io.photos.images import read_plain, stored_size
 from ..io.photos.kinds import kind_of_content
+from ..model.brightness import white_level
 from ..model.orientation import compose_orientations, orient_pixels
 
 __all__ = ["Picture", "PictureJob", "make_pictures"]
@@ -120,8 +121,8 @@ def _decoded(path: Path, side: float) -> NDArray[np.uint8]:
 def _as_bytes(pixels: NDArray[Any]) -> NDArray[np.uint8]:
     """Pixels of any depth and number of channels as 8-bit colours."""
     if pixels.dtype.kind == "f":
-        pixels = np.clip(np.nan_to_num(pixels), 0, 1) * 255
+        pixels = np.clip(np.nan_to_num(pixels / white_level(pixels)), 0, 1) * 255
     elif pixels.dtype != np.uint8:
-        pixels = pixels // 257
+        pixels = np.minimum(pixels.astype(np.uint32) * 255 // int(white_level(pixels)), 255)
     pixels = np.atleast_3d(pixels)[..., :3].astype(np.uint8)
     return np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.array_types import Array
+from ..model.brightness import white_level
 
 __all__ = [
     "DETECTION_MEGAPIXELS",
@@ -89,7 +90,7 @@ def detect_features(
     Parameters
     ----------
     photo : (h, w) or (h, w, 3 | 4) array
-        8-bit, 16-bit or float (0 to 1) pixels in OpenCV's channel order.
+        8-bit, 16-bit or float pixels in OpenCV's channel order, of which `white_level` is white.
     max_features : int
         Number that is kept, the largest first; features with several orientations count several times.
     mask : (h, w) uint8 array, optional
@@ -147,12 +148,13 @@ def _shrunk(
 
 
 def grey_8_bit(photo: NDArray[Any]) -> NDArray[np.uint8]:
-    """8-bit grey version of a photo of any depth and number of channels."""
+    """8-bit grey version of a photo of any depth and number of channels, in which its `white_level` is white."""
     gray = photo
     if photo.ndim == 3:
         gray = cv2.cvtColor(photo, cv2.COLOR_BGRA2GRAY if photo.shape[2] == 4 else cv2.COLOR_BGR2GRAY)
+    if gray.dtype == np.uint8:
+        return gray
+    white = white_level(photo)
     if gray.dtype == np.uint16:
-        return (gray >> 8).astype(np.uint8)
-    if gray.dtype != np.uint8:
-        return np.clip(np.nan_to_num(gray) * 255.0, 0, 255).astype(np.uint8)
-    return gray
+        return np.minimum(gray >> (int(white).bit_length() - 8), 255).astype(np.uint8)
+    return np.clip(np.nan_to_num(gray) * (255.0 / white), 0, 255).astype(np.uint8)

@@ -21,6 +21,7 @@ from make_photos import exif_block, texture
 from test_gpmf import COUNTS, gyro, mux, payload, telemetry
 from test_gyro import GCSV
 from test_models import Truth, openmvg, opensfm
+from tiff_files import tiff_file
 
 SEEDS = Path(__file__).with_name("seeds")
 Files = dict[str, bytes]
@@ -326,6 +327,7 @@ def whole_photos() -> Files:
             write_image(path, pixels.astype(dtype) * (257 if dtype == "uint16" else 1), metadata)
             found[path.name] = path.read_bytes()
     found["b.tif"] = bytes(cv2.imencode(".tif", texture(64, 48), [cv2.IMWRITE_TIFF_COMPRESSION, 8])[1])
+    found["c.tif"] = tiff_file(texture(64, 48).astype("i2"), 2, planar=True, method="lzw", predictor=2, tile=32)
     found["c.jpg"] = bytes(cv2.imencode(".jpg", texture(64, 48), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1])
     return found
 

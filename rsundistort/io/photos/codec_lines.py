@@ -23,6 +23,8 @@ T = TypeVar("T")
 _OF_CODECS = re.compile(
     rb"libpng |Corrupt JPEG|Premature end of JPEG|Invalid |Unsupported marker|\[ *(ERROR|WARN)\S*\].*grfmt"
 )
+# Tags of cameras and programs that libtiff has no name for: no damage.
+_HARMLESS = re.compile(rb"Unknown field with tag")
 _OF_OPENCV = re.compile(rb"\[ *(ERROR|WARN|INFO)[:@]")
 
 
@@ -46,7 +48,7 @@ class _Ear:
             for line in stream:
                 if (mark := self._marks.pop(line, None)) is not None:
                     mark.set()
-                elif _OF_CODECS.match(line):
+                elif _OF_CODECS.match(line) and not _HARMLESS.search(line):
                     self._lines.append(line.decode(errors="replace").strip())
                 elif not _OF_OPENCV.match(line):
                     with suppress(OSError):

@@ -9,7 +9,7 @@ import warnings
 # Before cv2 and before anybody's pycolmap. pycolmap exports a zlib of its own; if the system's zlib is first loaded
 # after it, the two get mixed and whatever compresses (PNG, Python's own zlib) aborts the process.
 import zlib  # noqa: F401
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, cast
@@ -36,7 +36,8 @@ from .kinds import (
 )
 from .metadata import Metadata
 from .raw import read_raw
-from .tiff import as_stored, damaged_strips, encode_tiff, tiff_metadata
+from .tiff import damaged_strips, encode_tiff, tiff_metadata
+from .tiff_pixels import misread_as_plain, read_tiff
 
 __all__ = [
     "LARGEST_SIDE",
@@ -54,10 +55,19 @@ __all__ = [
 ]
 
 # Pictures that are not read: a folder that holds some was meant to have more photos.
-_UNREAD = (".avif", ".bmp", ".exr", ".gif", ".hdr", ".jp2", ".jxl", ".pgm", ".ppm", ".tga")
+_UNREAD = (
+    *(".apng", ".avif", ".bmp", ".dib", ".exr", ".fit", ".fits", ".gif", ".hdr", ".j2k", ".jp2", ".jpf", ".jpx"),
+    *(".jxl", ".jxr", ".pam", ".pbm", ".pfm", ".pgm", ".pnm", ".ppm", ".psb", ".psd", ".ras", ".tga", ".wdp", ".xcf"),
+    # several pictures in one, or of several lenses
+    *(".avifs", ".heics", ".insp", ".jps", ".mpo"),
+    # RAW that LibRaw unpacks only with libraries of their makers, or that is no more than numbers
+    *(".ari", ".bay", ".braw", ".cap", ".eip", ".gpr", ".k25", ".mdc", ".ptx", ".pxn", ".raw", ".rwz"),
+)
 
 #: Photos of more pixels are refused, unless specified otherwise: a small file can claim to be a huge picture.
 MAX_MEGAPIXELS = 250.0
+
+_SUFFIX_OF = {"JPEG": ".jpg", "PNG": ".png", "WebP": ".webp"}
 
 #: Kinds that RAW and HEIC can be written as.
 RAW_AS = ("tif", "jpg", "png")
@@ -106,16 +116,22 @@ def list_photos(folder: Place | str, raw_as: str = "tif", sub_folders: Collectio
                 f"{other} and {name} would both be rectified to {output_name(name, raw_as)}; move one away"
             )
     if not names:
-        kinds = ", ".join(s[1:] for s in PHOTO_SUFFIXES) + ", heic and RAW"
+        unread = _unread(top)
+        others = f" ({unread[0]} is of no such kind; convert it to PNG or TIFF, and RAW to DNG)" if unread else ""
         raise FileError(
-            f"no photos in {folder}; it should hold files of the kinds {kinds}, and sub-folders are not searched"
+            f"no photos in {folder}; it should hold JPEG, PNG, TIFF, WebP, HEIC or RAW files{others}, and sub-folders "
+            "are not searched"
         )
     return names
 
 
 def unread_pictures(folder: Path) -> list[str]:
     """Names of pictures in a folder that `list_photos` passes over, since their kinds are not read."""
-    return [name for name in files_in(folder) or () if name.lower().endswith(_UNREAD) and not name.startswith(".")]
+    return _unread(files_in(folder) or ())
+
+
+def _unread(names: Iterable[str]) -> list[str]:
+    return [name for name in names if name.lower().endswith(_UNREAD) and not name.startswith(".")]
 
 
 def output_name(name: str, raw_as: str = "tif") -> str:
@@ -200,7 +216,11 @@ def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> Photo:
         pixels, metadata = read_heif(data, path.name)
     else:
         pixels, said = with_lines(
-            lambda: _decode(as_stored(data), path.name) if kind == "TIFF" else _decode_file(path, stamp, data)
+            lambda: (
+                read_tiff(data, path.name, lambda stored: _decode(stored, path.name))
+                if kind == "TIFF"
+                else _decode_file(path, stamp, data)
+            )
         )
         if kind == "TIFF" and (count := damaged_strips(data)):
             said = [f"the checksum of {count} of its strips is wrong"]
@@ -242,7 +262,7 @@ def _decode_file(path: Path, stamp: tuple[int, int] | None, data: bytes) -> NDAr
     return _decode(data, path.name)
 
 
-def _decode(data: bytes, name: str) -> NDArray[Any]:
+def _decode(data: bytes | bytearray, name: str) -> NDArray[Any]:
     try:
         pixels: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -268,6 +288,8 @@ def read_plain(path: Path, what: str, flags: int) -> NDArray[Any]:
     size = picture_size(data, kind)
     if size is not None and (size[0] * size[1] > MAX_MEGAPIXELS * 1e6 or not can_hold(data, kind, size)):
         raise FileError(f"{what} {path} has {size[0]}x{size[1]} pixels by its header, more than it can hold")
+    if kind == "TIFF" and (misread := misread_as_plain(data)):
+        raise FileError(f"{what} {path} is {misread}, which is not read; save it as PNG, or as a plain TIFF")
     try:
         decoded = with_lines(lambda: cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None)
     except cv2.error as error:
@@ -280,18 +302,18 @@ def read_plain(path: Path, what: str, flags: int) -> NDArray[Any]:
     return np.asarray(pixels)
 
 
-def _encode_params(suffix: str, quality: int, flat: bool) -> list[int]:
-    if suffix in (".jpg", ".jpeg"):
+def _encode_params(kind: str, quality: int, flat: bool) -> list[int]:
+    if kind == "JPEG":
         # colour at full resolution: halved again after the camera halved it, it costs 2 to 4 dB (measured)
         full = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
         return [cv2.IMWRITE_JPEG_QUALITY, quality, *full]
-    if suffix == ".webp":
+    if kind == "WebP":
         return [cv2.IMWRITE_WEBP_QUALITY, quality]
-    if suffix == ".png" and flat:
+    if kind == "PNG" and flat:
         # runs of the difference to the row above: 12 megapixels in 21 ms, not 54, and 18 kB, not 66 (measured)
         up = [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP] if hasattr(cv2, "IMWRITE_PNG_FILTER") else []
         return [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE, *up]
-    if suffix == ".png":
+    if kind == "PNG":
         return [cv2.IMWRITE_PNG_COMPRESSION, 3]
     return []
 
@@ -349,7 +371,8 @@ def _encode(path: Path, pixels: NDArray[Any], metadata: Metadata, quality: int, 
         else:
             if kind == "PNG":
                 check_compression()
-            done, array = cv2.imencode(suffix, pixels, _encode_params(suffix, quality, flat))
+            # by kind: OpenCV does not know each of its endings
+            done, array = cv2.imencode(_SUFFIX_OF[kind], pixels, _encode_params(kind, quality, flat))
             if not done:
                 raise InputError(f"an image {pixels.shape} {pixels.dtype} cannot be stored as {suffix}")
             parts, lost = with_metadata(array.data, kind, metadata)

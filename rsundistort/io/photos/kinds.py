@@ -20,11 +20,16 @@ __all__ = [
     "picture_size",
 ]
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
-RAW_SUFFIXES = (".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
+_KINDS = {
+    **dict.fromkeys((".jpg", ".jpeg", ".jpe", ".jfif", ".jif", ".jfi", ".pjpeg", ".pjp"), "JPEG"),
+    **{".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF", ".webp": "WebP"},
+}
+PHOTO_SUFFIXES = tuple(_KINDS)
+RAW_SUFFIXES = (
+    *(".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".nrw", ".rwl", ".crw", ".mrw"),
+    *(".sr2", ".srf", ".3fr", ".fff", ".iiq", ".mos", ".mef", ".erf", ".dcr", ".kdc", ".x3f"),
+)
 HEIF_SUFFIXES = (".heic", ".heif", ".hif")
-
-_KINDS = {".jpg": "JPEG", ".jpeg": "JPEG", ".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF", ".webp": "WebP"}
 _HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 
 _COLOUR_FILTER = 32803

@@ -42,7 +42,9 @@ def read_raw(data: bytes, name: str, check_size: Callable[[int, int], None]) -> 
     except (rawpy.LibRawError, OSError) as error:
         reason = error.args[0] if error.args else error
         text = reason.decode(errors="replace") if isinstance(reason, bytes) else str(reason)
-        raise FileError(f"{name} cannot be developed ({text}); copy it again from the camera") from error
+        raise FileError(
+            f"{name} cannot be developed ({text}); copy it again from the camera, or convert it to DNG"
+        ) from error
     metadata = _metadata(data)
     if metadata.orientation == 1 and flip in _FLIPS:
         metadata = metadata.with_orientation(_FLIPS[flip])
