@@ -486,7 +486,7 @@ def test_known_motions_are_read(tmp_path):
         ("name,phi1,phi2,phi3,sigma\na,1,2,3,-1\n", "positive"),
         ("name,phi1,phi2,phi3,sigma\na,one,2,3,1\n", "numbers"),
         ("name,phi1,phi2,phi3,sigma\na,1,2,3,\n", "numbers"),
-        ("name,phi1,phi2,phi3,sigma\na,1,2,3,1\na,1,2,3,1\n", "each once"),
+        ("name,phi1,phi2,phi3,sigma\na,0,1,0,1\na,0,1,0,1\n", "each once"),
         ("", "columns"),
     ],
 )

@@ -17,7 +17,7 @@ from .places import File, Place, files_in
 
 __all__ = ["check_one_photo_each", "find_masks", "read_mask"]
 
-_SUFFIXES = (*PHOTO_SUFFIXES, ".bmp")
+_SUFFIXES = (".png", *(each for each in PHOTO_SUFFIXES if each != ".png"), ".bmp")
 
 
 @overload

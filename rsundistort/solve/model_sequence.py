@@ -25,7 +25,7 @@ from ..bundle import (
     judge_known_motions,
 )
 from ..bundle.doubt import steps_after
-from ..critical import advise, heal, with_remedy
+from ..critical import Advice, Remedy, advise, heal, with_remedy
 from ..errors import RsUndistortWarning
 from ..input.load import LoadedPhotos
 from ..input.photo_cameras import PhotoCameras
@@ -190,15 +190,7 @@ def solve_tracks(
         return replace(solved, known_motions=known_motions)
     if survey is not None and survey.holding:
         survey, result, options = _with_control(survey, result, options, log)
-    mended, advice = None, []
-    if result.reconstruction.shutter_model != "global":
-        log.begin("critical motion")
-        result, mended = heal(result, options, remedy)
-        for text in mended.warnings:
-            warnings.warn(text, RsUndistortWarning, stacklevel=3)
-        if mended.after.is_flagged or mended.after.common.is_weak:
-            advice = advise(result, mended.added_to(options))
-        log.end("critical motion", remedy=mended.name, sigma_log_k=mended.after.sigma_log_k)
+    result, mended, advice = _healed(result, options, remedy, log)
     log.begin("comparison with a global shutter")
     global_result = without_shutter(result, options)
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
@@ -218,6 +210,22 @@ def solve_tracks(
         result, global_result, cameras, choice, mended, advice, directions, verdict, known_motions=known_motions
     )
     return solved if survey is None else _on_the_map(solved, survey, options)
+
+
+def _healed(
+    result: BundleResult, options: BundleOptions, remedy: str, log: StageLog
+) -> tuple[BundleResult, Remedy | None, list[Advice]]:
+    """The solution after a critical motion was examined and mended, and advice for the next shoot."""
+    if result.reconstruction.shutter_model == "global":
+        return result, None, []
+    log.begin("critical motion")
+    result, mended = heal(result, options, remedy)
+    for text in mended.warnings:
+        warnings.warn(text, RsUndistortWarning, stacklevel=4)
+    is_critical = mended.after.is_flagged or mended.after.common.is_weak
+    advice = advise(result, mended.added_to(options)) if is_critical else []
+    log.end("critical motion", remedy=mended.name, sigma_log_k=mended.after.sigma_log_k)
+    return result, mended, advice
 
 
 def _known_motions(result: BundleResult, model: str, options: BundleOptions, seed: int) -> KnownMotions | None:
