@@ -184,10 +184,7 @@ def solve_tracks(
         choice, result, tracks, options = _chosen(track_source, result, tracks, options, seed, log)
     known_motions = _known_motions(result, shutter_model, options, seed) if choice is None else choice.known_motions
     if known_motions is not None and known_motions.is_contradicted:
-        log.begin("again without the known motions")
-        log.end("again without the known motions", gain=known_motions.gain, miss=known_motions.miss)
-        solved = again(options_of=lambda rec: replace(options_of(rec), known_phi={}, known_bends={}))
-        return replace(solved, known_motions=known_motions)
+        return _without(known_motions, again, options_of, log)
     if survey is not None and survey.holding:
         survey, result, options = _with_control(survey, result, options, log)
     result, mended, advice = _healed(result, options, remedy, log)
@@ -233,6 +230,17 @@ def _known_motions(result: BundleResult, model: str, options: BundleOptions, see
     if model == "global" or not options.known_phi:
         return None
     return judge_known_motions(result.reconstruction, model, options, sigma_px=result.sigma_px, seed=seed)
+
+
+def _without(
+    known_motions: KnownMotions, again: Callable[..., Solved], options_of: Callable[[Reconstruction], BundleOptions],
+    log: StageLog,
+) -> Solved:  # fmt: skip
+    """The solution without the known motions, which the photos contradict: `again` solves with other options."""
+    log.begin("without the known motions")
+    log.end("without the known motions", gain=known_motions.gain, miss=known_motions.miss)
+    solved = again(options_of=lambda rec: replace(options_of(rec), known_phi={}, known_bends={}))
+    return replace(solved, known_motions=known_motions)
 
 
 def _on_the_map(solved: Solved, survey: Survey, options: BundleOptions) -> Solved:
