@@ -6,11 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bundle_scenes import make_scene
 from critical_scenes import named_scene
 from scipy.spatial.transform import Rotation
+from solved_scene import cameras_of
 
 from rsundistort import Camera, GyroOptions, RowMotion, RsUndistortWarning
-from rsundistort.bundle import KnownMotions
+from rsundistort.batch.progress import StageLog
+from rsundistort.bundle import BundleOptions, KnownMotions
 from rsundistort.errors import FileError, FormatError, InputError
 from rsundistort.input.gyroscope import gyro_motions, known_contradiction, known_readouts
 from rsundistort.io import (
@@ -24,6 +27,7 @@ from rsundistort.io import (
 )
 from rsundistort.io.gyro import parse_axes
 from rsundistort.model import READOUTS
+from rsundistort.solve.model_sequence import solve_tracks
 from rsundistort.synthetic import project_rows
 
 READOUT_S = 0.03
@@ -194,6 +198,27 @@ def test_a_solution_far_from_known_motions_is_reported():
     # and the photos of a gyroscope that rests may be bent by their lens
     assert not replace(worse, gain=0.0, size=2.0, miss=9.0).is_contradicted
     assert replace(worse, gain=0.0, miss=9.0).is_contradicted
+
+
+@pytest.mark.parametrize("model", ["auto", "rotation"])
+def test_motions_that_the_photos_contradict_are_left_out(rng, model):
+    scene = make_scene(rng, "rotation", num_images=8, num_points=300, noise_px=0.2, phi_size=0.01)
+    start = replace(scene, phi=np.zeros_like(scene.phi), shutter_model="global")
+    true = scene.phi * scene.frame_span()[:, None]
+
+    def solved(known):
+        options = BundleOptions(known_phi=known)
+        return solve_tracks(start, cameras_of(start), model, 0, lambda _: options, StageLog(None), "none")
+
+    names, sigma = scene.image_names, np.full(3, 5e-4)
+    right, wrong = (
+        solved({name: (way * phi, sigma) for name, phi in zip(names, true, strict=True)}) for way in (1.0, -1.0)
+    )
+    assert right.known_motions is not None
+    assert not right.known_motions.is_contradicted
+    assert wrong.known_motions is not None
+    assert wrong.known_motions.is_contradicted
+    np.testing.assert_array_equal(wrong.shared.phi, solved({}).shared.phi)
 
 
 # ---------------------------------------------------------------- what the log covers
