@@ -29,7 +29,7 @@ def write_nuke(folder: Path, scene: ExportScene) -> str:
     cameras: Sequence[Camera]
     if scene.track is not None:
         track = scene.track
-        frames = _FIRST + np.round(track.time_s / track.frame_s).astype(int)
+        frames = _FIRST + np.round(track.numbers).astype(int)
         cameras = [track.camera] * len(frames)
         R_cw, center_w = track.R_cw, track.center_w
     else:

@@ -38,8 +38,7 @@ def write_usd_camera(path: Path, track: CameraTrack, points_w: NDArray[np.float6
 
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    # whole numbers are such: quotients of times are off by their last digit
-    code, rate = np.round(track.time_s / track.frame_s, 6), round(1.0 / track.frame_s, 6)
+    code, rate = track.numbers, round(1.0 / track.frame_s, 6)
     camera = track.camera
     stage.SetTimeCodesPerSecond(rate)
     stage.SetFramesPerSecond(rate)

@@ -13,6 +13,9 @@ from .path import CameraPath
 
 __all__ = ["CameraTrack", "ShownFrames", "camera_track", "even_camera"]
 
+# Time stamps are whole milliseconds in some files: a frame of 1/120 s is then off by less than this share of itself.
+_ROUNDED = 0.13
+
 
 @dataclass(frozen=True)
 class ShownFrames:
@@ -34,8 +37,10 @@ class ShownFrames:
 
     @property
     def frame_s(self) -> float:
-        """The usual time from one frame to the next."""
-        return float(np.median(np.diff(self.time_s)))
+        """The time from one frame to the next, as exact as rounded time stamps say it: over all frames, gaps apart."""
+        step_s = np.diff(self.time_s)
+        frame_s = float(step_s[step_s < 1.5 * np.median(step_s)].mean())
+        return float(step_s.sum() / np.maximum(np.round(step_s / frame_s), 1).sum())
 
 
 @dataclass(frozen=True)
@@ -59,6 +64,13 @@ class CameraTrack:
     R_cw: Array
     center_w: Array
     camera: Camera
+
+    @property
+    def numbers(self) -> Array:
+        """(n,) number of each frame, counted from 0 by the times; whole where they are the rounded ones of a frame."""
+        number = self.time_s / self.frame_s
+        whole = np.round(number)
+        return np.where(np.abs(number - whole) < _ROUNDED, whole, np.round(number, 6))
 
 
 def camera_track(
