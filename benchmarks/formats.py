@@ -19,6 +19,7 @@ import json
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, RunOptions, Solution, SolveOptions, read_solution, run, solve
 from rsundistort.io.usd import write_usd_camera
-from rsundistort.model.path import CameraPath
+from rsundistort.model.track import CameraTrack
 from rsundistort.solve import OutputOptions
 
 SCENE = Path(__file__).resolve().parent.parent / "sample_scenes" / "courtyard"
@@ -92,15 +93,15 @@ def blender_px(python: str, work: Path) -> float:
     """The largest distance between Blender's pixels and ours."""
     rng, frames = np.random.default_rng(0), [0, 1, 2, 4]
     R_cw = Rotation.from_rotvec(rng.normal(0, 0.2, (4, 3))).as_matrix()
-    path = CameraPath(np.array(frames) / 25, R_cw, rng.normal(0, 1, (4, 3)), *np.zeros((4, 4, 3)))
+    track = CameraTrack(np.array(frames) / 25, 1 / 25, R_cw, rng.normal(0, 1, (4, 3)), Camera(1, 1, np.eye(3)))
     points_w = np.column_stack([rng.uniform(-1, 1, (50, 2)), rng.uniform(6, 12, 50)])
-    x_c = np.einsum("mij,mnj->mni", path.R_cw, points_w - path.center_w[:, None])
+    x_c = np.einsum("mij,mnj->mni", track.R_cw, points_w - track.center_w[:, None])
     off = []
     for width, height in ((640, 360), (360, 640)):
         for fx, fy in ((500, 500), (500, 505), (505, 500)):
             camera = Camera(width, height, [[fx, 0, width / 2 + 13], [0, fy, height / 2 - 9], [0, 0, 1]])
             file = work / f"{width}-{fx}-{fy}.usda"
-            write_usd_camera(file, camera, path, 1 / 25, points_w)
+            write_usd_camera(file, replace(track, camera=camera), points_w)
             asked = json.dumps([str(file), width, height, fy / fx, frames])
             said = subprocess.run([python, "-c", _BLENDER, asked], check=True, capture_output=True, text=True).stdout
             shown = json.loads(said.partition("shown ")[2].splitlines()[0])

@@ -32,6 +32,7 @@ from rsundistort import (
 )
 from rsundistort.batch.geometry import PhotoGeometry
 from rsundistort.batch.progress import StageLog
+from rsundistort.batch.rectify_options import RectifyOptions
 from rsundistort.batch.video_frames import rectify_clip
 from rsundistort.batch.workers import Workers
 from rsundistort.errors import FileError, InputError
@@ -41,8 +42,9 @@ from rsundistort.io.video_like import pixels_of
 from rsundistort.io.video_writer import write_video
 from rsundistort.model.orientation import orient_path
 from rsundistort.model.path import CameraPath
+from rsundistort.rectify import ViewOptions
 from rsundistort.report.facts import readout_facts
-from rsundistort.solve import MeasuredReadout, measure_readout
+from rsundistort.solve import MeasuredReadout, OutputOptions, measure_readout
 from rsundistort.solve.run_outputs import Outputs
 from rsundistort.verdict.judge_path import problem_of
 
@@ -546,24 +548,38 @@ def test_a_run_that_is_interrupted_behind_its_video_keeps_the_video_and_its_stag
 def test_frames_that_come_twice_are_corrected_as_the_one_before(cut, tmp_path):
     shown = [frame.to_ndarray(format="bgr24") for frame in frames_of(cut)]
     twice = tmp_path / "twice.mp4"
-    write_video(twice, [shown[k * 5 // 6] for k in range(24)], Fraction(30))
+    encode(twice, [shown[k * 5 // 6] for k in range(24)], rotation=-90)
     (tmp_path / "camera.json").write_bytes((cut.parent / "camera.json").read_bytes())
     with pytest.warns(RsUndistortWarning, match="4 of 24 frames show the same as the one before.* 40.0 ms apart"):
-        solution = run(twice, tmp_path / "out", RunOptions(frames="all", max_features=1000))
-    assert len(rows_of(tmp_path / "out" / "path.csv")) == 20
+        solution = run(
+            twice, tmp_path / "out", RunOptions(
+                frames="all", max_features=1000, outputs=OutputOptions(usd=True, exports=("nuke",)),
+                rectify=RectifyOptions(apply_orientation=True, view=ViewOptions(scale=0.51)),
+            ),
+        )  # fmt: skip
+    rows = rows_of(tmp_path / "out" / "path.csv")
+    assert len(rows) == 20
     assert solution.options["video"]["repeated"] == [1, 7, 13, 19]
     after = [frame.to_ndarray(format="gray").astype(float) for frame in frames_of(tmp_path / "out" / "video.mp4")]
     steps = np.array([np.abs(second - first).mean() for first, second in pairwise(after)])
     again = np.isin(np.arange(1, 24), solution.options["video"]["repeated"])
     assert steps[again].max() < 0.2 * steps[~again].min()
+    # for programs that play the video: a pose for each of its frames, and the sides that they are shown with
+    camera = solution.rectified_cameras[solution.registered[0].camera_id]
+    assert (camera.width, camera.height, *after[0].shape) == (183, 326, 182, 326)
+    camera = replace(camera, width=182)
+    assert np.loadtxt(tmp_path / "out" / "nuke" / "camera.chan")[:, 0].tolist() == list(range(1, 25))
+    assert ' format "182 326 0 0 182 326 1 rectified"' in (tmp_path / "out" / "nuke" / "camera.nk").read_text()
+    for frame, row in ((12, 10), (13, 10), (14, 11), (23, 19)):
+        check_usd(tmp_path / "out" / "camera.usda", rows[row], frame, camera, last=23)
 
 
-def check_usd(path, row, code, camera):
+def check_usd(path, row, code, camera, last=19):
     """USD's own camera shows its points where the pose of `path.csv` does."""
     from pxr import Gf, Usd, UsdGeom
 
     stage = Usd.Stage.Open(str(path))
-    assert (stage.GetTimeCodesPerSecond(), stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (30, 0, 19)
+    assert (stage.GetTimeCodesPerSecond(), stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (30, 0, last)
     frustum = UsdGeom.Camera(stage.GetPrimAtPath("/World/Camera")).GetCamera(code).frustum
     seen = frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()
     points = UsdGeom.Points(stage.GetPrimAtPath("/World/Points")).GetPointsAttr().Get()

@@ -33,8 +33,8 @@ from rsundistort.io.exports import EXPORTS, check_exports
 from rsundistort.io.metashape import read_metashape
 from rsundistort.io.models import read_model
 from rsundistort.io.shutter_poses import write_shutter_poses
-from rsundistort.model.path import CameraPath
 from rsundistort.model.projection import project_points, unproject_points
+from rsundistort.model.track import CameraTrack
 from rsundistort.solve import OutputOptions
 from rsundistort.solve.run_outputs import Outputs
 
@@ -464,7 +464,7 @@ def test_nukes_camera_shows_points_where_the_frames_do(tmp_path, clip):
     if clip:
         times = np.array([0.0, 1.0, 2.0, 3.0, 5.0]) / 25
         R_cw, center_w = (np.array([getattr(image, key) for image in images]) for key in ("R_cw", "center_w"))
-        scene = replace(scene, path=CameraPath(times, R_cw, center_w, *np.zeros((4, 5, 3))))
+        scene = replace(scene, track=CameraTrack(times, 1 / 25, R_cw, center_w, scene.camera(images[0])))
         frames = (1, 2, 3, 4, 6)
     assert EXPORTS["nuke"].write(tmp_path, scene) == ""
     text = (tmp_path / "camera.nk").read_text()

@@ -145,6 +145,16 @@ def test_models_round_trip(tmp_path, rng, form, lenses):
     assert not (tmp_path / "out" / "images").exists()
 
 
+def test_names_with_spaces_are_whole_in_text_too(tmp_path, rng):
+    scene = make_scene(rng)
+    for image in scene.model.images.values():
+        image.name = f"two words/{image.image_id} of all.png"
+    expected = {image.image_id: image.name for image in scene.model.images.values()}
+    rs.solve(save(scene.model, tmp_path / "model", "txt"), tmp_path / "out", OPTIONS)
+    found = pycolmap.Reconstruction(tmp_path / "out" / "sparse").images.values()
+    assert {image.image_id: image.name for image in found} == expected
+
+
 def test_what_comes_out_is_a_model_without_shutter(rng):
     scene = make_scene(rng, noise_px=0.05)
     out, solution = rs.solve(scene.model, options=OPTIONS)

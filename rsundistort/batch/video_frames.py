@@ -13,7 +13,7 @@ from ..errors import FileError, RsUndistortWarning
 from ..io.aside import written_aside
 from ..io.video import VideoReader, frame_name
 from ..io.video_like import Pixels, VideoWriter, black_out, pixels_of
-from ..model import Camera
+from ..model.track import even_camera
 from ..rectify import rectify
 from .geometry import PhotoGeometry
 from .progress import StageLog
@@ -30,11 +30,6 @@ class _Frame(NamedTuple):
 
     picture: Any
     geometry: PhotoGeometry
-
-
-def _even(camera: Camera) -> Camera:
-    """A camera of even sides, a pixel less where they are odd: encoders take colours for two pixels each way."""
-    return replace(camera, width=camera.width - camera.width % 2, height=camera.height - camera.height % 2)
 
 
 def rectify_clip(
@@ -73,7 +68,7 @@ def rectify_clip(
     FileError
         The video cannot be read, or the result not be written.
     """
-    target = _even(otherwise.new_camera)
+    target = even_camera(otherwise.new_camera)
     num_lens_only = num_frames = 0
 
     def work(frame: _Frame) -> tuple[_Frame, Pixels]:

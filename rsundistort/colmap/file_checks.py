@@ -110,9 +110,25 @@ def pycolmap_model(folder: Path) -> Any:
     """
     check_colmap_files(folder)
     try:
-        return quiet_pycolmap().Reconstruction(folder)
+        model = quiet_pycolmap().Reconstruction(folder)
     except Exception as error:  # pycolmap raises what its C++ raised
         raise FileError(f"{folder} is no COLMAP model: {' '.join(str(error).split())}") from error
+    if not (folder / "images.bin").is_file():
+        _complete_names(model, folder / "images.txt")
+    return model
+
+
+def _complete_names(model: Any, path: Path) -> None:
+    """Give photos of a model in text their names with spaces: COLMAP writes them, and reads up to the space."""
+    lines = (line.strip() for line in path.read_text(encoding="utf-8", errors="replace").split("\n"))
+    for line in lines:
+        fields = line.split(" ", 9)
+        if not line or line.startswith("#") or len(fields) < 10:
+            continue
+        next(lines, None)  # the measurements
+        key, name = int(fields[0]), fields[9].strip()
+        if " " in name and "\ufffd" not in name and model.images[key].name == name.split(" ")[0]:
+            model.images[key].name = name
 
 
 def check_colmap_cameras(path: Path) -> None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, RsUndistortWarning
 from ..io.video import FrameWriter, VideoFrames, VideoReader, converted, frame_name, sharpness_of
+from ..model.track import ShownFrames
 from ..sfm.flow import FlowFrame, KeyFlow, KeyFrameChooser, flow_size
 
 __all__ = ["Clip", "flow_frames_of", "read_clip"]
@@ -80,6 +81,8 @@ class Clip:
         Corners of key frames in the next one, in pixels of the flow.
     repeated : tuple of int
         Indices of frames that show the same as the one before.
+    shown : ShownFrames or None
+        What the file shows when, repeated frames too.
     """
 
     video: Path
@@ -93,6 +96,7 @@ class Clip:
     frames: VideoFrames
     flows: tuple[KeyFlow, ...] = ()
     repeated: tuple[int, ...] = ()
+    shown: ShownFrames | None = None
 
     @property
     def key_names(self) -> tuple[str, ...]:
@@ -178,7 +182,7 @@ def read_clip(video: Path, folder: Path, progress: Callable[[int, int], None] | 
 def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None) -> Clip:
     chooser, numbers, times, sharpness, num_late = KeyFrameChooser(), list[int](), list[float](), list[float](), 0
     held: dict[int, tuple[int, float, Any]] = {}  # frames that may become the next key
-    written, repeated, step = set[int](), list[int](), _Step()
+    written, repeated, shown, step = set[int](), list[int](), dict[float, int](), _Step()
     with VideoReader(video) as reader:
         writer = FrameWriter(reader, folder)
         for number, time_s, picture in reader:
@@ -196,11 +200,13 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
                 continue
             if step.is_none(grey):
                 repeated.append(number)
+                shown[time_s] = numbers[-1]
                 continue
             held[len(numbers)] = number, time_s, picture
             if len(held) * sum(plane.buffer_size for plane in picture.planes) > _HELD_BYTES:
                 del held[min(held)]
             numbers.append(number)
+            shown[time_s] = number
             times.append(time_s)
             sharpness.append(sharpness_of(picture))
             chooser.feed(FlowFrame.of(grey))
@@ -237,8 +243,9 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
     names = tuple(frame_name(video, number) for number in numbers)
     flows = tuple(each for each in chooser.flows if part[each.keys[0]] == part[each.keys[1]])
     return Clip(
-        video, folder, tuple(numbers), names, time, frame_s, part, keys, writer.finish(), flows, tuple(repeated)
-    )
+        video, folder, tuple(numbers), names, time, frame_s, part, keys, writer.finish(), flows, tuple(repeated),
+        ShownFrames(np.array([*shown]), tuple(frame_name(video, number) for number in shown.values())),
+    )  # fmt: skip
 
 
 class _Step:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..model import Camera, Reconstruction, RowMotion, Solution, SolvedImage
-from ..model.path import CameraPath
 from ..model.projection import project_points, unproject_points
+from ..model.track import CameraTrack
 
 __all__ = ["ExportScene", "euler_deg", "lens_left_px", "rotation_left_px"]
 
@@ -42,8 +42,8 @@ class ExportScene:
         Folder of the original photos.
     originals : mapping of photo name to path
         Of the original photos, as seen from a folder in OUT.
-    path : CameraPath or None
-        Of a video whose frames share one.
+    track : CameraTrack or None
+        Camera of a video whose frames share a path.
     """
 
     solution: Solution
@@ -53,7 +53,7 @@ class ExportScene:
     stored: Solution
     source: Path | None = None
     originals: Mapping[str, str] = field(default_factory=dict)
-    path: CameraPath | None = None
+    track: CameraTrack | None = None
 
     @property
     def images(self) -> list[SolvedImage]:

@@ -27,12 +27,11 @@ def write_nuke(folder: Path, scene: ExportScene) -> str:
     """
     folder.mkdir(parents=True, exist_ok=True)
     cameras: Sequence[Camera]
-    if scene.path is not None:
-        path = scene.path
-        frame_s = float(np.median(np.diff(path.time_s))) if len(path.time_s) > 1 else 1.0
-        frames = _FIRST + np.round(path.time_s / frame_s).astype(int)
-        cameras = [next(iter(scene.solution.rectified_cameras.values()))] * len(frames)
-        R_cw, center_w = path.R_cw, path.center_w
+    if scene.track is not None:
+        track = scene.track
+        frames = _FIRST + np.round(track.numbers).astype(int)
+        cameras = [track.camera] * len(frames)
+        R_cw, center_w = track.R_cw, track.center_w
     else:
         images = sorted(scene.images, key=lambda image: image.name)
         frames = np.arange(_FIRST, _FIRST + len(images))

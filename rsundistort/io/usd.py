@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model import Camera
-from ..model.path import CameraPath
+from ..model.track import CameraTrack
 
 __all__ = ["FILM_WIDTH", "FLIP", "write_usd_camera"]
 
@@ -18,21 +17,15 @@ FILM_WIDTH = 36.0
 FLIP = np.diag([1.0, -1.0, -1.0])
 
 
-def write_usd_camera(
-    path: Path, camera: Camera, camera_path: CameraPath, frame_s: float, points_w: NDArray[np.float64]
-) -> None:
+def write_usd_camera(path: Path, track: CameraTrack, points_w: NDArray[np.float64]) -> None:
     """Write a stage with an animated camera, which matches rectified frames, and the points of the scene.
 
     Parameters
     ----------
     path : Path
         File to write, .usda or .usdc.
-    camera : Camera
-        Of the rectified frames, a pinhole.
-    camera_path : CameraPath
-        Poses; time codes are frames, counted from 0 by the times.
-    frame_s : float
-        Time from one frame to the next.
+    track : CameraTrack
+        Camera and poses; time codes are frames, counted from 0 by the times.
     points_w : (n, 3) array
         Points.
 
@@ -45,8 +38,8 @@ def write_usd_camera(
 
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    # whole numbers are such: quotients of times are off by their last digit
-    code, rate = np.round(camera_path.time_s / frame_s, 6), round(1.0 / frame_s, 6)
+    code, rate = track.numbers, round(1.0 / track.frame_s, 6)
+    camera = track.camera
     stage.SetTimeCodesPerSecond(rate)
     stage.SetFramesPerSecond(rate)
     stage.SetStartTimeCode(float(code[0]))
@@ -61,10 +54,10 @@ def write_usd_camera(
     prim.CreateVerticalApertureAttr(float(camera.height * mm * fx / fy))
     prim.CreateHorizontalApertureOffsetAttr(float((camera.width / 2 - (cx + 0.5)) * mm))
     prim.CreateVerticalApertureOffsetAttr(float(((cy + 0.5) - camera.height / 2) * mm * fx / fy))
-    size = float(np.median(np.linalg.norm(points_w - camera_path.center_w.mean(0), axis=1))) if len(points_w) else 1.0
+    size = float(np.median(np.linalg.norm(points_w - track.center_w.mean(0), axis=1))) if len(points_w) else 1.0
     prim.CreateClippingRangeAttr(Gf.Vec2f(1e-3 * size, 1e3 * size))
     pose = prim.AddTransformOp()
-    for time, R_cw, center_w in zip(code.tolist(), camera_path.R_cw, camera_path.center_w, strict=True):
+    for time, R_cw, center_w in zip(code.tolist(), track.R_cw, track.center_w, strict=True):
         matrix = np.eye(4)  # of row vectors
         matrix[:3, :3] = FLIP @ R_cw @ FLIP
         matrix[3, :3] = FLIP @ center_w

@@ -31,6 +31,7 @@ from ..model.orientation import INVERSE, orient_reconstruction
 from ..sfm import matched_of_database
 from .from_poses import measured, posed_photos, shutter_terms
 from .going_on import RunFolder, key_of, run_folder
+from .model_frame import in_frame_of
 from .model_sequence import solve_tracks
 from .outcome import Solved
 from .run_options import OutputOptions, SolveOptions
@@ -398,8 +399,8 @@ def _solve(
             rec, cameras, options.shutter_model, options.seed, lambda _: fitting, log, options.remedy, track_source,
             survey,
         )  # fmt: skip
-    if solved.survey is None:  # the model's frame is kept
-        solved = replace(solved, georeference=given.georeference)
+    if solved.survey is None:
+        solved = replace(in_frame_of(solved, given.reconstruction), georeference=given.georeference)
     after = solved.shared
     contradictions = [
         known_contradiction(after, {}, options.known, solved.known_motions),

@@ -172,6 +172,8 @@ def _solved(
     outputs = Outputs.of_solved(
         replace(solved, facts=facts), solving, rectify, options.outputs, loaded.orientations, times=photo_times(folder)
     )
+    if source.clip is not None:
+        outputs = replace(outputs, shown=source.clip.shown, every_frame=options.frames == "all")
     before.solved(outputs, log)
     return outputs
 

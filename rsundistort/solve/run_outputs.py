@@ -47,10 +47,10 @@ from ..io.places import local_place
 from ..io.record import Record
 from ..io.usd import write_usd_camera
 from ..io.video import FRAME_TABLE, frame_name
-from ..model import Camera, Reconstruction, RowMotion, Solution, SolvedImage
+from ..model import Reconstruction, RowMotion, Solution, SolvedImage
 from ..model.array_types import Mask
 from ..model.orientation import orient_path, orient_reconstruction, orient_solution
-from ..model.path import CameraPath
+from ..model.track import CameraTrack, ShownFrames, camera_track
 from ..rectify import bend_px
 from ..report import Diagnostics, relative_folder, write_diagnostics, write_report
 from .outcome import Solved, solution_of
@@ -153,6 +153,10 @@ class Outputs:
         When photos were taken, in seconds.
     solved : Solved or None
         Data of the report; None if there is none.
+    shown : ShownFrames or None
+        Of a video whose frames share a path.
+    every_frame : bool
+        Whether all of its frames are rectified.
     """
 
     solution: Solution
@@ -165,6 +169,8 @@ class Outputs:
     with_photos: bool = True
     times: Mapping[str, float] = field(default_factory=dict)
     solved: Solved | None = None
+    shown: ShownFrames | None = None
+    every_frame: bool = False
 
     @classmethod
     def of_solved(
@@ -318,11 +324,11 @@ class Outputs:
             write_colmap_workspace(folder, [name for _, name in by_id])
         write_point_cloud(folder / "points.ply", rec.points_w, rgb)
         self._trajectory(folder / "poses.txt", solution)
-        path = self._path(folder, next(iter(solution.rectified_cameras.values())))
+        track = self._path(folder, solution)
         masks = mask_names([image.name for image in solution.images])
         files = {name: (f"images/{new}", f"masks/{masks[name]}") for name, new in written.items()}
         write_transforms(folder / "transforms.json", solution, files, "points.ply")
-        self._export(folder, ExportScene(solution, rec, written, rgb, stored, source, originals, path), last)
+        self._export(folder, ExportScene(solution, rec, written, rgb, stored, source, originals, track), last)
         return solution
 
     def _export(self, folder: Path, scene: ExportScene, tell: bool) -> None:
@@ -338,18 +344,20 @@ class Outputs:
             if warning is not None and tell:
                 warnings.warn(warning, stacklevel=4)
 
-    def _path(self, folder: Path, new_camera: Camera) -> CameraPath | None:
-        """Write the path of the camera of a video; rotated as the key frames are. None of photos."""
+    def _path(self, folder: Path, solution: Solution) -> CameraTrack | None:
+        """Write the path of the camera of a video; rotated as the key frames in the solution are. None of photos."""
         found = None if self.solved is None else self.solved.result.path
         if found is None:
             return None
         path = orient_path(found.path, next(iter(self.applied.values()), 1))
         write_path(folder / "path.csv", found.names, path)
         write_trajectory(folder / "path.txt", path.time_s, path.R_cw, path.center_w)
+        camera = solution.rectified_cameras[solution.registered[0].camera_id]
+        shown = self.shown or ShownFrames(path.time_s, found.names)
+        track = camera_track(path, found.names, shown, camera, even=self.every_frame)
         if self.options.usd:
-            frame_s = float(np.median(np.diff(path.time_s)))
-            write_usd_camera(folder / USD, new_camera, path, frame_s, self.reconstruction.points_w)
-        return path
+            write_usd_camera(folder / USD, track, self.reconstruction.points_w)
+        return track
 
     def rectify_clip(self, video: Path, out: Path, workers: Workers, log: StageLog) -> None:
         """Rectify all frames of a video into `out`, which `begin` has filled."""
