@@ -183,10 +183,10 @@ def _mean_sigmas(
     """Standard deviations of the priors on means; `sigmas` are those under which they were found.
 
     A velocity in common is expected to be a few times what the photos have of their own, as large as it is found, or
-    what a camera under way travels. A rotation in common is none, of a camera that only shakes, or at most one that keeps in view what a camera passes:
-    its travel by the depth. About each axis the prior says as little as the measurements alone (a unit-information
-    prior; Kass and Wasserman, 1995), and less by the odds that these give against none: what they hardly show is
-    halved, what they show stays.
+    what a camera under way travels. A rotation in common is none, of a camera that only shakes, or at most one that
+    keeps in view what a camera passes: its travel by the depth. About each axis the prior says as little as the
+    measurements alone (a unit-information prior; Kass and Wasserman, 1995), and less by the odds that these give
+    against none: what they hardly show is halved, what they show stays.
     """
     velocity = max(_MUCH * SIGMA_OF_SCALE * velocity_sigma, _UNDER_WAY * current.baseline)
     depth = _depth(current)
