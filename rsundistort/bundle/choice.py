@@ -75,7 +75,7 @@ class _Selection:
         fits = self._fits
         if steady.varying or not self._refines:
             return fit
-        vary = fits.fit(steady.model, True, [steady.reconstruction], bends=steady.bends)
+        vary = fits.fit(steady.model, True, [steady.reconstruction], bends=steady.bends, against=fit)
         self.gain[vary.label] = fits.gain(steady, vary)
         is_ahead = float(vary.errors.mean()) < float(fit.errors.mean())
         return vary if is_ahead and fits.is_better(steady, vary) else fit

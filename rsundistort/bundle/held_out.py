@@ -42,6 +42,8 @@ MIN_AGREEMENT = 0.5
 _AT_LIMIT = 0.99
 # A model that does not fit converges slowly along a narrow valley; the others converge in fewer steps.
 _MOST_STEPS = 15
+# A model that leaves so many times the held-out error of another will not be better.
+_HOPELESS = 2.0
 # Standard deviation that holds motions where they are, radians per frame.
 _HELD = 1e-6
 
@@ -196,12 +198,22 @@ class ModelFits:
 
     def fit(
         self, model: str, varying: bool, starts: Sequence[Reconstruction], label: str | None = None, bends: int = 0,
-        residual_field: bool = False,
+        residual_field: bool = False, against: ModelFit | None = None,
     ) -> ModelFit:  # fmt: skip
-        """Fit a model from the cheapest of some starts."""
+        """Fit a model from the cheapest of some starts.
+
+        It ends before its priors are estimated if it leaves a multiple of the held-out error of `against`: they change
+        that by some hundredths, and what fits badly converges slowly.
+        """
         label = label or model + BENDS[bends] + _VARYING * varying
         if label not in self.done:
             options = replace(self._rough, varying=varying, bends=bends, residual_field=residual_field)
+            if against is not None and len(self.held_out):
+                first = self._adjusted(label, model, starts, replace(options, prior_sigma_rounds=0))
+                if float(first.errors.mean()) > _HOPELESS * float(against.errors.mean()):
+                    self.done[label] = first
+                    return first
+                starts = [first.reconstruction]
             self.done[label] = self._adjusted(label, model, starts, options)
         return self.done[label]
 
@@ -230,7 +242,7 @@ class ModelFits:
 
         def read(starts: Sequence[Reconstruction], bends: int) -> ModelFit:
             label = f"{fit.model}{BENDS[bends]}{_VARYING * fit.varying}, read along the other axis"
-            return self.fit(fit.model, fit.varying, starts, label, bends)
+            return self.fit(fit.model, fit.varying, starts, label, bends, against=fit)
 
         smooth = min(fit.bends, SMOOTH_BENDS)
         still = self.fit(plain.model, False, [self.given])
