@@ -39,10 +39,6 @@ _SETTLED_MEANS = 0.2
 # a part of their speed. (Were the mean drawn to zero as a sample of what varies, that of an orbit would be lost, and
 # its rotation with it.)
 _MUCH = 3.0
-# And by the way between two photos: a camera that takes them under way, one in a second, travels some hundredths of it
-# while it reads one. (What a steady flight over flat ground has in common hardly shows. A prior as narrow as photos'
-# differences, or as the estimate that it allowed before, shrinks it to nothing and calls that certain.)
-_UNDER_WAY = 0.03
 # A lens that its model says so badly needs another model.
 _MOST_PX = 1.0
 
@@ -182,14 +178,13 @@ def _mean_sigmas(
 ) -> tuple[float, ...]:
     """Standard deviations of the priors on means; `sigmas` are those under which they were found.
 
-    A velocity in common is expected to be a few times what the photos have of their own, as large as it is found, or
-    what a camera under way travels. A rotation in common is none, of a camera that only shakes, or at most one that
-    keeps in view what a camera passes: its travel by the depth. About each axis the prior says as little as the
-    measurements alone (a unit-information prior; Kass and Wasserman, 1995), and less by the odds that these give
-    against none: what they hardly show is halved, what they show stays.
+    A velocity in common is expected to be a few times what the photos have of their own, or as large as it is found. A
+    rotation in common is none, of a camera that only shakes, or at most one that keeps in view what a camera passes:
+    its travel by the depth. About each axis the prior says as little as the measurements alone (a unit-information
+    prior; Kass and Wasserman, 1995), and less by the odds that these give against none: what they hardly show is
+    halved, what they show stays.
     """
-    velocity = max(_MUCH * SIGMA_OF_SCALE * velocity_sigma, _UNDER_WAY * current.baseline)
-    depth = _depth(current)
+    velocity, depth = _MUCH * SIGMA_OF_SCALE * velocity_sigma, _depth(current)
     sharing = np.flatnonzero(common.variances.any(1))
     if not len(sharing):
         return (*[velocity / depth] * 3, *[velocity] * 3)
