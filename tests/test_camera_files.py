@@ -171,3 +171,60 @@ def test_camera_of_exif(tmp_path):
     np.testing.assert_array_equal(camera.K[:2, 2], [31.5, 23.5])
     write_image(tmp_path / "bare.png", texture(64, 48))
     assert camera_from_exif(tmp_path / "bare.png", 64, 48) is None
+
+
+# ---------------------------------------------------------------- Kalibr
+
+CHAIN = """cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.1, 0.02, 0.001, -0.002]
+  distortion_model: radtan
+  intrinsics: [500.0, 510.0, 322.5, 235.25]
+  resolution: [640, 480]
+  rostopic: /cam0/image_raw
+cam1:
+  T_cn_cnm1:
+  - [1.0, 0.0, 0.0, -0.1]
+  - [0.0, 1.0, 0.0, 0.0]
+  - [0.0, 0.0, 1.0, 0.0]
+  - [0.0, 0.0, 0.0, 1.0]
+  cam_overlaps: [0]
+  camera_model: pinhole
+  distortion_coeffs: [0.01, -0.02, 0.03, -0.004]
+  distortion_model: equidistant
+  intrinsics: [400.0, 401.0, 311.0, 190.0]
+  resolution: [600, 400]
+  rostopic: /cam1/image_raw
+"""
+
+
+def test_a_camera_chain_of_kalibr_is_read(tmp_path):
+    path = tmp_path / "camchain.yaml"
+    path.write_text(CHAIN)
+    found = read_camera_file(path, 640, 480)
+    one, other = found.cameras["cam0"], found.cameras["cam1"]
+    np.testing.assert_array_equal(one.K, K)
+    assert (one.width, one.height, one.lens, other.width, other.height, other.lens) == (
+        640, 480, "pinhole", 600, 400, "fisheye",
+    )  # fmt: skip
+    np.testing.assert_array_equal(one.dist[:4], [-0.1, 0.02, 0.001, -0.002])
+    np.testing.assert_array_equal(other.dist[:4], [0.01, -0.02, 0.03, -0.004])
+    assert not found.without_size
+    assert found.source.endswith("(Kalibr)")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "says"),
+    [
+        ("[500.0, 510.0, 322.5, 235.25]", "[0.6, 500.0, 510.0, 322.5, 235.25]", "5 numbers, expected fx, fy, cx, cy"),
+        ("camera_model: pinhole", "camera_model: omni", "'omni'"),
+        ("distortion_model: radtan", "distortion_model: fov", "'fov'"),
+        ("[640, 480]", "[640]", "width and a height"),
+    ],
+)
+def test_cameras_of_kalibr_that_are_no_pinholes_are_refused(tmp_path, before, after, says):
+    path = tmp_path / "camchain.yaml"
+    path.write_text(CHAIN.replace(before, after, 1))
+    with pytest.raises(FormatError, match=rf"camchain\.yaml, cam0.*{says}"):
+        read_camera_file(path, 640, 480)

@@ -1,6 +1,6 @@
-"""Cameras in the calibration files of OpenCV and ROS.
+"""Cameras in the calibration files of OpenCV, ROS and Kalibr.
 
-Both are trees of named values; the names differ a little from program to program, the meaning does not. YAML is read by
+All are trees of named values; the names differ a little from program to program, the meaning does not. YAML is read by
 PyYAML and XML by the standard library, not by `cv2.FileStorage`: that refuses what ROS writes (lists in block style,
 empty names, Windows line ends), and a file with deep nesting ends the process.
 """
@@ -18,7 +18,7 @@ from ..errors import format_errors
 from ..model import Camera
 from .xml_text import parse_xml as parse_elements
 
-__all__ = ["camera_from_calibration", "is_calibration", "parse_xml", "parse_yaml"]
+__all__ = ["camera_from_calibration", "has_size", "is_calibration", "kalibr_cameras", "parse_xml", "parse_yaml"]
 
 # names without case, underscores, hyphens and blanks; the first are what OpenCV's and ROS's own programs write
 _MATRIX = ("cameramatrix", "k", "intrinsicmatrix", "mtx")
@@ -28,7 +28,7 @@ _HEIGHT = ("imageheight", "height")
 _SIZE = ("imagesize", "size", "resolution")
 
 # the names of lens models
-_PINHOLE = {"", "pinhole", "plumbbob", "radtan", "rationalpolynomial", "thinprism", "opencv"}
+_PINHOLE = {"", "none", "pinhole", "plumbbob", "radtan", "rationalpolynomial", "thinprism", "opencv"}
 _FISHEYE = {"fisheye", "equidistant", "opencvfisheye", "kannalabrandt", "kannalabrandt4", "kannalabrandt8"}
 
 
@@ -86,13 +86,24 @@ def parse_xml(text: str) -> Any:
     return value(parse_elements(text))
 
 
+def kalibr_cameras(tree: Any) -> dict[str, Mapping[str, Any]]:
+    """The calibrations in a camera chain of Kalibr, by name (cam0, cam1, ...); empty if it is none."""
+    if not isinstance(tree, Mapping) or not tree or not all(re.fullmatch(r"cam\d+", str(name)) for name in tree):
+        return {}
+    return {} if not all(_has_intrinsics(each) for each in tree.values()) else {str(k): v for k, v in tree.items()}
+
+
+def _has_intrinsics(tree: Any) -> bool:
+    return isinstance(tree, Mapping) and "intrinsics" in _fields(tree)
+
+
 def is_calibration(tree: Any) -> bool:
     """Whether a tree holds a camera matrix under one of its usual names."""
     return isinstance(tree, Mapping) and any(name in _fields(tree) for name in _MATRIX)
 
 
 def camera_from_calibration(tree: Mapping[str, Any], where: str, width: int, height: int) -> Camera:
-    """The camera of a calibration of OpenCV or of a ROS `camera_info`.
+    """The camera of a calibration of OpenCV, of a ROS `camera_info`, or of one camera of Kalibr.
 
     Parameters
     ----------
@@ -108,17 +119,29 @@ def camera_from_calibration(tree: Mapping[str, Any], where: str, width: int, hei
     Returns
     -------
     Camera
-        In pixels with integer centres, as both write them.
+        In pixels with integer centres, as all write them.
     """
     fields = _fields(tree)
     with format_errors(where, (TypeError, ValueError, OverflowError)):
-        matrix = _numbers(_first(fields, _MATRIX))
-        if len(matrix) != 9:
-            raise ValueError(f"its camera matrix has {len(matrix)} numbers, expected 9")
+        matrix = _matrix(fields)
         width, height = _size(fields, width, height)
         width, height, K = _read_out(fields, width, height, matrix.reshape(3, 3))
         dist, lens = _distortion(fields)
         return Camera(width, height, K, dist, lens=lens)
+
+
+def _matrix(fields: Mapping[str, Any]) -> NDArray[np.float64]:
+    """The nine numbers of K."""
+    if not any(name in fields for name in _MATRIX):
+        four = _numbers(fields.get("intrinsics"))
+        if len(four) != 4:
+            raise ValueError(f"its intrinsics are {len(four)} numbers, expected fx, fy, cx, cy of a pinhole camera")
+        fx, fy, cx, cy = four
+        return np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1])
+    matrix = _numbers(_first(fields, _MATRIX))
+    if len(matrix) != 9:
+        raise ValueError(f"its camera matrix has {len(matrix)} numbers, expected 9")
+    return matrix
 
 
 def has_size(tree: Mapping[str, Any]) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 from ..colmap import read_colmap_cameras
 from ..errors import FileError, FormatError, InputError, file_errors, format_errors
 from ..model import Camera, other_axis
-from .calibrations import camera_from_calibration, has_size, is_calibration, parse_xml, parse_yaml
+from .calibrations import camera_from_calibration, has_size, is_calibration, kalibr_cameras, parse_xml, parse_yaml
 from .json_text import parse_json
 
 __all__ = [
@@ -113,7 +113,7 @@ class CameraFile:
 
 _KINDS = (
     "camera.json, cameras.json, the nine numbers of K, a calibration of OpenCV (YAML, XML, JSON) or ROS (YAML), "
-    "or COLMAP's cameras.txt or cameras.bin"
+    "Kalibr's camchain.yaml, or COLMAP's cameras.txt or cameras.bin"
 )
 _ONLY = "camera"  # the id of one that has none
 _SUFFIXES = (".json", ".txt", ".yaml", ".yml", ".xml", ".bin")
@@ -242,6 +242,12 @@ def _read_file(path: Path, width: int, height: int) -> CameraFile:
         tree, kind = _parse(content)
     except (ValueError, RecursionError) as error:
         raise FormatError(f"{path} cannot be understood ({error}); expected {_KINDS}") from error
+    if chain := kalibr_cameras(tree):
+        cameras = {
+            name: camera_from_calibration(each, f"{path}, {name}", width, height) for name, each in chain.items()
+        }
+        without = frozenset(name for name, each in chain.items() if not has_size(each))
+        return CameraFile(cameras, source=f"{path} (Kalibr)", without_size=without)
     source = f"{path} ({kind})"
     if is_calibration(tree) and not (kind == "JSON" and "K" in tree):
         camera = camera_from_calibration(tree, str(path), width, height)
