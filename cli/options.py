@@ -78,8 +78,9 @@ out_option: Decorator = click.option(
 camera_option: Decorator = click.option(
     "--camera",
     metavar="FILE|FOLDER|NUMBERS",
-    help="Calibration of the camera: camera.json, cameras.json, a calibration of OpenCV or ROS, COLMAP cameras, a text "
-    "file with the 3x3 matrix K, a folder of such files named by group, or fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]. "
+    help="Calibration of the camera: camera.json, cameras.json, a calibration of OpenCV, ROS or Kalibr, COLMAP "
+    "cameras, a text file with the 3x3 matrix K, a folder of such files named by group, or "
+    "fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]. "
     "By default it is camera.json or cameras.json in or beside PHOTOS, else EXIF, else the focal length that the "
     "photos show.",
 )
