@@ -1,11 +1,12 @@
 """An outsider's bundle-adjustment problems: prints one JSON object {class: {"points", "rotation_deg", "centres"}}.
 
-    python benchmarks/nw_rsba.py DIR [--prior-sigmas FACTOR]
+    python benchmarks/nw_rsba.py DIR [--prior-sigmas FACTOR] [--means-of-zero] [--deviations MODEL]
 
 DIR holds general.npz, near-parallel.npz, parallel.npz of twenty problems each. Default options, no knowledge of the
 true motion. Medians; points: rms after the similarity that best aligns the points, in scene units; rotation (mean
 angle) and centres (rms) after the similarity that best aligns the centres. `--prior-sigmas` multiplies the standard
-deviations that the estimate of the priors starts from.
+deviations that the estimate of the priors starts from; `--means-of-zero` is without what motions have in common, and
+`--deviations model` takes measurements as independent.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import argparse
 import json
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 
@@ -55,11 +57,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("dir", type=Path)
     parser.add_argument("--prior-sigmas", type=float, default=1.0)
+    parser.add_argument("--means-of-zero", action="store_true")
+    parser.add_argument("--deviations", default="jackknife", choices=("jackknife", "model"))
     args = parser.parse_args()
+    if args.means_of_zero:
+        mock.patch("rsundistort.bundle.prior_sigmas.has_means", return_value=False).start()
     default = BundleOptions()
     options = BundleOptions(
         phi_sigma_start=args.prior_sigmas * default.phi_sigma_start,
         velocity_sigma_start=args.prior_sigmas * default.velocity_sigma_start,
+        deviations=args.deviations,
     )
     summary = {}
     for name in CLASSES:

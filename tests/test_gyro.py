@@ -13,9 +13,9 @@ from solved_scene import cameras_of
 
 from rsundistort import Camera, GyroOptions, RowMotion, RsUndistortWarning
 from rsundistort.batch.progress import StageLog
-from rsundistort.bundle import BundleOptions, KnownMotions
+from rsundistort.bundle import BundleOptions, KnownMotions, misses_of
 from rsundistort.errors import FileError, FormatError, InputError
-from rsundistort.input.gyroscope import gyro_motions, known_contradiction, known_readouts
+from rsundistort.input.gyroscope import gyro_motions, known_readouts
 from rsundistort.io import (
     GyroLog,
     VideoFrames,
@@ -27,6 +27,7 @@ from rsundistort.io import (
 )
 from rsundistort.io.gyro import parse_axes
 from rsundistort.model import READOUTS
+from rsundistort.solve.known_contradiction import known_contradiction
 from rsundistort.solve.model_sequence import solve_tracks
 from rsundistort.synthetic import project_rows
 
@@ -198,6 +199,15 @@ def test_a_solution_far_from_known_motions_is_reported():
     # and the photos of a gyroscope that rests may be bent by their lens
     assert not replace(worse, gain=0.0, size=2.0, miss=9.0).is_contradicted
     assert replace(worse, gain=0.0, miss=9.0).is_contradicted
+
+
+def test_unknown_components_say_nothing_of_a_contradiction():
+    rec = named_scene("random", m=4)
+    rec = replace(rec, shutter_model="rotation", phi=np.full((4, 3), 0.01) / rec.frame_span()[:, None])
+    sigma = np.array([0.001, np.inf, np.inf])
+    known = {name: (np.zeros(3), sigma) for name in rec.image_names}
+    assert misses_of(rec, known) == pytest.approx(10.0)
+    assert misses_of(rec, {name: (np.zeros(3), np.full(3, np.inf)) for name in rec.image_names}) == 0.0
 
 
 @pytest.mark.parametrize("model", ["auto", "rotation"])

@@ -11,6 +11,7 @@ from numpy_reference import Fisheye
 
 from rsundistort import BundleOptions, bundle_adjust
 from rsundistort.bundle import GuessedCameras, Posterior, choose_model
+from rsundistort.bundle.held_out import ModelFits
 from rsundistort.bundle.intrinsics import moved_camera
 from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
@@ -255,6 +256,18 @@ def test_a_lens_that_would_vary_as_no_lens_does_is_not_taken_out_where_a_shutter
     # predicts better, by a principal point that wanders by a fiftieth of the focal length
     assert choice.held_out_error["global, varying lens"] < choice.held_out_error["global"]
     assert (choice.shutter, choice.label, choice.varying) == ("not-determined", "global", False)
+
+
+def test_a_fit_that_ended_early_is_whole_where_it_counts(rng):
+    scene = make_scene(rng, "rotation", num_images=8, num_points=300, noise_px=0.1, phi_size=0.05)
+    fits = ModelFits(replace(scene, shutter_model="global"), BundleOptions(), 0.1, 0, None)
+    right = fits.fit("rotation", False, [fits.given])
+    ended = fits.fit("global", False, [fits.given], against=right)
+    assert ended.errors.mean() > 2 * right.errors.mean()
+    assert fits.fit("global", False, [fits.given], against=right) is ended
+    whole = fits.fit("global", False, [fits.given])
+    assert whole is not ended
+    assert fits.fit("global", False, [fits.given]) is whole
 
 
 def choice_with_known_motions(rng, off_by):

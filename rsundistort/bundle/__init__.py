@@ -10,13 +10,14 @@ from .control import CONTROL_SIGMA_PX, PlacedControl, place_control, with_contro
 from .direction import ReadoutChoice, choose_readouts
 from .intrinsics import GuessedCameras, deviation, pixels_of
 from .known_lengths import scale_of_lengths
-from .known_motions import KnownMotions, judge_known_motions, misses_of
+from .known_motions import FAR, KnownMotions, judge_known_motions, misses_of
 from .known_positions import KnownPlaces
 from .model_choice import ModelChoice
 from .posterior import Posterior, gauge_directions
 
 __all__ = [
     "CONTROL_SIGMA_PX",
+    "FAR",
     "MODEL_SEQUENCE",
     "BundleOptions",
     "BundleResult",

@@ -195,6 +195,7 @@ class ModelFits:
         self._sigma_px = sigma_px
         self._progress = progress
         self.done: dict[str, ModelFit] = {}
+        self._ended = set[str]()  # early
 
     def fit(
         self, model: str, varying: bool, starts: Sequence[Reconstruction], label: str | None = None, bends: int = 0,
@@ -206,11 +207,13 @@ class ModelFits:
         that by some hundredths, and what fits badly converges slowly.
         """
         label = label or model + BENDS[bends] + _VARYING * varying
-        if label not in self.done:
+        if label not in self.done or (against is None and label in self._ended):
+            self._ended.discard(label)
             options = replace(self._rough, varying=varying, bends=bends, residual_field=residual_field)
             if against is not None and len(self.held_out):
                 first = self._adjusted(label, model, starts, replace(options, prior_sigma_rounds=0))
                 if float(first.errors.mean()) > _HOPELESS * float(against.errors.mean()):
+                    self._ended.add(label)
                     self.done[label] = first
                     return first
                 starts = [first.reconstruction]

@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..model import Reconstruction
+from ..model.array_types import Array
 from .bundle_options import BundleOptions
 from .held_out import ModelFit, ModelFits
 
-__all__ = ["KnownMotions", "compare_known_motions", "judge_known_motions", "misses_of"]
+__all__ = ["FAR", "KnownMotions", "compare_known_motions", "judge_known_motions", "misses_of"]
 
-# Motions contradict photos by this many standard errors, or of their own standard deviations.
-_FAR = 3.0
+#: Motions contradict photos by this many standard errors, or of their own standard deviations.
+FAR = 3.0
 
 
 @dataclass(frozen=True)
@@ -50,20 +51,23 @@ class KnownMotions:
         They predict the photos worse than none does, or no better while the photos show others. Small ones are never
         contradicted: photos that seem to move while a gyroscope rests show an error of the lens.
         """
-        if self.is_better or self.size <= _FAR:
+        if self.is_better or self.size <= FAR:
             return False
-        return self.gain <= -_FAR or max(self.free_gain, self.miss) >= _FAR
+        return self.gain <= -FAR or max(self.free_gain, self.miss) >= FAR
 
 
 def misses_of(reconstruction: Reconstruction, known: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> float:
     """Root mean square of differences from known motions in units of their standard deviations; 0 without any."""
     rec, span = reconstruction, reconstruction.frame_span()
-    misses = [
-        (rec.phi[i] * span[i] - np.asarray(known[name][0])) / np.asarray(known[name][1])
-        for i, name in enumerate(rec.image_names)
-        if name in known
-    ]
-    return float(np.sqrt(np.mean(np.square(misses)))) if misses else 0.0
+    places = [i for i, name in enumerate(rec.image_names) if name in known]
+    motions, sigmas = zip(*(known[rec.image_names[i]] for i in places), strict=True) if places else ((), ())
+    return _in_sigmas(rec.phi[places] * span[places, None] - np.reshape(motions, (-1, 3)), np.reshape(sigmas, (-1, 3)))
+
+
+def _in_sigmas(values: Array, sigmas: Array) -> float:
+    """Root mean square of (n, 3) values in units of their standard deviations; infinite ones are of unknown values."""
+    known = np.isfinite(sigmas)
+    return float(np.sqrt(np.mean((values[known] / sigmas[known]) ** 2))) if known.any() else 0.0
 
 
 def compare_known_motions(fits: ModelFits, plain: ModelFit, best: ModelFit) -> KnownMotions | None:
@@ -77,12 +81,13 @@ def compare_known_motions(fits: ModelFits, plain: ModelFit, best: ModelFit) -> K
     if best.model == "global":
         best = fits.fit("rotation", best.varying, [plain.reconstruction, fits.given])
     known = fits.known_phi
+    motions, sigmas = (np.array(each, float) for each in zip(*known.values(), strict=True))
     return KnownMotions(
         gain=fits.gain(plain, exactly),
         is_better=fits.is_better(plain, exactly),
         free_gain=fits.gain(best, fits.without_known_motions(best)),
         miss=misses_of(best.reconstruction, known),
-        size=float(np.sqrt(np.mean([np.square(np.asarray(phi) / np.asarray(sigma)) for phi, sigma in known.values()]))),
+        size=_in_sigmas(motions, sigmas),
     )
 
 

@@ -10,23 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..bundle import KnownMotions, misses_of
 from ..errors import InputError
 from ..io import ExifFacts
 from ..io.gyro import GyroLog, bends_from_gyro, motions_from_gyro, read_gyro, read_photo_times
 from ..io.motions import Known
 from ..io.readout_times import readout_time
 from ..io.video import FRAME_TABLE, VideoFrames
-from ..model import Bend, Camera, Reconstruction
+from ..model import Bend, Camera
 from ..model.checks import check_fields
 
-__all__ = ["GyroOptions", "Readouts", "gyro_motions", "known_contradiction", "known_readouts"]
+__all__ = ["GyroOptions", "Readouts", "gyro_motions", "known_readouts"]
 
 #: By camera: readout time of a frame in seconds, and its source.
 Readouts = dict[int, tuple[float, str]]
-
-# A solution contradicts known motions that it misses by this many of their standard deviations.
-_FAR = 3.0
 
 
 @dataclass(frozen=True)
@@ -124,39 +120,3 @@ def gyro_motions(
     found = bends_from_gyro(log, {name: times[name] for name in known}, spans, cameras, offset_s=gyro.offset_s)
     # phi belongs to the bend: the slope of the rotation, not its mean rate
     return {name: (found[name][0], sigma) for name, (_, sigma) in known.items()}, {k: v for k, (_, v) in found.items()}
-
-
-def known_contradiction(
-    rec: Reconstruction,
-    from_gyro: Mapping[str, tuple[ArrayLike, ArrayLike]],
-    specified: Mapping[str, tuple[ArrayLike, ArrayLike]],
-    evidence: KnownMotions | None = None,
-) -> str | None:
-    """A warning, if a solution contradicts the motions that are known, by a gyroscope or as the user specified them.
-
-    Motions that `evidence` contradicts were left out of the solution; others are compared with its own motions.
-    """
-    if not from_gyro and not specified:
-        return None
-    sources, checks = [], []
-    if from_gyro:
-        sources.append("the gyroscope")
-        checks.append(
-            "the offset of its clock (--gyro-offset), its axes (--gyro-axes) and the time of the readout (--readout-ms)"
-        )
-    if specified:
-        sources.append("the known motions (--known)")
-        checks.append("to which photos they belong, their signs, and their unit, radians")
-    source, check = " and ".join(sources), f"check {', and '.join(checks)}"
-    if evidence is not None and evidence.is_contradicted:
-        than = f"{'worse' if evidence.gain < 0 else 'no better'} than none (by {evidence.gain:+.1f} standard errors)"
-        return (
-            f"the photos contradict {source}, whose motions were left out: they predict the photos {than}; {check}, or "
-            "the camera has no rolling shutter, or stabilises its photos"
-        )
-    if rec.shutter_model == "global":
-        return None
-    far = misses_of(rec, dict(specified) | dict(from_gyro))
-    if far <= _FAR:
-        return None
-    return f"the photos contradict {source}, by {far:.0f} times the uncertainty of these motions; {check}"

@@ -17,7 +17,7 @@ from ..colmap.conventions import kept_log_level
 from ..colmap.measured_model import ColmapModel, colmap_model_of, surviving_points
 from ..colmap.rectified_model import ModelIds, colmap_model
 from ..errors import FileError, InputError, ReconstructionError, RsUndistortWarning
-from ..input.gyroscope import known_contradiction, known_readouts
+from ..input.gyroscope import known_readouts
 from ..input.photo_cameras import PhotoCameras, check_readouts
 from ..io import ExifFacts, guess_readouts, list_photos, output_folder, output_name, read_exif, read_solution
 from ..io.metashape import is_metashape
@@ -31,6 +31,7 @@ from ..model.orientation import INVERSE, orient_reconstruction
 from ..sfm import matched_of_database
 from .from_poses import measured, posed_photos, shutter_terms
 from .going_on import RunFolder, key_of, run_folder
+from .known_contradiction import known_contradiction
 from .model_frame import in_frame_of
 from .model_sequence import solve_tracks
 from .outcome import Solved

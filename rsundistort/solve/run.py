@@ -16,7 +16,7 @@ from ..bundle.intrinsics import check_lenses
 from ..errors import FileError, InputError, RsUndistortWarning
 from ..input.exposure import bounded_by_exposure
 from ..input.frames import find_photos
-from ..input.gyroscope import GyroOptions, Readouts, gyro_motions, known_contradiction, known_readouts
+from ..input.gyroscope import GyroOptions, Readouts, gyro_motions, known_readouts
 from ..input.key_frames import Clip
 from ..input.load import LoadedPhotos, load_photos, with_finer_features
 from ..input.photo_cameras import camera_file_of
@@ -32,6 +32,7 @@ from ..io.video import VIDEO_SUFFIXES, VideoFrames
 from ..model import Reconstruction, Solution
 from ..model.checks import check_kind
 from .going_on import RunFolder, key_of, run_folder
+from .known_contradiction import known_contradiction
 from .model_sequence import solve_photos
 from .outcome import Solved
 from .run_options import RunOptions, SolveOptions
