@@ -20,7 +20,7 @@ from numpy_reference import project
 
 from rsundistort import BundleOptions, Camera, Observations, Reconstruction, bundle_adjust
 from rsundistort.bundle import Posterior
-from rsundistort.bundle.common_motion import LEAST_PHOTOS
+from rsundistort.bundle.common_motion import LEAST_PHOTOS, sigmas_of_means
 from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.synthetic import look_at
@@ -29,7 +29,7 @@ from rsundistort.synthetic import look_at
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 MODEL = "constant-motion"
-MEANS = (0.02, 0.02, 0.02, 0.3, 0.3, 0.3)
+MEANS = (0.2, 0.1, 0.05)  # of cameras that travel, that aim, and that do as they like
 
 
 def shared_problem(rng, refine=(), factor_limit=1e10, num_images=9):
@@ -40,8 +40,7 @@ def shared_problem(rng, refine=(), factor_limit=1e10, num_images=9):
     options = BundleOptions(loss="squared", factor_limit=factor_limit, cg_tolerance=1e-13, refine=refine)
     problem = BundleProblem(start, MODEL, options, 0.5, PriorSigmas(0.03, 0.1, means=MEANS))
     state = problem.initial_state()
-    moved = 0.1 * rng.normal(size=state.means.shape) * MEANS[: state.means.shape[1]]
-    return problem, replace(state, means=state.means + moved)
+    return problem, replace(state, means=state.means + 0.1 * rng.normal(size=state.means.shape))
 
 
 def whole_system(problem, state):
@@ -57,7 +56,8 @@ def whole_system(problem, state):
     T, own = np.zeros((m, 6, 6)), motion.copy()
     for i in np.flatnonzero(problem._start.camera_idx == 0):
         T[i, :3, :3], T[i, 3:, 3:] = np.eye(3) / span[i], problem._start.R_cw[i].T / span[i]
-        own[i] -= T[i] @ state.means[0]
+        own[i] -= T[i] @ problem.means.values(state.means)[0]
+        T[i] = T[i] @ problem.means.root
     sqrt_weight = np.sqrt(weights_of_motions(problem, own))
     for i in range(m):
         rows = slice(6 * i, 6 * i + 6)
@@ -68,8 +68,8 @@ def whole_system(problem, state):
         res[rows] = sqrt_weight[i] * own[i] / np.sqrt(INFORMATION)  # the gradient's weight is the whole one
     for c in range(cameras):
         rows = slice(6 * (m + c), 6 * (m + c) + 6)
-        J[rows, first + c * nc + nr : first + (c + 1) * nc] = np.diag(1 / np.array(MEANS))
-        res[rows] = state.means[c] / MEANS
+        J[rows, first + c * nc + nr : first + (c + 1) * nc] = np.eye(6)
+        res[rows] = state.means[c]
     wide, gradient = J.T @ J, J.T @ res
     # the dense system has the priors of motions without means already
     weight = np.hstack([np.zeros((m, 6)), weights_of_motions(problem, motion)])
@@ -167,6 +167,70 @@ def measured_rows(problem, state, size, nr):
         J[k, :, f : f + nb], J[k, :, p : p + 3] = J_frame[k], -J_frame[k, :, 3:6]
         J[k, :, c : c + nr] = J_camera[k]
     return J.reshape(-1, size)
+
+
+def prior_of_means(depth, sigmas=MEANS):
+    """Covariance of the prior on means, as `MotionMeans.of` says it in words."""
+    total = np.zeros((6, 6))
+    for axis in range(3):
+        travel = np.eye(3)[axis]
+        aiming = (
+            np.cross([0.0, 0.0, 1.0], travel) / depth
+        )  # x_c changes by phi x x_c less the travel: none at (0, 0, depth)
+        np.testing.assert_allclose(np.cross(aiming, [0.0, 0.0, depth]), travel * [1, 1, 0], atol=1e-15)
+        for sigma, phi in zip(sigmas[:2], (0 * aiming, aiming), strict=True):
+            motion = sigma * np.concatenate([phi, travel])
+            total += np.outer(motion, motion)
+    return total + sigmas[2] ** 2 * np.diag([depth**-2] * 3 + [1.0] * 3)
+
+
+def test_means_are_those_of_cameras_that_travel_aim_or_do_as_they_like(rng):
+    problem, state = shared_problem(rng)
+    root = problem.means.root
+    expected = prior_of_means(problem._start.typical_depth)
+    np.testing.assert_allclose(root @ root.T, expected, atol=1e-12 * expected.max())
+    values = problem.means.values(state.means)
+    np.testing.assert_allclose(problem.means.unknowns(values), state.means, atol=1e-10)
+
+
+def shown(rng, motion, exactness, under):
+    """What is found of a mean that is measured with a precision (6, 6), under a prior of covariance (6, 6)."""
+    measured = motion + np.linalg.solve(np.linalg.cholesky(exactness).T, rng.normal(size=6))
+    root = np.linalg.cholesky(under)
+    covariance = np.linalg.inv(root.T @ exactness @ root + np.eye(6))
+    return (covariance @ root.T @ exactness @ measured)[None], covariance[None], root
+
+
+@pytest.mark.parametrize("of", range(4), ids=["none", "travelling", "aiming", "both"])
+def test_the_prior_of_means_is_as_wide_as_each_way_to_move_is_likely(of, rng):
+    depth, velocity, num = 4.0, 0.05, 400
+    # the yaw and the travel sideways that show the same are measured five times less exactly than the others
+    exactness = np.diag([depth**2] * 3 + [1.0] * 3) * 40.0**2 / 0.05**2 * 0.01
+    weak = np.array([0.0, 1.0 / depth, 0.0, 1.0, 0.0, 0.0])
+    weak /= weak @ exactness @ weak / np.sqrt(weak @ exactness @ weak)
+    exactness -= 0.96 * np.outer(exactness @ weak, exactness @ weak)
+    ways = [prior_of_means(depth, velocity * each) for each in np.eye(3)]
+    likely = []
+    for _ in range(num):
+        motion = np.zeros(6) if of == 0 else np.linalg.cholesky(ways[of - 1] + 1e-15 * np.eye(6)) @ rng.normal(size=6)
+        under = prior_of_means(depth, velocity * rng.uniform(0.01, 1, 3))
+        found = sigmas_of_means(*shown(rng, motion, exactness, under), velocity, depth)
+        share = np.array(found) ** 2 / velocity**2
+        likely.append([1.0 - share.sum(), *share])
+    # drawn as the prior says, with each as likely, the truth has the probability that it is given: the largest, and of
+    # none nearly all
+    mean = np.mean(likely, axis=0)
+    assert mean.argmax() == of
+    assert mean[of] > 0.6
+
+
+def test_the_prior_of_means_does_not_depend_on_that_under_which_they_were_found(rng):
+    exactness = np.linalg.inv(np.diag([0.01] * 3 + [0.05] * 3) ** 2 * (np.eye(6) + 0.5))
+    found = []
+    for sigmas in ((0.1, 0.1, 0.1), (0.02, 1e-3, 0.3), (0.3, 0.1, 3e-3)):
+        each = shown(np.random.default_rng(5), np.full(6, 0.01), exactness, prior_of_means(4.0, sigmas))
+        found.append(sigmas_of_means(*each, 0.1, 4.0))
+    np.testing.assert_allclose(found[1:], found[:1] * 2, rtol=1e-8)
 
 
 def test_cameras_of_few_photos_share_nothing(rng):

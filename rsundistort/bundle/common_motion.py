@@ -5,16 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import softmax
 
 from ..model import Reconstruction
 from ..model.array_types import Array, Index, Mask
 
-__all__ = ["LEAST_PHOTOS", "CommonMotion", "MotionMeans"]
+__all__ = ["LEAST_PHOTOS", "CommonMotion", "MotionMeans", "sigmas_of_means"]
 
 
 #: Photos whose motions have a mean. It has a prior of its own, so they need not be as many as its unknowns; with two it
 #: would be as much each one's own. (`benchmarks/honest.py --only flights`: three to five photos.)
 LEAST_PHOTOS = 3
+# Of any way to move: a hundredth of the travel that it would have. The measurements can still be asked.
+_LEAST_PROBABILITY = 1e-4
 
 
 @dataclass(frozen=True)
@@ -27,8 +30,8 @@ class CommonMotion:
         Rotation, radians per frame, and travel, baselines per frame.
     deviations : (cameras, 6) array
         Their standard deviations.
-    sigmas : (6,) tuple of float
-        Those of their priors, whose means are zero.
+    sigmas : (3,) tuple of float
+        Standard deviations of their prior, baselines per frame, as `MotionMeans` takes them.
     """
 
     values: Array
@@ -40,44 +43,101 @@ class CommonMotion:
 class MotionMeans:
     """How the unknown motions of photos depend on the means of their cameras.
 
+    The unknowns of means have standard normal priors.
+
     Attributes
     ----------
     directions : (m, 6, 6) array
-        Motions, in the world frame per unit of the clock, by means, in the frame of the camera per frame. 0 for what a
-        photo does not share.
+        Motions, in the world frame per unit of the clock, by the unknowns. 0 for what a photo does not share.
     camera_idx : (m,) int array
         Camera of each photo.
-    sigmas : (6,) array
-        Standard deviations of the priors on the means: radians, and world units.
+    root : (6, 6) array
+        Means, in the frame of the camera per frame, radians and world units, by the unknowns.
     """
 
     directions: Array
     camera_idx: Index
-    sigmas: Array
+    root: Array
 
     @classmethod
     def of(cls, reconstruction: Reconstruction, sigmas: tuple[float, ...], shares: Mask) -> MotionMeans:
-        """The means of a reconstruction; `shares` (m, 6) says which components of its photos' motions have a mean."""
+        """The means of a reconstruction; `shares` (m, 6) says which components of its photos' motions have a mean.
+
+        `sigmas` are the standard deviations of travels in common, world units per frame: of cameras that travel, of
+        those that aim at what they pass, whose rotation is their travel by the depth, and of those that rotate as they
+        like, by as much.
+        """
         directions = np.zeros((reconstruction.num_images, 6, 6))
         directions[:, :3, :3] = np.eye(3)
         directions[:, 3:, 3:] = reconstruction.R_cw.transpose(0, 2, 1)
         directions *= shares[:, :, None] / reconstruction.frame_span()[:, None, None]
-        return cls(directions, reconstruction.camera_idx, np.array(sigmas))
+        ways = _ways(reconstruction.typical_depth)
+        root = np.linalg.cholesky(np.einsum("k,kab->ab", np.square(sigmas), np.array(ways)))
+        return cls(np.asarray(directions @ root, np.float64), reconstruction.camera_idx, np.asarray(root, np.float64))
 
-    def at(self, means: Array) -> Array:
-        """Motions (m, 6) of photos that move as the means (cameras, 6) say."""
-        return np.einsum("mak,mk->ma", self.directions, means[self.camera_idx])
+    def values(self, unknowns: Array) -> Array:
+        """Means (cameras, 6) of unknowns (cameras, 6)."""
+        return np.asarray(unknowns @ self.root.T)
 
-    def pull(self, weight: Array, motion: Array, means: Array) -> Array:
-        """Gradient (cameras, 6) of the photos' priors, of weights (m, 6), by the means."""
-        total = np.zeros_like(means)
-        by_photo = np.einsum("mak,ma->mk", self.directions, weight * (motion - self.at(means)))
+    def unknowns(self, values: Array) -> Array:
+        """Unknowns (cameras, 6) of means (cameras, 6)."""
+        return np.asarray(np.linalg.solve(self.root, values.T).T)
+
+    def at(self, unknowns: Array) -> Array:
+        """Motions (m, 6) of photos that move as the means of unknowns (cameras, 6) say."""
+        return np.einsum("mak,mk->ma", self.directions, unknowns[self.camera_idx])
+
+    def pull(self, weight: Array, motion: Array, unknowns: Array) -> Array:
+        """Gradient (cameras, 6) of the photos' priors, of weights (m, 6), by the unknowns."""
+        total = np.zeros_like(unknowns)
+        by_photo = np.einsum("mak,ma->mk", self.directions, weight * (motion - self.at(unknowns)))
         np.add.at(total, self.camera_idx, -by_photo)
         return total
 
     def most_likely(self, weight: Array, motion: Array, num_cameras: int) -> Array:
-        """Means (cameras, 6) where the priors of motions (m, 6), of weights (m, 6), and of the means cost least."""
+        """Unknowns (cameras, 6) where their priors and those of motions (m, 6), of weights (m, 6), cost least."""
         total = np.zeros((num_cameras, 6, 6))
         np.add.at(total, self.camera_idx, np.einsum("mak,ma,mal->mkl", self.directions, weight, self.directions))
         pull = -self.pull(weight, motion, np.zeros((num_cameras, 6)))
-        return np.asarray(np.linalg.solve(total + np.diag(self.sigmas**-2.0), pull[..., None])[..., 0], np.float64)
+        return np.asarray(np.linalg.solve(total + np.eye(6), pull[..., None])[..., 0], np.float64)
+
+
+def _ways(depth: float) -> tuple[Array, Array, Array]:
+    """Covariances (6, 6) of means for a travel in common of unit variance: `MotionMeans.of` says of which cameras."""
+    aim = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]) / depth  # what is passed stays in the middle
+    travelling, aiming = (np.vstack([each, np.eye(3)]) for each in (0.0 * aim, aim))
+    return travelling @ travelling.T, aiming @ aiming.T, np.diag(np.repeat([depth**-2.0, 1.0], 3))
+
+
+def sigmas_of_means(
+    unknowns: Array, covariances: Array, root: Array, velocity: float, depth: float
+) -> tuple[float, ...]:
+    """Standard deviations of the prior on means, as `MotionMeans` takes them, by what was found under another.
+
+    Photos may share no motion. Then the mean of few of them is easily taken for one, and what level photos hardly
+    show, nodding and rising, would be free in all of them at once, and the shape with it. So no motion in common
+    competes with each way to move, by its evidence (the marginal likelihood, Laplace's), and the prior's covariance is
+    that of their mixture: "spike and slab" (George and McCulloch, 1993), in which a slab is no wider than it is likely.
+
+    Parameters
+    ----------
+    unknowns, covariances, root : (cameras, 6), (cameras, 6, 6), (6, 6) array
+        As found, and `MotionMeans.root` there.
+    velocity : float
+        Standard deviation of a travel in common, if there is one, world units per frame.
+    depth : float
+        Of what photos show, world units.
+    """
+    # by the measurements alone: their precision, and that times what they say
+    from_unknowns = np.linalg.inv(root)
+    precision = np.linalg.inv(covariances)
+    pull = np.einsum("cij,cj->ci", precision, unknowns) @ from_unknowns
+    known = from_unknowns.T @ (precision - np.eye(6)) @ from_unknowns
+    evidence = [0.0]
+    for way in _ways(depth):
+        prior = velocity**2 * way
+        wider = np.eye(6) + known @ prior
+        gain = np.einsum("ci,ij,cj->c", pull, prior, np.linalg.solve(wider, pull[..., None])[..., 0])
+        evidence.append(0.5 * float((gain - np.linalg.slogdet(wider)[1]).sum()))
+    probability = np.maximum(softmax(evidence)[1:], _LEAST_PROBABILITY)
+    return tuple((velocity * np.sqrt(probability)).tolist())

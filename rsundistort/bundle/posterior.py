@@ -33,7 +33,7 @@ class Posterior:
             result.phi_sigma, max(result.velocity_sigma * rec.baseline, 1e-300),
             max(result.focal_sigma, 1e-300), max(result.centre_sigma, 1e-300), result.bend_sigmas,
             tuple(each * rec.baseline for each in result.way_sigmas), result.field_sigma_px, result.path_sigmas,
-            () if result.common is None else (*(per_unit * result.common.sigmas).tolist(),),
+            () if result.common is None else tuple(each * rec.baseline for each in result.common.sigmas),
         )  # fmt: skip
         plain = replace(options or BundleOptions(), loss="squared")
         self._path = None if result.path is None else result.path.state

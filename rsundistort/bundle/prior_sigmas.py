@@ -10,6 +10,7 @@ import numpy as np
 from ..model import Reconstruction
 from ..model.array_types import Array
 from .bundle_options import BundleOptions
+from .common_motion import sigmas_of_means
 from .layout import Layout
 from .motion_prior import SIGMA_OF_SCALE, tail_weight
 from .path_prior import PathPrior
@@ -76,8 +77,7 @@ class PriorSigmas:
     path : tuple of float
         Of a path, if there is one: rotation and travel, as `PathPrior` takes them.
     means : tuple of float
-        Of the means of a camera's motions, if there are any: rotation about and travel along each of its axes, radians
-        and world units per frame.
+        Of the means of a camera's motions, if there are any, as `MotionMeans` takes them.
     """
 
     phi: float
@@ -132,13 +132,15 @@ class Common(NamedTuple):
     """Means of the motions of photos (m, 6), their variances, and their covariances with the motions.
 
     In the frames of the cameras, radians and world units per frame, as are the motions; 0 where a motion has none. And
-    those of the cameras and their variances, (cameras, 6).
+    of the cameras the unknowns behind them (cameras, 6), their covariances (cameras, 6, 6), and `MotionMeans.root`.
     """
 
     values: Array
     variances: Array
     with_motions: Array
-    of_cameras: tuple[Array, Array]
+    unknowns: Array
+    covariances: Array
+    root: Array
 
 
 def estimated(
@@ -160,7 +162,7 @@ def estimated(
         velocity = _scale(own[:, 3:], own_variances[:, 3:], sigmas.velocity) + _MIN_SIGMA * current.baseline
         found = replace(found, velocity=velocity)
     if common is not None:
-        found = replace(found, means=_mean_sigmas(common, found.velocity, sigmas.means, current))
+        found = replace(found, means=_mean_sigmas(common, found.velocity, current))
     if options.varying:
         varied = current.variation
         of_varied = variances[:, layout.motion : layout.variation]
@@ -173,37 +175,19 @@ def estimated(
     return _bounded(replace(found, bends=bends, ways=ways), options, baseline)
 
 
-def _mean_sigmas(
-    common: Common, velocity_sigma: float, sigmas: tuple[float, ...], current: Reconstruction
-) -> tuple[float, ...]:
-    """Standard deviations of the priors on means; `sigmas` are those under which they were found.
+def _mean_sigmas(common: Common, velocity_sigma: float, current: Reconstruction) -> tuple[float, ...]:
+    """Standard deviations of the prior on means.
 
-    A velocity in common is expected to be a few times what the photos have of their own, or as large as it is found. A
-    rotation in common is none, of a camera that only shakes, or at most one that keeps in view what a camera passes:
-    its travel by the depth. About each axis the prior says as little as the measurements alone (a unit-information
-    prior; Kass and Wasserman, 1995), and less by the odds that these give against none: what they hardly show is
-    halved, what they show stays.
+    A velocity in common is expected to be a few times what the photos have of their own, or as large as it is found.
     """
-    velocity, depth = _MUCH * SIGMA_OF_SCALE * velocity_sigma, _depth(current)
+    velocity, depth = _MUCH * SIGMA_OF_SCALE * velocity_sigma, current.typical_depth
     sharing = np.flatnonzero(common.variances.any(1))
     if not len(sharing):
-        return (*[velocity / depth] * 3, *[velocity] * 3)
+        return (velocity,) * 3
+    found = (common.values**2 + common.variances)[sharing, 3:]
+    velocity = max(velocity, float(np.sqrt(found.mean())))
     cameras = np.unique(current.camera_idx[sharing])
-    values, variances = (each[cameras] for each in common.of_cameras)
-    velocity = max(velocity, float(np.sqrt((values**2 + variances)[:, 3:].mean())))
-    aimed, phi = (velocity / depth) ** 2, []
-    for value, variance, sigma in zip(values.T[:3], variances.T[:3], sigmas, strict=False):
-        # by the measurements alone
-        known = np.maximum(1.0 / variance - sigma**-2.0, 1e-3 / aimed)
-        square = (value / (variance * known)) ** 2
-        odds = float(0.5 * (square * known * aimed / (aimed + 1.0 / known)).sum())
-        phi.append(float(np.sqrt(min(aimed, np.exp(min(odds, 100.0)) / known.mean()))))
-    return (*phi, *[velocity] * 3)
-
-
-def _depth(reconstruction: Reconstruction) -> float:
-    """Median over the photos."""
-    return float(np.median([reconstruction.median_depth(i) for i in range(reconstruction.num_images)]))
+    return sigmas_of_means(common.unknowns[cameras], common.covariances[cameras], common.root, velocity, depth)
 
 
 def _own_motions(current: Reconstruction, covariances: Array, common: Common | None) -> tuple[Array, Array]:
@@ -264,9 +248,9 @@ def settled(before: PriorSigmas, after: PriorSigmas, tolerance: float) -> bool:
         "phi": phi, "velocity": velocity, "focal": _SETTLED_AT, "centre": _SETTLED_AT, "bends": _SETTLED_AT,
         "ways": 0.0, "field": _SETTLED_PX, "path": 0.0, "means": np.inf,
     }  # fmt: skip
-    for old, new in zip(before.means, after.means, strict=True):
-        if abs(new - old) > _SETTLED_MEANS * new and max(old, new) > _SETTLED_AT:
-            return False
+    most = max(after.means, default=0.0)
+    if any(abs(new - old) > _SETTLED_MEANS * most for old, new in zip(before.means, after.means, strict=True)):
+        return False
     for name, least in negligible.items():
         old, new = np.array([getattr(before, name), getattr(after, name)])
         if not ((np.abs(new - old) <= tolerance * new) | (np.maximum(old, new) < least)).all():
@@ -288,8 +272,8 @@ def starting_sigmas(options: BundleOptions, layout: Layout, reconstruction: Reco
         () if options.path is None else (_ROTATION_START, _TRAVEL_START * baseline),
     )
     if has_means(layout, options):
-        way = _MUCH * start.velocity
-        start = replace(start, means=(*[way / _depth(reconstruction)] * 3, *[way] * 3))
+        # none and each way to move are as likely
+        start = replace(start, means=(_MUCH * start.velocity / 2.0,) * 3)
     return _bounded(start, options, baseline)
 
 

@@ -69,9 +69,9 @@ class BundleProblem:
     unless the shutter is global, velocity (world units per unit of the clock) if the motion is whole, and the variation
     of its intrinsics (log f, cx / fx, cy / fy) if the options say that they vary, and the coefficients of its bends, if
     it has any (`Layout`). Unknowns of a camera: the intrinsics that the options name, as in `moved_camera`, those of
-    `LensFields` if they ask for fields, and the means of its photos' motions if `PriorSigmas` say how large these are.
-    Seven unknowns are held for the gauge: the pose of the photo with the most observations, and one coordinate of the
-    centre farthest from it; none where known places hold the frame. The prior on intrinsics has heavy tails
+    `LensFields` if they ask for fields, and those of the means of its photos' motions (`means`) if `PriorSigmas` has
+    any. Seven unknowns are held for the gauge: the pose of the photo with the most observations, and one coordinate of
+    the centre farthest from it; none where known places hold the frame. The prior on intrinsics has heavy tails
     (`prior_weight`), or it is normal.
     """
 
@@ -149,7 +149,7 @@ class BundleProblem:
         self._places = PlaceResiduals(self._start, options.places or KnownPlaces({}))
         self._known, self._known_weight = self._known_motions(span)
         self._free = self._free_unknowns()
-        self._means, self._means_start = self._motion_means(sigmas), means
+        self.means, self._means_start = self._motion_means(sigmas), means
         poses = reconstruction.R_cw, reconstruction.center_w
         chain = None if self._path is None else Chain(self._path.first, self._path.second, 6)
         self._elimination = Elimination.of(
@@ -243,10 +243,12 @@ class BundleProblem:
             path = path or self._path.start(start)
             motion = path.motions(start.camera_idx, variation)
         means = self._means_start
-        if self._means is None:
+        if self.means is None:
             means = np.zeros((len(cameras), 0))
         elif means is None:
-            means = self._means.most_likely(self._motion_prior.precision, motion, len(cameras))
+            means = self.means.most_likely(self._motion_prior.precision, motion, len(cameras))
+        else:
+            means = self.means.unknowns(means)
         return State(
             cameras, start.R_cw, start.center_w, motion[:, :3], motion[:, 3:], variation, bend, start.points_w, means,
             path,
@@ -319,7 +321,7 @@ class BundleProblem:
     def _own_motion(self, state: State) -> Array:
         """(m, nb - 6) what each photo's motion has of its own, beside the mean."""
         motion = self._motion(state)
-        return motion if self._means is None else motion - self._means.at(state.means)
+        return motion if self.means is None else motion - self.means.at(state.means)
 
     def _motion_weight(self, state: State) -> Array:
         """(m, nb - 6) weights of the prior on what each photo's motion has of its own."""
@@ -358,12 +360,11 @@ class BundleProblem:
             diagonal = np.hstack([diagonal, np.full(values.shape, self._field_weight)])
             gradient = np.hstack([gradient, self._field_weight * values])
             total += 0.5 * self._field_weight * float((values**2).sum())
-        if self._means is not None:
-            weight_of_means = np.broadcast_to(self._means.sigmas**-2.0, state.means.shape)
-            pull = self._means.pull(self._motion_weight(state), self._motion(state), state.means)
-            diagonal = np.hstack([diagonal, weight_of_means])
-            gradient = np.hstack([gradient, weight_of_means * state.means + pull])
-            total += 0.5 * float((weight_of_means * state.means**2).sum())
+        if self.means is not None:
+            pull = self.means.pull(self._motion_weight(state), self._motion(state), state.means)
+            diagonal = np.hstack([diagonal, np.ones_like(state.means)])
+            gradient = np.hstack([gradient, state.means + pull])
+            total += 0.5 * float((state.means**2).sum())
         if self._path is not None and state.path is not None:
             weight, slope_of_pace = self._path.prior_on_pace(state.path, self._bounded)
             diagonal = np.hstack([diagonal, weight[:, None]])
@@ -426,10 +427,10 @@ class BundleProblem:
         border = Border(self._camera_jacobians(state), self._start.camera_idx, *self._camera_priors(state)[:2])
         border.J[singular] = 0.0
         coupling = common = None
-        if self._means is not None:
+        if self.means is not None:
             border = replace(border, J=np.pad(border.J, ((0, 0), (0, 0), (0, 6))))
             around = (0, 0), (6, self.layout.size - 12)
-            common = CommonPrior(np.pad(information, around), np.pad(self._means.directions, (*around, (0, 0))))
+            common = CommonPrior(np.pad(information, around), np.pad(self.means.directions, (*around, (0, 0))))
         if self._path is not None and state.path is not None:
             f = self._structure.frame_idx
             pace, units = state.path.pace[self._start.camera_idx[f], None, None], np.exp(state.variation[f, :1])
@@ -459,8 +460,8 @@ class BundleProblem:
     @property
     def shares(self) -> Mask:
         """(m, 6) which components of the photos' motions have a mean."""
-        assert self._means is not None
-        return np.asarray(self._means.directions.any(axis=2))
+        assert self.means is not None
+        return np.asarray(self.means.directions.any(axis=2))
 
     @property
     def path(self) -> PathPrior:

@@ -184,7 +184,7 @@ class Rounds:
             self._sigmas, self._current, self._marginals.photos, options, self._layout, self._baseline,
             self._common(equations),
         )  # fmt: skip
-        self._means = state.means if state.means.size else None
+        self._means = None if problem.means is None else problem.means.values(state.means)
         if options.residual_field:
             values, variances = problem.fields(state, self._marginals.cameras)
             field = field_prior_sigma(values, variances, self._weighed_sigmas.field)
@@ -195,18 +195,26 @@ class Rounds:
 
     def _common(self, equations: NormalEquations) -> Common | None:
         """Means of the motions that the last solve found."""
-        state, current = self._solved.state, self._current
-        if not state.means.size:
+        state, current, of = self._solved.state, self._current, self._problem.means
+        if of is None:
             return None
-        variances = np.diagonal(self._marginals.cameras).reshape(len(state.means), -1)[:, -6:]
+        values, covariances = of.values(state.means), self._covariances_of_means
+        variances = np.diagonal(of.root @ covariances @ of.root.T, axis1=1, axis2=2)
         span, shares = current.frame_span(), self._problem.shares
         # of the motions in their cameras' frames
-        together = span[:, None, None] * equations.photos_by_shared(6)[:, 6:12]
+        together = span[:, None, None] * equations.photos_by_shared(6)[:, 6:12] @ of.root.T
         travels = np.einsum("mak,mka->ma", current.R_cw, together[:, 3:, 3:])
         with_motions = np.hstack([np.einsum("maa->ma", together[:, :3, :3]), travels])
-        of_photos = state.means[current.camera_idx], variances[current.camera_idx], with_motions
+        of_photos = values[current.camera_idx], variances[current.camera_idx], with_motions
         means, of_means, together = (np.where(shares, each, 0.0) for each in of_photos)
-        return Common(means, of_means, together, (state.means, variances))
+        return Common(means, of_means, together, state.means, covariances, of.root)
+
+    @property
+    def _covariances_of_means(self) -> Array:
+        """(cameras, 6, 6) of their unknowns by the last solve."""
+        c = len(self._solved.state.means)
+        blocks = self._marginals.cameras.reshape(c, -1, c, len(self._marginals.cameras) // c)
+        return blocks[np.arange(c), -6:, np.arange(c), -6:]
 
     def _follow_path(self, problem: BundleProblem, equations: NormalEquations) -> None:
         """Bend the motions of the next solve as the path of this one, and update its prior standard deviations."""
@@ -312,9 +320,10 @@ class Rounds:
         )
 
     def _common_motion(self) -> CommonMotion | None:
-        if self._means is None:
+        of = self._problem.means
+        if of is None or self._means is None:
             return None
         per_unit = np.repeat([1.0, 1.0 / self._baseline], 3)
-        variances = np.diagonal(self._marginals.cameras).reshape(len(self._means), -1)[:, -6:]
-        sigmas = (*(np.array(self._weighed_sigmas.means) * per_unit).tolist(),)
+        variances = np.diagonal(of.root @ self._covariances_of_means @ of.root.T, axis1=1, axis2=2)
+        sigmas = (*(each / self._baseline for each in self._weighed_sigmas.means),)
         return CommonMotion(self._means * per_unit, np.sqrt(np.maximum(variances, 0.0)) * per_unit, sigmas)

@@ -219,6 +219,13 @@ class Reconstruction:
         points = self.points_w[mine] if len(mine) else self.points_w
         return float(np.median(np.abs((points - self.center_w[image]) @ self.R_cw[image, 2])))
 
+    @property
+    def typical_depth(self) -> float:
+        """Median distance, along the optical axis, of measured points, over the measurements of all photos."""
+        obs = self.observations
+        away = self.points_w[obs.point_idx] - self.center_w[obs.frame_idx]
+        return float(np.median(np.abs((away * self.R_cw[obs.frame_idx, 2]).sum(axis=1))))
+
     def normalized(self) -> Reconstruction:
         """The reconstruction in its own frame: the first photo at the origin, consecutive centres 1 apart in the mean.
 
