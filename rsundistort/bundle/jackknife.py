@@ -16,6 +16,10 @@ window that errs to the safe side; Vats and Flegal, "Lugsail lag windows", 2022)
 The fit follows the noise, most where few measurements decide, and what it has followed the residuals do not show. How
 much that is, the same question says of residuals that a fit leaves of independent noise.
 
+Photos' priors are estimated, with the noise: more of it narrows them, and residuals then contain what they keep the
+motions from explaining. Taken for noise, that would grow until no motion is left (of 56 points in photos that moved, up
+to twelve times). So residuals are asked as they would be without these priors. A path's stay: they join its frames.
+
 A variance from few groups is noisy: one factor, the mean over the components of the motions, serves the photos and all
 that follows from them, another the cameras, and none is below 1. (With one for each component, that of phi1 came out
 between 1.4 and 5.3 on renderings of the same scene, whose true residuals say 2.2 to 3.3.) What the priors contribute is
@@ -47,6 +51,8 @@ _CORNERS = 4
 _LEAST_DRAWS = 4
 # A fit that leaves less than this share of a variance to see hides what it is of.
 _LEAST_SEEN = 0.2
+# Precision of the photos' priors as residuals are asked; where nothing else holds a motion, some is left.
+_RELEASED = 0.01
 
 
 def sketch(partition: Index, most: int) -> tuple[Index, Array, int]:
@@ -131,10 +137,12 @@ def inflation(
     if equations.inverse is None:
         return Inflation()
     shares = _Shares.of(equations, marginals, has_pace)
-    m, seen = equations.num_photos, equations.blocks[0]
+    m = equations.num_photos
+    released, seen = (equations, equations.blocks[0]) if has_pace else equations.released(_RELEASED)
     # what a fit leaves is the mean over all photos: of many it takes few families to find, and few draws
     few = int(np.clip(8 * _FAMILIES // m, _FAMILY, _FAMILIES))
-    left = _left_of_noise(equations, int(np.clip(64 // m, _LEAST_DRAWS, 2 * _LEAST_DRAWS)))
+    draws = int(np.clip(64 // m, _LEAST_DRAWS, 2 * _LEAST_DRAWS))
+    left = _left_of_noise(released, draws, with_priors=released is equations)
     # of the residuals, in the units of what weighs the measurements
     square = float((seen**2).sum() / np.mean([(each**2).sum() for each in left]))
     excess, doubt = np.zeros(2), np.zeros(2)
@@ -152,14 +160,17 @@ def inflation(
     return Inflation(float(factors[0]), float(factors[1]), has_pace)
 
 
-def _left_of_noise(equations: NormalEquations, draws: int) -> list[Array]:
-    """What a fit leaves (o, 2) of independent noise of the size that weighs the measurements, so many times."""
+def _left_of_noise(equations: NormalEquations, draws: int, with_priors: bool) -> list[Array]:
+    """What a fit leaves (o, 2) of independent noise of the size that weighs the measurements, so many times.
+
+    And of photos' priors whose means are off, if asked for.
+    """
     rng = np.random.default_rng(0)
     seen, J = equations.blocks
     of_photos, of_cameras = (equations.num_photos, J.shape[2]), equations.num_shared
     return [
         equations.residuals_of(
-            rng.normal(size=seen.shape), rng.normal(size=of_photos), rng.normal(size=of_cameras), rng
+            rng.normal(size=seen.shape), with_priors * rng.normal(size=of_photos), rng.normal(size=of_cameras), rng
         )
         for _ in range(draws)
     ]

@@ -126,7 +126,7 @@ class NormalEquations:
         self.blocks = res, J_frame
         self._num_unseen = nb - J_frame.shape[2]
         self._unknowns = unknowns_of(J_frame.shape[2])
-        self._prior_diag = prior_diag
+        self._prior_diag, self._prior_gradient = prior_diag, prior_gradient
         self._V, self._g_point = of_points.blocks(s.track_start, res, J_frame)
         self._diagonal, self._g_frame = (self._wide(each) for each in self._gradients(res, J_frame))
         self._diagonal += prior_diag
@@ -296,17 +296,21 @@ class NormalEquations:
                 variances += np.einsum("qra,qab,qrb->qr", J, self.inverse.pair_blocks(photo, other), J_other)
         return c.res, variances
 
-    def _with_priors(self, scale: float) -> NormalEquations:
-        """The equations with the priors' precision multiplied; for their inverse only, since gradients are not."""
+    def _with_priors(self, scale: float, by_cameras: float | None = None) -> NormalEquations:
+        """The equations with the priors' precision multiplied; for their inverse only, since gradients are not.
+
+        That of the cameras' own unknowns by another factor, if one is given.
+        """
         other = copy(self)
         other.__dict__.pop("inverse", None)
         other._prior_diag = scale * self._prior_diag
-        other._border = replace(self._border, prior_diag=scale * self._border.prior_diag)
+        by_cameras = scale if by_cameras is None else by_cameras
+        other._border = replace(self._border, prior_diag=by_cameras * self._border.prior_diag)
         S, (diagonal, own) = self._reduced.S.copy(), (self._s.pattern.diagonal, np.arange(self._prior_diag.shape[1]))
         S[diagonal[:, None], own, own] += (scale - 1.0) * self._prior_diag
         if self._coupling is not None:
             self._coupling.add_to(S, self._s.pattern, scale - 1.0)
-        corner = self._reduced.corner + np.diag((scale - 1.0) * self._border.prior_diag.ravel())
+        corner = self._reduced.corner + np.diag((by_cameras - 1.0) * self._border.prior_diag.ravel())
         border = self._reduced.border
         if self._common is not None:
             nb = self._prior_diag.shape[1]
@@ -372,6 +376,36 @@ class NormalEquations:
         moved: Array = np.einsum("oia,oa->oi", self._J, self._seen(frame)[f]) + np.einsum("oia,oa->oi", border.J, own)
         return moved - np.einsum("oia,oa->oi", self._J[:, :, 3:6], point[self._s.point_idx])
 
+    def released(self, scale: float) -> tuple[NormalEquations, Array]:
+        """Equations whose photos' priors have a precision so much smaller, and residuals (o, 2) of their solution.
+
+        From an optimum, by one linear step. The equations are for their inverse only, as those of `_with_priors`; they
+        themselves, and their residuals, where the system cannot be factored.
+        """
+        other = self._with_priors(scale, 1.0)
+        if self._common is not None:
+            other._common = self._common._replace(weight=scale * self._common.weight)
+            other.__dict__.pop("_common_rows", None)
+        if other.inverse is None:
+            return self, self.blocks[0]
+        # the gradient without that share of the priors; at the optimum there is none of means but by these
+        g_frame, g_camera = (scale - 1.0) * self._prior_gradient, np.zeros(self.num_shared)
+        if self._common is not None:
+            g_camera -= self._border.sum_photos(self._of_means(g_frame))
+        V_inv = np.empty_like(self._V)
+        schur.invert_points(self._V, 0.0, V_inv)
+        frame, camera = other.inverse.solve(-g_frame, -g_camera)
+        point = self._point_steps(V_inv, np.zeros_like(self._g_point), frame, camera)
+        return other, self.blocks[0] + self._moved(frame, point, camera)
+
+    def _of_means(self, by_photos: Array) -> Array:
+        """Gradients (m, nc) by the unknowns of each photo's camera, of those (m, nb) of priors that have means."""
+        assert self._common is not None
+        J = self._common.J
+        by_mean = np.zeros((len(by_photos), self._border.J.shape[2]))
+        by_mean[:, -J.shape[2] :] = np.einsum("mah,ma->mh", J, by_photos)
+        return by_mean
+
     def residuals_of(self, noise: Array, of_photos: Array, of_cameras: Array, rng: np.random.Generator) -> Array:
         """Residuals (o, 2) that a fit would leave of noise (o, 2), the priors' means being off, too.
 
@@ -389,10 +423,8 @@ class NormalEquations:
             g_frame += self._coupling.pull(rng.normal(size=self._coupling.res.shape), len(g_frame))
         g_camera = by_camera[0] + np.sqrt(self._border.prior_diag.ravel()) * of_cameras
         if self._common is not None:
-            weight, J = self._common
-            by_mean = np.zeros((len(weight), self._border.J.shape[2]))
-            by_mean[:, -J.shape[2] :] = np.einsum("mah,ma->mh", J, np.sqrt(weight) * self._wide(of_photos))
-            g_camera -= self._border.sum_photos(by_mean)
+            off = np.sqrt(self._common.weight) * self._wide(of_photos)
+            g_camera -= self._border.sum_photos(self._of_means(off))
         frame, camera = self.inverse.solve(-g_frame, -g_camera)
         point = self._point_steps(V_inv, g_point, frame, camera)
         return noise + self._moved(frame, point, camera)
