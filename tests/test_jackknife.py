@@ -13,6 +13,7 @@ from rsundistort.bundle import Posterior
 from rsundistort.bundle.jackknife import Inflation, by_corner, by_place, inflated, inflation, sketch
 from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
+from rsundistort.bundle.solver import minimize
 from rsundistort.critical.cost import _log_scale
 from rsundistort.errors import InputError
 
@@ -245,6 +246,37 @@ def test_what_a_lens_leaves_is_no_motion(rng):
             wrong = np.abs(result.reconstruction.phi) > 3 * result.sigma_phi
             assert wrong.mean() > 0.3 if each == "model" else wrong.mean() < 0.05
     assert square["jackknife"] < 0.6**2 * square["model"]
+
+
+@pytest.mark.parametrize("means", [(), (0.05, 0.05, 0.05)], ids=["each its own", "with means"])
+def test_released_residuals_are_those_of_a_solve_without_the_photos_priors(means, rng):
+    scene = make_scene(rng, "constant-motion", num_images=12, num_points=60, noise_px=0.3, phi_size=0.01)
+    scale, options = 0.01, BundleOptions(loss="squared", phi_sigma=0.001, velocity_sigma=0.005)
+    blocks = []
+    for sigmas in (PriorSigmas(0.001, 0.005, means=means), PriorSigmas(0.01, 0.05, means=means)):
+        problem = BundleProblem(scene, "constant-motion", options, 1.0, sigmas)
+        tolerances = {"cost_tolerance": 1e-15, "step_tolerance": 1e-12, "initial_damping": 1e-4, "max_damping": 1e8}
+        state = minimize(problem, problem.initial_state(), max_iterations=100, **tolerances).state
+        blocks.append(problem.linearize(state))
+    held, free = blocks
+    released, found = held.released(scale)
+    assert np.linalg.norm(held.blocks[0] - free.blocks[0]) > 0.05 * np.linalg.norm(free.blocks[0])
+    # but for what is not linear
+    assert np.linalg.norm(found - free.blocks[0]) < 0.03 * np.linalg.norm(held.blocks[0] - free.blocks[0])
+    for one, other in zip(released.marginal_covariances(False)[:2], free.marginal_covariances(False)[:2], strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=0.05 * np.abs(other).max(initial=0))
+
+
+def test_motions_of_few_points_do_not_drown_in_noise():
+    # where noise narrows priors, and what these leave of motions counted as noise, two of three lost all of them
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        truth = make_scene(rng, "constant-motion", num_images=5, num_points=50, noise_px=1.0, phi_size=0.04)
+        start = replace(truth, phi=0 * truth.phi, velocity=0 * truth.velocity)
+        result = bundle_adjust(start, "constant-motion", simpler_first=True)
+        assert result.noise_factor < 2.0
+        span = truth.frame_span()[:, None]
+        assert np.std(span * result.reconstruction.phi) > 0.5 * np.std(span * truth.phi)
 
 
 def test_photos_at_the_prior_keep_its_deviation(rng):
