@@ -109,19 +109,21 @@ def test_each_photo_is_bounded_by_its_own_exposure(rng):
 
 @pytest.mark.parametrize("model", ["rotation", "constant-motion"])
 def test_a_limit_holds_one_photo_and_leaves_the_others(model, rng):
-    rec = make_scene(rng, model, noise_px=0.3)
-    limit = 1e-6
-    free = bundle_adjust(rec, model)
-    held = bundle_adjust(rec, model, BundleOptions(phi_limits={"1.jpg": limit}))
-    # measurements pull with thousands of such deviations
-    assert np.linalg.norm(held.reconstruction.phi[1]) < 0.1 * np.linalg.norm(free.reconstruction.phi[1])
-    way = limit * rec.median_depth(1)
-    assert (held.sigma_velocity[1] * rec.frame_span()[1] <= 1.01 * way).all()
-    # what is held means nothing for how far hands move
-    assert held.phi_sigma == pytest.approx(free.phi_sigma, rel=0.5)
-    same = bundle_adjust(rec, model, BundleOptions(phi_limits={"1.jpg": 10.0, "not there.jpg": 1.0}))
-    # such a limit tells 1e-5 of what the prior does
-    np.testing.assert_allclose(same.reconstruction.phi, free.reconstruction.phi, rtol=0, atol=1e-6)
+    limit, ratios = 1e-6, []
+    for _ in range(5):
+        rec = make_scene(rng, model, noise_px=0.3)
+        free = bundle_adjust(rec, model)
+        held = bundle_adjust(rec, model, BundleOptions(phi_limits={"1.jpg": limit}))
+        # measurements pull with thousands of such deviations
+        assert np.linalg.norm(held.reconstruction.phi[1]) < 0.1 * np.linalg.norm(free.reconstruction.phi[1])
+        way = limit * held.reconstruction.median_depth(1)
+        assert (held.sigma_velocity[1] * rec.frame_span()[1] <= 1.01 * way).all()
+        ratios.append(held.phi_sigma / free.phi_sigma)
+        same = bundle_adjust(rec, model, BundleOptions(phi_limits={"1.jpg": 10.0, "not there.jpg": 1.0}))
+        # such a limit tells 1e-5 of what the prior does
+        np.testing.assert_allclose(same.reconstruction.phi, free.reconstruction.phi, rtol=0, atol=1e-6)
+    # what is held means nothing for how far hands move; but a photo that did move, by dozens of pixels, bends the scene
+    assert np.median(ratios) == pytest.approx(1.0, abs=0.25)
 
 
 @pytest.mark.parametrize("limit", [0.0, -1.0, np.nan, np.inf])
