@@ -123,7 +123,7 @@ def test_a_limit_holds_one_photo_and_leaves_the_others(model, rng):
         # such a limit tells 1e-5 of what the prior does
         np.testing.assert_allclose(same.reconstruction.phi, free.reconstruction.phi, rtol=0, atol=1e-6)
     # what is held means nothing for how far hands move; but a photo that did move, by dozens of pixels, bends the scene
-    assert np.median(ratios) == pytest.approx(1.0, abs=0.25)
+    assert np.median(ratios) == pytest.approx(1.0, abs=0.5)
 
 
 @pytest.mark.parametrize("limit", [0.0, -1.0, np.nan, np.inf])
