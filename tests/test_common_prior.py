@@ -29,7 +29,7 @@ from rsundistort.synthetic import look_at
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 MODEL = "constant-motion"
-MEANS = (0.2, 0.1, 0.05)  # of cameras that travel, that aim, and that do as they like
+MEANS = (0.2, 0.1, 0.05, 0.1, 0.2, 0.05)  # of travels along each axis, of such that aim, and of any
 
 
 def shared_problem(rng, refine=(), factor_limit=1e10, num_images=9):
@@ -171,17 +171,16 @@ def measured_rows(problem, state, size, nr):
 
 def prior_of_means(depth, sigmas=MEANS):
     """Covariance of the prior on means, as `MotionMeans.of` says it in words."""
-    total = np.zeros((6, 6))
+    total = sigmas[5] ** 2 * np.diag([depth**-2] * 3 + [1.0] * 3)
     for axis in range(3):
         travel = np.eye(3)[axis]
-        aiming = (
-            np.cross([0.0, 0.0, 1.0], travel) / depth
-        )  # x_c changes by phi x x_c less the travel: none at (0, 0, depth)
-        np.testing.assert_allclose(np.cross(aiming, [0.0, 0.0, depth]), travel * [1, 1, 0], atol=1e-15)
-        for sigma, phi in zip(sigmas[:2], (0 * aiming, aiming), strict=True):
-            motion = sigma * np.concatenate([phi, travel])
-            total += np.outer(motion, motion)
-    return total + sigmas[2] ** 2 * np.diag([depth**-2] * 3 + [1.0] * 3)
+        total += sigmas[axis] ** 2 * np.outer(*[np.concatenate([np.zeros(3), travel])] * 2)
+        if axis < 2:
+            # x_c changes by phi x x_c less the travel: at (0, 0, depth) by nothing
+            phi = np.cross([0.0, 0.0, 1.0], travel) / depth
+            np.testing.assert_allclose(np.cross(phi, [0.0, 0.0, depth]), travel, atol=1e-15)
+            total += sigmas[3 + axis] ** 2 * np.outer(*[np.concatenate([phi, travel])] * 2)
+    return total
 
 
 def test_means_are_those_of_cameras_that_travel_aim_or_do_as_they_like(rng):
@@ -201,33 +200,31 @@ def shown(rng, motion, exactness, under):
     return (covariance @ root.T @ exactness @ measured)[None], covariance[None], root
 
 
-@pytest.mark.parametrize("of", range(4), ids=["none", "travelling", "aiming", "both"])
+@pytest.mark.parametrize("of", [None, 0, 1, 2, 3, 4, 5])
 def test_the_prior_of_means_is_as_wide_as_each_way_to_move_is_likely(of, rng):
-    depth, velocity, num = 4.0, 0.05, 400
-    # the yaw and the travel sideways that show the same are measured five times less exactly than the others
-    exactness = np.diag([depth**2] * 3 + [1.0] * 3) * 40.0**2 / 0.05**2 * 0.01
+    depth, velocity, num = 4.0, 0.05, 300
+    # a yaw and a travel sideways that show the same are measured five times less exactly than the others
+    exactness = np.diag([depth**2] * 3 + [1.0] * 3) / 0.0025**2
     weak = np.array([0.0, 1.0 / depth, 0.0, 1.0, 0.0, 0.0])
-    weak /= weak @ exactness @ weak / np.sqrt(weak @ exactness @ weak)
+    weak /= np.sqrt(weak @ exactness @ weak)
     exactness -= 0.96 * np.outer(exactness @ weak, exactness @ weak)
-    ways = [prior_of_means(depth, velocity * each) for each in np.eye(3)]
     likely = []
     for _ in range(num):
-        motion = np.zeros(6) if of == 0 else np.linalg.cholesky(ways[of - 1] + 1e-15 * np.eye(6)) @ rng.normal(size=6)
-        under = prior_of_means(depth, velocity * rng.uniform(0.01, 1, 3))
+        motion = np.zeros(6)
+        if of is not None:
+            motion = np.linalg.cholesky(prior_of_means(depth, velocity * np.eye(6)[of] + 1e-9)) @ rng.normal(size=6)
+        under = prior_of_means(depth, velocity * rng.uniform(0.01, 1, 6))
         found = sigmas_of_means(*shown(rng, motion, exactness, under), velocity, depth)
-        share = np.array(found) ** 2 / velocity**2
-        likely.append([1.0 - share.sum(), *share])
-    # drawn as the prior says, with each as likely, the truth has the probability that it is given: the largest, and of
-    # none nearly all
+        likely.append(np.array(found) ** 2 / velocity**2)
     mean = np.mean(likely, axis=0)
-    assert mean.argmax() == of
-    assert mean[of] > 0.6
+    none = 1.0 - mean.sum()
+    assert none > 0.65 if of is None else (mean.argmax() == of and mean[of] > 0.5)
 
 
 def test_the_prior_of_means_does_not_depend_on_that_under_which_they_were_found(rng):
     exactness = np.linalg.inv(np.diag([0.01] * 3 + [0.05] * 3) ** 2 * (np.eye(6) + 0.5))
     found = []
-    for sigmas in ((0.1, 0.1, 0.1), (0.02, 1e-3, 0.3), (0.3, 0.1, 3e-3)):
+    for sigmas in ((0.1,) * 6, (0.02, 1e-3, 0.3, 0.1, 0.1, 0.01), (0.3, 0.1, 3e-3, 0.01, 0.1, 0.1)):
         each = shown(np.random.default_rng(5), np.full(6, 0.01), exactness, prior_of_means(4.0, sigmas))
         found.append(sigmas_of_means(*each, 0.1, 4.0))
     np.testing.assert_allclose(found[1:], found[:1] * 2, rtol=1e-8)

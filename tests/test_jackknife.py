@@ -248,7 +248,7 @@ def test_what_a_lens_leaves_is_no_motion(rng):
     assert square["jackknife"] < 0.6**2 * square["model"]
 
 
-@pytest.mark.parametrize("means", [(), (0.05, 0.05, 0.05)], ids=["each its own", "with means"])
+@pytest.mark.parametrize("means", [(), (0.05,) * 6], ids=["each its own", "with means"])
 def test_released_residuals_are_those_of_a_solve_without_the_photos_priors(means, rng):
     scene = make_scene(rng, "constant-motion", num_images=12, num_points=60, noise_px=0.3, phi_size=0.01)
     scale, options = 0.01, BundleOptions(loss="squared", phi_sigma=0.001, velocity_sigma=0.005)

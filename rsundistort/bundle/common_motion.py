@@ -10,12 +10,14 @@ from scipy.special import softmax
 from ..model import Reconstruction
 from ..model.array_types import Array, Index, Mask
 
-__all__ = ["LEAST_PHOTOS", "CommonMotion", "MotionMeans", "sigmas_of_means"]
+__all__ = ["LEAST_PHOTOS", "NUM_WAYS", "CommonMotion", "MotionMeans", "sigmas_of_means"]
 
 
 #: Photos whose motions have a mean. It has a prior of its own, so they need not be as many as its unknowns; with two it
 #: would be as much each one's own. (`benchmarks/honest.py --only flights`: three to five photos.)
 LEAST_PHOTOS = 3
+#: Ways to move together: `MotionMeans.of` tells them.
+NUM_WAYS = 6
 # Of any way to move: a hundredth of the travel that it would have. The measurements can still be asked.
 _LEAST_PROBABILITY = 1e-4
 
@@ -30,7 +32,7 @@ class CommonMotion:
         Rotation, radians per frame, and travel, baselines per frame.
     deviations : (cameras, 6) array
         Their standard deviations.
-    sigmas : (3,) tuple of float
+    sigmas : (6,) tuple of float
         Standard deviations of their prior, baselines per frame, as `MotionMeans` takes them.
     """
 
@@ -63,16 +65,16 @@ class MotionMeans:
     def of(cls, reconstruction: Reconstruction, sigmas: tuple[float, ...], shares: Mask) -> MotionMeans:
         """The means of a reconstruction; `shares` (m, 6) says which components of its photos' motions have a mean.
 
-        `sigmas` are the standard deviations of travels in common, world units per frame: of cameras that travel, of
-        those that aim at what they pass, whose rotation is their travel by the depth, and of those that rotate as they
-        like, by as much.
+        `sigmas` are the standard deviations of travels in common, world units per frame: of cameras that travel along
+        their x, y, or z, of those that aim at what they pass along x or y, whose rotation is their travel by the depth,
+        and of those that travel and rotate as they like, by as much.
         """
         directions = np.zeros((reconstruction.num_images, 6, 6))
         directions[:, :3, :3] = np.eye(3)
         directions[:, 3:, 3:] = reconstruction.R_cw.transpose(0, 2, 1)
         directions *= shares[:, :, None] / reconstruction.frame_span()[:, None, None]
         ways = _ways(reconstruction.typical_depth)
-        root = np.linalg.cholesky(np.einsum("k,kab->ab", np.square(sigmas), np.array(ways)))
+        root = np.linalg.cholesky(np.einsum("k,kab->ab", np.square(sigmas), ways))
         return cls(np.asarray(directions @ root, np.float64), reconstruction.camera_idx, np.asarray(root, np.float64))
 
     def values(self, unknowns: Array) -> Array:
@@ -102,11 +104,13 @@ class MotionMeans:
         return np.asarray(np.linalg.solve(total + np.eye(6), pull[..., None])[..., 0], np.float64)
 
 
-def _ways(depth: float) -> tuple[Array, Array, Array]:
-    """Covariances (6, 6) of means for a travel in common of unit variance: `MotionMeans.of` says of which cameras."""
-    aim = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]) / depth  # what is passed stays in the middle
-    travelling, aiming = (np.vstack([each, np.eye(3)]) for each in (0.0 * aim, aim))
-    return travelling @ travelling.T, aiming @ aiming.T, np.diag(np.repeat([depth**-2.0, 1.0], 3))
+def _ways(depth: float) -> Array:
+    """(6, 6, 6) covariances of means for travels of unit variance in common: `MotionMeans.of` says of which cameras."""
+    travels = np.hstack([np.zeros((3, 3)), np.eye(3)])
+    aiming = travels[:2].copy()
+    aiming[:, :2] = [[0.0, 1.0 / depth], [-1.0 / depth, 0.0]]  # what is passed stays in the middle
+    along = np.vstack([travels, aiming])
+    return np.concatenate([along[:, :, None] * along[:, None], [np.diag(np.repeat([depth**-2.0, 1.0], 3))]])
 
 
 def sigmas_of_means(
@@ -115,9 +119,11 @@ def sigmas_of_means(
     """Standard deviations of the prior on means, as `MotionMeans` takes them, by what was found under another.
 
     Photos may share no motion. Then the mean of few of them is easily taken for one, and what level photos hardly
-    show, nodding and rising, would be free in all of them at once, and the shape with it. So no motion in common
-    competes with each way to move, by its evidence (the marginal likelihood, Laplace's), and the prior's covariance is
-    that of their mixture: "spike and slab" (George and McCulloch, 1993), in which a slab is no wider than it is likely.
+    show, nodding and rising, would be free in all of them at once, and the shape with it. So no motion in common, as
+    likely at first as a travel along any axis, competes with each way to move by its evidence (the marginal likelihood,
+    Laplace's), and the prior's covariance is that of their mixture: "spike and slab" (George and McCulloch, 1993), in
+    which a slab is no wider than it is likely. A way has one axis, since evidence against a travel along the others, as
+    of one who walks around a thing, says nothing of that one.
 
     Parameters
     ----------
@@ -133,7 +139,7 @@ def sigmas_of_means(
     precision = np.linalg.inv(covariances)
     pull = np.einsum("cij,cj->ci", precision, unknowns) @ from_unknowns
     known = from_unknowns.T @ (precision - np.eye(6)) @ from_unknowns
-    evidence = [0.0]
+    evidence = [np.log(3.0)]
     for way in _ways(depth):
         prior = velocity**2 * way
         wider = np.eye(6) + known @ prior

@@ -10,7 +10,7 @@ import numpy as np
 from ..model import Reconstruction
 from ..model.array_types import Array
 from .bundle_options import BundleOptions
-from .common_motion import sigmas_of_means
+from .common_motion import NUM_WAYS, sigmas_of_means
 from .layout import Layout
 from .motion_prior import SIGMA_OF_SCALE, tail_weight
 from .path_prior import PathPrior
@@ -40,6 +40,8 @@ _SETTLED_MEANS = 0.2
 # a part of their speed. (Were the mean drawn to zero as a sample of what varies, that of an orbit would be lost, and
 # its rotation with it.)
 _MUCH = 3.0
+# Of the way between two photos, in a frame: half a second or more from photo to photo, a frame in a hundredth or less.
+_STEADY = 0.02
 # A lens that its model says so badly needs another model.
 _MOST_PX = 1.0
 
@@ -178,12 +180,14 @@ def estimated(
 def _mean_sigmas(common: Common, velocity_sigma: float, current: Reconstruction) -> tuple[float, ...]:
     """Standard deviations of the prior on means.
 
-    A velocity in common is expected to be a few times what the photos have of their own, or as large as it is found.
+    A velocity in common is expected to be a few times what the photos have of their own, or as large as it is found, or
+    that of a camera that does not stop.
     """
     velocity, depth = _MUCH * SIGMA_OF_SCALE * velocity_sigma, current.typical_depth
+    velocity = max(velocity, _STEADY * current.baseline)
     sharing = np.flatnonzero(common.variances.any(1))
     if not len(sharing):
-        return (velocity,) * 3
+        return (velocity,) * NUM_WAYS
     found = (common.values**2 + common.variances)[sharing, 3:]
     velocity = max(velocity, float(np.sqrt(found.mean())))
     cameras = np.unique(current.camera_idx[sharing])
@@ -272,8 +276,7 @@ def starting_sigmas(options: BundleOptions, layout: Layout, reconstruction: Reco
         () if options.path is None else (_ROTATION_START, _TRAVEL_START * baseline),
     )
     if has_means(layout, options):
-        # none and each way to move are as likely
-        start = replace(start, means=(_MUCH * start.velocity / 2.0,) * 3)
+        start = replace(start, means=(_MUCH * start.velocity / np.sqrt(NUM_WAYS),) * NUM_WAYS)
     return _bounded(start, options, baseline)
 
 
