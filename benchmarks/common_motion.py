@@ -1,8 +1,8 @@
 """Cameras that move alike in all photos: how right their common motion is; prints one JSON object a line.
 
-    python benchmarks/common_motion.py [--kinds KIND ...] [--seeds N] [--first-seed K]
+    python benchmarks/common_motion.py [--kinds KIND ...] [--seeds N] [--first-seed K] [--photos M]
 
-Twenty photos of 1600 x 1200 pixels at f = 1300, measured with 0.4 px, solved without knowledge of any motion:
+Twenty photos (at most) of 1600 x 1200 pixels at f = 1300, measured with 0.4 px, solved without knowledge of any motion:
 
     orbit     around a thing, once; the camera rotates with the orbit while a photo is read, so that it stays aimed
     straight  the same without that rotation
@@ -46,11 +46,11 @@ RADIUS, RATE = 4.0, 0.012
 Array = NDArray[np.float64]
 
 
-def orbit(kind: str, rng: np.random.Generator) -> tuple[Array, ...]:
-    """Poses, common rotation and travel, and points."""
+def orbit(kind: str, rng: np.random.Generator, m: int) -> tuple[Array, ...]:
+    """Poses of m photos, common rotation and travel, and points."""
     whole = np.pi / 2 if kind == "arc" else 2 * np.pi
-    angle = np.linspace(0, whole, PHOTOS, endpoint=False) + 0.03 * rng.normal(size=PHOTOS)
-    height = 0.6 + 0.25 * rng.normal(size=PHOTOS)
+    angle = np.linspace(0, whole, m, endpoint=False) + 0.03 * rng.normal(size=m)
+    height = 0.6 + 0.25 * rng.normal(size=m)
     center_w = np.column_stack([RADIUS * np.sin(angle), -RADIUS * np.cos(angle), height])
     points_w = rng.uniform(-1, 1, (400, 3)) * [1.3, 1.3, 0.9]
     R_cw = np.array([look_at(each, np.zeros(3), 90.0 * (kind == "portrait")) for each in center_w])
@@ -60,11 +60,10 @@ def orbit(kind: str, rng: np.random.Generator) -> tuple[Array, ...]:
     return R_cw, center_w, moves * (kind != "straight") * phi, moves * travel, points_w
 
 
-def along(kind: str, rng: np.random.Generator) -> tuple[Array, ...]:
+def along(kind: str, rng: np.random.Generator, m: int) -> tuple[Array, ...]:
     """The same of cameras that travel straight on, and do not rotate."""
-    m = PHOTOS
     if kind == "flyover":
-        above = np.stack(np.meshgrid(np.linspace(-3, 3, 4), np.linspace(-4, 4, 5)), 2).reshape(-1, 2)
+        above = np.stack(np.meshgrid(np.linspace(-3, 3, 4), np.linspace(-4, 4, 5)), 2).reshape(-1, 2)[:m]
         center_w = np.column_stack([above, np.full(m, 8.0)]) + 0.15 * rng.normal(size=(m, 3))
         R_cw, way = np.repeat(np.diag([1.0, -1.0, -1.0])[None], m, 0), [0.0, 0.3, 0.0]
         points_w = rng.uniform(-1, 1, (500, 3)) * [7, 8, 1.5]
@@ -83,11 +82,11 @@ def along(kind: str, rng: np.random.Generator) -> tuple[Array, ...]:
     return R_cw, center_w, np.zeros((m, 3)), np.tile(way, (m, 1)), points_w
 
 
-def scene(kind: str, seed: int) -> Reconstruction:
+def scene(kind: str, seed: int, num_photos: int = PHOTOS) -> Reconstruction:
     """A scene with its measurements, and what is true of it."""
     rng = np.random.default_rng(seed)
     of_orbit = kind in KINDS[:5]
-    R_cw, center_w, phi, velocity, points_w = (orbit if of_orbit else along)(kind, rng)
+    R_cw, center_w, phi, velocity, points_w = (orbit if of_orbit else along)(kind, rng, num_photos)
     shaking = {"hand": 0.012, "walk": 0.01}.get(kind, 0.004)
     phi = phi + shaking * rng.normal(size=phi.shape)
     velocity = velocity + (0.03 if kind == "flyover" else 0.012) * rng.normal(size=phi.shape)
@@ -127,9 +126,9 @@ def errors(truth: Reconstruction) -> tuple[Array, Array, float, float]:
     return (found.phi - truth.phi).mean(0) * span, sigma, apart, float(np.degrees(np.median(angle)))
 
 
-def figures(kind: str, seeds: range) -> dict[str, float]:
+def figures(kind: str, seeds: range, num_photos: int) -> dict[str, float]:
     """Those of a kind of scene."""
-    found = [errors(scene(kind, seed)) for seed in seeds]
+    found = [errors(scene(kind, seed, num_photos)) for seed in seeds]
     error, sigma = (np.array([each[k] for each in found]) for k in (0, 1))
     return {
         "error_mrad": round(1e3 * float(np.sqrt(np.mean(error**2))), 2),
@@ -144,12 +143,13 @@ def main() -> int:
     parser.add_argument("--kinds", nargs="*", default=KINDS, choices=KINDS)
     parser.add_argument("--seeds", type=int, default=8)
     parser.add_argument("--first-seed", type=int, default=100)
+    parser.add_argument("--photos", type=int, default=PHOTOS, choices=range(3, PHOTOS + 1), metavar="M")
     args = parser.parse_args()
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     for kind in args.kinds:
-        found = figures(kind, seeds)
+        found = figures(kind, seeds, args.photos)
         with mock.patch("rsundistort.bundle.prior_sigmas.has_means", return_value=False):
-            zero = figures(kind, seeds)
+            zero = figures(kind, seeds, args.photos)
         print(json.dumps({"kind": kind, "scenes": len(seeds), **found, "means_of_zero": zero}), flush=True)
     return 0
 

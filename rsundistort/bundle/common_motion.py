@@ -18,6 +18,8 @@ __all__ = ["LEAST_PHOTOS", "NUM_WAYS", "CommonMotion", "MotionMeans", "sigmas_of
 LEAST_PHOTOS = 3
 #: Ways to move together: `MotionMeans.of` tells them.
 NUM_WAYS = 6
+# How likely no motion in common is, by how likely each way is: as a travel along any of three axes.
+_NONE = 3.0
 # Of any way to move: a hundredth of the travel that it would have. The measurements can still be asked.
 _LEAST_PROBABILITY = 1e-4
 
@@ -139,7 +141,7 @@ def sigmas_of_means(
     precision = np.linalg.inv(covariances)
     pull = np.einsum("cij,cj->ci", precision, unknowns) @ from_unknowns
     known = from_unknowns.T @ (precision - np.eye(6)) @ from_unknowns
-    evidence = [np.log(3.0)]
+    evidence = [np.log(_NONE)]
     for way in _ways(depth):
         prior = velocity**2 * way
         wider = np.eye(6) + known @ prior

@@ -383,9 +383,6 @@ class NormalEquations:
         themselves, and their residuals, where the system cannot be factored.
         """
         other = self._with_priors(scale, 1.0)
-        if self._common is not None:
-            other._common = self._common._replace(weight=scale * self._common.weight)
-            other.__dict__.pop("_common_rows", None)
         if other.inverse is None:
             return self, self.blocks[0]
         # the gradient without that share of the priors; at the optimum there is none of means but by these
