@@ -290,6 +290,25 @@ def test_a_motion_that_nothing_supports_is_not_taken_out(rng):
     assert "only known to" in weak.doubtful["2.jpg"]
 
 
+def test_motions_within_their_standard_deviations_are_not_taken_out(rng):
+    result, choice = bundle_adjust(measured(rng, swung(rng)), "rotation"), choice_of("rotation", gain=9.0)
+    supported = judge(result, None, choice)
+    assert (supported.shutter, supported.lens_only) == ("found", ())
+    names = result.reconstruction.image_names
+    # of all photos but one, as another model that explains them as well may cause; a model that is named is applied
+    doubt = np.array(result.covariances)
+    doubt[:, 6:, 6:] *= (1.1 / photo_motions(result).relative_sigma ** 2)[:, None, None]
+    all_but_one = np.where(np.arange(len(names))[:, None, None] == 3, result.covariances, doubt)
+    verdict = judge(replace(result, covariances=all_but_one), None, choice)
+    assert (verdict.shutter, [*verdict.lens_only]) == ("found", [*names[:3], *names[4:]])
+    assert judge(replace(result, covariances=all_but_one)).lens_only == ()
+    # of all photos: then no motion is found that could be taken out
+    verdict = judge(replace(result, covariances=doubt), None, choice)
+    assert (verdict.shutter, verdict.shape, verdict.lens_only) == ("not-determined", "doubtful", tuple(names))
+    assert verdict.reasons[-1] == "No photo's motion is larger than its standard deviation."
+    assert judge(replace(result, covariances=doubt), None, choice, known=names).shutter == "found"
+
+
 def test_a_motion_that_may_be_all_error_is_named_and_says_nothing_about_the_shape(rng):
     result = bundle_adjust(measured(rng, swung(rng, 0.01)), "rotation")
     choice = choice_of("rotation", gain=9.0)
@@ -490,6 +509,20 @@ def test_report_and_closing_table_say_what_the_solution_says(shutter, model, rea
     table = " ".join(closing_table(solution, Path("out")).split())
     assert f"verdict {headline}" in table
     assert verdict.sentences[2].strip() in table
+
+
+@pytest.mark.parametrize(("tilted", "said"), [(0.0, True), (0.6, False)])
+def test_no_shutter_is_found_but_for_a_motion_that_photos_held_level_share(tilted, said):
+    """To first order, a nod that all of them share is the height of the scene (Ito and Okatani, section 4)."""
+    turns = Rotation.from_euler("yxz", [[0.4 * k, tilted * k, tilted * k * k] for k in range(4)]).as_matrix()
+    images = tuple(
+        SolvedImage(f"{k}.jpg", "1", R.T, R @ [0, 0, -4.0], motion=RowMotion(), rs_shift_px=0.0)
+        for k, R in enumerate(turns)
+    )
+    found = Verdict("not-found", "trusted").to_json()
+    text = verdict_of(Solution("global", {"1": CAMERA}, {"1": CAMERA.pinhole()}, images, verdict=found)).sentences[2]
+    assert "as good as that of a global shutter" in text
+    assert ("a motion that all photos share would hardly show, because all cameras were held level" in text) == said
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ..critical import CriticalMotion, advise_poses
+from ..critical import CriticalMotion, advise_poses, critical_motion
 from ..model import Solution
+from ..model.array_types import Array
 from ..model.orientation import in_stored_frame
 
 __all__ = ["Verdict", "advice_of", "degeneracy_of", "verdict_of"]
@@ -64,11 +65,15 @@ def advice_of(solution: Solution) -> list[str]:
     said = (solution.critical_motion or {}).get("advice")
     if said or degeneracy is None or not degeneracy.is_low or degeneracy.num_photos < 2:
         return [str(each) for each in said or ()]
+    return [each.sentence for each in advise_poses(*_poses(solution))]
+
+
+def _poses(solution: Solution) -> tuple[Array, Array, list[str]]:
+    """Rotations (m, 3, 3) and centres (m, 3) of the photos as they are stored, and how they were read."""
     stored = in_stored_frame(solution)
     images = [image for image in stored.registered if image.posed]
     R, centers = np.array([image.R_cw for image in images]), np.array([image.center_w for image in images])
-    readouts = [stored.cameras[image.camera_id].readout for image in images]
-    return [each.sentence for each in advise_poses(R, centers, readouts)]
+    return R, centers, [stored.cameras[image.camera_id].readout for image in images]
 
 
 def verdict_of(solution: Solution) -> Verdict:
@@ -154,7 +159,7 @@ def _shape(solution: Solution, said: Mapping[str, Any], largest: float | None) -
     if trusted and shutter == "not-found":
         reason = _unneeded(solution, largest) or "no shutter can be seen"
         text = f"No correction is needed: {reason}, and the shape of the scene is as good as that of a global shutter."
-        return "still", "No correction needed", text
+        return "still", "No correction needed", text + _unseen(solution)
     level, sentence = _height(solution)
     if trusted and _only_rotated(solution):
         text = (
@@ -175,6 +180,16 @@ def _shape(solution: Solution, said: Mapping[str, Any], largest: float | None) -
     if level and len(reasons) == 1:
         return level, _HEADLINES[level], sentence
     return "doubt", "The shape is doubtful", f"Do not trust the shape of the scene. {text}"
+
+
+def _unseen(solution: Solution) -> str:
+    """What would have stayed hidden in photos that show no shutter. Frames of a video show how they all move."""
+    if _is_video(solution) or sum(image.posed for image in solution.registered) < 2:
+        return ""
+    degeneracy = critical_motion(*_poses(solution))
+    if not degeneracy.is_low:
+        return ""
+    return f" Only a motion that all photos share would hardly show, because {_level(degeneracy)}."
 
 
 def _height(solution: Solution) -> tuple[str, str]:

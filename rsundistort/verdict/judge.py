@@ -146,7 +146,11 @@ def judge(
     doubts = _doubts(result, motions, outliers, most_phi or {})
     # the fixed scene draws both halves to the motion that it was solved with: their difference is less than the error
     torn = (motions.difference_px > np.maximum(UNSEEN_PX, motions.shift_px / 2)) | (outliers > 0.5)
-    shutter, why = _of_motions(result, global_result, choice, motions, torn, known)
+    # a motion that may as well be none: with an error of its size, one photo in three comes out worse than it was; a
+    # model that the user named is applied where there are measurements
+    unsupported = (motions.relative_sigma >= 1.0) & ((_counts(rec) < _FEW) | (choice is not None))
+    unsupported &= ~np.isin(rec.image_names, [*known])
+    shutter, why = _of_motions(result, global_result, choice, motions, torn, unsupported, known)
     reasons += _rival_reasons(choice)
     for name, said in _misplaced(result, bool(unexplained + why)).items() if strong else ():
         doubts[name].append(said)
@@ -159,7 +163,7 @@ def judge(
         doubts[name] = doubts[name] or [said]
     # pose and motion are one estimate: what contradicts the one does not support the other
     lost = torn | np.isin(rec.image_names, [*suspects])
-    lost |= (_counts(rec) < _FEW) & (motions.sigma_px >= motions.shift_px)
+    lost |= unsupported
     # motions that cannot be seen do no harm
     lost &= motions.shift_px >= UNSEEN_PX
     # a model that the user named is applied
@@ -288,6 +292,7 @@ def _of_motions(
     choice: ModelChoice | None,
     motions: PhotoMotions,
     torn: Mask,
+    unsupported: Mask,
     known: Collection[str],
 ) -> tuple[str, list[str]]:
     """Whether a shutter was found, and why not."""
@@ -309,6 +314,9 @@ def _of_motions(
     by_known = None if choice is None else choice.known_motions
     if 2 * torn.sum() > rec.num_images and not (by_known is not None and by_known.is_better):
         reasons.append("In most photos halves of the measurements do not agree on the motion found.")
+    seen = motions.shift_px >= UNSEEN_PX
+    if unsupported[seen].all():
+        reasons.append("No photo's motion is larger than its standard deviation.")
     return ("not-determined" if reasons else "found"), reasons
 
 
