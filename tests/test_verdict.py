@@ -122,6 +122,11 @@ def choice_of(model="global", error=1.0, gain=0.0, num_held_out=500, against=())
     )
 
 
+def held(names):
+    """Options of photos whose motion is known."""
+    return BundleOptions(known_phi={name: (np.zeros(3), np.full(3, 1e-4)) for name in names})
+
+
 # ---------------------------------------------------------------- shutter and shape
 
 
@@ -134,6 +139,16 @@ def test_motions_of_a_hand_are_found_and_trusted(rng):
 def test_noise_alone_is_no_shutter(rng):
     rec = measured(rng, np.zeros((8, 3)))
     assert chosen(rec) == named(rec)[1] == Verdict("not-found", "trusted")
+
+
+@pytest.mark.parametrize(("num_points", "shutter"), [(250, "not-found"), (10, "not-determined")])
+def test_no_shutter_is_found_only_where_photos_would_show_one(num_points, shutter, rng):
+    """Few photos, and few points: their motions are then estimated to be small because nothing shows them."""
+    plain = bundle_adjust(measured(rng, np.zeros((4, 3)), num_points=num_points), "global")
+    assert judge(plain, None, choice_of()).shutter == "not-found"
+    verdict = judge(plain, None, choice_of(), options=BundleOptions())
+    assert (verdict.shutter, verdict.shape == "trusted") == (shutter, shutter == "not-found")
+    assert any("would not show a rolling shutter" in reason for reason in verdict.reasons) == (num_points == 10)
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.04])
@@ -168,7 +183,7 @@ def test_motions_that_repeat_themselves_are_no_hands(rng):
     # a gyroscope may say so, too
     result = bundle_adjust(rec, "rotation")
     assert judge(result, None, choice_of("rotation", gain=9.0)).lens_only == tuple(rec.image_names)
-    by_gyro = judge(result, None, choice_of("rotation", gain=9.0), known=rec.image_names)
+    by_gyro = judge(result, None, choice_of("rotation", gain=9.0), options=held(rec.image_names))
     assert (by_gyro.shutter, by_gyro.shape, by_gyro.lens_only) == ("found", "trusted", ())
     # of a few photos chance may do the same
     assert "alike" not in " ".join(named(measured(rng, swung(rng, 0.002, 4) + ROLL))[1].reasons)
@@ -272,7 +287,7 @@ def test_a_photo_that_its_exposure_contradicts_is_doubtful(rng):
     result, _ = named(measured(rng, swung(rng)))
     turned = np.linalg.norm(result.reconstruction.phi[1]) * CAMERA.frame_span
     for bound, doubtful in ((1.1 * turned, False), (0.5 * turned, True)):
-        verdict = judge(result, most_phi={"1.jpg": bound})
+        verdict = judge(result, options=BundleOptions(phi_limits={"1.jpg": bound / 2}))
         assert ("1.jpg" in verdict.doubtful) == doubtful
     assert f"{np.degrees(turned):.2f} degrees, but would be blurred" in verdict.doubtful["1.jpg"]
 
@@ -306,7 +321,7 @@ def test_motions_within_their_standard_deviations_are_not_taken_out(rng):
     verdict = judge(replace(result, covariances=doubt), None, choice)
     assert (verdict.shutter, verdict.shape, verdict.lens_only) == ("not-determined", "doubtful", tuple(names))
     assert verdict.reasons[-1] == "No photo's motion is larger than its standard deviation."
-    assert judge(replace(result, covariances=doubt), None, choice, known=names).shutter == "found"
+    assert judge(replace(result, covariances=doubt), None, choice, options=held(names)).shutter == "found"
 
 
 def test_a_motion_that_may_be_all_error_is_named_and_says_nothing_about_the_shape(rng):
@@ -387,7 +402,7 @@ def test_motions_that_most_photos_contradict_are_not_taken_out_if_evidence_chose
     assert "halves of the measurements do not agree" in " ".join(torn.reasons)
     assert torn.lens_only == tuple(rec.image_names)
     # who knows a motion from elsewhere knows better
-    assert "2.jpg" not in judge(result, None, choice_of("rotation", gain=9.0), known=["2.jpg"]).lens_only
+    assert "2.jpg" not in judge(result, None, choice_of("rotation", gain=9.0), options=held(["2.jpg"])).lens_only
 
 
 def test_a_photo_that_moved_two_ways_is_left_alone(rng):

@@ -193,12 +193,9 @@ def solve_tracks(
     log.end("comparison with a global shutter", rms_px=global_result.rms_px)
     log.begin("verdict")
     measured = mapped if track_source is None else tracks
-    known = {*options.known_phi, *options.held_phi, *options.still}
-    # two standard deviations of the priors by exposure times
-    most_phi = {name: 2.0 * limit for name, limit in options.phi_limits.items()}
     suspects = [] if registrar is None else registrar.suspects(result.reconstruction)
     verdict = judge(
-        result, global_result, choice, mended, measured, known, most_phi, strong, suspects, survey is not None
+        result, global_result, choice, mended, measured, options, strong, suspects, survey is not None
     )  # fmt: skip
     if verdict.lens_only:
         warnings.warn(_lens_only(verdict), RsUndistortWarning, stacklevel=3)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import stdtr
 
-from ..bundle import BundleResult, ModelChoice
+from ..bundle import BundleOptions, BundleResult, ModelChoice
 from ..bundle.held_out import clipped_errors, corners, improves, standard_errors
 from ..bundle.layout import motion_end
 from ..critical import Remedy
@@ -18,7 +18,7 @@ from ..model import Reconstruction
 from ..model.array_types import Array, Index, Mask
 from ..model.field import field_over_frame
 from ..sfm import LEAST_MEASUREMENTS, LEAST_TIES, connected_photos
-from .photos import PhotoMotions, photo_motions
+from .photos import PhotoMotions, hidden_px, photo_motions
 from .residuals import left_along_readout, left_over_frame
 
 __all__ = ["UNSEEN_PX", "Verdict", "height_reasons", "judge", "loose_reasons", "unexplained_reasons"]
@@ -95,8 +95,7 @@ def judge(
     choice: ModelChoice | None = None,
     remedy: Remedy | None = None,
     tracks: Reconstruction | None = None,
-    known: Collection[str] = (),
-    most_phi: Mapping[str, float] | None = None,
+    options: BundleOptions | None = None,
     strong: bool = False,
     suspects: Collection[str] = (),
     scaled: bool = False,
@@ -115,10 +114,9 @@ def judge(
         The remedy of a critical motion, with the uncertainty of the height of the scene; None for a global shutter.
     tracks : Reconstruction, optional
         The measurements before outliers were dropped.
-    known : collection of photo names
-        Photos whose motion is known from elsewhere, and needs no support.
-    most_phi : mapping of photo name to float, optional
-        Largest rotation of each photo, radians per frame, by other knowledge (its exposure).
+    options : BundleOptions, optional
+        Of the adjustment: the motions that are known from elsewhere, and need no support, and the limits by exposure
+        times. Without them, photos that show no shutter are not asked whether they would show one.
     strong : bool
         Whether photos rotated so much during the readout that mapping, which knows no shutter, may have given them
         wrong poses: only the solution then determines these.
@@ -138,12 +136,13 @@ def judge(
     if suspects:
         reasons.append(f"{len(suspects)} of {rec.num_images} photos may have a wrong place ({', '.join(suspects)}).")
     if rec.shutter_model == "global":
-        shutter, why = _of_global(choice)
+        shutter, why = _of_global(result, choice, options)
         misplaced = _misplaced(result, bool(unexplained) or shutter != "not-found") if strong else {}
         return _verdict(shutter, reasons + why, dict.fromkeys(suspects, _SUSPECT) | misplaced)
-    motions = photo_motions(result)
-    outliers = _outliers(rec, tracks)
-    doubts = _doubts(result, motions, outliers, most_phi or {})
+    given = options or BundleOptions()
+    known = {*given.known_phi, *given.held_phi, *given.still}
+    motions, outliers = photo_motions(result), _outliers(rec, tracks)
+    doubts = _doubts(result, motions, outliers, given.phi_limits)
     # the fixed scene draws both halves to the motion that it was solved with: their difference is less than the error
     torn = (motions.difference_px > np.maximum(UNSEEN_PX, motions.shift_px / 2)) | (outliers > 0.5)
     # a motion that may as well be none: with an error of its size, one photo in three comes out worse than it was; a
@@ -270,7 +269,9 @@ def _rival_reasons(choice: ModelChoice | None) -> list[str]:
     ]
 
 
-def _of_global(choice: ModelChoice | None) -> tuple[str, list[str]]:
+def _of_global(
+    result: BundleResult, choice: ModelChoice | None, options: BundleOptions | None
+) -> tuple[str, list[str]]:
     """Whether there may be a shutter that was not corrected, and why."""
     if choice is None:
         return "not-determined", ["The shutter was not examined, as you asked (--model global)."]
@@ -282,6 +283,11 @@ def _of_global(choice: ModelChoice | None) -> tuple[str, list[str]]:
         return choice.shutter, [
             "A rolling shutter would explain a part of what bends the photos, and was not corrected: "
             f"{'; '.join(choice.against)}."
+        ]
+    if options is not None and not (hidden := hidden_px(result, options)) <= _UNCERTAIN_PX:
+        return "not-determined", [
+            f"These photos would not show a rolling shutter that displaces pixels by {hidden:.1f} px (one standard "
+            "deviation), so whether there is one is not known; take more photos that show the same points."
         ]
     return choice.shutter, []
 
@@ -373,9 +379,9 @@ def _trimmed_mean(values: Array, trimmed: int) -> tuple[Array, Array, int]:
 
 
 def _doubts(
-    result: BundleResult, motions: PhotoMotions, outliers: Array, most_phi: Mapping[str, float]
+    result: BundleResult, motions: PhotoMotions, outliers: Array, phi_limits: Mapping[str, float]
 ) -> dict[str, list[str]]:
-    """Reasons against each photo."""
+    """Reasons against each photo, of limits that are standard deviations."""
     rec = result.reconstruction
     rotation = rec.phi * rec.frame_span()[:, None]
     sigma = np.linalg.norm(result.sigma_phi, axis=1) * rec.frame_span()
@@ -396,10 +402,11 @@ def _doubts(
             said.append(f"its motion is only known to +-{motions.sigma_px[i]:.1f} px")
         if times[i] > _FAR and motions.shift_px[i] > UNSEEN_PX:
             said.append(f"it moved {times[i]:.0f} times as much as the other photos do")
-        if np.linalg.norm(rotation[i]) - 2 * sigma[i] > most_phi.get(name, np.inf):
+        most = 2 * phi_limits.get(name, np.inf)
+        if np.linalg.norm(rotation[i]) - 2 * sigma[i] > most:
             said.append(
                 f"it appears to have rotated by {np.degrees(np.linalg.norm(rotation[i])):.2f} degrees, but would be "
-                f"blurred by more than {np.degrees(most_phi[name]):.2f}"
+                f"blurred by more than {np.degrees(most):.2f}"
             )
     return doubts
 

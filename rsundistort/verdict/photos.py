@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import fdtrc
 
-from ..bundle import BundleResult
+from ..bundle import BundleOptions, BundleResult, bundle_adjust
 from ..bundle.layout import motion_end
 from ..model import Reconstruction
 from ..model.array_types import Array, Index, Mask
 from ..model.path import cross_matrices
 from ..model.projection import clock_of, project_points_with_jacobians, unproject_points
 
-__all__ = ["PhotoMotions", "photo_motions"]
+__all__ = ["PhotoMotions", "hidden_px", "photo_motions"]
 
 
 # Cells of the chequerboard, across and down; places across and down at which the frame is sampled.
@@ -81,6 +81,24 @@ def photo_motions(result: BundleResult) -> PhotoMotions:
                 photo.covered,
             )
     return PhotoMotions(*found)
+
+
+def hidden_px(result: BundleResult, options: BundleOptions) -> float:
+    """How far rotations could have displaced pixels of photos that show none: one standard deviation, of half of them.
+
+    It is that of rotations under a prior that the photos have not narrowed: where photos are few, an estimate of it
+    says no more than that they show none.
+
+    Parameters
+    ----------
+    result : BundleResult
+        A solution without a shutter.
+    options : BundleOptions
+        Of its adjustment.
+    """
+    prior = options.phi_sigma or BundleOptions().phi_sigma_start
+    wide = replace(options, phi_sigma=prior, loss="squared", outlier_rounds=0, sigma_px=result.sigma_px)
+    return float(np.median(photo_motions(bundle_adjust(result.reconstruction, "rotation", wide)).sigma_px))
 
 
 def _rms(values: Array) -> float:
