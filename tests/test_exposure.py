@@ -137,11 +137,11 @@ def test_motions_against_the_exposure_are_looked_for(rng, monkeypatch):
     stated = []
 
     def judged(*args):
-        stated.append(args[6])
+        stated.append(args[5].phi_limits)
         return judge(*args)
 
     monkeypatch.setattr(model_sequence, "judge", judged)
     options = BundleOptions(phi_limits={"1.jpg": 1e-5})
     solved = model_sequence.solve_tracks(rec, cameras_of(rec), "rotation", 0, lambda _: options, StageLog(None), "none")
-    assert stated == [{"1.jpg": 2e-5}]
+    assert stated == [{"1.jpg": 1e-5}]
     assert solved.verdict is not None
