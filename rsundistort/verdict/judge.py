@@ -149,7 +149,7 @@ def judge(
     # model that the user named is applied where there are measurements
     unsupported = (motions.relative_sigma >= 1.0) & ((_counts(rec) < _FEW) | (choice is not None))
     unsupported &= ~np.isin(rec.image_names, [*known])
-    shutter, why = _of_motions(result, global_result, choice, motions, torn, unsupported, known)
+    shutter, why = _of_motions(result, global_result, choice, motions, torn, unsupported, known, options)
     reasons += _rival_reasons(choice)
     for name, said in _misplaced(result, bool(unexplained + why)).items() if strong else ():
         doubts[name].append(said)
@@ -284,12 +284,20 @@ def _of_global(
             "A rolling shutter would explain a part of what bends the photos, and was not corrected: "
             f"{'; '.join(choice.against)}."
         ]
-    if options is not None and not (hidden := hidden_px(result, options)) <= _UNCERTAIN_PX:
-        return "not-determined", [
-            f"These photos would not show a rolling shutter that displaces pixels by {hidden:.1f} px (one standard "
-            "deviation), so whether there is one is not known; take more photos that show the same points."
-        ]
+    if choice.shutter == "not-found" and (why := _unshown(result, options)):
+        return "not-determined", why
     return choice.shutter, []
+
+
+def _unshown(result: BundleResult, options: BundleOptions | None) -> list[str]:
+    """Whether photos that show no shutter would show one."""
+    if options is None or (hidden := hidden_px(result, options)) <= _UNCERTAIN_PX:
+        return []
+    size = f" that displaces pixels by {hidden:.1f} px (one standard deviation)" if np.isfinite(hidden) else ""
+    return [
+        f"These photos would not show a rolling shutter{size}, so whether there is one is not known; take more photos "
+        "that show the same points."
+    ]
 
 
 def _of_motions(
@@ -300,11 +308,14 @@ def _of_motions(
     torn: Mask,
     unsupported: Mask,
     known: Collection[str],
+    options: BundleOptions | None,
 ) -> tuple[str, list[str]]:
     """Whether a shutter was found, and why not."""
     rec = result.reconstruction
-    if not (motions.shift_px >= UNSEEN_PX).any():
-        return "not-found", []
+    seen = motions.shift_px >= UNSEEN_PX
+    if not seen.any():
+        why = [] if choice is None else _unshown(result, options)
+        return ("not-determined" if why else "not-found"), why
     reasons = []
     if choice is None and not (global_result is not None and _explains(result, global_result)):
         reasons.append(
@@ -320,7 +331,6 @@ def _of_motions(
     by_known = None if choice is None else choice.known_motions
     if 2 * torn.sum() > rec.num_images and not (by_known is not None and by_known.is_better):
         reasons.append("In most photos halves of the measurements do not agree on the motion found.")
-    seen = motions.shift_px >= UNSEEN_PX
     if unsupported[seen].all():
         reasons.append("No photo's motion is larger than its standard deviation.")
     return ("not-determined" if reasons else "found"), reasons
