@@ -133,7 +133,11 @@ class Registrar:
     def suspects(self, reconstruction: Reconstruction) -> list[str]:
         """Photos that may have a wrong place, since matches with the others contradict it."""
         # measurements that were aligned are no keypoints any more
-        tracks = self._new_tracks(reconstruction)
+        try:
+            tracks = self._new_tracks(reconstruction)
+        except ReconstructionError:
+            # not one match agrees with the places
+            return list(reconstruction.image_names)
         beside = np.array(tracks.image_names)[self._breaks(tracks)]
         suspect = np.isin(reconstruction.image_names, [*set(beside.tolist()) - self._confirmed])
         suspect |= self._suspects(reconstruction)
