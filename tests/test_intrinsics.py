@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from bundle_scenes import FISHEYE, LENS, RATIONAL, gradients, make_scene, perturbed, scaled, unit_steps
 from numpy_reference import Fisheye
+from solved_scene import cameras_of
 
 from rsundistort import BundleOptions, bundle_adjust
+from rsundistort.batch.progress import StageLog
 from rsundistort.bundle import GuessedCameras, Posterior, choose_model
 from rsundistort.bundle.held_out import ModelFits
 from rsundistort.bundle.intrinsics import moved_camera
@@ -17,6 +19,7 @@ from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.errors import InputError
 from rsundistort.model.reprojection import reprojection_residuals
+from rsundistort.solve import model_sequence
 
 # thousands of calls on problems this small wait for threads longer than they compute
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -256,6 +259,29 @@ def test_a_lens_that_would_vary_as_no_lens_does_is_not_taken_out_where_a_shutter
     # predicts better, by a principal point that wanders by a fiftieth of the focal length
     assert choice.held_out_error["global, varying lens"] < choice.held_out_error["global"]
     assert (choice.shutter, choice.label, choice.varying) == ("not-determined", "global", False)
+
+
+def test_a_principal_point_that_makes_up_for_a_shutter_is_not_taken_out(rng, monkeypatch):
+    """Where the shutter is not determined, the lens is then that of the model which has one."""
+    scene = make_scene(rng, "rotation", num_images=8, num_points=200, noise_px=0.1, phi_size=0.05)
+    guessed = GuessedCameras(tuple(scene.cameras), {"cx": 1e-3, "cy": 1e-3})
+    options = BundleOptions(refine=("cx", "cy"), guessed=guessed, phi_sigma_most=0.02)
+    wanders = 0.2 * scene.cameras[0].height
+
+    def adjusted(rec, model, options, *args):
+        result = bundle_adjust(rec, model, options, *args)
+        found = result.reconstruction
+        moved = [replace(each, K=each.K + np.outer([0, wanders, 0], [0, 0, 1])) for each in found.cameras]
+        makes_up = model == "global" and "cy" in options.refine
+        return replace(result, reconstruction=replace(found, cameras=moved)) if makes_up else result
+
+    monkeypatch.setattr(model_sequence, "bundle_adjust", adjusted)
+    solved = model_sequence.solve_tracks(
+        replace(scene, phi=np.zeros_like(scene.phi), shutter_model="global"), cameras_of(scene), "auto", 0,
+        lambda _: options, StageLog(None), "none",
+    )  # fmt: skip
+    assert (solved.verdict.shutter, solved.shared.shutter_model) == ("not-determined", "global")
+    np.testing.assert_allclose(solved.shared.cameras[0].K, scene.cameras[0].K, rtol=0, atol=3.0)
 
 
 def test_a_fit_that_ended_early_is_whole_where_it_counts(rng):

@@ -212,6 +212,13 @@ def test_a_side_in_a_wrong_place_is_registered_again_with_a_weak_shutter(scene, 
 
 
 @pytest.mark.parametrize("rad", [0.02])
+def test_places_that_no_match_agrees_with_are_all_suspect(scene, matched):
+    registrar = Registrar(TrackSource(matched, mapped_here=True), BundleOptions(), StageLog(lambda *_: None))
+    away = replace(scene, R_cw=Rotation.random(scene.num_images, random_state=1).as_matrix())
+    assert registrar.suspects(away) == NAMES
+
+
+@pytest.mark.parametrize("rad", [0.02])
 def test_what_a_rejected_mapping_confirms_says_nothing_of_the_solution(scene, matched, monkeypatch):
     registrar = Registrar(TrackSource(matched, mapped_here=True), BundleOptions(), StageLog(lambda *_: None))
     start = bundle_adjust(with_a_side_turned(scene, 4), "rotation", rough_options(BundleOptions()))

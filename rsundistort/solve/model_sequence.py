@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -49,6 +50,10 @@ from .tracks import (
 )
 
 __all__ = ["solve_photos", "solve_tracks", "without_shutter"]
+
+# Between two models of a shutter, a principal point moves by this share of the frame at most; stabilised lenses move it
+# by a few hundredths.
+_NO_LENS = 0.1
 
 
 def _read_out(
@@ -284,6 +289,11 @@ def _chosen(
         how = replace(options, outlier_rounds=min(options.outlier_rounds, 1))
     start = replace(start, shutter_model=choice.shutter_model)
     result = bundle_adjust(start, choice.shutter_model, how, partial(tell, log, "choice"))
+    if choice.shutter != "found" and _is_no_lens(result.reconstruction, start):
+        # it makes up for a shutter; that of the model which has one does not
+        held: dict[str, Any] = {"refine": (), "guessed": None, "varying": False, "residual_field": False}
+        options = replace(options, **held)
+        result = bundle_adjust(start, choice.shutter_model, replace(how, **held), partial(tell, log, "choice"))
     result = replace(result, num_outliers=result.num_outliers + outliers)
     log.end(
         "choice of the model", chosen=choice.shutter_model, varying_lens=choice.varying, bends=choice.bends,
@@ -293,6 +303,14 @@ def _chosen(
     if track_source is not None and again:
         result, tracks, options = retriangulated(track_source, result, options, log, ["alignment again"])
     return choice, result, tracks, options
+
+
+def _is_no_lens(found: Reconstruction, start: Reconstruction) -> bool:
+    """Whether a camera's principal point went so far from where a shutter model has it that it is no lens any more."""
+    return any(
+        (np.abs(new.K[:2, 2] - old.K[:2, 2]) > _NO_LENS * np.array([new.width, new.height])).any()
+        for new, old in zip(found.cameras, start.cameras, strict=True)
+    )
 
 
 def without_shutter(result: BundleResult, options: BundleOptions) -> BundleResult:
