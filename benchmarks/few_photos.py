@@ -6,8 +6,8 @@ Each of N draws (40) takes three to eight neighbours of a set. A quarter of the 
 to 50 mrad a frame: each photo at random, all of them almost alike (a pan), or one of them far more than the others (a
 bump). Warps are by the camera file, or by the camera that a global shutter finds for the whole set where there is none
 (EXIF's focal length of `phone` is off by a fifth: a warp by it would be no rotation). The solver does not get that
-camera, and a third of the time no camera file either. Prints a line for each draw, and then by kind how
-many were found, not found and not determined, and
+camera, and a third of the time no camera file either. Prints a line for each draw, and then by kind how many were
+found, not found and not determined, and
 
     invented    of photos without a shutter, those with a corrected motion
     unseen      of photos with one, those said to be without, and to be trusted, though half of the photos are
@@ -27,6 +27,7 @@ import shutil
 import tempfile
 import warnings
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -97,14 +98,14 @@ class Found:
 
 def solved(draw: Draw, folder: Path) -> Found:
     """Warp the photos, and solve them."""
-    source, photos = folder / "source", folder / "source"
-    source.mkdir()
+    photos = folder / "source"
+    photos.mkdir()
     for each in draw.photos:
-        shutil.copy(each, source)
+        shutil.copy(each, photos)
     camera, truth = str(draw.camera), None
     if draw.phi.any():
         motion = {each.name: phi for each, phi in zip(draw.photos, draw.phi, strict=True)}
-        simulate_warp(source, folder / "warp", WarpOptions(camera, motion=motion, crop=True))
+        simulate_warp(photos, folder / "warp", WarpOptions(camera, motion=motion, crop=True))
         truth = rs.read_solution(folder / "warp" / "ground_truth.json")
         # away from the camera file, which would be found beside them
         photos = (folder / "warp" / "photos").rename(folder / "photos")
@@ -180,22 +181,27 @@ def displaced_px(
 
 
 def main() -> None:
-    """Print a line for each draw, and the table."""
+    """Draw photos and motions, and show what is made of them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--photos", type=Path, default=HERE.parent.parent / "shared" / "photos")
     parser.add_argument("--sets", nargs="+", default=["herz-jesus-8", "fountain-small/gs", "dslr", "phone"])
     parser.add_argument("--num", type=int, default=40)
     parser.add_argument("--first-seed", type=int, default=0)
     args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as calibrated:
+        cameras = {}
+        for k, name in enumerate(args.sets):
+            own = Path(calibrated, str(k))
+            own.mkdir()
+            cameras[name] = camera_of(args.photos / name, own)
+        draws = range(args.first_seed, args.first_seed + args.num)
+        show((seed, Draw.of(args.photos, cameras, seed)) for seed in draws)
+
+
+def show(draws: Iterable[tuple[int, Draw]]) -> None:
+    """Solve draws of these seeds: a line for each, and the table."""
     tables: dict[str, Counter[str]] = {kind: Counter() for kind in KINDS}
-    calibrated = tempfile.TemporaryDirectory()
-    cameras = {}
-    for name in args.sets:
-        own = Path(calibrated.name, name)
-        own.mkdir(parents=True)
-        cameras[name] = camera_of(args.photos / name, own)
-    for seed in range(args.first_seed, args.first_seed + args.num):
-        draw = Draw.of(args.photos, cameras, seed)
+    for seed, draw in draws:
         line = f"{seed:4} {draw.name:18}{len(draw.photos):2} {draw.kind:7}"
         with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -10,7 +10,7 @@ from bundle_scenes import FISHEYE, LENS, RATIONAL, gradients, make_scene, pertur
 from numpy_reference import Fisheye
 from solved_scene import cameras_of
 
-from rsundistort import BundleOptions, bundle_adjust
+from rsundistort import BundleOptions, RsUndistortWarning, bundle_adjust
 from rsundistort.batch.progress import StageLog
 from rsundistort.bundle import GuessedCameras, Posterior, choose_model
 from rsundistort.bundle.held_out import ModelFits
@@ -276,10 +276,11 @@ def test_a_principal_point_that_makes_up_for_a_shutter_is_not_taken_out(rng, mon
         return replace(result, reconstruction=replace(found, cameras=moved)) if makes_up else result
 
     monkeypatch.setattr(model_sequence, "bundle_adjust", adjusted)
-    solved = model_sequence.solve_tracks(
-        replace(scene, phi=np.zeros_like(scene.phi), shutter_model="global"), cameras_of(scene), "auto", 0,
-        lambda _: options, StageLog(None), "none",
-    )  # fmt: skip
+    still = replace(scene, phi=np.zeros_like(scene.phi), shutter_model="global")
+    with pytest.warns(RsUndistortWarning, match="corrected for the lens that the model with a shutter found"):
+        solved = model_sequence.solve_tracks(
+            still, cameras_of(scene), "auto", 0, lambda _: options, StageLog(None), "none"
+        )
     assert (solved.verdict.shutter, solved.shared.shutter_model) == ("not-determined", "global")
     np.testing.assert_allclose(solved.shared.cameras[0].K, scene.cameras[0].K, rtol=0, atol=3.0)
 

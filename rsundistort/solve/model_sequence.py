@@ -51,8 +51,8 @@ from .tracks import (
 
 __all__ = ["solve_photos", "solve_tracks", "without_shutter"]
 
-# Between two models of a shutter, a principal point moves by this share of the frame at most; stabilised lenses move it
-# by a few hundredths.
+# Where a shutter was not found, the principal point without one is not farther than this share of the frame from that
+# with one, if both are the lens's: stabilised lenses move it by a few hundredths.
 _NO_LENS = 0.1
 
 
@@ -291,6 +291,12 @@ def _chosen(
     result = bundle_adjust(start, choice.shutter_model, how, partial(tell, log, "choice"))
     if choice.shutter != "found" and _is_no_lens(result.reconstruction, start):
         # it makes up for a shutter; that of the model which has one does not
+        warnings.warn(
+            "without a shutter the photos would need a lens whose principal point lies far from that of any lens: they "
+            "are corrected for the lens that the model with a shutter found",
+            RsUndistortWarning,
+            stacklevel=4,
+        )
         held: dict[str, Any] = {"refine": (), "guessed": None, "varying": False, "residual_field": False}
         options = replace(options, **held)
         result = bundle_adjust(start, choice.shutter_model, replace(how, **held), partial(tell, log, "choice"))
