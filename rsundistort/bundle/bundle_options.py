@@ -17,15 +17,13 @@ from .common_motion import CommonMotion
 from .intrinsics import GuessedCameras, check_refined
 from .known_lengths import check_lengths
 from .known_positions import KnownPlaces
+from .loss import LOSSES, USUAL_SCALE, Loss
 from .path_prior import FramePath, PathSolution, PathStart
 
-__all__ = ["DEVIATIONS", "LOSSES", "BundleOptions", "BundleResult"]
+__all__ = ["DEVIATIONS", "BundleOptions", "BundleResult"]
 
 #: Source of the standard deviations: the residuals, or the model of independent noise.
 DEVIATIONS = ("jackknife", "model")
-
-#: Robust losses and their codes in the kernels.
-LOSSES: dict[str, int] = {"squared": 0, "huber": 1, "cauchy": 2, "soft-l1": 3}
 
 
 def _known(name: str, phi: ArrayLike, sigma: ArrayLike) -> tuple[Array, Array]:
@@ -65,8 +63,9 @@ class BundleOptions:
     loss : {"soft-l1", "huber", "cauchy", "squared"}
         Robust loss of an observation. Even without outliers the noise of features has heavy tails: with squares the
         same measurements give motions that are wrong by 1.1 to 1.4 times as much.
-    loss_scale : float
-        Residual length, in standard deviations of the noise, beyond which the loss grows more slowly.
+    loss_scale : float or None
+        Residual length, in standard deviations of the noise, beyond which the loss grows more slowly. None: of soft-l1
+        the most likely one by the residuals once outliers are dropped (`bundle.noise`), else 1.5.
     sigma_px : float or None
         Standard deviation of the measurements in pixels, which weighs them against the priors. None: estimated from the
         residuals, robustly, before each solve (never below `min_sigma_px`).
@@ -166,7 +165,7 @@ class BundleOptions:
     initial_damping: float = 1e-4
     max_damping: float = 1e12
     loss: str = "soft-l1"
-    loss_scale: float = 1.5
+    loss_scale: float | None = None
     sigma_px: float | None = None
     min_sigma_px: float = 0.02
     phi_sigma: float | None = None
@@ -203,6 +202,11 @@ class BundleOptions:
     rival: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     path: FramePath | None = None
 
+    @property
+    def usual_loss(self) -> Loss:
+        """The robust loss of measurements whose tails are not known."""
+        return Loss(self.loss, self.loss_scale or USUAL_SCALE)
+
     def __post_init__(self) -> None:
         check_fields(self)
         object.__setattr__(self, "refine", check_refined(self.refine))
@@ -227,13 +231,15 @@ class BundleOptions:
         if self.deviations not in DEVIATIONS:
             raise InputError(f"deviations={self.deviations!r}, expected one of {', '.join(DEVIATIONS)}")
         positive = (
-            "cost_tolerance", "round_tolerance", "step_tolerance", "initial_damping", "max_damping", "loss_scale",
+            "cost_tolerance", "round_tolerance", "step_tolerance", "initial_damping", "max_damping",
             "min_sigma_px", "phi_sigma_start", "velocity_sigma_start", "way_sigma_start", "focal_sigma_start",
             "centre_sigma_start", "field_sigma_start", "prior_sigma_tolerance", "outlier_sigma", "cg_tolerance",
         )  # fmt: skip
         for name in positive:
             if not getattr(self, name) > 0:
                 raise InputError(f"{name}={getattr(self, name)!r}, expected a positive number")
+        if self.loss_scale is not None and not self.loss_scale > 0:
+            raise InputError(f"loss_scale={self.loss_scale!r}, expected a positive number")
         if self.sigma_px is not None and not self.sigma_px > 0:
             raise InputError(f"sigma_px={self.sigma_px!r}, expected a positive number or None")
         for name in ("phi_sigma", "velocity_sigma", "phi_sigma_most", "velocity_sigma_most"):
@@ -304,6 +310,8 @@ class BundleResult:
         Standard deviations of its prior, of rotation and of translation, as `PathPrior` takes them.
     common : CommonMotion or None
         Means of the priors on phi and velocity, if they were solved for.
+    loss : Loss
+        The robust loss of the last solve.
     """
 
     reconstruction: Reconstruction
@@ -328,6 +336,7 @@ class BundleResult:
     path: PathSolution | None = None
     path_sigmas: tuple[float, ...] = ()
     common: CommonMotion | None = None
+    loss: Loss = field(default_factory=lambda: Loss("squared", USUAL_SCALE))
 
     @property
     def phi_rms(self) -> float:

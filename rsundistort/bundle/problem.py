@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..model import Camera, Reconstruction, check_shutter_model
 from ..model.array_types import Array, Index, Mask
 from ..model.reprojection import camera_arrays, motion_tables, observed_lens_pixels, plain_arrays
-from .bundle_options import LOSSES, BundleOptions
+from .bundle_options import BundleOptions
 from .common_motion import LEAST_PHOTOS, MotionMeans
 from .connections import Border, CommonPrior, Coupling
 from .elimination import Elimination
@@ -25,6 +25,7 @@ from .known_lengths import LengthResiduals
 from .known_positions import KnownPlaces, PlaceResiduals
 from .layout import Layout
 from .lens_field import LensFields
+from .loss import LOSSES, Loss
 from .motion_prior import MotionPrior
 from .normal_equations import NormalEquations, Step
 from .path_prior import PathPrior, PathState
@@ -85,6 +86,8 @@ class BundleProblem:
         heavy_tails: bool = True,
         path: PathState | None = None,
         means: Array | None = None,
+        noise: float = 1.0,
+        loss: Loss | None = None,
     ) -> None:
         self._model = check_shutter_model(shutter_model)
         obs = reconstruction.observations
@@ -116,7 +119,9 @@ class BundleProblem:
         self._start = replace(reconstruction, points_w=reconstruction.points_w[structure.points], observations=obs)
         self._nearest = nearest_photos(self._start.points_w, self._start.center_w, structure)
         self._xy = obs.xy_raw[structure.order]
-        self._sigma_px = sigma_px * obs.sigma[structure.order]
+        self._sigma_px = noise * sigma_px * obs.sigma[structure.order]
+        # measurements that weigh less have no other tails
+        self._loss, self._influence = (loss or options.usual_loss).of_noise(noise), None
         focal_px = np.array([camera.K[0, 0] for camera in reconstruction.cameras])[reconstruction.camera_idx]
         nearest = least_distance(reconstruction) or np.nan  # then no change is too large
         self._most_change = 2.0 * (focal_px[structure.frame_idx] / self._sigma_px / nearest) ** 2
@@ -254,14 +259,15 @@ class BundleProblem:
             path,
         )  # fmt: skip
 
-    def with_squares(self) -> BundleProblem:
+    def with_squares(self, influence: bool = False) -> BundleProblem:
         """The problem without a robust loss and without the bound of the readout time, for covariances.
 
-        The curvature of a robust loss is not the inverse of a covariance: of normal noise it would be too small by a
-        quarter. That of squares is right for normal noise, and to the safe side for noise with heavy tails.
+        With `influence` its residuals are those by which squares would be pulled as the loss is (Huber's
+        pseudo-residuals): the optimum is the same, and so is the influence of each measurement on it.
         """
         plain = copy(self)
-        plain._options, plain._lens_of, plain._bounded = replace(self._options, loss="squared"), None, False
+        plain._loss, plain._influence = Loss("squared", 1.0), self._loss if influence else None
+        plain._bounded, plain._args_of, plain._lens_of = False, None, None
         return plain
 
     def in_order(self, of_points: Array) -> Array:
@@ -308,9 +314,9 @@ class BundleProblem:
             self._args_of, self._args = state, plain_arrays(
                 *camera_arrays(self._start.camera_idx, state.cameras, state.variation),
                 state.R_cw, state.center_w, phi, state.velocity, state.points_w,
-                s.frame_idx, s.point_idx, xy, self._sigma_px,
+                s.frame_idx, s.point_idx, xy, self._sigma_px / self._loss.root,
             )  # fmt: skip
-        return self._model, *self._args, LOSSES[self._options.loss], self._options.loss_scale
+        return self._model, *self._args, LOSSES[self._loss.kind], self._loss.root * self._loss.scale
 
     def _motion(self, state: State) -> Array:
         """(m, nb - 6) unknowns of the shutter."""
@@ -391,10 +397,12 @@ class BundleProblem:
                 J_frame,
                 cost,
             )
+        if self._influence is not None:
+            res *= self._influence.weight * self._influence.pull((res**2).sum(1))[:, None]
         if self._options.varying:
             J_frame[:, :, self._block : self.layout.variation] = self._by_lens(state)[1][..., : self.layout.num_varying]
         of_place = J_frame[:, :, 3:6]
-        singular = np.flatnonzero(np.einsum("oia,oia->o", of_place, of_place) > self._most_change)
+        singular = np.flatnonzero(np.einsum("oia,oia->o", of_place, of_place) > self._loss.weight * self._most_change)
         res[singular], J_frame[singular] = 0.0, 0.0
         return res, J_frame, float(cost.sum()), singular
 

@@ -17,6 +17,7 @@ from .doubt import Doubt
 from .intrinsics import has_intrinsic, pixels_of
 from .jackknife import Inflation, inflated, inflation
 from .layout import Layout
+from .noise import noise_and_loss
 from .normal_equations import NormalEquations
 from .path_prior import (
     FramePath,
@@ -39,19 +40,6 @@ __all__ = ["Rounds"]
 _SETTLED_NOISE = 0.1
 # The bends of a path have converged if they change by less, radians: a twentieth of a pixel at any focal length in use.
 _SETTLED_BEND = 2e-5
-
-
-def _noise_px(reconstruction: Reconstruction, shutter_model: str, floor: float) -> float:
-    """Robust standard deviation of the residuals' parts in pixels, of measurements whose relative sigma is 1."""
-    res, valid = reprojection_residuals(reconstruction, shutter_model)
-    if not valid.any():
-        return max(1.0, floor)
-    # median of |x| of a normal variable is 0.6745 sigma; residuals of a fit are shorter than the noise
-    sigma = float(np.median(np.abs(res / reconstruction.observations.sigma[:, None])[valid])) / 0.6745
-    bends = max(reconstruction.bend.shape[1] - 2, 0)
-    unknowns = (9 + 3 * bends) * reconstruction.num_images + 3 * reconstruction.num_points
-    shrink = np.sqrt(max(1.0 - unknowns / (2.0 * len(res)), 0.1))
-    return max(sigma / shrink, floor)
 
 
 def _believed(reconstruction: Reconstruction, options: BundleOptions, sigma: float) -> Mask:
@@ -120,7 +108,9 @@ class Rounds:
         self._rotation_only = options.path is not None and options.path.rotation_only
         self._base = base if self._rotation_only else retriangulated(base, shutter_model, from_afar=True)
         self._keep = np.ones(len(self._base.observations), bool)
-        self._sigma_px = options.sigma_px or _noise_px(self._base, shutter_model, options.min_sigma_px)
+        self._sigma_px, self._loss = noise_and_loss(self._base, shutter_model, options)
+        if options.outlier_rounds or options.deviations == "model":  # a start says nothing of the tails, a solution does
+            self._loss = options.usual_loss
         self._baseline = reconstruction.baseline
         self._layout = Layout.of(shutter_model, options)
         self._sigmas = starting_sigmas(options, self._layout, self._base)
@@ -144,14 +134,15 @@ class Rounds:
         options = self._options
         believed = replace(self._base, observations=self._base.observations.select(self._keep))
         problem = self._problem = BundleProblem(
-            believed, self._model, options, self._sigma_px * self._noise, self._sigmas,
-            heavy_tails=self._heavy_tails, path=self._path, means=self._means,
+            believed, self._model, options, self._sigma_px, self._sigmas,
+            heavy_tails=self._heavy_tails, path=self._path, means=self._means, noise=self._noise, loss=self._loss,
         )  # fmt: skip
         self._solved = minimize(
             problem,
             problem.initial_state(),
             max_iterations=options.max_iterations,
-            cost_tolerance=cost_tolerance,
+            # more noise makes the cost smaller, and half a unit of it is still one standard deviation
+            cost_tolerance=cost_tolerance * self._noise**2,
             step_tolerance=options.step_tolerance,
             initial_damping=self._damping,
             max_damping=options.max_damping,
@@ -163,7 +154,7 @@ class Rounds:
         self._damping = min(self._solved.damping, options.initial_damping)
         self._current = problem.reconstruction(state)
         asks_residuals = is_judged and options.deviations == "jackknife"
-        equations = problem.with_squares().linearize(state)
+        equations = problem.with_squares(influence=True).linearize(state)
         self._marginals = equations.marginal_covariances(of_priors=asks_residuals)
         if state.path is not None:
             self._with_pace = equations.photos_by_shared(1)[:, :, 0]
@@ -240,7 +231,7 @@ class Rounds:
     def drop_outliers(self) -> None:
         """Keep in the next solve the measurements near to the last within their noise."""
         options = self._options
-        self._sigma_px = options.sigma_px or _noise_px(self._current, self._model, options.min_sigma_px)
+        self._sigma_px, self._loss = noise_and_loss(self._current, self._model, options)
         self.begin_next()
         base = self._base
         keep = _believed(base, options, self._sigma_px)
@@ -317,6 +308,7 @@ class Rounds:
             path,
             sigmas.path,
             common=self._common_motion(),
+            loss=self._loss,
         )
 
     def _common_motion(self) -> CommonMotion | None:
