@@ -336,7 +336,7 @@ class BundleResult:
     path: PathSolution | None = None
     path_sigmas: tuple[float, ...] = ()
     common: CommonMotion | None = None
-    loss: Loss = field(default_factory=lambda: Loss("squared", USUAL_SCALE))
+    loss: Loss = field(default_factory=Loss.none)
 
     @property
     def phi_rms(self) -> float:

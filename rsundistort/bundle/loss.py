@@ -35,6 +35,11 @@ class Loss:
     scale: float
     weight: float = 1.0
 
+    @classmethod
+    def none(cls) -> Loss:
+        """Squares."""
+        return cls("squared", USUAL_SCALE)
+
     def of_noise(self, factor: float) -> Loss:
         """The same loss of the same residuals in units of a noise that is so many times larger."""
         return replace(self, scale=self.scale / factor)

@@ -120,8 +120,7 @@ class BundleProblem:
         self._nearest = nearest_photos(self._start.points_w, self._start.center_w, structure)
         self._xy = obs.xy_raw[structure.order]
         self._sigma_px = noise * sigma_px * obs.sigma[structure.order]
-        # measurements that weigh less have no other tails
-        self._loss, self._influence = (loss or options.usual_loss).of_noise(noise), None
+        self._loss, self._influence = (loss or options.usual_loss).of_noise(noise), Loss.none()
         focal_px = np.array([camera.K[0, 0] for camera in reconstruction.cameras])[reconstruction.camera_idx]
         nearest = least_distance(reconstruction) or np.nan  # then no change is too large
         self._most_change = 2.0 * (focal_px[structure.frame_idx] / self._sigma_px / nearest) ** 2
@@ -266,7 +265,7 @@ class BundleProblem:
         pseudo-residuals): the optimum is the same, and so is the influence of each measurement on it.
         """
         plain = copy(self)
-        plain._loss, plain._influence = Loss("squared", 1.0), self._loss if influence else None
+        plain._loss, plain._influence = Loss.none(), self._loss if influence else Loss.none()
         plain._bounded, plain._args_of, plain._lens_of = False, None, None
         return plain
 
@@ -388,16 +387,10 @@ class BundleProblem:
         cost = np.empty(-(-o // _CHUNK))
         with numba.parallel_chunksize(1):
             residuals.residual_blocks(
-                *self._kernel_args(state),
-                self._rows(state),
-                self._block,
-                self.layout.pieces,
-                self.layout.ways,
-                res,
-                J_frame,
-                cost,
-            )
-        if self._influence is not None:
+                *self._kernel_args(state), self._rows(state), self._block, self.layout.pieces, self.layout.ways, res,
+                J_frame, cost,
+            )  # fmt: skip
+        if self._influence.kind != "squared":
             res *= self._influence.weight * self._influence.pull((res**2).sum(1))[:, None]
         if self._options.varying:
             J_frame[:, :, self._block : self.layout.variation] = self._by_lens(state)[1][..., : self.layout.num_varying]

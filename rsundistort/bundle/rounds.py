@@ -109,8 +109,8 @@ class Rounds:
         self._base = base if self._rotation_only else retriangulated(base, shutter_model, from_afar=True)
         self._keep = np.ones(len(self._base.observations), bool)
         self._sigma_px, self._loss = noise_and_loss(self._base, shutter_model, options)
-        if options.outlier_rounds or options.deviations == "model":  # a start says nothing of the tails, a solution does
-            self._loss = options.usual_loss
+        if options.outlier_rounds or options.deviations == "model":
+            self._loss = options.usual_loss  # residuals of a start do not say what tails the noise has
         self._baseline = reconstruction.baseline
         self._layout = Layout.of(shutter_model, options)
         self._sigmas = starting_sigmas(options, self._layout, self._base)
