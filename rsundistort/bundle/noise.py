@@ -57,6 +57,6 @@ def _most_likely_scale(square: Array) -> float:
     q m - log(q^2 / (1 + q)) vanishes.
     """
     square = np.quantile(square, (np.arange(_QUANTILES) + 0.5) / _QUANTILES)
-    m = (np.sqrt(1.0 + square / _SCALES[:, None] ** 2) - 1.0).mean(1)
+    m = np.maximum((np.sqrt(1.0 + square / _SCALES[:, None] ** 2) - 1.0).mean(1), 1e-9)  # of exact measurements, 0
     q = (1.0 - m + np.sqrt((1.0 - m) ** 2 + 8.0 * m)) / (2.0 * m)
     return float(_SCALES[np.argmin(q * m - np.log(q**2 / (1.0 + q)) + 2.0 * np.log(_SCALES))])
