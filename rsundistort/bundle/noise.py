@@ -40,7 +40,7 @@ def noise_and_loss(reconstruction: Reconstruction, shutter_model: str, options: 
     res = (res / reconstruction.observations.sigma[:, None])[valid]
     # median of |x| of a normal variable is 0.6745 sigma; residuals of a fit are shorter than the noise
     sigma = float(np.median(np.abs(res))) / 0.6745
-    square = (res**2).sum(1) / max(sigma, 1e-300) ** 2
+    square = (res**2).sum(1) / max(sigma, 1e-12) ** 2
     if loss.kind == "soft-l1" and options.loss_scale is None:
         loss = replace(loss, scale=_most_likely_scale(square))
     loss = replace(loss, weight=1.0 / float(loss.curvature(square).mean()))
