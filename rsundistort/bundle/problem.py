@@ -134,13 +134,12 @@ class BundleProblem:
         self._lens = np.empty((0, 2, 0)), np.empty((0, 2, 3))
         check_lenses(options.refine, reconstruction.cameras)
         self._refine = options.refine
-        self._fields = (
-            LensFields(reconstruction.cameras, options.refine, shutter_model) if options.residual_field else None
-        )
-        if self._fields is not None:
+        self._fields, self._field_weight = None, 0.0
+        if options.residual_field:
+            self._fields = LensFields(reconstruction.cameras, options.refine, shutter_model)
             camera = reconstruction.camera_idx[self._structure.frame_idx]
             self._field_jacobian = self._fields.jacobian(reconstruction.cameras, camera, self._xy)
-        self._field_weight = sigmas.field**-2.0 if options.residual_field else 0.0
+            self._field_weight = sigmas.field**-2.0
         self._refine_codes = np.array([INTRINSICS[name] for name in options.refine], np.int64)
         span = reconstruction.frame_span()[:, None]
         self._motion_prior = MotionPrior.of(reconstruction, options, sigmas.phi, sigmas.velocity, self._block - 6)
@@ -154,10 +153,10 @@ class BundleProblem:
         self._known, self._known_weight = self._known_motions(span)
         self._free = self._free_unknowns()
         self.means, self._means_start = self._motion_means(sigmas), means
-        poses = reconstruction.R_cw, reconstruction.center_w
         chain = None if self._path is None else Chain(self._path.first, self._path.second, 6)
         self._elimination = Elimination.of(
-            self._structure, self._free, poses, options.factor_limit, options.cg_tolerance, chain
+            structure, self._free, (reconstruction.R_cw, reconstruction.center_w), options.factor_limit,
+            options.cg_tolerance, chain,
         )  # fmt: skip
         self._size = reconstruction.size
 
