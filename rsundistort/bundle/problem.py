@@ -73,22 +73,15 @@ class BundleProblem:
     `LensFields` if they ask for fields, and those of the means of its photos' motions (`means`) if `PriorSigmas` has
     any. Seven unknowns are held for the gauge: the pose of the photo with the most observations, and one coordinate of
     the centre farthest from it; none where known places hold the frame. The prior on intrinsics has heavy tails
-    (`prior_weight`), or it is normal.
+    (`prior_weight`), or it is normal. `noise` is how many times larger than `sigma_px` the noise is that weighs the
+    measurements against the priors, since errors go together; `loss` is in units of `sigma_px` all the same.
     """
 
     def __init__(
-        self,
-        reconstruction: Reconstruction,
-        shutter_model: str,
-        options: BundleOptions,
-        sigma_px: float,
-        sigmas: PriorSigmas,
-        heavy_tails: bool = True,
-        path: PathState | None = None,
-        means: Array | None = None,
-        noise: float = 1.0,
-        loss: Loss | None = None,
-    ) -> None:
+        self, reconstruction: Reconstruction, shutter_model: str, options: BundleOptions, sigma_px: float,
+        sigmas: PriorSigmas, heavy_tails: bool = True, path: PathState | None = None, means: Array | None = None,
+        noise: float = 1.0, loss: Loss | None = None,
+    ) -> None:  # fmt: skip
         self._model = check_shutter_model(shutter_model)
         obs = reconstruction.observations
         if not len(obs) or reconstruction.num_images < 2:
@@ -143,11 +136,7 @@ class BundleProblem:
         self._refine_codes = np.array([INTRINSICS[name] for name in options.refine], np.int64)
         span = reconstruction.frame_span()[:, None]
         self._motion_prior = MotionPrior.of(reconstruction, options, sigmas.phi, sigmas.velocity, self._block - 6)
-        varied = np.array([sigmas.focal, sigmas.centre, sigmas.centre])[: self.layout.num_varying] ** -2.0
-        of_bends = self.layout.per_bend(sigmas.bends, sigmas.ways) ** -2.0
-        self._own_weight = np.tile(np.concatenate([varied, of_bends]), (len(span), 1))
-        for i, still in ((self._photo(name), still) for name, still in options.still.items() if still > 0):
-            self._own_weight[i, len(varied) :] += self.layout.still_bends(still, self._start.median_depth(i))
+        self._own_weight = self._weight_of_own(sigmas)
         self._lengths = LengthResiduals(self._start, options.lengths)
         self._places = PlaceResiduals(self._start, options.places or KnownPlaces({}))
         self._known, self._known_weight = self._known_motions(span)
@@ -159,6 +148,15 @@ class BundleProblem:
             options.cg_tolerance, chain,
         )  # fmt: skip
         self._size = reconstruction.size
+
+    def _weight_of_own(self, sigmas: PriorSigmas) -> Array:
+        """(m, k) weights of the priors on variation and bends."""
+        varied = np.array([sigmas.focal, sigmas.centre, sigmas.centre])[: self.layout.num_varying] ** -2.0
+        of_bends = self.layout.per_bend(sigmas.bends, sigmas.ways) ** -2.0
+        weight = np.tile(np.concatenate([varied, of_bends]), (self._start.num_images, 1))
+        for i, still in ((self._photo(name), still) for name, still in self._options.still.items() if still > 0):
+            weight[i, len(varied) :] += self.layout.still_bends(still, self._start.median_depth(i))
+        return weight
 
     def _motion_means(self, sigmas: PriorSigmas) -> MotionMeans | None:
         """How motions depend on their means, if these are solved for and any photo shares them."""
@@ -237,7 +235,7 @@ class BundleProblem:
         motion = np.zeros((self._start.num_images, 6))
         found = np.hstack([self._start.phi, self._start.velocity])[:, : self._block - 6]
         motion[:, : self._block - 6] = np.where(self._free[:, 6 : self._block], found, 0.0)
-        start = self._start
+        start, means = self._start, self._means_start
         variation = start.variation if self._options.varying else np.zeros_like(start.variation)
         bend = np.where(self._free[:, self.layout.variation : self.layout.size], self.layout.coefficients(start), 0.0)
         cameras = tuple(start.cameras) if self._fields is None else self._fields.started(start.cameras)
@@ -245,7 +243,6 @@ class BundleProblem:
         if self._path is not None:
             path = path or self._path.start(start)
             motion = path.motions(start.camera_idx, variation)
-        means = self._means_start
         if self.means is None:
             means = np.zeros((len(cameras), 0))
         elif means is None:
