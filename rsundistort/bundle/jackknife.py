@@ -51,6 +51,9 @@ _CORNERS = 4
 _LEAST_DRAWS = 4
 # A fit that leaves less than this share of a variance to see hides what it is of.
 _LEAST_SEEN = 0.2
+# Deviations of an excess beyond which it weighs measurements. A deviation that is too large harms nobody; a weight that
+# is too small lets the priors take a part of the motions.
+_SURE = 2.0
 # Precision of the photos' priors as residuals are asked; where nothing else holds a motion, some is left.
 _RELEASED = 0.01
 
@@ -116,11 +119,15 @@ class Inflation(NamedTuple):
         Of the unknowns of the photos, by what they have beside their poses if anything, and of the cameras.
     has_pace : bool
         Whether the last unknown of a camera is the pace of its path: that is one of the motions.
+    sure_photos, sure_cameras : float
+        The same as far as they are certain (two deviations of their own): what measurements are weighed with.
     """
 
     photos: float = 1.0
     cameras: float = 1.0
     has_pace: bool = False
+    sure_photos: float = 1.0
+    sure_cameras: float = 1.0
 
 
 def inflation(
@@ -153,11 +160,13 @@ def inflation(
         doubt += few / _FAMILIES * (square / shown) ** 2 * of_noise.var(0, ddof=1)
     # as far as it stands out of what independent noise makes of so few families (the positive part of James and Stein's
     # estimate)
-    excess -= np.divide(doubt, excess, out=np.full(2, np.inf), where=excess > 0)
-    factors = np.sqrt(np.maximum(noise_factor**2 * (square + np.maximum(excess, 0.0)), 1.0))
+    share = np.divide(doubt, excess, out=np.full(2, np.inf), where=excess > 0)
+    by_belief = np.stack([excess - share, excess - _SURE**2 * share]).clip(0.0)
+    factors = np.sqrt(np.maximum(noise_factor**2 * (square + by_belief), 1.0))
     # nothing is uncertain by the noise, such as a lens that is held
-    factors[[not noise.any() for noise in shares.noise]] = 1.0
-    return Inflation(float(factors[0]), float(factors[1]), has_pace)
+    factors[:, [not noise.any() for noise in shares.noise]] = 1.0
+    (photos, cameras), (sure_photos, sure_cameras) = factors.tolist()
+    return Inflation(photos, cameras, has_pace, sure_photos, sure_cameras)
 
 
 def _left_of_noise(equations: NormalEquations, draws: int, with_priors: bool) -> list[Array]:

@@ -167,7 +167,7 @@ class Rounds:
             has_pace = state.path is not None
             found = self._inflation = inflation(equations, self._partitions, self._marginals, self._noise, has_pace)
             # of all that has a prior of mean zero: what photos have beside their poses, else the lens
-            self._noise = found.photos if self._marginals.photos.shape[1] > 6 else found.cameras
+            self._noise = found.sure_photos if self._marginals.photos.shape[1] > 6 else found.sure_cameras
             self.noise_is_known = self._has_its_noise
             self._heavy_tails = True
         self._weighed_sigmas = self._sigmas
