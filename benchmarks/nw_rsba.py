@@ -1,4 +1,4 @@
-"""An outsider's bundle-adjustment problems: prints one JSON object {class: {"points", "rotation_deg", "centres"}}.
+"""An outsider's bundle-adjustment problems: prints two JSON objects {class: {"points", "rotation_deg", "centres"}}.
 
     python benchmarks/nw_rsba.py DIR [--prior-sigmas FACTOR] [--means-of-zero] [--deviations MODEL]
 
@@ -7,6 +7,9 @@ true motion. Medians; points: rms after the similarity that best aligns the poin
 angle) and centres (rms) after the similarity that best aligns the centres. `--prior-sigmas` multiplies the standard
 deviations that the estimate of the priors starts from; `--means-of-zero` is without what motions have in common, and
 `--deviations model` takes measurements as independent.
+
+The first object has the medians, the second the errors by those of version 0.1 on the same problem (`nw_rsba_0.1.json`):
+geometric means of the ratios, and the standard errors of their logarithms. Medians of twenty jump.
 """
 
 from __future__ import annotations
@@ -68,7 +71,8 @@ def main() -> None:
         velocity_sigma_start=args.prior_sigmas * default.velocity_sigma_start,
         deviations=args.deviations,
     )
-    summary = {}
+    before = json.loads((Path(__file__).parent / "nw_rsba_0.1.json").read_text(encoding="utf-8"))
+    summary, ratios = {}, {}
     for name in CLASSES:
         with np.load(args.dir / f"{name}.npz") as file:
             arrays = {key: file[key] for key in file.files}
@@ -81,7 +85,11 @@ def main() -> None:
             found.append(errors(result, arrays, k))
         points, rotation, centers = np.median(found, axis=0).round(4)
         summary[name] = {"points": points, "rotation_deg": rotation, "centres": centers}
+        logs = np.log(np.array(found) / before[name])
+        each = zip(np.exp(logs.mean(0)), logs.std(0, ddof=1) / np.sqrt(len(logs)), strict=True)
+        ratios[name] = dict(zip(summary[name], [(round(mean, 3), round(error, 3)) for mean, error in each], strict=True))
     print(json.dumps(summary))
+    print(json.dumps(ratios))
 
 
 if __name__ == "__main__":
