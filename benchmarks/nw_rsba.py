@@ -8,8 +8,8 @@ angle) and centres (rms) after the similarity that best aligns the centres. `--p
 deviations that the estimate of the priors starts from; `--means-of-zero` is without what motions have in common, and
 `--deviations model` takes measurements as independent.
 
-The first object has the medians, the second the errors by those of version 0.1 on the same problem (`nw_rsba_0.1.json`):
-geometric means of the ratios, and the standard errors of their logarithms. Medians of twenty jump.
+The first object has the medians, the second the errors by those of version 0.1 on the same problem
+(`nw_rsba_0.1.json`): geometric means of the ratios, and the standard errors of their logarithms. Medians of twenty jump.
 """
 
 from __future__ import annotations
@@ -86,8 +86,8 @@ def main() -> None:
         points, rotation, centers = np.median(found, axis=0).round(4)
         summary[name] = {"points": points, "rotation_deg": rotation, "centres": centers}
         logs = np.log(np.array(found) / before[name])
-        each = zip(np.exp(logs.mean(0)), logs.std(0, ddof=1) / np.sqrt(len(logs)), strict=True)
-        ratios[name] = dict(zip(summary[name], [(round(mean, 3), round(error, 3)) for mean, error in each], strict=True))
+        ratio = np.stack([np.exp(logs.mean(0)), logs.std(0, ddof=1) / np.sqrt(len(logs))], axis=1)
+        ratios[name] = dict(zip(summary[name], ratio.round(3).tolist(), strict=True))
     print(json.dumps(summary))
     print(json.dumps(ratios))
 
