@@ -9,7 +9,8 @@ deviations that the estimate of the priors starts from; `--means-of-zero` is wit
 `--deviations model` takes measurements as independent.
 
 The first object has the medians, the second the errors by those of version 0.1 on the same problem
-(`nw_rsba_0.1.json`): geometric means of the ratios, and the standard errors of their logarithms. Medians of twenty jump.
+(`nw_rsba_0.1.json`): geometric means of the ratios, and the standard errors of their logarithms. Medians of twenty
+jump.
 """
 
 from __future__ import annotations
