@@ -200,7 +200,7 @@ class Reconstruction:
 
     def frame_span(self) -> Array:
         """(m,) how far each photo's clock runs over its frame: converts phi into radians per frame."""
-        return np.array([self.camera(i).frame_span for i in range(self.num_images)])
+        return np.array([each.frame_span for each in self.cameras])[self.camera_idx] * np.exp(-self.variation[:, 0])
 
     @property
     def baseline(self) -> float:
