@@ -134,3 +134,15 @@ def test_a_given_scale_is_kept(rng):
     assert bundle_adjust(rec, "rotation", BundleOptions(loss_scale=2.0)).loss.scale == 2.0
     with pytest.raises(InputError, match="loss_scale"):
         BundleOptions(loss_scale=0.0)
+
+
+def test_the_scale_is_in_units_of_the_noise_that_is_given(rng):
+    truth = make_scene(rng, "rotation", num_images=6, num_points=200)
+    noise = NOISE_PX * rng.normal(size=(len(truth.observations), 2)) * np.sqrt(3.0 / rng.chisquare(3.0, size=(1200, 1)))
+    rec = replace(truth, observations=replace(truth.observations, xy_raw=truth.observations.xy_raw + noise))
+    sigma_px, loss = noise_and_loss(rec, "rotation", BundleOptions())
+    given, other = noise_and_loss(rec, "rotation", BundleOptions(sigma_px=sigma_px / 3.0))
+    assert given == sigma_px / 3.0
+    # the same length in pixels, and so the same curvature, as far as scales are compared in steps
+    assert other.scale * given == pytest.approx(loss.scale * sigma_px, rel=0.1)
+    assert other.weight == pytest.approx(loss.weight, rel=0.1)

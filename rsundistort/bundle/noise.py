@@ -22,7 +22,7 @@ _QUANTILES = 2048
 
 
 def noise_and_loss(reconstruction: Reconstruction, shutter_model: str, options: BundleOptions) -> tuple[float, Loss]:
-    """Robust standard deviation of the residuals' parts in pixels, of measurements whose relative sigma is 1.
+    """Robust standard deviation of the noise's parts in pixels, of measurements whose relative sigma is 1; or as given.
 
     And the loss: of soft L1 with the most likely scale, unless it is given. Its density exp(-rho / 2) is the hyperbolic
     distribution (Barndorff-Nielsen, "Exponentially decreasing distributions for the logarithm of particle size", 1977):
@@ -38,16 +38,17 @@ def noise_and_loss(reconstruction: Reconstruction, shutter_model: str, options: 
     if not valid.any():
         return max(1.0, options.min_sigma_px), loss
     res = (res / reconstruction.observations.sigma[:, None])[valid]
-    # median of |x| of a normal variable is 0.6745 sigma; residuals of a fit are shorter than the noise
-    sigma = float(np.median(np.abs(res))) / 0.6745
-    square = (res**2).sum(1) / max(sigma, 1e-12) ** 2
-    if loss.kind == "soft-l1" and options.loss_scale is None:
-        loss = replace(loss, scale=_most_likely_scale(square))
-    loss = replace(loss, weight=1.0 / float(loss.curvature(square).mean()))
     bends = max(reconstruction.bend.shape[1] - 2, 0)
     unknowns = (9 + 3 * bends) * reconstruction.num_images + 3 * reconstruction.num_points
+    # median of |x| of a normal variable is 0.6745 sigma; residuals of a fit are shorter than the noise
     shrink = np.sqrt(max(1.0 - unknowns / (2.0 * len(valid)), 0.1))
-    return options.sigma_px or max(sigma / shrink, options.min_sigma_px), loss
+    sigma = max(float(np.median(np.abs(res))) / 0.6745 / shrink, options.min_sigma_px)
+    sigma_px = options.sigma_px or sigma
+    square = (res**2).sum(1) / (shrink * sigma_px) ** 2
+    if loss.kind == "soft-l1" and options.loss_scale is None:
+        unit = sigma / sigma_px
+        loss = replace(loss, scale=unit * _most_likely_scale(square / unit**2))
+    return sigma_px, replace(loss, weight=1.0 / float(loss.curvature(square).mean()))
 
 
 def _most_likely_scale(square: Array) -> float:
