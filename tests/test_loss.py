@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bundle_scenes import make_scene, noisy_problem, perturbed
-from scipy.integrate import quad
 from scipy.optimize import minimize
 
 from rsundistort import BundleOptions, bundle_adjust
@@ -24,25 +23,13 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def hyperbolic(c, k, rng, num):
-    """Squared lengths of residuals with the density of `noise_and_loss`: a normal mixture."""
+    """Squared lengths of residuals with the density of `noise_and_loss`."""
     # by the lengths' own distribution: u = sqrt(1 + r^2 / c^2) has the density u exp(-q (u - 1)) from 1 on
     q = k**2
     u = np.linspace(1.0, 1.0 + 60.0 / q, 400_001)
     cumulative = np.cumsum(u * np.exp(-q * (u - 1.0)))
     drawn = np.interp(rng.random(num), cumulative / cumulative[-1], u)
     return c**2 * (drawn**2 - 1.0)
-
-
-def test_the_density_of_the_loss_has_the_integral_one():
-    for c, k in ((1.0, 0.8), (2.0, 5.0)):
-        total, _ = quad(
-            lambda r, c=c, k=k: (
-                2 * np.pi * r * np.exp(k**2 - k**2 * np.sqrt(1 + r**2 / c**2)) * k**4 / (2 * np.pi * c**2 * (1 + k**2))
-            ),
-            0,
-            np.inf,
-        )
-        assert total == pytest.approx(1.0, rel=1e-6)
 
 
 @pytest.mark.parametrize(("c", "k"), [(1.4, 1.5), (2.5, 1.0), (4.0, 3.0)])
@@ -56,6 +43,7 @@ def test_the_scale_is_the_most_likely_one(c, k, rng):
     best = float(np.exp(minimize(cost, [0.0, 0.0], method="Nelder-Mead", options={"xatol": 1e-6}).x[0]))
     # scales are compared in steps of 7 %, and residuals stand for themselves by their quantiles
     assert _most_likely_scale(square) == pytest.approx(best, rel=0.1)
+    # as it was drawn, as far as 40,000 tell
     assert best == pytest.approx(c, rel=0.15)
 
 

@@ -30,8 +30,7 @@ def noise_and_loss(reconstruction: Reconstruction, shutter_model: str, options: 
 
         p(r) = exp(k^2 - k^2 sqrt(1 + r^2 / c^2)) k^4 / (2 pi c^2 (1 + k^2))
 
-    which is normal for a large k and exponential for a small one. Features of photos have k = 0.7 to 0.9, and a loss
-    that is square far beyond follows their tails.
+    which is normal for a large k, and has exponential tails for a small one: features of photos have k = 0.7 to 0.9.
     """
     loss = options.usual_loss
     res, valid = reprojection_residuals(reconstruction, shutter_model)
