@@ -185,6 +185,9 @@ def test_motions_that_repeat_themselves_are_no_hands(rng):
     assert judge(result, None, choice_of("rotation", gain=9.0)).lens_only == tuple(rec.image_names)
     by_gyro = judge(result, None, choice_of("rotation", gain=9.0), options=held(rec.image_names))
     assert (by_gyro.shutter, by_gyro.shape, by_gyro.lens_only) == ("found", "trusted", ())
+    # no lens bends photos like this
+    far = swung(rng, 0.002) + ROLL * (0.03 / np.linalg.norm(ROLL))
+    assert named(measured(rng, far))[1].shutter == "found"
     # of a few photos chance may do the same
     assert "alike" not in " ".join(named(measured(rng, swung(rng, 0.002, 4) + ROLL))[1].reasons)
 

@@ -50,6 +50,9 @@ _OUTLIERS = 1 / 3
 # A hand does not repeat itself: motions are the camera's if their mean is this many times their standard deviation, in
 # this many photos, and by chance in one set of a thousand only.
 _REPEATED, _LEAST_PHOTOS, _CHANCE = 2.0, 5, 0.001
+# Rotations in common, in radians a frame, that no lens looks like: 0.03 focal lengths in cx and 0.01 in p2
+# (rotations about z), pixels that are 2 % longer than wide (about x), or 1 degree from square (about y).
+_NO_LENS = 0.02
 # Largest standard deviation of the direction of a photo whose pose counts as known, degrees.
 _LOST_DEG = 1.0
 # Said of a photo that may have a wrong place.
@@ -355,7 +358,8 @@ def _explains(result: BundleResult, global_result: BundleResult) -> bool:
 def _repeated(rec: Reconstruction) -> int | None:
     """The axis of the camera about which all photos rotated alike and visibly; None if there is none.
 
-    None also if the camera rotated so from photo to photo, too: then it panned.
+    None also if the camera rotated so from photo to photo, too: then it panned; or if they rotated by more than a lens
+    could feign.
     """
     m = rec.num_images
     if m < _LEAST_PHOTOS:
@@ -371,6 +375,7 @@ def _repeated(rec: Reconstruction) -> int | None:
             continue
         chance = 2.0 * stdtr(freedom, -np.abs(mean) / np.maximum(spread, 1e-12) * np.sqrt(m))
         alike = (np.abs(mean) > _REPEATED * spread) & (3 * chance < _CHANCE) & (np.abs(mean) * half_px > UNSEEN_PX)
+        alike &= np.abs(mean) < _NO_LENS
         if alike.any():
             return int(np.argmax(np.where(alike, np.abs(mean), 0.0)))
     return None
