@@ -63,7 +63,8 @@ class MotionPrior:
         if options.path is not None:  # which says it all
             return cls(np.zeros((m, num)), np.zeros((m, num)), np.zeros(kinds, bool))
         most = np.array([options.phi_limits.get(name, np.inf) for name in reconstruction.image_names])
-        depths = [reconstruction.median_depth(i) if np.isfinite(each) else 1.0 for i, each in enumerate(most)]
+        bounded = np.isfinite(most) & (num > 3)
+        depths = [reconstruction.median_depth(i) if each else 1.0 for i, each in enumerate(bounded)]
         sigmas = np.full((m, 2), [phi_sigma, velocity_sigma]), np.stack([most, most * depths], axis=1)
         span = reconstruction.frame_span()[:, None]
         precision, limit = (np.repeat((span / each) ** 2, 3, axis=1)[:, :num] for each in sigmas)

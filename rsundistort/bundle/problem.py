@@ -92,7 +92,7 @@ class BundleProblem:
         self.layout = Layout.of(shutter_model, options)
         self._block = self.layout.motion
         self._bend_clock = reconstruction.bend_clock
-        if not reconstruction.bends:
+        if self.layout.bent and not reconstruction.bends:
             self._bend_clock = np.array(
                 [reconstruction.camera(i).clock_range for i in range(reconstruction.num_images)]
             )

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.polynomial.polynomial import polyroots
 
 from ..errors import InputError
 from .array_types import Array
@@ -58,9 +59,9 @@ def _flat(value: Any) -> Any:
     return value.ravel() if isinstance(value, np.ndarray) else np.ravel(np.array(value, object))
 
 
-def _first_positive(*polynomials: np.polynomial.Polynomial) -> float:
-    """The smallest positive real root of some polynomials; inf without one."""
-    roots = np.concatenate([each.trim().roots() for each in polynomials])
+def _first_positive(coefficients: Array) -> float:
+    """The smallest positive real root of a polynomial, the constant first; inf without one."""
+    roots = polyroots(np.trim_zeros(coefficients, "b"))
     real = roots.real[(np.abs(roots.imag) < 1e-12 * (1 + np.abs(roots.real))) & (roots.real > 0)]
     return float(real.min()) if real.size else np.inf
 
@@ -70,13 +71,13 @@ def _fold_radius_squared(lens: str, dist: Array) -> float:
     k1, k2, _, _, k3, k4, k5, k6 = dist[:8]
     if lens == "fisheye":
         # d/dt [t (1 + k1 t^2 + ...)] = 0 in s = t^2, where t is the angle from the axis
-        angle = np.sqrt(_first_positive(np.polynomial.Polynomial([1.0, 3 * k1, 5 * k2, 7 * k3, 9 * k4])))
+        angle = np.sqrt(_first_positive(np.array([1.0, 3 * k1, 5 * k2, 7 * k3, 9 * k4])))
         return float(np.tan(angle)) ** 2 if angle < np.pi / 2 else np.inf
-    # d/dr [r num(r^2)/den(r^2)] = 0  <=>  (num + 2 s num') den - 2 s num den' = 0 with s = r^2
-    num = np.polynomial.Polynomial([1.0, k1, k2, k3])
-    den = np.polynomial.Polynomial([1.0, k4, k5, k6])
-    s = np.polynomial.Polynomial([0.0, 1.0])
-    return _first_positive((num + 2 * s * num.deriv()) * den - 2 * s * num * den.deriv(), den)
+    # d/dr [r num(r^2)/den(r^2)] = 0  <=>  (num + 2 s num') den - num 2 s den' = 0 with s = r^2
+    num, den = np.array([1.0, k1, k2, k3]), np.array([1.0, k4, k5, k6])
+    power = 2.0 * np.arange(4)
+    slope = np.convolve((1.0 + power) * num, den) - np.convolve(num, power * den)
+    return min(_first_positive(slope), _first_positive(den))
 
 
 @dataclass(frozen=True)
