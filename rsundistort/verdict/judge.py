@@ -50,9 +50,10 @@ _OUTLIERS = 1 / 3
 # A hand does not repeat itself: motions are the camera's if their mean is this many times their standard deviation, in
 # this many photos, and by chance in one set of a thousand only.
 _REPEATED, _LEAST_PHOTOS, _CHANCE = 2.0, 5, 0.001
-# Rotations in common, in radians a frame, that no lens looks like: 0.03 focal lengths in cx and 0.01 in p2
-# (rotations about z), pixels that are 2 % longer than wide (about x), or 1 degree from square (about y).
-_NO_LENS = 0.02
+# Rotations in common, in radians per unit of the clock, that no lens looks like: five standard deviations of the error
+# that does, (cx, p2) = (3, 1) e (docs/found.md); about the other axes, pixels that are 1 % too long or 0.6 degrees from
+# square.
+_NO_LENS = 0.01
 # Largest standard deviation of the direction of a photo whose pose counts as known, degrees.
 _LOST_DEG = 1.0
 # Said of a photo that may have a wrong place.
@@ -371,11 +372,12 @@ def _repeated(rec: Reconstruction) -> int | None:
     # have in common
     for trimmed in (0, m // 5):
         mean, spread, freedom = _trimmed_mean(phi, trimmed)
+        per_clock = np.abs(_trimmed_mean(rec.phi, trimmed)[0])
         if between @ mean > _SAME_WAY * np.linalg.norm(between) * np.linalg.norm(mean):
             continue
         chance = 2.0 * stdtr(freedom, -np.abs(mean) / np.maximum(spread, 1e-12) * np.sqrt(m))
         alike = (np.abs(mean) > _REPEATED * spread) & (3 * chance < _CHANCE) & (np.abs(mean) * half_px > UNSEEN_PX)
-        alike &= np.abs(mean) < _NO_LENS
+        alike &= per_clock < _NO_LENS
         if alike.any():
             return int(np.argmax(np.where(alike, np.abs(mean), 0.0)))
     return None
