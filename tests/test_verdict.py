@@ -29,7 +29,7 @@ from rsundistort import (
     read_solution,
     rectify_folder,
 )
-from rsundistort.bundle import KnownMotions, ModelChoice, choose_model
+from rsundistort.bundle import GuessedCameras, KnownMotions, ModelChoice, choose_model
 from rsundistort.critical import heal
 from rsundistort.errors import FormatError
 from rsundistort.io import write_solution
@@ -186,8 +186,12 @@ def test_motions_that_repeat_themselves_are_no_hands(rng):
     by_gyro = judge(result, None, choice_of("rotation", gain=9.0), options=held(rec.image_names))
     assert (by_gyro.shutter, by_gyro.shape, by_gyro.lens_only) == ("found", "trusted", ())
     # no lens bends photos like this
-    far = swung(rng, 0.001) + ROLL * (0.03 / np.linalg.norm(ROLL))
-    assert named(measured(rng, far))[1].shutter == "found"
+    result = bundle_adjust(measured(rng, swung(rng, 0.001) + 5 * ROLL), "rotation")
+    assert judge(result, None, choice_of("rotation", gain=9.0)).shutter == "found"
+    # but one whose focal length is off by a fifth may bend them by as much
+    expected = GuessedCameras([replace(CAMERA, K=CAMERA.K * [[0.8], [0.8], [1.0]])], {"f": 0.05})
+    options = BundleOptions(guessed=expected)
+    assert judge(result, None, choice_of("rotation", gain=9.0), options=options).shutter == "not-determined"
     # of a few photos chance may do the same
     assert "alike" not in " ".join(named(measured(rng, swung(rng, 0.001, 4) + ROLL))[1].reasons)
 

@@ -326,7 +326,7 @@ def _of_motions(
             f"The {rec.shutter_model} model, which you named, explains no more than it leaves unexplained: its "
             "motions may be an error of the lens."
         )
-    if (axis := _repeated(rec)) is not None and not {*known}.issuperset(rec.image_names):
+    if (axis := _repeated(rec, options)) is not None and not {*known}.issuperset(rec.image_names):
         rotation = np.degrees(np.mean(rec.phi[:, axis] * rec.frame_span()))
         reasons.append(
             f"All photos appear to have rotated alike, by {abs(rotation):.2f} degrees about {'xyz'[axis]}: an error of "
@@ -356,13 +356,16 @@ def _explains(result: BundleResult, global_result: BundleResult) -> bool:
     return improves(before, after, standard_errors(before - after, corners(rec, rec.observations)))
 
 
-def _repeated(rec: Reconstruction) -> int | None:
+def _repeated(rec: Reconstruction, options: BundleOptions | None = None) -> int | None:
     """The axis of the camera about which all photos rotated alike and visibly; None if there is none.
 
     None also if the camera rotated so from photo to photo, too: then it panned; or if they rotated by more than a lens
-    could feign.
+    could feign, of a camera that is what it was expected to be: a focal length that is wrong by a fifth makes up for as
+    much in common.
     """
     m = rec.num_images
+    guessed = None if options is None else options.guessed
+    most = np.inf if guessed is not None and guessed.surprises(rec.cameras) else _NO_LENS
     if m < _LEAST_PHOTOS:
         return None
     phi = rec.phi * rec.frame_span()[:, None]
@@ -377,7 +380,7 @@ def _repeated(rec: Reconstruction) -> int | None:
             continue
         chance = 2.0 * stdtr(freedom, -np.abs(mean) / np.maximum(spread, 1e-12) * np.sqrt(m))
         alike = (np.abs(mean) > _REPEATED * spread) & (3 * chance < _CHANCE) & (np.abs(mean) * half_px > UNSEEN_PX)
-        alike &= per_clock < _NO_LENS
+        alike &= per_clock < most
         if alike.any():
             return int(np.argmax(np.where(alike, np.abs(mean), 0.0)))
     return None
