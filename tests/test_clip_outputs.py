@@ -357,6 +357,8 @@ def test_the_readout_time_is_reported_with_its_evidence():
         ),
         ({"unfollowed_px": 2.0}, "the frames rotate by 2.0 px more than their path explains"),
         ({"seconds": 0.04, "of_frame": 1.2}, "longer than the time from frame to frame"),
+        ({"unbounded_seconds": 0.0345, "sigma": 0.001}, ""),
+        ({"unbounded_seconds": 0.0345, "sigma": 0.004}, "it would be 34 +- 4 ms, longer than the time from frame to"),
         (
             {"seconds": -0.0205, "of_frame": -0.615},
             "the last line is read first (--readout), the video runs backwards, or",

@@ -361,6 +361,10 @@ def test_frames_are_not_bent_by_a_readout_that_cannot_be() -> None:
     assert verdict.shutter == "not-determined"
     assert verdict.lens_only == tuple(truth.image_names)
     assert "longer than the 10.0 ms from frame to frame" in verdict.reasons[0]
+    # at its bound and hardly known, it is the bound
+    assert found.path is not None
+    path = replace(found.path, unbounded_s=np.array([1.2 * FRAME_S]), sigma_readout_s=np.array([0.15 * FRAME_S]))
+    assert judge_clip(replace(found, path=path), found, None, FRAME_S).shutter == "not-determined"
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,8 @@ _APART = 4.0
 _SHOWN_FAST = 0.5
 # Relative error that the scale of a gyroscope may have: 3 % by most data sheets, and what the lens adds.
 _GYRO_SCALE = 0.05
+# Of the time from frame to frame: a readout time that ends at it, and is known no better, is not measured.
+_KNOWN = 0.1
 # Where a path misses part of how fast its camera rotates, the readout time comes out longer.
 _TOO_FEW = "the camera shakes too fast for its frame rate, or frames are missing or came twice"
 _VIBRATES = "the camera vibrates faster than half of the frame rate, or something else bends the frames"
@@ -79,7 +81,7 @@ def judge_clip(
     """
     assert result.path is not None
     time = ReadoutTime(float(result.path.readout_s[0]), float(result.path.sigma_readout_s[0]))
-    beyond = abs(float(result.path.unbounded_s[0])) - SIGMAS * time.sigma
+    unbounded_s = float(result.path.unbounded_s[0])
     reasons = loose_reasons(keys, scaled=True) + height_reasons(remedy) + unexplained_reasons(keys, None)
     rec = keys.reconstruction
     shift = max(largest_shift_px(rec.camera(i), rec.motion(i), rec.shutter_model) for i in range(rec.num_images))
@@ -88,13 +90,13 @@ def judge_clip(
         return Verdict("not-determined", "doubtful", (f"{against}.", *reasons), {}, tuple(rec.image_names))
     if not most > UNSEEN_PX:
         shutter = "not-found"
-    elif beyond > frame_s:
+    elif _is_too_long(unbounded_s, time.sigma, frame_s):
         # whatever bends them, corrected as by a shutter they would be bent the more
         shutter = "not-determined"
         reasons.insert(
             0,
-            f"The readout appears to take longer than the {1e3 * frame_s:.1f} ms from frame to frame: something else "
-            "bends the frames.",
+            f"The readout appears to take {1e3 * abs(unbounded_s):.0f} +- {1e3 * time.sigma:.0f} ms, longer than the "
+            f"{1e3 * frame_s:.1f} ms from frame to frame: something else bends the frames.",
         )
     elif abs(time.seconds) > SIGMAS * time.sigma:
         shutter = "found"
@@ -147,6 +149,12 @@ def _contradictions(
                 f"{1e3 * b.seconds:.1f} ms by the second, {apart:.0f} standard deviations apart."
             )
     return reasons
+
+
+def _is_too_long(unbounded_s: float, sigma_s: float, frame_s: float) -> bool:
+    """Whether the measurements ask for a readout that ends after the next has begun; if they are vague, for any."""
+    most = frame_s + (SIGMAS * sigma_s if sigma_s < _KNOWN * frame_s else 0.0)
+    return abs(unbounded_s) > most
 
 
 def _is_backwards(time: ReadoutTime) -> bool:
@@ -211,6 +219,10 @@ def problem_of(evidence: Mapping[str, Any]) -> str:
         if _contradicts(ReadoutTime(seconds, sigma), slow):
             return f"slow rotations alone contradict it: {_TOO_FEW}"
     frame_s = abs(seconds / evidence["of_frame"]) if evidence.get("of_frame") else np.inf
-    if abs(evidence.get("unbounded_seconds", seconds)) - SIGMAS * sigma > frame_s:
-        return "it would be longer than the time from frame to frame: something else bends the frames"
+    unbounded_s = evidence.get("unbounded_seconds", seconds)
+    if _is_too_long(unbounded_s, sigma, frame_s):
+        return (
+            f"it would be {1e3 * abs(unbounded_s):.0f} +- {1e3 * sigma:.0f} ms, longer than the time from frame to "
+            "frame: something else bends the frames"
+        )
     return ""
