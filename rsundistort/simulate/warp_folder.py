@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
@@ -15,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..batch.many_photos import mask_names
 from ..batch.progress import ProgressCallback, StageLog
 from ..batch.workers import use_threads
-from ..errors import FormatError, InputError
+from ..errors import FormatError, InputError, RsUndistortWarning
 from ..input.photo_cameras import camera_file_of, find_cameras
 from ..io import facts_of_exif, list_photos, output_folder, output_name, read_photo, write_image, write_solution
 from ..io.cameras import camera_to_json
@@ -202,6 +203,13 @@ def _camera(photos: Path, name: str, options: WarpOptions) -> tuple[Camera, str,
         raise InputError(
             f"{name} has no focal length in its EXIF and there is no camera.json; "
             "give --camera FILE or --camera fx,fy,cx,cy in pixels"
+        )
+    if not found.calibrated:
+        warnings.warn(
+            f"{name}: the focal length is that of its EXIF; a warp by one that is wrong is not what a rotation of this "
+            "camera would do, and no truth to compare with: give a calibration (--camera)",
+            RsUndistortWarning,
+            stacklevel=3,
         )
     return found.of(0), found.source, found.sigma_of_file(int(found.camera_idx[0]))
 
