@@ -329,6 +329,13 @@ def test_motions_within_their_standard_deviations_are_not_taken_out(rng):
     assert (verdict.shutter, verdict.shape, verdict.lens_only) == ("not-determined", "doubtful", tuple(names))
     assert verdict.reasons[-1] == "No photo's motion is larger than its standard deviation."
     assert judge(replace(result, covariances=doubt), None, choice, options=held(names)).shutter == "found"
+    # errors alone may be larger than one deviation, but hardly than two
+    doubt[:, 6:, 6:] *= 0.5
+    verdict = judge(replace(result, covariances=doubt), None, choice)
+    assert (verdict.shutter, verdict.lens_only) == ("not-determined", tuple(names))
+    assert verdict.reasons[-1] == "No photo's motion is larger than 2 standard deviations."
+    doubt[:, 6:, 6:] *= 0.4
+    assert judge(replace(result, covariances=doubt), None, choice).shutter == "found"
 
 
 def test_a_motion_that_may_be_all_error_is_named_and_says_nothing_about_the_shape(rng):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, RsUndistortWarning
 from ..io.video import FrameWriter, VideoFrames, VideoReader, converted, frame_name, sharpness_of
-from ..model.track import ShownFrames
+from ..model.track import ShownFrames, usual_step
 from ..sfm.flow import FlowFrame, KeyFlow, KeyFrameChooser, flow_size
 
 __all__ = ["Clip", "flow_frames_of", "read_clip"]
@@ -229,7 +229,7 @@ def _read(video: Path, folder: Path, progress: Callable[[int, int], None] | None
         some = "1 frame that shows" if numbers else "no frame that shows"
         raise InputError(f"{video.name} has {some} anything; a path needs two")
     time = _with_repeated(video, np.array(numbers), np.array(times), len(repeated))
-    frame_s = float(np.median(np.diff(time)))
+    frame_s = usual_step(time)
     breaks = {*chooser.cuts, *(np.flatnonzero(np.diff(time) > _PAUSE * frame_s) + 1).tolist()}
     # no path leads across a break
     ends = {k - side for k in breaks for side in (0, 1)}

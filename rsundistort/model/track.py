@@ -11,7 +11,7 @@ from .array_types import Array
 from .camera import Camera
 from .path import CameraPath
 
-__all__ = ["CameraTrack", "ShownFrames", "camera_track", "even_camera"]
+__all__ = ["CameraTrack", "ShownFrames", "camera_track", "even_camera", "usual_step"]
 
 # Time stamps are whole milliseconds in some files: a frame of 1/120 s is then off by less than this share of itself.
 _ROUNDED = 0.13
@@ -37,10 +37,15 @@ class ShownFrames:
 
     @property
     def frame_s(self) -> float:
-        """The time from one frame to the next, as exact as rounded time stamps say it: over all frames, gaps apart."""
-        step_s = np.diff(self.time_s)
-        frame_s = float(step_s[step_s < 1.5 * np.median(step_s)].mean())
-        return float(step_s.sum() / np.maximum(np.round(step_s / frame_s), 1).sum())
+        """The time from one frame to the next."""
+        return usual_step(self.time_s)
+
+
+def usual_step(time_s: Array) -> float:
+    """The time from one frame to the next, as exact as rounded time stamps (n,) say it: over all frames, gaps apart."""
+    step_s = np.diff(time_s)
+    frame_s = float(step_s[step_s < 1.5 * np.median(step_s)].mean())
+    return float(step_s.sum() / np.maximum(np.round(step_s / frame_s), 1).sum())
 
 
 @dataclass(frozen=True)

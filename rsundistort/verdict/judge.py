@@ -37,6 +37,8 @@ _LEFT_PX = 0.1
 _FIELD_PX = 0.5
 # Largest error of held-out measurements beyond their noise.
 _HELD_OUT_PX = 0.5
+# Standard deviations that the motion of some photo must exceed: errors alone stay below, in 19 photos of 20.
+_EVIDENT = 2.0
 # Photos are displaced this much otherwise by a velocity that explains them as well, as a share of what is corrected.
 _RIVAL = 1 / 3
 # Fewer held-out measurements are not conclusive.
@@ -335,8 +337,11 @@ def _of_motions(
     by_known = None if choice is None else choice.known_motions
     if 2 * torn.sum() > rec.num_images and not (by_known is not None and by_known.is_better):
         reasons.append("In most photos halves of the measurements do not agree on the motion found.")
+    evident = (_EVIDENT * motions.relative_sigma < 1.0) | np.isin(rec.image_names, [*known])
     if unsupported[seen].all():
         reasons.append("No photo's motion is larger than its standard deviation.")
+    elif choice is not None and not evident[seen].any():
+        reasons.append(f"No photo's motion is larger than {_EVIDENT:.0f} standard deviations.")
     return ("not-determined" if reasons else "found"), reasons
 
 
