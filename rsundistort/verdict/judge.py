@@ -37,7 +37,8 @@ _LEFT_PX = 0.1
 _FIELD_PX = 0.5
 # Largest error of held-out measurements beyond their noise.
 _HELD_OUT_PX = 0.5
-# Standard deviations that the motion of some photo must exceed: errors alone stay below, in 19 photos of 20.
+# Standard deviations that the motion of some photo must exceed, root mean square over the frame: errors alone do so in
+# one photo of 20 if one component decides, in one of 140 if all three do.
 _EVIDENT = 2.0
 # Photos are displaced this much otherwise by a velocity that explains them as well, as a share of what is corrected.
 _RIVAL = 1 / 3

@@ -152,9 +152,12 @@ def _contradictions(
 
 
 def _is_too_long(unbounded_s: float, sigma_s: float, frame_s: float) -> bool:
-    """Whether the measurements ask for a readout that ends after the next has begun; if they are vague, for any."""
-    most = frame_s + (SIGMAS * sigma_s if sigma_s < _KNOWN * frame_s else 0.0)
-    return abs(unbounded_s) > most
+    """Whether the measurements ask for a readout that ends after the next has begun.
+
+    Exact ones have to say so beyond doubt; for vague ones, whose estimate would then be the bound, it is enough.
+    """
+    doubt_s = SIGMAS * sigma_s if sigma_s < _KNOWN * frame_s else 0.0
+    return abs(unbounded_s) > frame_s + doubt_s
 
 
 def _is_backwards(time: ReadoutTime) -> bool:
