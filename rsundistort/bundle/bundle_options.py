@@ -347,7 +347,7 @@ class BundleResult:
     @property
     def velocity_rms(self) -> float:
         """Root mean square of a component of the velocity by its prior, baselines per frame."""
-        mean = 0.0 if self.common is None else float(np.mean(self.common.values[:, 3:] ** 2))
+        mean = 0.0 if self.common is None else float(np.mean(np.sum(self.common.values[:, 3:] ** 2, axis=1)) / 3)
         return float(np.sqrt(self.velocity_sigma**2 + mean))
 
     def of_photos(self, keep: Mask) -> BundleResult:

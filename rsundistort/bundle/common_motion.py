@@ -17,7 +17,7 @@ __all__ = ["LEAST_PHOTOS", "NUM_WAYS", "CommonMotion", "MotionMeans", "sigmas_of
 #: would be as much each one's own. (`benchmarks/honest.py --only flights`: three to five photos.)
 LEAST_PHOTOS = 3
 #: Ways to move together: `MotionMeans.of` tells them.
-NUM_WAYS = 6
+NUM_WAYS = 7
 # How likely no motion in common is, by how likely each way is: as a travel along any of three axes.
 _NONE = 3.0
 # Of any way to move: a hundredth of the travel that it would have. The measurements can still be asked.
@@ -26,15 +26,16 @@ _LEAST_PROBABILITY = 1e-4
 
 @dataclass(frozen=True)
 class CommonMotion:
-    """Means of the motions of each camera's photos, in the frame of the camera.
+    """Means of the motions of each camera's photos.
 
     Attributes
     ----------
-    values : (cameras, 6) array
-        Rotation, radians per frame, and travel, baselines per frame.
-    deviations : (cameras, 6) array
+    values : (cameras, 7) array
+        Rotation, radians per frame, and travel, baselines per frame, in the frame of the camera; and travel along the
+        path of the photos.
+    deviations : (cameras, 7) array
         Their standard deviations.
-    sigmas : (6,) tuple of float
+    sigmas : (7,) tuple of float
         Standard deviations of their prior, baselines per frame, as `MotionMeans` takes them.
     """
 
@@ -51,16 +52,19 @@ class MotionMeans:
 
     Attributes
     ----------
-    directions : (m, 6, 6) array
+    directions : (m, 6, 7) array
         Motions, in the world frame per unit of the clock, by the unknowns. 0 for what a photo does not share.
     camera_idx : (m,) int array
         Camera of each photo.
-    root : (6, 6) array
-        Means, in the frame of the camera per frame, radians and world units, by the unknowns.
+    by_values : (m, 6, 7) array
+        Motions, in the frames of the cameras per frame, by the means as `CommonMotion` has them, in world units.
+    root : (7, 7) array
+        These means by the unknowns.
     """
 
     directions: Array
     camera_idx: Index
+    by_values: Array
     root: Array
 
     @classmethod
@@ -69,50 +73,70 @@ class MotionMeans:
 
         `sigmas` are the standard deviations of travels in common, world units per frame: of cameras that travel along
         their x, y, or z, of those that aim at what they pass along x or y, whose rotation is their travel by the depth,
-        and of those that travel and rotate as they like, by as much.
+        of those that travel and rotate as they like, by as much, and of those that were on their way from one photo to
+        the next, wherever they look.
         """
-        directions = np.zeros((reconstruction.num_images, 6, 6))
-        directions[:, :3, :3] = np.eye(3)
-        directions[:, 3:, 3:] = reconstruction.R_cw.transpose(0, 2, 1)
-        directions *= shares[:, :, None] / reconstruction.frame_span()[:, None, None]
-        ways = _ways(reconstruction.typical_depth)
-        root = np.linalg.cholesky(np.einsum("k,kab->ab", np.square(sigmas), ways))
-        return cls(np.asarray(directions @ root, np.float64), reconstruction.camera_idx, np.asarray(root, np.float64))
+        by_values = np.zeros((reconstruction.num_images, 6, 7))
+        by_values[:, :, :6] = np.eye(6)
+        by_values[:, 3:, 6] = np.einsum("mab,mb->ma", reconstruction.R_cw, _headings(reconstruction))
+        by_values *= shares[:, :, None]
+        root = np.linalg.cholesky(np.einsum("k,kab->ab", np.square(sigmas), _ways(reconstruction.typical_depth)))
+        directions = by_values @ root / reconstruction.frame_span()[:, None, None]
+        directions[:, 3:] = reconstruction.R_cw.transpose(0, 2, 1) @ directions[:, 3:]
+        return cls(
+            np.asarray(directions, np.float64), reconstruction.camera_idx, by_values, np.asarray(root, np.float64)
+        )
 
     def values(self, unknowns: Array) -> Array:
-        """Means (cameras, 6) of unknowns (cameras, 6)."""
+        """Means (cameras, 7) of unknowns (cameras, 7)."""
         return np.asarray(unknowns @ self.root.T)
 
     def unknowns(self, values: Array) -> Array:
-        """Unknowns (cameras, 6) of means (cameras, 6)."""
+        """Unknowns (cameras, 7) of means (cameras, 7)."""
         return np.asarray(np.linalg.solve(self.root, values.T).T)
 
     def at(self, unknowns: Array) -> Array:
-        """Motions (m, 6) of photos that move as the means of unknowns (cameras, 6) say."""
+        """Motions (m, 6) of photos that move as the means of unknowns (cameras, 7) say."""
         return np.einsum("mak,mk->ma", self.directions, unknowns[self.camera_idx])
 
     def pull(self, weight: Array, motion: Array, unknowns: Array) -> Array:
-        """Gradient (cameras, 6) of the photos' priors, of weights (m, 6), by the unknowns."""
+        """Gradient (cameras, 7) of the photos' priors, of weights (m, 6), by the unknowns."""
         total = np.zeros_like(unknowns)
         by_photo = np.einsum("mak,ma->mk", self.directions, weight * (motion - self.at(unknowns)))
         np.add.at(total, self.camera_idx, -by_photo)
         return total
 
     def most_likely(self, weight: Array, motion: Array, num_cameras: int) -> Array:
-        """Unknowns (cameras, 6) where their priors and those of motions (m, 6), of weights (m, 6), cost least."""
-        total = np.zeros((num_cameras, 6, 6))
+        """Unknowns (cameras, 7) where their priors and those of motions (m, 6), of weights (m, 6), cost least."""
+        total = np.zeros((num_cameras, *self.root.shape))
         np.add.at(total, self.camera_idx, np.einsum("mak,ma,mal->mkl", self.directions, weight, self.directions))
-        pull = -self.pull(weight, motion, np.zeros((num_cameras, 6)))
-        return np.asarray(np.linalg.solve(total + np.eye(6), pull[..., None])[..., 0], np.float64)
+        pull = -self.pull(weight, motion, np.zeros((num_cameras, len(self.root))))
+        return np.asarray(np.linalg.solve(total + np.eye(len(self.root)), pull[..., None])[..., 0], np.float64)
+
+
+def _headings(reconstruction: Reconstruction) -> Array:
+    """(m, 3) travels of photos on their way, world units per frame: of baseline's length, from those before to those
+    after.
+
+    Less where photos were taken closer together, as by somebody who stops; no more where one was left out.
+    """
+    found = np.zeros((reconstruction.num_images, 3))
+    for camera in range(len(reconstruction.cameras)):
+        mine = np.flatnonzero(reconstruction.camera_idx == camera)
+        if len(mine) > 1:
+            found[mine] = np.gradient(reconstruction.center_w[mine], axis=0)
+    length = np.linalg.norm(found, axis=1, keepdims=True) / reconstruction.baseline
+    return found / (reconstruction.baseline * np.maximum(length, 1.0))
 
 
 def _ways(depth: float) -> Array:
-    """(6, 6, 6) covariances of means for travels of unit variance in common: `MotionMeans.of` says of which cameras."""
-    travels = np.hstack([np.zeros((3, 3)), np.eye(3)])
+    """(7, 7, 7) covariances of means for travels of unit variance in common: `MotionMeans.of` says of which cameras."""
+    travels = np.hstack([np.zeros((3, 3)), np.eye(3), np.zeros((3, 1))])
     aiming = travels[:2].copy()
     aiming[:, :2] = [[0.0, 1.0 / depth], [-1.0 / depth, 0.0]]  # what is passed stays in the middle
     along = np.vstack([travels, aiming])
-    return np.concatenate([along[:, :, None] * along[:, None], [np.diag(np.repeat([depth**-2.0, 1.0], 3))]])
+    free, on_path = np.repeat([depth**-2.0, 1.0, 0.0], [3, 3, 1]), np.eye(7)[6]
+    return np.concatenate([along[:, :, None] * along[:, None], [np.diag(free), np.diag(on_path)]])
 
 
 def sigmas_of_means(
@@ -129,7 +153,7 @@ def sigmas_of_means(
 
     Parameters
     ----------
-    unknowns, covariances, root : (cameras, 6), (cameras, 6, 6), (6, 6) array
+    unknowns, covariances, root : (cameras, 7), (cameras, 7, 7), (7, 7) array
         As found, and `MotionMeans.root` there.
     velocity : float
         Standard deviation of a travel in common, if there is one, world units per frame.
@@ -140,11 +164,11 @@ def sigmas_of_means(
     from_unknowns = np.linalg.inv(root)
     precision = np.linalg.inv(covariances)
     pull = np.einsum("cij,cj->ci", precision, unknowns) @ from_unknowns
-    known = from_unknowns.T @ (precision - np.eye(6)) @ from_unknowns
+    known = from_unknowns.T @ (precision - np.eye(len(root))) @ from_unknowns
     evidence = [np.log(_NONE)]
     for way in _ways(depth):
         prior = velocity**2 * way
-        wider = np.eye(6) + known @ prior
+        wider = np.eye(len(root)) + known @ prior
         gain = np.einsum("ci,ij,cj->c", pull, prior, np.linalg.solve(wider, pull[..., None])[..., 0])
         evidence.append(0.5 * float((gain - np.linalg.slogdet(wider)[1]).sum()))
     probability = np.maximum(softmax(evidence)[1:], _LEAST_PROBABILITY)

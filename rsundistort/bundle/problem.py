@@ -425,7 +425,7 @@ class BundleProblem:
         border.J[singular] = 0.0
         coupling = common = None
         if self.means is not None:
-            border = replace(border, J=np.pad(border.J, ((0, 0), (0, 0), (0, 6))))
+            border = replace(border, J=np.pad(border.J, ((0, 0), (0, 0), (0, state.means.shape[1]))))
             around = (0, 0), (6, self.layout.size - 12)
             common = CommonPrior(np.pad(information, around), np.pad(self.means.directions, (*around, (0, 0))))
         if self._path is not None and state.path is not None:

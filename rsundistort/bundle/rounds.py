@@ -189,23 +189,22 @@ class Rounds:
         state, current, of = self._solved.state, self._current, self._problem.means
         if of is None:
             return None
-        values, covariances = of.values(state.means), self._covariances_of_means
-        variances = np.diagonal(of.root @ covariances @ of.root.T, axis1=1, axis2=2)
-        span, shares = current.frame_span(), self._problem.shares
+        covariances, by_unknowns = self._covariances_of_means, of.by_values @ of.root
+        photo = current.camera_idx
+        means = np.einsum("mak,mk->ma", by_unknowns, state.means[photo])
+        of_means = np.einsum("mak,mkl,mal->ma", by_unknowns, covariances[photo], by_unknowns)
         # of the motions in their cameras' frames
-        together = span[:, None, None] * equations.photos_by_shared(6)[:, 6:12] @ of.root.T
-        travels = np.einsum("mak,mka->ma", current.R_cw, together[:, 3:, 3:])
-        with_motions = np.hstack([np.einsum("maa->ma", together[:, :3, :3]), travels])
-        of_photos = values[current.camera_idx], variances[current.camera_idx], with_motions
-        means, of_means, together = (np.where(shares, each, 0.0) for each in of_photos)
-        return Common(means, of_means, together, state.means, covariances, of.root)
+        together = current.frame_span()[:, None, None] * equations.photos_by_shared(len(of.root))[:, 6:12]
+        together[:, 3:] = current.R_cw @ together[:, 3:]
+        with_motions = np.einsum("mak,mak->ma", together, by_unknowns)
+        return Common(means, of_means, with_motions, state.means, covariances, of.root)
 
     @property
     def _covariances_of_means(self) -> Array:
-        """(cameras, 6, 6) of their unknowns by the last solve."""
-        c = len(self._solved.state.means)
+        """(cameras, 7, 7) of their unknowns by the last solve."""
+        c, k = self._solved.state.means.shape
         blocks = self._marginals.cameras.reshape(c, -1, c, len(self._marginals.cameras) // c)
-        return blocks[np.arange(c), -6:, np.arange(c), -6:]
+        return blocks[np.arange(c), -k:, np.arange(c), -k:]
 
     def _follow_path(self, problem: BundleProblem, equations: NormalEquations) -> None:
         """Bend the motions of the next solve as the path of this one, and update its prior standard deviations."""
@@ -315,7 +314,7 @@ class Rounds:
         of = self._problem.means
         if of is None or self._means is None:
             return None
-        per_unit = np.repeat([1.0, 1.0 / self._baseline], 3)
+        per_unit = np.repeat([1.0, 1.0 / self._baseline], [3, 4])
         variances = np.diagonal(of.root @ self._covariances_of_means @ of.root.T, axis1=1, axis2=2)
         sigmas = (*(each / self._baseline for each in self._weighed_sigmas.means),)
         return CommonMotion(self._means * per_unit, np.sqrt(np.maximum(variances, 0.0)) * per_unit, sigmas)

@@ -477,11 +477,15 @@ def _of_photos(rec: Reconstruction, doubts: Mapping[str, list[str]], motions: Ph
     """Reasons in doubtful photos against a whole without other reasons."""
     # a motion that is wrong by this stretches the photo by its share of half the frame, and the scene as much
     half_px = np.array([min(each.width, each.height) / 2 for each in rec.cameras])[rec.camera_idx]
-    percent = 100 * float(np.sqrt(np.mean((motions.difference_px / half_px) ** 2)))
-    if percent > _SMALL_PERCENT:
+    contradicted, uncertain = (
+        100 * float(np.sqrt(np.mean((each / half_px) ** 2))) for each in (motions.difference_px, motions.sigma_px)
+    )
+    if contradicted > _SMALL_PERCENT:
         return [
             "Halves of the photos' measurements contradict each other about the motions, by "
-            f"{percent:.1f} % of the frame in the mean."
+            f"{contradicted:.1f} % of the frame in the mean."
         ]
+    if uncertain > _SMALL_PERCENT:
+        return [f"The photos' motions are only known to +-{uncertain:.1f} % of the frame in the mean."]
     doubtful = sum(bool(each) for each in doubts.values())
     return [f"{doubtful} of {rec.num_images} photos are doubtful."] if 2 * doubtful > rec.num_images else []
