@@ -408,14 +408,14 @@ def test_a_velocity_that_all_photos_share_is_not_taken_for_their_nodding(seed):
     result = bundle_adjust(start, MODEL)
     # under a prior of zero mean: 9 to 16 mrad
     assert abs((result.reconstruction.phi - truth.phi).mean(0)[0]) < 5e-3
-    _, ahead, _ = truth.baseline * result.common.values[0, 3:]
+    _, ahead, _ = truth.baseline * result.common.of_photos[:, 3:].mean(0)
     assert -0.35 < ahead < -0.2
 
 
 def test_velocities_without_a_common_direction_have_no_mean(rng):
     truth = flight(rng, np.zeros(3))
     result = bundle_adjust(truth, MODEL)
-    assert (np.abs(result.common.values) <= 2.5 * result.common.deviations)[:, 3:].all()
+    assert (np.abs(result.common.of_photos) <= 2.5 * result.common.deviations)[:, 3:].all()
 
 
 @pytest.mark.parametrize("orientation", [3, 6, 8])

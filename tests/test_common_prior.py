@@ -17,6 +17,7 @@ from bundle_scenes import (
     weights_of_motions,
 )
 from numpy_reference import project
+from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions, Camera, Observations, Reconstruction, bundle_adjust
 from rsundistort.bundle import Posterior
@@ -29,7 +30,16 @@ from rsundistort.synthetic import look_at
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 MODEL = "constant-motion"
-MEANS = (0.2, 0.1, 0.05, 0.1, 0.2, 0.05)  # of travels along each axis, of such that aim, and of any
+MEANS = (
+    0.2,
+    0.1,
+    0.05,
+    0.1,
+    0.2,
+    0.05,
+    0.15,
+    0.1,
+)  # of travels along each axis, of such that aim, of any, and from photo to photo
 
 
 def shared_problem(rng, refine=(), factor_limit=1e10, num_images=9):
@@ -43,19 +53,38 @@ def shared_problem(rng, refine=(), factor_limit=1e10, num_images=9):
     return problem, replace(state, means=state.means + 0.1 * rng.normal(size=state.means.shape))
 
 
+def on_the_way(rec):
+    """(m, 6, 2) motions by a baseline at most from the photo before to the one after: travels, and rotations, too."""
+    motions = np.zeros((rec.num_images, 6, 2))
+    for i, camera in enumerate(rec.camera_idx):
+        same = [k for k in range(rec.num_images) if rec.camera_idx[k] == camera]
+        at = same.index(i)
+        steps = []
+        for before, after in zip(same[max(at - 1, 0) : at + 2], same[max(at - 1, 0) + 1 : at + 2], strict=False):
+            rotation = Rotation.from_matrix(rec.R_cw[after] @ rec.R_cw[before].T).as_rotvec()
+            steps.append(np.concatenate([rotation, rec.center_w[after] - rec.center_w[before]]))
+        if steps:
+            motions[i, :, 1] = np.mean(steps, axis=0)
+            motions[i, :, 1] /= max(np.linalg.norm(motions[i, 3:, 1]), rec.baseline)
+            motions[i, 3:, 0] = motions[i, 3:, 1]
+    return motions
+
+
 def whole_system(problem, state):
     """Hessian and gradient of photos, points, and of the intrinsics and means of each camera, from residuals."""
     H, g, free = dense_system(problem, state)
     m, nb = problem._free.shape
     cameras, nr = len(state.cameras), len(problem._refine)
-    nc = nr + 6
+    nc = nr + 8
     first = m * nb + 3 * problem._start.num_points
     place = np.concatenate([np.arange(first), *(first + c * nc + np.arange(nr) for c in range(cameras))])
-    J, res = np.zeros((6 * (m + cameras), first + cameras * nc)), np.zeros(6 * (m + cameras))
+    rows_of_priors = 6 * m + 8 * cameras
+    J, res = np.zeros((rows_of_priors, first + cameras * nc)), np.zeros(rows_of_priors)
     span, motion = problem._start.frame_span(), np.hstack([state.phi, state.velocity])
-    T, own = np.zeros((m, 6, 6)), motion.copy()
+    T, own, on_way = np.zeros((m, 6, 8)), motion.copy(), on_the_way(problem._start)
     for i in np.flatnonzero(problem._start.camera_idx == 0):
-        T[i, :3, :3], T[i, 3:, 3:] = np.eye(3) / span[i], problem._start.R_cw[i].T / span[i]
+        T[i, :3, :3], T[i, 3:, 3:6] = np.eye(3) / span[i], problem._start.R_cw[i].T / span[i]
+        T[i, :, 6:] = on_way[i] / span[i]
         own[i] -= T[i] @ problem.means.values(state.means)[0]
         T[i] = T[i] @ problem.means.root
     sqrt_weight = np.sqrt(weights_of_motions(problem, own))
@@ -67,8 +96,8 @@ def whole_system(problem, state):
             J[rows, first + nr : first + nc] = -root[:, None] * T[i]
         res[rows] = sqrt_weight[i] * own[i] / np.sqrt(INFORMATION)  # the gradient's weight is the whole one
     for c in range(cameras):
-        rows = slice(6 * (m + c), 6 * (m + c) + 6)
-        J[rows, first + c * nc + nr : first + (c + 1) * nc] = np.eye(6)
+        rows = slice(6 * m + 8 * c, 6 * m + 8 * c + 8)
+        J[rows, first + c * nc + nr : first + (c + 1) * nc] = np.eye(8)
         res[rows] = state.means[c]
     wide, gradient = J.T @ J, J.T @ res
     # the dense system has the priors of motions without means already
@@ -89,7 +118,7 @@ def test_means_join_the_system(damping, factor_limit, refine, rng):
     seen = np.diag(dense_system(problem, state)[0])
     D = np.zeros(len(H))
     m, nb = problem._free.shape
-    first, nc, nr = m * nb + 3 * problem._start.num_points, len(refine) + 6, len(refine)
+    first, nc, nr = m * nb + 3 * problem._start.num_points, len(refine) + 8, len(refine)
     D[:first] = np.diag(H)[:first]  # means are not damped: their priors hold them
     for c in range(2):
         D[first + c * nc : first + c * nc + nr] = seen[first + c * nr : first + (c + 1) * nr]
@@ -133,8 +162,8 @@ def test_covariances_with_means_are_those_of_the_whole_inverse(rng):
     vector = rng.normal(size=(1, m, nb))
     reference = (whole[: m * nb, : m * nb] @ vector.ravel()).reshape(m, nb)
     np.testing.assert_allclose(equations.covariance(vector)[0], reference, atol=1e-7 * np.abs(reference).max())
-    shared = np.array([whole[nb * i : nb * i + nb, -k + 1 : -k + 7] for i in range(m - 1)])
-    np.testing.assert_allclose(equations.photos_by_shared(6)[:-1], shared, atol=1e-7 * np.abs(shared).max())
+    shared = np.array([whole[nb * i : nb * i + nb, -k + 1 : -k + 9] for i in range(m - 1)])
+    np.testing.assert_allclose(equations.photos_by_shared(8)[:-1], shared, atol=1e-7 * np.abs(shared).max())
     # the priors' share, H^-1 P H^-1: P is what is left without measurements
     J = measured_rows(problem, state, len(H), 1)
     P = H - J.T @ J
@@ -163,7 +192,7 @@ def measured_rows(problem, state, size, nr):
     J = np.zeros((len(obs), 2, size))
     for k in range(len(obs)):
         f, p = nb * obs.frame_idx[k], m * nb + 3 * obs.point_idx[k]
-        c = first + (nr + 6) * problem._start.camera_idx[obs.frame_idx[k]]
+        c = first + (nr + 8) * problem._start.camera_idx[obs.frame_idx[k]]
         J[k, :, f : f + nb], J[k, :, p : p + 3] = J_frame[k], -J_frame[k, :, 3:6]
         J[k, :, c : c + nr] = J_camera[k]
     return J.reshape(-1, size)
@@ -171,15 +200,16 @@ def measured_rows(problem, state, size, nr):
 
 def prior_of_means(depth, sigmas=MEANS):
     """Covariance of the prior on means, as `MotionMeans.of` says it in words."""
-    total = sigmas[5] ** 2 * np.diag([depth**-2] * 3 + [1.0] * 3)
+    total = np.diag([0.0] * 6 + [sigmas[5] ** 2, sigmas[6] ** 2])
+    total[:6, :6] = sigmas[7] ** 2 * np.diag([depth**-2] * 3 + [1.0] * 3)
     for axis in range(3):
         travel = np.eye(3)[axis]
-        total += sigmas[axis] ** 2 * np.outer(*[np.concatenate([np.zeros(3), travel])] * 2)
+        total[:6, :6] += sigmas[axis] ** 2 * np.outer(*[np.concatenate([np.zeros(3), travel])] * 2)
         if axis < 2:
             # x_c changes by phi x x_c less the travel: at (0, 0, depth) by nothing
             phi = np.cross([0.0, 0.0, 1.0], travel) / depth
             np.testing.assert_allclose(np.cross(phi, [0.0, 0.0, depth]), travel, atol=1e-15)
-            total += sigmas[3 + axis] ** 2 * np.outer(*[np.concatenate([phi, travel])] * 2)
+            total[:6, :6] += sigmas[3 + axis] ** 2 * np.outer(*[np.concatenate([phi, travel])] * 2)
     return total
 
 
@@ -193,27 +223,27 @@ def test_means_are_those_of_cameras_that_travel_aim_or_do_as_they_like(rng):
 
 
 def shown(rng, motion, exactness, under):
-    """What is found of a mean that is measured with a precision (6, 6), under a prior of covariance (6, 6)."""
-    measured = motion + np.linalg.solve(np.linalg.cholesky(exactness).T, rng.normal(size=6))
+    """What is found of a mean that is measured with a precision (8, 8), under a prior of covariance (8, 8)."""
+    measured = motion + np.linalg.solve(np.linalg.cholesky(exactness).T, rng.normal(size=8))
     root = np.linalg.cholesky(under)
-    covariance = np.linalg.inv(root.T @ exactness @ root + np.eye(6))
+    covariance = np.linalg.inv(root.T @ exactness @ root + np.eye(8))
     return (covariance @ root.T @ exactness @ measured)[None], covariance[None], root
 
 
-@pytest.mark.parametrize("of", [None, 0, 1, 2, 3, 4, 5])
+@pytest.mark.parametrize("of", [None, *range(8)])
 def test_the_prior_of_means_is_as_wide_as_each_way_to_move_is_likely(of, rng):
     depth, velocity, num = 4.0, 0.05, 300
     # a yaw and a travel sideways that show the same are measured five times less exactly than the others
-    exactness = np.diag([depth**2] * 3 + [1.0] * 3) / 0.0025**2
-    weak = np.array([0.0, 1.0 / depth, 0.0, 1.0, 0.0, 0.0])
+    exactness = np.diag([depth**2] * 3 + [1.0] * 5) / 0.0025**2
+    weak = np.array([0.0, 1.0 / depth, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
     weak /= np.sqrt(weak @ exactness @ weak)
     exactness -= 0.96 * np.outer(exactness @ weak, exactness @ weak)
     likely = []
     for _ in range(num):
-        motion = np.zeros(6)
+        motion = np.zeros(8)
         if of is not None:
-            motion = np.linalg.cholesky(prior_of_means(depth, velocity * np.eye(6)[of] + 1e-9)) @ rng.normal(size=6)
-        under = prior_of_means(depth, velocity * rng.uniform(0.01, 1, 6))
+            motion = np.linalg.cholesky(prior_of_means(depth, velocity * np.eye(8)[of] + 1e-9)) @ rng.normal(size=8)
+        under = prior_of_means(depth, velocity * rng.uniform(0.01, 1, 8))
         found = sigmas_of_means(*shown(rng, motion, exactness, under), velocity, depth)
         likely.append(np.array(found) ** 2 / velocity**2)
     mean = np.mean(likely, axis=0)
@@ -222,10 +252,14 @@ def test_the_prior_of_means_is_as_wide_as_each_way_to_move_is_likely(of, rng):
 
 
 def test_the_prior_of_means_does_not_depend_on_that_under_which_they_were_found(rng):
-    exactness = np.linalg.inv(np.diag([0.01] * 3 + [0.05] * 3) ** 2 * (np.eye(6) + 0.5))
+    exactness = np.linalg.inv(np.diag([0.01] * 3 + [0.05] * 5) ** 2 * (np.eye(8) + 0.5))
     found = []
-    for sigmas in ((0.1,) * 6, (0.02, 1e-3, 0.3, 0.1, 0.1, 0.01), (0.3, 0.1, 3e-3, 0.01, 0.1, 0.1)):
-        each = shown(np.random.default_rng(5), np.full(6, 0.01), exactness, prior_of_means(4.0, sigmas))
+    for sigmas in (
+        (0.1,) * 8,
+        (0.02, 1e-3, 0.3, 0.1, 0.1, 0.01, 0.2, 0.1),
+        (0.3, 0.1, 3e-3, 0.01, 0.1, 0.1, 1e-3, 0.2),
+    ):
+        each = shown(np.random.default_rng(5), np.full(8, 0.01), exactness, prior_of_means(4.0, sigmas))
         found.append(sigmas_of_means(*each, 0.1, 4.0))
     np.testing.assert_allclose(found[1:], found[:1] * 2, rtol=1e-8)
 
@@ -234,7 +268,7 @@ def test_cameras_of_few_photos_share_nothing(rng):
     for num_images, shares in ((LEAST_PHOTOS, False), (LEAST_PHOTOS + 1, True)):
         problem, _ = shared_problem(rng, num_images=num_images)
         means = problem.initial_state().means
-        assert means.shape == (2, 6 if shares else 0)
+        assert means.shape == (2, 8 if shares else 0)
         if shares:
             assert problem.shares[:-1].all()
             assert not problem.shares[-1].any()

@@ -341,14 +341,12 @@ class BundleResult:
     @property
     def phi_rms(self) -> float:
         """Root mean square of a component of phi by its prior, mean included, radians per frame."""
-        mean = 0.0 if self.common is None else float(np.mean(self.common.values[:, :3] ** 2))
-        return float(np.sqrt(self.phi_sigma**2 + mean))
+        return float(np.hypot(self.phi_sigma, 0.0 if self.common is None else self.common.rms[0]))
 
     @property
     def velocity_rms(self) -> float:
         """Root mean square of a component of the velocity by its prior, baselines per frame."""
-        mean = 0.0 if self.common is None else float(np.mean(np.sum(self.common.values[:, 3:] ** 2, axis=1)) / 3)
-        return float(np.sqrt(self.velocity_sigma**2 + mean))
+        return float(np.hypot(self.velocity_sigma, 0.0 if self.common is None else self.common.rms[1]))
 
     def of_photos(self, keep: Mask) -> BundleResult:
         """The result of some photos (m,) only, with the points that two of them show."""

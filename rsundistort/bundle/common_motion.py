@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.special import softmax
 
 from ..model import Reconstruction
@@ -17,7 +18,7 @@ __all__ = ["LEAST_PHOTOS", "NUM_WAYS", "CommonMotion", "MotionMeans", "sigmas_of
 #: would be as much each one's own. (`benchmarks/honest.py --only flights`: three to five photos.)
 LEAST_PHOTOS = 3
 #: Ways to move together: `MotionMeans.of` tells them.
-NUM_WAYS = 7
+NUM_WAYS = 8
 # How likely no motion in common is, by how likely each way is: as a travel along any of three axes.
 _NONE = 3.0
 # Of any way to move: a hundredth of the travel that it would have. The measurements can still be asked.
@@ -30,18 +31,26 @@ class CommonMotion:
 
     Attributes
     ----------
-    values : (cameras, 7) array
-        Rotation, radians per frame, and travel, baselines per frame, in the frame of the camera; and travel along the
-        path of the photos.
-    deviations : (cameras, 7) array
-        Their standard deviations.
-    sigmas : (7,) tuple of float
+    values : (cameras, 8) array
+        Rotation, radians per frame, and travel, baselines per frame, in the frame of the camera; and travels from
+        photo to photo, without the rotation from one to the next and with it.
+    sigmas : (8,) tuple of float
         Standard deviations of their prior, baselines per frame, as `MotionMeans` takes them.
+    of_photos, deviations : (m, 6) array
+        What photos are expected to move by it, in the frames of their cameras: rotation and travel, in the same units;
+        and its standard deviations.
     """
 
     values: Array
-    deviations: Array
     sigmas: tuple[float, ...]
+    of_photos: Array
+    deviations: Array
+
+    @property
+    def rms(self) -> tuple[float, float]:
+        """Root mean square of a component of the photos' rotations and of their travels."""
+        rotation, travel = np.sqrt((self.of_photos.reshape(-1, 2, 3) ** 2).mean((0, 2))).tolist()
+        return rotation, travel
 
 
 @dataclass(frozen=True)
@@ -52,13 +61,13 @@ class MotionMeans:
 
     Attributes
     ----------
-    directions : (m, 6, 7) array
+    directions : (m, 6, 8) array
         Motions, in the world frame per unit of the clock, by the unknowns. 0 for what a photo does not share.
     camera_idx : (m,) int array
         Camera of each photo.
-    by_values : (m, 6, 7) array
+    by_values : (m, 6, 8) array
         Motions, in the frames of the cameras per frame, by the means as `CommonMotion` has them, in world units.
-    root : (7, 7) array
+    root : (8, 8) array
         These means by the unknowns.
     """
 
@@ -73,12 +82,13 @@ class MotionMeans:
 
         `sigmas` are the standard deviations of travels in common, world units per frame: of cameras that travel along
         their x, y, or z, of those that aim at what they pass along x or y, whose rotation is their travel by the depth,
-        of those that travel and rotate as they like, by as much, and of those that were on their way from one photo to
-        the next, wherever they look.
+        of those that are on their way from one photo to the next (travelling only, as drones that hold their gimbal do,
+        and rotating as they do from photo to photo, as the frames of a video), and of those that travel and rotate as
+        they like, by as much.
         """
-        by_values = np.zeros((reconstruction.num_images, 6, 7))
-        by_values[:, :, :6] = np.eye(6)
-        by_values[:, 3:, 6] = np.einsum("mab,mb->ma", reconstruction.R_cw, _headings(reconstruction))
+        by_values = np.concatenate(
+            [np.tile(np.eye(6), (reconstruction.num_images, 1, 1)), _on_the_way(reconstruction)], axis=2
+        )
         by_values *= shares[:, :, None]
         root = np.linalg.cholesky(np.einsum("k,kab->ab", np.square(sigmas), _ways(reconstruction.typical_depth)))
         directions = by_values @ root / reconstruction.frame_span()[:, None, None]
@@ -88,55 +98,69 @@ class MotionMeans:
         )
 
     def values(self, unknowns: Array) -> Array:
-        """Means (cameras, 7) of unknowns (cameras, 7)."""
+        """Means (cameras, 8) of unknowns (cameras, 8)."""
         return np.asarray(unknowns @ self.root.T)
 
     def unknowns(self, values: Array) -> Array:
-        """Unknowns (cameras, 7) of means (cameras, 7)."""
+        """Unknowns (cameras, 8) of means (cameras, 8)."""
         return np.asarray(np.linalg.solve(self.root, values.T).T)
 
+    def of_photos(self, unknowns: Array, covariances: Array) -> tuple[Array, Array]:
+        """Means (m, 6) of the photos, in their cameras' frames per frame, and their variances.
+
+        By unknowns (cameras, 8) and their covariances (cameras, 8, 8).
+        """
+        by_unknowns, i = self.by_values @ self.root, self.camera_idx
+        means = np.einsum("mak,mk->ma", by_unknowns, unknowns[i])
+        return means, np.einsum("mak,mkl,mal->ma", by_unknowns, covariances[i], by_unknowns)
+
     def at(self, unknowns: Array) -> Array:
-        """Motions (m, 6) of photos that move as the means of unknowns (cameras, 7) say."""
+        """Motions (m, 6) of photos that move as the means of unknowns (cameras, 8) say."""
         return np.einsum("mak,mk->ma", self.directions, unknowns[self.camera_idx])
 
     def pull(self, weight: Array, motion: Array, unknowns: Array) -> Array:
-        """Gradient (cameras, 7) of the photos' priors, of weights (m, 6), by the unknowns."""
+        """Gradient (cameras, 8) of the photos' priors, of weights (m, 6), by the unknowns."""
         total = np.zeros_like(unknowns)
         by_photo = np.einsum("mak,ma->mk", self.directions, weight * (motion - self.at(unknowns)))
         np.add.at(total, self.camera_idx, -by_photo)
         return total
 
     def most_likely(self, weight: Array, motion: Array, num_cameras: int) -> Array:
-        """Unknowns (cameras, 7) where their priors and those of motions (m, 6), of weights (m, 6), cost least."""
+        """Unknowns (cameras, 8) where their priors and those of motions (m, 6), of weights (m, 6), cost least."""
         total = np.zeros((num_cameras, *self.root.shape))
         np.add.at(total, self.camera_idx, np.einsum("mak,ma,mal->mkl", self.directions, weight, self.directions))
         pull = -self.pull(weight, motion, np.zeros((num_cameras, len(self.root))))
         return np.asarray(np.linalg.solve(total + np.eye(len(self.root)), pull[..., None])[..., 0], np.float64)
 
 
-def _headings(reconstruction: Reconstruction) -> Array:
-    """(m, 3) travels of photos on their way, world units per frame: of baseline's length, from those before to those
-    after.
+def _on_the_way(reconstruction: Reconstruction) -> Array:
+    """(m, 6, 2) motions from the photos before to those after, in the cameras' frames: travels, and whole motions.
 
-    Less where photos were taken closer together, as by somebody who stops; no more where one was left out.
+    By a travel of one unit. It is less where photos were taken closer together than usual, as by somebody who stops;
+    not more where one was left out.
     """
-    found = np.zeros((reconstruction.num_images, 3))
-    for camera in range(len(reconstruction.cameras)):
-        mine = np.flatnonzero(reconstruction.camera_idx == camera)
+    rec = reconstruction
+    found = np.zeros((rec.num_images, 6))
+    for camera in range(len(rec.cameras)):
+        mine = np.flatnonzero(rec.camera_idx == camera)
         if len(mine) > 1:
-            found[mine] = np.gradient(reconstruction.center_w[mine], axis=0)
-    length = np.linalg.norm(found, axis=1, keepdims=True) / reconstruction.baseline
-    return found / (reconstruction.baseline * np.maximum(length, 1.0))
+            rotations = Rotation.from_matrix(rec.R_cw[mine[1:]] @ rec.R_cw[mine[:-1]].transpose(0, 2, 1)).as_rotvec()
+            steps = np.hstack([rotations, np.diff(rec.center_w[mine], axis=0)])
+            found[mine] = (np.vstack([steps[:1], steps]) + np.vstack([steps, steps[-1:]])) / 2
+    found /= np.maximum(rec.baseline, np.linalg.norm(found[:, 3:], axis=1, keepdims=True))
+    found[:, 3:] = np.einsum("mab,mb->ma", rec.R_cw, found[:, 3:])
+    travels = np.hstack([np.zeros((rec.num_images, 3)), found[:, 3:]])
+    return np.stack([travels, found], axis=2)
 
 
 def _ways(depth: float) -> Array:
-    """(7, 7, 7) covariances of means for travels of unit variance in common: `MotionMeans.of` says of which cameras."""
-    travels = np.hstack([np.zeros((3, 3)), np.eye(3), np.zeros((3, 1))])
+    """(8, 8, 8) covariances of means for travels of unit variance in common: `MotionMeans.of` says of which cameras."""
+    travels = np.eye(8)[3:6]
     aiming = travels[:2].copy()
     aiming[:, :2] = [[0.0, 1.0 / depth], [-1.0 / depth, 0.0]]  # what is passed stays in the middle
-    along = np.vstack([travels, aiming])
-    free, on_path = np.repeat([depth**-2.0, 1.0, 0.0], [3, 3, 1]), np.eye(7)[6]
-    return np.concatenate([along[:, :, None] * along[:, None], [np.diag(free), np.diag(on_path)]])
+    along = np.vstack([travels, aiming, np.eye(8)[6:]])
+    free = np.diag(np.repeat([depth**-2.0, 1.0, 0.0], [3, 3, 2]))
+    return np.concatenate([along[:, :, None] * along[:, None], free[None]])
 
 
 def sigmas_of_means(
@@ -153,7 +177,7 @@ def sigmas_of_means(
 
     Parameters
     ----------
-    unknowns, covariances, root : (cameras, 7), (cameras, 7, 7), (7, 7) array
+    unknowns, covariances, root : (cameras, 8), (cameras, 8, 8), (8, 8) array
         As found, and `MotionMeans.root` there.
     velocity : float
         Standard deviation of a travel in common, if there is one, world units per frame.

@@ -28,7 +28,7 @@ class Posterior:
 
     def __init__(self, result: BundleResult, options: BundleOptions | None = None) -> None:
         rec = result.reconstruction
-        per_unit = np.repeat([1.0, rec.baseline], [3, 4])
+        per_unit = np.repeat([1.0, rec.baseline], [3, 5])
         sigmas = self._sigmas = PriorSigmas(
             result.phi_sigma, max(result.velocity_sigma * rec.baseline, 1e-300),
             max(result.focal_sigma, 1e-300), max(result.centre_sigma, 1e-300), result.bend_sigmas,

@@ -134,7 +134,7 @@ class Common(NamedTuple):
     """Means of the motions of photos (m, 6), their variances, and their covariances with the motions.
 
     In the frames of the cameras, radians and world units per frame, as are the motions; 0 where a motion has none. And
-    of the cameras the unknowns behind them (cameras, 6), their covariances (cameras, 6, 6), and `MotionMeans.root`.
+    of the cameras the unknowns behind them (cameras, 8), their covariances (cameras, 8, 8), and `MotionMeans.root`.
     """
 
     values: Array

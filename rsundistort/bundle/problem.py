@@ -43,7 +43,7 @@ class State:
     """Unknowns that a step changes: cameras, poses, shutter motion, variation and points, as in `Reconstruction`.
 
     Of the bends (m, 3 k) coefficients along `Layout.functions`, of the rotation, then of the position, three by three.
-    Of frames on a path, phi and velocity are those of its rates. Means (cameras, 6) are the unknowns behind those
+    Of frames on a path, phi and velocity are those of its rates. Means (cameras, 8) are the unknowns behind those
     of the motions (`MotionMeans`), in units of their priors; (cameras, 0) if they are not solved for.
     """
 

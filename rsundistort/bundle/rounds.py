@@ -189,19 +189,17 @@ class Rounds:
         state, current, of = self._solved.state, self._current, self._problem.means
         if of is None:
             return None
-        covariances, by_unknowns = self._covariances_of_means, of.by_values @ of.root
-        photo = current.camera_idx
-        means = np.einsum("mak,mk->ma", by_unknowns, state.means[photo])
-        of_means = np.einsum("mak,mkl,mal->ma", by_unknowns, covariances[photo], by_unknowns)
+        covariances = self._covariances_of_means
+        means, of_means = of.of_photos(state.means, covariances)
         # of the motions in their cameras' frames
         together = current.frame_span()[:, None, None] * equations.photos_by_shared(len(of.root))[:, 6:12]
         together[:, 3:] = current.R_cw @ together[:, 3:]
-        with_motions = np.einsum("mak,mak->ma", together, by_unknowns)
+        with_motions = np.einsum("mak,mak->ma", together, of.by_values @ of.root)
         return Common(means, of_means, with_motions, state.means, covariances, of.root)
 
     @property
     def _covariances_of_means(self) -> Array:
-        """(cameras, 7, 7) of their unknowns by the last solve."""
+        """(cameras, 8, 8) of their unknowns by the last solve."""
         c, k = self._solved.state.means.shape
         blocks = self._marginals.cameras.reshape(c, -1, c, len(self._marginals.cameras) // c)
         return blocks[np.arange(c), -k:, np.arange(c), -k:]
@@ -314,7 +312,8 @@ class Rounds:
         of = self._problem.means
         if of is None or self._means is None:
             return None
-        per_unit = np.repeat([1.0, 1.0 / self._baseline], [3, 4])
-        variances = np.diagonal(of.root @ self._covariances_of_means @ of.root.T, axis1=1, axis2=2)
+        per_unit = np.repeat([1.0, 1.0 / self._baseline], [3, 5])
+        means, variances = of.of_photos(self._solved.state.means, self._covariances_of_means)
         sigmas = (*(each / self._baseline for each in self._weighed_sigmas.means),)
-        return CommonMotion(self._means * per_unit, np.sqrt(np.maximum(variances, 0.0)) * per_unit, sigmas)
+        deviations = np.sqrt(np.maximum(variances, 0.0))
+        return CommonMotion(self._means * per_unit, sigmas, means * per_unit[:6], deviations * per_unit[:6])

@@ -163,11 +163,11 @@ def _expected(
     own = np.array([result.phi_sigma, result.velocity_sigma * rec.baseline])
     if common is None:
         return np.zeros((rec.num_images, 6)), *np.repeat(own[:, None], rec.num_images, axis=1)
-    per_unit = np.repeat([1.0, rec.baseline], [3, 4])
+    per_unit = np.repeat([1.0, rec.baseline], [3, 5])
     # of a camera with few photos, and of a photo with a limit of its own, the motion is its own
     of = MotionMeans.of(rec, tuple(each * rec.baseline for each in common.sigmas), freed.shares)
     means = of.at(of.unknowns(per_unit * common.values))
-    of_means = np.einsum("mak,mk->ma", of.by_values**2, (per_unit * common.deviations)[rec.camera_idx] ** 2)
+    of_means = (per_unit[:6] * common.deviations) ** 2 * freed.shares
     of_means = of_means.reshape(-1, 2, 3).mean(axis=2)
     return means, *np.sqrt(own**2 + of_means).T
 
