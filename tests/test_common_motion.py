@@ -381,24 +381,33 @@ def test_a_photo_rotated_by_90_degrees_is_advised_for_what_it_tells_of_the_commo
     assert "px" in advice[0].sentence
 
 
-def flight(rng, travel):
-    """Ten photos straight down from 6 m above hills of 1.2 m, that travel alike but for 0.03 m a unit of the clock."""
-    camera, m = Camera(800, 600, [[700, 0, 400], [0, 700, 300], [0, 0, 1]], [], "top-to-bottom"), 10
+def from_above(rng, R_cw, center_w, phi, velocity):
+    """Photos of hills of 1.2 m that move so, per unit of the clock, and what they measure."""
+    camera, m = Camera(800, 600, [[700, 0, 400], [0, 700, 300], [0, 0, 1]], [], "top-to-bottom"), len(R_cw)
     points_w = rng.uniform(-1, 1, (150, 3)) * [6.0, 6.0, 1.2]
-    above = np.stack(np.meshgrid([-1.0, 1.0], np.arange(-2.0, 3.0)), axis=2).reshape(-1, 2)
-    center_w = np.column_stack([above, np.full(m, 6.0)]) + 0.1 * rng.normal(size=(m, 3))
-    R_cw = Rotation.from_rotvec(0.03 * rng.normal(size=(m, 3))).as_matrix() @ np.diag([1.0, -1.0, -1.0])
-    velocity = np.einsum("mji,mj->mi", R_cw, travel + 0.03 * rng.normal(size=(m, 3)))
     point_idx, frame_idx = (a.ravel() for a in np.mgrid[: len(points_w), :m])
     scene = Reconstruction(
         [camera], [f"{i}.jpg" for i in range(m)], np.zeros(m, np.int64), R_cw, center_w, points_w,
-        Observations(frame_idx, point_idx, np.zeros((len(point_idx), 2))), 0.012 * rng.normal(size=(m, 3)), velocity,
-        MODEL,
+        Observations(frame_idx, point_idx, np.zeros((len(point_idx), 2))), phi, velocity, MODEL,
     )  # fmt: skip
     xy = pixels(scene)
     inside = ((xy > 0) & (xy < [800, 600])).all(axis=1)
     observations = replace(scene.observations, xy_raw=xy + 0.1 * rng.normal(size=xy.shape)).select(inside)
     return replace(scene, observations=observations)
+
+
+def straight_down(rng, m):
+    """Rotations (m, 3, 3) of photos that look down, but for 0.03 rad."""
+    return Rotation.from_rotvec(0.03 * rng.normal(size=(m, 3))).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+
+
+def flight(rng, travel, m=10):
+    """Photos straight down from 6 m above hills, that travel alike but for 0.03 m a unit of the clock."""
+    above = np.stack(np.meshgrid([-1.0, 1.0], np.arange(-2.0, 3.0)), axis=2).reshape(-1, 2)
+    center_w = np.column_stack([above, np.full(m, 6.0)]) + 0.1 * rng.normal(size=(m, 3))
+    R_cw = straight_down(rng, m)
+    velocity = np.einsum("mji,mj->mi", R_cw, travel + 0.03 * rng.normal(size=(m, 3)))
+    return from_above(rng, R_cw, center_w, 0.012 * rng.normal(size=(m, 3)), velocity)
 
 
 @pytest.mark.parametrize("seed", [20, 21])
@@ -410,6 +419,30 @@ def test_a_velocity_that_all_photos_share_is_not_taken_for_their_nodding(seed):
     assert abs((result.reconstruction.phi - truth.phi).mean(0)[0]) < 5e-3
     _, ahead, _ = truth.baseline * result.common.of_photos[:, 3:].mean(0)
     assert -0.35 < ahead < -0.2
+
+
+def on_its_way(rng, rotates, share=0.05, m=9):
+    """Photos straight down along a bend, turned against each other: on their way when read, and rotating, or not."""
+    yaw, along = -np.cumsum(rng.uniform(0.2, 0.6, m)), np.cumsum(rng.uniform(0.2, 0.4, m))
+    R_cw = Rotation.from_rotvec(yaw[:, None] * [0.0, 0.0, 1.0]).as_matrix() @ straight_down(rng, m)
+    center_w = np.column_stack([2.5 * np.cos(along), 2.5 * np.sin(along), 6.0 + 0.1 * rng.normal(size=m)])
+    heading = np.column_stack([-np.sin(along), np.cos(along), 0 * along])
+    speed = share * np.linalg.norm(np.diff(center_w, axis=0), axis=1).mean()
+    steps = Rotation.from_matrix(R_cw[1:] @ R_cw[:-1].transpose(0, 2, 1)).as_rotvec()
+    turns = share * rotates * (np.vstack([steps[:1], steps]) + np.vstack([steps, steps[-1:]])) / 2
+    phi, velocity = turns + 2e-3 * rng.normal(size=(m, 3)), speed * heading + 0.1 * speed * rng.normal(size=(m, 3))
+    return from_above(rng, R_cw, center_w, phi, velocity)
+
+
+@pytest.mark.parametrize("rotates", [False, True])
+@pytest.mark.parametrize("seed", [20, 21, 22])
+def test_photos_taken_on_the_way_from_one_to_the_next_travel_along_it(seed, rotates):
+    truth = on_its_way(np.random.default_rng(seed), rotates)
+    result = bundle_adjust(replace(truth, phi=0 * truth.phi, velocity=0 * truth.velocity), MODEL)
+    assert np.argmax(result.common.sigmas) == 5 + rotates
+    error = np.linalg.norm(result.reconstruction.velocity - truth.velocity, axis=1)
+    # where the prior knows only motions that are the same in all cameras' frames: 0.4 to 1.4
+    assert error.max() < 0.6 * np.linalg.norm(truth.velocity, axis=1).mean()
 
 
 def test_velocities_without_a_common_direction_have_no_mean(rng):
