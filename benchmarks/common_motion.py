@@ -12,10 +12,13 @@ Twenty photos (at most) of 1600 x 1200 pixels at f = 1300, measured with 0.4 px,
     flyover   straight down from 8 m, travelling along the photos
     side      along a wall, looking at it
     walk      ahead through a street
+    bend      straight down from 8 m along a bend, turned otherwise: on the way from each photo to the next, as a drone
+    frames    the same, rotating as from photo to photo, as frames of a video
 
 `error_mrad`: rms over scenes and axes of the error of the mean of phi over the photos; `deviations`: of that in its
-standard deviations, to be 1; `travel`: rms error of the mean velocity by the true one; `rotation_deg`: median error of
-the rotations after the scenes are aligned. Beside it the same with priors whose means are zero.
+standard deviations, to be 1; `travel`: rms error of the mean velocity by the true one; `travels`: mean error of each
+photo's velocity by their mean; `rotation_deg`: median error of the rotations after the scenes are aligned. Beside it
+the same with priors whose means are zero.
 """
 
 from __future__ import annotations
@@ -36,12 +39,14 @@ from rsundistort.model import RowMotion
 from rsundistort.synthetic import look_at, project_rows
 
 MODEL = "constant-motion"
-KINDS = ("orbit", "straight", "arc", "portrait", "hand", "flyover", "side", "walk")
+KINDS = ("orbit", "straight", "arc", "portrait", "hand", "flyover", "side", "walk", "bend", "frames")
 CAMERA = Camera(1600, 1200, [[1300, 0, 800], [0, 1300, 600], [0, 0, 1]], [], "top-to-bottom")
 NOISE_PX = 0.4
 PHOTOS = 20
 # of the orbits: metres, radians a frame
 RADIUS, RATE = 4.0, 0.012
+# of the way from one photo to the next, while a frame is read
+SHARE = 0.05
 
 Array = NDArray[np.float64]
 
@@ -82,11 +87,26 @@ def along(kind: str, rng: np.random.Generator, m: int) -> tuple[Array, ...]:
     return R_cw, center_w, np.zeros((m, 3)), np.tile(way, (m, 1)), points_w
 
 
+def on_the_way(kind: str, rng: np.random.Generator, m: int) -> tuple[Array, ...]:
+    """The same of cameras that look down, and are on the way from one photo to the next."""
+    bends, yaws = np.cumsum(rng.uniform(0.1, 0.3, m)), -np.cumsum(rng.uniform(0.1, 0.5, m))
+    center_w = np.column_stack([3 * np.cos(bends), 3 * np.sin(bends), 8 + 0.15 * rng.normal(size=m)])
+    rotvecs = np.column_stack([0.03 * rng.normal(size=(m, 2)), yaws])
+    R_cw = Rotation.from_rotvec(rotvecs).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+    rates = Rotation.from_matrix(R_cw[1:] @ R_cw[:-1].transpose(0, 2, 1)).as_rotvec()
+    rates = (np.vstack([rates[:1], rates]) + np.vstack([rates, rates[-1:]])) / 2
+    speed = SHARE * np.linalg.norm(np.diff(center_w, axis=0), axis=1).mean()
+    ways = speed * np.column_stack([-np.sin(bends), np.cos(bends), 0 * bends])
+    points_w = rng.uniform(-1, 1, (500, 3)) * [8, 8, 1.5]
+    return R_cw, center_w, (kind == "frames") * SHARE * rates, ways, points_w
+
+
 def scene(kind: str, seed: int, num_photos: int = PHOTOS) -> Reconstruction:
     """A scene with its measurements, and what is true of it."""
     rng = np.random.default_rng(seed)
     of_orbit = kind in KINDS[:5]
-    R_cw, center_w, phi, velocity, points_w = (orbit if of_orbit else along)(kind, rng, num_photos)
+    make = orbit if of_orbit else on_the_way if kind in ("bend", "frames") else along
+    R_cw, center_w, phi, velocity, points_w = make(kind, rng, num_photos)
     shaking = {"hand": 0.012, "walk": 0.01}.get(kind, 0.004)
     phi = phi + shaking * rng.normal(size=phi.shape)
     velocity = velocity + (0.03 if kind == "flyover" else 0.012) * rng.normal(size=phi.shape)
@@ -109,8 +129,11 @@ def scene(kind: str, seed: int, num_photos: int = PHOTOS) -> Reconstruction:
     return truth.take_points(truth.track_lengths(np.ones(len(measured), bool)) >= 2)
 
 
-def errors(truth: Reconstruction) -> tuple[Array, Array, float, float]:
-    """Of the mean of phi: errors and standard deviations (3,), rad; of the mean travel; of the rotations, degrees."""
+def errors(truth: Reconstruction) -> tuple[Array, Array, float, float, float]:
+    """Of the mean of phi: errors and standard deviations (3,), rad; of the mean travel; of the rotations, degrees.
+
+    And of each photo's travel.
+    """
     start = replace(truth, phi=0 * truth.phi, velocity=0 * truth.velocity)
     options = BundleOptions(deviations="jackknife")
     result = bundle_adjust(start, MODEL, options)
@@ -120,10 +143,11 @@ def errors(truth: Reconstruction) -> tuple[Array, Array, float, float]:
     vectors[np.arange(3), :, 6 + np.arange(3)] = span / m
     sigma = np.sqrt(np.einsum("kma,kma->k", Posterior(result, options).of_photos(vectors), vectors))
     scale, turn, _ = align_points(found.center_w, truth.center_w)
-    travels = [np.einsum("mij,mj->mi", rec.R_cw, rec.velocity).mean(0) for rec in (found, truth)]
-    apart = float(np.linalg.norm(scale * travels[0] - travels[1]) / max(np.linalg.norm(travels[1]), 1e-9))
+    one, other = (np.einsum("mij,mj->mi", rec.R_cw, rec.velocity) for rec in (found, truth))
+    apart = float(np.linalg.norm((scale * one - other).mean(0)) / max(np.linalg.norm(other.mean(0)), 1e-9))
+    each = np.linalg.norm(scale * one - other, axis=1).mean() / np.linalg.norm(other, axis=1).mean()
     angle = Rotation.from_matrix(found.R_cw @ turn.T @ truth.R_cw.transpose(0, 2, 1)).magnitude()
-    return (found.phi - truth.phi).mean(0) * span, sigma, apart, float(np.degrees(np.median(angle)))
+    return (found.phi - truth.phi).mean(0) * span, sigma, apart, float(np.degrees(np.median(angle))), float(each)
 
 
 def figures(kind: str, seeds: range, num_photos: int) -> dict[str, float]:
@@ -134,6 +158,7 @@ def figures(kind: str, seeds: range, num_photos: int) -> dict[str, float]:
         "error_mrad": round(1e3 * float(np.sqrt(np.mean(error**2))), 2),
         "deviations": round(float(np.sqrt(np.mean((error / sigma) ** 2))), 2),
         "travel": round(float(np.sqrt(np.mean([each[2] ** 2 for each in found]))), 2),
+        "travels": round(float(np.mean([each[4] for each in found])), 2),
         "rotation_deg": round(float(np.median([each[3] for each in found])), 4),
     }
 
