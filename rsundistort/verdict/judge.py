@@ -404,14 +404,6 @@ def _trimmed_mean(values: Array, trimmed: int) -> tuple[Array, Array, int]:
     return kept.mean(0), winsorised.std(0, ddof=1) * m / len(kept), len(kept) - 1
 
 
-def _half_px(rec: Reconstruction) -> Array:
-    """(m,) half the shorter side of each photo.
-
-    A motion that is wrong by a share of it stretches the photo by that share, and the scene as much.
-    """
-    return np.array([min(each.width, each.height) / 2 for each in rec.cameras])[rec.camera_idx]
-
-
 def _doubts(
     result: BundleResult, motions: PhotoMotions, outliers: Array, phi_limits: Mapping[str, float]
 ) -> dict[str, list[str]]:
@@ -421,7 +413,6 @@ def _doubts(
     sigma = np.linalg.norm(result.sigma_phi, axis=1) * rec.frame_span()
     times = np.abs(rotation).max(1) / result.phi_rms
     counts = _counts(rec)
-    uncertain = motions.sigma_px > np.minimum(_UNCERTAIN_PX, _SMALL_PERCENT / 100 * _half_px(rec))
     doubts: dict[str, list[str]] = {}
     for i, name in enumerate(rec.image_names):
         said = doubts[name] = []
@@ -433,7 +424,7 @@ def _doubts(
             said.append(f"{100 * outliers[i]:.0f} % of its measurements contradict the others")
         if motions.difference_px[i] > UNSEEN_PX:
             said.append(f"its halves contradict each other by {motions.difference_px[i]:.1f} px")
-        if uncertain[i]:
+        if motions.sigma_px[i] > _UNCERTAIN_PX:
             said.append(f"its motion is only known to +-{motions.sigma_px[i]:.1f} px")
         if times[i] > _FAR and motions.shift_px[i] > UNSEEN_PX:
             said.append(f"it moved {times[i]:.0f} times as much as the other photos do")
@@ -484,7 +475,9 @@ def _misplaced(result: BundleResult, unexplained: bool) -> dict[str, str]:
 
 def _of_photos(rec: Reconstruction, doubts: Mapping[str, list[str]], motions: PhotoMotions) -> list[str]:
     """Reasons in doubtful photos against a whole without other reasons."""
-    percent = 100 * float(np.sqrt(np.mean((motions.difference_px / _half_px(rec)) ** 2)))
+    # a motion that is wrong by this stretches the photo by its share of half the frame, and the scene as much
+    half_px = np.array([min(each.width, each.height) / 2 for each in rec.cameras])[rec.camera_idx]
+    percent = 100 * float(np.sqrt(np.mean((motions.difference_px / half_px) ** 2)))
     if percent > _SMALL_PERCENT:
         return [
             "Halves of the photos' measurements contradict each other about the motions, by "
