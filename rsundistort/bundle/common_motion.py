@@ -23,6 +23,8 @@ NUM_WAYS = 8
 _NONE = 3.0
 # Of any way to move: a hundredth of the travel that it would have. The measurements can still be asked.
 _LEAST_PROBABILITY = 1e-4
+# Photos that rest share one by odds of up to 14 (seven sets of fountain-small/gs): errors of the lens look like that.
+_CERTAIN = 0.99
 
 
 @dataclass(frozen=True)
@@ -39,12 +41,20 @@ class CommonMotion:
     of_photos, deviations : (m, 6) array
         What photos are expected to move by it, in the frames of their cameras: rotation and travel, in the same units;
         and its standard deviations.
+    probability : float
+        How likely they share a motion.
     """
 
     values: Array
     sigmas: tuple[float, ...]
     of_photos: Array
     deviations: Array
+    probability: float
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether photos share a motion by odds of a hundred."""
+        return self.probability > _CERTAIN
 
     @property
     def rms(self) -> tuple[float, float]:

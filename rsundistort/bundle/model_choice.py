@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from .known_motions import KnownMotions
 
 __all__ = ["ModelChoice"]
+
+# Photos are displaced this much otherwise by a velocity that explains them as well, as a share of what is corrected.
+_RIVAL = 1 / 3
 
 
 @dataclass(frozen=True)
@@ -78,3 +81,17 @@ class ModelChoice:
     rival: float = 0.0
     steps: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     known_motions: KnownMotions | None = None
+
+    @property
+    def has_rival(self) -> bool:
+        """Whether a velocity explains the photos as well, and displaces them otherwise."""
+        return self.rival >= _RIVAL
+
+    def with_velocity(self) -> ModelChoice:
+        """The choice of a velocity beside the rotations, if it was tried with the same lens; else this one."""
+        label = self.label.replace("rotation", "constant-motion")
+        if label not in self.held_out_error or self.bends:
+            return self
+        return replace(
+            self, shutter_model="constant-motion", label=label, kept=(*self.kept, label), rival=0.0, steps={}
+        )

@@ -80,6 +80,8 @@ class PriorSigmas:
         Of a path, if there is one: rotation and travel, as `PathPrior` takes them.
     means : tuple of float
         Of the means of a camera's motions, if there are any, as `MotionMeans` takes them.
+    shared : float
+        How likely photos share a motion.
     """
 
     phi: float
@@ -91,6 +93,7 @@ class PriorSigmas:
     field: float = 1.0
     path: tuple[float, ...] = ()
     means: tuple[float, ...] = ()
+    shared: float = 0.0
 
 
 def _prior_sigma(values: Array, variance: Array, span: Array, sigma: float) -> float:
@@ -164,7 +167,8 @@ def estimated(
         velocity = _scale(own[:, 3:], own_variances[:, 3:], sigmas.velocity) + _MIN_SIGMA * current.baseline
         found = replace(found, velocity=velocity)
     if common is not None:
-        found = replace(found, means=_mean_sigmas(common, found.velocity, current))
+        means, shared = _mean_sigmas(common, found.velocity, current)
+        found = replace(found, means=means, shared=shared)
     if options.varying:
         varied = current.variation
         of_varied = variances[:, layout.motion : layout.variation]
@@ -177,8 +181,8 @@ def estimated(
     return _bounded(replace(found, bends=bends, ways=ways), options, baseline)
 
 
-def _mean_sigmas(common: Common, velocity_sigma: float, current: Reconstruction) -> tuple[float, ...]:
-    """Standard deviations of the prior on means.
+def _mean_sigmas(common: Common, velocity_sigma: float, current: Reconstruction) -> tuple[tuple[float, ...], float]:
+    """Standard deviations of the prior on means, and how likely the photos share a motion.
 
     A velocity in common is expected to be a few times what the photos have of their own, or as large as it is found, or
     that of a camera that does not stop.
@@ -187,11 +191,13 @@ def _mean_sigmas(common: Common, velocity_sigma: float, current: Reconstruction)
     velocity = max(velocity, _STEADY * current.baseline)
     sharing = np.flatnonzero(common.variances.any(1))
     if not len(sharing):
-        return (velocity,) * NUM_WAYS
+        return (velocity,) * NUM_WAYS, 0.0
     found = (common.values**2 + common.variances)[sharing, 3:]
     velocity = max(velocity, float(np.sqrt(found.mean())))
     cameras = np.unique(current.camera_idx[sharing])
-    return sigmas_of_means(common.unknowns[cameras], common.covariances[cameras], common.root, velocity, depth)
+    of_cameras = common.unknowns[cameras], common.covariances[cameras]
+    sigmas = sigmas_of_means(*of_cameras, common.root, velocity, depth)
+    return sigmas, min(1.0, float(np.sum(np.square(sigmas))) / velocity**2)
 
 
 def _own_motions(current: Reconstruction, covariances: Array, common: Common | None) -> tuple[Array, Array]:

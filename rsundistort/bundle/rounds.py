@@ -315,5 +315,5 @@ class Rounds:
         per_unit = np.repeat([1.0, 1.0 / self._baseline], [3, 5])
         means, variances = of.of_photos(self._solved.state.means, self._covariances_of_means)
         sigmas = (*(each / self._baseline for each in self._weighed_sigmas.means),)
-        deviations = np.sqrt(np.maximum(variances, 0.0))
-        return CommonMotion(self._means * per_unit, sigmas, means * per_unit[:6], deviations * per_unit[:6])
+        deviations = np.sqrt(np.maximum(variances, 0.0)) * per_unit[:6]
+        return CommonMotion(self._means * per_unit, sigmas, means * per_unit[:6], deviations, self._sigmas.shared)

@@ -280,6 +280,9 @@ def _chosen(
     options = replace(
         options, varying=choice.varying, bends=choice.bends, residual_field=choice.residual_field, rival=choice.steps,
     )  # fmt: skip
+    if choice.has_rival and _is_common(result, choice, options, log):
+        choice = choice.with_velocity()
+        options = replace(options, rival=choice.steps)
     # windows were aligned, and outliers found, with a model that may be replaced now
     again = track_source is not None and track_source.workers is not None
     again = again and (choice.shutter_model == "constant-motion" or choice.bends > 0)
@@ -309,6 +312,19 @@ def _chosen(
     if track_source is not None and again:
         result, tracks, options = retriangulated(track_source, result, options, log, ["alignment again"])
     return choice, result, tracks, options
+
+
+def _is_common(result: BundleResult, choice: ModelChoice, options: BundleOptions, log: StageLog) -> bool:
+    """Whether photos share a travel that no choice by held-out measurements shows.
+
+    Each photo's velocity may as well be a rotation, and hardly predicts others better. What they share is asked by its
+    evidence, which an adjustment has that knows its noise.
+    """
+    if choice.with_velocity() is choice:
+        return False
+    own = replace(options, rival={}, outlier_rounds=min(options.outlier_rounds, 1))
+    found = bundle_adjust(result.reconstruction, "constant-motion", own, partial(tell, log, "choice"))
+    return found.common is not None and found.common.is_certain
 
 
 def _is_no_lens(found: Reconstruction, start: Reconstruction) -> bool:

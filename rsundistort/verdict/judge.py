@@ -40,8 +40,6 @@ _HELD_OUT_PX = 0.5
 # Standard deviations that the motion of some photo must exceed, root mean square over the frame: errors alone do so in
 # one photo of 20 if one component decides, in one of 140 if all three do.
 _EVIDENT = 2.0
-# Photos are displaced this much otherwise by a velocity that explains them as well, as a share of what is corrected.
-_RIVAL = 1 / 3
 # Fewer held-out measurements are not conclusive.
 _LEAST_HELD_OUT = 30
 # A photo is doubtful if its motion is this many times the prior standard deviation, if it has this few measurements, if
@@ -267,7 +265,7 @@ def unexplained_reasons(result: BundleResult, choice: ModelChoice | None) -> lis
 
 def _rival_reasons(choice: ModelChoice | None) -> list[str]:
     """Whether the photos may have been displaced by a velocity, and not by the rotations that were found."""
-    if choice is None or choice.rival < _RIVAL:
+    if choice is None or not choice.has_rival:
         return []
     return [
         "A camera that travels explains the photos as well as one that rotates, and would displace pixels elsewhere, "
@@ -339,6 +337,8 @@ def _of_motions(
     if 2 * torn.sum() > rec.num_images and not (by_known is not None and by_known.is_better):
         reasons.append("In most photos halves of the measurements do not agree on the motion found.")
     evident = (_EVIDENT * motions.relative_sigma < 1.0) | np.isin(rec.image_names, [*known])
+    # photos together show what none of them does alone
+    evident |= result.common is not None and result.common.is_certain
     if unsupported[seen].all():
         reasons.append("No photo's motion is larger than its standard deviation.")
     elif choice is not None and not evident[seen].any():
