@@ -10,9 +10,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, Observations, Reconstruction, RowMotion, project_points
+from rsundistort.batch.progress import StageLog
 from rsundistort.bundle import BundleOptions, Posterior, bundle_adjust, choose_model
 from rsundistort.bundle.doubt import steps_after, steps_to
 from rsundistort.model.reprojection import shutter_displacements
+from rsundistort.solve.model_sequence import _is_common
 from rsundistort.verdict.judge import _rival_reasons
 
 CAMERA = Camera(768, 512, [[640, 0, 388], [0, 640, 251], [0, 0, 1]])
@@ -82,6 +84,22 @@ def test_a_rival_is_a_reason_that_says_what_to_give(rng):
     (said,) = _rival_reasons(choice)
     assert "1.9 times" in said
     assert "--model constant-motion" in said
+
+
+@pytest.mark.parametrize(("drift", "rotation"), [(0.5, 0.003), (0.0, 0.03)])
+def test_a_travel_that_photos_share_decides_where_held_out_measurements_do_not(rng, drift, rotation):
+    rec = flight(rng, 5, drift, rotation)
+    choice = replace(choose(rec), shutter_model="rotation", label="rotation", rival=1.9)
+    assert choice.has_rival
+    options = BundleOptions(deviations="jackknife")
+    result = bundle_adjust(at_rest(rec), "rotation", options)
+    assert _is_common(result, choice, options, StageLog(None)) == bool(drift)
+    travelling = choice.with_velocity()
+    assert (travelling.shutter_model, travelling.label) == ("constant-motion", "constant-motion")
+    assert not travelling.has_rival
+    # what was not tried says nothing
+    untried = replace(choice, held_out_error={"rotation": 1.0})
+    assert not _is_common(result, untried, options, StageLog(None))
 
 
 def test_a_model_that_may_be_right_too_widens_the_deviations(rng):

@@ -19,6 +19,7 @@ from rsundistort import (
     bundle_adjust,
 )
 from rsundistort.bundle import GuessedCameras, KnownMotions, ModelChoice, choose_model
+from rsundistort.bundle.common_motion import CommonMotion
 from rsundistort.critical import heal
 from rsundistort.rectify import largest_shift_px
 from rsundistort.verdict import Verdict, judge
@@ -318,6 +319,11 @@ def test_motions_within_their_standard_deviations_are_not_taken_out(rng):
     verdict = judge(replace(result, covariances=doubt), None, choice)
     assert (verdict.shutter, verdict.lens_only) == ("not-determined", tuple(names))
     assert verdict.reasons[-1] == "No photo's motion is larger than 2 standard deviations."
+    # what all share may be certain nevertheless
+    nothing = np.zeros((len(names), 6))
+    for probability, found in ((0.9, "not-determined"), (0.999, "found")):
+        common = CommonMotion(np.zeros((1, 8)), (0.01,) * 8, nothing, nothing, probability)
+        assert judge(replace(result, covariances=doubt, common=common), None, choice).shutter == found
     doubt[:, 6:, 6:] *= 0.4
     assert judge(replace(result, covariances=doubt), None, choice).shutter == "found"
 
