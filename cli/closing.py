@@ -235,6 +235,8 @@ def _held_out(quality: Mapping[str, Any]) -> str:
             said.append(f"{model} {error:.3f}")
             continue
         kept = "" if model in quality["held_out_kept"] else ": not kept"
+        if quality.get("shared_travel") and model == quality["held_out_chosen"]:
+            kept = ": kept, since the photos share a travel"
         said.append(f"{model} {error:.3f} ({'better' if gain > 0 else 'worse'} by {abs(gain):.1f}{unit}{kept})")
         unit = ""
     return ", ".join(said)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from rsundistort_cli.closing import _held_out
 from scipy.spatial.transform import Rotation
 
 from rsundistort import Camera, Observations, Reconstruction, RowMotion, project_points
@@ -96,7 +97,12 @@ def test_a_travel_that_photos_share_decides_where_held_out_measurements_do_not(r
     assert _is_common(result, choice, options, StageLog(None)) == bool(drift)
     travelling = choice.with_velocity()
     assert (travelling.shutter_model, travelling.label) == ("constant-motion", "constant-motion")
+    assert travelling.is_shared
     assert not travelling.has_rival
+    error = {"rotation": 4.19, "constant-motion": 4.10}
+    quality = {"held_out_error": error, "held_out_gain": {"constant-motion": 0.9}, "held_out_kept": travelling.kept}
+    quality |= {"held_out_chosen": travelling.label, "shared_travel": travelling.is_shared}
+    assert "better by 0.9 standard errors: kept, since the photos share a travel" in _held_out(quality)
     # what was not tried says nothing
     untried = replace(choice, held_out_error={"rotation": 1.0})
     assert not _is_common(result, untried, options, StageLog(None))

@@ -61,6 +61,8 @@ class ModelChoice:
         Of a shutter: how far the other model that moves its motions most would move them, as `BundleOptions.rival`.
     known_motions : KnownMotions or None
         What the photos say of motions that are known from elsewhere; None if none are.
+    is_shared : bool
+        Whether a velocity was kept since photos share it, which held-out measurements do not show.
     """
 
     shutter_model: str
@@ -81,6 +83,7 @@ class ModelChoice:
     rival: float = 0.0
     steps: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     known_motions: KnownMotions | None = None
+    is_shared: bool = False
 
     @property
     def has_rival(self) -> bool:
@@ -93,5 +96,11 @@ class ModelChoice:
         if label not in self.held_out_error or self.bends:
             return self
         return replace(
-            self, shutter_model="constant-motion", label=label, kept=(*self.kept, label), rival=0.0, steps={}
+            self,
+            shutter_model="constant-motion",
+            label=label,
+            kept=(*self.kept, label),
+            rival=0.0,
+            steps={},
+            is_shared=True,
         )

@@ -82,6 +82,7 @@ _QUALITY = {
     **{f"held_out_{name}?": _BY_NAME for name in ("rms_px", "error", "gain")},
     "held_out_kept?": Maybe([str]),
     "held_out_chosen?": Maybe(str),
+    "shared_travel?": Maybe(bool),
     "sigma_intrinsics?": Maybe({str: _BY_NAME}),
     "lens_fields?": Maybe({str: _BY_NAME}),
     "readout_times?": Maybe({str: {"ms": float, "source": str}}),

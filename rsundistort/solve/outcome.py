@@ -312,6 +312,7 @@ def _held_out(choice: ModelChoice | None) -> dict[str, Any]:
         "held_out_gain": {} if choice is None else choice.gain,
         "held_out_kept": [] if choice is None else list(choice.kept),
         "held_out_chosen": None if choice is None else choice.label,
+        "shared_travel": choice is not None and choice.is_shared,
         "held_out_left": {} if choice is None else choice.left,
         "agreement_of_halves": None if choice is None else choice.agreement,
     }
