@@ -19,8 +19,9 @@ __all__ = ["LEAST_PHOTOS", "NUM_WAYS", "CommonMotion", "MotionMeans", "sigmas_of
 LEAST_PHOTOS = 3
 #: Ways to move together: `MotionMeans.of` tells them.
 NUM_WAYS = 8
-# How likely no motion in common is, by how likely each way is: as a travel along any of three axes.
-_NONE = 3.0
+# How likely no motion in common is, by how likely each way is: as a travel along any of three axes, or from photo to
+# photo.
+_NONE = 4.0
 # Of any way to move: a hundredth of the travel that it would have. The measurements can still be asked.
 _LEAST_PROBABILITY = 1e-4
 # Photos that rest share one by odds of up to 14 (seven sets of fountain-small/gs): errors of the lens look like that.
