@@ -108,6 +108,11 @@ class MotionMeans:
             np.asarray(directions, np.float64), reconstruction.camera_idx, by_values, np.asarray(root, np.float64)
         )
 
+    @property
+    def by_unknowns(self) -> Array:
+        """(m, 6, 8) motions, in the frames of the cameras per frame, by the unknowns."""
+        return np.asarray(self.by_values @ self.root)
+
     def values(self, unknowns: Array) -> Array:
         """Means (cameras, 8) of unknowns (cameras, 8)."""
         return np.asarray(unknowns @ self.root.T)
@@ -121,7 +126,7 @@ class MotionMeans:
 
         By unknowns (cameras, 8) and their covariances (cameras, 8, 8).
         """
-        by_unknowns, i = self.by_values @ self.root, self.camera_idx
+        by_unknowns, i = self.by_unknowns, self.camera_idx
         means = np.einsum("mak,mk->ma", by_unknowns, unknowns[i])
         return means, np.einsum("mak,mkl,mal->ma", by_unknowns, covariances[i], by_unknowns)
 

@@ -194,7 +194,7 @@ class Rounds:
         # of the motions in their cameras' frames
         together = current.frame_span()[:, None, None] * equations.photos_by_shared(len(of.root))[:, 6:12]
         together[:, 3:] = current.R_cw @ together[:, 3:]
-        with_motions = np.einsum("mak,mak->ma", together, of.by_values @ of.root)
+        with_motions = np.einsum("mak,mak->ma", together, of.by_unknowns)
         return Common(means, of_means, with_motions, state.means, covariances, of.root)
 
     @property

@@ -315,10 +315,10 @@ def _chosen(
 
 
 def _is_common(result: BundleResult, choice: ModelChoice, options: BundleOptions, log: StageLog) -> bool:
-    """Whether photos share a travel that no choice by held-out measurements shows.
+    """Whether photos share a travel that held-out measurements do not show.
 
-    Each photo's velocity may as well be a rotation, and hardly predicts others better. What they share is asked by its
-    evidence, which an adjustment has that knows its noise.
+    Each photo's velocity may as well be a rotation, and hardly predicts measurements better. Of what photos share, the
+    evidence says more; it takes an adjustment that knows its noise.
     """
     if choice.with_velocity() is choice:
         return False
