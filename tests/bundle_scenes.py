@@ -136,7 +136,7 @@ def dense_system(problem, state):
     res, J_frame = problem.blocks(state)
     J_camera = problem._camera_jacobians(state)
     nc = J_camera.shape[2]
-    obs = problem._start.observations.select(problem._structure.order)
+    obs = problem._start.observations.select(problem.structure.order)
     m, nb = problem._free.shape
     others = 3 * problem._start.num_points, nc * len(state.cameras)
     J = np.zeros((len(obs), 2, m * nb + sum(others)))

@@ -177,7 +177,7 @@ def test_covariances_with_means_are_those_of_the_whole_inverse(rng):
     weights = rng.normal(size=(problem._start.num_points, 3))
     found = equations.function_of_points(problem.in_order(weights))
     b = np.zeros(len(H))
-    b[m * nb : m * nb + weights.size] = weights[problem._structure.points].ravel()
+    b[m * nb : m * nb + weights.size] = weights[problem.structure.points].ravel()
     assert found.variance == pytest.approx(b @ whole @ b, rel=1e-7)
     assert found.of_priors == pytest.approx(b @ share @ b, rel=1e-6)
 
@@ -186,7 +186,7 @@ def measured_rows(problem, state, size, nr):
     """Jacobian (2 o, size) of the measurements alone."""
     _, J_frame = problem.blocks(state)
     J_camera = problem._camera_jacobians(state)
-    obs = problem._start.observations.select(problem._structure.order)
+    obs = problem._start.observations.select(problem.structure.order)
     m, nb = problem._free.shape
     first = m * nb + 3 * problem._start.num_points
     J = np.zeros((len(obs), 2, size))

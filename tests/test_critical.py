@@ -169,7 +169,7 @@ def test_hessian_without_a_gauge_has_as_many_zeros_as_the_measure_says(name):
     problem = BundleProblem(scene, "two-step", options, 1.0, PriorSigmas(1e9, 1e9))
     state = problem.initial_state()
     _, J_frame = problem.blocks(state)
-    obs = problem._start.observations.select(problem._structure.order)
+    obs = problem._start.observations.select(problem.structure.order)
     m, n, nb = scene.num_images, scene.num_points, 9
     J = np.zeros((len(obs), 2, nb * m + 3 * n))
     for k in range(len(obs)):

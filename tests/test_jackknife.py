@@ -24,7 +24,7 @@ def whole_jacobian(problem, state):
     res, J_frame = problem.blocks(state)
     J_camera = problem._camera_jacobians(state)
     H, _, free = dense_system(problem, state)
-    s, camera_idx = problem._structure, problem._start.camera_idx
+    s, camera_idx = problem.structure, problem._start.camera_idx
     (m, nb), n, nc = problem._free.shape, len(state.points_w), J_camera.shape[2]
     J = np.zeros((len(res), 2, len(free)))
     for k, (f, p) in enumerate(zip(s.frame_idx, s.point_idx, strict=True)):

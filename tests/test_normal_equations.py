@@ -48,7 +48,7 @@ REFINE = ("f", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 @pytest.mark.parametrize("model", MODELS)
 def test_jacobian_equals_central_differences_through_the_step(model, varying, refine, dist, rng):
     problem, state = noisy_problem(rng, model, refine=refine, dist=dist, varying=varying)
-    order = problem._structure.order
+    order = problem.structure.order
     obs = problem._start.observations.select(order)
     _, J_frame = problem.blocks(state)
     jacobians = J_frame, -J_frame[:, :, 3:6], problem._camera_jacobians(state)
@@ -132,7 +132,7 @@ def test_covariances_are_those_of_the_whole_inverse(factor_limit, refine, rng):
     found = problem.linearize(state).function_of_points(problem.in_order(weights))
     variance, with_photos = found.variance, found.with_photos
     start, stop = m * nb, m * nb + weights.size
-    b = weights[problem._structure.points].ravel()
+    b = weights[problem.structure.points].ravel()
     assert variance == pytest.approx(b @ whole[start:stop, start:stop] @ b, rel=1e-7)
     reference = (whole[: m * nb, start:stop] @ b).reshape(m, nb)
     np.testing.assert_allclose(with_photos, reference, rtol=0, atol=1e-7 * np.abs(reference).max())
@@ -249,12 +249,12 @@ def test_points_without_parallax_keep_what_their_measurements_say_across_them(rn
 
 def test_a_point_at_the_lens_neither_moves_nor_says_anything(rng):
     problem, state = noisy_problem(rng, "rotation", refine=("f", "k1"))
-    point, photo = 7, problem._structure.frame_idx[problem._structure.track_start[7]]
+    point, photo = 7, problem.structure.frame_idx[problem.structure.track_start[7]]
     at_lens = state.points_w.copy()
     at_lens[point] = state.center_w[photo] + 1e-7 * state.R_cw[photo][2]
     moved = replace(state, points_w=at_lens)
-    mine = np.arange(*problem._structure.track_start[point : point + 2])
-    singular = mine[problem._structure.frame_idx[mine] == photo]
+    mine = np.arange(*problem.structure.track_start[point : point + 2])
+    singular = mine[problem.structure.frame_idx[mine] == photo]
     res, J_frame = problem.blocks(moved)
     assert not res[singular].any()
     assert not J_frame[singular].any()

@@ -50,7 +50,7 @@ class Envelope:
     @classmethod
     def smallest(cls, pattern: BlockPattern, free: Mask) -> Envelope:
         """Envelope of the free unknowns (m, nb), in the order as given or reverse Cuthill-McKee: what takes less."""
-        orders = np.arange(len(free)), reverse_cuthill_mckee(pattern.graph(), symmetric_mode=True).astype(np.int64)
+        orders = np.arange(len(free)), pattern.reverse_cuthill_mckee
         return min((cls.of(pattern, free, order) for order in orders), key=lambda envelope: envelope.multiply_adds)
 
     @classmethod

@@ -20,8 +20,10 @@ _FURTHEST = 10.0
 def nearest_photos(points_w: Array, center_w: Array, structure: Structure) -> Index:
     """(n,) the photo nearest to each point of a structure, of those that measured it."""
     away = np.linalg.norm(points_w[structure.point_idx] - center_w[structure.frame_idx], axis=1)
-    order = np.lexsort((away, structure.point_idx))
-    return structure.frame_idx[order[structure.track_start[:-1]]]
+    least = np.minimum.reduceat(away, structure.track_start[:-1])
+    nearest = np.flatnonzero(away == least[structure.point_idx])
+    first = np.searchsorted(structure.point_idx[nearest], np.arange(len(least)))
+    return structure.frame_idx[nearest[first]]
 
 
 def moved_points(points_w: Array, steps: Array, center_w: Array) -> Array:

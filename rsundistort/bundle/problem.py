@@ -75,12 +75,14 @@ class BundleProblem:
     the centre farthest from it; none where known places hold the frame. The prior on intrinsics has heavy tails
     (`prior_weight`), or it is normal. `noise` is how many times larger than `sigma_px` the noise is that weighs the
     measurements against the priors, since errors go together; `loss` is in units of `sigma_px` all the same.
+    `structure` and `fields` are those of a problem with the same observations or cameras, if there was one.
     """
 
     def __init__(
         self, reconstruction: Reconstruction, shutter_model: str, options: BundleOptions, sigma_px: float,
         sigmas: PriorSigmas, heavy_tails: bool = True, path: PathState | None = None, means: Array | None = None,
-        noise: float = 1.0, loss: Loss | None = None,
+        noise: float = 1.0, loss: Loss | None = None, structure: Structure | None = None,
+        fields: LensFields | None = None,
     ) -> None:  # fmt: skip
         self._model = check_shutter_model(shutter_model)
         obs = reconstruction.observations
@@ -102,11 +104,10 @@ class BundleProblem:
             if shutter_model != "constant-motion":
                 raise InputError(f"frames on a path move by constant-motion, not by {shutter_model}")
             self._path = PathPrior(options.path, reconstruction, (sigmas.path[0], sigmas.path[1]))
-        structure = Structure.from_observations(
+        self.structure = structure = structure or Structure.from_observations(
             obs.frame_idx, obs.point_idx, reconstruction.num_images, reconstruction.num_points,
             None if self._path is None else (self._path.first, self._path.second),
         )  # fmt: skip
-        self._structure = structure
         self._given = reconstruction
         obs = replace(obs, point_idx=np.argsort(structure.points)[obs.point_idx])
         self._start = replace(reconstruction, points_w=reconstruction.points_w[structure.points], observations=obs)
@@ -127,11 +128,11 @@ class BundleProblem:
         self._lens = np.empty((0, 2, 0)), np.empty((0, 2, 3))
         check_lenses(options.refine, reconstruction.cameras)
         self._refine = options.refine
-        self._fields, self._field_weight = None, 0.0
+        self.lens_fields, self._field_weight = fields, 0.0
         if options.residual_field:
-            self._fields = LensFields(reconstruction.cameras, options.refine, shutter_model)
-            camera = reconstruction.camera_idx[self._structure.frame_idx]
-            self._field_jacobian = self._fields.jacobian(reconstruction.cameras, camera, self._xy)
+            self.lens_fields = fields or LensFields(reconstruction.cameras, options.refine, shutter_model)
+            camera = reconstruction.camera_idx[self.structure.frame_idx]
+            self._field_jacobian = self.lens_fields.jacobian(reconstruction.cameras, camera, self._xy)
             self._field_weight = sigmas.field**-2.0
         self._refine_codes = np.array([INTRINSICS[name] for name in options.refine], np.int64)
         span = reconstruction.frame_span()[:, None]
@@ -208,7 +209,7 @@ class BundleProblem:
         """(m, nb) unknowns that are solved for."""
         rec = self._start
         free = np.ones((rec.num_images, self.layout.size), bool)
-        reference = int(np.argmax(np.bincount(self._structure.frame_idx, minlength=rec.num_images)))
+        reference = int(np.argmax(np.bincount(self.structure.frame_idx, minlength=rec.num_images)))
         offset = np.abs(rec.center_w - rec.center_w[reference])
         far, axis = np.unravel_index(np.argmax(offset), offset.shape)
         if not self._places.holds_frame:
@@ -238,7 +239,7 @@ class BundleProblem:
         start, means = self._start, self._means_start
         variation = start.variation if self._options.varying else np.zeros_like(start.variation)
         bend = np.where(self._free[:, self.layout.variation : self.layout.size], self.layout.coefficients(start), 0.0)
-        cameras = tuple(start.cameras) if self._fields is None else self._fields.started(start.cameras)
+        cameras = tuple(start.cameras) if self.lens_fields is None else self.lens_fields.started(start.cameras)
         path = self._path_start
         if self._path is not None:
             path = path or self._path.start(start)
@@ -267,11 +268,11 @@ class BundleProblem:
 
     def in_order(self, of_points: Array) -> Array:
         """Values of the reconstruction's points in the order of the state's."""
-        return of_points[self._structure.points]
+        return of_points[self.structure.points]
 
     def partitions(self, state: State) -> tuple[Index, ...]:
         """Measurements that may go wrong together: of one corner of the scene, and of one corner of a lens."""
-        s, start = self._structure, self._start
+        s, start = self.structure, self._start
         camera = start.camera_idx[s.frame_idx]
         size = np.array([(each.width, each.height) for each in start.cameras])[camera]
         return (
@@ -283,7 +284,7 @@ class BundleProblem:
         """The reconstruction at a state."""
         U, _, Vt = np.linalg.svd(state.R_cw)  # rounding of many increments
         points_w = np.empty_like(state.points_w)
-        points_w[self._structure.points] = state.points_w
+        points_w[self.structure.points] = state.points_w
         return replace(
             self._given,
             cameras=state.cameras,
@@ -301,7 +302,7 @@ class BundleProblem:
     def _kernel_args(self, state: State) -> tuple[Any, ...]:
         """Arguments of the kernels: model, cameras, photos, points, measurements and loss."""
         if state is not self._args_of:
-            s, phi = self._structure, state.phi
+            s, phi = self.structure, state.phi
             if self.layout.bent:
                 values = self.layout.values(state.bend, self._start.image_names)
                 phi = motion_tables(phi, values, self._bend_clock, state.R_cw)
@@ -356,8 +357,8 @@ class BundleProblem:
                 apart[k], slope[k] = np.array(deviation(camera, guess, self._refine)) / sigma
         cost, weight = prior_weight(apart**2) if self._heavy_tails else (0.5 * apart**2, np.ones_like(apart))
         diagonal, gradient, total = slope**2 * weight, slope * apart * weight, float(cost.sum())
-        if self._fields is not None:
-            values = self._fields.values(state.cameras)
+        if self.lens_fields is not None:
+            values = self.lens_fields.values(state.cameras)
             diagonal = np.hstack([diagonal, np.full(values.shape, self._field_weight)])
             gradient = np.hstack([gradient, self._field_weight * values])
             total += 0.5 * self._field_weight * float((values**2).sum())
@@ -429,7 +430,7 @@ class BundleProblem:
             around = (0, 0), (6, self.layout.size - 12)
             common = CommonPrior(np.pad(information, around), np.pad(self.means.directions, (*around, (0, 0))))
         if self._path is not None and state.path is not None:
-            f = self._structure.frame_idx
+            f = self.structure.frame_idx
             pace, units = state.path.pace[self._start.camera_idx[f], None, None], np.exp(state.variation[f, :1])
             border.J[:, :, -1] = np.einsum("oia,oa->oi", J_frame[:, :, 6:12], units * state.path.rates[f])
             # a longer focal length is a slower clock
@@ -469,28 +470,28 @@ class BundleProblem:
     def fields(self, state: State, covariance: Array) -> tuple[Array, Array]:
         """Unknowns of the cameras' fields (cameras, nz), and their variances by all cameras' covariance (k, k)."""
         num = len(state.cameras)
-        if self._fields is None:
+        if self.lens_fields is None:
             return np.zeros((num, 0)), np.zeros((num, 0))
-        values, own = self._fields.values(state.cameras), len(self._refine)
+        values, own = self.lens_fields.values(state.cameras), len(self._refine)
         return values, np.diagonal(covariance).reshape(num, -1)[:, own : own + values.shape[1]]
 
     @property
     def measurements(self) -> tuple[Index, Index, Array]:
         """Photos (o,), points (o,) as in a state, and noise (o,) in pixels of the equations' measurements."""
-        return self._structure.frame_idx, self._structure.point_idx, self._sigma_px
+        return self.structure.frame_idx, self.structure.point_idx, self._sigma_px
 
     @property
     def by_photo(self) -> list[Index]:
         """The equations' measurements of each photo."""
-        return np.split(self._structure.frame_order, self._structure.frame_start[1:-1])
+        return np.split(self.structure.frame_order, self.structure.frame_start[1:-1])
 
     def _camera_jacobians(self, state: State) -> Array:
         """Weighted Jacobians (o, 2, nc) of what is solved for of the cameras, with room for the pace of a path."""
         J, of_photo = self._by_lens(state)
-        if self._fields is None:
+        if self.lens_fields is None:
             return J
         # what a shift of the principal point does is what weighs a measurement
-        camera = self._start.camera_idx[self._structure.frame_idx]
+        camera = self._start.camera_idx[self.structure.frame_idx]
         weight = of_photo[:, :, 1:] / np.array([np.diag(each.K)[:2] for each in state.cameras])[camera, None]
         own = len(self._refine)
         return np.concatenate([J[:, :, :own], weight @ self._field_jacobian, J[:, :, own:]], axis=2)
@@ -502,7 +503,7 @@ class BundleProblem:
         """
         if state is self._lens_of:
             return self._lens
-        o, wanted = len(self._xy), self._options.varying or self._fields is not None
+        o, wanted = len(self._xy), self._options.varying or self.lens_fields is not None
         J = np.empty((o, 2, len(self._refine) + (self._path is not None)))
         of_photo = np.empty((o, 2, 3 * wanted))
         if self._refine or wanted:
@@ -529,7 +530,7 @@ class BundleProblem:
         cost = self._costs_of_points(state)
         if before is not None:
             state, cost = self._with_better_points(state, cost, before.points_w)
-        steps = self._point_terms(state).steps(self._structure.track_start, *self.blocks(state))
+        steps = self._point_terms(state).steps(self.structure.track_start, *self.blocks(state))
         return self._with_better_points(
             state, cost, moved_points(state.points_w, steps, state.center_w[self._nearest])
         )[0]
@@ -542,7 +543,7 @@ class BundleProblem:
 
     def _costs_of_points(self, state: State) -> Array:
         """(n,) cost of the measurements of each point."""
-        return np.asarray(np.bincount(self._structure.point_idx, self.costs(state), len(state.points_w)))
+        return np.asarray(np.bincount(self.structure.point_idx, self.costs(state), len(state.points_w)))
 
     def costs(self, state: State) -> Array:
         """(o,) cost of each of the equations' measurements."""
@@ -557,8 +558,8 @@ class BundleProblem:
         cameras, own = state.cameras, len(self._refine)
         if self._refine:
             cameras = tuple(moved_camera(c, self._refine, s[:own]) for c, s in zip(cameras, intrinsics, strict=True))
-        if self._fields is not None:
-            moved = self._fields.moved
+        if self.lens_fields is not None:
+            moved = self.lens_fields.moved
             last = intrinsics.shape[1] - (self._path is not None) - state.means.shape[1]
             cameras = tuple(moved(k, c, s[own:last]) for k, (c, s) in enumerate(zip(cameras, intrinsics, strict=True)))
         phi = state.phi + frame[:, 6:9] if self._block > 6 else state.phi

@@ -17,6 +17,7 @@ from .doubt import Doubt
 from .intrinsics import has_intrinsic, pixels_of
 from .jackknife import Inflation, inflated, inflation
 from .layout import Layout
+from .lens_field import LensFields
 from .noise import noise_and_loss
 from .normal_equations import NormalEquations
 from .path_prior import (
@@ -32,6 +33,7 @@ from .path_prior import (
 from .prior_sigmas import Common, estimated, field_prior_sigma, path_prior_sigmas, settled, starting_sigmas
 from .problem import BundleProblem
 from .solver import minimize
+from .structure import Structure
 from .triangulate import least_distance, retriangulated
 
 __all__ = ["Rounds"]
@@ -128,6 +130,8 @@ class Rounds:
         self._iterations = 0
         self._means: Array | None = None
         self._partitions: tuple[Index, ...] = ()
+        self._structure: Structure | None = None
+        self._lens_fields: LensFields | None = None
 
     def solve(self, cost_tolerance: float, is_judged: bool = False) -> None:
         """Solve once. One that is judged says how uncertain it is by its residuals, if the options ask for that."""
@@ -136,7 +140,9 @@ class Rounds:
         problem = self._problem = BundleProblem(
             believed, self._model, options, self._sigma_px, self._sigmas,
             heavy_tails=self._heavy_tails, path=self._path, means=self._means, noise=self._noise, loss=self._loss,
+            structure=self._structure, fields=self._lens_fields,
         )  # fmt: skip
+        self._structure, self._lens_fields = problem.structure, problem.lens_fields
         self._solved = minimize(
             problem,
             problem.initial_state(),
@@ -234,6 +240,7 @@ class Rounds:
         keep = _believed(base, options, self._sigma_px)
         alive = base.track_lengths(keep) >= 2
         self._keep, self._partitions = keep[alive[base.observations.point_idx]], ()
+        self._structure = None
         self.noise_is_known = False
         self._base = base.take_points(alive)
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse
+from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from ..model.array_types import Index
 
@@ -50,6 +52,11 @@ class BlockPattern:
         """(q,) places of the blocks of pairs of rows and columns, in either order."""
         keys = np.minimum(first, second) * self.size + np.maximum(first, second)
         return np.searchsorted(self.rows * self.size + self.cols, keys)
+
+    @cached_property
+    def reverse_cuthill_mckee(self) -> Index:
+        """(m,) an order of the block rows in which each has its blocks near its diagonal."""
+        return np.asarray(reverse_cuthill_mckee(self.graph(), symmetric_mode=True).astype(np.int64))
 
     def graph(self) -> scipy.sparse.csr_array:
         """The whole pattern, below the diagonal too, as (m, m) ones."""
