@@ -229,7 +229,7 @@ def test_known_lengths_join_the_system(damping, refine, rng):
         np.testing.assert_allclose(cameras, block, rtol=0, atol=1e-7 * np.abs(block).max(initial=0))
         weights = rng.normal(size=(given.num_points, 3))
         variance = joined.linearize(state).function_of_points(joined.in_order(weights)).variance
-        b = weights[joined._structure.points].ravel()
+        b = weights[joined.structure.points].ravel()
         assert variance == pytest.approx(b @ whole[points, points] @ b, rel=1e-6)
 
 
@@ -278,4 +278,4 @@ def test_near_points_count_where_most_of_the_scene_is_far(rng):
     )
     _, J_frame = mountains.blocks(mountains.initial_state())
     _, valid = reprojection_residuals(replace(given, points_w=far))
-    assert (J_frame.any(axis=(1, 2)) == valid[mountains._structure.order]).all()
+    assert (J_frame.any(axis=(1, 2)) == valid[mountains.structure.order]).all()

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from .._kernels import envelope as kernels
 from ..model.array_types import Array, Index, Mask
