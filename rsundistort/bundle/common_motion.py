@@ -26,6 +26,8 @@ _NONE = 4.0
 _LEAST_PROBABILITY = 1e-4
 # Photos that rest share one by odds of up to 14 (seven sets of fountain-small/gs): errors of the lens look like that.
 _CERTAIN = 0.99
+# Of the squares of what photos move by, as far as a motion in common that was not believed before explains it.
+_LEAST_LEFT = 0.1
 
 
 @dataclass(frozen=True)
@@ -180,7 +182,7 @@ def _ways(depth: float) -> Array:
 
 
 def sigmas_of_means(
-    unknowns: Array, covariances: Array, root: Array, velocity: float, depth: float
+    unknowns: Array, covariances: Array, root: Array, velocity: float, depth: float, freedom: float = np.inf
 ) -> tuple[float, ...]:
     """Standard deviations of the prior on means, as `MotionMeans` takes them, by what was found under another.
 
@@ -199,17 +201,29 @@ def sigmas_of_means(
         Standard deviation of a travel in common, if there is one, world units per frame.
     depth : float
         Of what photos show, world units.
+    freedom : float
+        How many numbers decide what photos move by of their own, which is not known beforehand: they move more if they
+        share less. The likelihood is marginal over that, too (of Student's t): else what is believed to be shared makes
+        the rest so small that nothing but a motion in common could explain it.
     """
     # by the measurements alone: their precision, and that times what they say
     from_unknowns = np.linalg.inv(root)
     precision = np.linalg.inv(covariances)
     pull = np.einsum("cij,cj->ci", precision, unknowns) @ from_unknowns
     known = from_unknowns.T @ (precision - np.eye(len(root))) @ from_unknowns
-    evidence = [np.log(_NONE)]
-    for way in _ways(depth):
-        prior = velocity**2 * way
+
+    def gain(prior: Array) -> tuple[float, float]:
+        """By how much the squared deviations are smaller with a prior than without means, and the price of its width."""
         wider = np.eye(len(root)) + known @ prior
-        gain = np.einsum("ci,ij,cj->c", pull, prior, np.linalg.solve(wider, pull[..., None])[..., 0])
-        evidence.append(0.5 * float((gain - np.linalg.slogdet(wider)[1]).sum()))
+        squares = np.einsum("ci,ij,cj->c", pull, prior, np.linalg.solve(wider, pull[..., None])[..., 0])
+        return float(squares.sum()), float(np.linalg.slogdet(wider)[1].sum())
+
+    # what is left of the squares, in units of what photos move by of their own, with the means as they were found
+    left, evidence = freedom + gain(root @ root.T)[0], [np.log(_NONE)]
+    for way in _ways(depth):
+        fall, price = gain(velocity**2 * way)
+        if np.isfinite(freedom):
+            fall = freedom * float(np.log(left / max(left - fall, _LEAST_LEFT * left)))
+        evidence.append(0.5 * (fall - price))
     probability = np.maximum(softmax(evidence)[1:], _LEAST_PROBABILITY)
     return tuple((velocity * np.sqrt(probability)).tolist())

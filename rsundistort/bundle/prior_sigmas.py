@@ -167,7 +167,8 @@ def estimated(
         velocity = _scale(own[:, 3:], own_variances[:, 3:], sigmas.velocity) + _MIN_SIGMA * current.baseline
         found = replace(found, velocity=velocity)
     if common is not None:
-        means, shared = _mean_sigmas(common, found.velocity, current)
+        freedom = _freedom(own, own_variances, common, sigmas)
+        means, shared = _mean_sigmas(common, found.velocity, current, freedom)
         found = replace(found, means=means, shared=shared)
     if options.varying:
         varied = current.variation
@@ -181,7 +182,22 @@ def estimated(
     return _bounded(replace(found, bends=bends, ways=ways), options, baseline)
 
 
-def _mean_sigmas(common: Common, velocity_sigma: float, current: Reconstruction) -> tuple[tuple[float, ...], float]:
+def _freedom(own: Array, variances: Array, common: Common, sigmas: PriorSigmas) -> float:
+    """How many of the motions (m, 6) that share a mean the measurements would decide, if they shared none."""
+    known = 0.0
+    for part, sigma in ((slice(3), sigmas.phi), (slice(3, 6), sigmas.velocity)):
+        shares = (common.variances[:, part] > 0) & (variances[:, part] > 0)
+        if shares.any():
+            x, mean, variance = (each[:, part][shares] for each in (own, common.values, variances))
+            of_noise = 1.0 / np.maximum(1.0 / variance - 1.0 / sigma**2, 1e-9 / sigma**2)
+            alone = float((x**2 + mean**2 + variance).mean())
+            known += float((alone / (alone + of_noise)).sum())
+    return known
+
+
+def _mean_sigmas(
+    common: Common, velocity_sigma: float, current: Reconstruction, freedom: float
+) -> tuple[tuple[float, ...], float]:
     """Standard deviations of the prior on means, and how likely the photos share a motion.
 
     A velocity in common is expected to be a few times what the photos have of their own, or as large as it is found, or
@@ -196,7 +212,7 @@ def _mean_sigmas(common: Common, velocity_sigma: float, current: Reconstruction)
     velocity = max(velocity, float(np.sqrt(found.mean())))
     cameras = np.unique(current.camera_idx[sharing])
     of_cameras = common.unknowns[cameras], common.covariances[cameras]
-    sigmas = sigmas_of_means(*of_cameras, common.root, velocity, depth)
+    sigmas = sigmas_of_means(*of_cameras, common.root, velocity, depth, freedom)
     return sigmas, min(1.0, float(np.sum(np.square(sigmas))) / velocity**2)
 
 
