@@ -264,6 +264,28 @@ def test_the_prior_of_means_does_not_depend_on_that_under_which_they_were_found(
     np.testing.assert_allclose(found[1:], found[:1] * 2, rtol=1e-8)
 
 
+def test_a_motion_in_common_does_not_make_itself_likely(rng):
+    # photos that share nothing: if they are believed to, what they move by of their own seems smaller
+    photos, depth, travel, likely = 3, 1.0, 0.15, []
+    freedom = 6.0 * photos
+    for _ in range(200):
+        x = 0.05 * rng.normal(size=(photos, 6))
+        for believed in (0.0, 1.0):
+            sigma = np.sqrt(((x - believed * x.mean(0)) ** 2).sum() / freedom)
+            exactness = np.diag([photos / sigma**2] * 6 + [1e-6] * 2)
+            root = np.linalg.cholesky(prior_of_means(depth, np.full(8, 1e-5 + believed)))
+            covariance = np.linalg.inv(root.T @ exactness @ root + np.eye(8))
+            unknowns = covariance @ root.T @ exactness @ np.append(x.mean(0), [0.0, 0.0])
+            for of in (np.inf, freedom):
+                sigmas = sigmas_of_means(unknowns[None], covariance[None], root, travel, depth, of)
+                likely.append(np.square(sigmas).sum() / travel**2)
+    unsure, of_unknown_size, sure, of_unknown_size_believed = np.array(likely).reshape(-1, 4).T
+    assert (sure > 0.99).mean() > 0.02
+    assert not (of_unknown_size_believed > 0.99).any()
+    changes = abs(sure - unsure).mean(), abs(of_unknown_size_believed - of_unknown_size).mean()
+    assert changes[1] < 0.4 * changes[0]
+
+
 def test_cameras_of_few_photos_share_nothing(rng):
     for num_images, shares in ((LEAST_PHOTOS, False), (LEAST_PHOTOS + 1, True)):
         problem, _ = shared_problem(rng, num_images=num_images)
