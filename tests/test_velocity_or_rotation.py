@@ -103,6 +103,10 @@ def test_a_travel_that_photos_share_decides_where_held_out_measurements_do_not(r
     quality = {"held_out_error": error, "held_out_gain": {"constant-motion": 0.9}, "held_out_kept": travelling.kept}
     quality |= {"held_out_chosen": travelling.label, "shared_travel": travelling.is_shared}
     assert "better by 0.9 standard errors: kept, since the photos share a travel" in _held_out(quality)
+    # what looks like a rotation that changes may be a travel, too
+    label = "rotation, accelerating"
+    changing = replace(choice, label=label, bends=1, held_out_error={label: 4.1, **error}).with_velocity()
+    assert (changing.shutter_model, changing.label, changing.bends) == ("constant-motion", "constant-motion", 0)
     # what was not tried says nothing
     untried = replace(choice, held_out_error={"rotation": 1.0})
     assert not _is_common(result, untried, options, StageLog(None))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+from .held_out import BENDS
 from .known_motions import KnownMotions
 
 __all__ = ["ModelChoice"]
@@ -91,14 +92,16 @@ class ModelChoice:
         return self.rival >= _RIVAL
 
     def with_velocity(self) -> ModelChoice:
-        """The choice of a velocity beside the rotations, if it was tried with the same lens; else this one."""
-        label = self.label.replace("rotation", "constant-motion")
-        if label not in self.held_out_error or self.bends:
+        """The choice of a velocity beside steady rotations, if it was tried with the same lens; else this one."""
+        # what a velocity explains as well as a rotation that changes is the one or the other
+        label = "constant-motion" + self.label.removeprefix("rotation" + BENDS[self.bends])
+        if label not in self.held_out_error:
             return self
         return replace(
             self,
             shutter_model="constant-motion",
             label=label,
+            bends=0,
             kept=(*self.kept, label),
             rival=0.0,
             steps={},

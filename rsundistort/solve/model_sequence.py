@@ -282,7 +282,7 @@ def _chosen(
     )  # fmt: skip
     if choice.has_rival and _is_common(result, choice, options, log):
         choice = choice.with_velocity()
-        options = replace(options, rival=choice.steps)
+        options = replace(options, bends=choice.bends, rival=choice.steps)
     # windows were aligned, and outliers found, with a model that may be replaced now
     again = track_source is not None and track_source.workers is not None
     again = again and (choice.shutter_model == "constant-motion" or choice.bends > 0)
@@ -320,9 +320,10 @@ def _is_common(result: BundleResult, choice: ModelChoice, options: BundleOptions
     Each photo's velocity may as well be a rotation, and hardly predicts measurements better. Of what photos share, the
     evidence says more; it takes an adjustment that knows its noise.
     """
-    if choice.with_velocity() is choice:
+    travelling = choice.with_velocity()
+    if travelling is choice:
         return False
-    own = replace(options, rival={}, outlier_rounds=min(options.outlier_rounds, 1))
+    own = replace(options, bends=travelling.bends, rival={}, outlier_rounds=min(options.outlier_rounds, 1))
     found = bundle_adjust(result.reconstruction, "constant-motion", own, partial(tell, log, "choice"))
     return found.common is not None and found.common.is_certain
 
