@@ -213,7 +213,7 @@ def sigmas_of_means(
     known = from_unknowns.T @ (precision - np.eye(len(root))) @ from_unknowns
 
     def gain(prior: Array) -> tuple[float, float]:
-        """By how much the squared deviations are smaller with a prior than without means, and the price of its width."""
+        """By how much squared deviations are smaller with a prior than without means, and the price of its width."""
         wider = np.eye(len(root)) + known @ prior
         squares = np.einsum("ci,ij,cj->c", pull, prior, np.linalg.solve(wider, pull[..., None])[..., 0])
         return float(squares.sum()), float(np.linalg.slogdet(wider)[1].sum())
