@@ -19,9 +19,8 @@ __all__ = ["LEAST_PHOTOS", "NUM_WAYS", "CommonMotion", "MotionMeans", "sigmas_of
 LEAST_PHOTOS = 3
 #: Ways to move together: `MotionMeans.of` tells them.
 NUM_WAYS = 8
-# How likely no motion in common is, by how likely each way is: as a travel along any of three axes, or from photo to
-# photo.
-_NONE = 4.0
+# How likely no motion in common is, by how likely each way is: photos share one as likely as not.
+_NONE = float(NUM_WAYS)
 # Of any way to move: a hundredth of the travel that it would have. The measurements can still be asked.
 _LEAST_PROBABILITY = 1e-4
 # Photos that rest share one by odds of up to 14 (seven sets of fountain-small/gs): errors of the lens look like that.
@@ -188,7 +187,7 @@ def sigmas_of_means(
 
     Photos may share no motion. Then the mean of few of them is easily taken for one, and what level photos hardly
     show, nodding and rising, would be free in all of them at once, and the shape with it. So no motion in common, as
-    likely at first as a travel along any axis, competes with each way to move by its evidence (the marginal likelihood,
+    likely at first as all ways together, competes with each way to move by its evidence (the marginal likelihood,
     Laplace's), and the prior's covariance is that of their mixture: "spike and slab" (George and McCulloch, 1993), in
     which a slab is no wider than it is likely. A way has one axis, since evidence against a travel along the others, as
     of one who walks around a thing, says nothing of that one.
