@@ -13,7 +13,10 @@ from scipy.spatial.transform import Rotation
 from rsundistort import Camera, Observations, Reconstruction, RowMotion, project_points
 from rsundistort.batch.progress import StageLog
 from rsundistort.bundle import BundleOptions, Posterior, bundle_adjust, choose_model
+from rsundistort.bundle.choice import _rival
 from rsundistort.bundle.doubt import steps_after, steps_to
+from rsundistort.bundle.held_out import ModelFits
+from rsundistort.bundle.model_choice import LEAST_RIVAL
 from rsundistort.model.reprojection import shutter_displacements
 from rsundistort.solve.model_sequence import _is_common
 from rsundistort.verdict.judge import _rival_reasons
@@ -78,6 +81,19 @@ def test_rotations_of_a_camera_that_stays_have_no_rival(rng):
     assert choice.shutter_model == "rotation"
     assert choice.rival < 0.2
     assert not _rival_reasons(choice)
+
+
+def test_a_rival_of_another_lens_is_tried_with_the_same_one(rng):
+    rec = at_rest(flight(rng, 5, drift=0.5))
+    fits, gain = ModelFits(rec, BundleOptions(), NOISE_PX, 0, None), dict[str, float]()
+    best = fits.fit("rotation", False, [fits.given])
+    # no velocity was tried, so nothing is a rival
+    assert _rival(fits, best, gain) == 0.0
+    assert list(fits.done) == ["rotation"]
+    fits.fit("constant-motion", True, [best.reconstruction])
+    assert _rival(fits, best, gain) > LEAST_RIVAL
+    assert list(fits.done) == ["rotation", "constant-motion, varying lens", "constant-motion"]
+    assert gain == {"constant-motion": fits.gain(best, fits.done["constant-motion"])}
 
 
 def test_a_rival_is_a_reason_that_says_what_to_give(rng):

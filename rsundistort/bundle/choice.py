@@ -15,7 +15,7 @@ from .bundle_options import BundleOptions
 from .doubt import steps_to
 from .held_out import BENDS, MIN_AGREEMENT, MIN_FALL, SMOOTH_BENDS, ModelFit, ModelFits
 from .known_motions import compare_known_motions
-from .model_choice import ModelChoice
+from .model_choice import LEAST_RIVAL, ModelChoice
 
 __all__ = ["choose_model"]
 
@@ -168,6 +168,7 @@ def choose_model(
         kept = kept[: kept.index(best.label) + 1]
     if options.refine:
         best = _with_field(fits, best, kept, gain)
+    rival = _rival(fits, best, gain)
     return ModelChoice(
         best.model,
         best.label,
@@ -184,7 +185,7 @@ def choose_model(
         best.residual_field,
         best.bends,
         shutter != "not-determined" and fits.waves(best, _RESTLESS, _UNSEEN_PX / 2),
-        _rival(fits, best),
+        rival,
         _steps_of_others(fits, best),
         known,
     )
@@ -219,10 +220,20 @@ def _steps_of_others(fits: ModelFits, best: ModelFit) -> dict[str, tuple[float, 
     return {name: tuple(each) for name, each in zip(rec.image_names, most.tolist(), strict=True)}
 
 
-def _rival(fits: ModelFits, best: ModelFit) -> float:
-    """`ModelChoice.rival`, the most of the velocities that were tried."""
+def _rival(fits: ModelFits, best: ModelFit, gain: dict[str, float]) -> float:
+    """`ModelChoice.rival`, the most of the velocities that were tried; with the lens of the best, if there is one."""
     if best.model != "rotation":
         return 0.0
+    found = _rival_of_tried(fits, best)
+    if found >= LEAST_RIVAL and not best.residual_field:
+        velocity = fits.fit("constant-motion", best.varying, [best.reconstruction])
+        gain.setdefault(velocity.label, fits.gain(best, velocity))
+        found = _rival_of_tried(fits, best)
+    return found
+
+
+def _rival_of_tried(fits: ModelFits, best: ModelFit) -> float:
+    """`_rival` of the models that were fitted."""
     shares, (own, seen) = [0.0], shutter_displacements(best.reconstruction)
     for fit in fits.done.values():
         if fit.model == "constant-motion" and not fits.is_better(fit, best):

@@ -11,7 +11,7 @@ from .known_motions import KnownMotions
 __all__ = ["ModelChoice"]
 
 # Photos are displaced this much otherwise by a velocity that explains them as well, as a share of what is corrected.
-_RIVAL = 1 / 3
+LEAST_RIVAL = 1 / 3
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class ModelChoice:
     @property
     def has_rival(self) -> bool:
         """Whether a velocity explains the photos as well, and displaces them otherwise."""
-        return self.rival >= _RIVAL
+        return self.rival >= LEAST_RIVAL
 
     def with_velocity(self) -> ModelChoice:
         """The choice of a velocity beside steady rotations, if it was tried with the same lens; else this one."""
