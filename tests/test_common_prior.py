@@ -40,6 +40,8 @@ MEANS = (
     0.15,
     0.1,
 )  # of travels along each axis, of such that aim, of any, and from photo to photo
+# Freedom of motions whose size is known as well as if so many numbers told it.
+KNOWN_SIZE = 1e12
 
 
 def shared_problem(rng, refine=(), factor_limit=1e10, num_images=9):
@@ -244,7 +246,7 @@ def test_the_prior_of_means_is_as_wide_as_each_way_to_move_is_likely(of, rng):
         if of is not None:
             motion = np.linalg.cholesky(prior_of_means(depth, velocity * np.eye(8)[of] + 1e-9)) @ rng.normal(size=8)
         under = prior_of_means(depth, velocity * rng.uniform(0.01, 1, 8))
-        found = sigmas_of_means(*shown(rng, motion, exactness, under), velocity, depth)
+        found = sigmas_of_means(*shown(rng, motion, exactness, under), velocity, depth, KNOWN_SIZE)
         likely.append(np.array(found) ** 2 / velocity**2)
     mean = np.mean(likely, axis=0)
     none = 1.0 - mean.sum()
@@ -260,7 +262,7 @@ def test_the_prior_of_means_does_not_depend_on_that_under_which_they_were_found(
         (0.3, 0.1, 3e-3, 0.01, 0.1, 0.1, 1e-3, 0.2),
     ):
         each = shown(np.random.default_rng(5), np.full(8, 0.01), exactness, prior_of_means(4.0, sigmas))
-        found.append(sigmas_of_means(*each, 0.1, 4.0))
+        found.append(sigmas_of_means(*each, 0.1, 4.0, KNOWN_SIZE))
     np.testing.assert_allclose(found[1:], found[:1] * 2, rtol=1e-8)
 
 
@@ -276,10 +278,11 @@ def test_a_motion_in_common_does_not_make_itself_likely(rng):
             root = np.linalg.cholesky(prior_of_means(depth, np.full(8, 1e-5 + believed)))
             covariance = np.linalg.inv(root.T @ exactness @ root + np.eye(8))
             unknowns = covariance @ root.T @ exactness @ np.append(x.mean(0), [0.0, 0.0])
-            for of in (np.inf, freedom):
+            for of in (KNOWN_SIZE, freedom):
                 sigmas = sigmas_of_means(unknowns[None], covariance[None], root, travel, depth, of)
                 likely.append(np.square(sigmas).sum() / travel**2)
     unsure, of_unknown_size, sure, of_unknown_size_believed = np.array(likely).reshape(-1, 4).T
+    # 0.045 of them are sure; what belief changes is 0.10 in the mean, 0.024 if their size is unknown
     assert (sure > 0.99).mean() > 0.02
     assert not (of_unknown_size_believed > 0.99).any()
     changes = abs(sure - unsure).mean(), abs(of_unknown_size_believed - of_unknown_size).mean()

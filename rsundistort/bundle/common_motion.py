@@ -181,7 +181,7 @@ def _ways(depth: float) -> Array:
 
 
 def sigmas_of_means(
-    unknowns: Array, covariances: Array, root: Array, velocity: float, depth: float, freedom: float = np.inf
+    unknowns: Array, covariances: Array, root: Array, velocity: float, depth: float, freedom: float
 ) -> tuple[float, ...]:
     """Standard deviations of the prior on means, as `MotionMeans` takes them, by what was found under another.
 
@@ -221,8 +221,7 @@ def sigmas_of_means(
     left, evidence = freedom + gain(root @ root.T)[0], [np.log(_NONE)]
     for way in _ways(depth):
         fall, price = gain(velocity**2 * way)
-        if np.isfinite(freedom):
-            fall = freedom * float(np.log(left / max(left - fall, _LEAST_LEFT * left)))
-        evidence.append(0.5 * (fall - price))
+        by_unknown_size = -freedom * float(np.log1p(-min(fall / left, 1.0 - _LEAST_LEFT)))
+        evidence.append(0.5 * (by_unknown_size - price))
     probability = np.maximum(softmax(evidence)[1:], _LEAST_PROBABILITY)
     return tuple((velocity * np.sqrt(probability)).tolist())

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 from .held_out import BENDS
 from .known_motions import KnownMotions
 
-__all__ = ["ModelChoice"]
+__all__ = ["LEAST_RIVAL", "ModelChoice"]
 
-# Photos are displaced this much otherwise by a velocity that explains them as well, as a share of what is corrected.
+#: Photos are displaced this much otherwise by a velocity that explains them as well, as a share of what is corrected.
 LEAST_RIVAL = 1 / 3
 
 
