@@ -184,7 +184,7 @@ def choose_model(
         shutter != "not-determined" and fits.waves(best, _RESTLESS, UNSEEN_PX / 2),
         rival,
         _others(fits, best),
-        best.reconstruction.image_names,
+        tuple(best.reconstruction.image_names),
         known_motions=known,
     )
 
