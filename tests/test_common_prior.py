@@ -18,10 +18,12 @@ from bundle_scenes import (
 )
 from numpy_reference import project
 from scipy.spatial.transform import Rotation
+from scipy.stats import multivariate_normal
 
 from rsundistort import BundleOptions, Camera, Observations, Reconstruction, bundle_adjust
 from rsundistort.bundle import Posterior
-from rsundistort.bundle.common_motion import LEAST_PHOTOS, sigmas_of_means
+from rsundistort.bundle.common_motion import LEAST_PHOTOS, MeansPrior, prior_of_means
+from rsundistort.bundle.doubt import Doubt
 from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
 from rsundistort.synthetic import look_at
@@ -50,7 +52,8 @@ def shared_problem(rng, refine=(), factor_limit=1e10, num_images=9):
     scene = replace(scene, cameras=scene.cameras[:2], camera_idx=np.arange(num_images) // (num_images - 1))
     start = replace(perturbed(scene, rng, 0.01, 0.02), phi=scene.phi, velocity=scene.velocity)
     options = BundleOptions(loss="squared", factor_limit=factor_limit, cg_tolerance=1e-13, refine=refine)
-    problem = BundleProblem(start, MODEL, options, 0.5, PriorSigmas(0.03, 0.1, means=MEANS))
+    means = MeansPrior(covariance_of_ways(start.typical_depth), 0.3)
+    problem = BundleProblem(start, MODEL, options, 0.5, PriorSigmas(0.03, 0.1, means=means))
     state = problem.initial_state()
     return problem, replace(state, means=state.means + 0.1 * rng.normal(size=state.means.shape))
 
@@ -200,7 +203,7 @@ def measured_rows(problem, state, size, nr):
     return J.reshape(-1, size)
 
 
-def prior_of_means(depth, sigmas=MEANS):
+def covariance_of_ways(depth, sigmas=MEANS):
     """Covariance of the prior on means, as `MotionMeans.of` says it in words."""
     total = np.diag([0.0] * 6 + [sigmas[5] ** 2, sigmas[6] ** 2])
     total[:6, :6] = sigmas[7] ** 2 * np.diag([depth**-2] * 3 + [1.0] * 3)
@@ -215,10 +218,21 @@ def prior_of_means(depth, sigmas=MEANS):
     return total
 
 
-def test_means_are_those_of_cameras_that_travel_aim_or_do_as_they_like(rng):
+def test_at_first_cameras_travel_aim_or_do_as_they_like(rng):
+    prior = MeansPrior.of_ways(0.2, 3.0)
+    expected = covariance_of_ways(3.0, (0.2 / np.sqrt(8),) * 8)
+    np.testing.assert_allclose(prior.covariance, expected, atol=1e-12 * expected.max())
+    # lengths in another unit
+    again = MeansPrior.of_ways(0.1, 1.5).covariance
+    np.testing.assert_allclose(prior.scaled(0.5).covariance, again, atol=1e-12 * again.max())
+    assert (prior.probability, prior.odds_against) == (0.0, 0.0)
+    assert not prior.differs(MeansPrior(1.3 * expected), 0.2)
+    assert prior.differs(MeansPrior(1.7 * expected), 0.2)
+
+
+def test_unknowns_of_means_have_standard_normal_priors(rng):
     problem, state = shared_problem(rng)
-    root = problem.means.root
-    expected = prior_of_means(problem._start.typical_depth)
+    root, expected = problem.means.root, covariance_of_ways(problem._start.typical_depth)
     np.testing.assert_allclose(root @ root.T, expected, atol=1e-12 * expected.max())
     values = problem.means.values(state.means)
     np.testing.assert_allclose(problem.means.unknowns(values), state.means, atol=1e-10)
@@ -232,9 +246,24 @@ def shown(rng, motion, exactness, under):
     return (covariance @ root.T @ exactness @ measured)[None], covariance[None], root
 
 
+def averaged(depth, velocity, exactness, measured):
+    """What the mean of models makes of measured means, as a matrix, and how likely photos share a motion.
+
+    By the densities of what was measured.
+    """
+    noise = np.linalg.inv(exactness)
+    ways = [covariance_of_ways(depth, velocity * np.eye(8)[k]) for k in range(8)]
+    log_density = [multivariate_normal.logpdf(measured, cov=noise + way) for way in (np.zeros((8, 8)), *ways)]
+    density = np.exp(np.array(log_density) - np.max(log_density)) * [8.0, *[1.0] * 8]
+    of_ways = np.maximum((density / density.sum())[1:], 1e-4)  # each can still be asked
+    slab = np.einsum("k,kab->ab", of_ways / of_ways.sum(), ways)
+    probability = min(of_ways.sum(), 1.0)
+    return probability * slab @ np.linalg.inv(slab + noise), probability
+
+
 @pytest.mark.parametrize("of", [None, *range(8)])
-def test_the_prior_of_means_is_as_wide_as_each_way_to_move_is_likely(of, rng):
-    depth, velocity, num = 4.0, 0.05, 300
+def test_the_prior_of_means_gives_the_mean_of_none_and_of_all_ways_to_move(of, rng):
+    depth, velocity, num = 4.0, 0.05, 60
     # a yaw and a travel sideways that show the same are measured five times less exactly than the others
     exactness = np.diag([depth**2] * 3 + [1.0] * 5) / 0.0025**2
     weak = np.array([0.0, 1.0 / depth, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
@@ -244,13 +273,20 @@ def test_the_prior_of_means_is_as_wide_as_each_way_to_move_is_likely(of, rng):
     for _ in range(num):
         motion = np.zeros(8)
         if of is not None:
-            motion = np.linalg.cholesky(prior_of_means(depth, velocity * np.eye(8)[of] + 1e-9)) @ rng.normal(size=8)
-        under = prior_of_means(depth, velocity * rng.uniform(0.01, 1, 8))
-        found = sigmas_of_means(*shown(rng, motion, exactness, under), velocity, depth, KNOWN_SIZE)
-        likely.append(np.array(found) ** 2 / velocity**2)
-    mean = np.mean(likely, axis=0)
-    none = 1.0 - mean.sum()
-    assert none > 0.65 if of is None else (mean.argmax() == of and mean[of] > 0.5)
+            motion = np.linalg.cholesky(covariance_of_ways(depth, velocity * np.eye(8)[of] + 1e-9)) @ rng.normal(size=8)
+        under = covariance_of_ways(depth, velocity * rng.uniform(0.01, 1, 8))
+        u, covariance, root = shown(rng, motion, exactness, under)
+        measured = np.linalg.solve(exactness, np.linalg.solve(root.T, np.linalg.solve(covariance[0], u[0])))
+        found = prior_of_means(u, covariance, root, velocity, depth, KNOWN_SIZE)
+        expected, probability = averaged(depth, velocity, exactness, measured)
+        assert found.probability == pytest.approx(probability, abs=1e-6)
+        W = found.covariance
+        by_prior = W @ exactness @ np.linalg.inv(np.eye(8) + W @ exactness) @ measured
+        size = np.sqrt(np.diag(np.linalg.inv(exactness)))
+        np.testing.assert_allclose(by_prior / size, expected @ measured / size, atol=1e-5)
+        likely.append(found.probability)
+    mean = np.mean(likely)
+    assert mean < 0.35 if of is None else mean > 0.5
 
 
 def test_the_prior_of_means_does_not_depend_on_that_under_which_they_were_found(rng):
@@ -261,9 +297,29 @@ def test_the_prior_of_means_does_not_depend_on_that_under_which_they_were_found(
         (0.02, 1e-3, 0.3, 0.1, 0.1, 0.01, 0.2, 0.1),
         (0.3, 0.1, 3e-3, 0.01, 0.1, 0.1, 1e-3, 0.2),
     ):
-        each = shown(np.random.default_rng(5), np.full(8, 0.01), exactness, prior_of_means(4.0, sigmas))
-        found.append(sigmas_of_means(*each, 0.1, 4.0, KNOWN_SIZE))
-    np.testing.assert_allclose(found[1:], found[:1] * 2, rtol=1e-8)
+        each = shown(np.random.default_rng(5), np.full(8, 0.01), exactness, covariance_of_ways(4.0, sigmas))
+        found.append(prior_of_means(*each, 0.1, 4.0, KNOWN_SIZE))
+    for each in found[1:]:
+        np.testing.assert_allclose(each.covariance, found[0].covariance, rtol=1e-6, atol=1e-12)
+        assert each.probability == pytest.approx(found[0].probability, rel=1e-8)
+
+
+def test_not_knowing_whether_photos_share_a_motion_is_part_of_their_deviations(rng):
+    problem, state = shared_problem(rng, ("f",))
+    H, _, free = whole_system(problem, state)
+    scale = 1 / np.sqrt(np.diag(H)[free])
+    whole = np.zeros_like(H)
+    whole[np.ix_(free, free)] = scale[:, None] * np.linalg.inv(scale[:, None] * H[np.ix_(free, free)] * scale) * scale
+    rec, (m, nb) = problem._start, problem._free.shape
+    off = rng.normal(size=state.means.shape)
+    doubt = Doubt.of(problem.linearize(state), BundleOptions(refine=("f",)), rec, means=off)
+    first = m * nb + 3 * rec.num_points
+    last = np.concatenate([first + 9 * c + 1 + np.arange(8) for c in range(2)])
+    # all else as it is most likely if the means are off by so much
+    expected = whole[:, last] @ np.linalg.solve(whole[np.ix_(last, last)], off.ravel())
+    np.testing.assert_allclose(doubt.photos[0], expected[: m * nb].reshape(m, nb), atol=1e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(doubt.cameras[0], expected[first:], atol=1e-6 * np.abs(expected).max())
+    assert MeansPrior(np.eye(8), 0.2).odds_against == pytest.approx(4.0)
 
 
 def test_a_motion_in_common_does_not_make_itself_likely(rng):
@@ -275,12 +331,12 @@ def test_a_motion_in_common_does_not_make_itself_likely(rng):
         for believed in (0.0, 1.0):
             sigma = np.sqrt(((x - believed * x.mean(0)) ** 2).sum() / freedom)
             exactness = np.diag([photos / sigma**2] * 6 + [1e-6] * 2)
-            root = np.linalg.cholesky(prior_of_means(depth, np.full(8, 1e-5 + believed)))
+            root = np.linalg.cholesky(covariance_of_ways(depth, np.full(8, 1e-5 + believed)))
             covariance = np.linalg.inv(root.T @ exactness @ root + np.eye(8))
             unknowns = covariance @ root.T @ exactness @ np.append(x.mean(0), [0.0, 0.0])
             for of in (KNOWN_SIZE, freedom):
-                sigmas = sigmas_of_means(unknowns[None], covariance[None], root, travel, depth, of)
-                likely.append(np.square(sigmas).sum() / travel**2)
+                prior = prior_of_means(unknowns[None], covariance[None], root, travel, depth, of)
+                likely.append(prior.probability)
     unsure, of_unknown_size, sure, of_unknown_size_believed = np.array(likely).reshape(-1, 4).T
     # 0.045 of them are sure; what belief changes is 0.10 in the mean, 0.024 if their size is unknown
     assert (sure > 0.99).mean() > 0.02

@@ -10,7 +10,7 @@ from bundle_scenes import dense_system, make_scene, noisy_problem
 
 from rsundistort import BundleOptions, KnownLength, bundle_adjust
 from rsundistort.bundle import Posterior
-from rsundistort.bundle.common_motion import NUM_WAYS
+from rsundistort.bundle.common_motion import MeansPrior
 from rsundistort.bundle.jackknife import Inflation, by_corner, by_place, inflated, inflation, sketch
 from rsundistort.bundle.prior_sigmas import PriorSigmas
 from rsundistort.bundle.problem import BundleProblem
@@ -249,7 +249,7 @@ def test_what_a_lens_leaves_is_no_motion(rng):
     assert square["jackknife"] < 0.6**2 * square["model"]
 
 
-@pytest.mark.parametrize("means", [(), (0.05,) * NUM_WAYS], ids=["each its own", "with means"])
+@pytest.mark.parametrize("means", [None, MeansPrior.of_ways(0.14, 4.0)], ids=["each its own", "with means"])
 def test_released_residuals_are_those_of_a_solve_without_the_photos_priors(means, rng):
     scene = make_scene(rng, "constant-motion", num_images=12, num_points=60, noise_px=0.3, phi_size=0.01)
     scale, options = 0.01, BundleOptions(loss="squared", phi_sigma=0.001, velocity_sigma=0.005)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -11,22 +11,71 @@ from scipy.special import softmax
 from ..model import Reconstruction
 from ..model.array_types import Array, Index, Mask
 
-__all__ = ["LEAST_PHOTOS", "NUM_WAYS", "CommonMotion", "MotionMeans", "sigmas_of_means"]
+__all__ = ["LEAST_PHOTOS", "CommonMotion", "MeansPrior", "MotionMeans", "prior_of_means"]
 
 
 #: Photos whose motions have a mean. It has a prior of its own, so they need not be as many as its unknowns; with two it
 #: would be as much each one's own. (`benchmarks/honest.py --only flights`: three to five photos.)
 LEAST_PHOTOS = 3
-#: Ways to move together: `MotionMeans.of` tells them.
-NUM_WAYS = 8
+# Ways to move together: `MeansPrior.of_ways` tells them.
+_NUM_WAYS = 8
 # How likely no motion in common is, by how likely each way is: photos share one as likely as not.
-_NONE = float(NUM_WAYS)
-# Of any way to move: a hundredth of the travel that it would have. The measurements can still be asked.
+_NONE = float(_NUM_WAYS)
+# Of any way to move. The measurements can still be asked.
 _LEAST_PROBABILITY = 1e-4
 # Photos that rest share one by odds of up to 14 (seven sets of fountain-small/gs): errors of the lens look like that.
 _CERTAIN = 0.99
 # Of the squares of what photos move by, as far as a motion in common that was not believed before explains it.
 _LEAST_LEFT = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class MeansPrior:
+    """Normal prior of the mean motion of a camera's photos.
+
+    Attributes
+    ----------
+    covariance : (8, 8) array
+        Of means as `CommonMotion` has them, in world units.
+    probability : float
+        How likely photos share a motion, which the covariance allows for; 0 before that is known.
+    """
+
+    covariance: Array
+    probability: float = 0.0
+
+    @classmethod
+    def of_ways(cls, velocity: float, depth: float) -> MeansPrior:
+        """Before anything is known, by the standard deviation of travels in common, and the depth of what is seen.
+
+        The ways to move together, as likely as each other: of cameras that travel along their x, y, or z, of those that
+        aim at what they pass along x or y, whose rotation is their travel by the depth, of those that are on their way
+        from one photo to the next (travelling only, as drones that hold their gimbal do, and rotating as they do from
+        photo to photo, as the frames of a video), and of those that travel and rotate as they like, by as much.
+        """
+        return cls(velocity**2 * _ways(depth).mean(axis=0))
+
+    def scaled(self, unit: float) -> MeansPrior:
+        """The same where lengths have other numbers, `unit` times as large."""
+        units = np.repeat([1.0, unit], [3, 5])
+        return replace(self, covariance=units[:, None] * self.covariance * units)
+
+    def differs(self, other: MeansPrior, share: float) -> bool:
+        """Whether a standard deviation differs by more than a share of the largest, among rotations or travels."""
+        sigmas = (np.sqrt(np.diagonal(each.covariance)) for each in (self, other))
+        (rotation, travel), (others, its) = (np.split(each, [3]) for each in sigmas)
+        return any(
+            bool((np.abs(one - another) > share * one.max()).any())
+            for one, another in ((rotation, others), (travel, its))
+        )
+
+    @property
+    def odds_against(self) -> float:
+        """Of sharing none against sharing a motion; 0 before they are known.
+
+        Times the square of a mean that was found, this is the variance of it that comes of not knowing which.
+        """
+        return (1.0 - self.probability) / self.probability if self.probability else 0.0
 
 
 @dataclass(frozen=True)
@@ -38,8 +87,8 @@ class CommonMotion:
     values : (cameras, 8) array
         Rotation, radians per frame, and travel, baselines per frame, in the frame of the camera; and travels from
         photo to photo, without the rotation from one to the next and with it.
-    sigmas : (8,) tuple of float
-        Standard deviations of their prior, baselines per frame, as `MotionMeans` takes them.
+    prior : MeansPrior
+        Their prior, in baselines.
     of_photos, deviations : (m, 6) array
         What photos are expected to move by it, in the frames of their cameras: rotation and travel, in the same units;
         and its standard deviations.
@@ -48,7 +97,7 @@ class CommonMotion:
     """
 
     values: Array
-    sigmas: tuple[float, ...]
+    prior: MeansPrior
     of_photos: Array
     deviations: Array
     probability: float
@@ -89,20 +138,13 @@ class MotionMeans:
     root: Array
 
     @classmethod
-    def of(cls, reconstruction: Reconstruction, sigmas: tuple[float, ...], shares: Mask) -> MotionMeans:
-        """The means of a reconstruction; `shares` (m, 6) says which components of its photos' motions have a mean.
-
-        `sigmas` are the standard deviations of travels in common, world units per frame: of cameras that travel along
-        their x, y, or z, of those that aim at what they pass along x or y, whose rotation is their travel by the depth,
-        of those that are on their way from one photo to the next (travelling only, as drones that hold their gimbal do,
-        and rotating as they do from photo to photo, as the frames of a video), and of those that travel and rotate as
-        they like, by as much.
-        """
+    def of(cls, reconstruction: Reconstruction, prior: MeansPrior, shares: Mask) -> MotionMeans:
+        """The means of a reconstruction; `shares` (m, 6) says which components of its photos' motions have a mean."""
         by_values = np.concatenate(
             [np.tile(np.eye(6), (reconstruction.num_images, 1, 1)), _on_the_way(reconstruction)], axis=2
         )
         by_values *= shares[:, :, None]
-        root = np.linalg.cholesky(np.einsum("k,kab->ab", np.square(sigmas), _ways(reconstruction.typical_depth)))
+        root = np.linalg.cholesky(prior.covariance)
         directions = by_values @ root / reconstruction.frame_span()[:, None, None]
         directions[:, 3:] = reconstruction.R_cw.transpose(0, 2, 1) @ directions[:, 3:]
         return cls(
@@ -171,7 +213,7 @@ def _on_the_way(reconstruction: Reconstruction) -> Array:
 
 
 def _ways(depth: float) -> Array:
-    """(8, 8, 8) covariances of means for travels of unit variance in common: `MotionMeans.of` says of which cameras."""
+    """(8, 8, 8) covariances of means for travels of unit variance in common: `MeansPrior.of_ways` says of which."""
     travels = np.eye(8)[3:6]
     aiming = travels[:2].copy()
     aiming[:, :2] = [[0.0, 1.0 / depth], [-1.0 / depth, 0.0]]  # what is passed stays in the middle
@@ -180,17 +222,24 @@ def _ways(depth: float) -> Array:
     return np.concatenate([along[:, :, None] * along[:, None], free[None]])
 
 
-def sigmas_of_means(
+def prior_of_means(
     unknowns: Array, covariances: Array, root: Array, velocity: float, depth: float, freedom: float
-) -> tuple[float, ...]:
-    """Standard deviations of the prior on means, as `MotionMeans` takes them, by what was found under another.
+) -> MeansPrior:
+    """Prior on means by what was found under another.
 
     Photos may share no motion. Then the mean of few of them is easily taken for one, and what level photos hardly
     show, nodding and rising, would be free in all of them at once, and the shape with it. So no motion in common, as
     likely at first as all ways together, competes with each way to move by its evidence (the marginal likelihood,
-    Laplace's), and the prior's covariance is that of their mixture: "spike and slab" (George and McCulloch, 1993), in
-    which a slab is no wider than it is likely. A way has one axis, since evidence against a travel along the others, as
-    of one who walks around a thing, says nothing of that one.
+    Laplace's): "spike and slab" (George and McCulloch, 1993). A way has one axis, since evidence against a travel along
+    the others, as of one who walks around a thing, says nothing of that one.
+
+    With the probability P they share a motion, whose covariance V is that of the mixture of its ways; K is the
+    precision of the measurements. The mean over both (Hoeting et al., "Bayesian model averaging", 1999) is P times that
+    of a normal prior V. This is what the normal prior W gives with
+
+        K W (1 + K W)^-1 = P K V (1 + K V)^-1
+
+    so W is that (P V, where P is small, would be wide beside what the measurements tell, and the mean free).
 
     Parameters
     ----------
@@ -219,9 +268,15 @@ def sigmas_of_means(
 
     # what is left of the squares, in units of what photos move by of their own, with the means as they were found
     left, evidence = freedom + gain(root @ root.T)[0], [np.log(_NONE)]
-    for way in _ways(depth):
-        fall, price = gain(velocity**2 * way)
+    ways = velocity**2 * _ways(depth)
+    for way in ways:
+        fall, price = gain(way)
         by_unknown_size = -freedom * float(np.log1p(-min(fall / left, 1.0 - _LEAST_LEFT)))
         evidence.append(0.5 * (by_unknown_size - price))
-    probability = np.maximum(softmax(evidence)[1:], _LEAST_PROBABILITY)
-    return tuple((velocity * np.sqrt(probability)).tolist())
+    of_ways = np.maximum(softmax(evidence)[1:], _LEAST_PROBABILITY)
+    probability = min(float(of_ways.sum()), 1.0)
+    slab = np.linalg.cholesky(np.einsum("k,kab->ab", of_ways / of_ways.sum(), ways))
+    exactness, vector = np.linalg.eigh(slab.T @ known.mean(axis=0) @ slab)
+    width = probability / (1.0 + (1.0 - probability) * np.maximum(exactness, 0.0))
+    side = slab @ vector
+    return MeansPrior((side * width) @ side.T, probability)

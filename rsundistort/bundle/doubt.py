@@ -14,6 +14,10 @@ A model that predicts held-out measurements about as well as the one that is kep
 ground, a velocity looks like a rotation. If it is right with the probability p, the second moment of the estimate's
 error has p d d' beside the covariances, where d is what the one differs by from the other (averaging over models;
 Hoeting et al., "Bayesian model averaging", 1999).
+
+Photos share a motion or none. The mean of the two, M, is P times the motion if they share one, with the probability P;
+its second moment has P (1 - P) (M / P)^2 = M^2 (1 - P) / P beside that of either (`MeansPrior.odds_against`), and
+what follows from the mean moves with it.
 """
 
 from __future__ import annotations
@@ -53,8 +57,14 @@ class Doubt:
     cameras: Array
 
     @classmethod
-    def of(cls, equations: NormalEquations, options: BundleOptions, rec: Reconstruction, heavy: bool = True) -> Doubt:
-        """At the solution that has these equations; NaN where the system cannot be factored."""
+    def of(
+        cls, equations: NormalEquations, options: BundleOptions, rec: Reconstruction, heavy: bool = True,
+        means: Array | None = None,
+    ) -> Doubt:  # fmt: skip
+        """At the solution that has these equations; NaN where the system cannot be factored.
+
+        `means` (cameras, k), the last unknowns of each camera, may be off by so much together.
+        """
         cameras = rec.cameras
         c, names = equations.num_cameras, options.refine
         of_each = np.zeros((2, c, c, equations.num_shared // c))
@@ -63,6 +73,8 @@ class Doubt:
             of_each[:, each, each, : len(names)] = options.guessed.pulls_of_decentring(cameras, names, heavy)
         pulls = of_each.reshape(2 * c, -1)
         pulls = pulls[pulls.any(1)]
+        if means is not None and means.any():
+            pulls = np.vstack([pulls, _pull_of_means(equations, means)])
         unmoved = np.zeros((len(pulls), equations.num_photos, equations.blocks[1].shape[2]))
         photos, moved = equations.times(unmoved, pulls) if len(pulls) else (unmoved, pulls)
         if not options.rival:
@@ -99,6 +111,16 @@ class Doubt:
         """Variance of a function of the points, and its covariance (m, nb) with the photos' unknowns."""
         moved = self.pulls @ found.with_cameras
         return float(moved @ moved), np.einsum("r,rma->ma", moved, self.photos)
+
+
+def _pull_of_means(equations: NormalEquations, means: Array) -> Array:
+    """(k,) change of the gradient of the cameras' unknowns that moves the means by (cameras, n)."""
+    c, n = means.shape
+    last = (np.arange(1, c + 1)[:, None] * (equations.num_shared // c) - n + np.arange(n)).ravel()
+    units = np.eye(equations.num_shared)[last]
+    none = np.zeros((len(units), equations.num_photos, equations.blocks[1].shape[2]))
+    covariance = equations.times(none, units)[1][:, last]
+    return np.asarray(np.linalg.solve(covariance, means.ravel()) @ units)
 
 
 def steps_after(

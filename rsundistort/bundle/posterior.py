@@ -33,7 +33,7 @@ class Posterior:
             result.phi_sigma, max(result.velocity_sigma * rec.baseline, 1e-300),
             max(result.focal_sigma, 1e-300), max(result.centre_sigma, 1e-300), result.bend_sigmas,
             tuple(each * rec.baseline for each in result.way_sigmas), result.field_sigma_px, result.path_sigmas,
-            () if result.common is None else tuple(each * rec.baseline for each in result.common.sigmas),
+            None if result.common is None else result.common.prior.scaled(rec.baseline),
         )  # fmt: skip
         plain = replace(options or BundleOptions(), loss="squared")
         self._path = None if result.path is None else result.path.state
@@ -44,7 +44,9 @@ class Posterior:
         self._state = self._problem.initial_state()
         self._equations = self._problem.linearize(self._state)
         self._inflation = (result.inflation if plain.deviations == "jackknife" else 1.0) / result.noise_factor
-        self._doubt = Doubt.of(self._equations, plain, rec)
+        prior = sigmas.means
+        unsure = None if prior is None else np.sqrt(prior.odds_against) * self._state.means
+        self._doubt = Doubt.of(self._equations, plain, rec, means=unsure)
         self._camera_idx = rec.camera_idx
         self._own = self._problem.layout.size - self._problem.layout.motion
         self._shape = rec.num_images, self._equations.blocks[1].shape[2] - self._own

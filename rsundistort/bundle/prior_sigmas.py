@@ -10,7 +10,7 @@ import numpy as np
 from ..model import Reconstruction
 from ..model.array_types import Array
 from .bundle_options import BundleOptions
-from .common_motion import NUM_WAYS, sigmas_of_means
+from .common_motion import MeansPrior, prior_of_means
 from .layout import Layout
 from .motion_prior import SIGMA_OF_SCALE, tail_weight
 from .path_prior import PathPrior
@@ -78,10 +78,8 @@ class PriorSigmas:
         Of the unknowns of the cameras' residual fields, pixels.
     path : tuple of float
         Of a path, if there is one: rotation and travel, as `PathPrior` takes them.
-    means : tuple of float
-        Of the means of a camera's motions, if there are any, as `MotionMeans` takes them.
-    shared : float
-        How likely photos share a motion.
+    means : MeansPrior or None
+        Of the means of a camera's motions, if there are any.
     """
 
     phi: float
@@ -92,8 +90,7 @@ class PriorSigmas:
     ways: tuple[float, ...] = ()
     field: float = 1.0
     path: tuple[float, ...] = ()
-    means: tuple[float, ...] = ()
-    shared: float = 0.0
+    means: MeansPrior | None = None
 
 
 def _prior_sigma(values: Array, variance: Array, span: Array, sigma: float) -> float:
@@ -167,9 +164,9 @@ def estimated(
         velocity = _scale(own[:, 3:], own_variances[:, 3:], sigmas.velocity) + _MIN_SIGMA * current.baseline
         found = replace(found, velocity=velocity)
     if common is not None:
+        assert sigmas.means is not None
         freedom = _freedom(own, own_variances, common, sigmas)
-        means, shared = _mean_sigmas(common, found.velocity, current, freedom)
-        found = replace(found, means=means, shared=shared)
+        found = replace(found, means=_means_prior(common, sigmas.means, found.velocity, current, freedom))
     if options.varying:
         varied = current.variation
         of_varied = variances[:, layout.motion : layout.variation]
@@ -190,15 +187,15 @@ def _freedom(own: Array, variances: Array, common: Common, sigmas: PriorSigmas) 
         if shares.any():
             x, mean, variance = (each[:, part][shares] for each in (own, common.values, variances))
             of_noise = 1.0 / np.maximum(1.0 / variance - 1.0 / sigma**2, 1e-9 / sigma**2)
-            alone = float((x**2 + mean**2 + variance).mean())
+            alone = float(((x + mean) ** 2 + variance).mean())
             known += float((alone / (alone + of_noise)).sum())
     return known
 
 
-def _mean_sigmas(
-    common: Common, velocity_sigma: float, current: Reconstruction, freedom: float
-) -> tuple[tuple[float, ...], float]:
-    """Standard deviations of the prior on means, and how likely the photos share a motion.
+def _means_prior(
+    common: Common, before: MeansPrior, velocity_sigma: float, current: Reconstruction, freedom: float
+) -> MeansPrior:
+    """Prior on means that were found under the one before.
 
     A velocity in common is expected to be a few times what the photos have of their own, or as large as it is found, or
     that of a camera that does not stop.
@@ -207,13 +204,15 @@ def _mean_sigmas(
     velocity = max(velocity, _STEADY * current.baseline)
     sharing = np.flatnonzero(common.variances.any(1))
     if not len(sharing):
-        return (velocity,) * NUM_WAYS, 0.0
-    found = (common.values**2 + common.variances)[sharing, 3:]
+        return MeansPrior.of_ways(velocity, depth)
+    # if they share one: what was found is the mean over both
+    likely = before.probability or 1.0
+    found = ((common.values / likely) ** 2 + common.variances / likely)[sharing, 3:]
     velocity = max(velocity, float(np.sqrt(found.mean())))
     cameras = np.unique(current.camera_idx[sharing])
-    of_cameras = common.unknowns[cameras], common.covariances[cameras]
-    sigmas = sigmas_of_means(*of_cameras, common.root, velocity, depth, freedom)
-    return sigmas, min(1.0, float(np.sum(np.square(sigmas))) / velocity**2)
+    return prior_of_means(
+        common.unknowns[cameras], common.covariances[cameras], common.root, velocity, depth, freedom
+    )  # fmt: skip
 
 
 def _own_motions(current: Reconstruction, covariances: Array, common: Common | None) -> tuple[Array, Array]:
@@ -272,10 +271,9 @@ def settled(before: PriorSigmas, after: PriorSigmas, tolerance: float) -> bool:
     phi, velocity = (np.inf, np.inf) if before.path else (_SETTLED_AT, 0.0)
     negligible = {
         "phi": phi, "velocity": velocity, "focal": _SETTLED_AT, "centre": _SETTLED_AT, "bends": _SETTLED_AT,
-        "ways": 0.0, "field": _SETTLED_PX, "path": 0.0, "means": np.inf,
+        "ways": 0.0, "field": _SETTLED_PX, "path": 0.0,
     }  # fmt: skip
-    most = max(after.means, default=0.0)
-    if any(abs(new - old) > _SETTLED_MEANS * most for old, new in zip(before.means, after.means, strict=True)):
+    if before.means is not None and after.means is not None and after.means.differs(before.means, _SETTLED_MEANS):
         return False
     for name, least in negligible.items():
         old, new = np.array([getattr(before, name), getattr(after, name)])
@@ -298,7 +296,7 @@ def starting_sigmas(options: BundleOptions, layout: Layout, reconstruction: Reco
         () if options.path is None else (_ROTATION_START, _TRAVEL_START * baseline),
     )
     if has_means(layout, options):
-        start = replace(start, means=(_MUCH * start.velocity / np.sqrt(NUM_WAYS),) * NUM_WAYS)
+        start = replace(start, means=MeansPrior.of_ways(_MUCH * start.velocity, reconstruction.typical_depth))
     return _bounded(start, options, baseline)
 
 

@@ -161,7 +161,7 @@ class BundleProblem:
 
     def _motion_means(self, sigmas: PriorSigmas) -> MotionMeans | None:
         """How motions depend on their means, if these are solved for and any photo shares them."""
-        if not sigmas.means:
+        if sigmas.means is None:
             return None
         # what a photo's own limit bounds is no sample of the others, and few photos are none of their camera
         limits, start = self._options.phi_limits, self._start

@@ -165,7 +165,9 @@ class Rounds:
         if state.path is not None:
             self._with_pace = equations.photos_by_shared(1)[:, :, 0]
         self._weighed_noise, self._had_heavy_tails = self._noise, self._heavy_tails
-        self._doubt = Doubt.of(equations, options, self._current, self._heavy_tails)
+        prior = self._sigmas.means
+        unsure = None if prior is None else np.sqrt(prior.odds_against) * state.means
+        self._doubt = Doubt.of(equations, options, self._current, self._heavy_tails, unsure)
         self._inflation = Inflation()
         if asks_residuals:
             # the measurements of judged solves are the same, and their points hardly move
@@ -319,8 +321,13 @@ class Rounds:
         of = self._problem.means
         if of is None or self._means is None:
             return None
+        prior = self._weighed_sigmas.means
+        assert prior is not None
+        assert self._sigmas.means is not None
         per_unit = np.repeat([1.0, 1.0 / self._baseline], [3, 5])
         means, variances = of.of_photos(self._solved.state.means, self._covariances_of_means)
-        sigmas = (*(each / self._baseline for each in self._weighed_sigmas.means),)
-        deviations = np.sqrt(np.maximum(variances, 0.0)) * per_unit[:6]
-        return CommonMotion(self._means * per_unit, sigmas, means * per_unit[:6], deviations, self._sigmas.shared)
+        deviations = np.sqrt(np.maximum(variances + prior.odds_against * means**2, 0.0))
+        return CommonMotion(
+            self._means * per_unit, prior.scaled(1.0 / self._baseline), means * per_unit[:6],
+            deviations * per_unit[:6], self._sigmas.means.probability,
+        )  # fmt: skip

@@ -165,7 +165,7 @@ def _expected(
         return np.zeros((rec.num_images, 6)), *np.repeat(own[:, None], rec.num_images, axis=1)
     per_unit = np.repeat([1.0, rec.baseline], [3, 5])
     # of a camera with few photos, and of a photo with a limit of its own, the motion is its own
-    of = MotionMeans.of(rec, tuple(each * rec.baseline for each in common.sigmas), freed.shares)
+    of = MotionMeans.of(rec, common.prior.scaled(rec.baseline), freed.shares)
     means = of.at(of.unknowns(per_unit * common.values))
     of_means = (per_unit[:6] * common.deviations) ** 2 * freed.shares
     of_means = of_means.reshape(-1, 2, 3).mean(axis=2)
