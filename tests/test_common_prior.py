@@ -215,8 +215,6 @@ def covariance_of_ways(depth, sigmas=MEANS):
             phi = np.cross([0.0, 0.0, 1.0], travel) / depth
             np.testing.assert_allclose(np.cross(phi, [0.0, 0.0, depth]), travel, atol=1e-15)
             total[:6, :6] += sigmas[3 + axis] ** 2 * np.outer(*[np.concatenate([phi, travel])] * 2)
-            # what is aimed at may lie a quarter of the depth before or behind what is seen
-            total[:3, :3] += sigmas[3 + axis] ** 2 * np.outer(phi, phi) / 16
     return total
 
 

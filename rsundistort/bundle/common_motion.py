@@ -23,9 +23,6 @@ _NUM_WAYS = 8
 _NONE = float(_NUM_WAYS)
 # Of any way to move. The measurements can still be asked.
 _LEAST_PROBABILITY = 1e-4
-# What is aimed at lies so much, of the depth of what photos show, before or behind that (the middle of a thing does,
-# whose front is all that shows).
-_DEPTH_OF_AIM = 0.25
 # Photos that rest share one by odds of up to 14 (seven sets of fountain-small/gs): errors of the lens look like that.
 _CERTAIN = 0.99
 # Of the squares of what photos move by, as far as a motion in common that was not believed before explains it.
@@ -52,9 +49,9 @@ class MeansPrior:
         """Before anything is known, by the standard deviation of travels in common, and the depth of what is seen.
 
         The ways to move together, as likely as each other: of cameras that travel along their x, y, or z, of those that
-        aim at what they pass along x or y, whose rotation is their travel by about the depth, of those that are on
-        their way from one photo to the next (travelling only, as drones that hold their gimbal do, and rotating as they
-        do from photo to photo, as the frames of a video), and of those that travel and rotate as they like, by as much.
+        aim at what they pass along x or y, whose rotation is their travel by the depth, of those that are on their way
+        from one photo to the next (travelling only, as drones that hold their gimbal do, and rotating as they do from
+        photo to photo, as the frames of a video), and of those that travel and rotate as they like, by as much.
         """
         return cls(velocity**2 * _ways(depth).mean(axis=0))
 
@@ -221,11 +218,8 @@ def _ways(depth: float) -> Array:
     aiming = travels[:2].copy()
     aiming[:, :2] = [[0.0, 1.0 / depth], [-1.0 / depth, 0.0]]  # what is passed stays in the middle
     along = np.vstack([travels, aiming, np.eye(8)[6:]])
-    ways = along[:, :, None] * along[:, None]
-    for way, rotation in zip(ways[3:5], (1, 0), strict=True):
-        way[rotation, rotation] += (_DEPTH_OF_AIM / depth) ** 2
     free = np.diag(np.repeat([depth**-2.0, 1.0, 0.0], [3, 3, 2]))
-    return np.concatenate([ways, free[None]])
+    return np.concatenate([along[:, :, None] * along[:, None], free[None]])
 
 
 def prior_of_means(
