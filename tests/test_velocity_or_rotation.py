@@ -16,9 +16,9 @@ from rsundistort.bundle import BundleOptions, Posterior, bundle_adjust, choose_m
 from rsundistort.bundle.choice import _rival
 from rsundistort.bundle.doubt import steps_after, steps_to
 from rsundistort.bundle.held_out import ModelFits
-from rsundistort.bundle.rivals import LEAST_RIVAL
+from rsundistort.bundle.model_choice import LEAST_RIVAL
 from rsundistort.model.reprojection import shutter_displacements
-from rsundistort.solve.model_sequence import _against_rival
+from rsundistort.solve.model_sequence import _is_common
 from rsundistort.verdict.judge import _rival_reasons
 
 CAMERA = Camera(768, 512, [[640, 0, 388], [0, 640, 251], [0, 0, 1]])
@@ -110,7 +110,7 @@ def test_a_travel_that_photos_share_decides_where_held_out_measurements_do_not(r
     assert choice.has_rival
     options = BundleOptions(deviations="jackknife")
     result = bundle_adjust(at_rest(rec), "rotation", options)
-    assert _against_rival(result, choice, options, StageLog(None)).is_shared == bool(drift)
+    assert _is_common(result, choice, options, StageLog(None)) == bool(drift)
     travelling = choice.with_velocity()
     assert (travelling.shutter_model, travelling.label) == ("constant-motion", "constant-motion")
     assert travelling.is_shared
@@ -125,23 +125,7 @@ def test_a_travel_that_photos_share_decides_where_held_out_measurements_do_not(r
     assert (changing.shutter_model, changing.label, changing.bends) == ("constant-motion", "constant-motion", 0)
     # what was not tried says nothing
     untried = replace(choice, held_out_error={"rotation": 1.0})
-    assert _against_rival(result, untried, options, StageLog(None)) is untried
-
-
-def test_a_rival_is_what_it_is_by_all_measurements(rng):
-    """Fits that held measurements out took noise as independent: what they saw in photos may be none."""
-    rec = flight(rng, 5, drift=0.0, rotation=0.03)
-    choice = choose(rec)
-    phantom = replace(choice.others["constant-motion"], steps=np.full((5, 12), 0.1), probability=0.3)
-    choice = replace(choice, rival=1.9, others={"constant-motion": phantom})
-    assert_allclose(choice.steps[rec.image_names[0]], np.sqrt(0.3) * 0.1)
-    options = BundleOptions(deviations="jackknife")
-    result = bundle_adjust(at_rest(rec), "rotation", options)
-    settled = _against_rival(result, choice, options, StageLog(None))
-    assert settled.shutter_model == "rotation"
-    assert not settled.has_rival
-    assert settled.others["constant-motion"].probability == 0.3
-    assert np.abs(np.array([*settled.steps.values()])[:, 6:9]).max() < 0.003
+    assert not _is_common(result, untried, options, StageLog(None))
 
 
 def test_a_model_that_may_be_right_too_widens_the_deviations(rng):

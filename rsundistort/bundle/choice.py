@@ -9,12 +9,13 @@ from scipy.special import ndtr
 
 from ..model import SHUTTER_MODELS, Reconstruction
 from ..model.array_types import Array
+from ..model.reprojection import shutter_displacements, typical_px
 from .adjust import MODEL_SEQUENCE
 from .bundle_options import BundleOptions
+from .doubt import steps_to
 from .held_out import BENDS, MIN_AGREEMENT, MIN_FALL, SMOOTH_BENDS, ModelFit, ModelFits
 from .known_motions import compare_known_motions
-from .model_choice import ModelChoice
-from .rivals import LEAST_RIVAL, UNSEEN_PX, Rival, moved_otherwise
+from .model_choice import LEAST_RIVAL, ModelChoice
 
 __all__ = ["choose_model"]
 
@@ -22,6 +23,8 @@ __all__ = ["choose_model"]
 _MOST_OF_IT = 0.5
 # Splines along the readout through this many values follow motions that none of the models can.
 _RESTLESS = 49
+# Motions that displace pixels by less than this, root mean square over the photos, count as none.
+_UNSEEN_PX = 0.5
 _FIELD = ", residual field"
 
 
@@ -148,7 +151,7 @@ def choose_model(
     against, agreement = selection.against if best is plain else [], None
     known = compare_known_motions(fits, plain, best)
     if best is not plain:
-        if np.sqrt(np.mean(moved_px(best.reconstruction) ** 2)) < UNSEEN_PX:
+        if np.sqrt(np.mean(moved_px(best.reconstruction) ** 2)) < _UNSEEN_PX:
             best = plain
         else:
             # what else bends photos knows nothing of motions that were measured elsewhere
@@ -181,11 +184,10 @@ def choose_model(
         len(fits.held_out),
         best.residual_field,
         best.bends,
-        shutter != "not-determined" and fits.waves(best, _RESTLESS, UNSEEN_PX / 2),
+        shutter != "not-determined" and fits.waves(best, _RESTLESS, _UNSEEN_PX / 2),
         rival,
-        _others(fits, best),
-        tuple(best.reconstruction.image_names),
-        known_motions=known,
+        _steps_of_others(fits, best),
+        known,
     )
 
 
@@ -203,18 +205,19 @@ def _with_field(fits: ModelFits, best: ModelFit, kept: list[str], gain: dict[str
     return field
 
 
-def _others(fits: ModelFits, best: ModelFit) -> dict[str, Rival]:
-    """`ModelChoice.others`. A model is right with the probability that its held-out error is the smaller one."""
+def _steps_of_others(fits: ModelFits, best: ModelFit) -> dict[str, tuple[float, ...]]:
+    """`ModelChoice.steps`. A model is right with the probability that its held-out error is the smaller one."""
     if best.model == "global":
         return {}
-    rec, others = best.reconstruction, dict[str, Rival]()
-    for label, fit in fits.done.items():
+    rec, most = best.reconstruction, np.zeros((best.reconstruction.num_images, 12))
+    for fit in fits.done.values():
         same = [each.readout for each in fit.reconstruction.cameras] == [each.readout for each in rec.cameras]
         if fit is best or not same or SHUTTER_MODELS[fit.model] < SHUTTER_MODELS["rotation"] or not len(fit.errors):
             continue
         ahead = float(ndtr(-fits.gain(fit, best)))
-        others[label] = Rival.of(fit.reconstruction, rec, ahead / (ahead + 0.5))
-    return others
+        steps = np.sqrt(ahead / (ahead + 0.5)) * steps_to(fit.reconstruction, rec)
+        most = steps if (steps[:, 6:9] ** 2).sum() > (most[:, 6:9] ** 2).sum() else most
+    return {name: tuple(each) for name, each in zip(rec.image_names, most.tolist(), strict=True)}
 
 
 def _rival(fits: ModelFits, best: ModelFit, gain: dict[str, float]) -> float:
@@ -231,8 +234,13 @@ def _rival(fits: ModelFits, best: ModelFit, gain: dict[str, float]) -> float:
 
 def _rival_of_tried(fits: ModelFits, best: ModelFit) -> float:
     """`_rival` of the models that were fitted."""
-    others = [fit for fit in fits.done.values() if fit.model == "constant-motion" and not fits.is_better(fit, best)]
-    return max((moved_otherwise(best.reconstruction, fit.reconstruction) for fit in others), default=0.0)
+    shares, (own, seen) = [0.0], shutter_displacements(best.reconstruction)
+    for fit in fits.done.values():
+        if fit.model == "constant-motion" and not fits.is_better(fit, best):
+            other, valid = shutter_displacements(fit.reconstruction)
+            apart, size = (typical_px(best.reconstruction, each, seen & valid) for each in (other - own, own))
+            shares.append(float(apart / max(size, 1e-9)) if apart >= _UNSEEN_PX else 0.0)
+    return max(shares)
 
 
 def _selected(fits: ModelFits, models: Sequence[str], refines: bool) -> _Selection:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from ..model import Reconstruction
 from .held_out import BENDS
 from .known_motions import KnownMotions
-from .rivals import LEAST_RIVAL, Rival, largest_steps, moved_otherwise
 
-__all__ = ["ModelChoice"]
+__all__ = ["LEAST_RIVAL", "ModelChoice"]
+
+#: Photos are displaced this much otherwise by a velocity that explains them as well, as a share of what is corrected.
+LEAST_RIVAL = 1 / 3
 
 
 @dataclass(frozen=True)
@@ -57,10 +58,8 @@ class ModelChoice:
         Of rotations: by how much a velocity that predicts the held-out measurements as well displaces the photos
         otherwise (the mean over the photos of their medians) over what the rotations displace them by. 0 where no
         velocity does as well, and where that is less than half a pixel.
-    others : mapping of str to Rival
-        Of a shutter: the models beside it that may be right.
-    names : tuple of str
-        The photos, in the order of what the others move.
+    steps : mapping of photo to 12 floats
+        Of a shutter: how far the other model that moves its motions most would move them, as `BundleOptions.rival`.
     known_motions : KnownMotions or None
         What the photos say of motions that are known from elsewhere; None if none are.
     is_shared : bool
@@ -83,8 +82,7 @@ class ModelChoice:
     bends: int = 0
     restless: bool = False
     rival: float = 0.0
-    others: Mapping[str, Rival] = field(default_factory=dict)
-    names: tuple[str, ...] = ()
+    steps: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     known_motions: KnownMotions | None = None
     is_shared: bool = False
 
@@ -92,22 +90,6 @@ class ModelChoice:
     def has_rival(self) -> bool:
         """Whether a velocity explains the photos as well, and displaces them otherwise."""
         return self.rival >= LEAST_RIVAL
-
-    @property
-    def steps(self) -> dict[str, tuple[float, ...]]:
-        """How far the other model that moves its motions most would move each photo, as `BundleOptions.rival`."""
-        return largest_steps(self.others, self.names)
-
-    def with_rival(self, rotating: Reconstruction, travelling: Reconstruction) -> ModelChoice:
-        """The choice of rotations, with a velocity beside them as both were adjusted to all measurements.
-
-        What it was in the fits that held measurements out took noise as independent, and photos as sharing more of a
-        motion than they do.
-        """
-        label = self.with_velocity().label
-        velocity = Rival.of(travelling, rotating, self.others[label].probability)
-        others = {key: each for key, each in self.others.items() if each.model != velocity.model} | {label: velocity}
-        return replace(self, rival=moved_otherwise(rotating, travelling), others=others)
 
     def with_velocity(self) -> ModelChoice:
         """The choice of a velocity beside steady rotations, if it was tried with the same lens; else this one."""
@@ -122,6 +104,6 @@ class ModelChoice:
             bends=0,
             kept=(*self.kept, label),
             rival=0.0,
-            others={},
+            steps={},
             is_shared=True,
         )

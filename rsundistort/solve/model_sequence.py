@@ -277,10 +277,12 @@ def _chosen(
         result.reconstruction, MODEL_SEQUENCE, options, sigma_px=result.sigma_px, seed=seed,
         progress=lambda model, _: log.tell(f"choice: {model}", 0),
     )  # fmt: skip
-    options = replace(options, varying=choice.varying, bends=choice.bends, residual_field=choice.residual_field)
-    if choice.has_rival:
-        choice = _against_rival(result, choice, options, log)
-    options = replace(options, bends=choice.bends, rival=choice.steps)
+    options = replace(
+        options, varying=choice.varying, bends=choice.bends, residual_field=choice.residual_field, rival=choice.steps,
+    )  # fmt: skip
+    if choice.has_rival and _is_common(result, choice, options, log):
+        choice = choice.with_velocity()
+        options = replace(options, bends=choice.bends, rival=choice.steps)
     # windows were aligned, and outliers found, with a model that may be replaced now
     again = track_source is not None and track_source.workers is not None
     again = again and (choice.shutter_model == "constant-motion" or choice.bends > 0)
@@ -312,23 +314,18 @@ def _chosen(
     return choice, result, tracks, options
 
 
-def _against_rival(result: BundleResult, choice: ModelChoice, options: BundleOptions, log: StageLog) -> ModelChoice:
-    """The choice of rotations or of a velocity that predicts as well, by adjustments of both, which know their noise.
+def _is_common(result: BundleResult, choice: ModelChoice, options: BundleOptions, log: StageLog) -> bool:
+    """Whether photos share a travel that held-out measurements do not show.
 
     Each photo's velocity may as well be a rotation, and hardly predicts measurements better. Of what photos share, the
-    evidence says more: a travel in common that is certain is kept. If there is none, the velocity stays a rival as far
-    as it displaces the photos otherwise.
+    evidence says more; it takes an adjustment that knows its noise.
     """
     travelling = choice.with_velocity()
     if travelling is choice:
-        return choice
-    start, step = result.reconstruction, partial(tell, log, "choice")
-    own = replace(options, rival={}, outlier_rounds=0)
-    travelled = bundle_adjust(start, "constant-motion", replace(own, bends=travelling.bends), step)
-    if travelled.common is not None and travelled.common.is_certain:
-        return travelling
-    rotated = bundle_adjust(start, "rotation", own, step)
-    return choice.with_rival(rotated.reconstruction, travelled.reconstruction)
+        return False
+    own = replace(options, bends=travelling.bends, rival={}, outlier_rounds=min(options.outlier_rounds, 1))
+    found = bundle_adjust(result.reconstruction, "constant-motion", own, partial(tell, log, "choice"))
+    return found.common is not None and found.common.is_certain
 
 
 def _is_no_lens(found: Reconstruction, start: Reconstruction) -> bool:
