@@ -40,6 +40,9 @@ _SETTLED_MEANS = 0.2
 # a part of their speed. (Were the mean drawn to zero as a sample of what varies, that of an orbit would be lost, and
 # its rotation with it.)
 _MUCH = 3.0
+# A motion that is less likely is not taken from the mean over sharing it and none: what a solve leaves of steps would
+# count many times.
+_LEAST_LIKELY = 0.1
 # Of the way between two photos, in a frame: half a second or more from photo to photo, a frame in a hundredth or less.
 _STEADY = 0.02
 # A lens that its model says so badly needs another model.
@@ -206,7 +209,7 @@ def _means_prior(
     if not len(sharing):
         return MeansPrior.of_ways(velocity, depth)
     # if they share one: what was found is the mean over both
-    likely = before.probability or 1.0
+    likely = max(before.probability, _LEAST_LIKELY) if before.probability else 1.0
     found = ((common.values / likely) ** 2 + common.variances / likely)[sharing, 3:]
     velocity = max(velocity, float(np.sqrt(found.mean())))
     cameras = np.unique(current.camera_idx[sharing])
