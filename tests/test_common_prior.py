@@ -289,6 +289,15 @@ def test_the_prior_of_means_gives_the_mean_of_none_and_of_all_ways_to_move(of, r
     assert mean < 0.35 if of is None else mean > 0.5
 
 
+def test_the_prior_of_means_can_be_factored_however_exact_measurements_are(rng):
+    depth, motion = 4.0, np.zeros(8)
+    for exactness in (1e16 * np.eye(8), np.diag([1e20] * 3 + [1e-6] * 5), np.diag([1e-6] * 7 + [1e20])):
+        under = covariance_of_ways(depth, (0.05,) * 8)
+        prior = prior_of_means(*shown(rng, motion, exactness, under), 0.05, depth, KNOWN_SIZE)
+        root = np.linalg.cholesky(prior.covariance)
+        np.testing.assert_allclose(root @ root.T, prior.covariance, rtol=1e-9, atol=1e-12 * prior.covariance.max())
+
+
 def test_the_prior_of_means_does_not_depend_on_that_under_which_they_were_found(rng):
     exactness = np.linalg.inv(np.diag([0.01] * 3 + [0.05] * 5) ** 2 * (np.eye(8) + 0.5))
     found = []
