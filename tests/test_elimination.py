@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from rsundistort import BundleOptions
 from rsundistort._kernels import blocks
-from rsundistort.bundle import envelope, reduced
+from rsundistort.bundle import envelope, reduced, sparse_blocks
 from rsundistort.bundle.coarse_space import CoarseSpace
 from rsundistort.bundle.conjugate_gradients import solve_iteratively
 from rsundistort.bundle.elimination import Elimination
@@ -324,7 +324,19 @@ def test_a_sparse_matrix_that_is_not_positive_is_refused(rng):
     assert SparseBlocks.of(grid.pattern, grid.free).factor(S) is None
 
 
-def test_a_sparse_factor_does_not_depend_on_the_number_of_threads(rng):
+def test_few_threads_are_woken_for_little_work(rng, monkeypatch):
+    grid, woken = Grid(rng), numba.get_num_threads()
+    shape = SparseBlocks.of(grid.pattern, grid.free)
+    with shape.threads():
+        assert numba.get_num_threads() == 1
+    assert numba.get_num_threads() == woken
+    monkeypatch.setattr(sparse_blocks, "_WORTH_THREADS", 0.0)
+    with shape.threads():
+        assert numba.get_num_threads() == woken
+
+
+def test_a_sparse_factor_does_not_depend_on_the_number_of_threads(rng, monkeypatch):
+    monkeypatch.setattr(sparse_blocks, "_WORTH_THREADS", 0.0)  # else one thread does
     grid = Grid(rng)
     shape = SparseBlocks.of(grid.pattern, grid.free)
     found = []
